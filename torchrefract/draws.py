@@ -1,0 +1,93 @@
+"""Keyed random numbers: what a sample draws depends on (seed, key, place) and on nothing else.
+
+The generator is Threefry-2x32 with 20 rounds, written in integer tensor operations that never overflow. So the same
+words come out for every batch size, order, worker, thread count and device, inside torch.compile too.
+
+Source: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+_WORD = 0xFFFFFFFF
+_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
+_PARITY = 0x1BD11BDA
+
+
+class Stream(NamedTuple):
+    """Where the random numbers of each sample come from: two words of 32 bits a sample, each (B,), int64."""
+
+    high: Tensor
+    low: Tensor
+
+
+def stream(seed: int | Tensor, keys: Tensor) -> Stream:
+    """The stream of each sample.
+
+    Args:
+        seed: a whole number or a tensor of one, int64; of larger numbers the lowest 64 bits count.
+        keys: (B,), int64.
+    """
+    if not isinstance(seed, Tensor):
+        # Two's complement, so that every Python integer has its 64 bits.
+        seed = torch.full((), (seed + 2**63) % 2**64 - 2**63, dtype=torch.int64, device=keys.device)
+    return Stream(*threefry(_words(seed), _words(keys)))
+
+
+def fold(parent: Stream, place: int) -> Stream:
+    """The stream of each sample at one place of a pipeline."""
+    zero = torch.zeros_like(parent.low)
+    return Stream(*threefry(parent, (zero + place, zero + 1)))
+
+
+def uniform(source: Stream, count: int) -> Tensor:
+    """(B, count), float32, uniform in the open interval (0, 1), on a lattice of 2^23 values."""
+    pairs = (count + 1) // 2
+    counter = torch.arange(pairs, dtype=torch.int64, device=source.low.device)
+    words = threefry((source.high[:, None], source.low[:, None]), (counter, torch.zeros_like(counter)))
+    return (torch.cat(words, dim=1)[:, :count] >> 9).float().add(0.5).mul(2.0**-23)
+
+
+def normal(source: Stream, count: int) -> Tensor:
+    """(B, count), float32, standard normal (Box and Muller 1958), up to 5.7 in magnitude."""
+    pairs = (count + 1) // 2
+    radius, angle = uniform(source, 2 * pairs).chunk(2, dim=1)
+    radius, angle = (-2 * radius.log()).sqrt(), 2 * math.pi * angle
+    return torch.cat([radius * angle.cos(), radius * angle.sin()], dim=1)[:, :count]
+
+
+def call_seed() -> Tensor:
+    """(), int64: a fresh seed from torch's global generator, in eager mode and under torch.compile alike."""
+    return torch.ops.torchrefract.call_seed()
+
+
+def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Two words for each counter under each key, all of them int64 tensors in [0, 2^32) that broadcast."""
+    keys = (*key, key[0] ^ key[1] ^ _PARITY)
+    x, y = (counter[0] + keys[0]) & _WORD, (counter[1] + keys[1]) & _WORD
+    for group in range(5):
+        for rotation in _ROTATIONS[group % 2]:
+            x = (x + y) & _WORD
+            y = (((y << rotation) & _WORD) | (y >> (32 - rotation))) ^ x
+        x = (x + keys[(group + 1) % 3]) & _WORD
+        y = (y + keys[(group + 2) % 3] + group + 1) & _WORD
+    return x, y
+
+
+def _words(value: Tensor) -> tuple[Tensor, Tensor]:
+    value = value.long()
+    return (value >> 32) & _WORD, value & _WORD
+
+
+@torch.library.custom_op("torchrefract::call_seed", mutates_args=(), tags=(torch.Tag.nondeterministic_seeded,))
+def _call_seed() -> Tensor:
+    # An operator of its own: the compiler neither folds it to a constant nor swaps in its own random numbers.
+    return torch.randint(-(2**63), 2**63 - 1, (), dtype=torch.int64)
+
+
+@_call_seed.register_fake
+def _() -> Tensor:
+    return torch.empty((), dtype=torch.int64)

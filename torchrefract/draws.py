@@ -22,6 +22,11 @@ class Stream(NamedTuple):
 
     high: Tensor
     low: Tensor
+    lane: int = 0  # numbers of different lanes are independent
+
+    def at(self, lane: int) -> "Stream":
+        """The same samples, in another lane."""
+        return self._replace(lane=lane)
 
 
 def stream(seed: int | Tensor, keys: Tensor) -> Stream:
@@ -37,17 +42,17 @@ def stream(seed: int | Tensor, keys: Tensor) -> Stream:
     return Stream(*threefry(_words(seed), _words(keys)))
 
 
-def fold(parent: Stream, place: int) -> Stream:
-    """The stream of each sample at one place of a pipeline."""
+def fold(parent: Stream) -> Stream:
+    """Streams of their own for what is nested in a lane."""
     zero = torch.zeros_like(parent.low)
-    return Stream(*threefry(parent, (zero + place, zero + 1)))
+    return Stream(*threefry((parent.high, parent.low), (zero + _WORD, zero + parent.lane)))
 
 
 def uniform(source: Stream, count: int) -> Tensor:
     """(B, count), float32, uniform in the open interval (0, 1), on a lattice of 2^23 values."""
-    pairs = (count + 1) // 2
-    counter = torch.arange(pairs, dtype=torch.int64, device=source.low.device)
-    words = threefry((source.high[:, None], source.low[:, None]), (counter, torch.zeros_like(counter)))
+    counter = torch.arange((count + 1) // 2, dtype=torch.int64, device=source.low.device)
+    lane = torch.full_like(counter, source.lane)
+    words = threefry((source.high[:, None], source.low[:, None]), (counter, lane))
     return (torch.cat(words, dim=1)[:, :count] >> 9).float().add(0.5).mul(2.0**-23)
 
 
@@ -67,14 +72,16 @@ def call_seed() -> Tensor:
 def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Two words for each counter under each key, all of them int64 tensors in [0, 2^32) that broadcast."""
     keys = (*key, key[0] ^ key[1] ^ _PARITY)
-    x, y = (counter[0] + keys[0]) & _WORD, (counter[1] + keys[1]) & _WORD
+    x, y = counter[0] + keys[0], counter[1] + keys[1]
     for group in range(5):
         for rotation in _ROTATIONS[group % 2]:
-            x = (x + y) & _WORD
-            y = (((y << rotation) & _WORD) | (y >> (32 - rotation))) ^ x
+            # Only what is shifted right must be free of carries; they never reach bit 63.
+            y = y & _WORD
+            x = x + y
+            y = (y << rotation | y >> (32 - rotation)) ^ x
         x = (x + keys[(group + 1) % 3]) & _WORD
-        y = (y + keys[(group + 2) % 3] + group + 1) & _WORD
-    return x, y
+        y = y + keys[(group + 2) % 3] + group + 1
+    return x, y & _WORD
 
 
 def _words(value: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,296 @@
+"""What every effect is: parameters drawn by key, then a deterministic and differentiable function of them."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
+
+import torch
+from torch import Tensor, nn
+
+from torchrefract import draws
+from torchrefract._checks import check_all, check_choice, check_number, is_true
+from torchrefract.effects.door import check_image, enter, leave
+from torchrefract.types import Degraded, Range
+from torchrefract.warping.grid import field_dtype, inside
+from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, look_up
+
+
+class Effect(nn.Module, ABC):
+    """A degradation of images.
+
+    Images are (B, C, H, W) or (C, H, W), floating in [0, 1] or uint8, and come back in shape, type and memory format
+    as they were. A sample that the effect leaves alone comes back bit for bit.
+
+    Args:
+        p: chance that a sample is degraded at all, in [0, 1].
+    """
+
+    def __init__(self, *, p: float = 1.0):
+        super().__init__()
+        self.p = check_number("p", p, low=0.0, high=1.0)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """The image degraded, by a draw that torch's global generator seeds."""
+        return self.degrade(image).image
+
+    def degrade(
+        self,
+        image: Tensor,
+        *,
+        seed: int | Tensor | None = None,
+        keys: Tensor | Sequence[int] | None = None,
+        depth: Tensor | None = None,
+    ) -> Degraded:
+        """The image degraded, with the maps of what was done.
+
+        Args:
+            image: (B, C, H, W) or (C, H, W), floating in [0, 1] or uint8.
+            seed: of the draw; None takes one from torch's global generator.
+            keys: (B,), whole numbers: sample i depends on (seed, keys[i]) alone; None counts from 0.
+            depth: (B, 1, H, W) or (1, H, W), m, for the effects that ask for it.
+
+        Raises:
+            ValueError, TypeError: arguments that do not fit.
+        """
+        return self.apply(image, self.sample(image, seed=seed, keys=keys), depth=depth)
+
+    def sample(
+        self,
+        image: Tensor,
+        *,
+        seed: int | Tensor | None = None,
+        keys: Tensor | Sequence[int] | None = None,
+        place: int = 0,
+    ) -> Any:
+        """The parameters of one draw for this image, a NamedTuple of tensors; `place` is that in a pipeline."""
+        check_image(image)
+        batch = 1 if image.ndim == 3 else image.shape[0]
+        source = draws.stream(draws.call_seed() if seed is None else _seed(seed), _keys(keys, batch, image.device))
+        return self.draw(source.at(place), image if image.ndim == 4 else image[None])
+
+    def apply(  # pyright: ignore[reportIncompatibleMethodOverride]  # nn.Module has taken the name; both uses work
+        self, image: Any, params: Any = None, *, depth: Tensor | None = None
+    ) -> Any:
+        """The image degraded by parameters that are given, as by those of an earlier draw -> Degraded.
+
+        With a function as its one argument this is `nn.Module.apply`, so that an effect can sit inside a model.
+        """
+        if params is None and callable(image) and not isinstance(image, Tensor):
+            return super().apply(cast(Callable[[nn.Module], None], image))
+        check_image(image)
+        batched = enter(image)
+        self._check_params(params, batched)
+        result = self.compute(batched, params, _batched_depth(depth, image))
+        result.image = leave(result.image, image, untouched=result.image is batched)
+        return result if image.ndim == 4 else result.map(lambda value: value[0])
+
+    @abstractmethod
+    def draw(self, source: draws.Stream, image: Tensor) -> Any:
+        """The parameters of a batch (B, C, H, W), drawn from the streams of its samples."""
+
+    @abstractmethod
+    def check(self, params: Any, image: Tensor) -> None:
+        """Raise for parameters outside their domain, where reading them costs nothing."""
+
+    @abstractmethod
+    def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
+        """The batch (B, C, H, W), floating, degraded by checked parameters."""
+
+    def _uniform(self, source: draws.Stream, ranges: Sequence[Range], image: Tensor) -> tuple[Tensor, Tensor]:
+        """The gate, (B,), bool, and a value out of each range, (B, n)."""
+        values = draws.uniform(source, 1 + len(ranges))
+        gate, values = values[:, 0] < self.p, values[:, 1:].to(field_dtype(image.dtype))
+        low, high = torch.tensor(ranges, dtype=values.dtype, device=values.device).unbind(1)
+        return gate, low + (high - low) * values
+
+    def _check_params(self, params: Any, image: Tensor) -> None:
+        if not hasattr(params, "_fields"):
+            raise TypeError(f"params must be what {type(self).__name__}.sample returns, got {type(params).__name__}")
+        for name, value in zip(params._fields, params, strict=True):
+            if not isinstance(value, Tensor) or value.ndim == 0 or value.shape[0] != image.shape[0]:
+                found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+                raise ValueError(
+                    f"params.{name} must have one row for each of the {image.shape[0]} images, got {found}"
+                )
+            if value.is_floating_point():
+                # A visibility may be infinite; what may not is for the effect to say.
+                check_all(f"params.{name}", "not be NaN", value, lambda v: ~v.isnan())
+        self.check(params, image)
+
+    def extra_repr(self) -> str:
+        """The arguments, as they were given."""
+        return ", ".join(
+            f"{name}={value}" for name, value in vars(self).items() if name[0] != "_" and name != "training"
+        )
+
+
+class WarpEffect(Effect):
+    """An effect that moves pixels.
+
+    Args:
+        padding: what lies outside the frame: "zeros", "border" or "reflection".
+        interpolation: "nearest", "bilinear" or "bicubic".
+        p: chance that a sample is degraded at all.
+    """
+
+    def __init__(self, *, padding: str = "zeros", interpolation: str = "bilinear", p: float = 1.0):
+        super().__init__(p=p)
+        self.padding = check_choice("padding", padding, PADDINGS)
+        self.interpolation = check_choice("interpolation", interpolation, INTERPOLATIONS)
+
+    @abstractmethod
+    def flow(self, params: Any, *, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """The flow (B, 2, H, W) in px, and where it exists, (B, 1, H, W), bool."""
+
+    @abstractmethod
+    def restore_flow(self, params: Any, *, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """The flow that undoes `flow`, and where it exists."""
+
+    @abstractmethod
+    def moves(self, params: Any) -> Tensor:
+        """(B,), bool: the samples whose parameters move anything at all."""
+
+    def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
+        """The batch looked up along the flow."""
+        size = {"height": image.shape[2], "width": image.shape[3]}
+        active = params.gate & self.moves(params) & (size["height"] * size["width"] > 1)
+        if is_true(active.any) is False and not _learns(params):
+            return _identity(image, params)
+        flow, exists = self.flow(params, **size)
+        flow = _only(flow, torch.zeros_like(flow), active, params)
+        warped = look_up(image, flow, padding=self.padding, interpolation=self.interpolation)
+
+        def valid() -> Tensor:
+            return (exists & inside(flow)) | ~_column(active)
+
+        def restore() -> tuple[Tensor, Tensor]:
+            back, known = self.restore_flow(params, **size)
+            back = _only(back, torch.zeros_like(back), active, params)
+            seen = look_up(result.valid.to(back.dtype), back, padding="zeros", interpolation="bilinear")
+            # All pixels that the look-up mixes must be good, but for weights below a thousandth.
+            return back, (known & inside(back) & (seen > 0.999)) | ~_column(active)
+
+        result = Degraded(_only(warped, image, active, params), params, valid=valid, flow=flow, restore=restore)
+        return result
+
+
+class Shaded(NamedTuple):
+    """What a radiance effect makes of a batch."""
+
+    image: Tensor
+    valid: Tensor
+    transmission: Tensor | None = None
+    intensity: Tensor | None = None
+
+
+class RadianceEffect(Effect):
+    """An effect that changes light and moves nothing."""
+
+    @abstractmethod
+    def shade(self, image: Tensor, params: Any, depth: Tensor | None) -> Shaded:
+        """The batch (B, C, H, W) in other light."""
+
+    def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
+        """The batch in other light, where the gate is open."""
+        if is_true(params.gate.any) is False:
+            depth = None
+        shaded = self.shade(image, params, depth)
+        size = (image.shape[0], 1, *image.shape[2:])
+
+        def gated(value: Tensor | None, off: float) -> Tensor | None:
+            return None if value is None else _gated(value, torch.full_like(value, off), params.gate).expand(size)
+
+        return Degraded(
+            _gated(shaded.image, image, params.gate),
+            params,
+            valid=lambda: (shaded.valid | ~_column(params.gate)).expand(size),
+            transmission=gated(shaded.transmission, 1.0),
+            intensity=gated(shaded.intensity, 0.0),
+        )
+
+
+class _Swap(torch.autograd.Function):
+    """The first tensor forward, the gradient of the second backward."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(value: Tensor, path: Tensor) -> Tensor:
+        return value.view_as(value)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        return None
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return None, gradient
+
+
+def _only(changed: Tensor, same: Tensor, active: Tensor, params: Any) -> Tensor:
+    """`changed` for the active samples and `same`, bit for bit, for the others.
+
+    A sample at strength zero keeps the gradient of its parameters: descent must be able to start there.
+    """
+    if is_true(active.all):
+        return changed
+    value = torch.where(_column(active), changed, same)
+    if not _learns(params):
+        return value
+    return cast(Tensor, _Swap.apply(value.detach(), torch.where(_column(params.gate), changed, same)))
+
+
+def _gated(changed: Tensor, same: Tensor, gate: Tensor) -> Tensor:
+    return changed if is_true(gate.all) else torch.where(_column(gate), changed, same)
+
+
+def _learns(params: Any) -> bool:
+    return torch.is_grad_enabled() and any(value.requires_grad for value in params)
+
+
+def _column(flags: Tensor) -> Tensor:
+    return flags.view(-1, 1, 1, 1)
+
+
+def _identity(image: Tensor, params: Any) -> Degraded:
+    size = (image.shape[0], 1, *image.shape[2:])
+    everywhere = torch.ones(size, dtype=torch.bool, device=image.device)
+    still = torch.zeros(size, dtype=field_dtype(image.dtype), device=image.device).expand(-1, 2, -1, -1)
+    return Degraded(image, params, valid=lambda: everywhere, flow=still, restore=lambda: (still, everywhere))
+
+
+def _seed(seed: int | Tensor) -> int | Tensor:
+    if isinstance(seed, bool) or not isinstance(seed, int | Tensor):
+        raise TypeError(f"seed must be a whole number, got {seed!r}")
+    return seed
+
+
+def _keys(keys: Tensor | Sequence[int] | None, batch: int, device: torch.device) -> Tensor:
+    if keys is None:
+        return torch.arange(batch, device=device)
+    keys = torch.as_tensor(keys, device=device)
+    if keys.is_floating_point() or keys.is_complex() or keys.dtype is torch.bool:
+        raise TypeError(f"keys must be whole numbers, got {keys.dtype}")
+    if keys.reshape(-1).shape[0] != batch or keys.ndim > 1:
+        raise ValueError(f"keys must have one key for each of the {batch} images, got shape {tuple(keys.shape)}")
+    return keys.reshape(-1)
+
+
+def _batched_depth(depth: Tensor | None, image: Tensor) -> Tensor | None:
+    if depth is None:
+        return None
+    if not isinstance(depth, Tensor) or not depth.is_floating_point():
+        raise TypeError(f"depth must be a floating tensor, got {getattr(depth, 'dtype', type(depth).__name__)}")
+    if depth.shape != (*image.shape[:-3], 1, *image.shape[-2:]):
+        raise ValueError(
+            f"depth must have one channel of the size of the image {tuple(image.shape)}, got {tuple(depth.shape)}"
+        )
+    return depth if image.ndim == 4 else depth[None]
+
+
+def params_to(params: Any, *args: Any, **kwargs: Any) -> Any:
+    """The parameters with each tensor moved as by `Tensor.to`; a change of type leaves flags as they are."""
+    floating = [value.to(*args, **kwargs) for value in params]
+    return type(params)(
+        *(new.to(old.dtype) if not old.is_floating_point() else new for old, new in zip(params, floating, strict=True))
+    )

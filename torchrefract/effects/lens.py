@@ -1,0 +1,144 @@
+"""The lens of a cheap dashcam."""
+
+import warnings
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrefract import draws
+from torchrefract._checks import check_all, check_range, is_true
+from torchrefract.cameras.distortion import POLYNOMIAL12
+from torchrefract.effects.base import WarpEffect, params_to
+from torchrefract.fields.lens import corner_radius, frame_limit, lens_flow, lens_restore_flow
+from torchrefract.types import Range
+
+_LARGEST_COEFFICIENT = 100.0
+
+
+class LensParams(NamedTuple):
+    """The lenses of a batch."""
+
+    gate: Tensor  # (B,), bool: the sample is degraded
+    coefficients: Tensor  # (B, 12): k1 ... k6, p1, p2, s1 ... s4
+    focal: Tensor  # (B, 2), in widths of the frame: fx / W and fy / W
+    center: Tensor  # (B, 2), in widths: the principal point's offset from the center of the frame
+
+    to = params_to
+
+
+class LensDistortion(WarpEffect):
+    """A frame as seen through a lens of the extended Brown-Conrady model, the polynomial of the paper.
+
+        x_d = x (1 + sum k_i r^2i) + 2 p1 x y + p2 (r^2 + 2 x^2) + s1 r^2 + s2 r^4
+        y_d = y (1 + sum k_i r^2i) + p1 (r^2 + 2 y^2) + 2 p2 x y + s3 r^2 + s4 r^4,  i = 1 ... 6
+
+    `flow` undistorts (the exact inverse), `restore_flow` distorts (closed form). Pixels that the lens shows nothing
+    at, beyond the radius where the model folds back, are padded and not valid. OpenCV's k4, k5, k6 belong to another
+    model. The defaults are those of one fleet of cheap dashcams: a barrel that folds nowhere.
+
+    Args:
+        k1_range ... k6_range: radial coefficients, each within [-100, 100].
+        p1_range, p2_range: decentring (tangential) coefficients.
+        s1_range ... s4_range: thin-prism coefficients; s1, s2 act on x, s3, s4 on y.
+        focal_range: focal length fx in widths of the frame, above 0.
+        aspect_range: fy / fx, above 0.
+        center_x_range, center_y_range: offset of the principal point from the center of the frame, in widths.
+        strict: raise, instead of warning, where the model folds back inside the frame (on the CPU).
+        padding, interpolation, p: as for every warp.
+
+    Raises:
+        ValueError: an argument outside its range; a lens that folds inside the frame, if `strict`.
+
+    Source: Brown, "Close-range camera calibration", Photogrammetric Engineering 37 (1971), with thin-prism terms.
+    """
+
+    def __init__(
+        self,
+        *,
+        k1_range: Range = (-0.35, -0.15),
+        k2_range: Range = (0.06, 0.12),
+        k3_range: Range = (0.0, 0.0),
+        k4_range: Range = (0.0, 0.0),
+        k5_range: Range = (0.0, 0.0),
+        k6_range: Range = (0.0, 0.0),
+        p1_range: Range = (-0.001, 0.001),
+        p2_range: Range = (-0.001, 0.001),
+        s1_range: Range = (0.0, 0.0),
+        s2_range: Range = (0.0, 0.0),
+        s3_range: Range = (0.0, 0.0),
+        s4_range: Range = (0.0, 0.0),
+        focal_range: Range = (0.7, 1.1),
+        aspect_range: Range = (1.0, 1.0),
+        center_x_range: Range = (-0.01, 0.01),
+        center_y_range: Range = (-0.01, 0.01),
+        strict: bool = False,
+        padding: str = "zeros",
+        interpolation: str = "bilinear",
+        p: float = 1.0,
+    ):
+        super().__init__(padding=padding, interpolation=interpolation, p=p)
+        radial = (k1_range, k2_range, k3_range, k4_range, k5_range, k6_range)
+        others = (p1_range, p2_range, s1_range, s2_range, s3_range, s4_range)
+        for name, value in zip(POLYNOMIAL12, radial + others, strict=True):
+            bounds = {"low": -_LARGEST_COEFFICIENT, "high": _LARGEST_COEFFICIENT}
+            setattr(self, f"{name}_range", check_range(f"{name}_range", value, **bounds))
+        self.focal_range = check_range("focal_range", focal_range, low=0.01, high=1000.0)
+        self.aspect_range = check_range("aspect_range", aspect_range, low=0.01, high=100.0)
+        self.center_x_range = check_range("center_x_range", center_x_range, low=-10.0, high=10.0)
+        self.center_y_range = check_range("center_y_range", center_y_range, low=-10.0, high=10.0)
+        self.strict = strict
+
+    def draw(self, source: draws.Stream, image: Tensor) -> LensParams:
+        """One lens a sample, every number uniform in its range."""
+        ranges = [getattr(self, f"{name}_range") for name in POLYNOMIAL12]
+        ranges += [self.focal_range, self.aspect_range, self.center_x_range, self.center_y_range]
+        gate, values = self._uniform(source, ranges, image)
+        fx, aspect = values[:, 12], values[:, 13]
+        return LensParams(gate, values[:, :12], torch.stack([fx, fx * aspect], dim=1), values[:, 14:])
+
+    def check(self, params: LensParams, image: Tensor) -> None:
+        """Raise for lenses that are none."""
+        for name, width in (("coefficients", 12), ("focal", 2), ("center", 2)):
+            value = getattr(params, name)
+            if value.shape != (image.shape[0], width):
+                raise ValueError(f"params.{name} must have shape (B, {width}), got {tuple(value.shape)}")
+        bound = _LARGEST_COEFFICIENT
+        check_all(
+            "params.coefficients", f"lie in [-{bound:g}, {bound:g}]", params.coefficients, lambda v: v.abs() <= bound
+        )
+        check_all("params.focal", "be positive and finite", params.focal, lambda v: (v > 0) & v.isfinite())
+        check_all("params.center", "be finite", params.center, torch.isfinite)
+        self._check_fold(params, *image.shape[2:])
+
+    def flow(self, params: LensParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """The flow of `lens_flow`, and where it exists."""
+        return lens_flow(*_in_px(params, height, width), height=height, width=width)
+
+    def restore_flow(self, params: LensParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """The flow of `lens_restore_flow`, and where it exists."""
+        return lens_restore_flow(*_in_px(params, height, width), height=height, width=width)
+
+    def moves(self, params: LensParams) -> Tensor:
+        """The samples with a coefficient that is not zero."""
+        return (params.coefficients != 0).any(dim=1)
+
+    def _check_fold(self, params: LensParams, height: int, width: int) -> None:
+        camera = _in_px(params, height, width)
+
+        def folds() -> Tensor:
+            limit = frame_limit(*camera, height=height, width=width)
+            corner = corner_radius(*camera[1:], height=height, width=width)
+            return (params.gate & limit.folds & (limit.image_radius.flatten() < corner)).any()
+
+        if not is_true(folds):
+            return
+        rule = "the lens must not fold back inside the frame (k1, k2 ... and focal_range decide)"
+        if self.strict:
+            raise ValueError(f"coefficients: {rule}, got {params.coefficients.tolist()}")
+        warnings.warn(f"{rule}: pixels beyond have no preimage and are padded, not valid", stacklevel=2)
+
+
+def _in_px(params: LensParams, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+    middle = torch.tensor([width - 1, height - 1], dtype=params.center.dtype, device=params.center.device) / 2
+    return params.coefficients, params.focal * width, middle + params.center * width

@@ -1,0 +1,54 @@
+"""Fog after Koschmieder: what arrives of the light, and what the fog adds."""
+
+import math
+
+import torch
+from torch import Tensor
+
+# exp(-800) is 0 in float64 and float32 alike, and its gradient is 0, not NaN.
+_OPAQUE = 800.0
+# Farther than anything; an infinite depth times an extinction of zero would be NaN.
+_FARTHEST = 1e12
+
+
+def extinction(visibility: Tensor, threshold: float) -> Tensor:
+    """k = -ln(threshold) / V in 1/m, the extinction that leaves the contrast `threshold` at V meters; any shape.
+
+    Source: Koschmieder 1924; a threshold of 0.05 is the meteorological optical range of CIE and WMO.
+    """
+    return -math.log(threshold) / visibility
+
+
+def transmission(depth: Tensor, k: Tensor) -> Tensor:
+    """t = exp(-k d), the share of light that arrives from d meters through an extinction k in 1/m; they broadcast."""
+    return torch.exp(-(k * depth.clamp(max=_FARTHEST)).clamp(max=_OPAQUE))
+
+
+def veil(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
+    """I t + A (1 - t), exactly I where t = 1 and exactly A where t = 0; the three broadcast.
+
+    Args:
+        image: (B, C, H, W).
+        t: (B, 1, H or 1, W or 1), in [0, 1].
+        airlight: (B, C, 1, 1).
+    """
+    # One pass over the image, and exact at both ends.
+    return torch.addcmul(airlight * (1 - t), image, t)
+
+
+def linear_depth(height: int, max_depth: float, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(1, 1, H, 1), m: d(y) = (1 - (y + 1/2) / H) D_max, from the far top row to the near bottom row."""
+    row = torch.arange(height, dtype=dtype, device=device).view(1, 1, height, 1)
+    return (1 - (row + 0.5) / height) * max_depth
+
+
+def srgb_to_linear(value: Tensor) -> Tensor:
+    """Linear light of stored values in [0, 1], any shape. Source: IEC 61966-2-1."""
+    low = value / 12.92
+    return torch.where(value <= 0.04045, low, ((value.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(value: Tensor) -> Tensor:
+    """Stored values of linear light in [0, 1], any shape. Source: IEC 61966-2-1."""
+    high = 1.055 * value.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
+    return torch.where(value <= 0.0031308, 12.92 * value, high)

@@ -1,0 +1,114 @@
+"""The flow of a lens, and the flow that undoes it."""
+
+import torch
+from torch import Tensor
+
+from torchrefract.cameras.distortion import (
+    ALL_TERMS,
+    RadialLimit,
+    Terms,
+    distort_polynomial,
+    jacobian_polynomial,
+    radial_limit,
+    undistort_polynomial,
+    used_terms,
+)
+from torchrefract.warping.grid import pixel_axes
+
+# The preimage of a pixel is looked for up to so many half-diagonals of the frame; beyond, nothing of it is seen.
+_REACH = 4.0
+
+
+def lens_flow(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """The flow that shows a frame as seen through a lens: each pixel looks where it came from before the lens.
+
+        flow(p) = f (undistort((p - c) / f) - (p - c) / f)
+
+    Differentiable in all three arguments by the implicit function theorem. A pixel without a preimage looks outside
+    the frame.
+
+    Args:
+        coefficients: (B, 12), k1 ... k6, p1, p2, s1 ... s4 of the polynomial model.
+        focal: (B, 2), px, fx and fy.
+        center: (B, 2), px, cx and cy.
+        height, width: px, of the frame.
+
+    Returns:
+        flow: (B, 2, H, W), px.
+        exists: (B, 1, H, W), bool: the pixel has a preimage.
+    """
+    c, terms, x_d, y_d = _normalized(coefficients, focal, center, height, width)
+    limit = frame_limit(coefficients, focal, center, height=height, width=width)
+    bands = [
+        undistort_polynomial(x_d.detach(), band, c.detach(), limit=limit, terms=terms)
+        for band in y_d.detach().split(_rows_at_once(x_d, height), dim=2)
+    ]
+    x, y, exists = (torch.cat(parts, dim=2) for parts in zip(*bands, strict=True))
+    if torch.is_grad_enabled() and (c.requires_grad or x_d.requires_grad):
+        x, y = _attach(x, y, x_d, y_d, c, terms)
+    return _as_flow(x - x_d, y - y_d, exists, x_d, y_d, focal), exists
+
+
+def lens_restore_flow(
+    coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int
+) -> tuple[Tensor, Tensor]:
+    """The flow that undoes `lens_flow`, in closed form: each clean pixel looks where the lens has put it.
+
+        flow(p) = f (distort((p - c) / f) - (p - c) / f)
+
+    Args and Returns as for `lens_flow`; `exists` is false where the lens shows that part of the scene folded over.
+    """
+    c, terms, x, y = _normalized(coefficients, focal, center, height, width)
+    limit = frame_limit(coefficients, focal, center, height=height, width=width)
+    x_d, y_d = distort_polynomial(x, y, c, terms)
+    with torch.no_grad():
+        exists = x * x + y * y <= limit.radius.square()
+        if terms.tangential or terms.prism:
+            exists &= jacobian_polynomial(x, y, c, terms).determinant > 0
+    return _as_flow(x_d - x, y_d - y, exists, x, y, focal), exists
+
+
+def frame_limit(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> RadialLimit:
+    """How far the radial part can be inverted, looked for as far as the frame asks; arguments as for `lens_flow`."""
+    corner = corner_radius(focal.detach(), center.detach(), height=height, width=width)
+    return radial_limit(coefficients.detach()[:, :, None, None, None], _REACH * corner, 1.1 * corner)
+
+
+def corner_radius(focal: Tensor, center: Tensor, *, height: int, width: int) -> Tensor:
+    """(B,), on the plane z = 1: the distance of the farthest corner of the frame; arguments as for `lens_flow`."""
+    size = torch.tensor([width - 1, height - 1], dtype=focal.dtype, device=focal.device)
+    # Half a pixel at least, so that a frame of one pixel has a radius too.
+    farthest = torch.maximum(center.abs(), (size - center).abs()).clamp(min=0.5) / focal
+    return farthest.square().sum(dim=1).sqrt()
+
+
+def _normalized(
+    coefficients: Tensor, focal: Tensor, center: Tensor, height: int, width: int
+) -> tuple[Tensor, Terms, Tensor, Tensor]:
+    axes = pixel_axes(height, width, dtype=focal.dtype, device=focal.device)
+    x, y = ((axis - center[:, i, None, None, None]) / focal[:, i, None, None, None] for i, axis in enumerate(axes))
+    readable = coefficients.device.type == "cpu" and not torch.compiler.is_compiling()
+    return coefficients[:, :, None, None, None], used_terms(coefficients) if readable else ALL_TERMS, x, y
+
+
+def _rows_at_once(x: Tensor, height: int) -> int:
+    """Rows whose temporaries stay in a core's cache; an accelerator, or a compiled graph, takes all at once."""
+    if x.device.type != "cpu" or torch.compiler.is_compiling():
+        return max(1, height)
+    return max(1, (1 << 16) // max(1, x.shape[0] * x.shape[3]))
+
+
+def _attach(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, c: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:
+    """(x, y) with the gradient of the exact inverse: one Newton step of length zero, its Jacobian held fixed."""
+    with torch.no_grad():
+        jacobian = jacobian_polynomial(x, y, c, terms)
+    reached_x, reached_y = distort_polynomial(x, y, c, terms)
+    error_x, error_y = reached_x - x_d, reached_y - y_d
+    step_x, step_y = jacobian.solve(error_x - error_x.detach(), error_y - error_y.detach())
+    return x - step_x, y - step_y
+
+
+def _as_flow(u: Tensor, v: Tensor, exists: Tensor, x: Tensor, y: Tensor, focal: Tensor) -> Tensor:
+    # Where there is no answer, look outward past every frame: padded, never extrapolated.
+    u, v = torch.where(exists, u, 2 * _REACH * x.detach()), torch.where(exists, v, 2 * _REACH * y.detach())
+    return torch.cat([u, v], dim=1) * focal[:, :, None, None]

@@ -1,0 +1,43 @@
+"""Pixels and the sampler's coordinates: the one place that knows both."""
+
+import torch
+from torch import Tensor
+
+# F.grid_sample spans [-1, 1]; four of these lie well outside whatever the padding, and keep every product finite.
+_FAR = 4.0
+# Positions this near to the border pixels count as inside: rounding of fp32 coordinates, 1/1000 px.
+_TOLERANCE = 1e-3
+
+
+def field_dtype(dtype: torch.dtype) -> torch.dtype:
+    """The type that coordinates have beside an image of `dtype`: float32, or float64 where float32 loses digits."""
+    return torch.float64 if dtype in (torch.float64, torch.int32, torch.int64) else torch.float32
+
+
+def pixel_axes(height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """x, (1, 1, 1, W), and y, (1, 1, H, 1), px: the pixel centers, whole numbers."""
+    x = torch.arange(width, dtype=dtype, device=device).view(1, 1, 1, width)
+    return x, torch.arange(height, dtype=dtype, device=device).view(1, 1, height, 1)
+
+
+def inside(flow: Tensor) -> Tensor:
+    """(B, 1, H, W), bool: where p + flow(p) lies on the frame; NaN does not."""
+    height, width = flow.shape[2:]
+    x, y = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
+    u, v = flow.split(1, dim=1)
+    on_x = (u >= -_TOLERANCE - x) & (u <= width - 1 + _TOLERANCE - x)
+    return on_x & (v >= -_TOLERANCE - y) & (v <= height - 1 + _TOLERANCE - y)
+
+
+def sampler_grid(flow: Tensor) -> Tensor:
+    """(B, H, W, 2): the positions p + flow(p) as F.grid_sample(align_corners=False) wants them, finite in any case.
+
+    x' = clamp((2 x + 1) / W - 1 + 2 u / W, -4, 4),  y' likewise with v and H
+    """
+    height, width = flow.shape[2:]
+    x, y = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
+    u, v = flow.split(1, dim=1)
+    # A pixel center sits at (i + 1/2) / n of the width, so an image of one pixel is no special case.
+    grid = torch.cat([(2 * x + 1) / width - 1 + u * (2 / width), (2 * y + 1) / height - 1 + v * (2 / height)], dim=1)
+    # One NaN in a grid with border padding ends the process in the sampler's backward.
+    return grid.nan_to_num(nan=_FAR, posinf=_FAR, neginf=-_FAR).clamp(-_FAR, _FAR).movedim(1, -1)

@@ -1,0 +1,124 @@
+"""Looking an image up along a flow: the one call of F.grid_sample."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchrefract._checks import check_choice, check_flow, check_tensor
+from torchrefract.warping.grid import field_dtype, inside, sampler_grid
+
+PADDINGS = ("zeros", "border", "reflection")
+INTERPOLATIONS = ("nearest", "bilinear", "bicubic")
+# Above this, float32 coordinates of the sampler are off by more than 1/1000 px.
+_LARGEST_FLOAT32_SIDE = 8192
+# Below this many output pixels a second thread costs more than it brings.
+_SMALLEST_SPLIT = 1 << 14
+
+
+def warp(
+    image: Tensor, flow: Tensor, *, padding: str = "zeros", interpolation: str = "bilinear"
+) -> tuple[Tensor, Tensor]:
+    """The image looked up along a backward flow, and where that look-up stays on the image.
+
+        out(p) = image(p + flow(p)),  valid(p) = 0 <= p + flow(p) <= size - 1
+
+    Coordinates are float32 (float64 for a float64 image) whatever the type of the image; flow that is not finite is
+    looked up outside and is not valid.
+
+    Args:
+        image: (B, C, H, W) or (C, H, W), floating or integer; integers are converted, rounded and clamped.
+        flow: (B, 2, H, W) or (1, 2, H, W), px, u (right) and v (down); (2, H, W) for an unbatched image.
+        padding: what lies outside: "zeros", "border" or "reflection".
+        interpolation: "nearest", "bilinear" or "bicubic" (a = -3/4, clamped to the range of the image's values).
+
+    Returns:
+        image of the same shape, type and memory format, and valid, (B, 1, H, W) or (1, H, W), bool.
+
+    Raises:
+        ValueError: shapes that do not fit, an unknown padding or interpolation.
+        TypeError: an argument that is no tensor, a flow of integers.
+    """
+    check_tensor("image", image)
+    check_tensor("flow", flow)
+    if image.ndim == 3 and flow.ndim == 3:
+        warped, valid = warp(image[None], flow[None], padding=padding, interpolation=interpolation)
+        return warped[0], valid[0]
+    _check_fit(image, flow)
+    check_choice("padding", padding, PADDINGS)
+    check_choice("interpolation", interpolation, INTERPOLATIONS)
+    flow = flow.to(field_dtype(image.dtype)).expand(image.shape[0], -1, -1, -1)
+    return look_up(image, flow, padding=padding, interpolation=interpolation), inside(flow)
+
+
+def look_up(image: Tensor, flow: Tensor, *, padding: str, interpolation: str) -> Tensor:
+    """The image (B, C, H, W) at p + flow(p), flow being (B, 2, H, W) in px; the arguments are taken as checked."""
+    if image.numel() == 0:
+        return image.clone()
+    source = _as_field(image, flow)
+    grid = sampler_grid(flow.to(source.dtype))
+    warped = _sample(source, grid, padding=padding, interpolation=interpolation)
+    if interpolation == "bicubic":
+        warped = _clamped(warped, source, padding)
+    return _as_image(warped, image)
+
+
+def _check_fit(image: Tensor, flow: Tensor) -> None:
+    check_flow("flow", flow)
+    if image.ndim != 4:
+        raise ValueError(f"image must have shape (B, C, H, W) beside a batched flow, got {tuple(image.shape)}")
+    if image.is_complex():
+        raise TypeError(f"image must be real, got {image.dtype}")
+    if image.shape[2:] != flow.shape[2:] or flow.shape[0] not in (1, image.shape[0]):
+        raise ValueError(
+            f"flow must have the batch and the size of the image, {tuple(image.shape)}, got {tuple(flow.shape)}"
+        )
+
+
+def _as_field(image: Tensor, flow: Tensor) -> Tensor:
+    large = max(image.shape[2:]) > _LARGEST_FLOAT32_SIDE
+    # The CPU sampler of half types is wrong above 2^15 pixels, and no type of 16 bits holds a coordinate.
+    return image.to(torch.float64 if large else torch.promote_types(field_dtype(image.dtype), flow.dtype))
+
+
+def _as_image(warped: Tensor, image: Tensor) -> Tensor:
+    if not image.is_floating_point():
+        limits = (0, 1) if image.dtype is torch.bool else (torch.iinfo(image.dtype).min, torch.iinfo(image.dtype).max)
+        warped = warped.round().clamp(*limits)
+    # A batch of one, or one channel, counts as both formats; only a real channels_last image asks for its own.
+    if not image.is_contiguous() and image.is_contiguous(memory_format=torch.channels_last):
+        return warped.to(image.dtype, memory_format=torch.channels_last)
+    return warped.to(image.dtype)
+
+
+def _clamped(warped: Tensor, source: Tensor, padding: str) -> Tensor:
+    # NaN must stay where it is: as a bound it would spread over the whole image.
+    known = source.detach().nan_to_num(nan=0.0, posinf=torch.inf, neginf=-torch.inf)
+    low, high = known.amin(dim=(2, 3), keepdim=True), known.amax(dim=(2, 3), keepdim=True)
+    if padding == "zeros":
+        low, high = low.clamp(max=0), high.clamp(min=0)
+    return warped.clamp(low, high)
+
+
+def _sample(source: Tensor, grid: Tensor, *, padding: str, interpolation: str) -> Tensor:
+    parts = _parts(source, grid)
+    if parts == 1:
+        return F.grid_sample(source, grid, mode=interpolation, padding_mode=padding, align_corners=False)
+    # The CPU sampler threads over the batch alone: bands of rows as a batch give the same bits on all threads.
+    batch, channels = source.shape[:2]
+    height, width = grid.shape[1:3]
+    rows = -(-height // parts)
+    if rows * parts > height:
+        grid = F.pad(grid, (0, 0, 0, 0, 0, rows * parts - height))
+    bands = grid.reshape(batch * parts, rows, width, 2)
+    repeated = source[:, None].expand(-1, parts, -1, -1, -1).reshape(batch * parts, *source.shape[1:])
+    out = F.grid_sample(repeated, bands, mode=interpolation, padding_mode=padding, align_corners=False)
+    out = out.view(batch, parts, channels, rows, width).movedim(1, 2)
+    return out.reshape(batch, channels, parts * rows, width)[:, :, :height]
+
+
+def _parts(source: Tensor, grid: Tensor) -> int:
+    if source.device.type != "cpu" or torch.compiler.is_compiling() or grid.shape[1] * grid.shape[2] < _SMALLEST_SPLIT:
+        return 1
+    threads = torch.get_num_threads() // source.shape[0]
+    # The backward pass keeps one gradient image a band, so a long gradient caps the bands.
+    return max(1, min(threads, 4 if source.requires_grad else grid.shape[1]))

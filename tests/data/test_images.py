@@ -1,0 +1,267 @@
+import io
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.testing import assert_close
+
+from torchrefract.data.images import UnreadableImageError, fit, image_size, read_image
+
+RNG = np.random.default_rng(0)
+PIXELS = RNG.integers(0, 256, (36, 50, 3), dtype=np.uint8)
+PIXELS_16 = RNG.integers(0, 65536, (36, 50, 3), dtype=np.uint16)
+SMOOTH = cv2.GaussianBlur(PIXELS, (0, 0), 4)
+FORMATS = {
+    "jpg": {"format": "JPEG"},
+    "progressive.jpg": {"format": "JPEG", "progressive": True},
+    "png": {"format": "PNG"},
+    "webp": {"format": "WEBP"},
+    "lossless.webp": {"format": "WEBP", "lossless": True},
+    "bmp": {"format": "BMP"},
+}
+
+
+def encode(pixels: np.ndarray, **options) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, **options)
+    return stream.getvalue()
+
+
+def as_tensor(pixels: np.ndarray) -> torch.Tensor:
+    """The definition of reading: (H, W, 3) whole numbers over the largest of their type."""
+    scale = np.float32(np.iinfo(pixels.dtype).max)
+    return torch.from_numpy((pixels.astype(np.float32) / scale).transpose(2, 0, 1).copy())
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp", "lossless.webp"])
+def test_eight_bit_pixels_come_back_exactly(tmp_path, suffix):
+    path = tmp_path / f"frame.{suffix}"
+    path.write_bytes(encode(PIXELS, **FORMATS[suffix]))
+    assert_close(read_image(path), as_tensor(PIXELS), rtol=0, atol=0)
+    assert_close(read_image(str(path)), read_image(path), rtol=0, atol=0)
+
+
+def test_sixteen_bit_pixels_come_back_exactly(tmp_path):
+    assert cv2.imwrite(str(tmp_path / "color.png"), PIXELS_16[..., ::-1])
+    assert_close(read_image(tmp_path / "color.png"), as_tensor(PIXELS_16), rtol=0, atol=0)
+    Image.fromarray(PIXELS_16[..., 0]).save(tmp_path / "gray.png")
+    expected = as_tensor(np.repeat(PIXELS_16[..., :1], 3, axis=2))
+    assert_close(read_image(tmp_path / "gray.png"), expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp"])
+def test_a_gray_picture_has_three_equal_channels(tmp_path, suffix):
+    Image.fromarray(PIXELS[..., 0]).save(tmp_path / f"frame.{suffix}")
+    expected = as_tensor(np.repeat(PIXELS[..., :1], 3, axis=2))
+    assert_close(read_image(tmp_path / f"frame.{suffix}"), expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp", "webp"])
+def test_alpha_is_dropped_and_blends_nothing(tmp_path, suffix):
+    alpha = np.dstack([PIXELS, PIXELS[..., :1]])
+    Image.fromarray(alpha).save(tmp_path / f"frame.{suffix}", lossless=True, exact=True)  # words for WebP alone
+    assert_close(read_image(tmp_path / f"frame.{suffix}"), as_tensor(PIXELS), rtol=0, atol=0)
+
+
+def test_palette_pictures_and_bits_are_read_in_their_colors(tmp_path):
+    palette = Image.fromarray(PIXELS).convert("P", palette=Image.Palette.ADAPTIVE)
+    palette.save(tmp_path / "palette.png")
+    assert_close(read_image(tmp_path / "palette.png"), as_tensor(np.asarray(palette.convert("RGB"))), rtol=0, atol=0)
+    bits = Image.fromarray(PIXELS[..., 0] > 127)
+    bits.save(tmp_path / "bits.png")
+    assert_close(read_image(tmp_path / "bits.png"), as_tensor(np.asarray(bits.convert("RGB"))), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "progressive.jpg", "webp"])
+def test_lossy_pictures_agree_with_another_decoder(tmp_path, suffix):
+    path = tmp_path / f"frame.{suffix}"
+    path.write_bytes(encode(SMOOTH, quality=95, **FORMATS[suffix]))
+    expected = as_tensor(np.asarray(Image.open(path).convert("RGB")))
+    # Decoders may round and interpolate color differently, by a few of 255 levels.
+    assert_close(read_image(path), expected, rtol=0, atol=4 / 255)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+@pytest.mark.parametrize(("orientation", "quarter_turns"), [(1, 0), (3, 2), (6, 3), (8, 1)])
+def test_the_exif_orientation_is_honored(tmp_path, suffix, orientation, quarter_turns):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = tmp_path / f"frame.{suffix}"
+    path.write_bytes(encode(SMOOTH, exif=exif, quality=95, **FORMATS[suffix]))
+    expected = as_tensor(np.rot90(SMOOTH, quarter_turns))
+    assert (read_image(path) - expected).abs().mean() < 4 / 255
+    assert image_size(path) == expected.shape[1:]
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_the_size_is_told_from_the_header(tmp_path, suffix):
+    path = tmp_path / f"frame.{suffix}"
+    path.write_bytes(encode(PIXELS, **FORMATS[suffix]))
+    assert image_size(path) == (36, 50)
+
+
+def test_the_content_counts_and_not_the_extension(tmp_path):
+    (tmp_path / "frame.jpg").write_bytes(encode(PIXELS, format="PNG"))
+    assert_close(read_image(tmp_path / "frame.jpg"), as_tensor(PIXELS), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("read", [read_image, image_size])
+@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.9, 0.999])
+def test_a_truncated_picture_is_refused_in_silence(tmp_path, capfd, read, suffix, share):
+    data = encode(SMOOTH, **FORMATS[suffix])
+    path = tmp_path / f"frame_12.{suffix}"
+    path.write_bytes(data[: max(16, min(int(share * len(data)), len(data) - 2))])
+    with pytest.raises(UnreadableImageError, match=rf"frame_12\.{suffix} is truncated \(\d+ bytes"):
+        read(path)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("read", [read_image, image_size])
+@pytest.mark.parametrize("suffix", ["jpg", "progressive.jpg", "png"])
+def test_a_picture_whose_second_half_was_never_written_is_refused(tmp_path, read, suffix):
+    data = encode(SMOOTH, **FORMATS[suffix])
+    half = len(data) // 2
+    (tmp_path / "frame").write_bytes(data[:half] + bytes(len(data) - half))
+    with pytest.raises(UnreadableImageError, match="frame is truncated"):
+        read(tmp_path / "frame")
+
+
+@pytest.mark.parametrize("read", [read_image, image_size])
+def test_the_end_of_a_thumbnail_is_not_the_end_of_the_picture(tmp_path, read):
+    data = encode(SMOOTH, format="JPEG")
+    thumbnail = b"Exif\0\0" + encode(PIXELS[:8, :8], format="JPEG")
+    segment = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
+    (tmp_path / "frame.jpg").write_bytes((data[:2] + segment + data[2:])[:-200])
+    with pytest.raises(UnreadableImageError, match="is truncated"):
+        read(tmp_path / "frame.jpg")
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("count", [1, 10_000])
+def test_bytes_after_the_end_do_no_harm(tmp_path, suffix, count):
+    path = tmp_path / f"frame.{suffix}"
+    path.write_bytes(encode(SMOOTH, **FORMATS[suffix]))
+    expected = read_image(path)
+    path.write_bytes(path.read_bytes() + bytes(count))
+    assert_close(read_image(path), expected, rtol=0, atol=0)
+    assert image_size(path) == (36, 50)
+
+
+@pytest.mark.parametrize("read", [read_image, image_size])
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"", r"is empty \(0 bytes\)"),
+        (b"\xff\xd8", "is not a JPEG, PNG, WebP or BMP picture"),
+        (b"<html>404</html>", "is not a JPEG"),
+        (b"RIFF\x04\0\0\0WAVE", "is not a JPEG"),
+        (b"BM\x02\0\0\0", "is truncated"),
+    ],
+)
+def test_what_is_no_picture_is_named_with_the_reason(tmp_path, read, data, reason):
+    (tmp_path / "frame_7.jpg").write_bytes(data)
+    with pytest.raises(UnreadableImageError, match=rf"frame_7\.jpg {reason}"):
+        read(tmp_path / "frame_7.jpg")
+
+
+@pytest.mark.parametrize("read", [read_image, image_size])
+def test_a_missing_file_is_named_with_the_reason(tmp_path, read):
+    with pytest.raises(UnreadableImageError, match=r"gone\.jpg cannot be opened \(No such file"):
+        read(tmp_path / "gone.jpg")
+
+
+def test_damage_between_header_and_end_is_found_on_reading(tmp_path, capfd):
+    data = bytearray(encode(PIXELS, format="PNG"))
+    middle = len(data) // 2
+    data[middle : middle + 200] = bytes(200)
+    (tmp_path / "frame.png").write_bytes(data)
+    assert image_size(tmp_path / "frame.png") == (36, 50)
+    level = cv2.utils.logging.getLogLevel()
+    with pytest.raises(UnreadableImageError, match=r"frame\.png is damaged"):
+        read_image(tmp_path / "frame.png")
+    assert cv2.utils.logging.getLogLevel() == level
+    assert "WARN" not in capfd.readouterr().err
+
+
+def test_a_header_without_sense_is_refused(tmp_path):
+    data = bytearray(encode(PIXELS, format="BMP"))
+    data[14:18] = (9).to_bytes(4, "little")  # no BMP header has 9 bytes
+    (tmp_path / "frame.bmp").write_bytes(data)
+    with pytest.raises(UnreadableImageError, match=r"frame\.bmp has a damaged header"):
+        image_size(tmp_path / "frame.bmp")
+
+
+def box_weights(coarse: int, fine: int) -> torch.Tensor:
+    """(coarse, fine): the share of each fine cell in each coarse one, from the overlap of their intervals."""
+    ends = torch.arange(coarse, dtype=torch.float64)[:, None] * fine / coarse
+    cells = torch.arange(fine, dtype=torch.float64)
+    overlap = torch.minimum(ends + fine / coarse, cells + 1) - torch.maximum(ends, cells)
+    return overlap.clamp(min=0) * coarse / fine
+
+
+@pytest.mark.parametrize(("size", "crop"), [((18, 25), (36, 50)), ((9, 16), (28, 50)), ((8, 8), (36, 36))])
+def test_fit_is_the_area_average_of_the_middle(size, crop):
+    image = as_tensor(PIXELS)
+    top, left = (36 - crop[0]) // 2, (50 - crop[1]) // 2
+    middle = image[:, top : top + crop[0], left : left + crop[1]].double()
+    expected = box_weights(size[0], crop[0]) @ middle @ box_weights(size[1], crop[1]).T
+    result = fit(image, size)
+    assert_close(result, expected.float(), rtol=0, atol=1e-6)
+    assert result.is_contiguous()
+
+
+def test_fit_to_the_same_size_changes_nothing():
+    assert_close(fit(as_tensor(PIXELS), [36, 50]), as_tensor(PIXELS), rtol=0, atol=0)
+
+
+def test_fit_leaves_the_picture_as_it_was():
+    image = as_tensor(PIXELS)
+    fit(image, (36, 50)).zero_()
+    fit(image, (5, 7)).zero_()
+    assert_close(image, as_tensor(PIXELS), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("size", [(37, 50), (36, 51), (64, 112)])
+def test_fit_never_enlarges(size):
+    with pytest.raises(ValueError, match=r"image must be at least size = .* got 36x50"):
+        fit(as_tensor(PIXELS), size)
+
+
+@pytest.mark.parametrize(
+    ("image", "size", "error", "message"),
+    [
+        (torch.zeros(3, 8, 8), (4,), ValueError, r"size must be \(height, width\), got \(4,\)"),
+        (torch.zeros(3, 8, 8), "44", ValueError, r"size must be \(height, width\), got '44'"),
+        (torch.zeros(3, 8, 8), (4, 0), ValueError, "size must be at least 1, got 0"),
+        (torch.zeros(3, 8, 8), (4, 4.0), TypeError, r"size must be a whole number, got 4\.0"),
+        (torch.zeros(1, 8, 8), (4, 4), ValueError, r"image must have shape \(3, H, W\), got \(1, 8, 8\)"),
+        (
+            torch.zeros(3, 8, 8, dtype=torch.uint8),
+            (4, 4),
+            TypeError,
+            "image must be float32 on the CPU, got torch.uint8",
+        ),
+    ],
+)
+def test_fit_names_a_wrong_argument(image, size, error, message):
+    with pytest.raises(error, match=message):
+        fit(image, size)
+
+
+def test_real_frames_are_read_as_another_decoder_reads_them(shared_data):
+    path = sorted((shared_data / "frames" / "val").glob("*.jpg"))[0]
+    image = read_image(path)
+    assert image.shape == (3, 360, 640)
+    assert (image - as_tensor(np.asarray(Image.open(path)))).abs().mean() < 1 / 255
+
+
+@pytest.mark.parametrize("read", [read_image, image_size])
+@pytest.mark.parametrize("share", [0.01, 0.5, 0.99])
+def test_real_frames_cut_short_are_refused(shared_data, tmp_path, read, share):
+    data = sorted((shared_data / "frames" / "val").glob("*.jpg"))[0].read_bytes()
+    (tmp_path / "cut.jpg").write_bytes(data[: int(share * len(data))])
+    with pytest.raises(UnreadableImageError, match=r"cut\.jpg is truncated"):
+        read(tmp_path / "cut.jpg")

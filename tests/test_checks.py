@@ -1,0 +1,147 @@
+import math
+
+import pytest
+import torch
+
+from torchrefract._checks import (
+    check_all,
+    check_choice,
+    check_count,
+    check_flow,
+    check_number,
+    check_range,
+    check_tensor,
+    is_true,
+)
+
+
+def positive(value):
+    return value > 0
+
+
+def test_a_number_inside_its_bounds_comes_back_as_a_float():
+    value = check_number("p", 1, low=0.0, high=1.0)
+    assert (value, type(value)) == (1.0, float)
+    assert check_number("depth", math.inf, low=0.0) == math.inf
+    assert check_number("shift", -1e300) == -1e300
+
+
+@pytest.mark.parametrize(
+    ("value", "rule"),
+    [
+        (-0.1, r"p must be a number in \[0, 1\], got -0\.1"),
+        (1.5, r"p must be a number in \[0, 1\], got 1\.5"),
+        (math.inf, r"p must be a number in \[0, 1\], got inf"),
+        (math.nan, "p must not be NaN"),
+    ],
+)
+def test_a_number_outside_its_bounds_raises(value, rule):
+    with pytest.raises(ValueError, match=rule):
+        check_number("p", value, low=0.0, high=1.0)
+
+
+@pytest.mark.parametrize("value", ["1", None, True, [1.0], 1j, torch.tensor(1.0)])
+def test_what_is_no_real_number_raises(value):
+    with pytest.raises(TypeError, match="p must be a real number, got"):
+        check_number("p", value)
+
+
+@pytest.mark.parametrize("value", [(1, 2), [1, 2], (1.0, 1.0)])
+def test_a_range_comes_back_as_two_floats(value):
+    result = check_range("k1_range", value)
+    assert result == tuple(value)
+    assert [type(end) for end in result] == [float, float]
+
+
+def test_a_range_may_end_at_an_infinite_bound_only_where_one_is_given():
+    assert check_range("visibility_range", (1.0, math.inf), low=0.0, high=math.inf) == (1.0, math.inf)
+    with pytest.raises(ValueError, match="visibility_range must be"):
+        check_range("visibility_range", (math.inf, math.inf), low=0.0, high=100.0)
+
+
+@pytest.mark.parametrize("value", [(2.0, 1.0), (-1.0, 0.5), (0.5, 1.5), (math.nan, 1.0), (0.0, math.nan)])
+def test_a_range_out_of_order_or_bounds_raises(value):
+    with pytest.raises(ValueError, match="beta_range must"):
+        check_range("beta_range", value, low=0.0, high=1.0)
+
+
+@pytest.mark.parametrize("value", [1.0, (1.0,), (1.0, 2.0, 3.0), "12", None, {1.0, 2.0}])
+def test_what_is_no_pair_raises(value):
+    with pytest.raises(ValueError, match=r"beta_range must be \(low, high\), got"):
+        check_range("beta_range", value)
+
+
+@pytest.mark.parametrize("value", [("0", "1"), (None, 1.0), (False, True)])
+def test_a_pair_of_no_numbers_raises(value):
+    with pytest.raises(TypeError, match="beta_range must be a real number"):
+        check_range("beta_range", value)
+
+
+def test_a_choice_is_one_of_its_names():
+    assert check_choice("padding", "zeros", ("zeros", "border")) == "zeros"
+    with pytest.raises(ValueError, match="padding must be one of zeros, border, got 'wrap'"):
+        check_choice("padding", "wrap", ("zeros", "border"))
+
+
+def test_a_count_is_a_whole_number_from_its_lowest_on():
+    assert check_count("steps", 1) == 1
+    assert check_count("steps", 0, low=0) == 0
+    with pytest.raises(ValueError, match="steps must be at least 1, got 0"):
+        check_count("steps", 0)
+
+
+@pytest.mark.parametrize("value", [1.0, "1", True, None])
+def test_what_is_no_whole_number_is_no_count(value):
+    with pytest.raises(TypeError, match="steps must be a whole number, got"):
+        check_count("steps", value)
+
+
+def test_what_is_no_tensor_raises():
+    with pytest.raises(TypeError, match="image must be a tensor, got list"):
+        check_tensor("image", [1.0])  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 4), (1, 3, 4, 5), (2,), (1, 1, 2, 4, 5)])
+def test_a_flow_of_another_shape_raises(shape):
+    with pytest.raises(ValueError, match=r"flow must have shape \(B, 2, H, W\), got"):
+        check_flow("flow", torch.zeros(shape))
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.uint8, torch.bool, torch.complex64])
+def test_a_flow_of_no_floats_raises(dtype):
+    with pytest.raises(TypeError, match="flow must be of a floating type, got"):
+        check_flow("flow", torch.zeros(1, 2, 3, 4, dtype=dtype))
+
+
+def test_a_wrong_value_in_a_tensor_is_named():
+    check_all("depth", "be above 0, in m", torch.tensor([1.0, 2.0]), positive)
+    with pytest.raises(ValueError, match=r"depth must be above 0, in m, got -2\.5"):
+        check_all("depth", "be above 0, in m", torch.tensor([1.0, -2.5, -3.0]), positive)
+
+
+def test_nothing_is_read_from_a_device_that_would_make_us_wait():
+    elsewhere = torch.empty(3, device="meta")
+    check_all("depth", "be above 0, in m", elsewhere, positive)
+    assert is_true(lambda: (elsewhere > 0).all()) is None
+
+
+def test_nothing_is_read_while_compiling():
+    @torch.compile(fullgraph=True, backend="eager")
+    def checked(value):
+        check_all("depth", "be above 0, in m", value, positive)
+        return value + 1
+
+    assert torch.equal(checked(torch.tensor([-1.0])), torch.tensor([0.0]))
+
+
+def test_nothing_is_read_inside_vmap():
+    def checked(value):
+        check_all("depth", "be above 0, in m", value, positive)
+        return value + 1
+
+    assert torch.equal(torch.vmap(checked)(torch.tensor([[-1.0], [1.0]])), torch.tensor([[0.0], [2.0]]))
+
+
+def test_the_truth_of_a_readable_tensor_is_told():
+    assert is_true(lambda: torch.tensor(True)) is True
+    assert is_true(lambda: torch.tensor(False)) is False

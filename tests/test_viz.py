@@ -1,0 +1,147 @@
+import colorsys
+import math
+
+import pytest
+import torch
+from matplotlib import colormaps
+from torch.testing import assert_close
+
+from torchrefract.viz import checkerboard, flow_to_rgb, flow_wheel, transmission_to_rgb
+
+
+def arrow(u: float, v: float, *, max_px: float | None = 1.0) -> torch.Tensor:
+    """(3,), the color of one flow."""
+    return flow_to_rgb(torch.tensor([u, v], dtype=torch.float32).view(1, 2, 1, 1), max_px=max_px).flatten()
+
+
+def hue_deg(rgb: torch.Tensor) -> float:
+    r, g, b = rgb.tolist()
+    return 360 * colorsys.rgb_to_hsv(r, g, b)[0]
+
+
+def published_wheel() -> torch.Tensor:
+    """(55, 3): from each color to the next, one channel rises or falls in 15, 6, 4, 11, 13 and 6 equal steps."""
+    ends = [(1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 1, 1), (0, 0, 1), (1, 0, 1), (1, 0, 0)]
+    hues = []
+    for first, last, count in zip(ends, ends[1:], (15, 6, 4, 11, 13, 6), strict=False):
+        hues += [[a + (b - a) * k / count for a, b in zip(first, last, strict=True)] for k in range(count)]
+    return torch.tensor(hues)
+
+
+def test_no_motion_is_white():
+    assert_close(flow_to_rgb(torch.zeros(2, 2, 3, 4)), torch.ones(2, 3, 3, 4))
+
+
+@pytest.mark.parametrize(
+    ("u", "v", "rgb"),
+    [
+        (1, 0, (1, 0, 0)),
+        (0, 1, (1, 13.75 / 15, 0)),  # a quarter turn is hue 13.75 of 55, between red (0) and yellow (15)
+        (-1, 0, (0, 1 - 2.5 / 11, 1)),
+        (0, -1, (5.25 / 13, 0, 1)),
+    ],
+)
+def test_right_is_red_down_yellow_left_azure_up_violet(u, v, rgb):
+    assert_close(arrow(u, v), torch.tensor(rgb, dtype=torch.float32), atol=1e-5, rtol=0)
+
+
+def test_the_published_55_hues_lie_evenly_around_the_circle():
+    turn = 2 * math.pi * torch.arange(55) / 55
+    flow = torch.stack([turn.cos(), turn.sin()]).view(1, 2, 1, 55)
+    assert_close(flow_to_rgb(flow, max_px=1.0)[0, :, 0].T, published_wheel(), atol=1e-4, rtol=0)
+
+
+def test_the_circle_has_no_seam():
+    assert_close(arrow(0.5, 1e-6), arrow(0.5, -1e-6), atol=1e-4, rtol=0)
+    assert_close(arrow(-0.5, 1e-6), arrow(-0.5, -1e-6), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("angle_deg", range(0, 360, 15))
+def test_opposite_directions_have_roughly_complementary_hues(angle_deg):
+    u, v = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    assert 140 < abs(hue_deg(arrow(u, v)) - hue_deg(arrow(-u, -v))) < 220
+
+
+@pytest.mark.parametrize("angle_deg", [5, 100, 222, 301])
+def test_hue_depends_on_direction_only_and_saturation_is_the_share_of_the_scale(angle_deg):
+    u, v = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    for share in (0.1, 0.4, 0.9):
+        rgb = arrow(8 * share * u, 8 * share * v, max_px=8.0)
+        assert hue_deg(rgb) == pytest.approx(hue_deg(arrow(u, v, max_px=1.001)), abs=0.1)
+        _, saturation, value = colorsys.rgb_to_hsv(*rgb.tolist())
+        assert (saturation, value) == pytest.approx((share, 1.0), abs=1e-4)
+
+
+def test_motion_beyond_the_scale_keeps_its_hue_and_is_darker():
+    assert_close(arrow(0, 50, max_px=2.0), 0.75 * arrow(0, 2, max_px=2.0))
+
+
+def test_without_a_scale_the_longest_flow_of_the_batch_has_full_color():
+    flow = torch.randn(3, 2, 6, 7)
+    flow[1, :, 2, 3] = torch.tensor([30.0, -40.0])
+    assert_close(flow_to_rgb(flow), flow_to_rgb(flow, max_px=50.0))
+    assert flow_to_rgb(flow)[1, :, 2, 3].min() == 0
+
+
+def test_flow_that_is_not_finite_is_gray_and_leaves_the_others_as_they_are():
+    flow = torch.randn(1, 2, 4, 5)
+    spoiled = flow.clone()
+    spoiled[0, 0, 0, 0], spoiled[0, 1, 1, 1], spoiled[0, :, 2, 2] = math.nan, math.inf, -math.inf
+    gray = torch.zeros(4, 5, dtype=torch.bool)
+    gray[0, 0] = gray[1, 1] = gray[2, 2] = True
+    rgb = flow_to_rgb(spoiled)[0]
+    assert (rgb[:, gray] == 0.5).all()
+    assert_close(rgb[:, ~gray], flow_to_rgb(torch.where(gray, 0, flow))[0][:, ~gray])
+
+
+def test_a_half_precision_flow_has_the_colors_of_the_same_float_flow():
+    flow = 300 * torch.randn(1, 2, 5, 5).half()  # its square would overflow
+    assert_close(flow_to_rgb(flow), flow_to_rgb(flow.float()))
+
+
+@pytest.mark.parametrize("size", [1, 8, 33])
+def test_a_place_of_the_wheel_has_the_color_of_the_flow_that_points_there(size):
+    wheel = flow_wheel(size)
+    for row in range(size):
+        for column in range(size):
+            x, y = column - (size - 1) / 2, row - (size - 1) / 2
+            inside = math.hypot(x, y) <= size / 2
+            expected = arrow(x, y, max_px=size / 2) if inside else torch.ones(3)
+            assert_close(wheel[:, row, column], expected, atol=1e-4, rtol=0)
+
+
+def test_transmission_follows_viridis_and_brightens_all_the_way():
+    transmission = torch.linspace(0, 1, 257)
+    rgb = transmission_to_rgb(transmission.view(1, 1, 1, -1))[0, :, 0].T
+    viridis = torch.from_numpy(colormaps["viridis"](transmission.numpy())[:, :3]).float()
+    assert_close(rgb[::32], viridis[::32], atol=1e-3, rtol=0)
+    assert_close(rgb, viridis, atol=0.07, rtol=0)
+    assert (rgb @ torch.tensor([0.2126, 0.7152, 0.0722])).diff().min() > 0
+
+
+def test_transmission_that_is_nan_is_gray():
+    rgb = transmission_to_rgb(torch.tensor([math.nan, 0.0]).view(1, 1, 1, 2))
+    assert rgb[0, :, 0, 0].tolist() == [0.5, 0.5, 0.5]
+    assert_close(rgb[0, :, 0, 1], torch.tensor([0.267, 0.005, 0.329]))
+
+
+def test_a_checkerboard_changes_color_every_cell_and_starts_white():
+    board = checkerboard(5, 7, cell=3)
+    top, bottom = [1, 1, 1, 0, 0, 0, 1], [0, 0, 0, 1, 1, 1, 0]
+    expected = torch.tensor([top, top, top, bottom, bottom], dtype=torch.float32)
+    assert_close(board, expected.expand(1, 3, 5, 7))
+
+
+def test_wrong_arguments_are_refused():
+    with pytest.raises(ValueError, match=r"flow must have shape \(B, 2, H, W\), got \(2, 4, 4\)"):
+        flow_to_rgb(torch.zeros(2, 4, 4))
+    with pytest.raises(TypeError, match="flow must be of a floating type"):
+        flow_to_rgb(torch.zeros(1, 2, 4, 4, dtype=torch.int32))
+    with pytest.raises(ValueError, match="max_px must be a finite number above 0, got 0"):
+        flow_to_rgb(torch.zeros(1, 2, 4, 4), max_px=0)
+    with pytest.raises(ValueError, match=r"transmission must have shape \(B, 1, H, W\)"):
+        transmission_to_rgb(torch.zeros(1, 3, 4, 4))
+    with pytest.raises(ValueError, match="size must be at least 1, got 0"):
+        flow_wheel(0)
+    with pytest.raises(ValueError, match="cell must be at least 1, got 0"):
+        checkerboard(4, 4, cell=0)

@@ -1,0 +1,365 @@
+import itertools
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchrefract import warp
+from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS
+
+SIZES = [(1, 1), (1, 7), (9, 1), (2, 2), (37, 53)]
+# What SciPy calls the paddings of F.grid_sample(align_corners=False).
+SCIPY_MODES = {"zeros": "grid-constant", "border": "nearest", "reflection": "reflect"}
+CV2_BORDERS = {"zeros": cv2.BORDER_CONSTANT, "border": cv2.BORDER_REPLICATE}
+
+
+def noise(*shape: int, seed: int = 0) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def random_flow(batch: int, height: int, width: int, reach: float = 4.0) -> Tensor:
+    return (2 * noise(batch, 2, height, width, seed=1) - 1) * reach
+
+
+def positions(flow: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """x and y of p + flow(p), (B, H, W)."""
+    y, x = np.mgrid[: flow.shape[2], : flow.shape[3]]
+    return x + flow[:, 0].numpy(), y + flow[:, 1].numpy()
+
+
+def by_scipy(image: Tensor, flow: Tensor, order: int, padding: str) -> Tensor:
+    x, y = positions(flow)
+    planes = [
+        [ndimage.map_coordinates(c.numpy(), [y[i], x[i]], order=order, mode=SCIPY_MODES[padding]) for c in image[i]]
+        for i in range(len(image))
+    ]
+    return torch.from_numpy(np.array(planes))
+
+
+def by_opencv(image: Tensor, flow: Tensor, interpolation: int, border: int = cv2.BORDER_REPLICATE) -> Tensor:
+    """The first sample of a batch, by cv2.remap with maps in float32."""
+    x, y = (position[0].astype(np.float32) for position in positions(flow))
+    source = np.ascontiguousarray(image[0].movedim(0, -1).numpy())
+    return torch.from_numpy(cv2.remap(source, x, y, interpolation, borderMode=border)).movedim(-1, 0)[None]
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("padding", PADDINGS)
+@pytest.mark.parametrize(("interpolation", "order"), [("bilinear", 1), ("nearest", 0)])
+def test_double_precision_agrees_with_scipy(size, padding, interpolation, order):
+    image, flow = noise(2, 3, *size), random_flow(2, *size)
+    warped, _ = warp(image, flow, padding=padding, interpolation=interpolation)
+    assert_close(warped, by_scipy(image, flow, order, padding), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("padding", CV2_BORDERS)
+def test_bilinear_single_precision_agrees_with_opencv(padding):
+    image, flow = noise(1, 3, 270, 480).float(), random_flow(1, 270, 480).float()
+    expected = by_opencv(image, flow, cv2.INTER_LINEAR, CV2_BORDERS[padding])
+    assert_close(warp(image, flow, padding=padding)[0], expected, rtol=0, atol=5e-4)
+
+
+def test_bicubic_agrees_with_opencv_up_to_the_clamp():
+    image, flow = noise(1, 3, 270, 480).float(), random_flow(1, 270, 480).float()
+    low, high = image.amin(dim=(2, 3), keepdim=True), image.amax(dim=(2, 3), keepdim=True)
+    expected = by_opencv(image, flow, cv2.INTER_CUBIC).clamp(low, high)
+    warped, _ = warp(image, flow, padding="border", interpolation="bicubic")
+    assert_close(warped, expected, rtol=0, atol=5e-4)
+
+
+def test_bytes_agree_with_opencv_within_one_level():
+    image = (noise(1, 3, 120, 160) * 255).round().to(torch.uint8)
+    flow = random_flow(1, 120, 160).float()
+    warped, _ = warp(image, flow, padding="border")
+    expected = by_opencv(image, flow, cv2.INTER_LINEAR)
+    assert warped.dtype == torch.uint8
+    assert (warped.int() - expected.int()).abs().max() <= 1
+
+
+@pytest.mark.parametrize("padding", PADDINGS)
+def test_whole_shifts_move_pixels_unchanged(padding):
+    image = noise(1, 2, 12, 17).float()
+    flow = torch.tensor([3.0, -2.0]).view(1, 2, 1, 1).expand(-1, -1, 12, 17)
+    warped, valid = warp(image, flow, padding=padding)
+    # out(x, y) = image(x + 3, y - 2) where that is on the frame.
+    assert_close(warped[:, :, 2:, :-3], image[:, :, :-2, 3:], rtol=0, atol=1e-5)
+    expected = torch.zeros(1, 1, 12, 17, dtype=torch.bool)
+    expected[:, :, 2:, :-3] = True
+    assert torch.equal(valid, expected)
+
+
+def test_only_positions_within_the_outermost_pixel_centers_are_valid():
+    flow = random_flow(2, 19, 23, reach=30)
+    x, y = positions(flow)
+    expected = torch.from_numpy((x >= 0) & (x <= 22) & (y >= 0) & (y <= 18))[:, None]
+    assert torch.equal(warp(noise(2, 1, 19, 23), flow)[1], expected)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "largest"),
+    [(torch.int64, 2**40), (torch.int32, 2**31 - 1), (torch.int16, 2**15 - 1), (torch.uint8, 255)],
+)
+def test_nearest_keeps_the_numbers_of_integer_masks(dtype, largest):
+    # Up to 2^53 for int64: the sampler has no wider type than float64.
+    image = torch.randint(largest - 50, largest + 1, (2, 1, 31, 29), generator=torch.Generator().manual_seed(0))
+    flow = random_flow(2, 31, 29)
+    warped, _ = warp(image.to(dtype), flow.float(), padding="border", interpolation="nearest")
+    assert warped.dtype == dtype
+    assert torch.equal(warped.long(), by_scipy(image.double(), flow, 0, "border").long())
+
+
+def test_nearest_keeps_the_truth_of_boolean_masks():
+    image, flow = noise(2, 1, 31, 29) > 0.5, random_flow(2, 31, 29)
+    warped, _ = warp(image, flow.float(), padding="border", interpolation="nearest")
+    assert torch.equal(warped, by_scipy(image.double(), flow, 0, "border") > 0.5)
+
+
+def test_bilinear_rounds_integers_to_the_nearest():
+    image = torch.tensor([0, 10, 21], dtype=torch.int32).view(1, 1, 1, 3)
+    flow = torch.tensor([0.24, 0.5, 0.0]).view(1, 1, 1, 3)
+    warped, _ = warp(image, torch.cat([flow, torch.zeros_like(flow)], dim=1))
+    assert warped.flatten().tolist() == [2, 16, 21]
+
+
+@pytest.mark.parametrize("size", [(131, 127), (257, 64), (128, 128)])
+@pytest.mark.parametrize("padding", PADDINGS)
+@pytest.mark.parametrize("interpolation", INTERPOLATIONS)
+def test_the_split_into_bands_of_rows_changes_no_bit(on_threads, size, padding, interpolation):
+    image, flow = noise(1, 3, *size).float(), random_flow(1, *size).float()
+    results = []
+    for threads in (1, 2, 3):
+        on_threads(threads)
+        results.append(warp(image, flow, padding=padding, interpolation=interpolation))
+    for warped, valid in results[1:]:
+        assert torch.equal(warped, results[0][0])
+        assert torch.equal(valid, results[0][1])
+
+
+def test_the_split_into_bands_of_rows_keeps_the_gradients(on_threads):
+    weights = noise(1, 2, 131, 127, seed=2)
+    gradients = []
+    for threads in (1, 3):
+        on_threads(threads)
+        image, flow = noise(1, 2, 131, 127).requires_grad_(), random_flow(1, 131, 127).requires_grad_()
+        gradients.append(torch.autograd.grad((warp(image, flow)[0] * weights).sum(), [image, flow]))
+    assert_close(gradients[1], gradients[0], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [(1080, 1920), (2160, 3840)])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_types_are_computed_in_single_precision(size, dtype):
+    image = noise(1, 1, *size).to(dtype)
+    flow = torch.tensor([0.25, -0.5]).view(1, 2, 1, 1).expand(-1, -1, *size)
+    warped, _ = warp(image, flow, padding="border")
+    assert warped.dtype == dtype
+    # The same weights by hand: 3/4 and 1/4 along the row, 1/2 and 1/2 of this row and the one above.
+    exact = image.double()
+    rows = 0.5 * exact[..., 1:, :] + 0.5 * exact[..., :-1, :]
+    expected = 0.75 * rows[..., :-1] + 0.25 * rows[..., 1:]
+    # Half a unit in the last place of 1, and what fp32 coordinates are off.
+    tolerance = torch.finfo(dtype).eps / 2 + 1e-3
+    assert_close(warped[..., 1:, :-1].double(), expected, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_a_half_flow_is_read_as_what_it_says(dtype):
+    image, flow = noise(1, 1, 31, 300).float(), random_flow(1, 31, 300).to(dtype)
+    assert torch.equal(warp(image, flow)[0], warp(image, flow.float())[0])
+
+
+POISON = """
+import itertools, math, torch
+from torchrefract import warp
+for padding, kind, dtype, poison in itertools.product(
+    ("zeros", "border", "reflection"), ("nearest", "bilinear", "bicubic"), (torch.float32, torch.float64),
+    (math.nan, math.inf, -math.inf, 3e38, -3e38, 1e10),
+):
+    image = torch.rand(1, 2, 9, 11, dtype=dtype, requires_grad=True)
+    flow = torch.full((1, 2, 9, 11), 0.3, dtype=dtype)
+    clean, _ = warp(image, flow, padding=padding, interpolation=kind)
+    bad = flow.clone()
+    bad[0, 0, 4, 5] = bad[0, 1, 2, 3] = poison
+    bad.requires_grad_()
+    warped, valid = warp(image, bad, padding=padding, interpolation=kind)
+    warped.square().sum().backward()
+    case = f"{padding} {kind} {dtype} {poison}"
+    spot = torch.zeros(1, 1, 9, 11, dtype=torch.bool)
+    spot[..., 4, 5] = spot[..., 2, 3] = True
+    assert warped.isfinite().all() and bad.grad.isfinite().all() and image.grad.isfinite().all(), case
+    assert not valid[spot].any() and torch.equal(valid[~spot], warp(image, flow)[1][~spot]), case
+    assert torch.equal(warped.where(~spot, 0), clean.where(~spot, 0)), case
+    assert padding != "zeros" or not warped.where(spot, 0).any(), case
+print("lived")
+"""
+
+
+def test_poisoned_flows_neither_crash_nor_spread_forward_or_backward():
+    # In a process of its own: what this guards against ends the process.
+    run = subprocess.run([sys.executable, "-c", POISON], capture_output=True, text=True, check=False, timeout=120)
+    assert (run.returncode, run.stdout.strip()) == (0, "lived"), run.stderr
+
+
+@pytest.mark.parametrize("shift", [1e6, -1e6])
+@pytest.mark.parametrize("interpolation", INTERPOLATIONS)
+def test_a_million_pixels_away_lies_the_padding(shift, interpolation):
+    image = noise(1, 1, 8, 9).float()
+    flow = torch.full((1, 2, 8, 9), shift)
+    corner = image[..., -1, -1] if shift > 0 else image[..., 0, 0]
+    for padding, expected in (("zeros", torch.zeros(1, 1)), ("border", corner)):
+        warped, valid = warp(image, flow, padding=padding, interpolation=interpolation)
+        assert_close(warped, expected[..., None, None].expand_as(warped), rtol=0, atol=1e-6)
+        assert not valid.any()
+
+
+@pytest.mark.parametrize("poison", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize(("interpolation", "support"), [("nearest", 0.5), ("bilinear", 1), ("bicubic", 2)])
+def test_poisoned_pixels_stay_local(poison, interpolation, support):
+    image, flow = noise(2, 2, 40, 30).float() > 0.5, random_flow(2, 40, 30).float()
+    image = image * 0.6 + 0.2
+    poisoned = image.clone()
+    poisoned[0, 1, 20, 10] = poison
+    clean, _ = warp(image, flow, padding="border", interpolation=interpolation)
+    warped, _ = warp(poisoned, flow, padding="border", interpolation=interpolation)
+    x, y = positions(flow[:1])
+    near = torch.from_numpy((np.abs(x - 10) < support + 1e-3) & (np.abs(y - 20) < support + 1e-3))
+    assert torch.equal(warped[1], clean[1])
+    assert torch.equal(warped[0, 0], clean[0, 0])
+    assert torch.equal(warped[0, 1][~near[0]], clean[0, 1][~near[0]])
+    assert not warped[0, 1][near[0]].isfinite().all()
+
+
+@pytest.mark.parametrize("padding", PADDINGS)
+def test_bicubic_keeps_a_binary_image_in_its_range(padding):
+    image = (noise(2, 2, 40, 30) > 0.5).float()
+    warped, _ = warp(image, random_flow(2, 40, 30).float(), padding=padding, interpolation="bicubic")
+    assert warped.amin() >= 0
+    assert warped.amax() <= 1
+    # The bound is that of the values, not of [0, 1].
+    warped, _ = warp(3 - image, random_flow(2, 40, 30).float(), padding="border", interpolation="bicubic")
+    assert warped.amin() >= 2
+    assert warped.amax() <= 3
+
+
+@pytest.mark.parametrize("interpolation", INTERPOLATIONS)
+@pytest.mark.parametrize("shape", [(3, 1, 1, 1), (2, 4, 1, 13), (2, 4, 13, 1), (1, 12, 31, 37), (2, 1, 16, 16)])
+def test_every_channel_and_sample_is_warped_by_itself(shape, interpolation):
+    image, flow = noise(*shape).float(), random_flow(shape[0], *shape[2:]).float()
+    warped, valid = warp(image, flow, interpolation=interpolation)
+    for i, channel in itertools.product(range(shape[0]), range(shape[1])):
+        alone, mask = warp(image[i : i + 1, [channel]], flow[i : i + 1], interpolation=interpolation)
+        assert torch.equal(alone[0, 0], warped[i, channel])
+        assert torch.equal(mask[0], valid[i])
+
+
+@pytest.mark.parametrize("interpolation", INTERPOLATIONS)
+def test_a_batch_of_none_stays_one(interpolation):
+    warped, valid = warp(torch.zeros(0, 3, 5, 7), torch.zeros(0, 2, 5, 7), interpolation=interpolation)
+    assert (warped.shape, valid.shape, valid.dtype) == ((0, 3, 5, 7), (0, 1, 5, 7), torch.bool)
+
+
+def test_the_layout_in_memory_changes_nothing_and_is_kept():
+    image, flow = noise(2, 3, 12, 16).float(), random_flow(2, 12, 16).float()
+    expected, _ = warp(image, flow)
+    last, _ = warp(image.contiguous(memory_format=torch.channels_last), flow)
+    assert torch.equal(last, expected)
+    assert last.is_contiguous(memory_format=torch.channels_last)
+    strided = torch.stack([image, image], dim=-1)[..., 0]
+    flipped = flow.mT.contiguous().mT
+    assert torch.equal(warp(strided, flipped)[0], expected)
+    assert warp(strided, flipped)[0].is_contiguous()
+
+
+def test_an_unbatched_image_is_a_batch_of_one():
+    image, flow = noise(3, 12, 16).float(), random_flow(1, 12, 16)[0].float()
+    warped, valid = warp(image, flow)
+    batched, mask = warp(image[None], flow[None])
+    assert torch.equal(warped, batched[0])
+    assert torch.equal(valid, mask[0])
+
+
+def test_one_flow_serves_a_whole_batch():
+    image, flow = noise(3, 2, 12, 16).float(), random_flow(1, 12, 16).float()
+    assert torch.equal(warp(image, flow)[0], warp(image, flow.expand(3, -1, -1, -1))[0])
+
+
+@pytest.mark.parametrize("size", [(3, 7680), (4320, 3), (2, 8192), (1, 40000), (40000, 1)])
+@pytest.mark.parametrize("shift", [0, 3])
+def test_coordinates_of_large_frames_are_right_to_a_thousandth_of_a_pixel(size, shift):
+    # A triangle wave of slope 1 and small values: what it changes by is the error in px, its own rounding is 1e-5.
+    place = torch.arange(max(size))
+    wave = ((place % 128) - 64).abs().float()
+    image = (wave if size[1] > size[0] else wave[:, None]).expand(1, 1, *size)
+    flow = torch.zeros(1, 2, *size)
+    flow[:, 0 if size[1] > size[0] else 1] = shift
+    warped, valid = warp(image, flow, padding="border")
+    expected = ((((place + shift).clamp(max=max(size) - 1)) % 128) - 64).abs().float()
+    expected = (expected if size[1] > size[0] else expected[:, None]).expand(1, 1, *size)
+    assert_close(warped, expected, rtol=0, atol=1e-3 - 1e-5)
+    assert valid.sum() == valid.numel() // max(size) * (max(size) - shift)
+
+
+@pytest.mark.parametrize("padding", PADDINGS)
+def test_bilinear_gradients_are_those_of_finite_differences(padding):
+    image = noise(2, 2, 4, 5).requires_grad_()
+    # Off whole pixels, where bilinear sampling has no derivative, and in part outside.
+    flow = (torch.randint(-2, 3, (2, 2, 4, 5), generator=torch.Generator().manual_seed(3)) + 0.37).double()
+    assert torch.autograd.gradcheck(lambda i, f: warp(i, f, padding=padding)[0], [image, flow.requires_grad_()])
+
+
+def test_bicubic_gradients_are_those_of_finite_differences():
+    image = (0.5 + 0.1 * noise(1, 1, 7, 8)).index_put((torch.tensor(0),) * 4, torch.tensor(9.0).double())
+    flow = torch.full((1, 2, 7, 8), 0.37, dtype=torch.float64)
+    flow[..., :4, :4] += 2  # away from the one pixel that sets the range, so that nothing is clamped above
+
+    def interior(image: Tensor, flow: Tensor) -> Tensor:
+        return warp(image - 9, flow, interpolation="bicubic")[0][..., :3, :4]
+
+    assert torch.autograd.gradcheck(interior, [image.requires_grad_(), flow.requires_grad_()])
+
+
+@pytest.mark.parametrize(
+    ("image", "flow", "rule"),
+    [
+        ((3, 8, 9), (1, 2, 8, 9), r"image must have shape \(B, C, H, W\) beside a batched flow"),
+        ((1, 3, 8, 9), (2, 8, 9), r"flow must have shape \(B, 2, H, W\)"),
+        ((1, 3, 8, 9), (1, 3, 8, 9), r"flow must have shape \(B, 2, H, W\)"),
+        ((1, 3, 8, 9), (1, 2, 9, 8), "flow must have the batch and the size of the image"),
+        ((3, 1, 8, 9), (2, 2, 8, 9), "flow must have the batch and the size of the image"),
+        ((8, 9), (1, 2, 8, 9), "image must have shape"),
+    ],
+)
+def test_shapes_that_do_not_fit_raise(image, flow, rule):
+    with pytest.raises(ValueError, match=rule):
+        warp(torch.zeros(image), torch.zeros(flow))
+
+
+@pytest.mark.parametrize(
+    ("options", "rule"),
+    [
+        ({"padding": "wrap"}, "padding must be one of zeros, border, reflection, got 'wrap'"),
+        ({"interpolation": "lanczos"}, "interpolation must be one of nearest, bilinear, bicubic, got 'lanczos'"),
+    ],
+)
+def test_an_unknown_option_raises(options, rule):
+    with pytest.raises(ValueError, match=rule):
+        warp(torch.zeros(1, 1, 2, 2), torch.zeros(1, 2, 2, 2), **options)
+
+
+@pytest.mark.parametrize(
+    ("image", "flow", "rule"),
+    [
+        (torch.zeros(1, 1, 2, 2), torch.zeros(1, 2, 2, 2, dtype=torch.int64), "flow must be of a floating type"),
+        (torch.zeros(1, 1, 2, 2, dtype=torch.complex64), torch.zeros(1, 2, 2, 2), "image must be real"),
+        (np.zeros((1, 1, 2, 2)), torch.zeros(1, 2, 2, 2), "image must be a tensor"),
+        (torch.zeros(1, 1, 2, 2), None, "flow must be a tensor"),
+    ],
+)
+def test_types_that_do_not_fit_raise(image, flow, rule):
+    with pytest.raises(TypeError, match=rule):
+        warp(image, flow)

@@ -1,0 +1,135 @@
+"""What the commands share: one line for what a user can mend, a traceback for what only we can."""
+
+import errno
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import NamedTuple, NoReturn
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, InstantiationException, MissingConfigException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from pytorch_lightning import LightningDataModule, LightningModule, Trainer, seed_everything
+
+from torchrefract._config import CONFIG_DIR
+from torchrefract.data.images import UnreadableImageError
+from torchrefract.restoration.checkpoints import CheckpointError, check_fits, read_checkpoint
+from torchrefract.restoration.files import replacing
+
+_INFORMING = ("--help", "-h", "--hydra-help", "--info", "--shell-completion", "-sc")
+# Advice of libraries on what is meant so here.
+_HINTS = (
+    ".*does not have many workers.*",
+    ".*LeafSpec.*",
+    ".*smaller than the logging interval.*",
+    ".*exists and is not empty.*",
+)
+
+
+class Job(NamedTuple):
+    """What a command works with."""
+
+    data: LightningDataModule
+    model: LightningModule
+    trainer: Trainer
+
+
+class UsageError(Exception):
+    """Something that the user can mend; the message says how."""
+
+
+def command(name: str) -> Callable[[Callable[[], None]], Callable[[], None]]:
+    """Decorates the Hydra main function of `python -m torchrefract.<name>`: checks its words, shortens its errors."""
+
+    def decorate(main: Callable[[], None]) -> Callable[[], None]:
+        @wraps(main)
+        def run() -> None:
+            _quieten()
+            # With this, Hydra hands on its errors instead of printing them in its own form.
+            os.environ["HYDRA_FULL_ERROR"] = "1"
+            try:
+                _check_words(name, sys.argv[1:])
+                main()
+            except Exception as error:
+                if (message := _mendable(error)) is None:
+                    raise
+                _stop(message)
+
+        return run
+
+    return decorate
+
+
+def make_job(cfg: DictConfig, *, needs_checkpoint: bool = False) -> Job:
+    """Data, model and trainer of a configuration, the checkpoint checked, the resolved configuration written."""
+    seed_everything(cfg.seed, workers=True, verbose=False)
+    OmegaConf.resolve(cfg)
+    if needs_checkpoint and cfg.ckpt_path is None:
+        raise UsageError("ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none")
+    checkpoint = None
+    if cfg.ckpt_path is not None:
+        checkpoint = read_checkpoint(Path(cfg.ckpt_path), task=HydraConfig.get().runtime.choices["task"])
+    job = Job(*(_make(cfg, part) for part in ("data", "model", "trainer")))
+    if checkpoint is not None:
+        check_fits(checkpoint, job.model)
+    if job.trainer.is_global_zero:
+        with replacing(Path(cfg.run_dir, "config.yaml")) as path:
+            OmegaConf.save(cfg, path)
+    return job
+
+
+def tasks() -> list[str]:
+    """The names of the tasks that conf/task holds."""
+    return sorted(path.stem for path in Path(CONFIG_DIR, "task").glob("*.yaml"))
+
+
+def _make(cfg: DictConfig, part: str) -> LightningDataModule | LightningModule | Trainer:
+    try:
+        return instantiate(cfg[part])
+    except InstantiationException as error:
+        cause = error.__cause__
+        if isinstance(cause, ValueError | TypeError | OSError):
+            raise UsageError(f"{part}: {cause}") from error
+        raise
+
+
+def _check_words(name: str, words: list[str]) -> None:
+    if any(word in _INFORMING for word in words):
+        return
+    listed = ", ".join(tasks())
+    for word in words:
+        if word.startswith("task="):
+            raise UsageError(f"{word} needs a plus, since no task is chosen yet: python -m torchrefract.{name} +{word}")
+    if not any(word.startswith(("+task=", "++task=")) for word in words):
+        raise UsageError(f"+task must be one of {listed}: python -m torchrefract.{name} +task={tasks()[-1]}, got none")
+
+
+def _mendable(error: Exception) -> str | None:
+    """One line for an error of the user's, None for one of ours."""
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        group, _, option = error.missing_cfg_file.rpartition("/")
+        return f"{group} must be one of {', '.join(error.options or [])}, got {option}"
+    if isinstance(error, UnreadableImageError):
+        return str(error).strip().splitlines()[-1].split("Error: ", 1)[-1]  # a worker prepends its traceback
+    if isinstance(error, UsageError | CheckpointError | HydraException | OmegaConfBaseException):
+        return " ".join(str(error).split())
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
+        return f"{error.filename or 'a file'} could not be written: {error.strerror}"
+    return None
+
+
+def _stop(message: str) -> NoReturn:
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(1)
+
+
+def _quieten() -> None:
+    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
+    for hint in _HINTS:
+        warnings.filterwarnings("ignore", hint)

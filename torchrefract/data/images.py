@@ -1,0 +1,186 @@
+"""Reading clean pictures, and cutting them to one size.
+
+A damaged picture must not slip in: a decoder may fill what is missing with gray and call it a success. So a file
+counts as readable only where its format's own mark of completeness is there: the end marker of JPEG and PNG, the
+length that WebP and BMP state at their start.
+"""
+
+import io
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+import cv2
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from torchrefract._checks import check_count, check_tensor
+
+EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
+
+_TAIL = 4096  # bytes read first in the search for an end marker: nearly all files have it in the last few
+_PNG_END = b"IEND\xaeB`\x82"
+_JPEG_END = b"\xff\xd9"
+_START_OF_SCAN = 0xDA
+_BARE_MARKERS = (0x01, *range(0xD0, 0xD8))  # TEM and RST0 to RST7 carry no length
+_ORIENTATION = 0x0112
+_TURNED = (5, 6, 7, 8)  # EXIF orientations that swap height and width
+
+
+class UnreadableImageError(ValueError):
+    """A file that is no complete picture. The message names it and says what is wrong."""
+
+
+def read_image(path: str | Path) -> Tensor:
+    """The picture in a JPEG, PNG, WebP or BMP file, upright as its EXIF orientation says, without its alpha channel.
+
+    Returns:
+        (3, H, W), float32 in [0, 1], RGB, 8-bit values / 255 and 16-bit values / 65535; strides as decoded, so
+        channels last.
+    """
+    data = _bytes(path)
+    _check_whole(path, io.BytesIO(data), len(data))
+    pixels = _decode(path, data)
+    scale = np.iinfo(pixels.dtype).max
+    return torch.from_numpy(pixels).to(torch.float32).div_(scale).permute(2, 0, 1)
+
+
+def image_size(path: str | Path) -> tuple[int, int]:
+    """(H, W) of what `read_image` returns, from the file's header and tail, without decoding a pixel.
+
+    A file that lacks its end, is empty, or is no picture raises UnreadableImageError, as `read_image` does; one that
+    is damaged in between is found by `read_image` alone.
+    """
+    try:
+        with open(path, "rb") as stream:
+            _check_whole(path, stream, os.fstat(stream.fileno()).st_size)
+            return _header_size(path, stream)
+    except OSError as error:
+        raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
+
+
+def fit(image: Tensor, size: Sequence[int]) -> Tensor:
+    """The middle of a picture, cut to the aspect of `size` and reduced to it by area averaging.
+
+    Each output pixel is the mean of the input pixels that it covers, those at its border by the share covered: a
+    scene seen by a coarser sensor. (An antialiased bilinear filter would reach twice as far and blur more.)
+
+    Args:
+        image: (3, H, W), float32 in [0, 1], on the CPU.
+        size: (h, w), at most (H, W): nothing is ever enlarged.
+
+    Returns:
+        (3, h, w), float32 in [0, 1].
+    """
+    height, width = check_size("size", size)
+    _check_image(image)
+    H, W = image.shape[1:]
+    if height > H or width > W:
+        raise ValueError(f"image must be at least size = {height}x{width} (height x width), got {H}x{W}")
+    crop_height, crop_width = min(H, round(W * height / width)), min(W, round(H * width / height))
+    top, left = (H - crop_height) // 2, (W - crop_width) // 2
+    crop = image.detach()[:, top : top + crop_height, left : left + crop_width].permute(1, 2, 0).contiguous().numpy()
+    small = cv2.resize(crop, (width, height), interpolation=cv2.INTER_AREA)
+    # Weights that sum to 1 only up to rounding may step over 1.
+    return torch.from_numpy(small).permute(2, 0, 1).contiguous().clamp_(0, 1)
+
+
+def check_size(name: str, size: Sequence[int]) -> tuple[int, int]:
+    """`size` as (height, width), two whole numbers of at least 1."""
+    if isinstance(size, str) or not isinstance(size, Sequence) or len(size) != 2:
+        raise ValueError(f"{name} must be (height, width), got {size!r}")
+    return check_count(name, size[0]), check_count(name, size[1])
+
+
+def _check_image(image: Tensor) -> None:
+    check_tensor("image", image)
+    if image.ndim != 3 or image.shape[0] != 3:
+        raise ValueError(f"image must have shape (3, H, W), got {tuple(image.shape)}")
+    if image.dtype != torch.float32 or image.device.type != "cpu":
+        raise TypeError(f"image must be float32 on the CPU, got {image.dtype} on {image.device}")
+
+
+def _bytes(path: str | Path) -> bytes:
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
+
+
+def _header_size(path: str | Path, stream: BinaryIO) -> tuple[int, int]:
+    try:
+        with Image.open(stream) as picture:
+            width, height = picture.size
+            # Asked without need, Pillow decodes a whole PNG in search of EXIF data behind its pixels.
+            turned = "exif" in picture.info and picture.getexif().get(_ORIENTATION) in _TURNED
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise UnreadableImageError(f"{path} has a damaged header ({error})") from error
+    return (width, height) if turned else (height, width)
+
+
+def _decode(path: str | Path, data: bytes) -> np.ndarray:
+    # Decoding from memory: from a file OpenCV would fill the missing rows of a cut JPEG with gray, and call it well.
+    try:
+        with _quiet():
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
+    except cv2.error as error:
+        raise UnreadableImageError(f"{path} cannot be decoded ({error.err})") from error
+    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+        raise UnreadableImageError(f"{path} is damaged: its pixels cannot be decoded")
+    return pixels
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """OpenCV's log lines off: what they say is raised as an error."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+def _check_whole(path: str | Path, stream: BinaryIO, length: int) -> None:
+    """Raise unless `stream`, of `length` bytes, is a picture file with its end in place."""
+    if length == 0:
+        raise UnreadableImageError(f"{path} is empty (0 bytes)")
+    head = stream.read(16)
+    if head.startswith(b"\xff\xd8\xff"):
+        whole = _contains(stream, _JPEG_END, _scan_start(stream, length), length)
+    elif head.startswith(b"\x89PNG\r\n\x1a\n"):
+        whole = _contains(stream, _PNG_END, 8, length)
+    elif head.startswith(b"RIFF") and head[8:12] == b"WEBP":
+        whole = int.from_bytes(head[4:8], "little") + 8 <= length
+    elif head.startswith(b"BM"):
+        whole = length >= 26 and int.from_bytes(head[2:6], "little") <= length
+    else:
+        raise UnreadableImageError(f"{path} is not a JPEG, PNG, WebP or BMP picture")
+    if not whole:
+        raise UnreadableImageError(f"{path} is truncated ({length} bytes, its end is missing)")
+
+
+def _contains(stream: BinaryIO, marker: bytes, start: int, length: int) -> bool:
+    """Whether `marker` lies at `start` or later: programs append bytes to whole pictures, so not just at the end."""
+    for begin in (max(start, length - _TAIL), start):
+        stream.seek(begin)
+        if marker in stream.read():
+            return True
+    return False
+
+
+def _scan_start(stream: BinaryIO, length: int) -> int:
+    """Where the coded pixels of a JPEG begin, or its length: what lies before may hold a thumbnail with its own end."""
+    position = 2
+    while position + 4 <= length:
+        stream.seek(position)
+        fill, marker, high, low = stream.read(4)
+        if fill != 0xFF or marker == _START_OF_SCAN:
+            return position
+        # A marker may be preceded by any number of fill bytes 0xFF.
+        position += 1 if marker == 0xFF else 2 if marker in _BARE_MARKERS else 2 + 256 * high + low
+    return length

@@ -1,0 +1,125 @@
+"""Batches to learn from: clean frames come out of workers, and are corrupted on the device that trains."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from pytorch_lightning import LightningDataModule
+from torch.utils.data import DataLoader, Dataset, DistributedSampler
+
+from torchrefract._checks import check_count
+from torchrefract.data.frame_folder import FrameFolder
+from torchrefract.data.road_scenes import RoadScenes
+from torchrefract.effects.base import Effect
+from torchrefract.types import Frame, Pair
+
+# Seeds of the epochs of training lie above the one of validation.
+_FIRST_EPOCH = 1
+
+
+class PairData(LightningDataModule):
+    """Pairs of clean and degraded frames.
+
+    In training a frame is degraded anew each epoch, by the draw of (seed, epoch, key of the frame); in validation it is
+    degraded alike each time. So a run that goes on after a stop sees what it would have seen.
+
+    Args:
+        train, val: clean frames; val of drives that train has none of.
+        effect: what degrades them.
+        batch_size: frames in a batch, of each device.
+        workers: processes that read or render frames; 0 does it in the training process.
+        seed: of the draws and of the order.
+    """
+
+    def __init__(
+        self,
+        train: Dataset[Frame],
+        val: Dataset[Frame],
+        *,
+        effect: Effect,
+        batch_size: int = 16,
+        workers: int = 2,
+        seed: int = 0,
+    ):
+        super().__init__()
+        self.train, self.val, self.effect = train, val, effect
+        self.batch_size = check_count("batch_size", batch_size)
+        self.workers = check_count("workers", workers, low=0)
+        self.seed = check_count("seed", seed, low=0)
+        if len(train) < batch_size:  # pyright: ignore[reportArgumentType]  # a map-style dataset has a length
+            raise ValueError(f"batch_size must be at most the {len(train)} training frames, got {batch_size}")  # pyright: ignore[reportArgumentType]
+
+    def train_dataloader(self) -> DataLoader[Frame]:
+        """Batches of frames in an order of the epoch."""
+        return self._loader(self.train, training=True)
+
+    def val_dataloader(self) -> DataLoader[Frame]:
+        """Batches of frames in their order."""
+        return self._loader(self.val, training=False)
+
+    def on_after_batch_transfer(self, batch: Frame, dataloader_idx: int) -> Pair:
+        """The batch and its degraded copy, made on the device that it has come to."""
+        training = self.trainer is not None and self.trainer.training
+        epoch = _FIRST_EPOCH + self.trainer.current_epoch if training and self.trainer else 0
+        return make_pair(batch, self.effect, seed=(self.seed << 32) + epoch)
+
+    def _loader(self, frames: Dataset[Frame], *, training: bool) -> DataLoader[Frame]:
+        ranks, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
+        # Every rank its own frames, none twice in training; Lightning sets the epoch.
+        sampler = DistributedSampler(frames, ranks, rank, shuffle=training, seed=self.seed, drop_last=training)
+        return DataLoader(
+            frames,
+            batch_size=self.batch_size,
+            sampler=sampler,
+            drop_last=training,
+            num_workers=self.workers,
+            persistent_workers=self.workers > 0,
+            pin_memory=torch.cuda.is_available(),
+        )
+
+
+@torch.no_grad()
+def make_pair(frames: Frame, effect: Effect, *, seed: int) -> Pair:
+    """A batch of frames and what an effect makes of it, on the device of the frames."""
+    depth = frames.depth if frames.depth.ndim == 4 else None
+    degraded = effect.degrade(frames.image, seed=seed, keys=frames.key, depth=depth)
+    flow, valid = degraded.restore_flow, degraded.restore_valid
+    if flow is None or valid is None:
+        like = frames.image[:, :1]
+        flow, valid = torch.zeros_like(like).expand(-1, 2, -1, -1), torch.ones_like(like, dtype=torch.bool)
+    return Pair(degraded.image, frames.image, flow, valid, frames.key)
+
+
+def road_scenes(
+    *,
+    effect: Effect,
+    size: Sequence[int] = (64, 112),
+    train_count: int = 1024,
+    val_count: int = 128,
+    batch_size: int = 16,
+    workers: int = 2,
+    seed: int = 0,
+) -> PairData:
+    """Pairs of rendered road scenes; arguments as for `RoadScenes` and `PairData`."""
+    train = RoadScenes(train_count, size=size, seed=seed)
+    val = RoadScenes(val_count, size=size, seed=seed, first=train_count)
+    return PairData(train, val, effect=effect, batch_size=batch_size, workers=workers, seed=seed)
+
+
+def frames(
+    *,
+    root: str | Path,
+    effect: Effect,
+    size: Sequence[int] = (64, 112),
+    drive_by: str = "auto",
+    val_share: float = 0.2,
+    batch_size: int = 16,
+    workers: int = 2,
+    seed: int = 0,
+) -> PairData:
+    """Pairs of a folder's frames, split by drive; arguments as for `FrameFolder` and `PairData`."""
+    train, val = (
+        FrameFolder(root, size=size, split=split, drive_by=drive_by, val_share=val_share, seed=seed)
+        for split in ("train", "val")
+    )
+    return PairData(train, val, effect=effect, batch_size=batch_size, workers=workers, seed=seed)

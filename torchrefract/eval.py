@@ -1,0 +1,19 @@
+"""Score a checkpoint: `python -m torchrefract.eval +task=undistort ckpt_path=<run>/best.ckpt`."""
+
+import hydra
+from omegaconf import DictConfig
+
+from torchrefract._command import command, make_job
+from torchrefract._config import CONFIG_DIR
+
+
+@command("eval")
+@hydra.main(config_path=CONFIG_DIR, config_name="eval", version_base="1.3")
+def main(cfg: DictConfig) -> None:
+    """Validate the checkpoint on the data of a configuration."""
+    job = make_job(cfg, needs_checkpoint=True)
+    job.trainer.validate(job.model, job.data, ckpt_path=cfg.ckpt_path, verbose=False, weights_only=True)
+
+
+if __name__ == "__main__":
+    main()

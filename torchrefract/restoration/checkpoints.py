@@ -1,0 +1,63 @@
+"""Checkpoints: written whole or not at all, and looked at before they are used."""
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import torch
+from pytorch_lightning.plugins.io import TorchCheckpointIO
+from torch import nn
+
+from torchrefract.restoration.files import replacing
+
+
+class CheckpointError(Exception):
+    """A checkpoint that cannot be read, does not fit, or cannot be written; the message says what to do."""
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Checkpoints take the place of their predecessors when they are complete, so a full disk leaves the last good one."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        """Write the checkpoint beside `path`, then move it there."""
+        path = Path(path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with replacing(path) as temporary:
+                torch.save(checkpoint, temporary)
+        # torch reports a disk that is full while it writes as a RuntimeError of its archive writer.
+        except (OSError, RuntimeError) as error:
+            kept = f"; {path} of an earlier epoch is whole" if path.exists() else ""
+            reason = error.strerror if isinstance(error, OSError) else "the disk may be full"
+            raise CheckpointError(
+                f"{path} could not be written ({reason}){kept}: make room or choose another hydra.run.dir, and go on "
+                "with ckpt_path="
+            ) from error
+
+
+def read_checkpoint(path: Path, *, task: str) -> dict[str, Any]:
+    """What the file holds, read without running code from it.
+
+    Raises:
+        CheckpointError: no such file, a file that is no checkpoint or damaged, one of another task.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"ckpt_path must be a checkpoint file, such as <run>/last.ckpt, got {path}")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except (RuntimeError, OSError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        raise CheckpointError(f"ckpt_path must be a whole checkpoint, got {path}, which is damaged or none") from error
+    if not isinstance(checkpoint, dict) or not {"state_dict", "task"} <= checkpoint.keys():
+        raise CheckpointError(f"ckpt_path must be a checkpoint of torchrefract, got {path}")
+    if checkpoint["task"] != task:
+        raise CheckpointError(f"ckpt_path must be a checkpoint of the task {task}, got {path} of {checkpoint['task']}")
+    return checkpoint
+
+
+def check_fits(checkpoint: dict[str, Any], model: nn.Module) -> None:
+    """Raise CheckpointError unless the weights are those of such a model."""
+    shapes = {name: value.shape for name, value in model.state_dict().items()}
+    saved = {name: value.shape for name, value in checkpoint["state_dict"].items()}
+    if shapes != saved:
+        name = next(name for name in shapes.keys() | saved.keys() if shapes.get(name) != saved.get(name))
+        raise CheckpointError(f"ckpt_path must be a checkpoint of the model chosen with model=, but {name} differs")

@@ -1,0 +1,118 @@
+"""One LightningModule for all tasks and networks."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from diffusers.optimization import get_cosine_schedule_with_warmup
+from pytorch_lightning import LightningModule
+from torch import Tensor, nn
+
+from torchrefract.restoration.metrics import endpoint_error, psnr, ssim
+from torchrefract.restoration.tasks import Restored, Task
+from torchrefract.types import Pair
+from torchrefract.warping.resample import warp
+
+
+class Restoration(LightningModule):
+    """A network that learns to restore pairs.
+
+    Logged each epoch, for train and val: loss and PSNR in dB; for val also SSIM, and PSNR and SSIM of the degraded image
+    as it is (`…_identity`); for a task with a flow the endpoint error in px at `metric_size`, that of a zero flow, and
+    what the mean flow of the training set achieves (`…_constant`).
+
+    Args:
+        network: makes the network, given the number of channels to predict.
+        task: what is to be restored.
+        lr: peak learning rate of AdamW, reached after `warmup_steps` and brought to zero by a cosine.
+        weight_decay: of AdamW.
+        warmup_steps: steps of linear warm-up.
+        metric_size: (height, width) of the frame whose pixels the endpoint error is given in.
+    """
+
+    def __init__(
+        self,
+        network: Callable[[int], nn.Module],
+        task: Task,
+        *,
+        lr: float = 1e-3,
+        weight_decay: float = 1e-2,
+        warmup_steps: int = 50,
+        metric_size: Sequence[int] = (1080, 1920),
+    ):
+        super().__init__()
+        self.task = task
+        self.network = network(task.channels)
+        self.lr, self.weight_decay, self.warmup_steps = lr, weight_decay, warmup_steps
+        self.metric_size = (metric_size[0], metric_size[1])
+        # What a rival without eyes would answer: summed over the training set, and over how many frames.
+        self.flow_sum, self.flow_count = torch.zeros(0), torch.zeros(0)
+
+    def forward(self, degraded: Tensor) -> Restored:
+        """The restoration of images (B, 3, H, W) in [0, 1]."""
+        return self.task.restore(self.network(degraded), degraded)
+
+    def training_step(self, batch: Pair, _: int) -> Tensor:
+        """The loss of a batch."""
+        restored = self(batch.degraded)
+        loss = self.task.loss(restored, batch)
+        self._log("train", {"loss": loss} | self._scores(restored, batch), batch)
+        self._count_flow(batch)
+        return loss
+
+    def validation_step(self, batch: Pair, _: int) -> Restored:
+        """The scores of a batch, beside those of rivals that need no network."""
+        restored = self(batch.degraded)
+        scores = {"loss": self.task.loss(restored, batch)} | self._scores(restored, batch)
+        scores["ssim"] = ssim(restored.image, batch.clean, batch.valid)
+        self._log("val", scores, batch)
+        nothing = Restored(batch.degraded, None if restored.flow is None else torch.zeros_like(batch.flow))
+        self._log("val", self._scores(nothing, batch), batch, suffix="_identity")
+        self._log("val", {"ssim": ssim(batch.degraded, batch.clean, batch.valid)}, batch, suffix="_identity")
+        if restored.flow is not None:
+            flow = self.constant_flow(batch.flow)
+            constant = Restored(warp(batch.degraded, flow, padding="border")[0], flow)
+            self._log("val", self._scores(constant, batch), batch, suffix="_constant")
+        return restored
+
+    def constant_flow(self, like: Tensor) -> Tensor:
+        """The mean of the training set's flows on valid pixels, zero where there was none, in the shape of `like`."""
+        if self.flow_sum.shape != like.shape[1:]:
+            return torch.zeros_like(like)
+        total = self.flow_sum.to(like.device), self.flow_count.to(like.device)
+        flow_sum, flow_count = (self.trainer.strategy.reduce(value, reduce_op="sum") for value in total)
+        return (flow_sum / flow_count.clamp(min=1)).to(like.dtype).expand_as(like)
+
+    def configure_optimizers(self) -> Any:
+        """AdamW with a warm-up and a cosine."""
+        optimizer = torch.optim.AdamW(self.parameters(), lr=self.lr, weight_decay=self.weight_decay)
+        steps = int(self.trainer.estimated_stepping_batches)
+        schedule = get_cosine_schedule_with_warmup(optimizer, min(self.warmup_steps, steps // 10), steps)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """The task, and the flows counted so far, go along."""
+        checkpoint["task"] = self.task.name
+        checkpoint["constant_flow"] = (self.flow_sum, self.flow_count)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """The flows counted so far come back."""
+        self.flow_sum, self.flow_count = checkpoint["constant_flow"]
+
+    def _scores(self, restored: Restored, pair: Pair) -> dict[str, Tensor]:
+        scores = {"psnr": psnr(restored.image.detach(), pair.clean, pair.valid)}
+        if restored.flow is not None:
+            scores["epe"] = endpoint_error(restored.flow.detach(), pair.flow, pair.valid, size=self.metric_size)
+        return scores
+
+    def _log(self, split: str, scores: dict[str, Tensor], batch: Pair, suffix: str = "") -> None:
+        values = {f"{split}/{name}{suffix}": value.mean() for name, value in scores.items()}
+        self.log_dict(values, on_step=False, on_epoch=True, batch_size=len(batch.clean), sync_dist=True)
+
+    def _count_flow(self, pair: Pair) -> None:
+        weight = pair.valid.double()
+        added = (pair.flow.double() * weight).sum(dim=0), weight.sum(dim=0)
+        if self.flow_sum.shape != added[0].shape:
+            self.flow_sum, self.flow_count = added
+        else:
+            self.flow_sum, self.flow_count = self.flow_sum + added[0], self.flow_count + added[1]

@@ -1,0 +1,91 @@
+"""The two tasks: what a network predicts, how an image comes of it, and what that costs."""
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchrefract.restoration.metrics import masked_mean
+from torchrefract.types import Pair
+from torchrefract.warping.resample import warp
+
+
+class Restored(NamedTuple):
+    """A restoration of a batch."""
+
+    image: Tensor  # (B, 3, H, W)
+    flow: Tensor | None = None  # (B, 2, H, W), px, of a task that predicts one
+
+
+class Task(ABC):
+    """What is to be restored. `name` is that of its file in conf/task, `channels` what the network has to predict."""
+
+    name: str
+    channels: int
+
+    @abstractmethod
+    def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
+        """The restoration that a prediction (B, channels, H, W) stands for."""
+
+    @abstractmethod
+    def loss(self, restored: Restored, pair: Pair) -> Tensor:
+        """(), the mean over the batch."""
+
+
+class Undistort(Task):
+    """The flow that undoes a warp is predicted, and the image looked up along it.
+
+        flow = (W, H) limit tanh(prediction),  loss = |warp(degraded, flow) - clean|_1 + |flow - true flow|_1,
+
+    on the valid pixels, the flow in units of half the frame as in [-1, 1]. The prediction is averaged over cells of 4 px
+    and interpolated: a lens is smooth.
+
+    Args:
+        limit: largest displacement in widths and heights of the frame.
+    """
+
+    name = "undistort"
+    channels = 2
+
+    def __init__(self, limit: float = 0.25):
+        self.limit = limit
+
+    def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
+        """The degraded image looked up along the predicted flow."""
+        size = degraded.shape[2:]
+        coarse = F.avg_pool2d(prediction.float(), 4, ceil_mode=True)
+        smooth = F.interpolate(coarse, size=size, mode="bicubic", antialias=True)
+        flow = self.limit * torch.tanh(smooth) * _sizes(smooth)
+        return Restored(warp(degraded, flow, padding="border")[0], flow)
+
+    def loss(self, restored: Restored, pair: Pair) -> Tensor:
+        """L1 of the image and of the flow."""
+        assert_flow = restored.flow if restored.flow is not None else torch.zeros_like(pair.flow)
+        flow_error = (assert_flow - pair.flow).abs() * 2 / _sizes(pair.flow)
+        image_error = masked_mean((restored.image - pair.clean).abs(), pair.valid)
+        return (image_error + masked_mean(flow_error, pair.valid)).mean()
+
+
+class Deweather(Task):
+    """The clean image is predicted, as a change of the degraded one.
+
+    restored = degraded + prediction,  loss = |restored - clean|_1 on all pixels
+    """
+
+    name = "deweather"
+    channels = 3
+
+    def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
+        """The degraded image plus the predicted change."""
+        return Restored(degraded + prediction.float())
+
+    def loss(self, restored: Restored, pair: Pair) -> Tensor:
+        """L1 of the image."""
+        return (restored.image - pair.clean).abs().mean()
+
+
+def _sizes(flow: Tensor) -> Tensor:
+    """(1, 2, 1, 1): width and height."""
+    return torch.tensor([flow.shape[3], flow.shape[2]], dtype=flow.dtype, device=flow.device).view(1, 2, 1, 1)

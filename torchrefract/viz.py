@@ -1,0 +1,150 @@
+"""Pictures of fields: flow by the color wheel, transmission by a color map, and a checkerboard to bend."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+_RED_TO_RED = ((1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 1, 1), (0, 0, 1), (1, 0, 1), (1, 0, 0))
+_HUES = (0, 15, 21, 25, 36, 49, 55)  # of the 55 hues of a turn: yellow is the 15th, green the 21st, ...
+# Viridis at 0, 1/8, ..., 1.
+_VIRIDIS = (
+    (0.267, 0.005, 0.329),
+    (0.279, 0.175, 0.483),
+    (0.230, 0.322, 0.546),
+    (0.173, 0.449, 0.558),
+    (0.128, 0.567, 0.551),
+    (0.158, 0.684, 0.502),
+    (0.369, 0.789, 0.383),
+    (0.678, 0.864, 0.190),
+    (0.993, 0.906, 0.144),
+)
+_GRAY = 0.5
+_BEYOND = 0.75  # brightness of a motion longer than the scale
+
+
+def flow_to_rgb(flow: Tensor, *, max_px: float | None = None) -> Tensor:
+    """The flow as colors: hue by direction, saturation by magnitude, white where nothing moves.
+
+        hue = 55 atan2(v, u) / (2 pi) mod 55,  r = |flow| / max_px
+        rgb = 1 - r (1 - wheel(hue)) if r <= 1, else 0.75 wheel(hue)
+
+    Right is red, down yellow, left azure, up violet. The 55 hues close into a circle, without the seam that the
+    original program leaves by spreading 54 of them over the turn.
+
+    Args:
+        flow: (B, 2, H, W), px.
+        max_px: px, the magnitude drawn in full color; None for the largest finite one of the batch, at least 1e-6 px.
+
+    Returns:
+        (B, 3, H, W), in [0, 1], float32 or with a float64 flow float64; gray where the magnitude is not finite.
+
+    Source: Baker, Scharstein, Lewis, Roth, Black, Szeliski, "A database and evaluation methodology for optical flow",
+    IJCV 92 (2011).
+    """
+    _check_map("flow", flow, channels=2)
+    if max_px is not None and not 0 < max_px < math.inf:
+        raise ValueError(f"max_px must be a finite number above 0, got {max_px}")
+    u, v = _at_least_float32(flow).unbind(1)
+    magnitude = torch.hypot(u, v)
+    finite = magnitude.isfinite()
+    u, v, magnitude = (torch.where(finite, value, 0) for value in (u, v, magnitude))
+    # A tensor, since some devices divide by a number through its reciprocal, and then max_px / max_px may exceed 1.
+    full = _largest(magnitude) if max_px is None else magnitude.new_full((), max_px)
+    r = (magnitude / full).unsqueeze(1)
+    hue = (torch.atan2(v, u) * (55 / (2 * math.pi))).remainder(55)
+    color = _interpolate(hue, hue.new_tensor(_HUES), hue.new_tensor(_RED_TO_RED))
+    color = torch.where(r <= 1, 1 - r * (1 - color), _BEYOND * color)
+    return torch.where(finite.unsqueeze(1), color, _GRAY)
+
+
+def flow_wheel(size: int) -> Tensor:
+    """The legend of `flow_to_rgb`: each place has the color of the flow that points there from the center.
+
+        rgb(u, v) = flow_to_rgb((u, v), max_px=1),  u = (2 i + 1) / size - 1 in column i, v likewise in row j
+
+    Args:
+        size: px, side of the picture and diameter of the disc.
+
+    Returns:
+        (3, size, size), in [0, 1], float32; white outside the disc.
+
+    Source: as `flow_to_rgb`.
+    """
+    _check_size("size", size)
+    axis = (2 * torch.arange(size, dtype=torch.float32) + 1) / size - 1
+    v, u = torch.meshgrid(axis, axis, indexing="ij")
+    rgb = flow_to_rgb(torch.stack([u, v])[None], max_px=1.0)[0]
+    return torch.where(torch.hypot(u, v) <= 1, rgb, 1.0)
+
+
+def transmission_to_rgb(transmission: Tensor) -> Tensor:
+    """The transmission as colors, even to the eye: violet at 0 (opaque), teal at 1/2, yellow at 1 (clear).
+
+        rgb = linear between nine colors of viridis, at 0, 1/8, ..., 1
+
+    Args:
+        transmission: (B, 1, H, W), in [0, 1]; what lies outside has the color of the nearer end.
+
+    Returns:
+        (B, 3, H, W), in [0, 1], float32 or with a float64 transmission float64; gray where it is NaN.
+
+    Source: viridis, by Smith, van der Walt and Firing (2015), released under CC0.
+    """
+    _check_map("transmission", transmission, channels=1)
+    value = _at_least_float32(transmission)[:, 0]
+    known = ~value.isnan()
+    knots = torch.linspace(0, 1, len(_VIRIDIS), dtype=value.dtype, device=value.device)
+    color = _interpolate(torch.where(known, value, 0).clamp(0, 1), knots, value.new_tensor(_VIRIDIS))
+    return torch.where(known.unsqueeze(1), color, _GRAY)
+
+
+def checkerboard(height: int, width: int, *, cell: int = 32) -> Tensor:
+    """A black and white checkerboard, white at the top left: straight lines that show what a flow bends.
+
+        image(row, column) = 1 if floor(row / cell) + floor(column / cell) is even, else 0
+
+    Args:
+        height: px.
+        width: px.
+        cell: px, side of a square.
+
+    Returns:
+        (1, 3, height, width), 0 or 1, float32.
+    """
+    for name, value in (("height", height), ("width", width), ("cell", cell)):
+        _check_size(name, value)
+    rows, columns = torch.arange(height) // cell, torch.arange(width) // cell
+    white = (rows[:, None] + columns) % 2 == 0
+    return white.float().expand(1, 3, -1, -1).contiguous()
+
+
+def _largest(magnitude: Tensor) -> Tensor:
+    """() or the floor of 1e-6, which an empty batch has too."""
+    return F.pad(magnitude.flatten(), (0, 1), value=1e-6).amax()
+
+
+def _interpolate(value: Tensor, knots: Tensor, colors: Tensor) -> Tensor:
+    """(B, 3, H, W): `colors` (K, 3) at the `knots` (K,), linear in between, for a (B, H, W) inside the knots."""
+    right = torch.bucketize(value.contiguous(), knots).clamp(min=1)
+    left = right - 1
+    share = (value - knots[left]) / (knots[right] - knots[left])
+    return torch.lerp(colors[left], colors[right], share.unsqueeze(-1)).movedim(-1, 1)
+
+
+def _at_least_float32(value: Tensor) -> Tensor:
+    return value.detach().to(torch.promote_types(value.dtype, torch.float32))
+
+
+# Written out here, since this module and _checks share a layer and may not import each other.
+def _check_map(name: str, value: Tensor, *, channels: int) -> None:
+    if value.ndim != 4 or value.shape[1] != channels:
+        raise ValueError(f"{name} must have shape (B, {channels}, H, W), got {tuple(value.shape)}")
+    if not value.is_floating_point():
+        raise TypeError(f"{name} must be of a floating type, got {value.dtype}")
+
+
+def _check_size(name: str, value: int) -> None:
+    if value < 1:
+        raise ValueError(f"{name} must be at least 1, got {value}")

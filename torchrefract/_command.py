@@ -5,17 +5,19 @@ import logging
 import os
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, InstantiationException, MissingConfigException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from pytorch_lightning import LightningDataModule, LightningModule, Trainer, seed_everything
+from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
 from torchrefract._config import CONFIG_DIR
 from torchrefract.data.images import UnreadableImageError
@@ -53,17 +55,24 @@ def command(name: str) -> Callable[[Callable[[], None]], Callable[[], None]]:
             _quieten()
             # With this, Hydra hands on its errors instead of printing them in its own form.
             os.environ["HYDRA_FULL_ERROR"] = "1"
-            try:
+            with _one_line_errors():
                 _check_words(name, sys.argv[1:])
                 main()
-            except Exception as error:
-                if (message := _mendable(error)) is None:
-                    raise
-                _stop(message)
 
         return run
 
     return decorate
+
+
+def job(function: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+    """Decorates the function that Hydra calls: its errors end the program before Hydra adds lines to them."""
+
+    @wraps(function)
+    def run(cfg: DictConfig) -> None:
+        with _one_line_errors():
+            function(cfg)
+
+    return run
 
 
 def make_job(cfg: DictConfig, *, needs_checkpoint: bool = False) -> Job:
@@ -75,13 +84,13 @@ def make_job(cfg: DictConfig, *, needs_checkpoint: bool = False) -> Job:
     checkpoint = None
     if cfg.ckpt_path is not None:
         checkpoint = read_checkpoint(Path(cfg.ckpt_path), task=HydraConfig.get().runtime.choices["task"])
-    job = Job(*(_make(cfg, part) for part in ("data", "model", "trainer")))
+    made = Job(_make(cfg, "data"), _make(cfg, "model"), _make(cfg, "trainer"))
     if checkpoint is not None:
-        check_fits(checkpoint, job.model)
-    if job.trainer.is_global_zero:
+        check_fits(checkpoint, made.model)
+    if made.trainer.is_global_zero:
         with replacing(Path(cfg.run_dir, "config.yaml")) as path:
             OmegaConf.save(cfg, path)
-    return job
+    return made
 
 
 def tasks() -> list[str]:
@@ -89,12 +98,12 @@ def tasks() -> list[str]:
     return sorted(path.stem for path in Path(CONFIG_DIR, "task").glob("*.yaml"))
 
 
-def _make(cfg: DictConfig, part: str) -> LightningDataModule | LightningModule | Trainer:
+def _make(cfg: DictConfig, part: str) -> Any:
     try:
         return instantiate(cfg[part])
     except InstantiationException as error:
         cause = error.__cause__
-        if isinstance(cause, ValueError | TypeError | OSError):
+        if isinstance(cause, ValueError | TypeError | OSError | MisconfigurationException):
             raise UsageError(f"{part}: {cause}") from error
         raise
 
@@ -115,6 +124,8 @@ def _mendable(error: Exception) -> str | None:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, option = error.missing_cfg_file.rpartition("/")
         return f"{group} must be one of {', '.join(error.options or [])}, got {option}"
+    if isinstance(error, MissingMandatoryValue):
+        return f"{error.full_key} must be given, as in {error.full_key}=…, got nothing"
     if isinstance(error, UnreadableImageError):
         return str(error).strip().splitlines()[-1].split("Error: ", 1)[-1]  # a worker prepends its traceback
     if isinstance(error, UsageError | CheckpointError | HydraException | OmegaConfBaseException):
@@ -124,9 +135,15 @@ def _mendable(error: Exception) -> str | None:
     return None
 
 
-def _stop(message: str) -> NoReturn:
-    print(f"error: {message}", file=sys.stderr)
-    raise SystemExit(1)
+@contextmanager
+def _one_line_errors() -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        if (message := _mendable(error)) is None:
+            raise
+        print(f"error: {message}", file=sys.stderr)
+        raise SystemExit(1) from error
 
 
 def _quieten() -> None:

@@ -3,16 +3,17 @@
 import hydra
 from omegaconf import DictConfig
 
-from torchrefract._command import command, make_job
+from torchrefract._command import command, job, make_job
 from torchrefract._config import CONFIG_DIR
 
 
 @command("eval")
 @hydra.main(config_path=CONFIG_DIR, config_name="eval", version_base="1.3")
+@job
 def main(cfg: DictConfig) -> None:
     """Validate the checkpoint on the data of a configuration."""
-    job = make_job(cfg, needs_checkpoint=True)
-    job.trainer.validate(job.model, job.data, ckpt_path=cfg.ckpt_path, verbose=False, weights_only=True)
+    made = make_job(cfg, needs_checkpoint=True)
+    made.trainer.validate(made.model, made.data, ckpt_path=cfg.ckpt_path, verbose=False, weights_only=True)
 
 
 if __name__ == "__main__":

@@ -3,16 +3,17 @@
 import hydra
 from omegaconf import DictConfig
 
-from torchrefract._command import command, make_job
+from torchrefract._command import command, job, make_job
 from torchrefract._config import CONFIG_DIR
 
 
 @command("train")
 @hydra.main(config_path=CONFIG_DIR, config_name="train", version_base="1.3")
+@job
 def main(cfg: DictConfig) -> None:
     """Fit the model of a configuration to its data."""
-    job = make_job(cfg)
-    job.trainer.fit(job.model, job.data, ckpt_path=cfg.ckpt_path, weights_only=True)
+    made = make_job(cfg)
+    made.trainer.fit(made.model, made.data, ckpt_path=cfg.ckpt_path, weights_only=True)
 
 
 if __name__ == "__main__":

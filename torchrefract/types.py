@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from torch import Tensor
 
@@ -92,8 +92,9 @@ class Degraded:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Degraded":
         """A copy with `function` applied to each map, not to image and params; what is lazy stays so."""
+
         def restore() -> tuple[Tensor, Tensor]:
-            flow, valid = self.restored or ()
+            flow, valid = cast(tuple[Tensor, Tensor], self.restored)
             return function(flow), function(valid)
 
         return Degraded(

@@ -16,7 +16,7 @@ class CheckpointError(Exception):
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Checkpoints take the place of their predecessors when they are complete, so a full disk leaves the last good one."""
+    """A checkpoint takes the place of its predecessor when it is complete, so a full disk leaves the last good one."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Write the checkpoint beside `path`, then move it there."""

@@ -17,9 +17,9 @@ from torchrefract.warping.resample import warp
 class Restoration(LightningModule):
     """A network that learns to restore pairs.
 
-    Logged each epoch, for train and val: loss and PSNR in dB; for val also SSIM, and PSNR and SSIM of the degraded image
-    as it is (`…_identity`); for a task with a flow the endpoint error in px at `metric_size`, that of a zero flow, and
-    what the mean flow of the training set achieves (`…_constant`).
+    Logged each epoch, for train and val: loss, PSNR in dB and, for a task with a flow, the endpoint error in px at
+    `metric_size`. For val also SSIM, and all scores of the degraded image as it is (`…_identity`) and of the mean flow
+    of the training set (`…_constant`).
 
     Args:
         network: makes the network, given the number of channels to predict.
@@ -60,20 +60,19 @@ class Restoration(LightningModule):
         self._count_flow(batch)
         return loss
 
-    def validation_step(self, batch: Pair, _: int) -> Restored:
+    def validation_step(self, batch: Pair, _: int) -> dict[str, Any]:
         """The scores of a batch, beside those of rivals that need no network."""
         restored = self(batch.degraded)
-        scores = {"loss": self.task.loss(restored, batch)} | self._scores(restored, batch)
-        scores["ssim"] = ssim(restored.image, batch.clean, batch.valid)
-        self._log("val", scores, batch)
-        nothing = Restored(batch.degraded, None if restored.flow is None else torch.zeros_like(batch.flow))
-        self._log("val", self._scores(nothing, batch), batch, suffix="_identity")
-        self._log("val", {"ssim": ssim(batch.degraded, batch.clean, batch.valid)}, batch, suffix="_identity")
+        self._log("val", {"loss": self.task.loss(restored, batch)}, batch)
+        rivals = {"": restored, "_identity": Restored(batch.degraded)}
         if restored.flow is not None:
-            flow = self.constant_flow(batch.flow)
-            constant = Restored(warp(batch.degraded, flow, padding="border")[0], flow)
-            self._log("val", self._scores(constant, batch), batch, suffix="_constant")
-        return restored
+            constant = self.constant_flow(batch.flow)
+            rivals["_identity"] = Restored(batch.degraded, torch.zeros_like(constant))
+            rivals["_constant"] = Restored(warp(batch.degraded, constant, padding="border")[0], constant)
+        for suffix, rival in rivals.items():
+            scores = self._scores(rival, batch) | {"ssim": ssim(rival.image, batch.clean, batch.valid)}
+            self._log("val", scores, batch, suffix=suffix)
+        return restored._asdict()
 
     def constant_flow(self, like: Tensor) -> Tensor:
         """The mean of the training set's flows on valid pixels, zero where there was none, in the shape of `like`."""

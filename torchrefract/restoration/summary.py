@@ -1,5 +1,6 @@
 """What a run leaves behind: its pictures, and how the model compares with doing nothing."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,43 +40,39 @@ class RunSummary(Callback):
     ) -> None:
         """The first rows of the first batch are kept for the panel."""
         if batch_idx == 0:
-            self._rows = _panel_rows(outputs, batch)
+            self._rows = _panel_rows(Restored(**outputs), batch)
 
-    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Pictures and figures of a training."""
-        if trainer.is_global_zero and isinstance(pl_module, Restoration):
-            height, width = pl_module.metric_size
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """The pictures, and the last lines."""
+        if self._rows is None or not trainer.is_global_zero or not isinstance(pl_module, Restoration):
+            return
+        height, width = pl_module.metric_size
+        if stage == "fit":
             save_curves(self.run_dir / "metrics.csv", self.run_dir / "curves.png", epe_unit=f"px at {width}x{height}")
-            self._finish(trainer, pl_module)
-
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Panel and figures of an evaluation."""
-        if trainer.is_global_zero and trainer.state.fn == "validate" and isinstance(pl_module, Restoration):
-            self._finish(trainer, pl_module)
-
-    def _finish(self, trainer: Trainer, model: Restoration) -> None:
-        if self._rows is not None:
-            save_panel(self._rows, self.run_dir / "panel.png")
-        print("\n".join(summary(trainer.callback_metrics, model.metric_size)))
+        save_panel(self._rows, self.run_dir / "panel.png")
+        print("\n".join(summary(trainer.callback_metrics, pl_module.metric_size)))
         print(f"{self.run_dir}: {', '.join(sorted(path.name for path in self.run_dir.iterdir() if path.is_file()))}")
 
 
-def summary(metrics: dict[str, Tensor], metric_size: tuple[int, int]) -> list[str]:
-    """The lines of a table: a row for each rival and the model, with what the model gains on doing nothing."""
+def summary(metrics: Mapping[str, Tensor], metric_size: tuple[int, int]) -> list[str]:
+    """The lines of a table: a row for each rival and the model, with what it gains on doing nothing."""
     values = {name.removeprefix("val/"): float(value) for name, value in metrics.items() if name.startswith("val/")}
-    head = f"{'validation':<20}{'PSNR (dB)':>18}{'SSIM':>8}"
-    lines = [head + f"{f'endpoint error (px at {metric_size[1]}x{metric_size[0]})':>40}" * ("epe" in values)]
+    lines = [f"{'validation':<20}{'PSNR (dB)':>18}{'SSIM':>8}"]
+    if "epe" in values:
+        lines[0] += f"{f'endpoint error (px at {metric_size[1]}x{metric_size[0]})':>40}"
     for name, suffix in _RIVALS.items():
-        if f"psnr{suffix}" not in values:
-            continue
-        gain = values[f"psnr{suffix}"] - values["psnr_identity"]
-        line = f"{name:<20}{values[f'psnr{suffix}']:>8.2f} ({gain:+.2f})" + " " * 2
-        line += f"{values[f'ssim{suffix}']:>7.3f}" if f"ssim{suffix}" in values else " " * 7
-        if "epe" in values:
-            share = values[f"epe{suffix}"] / max(values["epe_identity"], 1e-9)
-            line += f"{values[f'epe{suffix}']:>18.2f} ({share:.2f} x do nothing)"
-        lines.append(line)
+        if f"psnr{suffix}" in values:
+            lines.append(f"{name:<20}" + _scores(values, suffix))
     return lines
+
+
+def _scores(values: dict[str, float], suffix: str) -> str:
+    psnr, ssim = values[f"psnr{suffix}"], values[f"ssim{suffix}"]
+    line = f"{psnr:.2f} ({psnr - values['psnr_identity']:+.2f})".rjust(18) + f"{ssim:8.3f}"
+    if "epe" in values:
+        epe = values[f"epe{suffix}"]
+        line += f"{epe:.2f} ({epe / max(values['epe_identity'], 1e-9):.2f} x do nothing)".rjust(40)
+    return line
 
 
 def _panel_rows(restored: Restored, pair: Pair) -> PanelRows:

@@ -37,10 +37,10 @@ class Task(ABC):
 class Undistort(Task):
     """The flow that undoes a warp is predicted, and the image looked up along it.
 
-        flow = (W, H) limit tanh(prediction),  loss = |warp(degraded, flow) - clean|_1 + |flow - true flow|_1,
+        flow = limit tanh(prediction) (W, H),  loss = |warp(degraded, flow) - clean|_1 + |flow - true flow|_1,
 
-    on the valid pixels, the flow in units of half the frame as in [-1, 1]. The prediction is averaged over cells of 4 px
-    and interpolated: a lens is smooth.
+    on the valid pixels, the flow in units of half the frame as in [-1, 1]. The prediction is averaged over cells of
+    4 px and interpolated: a lens is smooth.
 
     Args:
         limit: largest displacement in widths and heights of the frame.
@@ -62,8 +62,8 @@ class Undistort(Task):
 
     def loss(self, restored: Restored, pair: Pair) -> Tensor:
         """L1 of the image and of the flow."""
-        assert_flow = restored.flow if restored.flow is not None else torch.zeros_like(pair.flow)
-        flow_error = (assert_flow - pair.flow).abs() * 2 / _sizes(pair.flow)
+        flow = torch.zeros_like(pair.flow) if restored.flow is None else restored.flow
+        flow_error = (flow - pair.flow).abs() * 2 / _sizes(pair.flow)
         image_error = masked_mean((restored.image - pair.clean).abs(), pair.valid)
         return (image_error + masked_mean(flow_error, pair.valid)).mean()
 

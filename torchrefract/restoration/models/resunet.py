@@ -13,8 +13,8 @@ _STRIDE = 32
 class ResUNet(nn.Module):
     """A U-Net whose encoder is a residual network, given the pixel coordinates as two more channels.
 
-    Without them a convolution cannot know where it looks, and a lens does nothing else than depend on it. The last layer
-    starts at zero: before training the network does nothing.
+    Without them a convolution cannot know where it looks, and what a lens does depends on that. The last layer starts
+    at zero: before training the network does nothing.
 
     Args:
         channels: to predict.

@@ -45,7 +45,7 @@ def curves(figure: Figure) -> dict[str, dict[str, tuple[list[float], list[float]
 
 
 def test_curves_show_each_quantity_with_its_unit_and_what_needs_no_network(metrics):
-    drawn = curves(_curves(metrics, epe_unit="px at 1920x1080"))
+    drawn = curves(_curves(metrics.parent, epe_unit="px at 1920x1080"))
     assert drawn["PSNR (dB)"] == {
         "training": ([0, 1, 2], [19, 23, 25]),
         "validation": ([0, 1, 2], [20, 24, 26]),
@@ -60,13 +60,13 @@ def test_curves_show_each_quantity_with_its_unit_and_what_needs_no_network(metri
 
 
 def test_a_nan_leaves_a_gap_in_its_curve_only(metrics):
-    drawn = curves(_curves(metrics, epe_unit="px"))["loss"]
+    drawn = curves(_curves(metrics.parent, epe_unit="px"))["loss"]
     assert drawn["training"] == ([0, 1, 2], [0.6, 0.4, 0.3])
     np.testing.assert_array_equal(drawn["validation"][1], [0.5, math.nan, 0.2])
 
 
 def test_references_are_dashed_and_results_are_not(metrics):
-    for axes in _curves(metrics, epe_unit="px").axes:
+    for axes in _curves(metrics.parent, epe_unit="px").axes:
         for line in axes.lines:
             is_result = str(line.get_label()).startswith(("training", "validation"))
             assert line.get_linestyle() == ("-" if is_result else "--")
@@ -74,12 +74,12 @@ def test_references_are_dashed_and_results_are_not(metrics):
 
 def test_several_rows_of_an_epoch_are_a_mean_in_training_and_the_last_in_validation(metrics):
     metrics.write_text("epoch,step,train/loss,val/loss\n0,1,1.0,\n0,2,3.0,\n0,2,,8.0\n0,3,,5.0\n")
-    assert curves(_curves(metrics, epe_unit="px"))["loss"] == {"training": ([0], [2]), "validation": ([0], [5])}
+    assert curves(_curves(metrics.parent, epe_unit="px"))["loss"] == {"training": ([0], [2]), "validation": ([0], [5])}
 
 
 def test_one_epoch_still_shows_its_references_and_whole_epochs_on_the_axis(metrics):
     metrics.write_text("".join(METRICS.splitlines(keepends=True)[:3]))
-    figure = _curves(metrics, epe_unit="px")
+    figure = _curves(metrics.parent, epe_unit="px")
     figure.canvas.draw()
     epe = figure.axes[2]
     left, right = epe.get_xlim()
@@ -91,7 +91,7 @@ def test_one_epoch_still_shows_its_references_and_whole_epochs_on_the_axis(metri
 
 def test_a_quantity_without_columns_has_no_panel(metrics):
     metrics.write_text("epoch,step,val/psnr,lr\n0,9,20.0,\n,9,,0.001\n1,19,22.0,\n")
-    assert curves(_curves(metrics, epe_unit="px")) == {"PSNR (dB)": {"validation": ([0, 1], [20, 22])}}
+    assert curves(_curves(metrics.parent, epe_unit="px")) == {"PSNR (dB)": {"validation": ([0, 1], [20, 22])}}
 
 
 @pytest.mark.parametrize("text", ["", "epoch,step,val/loss\n", "epoch,step,val/loss\n0,9,\n", "epoch,step,lr\n0,9,1\n"])
@@ -100,13 +100,13 @@ def test_metrics_without_a_value_to_draw_are_refused_and_the_old_picture_stays(m
     out = metrics.with_name("curves.png")
     out.write_text("old")
     with pytest.raises(ValueError, match="metrics must hold a loss, psnr or epe of some epoch"):
-        save_curves(metrics, out)
+        save_curves(metrics.parent, out)
     assert out.read_text() == "old"
 
 
 def test_saved_curves_are_a_picture_and_the_only_new_file(metrics):
     out = metrics.with_name("curves.png")
-    save_curves(metrics, out, epe_unit="px at 1920x1080")
+    save_curves(metrics.parent, out, epe_unit="px at 1920x1080")
     assert sorted(out.parent.iterdir()) == [out, metrics]
     assert np.ptp(matplotlib.image.imread(out)[..., :3]) > 0.5
 

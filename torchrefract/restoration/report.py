@@ -1,6 +1,5 @@
 """Two pictures of a training run: its curves over the epochs, and a panel of examples."""
 
-import csv
 import math
 from collections import defaultdict
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from torchrefract.restoration.files import replacing
+from torchrefract.restoration.history import metrics_rows
 from torchrefract.viz import flow_to_rgb, flow_wheel
 
 _Columns = dict[str, dict[int, float]]  # name -> epoch -> value
@@ -40,28 +40,28 @@ _DPI = 100
 _SMALLEST, _LARGEST = 320, 640  # px, the longer side of an image as drawn
 
 
-def save_curves(metrics: Path, out: Path, *, epe_unit: str = "px") -> None:
+def save_curves(run: Path, out: Path, *, epe_unit: str = "px") -> None:
     """The curves of a run as a picture: loss, PSNR and endpoint error over the epochs, beside what needs no network.
 
     A quantity whose columns are missing has no panel. Training values are means over an epoch's rows, validation
     values the last of an epoch; a value that is not finite leaves a gap. A label holds the last value in brackets.
 
     Args:
-        metrics: the metrics.csv of Lightning's CSVLogger.
+        run: the run folder, with the metrics.csv of Lightning's CSVLogger and, after a stop, metrics_before.csv.
         out: the picture to write; the suffix is its format.
         epe_unit: the unit of the endpoint error, with the image size that it holds for: "px at 1920x1080".
     """
-    figure = _curves(metrics, epe_unit=epe_unit)
+    figure = _curves(run, epe_unit=epe_unit)
     with replacing(out) as path:
         figure.savefig(path)
 
 
-def _curves(metrics: Path, *, epe_unit: str) -> Figure:
+def _curves(run: Path, *, epe_unit: str) -> Figure:
     units = {"loss": "loss", "psnr": "PSNR (dB)", "epe": f"endpoint error ({epe_unit})"}
-    columns = _read_columns(metrics, [style.column.format(quantity) for quantity in units for style in _STYLES])
+    columns = _read_columns(run, [style.column.format(quantity) for quantity in units for style in _STYLES])
     shown = {q: unit for q, unit in units.items() if any(style.column.format(q) in columns for style in _STYLES)}
     if not shown:
-        raise ValueError(f"metrics must hold a loss, psnr or epe of some epoch, got none in {metrics}")
+        raise ValueError(f"metrics must hold a loss, psnr or epe of some epoch, got none in {run}")
     figure = Figure(figsize=(4.8 * len(shown), 4.4), dpi=120, layout=ConstrainedLayoutEngine(w_pad=0.12))
     for axes, (quantity, unit) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
         _draw_quantity(axes, columns, quantity)
@@ -92,14 +92,13 @@ def _draw_curve(axes: Axes, column: dict[int, float], style: _Style) -> None:
     axes.plot(epochs, values, style.line, color=style.color, marker=marker, markersize=3, linewidth=1.6, label=label)
 
 
-def _read_columns(metrics: Path, names: Sequence[str]) -> _Columns:
-    """Those of the columns `names` that have a value at all; the file leaves most cells of a row empty."""
+def _read_columns(run: Path, names: Sequence[str]) -> _Columns:
+    """Those of the columns `names` that have a value at all; a logger leaves most cells of a row empty."""
     cells: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    with metrics.open(newline="") as file:
-        for row in csv.DictReader(file):
-            for name in names:
-                if row.get("epoch") and row.get(name):
-                    cells[name][int(row["epoch"])].append(float(row[name]))
+    for row in metrics_rows(run):
+        for name in names:
+            if row.get("epoch") and row.get(name):
+                cells[name][int(row["epoch"])].append(float(row[name]))
     return {name: {epoch: _of_epoch(name, by[epoch]) for epoch in sorted(by)} for name, by in cells.items()}
 
 

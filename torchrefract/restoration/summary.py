@@ -8,6 +8,7 @@ import torch
 from pytorch_lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
+from torchrefract.restoration.history import carry_over
 from torchrefract.restoration.metrics import psnr
 from torchrefract.restoration.module import Restoration
 from torchrefract.restoration.report import PanelRows, save_curves, save_panel
@@ -23,11 +24,18 @@ class RunSummary(Callback):
 
     Args:
         run_dir: the run folder.
+        ckpt_path: the checkpoint that the run goes on with; the figures beside it are carried over.
     """
 
-    def __init__(self, run_dir: str):
+    def __init__(self, run_dir: str, ckpt_path: str | None = None):
         self.run_dir = Path(run_dir)
+        self.stopped = None if ckpt_path is None else Path(ckpt_path).parent
         self._rows: PanelRows | None = None
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """The figures of the run that was stopped are carried over."""
+        if self.stopped is not None and trainer.is_global_zero:
+            carry_over(self.stopped, self.run_dir, before_epoch=trainer.current_epoch)
 
     def on_validation_batch_end(
         self,
@@ -48,7 +56,7 @@ class RunSummary(Callback):
             return
         height, width = pl_module.metric_size
         if stage == "fit":
-            save_curves(self.run_dir / "metrics.csv", self.run_dir / "curves.png", epe_unit=f"px at {width}x{height}")
+            save_curves(self.run_dir, self.run_dir / "curves.png", epe_unit=f"px at {width}x{height}")
         save_panel(self._rows, self.run_dir / "panel.png")
         print("\n".join(summary(trainer.callback_metrics, pl_module.metric_size)))
         print(f"{self.run_dir}: {', '.join(sorted(path.name for path in self.run_dir.iterdir() if path.is_file()))}")

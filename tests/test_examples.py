@@ -1,0 +1,19 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("0*.py"))
+
+
+@pytest.mark.parametrize("script", EXAMPLES, ids=lambda path: path.name)
+def test_an_example_is_short_and_draws_its_picture(script: Path, tmp_path: Path):
+    assert len(script.read_text().splitlines()) <= 60
+    picture = tmp_path / "picture.png"
+    subprocess.run([sys.executable, script, picture], check=True, cwd=tmp_path)
+    pixels = np.asarray(Image.open(picture).convert("RGB"))
+    assert min(pixels.shape[:2]) >= 200
+    assert pixels.std() > 20

@@ -1,5 +1,11 @@
+import importlib
+import logging
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -45,3 +51,89 @@ def pixels() -> Callable[[int, int], tuple[Tensor, Tensor]]:
         return x, y
 
     return axes
+
+
+class Outcome(NamedTuple):
+    """What a command left behind."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def message(self) -> str:
+        """The one line of an error that the user can mend."""
+        assert self.code == 1, self.out + self.err
+        (line,) = self.err.splitlines()
+        assert line.startswith("error: "), line
+        return line.removeprefix("error: ")
+
+    @property
+    def folder(self) -> Path:
+        """The run folder, as the last line tells it."""
+        assert self.code == 0, self.out + self.err
+        return Path(self.out.splitlines()[-1].rsplit(": ", 1)[0])
+
+
+class Trained(NamedTuple):
+    """A finished training, and the words that asked for it."""
+
+    words: tuple[str, ...]
+    outcome: Outcome
+    folder: Path
+
+
+@pytest.fixture(scope="session")
+def small() -> tuple[str, ...]:
+    """The words that make a training a matter of seconds."""
+    data = ("data.train_count=32", "data.val_count=16", "data.batch_size=8", "data.size=[32,64]", "data.workers=0")
+    return (*data, "trainer.max_epochs=3", "model.network.encoder=tu-mobilenetv3_small_050")
+
+
+@pytest.fixture(scope="session")
+def spawn() -> Callable[..., Outcome]:
+    """Runs Python, on one thread, in a process and a folder of its own."""
+
+    def run(*words: str, cwd: Path) -> Outcome:
+        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(
+            [sys.executable, *words], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False
+        )
+        return Outcome(done.returncode, done.stdout, done.stderr)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory, spawn, small) -> Trained:
+    """A training of three epochs by the command, as a user would start it."""
+    words = ("+task=undistort", *small)
+    outcome = spawn("-m", "torchrefract.train", *words, cwd=tmp_path_factory.mktemp("trained"))
+    return Trained(words, outcome, outcome.folder)
+
+
+@pytest.fixture
+def call(monkeypatch, tmp_path, capsys, on_threads) -> Iterator[Callable[..., Outcome]]:
+    """Runs a command in this process, on one thread, in the test's folder: no start to wait for."""
+    for name in ("HYDRA_FULL_ERROR", "PL_GLOBAL_SEED", "PL_SEED_WORKERS"):
+        monkeypatch.setenv(name, "")  # what a command sets goes again
+    monkeypatch.chdir(tmp_path)
+    on_threads(1)
+    hydra = importlib.import_module("hydra.core.global_hydra").GlobalHydra.instance()
+    handlers = list(logging.root.handlers)
+
+    def run(name: str, *words: str) -> Outcome:
+        monkeypatch.setattr(sys, "argv", [f"torchrefract.{name}", *words])
+        hydra.clear()
+        code = 0
+        try:
+            importlib.import_module(f"torchrefract.{name}").main()
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) else 1
+        finally:
+            hydra.clear()
+        return Outcome(code, *capsys.readouterr())
+
+    yield run
+    # Hydra's log handlers would write to the captured output of this test.
+    logging.root.handlers[:] = handlers

@@ -4,7 +4,6 @@ import pytest
 import torch
 from scipy import stats
 from torch import Tensor
-from torch.testing import assert_close
 
 from torchrefract import draws
 
@@ -14,8 +13,8 @@ COUNT = 20_000
 ALARM = 1e-4
 
 
-def words(*values: int) -> tuple[Tensor, ...]:
-    return tuple(torch.tensor([value]) for value in values)
+def words(high: int, low: int) -> tuple[Tensor, Tensor]:
+    return torch.tensor([high]), torch.tensor([low])
 
 
 def threefry_of_whole_numbers(key: tuple[int, int], counter: tuple[int, int]) -> tuple[int, int]:
@@ -158,3 +157,17 @@ def test_a_call_seed_follows_the_global_generator():
     assert len(set(first)) == 3
     torch.manual_seed(12)
     assert draws.call_seed().item() != first[0]
+
+
+def test_compiled_code_takes_the_same_seeds_as_eager_code():
+    compiled = torch.compile(lambda: draws.call_seed() ^ 1, fullgraph=True)
+    torch.manual_seed(11)
+    expected = [(draws.call_seed() ^ 1).item() for _ in range(3)]
+    torch.manual_seed(11)
+    assert [compiled().item() for _ in range(3)] == expected
+
+
+def test_compiled_code_draws_the_same_numbers_as_eager_code():
+    keys = torch.tensor([0, -5, 2**40])
+    compiled = torch.compile(lambda keys: draws.normal(draws.stream(3, keys), 7), fullgraph=True, backend="aot_eager")
+    assert torch.equal(compiled(keys), draws.normal(draws.stream(3, keys), 7))

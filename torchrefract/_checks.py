@@ -1,31 +1,48 @@
 """Argument checks, in one form: `<argument> must <condition>, got <value>`."""
 
 import math
+import sys
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrefract.types import Range
 
+_LARGEST = sys.float_info.max
 
-def check_number(name: str, value: float, *, low: float = -math.inf, high: float = math.inf) -> float:
-    """`value` as a float in [low, high]; NaN never is, and infinity only where a bound says so."""
+
+def check_number(name: str, value: float, *, low: float = -_LARGEST, high: float = _LARGEST) -> float:
+    """`value` as a float in [low, high]; NaN never is, and infinity only where a bound is."""
     _check_real(name, value)
-    if not low <= value <= high or (math.isinf(value) and value not in (low, high)):
-        raise ValueError(f"{name} must be a number in [{low:g}, {high:g}], got {value}")
+    if not low <= value <= high:
+        raise ValueError(f"{name} must be a number {_bounds(low, high)}, got {value}")
     return float(value)
 
 
-def check_range(name: str, value: Sequence[float], *, low: float = -math.inf, high: float = math.inf) -> Range:
-    """`value` as (low, high) with both ends finite and inside the bounds."""
+def check_positive(name: str, value: float) -> float:
+    """`value` as a finite float above 0."""
+    if check_number(name, value) <= 0:
+        raise ValueError(f"{name} must be above 0, got {value}")
+    return float(value)
+
+
+def check_range(name: str, value: Sequence[float], *, low: float = -_LARGEST, high: float = _LARGEST) -> Range:
+    """`value` as (low, high), both ends inside the bounds."""
     if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 2:
         raise ValueError(f"{name} must be (low, high), got {value!r}")
     for end in value:
         _check_real(name, end)
-    if not low <= value[0] <= value[1] <= high or any(math.isinf(end) and end not in (low, high) for end in value):
-        raise ValueError(f"{name} must be (low, high) with {low:g} <= low <= high <= {high:g}, got {tuple(value)}")
+    if not low <= value[0] <= value[1] <= high:
+        raise ValueError(f"{name} must be (low, high), low <= high, each {_bounds(low, high)}, got {tuple(value)}")
     return float(value[0]), float(value[1])  # Hydra hands over its own list type
+
+
+def check_flag(name: str, value: bool) -> bool:
+    if not isinstance(value, bool):
+        raise TypeError(f"{name} must be True or False, got {value!r}")
+    return value
 
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> str:
@@ -70,14 +87,20 @@ def check_all(name: str, condition: str, value: Tensor, test: Callable[[Tensor],
 
 def is_true(predicate: Callable[[], Tensor]) -> bool | None:
     """The truth of a one-element tensor, or None where reading it would wait for a device or break a graph."""
+    values = read(predicate)
+    return None if values is None else bool(values)
+
+
+def read(tensor: Callable[[], Tensor]) -> Any:
+    """The values of a tensor as a number or nested lists, or None where reading them would wait for a device."""
     if torch.compiler.is_compiling():
         return None
-    value = predicate()
+    value = tensor()
     if value.device.type != "cpu":
         return None
     try:
-        return bool(value)
-    except RuntimeError:  # torch.vmap has no single truth to tell
+        return value.tolist()
+    except RuntimeError:  # inside torch.vmap no sample has values of its own
         return None
 
 
@@ -86,3 +109,10 @@ def _check_real(name: str, value: float) -> None:
         raise TypeError(f"{name} must be a real number, got {value!r}")
     if math.isnan(value):
         raise ValueError(f"{name} must not be NaN, got {value}")
+
+
+def _bounds(low: float, high: float) -> str:
+    """`in [low, high]`, without those that are no bounds at all."""
+    if high == _LARGEST:
+        return "that is finite" if low == -_LARGEST else f"of at least {low:g}"
+    return f"of at most {high:g}" if low == -_LARGEST else f"in [{low:g}, {high:g}]"

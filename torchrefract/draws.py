@@ -71,8 +71,15 @@ def call_seed() -> Tensor:
 
 def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Two words for each counter under each key, all of them int64 tensors in [0, 2^32) that broadcast."""
-    keys = (*key, key[0] ^ key[1] ^ _PARITY)
-    x, y = counter[0] + keys[0], counter[1] + keys[1]
+    # For a compiler this is one operator: its hundreds of steps would take it a minute.
+    if torch.compiler.is_compiling():
+        return torch.ops.torchrefract.threefry(*key, *counter)
+    return _threefry(*key, *counter)
+
+
+def _threefry(key0: Tensor, key1: Tensor, counter0: Tensor, counter1: Tensor) -> tuple[Tensor, Tensor]:
+    keys = (key0, key1, key0 ^ key1 ^ _PARITY)
+    x, y = counter0 + key0, counter1 + key1
     for group in range(5):
         for rotation in _ROTATIONS[group % 2]:
             # Only what is shifted right must be free of carries; they never reach bit 63.
@@ -98,3 +105,12 @@ def _call_seed() -> Tensor:
 @_call_seed.register_fake
 def _() -> Tensor:
     return torch.empty((), dtype=torch.int64)
+
+
+_threefry_op = torch.library.custom_op("torchrefract::threefry", _threefry, mutates_args=())
+
+
+@_threefry_op.register_fake
+def _(key0: Tensor, key1: Tensor, counter0: Tensor, counter1: Tensor) -> tuple[Tensor, Tensor]:
+    shape = torch.broadcast_shapes(key0.shape, key1.shape, counter0.shape, counter1.shape)
+    return counter0.new_empty(shape), counter0.new_empty(shape)

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrefract._checks import read
+
 POLYNOMIAL12 = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
 _NODES = 1024
 
@@ -44,10 +46,10 @@ class Jacobian(NamedTuple):
 
 
 def used_terms(coefficients: Tensor) -> Terms:
-    """The terms that (B, 12) coefficients on the CPU make use of: not zero, or asked for their gradient."""
-    if coefficients.requires_grad:
+    """The terms that coefficients (B, 12) make use of: not zero, or asked for their gradient, or not to be read."""
+    used = None if coefficients.requires_grad else read(lambda: (coefficients != 0).any(dim=0))
+    if used is None:
         return ALL_TERMS
-    used = [bool(flag) for flag in (coefficients != 0).any(dim=0)]
     return Terms(max((i + 1 for i in range(6) if used[i]), default=0), any(used[6:8]), any(used[8:]))
 
 
@@ -123,8 +125,8 @@ def undistort_polynomial(
         scale = torch.where(r_d > torch.finfo(r_d.dtype).tiny, r / r_d, 1)
         x, y = scale * x_d, scale * y_d
         bent = terms.tangential or terms.prism
-        for _ in range(_steps_for(r_d, 3) if bent else 0):
-            x, y = _newton(x, y, x_d, y_d, coefficients, terms)
+        if bent:
+            x, y = _bend(x, y, x_d, y_d, coefficients, terms)
         reached = distort_polynomial(x, y, coefficients, terms)
         tolerance = 1e-12 if r_d.dtype is torch.float64 else 2e-6
         error = tolerance * (1 + r_d)
@@ -222,12 +224,17 @@ def _steps_for(like: Tensor, steps: int) -> int:
     return steps + 1 if like.dtype is torch.float64 else steps
 
 
-def _newton(
-    x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, coefficients: Tensor, terms: Terms
-) -> tuple[Tensor, Tensor]:
-    reached = distort_polynomial(x, y, coefficients, terms)
-    step_x, step_y = jacobian_polynomial(x, y, coefficients, terms).solve(reached[0] - x_d, reached[1] - y_d)
-    return x - step_x, y - step_y
+def _bend(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, coefficients: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:
+    """(x, y) brought from the inverse of the radial part to that of the whole model."""
+    radial = x, y
+    for _ in range(_steps_for(x, 3)):
+        reached = distort_polynomial(x, y, coefficients, terms)
+        jacobian = jacobian_polynomial(x, y, coefficients, terms)
+        step_x, step_y = jacobian.solve(reached[0] - x_d, reached[1] - y_d)
+        x, y = x - step_x, y - step_y
+    # A sample without such terms keeps its bits, whatever its neighbors in the batch have.
+    bent = (coefficients[:, 6:] != 0).any(dim=1)
+    return torch.where(bent, x, radial[0]), torch.where(bent, y, radial[1])
 
 
 def _radial(r2: Tensor, k: tuple[Tensor, ...], order: int) -> Tensor:

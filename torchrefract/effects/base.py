@@ -84,6 +84,8 @@ class Effect(nn.Module, ABC):
         result.image = leave(result.image, image, untouched=result.image is batched)
         return result if image.ndim == 4 else result.map(lambda value: value[0])
 
+    params_type: type[Any]
+
     @abstractmethod
     def draw(self, source: draws.Stream, image: Tensor) -> Any:
         """The parameters of a batch (B, C, H, W), drawn from the streams of its samples."""
@@ -104,8 +106,8 @@ class Effect(nn.Module, ABC):
         return gate, low + (high - low) * values
 
     def _check_params(self, params: Any, image: Tensor) -> None:
-        if not hasattr(params, "_fields"):
-            raise TypeError(f"params must be what {type(self).__name__}.sample returns, got {type(params).__name__}")
+        if not isinstance(params, self.params_type):
+            raise TypeError(f"params must be {self.params_type.__name__}, got {type(params).__name__}")
         for name, value in zip(params._fields, params, strict=True):
             if not isinstance(value, Tensor) or value.ndim == 0 or value.shape[0] != image.shape[0]:
                 found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_number, check_range
+from torchrefract._checks import check_all, check_flag, check_number, check_range
 from torchrefract.effects.base import RadianceEffect, Shaded, params_to
 from torchrefract.fields.fog import extinction, linear_depth, linear_to_srgb, srgb_to_linear, transmission, veil
 from torchrefract.types import Range
@@ -69,7 +69,9 @@ class UniformFog(RadianceEffect):
         self.airlight = None if airlight is None else _check_airlight(airlight)
         self.threshold = check_number("threshold", threshold, low=1e-6, high=1 - 1e-6)
         self.max_depth = check_number("max_depth", max_depth, low=0.0)
-        self.linear_light = linear_light
+        self.linear_light = check_flag("linear_light", linear_light)
+
+    params_type = FogParams
 
     def draw(self, source: draws.Stream, image: Tensor) -> FogParams:
         """One fog a sample; V and the deviation are uniform in their ranges."""

@@ -7,13 +7,14 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_range, is_true
+from torchrefract._checks import check_all, check_flag, check_range, is_true
 from torchrefract.cameras.distortion import POLYNOMIAL12
 from torchrefract.effects.base import WarpEffect, params_to
-from torchrefract.fields.lens import corner_radius, frame_limit, lens_flow, lens_restore_flow
+from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow
 from torchrefract.types import Range
 
 _LARGEST_COEFFICIENT = 100.0
+_MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors are another model in another order)"
 
 
 class LensParams(NamedTuple):
@@ -87,7 +88,9 @@ class LensDistortion(WarpEffect):
         self.aspect_range = check_range("aspect_range", aspect_range, low=0.01, high=100.0)
         self.center_x_range = check_range("center_x_range", center_x_range, low=-10.0, high=10.0)
         self.center_y_range = check_range("center_y_range", center_y_range, low=-10.0, high=10.0)
-        self.strict = strict
+        self.strict = check_flag("strict", strict)
+
+    params_type = LensParams
 
     def draw(self, source: draws.Stream, image: Tensor) -> LensParams:
         """One lens a sample, every number uniform in its range."""
@@ -99,10 +102,10 @@ class LensDistortion(WarpEffect):
 
     def check(self, params: LensParams, image: Tensor) -> None:
         """Raise for lenses that are none."""
-        for name, width in (("coefficients", 12), ("focal", 2), ("center", 2)):
+        for name, width, what in (("coefficients", 12, _MODEL), ("focal", 2, "fx, fy"), ("center", 2, "x, y")):
             value = getattr(params, name)
             if value.shape != (image.shape[0], width):
-                raise ValueError(f"params.{name} must have shape (B, {width}), got {tuple(value.shape)}")
+                raise ValueError(f"params.{name} must have shape (B, {width}), {what}, got {tuple(value.shape)}")
         bound = _LARGEST_COEFFICIENT
         check_all(
             "params.coefficients", f"lie in [-{bound:g}, {bound:g}]", params.coefficients, lambda v: v.abs() <= bound
@@ -127,9 +130,7 @@ class LensDistortion(WarpEffect):
         camera = _in_px(params, height, width)
 
         def folds() -> Tensor:
-            limit = frame_limit(*camera, height=height, width=width)
-            corner = corner_radius(*camera[1:], height=height, width=width)
-            return (params.gate & limit.folds & (limit.image_radius.flatten() < corner)).any()
+            return (params.gate & folds_inside(*camera, height=height, width=width)).any()
 
         if not is_true(folds):
             return

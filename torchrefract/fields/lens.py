@@ -4,7 +4,6 @@ import torch
 from torch import Tensor
 
 from torchrefract.cameras.distortion import (
-    ALL_TERMS,
     RadialLimit,
     Terms,
     distort_polynomial,
@@ -17,6 +16,8 @@ from torchrefract.warping.grid import pixel_axes
 
 # The preimage of a pixel is looked for up to so many half-diagonals of the frame; beyond, nothing of it is seen.
 _REACH = 4.0
+# Points of each side of the frame at which a fold is looked for; folds begin at the border.
+_BORDER = 17
 
 
 def lens_flow(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -70,12 +71,24 @@ def lens_restore_flow(
 
 def frame_limit(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> RadialLimit:
     """How far the radial part can be inverted, looked for as far as the frame asks; arguments as for `lens_flow`."""
-    corner = corner_radius(focal.detach(), center.detach(), height=height, width=width)
+    corner = _corner_radius(focal.detach(), center.detach(), height, width)
     return radial_limit(coefficients.detach()[:, :, None, None, None], _REACH * corner, 1.1 * corner)
 
 
-def corner_radius(focal: Tensor, center: Tensor, *, height: int, width: int) -> Tensor:
-    """(B,), on the plane z = 1: the distance of the farthest corner of the frame; arguments as for `lens_flow`."""
+def folds_inside(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> Tensor:
+    """(B,), bool: part of the border of the frame has no preimage; arguments as for `lens_flow`."""
+    limit = frame_limit(coefficients, focal, center, height=height, width=width)
+    steps = torch.linspace(0, 1, _BORDER, dtype=focal.dtype, device=focal.device)
+    ends = torch.tensor([0, 1], dtype=focal.dtype, device=focal.device)
+    sides = torch.cat([torch.cartesian_prod(steps, ends), torch.cartesian_prod(ends, steps)])
+    size = torch.tensor([width - 1, height - 1], dtype=focal.dtype, device=focal.device)
+    x_d, y_d = ((sides * size - center[:, None]) / focal[:, None]).detach()[:, None, None].unbind(-1)
+    c = coefficients.detach()[:, :, None, None, None]
+    return ~undistort_polynomial(x_d, y_d, c, limit=limit)[2].flatten(1).all(dim=1)
+
+
+def _corner_radius(focal: Tensor, center: Tensor, height: int, width: int) -> Tensor:
+    """(B,), on the plane z = 1: the distance of the farthest corner of the frame."""
     size = torch.tensor([width - 1, height - 1], dtype=focal.dtype, device=focal.device)
     # Half a pixel at least, so that a frame of one pixel has a radius too.
     farthest = torch.maximum(center.abs(), (size - center).abs()).clamp(min=0.5) / focal
@@ -87,8 +100,7 @@ def _normalized(
 ) -> tuple[Tensor, Terms, Tensor, Tensor]:
     axes = pixel_axes(height, width, dtype=focal.dtype, device=focal.device)
     x, y = ((axis - center[:, i, None, None, None]) / focal[:, i, None, None, None] for i, axis in enumerate(axes))
-    readable = coefficients.device.type == "cpu" and not torch.compiler.is_compiling()
-    return coefficients[:, :, None, None, None], used_terms(coefficients) if readable else ALL_TERMS, x, y
+    return coefficients[:, :, None, None, None], used_terms(coefficients), x, y
 
 
 def _rows_at_once(x: Tensor, height: int) -> int:

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_count, check_flow, check_number
-from torchrefract.warping.grid import field_dtype, inside
+from torchrefract._checks import check_count, check_flow, check_positive
+from torchrefract.warping.grid import field_dtype, inside, pixel_axes
 from torchrefract.warping.resample import look_up
 
 
@@ -35,7 +35,7 @@ def invert_flow(flow: Tensor, *, steps: int = 6, tolerance_px: float = 0.05) -> 
     """
     check_flow("flow", flow)
     check_count("steps", steps)
-    check_number("tolerance_px", tolerance_px, low=torch.finfo(torch.float32).tiny)
+    check_positive("tolerance_px", tolerance_px)
     flow = flow.to(field_dtype(flow.dtype))
     known = flow.isfinite().all(dim=1, keepdim=True)
     flow = torch.where(known, flow, 0)
@@ -49,10 +49,12 @@ def invert_flow(flow: Tensor, *, steps: int = 6, tolerance_px: float = 0.05) -> 
         residual = error.norm(dim=1, keepdim=True)
         solution = inverse
         solved = (residual <= tolerance_px) & (_determinant(jacobian) > 0) & inside(solution)
-        valid = solved & known  # a hole in the flow has no inverse of its own
+        # Nothing is known where a hole in the flow would have been read.
+        read = look_up(known.to(flow.dtype), solution, padding="border", interpolation="bilinear")
+        valid = solved & known & (read > 0.999)
     if flow.requires_grad and torch.is_grad_enabled():
         moved = look_up(flow, solution, padding="border", interpolation="bilinear")
-        inverse = inverse - _solve(jacobian, moved - moved.detach())
+        inverse = inverse - _solve(_cell_gradient(flow.detach(), solution), moved - moved.detach())
     return inverse, valid, residual
 
 
@@ -60,6 +62,19 @@ def _gradient(flow: Tensor) -> Tensor:
     """(B, 4, H, W): u_x, v_x, u_y, v_y by central differences, one-sided at the border."""
     sides = [torch.gradient(flow, dim=dim)[0] if flow.shape[dim] > 1 else torch.zeros_like(flow) for dim in (-1, -2)]
     return torch.cat(sides, dim=1)
+
+
+def _cell_gradient(flow: Tensor, at: Tensor) -> Tensor:
+    """(B, 4, H, W): u_x, v_x, u_y, v_y of the bilinear reading itself at p + at(p), each the slope of a cell."""
+    axes = pixel_axes(flow.shape[2], flow.shape[3], dtype=flow.dtype, device=flow.device)
+    slopes = []
+    for channel, axis in enumerate(axes):
+        shift = (axis + at[:, channel : channel + 1]).floor() - axis
+        low = torch.cat([shift, at[:, 1:]] if channel == 0 else [at[:, :1], shift], dim=1)
+        high = low + torch.eye(2, dtype=flow.dtype, device=flow.device)[channel].view(1, 2, 1, 1)
+        ends = (look_up(flow, end, padding="border", interpolation="bilinear") for end in (high, low))
+        slopes.append(torch.sub(*ends))
+    return torch.cat(slopes, dim=1)
 
 
 def _residual(table: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:

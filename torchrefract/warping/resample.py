@@ -28,7 +28,7 @@ def warp(
     Args:
         image: (B, C, H, W) or (C, H, W), floating or integer; integers are converted, rounded and clamped.
         flow: (B, 2, H, W) or (1, 2, H, W), px, u (right) and v (down); (2, H, W) for an unbatched image.
-        padding: what lies outside: "zeros", "border" or "reflection".
+        padding: what lies outside: "zeros", "border" or "reflection" (of positions up to 3/2 frames off the center).
         interpolation: "nearest", "bilinear" or "bicubic" (a = -3/4, clamped to the range of the image's values).
 
     Returns:
@@ -91,16 +91,19 @@ def _as_image(warped: Tensor, image: Tensor) -> Tensor:
 
 
 def _clamped(warped: Tensor, source: Tensor, padding: str) -> Tensor:
-    # NaN must stay where it is: as a bound it would spread over the whole image.
-    known = source.detach().nan_to_num(nan=0.0, posinf=torch.inf, neginf=-torch.inf)
-    low, high = known.amin(dim=(2, 3), keepdim=True), known.amax(dim=(2, 3), keepdim=True)
+    # Pixels that are not finite must stay where they are: as bounds they would spread over the whole image.
+    known, source = source.isfinite(), source.detach()
+    low = torch.where(known, source, torch.inf).amin(dim=(2, 3), keepdim=True)
+    high = torch.where(known, source, -torch.inf).amax(dim=(2, 3), keepdim=True)
     if padding == "zeros":
         low, high = low.clamp(max=0), high.clamp(min=0)
-    return warped.clamp(low, high)
+    return torch.where(warped.isfinite(), warped.clamp(low, high), warped)
 
 
 def _sample(source: Tensor, grid: Tensor, *, padding: str, interpolation: str) -> Tensor:
-    parts = _parts(source, grid)
+    # The kernel of this pair alone rounds by the layout of its grid, which the bands change.
+    whole = (interpolation, padding) == ("bicubic", "reflection")
+    parts = 1 if whole else _parts(source, grid)
     if parts == 1:
         return F.grid_sample(source, grid, mode=interpolation, padding_mode=padding, align_corners=False)
     # The CPU sampler threads over the batch alone: bands of rows as a batch give the same bits on all threads.

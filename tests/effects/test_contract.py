@@ -1,0 +1,515 @@
+"""What every effect owes; a new effect is one entry more in EFFECTS."""
+
+import copy
+import math
+import pickle
+import random
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.testing import assert_close
+from torch.utils.data import DataLoader, Dataset
+
+from torchrefract import Degraded, LensDistortion, UniformFog
+from torchrefract.effects.base import Effect
+
+DTYPES = [torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64]
+MAPS = ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission", "intensity")
+NO_RANGE = (0.0, 0.0)
+
+
+class Case(NamedTuple):
+    """An effect: how to make it, strongest, and at strength zero; where its descent starts at strength zero."""
+
+    make: Callable[..., Effect]
+    strongest: dict[str, Any]
+    still: dict[str, Any]
+    alive: str | None
+    fields: tuple[str, ...]  # of its params, those that are real numbers
+
+    def strong(self, **options: Any) -> Effect:
+        return self.make(**self.strongest, **options)
+
+
+EFFECTS = {
+    "lens": Case(
+        LensDistortion,
+        strongest={
+            "k1_range": (-0.3, -0.2),
+            "k2_range": (0.1, 0.2),
+            "k3_range": (0.0, 0.02),
+            "k4_range": (0.0, 0.002),
+            "k5_range": (0.0, 0.002),
+            "k6_range": (0.0, 0.002),
+            "p1_range": (-0.004, 0.004),
+            "p2_range": (-0.004, 0.004),
+            "s1_range": (-0.004, 0.004),
+            "s2_range": (-0.004, 0.004),
+            "s3_range": (-0.004, 0.004),
+            "s4_range": (-0.004, 0.004),
+            "focal_range": (0.7, 0.9),
+            "aspect_range": (0.9, 1.1),
+            "center_x_range": (-0.03, 0.03),
+            "center_y_range": (-0.03, 0.03),
+        },
+        still={"k1_range": NO_RANGE, "k2_range": NO_RANGE, "p1_range": NO_RANGE, "p2_range": NO_RANGE},
+        alive="coefficients",
+        fields=("coefficients", "focal", "center"),
+    ),
+    "fog": Case(
+        UniformFog,
+        strongest={"visibility_range": (20.0, 60.0), "deviation_range": (-0.5, 0.5), "airlight": (0.9, 0.7, 0.8)},
+        still={"visibility_range": (math.inf, math.inf)},
+        alive=None,  # clear air is infinitely far from every fog
+        fields=("visibility", "deviation", "airlight"),
+    ),
+}
+
+
+@pytest.fixture(params=EFFECTS)
+def case(request) -> Case:
+    return EFFECTS[request.param]
+
+
+class DegradedFrames(Dataset):
+    """Frame by frame, degraded where it is loaded."""
+
+    def __init__(self, effect: Effect, images: Tensor, keys: Tensor):
+        self.effect, self.images, self.keys = effect, images, keys
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, i: int) -> dict[str, Tensor]:
+        return maps(self.effect.degrade(self.images[i], seed=7, keys=self.keys[i : i + 1]))
+
+
+def picture(*shape: int, dtype: torch.dtype = torch.float32, seed: int = 0) -> Tensor:
+    image = torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return (255 * image).round().to(dtype) if dtype is torch.uint8 else image.to(dtype)
+
+
+def maps(degraded: Degraded) -> dict[str, Tensor]:
+    return {name: getattr(degraded, name) for name in MAPS if getattr(degraded, name) is not None}
+
+
+def assert_same(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
+    assert actual.keys() == expected.keys()
+    for name, value in expected.items():
+        assert torch.equal(actual[name], value), name
+
+
+def test_a_sample_does_not_depend_on_the_batch_around_it(case):
+    effect, images, keys = case.strong(p=0.8), picture(16, 3, 33, 47), torch.arange(100, 116) * 2**33
+    together = maps(effect.degrade(images, seed=7, keys=keys))
+    shuffled = torch.randperm(16, generator=torch.Generator().manual_seed(1))
+    for rows in ([0], [11], [5, 0, 9], shuffled.tolist()):
+        some = maps(effect.degrade(images[rows], seed=7, keys=keys[rows]))
+        assert_same(some, {name: value[rows] for name, value in together.items()})
+
+
+def test_a_sample_does_not_depend_on_the_number_of_threads(case, on_threads):
+    effect, images = case.strong(), picture(1, 3, 151, 127)
+    results = []
+    for threads in (1, 2, 3):
+        on_threads(threads)
+        results.append(maps(effect.degrade(images, seed=7, keys=[5])))
+    for result in results[1:]:
+        assert_same(result, results[0])
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+def test_a_sample_does_not_depend_on_the_worker_that_loads_it(case):
+    effect, images, keys = case.strong(p=0.8), picture(6, 3, 20, 30), torch.tensor([4, -1, 7, 2**40, 0, 3])
+    expected = maps(effect.degrade(images, seed=7, keys=keys))
+    frames = DegradedFrames(effect, images, keys)
+    for workers in (0, 2):
+        context = "fork" if workers else None
+        batches = list(DataLoader(frames, batch_size=4, num_workers=workers, multiprocessing_context=context))
+        assert_same({name: torch.cat([batch[name] for batch in batches]) for name in expected}, expected)
+
+
+def test_seed_key_and_place_each_change_the_draw(case):
+    effect, image = case.strong(), picture(2, 3, 9, 11)
+    draws = [
+        effect.sample(image, seed=7, keys=[1, 2]),
+        effect.sample(image, seed=8, keys=[1, 2]),
+        effect.sample(image, seed=7, keys=[3, 4]),
+        effect.sample(image, seed=7, keys=[1, 2], place=1),
+    ]
+    name = case.fields[0]
+    rows = torch.cat([getattr(params, name).view(2, -1) for params in draws])
+    assert rows.unique(dim=0).shape[0] == 8
+
+
+def test_what_torch_manual_seed_seeds_is_repeated(case):
+    effect, image = case.strong(), picture(2, 3, 9, 11)
+    torch.manual_seed(3)
+    first, second = effect(image), effect(image)
+    torch.manual_seed(3)
+    assert torch.equal(effect(image), first)
+    assert torch.equal(effect(image), second)
+    assert not torch.equal(first, second)
+
+
+def test_a_given_seed_leaves_all_global_generators_alone(case):
+    before = torch.get_rng_state(), random.getstate(), repr(np.random.get_state())
+    case.strong().degrade(picture(2, 3, 9, 11), seed=7)
+    after = torch.get_rng_state(), random.getstate(), repr(np.random.get_state())
+    assert torch.equal(before[0], after[0])
+    assert before[1:] == after[1:]
+
+
+def test_forward_stores_nothing_on_the_module(case):
+    effect = case.strong()
+    before = copy.deepcopy(vars(effect))
+    effect(picture(2, 3, 9, 11))
+    effect(picture(3, 9, 11, dtype=torch.uint8))
+    assert vars(effect) == before
+    assert not list(effect.buffers())
+    assert not list(effect.parameters())
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("how", ["never", "still", "gate"])
+def test_an_effect_that_is_off_hands_the_image_on_bit_for_bit(case, dtype, how):
+    image = picture(3, 3, 21, 17, dtype=dtype)
+    if how == "gate":
+        effect = case.strong()
+        params = effect.sample(image, seed=7)._replace(gate=torch.zeros(3, dtype=torch.bool))
+        degraded = effect.apply(image, params)
+    else:
+        effect = case.strong(p=0.0) if how == "never" else case.make(**case.still)
+        degraded = effect.degrade(image, seed=7)
+    assert degraded.image.dtype == dtype
+    assert torch.equal(degraded.image, image)
+    expected = {"valid": 1, "restore_valid": 1, "flow": 0, "restore_flow": 0, "transmission": 1, "intensity": 0}
+    for name, value in maps(degraded).items():
+        if name != "image":
+            assert (value == expected[name]).all(), name
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_in_a_mixed_batch_only_the_samples_drawn_are_degraded(case, dtype):
+    image = picture(16, 3, 21, 17, dtype=dtype)
+    degraded = case.strong(p=0.5).degrade(image, seed=7)
+    gate = degraded.params.gate
+    assert 0 < gate.sum() < 16
+    assert torch.equal(degraded.image[~gate], image[~gate])
+    assert (degraded.image != image).flatten(1).any(dim=1).tolist() == gate.tolist()
+
+
+def test_the_share_of_degraded_samples_is_p(case):
+    count, p = 4000, 0.3
+    gate = case.strong(p=p).sample(torch.zeros(count, 3, 1, 1), seed=7).gate
+    assert abs(gate.double().mean().item() - p) < 4 * math.sqrt(p * (1 - p) / count)
+
+
+def test_at_strength_zero_descent_can_start(case, pixels):
+    x, y = pixels(9, 12)
+    # On a ramp bilinear sampling has a derivative on whole pixels too; the border, where padding begins, is left out.
+    image = torch.stack([x, y, x - 2 * y])[None].expand(2, -1, -1, -1) / 50
+    weights = torch.zeros_like(image)
+    weights[..., 1:-1, 1:-1] = picture(2, 3, 7, 10, dtype=torch.float64)
+    effect = case.make(**case.still)
+    params = effect.sample(image, seed=7)
+    assert torch.equal(effect.apply(image, params).image, image)
+    if case.alive is None:
+        return
+    gradients = []
+    for step in (0.0, 1e-7):
+        strength = (getattr(params, case.alive) + step).requires_grad_()
+        degraded = effect.apply(image, params._replace(**{case.alive: strength}))
+        assert torch.equal(degraded.image, image) == (step == 0)
+        gradients += torch.autograd.grad((degraded.image * weights).sum(), strength)
+    assert gradients[0].all()
+    assert_close(gradients[0], gradients[1], rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("layout", ["contiguous", "channels_last", "strided", "unbatched"])
+def test_shape_type_and_layout_are_kept(case, dtype, layout):
+    effect, image = case.strong(), picture(2, 3, 20, 30, dtype=dtype)
+    scale = 255 if dtype is torch.uint8 else 1
+    wide = image.double() if dtype is torch.float64 else image.float()
+    expected = effect.degrade(wide / scale, seed=7).image * scale
+    if layout == "channels_last":
+        image = image.contiguous(memory_format=torch.channels_last)
+    elif layout == "strided":
+        image = torch.stack([image, image], dim=-1)[..., 0]
+    elif layout == "unbatched":
+        image, expected = image[0], expected[0]
+    result = effect.degrade(image, seed=7).image
+    assert (result.shape, result.dtype) == (image.shape, dtype)
+    assert result.is_contiguous(memory_format=torch.channels_last) == (layout == "channels_last")
+    assert torch.equal(result, expected.round().to(dtype) if dtype is torch.uint8 else expected.to(dtype))
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float16, torch.bfloat16, torch.float64])
+def test_every_type_shows_the_same_picture(case, dtype):
+    effect, image = case.strong(), picture(2, 3, 20, 30)
+    stored = (255 * image).round().to(dtype) if dtype is torch.uint8 else image.to(dtype)
+    result = effect.degrade(stored, seed=7).image.double() / (255 if dtype is torch.uint8 else 1)
+    step = {torch.uint8: 1 / 255, torch.float64: 2e-4}.get(dtype) or torch.finfo(dtype).eps
+    assert_close(result, effect.degrade(image, seed=7).image.double(), rtol=0, atol=step + 1e-6)
+
+
+def test_maps_of_an_unbatched_image_are_unbatched(case):
+    effect, image = case.strong(), picture(3, 20, 30)
+    alone = maps(effect.degrade(image, seed=7, keys=[5]))
+    batched = maps(effect.degrade(image[None], seed=7, keys=[5]))
+    assert_same(alone, {name: value[0] for name, value in batched.items()})
+
+
+@pytest.mark.parametrize("channels", [1, 4, 12])
+def test_any_number_of_channels_is_taken(case, channels):
+    options = case.strongest | ({"airlight": 0.7} if "airlight" in case.strongest else {})
+    effect, image = case.make(**options), picture(2, channels, 20, 30)
+    result = effect.degrade(image, seed=7).image
+    for channel in range(channels):
+        alone = effect.degrade(image[:, [channel]], seed=7).image
+        assert torch.equal(alone[:, 0], result[:, channel])
+
+
+@pytest.mark.parametrize("size", [(1, 13), (13, 1), (31, 37), (2, 2)])
+def test_narrow_and_prime_frames_are_no_special_case(case, size):
+    degraded = case.strong().degrade(picture(2, 3, *size), seed=7)
+    for name, value in maps(degraded).items():
+        assert value.shape[2:] == size, name
+        assert value.isfinite().all(), name
+
+
+def test_a_frame_of_one_pixel_does_not_move():
+    image = picture(2, 3, 1, 1)
+    for case in EFFECTS.values():
+        degraded = case.strong().degrade(image, seed=7)
+        assert degraded.image.isfinite().all()
+        if degraded.flow is not None:
+            assert torch.equal(degraded.image, image)
+
+
+def test_a_batch_of_none_stays_one(case):
+    degraded = case.strong().degrade(torch.zeros(0, 3, 8, 9), seed=7)
+    for name, value in maps(degraded).items():
+        assert (value.shape[0], *value.shape[2:]) == (0, 8, 9), name
+
+
+@pytest.mark.parametrize("poison", [math.nan, math.inf])
+def test_poisoned_pixels_stay_local(case, poison):
+    effect, image = case.strong(), picture(2, 3, 24, 32)
+    poisoned = image.clone()
+    poisoned[0, 1, 11, 13] = poison
+    clean, dirty = effect.degrade(image, seed=7), effect.degrade(poisoned, seed=7)
+    mark = torch.zeros(1, 1, 24, 32)
+    mark[..., 10:13, 12:15] = 1  # the pixel and its neighbors, which share its cells
+    touched = torch.zeros(2, 3, 24, 32, dtype=torch.bool)
+    shown = mark if clean.flow is None else effect.apply(mark, type(clean.params)(*(v[:1] for v in clean.params))).image
+    touched[0, 1] = shown[0, 0] > 0
+    assert torch.equal(dirty.image[~touched], clean.image[~touched])
+    assert not dirty.image[touched].isfinite().all()
+    assert touched.sum() <= 25
+
+
+def test_params_replay_the_draw_bit_for_bit(case):
+    effect, image, other = case.strong(p=0.8), picture(3, 3, 20, 30), picture(3, 3, 20, 30, seed=1)
+    drawn = effect.degrade(image, seed=7)
+    assert_same(maps(effect.apply(image, drawn.params)), maps(drawn))
+    assert_same(maps(effect.apply(other, drawn.params)), maps(effect.degrade(other, seed=7)))
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value))])
+def test_effects_params_and_results_are_copied_whole(case, copied):
+    effect, image = case.strong(p=0.8), picture(3, 3, 20, 30)
+    drawn = effect.degrade(image, seed=7)
+    params = copied(effect.sample(image, seed=7))
+    assert type(params) is type(drawn.params)
+    assert_same(params._asdict(), drawn.params._asdict())
+    assert_same(maps(copied(effect).degrade(image, seed=7)), maps(drawn))
+    duplicate = copied(effect.degrade(image, seed=7))
+    assert_same(maps(duplicate), maps(drawn))
+    assert_same(duplicate.params._asdict(), drawn.params._asdict())
+
+
+def test_params_change_type_together_but_for_their_flags(case):
+    params = case.strong(p=0.5).sample(picture(3, 3, 8, 9), seed=7)
+    double = params.to(torch.float64)
+    assert type(double) is type(params)
+    for name, value in double._asdict().items():
+        floating = getattr(params, name).is_floating_point()
+        assert value.dtype == (torch.float64 if floating else getattr(params, name).dtype), name
+        assert_close(value, getattr(params, name).to(value.dtype), rtol=0, atol=0)
+    assert {value.device.type for value in params.to("meta")} == {"meta"}
+
+
+def test_gradients_of_params_and_image_are_those_of_finite_differences(case):
+    effect = case.strong()
+    image = picture(2, 3, 4, 6, dtype=torch.float64)
+    params = effect.sample(image, seed=5)
+    assert {name for name, value in params._asdict().items() if value.is_floating_point()} == set(case.fields)
+
+    def degrade(image: Tensor, *values: Tensor) -> Tensor:
+        return effect.apply(image, params._replace(**dict(zip(case.fields, values, strict=True)))).image
+
+    inputs = [image, *(getattr(params, name).clone() for name in case.fields)]
+    assert torch.autograd.gradcheck(degrade, [value.requires_grad_() for value in inputs])
+
+
+def test_a_closed_gate_passes_gradients_to_the_image_only(case):
+    effect, image = case.strong(), picture(2, 3, 8, 9).requires_grad_()
+    params = effect.sample(image, seed=7)._replace(gate=torch.tensor([False, True]))
+    field = getattr(params, case.fields[0]).clone().requires_grad_()
+    degraded = effect.apply(image, params._replace(**{case.fields[0]: field}))
+    of_image, of_field = torch.autograd.grad(degraded.image.sum(), [image, field])
+    assert torch.equal(of_image[0], torch.ones_like(of_image[0]))
+    assert not of_field[0].any()
+    assert of_field[1].any()
+
+
+def test_one_graph_gives_the_same_as_eager_mode(case):
+    effect, image = case.strong(p=0.8), picture(3, 3, 24, 32)
+    torch.manual_seed(3)
+    expected = [effect(image) for _ in range(2)]
+    # Without code generation, which takes a minute: whether the graph is whole and true is what is asked.
+    compiled = torch.compile(effect, fullgraph=True, backend="aot_eager")
+    torch.manual_seed(3)
+    assert_close([compiled(image) for _ in range(2)], expected, rtol=0, atol=2e-4)
+
+
+def test_autocast_changes_nothing(case):
+    effect, image = case.strong(), picture(3, 3, 24, 32)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        result = effect.degrade(image, seed=7).image
+    assert result.dtype == torch.float32
+    assert_close(result, effect.degrade(image, seed=7).image, rtol=0, atol=2e-4)
+
+
+def test_vmap_over_samples_is_the_batch(case):
+    effect, image = case.strong(), picture(3, 3, 24, 32)
+    params = effect.sample(image, seed=7)
+
+    def alone(image: Tensor, params: Any) -> Tensor:
+        return effect.apply(image[None], type(params)(*(value[None] for value in params))).image[0]
+
+    assert_close(torch.vmap(alone)(image, params), effect.apply(image, params).image, rtol=0, atol=2e-4)
+
+
+def test_nan_in_a_field_of_the_params_is_named(case):
+    effect, image = case.strong(), picture(2, 3, 8, 9)
+    params = effect.sample(image, seed=7)
+    for name in case.fields:
+        wrong = getattr(params, name).clone()
+        wrong.view(-1)[-1] = math.nan
+        with pytest.raises(ValueError, match=rf"params\.{name} must"):
+            effect.apply(image, params._replace(**{name: wrong}))
+
+
+def test_params_of_another_batch_are_named(case):
+    effect, image = case.strong(), picture(2, 3, 8, 9)
+    params = effect.sample(picture(3, 3, 8, 9), seed=7)
+    with pytest.raises(ValueError, match=r"params\.gate must have one row for each of the 2 images, got \(3,\)"):
+        effect.apply(image, params)
+
+
+@pytest.mark.parametrize("params", [None, {"gate": torch.ones(2)}, (1.0, 2.0)])
+def test_what_are_no_params_raises(case, params):
+    with pytest.raises(TypeError, match=r"params must be \w+Params, got"):
+        case.strong().apply(picture(2, 3, 8, 9), params)
+
+
+def test_params_of_another_effect_raise(case):
+    image = picture(2, 3, 8, 9)
+    others = [other for other in EFFECTS.values() if other.make is not case.make]
+    for other in others:
+        with pytest.raises((TypeError, ValueError), match="params"):
+            case.strong().apply(image, other.strong().sample(image, seed=7))
+
+
+def test_unknown_arguments_raise(case):
+    with pytest.raises(TypeError, match="k7_range"):
+        case.make(k7_range=(0.0, 1.0))
+
+
+def test_positional_arguments_raise(case):
+    with pytest.raises(TypeError, match="positional"):
+        case.make((0.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("p", "error"), [(-0.1, ValueError), (1.1, ValueError), (math.nan, ValueError), ("1", TypeError)]
+)
+def test_a_chance_out_of_range_raises(case, p, error):
+    with pytest.raises(error, match="p must"):
+        case.make(p=p)
+
+
+def test_ranges_the_wrong_way_round_raise(case):
+    for name in (name for name in case.strongest if name.endswith("_range")):
+        low, high = case.strongest[name]
+        with pytest.raises(ValueError, match=f"{name} must be"):
+            case.make(**{name: (high + 1e-3, low)})
+
+
+@pytest.mark.parametrize("shape", [(8, 9), (1, 2, 3, 8, 9), (3, 0, 9), (2, 0, 8, 9)])
+def test_what_has_not_the_shape_of_an_image_raises(case, shape):
+    with pytest.raises(ValueError, match=r"image must have shape \(B, C, H, W\) or \(C, H, W\)"):
+        case.strong()(torch.zeros(shape))
+
+
+@pytest.mark.parametrize("image", [torch.zeros(3, 8, 9, dtype=torch.int32), np.zeros((3, 8, 9)), None])
+def test_what_has_not_the_type_of_an_image_raises(case, image):
+    with pytest.raises(TypeError, match="image must be"):
+        case.strong()(image)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "rule"),
+    [
+        ({"keys": [1, 2, 3]}, ValueError, "keys must have one key for each of the 2 images"),
+        ({"keys": torch.zeros(2)}, TypeError, "keys must be whole numbers"),
+        ({"keys": torch.zeros(2, 1, dtype=torch.int64)}, ValueError, "keys must have one key for each"),
+        ({"seed": 1.5}, TypeError, "seed must be a whole number"),
+        ({"seed": True}, TypeError, "seed must be a whole number"),
+        ({"depth": torch.zeros(2, 1, 9, 8)}, ValueError, "depth must have one channel of the size of the image"),
+        ({"depth": [1.0]}, TypeError, "depth must be a floating tensor"),
+    ],
+)
+def test_wrong_seeds_keys_and_depths_raise(case, options, error, rule):
+    with pytest.raises(error, match=rule):
+        case.strong().degrade(picture(2, 3, 8, 9), **options)
+
+
+def test_an_effect_is_a_module_among_modules(case):
+    seen: list[nn.Module] = []
+    effect = case.strong()
+    model = nn.Sequential(nn.Conv2d(3, 3, 1), effect)
+    assert model.apply(seen.append) is model
+    assert effect in seen
+    assert effect.apply(seen.append) is effect
+    model.half().float().eval().to("cpu")
+    assert model(picture(2, 3, 8, 9)).shape == (2, 3, 8, 9)
+    model(picture(2, 3, 8, 9)).sum().backward()
+    weight = next(model.parameters())
+    assert weight.grad is not None
+    assert weight.grad.any()
+
+
+def test_the_state_of_a_model_is_saved_and_loaded(case):
+    model = nn.Sequential(nn.Conv2d(3, 3, 1), case.strong())
+    other = nn.Sequential(nn.Conv2d(3, 3, 1), case.strong())
+    other.load_state_dict(copy.deepcopy(model.state_dict()), strict=True)
+    image = picture(2, 3, 8, 9)
+    torch.manual_seed(3)
+    expected = model(image)
+    torch.manual_seed(3)
+    assert torch.equal(other(image), expected)
+
+
+def test_an_effect_shows_its_arguments(case):
+    text = repr(case.strong(p=0.25))
+    assert text.startswith(f"{case.make.__name__}(")  # pyright: ignore[reportFunctionMemberAccess]
+    for name in (*case.strongest, "p=0.25"):
+        assert name in text

@@ -1,0 +1,244 @@
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchrefract import FogParams, UniformFog
+
+PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)
+
+
+def picture(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
+
+
+def fogs(image: Tensor, visibility: float, deviation: float = 0.0) -> FogParams:
+    batch, dtype = image.shape[0], image.dtype
+    return FogParams(
+        gate=torch.ones(batch, dtype=torch.bool),
+        visibility=torch.full((batch,), visibility, dtype=dtype),
+        deviation=torch.full((batch,), deviation, dtype=dtype),
+        airlight=torch.tensor([PAPER_AIRLIGHT[: image.shape[1]]] * batch, dtype=dtype),
+    )
+
+
+def to_linear(stored: np.ndarray) -> np.ndarray:
+    return np.where(stored <= 0.04045, stored / 12.92, np.power((stored + 0.055) / 1.055, 2.4))
+
+
+def to_stored(linear: np.ndarray) -> np.ndarray:
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - 0.055)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("linear_light", [False, True])
+@pytest.mark.parametrize("given_depth", [False, True])
+def test_the_image_is_the_closed_form(dtype, linear_light, given_depth):
+    image = picture(2, 3, 20, 30, dtype=dtype)
+    depth = 200 * picture(2, 1, 20, 30, dtype=dtype) if given_depth else None
+    effect = UniformFog(visibility_range=(50.0, 150.0), linear_light=linear_light)
+    degraded = effect.degrade(image, seed=7, depth=depth)
+    visibility, deviation = (getattr(degraded.params, name).double().numpy() for name in ("visibility", "deviation"))
+    rows = (1 - (np.arange(20) + 0.5) / 20) * 160
+    d = rows[None, None, :, None] if depth is None else depth.double().numpy()
+    k = (-math.log(0.05) / visibility * (1 + deviation))[:, None, None, None]
+    t = np.broadcast_to(np.exp(-k * d), (2, 1, 20, 30))
+    clean, airlight = image.double().numpy(), np.array(PAPER_AIRLIGHT)[None, :, None, None]
+    expected = (
+        to_stored(to_linear(clean) * t + to_linear(airlight) * (1 - t))
+        if linear_light
+        else clean * t + airlight * (1 - t)
+    )
+    assert degraded.transmission is not None
+    assert_close(degraded.image.double(), torch.from_numpy(expected), rtol=0, atol=1e-6)
+    assert_close(degraded.transmission.double(), torch.from_numpy(t.copy()), rtol=0, atol=1e-6)
+    assert torch.equal(degraded.valid, degraded.transmission >= 1 / 255)
+    assert degraded.valid.any()
+    assert degraded.flow is None
+    assert degraded.restore_flow is None
+
+
+@pytest.mark.parametrize("threshold", [0.02, 0.05])
+def test_at_the_visibility_the_threshold_arrives(threshold):
+    image = picture(1, 3, 4, 5)
+    depth = torch.full((1, 1, 4, 5), 80.0, dtype=torch.float64)
+    degraded = UniformFog(threshold=threshold).apply(image, fogs(image, 80.0), depth=depth)
+    assert_close(degraded.transmission, torch.full_like(depth, threshold), rtol=0, atol=1e-12)
+
+
+def test_a_hundred_meters_have_the_extinction_of_the_specification():
+    image, one = picture(1, 3, 4, 5), torch.ones(1, 1, 4, 5, dtype=torch.float64)
+    degraded = UniformFog().apply(image, fogs(image, 100.0), depth=one)
+    assert_close(-degraded.transmission.log(), 0.029957 * one, rtol=0, atol=5e-7)
+    degraded = UniformFog().apply(image, fogs(image, 100.0, deviation=0.05), depth=one)
+    assert_close(-degraded.transmission.log(), 1.05 * 0.029957 * one, rtol=0, atol=6e-7)
+
+
+def test_the_draw_is_uniform_in_its_ranges():
+    image = torch.zeros(4000, 3, 1, 1)
+    params = UniformFog(visibility_range=(30.0, 300.0), deviation_range=(-0.2, 0.1)).sample(image, seed=7)
+    for values, low, high in ((params.visibility, 30, 300), (params.deviation, -0.2, 0.1)):
+        assert stats.kstest(((values.double() - low) / (high - low)).numpy(), "uniform").pvalue > 1e-4
+    assert torch.equal(params.airlight, torch.tensor(PAPER_AIRLIGHT).expand(4000, 3))
+
+
+def test_up_to_clear_air_the_extinction_is_uniform():
+    params = UniformFog(visibility_range=(50.0, math.inf)).sample(torch.zeros(4000, 3, 1, 1), seed=7)
+    assert stats.kstest((50 / params.visibility.double()).numpy(), "uniform").pvalue > 1e-4
+    assert params.visibility.min() >= 50
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64])
+@pytest.mark.parametrize("linear_light", [False, True])
+@pytest.mark.parametrize("clear", [{"visibility_range": (math.inf, math.inf)}, {"max_depth": 0.0}])
+def test_clear_air_and_no_distance_leave_every_bit(dtype, linear_light, clear):
+    image = (
+        (255 * picture(2, 3, 20, 30)).round().to(dtype) if dtype is torch.uint8 else picture(2, 3, 20, 30, dtype=dtype)
+    )
+    degraded = UniformFog(linear_light=linear_light, **clear).degrade(image, seed=7)
+    assert torch.equal(degraded.image, image)
+    assert (degraded.transmission == 1).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_fog_as_thick_as_a_wall_is_its_airlight_with_finite_gradients(dtype):
+    image = picture(1, 3, 20, 30, dtype=dtype).requires_grad_()
+    params = fogs(image.detach(), 1e-3)
+    values = [params.visibility.requires_grad_(), params.deviation.requires_grad_(), params.airlight.requires_grad_()]
+    degraded = UniformFog().apply(image, params)
+    assert torch.equal(degraded.image, params.airlight[:, :, None, None].expand_as(image))
+    assert not degraded.valid.any()
+    gradients = torch.autograd.grad(degraded.image.sum(), [image, *values])
+    expected = [torch.zeros_like(image), torch.zeros(1), torch.zeros(1), torch.full((1, 3), 600.0)]
+    assert_close(list(gradients), [value.to(dtype) for value in expected], rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("linear_light", [False, True])
+def test_the_sky_is_infinitely_far(linear_light):
+    image = picture(1, 3, 4, 5).requires_grad_()
+    depth = torch.full((1, 1, 4, 5), 10.0, dtype=torch.float64)
+    depth[..., :2, :] = math.inf
+    degraded = UniformFog(linear_light=linear_light).apply(image, fogs(image.detach(), 100.0), depth=depth)
+    assert not degraded.transmission[..., :2, :].any()
+    sky = torch.tensor(PAPER_AIRLIGHT, dtype=torch.float64).view(1, 3, 1, 1).expand(-1, -1, 2, 5)
+    assert_close(degraded.image[..., :2, :], sky, rtol=0, atol=1e-12)
+    (gradient,) = torch.autograd.grad(degraded.image.sum(), image)
+    assert gradient.isfinite().all()
+    assert not gradient[..., :2, :].any()
+    clear = UniformFog(linear_light=linear_light).apply(image, fogs(image.detach(), math.inf), depth=depth)
+    assert torch.equal(clear.image, image)
+
+
+@pytest.mark.parametrize("value", [-1.0, -math.inf, math.nan])
+def test_a_depth_that_is_none_raises(value):
+    image = picture(1, 3, 4, 5)
+    depth = torch.full((1, 1, 4, 5), 10.0, dtype=torch.float64)
+    depth[0, 0, 2, 3] = value
+    with pytest.raises(ValueError, match="depth must be at least 0, in m"):
+        UniformFog().degrade(image, seed=7, depth=depth)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 5, 4), (1, 3, 4, 5), (2, 1, 4, 5), (1, 4, 5), (4, 5)])
+def test_a_depth_of_another_shape_raises(shape):
+    with pytest.raises(ValueError, match="depth must have one channel of the size of the image"):
+        UniformFog().degrade(picture(1, 3, 4, 5), seed=7, depth=torch.ones(shape))
+
+
+def test_an_unbatched_image_takes_an_unbatched_depth():
+    image, depth = picture(3, 4, 5), 100 * picture(1, 4, 5)
+    alone = UniformFog().degrade(image, seed=7, depth=depth)
+    batched = UniformFog().degrade(image[None], seed=7, depth=depth[None])
+    assert torch.equal(alone.image, batched.image[0])
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_a_half_depth_is_computed_with_in_single_precision(dtype):
+    image, depth = picture(1, 3, 4, 5, dtype=torch.float32), (100 * picture(1, 1, 4, 5)).to(dtype)
+    expected = UniformFog().degrade(image, seed=7, depth=depth.float()).image
+    assert torch.equal(UniformFog().degrade(image, seed=7, depth=depth).image, expected)
+
+
+def wall(channels: int, airlight: float | tuple[float, ...] | None) -> list[float]:
+    """The color of a fog too thick to see through."""
+    effect = UniformFog(visibility_range=(1e-3, 1e-3), airlight=airlight)
+    return effect.degrade(picture(1, channels, 2, 2), seed=7).image[0, :, 0, 0].tolist()
+
+
+def test_the_airlight_fits_the_channels():
+    assert wall(3, None) == pytest.approx(PAPER_AIRLIGHT)
+    luminance = float(np.dot((0.2126, 0.7152, 0.0722), PAPER_AIRLIGHT))
+    assert wall(1, None) == pytest.approx([luminance])
+    assert wall(4, None) == pytest.approx([luminance] * 4)
+    assert wall(4, 0.5) == [0.5] * 4
+    assert wall(2, (0.25, 0.75)) == [0.25, 0.75]
+    assert wall(3, (0.5,)) == [0.5] * 3
+
+
+def test_an_airlight_for_other_channels_raises():
+    with pytest.raises(ValueError, match="airlight must have 1 number or 4, one for each channel"):
+        UniformFog(airlight=(0.1, 0.2, 0.3)).degrade(picture(1, 4, 2, 2), seed=7)
+    image = picture(1, 4, 2, 2)
+    with pytest.raises(ValueError, match=r"params\.airlight must have shape \(1, 4\), got \(1, 3\)"):
+        UniformFog().apply(image, fogs(image, 10.0))
+
+
+@pytest.mark.parametrize("airlight", [(), -0.1, 1.1, (0.5, math.nan, 0.5), math.inf])
+def test_an_airlight_out_of_range_raises(airlight):
+    with pytest.raises(ValueError, match="airlight must"):
+        UniformFog(airlight=airlight)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"visibility_range": (0.0, 10.0)},
+        {"visibility_range": (-1.0, 10.0)},
+        {"visibility_range": (math.nan, 10.0)},
+        {"deviation_range": (-1.0, 0.0)},
+        {"deviation_range": (0.0, 1.0)},
+        {"threshold": 0.0},
+        {"threshold": 1.0},
+        {"max_depth": -1.0},
+        {"max_depth": math.nan},
+    ],
+)
+def test_arguments_out_of_range_raise(options: dict[str, Any]):
+    with pytest.raises(ValueError, match=f"{next(iter(options))} must"):
+        UniformFog(**options)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "rule"),
+    [
+        ("visibility", 0.0, "be above 0"),
+        ("visibility", -5.0, "be above 0"),
+        ("deviation", -1.0, "be above -1"),
+        ("deviation", math.inf, "be above -1"),
+        ("airlight", math.inf, "be finite"),
+    ],
+)
+def test_params_out_of_range_raise(field, value, rule):
+    image = picture(2, 3, 4, 5)
+    params = fogs(image, 100.0)
+    wrong = getattr(params, field).clone()
+    wrong.view(-1)[-1] = value
+    with pytest.raises(ValueError, match=rf"params\.{field} must {rule}"):
+        UniformFog().apply(image, params._replace(**{field: wrong}))
+
+
+@pytest.mark.parametrize("linear_light", [False, True])
+def test_gradients_are_those_of_finite_differences(linear_light):
+    image, depth = picture(2, 3, 3, 4), 100 * picture(2, 1, 3, 4)
+    params = fogs(image, 60.0, deviation=0.03)
+    effect = UniformFog(linear_light=linear_light)
+
+    def fogged(image, depth, visibility, deviation, airlight):
+        return effect.apply(image, FogParams(params.gate, visibility, deviation, airlight), depth=depth).image
+
+    inputs = [image, depth, params.visibility, params.deviation, params.airlight]
+    assert torch.autograd.gradcheck(fogged, [value.clone().requires_grad_() for value in inputs])

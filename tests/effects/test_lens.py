@@ -1,0 +1,248 @@
+import math
+import warnings
+from typing import Any
+
+import cv2
+import pytest
+import torch
+from scipy import stats
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchrefract import Degraded, LensDistortion, LensParams, warp
+from torchrefract.cameras.distortion import POLYNOMIAL12
+
+FOLDING: dict[str, Any] = {"k1_range": (-0.6, -0.6), "k2_range": (0.0, 0.0), "focal_range": (0.7, 0.7)}
+
+
+def lenses(coefficients: dict[str, float], focal: float = 0.8, batch: int = 1) -> LensParams:
+    row = [coefficients.get(name, 0.0) for name in POLYNOMIAL12]
+    return LensParams(
+        gate=torch.ones(batch, dtype=torch.bool),
+        coefficients=torch.tensor([row] * batch),
+        focal=torch.full((batch, 2), focal),
+        center=torch.zeros(batch, 2),
+    )
+
+
+def flows(degraded: Degraded) -> tuple[Tensor, Tensor, Tensor]:
+    """flow, restore_flow and restore_valid, which a lens has."""
+    maps = (degraded.flow, degraded.restore_flow, degraded.restore_valid)
+    assert maps[0] is not None
+    assert maps[1] is not None
+    assert maps[2] is not None
+    return maps[0], maps[1], maps[2]
+
+
+def psnr(image: Tensor, clean: Tensor, valid: Tensor) -> float:
+    """dB, over the valid pixels."""
+    error = (image - clean).square().mean(dim=-3, keepdim=True)[valid].mean()
+    return -10 * math.log10(error.item())
+
+
+@pytest.fixture(scope="module")
+def frames(shared_data) -> Tensor:
+    """(3, 3, 360, 640): real frames, one from each of three drives."""
+    names = ["ca_p1_*", "br_es_*", "us_losaltos_*"]
+    paths = [sorted((shared_data / "frames" / "val").glob(f"{name}.jpg"))[0] for name in names]
+    pictures = [cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB) for path in paths]  # pyright: ignore
+    return torch.stack([torch.from_numpy(picture).movedim(-1, 0) for picture in pictures]).float() / 255
+
+
+@pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
+def test_the_flow_back_restores_real_frames_and_the_negative_flow_does_not(frames, interpolation):
+    d = LensDistortion(interpolation=interpolation).degrade(frames, seed=7, keys=[0, 1, 2])
+    flow, restore_flow, restore_valid = flows(d)
+    naive = (flow + restore_flow).norm(dim=1, keepdim=True)
+    for i, clean in enumerate(frames):
+        valid = restore_valid[i]
+        scores = [
+            psnr(warp(d.image[i], back[i], interpolation=interpolation)[0], clean, valid)
+            for back in (restore_flow, -flow)
+        ]
+        assert valid.float().mean() > 0.5
+        # What the specification promises: 4.6 dB at an error of 2.3 px, 9.5 dB at 6 px.
+        assert naive[i][valid].max() > 2.3
+        assert scores[0] > scores[1] + 4.6, scores
+        # Two look-ups are all that is lost, so bicubic ones lose less.
+        do_nothing = psnr(d.image[i], clean, valid)
+        assert scores[0] > do_nothing + 4.6, (scores, do_nothing)
+
+
+def test_bicubic_restores_real_frames_better_than_bilinear(frames):
+    scores = {}
+    for interpolation in ("bilinear", "bicubic"):
+        d = LensDistortion(interpolation=interpolation).degrade(frames, seed=7, keys=[0, 1, 2])
+        _, restore_flow, restore_valid = flows(d)
+        back, _ = warp(d.image, restore_flow, interpolation=interpolation)
+        scores[interpolation] = psnr(back, frames, restore_valid)
+    assert scores["bicubic"] > scores["bilinear"] + 1
+
+
+def test_both_flows_undo_each_other(pixels):
+    x, y = pixels(60, 90)
+    ramp = torch.stack([x, y])[None]
+    d = LensDistortion(k1_range=(-0.3, -0.3), k2_range=(0.1, 0.1)).degrade(ramp, seed=7)
+    _, restore_flow, restore_valid = flows(d)
+    back, seen = warp(d.image, restore_flow)
+    assert restore_valid.double().mean() > 0.8
+    assert seen[restore_valid].all()
+    # The ramp's image is the smooth map itself; read bilinearly it errs by (|f_xx| + |f_yy|) / 8, here below 0.01 px.
+    assert (back - ramp).abs().amax(dim=1, keepdim=True)[restore_valid].max() < 0.01
+
+
+def test_content_moves_as_the_camera_would_see_it():
+    # A point at radius r in widths of the focal length appears at r (1 + k1 r^2 + k2 r^4): a barrel draws it inward.
+    image = torch.zeros(1, 1, 101, 101, dtype=torch.float64)
+    image[..., 50, 90] = 1
+    params = lenses({"k1": -0.3, "k2": 0.1}, focal=0.7).to(torch.float64)
+    degraded = LensDistortion().apply(image, params).image[0, 0, 50]
+    f = 0.7 * 101
+    r = 40 / f
+    expected = 50 + f * r * (1 - 0.3 * r**2 + 0.1 * r**4)
+    seen = (degraded * torch.arange(101)).sum() / degraded.sum()
+    assert seen.item() == pytest.approx(expected, abs=0.1)
+    assert expected < 89
+
+
+def test_parameters_are_relative_to_the_width_so_that_a_scene_survives_resizing():
+    params = lenses({"k1": -0.25, "k2": 0.08, "p1": 1e-3}).to(torch.float64)
+    effect = LensDistortion()
+    small = effect.apply(torch.zeros(1, 1, 45, 80, dtype=torch.float64), params).flow
+    large = effect.apply(torch.zeros(1, 1, 135, 240, dtype=torch.float64), params).flow
+    # Every third pixel of the larger frame has its center where a pixel of the smaller one has.
+    assert_close(large[..., 1::3, 1::3], 3 * small, rtol=0, atol=1e-9)
+
+
+def test_every_number_is_uniform_in_its_range_and_on_its_own():
+    count = 3000
+    coefficients: dict[str, Any] = {f"{name}_range": (-1.0 - i, 2.0 + i) for i, name in enumerate(POLYNOMIAL12)}
+    effect = LensDistortion(
+        **coefficients,
+        focal_range=(0.5, 2.0),
+        aspect_range=(0.5, 3.0),
+        center_x_range=(-1.0, 0.0),
+        center_y_range=(2.0, 5.0),
+    )
+    params = effect.sample(torch.zeros(count, 1, 1, 1), seed=7)
+    fx, fy = params.focal.double().T
+    columns = [*params.coefficients.double().T, fx, fy / fx, *params.center.double().T]
+    ranges = [(-1.0 - i, 2.0 + i) for i in range(12)] + [(0.5, 2.0), (0.5, 3.0), (-1.0, 0.0), (2.0, 5.0)]
+    for column, (low, high) in zip(columns, ranges, strict=True):
+        assert stats.kstest(((column - low) / (high - low)).numpy(), "uniform").pvalue > 1e-4
+    others = torch.corrcoef(torch.stack(columns)).fill_diagonal_(0).abs()
+    assert others.max() < stats.norm.isf(1e-4 / 240) / math.sqrt(count)
+
+
+@pytest.mark.parametrize("size", [(36, 64), (48, 64), (64, 64)])
+def test_the_default_fleet_folds_nowhere(size):
+    degraded = LensDistortion(strict=True).degrade(torch.zeros(300, 1, *size), seed=7)
+    assert (degraded.params.coefficients[:, 0] < 0).all()
+
+
+def test_pixels_beyond_a_fold_are_warned_of_once_padded_and_marked():
+    effect = LensDistortion(**FOLDING)
+    image = torch.ones(3, 1, 36, 64)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        first, *_ = [effect.degrade(image, seed=7) for _ in range(3)]
+    assert [warning.category for warning in caught] == [UserWarning]
+    assert "fold" in str(caught[0].message)
+    y, x = torch.meshgrid(torch.arange(36) - 17.5, torch.arange(64) - 31.5, indexing="ij")
+    center = first.params.center[0] * 64
+    r = torch.hypot(x - center[0], y - center[1]) / (0.7 * 64)
+    edge = 2 / 3 / math.sqrt(1.8)
+    # The smaller terms, decentring by a thousandth, blur the edge a little; before it the frame may end.
+    assert not first.valid[0, 0][r > 1.03 * edge].any()
+    assert first.valid[0, 0][r < 0.5 * edge].all()
+    assert not first.image[0, 0][r > 1.03 * edge].any()
+    assert (r > 1.03 * edge).any()
+
+
+def test_strict_refuses_a_lens_that_folds():
+    with pytest.raises(ValueError, match="must not fold back inside the frame"):
+        LensDistortion(**FOLDING, strict=True).degrade(torch.ones(1, 1, 36, 64), seed=7)
+
+
+def test_a_fold_behind_a_closed_gate_or_outside_the_frame_is_nobodys_business():
+    image = torch.rand(1, 1, 36, 64)
+    LensDistortion(**FOLDING, strict=True, p=0.0).degrade(image, seed=7)
+    far: dict[str, Any] = FOLDING | {"focal_range": (3.0, 3.0)}
+    LensDistortion(**far, strict=True).degrade(image, seed=7)
+
+
+@pytest.mark.parametrize("k1", [1.0, 4.0, 10.0])
+def test_strong_pincushions_converge_everywhere(k1):
+    degraded = LensDistortion().apply(torch.rand(1, 1, 36, 64), lenses({"k1": k1}))
+    assert degraded.image.isfinite().all()
+    assert degraded.valid.all()
+
+
+@pytest.mark.parametrize("name", POLYNOMIAL12)
+@pytest.mark.parametrize("value", [-1e3, 1e30, math.inf])
+def test_coefficients_out_of_bounds_raise(name, value):
+    options: dict[str, Any] = {f"{name}_range": (value, value)}
+    with pytest.raises(ValueError, match=rf"{name}_range must be"):
+        LensDistortion(**options)
+
+
+@pytest.mark.parametrize("value", [-1e3, 1e30, math.inf, -math.inf])
+def test_params_out_of_bounds_raise(value):
+    with pytest.raises(ValueError, match=r"params\.coefficients must lie in \[-100, 100\]"):
+        LensDistortion().apply(torch.zeros(1, 1, 8, 9), lenses({"k1": value}))
+
+
+@pytest.mark.parametrize("focal", [0.0, -1.0])
+def test_a_focal_length_that_is_not_positive_raises(focal):
+    with pytest.raises(ValueError, match="focal_range must be"):
+        LensDistortion(focal_range=(focal, 1.0))
+    with pytest.raises(ValueError, match=r"params\.focal must be positive and finite"):
+        LensDistortion().apply(torch.zeros(1, 1, 8, 9), lenses({"k1": -0.1}, focal=focal))
+
+
+@pytest.mark.parametrize("field", ["focal", "center"])
+def test_infinite_params_raise(field):
+    params = lenses({"k1": -0.1})
+    with pytest.raises(ValueError, match=rf"params\.{field} must be"):
+        LensDistortion().apply(torch.zeros(1, 1, 8, 9), params._replace(**{field: torch.full((1, 2), math.inf)}))
+
+
+def test_a_vector_of_opencv_is_refused_and_the_model_named():
+    params = lenses({"k1": -0.1})._replace(coefficients=torch.zeros(1, 14))
+    with pytest.raises(ValueError, match=r"params\.coefficients .*polynomial"):
+        LensDistortion().apply(torch.zeros(1, 1, 8, 9), params)
+
+
+@pytest.mark.parametrize("option", [{"padding": "wrap"}, {"interpolation": "lanczos"}])
+def test_unknown_options_raise(option):
+    with pytest.raises(ValueError, match=f"{next(iter(option))} must be one of"):
+        LensDistortion(**option)
+
+
+@pytest.mark.parametrize(("padding", "outside"), [("zeros", 0.0), ("border", 1.0), ("reflection", 1.0)])
+def test_the_padding_fills_what_the_lens_sees_beyond_the_frame(padding, outside):
+    # A barrel shows more than the frame holds: its corners look out.
+    effect = LensDistortion(padding=padding)
+    degraded: Degraded = effect.apply(torch.ones(1, 1, 36, 64), lenses({"k1": -0.2, "k2": 0.05}))
+    assert not degraded.valid[0, 0, 0, 0]
+    assert degraded.image[0, 0, 0, 0] == outside
+    assert degraded.image[0, 0, 18, 32] == 1
+
+
+def test_restored_pixels_are_those_that_the_damaged_frame_shows():
+    # A pincushion pushes the corners of the scene out of the frame: no flow brings them back.
+    degraded = LensDistortion().apply(torch.ones(1, 1, 36, 64), lenses({"k1": 0.3}))
+    _, restore_flow, restore_valid = flows(degraded)
+    back, seen = warp(degraded.image, restore_flow)
+    assert degraded.valid.all()
+    assert torch.equal(restore_valid, seen)
+    assert not restore_valid[0, 0, 0, 0]
+    assert restore_valid[0, 0, 18, 32]
+    assert_close(back[restore_valid], torch.ones_like(back[restore_valid]), rtol=0, atol=1e-5)
+
+
+def test_the_draw_counts_for_what_it_says_in_double_precision_too():
+    image = torch.rand(2, 1, 36, 64)
+    single, double = (LensDistortion().degrade(image.to(dtype), seed=7) for dtype in (torch.float32, torch.float64))
+    assert_close(single.params.to(torch.float64), double.params, rtol=0, atol=1e-6)
+    assert_close(flows(single)[0].double(), flows(double)[0], rtol=0, atol=1e-3)

@@ -1,0 +1,90 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from torchrefract.fields.fog import extinction, linear_depth, linear_to_srgb, srgb_to_linear, transmission, veil
+
+
+def srgb_by_the_standard(linear: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1, one number at a time."""
+    return np.array([12.92 * v if v <= 0.0031308 else 1.055 * math.pow(v, 1 / 2.4) - 0.055 for v in linear])
+
+
+def test_the_extinction_of_a_hundred_meters_is_that_of_the_specification():
+    assert extinction(torch.tensor(100.0).double(), 0.05).item() == pytest.approx(0.029957, abs=5e-7)
+    # A contrast of 2 % is Koschmieder's own 3.912 / V.
+    assert extinction(torch.tensor(50.0).double(), 0.02).item() == pytest.approx(3.912 / 50, abs=1e-5)
+    assert extinction(torch.tensor(math.inf), 0.05).item() == 0
+
+
+@pytest.mark.parametrize("visibility", [1e-3, 10.0, 100.0, 1e6])
+@pytest.mark.parametrize("threshold", [0.02, 0.05, 0.5])
+def test_at_the_visibility_the_threshold_is_what_arrives(visibility, threshold):
+    v = torch.tensor(visibility, dtype=torch.float64)
+    assert transmission(v, extinction(v, threshold)).item() == pytest.approx(threshold, rel=1e-12)
+
+
+def test_light_through_two_layers_is_the_product():
+    near, far, k = (torch.tensor(value).double() for value in (13.0, 29.0, 0.03))
+    assert_close(transmission(near + far, k), transmission(near, k) * transmission(far, k))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("depth", "k", "t"),
+    [(math.inf, 0.03, 0.0), (math.inf, 0.0, 1.0), (0.0, 3e6, 1.0), (1e30, 3e6, 0.0), (5.0, 0.0, 1.0)],
+)
+def test_the_ends_of_the_transmission_are_exact_and_have_finite_gradients(dtype, depth, k, t):
+    d, k = (torch.tensor(value, dtype=dtype).requires_grad_() for value in (depth, k))
+    result = transmission(d, k)
+    assert result.item() == t
+    for gradient in torch.autograd.grad(result, [d, k]):
+        assert gradient.isfinite()
+
+
+def test_the_veil_is_exact_at_both_ends():
+    image, airlight = torch.rand(2, 3, 4, 5), torch.rand(2, 3, 1, 1)
+    assert torch.equal(veil(image, torch.ones(2, 1, 4, 5), airlight), image)
+    assert torch.equal(veil(image, torch.zeros(2, 1, 4, 5), airlight), airlight.expand_as(image))
+    middle = veil(image, torch.full((2, 1, 4, 1), 0.25), airlight)
+    assert_close(middle, 0.25 * image + 0.75 * airlight)
+
+
+def test_depth_runs_from_the_far_top_row_to_the_near_bottom_row():
+    depth = linear_depth(4, 160.0, dtype=torch.float64, device=torch.device("cpu"))
+    assert depth.flatten().tolist() == [140.0, 100.0, 60.0, 20.0]
+    assert depth.shape == (1, 1, 4, 1)
+
+
+def test_stored_values_and_linear_light_agree_with_the_standard():
+    # Around the joint at 0.0031308 too.
+    linear = np.concatenate([np.linspace(0, 0.006, 200), np.linspace(0.006, 1, 200)])
+    stored = torch.from_numpy(srgb_by_the_standard(linear))
+    assert_close(linear_to_srgb(torch.from_numpy(linear)), stored, rtol=0, atol=1e-14)
+    assert_close(srgb_to_linear(stored), torch.from_numpy(linear), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("convert", [linear_to_srgb, srgb_to_linear])
+def test_black_has_a_finite_gradient(convert):
+    value = torch.zeros(3).requires_grad_()
+    (gradient,) = torch.autograd.grad(convert(value).sum(), value)
+    assert_close(gradient, torch.full((3,), 12.92 if convert is linear_to_srgb else 1 / 12.92))
+
+
+def test_gradients_are_those_of_finite_differences():
+    generator = torch.Generator().manual_seed(0)
+    image, airlight, depth = (
+        torch.rand(shape, generator=generator, dtype=torch.float64).requires_grad_()
+        for shape in ((2, 3, 3, 4), (2, 3, 1, 1), (2, 1, 3, 4))
+    )
+    visibility = torch.tensor([20.0, 90.0], dtype=torch.float64).requires_grad_()
+
+    def fogged(image, airlight, depth, visibility):
+        k = extinction(visibility, 0.05).view(-1, 1, 1, 1)
+        mixed = veil(srgb_to_linear(image), transmission(100 * depth, k), airlight)
+        return linear_to_srgb(mixed)
+
+    assert torch.autograd.gradcheck(fogged, [image, airlight, depth, visibility])

@@ -1,0 +1,109 @@
+import inspect
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from pytorch_lightning import Trainer
+
+from torchrefract import presets
+from torchrefract._config import CONFIG_DIR
+from torchrefract.data.module import PairData
+from torchrefract.effects.base import Effect
+from torchrefract.restoration.module import Restoration
+
+CONF = Path(CONFIG_DIR)
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+def composed(tmp_path: Path, *words: str, command: str = "train") -> Any:
+    """What a command would be given."""
+    with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
+        cfg = compose(command, overrides=[*words, f"run_dir={tmp_path}"])
+    OmegaConf.resolve(cfg)
+    return cfg
+
+
+def test_conf_holds_nothing_but_yaml():
+    files = [path for path in CONF.rglob("*") if path.is_file()]
+    assert {path.suffix for path in files} == {".yaml"}
+    for path in files:
+        assert isinstance(OmegaConf.load(path), DictConfig), path
+
+
+@pytest.mark.parametrize("trainer", ["cpu", "gpu", "ddp"])
+@pytest.mark.parametrize("task", options("task"))
+def test_every_task_composes_with_every_trainer(tmp_path, task, trainer):
+    cfg = composed(tmp_path, f"+task={task}", f"trainer={trainer}")
+    assert cfg.task._target_ == f"torchrefract.restoration.tasks.{task.capitalize()}"
+    assert cfg.model.task == cfg.task
+    assert cfg.data.effect == cfg.scene
+    assert cfg.trainer.logger.save_dir == str(tmp_path)
+    assert not OmegaConf.missing_keys(cfg)
+
+
+@pytest.mark.parametrize("task", options("task"))
+def test_every_task_makes_its_data_and_its_model(tmp_path, task):
+    cfg = composed(tmp_path, f"+task={task}", "seed=5")
+    data, model = instantiate(cfg.data), instantiate(cfg.model)
+    assert isinstance(data, PairData)
+    assert isinstance(model, Restoration)
+    assert model.task.name == task
+    assert (data.seed, len(data.train), len(data.val)) == (5, 1024, 128)  # pyright: ignore[reportArgumentType]
+    assert data.effect.extra_repr() == getattr(presets, cfg.scene._target_.rsplit(".", 1)[1])().extra_repr()
+
+
+@pytest.mark.parametrize("trainer", ["cpu", "ddp"])
+def test_every_trainer_writes_into_the_run_folder(tmp_path, trainer):
+    made = instantiate(composed(tmp_path, "+task=undistort", f"trainer={trainer}").trainer)
+    assert isinstance(made, Trainer)
+    assert made.checkpoint_callback is not None
+    assert made.checkpoint_callback.dirpath == str(tmp_path)  # pyright: ignore[reportAttributeAccessIssue]
+    assert made.logger is not None
+    assert Path(made.logger.log_dir or "") == tmp_path
+    assert made.max_epochs == 8
+    assert type(made.strategy).__name__ == {"cpu": "SingleDeviceStrategy", "ddp": "DDPStrategy"}[trainer]
+
+
+def test_the_gpu_trains_in_bfloat16(tmp_path):
+    cfg = composed(tmp_path, "+task=undistort", "trainer=gpu")
+    assert (cfg.trainer.accelerator, cfg.trainer.devices, cfg.trainer.precision) == ("gpu", 1, "bf16-mixed")
+
+
+def test_an_evaluation_composes_what_the_training_did(tmp_path):
+    words = ("+task=deweather", "seed=3")
+    assert composed(tmp_path, *words, command="eval") == composed(tmp_path, *words)
+
+
+@pytest.mark.parametrize("scene", options("scene"))
+def test_a_scene_is_the_preset_of_its_name(scene):
+    made = instantiate(OmegaConf.load(CONF / "scene" / f"{scene}.yaml"))
+    expected = getattr(presets, scene)()
+    assert isinstance(made, Effect)
+    assert (type(made), made.extra_repr()) == (type(expected), expected.extra_repr())
+    assert "range=(" in made.extra_repr()
+
+
+def test_every_preset_has_a_scene():
+    public = [name for name, _ in inspect.getmembers(presets, inspect.isfunction) if not name.startswith("_")]
+    assert [name for name in public if getattr(presets, name).__module__ == presets.__name__] == options("scene")
+
+
+def test_another_scene_can_be_chosen_for_a_task(tmp_path):
+    cfg = composed(tmp_path, "+task=undistort", "scene=cape_town_fog")
+    assert cfg.data.effect._target_ == "torchrefract.presets.cape_town_fog"
+
+
+def test_a_task_of_the_user_comes_with_a_folder_of_his_own(tmp_path):
+    (tmp_path / "task").mkdir()
+    (tmp_path / "task" / "mine.yaml").write_text(
+        "# @package _global_\ndefaults:\n  - override /scene: cheap_dashcam\ntask:\n"
+        "  _target_: torchrefract.restoration.tasks.Undistort\n  limit: 0.5\n"
+    )
+    cfg = composed(tmp_path, "+task=mine", f"hydra.searchpath=[file://{tmp_path}]")
+    assert instantiate(cfg.task).limit == 0.5

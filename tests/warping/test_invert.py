@@ -1,0 +1,205 @@
+import pytest
+import torch
+from scipy import ndimage
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchrefract import invert_flow, warp
+from torchrefract.warping.grid import inside
+
+SIZE = (80, 110)
+
+
+def read(flow: Tensor, at: Tensor) -> Tensor:
+    """The flow (1, 2, H, W) read bilinearly at p + at(p), by SciPy."""
+    y, x = torch.meshgrid(*(torch.arange(n).double() for n in flow.shape[2:]), indexing="ij")
+    places = [(y + at[0, 1]).numpy(), (x + at[0, 0]).numpy()]
+    planes = [ndimage.map_coordinates(plane.numpy(), places, order=1, mode="nearest") for plane in flow[0]]
+    return torch.stack([torch.from_numpy(plane) for plane in planes])[None]
+
+
+def solve_waves(waves, x: Tensor, y: Tensor, amplitude_px: float, length: float) -> Tensor:
+    """v with v(q) + u(q + v) = 0 for the analytic flow u, by 60 Newton steps in fp64."""
+
+    def u(at: Tensor) -> Tensor:
+        return waves(at[0], at[1], amplitude_px, length)[0]
+
+    q, step = torch.stack([x, y]), 1e-4
+    at = q
+    for _ in range(60):
+        moved = [at + step * direction.view(2, 1, 1) for direction in torch.eye(2, dtype=torch.float64)]
+        (a, c), (b, d) = [(u(plus) + plus - u(2 * at - plus) - 2 * at + plus) / (2 * step) for plus in moved]
+        e, f = at - q + u(at)
+        at = at - torch.stack([d * e - b * f, a * f - c * e]) / (a * d - b * c)
+    assert (at - q + u(at)).abs().max() < 1e-12
+    return (at - q)[None]
+
+
+@pytest.mark.parametrize(("amplitude_px", "length"), [(5.0, 40.0), (4.0, 20.0), (1.0, 8.0), (0.02, 60.0)])
+def test_the_inverse_of_waves_is_the_analytic_one_up_to_interpolation(pixels, waves, amplitude_px, length):
+    x, y = pixels(*SIZE)
+    flow = waves(x, y, amplitude_px, length)
+    inverse, valid, _ = invert_flow(flow, steps=20)
+    exact = solve_waves(waves, x, y, amplitude_px, length)
+    # Read bilinearly u errs by amplitude / (4 length^2), which the inverse passes on times 1 / (1 - slope).
+    slope = 2**0.5 * amplitude_px / length
+    floor = amplitude_px / (4 * length**2) / (1 - slope)
+    assert valid.float().mean() > 0.75
+    assert (inverse - exact).norm(dim=1, keepdim=True)[valid].max() <= 2**0.5 * floor
+    if length == 60.0:
+        assert floor < 1.5e-6
+
+
+def test_an_affine_flow_is_inverted_exactly(pixels):
+    x, y = pixels(*SIZE)
+    matrix = torch.tensor([[0.1, -0.2], [0.15, -0.05]], dtype=torch.float64)
+    shift = torch.tensor([-6.0, 3.0], dtype=torch.float64).view(2, 1, 1)
+    p = torch.stack([x, y])
+    flow = torch.einsum("ij,jhw->ihw", matrix, p) + shift
+    inverse, valid, residual = invert_flow(flow[None])
+    # p + A p + b = q has p = (I + A)^-1 (q - b).
+    exact = torch.einsum("ij,jhw->ihw", torch.linalg.inv(torch.eye(2) + matrix), p - shift) - p
+    expected = inside(exact[None])
+    assert torch.equal(valid, expected)
+    assert 0.5 < expected.double().mean() < 1
+    assert_close(inverse.where(valid, 0), exact[None].where(valid, 0), rtol=0, atol=1e-9)
+    assert residual[valid].max() < 1e-9
+
+
+def test_the_residual_is_what_it_says_and_vanishes_where_valid(pixels, waves):
+    flow = waves(*pixels(*SIZE), 4.0, 20.0)
+    inverse, valid, residual = invert_flow(flow, steps=2)
+    expected = (inverse + read(flow, inverse)).norm(dim=1, keepdim=True)
+    assert_close(residual, expected, rtol=0, atol=1e-10)
+    inverse, valid, residual = invert_flow(flow, steps=20)
+    assert residual[valid].max() < 1e-6
+
+
+def test_a_looser_tolerance_accepts_what_a_tighter_one_does_not(pixels, waves):
+    flow = waves(*pixels(*SIZE), 8.0, 12.0)
+    _, loose, residual = invert_flow(flow, steps=1, tolerance_px=1.0)
+    _, tight, _ = invert_flow(flow, steps=1, tolerance_px=1e-3)
+    assert torch.equal(tight, loose & (residual <= 1e-3))
+    assert tight.sum() < loose.sum()
+
+
+def test_single_precision_reaches_the_floor_of_interpolation(pixels, waves):
+    x, y = pixels(*SIZE)
+    flow = waves(x, y, 5.0, 40.0)
+    inverse, valid, _ = invert_flow(flow.float())
+    exact = solve_waves(waves, x, y, 5.0, 40.0)
+    assert inverse.dtype == torch.float32
+    assert (inverse - exact).norm(dim=1, keepdim=True)[valid].max() <= 2e-3
+
+
+def test_a_warp_and_its_inverse_give_the_picture_back(pixels, waves):
+    x, y = pixels(*SIZE)
+    picture = waves(x, y, 0.5, 10.0)
+    flow = waves(x, y, 4.0, 30.0)
+    inverse, valid, _ = invert_flow(flow)
+    moved, seen = warp(picture, flow)
+    back, _ = warp(moved, inverse)
+    whole = valid & (warp(seen.double(), inverse)[0] == 1)
+    # Two bilinear look-ups, the second of a picture stretched by up to 1.2, and the floor of the inverse.
+    bound = 0.01 / 8 * (1 + 1.2**2) + 0.05 * 2e-3
+    assert (back - picture).abs().amax(dim=1, keepdim=True)[whole].max() <= bound
+
+
+def test_what_leaves_the_frame_is_not_valid():
+    flow = torch.zeros(1, 2, 8, 12, dtype=torch.float64)
+    flow[:, 0] = 3.0
+    inverse, valid, _ = invert_flow(flow)
+    expected = torch.ones(1, 1, 8, 12, dtype=torch.bool)
+    expected[..., :3] = False  # q - 3 is off the frame
+    assert torch.equal(valid, expected)
+    assert torch.equal(inverse.where(valid, -flow), -flow)
+
+
+def test_a_mirrored_or_collapsed_sheet_is_not_valid(pixels):
+    x, y = pixels(9, 11)
+    mirror = torch.stack([-2 * (x - 5), 0 * y])[None]
+    collapse = torch.stack([5.5 - x, 4.5 - y])[None]
+    for flow in (mirror, collapse):
+        inverse, valid, residual = invert_flow(flow, steps=20)
+        assert not valid.any()
+        assert inverse.isfinite().all()
+        assert residual.isfinite().all()
+
+
+def test_where_the_map_folds_only_upright_sheets_are_valid(pixels):
+    x, y = pixels(40, 200)
+    length = 8.0
+    flow = torch.stack([-1.5 * length * torch.sin(x / length), 0 * y])[None]
+    inverse, valid, _ = invert_flow(flow, steps=40)
+    stretch = 1 - 1.5 * torch.cos((x + inverse[0, 0]) / length)
+    # Where central differences, one pixel long, can tell: not at the very edge of a fold.
+    assert (stretch[valid[0, 0]] > -2 / length).all()
+    assert_close(inverse.where(valid, 0), -read(flow, inverse).where(valid, 0), rtol=0, atol=0.05)
+    assert 0.1 < valid.double().mean() < 1
+    assert inverse.isfinite().all()
+
+
+@pytest.mark.parametrize("poison", [torch.nan, torch.inf, -torch.inf])
+def test_nothing_is_valid_that_is_read_from_a_hole(poison):
+    flow = torch.full((1, 2, 20, 40), 5.0, dtype=torch.float64)
+    flow[:, 1] = 0
+    flow[:, :, 8:12, 20:25] = poison
+    inverse, valid, residual = invert_flow(flow, steps=20)
+    expected = torch.ones(1, 1, 20, 40, dtype=torch.bool)
+    expected[..., :5] = False  # off the frame
+    expected[..., 8:12, 25:30] = False  # q - 5 lies in the hole
+    assert inverse.isfinite().all()
+    assert residual.isfinite().all()
+    solved = valid & expected
+    assert not (valid & ~expected).any()
+    assert_close(inverse.where(solved, 0)[:, 0], (-5.0 * solved[:, 0]).double(), rtol=0, atol=1e-9)
+    # A hole's own place has no flow, but its inverse is read beside it: only there may we be more careful.
+    expected[..., 8:12, 20:25] = False
+    assert (valid | ~expected).all()
+
+
+def test_gradients_through_an_affine_flow_are_those_of_finite_differences(pixels):
+    x, y = pixels(5, 6)
+    flow = torch.stack([0.1 * x - 0.05 * y + 0.23, 0.08 * y + 0.04 * x - 0.31])[None].requires_grad_()
+    assert torch.autograd.gradcheck(lambda f: invert_flow(f, steps=30)[0][..., 1:-1, 1:-1], [flow])
+
+
+def test_gradients_through_a_curved_flow_are_those_of_finite_differences(pixels, waves):
+    x, y = pixels(5, 6)
+    flow = (waves(x, y, 0.3, 2.0) + 0.4).requires_grad_()
+    assert torch.autograd.gradcheck(lambda f: invert_flow(f, steps=60)[0][..., 2:-1, 2:-1], [flow])
+
+
+def test_the_gradient_is_not_paid_for_where_nobody_asks():
+    flow = torch.full((1, 2, 5, 6), 0.3)
+    assert not invert_flow(flow)[0].requires_grad
+    with torch.no_grad():
+        assert not invert_flow(flow.requires_grad_())[0].requires_grad
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 1)])
+def test_a_frame_of_one_row_or_column_is_inverted_too(size):
+    flow = torch.zeros(2, 2, *size)
+    inverse, valid, residual = invert_flow(flow)
+    assert torch.equal(inverse, flow)
+    assert valid.all()
+    assert not residual.any()
+
+
+def test_a_batch_of_none_stays_one():
+    inverse, valid, residual = invert_flow(torch.zeros(0, 2, 5, 6))
+    assert [t.shape for t in (inverse, valid, residual)] == [(0, 2, 5, 6), (0, 1, 5, 6), (0, 1, 5, 6)]
+
+
+@pytest.mark.parametrize(
+    ("options", "rule"),
+    [({"steps": 0}, "steps must be at least 1"), ({"tolerance_px": 0.0}, "tolerance_px must be above 0")],
+)
+def test_options_out_of_range_raise(options, rule):
+    with pytest.raises(ValueError, match=rule):
+        invert_flow(torch.zeros(1, 2, 5, 6), **options)
+
+
+def test_what_is_no_flow_raises():
+    with pytest.raises(ValueError, match=r"flow must have shape \(B, 2, H, W\)"):
+        invert_flow(torch.zeros(1, 3, 5, 6))

@@ -1,4 +1,4 @@
-"""Each effect on one rendered frame: clean, degraded, the map of what was done, and the frame after the map is undone."""
+"""Each effect on one rendered frame: clean, degraded, the map of what was done, and the frame with it undone."""
 
 import sys
 
@@ -13,17 +13,20 @@ out = sys.argv[1] if len(sys.argv) > 1 else "degrade_and_restore.png"
 clean, depth = render_road_scenes(torch.tensor([29]), 270, 480)
 
 lens = tr.LensDistortion(k1_range=(-0.3, -0.3), focal_range=(0.75, 0.75)).degrade(clean, seed=7)
-unbent, _ = tr.warp(lens.image, lens.restore_flow, interpolation="bicubic")
+assert lens.flow is not None  # a lens has one, a fog does not
+assert lens.restore_flow is not None
+unbent, seen = tr.warp(lens.image, lens.restore_flow, interpolation="bicubic")
 
 fog = tr.UniformFog(visibility_range=(90, 90))
 misty = fog.degrade(clean, seed=7, depth=depth)
+assert misty.transmission is not None
 airlight = misty.params.airlight[:, :, None, None]
 # What 8 bits cannot hold any more stays fog.
 t = misty.transmission.clamp(min=1 / 255)
 unveiled = torch.where(misty.valid, (misty.image - airlight * (1 - t)) / t, airlight)
 
 rows = {
-    "LensDistortion": (clean, lens.image, viz.flow_to_rgb(lens.flow * lens.valid), unbent * lens.restore_valid),
+    "LensDistortion": (clean, lens.image, viz.flow_to_rgb(lens.flow * lens.valid), unbent * seen),
     "UniformFog": (clean, misty.image, viz.transmission_to_rgb(misty.transmission), unveiled),
 }
 columns = ("clean", "degraded", "flow / transmission", "restored by the map")

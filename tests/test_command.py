@@ -53,7 +53,8 @@ def test_a_task_without_its_plus_is_told_of_the_plus(call, name):
         ("data.color=red", "data.color"),
         ("model.depth=3", "model.depth"),
         ("+model.depth=3", "model: .*'depth'"),
-        ("model.network.encoder=nonsense", "nonsense"),
+        ("model.network.encoder=nonsense", "model: encoder must be known to .*, got nonsense"),
+        ("model.network.encoder=tu-nonsense", "model: encoder must be known to .*, got tu-nonsense"),
         ("data.size=[64", r"\[64"),
         ("data.size=[4,4]", "data: size must be at least 8, got 4"),
         ("data.batch_size=33", "data: batch_size must be at most the 32 training frames, got 33"),
@@ -147,7 +148,7 @@ def other_task(path: Path) -> None:
         (lambda path: path.write_bytes(random.Random(0).randbytes(5000)), "damaged"),
         (lambda path: path.write_bytes(b""), "damaged"),
         (other_task, "a checkpoint of the task undistort, got"),
-        (other_model, "a checkpoint of the model chosen with model="),
+        (other_model, "a checkpoint of the model that model= names, got"),
     ],
     ids=["missing", "noise", "empty", "task", "model"],
 )

@@ -6,7 +6,6 @@ from omegaconf import OmegaConf
 from torchrefract.restoration.checkpoints import read_checkpoint
 
 # The folder that best.ckpt lies in is another than that of the evaluation; Lightning says so.
-pytestmark = pytest.mark.filterwarnings("ignore:The dirpath has changed")
 
 
 def test_an_evaluation_without_a_checkpoint_asks_for_one(call, small):

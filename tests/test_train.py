@@ -11,7 +11,6 @@ from PIL import Image
 from torchrefract.restoration.checkpoints import read_checkpoint
 
 # A run that goes on leaves best.ckpt of the one before where it is; Lightning says so.
-pytestmark = pytest.mark.filterwarnings("ignore:The dirpath has changed")
 
 FILES = ["best.ckpt", "config.yaml", "curves.png", "last.ckpt", "metrics.csv", "panel.png"]
 # A training that ends itself as `kill -9` would, in the middle of its second epoch.

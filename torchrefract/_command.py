@@ -16,28 +16,31 @@ from hydra.errors import HydraException, InstantiationException, MissingConfigEx
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
-from pytorch_lightning import LightningDataModule, LightningModule, Trainer, seed_everything
+from pytorch_lightning import LightningModule, Trainer, seed_everything
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
 from torchrefract._config import CONFIG_DIR
 from torchrefract.data.images import UnreadableImageError
+from torchrefract.data.module import PairData
 from torchrefract.restoration.checkpoints import CheckpointError, check_fits, read_checkpoint
 from torchrefract.restoration.files import replacing
 
 _INFORMING = ("--help", "-h", "--hydra-help", "--info", "--shell-completion", "-sc")
+_SEEDS = 2**32  # as many as numpy takes
 # Advice of libraries on what is meant so here.
 _HINTS = (
     ".*does not have many workers.*",
     ".*LeafSpec.*",
     ".*smaller than the logging interval.*",
     ".*exists and is not empty.*",
+    ".*dirpath has changed.*",
 )
 
 
 class Job(NamedTuple):
     """What a command works with."""
 
-    data: LightningDataModule
+    data: PairData
     model: LightningModule
     trainer: Trainer
 
@@ -77,20 +80,34 @@ def job(function: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
 
 def make_job(cfg: DictConfig, *, needs_checkpoint: bool = False) -> Job:
     """Data, model and trainer of a configuration, the checkpoint checked, the resolved configuration written."""
-    seed_everything(cfg.seed, workers=True, verbose=False)
     OmegaConf.resolve(cfg)
+    if not isinstance(cfg.seed, int) or not 0 <= cfg.seed < _SEEDS:
+        raise UsageError(f"seed must be a whole number from 0 to {_SEEDS - 1}, got {cfg.seed}")
+    seed_everything(cfg.seed, workers=True, verbose=False)
     if needs_checkpoint and cfg.ckpt_path is None:
         raise UsageError("ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none")
+    path = Path(cfg.ckpt_path or "")
     checkpoint = None
     if cfg.ckpt_path is not None:
-        checkpoint = read_checkpoint(Path(cfg.ckpt_path), task=HydraConfig.get().runtime.choices["task"])
+        checkpoint = read_checkpoint(path, task=str(HydraConfig.get().runtime.choices["task"]))
     made = Job(_make(cfg, "data"), _make(cfg, "model"), _make(cfg, "trainer"))
+    with _naming("data"):
+        made.data.check_ranks(made.trainer.world_size)
     if checkpoint is not None:
-        check_fits(checkpoint, made.model)
+        check_fits(checkpoint, made.model, path)
+        if not needs_checkpoint:
+            _check_unfinished(checkpoint["epoch"] + 1, made.trainer.max_epochs)
     if made.trainer.is_global_zero:
         with replacing(Path(cfg.run_dir, "config.yaml")) as path:
             OmegaConf.save(cfg, path)
     return made
+
+
+def _check_unfinished(done: int, epochs: int | None) -> None:
+    if epochs is not None and -1 < epochs <= done:
+        raise UsageError(
+            f"trainer.max_epochs must be above the {done} epochs that ckpt_path has behind it, got {epochs}"
+        )
 
 
 def tasks() -> list[str]:
@@ -99,13 +116,19 @@ def tasks() -> list[str]:
 
 
 def _make(cfg: DictConfig, part: str) -> Any:
+    with _naming(part):
+        try:
+            return instantiate(cfg[part])
+        except InstantiationException as error:
+            raise error.__cause__ or error from None
+
+
+@contextmanager
+def _naming(part: str) -> Iterator[None]:
     try:
-        return instantiate(cfg[part])
-    except InstantiationException as error:
-        cause = error.__cause__
-        if isinstance(cause, ValueError | TypeError | OSError | MisconfigurationException):
-            raise UsageError(f"{part}: {cause}") from error
-        raise
+        yield
+    except (ValueError, TypeError, OSError, MisconfigurationException) as error:
+        raise UsageError(f"{part}: {error}") from error
 
 
 def _check_words(name: str, words: list[str]) -> None:

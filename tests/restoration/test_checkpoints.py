@@ -19,7 +19,7 @@ def content(value: float = 1.0, task: str = "undistort"):
         "state_dict": weights,
         "task": task,
         "epoch": 3,
-        "constant_flow": (torch.ones(2, 3, 4), torch.ones(1, 3, 4)),
+        "flows": (torch.ones(2, 3, 4), torch.ones(1, 3, 4)),
     }
 
 
@@ -47,7 +47,7 @@ def test_what_is_saved_comes_back(path):
     assert found["epoch"] == 3
     for name, value in expected["state_dict"].items():
         assert torch.equal(found["state_dict"][name], value)
-    assert torch.equal(found["constant_flow"][0], expected["constant_flow"][0])
+    assert torch.equal(found["flows"][0], expected["flows"][0])
     assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
 
 
@@ -190,7 +190,7 @@ def test_a_file_of_something_else_is_refused(tmp_path, value):
 
 def test_the_weights_of_such_a_model_fit():
     model = nn.Sequential(nn.Linear(8, 8))
-    check_fits({"state_dict": model.state_dict()}, model)
+    check_fits({"state_dict": model.state_dict()}, model, Path("last.ckpt"))
 
 
 @pytest.mark.parametrize(
@@ -201,6 +201,7 @@ def test_the_weights_of_such_a_model_fit():
 def test_the_weights_of_another_model_do_not_fit(other):
     model = nn.Sequential(nn.Linear(8, 8))
     with pytest.raises(
-        CheckpointError, match=r"^ckpt_path must be a checkpoint of the model chosen with model=.* \d\."
+        CheckpointError,
+        match=r"^ckpt_path must be a checkpoint of the model that model= names, got last.ckpt, where \d\..* differs$",
     ):
-        check_fits({"state_dict": other.state_dict()}, model)
+        check_fits({"state_dict": other.state_dict()}, model, Path("last.ckpt"))

@@ -1,7 +1,6 @@
 import math
 from collections.abc import Callable
 from functools import partial
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -77,13 +76,6 @@ def trainer(tmp_path) -> Callable[..., Trainer]:
     )
 
 
-def alone(model: Restoration) -> Restoration:
-    """The model as if on one device."""
-    strategy = SimpleNamespace(reduce=lambda value, reduce_op: value)
-    model._trainer = SimpleNamespace(strategy=strategy)  # pyright: ignore[reportAttributeAccessIssue]
-    return model
-
-
 def mean_flow(pairs: list[Pair]) -> Tensor:
     """(2, H, W): the mean over the samples that are valid at a pixel, written the long way."""
     flow = torch.cat([pair.flow for pair in pairs]).double()
@@ -94,7 +86,7 @@ def mean_flow(pairs: list[Pair]) -> Tensor:
 def test_the_constant_flow_is_the_mean_of_the_valid_flows_of_the_training(trainer, distorted, held):
     model = Restoration(Flat, Undistort())
     trainer(max_epochs=1).fit(model, loader(distorted), loader(held))
-    found = alone(model).constant_flow(torch.empty(2, 2, *SIZE))
+    found = model.constant_flow(torch.empty(2, 2, *SIZE))
     expected = mean_flow(distorted)
     assert not torch.cat([pair.valid for pair in distorted]).all()
     assert_close(found, expected.expand(2, -1, -1, -1), rtol=0, atol=1e-5)
@@ -103,7 +95,7 @@ def test_the_constant_flow_is_the_mean_of_the_valid_flows_of_the_training(traine
 def test_the_constant_flow_of_two_epochs_is_the_mean_of_both(trainer, distorted):
     model = Restoration(Flat, Undistort())
     trainer(max_epochs=2).fit(model, loader(distorted))
-    assert_close(alone(model).constant_flow(distorted[0].flow)[0], mean_flow(2 * distorted), rtol=0, atol=1e-5)
+    assert_close(model.constant_flow(distorted[0].flow)[0], mean_flow(2 * distorted), rtol=0, atol=1e-5)
 
 
 def test_the_constant_flow_of_nothing_seen_is_zero(distorted):
@@ -115,7 +107,7 @@ def test_garbage_in_an_invalid_pixel_changes_no_constant_flow(trainer, distorted
     garbage = [pair._replace(flow=torch.where(pair.valid, pair.flow, 1e6)) for pair in distorted]
     model = Restoration(Flat, Undistort())
     trainer(max_epochs=1).fit(model, loader(garbage))
-    assert_close(alone(model).constant_flow(garbage[0].flow)[0], mean_flow(distorted), rtol=0, atol=1e-5)
+    assert_close(model.constant_flow(garbage[0].flow)[0], mean_flow(distorted), rtol=0, atol=1e-5)
 
 
 def test_the_constant_flow_survives_a_checkpoint(trainer, distorted, tmp_path):
@@ -128,7 +120,7 @@ def test_the_constant_flow_survives_a_checkpoint(trainer, distorted, tmp_path):
     trainer().validate(
         again, loader(distorted), ckpt_path=str(tmp_path / "last.ckpt"), verbose=False, weights_only=True
     )
-    assert_close(alone(again).constant_flow(distorted[0].flow)[0], mean_flow(distorted), rtol=0, atol=1e-5)
+    assert_close(again.constant_flow(distorted[0].flow)[0], mean_flow(distorted), rtol=0, atol=1e-5)
     assert_close(again.state_dict(), model.state_dict())
 
 

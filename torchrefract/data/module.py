@@ -46,8 +46,14 @@ class PairData(LightningDataModule):
         self.batch_size = check_count("batch_size", batch_size)
         self.workers = check_count("workers", workers, low=0)
         self.seed = check_count("seed", seed, low=0)
-        if len(train) < batch_size:  # pyright: ignore[reportArgumentType]  # a map-style dataset has a length
-            raise ValueError(f"batch_size must be at most the {len(train)} training frames, got {batch_size}")  # pyright: ignore[reportArgumentType]
+        self.check_ranks(1)
+
+    def check_ranks(self, ranks: int) -> None:
+        """Raise ValueError unless each of so many processes has frames for a batch."""
+        count = len(self.train) // ranks  # pyright: ignore[reportArgumentType]  # a map-style dataset has a length
+        if count < self.batch_size:
+            share = "" if ranks == 1 else f" that each of {ranks} processes has"
+            raise ValueError(f"batch_size must be at most the {count} training frames{share}, got {self.batch_size}")
 
     def train_dataloader(self) -> DataLoader[Frame]:
         """Batches of frames in an order of the epoch."""
@@ -65,6 +71,7 @@ class PairData(LightningDataModule):
 
     def _loader(self, frames: Dataset[Frame], *, training: bool) -> DataLoader[Frame]:
         ranks, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
+        self.check_ranks(ranks)
         # Every rank its own frames, none twice in training; Lightning sets the epoch.
         sampler = DistributedSampler(frames, ranks, rank, shuffle=training, seed=self.seed, drop_last=training)
         return DataLoader(

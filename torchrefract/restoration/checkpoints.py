@@ -1,6 +1,7 @@
 """Checkpoints: written whole or not at all, and looked at before they are used."""
 
 import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,9 @@ from pytorch_lightning.plugins.io import TorchCheckpointIO
 from torch import nn
 
 from torchrefract.restoration.files import replacing
+
+# What a damaged archive, or a file that is none, makes the readers raise.
+_DAMAGE = (zipfile.BadZipFile, pickle.UnpicklingError, EOFError, LookupError, OSError, RuntimeError, ValueError)
 
 
 class CheckpointError(Exception):
@@ -44,8 +48,12 @@ def read_checkpoint(path: Path, *, task: str) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(f"ckpt_path must be a checkpoint file, such as <run>/last.ckpt, got {path}")
     try:
+        # torch itself compares no checksum: a hole in the file would come back as other weights.
+        with zipfile.ZipFile(path) as archive:
+            if (damaged := archive.testzip()) is not None:
+                raise zipfile.BadZipFile(damaged)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except (RuntimeError, OSError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
+    except _DAMAGE as error:
         raise CheckpointError(f"ckpt_path must be a whole checkpoint, got {path}, which is damaged or none") from error
     if not isinstance(checkpoint, dict) or not {"state_dict", "task"} <= checkpoint.keys():
         raise CheckpointError(f"ckpt_path must be a checkpoint of torchrefract, got {path}")
@@ -54,10 +62,11 @@ def read_checkpoint(path: Path, *, task: str) -> dict[str, Any]:
     return checkpoint
 
 
-def check_fits(checkpoint: dict[str, Any], model: nn.Module) -> None:
-    """Raise CheckpointError unless the weights are those of such a model."""
+def check_fits(checkpoint: dict[str, Any], model: nn.Module, path: Path) -> None:
+    """Raise CheckpointError unless the weights of the checkpoint at `path` are those of such a model."""
     shapes = {name: value.shape for name, value in model.state_dict().items()}
     saved = {name: value.shape for name, value in checkpoint["state_dict"].items()}
-    if shapes != saved:
-        name = next(name for name in shapes.keys() | saved.keys() if shapes.get(name) != saved.get(name))
-        raise CheckpointError(f"ckpt_path must be a checkpoint of the model chosen with model=, but {name} differs")
+    if differing := sorted(name for name in shapes.keys() | saved.keys() if shapes.get(name) != saved.get(name)):
+        raise CheckpointError(
+            f"ckpt_path must be a checkpoint of the model that model= names, got {path}, where {differing[0]} differs"
+        )

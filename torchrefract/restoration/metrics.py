@@ -26,9 +26,11 @@ def psnr(restored: Tensor, clean: Tensor, valid: Tensor) -> Tensor:
 def ssim(restored: Tensor, clean: Tensor, valid: Tensor) -> Tensor:
     """(B,): structural similarity with an 11 x 11 Gaussian window; arguments as for `psnr`.
 
+    A window that reaches over pixels that do not count reads the clean ones there.
+
     Source: Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment", IEEE TIP 13 (2004).
     """
-    return masked_mean(ssim_map(restored.clamp(0, 1), clean, window_size=11), valid)
+    return masked_mean(ssim_map(torch.where(valid, restored.clamp(0, 1), clean), clean, window_size=11), valid)
 
 
 def endpoint_error(flow: Tensor, target: Tensor, valid: Tensor, *, size: tuple[int, int]) -> Tensor:

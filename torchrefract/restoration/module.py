@@ -13,6 +13,8 @@ from torchrefract.restoration.tasks import Restored, Task
 from torchrefract.types import Pair
 from torchrefract.warping.resample import warp
 
+_NOTHING: tuple[Tensor, ...] = (torch.zeros(0), torch.zeros(0))
+
 
 class Restoration(LightningModule):
     """A network that learns to restore pairs.
@@ -45,8 +47,8 @@ class Restoration(LightningModule):
         self.network = network(task.channels)
         self.lr, self.weight_decay, self.warmup_steps = lr, weight_decay, warmup_steps
         self.metric_size = (metric_size[0], metric_size[1])
-        # What a rival without eyes would answer: summed over the training set, and over how many frames.
-        self.flow_sum, self.flow_count = torch.zeros(0), torch.zeros(0)
+        # For a rival without eyes: flows summed on valid pixels, and how many; of all ranks, and new ones of this one.
+        self.flows, self.new_flows = _NOTHING, _NOTHING
 
     def forward(self, degraded: Tensor) -> Restored:
         """The restoration of images (B, 3, H, W) in [0, 1]."""
@@ -74,13 +76,20 @@ class Restoration(LightningModule):
             self._log("val", scores, batch, suffix=suffix)
         return restored._asdict()
 
+    def on_validation_start(self) -> None:
+        """The flows that the ranks have seen are put together, for the rival that needs them now."""
+        self._gather_flows()
+
+    def on_train_epoch_end(self) -> None:
+        """The flows that the ranks have seen are put together, for the checkpoint."""
+        self._gather_flows()
+
     def constant_flow(self, like: Tensor) -> Tensor:
         """The mean of the training set's flows on valid pixels, zero where there was none, in the shape of `like`."""
-        if self.flow_sum.shape != like.shape[1:]:
+        flow_sum, count = self.flows
+        if flow_sum.shape != like.shape[1:]:
             return torch.zeros_like(like)
-        total = self.flow_sum.to(like.device), self.flow_count.to(like.device)
-        flow_sum, flow_count = (self.trainer.strategy.reduce(value, reduce_op="sum") for value in total)
-        return (flow_sum / flow_count.clamp(min=1)).to(like.dtype).expand_as(like)
+        return (flow_sum / count.clamp(min=1)).to(like).expand_as(like)
 
     def configure_optimizers(self) -> Any:
         """AdamW with a warm-up and a cosine."""
@@ -92,11 +101,11 @@ class Restoration(LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The task, and the flows counted so far, go along."""
         checkpoint["task"] = self.task.name
-        checkpoint["constant_flow"] = (self.flow_sum, self.flow_count)
+        checkpoint["flows"] = self.flows
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The flows counted so far come back."""
-        self.flow_sum, self.flow_count = checkpoint["constant_flow"]
+        self.flows = checkpoint["flows"]
 
     def _scores(self, restored: Restored, pair: Pair) -> dict[str, Tensor]:
         scores = {"psnr": psnr(restored.image.detach(), pair.clean, pair.valid)}
@@ -110,8 +119,15 @@ class Restoration(LightningModule):
 
     def _count_flow(self, pair: Pair) -> None:
         weight = pair.valid.double()
-        added = (pair.flow.double() * weight).sum(dim=0), weight.sum(dim=0)
-        if self.flow_sum.shape != added[0].shape:
-            self.flow_sum, self.flow_count = added
-        else:
-            self.flow_sum, self.flow_count = self.flow_sum + added[0], self.flow_count + added[1]
+        self.new_flows = _add(self.new_flows, ((pair.flow.double() * weight).sum(dim=0), weight.sum(dim=0)))
+
+    def _gather_flows(self) -> None:
+        if len(self.new_flows[0]):
+            ranks = (self.trainer.strategy.reduce(value.to(self.device), reduce_op="sum") for value in self.new_flows)
+            self.flows, self.new_flows = _add(self.flows, tuple(ranks)), _NOTHING
+
+
+def _add(old: tuple[Tensor, ...], new: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    if old[0].shape != new[0].shape:
+        return new
+    return tuple(a.to(b.device) + b for a, b in zip(old, new, strict=True))

@@ -11,6 +11,8 @@ from torchrefract.restoration.metrics import masked_mean
 from torchrefract.types import Pair
 from torchrefract.warping.resample import warp
 
+_CELL = 4
+
 
 class Restored(NamedTuple):
     """A restoration of a batch."""
@@ -54,9 +56,11 @@ class Undistort(Task):
 
     def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
         """The degraded image looked up along the predicted flow."""
-        size = degraded.shape[2:]
-        coarse = F.avg_pool2d(prediction.float(), 4, ceil_mode=True)
-        smooth = F.interpolate(coarse, size=size, mode="bicubic", antialias=True)
+        height, width = degraded.shape[2:]
+        # Whole cells only, or the flow would be stretched along a side that 4 does not divide.
+        whole = F.pad(prediction.float(), (0, -width % _CELL, 0, -height % _CELL), mode="replicate")
+        coarse = F.avg_pool2d(whole, _CELL)
+        smooth = F.interpolate(coarse, size=whole.shape[2:], mode="bicubic", antialias=True)[:, :, :height, :width]
         flow = self.limit * torch.tanh(smooth) * _sizes(smooth)
         return Restored(warp(degraded, flow, padding="border")[0], flow)
 

@@ -20,12 +20,21 @@ class ResUNet(nn.Module):
         channels: to predict.
         encoder: a name known to segmentation-models-pytorch; "tu-…" is timm's.
 
+    Raises:
+        ValueError: an encoder that is not known, or not of this kind.
+
     Source: Ronneberger, Fischer, Brox, "U-Net", MICCAI 2015; He, Zhang, Ren, Sun, "Deep residual learning", CVPR 2016.
     """
 
     def __init__(self, channels: int, *, encoder: str = "tu-resnet34"):
         super().__init__()
-        self.network = smp.Unet(encoder, encoder_weights=None, in_channels=5, classes=channels)
+        try:
+            self.network = smp.Unet(encoder, encoder_weights=None, in_channels=5, classes=channels)
+        except (KeyError, RuntimeError) as error:
+            raise ValueError(
+                "encoder must be known to segmentation-models-pytorch, or to timm with tu- in front, and have features "
+                f"at five scales, got {encoder}"
+            ) from error
         for parameter in self.network.segmentation_head.parameters():
             nn.init.zeros_(parameter)
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # missing in torch's annotations

@@ -1,0 +1,136 @@
+"""What a whole effect costs, as a multiple of one bare F.grid_sample on the same frame.
+
+python benchmarks/effects.py [--size 1080x1920] [--batch 1] [--threads 2] [--repeats 15] [--real PATH]
+                             [--device cpu] [--out benchmarks/results/effects.json]
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from timing import (
+    COPY,
+    FEWEST_REPEATS,
+    GRID_SAMPLE,
+    Bar,
+    Candidate,
+    Conditions,
+    Timing,
+    measure,
+    references,
+    save,
+    table,
+)
+from torch import Tensor
+
+from torchrefract import LensDistortion, UniformFog
+from torchrefract.data.images import fit, read_image
+
+WHAT = (
+    "Whole effects through the public API, with a new draw in every call: effect(image) without gradients; 'all maps' "
+    "is degrade() with flow, valid, restore_flow and restore_valid; 'to params' asks for the gradient of every drawn "
+    "number (of a lens all 12 coefficients, so that none is skipped as zero), forward alone or forward and backward. "
+    "'radial' is a lens without decentring, which needs no Newton steps in the plane. On the CPU the bare grid_sample "
+    "threads over the batch alone; the effects use all threads on one frame too."
+)
+LENS, RADIAL, FOG = "LensDistortion", "LensDistortion radial", "UniformFog"
+LIMITS = {LENS: 20.0, FOG: 0.25}  # multiples of the bare grid_sample
+BARS = "bars for now, set for 1x3x1080x1920 float32 on 2 threads:"
+
+
+def main() -> None:
+    """Measure, print and save; where a bar does not hold it is said, and is no failure of this command."""
+    parser = _parser()
+    args = parser.parse_args()
+    torch.manual_seed(0)
+    try:
+        frame = _frame(args.real, args.size).expand(args.batch, -1, -1, -1).contiguous().to(args.device)
+    except (ValueError, RuntimeError) as error:
+        parser.error(str(error))
+    conditions = Conditions.now(frame, threads=args.threads, repeats=args.repeats)
+    print(WHAT, end="\n\n", flush=True)
+    timings = measure(candidates(frame), references=(GRID_SAMPLE, COPY), repeats=args.repeats, threads=args.threads)
+    held = bars(timings)
+    print(table(timings, conditions), "", BARS, *held, sep="\n")
+    save(args.out, timings, conditions, what=WHAT, bars=held)
+    print(f"written to {args.out}")
+
+
+def candidates(frame: Tensor) -> dict[str, Candidate]:
+    """What is compared on a frame (B, C, H, W), by name; the references come first."""
+    lens, fog = LensDistortion(), UniformFog()
+    radial = LensDistortion(p1_range=(0.0, 0.0), p2_range=(0.0, 0.0))
+    found = references(frame)
+    for name, effect in ((LENS, lens), (RADIAL, radial), (FOG, fog)):
+        found[name] = lambda effect=effect: effect(frame)
+    found[f"{LENS}, all maps"] = lambda: _all_maps(lens, frame)
+    for name, effect in ((LENS, lens), (RADIAL, radial), (FOG, fog)):
+        found[f"{name}, to params, forward"] = lambda effect=effect: _forward(effect, frame)
+        found[f"{name}, to params, forward + backward"] = _forward_and_backward(effect, frame)
+    return found
+
+
+def bars(timings: Sequence[Timing]) -> list[Bar]:
+    """The limits that hold for now, beside what was measured."""
+    ratios = {timing.name: timing.ratios[GRID_SAMPLE].median for timing in timings}
+    return [Bar(name, GRID_SAMPLE, limit, ratios[name]) for name, limit in LIMITS.items()]
+
+
+def _all_maps(lens: LensDistortion, frame: Tensor) -> tuple[Tensor | None, ...]:
+    made = lens.degrade(frame)
+    return made.image, made.flow, made.valid, made.restore_flow, made.restore_valid
+
+
+def _forward(effect: LensDistortion | UniformFog, frame: Tensor) -> tuple[Tensor, list[Tensor]]:
+    params = effect.sample(frame)
+    leaves = [value.detach().requires_grad_() if value.is_floating_point() else value for value in params]
+    made: Any = effect.apply(frame, type(params)(*leaves))
+    return made.image, [value for value in leaves if value.requires_grad]
+
+
+def _forward_and_backward(effect: LensDistortion | UniformFog, frame: Tensor) -> Callable[[], tuple[Tensor, ...]]:
+    upstream = torch.rand_like(frame)
+
+    def call() -> tuple[Tensor, ...]:
+        image, leaves = _forward(effect, frame)
+        return torch.autograd.grad(image, leaves, upstream)
+
+    return call
+
+
+def _frame(path: Path | None, size: tuple[int, int]) -> Tensor:
+    return torch.rand(1, 3, *size) if path is None else fit(read_image(path), size)[None]
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--size", type=_size, default=(1080, 1920), help="height x width of the frame, 1080x1920")
+    parser.add_argument("--batch", type=_count(1), default=1, help="frames at once, 1")
+    parser.add_argument("--threads", type=_count(1), default=2, help="threads of torch on the CPU, 2")
+    parser.add_argument("--repeats", type=_count(FEWEST_REPEATS), default=FEWEST_REPEATS, help="rounds, 15 or more")
+    parser.add_argument("--real", type=Path, help="a picture to use as the frame, instead of noise")
+    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"), help="cpu, or cuda")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "effects.json", help="the JSON")
+    return parser
+
+
+def _size(text: str) -> tuple[int, int]:
+    height, cross, width = text.partition("x")
+    if not (cross and height.isdecimal() and width.isdecimal() and int(height) and int(width)):
+        raise argparse.ArgumentTypeError(f"must be HEIGHTxWIDTH in px, got {text!r}")
+    return int(height), int(width)
+
+
+def _count(low: int) -> Callable[[str], int]:
+    def count(text: str) -> int:
+        if not text.isdecimal() or int(text) < low:
+            raise argparse.ArgumentTypeError(f"must be a whole number of at least {low}, got {text!r}")
+        return int(text)
+
+    return count
+
+
+if __name__ == "__main__":
+    main()

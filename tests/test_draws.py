@@ -48,11 +48,26 @@ def test_threefry_gives_the_known_answers_of_random123(key, counter, answer):
     assert threefry_of_whole_numbers(key, counter) == answer
 
 
-def test_threefry_agrees_with_whole_number_arithmetic_on_random_words():
-    table = torch.randint(WORD, (4, 50), generator=torch.Generator().manual_seed(0))
-    x, y = draws.threefry((table[0], table[1]), (table[2], table[3]))
+@pytest.mark.parametrize("count", [0, 1, 8, 9, 50])  # whole numbers, arrays and tensors each have their turn
+@pytest.mark.parametrize("mapped", [False, True], ids=["plain", "vmap"])
+def test_threefry_agrees_with_whole_number_arithmetic_on_random_words(count, mapped):
+    table = torch.randint(WORD, (4, count), generator=torch.Generator().manual_seed(count))
+
+    def draw(words: Tensor) -> Tensor:
+        return torch.stack(draws.threefry((words[0], words[1]), (words[2], words[3])))
+
+    found = torch.func.vmap(draw, in_dims=1, out_dims=1)(table) if mapped and count else draw(table)
     expected = [threefry_of_whole_numbers((a, b), (c, d)) for a, b, c, d in table.T.tolist()]
-    assert list(zip(x.tolist(), y.tolist(), strict=True)) == expected
+    assert list(map(tuple, found.T.tolist())) == expected
+
+
+def test_the_words_of_keys_and_counters_that_broadcast_are_those_of_each_pair():
+    keys, counters = torch.tensor([[3], [5]]), torch.tensor([[0, 1, 2]])
+    x, y = draws.threefry((keys, keys), (counters, torch.zeros_like(counters)))
+    assert x.shape == y.shape == (2, 3)
+    for i, key in enumerate((3, 5)):
+        for j in range(3):
+            assert (x[i, j].item(), y[i, j].item()) == threefry_of_whole_numbers((key, key), (j, 0))
 
 
 @pytest.mark.parametrize("seed", [0, 1, -1, 7, 2**31, 2**32 + 5, -(2**63), 2**63 - 1, 2**64 - 1, 2**64 + 5, -(10**30)])

@@ -7,14 +7,16 @@ Source: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 _WORD = 0xFFFFFFFF
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
+_FEW = 8  # up to so many, Python computes faster than numpy
 
 
 class Stream(NamedTuple):
@@ -74,10 +76,26 @@ def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tupl
     # For a compiler this is one operator: its hundreds of steps would take it a minute.
     if torch.compiler.is_compiling():
         return torch.ops.torchrefract.threefry(*key, *counter)
-    return _threefry(*key, *counter)
+    try:
+        arrays = [value.numpy() for value in (*key, *counter)]
+    except (TypeError, RuntimeError):  # on an accelerator, or inside torch.vmap
+        return _rounds(*key, *counter)
+    # Mostly a few numbers are drawn, and hundreds of operations on them take longest to start.
+    places = np.broadcast(*arrays)
+    if not 0 < places.size <= _FEW:
+        x, y = _rounds(*arrays)
+    else:
+        pairs = [_rounds(*map(int, words)) for words in places]
+        x, y = (np.array(words, dtype=np.int64).reshape(places.shape) for words in zip(*pairs, strict=True))
+    return torch.from_numpy(np.asarray(x)), torch.from_numpy(np.asarray(y))
 
 
 def _threefry(key0: Tensor, key1: Tensor, counter0: Tensor, counter1: Tensor) -> tuple[Tensor, Tensor]:
+    return _rounds(key0, key1, counter0, counter1)
+
+
+def _rounds(key0: Any, key1: Any, counter0: Any, counter1: Any) -> tuple[Any, Any]:
+    """The generator, on tensors or arrays alike."""
     keys = (key0, key1, key0 ^ key1 ^ _PARITY)
     x, y = counter0 + key0, counter1 + key1
     for group in range(5):

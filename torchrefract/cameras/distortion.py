@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrefract._checks import read
 
 POLYNOMIAL12 = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
-_NODES = 1024
+_NODES = 2048
 
 
 class Terms(NamedTuple):
@@ -20,6 +20,12 @@ class Terms(NamedTuple):
     radial: int = 6
     tangential: bool = True
     prism: bool = True
+    round: bool = True  # some lens of the batch may have radial terms only
+
+    @property
+    def bent(self) -> bool:
+        """Some lens of the batch may have other terms than radial ones."""
+        return self.tangential or self.prism
 
 
 ALL_TERMS = Terms()
@@ -39,18 +45,19 @@ class Jacobian(NamedTuple):
         return self.xx * self.yy - self.xy * self.yx
 
     def solve(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """J^-1 (a, b), with the determinant held away from zero."""
-        determinant = self.determinant
-        determinant = torch.where(determinant.abs() < 1e-6, 1e-6, determinant)
-        return (self.yy * a - self.xy * b) / determinant, (self.xx * b - self.yx * a) / determinant
+        """J^-1 (a, b), with the determinant held above zero."""
+        scale = 1 / self.determinant.clamp(min=1e-6)
+        return (self.yy * a - self.xy * b) * scale, (self.xx * b - self.yx * a) * scale
 
 
 def used_terms(coefficients: Tensor) -> Terms:
     """The terms that coefficients (B, 12) make use of: not zero, or asked for their gradient, or not to be read."""
-    used = None if coefficients.requires_grad else read(lambda: (coefficients != 0).any(dim=0))
-    if used is None:
+    values = None if coefficients.requires_grad else read(lambda: coefficients)
+    if values is None:
         return ALL_TERMS
-    return Terms(max((i + 1 for i in range(6) if used[i]), default=0), any(used[6:8]), any(used[8:]))
+    used = [any(row[i] for row in values) for i in range(12)]
+    radial = max((i + 1 for i in range(6) if used[i]), default=0)
+    return Terms(radial, any(used[6:8]), any(used[8:]), not all(any(row[6:]) for row in values))
 
 
 def distort_polynomial(x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms = ALL_TERMS) -> tuple[Tensor, Tensor]:
@@ -68,36 +75,14 @@ def distort_polynomial(x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms 
 
     Source: Brown, "Close-range camera calibration", Photogrammetric Engineering 37 (1971), with thin-prism terms.
     """
-    c = coefficients.unbind(1)
-    r2 = x * x + y * y
-    radial = _radial(r2, c, terms.radial)
-    x_d, y_d = x * radial, y * radial
-    if terms.tangential:
-        p1, p2 = c[6:8]
-        xy = 2 * x * y
-        x_d, y_d = x_d + p1 * xy + p2 * (r2 + 2 * x * x), y_d + p1 * (r2 + 2 * y * y) + p2 * xy
-    if terms.prism:
-        s1, s2, s3, s4 = c[8:]
-        x_d, y_d = x_d + r2 * (s1 + s2 * r2), y_d + r2 * (s3 + s4 * r2)
-    return x_d, y_d
+    return _distorted(x, y, coefficients.unbind(1), terms)[0]
 
 
 def jacobian_polynomial(x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms = ALL_TERMS) -> Jacobian:
     """The derivatives of `distort_polynomial` with respect to x and y."""
     c = coefficients.unbind(1)
-    r2 = x * x + y * y
-    radial, slope = _radial(r2, c, terms.radial), _radial_slope(r2, c, terms.radial)
-    xx, xy, yy = radial + 2 * x * x * slope, 2 * x * y * slope, radial + 2 * y * y * slope
-    yx = xy
-    if terms.tangential:
-        p1, p2 = c[6:8]
-        xx, yy, cross = xx + 2 * p1 * y + 6 * p2 * x, yy + 6 * p1 * y + 2 * p2 * x, 2 * (p1 * x + p2 * y)
-        xy, yx = xy + cross, yx + cross
-    if terms.prism:
-        s1, s2, s3, s4 = c[8:]
-        s_x, s_y = 2 * (s1 + 2 * s2 * r2), 2 * (s3 + 2 * s4 * r2)
-        xx, xy, yx, yy = xx + x * s_x, xy + y * s_x, yx + x * s_y, yy + y * s_y
-    return Jacobian(xx, xy, yx, yy)
+    _, r2, g = _distorted(x, y, c, terms)
+    return _slopes(x, y, r2, g, c, terms)
 
 
 def undistort_polynomial(
@@ -105,9 +90,9 @@ def undistort_polynomial(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The points that `distort_polynomial` maps to (x_d, y_d), without gradient, and which of them exist.
 
-    The radial part is inverted by a table and Newton steps (2, in float64 3), the rest by Newton steps in the plane (3,
-    in float64 4). A point
-    exists if the radial part still grows there, the map keeps its orientation and the residual vanishes.
+    A table gives the inverse of the radial part to 1e-6. From there go Newton steps: along the radius for a lens with
+    radial terms only (2, in float64 3), in the plane for others (3, in float64 5). A point exists if the radial part
+    still grows there, the map keeps its orientation and the residual vanishes.
 
     Args:
         x_d, y_d: (B, ...), on the plane z = 1.
@@ -120,21 +105,21 @@ def undistort_polynomial(
         exists: (B, ...), bool.
     """
     with torch.no_grad():
+        c = coefficients.unbind(1)
         r_d = (x_d * x_d + y_d * y_d).sqrt()
-        r = limit.undistort(r_d, coefficients, terms.radial)
-        scale = torch.where(r_d > torch.finfo(r_d.dtype).tiny, r / r_d, 1)
+        r = _radial_start(r_d, c, limit, terms)
+        scale = r / r_d.clamp(min=torch.finfo(r_d.dtype).tiny)
         x, y = scale * x_d, scale * y_d
-        bent = terms.tangential or terms.prism
-        if bent:
+        if terms.bent:
             x, y = _bend(x, y, x_d, y_d, coefficients, terms)
-        reached = distort_polynomial(x, y, coefficients, terms)
-        tolerance = 1e-12 if r_d.dtype is torch.float64 else 2e-6
-        error = tolerance * (1 + r_d)
-        exists = ((reached[0] - x_d).abs() <= error) & ((reached[1] - y_d).abs() <= error)
-        exists &= x * x + y * y <= limit.radius.square()
-        if bent:
-            exists &= jacobian_polynomial(x, y, coefficients, terms).determinant > 0
-        return x.nan_to_num(), y.nan_to_num(), exists
+        (reached_x, reached_y), r2, g = _distorted(x, y, c, terms)
+        # What must not be negative, in one number: comparisons are slow.
+        room = (1e-12 if r_d.dtype is torch.float64 else 2e-6) * (1 + r_d)
+        room = torch.minimum(room - (reached_x - x_d).abs(), room - (reached_y - y_d).abs())
+        room = torch.minimum(room, limit.radius.square() - (x * x + y * y))
+        if terms.bent:
+            room = torch.minimum(room, _slopes(x, y, r2, g, c, terms).determinant)
+        return x.nan_to_num(0, 0, 0), y.nan_to_num(0, 0, 0), room >= 0
 
 
 class RadialLimit(NamedTuple):
@@ -143,7 +128,8 @@ class RadialLimit(NamedTuple):
     radius: (B, 1, ...), the largest radius before distortion, on the plane z = 1.
     image_radius: (B, 1, ...), the largest radius after distortion that the table covers.
     folds: (B,), bool: the radial part stops growing there; otherwise it was only followed so far.
-    table: (B, 1025), the radius before distortion at equal steps from 0 to image_radius after it.
+    table: (B, 2049), the radius before distortion at r_d = image_radius (1 - (1 - i / 2048)^2): where the map folds,
+        the inverse grows as a square root, and on these nodes it is smooth.
     """
 
     radius: Tensor
@@ -151,24 +137,14 @@ class RadialLimit(NamedTuple):
     folds: Tensor
     table: Tensor
 
-    def undistort(self, r_d: Tensor, coefficients: Tensor, order: int) -> Tensor:
-        """The radius (B, ...) that the radial part maps to r_d, or `radius` where there is none."""
-        if order == 0:
-            return r_d.clone()
-        place = (r_d / self.image_radius * _NODES).nan_to_num(nan=_NODES).clamp(0, _NODES)
-        node = place.long().clamp(max=_NODES - 1)
+    def look_up(self, r_d: Tensor) -> Tensor:
+        """The radius (B, ...) that the radial part maps to r_d, from the table; `radius` where there is none."""
+        place = _NODES * (1 - (1 - r_d / self.image_radius).clamp(min=0).sqrt())
+        node = place.long().clamp(0, _NODES - 1)
         flat = node.flatten(1)
         low = self.table.gather(1, flat).view(node.shape)
         high = self.table.gather(1, flat + 1).view(node.shape)
-        r = torch.lerp(low, high, place - node)
-        c = coefficients.unbind(1)
-        for _ in range(_steps_for(r, 2)):
-            r2 = r * r
-            radial = _radial(r2, c, order)
-            growth = radial + 2 * r2 * _radial_slope(r2, c, order)
-            step = (r * radial - r_d) / growth.clamp(min=torch.finfo(r.dtype).eps)
-            r = torch.minimum((r - step).clamp(min=0), self.radius)
-        return r
+        return torch.lerp(low, high, place - node)
 
 
 def radial_limit(coefficients: Tensor, reach: Tensor, image_reach: Tensor) -> RadialLimit:
@@ -209,10 +185,10 @@ def _lattice(radius: Tensor, k: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
 
 
 def _inverse_table(r: Tensor, r_d: Tensor) -> Tensor:
-    even = r_d[:, -1:] * _steps(r[:, 0])
-    node = torch.searchsorted(r_d.contiguous(), even.contiguous()).clamp(1, _NODES)
+    nodes = r_d[:, -1:] * (1 - (1 - _steps(r[:, 0])).square())
+    node = torch.searchsorted(r_d.contiguous(), nodes.contiguous()).clamp(1, _NODES)
     low, high = r_d.gather(1, node - 1), r_d.gather(1, node)
-    share = ((even - low) / (high - low).clamp(min=torch.finfo(r.dtype).tiny)).clamp(0, 1)
+    share = ((nodes - low) / (high - low).clamp(min=torch.finfo(r.dtype).tiny)).clamp(0, 1)
     return torch.lerp(r.gather(1, node - 1), r.gather(1, node), share)
 
 
@@ -220,34 +196,94 @@ def _steps(like: Tensor) -> Tensor:
     return torch.arange(_NODES + 1, dtype=like.dtype, device=like.device) / _NODES
 
 
-def _steps_for(like: Tensor, steps: int) -> int:
-    return steps + 1 if like.dtype is torch.float64 else steps
+def _radial_start(r_d: Tensor, c: tuple[Tensor, ...], limit: RadialLimit, terms: Terms) -> Tensor:
+    """The inverse of the radial part: exact for lenses without other terms, to start from for the others."""
+    if terms.radial == 0:
+        return r_d
+    start = r = limit.look_up(r_d)
+    if not terms.round:
+        return start
+    for _ in range(3 if r.dtype is torch.float64 else 2):
+        r2 = r * r
+        radial = _radial(r2, c, terms.radial)
+        growth = radial + 2 * r2 * _radial_slope(r2, c, terms.radial)
+        step = (r * radial - r_d) / growth.clamp(min=torch.finfo(r.dtype).eps)
+        r = torch.minimum((r - step).clamp(min=0), limit.radius)
+    return torch.where(_is_bent(c), start, r) if terms.bent else r
 
 
 def _bend(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, coefficients: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:
     """(x, y) brought from the inverse of the radial part to that of the whole model."""
-    radial = x, y
-    for _ in range(_steps_for(x, 3)):
-        reached = distort_polynomial(x, y, coefficients, terms)
-        jacobian = jacobian_polynomial(x, y, coefficients, terms)
-        step_x, step_y = jacobian.solve(reached[0] - x_d, reached[1] - y_d)
+    c = coefficients.unbind(1)
+    straight = x, y
+    for _ in range(5 if x.dtype is torch.float64 else 3):
+        (reached_x, reached_y), r2, g = _distorted(x, y, c, terms)
+        step_x, step_y = _slopes(x, y, r2, g, c, terms).solve(reached_x - x_d, reached_y - y_d)
         x, y = x - step_x, y - step_y
-    # A sample without such terms keeps its bits, whatever its neighbors in the batch have.
-    bent = (coefficients[:, 6:] != 0).any(dim=1)
-    return torch.where(bent, x, radial[0]), torch.where(bent, y, radial[1])
+    if not terms.round:
+        return x, y
+    # A lens without such terms keeps its bits, whatever its neighbors in the batch have.
+    bent = _is_bent(c)
+    return torch.where(bent, x, straight[0]), torch.where(bent, y, straight[1])
+
+
+def _is_bent(c: tuple[Tensor, ...]) -> Tensor:
+    return torch.stack(c[6:]).ne(0).any(dim=0)
+
+
+def _distorted(
+    x: Tensor, y: Tensor, c: tuple[Tensor, ...], terms: Terms
+) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
+    """The distorted point, with r^2 and g.
+
+    x_d = x g + r^2 (p2 + s1 + s2 r^2),  y_d = y g + r^2 (p1 + s3 + s4 r^2),  g = 1 + sum k_i r^2i + 2 p1 y + 2 p2 x
+    """
+    p1, p2, s1, s2, s3, s4 = c[6:]
+    r2 = x * x + y * y
+    g = _radial(r2, c, terms.radial)
+    if not terms.bent:
+        return (x * g, y * g), r2, g
+    if terms.tangential:
+        g = g + 2 * p1 * y + 2 * p2 * x
+    a, b = (p2 + s1 + s2 * r2, p1 + s3 + s4 * r2) if terms.prism else (p2, p1)
+    return (x * g + r2 * a, y * g + r2 * b), r2, g
+
+
+def _slopes(x: Tensor, y: Tensor, r2: Tensor, g: Tensor, c: tuple[Tensor, ...], terms: Terms) -> Jacobian:
+    """The derivatives of the distorted point, by what `_distorted` has computed already."""
+    p1, p2, s1, s2, s3, s4 = c[6:]
+    slope = _radial_slope(r2, c, terms.radial)
+    along_x, along_y = slope * x, slope * y
+    cross = along_x * y
+    if not terms.bent:
+        return Jacobian(g + 2 * x * along_x, 2 * cross, 2 * cross, g + 2 * y * along_y)
+    if not terms.prism:
+        cross = 2 * (cross + p1 * x + p2 * y)
+        return Jacobian(g + 2 * x * (along_x + 2 * p2), cross, cross, g + 2 * y * (along_y + 2 * p1))
+    a, b = p2 + s1 + 2 * s2 * r2, p1 + s3 + 2 * s4 * r2
+    return Jacobian(
+        g + 2 * x * (along_x + (p2 + a)),
+        2 * (cross + p1 * x + a * y),
+        2 * (cross + b * x + p2 * y),
+        g + 2 * y * (along_y + (p1 + b)),
+    )
 
 
 def _radial(r2: Tensor, k: tuple[Tensor, ...], order: int) -> Tensor:
     """1 + sum k_i r^2i."""
-    value = torch.zeros_like(r2)
-    for i in reversed(range(order)):
-        value = r2 * (k[i] + value)
+    if order == 0:
+        return torch.ones_like(r2)
+    value = k[order - 1] * r2
+    for i in reversed(range(order - 1)):
+        value = (k[i] + value) * r2
     return 1 + value
 
 
 def _radial_slope(r2: Tensor, k: tuple[Tensor, ...], order: int) -> Tensor:
     """The derivative of `_radial` with respect to r^2: sum i k_i r^(2i - 2)."""
-    value = torch.zeros_like(r2)
-    for i in reversed(range(order)):
+    if order == 0:
+        return torch.zeros_like(r2)
+    value = order * k[order - 1]
+    for i in reversed(range(order - 1)):
         value = (i + 1) * k[i] + r2 * value
     return value

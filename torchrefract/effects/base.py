@@ -52,7 +52,7 @@ class Effect(nn.Module, ABC):
         Raises:
             ValueError, TypeError: arguments that do not fit.
         """
-        return self.apply(image, self.sample(image, seed=seed, keys=keys), depth=depth)
+        return self._run(image, self.sample(image, seed=seed, keys=keys), depth)
 
     def sample(
         self,
@@ -78,11 +78,8 @@ class Effect(nn.Module, ABC):
         if params is None and callable(image) and not isinstance(image, Tensor):
             return super().apply(cast(Callable[[nn.Module], None], image))
         check_image(image)
-        batched = enter(image)
-        self._check_params(params, batched)
-        result = self.compute(batched, params, _batched_depth(depth, image))
-        result.image = leave(result.image, image, untouched=result.image is batched)
-        return result if image.ndim == 4 else result.map(lambda value: value[0])
+        self._check_params(params, image if image.ndim == 4 else image[None])
+        return self._run(image, params, depth)
 
     params_type: type[Any]
 
@@ -97,6 +94,12 @@ class Effect(nn.Module, ABC):
     @abstractmethod
     def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """The batch (B, C, H, W), floating, degraded by checked parameters."""
+
+    def _run(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
+        batched = enter(image)
+        result = self.compute(batched, params, _batched_depth(depth, image))
+        result.image = leave(result.image, image, untouched=result.image is batched)
+        return result if image.ndim == 4 else result.map(lambda value: value[0])
 
     def _uniform(self, source: draws.Stream, ranges: Sequence[Range], image: Tensor) -> tuple[Tensor, Tensor]:
         """The gate, (B,), bool, and a value out of each range, (B, n)."""
@@ -159,7 +162,7 @@ class WarpEffect(Effect):
         if is_true(active.any) is False and not _learns(params):
             return _identity(image, params)
         flow, exists = self.flow(params, **size)
-        flow = _only(flow, torch.zeros_like(flow), active, params)
+        flow = _only(flow, 0.0, active, params)
         warped = look_up(image, flow, padding=self.padding, interpolation=self.interpolation)
 
         def valid() -> Tensor:
@@ -167,7 +170,7 @@ class WarpEffect(Effect):
 
         def restore() -> tuple[Tensor, Tensor]:
             back, known = self.restore_flow(params, **size)
-            back = _only(back, torch.zeros_like(back), active, params)
+            back = _only(back, 0.0, active, params)
             seen = look_up(result.valid.to(back.dtype), back, padding="zeros", interpolation="bilinear")
             # All pixels that the look-up mixes must be good, but for weights below a thousandth.
             return back, (known & inside(back) & (seen > 0.999)) | ~_column(active)
@@ -229,7 +232,7 @@ class _Swap(torch.autograd.Function):
         return None, gradient
 
 
-def _only(changed: Tensor, same: Tensor, active: Tensor, params: Any) -> Tensor:
+def _only(changed: Tensor, same: Tensor | float, active: Tensor, params: Any) -> Tensor:
     """`changed` for the active samples and `same`, bit for bit, for the others.
 
     A sample at strength zero keeps the gradient of its parameters: descent must be able to start there.

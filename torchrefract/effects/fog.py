@@ -82,7 +82,7 @@ class UniformFog(RadianceEffect):
         gate, values = self._uniform(source, [span, self.deviation_range], image)
         visibility = 1 / values[:, 0] if inverse else values[:, 0]
         airlight = torch.tensor(self._airlight(image.shape[1]), dtype=values.dtype, device=values.device)
-        return FogParams(gate, visibility, values[:, 1], airlight.expand(image.shape[0], -1))
+        return FogParams(gate, visibility, values[:, 1], airlight.repeat(image.shape[0], 1))
 
     def check(self, params: FogParams, image: Tensor) -> None:
         """Raise for fogs that are none."""
@@ -103,8 +103,9 @@ class UniformFog(RadianceEffect):
             depth = linear_depth(image.shape[2], self.max_depth, dtype=dtype, device=image.device)
         else:
             check_all("depth", "be at least 0, in m", depth, lambda v: v >= 0)
+            depth = depth.to(dtype).nan_to_num(nan=0.0, posinf=torch.inf).clamp(min=0)
         k = extinction(params.visibility.to(dtype), self.threshold) * (1 + params.deviation.to(dtype))
-        t = transmission(depth.to(dtype).nan_to_num(nan=0.0, posinf=torch.inf).clamp(min=0), k.view(-1, 1, 1, 1))
+        t = transmission(depth, k.view(-1, 1, 1, 1))
         airlight = params.airlight.to(dtype)[:, :, None, None]
         return Shaded(self._blend(image, t, airlight), valid=t >= 1 / 255, transmission=t)
 

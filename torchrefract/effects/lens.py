@@ -11,7 +11,7 @@ from torchrefract._checks import check_all, check_flag, check_range, is_true
 from torchrefract.cameras.distortion import POLYNOMIAL12
 from torchrefract.effects.base import WarpEffect, params_to
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow
-from torchrefract.types import Range
+from torchrefract.types import Degraded, Range
 
 _LARGEST_COEFFICIENT = 100.0
 _MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors are another model in another order)"
@@ -112,7 +112,11 @@ class LensDistortion(WarpEffect):
         )
         check_all("params.focal", "be positive and finite", params.focal, lambda v: (v > 0) & v.isfinite())
         check_all("params.center", "be finite", params.center, torch.isfinite)
+
+    def compute(self, image: Tensor, params: LensParams, depth: Tensor | None) -> Degraded:
+        """The batch looked up along the flow; a lens that folds is told."""
         self._check_fold(params, *image.shape[2:])
+        return super().compute(image, params, depth)
 
     def flow(self, params: LensParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
         """The flow of `lens_flow`, and where it exists."""

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torchrefract._checks import is_true
 from torchrefract.cameras.distortion import (
     RadialLimit,
     Terms,
@@ -40,14 +41,8 @@ def lens_flow(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: in
     """
     c, terms, x_d, y_d = _normalized(coefficients, focal, center, height, width)
     limit = frame_limit(coefficients, focal, center, height=height, width=width)
-    bands = [
-        undistort_polynomial(x_d.detach(), band, c.detach(), limit=limit, terms=terms)
-        for band in y_d.detach().split(_rows_at_once(x_d, height), dim=2)
-    ]
-    x, y, exists = (torch.cat(parts, dim=2) for parts in zip(*bands, strict=True))
-    if torch.is_grad_enabled() and (c.requires_grad or x_d.requires_grad):
-        x, y = _attach(x, y, x_d, y_d, c, terms)
-    return _as_flow(x - x_d, y - y_d, exists, x_d, y_d, focal), exists
+    bands = y_d.split(_rows_at_once(x_d, height), dim=2)
+    return _stacked([_flow_of_rows(x_d, rows, c, focal, limit, terms) for rows in bands])
 
 
 def lens_restore_flow(
@@ -61,12 +56,8 @@ def lens_restore_flow(
     """
     c, terms, x, y = _normalized(coefficients, focal, center, height, width)
     limit = frame_limit(coefficients, focal, center, height=height, width=width)
-    x_d, y_d = distort_polynomial(x, y, c, terms)
-    with torch.no_grad():
-        exists = x * x + y * y <= limit.radius.square()
-        if terms.tangential or terms.prism:
-            exists &= jacobian_polynomial(x, y, c, terms).determinant > 0
-    return _as_flow(x_d - x, y_d - y, exists, x, y, focal), exists
+    bands = y.split(_rows_at_once(x, height), dim=2)
+    return _stacked([_restore_flow_of_rows(x, rows, c, focal, limit, terms) for rows in bands])
 
 
 def frame_limit(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> RadialLimit:
@@ -110,6 +101,33 @@ def _rows_at_once(x: Tensor, height: int) -> int:
     return max(1, (1 << 16) // max(1, x.shape[0] * x.shape[3]))
 
 
+def _stacked(bands: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    if len(bands) == 1:
+        return bands[0]
+    flows, exists = zip(*bands, strict=True)
+    return torch.cat(flows, dim=2), torch.cat(exists, dim=2)
+
+
+def _flow_of_rows(
+    x_d: Tensor, y_d: Tensor, c: Tensor, focal: Tensor, limit: RadialLimit, terms: Terms
+) -> tuple[Tensor, Tensor]:
+    x, y, exists = undistort_polynomial(x_d.detach(), y_d.detach(), c.detach(), limit=limit, terms=terms)
+    if torch.is_grad_enabled() and (c.requires_grad or x_d.requires_grad):
+        x, y = _attach(x, y, x_d, y_d, c, terms)
+    return _as_flow(x - x_d, y - y_d, exists, x_d, y_d, focal), exists
+
+
+def _restore_flow_of_rows(
+    x: Tensor, y: Tensor, c: Tensor, focal: Tensor, limit: RadialLimit, terms: Terms
+) -> tuple[Tensor, Tensor]:
+    x_d, y_d = distort_polynomial(x, y, c, terms)
+    with torch.no_grad():
+        exists = x * x + y * y <= limit.radius.square()
+        if terms.bent:
+            exists &= jacobian_polynomial(x, y, c, terms).determinant > 0
+    return _as_flow(x_d - x, y_d - y, exists, x, y, focal), exists
+
+
 def _attach(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, c: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:
     """(x, y) with the gradient of the exact inverse: one Newton step of length zero, its Jacobian held fixed."""
     with torch.no_grad():
@@ -121,6 +139,7 @@ def _attach(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, c: Tensor, terms: Te
 
 
 def _as_flow(u: Tensor, v: Tensor, exists: Tensor, x: Tensor, y: Tensor, focal: Tensor) -> Tensor:
-    # Where there is no answer, look outward past every frame: padded, never extrapolated.
-    u, v = torch.where(exists, u, 2 * _REACH * x.detach()), torch.where(exists, v, 2 * _REACH * y.detach())
+    if not is_true(exists.all):
+        # Where there is no answer, look outward past every frame: padded, never extrapolated.
+        u, v = torch.where(exists, u, 2 * _REACH * x.detach()), torch.where(exists, v, 2 * _REACH * y.detach())
     return torch.cat([u, v], dim=1) * focal[:, :, None, None]

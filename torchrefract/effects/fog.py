@@ -8,7 +8,8 @@ from torch import Tensor
 
 from torchrefract import draws
 from torchrefract._checks import check_all, check_flag, check_number, check_range
-from torchrefract.effects.base import RadianceEffect, Shaded, params_to
+from torchrefract.effects.base import params_to
+from torchrefract.effects.radiance import RadianceEffect, Shaded
 from torchrefract.fields.fog import extinction, linear_depth, linear_to_srgb, srgb_to_linear, transmission, veil
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype

@@ -9,7 +9,8 @@ from torch import Tensor
 from torchrefract import draws
 from torchrefract._checks import check_all, check_flag, check_range, is_true
 from torchrefract.cameras.distortion import POLYNOMIAL12
-from torchrefract.effects.base import WarpEffect, params_to
+from torchrefract.effects.base import params_to
+from torchrefract.effects.refraction import WarpEffect
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow
 from torchrefract.types import Degraded, Range
 

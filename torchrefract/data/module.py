@@ -101,7 +101,7 @@ def road_scenes(
     *,
     effect: Effect,
     size: Sequence[int] = (64, 112),
-    train_count: int = 1024,
+    train_count: int = 512,
     val_count: int = 128,
     batch_size: int = 16,
     workers: int = 2,

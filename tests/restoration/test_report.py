@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.image
@@ -161,6 +162,13 @@ def test_both_flows_have_the_scale_of_the_longest_valid_true_flow_and_the_key_st
         assert (column[0] - expected).abs().max() <= 0.5 / 255 + 1e-6
     assert texts(figure)[3:5] == ["true flow", "predicted flow"]
     assert "full color = 37 px at 10x8" in texts(figure)
+
+
+def test_the_stripes_are_explained_where_there_are_any():
+    striped, whole = rows(), replace(rows(), valid=torch.ones(2, 1, 8, 10, dtype=torch.bool))
+    line = "not valid: lost in the corrupted image"
+    assert line in texts(_panel(striped))
+    assert line not in texts(_panel(whole))
 
 
 def test_a_prediction_without_truth_has_its_own_scale():

@@ -261,9 +261,10 @@ class _Page(NamedTuple):
 def _draw_key(figure: Figure, page: _Page, rows: PanelRows, scale: float) -> None:
     """A stripe below all rows: what hatching means and, where there is flow, the color wheel with its scale."""
     text, y = page.text, page.top(page.rows) - page.text
-    stripes = _hatch(torch.zeros(1, 3, page.height, page.width), torch.zeros(1, 1, 1, 1, dtype=torch.bool))[0]
-    page.show(figure, stripes[:, : 2 * text, : 3 * text], page.left(0), y + text)
-    page.write(figure, "not valid: lost in the corrupted image", page.left(0) + 4 * text, y + round(2.5 * text))
+    if not rows.valid.all():
+        stripes = _hatch(torch.zeros(1, 3, page.height, page.width), torch.zeros(1, 1, 1, 1, dtype=torch.bool))[0]
+        page.show(figure, stripes[:, : 2 * text, : 3 * text], page.left(0), y + text)
+        page.write(figure, "not valid: lost in the corrupted image", page.left(0) + 4 * text, y + round(2.5 * text))
     if rows.flow is None and rows.predicted_flow is None:
         return
     height, width = rows.clean.shape[2:]

@@ -54,7 +54,7 @@ def test_every_task_makes_its_data_and_its_model(tmp_path, task):
     assert isinstance(data, PairData)
     assert isinstance(model, Restoration)
     assert model.task.name == task
-    assert (data.seed, len(data.train), len(data.val)) == (5, 1024, 128)  # pyright: ignore[reportArgumentType]
+    assert (data.seed, len(data.train), len(data.val)) == (5, 512, 128)  # pyright: ignore[reportArgumentType]
     assert data.effect.extra_repr() == getattr(presets, cfg.scene._target_.rsplit(".", 1)[1])().extra_repr()
 
 
@@ -66,7 +66,7 @@ def test_every_trainer_writes_into_the_run_folder(tmp_path, trainer):
     assert made.checkpoint_callback.dirpath == str(tmp_path)  # pyright: ignore[reportAttributeAccessIssue]
     assert made.logger is not None
     assert Path(made.logger.log_dir or "") == tmp_path
-    assert made.max_epochs == 8
+    assert made.max_epochs == 6
     assert type(made.strategy).__name__ == {"cpu": "SingleDeviceStrategy", "ddp": "DDPStrategy"}[trainer]
 
 

@@ -16,6 +16,9 @@ from torch import Tensor
 _WORD = 0xFFFFFFFF
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
+# Odd constants of the hash, as int32: 2^32 over the golden ratio, and the two of lowbias32.
+_HASH = (0x9E3779B1 - 2**32, 0x7FEB352D, 0x846CA68B - 2**32)
+_CACHED = 1 << 16  # numbers that stay in a core's cache
 _FEW = 8  # up to so many, Python computes faster than numpy
 
 
@@ -66,6 +69,30 @@ def normal(source: Stream, count: int) -> Tensor:
     return torch.cat([radius * angle.cos(), radius * angle.sin()], dim=1)[:, :count]
 
 
+def noise_key(source: Stream) -> Tensor:
+    """(B, 4), int64, in [0, 2^32): what the white noise of each sample comes from."""
+    child = fold(source)
+    zero = torch.zeros_like(child.low)
+    return torch.stack([child.high, child.low, *threefry((child.high, child.low), (zero, zero))], dim=1)
+
+
+def noise(key: Tensor, count: int) -> Tensor:
+    """(B, 2, count), float32, white noise, standard normal, up to 5.8 in magnitude.
+
+    For millions of numbers: the i-th pair of a sample is a hash of i under its key, two rounds of multiply and
+    xor-shift on 32 bits, and Box and Muller's transform of it.
+
+    Args:
+        key: (B, 4), int64, of `noise_key`.
+        count: pairs to a sample.
+
+    Source: Wellons, "Prospecting for hash functions" (2018), for the constants; Box and Muller 1958.
+    """
+    if torch.compiler.is_compiling():
+        return torch.ops.torchrefract.noise(key, count)
+    return _noise(key, count)
+
+
 def call_seed() -> Tensor:
     """(), int64: a fresh seed from torch's global generator, in eager mode and under torch.compile alike."""
     return torch.ops.torchrefract.call_seed()
@@ -109,6 +136,26 @@ def _rounds(key0: Any, key1: Any, counter0: Any, counter1: Any) -> tuple[Any, An
     return x, y & _WORD
 
 
+def _noise(key: Tensor, count: int) -> Tensor:
+    # As int32, whose products drop what does not fit; a key above 2^31 is a negative number there.
+    a, b, c, d = (key - (key >> 31 << 32)).to(torch.int32)[:, :, None].unbind(1)
+    at_once = max(1, _CACHED // max(1, len(key)) if key.device.type == "cpu" else count)
+    parts = []
+    for start in range(0, count, at_once):
+        index = torch.arange(start, min(start + at_once, count), dtype=torch.int32, device=key.device) * _HASH[0]
+        uniform = (_hash(index, a, b) >> 9 & 0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
+        radius, angle = uniform.log_().mul_(-2).sqrt_(), _hash(index, c, d).float().mul_(math.pi * 2.0**-31)
+        parts.append(torch.stack([radius * angle.cos(), radius * angle.sin()], dim=1))
+    return torch.cat(parts, dim=2) if parts else torch.empty(key.shape[0], 2, 0, device=key.device)
+
+
+def _hash(index: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    x = index + a
+    x = (x ^ x >> 16 & 0xFFFF) * _HASH[1] + b
+    x = (x ^ x >> 15 & 0x1FFFF) * _HASH[2]
+    return x ^ x >> 16 & 0xFFFF
+
+
 def _words(value: Tensor) -> tuple[Tensor, Tensor]:
     value = value.long()
     return (value >> 32) & _WORD, value & _WORD
@@ -132,3 +179,11 @@ _threefry_op = torch.library.custom_op("torchrefract::threefry", _threefry, muta
 def _(key0: Tensor, key1: Tensor, counter0: Tensor, counter1: Tensor) -> tuple[Tensor, Tensor]:
     shape = torch.broadcast_shapes(key0.shape, key1.shape, counter0.shape, counter1.shape)
     return counter0.new_empty(shape), counter0.new_empty(shape)
+
+
+_noise_op = torch.library.custom_op("torchrefract::noise", _noise, mutates_args=())
+
+
+@_noise_op.register_fake
+def _(key: Tensor, count: int) -> Tensor:
+    return key.new_empty((key.shape[0], 2, count), dtype=torch.float32)

@@ -1,0 +1,57 @@
+"""How the values of a random field hang together over a distance."""
+
+import math
+
+import torch
+from torch import Tensor
+
+# Lengths after which less than 4e-4 is left of each covariance.
+REACH = {"exponential": 8.0, "gaussian": 5.0, "matern32": 6.0, "matern52": 6.0}
+COVARIANCES = tuple(REACH)
+# nu of the Matern covariances, of which the exponential one is the roughest.
+_SMOOTHNESS = {"exponential": 0.5, "matern32": 1.5, "matern52": 2.5}
+
+
+def covariance(distance: Tensor, length: Tensor, kind: str) -> Tensor:
+    """C(h), with C(0) = 1, at distances h in px for a correlation length l in px; the two broadcast.
+
+        exponential  exp(-h / l)                       gaussian  exp(-h^2 / (2 l^2))
+        matern32     (1 + a) exp(-a), a = sqrt(3) h / l
+        matern52     (1 + a + a^2 / 3) exp(-a), a = sqrt(5) h / l
+
+    Source: Rasmussen and Williams, "Gaussian processes for machine learning" (2006), section 4.2.
+    """
+    h = distance / length
+    if kind == "gaussian":
+        return torch.exp(-0.5 * h * h)
+    if kind == "exponential":
+        return torch.exp(-h)
+    if kind == "matern32":
+        a = math.sqrt(3) * h
+        return (1 + a) * torch.exp(-a)
+    a = math.sqrt(5) * h
+    return (1 + a + a * a / 3) * torch.exp(-a)
+
+
+def slope_rms(length: Tensor, *, kind: str, aperture: Tensor | None = None) -> Tensor:
+    """(B,), 1/px: the root mean square of the difference between neighboring pixels of a field of variance 1.
+
+        sqrt(2 (1 - C(1) / C(0))),  C smoothed by the aperture a twice, for which it is a sum of Gaussians:
+        C(h) = sum w s / (s + 2 a^2) exp(-h^2 / (2 (s + 2 a^2))),  s = l^2 t / nu,
+        w = t^nu exp(-t) over equal steps of ln t
+
+    An aperture below half a pixel smooths pixels by less than this, up to a tenth.
+
+    Args:
+        length: (B,), px.
+        kind: one of COVARIANCES.
+        aperture: (B,), px.
+    """
+    variance = length.double()[:, None].square()
+    weight = torch.ones_like(variance)
+    if kind != "gaussian":
+        t = torch.arange(-60.0, 5.0, 0.5, dtype=torch.float64, device=length.device).exp()
+        weight, variance = t ** _SMOOTHNESS[kind] * torch.exp(-t), variance * t / _SMOOTHNESS[kind]
+    spread = variance if aperture is None else variance + 2 * aperture.double()[:, None].square()
+    weight = weight * variance / spread
+    return (-2 * (weight * torch.expm1(-0.5 / spread)).sum(dim=1) / weight.sum(dim=1)).sqrt()

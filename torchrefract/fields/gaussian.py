@@ -1,0 +1,257 @@
+"""Gaussian random fields, sampled exactly on a torus that the frame is cut out of."""
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrefract.fields.covariance import REACH, covariance
+
+# Room round the torus in apertures: a smoothed field is correlated over sqrt(2) of them.
+_APERTURE_REACH = 6.0
+# Larger tori cost gigabytes. With less room the covariance is off by up to twice what `Spectrum.clipped` tells.
+_MOST_POINTS = 1 << 24
+_ROUNDING = 1e-13  # of the transform, relative to the largest eigenvalue
+_CACHED = 1 << 16  # complex numbers that stay in a core's cache
+
+
+class Spectrum(NamedTuple):
+    """The eigenvalues of a covariance on a torus, ready to shape white noise."""
+
+    amplitude: Tensor  # (B, Ht / 2 + 1, Wt / 2 + 1): what noise of variance 1 is multiplied by, at each frequency
+    clipped: Tensor  # (B,): negative eigenvalues that were set to zero, as a share of all
+
+
+def torus(height: int, width: int, *, length: float, kind: str, aperture: float = 0.0) -> tuple[int, int]:
+    """(Ht, Wt), px: a torus on which opposite edges of a frame have lost sight of each other.
+
+    Args:
+        height, width: of the frame, px.
+        length: the longest correlation length, px.
+        kind: of the covariance.
+        aperture: the widest, px.
+    """
+    # A frame as large as the cap still gets some room: its edges must not join.
+    most = max(_MOST_POINTS, 2 * height * width)
+    room = math.ceil(min(math.hypot(REACH[kind] * length, _APERTURE_REACH * aperture), most))
+    size = _fast_size(height + room), _fast_size(width + room)
+    if size[0] * size[1] <= most:
+        return size
+    # The room for which (height + room) (width + room) is the most that is allowed.
+    half = (height + width) / 2
+    room = math.floor(math.sqrt(half * half - height * width + most) - half)
+    return _fast_size_below(height + room, height), _fast_size_below(width + room, width)
+
+
+def spectrum(
+    size: tuple[int, int], length: Tensor, *, kind: str, aperture: Tensor | None = None, dtype: torch.dtype
+) -> Spectrum:
+    """The spectrum of a covariance on a torus, normalized to variance 1.
+
+    The eigenvalues are the discrete Fourier transform of the covariance at the distances on the torus, multiplied by
+    exp(-(k a)^2) for an aperture a: the field is then smoothed by a Gaussian of standard deviation a.
+
+    Args:
+        size: (Ht, Wt), even, of the torus.
+        length: (B,), px.
+        kind: one of COVARIANCES.
+        aperture: (B,), px.
+        dtype: of the amplitude.
+
+    Source: Dietrich and Newsam, "Fast and exact simulation of stationary Gaussian processes through circulant embedding
+    of the covariance matrix", SIAM J. Sci. Comput. 18 (1997).
+    """
+    if torch.compiler.is_compiling() or len(length) < 2:
+        return _spectrum(size, length, kind=kind, aperture=aperture, dtype=dtype)
+    # Transforms and sums of several samples round in another way than those of one.
+    apertures = [None] * len(length) if aperture is None else aperture.split(1)
+    parts = [
+        _spectrum(size, one, kind=kind, aperture=wide, dtype=dtype)
+        for one, wide in zip(length.split(1), apertures, strict=True)
+    ]
+    return Spectrum(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+def gaussian_random_field(noise: Tensor, shape: Tensor, *, height: int, width: int) -> Tensor:
+    """Two independent fields (B, 2, H, W) of mean 0 and variance 1, with the covariance that a spectrum stands for.
+
+        field = Re, Im of sum_k amplitude_k (n1_k + i n2_k) exp(-2 pi i k . p / size)
+
+    Args:
+        noise: (B, 2, Ht, Wt), white, standard normal, for each frequency of the torus.
+        shape: (B, Ht / 2 + 1, Wt / 2 + 1), the amplitude of a `Spectrum`.
+        height, width: of the frame, at most Ht and Wt.
+    """
+    if torch.compiler.is_compiling():  # the compiler knows no complex numbers
+        return torch.ops.torchrefract.gaussian_random_field(noise, shape, height, width)
+    return _fields(noise, shape, height, width)
+
+
+def _spectrum(
+    size: tuple[int, int], length: Tensor, *, kind: str, aperture: Tensor | None, dtype: torch.dtype
+) -> Spectrum:
+    # The covariance is even along both axes, so a quarter of it holds everything. Smooth ones need float64: their
+    # eigenvalues span sixteen powers of ten.
+    length = length.double()[:, None, None]
+    y, x = (torch.arange(n // 2 + 1, dtype=torch.float64, device=length.device) for n in size)
+    y = y[:, None]
+    # A smooth covariance of the shortest way round the torus has a kink half-way, and so negative eigenvalues. Summed
+    # over the ways round it has none; on a torus too short for it, the sum would be off by more.
+    others = (REACH[kind] * length <= min(size)).double()
+    if kind == "gaussian":  # a product of two functions of one axis
+        rows, columns = (
+            covariance(t, length, kind) + others * (covariance(n - t, length, kind) + covariance(n + t, length, kind))
+            for t, n in ((y, size[0]), (x, size[1]))
+        )
+        values = _transform(rows, size[0], -2) * _transform(columns, size[1], -1)
+    else:
+        values = covariance((x * x + y * y).sqrt(), length, kind)
+        if kind != "exponential":
+            x2, y2, far_x2, far_y2 = x * x, y * y, (size[1] - x).square(), (size[0] - y).square()
+            squares = (far_x2 + y2, x2 + far_y2, far_x2 + far_y2)
+            values = values + others * sum(covariance(square.sqrt(), length, kind) for square in squares)
+        values = _transform(_transform(values, size[1], -1), size[0], -2)
+    # What rounding leaves is no eigenvalue: the slope of its root would be anything.
+    values = torch.where(values.abs() > _ROUNDING * values.amax(dim=(1, 2), keepdim=True), values, 0)
+    if aperture is not None:
+        a = (2 * math.pi * aperture.double()[:, None, None]).square()
+        values = values * torch.exp(-a * (y / size[0]).square()) * torch.exp(-a * (x / size[1]).square())
+    count = _multiplicity(size[0], length.device)[:, None] * _multiplicity(size[1], length.device)
+    total = (count * values.abs()).sum(dim=(1, 2))
+    kept = values.clamp(min=0)
+    variance = (count * kept).sum(dim=(1, 2), keepdim=True)  # of all points of the torus together
+    share = kept / variance
+    # The root of zero has no slope, and a frequency that is not there needs none.
+    amplitude = torch.where(share > 0, share, 1).sqrt() * (share > 0)
+    return Spectrum(amplitude.to(dtype), (1 - variance[:, 0, 0] / total).to(dtype))
+
+
+def _transform(values: Tensor, count: int, dim: int) -> Tensor:
+    """The real Fourier transform of an even, periodic sequence of `count`, half of which is given and returned."""
+    if torch.compiler.is_compiling():
+        return torch.ops.torchrefract.even_transform(values, count, dim)
+    return _even_transform(values, count, dim)
+
+
+def _even_transform(values: Tensor, count: int, dim: int) -> Tensor:
+    return torch.fft.hfft(values, n=count, dim=dim).narrow(dim, 0, count // 2 + 1)
+
+
+def _fields(noise: Tensor, shape: Tensor, height: int, width: int) -> Tensor:
+    parts = [_field(*one, height, width) for one in zip(noise.split(1), shape.split(1), strict=True)]
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def _field(noise: Tensor, shape: Tensor, height: int, width: int) -> Tensor:
+    rows, columns = noise.shape[2:]
+    shape = _whole(shape, -1)
+    place = torch.arange(rows, device=noise.device)
+    place = torch.minimum(place, rows - place)
+    # Rows and then columns at a time stay in the cache, and only what the frame needs is kept of them.
+    at_once = _at_once(noise, columns)
+    parts = []
+    for index, part in zip(place.split(at_once), noise.split(at_once, dim=2), strict=True):
+        weighted = part * shape[:, index].unsqueeze(1)
+        parts.append(torch.fft.fft(torch.complex(weighted[:, 0], weighted[:, 1]), dim=2)[:, :, :width])
+    parts = torch.cat(parts, dim=1).split(_at_once(noise, rows), dim=2)
+    parts = [torch.view_as_real(torch.fft.fft(part, dim=1)[:, :height]).movedim(-1, 1) for part in parts]
+    return torch.cat(parts, dim=3)
+
+
+def _whole(half: Tensor, dim: int) -> Tensor:
+    """An even, periodic sequence, half of which is given."""
+    return torch.cat([half, half.narrow(dim, 1, half.shape[dim] - 2).flip(dim)], dim=dim)
+
+
+def _at_once(noise: Tensor, count: int) -> int:
+    """How many lines of `count` points go through the cache together."""
+    return noise.shape[2] * noise.shape[3] if noise.device.type != "cpu" else max(1, _CACHED // count)
+
+
+def _multiplicity(count: int, device: torch.device) -> Tensor:
+    """How often each value of a half stands in the whole."""
+    times = torch.full((count // 2 + 1,), 2.0, dtype=torch.float64, device=device)
+    times[0] = times[-1] = 1
+    return times
+
+
+def _fast_size(least: int) -> int:
+    """The smallest even number from `least` on that has no prime factor above 7."""
+    size = max(2, least + least % 2)
+    while not _is_smooth(size):
+        size += 2
+    return size
+
+
+def _fast_size_below(most: int, least: int) -> int:
+    """The largest such number up to `most`, or where that is below `least`, the smallest from there on."""
+    sizes = range(most - most % 2, max(least, 2) - 1, -2)
+    return next(filter(_is_smooth, sizes), _fast_size(least))
+
+
+def _is_smooth(size: int) -> bool:
+    return 210**64 % size == 0
+
+
+@torch.library.custom_op("torchrefract::even_transform", mutates_args=())
+def _even_transform_op(values: Tensor, count: int, dim: int) -> Tensor:
+    return _even_transform(values, count, dim).contiguous()
+
+
+@_even_transform_op.register_fake
+def _(values: Tensor, count: int, dim: int) -> Tensor:
+    return torch.empty_like(values, memory_format=torch.contiguous_format)
+
+
+def _keep_even_transform(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    ctx.count, ctx.dim = inputs[1:]
+
+
+def _even_transform_gradient(ctx: Any, slope: Tensor) -> tuple[Tensor, None, None]:
+    times = _multiplicity(ctx.count, slope.device)
+    times = times if ctx.dim == -1 else times[:, None]
+    return times * torch.ops.torchrefract.even_transform(slope / times, ctx.count, ctx.dim), None, None
+
+
+_even_transform_op.register_autograd(_even_transform_gradient, setup_context=_keep_even_transform)
+
+
+@torch.library.custom_op("torchrefract::gaussian_random_field", mutates_args=())
+def _field_op(noise: Tensor, shape: Tensor, height: int, width: int) -> Tensor:
+    return _fields(noise, shape, height, width)
+
+
+@_field_op.register_fake
+def _(noise: Tensor, shape: Tensor, height: int, width: int) -> Tensor:
+    return noise.new_empty((noise.shape[0], 2, height, width))
+
+
+@torch.library.custom_op("torchrefract::gaussian_random_field_gradients", mutates_args=())
+def _field_gradients(slope: Tensor, noise: Tensor, shape: Tensor) -> tuple[Tensor, Tensor]:
+    """What `_fields` passes back from the slope (B, 2, H, W) to its two inputs."""
+    size = noise.shape[2:]
+    weighted = torch.fft.fft2(torch.complex(slope[:, 0], -slope[:, 1]), s=tuple(size)).conj()
+    weighted = torch.view_as_real(weighted.resolve_conj()).movedim(-1, 1)
+    quarter = (noise * weighted).sum(dim=1)
+    for dim, count in ((1, size[0]), (2, size[1])):
+        half, mirrored = quarter.split([count // 2 + 1, count // 2 - 1], dim=dim)
+        inner = half.narrow(dim, 1, count // 2 - 1) + mirrored.flip(dim)
+        quarter = torch.cat([half.narrow(dim, 0, 1), inner, half.narrow(dim, count // 2, 1)], dim=dim)
+    return (_whole(_whole(shape, -1), -2).unsqueeze(1) * weighted).contiguous(), quarter
+
+
+@_field_gradients.register_fake
+def _(slope: Tensor, noise: Tensor, shape: Tensor) -> tuple[Tensor, Tensor]:
+    return noise.new_empty(noise.shape), shape.new_empty(shape.shape)
+
+
+def _keep_field(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    ctx.save_for_backward(*inputs[:2])
+
+
+def _field_gradient(ctx: Any, slope: Tensor) -> tuple[Tensor, Tensor, None, None]:
+    return *torch.ops.torchrefract.gaussian_random_field_gradients(slope, *ctx.saved_tensors), None, None
+
+
+_field_op.register_autograd(_field_gradient, setup_context=_keep_field)

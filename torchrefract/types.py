@@ -9,6 +9,17 @@ from torch import Tensor
 Range = tuple[float, float]
 
 
+Map = Tensor | Callable[[], Tensor]
+
+
+class Inverse(NamedTuple):
+    """The flow that undoes a warp."""
+
+    flow: Tensor  # (B, 2, H, W), px
+    valid: Tensor  # (B, 1, H, W), bool: where it does
+    residual: Map  # (B, 1, H, W), px: by how much it misses
+
+
 class Frame(NamedTuple):
     """A clean frame, or a batch of them, before any corruption.
 
@@ -47,8 +58,13 @@ class Degraded:
     valid: (B, 1, H, W), bool, the pixels that show what the clean image holds.
     restore_flow: (B, 2, H, W), px, warp(image, restore_flow) = clean on restore_valid; None without a flow.
     restore_valid: (B, 1, H, W), bool; None without a flow.
+    restore_residual: (B, 1, H, W), px, how far from its place each pixel is looked up when both flows are applied;
+        None without a flow.
     transmission: (B, 1, H, W) in [0, 1], the share of the clean light that arrives; None without such a map.
     intensity: (B, 1, H, W), light added; None without such a map.
+
+    Each map is given as a tensor or as a function that computes it. Those that can be None are typed Any: whoever knows
+    the effect knows which maps it has.
     """
 
     def __init__(
@@ -56,58 +72,96 @@ class Degraded:
         image: Tensor,
         params: Any,
         *,
-        valid: Callable[[], Tensor],
-        flow: Tensor | None = None,
-        restore: Callable[[], tuple[Tensor, Tensor]] | None = None,
-        transmission: Tensor | None = None,
-        intensity: Tensor | None = None,
+        valid: Map,
+        flow: Map | None = None,
+        restore: Callable[[], Inverse] | None = None,
+        transmission: Map | None = None,
+        intensity: Map | None = None,
     ):
         self.image = image
         self.params = params
-        self.flow = flow
-        self.transmission = transmission
-        self.intensity = intensity
-        self._valid = valid
+        self._maps: dict[str, Map | None] = {
+            "valid": valid,
+            "flow": flow,
+            "transmission": transmission,
+            "intensity": intensity,
+        }
         self._restore = restore
 
-    @cached_property
+    @property
     def valid(self) -> Tensor:
         """Where the image shows what the clean one holds."""
-        return self._valid()
+        return cast(Tensor, self._read("valid"))
+
+    @property
+    def flow(self) -> Any:
+        """The flow that makes the image from the clean one."""
+        return self._read("flow")
+
+    @property
+    def transmission(self) -> Any:
+        """The share of the clean light that arrives."""
+        return self._read("transmission")
+
+    @property
+    def intensity(self) -> Any:
+        """Light added."""
+        return self._read("intensity")
+
+    @property
+    def restore_flow(self) -> Any:
+        """The flow that undoes the damage."""
+        return None if self._restored is None else self._restored.flow
+
+    @property
+    def restore_valid(self) -> Any:
+        """Where it does."""
+        return None if self._restored is None else self._restored.valid
+
+    @property
+    def restore_residual(self) -> Any:
+        """By how much it misses, in px."""
+        if self._restored is None:
+            return None
+        residual = self._restored.residual
+        return residual() if callable(residual) else residual
 
     @cached_property
-    def restored(self) -> tuple[Tensor, Tensor] | None:
-        """(restore_flow, restore_valid), which are computed together."""
+    def _restored(self) -> Inverse | None:
         return None if self._restore is None else self._restore()
 
-    @property
-    def restore_flow(self) -> Tensor | None:
-        """The flow that undoes the damage."""
-        return None if self.restored is None else self.restored[0]
-
-    @property
-    def restore_valid(self) -> Tensor | None:
-        """Where it does."""
-        return None if self.restored is None else self.restored[1]
+    def has(self, name: str) -> bool:
+        """Whether there is a map of this name, without computing it."""
+        return self._maps[name] is not None
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Degraded":
         """A copy with `function` applied to each map, not to image and params; what is lazy stays so."""
 
-        def restore() -> tuple[Tensor, Tensor]:
-            flow, valid = cast(tuple[Tensor, Tensor], self.restored)
-            return function(flow), function(valid)
+        def later(name: str) -> Map | None:
+            return None if self._maps[name] is None else lambda: function(cast(Tensor, self._read(name)))
+
+        def restore() -> Inverse:
+            flow, valid, _ = cast(Inverse, self._restored)
+            return Inverse(function(flow), function(valid), lambda: function(cast(Tensor, self.restore_residual)))
 
         return Degraded(
             self.image,
             self.params,
             valid=lambda: function(self.valid),
-            flow=None if self.flow is None else function(self.flow),
+            flow=later("flow"),
             restore=None if self._restore is None else restore,
-            transmission=None if self.transmission is None else function(self.transmission),
-            intensity=None if self.intensity is None else function(self.intensity),
+            transmission=later("transmission"),
+            intensity=later("intensity"),
         )
+
+    def _read(self, name: str) -> Tensor | None:
+        value = self._maps[name]
+        if value is not None and not isinstance(value, Tensor):
+            value = self._maps[name] = value()
+        return value
 
     def __getstate__(self) -> dict[str, Any]:
         """All maps computed: what is still to be computed cannot travel to another process."""
-        _ = self.valid, self.restored
-        return self.__dict__ | {"_valid": None, "_restore": None}
+        restored = self._restored
+        kept = None if restored is None else restored._replace(residual=self.restore_residual)
+        return self.__dict__ | {"_maps": {n: self._read(n) for n in self._maps}, "_restore": None, "_restored": kept}

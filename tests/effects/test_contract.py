@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 from torch.utils.data import DataLoader, Dataset
 
-from torchrefract import Degraded, LensDistortion, UniformFog
+from torchrefract import Degraded, DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, UniformFog
 from torchrefract.effects.base import Effect
 
 DTYPES = [torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64]
@@ -59,6 +59,27 @@ EFFECTS = {
         still={"k1_range": NO_RANGE, "k2_range": NO_RANGE, "p1_range": NO_RANGE, "p2_range": NO_RANGE},
         alive="coefficients",
         fields=("coefficients", "focal", "center"),
+    ),
+    "turbulence": Case(
+        Turbulence,
+        strongest={"amplitude_range": (0.3, 0.5), "length_range": (9.0, 14.0), "aperture_range": (1.5, 2.0)},
+        still={"amplitude_range": NO_RANGE},
+        alive="amplitude",
+        fields=("amplitude", "length", "aperture"),
+    ),
+    "thin plate": Case(
+        ThinPlateSpline,
+        strongest={"amplitude_range": (0.5, 1.0), "smoothing_range": (0.0, 0.1)},
+        still={"amplitude_range": NO_RANGE},
+        alive="displacement",
+        fields=("displacement", "points", "smoothing"),
+    ),
+    "divergence-free": Case(
+        DivergenceFree,
+        strongest={"amplitude_range": (0.5, 1.0), "length_range": (5.0, 9.0), "steps": 2},
+        still={"amplitude_range": NO_RANGE},
+        alive="amplitude",
+        fields=("amplitude", "length"),
     ),
     "fog": Case(
         UniformFog,

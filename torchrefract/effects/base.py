@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from torchrefract import draws
 from torchrefract._checks import check_all, check_number
 from torchrefract.effects.door import check_image, enter, leave
+from torchrefract.labels.rows import is_tv, wrapped
+from torchrefract.labels.targets import warp_labels
 from torchrefract.types import Degraded, Range
 from torchrefract.warping.grid import field_dtype
 
@@ -28,9 +30,19 @@ class Effect(nn.Module, ABC):
         super().__init__()
         self.p = check_number("p", p, low=0.0, high=1.0)
 
-    def forward(self, image: Tensor) -> Tensor:
-        """The image degraded, by a draw that torch's global generator seeds."""
-        return self.degrade(image).image
+    def forward(self, image: Tensor, *target: Any) -> Any:
+        """The image degraded, by a draw that torch's global generator seeds; beside a target, both of them.
+
+        The target is any nesting of torchvision's tv_tensors and plain values. What has a place in the image moves as
+        by `warp_labels`, which says what raises; light moves nothing.
+        """
+        if len(target) > 1:
+            raise TypeError(f"target must be one, of any nesting, got {len(target)}")
+        degraded = self.degrade(image)
+        result = wrapped(degraded.image, image) if is_tv(image, "Image") else degraded.image
+        if not target:
+            return result
+        return result, target[0] if degraded.flow is None else warp_labels(target[0], degraded.flow)
 
     def degrade(
         self,
@@ -77,7 +89,7 @@ class Effect(nn.Module, ABC):
         if params is None and callable(image) and not isinstance(image, Tensor):
             return super().apply(cast(Callable[[nn.Module], None], image))
         check_image(image)
-        self._check_params(params, image if image.ndim == 4 else image[None])
+        self.check_params(params, image if image.ndim == 4 else image[None])
         return self._run(image, params, depth)
 
     params_type: type[Any]
@@ -107,7 +119,8 @@ class Effect(nn.Module, ABC):
         low, high = torch.tensor(ranges, dtype=values.dtype, device=values.device).unbind(1)
         return gate, low + (high - low) * values
 
-    def _check_params(self, params: Any, image: Tensor) -> None:
+    def check_params(self, params: Any, image: Tensor) -> None:
+        """Raise unless these are parameters of this effect for the batch (B, C, H, W)."""
         if not isinstance(params, self.params_type):
             raise TypeError(f"params must be {self.params_type.__name__}, got {type(params).__name__}")
         for name, value in zip(params._fields, params, strict=True):

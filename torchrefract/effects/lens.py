@@ -123,8 +123,9 @@ class LensDistortion(WarpEffect):
         """The flow of `lens_flow`, and where it exists."""
         return lens_flow(*_in_px(params, height, width), height=height, width=width)
 
-    def restore_flow(self, params: LensParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
-        """The flow of `lens_restore_flow`, and where it exists."""
+    def undo(self, params: LensParams, flow: Tensor) -> tuple[Tensor, Tensor]:
+        """The flow of `lens_restore_flow`, and where it exists; the closed form needs no flow."""
+        height, width = flow.shape[2:]
         return lens_restore_flow(*_in_px(params, height, width), height=height, width=width)
 
     def moves(self, params: LensParams) -> Tensor:

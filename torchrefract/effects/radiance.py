@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrefract._checks import is_true
 from torchrefract.effects.base import Effect, column
-from torchrefract.types import Degraded
+from torchrefract.types import Degraded, Map
 
 
 class Shaded(NamedTuple):
@@ -34,8 +34,10 @@ class RadianceEffect(Effect):
         shaded = self.shade(image, params, depth)
         size = (image.shape[0], 1, *image.shape[2:])
 
-        def gated(value: Tensor | None, off: float) -> Tensor | None:
-            return None if value is None else _gated(value, torch.full_like(value, off), params.gate).expand(size)
+        def gated(value: Tensor | None, off: float) -> Map | None:
+            if value is None:
+                return None
+            return lambda: _gated(value, torch.full_like(value, off), params.gate).expand(size)
 
         return Degraded(
             _gated(shaded.image, image, params.gate),

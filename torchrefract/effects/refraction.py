@@ -1,15 +1,18 @@
 """What every effect that moves pixels is: a flow, the flow back, and one look-up."""
 
 from abc import abstractmethod
-from typing import Any, cast
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
 
 from torchrefract._checks import check_choice, is_true
 from torchrefract.effects.base import Effect, column
-from torchrefract.types import Degraded
+from torchrefract.types import Degraded, Inverse, Map
+from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import field_dtype, inside
+from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, look_up
 
 
@@ -31,36 +34,80 @@ class WarpEffect(Effect):
     def flow(self, params: Any, *, height: int, width: int) -> tuple[Tensor, Tensor]:
         """The flow (B, 2, H, W) in px, and where it exists, (B, 1, H, W), bool."""
 
-    @abstractmethod
     def restore_flow(self, params: Any, *, height: int, width: int) -> tuple[Tensor, Tensor]:
         """The flow that undoes `flow`, and where it exists."""
+        return self.undo(params, self.flow(params, height=height, width=width)[0])
+
+    def undo(self, params: Any, flow: Tensor) -> tuple[Tensor, Tensor]:
+        """The flow that undoes a flow of these parameters, and where it exists: by Newton's method on the flow."""
+        inverse, valid, _ = invert_flow(flow)
+        return inverse, valid
 
     @abstractmethod
     def moves(self, params: Any) -> Tensor:
         """(B,), bool: the samples whose parameters move anything at all."""
 
+    def gated(self, params: Any, *, height: int, width: int) -> "Moved":
+        """The flow, zero for the samples that the effect leaves alone."""
+        active = params.gate & self.moves(params) & (height * width > 1)
+        flow, exists = self.flow(params, height=height, width=width)
+        return Moved(only(flow, 0.0, active, params), exists | ~column(active), active)
+
+    def gated_undo(self, params: Any, moved: "Moved") -> tuple[Tensor, Tensor]:
+        """The flow that undoes `gated`, and where it exists."""
+        back, known = self.undo(params, moved.flow)
+        return only(back, 0.0, moved.active, params), known | ~column(moved.active)
+
     def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """The batch looked up along the flow."""
-        size = {"height": image.shape[2], "width": image.shape[3]}
-        active = params.gate & self.moves(params) & (size["height"] * size["width"] > 1)
-        if is_true(active.any) is False and not _learns(params):
-            return _identity(image, params)
-        flow, exists = self.flow(params, **size)
-        flow = _only(flow, 0.0, active, params)
-        warped = look_up(image, flow, padding=self.padding, interpolation=self.interpolation)
+        height, width = image.shape[2:]
+        if is_true((params.gate & self.moves(params)).any) is False and not learns(params):
+            return identity(image, params)
+        moved = self.gated(params, height=height, width=width)
+        warped = look_up(image, moved.flow, padding=self.padding, interpolation=self.interpolation)
+        return moving(
+            only(warped, image, moved.active, params),
+            params,
+            flow=lambda: moved.flow,
+            valid=lambda: (moved.exists & inside(moved.flow)) | ~column(moved.active),
+            undo=lambda: self.gated_undo(params, moved),
+        )
 
-        def valid() -> Tensor:
-            return (exists & inside(flow)) | ~column(active)
 
-        def restore() -> tuple[Tensor, Tensor]:
-            back, known = self.restore_flow(params, **size)
-            back = _only(back, 0.0, active, params)
-            seen = look_up(result.valid.to(back.dtype), back, padding="zeros", interpolation="bilinear")
-            # All pixels that the look-up mixes must be good, but for weights below a thousandth.
-            return back, (known & inside(back) & (seen > 0.999)) | ~column(active)
+class Moved(NamedTuple):
+    """What an effect moves."""
 
-        result = Degraded(_only(warped, image, active, params), params, valid=valid, flow=flow, restore=restore)
-        return result
+    flow: Tensor  # (B, 2, H, W), px
+    exists: Tensor  # (B, 1, H, W), bool
+    active: Tensor  # (B,), bool: the samples that are moved at all
+
+
+def moving(
+    image: Tensor,
+    params: Any,
+    *,
+    flow: Callable[[], Tensor],
+    valid: Callable[[], Tensor],
+    undo: Callable[[], tuple[Tensor, Tensor]],
+    transmission: Map | None = None,
+    intensity: Map | None = None,
+) -> Degraded:
+    """What an effect with a flow hands over; `restore_valid` is where the flow back exists and sees valid pixels."""
+
+    def restore() -> Inverse:
+        back, known = undo()
+        sound = known & inside(back) & sees(result.valid, back)
+        return Inverse(back, sound, lambda: compose_flows(cast(Tensor, result.flow), back).norm(dim=1, keepdim=True))
+
+    result = Degraded(
+        image, params, valid=valid, flow=flow, restore=restore, transmission=transmission, intensity=intensity
+    )
+    return result
+
+
+def sees(good: Tensor, flow: Tensor) -> Tensor:
+    """(B, 1, H, W), bool: all pixels that a look-up along the flow mixes are good, but for weights below 1/1000."""
+    return look_up(good.to(flow.dtype), flow, padding="zeros", interpolation="bilinear") > 0.999
 
 
 class _Swap(torch.autograd.Function):
@@ -81,7 +128,7 @@ class _Swap(torch.autograd.Function):
         return None, gradient
 
 
-def _only(changed: Tensor, same: Tensor | float, active: Tensor, params: Any) -> Tensor:
+def only(changed: Tensor, same: Tensor | float, active: Tensor, params: Any) -> Tensor:
     """`changed` for the active samples and `same`, bit for bit, for the others.
 
     A sample at strength zero keeps the gradient of its parameters: descent must be able to start there.
@@ -89,17 +136,25 @@ def _only(changed: Tensor, same: Tensor | float, active: Tensor, params: Any) ->
     if is_true(active.all):
         return changed
     value = torch.where(column(active), changed, same)
-    if not _learns(params):
+    if not learns(params):
         return value
     return cast(Tensor, _Swap.apply(value.detach(), torch.where(column(params.gate), changed, same)))
 
 
-def _learns(params: Any) -> bool:
+def learns(params: Any) -> bool:
+    """Whether a gradient of the parameters is asked for."""
     return torch.is_grad_enabled() and any(value.requires_grad for value in params)
 
 
-def _identity(image: Tensor, params: Any) -> Degraded:
+def identity(image: Tensor, params: Any) -> Degraded:
+    """The image as it is, with maps that say so."""
     size = (image.shape[0], 1, *image.shape[2:])
     everywhere = torch.ones(size, dtype=torch.bool, device=image.device)
     still = torch.zeros(size, dtype=field_dtype(image.dtype), device=image.device).expand(-1, 2, -1, -1)
-    return Degraded(image, params, valid=lambda: everywhere, flow=still, restore=lambda: (still, everywhere))
+    return Degraded(
+        image,
+        params,
+        valid=lambda: everywhere,
+        flow=lambda: still,
+        restore=lambda: Inverse(still, everywhere, lambda: still[:, :1]),
+    )

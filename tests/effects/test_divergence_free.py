@@ -1,0 +1,81 @@
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchrefract import DivergenceFree, jacobian_determinant
+from torchrefract.fields.covariance import COVARIANCES
+
+GENTLE: dict[str, Any] = {"amplitude_range": (3.0, 3.0), "length_range": (12.0, 20.0)}
+
+
+def divergence(flow: Tensor) -> Tensor:
+    """By central differences, inside the frame."""
+    u_x = (flow[:, 0, 1:-1, 2:] - flow[:, 0, 1:-1, :-2]) / 2
+    v_y = (flow[:, 1, 2:, 1:-1] - flow[:, 1, :-2, 1:-1]) / 2
+    return u_x + v_y
+
+
+@pytest.mark.parametrize("covariance", COVARIANCES)
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-4), (torch.float64, 1e-12)])
+def test_the_flow_has_no_divergence(covariance, dtype, bound):
+    effect = DivergenceFree(**GENTLE, covariance=covariance)
+    flow = effect.degrade(torch.zeros(2, 1, 61, 83, dtype=dtype), seed=1).flow
+    slope = (flow[:, 0, :, 2:] - flow[:, 0, :, :-2]).square().mean().sqrt() / 2
+    assert divergence(flow).abs().max() < bound * slope
+    # It swirls instead: the other sum of slopes is as large as they are.
+    curl = (flow[:, 1, 1:-1, 2:] - flow[:, 1, 1:-1, :-2] - flow[:, 0, 2:, 1:-1] + flow[:, 0, :-2, 1:-1]) / 2
+    assert curl.square().mean().sqrt() > slope
+
+
+@pytest.mark.parametrize("covariance", COVARIANCES)
+def test_the_amplitude_is_the_standard_deviation_of_each_component(covariance):
+    effect = DivergenceFree(amplitude_range=(2.0, 2.0), length_range=(4.0, 7.0), covariance=covariance)
+    flow = effect.degrade(torch.zeros(48, 1, 64, 96), seed=1).flow
+    assert_close(flow.square().mean(dim=(0, 2, 3)).sqrt(), torch.full((2,), 2.0), rtol=0.03, atol=0)
+
+
+def test_normalized_by_the_maximum_the_longest_displacement_is_the_amplitude():
+    flow = DivergenceFree(**GENTLE, normalize="max").degrade(torch.zeros(3, 1, 61, 83), seed=1).flow
+    assert_close(flow.norm(dim=1).amax(dim=(1, 2)), torch.full((3,), 3.0), rtol=1e-5, atol=0)
+
+
+def test_not_normalized_the_amplitude_multiplies_the_curl_itself():
+    image = torch.zeros(48, 1, 160, 160)
+    effect = DivergenceFree(amplitude_range=(3.0, 3.0), length_range=(10.0, 10.0), normalize="none")
+    flow = effect.degrade(image, seed=1).flow
+    assert flow.square().mean().sqrt().item() == pytest.approx(0.3, rel=0.04)  # a Gaussian psi has a slope of 1 / l
+
+
+def test_steps_keep_areas_better_and_the_map_one_to_one():
+    image = torch.zeros(4, 1, 96, 128, dtype=torch.float64)
+    strong: dict[str, Any] = {"amplitude_range": (4.0, 4.0), "length_range": (10.0, 10.0)}
+    once, often = (DivergenceFree(**strong, steps=n).degrade(image, seed=1).flow for n in (1, 16))
+    inner = (slice(None), slice(None), slice(12, -12), slice(12, -12))
+    ratios = [jacobian_determinant(flow)[inner] for flow in (once, often)]
+    assert ratios[0].amin() < 0 < ratios[1].amin()
+    change = [(ratio.clamp(min=0.05).log().square().mean().sqrt()) for ratio in ratios]
+    assert change[1] < 0.5 * change[0]
+
+
+def test_one_step_is_the_displacement_itself():
+    effect, image = DivergenceFree(**GENTLE), torch.zeros(2, 1, 31, 37)
+    degraded = effect.degrade(image, seed=1)
+    assert torch.equal(degraded.flow, effect.displacement(degraded.params, height=31, width=37))
+
+
+@pytest.mark.parametrize(
+    ("options", "rule"),
+    [
+        ({"length_range": (0.0, 1.0)}, "length_range must be"),
+        ({"amplitude_range": (-1.0, 1.0)}, "amplitude_range must be"),
+        ({"covariance": "spherical"}, "covariance must be one of"),
+        ({"normalize": "image"}, "normalize must be one of theory, max, none"),
+        ({"steps": 0}, "steps must be at least 1, got 0"),
+    ],
+)
+def test_wrong_arguments_raise(options, rule):
+    with pytest.raises(ValueError, match=rule):
+        DivergenceFree(**options)

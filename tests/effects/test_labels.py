@@ -1,0 +1,76 @@
+"""What an effect does to the labels beside its image."""
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from torchrefract import Compose, LensDistortion, ThinPlateSpline, Turbulence, UniformFog, warp_points
+from torchrefract.effects.base import Effect
+
+tv_tensors = pytest.importorskip("torchvision.tv_tensors")
+transforms = pytest.importorskip("torchvision.transforms.v2")
+
+EFFECTS = [LensDistortion(), Turbulence(), ThinPlateSpline(), Compose([Turbulence(), UniformFog(), LensDistortion()])]
+
+
+def sample(size: tuple[int, int] = (64, 96)) -> tuple[Tensor, dict]:
+    height, width = size
+    mask = torch.zeros(2, height, width, dtype=torch.uint8)
+    mask[0, 20:40, 30:50] = 1
+    mask[1, 5:15, 60:80] = 1
+    boxes = torch.tensor([[30.0, 20.0, 50.0, 40.0], [60.0, 5.0, 80.0, 15.0]])
+    target = {
+        "boxes": tv_tensors.BoundingBoxes(boxes, format="XYXY", canvas_size=size),  # pyright: ignore[reportCallIssue]
+        "masks": tv_tensors.Mask(mask),
+        "points": tv_tensors.KeyPoints(torch.tensor([[40.0, 30.0], [70.0, 10.0]]), canvas_size=size),  # pyright: ignore
+        "labels": torch.tensor([3, 7]),
+        "name": "frame 1",
+    }
+    return torch.rand(3, height, width), target
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: type(effect).__name__)
+def test_labels_move_with_the_image(effect: Effect):
+    image, target = sample()
+    torch.manual_seed(4)
+    expected = effect.degrade(image)
+    torch.manual_seed(4)
+    result, moved = effect(image, target)
+    assert torch.equal(result, expected.image)
+    points, _ = warp_points(target["points"].as_subclass(Tensor), expected.flow)
+    assert torch.allclose(moved["points"].as_subclass(Tensor), points, atol=1e-4)
+    assert not torch.equal(moved["points"], target["points"])
+    for row, box in zip(moved["masks"], moved["boxes"].as_subclass(Tensor), strict=True):
+        y, x = row.nonzero().unbind(1)
+        found = torch.stack([x.min(), y.min(), x.max() + 1, y.max() + 1])
+        assert (found - box).abs().max() < 1.0
+    assert moved["labels"].tolist() == [3, 7]
+    assert moved["name"] == "frame 1"
+
+
+def test_an_image_of_torchvision_comes_back_as_one():
+    image, target = sample()
+    result = LensDistortion()(tv_tensors.Image(image))
+    assert type(result) is tv_tensors.Image
+    pipeline = transforms.Compose([LensDistortion(), transforms.RandomHorizontalFlip(p=1.0), UniformFog()])
+    flipped, moved = pipeline(tv_tensors.Image(image), target)
+    assert type(flipped) is tv_tensors.Image
+    assert moved["boxes"].canvas_size == (64, 96)
+    plain = transforms.Compose([LensDistortion(p=0.0), transforms.RandomHorizontalFlip(p=1.0)])
+    _, mirrored = plain(tv_tensors.Image(image), target)
+    assert mirrored["boxes"].tolist() == [[46.0, 20.0, 66.0, 40.0], [16.0, 5.0, 36.0, 15.0]]
+
+
+def test_light_moves_no_label():
+    image, target = sample()
+    result, moved = UniformFog()(image, target)
+    assert moved is target
+    assert not torch.equal(result, image)
+
+
+def test_what_cannot_be_moved_raises():
+    image, target = sample()
+    with pytest.raises(TypeError, match="target must hold what is known how to move, or plain values, got"):
+        LensDistortion()(image, target | {"camera": nn.Identity()})
+    with pytest.raises(TypeError, match="target must be one, of any nesting, got 2"):
+        LensDistortion()(image, target, target)

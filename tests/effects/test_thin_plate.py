@@ -1,0 +1,86 @@
+import math
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from torchrefract import ThinPlateParams, ThinPlateSpline
+
+
+def plate(points: torch.Tensor, displacement: torch.Tensor, smoothing: float = 0.0) -> ThinPlateParams:
+    gate = torch.ones(len(points), dtype=torch.bool)
+    return ThinPlateParams(gate, points, displacement, torch.full((len(points),), smoothing, dtype=points.dtype))
+
+
+def test_control_points_are_displaced_as_told():
+    points = torch.tensor([[[3.0, 5.0], [40.0, 7.0], [22.0, 30.0], [50.0, 33.0], [0.0, 39.0]]]).double()
+    displacement = torch.tensor([[[1.0, -2.0], [0.5, 0.0], [-3.0, 2.0], [0.0, 1.0], [2.0, 2.0]]]).double()
+    flow = ThinPlateSpline().apply(torch.zeros(1, 1, 40, 60).double(), plate(points, displacement)).flow
+    x, y = points[0].long().unbind(1)
+    assert_close(flow[0, :, y, x].T, displacement[0], rtol=0, atol=1e-10)
+
+
+def test_drawn_plates_have_a_lattice_over_the_frame_and_normal_displacements():
+    effect = ThinPlateSpline(amplitude_range=(3.0, 3.0), lattice=(3, 5))
+    params = effect.sample(torch.zeros(400, 1, 21, 41), seed=1)
+    expected = torch.cartesian_prod(torch.linspace(0, 20, 3), torch.linspace(0, 40, 5)).flip(1)
+    assert_close(params.points, expected.expand(400, -1, -1))
+    assert params.displacement.std().item() == pytest.approx(3, rel=0.02)
+    assert params.displacement.mean().abs() < 0.06
+    sides = torch.corrcoef(params.displacement.flatten(0, 1).T)
+    assert sides[0, 1].abs() < 0.04
+
+
+def test_smoothing_leads_to_the_plane_of_least_squares():
+    generator = torch.Generator().manual_seed(0)
+    points = 50 * torch.rand(1, 12, 2, generator=generator, dtype=torch.float64)
+    displacement = torch.randn(1, 12, 2, generator=generator, dtype=torch.float64)
+    effect, image = ThinPlateSpline(), torch.zeros(1, 1, 50, 50).double()
+    flow = effect.apply(image, plate(points, displacement, 1e9)).flow
+    plane = torch.cat([torch.ones(12, 1).double(), points[0]], dim=1)
+    a = torch.linalg.lstsq(plane, displacement[0]).solution
+    y, x = torch.meshgrid(torch.arange(50.0), torch.arange(50.0), indexing="ij")
+    expected = torch.stack([torch.ones(50, 50), x, y], dim=-1).double() @ a
+    assert_close(flow[0].movedim(0, -1), expected, rtol=0, atol=1e-6)
+    exact = effect.apply(image, plate(points, displacement)).flow
+    assert (exact - flow).abs().max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("points", "rule"),
+    [
+        ([[0.0, 0.0], [9.0, 0.0]], "points must be at least 3 to a sample, got 2"),
+        ([[0.0, 0.0], [9.0, 0.0], [9.0, 0.0], [4.0, 4.0]], "points must differ from one another"),
+        ([[0.0, 0.0], [3.0, 1.0], [6.0, 2.0], [9.0, 3.0]], "points must not lie on a line"),
+        ([[0.0, 0.0], [3.0, math.inf], [6.0, 2.0]], "points must be finite"),
+    ],
+)
+def test_points_that_hold_no_plate_raise(points, rule):
+    points = torch.tensor([points])
+    with pytest.raises(ValueError, match=rule):
+        ThinPlateSpline().apply(torch.zeros(1, 1, 8, 9), plate(points, torch.ones_like(points)))
+
+
+def test_params_of_a_wrong_shape_raise():
+    effect, image = ThinPlateSpline(), torch.zeros(2, 1, 8, 9)
+    params = effect.sample(image, seed=1)
+    with pytest.raises(ValueError, match=r"params\.displacement must have the shape of points"):
+        effect.apply(image, params._replace(displacement=params.displacement[:, :3]))
+    with pytest.raises(ValueError, match=r"params\.points must have shape \(B, N, 2\)"):
+        effect.apply(image, params._replace(points=params.points[..., 0]))
+    with pytest.raises(ValueError, match=r"params\.smoothing must be at least 0"):
+        effect.apply(image, params._replace(smoothing=-torch.ones(2)))
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "rule"),
+    [
+        ({"amplitude_range": (-1.0, 1.0)}, ValueError, "amplitude_range must be"),
+        ({"smoothing_range": (-1.0, 1.0)}, ValueError, "smoothing_range must be"),
+        ({"lattice": (1, 4)}, ValueError, "lattice must be at least 2, got 1"),
+        ({"lattice": (2.5, 4)}, TypeError, "lattice must be a whole number"),
+    ],
+)
+def test_wrong_arguments_raise(options, error, rule):
+    with pytest.raises(error, match=rule):
+        ThinPlateSpline(**options)

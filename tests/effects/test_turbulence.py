@@ -1,0 +1,109 @@
+import math
+import warnings
+from typing import Any
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from torchrefract import Turbulence, folding
+from torchrefract.fields.covariance import COVARIANCES
+
+CALM: dict[str, Any] = {"amplitude_range": (0.3, 0.3), "length_range": (12.0, 12.0), "aperture_range": (2.0, 2.0)}
+
+
+@pytest.mark.parametrize("covariance", COVARIANCES)
+@pytest.mark.parametrize("aperture", [0.0, 3.0])
+def test_the_amplitude_is_the_standard_deviation_of_each_component(covariance, aperture):
+    effect = Turbulence(
+        amplitude_range=(0.2, 0.2), length_range=(4.0, 8.0), aperture_range=(aperture, aperture), covariance=covariance
+    )
+    flow = effect.degrade(torch.zeros(40, 1, 64, 96), seed=1).flow
+    assert_close(flow.square().mean(dim=(0, 2, 3)).sqrt(), torch.full((2,), 0.2), rtol=0.03, atol=0)
+    assert flow.mean(dim=(0, 2, 3)).abs().max() < 0.01
+
+
+def test_each_sample_has_its_own_air():
+    flow = Turbulence(**CALM).degrade(torch.zeros(3, 1, 192, 256), seed=1).flow.flatten(2)
+    fields = torch.cat([flow[:, 0], flow[:, 1]])
+    correlation = torch.corrcoef(fields) - torch.eye(6)
+    assert correlation.abs().max() < 0.2  # some 340 patches of a length each way in each field
+
+
+def test_normalized_by_the_image_every_frame_has_the_amplitude_itself():
+    effect = Turbulence(**CALM, normalize="image")
+    flow = effect.degrade(torch.zeros(3, 1, 64, 96), seed=1).flow
+    assert_close(flow.std(dim=(2, 3), correction=0), torch.full((3, 2), 0.3), rtol=1e-4, atol=0)
+
+
+def test_a_field_longer_than_the_frame_stays_finite():
+    for normalize in ("theory", "image"):
+        effect = Turbulence(length_range=(900.0, 900.0), covariance="gaussian", normalize=normalize)
+        degraded = effect.degrade(torch.rand(2, 3, 32, 48), seed=1)
+        assert degraded.flow.isfinite().all()
+        assert degraded.flow.abs().max() < 8
+
+
+def test_white_noise_has_the_amplitude_too():
+    effect = Turbulence(amplitude_range=(0.1, 0.1), length_range=(0.1, 0.1), aperture_range=(0.0, 0.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        flow = effect.degrade(torch.zeros(4, 1, 128, 128), seed=1).flow
+    assert flow.std().item() == pytest.approx(0.1, rel=0.01)
+    assert torch.corrcoef(torch.stack([flow[..., 1:].flatten(), flow[..., :-1].flatten()]))[0, 1].abs() < 0.02
+
+
+@pytest.mark.parametrize("length", [20.0, 50.0])
+def test_an_amplitude_that_folds_is_told_and_its_folds_are_not_valid(length):
+    limit = 0.14 * math.sqrt(length)  # of the exponential covariance without an aperture
+    image = torch.rand(1, 3, 96, 128)
+
+    def at(amplitude: float) -> Turbulence:
+        return Turbulence(
+            amplitude_range=(amplitude, amplitude), length_range=(length, length), aperture_range=(0.0, 0.0)
+        )
+
+    calm = at(0.9 * limit).degrade(image, seed=1)
+    assert folding(calm.flow).fraction < 1e-3
+    with pytest.warns(UserWarning, match="amplitude is above what the covariance bears"):
+        wild = at(8 * limit).degrade(image, seed=1)
+    assert folding(wild.flow).fraction > 0.05
+    assert wild.image.isfinite().all()
+    assert wild.restore_flow.isfinite().all()
+    assert wild.restore_valid.double().mean() < 0.9 < calm.restore_valid.double().mean()
+    assert wild.restore_residual[wild.restore_valid].max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("options", "rule"),
+    [
+        ({"length_range": (0.0, 1.0)}, "length_range must be"),
+        ({"length_range": (math.nan, 1.0)}, "length_range must not be NaN"),
+        ({"amplitude_range": (-1.0, 1.0)}, "amplitude_range must be"),
+        ({"aperture_range": (-1.0, 1.0)}, "aperture_range must be"),
+        ({"covariance": "spherical"}, "covariance must be one of exponential, gaussian, matern32, matern52"),
+        ({"normalize": "max"}, "normalize must be one of theory, image"),
+    ],
+)
+def test_wrong_arguments_raise(options, rule):
+    with pytest.raises(ValueError, match=rule):
+        Turbulence(**options)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "rule"),
+    [
+        ("length", 0.0, "params.length must be above 0"),
+        ("amplitude", -1.0, "params.amplitude must be at least 0"),
+        ("aperture", math.inf, "params.aperture must be at least 0 and finite"),
+    ],
+)
+def test_air_that_is_none_raises(field, value, rule):
+    effect, image = Turbulence(), torch.rand(2, 3, 8, 9)
+    params = effect.sample(image, seed=1)
+    with pytest.raises(ValueError, match=rule):
+        effect.apply(image, params._replace(**{field: torch.tensor([1.0, value])}))
+    with pytest.raises(ValueError, match=r"params\.length must have shape \(B,\)"):
+        effect.apply(image, params._replace(length=torch.ones(2, 1)))
+    with pytest.raises(ValueError, match=r"params\.key must be \(B, 4\) of int64"):
+        effect.apply(image, params._replace(key=torch.zeros(2, 3, dtype=torch.int64)))

@@ -1,0 +1,112 @@
+"""A warp that swirls: its displacement has no divergence."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrefract import draws
+from torchrefract._checks import check_choice, check_count, check_range
+from torchrefract.effects.base import params_to
+from torchrefract.effects.refraction import WarpEffect
+from torchrefract.effects.turbulence import check_field_params
+from torchrefract.fields.covariance import COVARIANCES
+from torchrefract.fields.gaussian import gaussian_random_field, spectrum, torus
+from torchrefract.fields.stream import curl, curl_rms
+from torchrefract.types import Range
+from torchrefract.warping.compose import compose_flows
+
+
+class DivergenceFreeParams(NamedTuple):
+    """The swirls of a batch."""
+
+    gate: Tensor  # (B,), bool: the sample is degraded
+    amplitude: Tensor  # (B,), px, of the displacement as `normalize` has it
+    length: Tensor  # (B,), px, correlation length of the stream function
+    key: Tensor  # (B, 4), int64, of the white noise
+
+    to = params_to
+
+
+class DivergenceFree(WarpEffect):
+    """A frame stirred by a displacement without divergence, the curl of a Gaussian random stream function.
+
+        flow = amplitude (D_y psi, -D_x psi) / rms,  Cov(psi(p), psi(p + h)) = C(|h| / length)
+
+    D is the central difference, so the divergence taken with central differences is zero to round-off. The map itself
+    keeps areas to first order only: det(I + grad flow) differs from 1 by the square of the slope. With `steps` the
+    displacement is followed in so many equal parts, which keeps the map one-to-one and nearer to equal areas.
+
+    Args:
+        amplitude_range: px, 0 or above.
+        length_range: px, correlation length of psi, above 0.
+        covariance: of psi: "gaussian", "matern52", "matern32" or "exponential"; psi of the last has no slope, so that
+            the flow is nearly white.
+        normalize: "theory" divides by the standard deviation that each component has over all fields, "max" by the
+            longest displacement in the frame, "none" by nothing: amplitude is then in px per unit of slope.
+        steps: parts that the displacement is followed in.
+        padding, interpolation, p: as for every warp.
+
+    Raises:
+        ValueError: an argument outside its range.
+
+    Source: the torchrefract paper; Bridson, Houriham, Nordenstam, "Curl-noise for procedural fluid flow", ACM
+    Transactions on Graphics 26 (2007).
+    """
+
+    def __init__(
+        self,
+        *,
+        amplitude_range: Range = (2.0, 6.0),
+        length_range: Range = (40.0, 100.0),
+        covariance: str = "gaussian",
+        normalize: str = "theory",
+        steps: int = 1,
+        padding: str = "reflection",
+        interpolation: str = "bilinear",
+        p: float = 1.0,
+    ):
+        super().__init__(padding=padding, interpolation=interpolation, p=p)
+        self.amplitude_range = check_range("amplitude_range", amplitude_range, low=0.0, high=1e4)
+        self.length_range = check_range("length_range", length_range, low=1e-3, high=1e6)
+        self.covariance = check_choice("covariance", covariance, COVARIANCES)
+        self.normalize = check_choice("normalize", normalize, ("theory", "max", "none"))
+        self.steps = check_count("steps", steps)
+
+    params_type = DivergenceFreeParams
+
+    def draw(self, source: draws.Stream, image: Tensor) -> DivergenceFreeParams:
+        """One stream function a sample, every number uniform in its range."""
+        gate, values = self._uniform(source, (self.amplitude_range, self.length_range), image)
+        return DivergenceFreeParams(gate, values[:, 0], values[:, 1], draws.noise_key(source))
+
+    def check(self, params: DivergenceFreeParams, image: Tensor) -> None:
+        """Raise for swirls that are none."""
+        check_field_params(params, at_least_zero=("amplitude",))
+
+    def flow(self, params: DivergenceFreeParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """The flow, and where it exists: everywhere."""
+        displacement = self.displacement(params, height=height, width=width)
+        flow = part = displacement / self.steps
+        for _ in range(self.steps - 1):
+            flow = compose_flows(flow, part)
+        return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
+
+    def displacement(self, params: DivergenceFreeParams, *, height: int, width: int) -> Tensor:
+        """(B, 2, H, W), px: what is followed in `steps` parts; the curl itself."""
+        size = torus(height + 2, width + 2, length=self.length_range[1], kind=self.covariance)
+        dtype = params.amplitude.dtype
+        shape = spectrum(size, params.length, kind=self.covariance, dtype=dtype).amplitude
+        noise = draws.noise(params.key, size[0] * size[1]).view(-1, 2, *size).to(dtype)
+        psi = gaussian_random_field(noise, shape, height=height + 2, width=width + 2)[:, :1]
+        displacement = curl(psi)
+        if self.normalize == "theory":
+            displacement = displacement / curl_rms(params.length, self.covariance)[:, None, None, None]
+        elif self.normalize == "max":
+            longest = displacement.norm(dim=1, keepdim=True).amax(dim=(2, 3), keepdim=True)
+            displacement = displacement / longest.clamp(min=1e-12)
+        return params.amplitude[:, None, None, None] * displacement
+
+    def moves(self, params: DivergenceFreeParams) -> Tensor:
+        """The samples with an amplitude."""
+        return params.amplitude != 0

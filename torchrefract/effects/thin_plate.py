@@ -1,0 +1,102 @@
+"""A warp that bends the frame like a thin plate."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrefract import draws
+from torchrefract._checks import check_all, check_count, check_range
+from torchrefract.effects.base import params_to
+from torchrefract.effects.refraction import WarpEffect
+from torchrefract.fields.spline import check_points, fit_spline, spline_flow
+from torchrefract.types import Range
+
+
+class ThinPlateParams(NamedTuple):
+    """The plates of a batch."""
+
+    gate: Tensor  # (B,), bool: the sample is degraded
+    points: Tensor  # (B, N, 2), px, control points, x and y
+    displacement: Tensor  # (B, N, 2), px, of each point
+    smoothing: Tensor  # (B,), 0 or above
+
+    to = params_to
+
+
+class ThinPlateSpline(WarpEffect):
+    """A frame bent by a thin-plate spline: the smoothest flow that moves given points as told.
+
+        flow(p) = a1 + a2 x + a3 y + sum w_i U(|p - p_i|),  U(r) = r^2 ln r,  sum w = sum w x = sum w y = 0
+
+    Drawn plates have a lattice of control points over the frame, corner to corner, each displaced by a normal number
+    times the amplitude in x and in y. Own points go through `apply` with a `ThinPlateParams`.
+
+    Args:
+        amplitude_range: px, standard deviation of the displacements, 0 or above.
+        lattice: (rows, columns) of control points, each at least 2.
+        smoothing_range: 0 goes through the points exactly; larger bends less, in units of the points' rms radius.
+        padding, interpolation, p: as for every warp.
+
+    Raises:
+        ValueError: an argument outside its range; points that are fewer than three, the same, or on one line.
+
+    Source: Bookstein, "Principal warps", IEEE TPAMI 11 (1989).
+    """
+
+    def __init__(
+        self,
+        *,
+        amplitude_range: Range = (2.0, 8.0),
+        lattice: tuple[int, int] = (4, 4),
+        smoothing_range: Range = (0.0, 0.0),
+        padding: str = "reflection",
+        interpolation: str = "bilinear",
+        p: float = 1.0,
+    ):
+        super().__init__(padding=padding, interpolation=interpolation, p=p)
+        self.amplitude_range = check_range("amplitude_range", amplitude_range, low=0.0, high=1e4)
+        rows, columns = lattice
+        self.lattice = (check_count("lattice", rows, low=2), check_count("lattice", columns, low=2))
+        self.smoothing_range = check_range("smoothing_range", smoothing_range, low=0.0, high=1e12)
+
+    params_type = ThinPlateParams
+
+    def draw(self, source: draws.Stream, image: Tensor) -> ThinPlateParams:
+        """One plate a sample, amplitude and smoothing uniform in their ranges."""
+        gate, values = self._uniform(source, (self.amplitude_range, self.smoothing_range), image)
+        amplitude, smoothing = values.unbind(1)
+        rows, columns = self.lattice
+        normal = draws.normal(draws.fold(source), 2 * rows * columns).to(values.dtype).view(-1, rows * columns, 2)
+        # A frame of one pixel has no extent, and a plate needs one.
+        y = torch.linspace(0, max(image.shape[2] - 1, 1), rows, dtype=values.dtype, device=values.device)
+        x = torch.linspace(0, max(image.shape[3] - 1, 1), columns, dtype=values.dtype, device=values.device)
+        points = torch.stack([x.expand(rows, -1), y[:, None].expand(-1, columns)], dim=-1).view(1, -1, 2)
+        displacement = amplitude[:, None, None] * normal
+        return ThinPlateParams(gate, points.repeat(image.shape[0], 1, 1), displacement, smoothing)
+
+    def check(self, params: ThinPlateParams, image: Tensor) -> None:
+        """Raise for plates that are none."""
+        points, displacement, smoothing = params[1:]
+        if points.ndim != 3 or points.shape[2] != 2:
+            raise ValueError(f"params.points must have shape (B, N, 2), got {tuple(points.shape)}")
+        if displacement.shape != points.shape:
+            raise ValueError(
+                f"params.displacement must have the shape of points, {tuple(points.shape)}, "
+                f"got {tuple(displacement.shape)}"
+            )
+        if smoothing.ndim != 1:
+            raise ValueError(f"params.smoothing must have shape (B,), got {tuple(smoothing.shape)}")
+        check_points(points)
+        check_all("params.displacement", "be finite", displacement, torch.isfinite)
+        check_all("params.smoothing", "be at least 0 and finite", smoothing, lambda v: v.isfinite() & (v >= 0))
+
+    def flow(self, params: ThinPlateParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """The flow of `spline_flow`, and where it exists: everywhere."""
+        spline = fit_spline(params.points, params.displacement, params.smoothing)
+        flow = spline_flow(spline, height=height, width=width, dtype=params.points.dtype)
+        return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
+
+    def moves(self, params: ThinPlateParams) -> Tensor:
+        """The samples with a displaced point."""
+        return (params.displacement != 0).flatten(1).any(dim=1)

@@ -1,0 +1,133 @@
+"""Hot air over a road."""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrefract import draws
+from torchrefract._checks import check_all, check_choice, check_range, is_true
+from torchrefract.effects.base import params_to
+from torchrefract.effects.refraction import WarpEffect
+from torchrefract.fields.covariance import COVARIANCES, slope_rms
+from torchrefract.fields.gaussian import gaussian_random_field, spectrum, torus
+from torchrefract.types import Range
+
+# A field folds first where a slope of five standard deviations reaches 1.
+_FOLD = 0.2
+
+
+class TurbulenceParams(NamedTuple):
+    """The air of a batch."""
+
+    gate: Tensor  # (B,), bool: the sample is degraded
+    amplitude: Tensor  # (B,), px, standard deviation of each component of the flow
+    length: Tensor  # (B,), px, correlation length
+    aperture: Tensor  # (B,), px, standard deviation of the Gaussian that averages the field
+    key: Tensor  # (B, 4), int64, of the white noise
+
+    to = params_to
+
+
+class Turbulence(WarpEffect):
+    """A frame seen through turbulent air: a Gaussian random field of displacements (the paper's "Perlin distortion").
+
+        flow = amplitude R,  Cov(R(p), R(p + h)) = C(|h| / length), smoothed by the aperture, Var R = 1
+
+    The two components are independent. The exponential covariance has no slope: it folds the image from an amplitude of
+    0.14 sqrt(length) px on, unless an aperture smooths it, as the pupil of a real lens does. `restore_flow` is found by
+    Newton's method; folded pixels are not valid in it.
+
+    Args:
+        amplitude_range: px, standard deviation of each component, 0 or above.
+        length_range: px, correlation length, above 0.
+        aperture_range: px, 0 or above.
+        covariance: "exponential", "gaussian", "matern32" or "matern52".
+        normalize: "theory" gives the amplitude to all fields together, "image" to each: its mean is subtracted and its
+            standard deviation divided by, which inflates fields that are longer than the frame.
+        padding, interpolation, p: as for every warp.
+
+    Raises:
+        ValueError: an argument outside its range.
+
+    Warns:
+        UserWarning: an amplitude from which on the field folds the image (on the CPU).
+
+    Source: the torchrefract paper; Dietrich and Newsam, SIAM J. Sci. Comput. 18 (1997), for the sampling.
+    """
+
+    def __init__(
+        self,
+        *,
+        amplitude_range: Range = (0.5, 1.5),
+        length_range: Range = (20.0, 60.0),
+        aperture_range: Range = (2.0, 3.0),
+        covariance: str = "exponential",
+        normalize: str = "theory",
+        padding: str = "reflection",
+        interpolation: str = "bilinear",
+        p: float = 1.0,
+    ):
+        super().__init__(padding=padding, interpolation=interpolation, p=p)
+        self.amplitude_range = check_range("amplitude_range", amplitude_range, low=0.0, high=1e4)
+        self.length_range = check_range("length_range", length_range, low=1e-3, high=1e6)
+        self.aperture_range = check_range("aperture_range", aperture_range, low=0.0, high=1e4)
+        self.covariance = check_choice("covariance", covariance, COVARIANCES)
+        self.normalize = check_choice("normalize", normalize, ("theory", "image"))
+
+    params_type = TurbulenceParams
+
+    def draw(self, source: draws.Stream, image: Tensor) -> TurbulenceParams:
+        """One air a sample, every number uniform in its range."""
+        gate, values = self._uniform(source, (self.amplitude_range, self.length_range, self.aperture_range), image)
+        return TurbulenceParams(gate, values[:, 0], values[:, 1], values[:, 2], draws.noise_key(source))
+
+    def check(self, params: TurbulenceParams, image: Tensor) -> None:
+        """Raise for air that is none."""
+        check_field_params(params, at_least_zero=("amplitude", "aperture"))
+
+    def flow(self, params: TurbulenceParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """The flow, and where it exists: everywhere."""
+        self._check_folds(params)
+        aperture = self.aperture_range[1]
+        size = torus(height, width, length=self.length_range[1], kind=self.covariance, aperture=aperture)
+        dtype = params.amplitude.dtype
+        shape = spectrum(size, params.length, kind=self.covariance, aperture=params.aperture, dtype=dtype).amplitude
+        noise = draws.noise(params.key, size[0] * size[1]).view(-1, 2, *size).to(dtype)
+        field = gaussian_random_field(noise, shape, height=height, width=width)
+        if self.normalize == "image":
+            field = field - field.mean(dim=(2, 3), keepdim=True)
+            field = field / field.square().mean(dim=(2, 3), keepdim=True).clamp(min=1e-12).sqrt()
+        flow = params.amplitude[:, None, None, None] * field
+        return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
+
+    def moves(self, params: TurbulenceParams) -> Tensor:
+        """The samples with an amplitude."""
+        return params.amplitude != 0
+
+    def _check_folds(self, params: TurbulenceParams) -> None:
+        def folds() -> Tensor:
+            slope = slope_rms(params.length, kind=self.covariance, aperture=params.aperture)
+            return (params.gate & (params.amplitude * slope > _FOLD)).any()
+
+        if is_true(folds):
+            warnings.warn(
+                "amplitude is above what the covariance bears without folding the image (0.2 px over the slope of the "
+                "field): restore_valid leaves folded pixels out; a larger length_range or aperture_range folds less",
+                stacklevel=2,
+            )
+
+
+def check_field_params(params: Any, *, at_least_zero: Sequence[str]) -> None:
+    """Raise for parameters of a random field with a `length` and a `key` that are none."""
+    for name in (*at_least_zero, "length"):
+        if getattr(params, name).ndim != 1:
+            raise ValueError(f"params.{name} must have shape (B,), got {tuple(getattr(params, name).shape)}")
+    if params.key.shape[1:] != (4,) or params.key.dtype is not torch.int64:
+        raise ValueError(f"params.key must be (B, 4) of int64, got {tuple(params.key.shape)} of {params.key.dtype}")
+    for name in at_least_zero:
+        value = getattr(params, name)
+        check_all(f"params.{name}", "be at least 0 and finite", value, lambda v: v.isfinite() & (v >= 0))
+    check_all("params.length", "be above 0 and finite", params.length, lambda v: v.isfinite() & (v > 0))

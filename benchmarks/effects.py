@@ -25,7 +25,7 @@ from timing import (
 )
 from torch import Tensor
 
-from torchrefract import LensDistortion, UniformFog
+from torchrefract import DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, UniformFog
 from torchrefract.data.images import fit, read_image
 
 WHAT = (
@@ -36,7 +36,8 @@ WHAT = (
     "threads over the batch alone; the effects use all threads on one frame too."
 )
 LENS, RADIAL, FOG = "LensDistortion", "LensDistortion radial", "UniformFog"
-LIMITS = {LENS: 20.0, FOG: 0.25}  # multiples of the bare grid_sample
+TURBULENCE, SPLINE, SWIRL = "Turbulence, length 20 px", "ThinPlateSpline, 16 points", "DivergenceFree, length 20 px"
+LIMITS = {LENS: 20.0, FOG: 0.25, TURBULENCE: 10.0, SPLINE: 20.0, SWIRL: 10.0}  # multiples of the bare grid_sample
 BARS = "bars for now, set for 1x3x1080x1920 float32 on 2 threads:"
 
 
@@ -63,7 +64,12 @@ def candidates(frame: Tensor) -> dict[str, Candidate]:
     lens, fog = LensDistortion(), UniformFog()
     radial = LensDistortion(p1_range=(0.0, 0.0), p2_range=(0.0, 0.0))
     found = references(frame)
-    for name, effect in ((LENS, lens), (RADIAL, radial), (FOG, fog)):
+    others = {
+        TURBULENCE: Turbulence(length_range=(20.0, 20.0)),
+        SPLINE: ThinPlateSpline(),
+        SWIRL: DivergenceFree(length_range=(20.0, 20.0)),
+    }
+    for name, effect in {LENS: lens, RADIAL: radial, FOG: fog, **others}.items():
         found[name] = lambda effect=effect: effect(frame)
     found[f"{LENS}, all maps"] = lambda: _all_maps(lens, frame)
     for name, effect in ((LENS, lens), (RADIAL, radial), (FOG, fog)):

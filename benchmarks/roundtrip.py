@@ -16,13 +16,23 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchrefract import Degraded, LensDistortion, compose_flows, warp
+from torchrefract import DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, compose_flows, warp
 from torchrefract.data.images import EXTENSIONS, read_image
 from torchrefract.effects.refraction import WarpEffect
 from torchrefract.restoration.files import replacing
 
 EFFECTS: dict[str, Callable[[str], WarpEffect]] = {
     "LensDistortion": lambda mode: LensDistortion(interpolation=mode),
+    "Turbulence": lambda mode: Turbulence(interpolation=mode),
+    "Turbulence, strong": lambda mode: Turbulence(
+        amplitude_range=(3.0, 3.0), length_range=(60.0, 60.0), aperture_range=(3.0, 3.0), interpolation=mode
+    ),
+    "ThinPlateSpline": lambda mode: ThinPlateSpline(interpolation=mode),
+    "ThinPlateSpline, strong": lambda mode: ThinPlateSpline(amplitude_range=(25.0, 25.0), interpolation=mode),
+    "DivergenceFree": lambda mode: DivergenceFree(interpolation=mode),
+    "DivergenceFree, strong": lambda mode: DivergenceFree(
+        amplitude_range=(8.0, 8.0), length_range=(60.0, 60.0), interpolation=mode
+    ),
     "LensDistortion, strong": lambda mode: LensDistortion(
         k1_range=(-0.4, -0.35),
         k2_range=(0.12, 0.15),
@@ -53,21 +63,13 @@ def measure(name: str, frames: list[Tensor]) -> Row:
         clean = frame[None]
         by_mode = {m: EFFECTS[name](m).degrade(clean, seed=7, keys=[key]) for m in ("bilinear", "bicubic")}
         made = by_mode["bilinear"]
-        flow, back, valid = maps(made)
+        flow, back, valid = made.flow, made.restore_flow, made.restore_valid
         residual = compose_flows(flow.double(), back.double()).norm(dim=1, keepdim=True)[valid].max()
         restored = {mode: warp(d.image, back, interpolation=mode)[0] for mode, d in by_mode.items()}
         images = (made.image, warp(made.image, -flow)[0], restored["bilinear"], restored["bicubic"])
         found.append([residual, valid.double().mean(), *(psnr(image, clean, valid) for image in images)])
     values = torch.tensor(found, dtype=torch.float64)
     return Row(name, values[:, 0].max().item(), values[:, 1].min().item(), *values[:, 2:].mean(dim=0).tolist())
-
-
-def maps(made: Degraded) -> tuple[Tensor, Tensor, Tensor]:
-    """flow, restore_flow and restore_valid of a warp."""
-    assert made.flow is not None
-    assert made.restore_flow is not None
-    assert made.restore_valid is not None
-    return made.flow, made.restore_flow, made.restore_valid
 
 
 def psnr(image: Tensor, clean: Tensor, valid: Tensor) -> Tensor:

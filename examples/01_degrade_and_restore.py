@@ -13,13 +13,10 @@ out = sys.argv[1] if len(sys.argv) > 1 else "degrade_and_restore.png"
 clean, depth = render_road_scenes(torch.tensor([29]), 270, 480)
 
 lens = tr.LensDistortion(k1_range=(-0.3, -0.3), focal_range=(0.75, 0.75)).degrade(clean, seed=7)
-assert lens.flow is not None  # a lens has one, a fog does not
-assert lens.restore_flow is not None
 unbent, seen = tr.warp(lens.image, lens.restore_flow, interpolation="bicubic")
 
 fog = tr.UniformFog(visibility_range=(90, 90))
 misty = fog.degrade(clean, seed=7, depth=depth)
-assert misty.transmission is not None
 airlight = misty.params.airlight[:, :, None, None]
 # What 8 bits cannot hold any more stays fog.
 t = misty.transmission.clamp(min=1 / 255)

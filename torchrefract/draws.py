@@ -7,6 +7,7 @@ Source: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3
 """
 
 import math
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,7 +45,11 @@ def stream(seed: int | Tensor, keys: Tensor) -> Stream:
     if not isinstance(seed, Tensor):
         # Two's complement, so that every Python integer has its 64 bits.
         seed = torch.full((), (seed + 2**63) % 2**64 - 2**63, dtype=torch.int64, device=keys.device)
-    return Stream(*threefry(_words(seed), _words(keys)))
+    if (few := _few(len(keys), seed, keys)) is not None:
+        (start,), numbers = few
+        high, low = zip(*(_rounds(*_words(start), *_words(number)) for number in numbers), strict=True)
+        return Stream(torch.tensor(high), torch.tensor(low))
+    return Stream(*threefry(_words(seed.long()), _words(keys.long())))
 
 
 def fold(parent: Stream) -> Stream:
@@ -55,7 +60,14 @@ def fold(parent: Stream) -> Stream:
 
 def uniform(source: Stream, count: int) -> Tensor:
     """(B, count), float32, uniform in the open interval (0, 1), on a lattice of 2^23 values."""
-    counter = torch.arange((count + 1) // 2, dtype=torch.int64, device=source.low.device)
+    pairs = (count + 1) // 2
+    if (few := _few(pairs * len(source.low), source.high, source.low)) is not None:
+        rows = []
+        for high, low in zip(*few, strict=True):
+            words = zip(*(_rounds(high, low, i, source.lane) for i in range(pairs)), strict=True)
+            rows.append([((word >> 9) + 0.5) * 2.0**-23 for word in chain.from_iterable(words)][:count])
+        return torch.tensor(rows, dtype=torch.float32)
+    counter = torch.arange(pairs, dtype=torch.int64, device=source.low.device)
     lane = torch.full_like(counter, source.lane)
     words = threefry((source.high[:, None], source.low[:, None]), (counter, lane))
     return (torch.cat(words, dim=1)[:, :count] >> 9).float().add(0.5).mul(2.0**-23)
@@ -107,13 +119,8 @@ def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tupl
         arrays = [value.numpy() for value in (*key, *counter)]
     except (TypeError, RuntimeError):  # on an accelerator, or inside torch.vmap
         return _rounds(*key, *counter)
-    # Mostly a few numbers are drawn, and hundreds of operations on them take longest to start.
-    places = np.broadcast(*arrays)
-    if not 0 < places.size <= _FEW:
-        x, y = _rounds(*arrays)
-    else:
-        pairs = [_rounds(*map(int, words)) for words in places]
-        x, y = (np.array(words, dtype=np.int64).reshape(places.shape) for words in zip(*pairs, strict=True))
+    # Hundreds of operations on not so many numbers: those of numpy start several times as fast.
+    x, y = _rounds(*arrays)
     return torch.from_numpy(np.asarray(x)), torch.from_numpy(np.asarray(y))
 
 
@@ -122,7 +129,7 @@ def _threefry(key0: Tensor, key1: Tensor, counter0: Tensor, counter1: Tensor) ->
 
 
 def _rounds(key0: Any, key1: Any, counter0: Any, counter1: Any) -> tuple[Any, Any]:
-    """The generator, on tensors or arrays alike."""
+    """The generator, on tensors, arrays or whole numbers alike."""
     keys = (key0, key1, key0 ^ key1 ^ _PARITY)
     x, y = counter0 + key0, counter1 + key1
     for group in range(5):
@@ -156,8 +163,17 @@ def _hash(index: Tensor, a: Tensor, b: Tensor) -> Tensor:
     return x ^ x >> 16 & 0xFFFF
 
 
-def _words(value: Tensor) -> tuple[Tensor, Tensor]:
-    value = value.long()
+def _few(count: int, *values: Tensor) -> list[list[int]] | None:
+    """The values as whole numbers where a draw of so many blocks is faster in Python than to start on tensors."""
+    if not 0 < count <= _FEW or torch.compiler.is_compiling() or values[0].device.type != "cpu":
+        return None
+    try:
+        return [value.reshape(-1).tolist() for value in values]
+    except RuntimeError:  # inside torch.vmap no sample has values of its own
+        return None
+
+
+def _words(value: Any) -> tuple[Any, Any]:
     return (value >> 32) & _WORD, value & _WORD
 
 

@@ -1,0 +1,51 @@
+"""Effects in the transforms.Compose of a training script: degraded by the workers, with boxes that move along."""
+
+import sys
+
+import torch
+from torch.utils.data import DataLoader, Dataset
+from torchvision import tv_tensors
+from torchvision.transforms import v2
+from torchvision.utils import draw_bounding_boxes, make_grid, save_image
+
+import torchrefract as tr
+from torchrefract.data.road_scenes import RoadScenes
+
+SIZE = (180, 320)
+
+
+class Scenes(Dataset):
+    """Rendered roads, with the box of a part of each."""
+
+    def __init__(self, transform: v2.Transform):
+        self.frames, self.transform = RoadScenes(64, size=SIZE), transform
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, i: int) -> tuple[torch.Tensor, dict]:
+        box = torch.tensor([[110.0, 70.0, 210.0, 130.0]])
+        boxes = tv_tensors.BoundingBoxes(box, format="XYXY", canvas_size=SIZE)  # pyright: ignore[reportCallIssue]
+        target = {"boxes": boxes, "labels": torch.tensor([1])}
+        return self.transform(tv_tensors.Image(self.frames[i].image), target)
+
+
+def main() -> None:
+    """One batch, as a training step would get it."""
+    out = sys.argv[1] if len(sys.argv) > 1 else "train_with_transforms.png"
+    weather = tr.OneOf([tr.UniformFog(visibility_range=(60, 200)), tr.Turbulence(amplitude_range=(0.5, 1.0))], p=0.8)
+    transform = v2.Compose([v2.RandomHorizontalFlip(), weather, tr.LensDistortion(padding="border", p=0.8)])
+    torch.manual_seed(0)  # seeds the workers, and they the effects
+    loader = DataLoader(
+        Scenes(transform), batch_size=8, num_workers=2, collate_fn=lambda batch: list(zip(*batch, strict=True))
+    )
+    images, targets = next(iter(loader))
+    shown = [
+        draw_bounding_boxes((255 * image).byte(), target["boxes"], colors="yellow", width=2)
+        for image, target in zip(images, targets, strict=True)
+    ]
+    save_image(make_grid(torch.stack(shown).float() / 255, nrow=4), out)
+
+
+if __name__ == "__main__":
+    main()

@@ -107,7 +107,7 @@ def noise(key: Tensor, count: int) -> Tensor:
 
 def call_seed() -> Tensor:
     """(), int64: a fresh seed from torch's global generator, in eager mode and under torch.compile alike."""
-    return torch.ops.torchrefract.call_seed()
+    return torch.ops.torchrefract.call_seed.default()
 
 
 def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:

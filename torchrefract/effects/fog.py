@@ -108,7 +108,7 @@ class UniformFog(RadianceEffect):
         k = extinction(params.visibility.to(dtype), self.threshold) * (1 + params.deviation.to(dtype))
         t = transmission(depth, k.view(-1, 1, 1, 1))
         airlight = params.airlight.to(dtype)[:, :, None, None]
-        return Shaded(self._blend(image, t, airlight), valid=t >= 1 / 255, transmission=t)
+        return Shaded(self._blend(image, t, airlight), valid=lambda: t >= 1 / 255, transmission=t)
 
     def _blend(self, image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
         if not self.linear_light:

@@ -1,6 +1,7 @@
 """What every effect that changes light is: it moves nothing, and tells what arrives and what is added."""
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -15,7 +16,7 @@ class Shaded(NamedTuple):
     """What a radiance effect makes of a batch."""
 
     image: Tensor
-    valid: Tensor
+    valid: Callable[[], Tensor]
     transmission: Tensor | None = None
     intensity: Tensor | None = None
 
@@ -29,8 +30,8 @@ class RadianceEffect(Effect):
 
     def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """The batch in other light, where the gate is open."""
-        if is_true(params.gate.any) is False:
-            depth = None
+        if depth is not None and is_true(params.gate.any) is False:
+            depth = None  # and nobody looks at its values
         shaded = self.shade(image, params, depth)
         size = (image.shape[0], 1, *image.shape[2:])
 
@@ -42,7 +43,7 @@ class RadianceEffect(Effect):
         return Degraded(
             _gated(shaded.image, image, params.gate),
             params,
-            valid=lambda: (shaded.valid | ~column(params.gate)).expand(size),
+            valid=lambda: (shaded.valid() | ~column(params.gate)).expand(size),
             transmission=gated(shaded.transmission, 1.0),
             intensity=gated(shaded.intensity, 0.0),
         )

@@ -46,8 +46,8 @@ def veil(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
 
 def linear_depth(height: int, max_depth: float, *, dtype: torch.dtype, device: torch.device) -> Tensor:
     """(1, 1, H, 1), m: d(y) = (1 - (y + 1/2) / H) D_max, from the far top row to the near bottom row."""
-    row = torch.arange(height, dtype=dtype, device=device).view(1, 1, height, 1)
-    return (1 - (row + 0.5) / height) * max_depth
+    half = max_depth / (2 * height)
+    return torch.linspace(max_depth - half, half, height, dtype=dtype, device=device).view(1, 1, height, 1)
 
 
 def srgb_to_linear(value: Tensor) -> Tensor:

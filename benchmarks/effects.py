@@ -38,7 +38,7 @@ WHAT = (
 LENS, RADIAL, FOG = "LensDistortion", "LensDistortion radial", "UniformFog"
 TURBULENCE, SPLINE, SWIRL = "Turbulence, length 20 px", "ThinPlateSpline, 16 points", "DivergenceFree, length 20 px"
 LIMITS = {LENS: 20.0, FOG: 0.25, TURBULENCE: 10.0, SPLINE: 20.0, SWIRL: 10.0}  # multiples of the bare grid_sample
-BARS = "bars for now, set for 1x3x1080x1920 float32 on 2 threads:"
+BARS = "bars, set for 1x3x1080x1920 float32 on 2 threads:"
 
 
 def main() -> None:
@@ -79,7 +79,7 @@ def candidates(frame: Tensor) -> dict[str, Candidate]:
 
 
 def bars(timings: Sequence[Timing]) -> list[Bar]:
-    """The limits that hold for now, beside what was measured."""
+    """The limits, beside what was measured."""
     ratios = {timing.name: timing.ratios[GRID_SAMPLE].median for timing in timings}
     return [Bar(name, GRID_SAMPLE, limit, ratios[name]) for name, limit in LIMITS.items()]
 

@@ -25,7 +25,7 @@ class Scenes(Dataset):
 
     def __getitem__(self, i: int) -> tuple[torch.Tensor, dict]:
         box = torch.tensor([[110.0, 70.0, 210.0, 130.0]])
-        boxes = tv_tensors.BoundingBoxes(box, format="XYXY", canvas_size=SIZE)  # pyright: ignore[reportCallIssue]
+        boxes = tv_tensors.BoundingBoxes(box, format="XYXY", canvas_size=SIZE)  # pyright: ignore[reportCallIssue]  # torchvision's overloads
         target = {"boxes": boxes, "labels": torch.tensor([1])}
         return self.transform(tv_tensors.Image(self.frames[i].image), target)
 

@@ -20,9 +20,9 @@ def sample(size: tuple[int, int] = (64, 96)) -> tuple[Tensor, dict]:
     mask[1, 5:15, 60:80] = 1
     boxes = torch.tensor([[30.0, 20.0, 50.0, 40.0], [60.0, 5.0, 80.0, 15.0]])
     target = {
-        "boxes": tv_tensors.BoundingBoxes(boxes, format="XYXY", canvas_size=size),  # pyright: ignore[reportCallIssue]
+        "boxes": tv_tensors.BoundingBoxes(boxes, format="XYXY", canvas_size=size),  # pyright: ignore[reportCallIssue]  # torchvision's overloads
         "masks": tv_tensors.Mask(mask),
-        "points": tv_tensors.KeyPoints(torch.tensor([[40.0, 30.0], [70.0, 10.0]]), canvas_size=size),  # pyright: ignore
+        "points": tv_tensors.KeyPoints(torch.tensor([[40.0, 30.0], [70.0, 10.0]]), canvas_size=size),  # pyright: ignore[reportCallIssue]  # as above
         "labels": torch.tensor([3, 7]),
         "name": "frame 1",
     }

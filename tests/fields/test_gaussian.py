@@ -298,7 +298,7 @@ def test_an_aperture_smooths_the_field_by_a_gaussian(kind):
 def test_the_slope_is_that_of_the_spectrum(kind, length):
     for aperture, rel in ((None, 2e-3), (0.0, 2e-3), (0.3, 0.1), (1.0, 0.03), (2.0, 0.01), (8.0, 0.01), (30.0, 0.01)):
         size = tuple(n + n % 2 for n in torus(40, 40, length=length, kind=kind, aperture=2 * (aperture or 0.0)))
-        found = covariance_of(exact_spectrum(size, length, kind, aperture))  # pyright: ignore[reportArgumentType]
+        found = covariance_of(exact_spectrum(size, length, kind, aperture))  # pyright: ignore[reportArgumentType]  # two numbers
         exact = math.sqrt(2 * (1 - found[0, 1].item()))
         apertures = None if aperture is None else one(aperture)
         assert slope_rms(one(length), kind=kind, aperture=apertures).item() == pytest.approx(exact, rel=rel)

@@ -3,6 +3,7 @@
 import errno
 import logging
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, InstantiationException, MissingConfigException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -34,7 +36,11 @@ _HINTS = (
     ".*smaller than the logging interval.*",
     ".*exists and is not empty.*",
     ".*dirpath has changed.*",
+    "Glyph .* missing from font.*",
 )
+# The options of Hydra whose value is the next word.
+_TAKING = ("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--cfg", "-c", "--package", "-p")
+_TAKING += ("--info", "-i", "--experimental-rerun")
 
 
 class Job(NamedTuple):
@@ -49,8 +55,32 @@ class UsageError(Exception):
     """Something that the user can mend; the message says how."""
 
 
-def command(name: str) -> Callable[[Callable[[], None]], Callable[[], None]]:
-    """Decorates the Hydra main function of `python -m torchrefract.<name>`: checks its words, shortens its errors."""
+def with_task(name: str, words: list[str]) -> list[str]:
+    """The words of `python -m torchrefract.<name>` as they are, if they choose a task or only ask for information."""
+    if any(word in _INFORMING for word in words):
+        return words
+    listed = ", ".join(tasks())
+    for word in words:
+        if word.startswith("task="):
+            raise UsageError(f"{word} needs a plus, since no task is chosen yet: python -m torchrefract.{name} +{word}")
+    if not any(word.startswith(("+task=", "++task=")) for word in words):
+        raise UsageError(f"+task must be one of {listed}: python -m torchrefract.{name} +task={tasks()[-1]}, got none")
+    return words
+
+
+def with_picture(name: str, words: list[str]) -> list[str]:
+    """The words of `python -m torchrefract.<name>`, with a bare one that names a picture turned into `image=<word>`."""
+    pictures = [i for i, word in enumerate(words) if _is_picture(word) and (i == 0 or words[i - 1] not in _TAKING)]
+    if len(pictures) > 1:
+        several = " and ".join(words[i] for i in pictures)
+        raise UsageError(f"{name} must have one picture, in quotes if its name has spaces, got {several}")
+    return [f"image={_quoted(word)}" if i in pictures else word for i, word in enumerate(words)]
+
+
+def command(
+    name: str, *, prepare: Callable[[str, list[str]], list[str]] = with_task
+) -> Callable[[Callable[[], None]], Callable[[], None]]:
+    """Decorates the Hydra main function of `python -m torchrefract.<name>`: prepares its words, shortens its errors."""
 
     def decorate(main: Callable[[], None]) -> Callable[[], None]:
         @wraps(main)
@@ -59,7 +89,7 @@ def command(name: str) -> Callable[[Callable[[], None]], Callable[[], None]]:
             # With this, Hydra hands on its errors instead of printing them in its own form.
             os.environ["HYDRA_FULL_ERROR"] = "1"
             with _one_line_errors():
-                _check_words(name, sys.argv[1:])
+                sys.argv[1:] = prepare(name, sys.argv[1:])
                 main()
 
         return run
@@ -81,17 +111,15 @@ def job(function: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
 def make_job(cfg: DictConfig, *, needs_checkpoint: bool = False) -> Job:
     """Data, model and trainer of a configuration, the checkpoint checked, the resolved configuration written."""
     OmegaConf.resolve(cfg)
-    if not isinstance(cfg.seed, int) or not 0 <= cfg.seed < _SEEDS:
-        raise UsageError(f"seed must be a whole number from 0 to {_SEEDS - 1}, got {cfg.seed}")
-    seed_everything(cfg.seed, workers=True, verbose=False)
+    seed_everything(check_seed(cfg.seed), workers=True, verbose=False)
     if needs_checkpoint and cfg.ckpt_path is None:
         raise UsageError("ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none")
     path = Path(cfg.ckpt_path or "")
     checkpoint = None
     if cfg.ckpt_path is not None:
         checkpoint = read_checkpoint(path, task=str(HydraConfig.get().runtime.choices["task"]))
-    made = Job(_make(cfg, "data"), _make(cfg, "model"), _make(cfg, "trainer"))
-    with _naming("data"):
+    made = Job(make(cfg, "data"), make(cfg, "model"), make(cfg, "trainer"))
+    with naming("data"):
         made.data.check_ranks(made.trainer.world_size)
     if checkpoint is not None:
         check_fits(checkpoint, made.model, path)
@@ -101,6 +129,13 @@ def make_job(cfg: DictConfig, *, needs_checkpoint: bool = False) -> Job:
         with replacing(Path(cfg.run_dir, "config.yaml")) as path:
             OmegaConf.save(cfg, path)
     return made
+
+
+def check_seed(seed: Any) -> int:
+    """`seed` if a command can take it."""
+    if not isinstance(seed, int) or not 0 <= seed < _SEEDS:
+        raise UsageError(f"seed must be a whole number from 0 to {_SEEDS - 1}, got {seed}")
+    return seed
 
 
 def _check_unfinished(done: int, epochs: int | None) -> None:
@@ -115,8 +150,9 @@ def tasks() -> list[str]:
     return sorted(path.stem for path in Path(CONFIG_DIR, "task").glob("*.yaml"))
 
 
-def _make(cfg: DictConfig, part: str) -> Any:
-    with _naming(part):
+def make(cfg: DictConfig, part: str) -> Any:
+    """What a part of a configuration instantiates to."""
+    with naming(part):
         try:
             return instantiate(cfg[part])
         except InstantiationException as error:
@@ -124,22 +160,22 @@ def _make(cfg: DictConfig, part: str) -> Any:
 
 
 @contextmanager
-def _naming(part: str) -> Iterator[None]:
+def naming(part: str) -> Iterator[None]:
+    """Errors of values inside the block are the user's, in the part of the configuration that is named."""
     try:
         yield
     except (ValueError, TypeError, OSError, MisconfigurationException) as error:
         raise UsageError(f"{part}: {error}") from error
 
 
-def _check_words(name: str, words: list[str]) -> None:
-    if any(word in _INFORMING for word in words):
-        return
-    listed = ", ".join(tasks())
-    for word in words:
-        if word.startswith("task="):
-            raise UsageError(f"{word} needs a plus, since no task is chosen yet: python -m torchrefract.{name} +{word}")
-    if not any(word.startswith(("+task=", "++task=")) for word in words):
-        raise UsageError(f"+task must be one of {listed}: python -m torchrefract.{name} +task={tasks()[-1]}, got none")
+def _is_picture(word: str) -> bool:
+    # A name may hold what is not its own in Hydra's grammar, so a file that is there is always meant.
+    return not word.startswith("-") and (os.path.isfile(word) or not ("=" in word or word.startswith("~")))
+
+
+def _quoted(text: str) -> str:
+    """`text` so that Hydra's grammar and OmegaConf's interpolation hand it on letter by letter."""
+    return QuotedString(re.sub(r"(\\*)\$\{", r"\1\1\\${", text), Quote.single).with_quotes()
 
 
 def _mendable(error: Exception) -> str | None:

@@ -1,4 +1,4 @@
-"""Pictures of fields: flow by the color wheel, transmission by a color map, and a checkerboard to bend."""
+"""Pictures of fields: flow by the color wheel, transmission by a color map, a checkerboard to bend, and marks on it."""
 
 import math
 
@@ -22,6 +22,9 @@ _VIRIDIS = (
 )
 _GRAY = 0.5
 _BEYOND = 0.75  # brightness of a motion longer than the scale
+_STRIPES = (0.86, 0.62)
+_FOLD = (1.0, 0.0, 1.0)
+_FOLD_SHARE = 0.75
 
 
 def flow_to_rgb(flow: Tensor, *, max_px: float | None = None) -> Tensor:
@@ -57,6 +60,29 @@ def flow_to_rgb(flow: Tensor, *, max_px: float | None = None) -> Tensor:
     color = _interpolate(hue, hue.new_tensor(_HUES), hue.new_tensor(_RED_TO_RED))
     color = torch.where(r <= 1, 1 - r * (1 - color), _BEYOND * color)
     return torch.where(finite.unsqueeze(1), color, _GRAY)
+
+
+def full_color_px(flow: Tensor, valid: Tensor) -> float:
+    """A round `max_px` for `flow_to_rgb`: the longest flow that is valid, rounded up to two digits.
+
+        step = 10^(floor(log10(longest)) - 1),  full_color_px = ceil(longest / step) step
+
+    Args:
+        flow: (B, 2, H, W), px.
+        valid: (B, 1, H, W), bool, the pixels that count; what is not finite never does.
+
+    Returns:
+        px; 1 where nothing that counts moves.
+    """
+    _check_map("flow", flow, channels=2)
+    _check_mask("valid", valid, flow)
+    u, v = _at_least_float32(flow).unbind(1)
+    magnitude = torch.hypot(u, v)
+    longest = F.pad(magnitude[valid[:, 0] & magnitude.isfinite()], (0, 1)).amax().item()
+    if longest == 0:
+        return 1.0
+    step = 10.0 ** (math.floor(math.log10(longest)) - 1)
+    return math.ceil(longest / step) * step
 
 
 def flow_wheel(size: int) -> Tensor:
@@ -120,6 +146,50 @@ def checkerboard(height: int, width: int, *, cell: int = 32) -> Tensor:
     return white.float().expand(1, 3, -1, -1).contiguous()
 
 
+def hatch_invalid(image: Tensor, valid: Tensor) -> Tensor:
+    """The picture with gray stripes over what is not valid.
+
+        stripe(row, column) = 0.86 if (row + column) mod period < period / 2, else 0.62,  period = max(8, side / 40)
+
+    The side is the longer one. A pixel of the picture takes the valid flag that lies under its center.
+
+    Args:
+        image: (B, 3, H, W), floating in [0, 1], in the pixels that it is drawn with.
+        valid: (B, 1, h, w), bool, of any size.
+
+    Returns:
+        (B, 3, H, W), of the type of the image.
+    """
+    _check_map("image", image, channels=3)
+    _check_mask("valid", valid, image, any_size=True)
+    height, width = image.shape[2:]
+    period = max(8, max(height, width) // 40)
+    diagonal = torch.arange(height, device=image.device)[:, None] + torch.arange(width, device=image.device)
+    stripes = torch.where(diagonal % period < period // 2, *_STRIPES).to(image.dtype)
+    kept = F.interpolate(valid.to(image.device, torch.float32), (height, width), mode="nearest-exact") > 0
+    return torch.where(kept, image, stripes)
+
+
+def mark_folded(image: Tensor, folded: Tensor) -> Tensor:
+    """The picture with magenta over the folded pixels.
+
+        out = 0.25 image + 0.75 (1, 0, 1)
+
+    A pixel of the picture is marked if any of those that it covers is folded, so that a thin fold outlives shrinking.
+
+    Args:
+        image: (B, 3, H, W), floating in [0, 1], in the pixels that it is drawn with.
+        folded: (B, 1, h, w), bool, of any size, such as `jacobian_determinant(flow) <= 0`.
+
+    Returns:
+        (B, 3, H, W), of the type of the image.
+    """
+    _check_map("image", image, channels=3)
+    _check_mask("folded", folded, image, any_size=True)
+    marked = F.adaptive_max_pool2d(folded.to(image.device, torch.float32), image.shape[2:]) > 0
+    return torch.where(marked, torch.lerp(image, image.new_tensor(_FOLD).view(3, 1, 1), _FOLD_SHARE), image)
+
+
 def _largest(magnitude: Tensor) -> Tensor:
     """() or the floor of 1e-6, which an empty batch has too."""
     return F.pad(magnitude.flatten(), (0, 1), value=1e-6).amax()
@@ -143,6 +213,15 @@ def _check_map(name: str, value: Tensor, *, channels: int) -> None:
         raise ValueError(f"{name} must have shape (B, {channels}, H, W), got {tuple(value.shape)}")
     if not value.is_floating_point():
         raise TypeError(f"{name} must be of a floating type, got {value.dtype}")
+
+
+def _check_mask(name: str, value: Tensor, like: Tensor, *, any_size: bool = False) -> None:
+    size = tuple(value.shape[2:]) if any_size else tuple(like.shape[2:])
+    if value.ndim != 4 or value.shape != (like.shape[0], 1, *size):
+        size_text = "h, w" if any_size else f"{size[0]}, {size[1]}"
+        raise ValueError(f"{name} must have shape ({like.shape[0]}, 1, {size_text}), got {tuple(value.shape)}")
+    if value.dtype is not torch.bool:
+        raise TypeError(f"{name} must be of type bool, got {value.dtype}")
 
 
 def _check_size(name: str, value: int) -> None:

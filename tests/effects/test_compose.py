@@ -208,6 +208,80 @@ def test_a_sample_does_not_depend_on_the_batch_around_it():
             assert torch.equal(some[name], value[rows]), name
 
 
+def several() -> list[Compose]:
+    """Compositions whose effects pad in different ways and are drawn for some samples only."""
+    return [
+        Compose([ThinPlateSpline(p=0.5), UniformFog(p=0.5), Turbulence(p=0.5), LensDistortion(p=0.5)]),
+        OneOf([LensDistortion(), UniformFog(), ThinPlateSpline(), DivergenceFree(interpolation="bicubic")]),
+        Compose([OneOf([LensDistortion(), Turbulence()], p=0.7), ThinPlateSpline(p=0.5)], p=0.8),
+    ]
+
+
+SEVERAL = ["Compose", "OneOf", "OneOf inside"]
+
+
+@pytest.mark.parametrize("which", range(3), ids=SEVERAL)
+def test_a_sample_does_not_depend_on_what_others_draw(which):
+    effect, image, keys = several()[which], picture(12, 3, 33, 47), torch.arange(12) * 2**33
+    together = maps(effect.degrade(image, seed=7, keys=keys))
+    for i in range(12):
+        alone = maps(effect.degrade(image[i], seed=7, keys=keys[[i]]))
+        for name, value in together.items():
+            assert torch.equal(alone[name], value[i]), (i, name)
+
+
+@pytest.mark.parametrize("which", range(3), ids=SEVERAL)
+def test_a_sample_does_not_depend_on_the_number_of_threads(which, on_threads):
+    effect, image = several()[which], picture(3, 3, 151, 127)
+    results = []
+    for threads in (1, 2, 3):
+        on_threads(threads)
+        results.append(maps(effect.degrade(image, seed=7)))
+    for result in results[1:]:
+        for name, value in results[0].items():
+            assert torch.equal(result[name], value), name
+
+
+def test_one_of_shows_each_sample_as_the_effect_chosen_for_it_does():
+    effect, image = several()[1], picture(12, 3, 33, 47)
+    drawn = effect.degrade(image, seed=7)
+    for child, params in zip(effect.effects, drawn.params.children, strict=True):
+        alone = cast(Effect, child).apply(image, params)
+        assert params.gate.any()
+        assert torch.equal(drawn.image[params.gate], alone.image[params.gate]), type(child).__name__
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float16, torch.bfloat16, torch.float64])
+@pytest.mark.parametrize("layout", ["contiguous", "channels_last", "strided", "unbatched"])
+def test_shape_type_and_layout_are_kept(dtype, layout):
+    effect = Compose([*warps(), UniformFog()])
+    image, scale = picture(2, 3, 20, 30), 255 if dtype is torch.uint8 else 1
+    image = (255 * image).round().to(dtype) if dtype is torch.uint8 else image.to(dtype)
+    wide = image if dtype is torch.float64 else image.float()
+    expected = effect.degrade(wide / scale, seed=7).image * scale
+    expected = expected.round().to(dtype) if dtype is torch.uint8 else expected.to(dtype)
+    if layout == "channels_last":
+        image = image.contiguous(memory_format=torch.channels_last)
+    elif layout == "strided":
+        image = torch.stack([image, image], dim=-1)[..., 0]
+    elif layout == "unbatched":
+        image, expected = image[0], expected[0]
+    result = effect.degrade(image, seed=7).image
+    assert torch.equal(result, expected)
+    assert result.is_contiguous(memory_format=torch.channels_last) == (layout == "channels_last")
+
+
+@pytest.mark.parametrize("shape", [(0, 3, 8, 9), (2, 1, 1, 13), (2, 4, 13, 1), (1, 12, 31, 37)])
+def test_frames_of_any_shape_are_no_special_case(shape):
+    image = picture(*shape) if shape[0] else torch.zeros(shape)
+    degraded = Compose([*warps(), UniformFog()]).degrade(image, seed=7)
+    for name, value in maps(degraded).items():
+        assert (value.shape[0], *value.shape[2:]) == (shape[0], *shape[2:]), name
+        assert value.isfinite().all(), name
+    pixel = torch.rand(2, 3, 1, 1)
+    assert torch.equal(Compose(warps()).degrade(pixel, seed=7).image, pixel)
+
+
 def test_one_of_chooses_one_by_weight():
     effect = OneOf([LensDistortion(), UniformFog(), ThinPlateSpline()], weights=[1, 2, 5], p=0.8)
     params = effect.sample(torch.zeros(8000, 3, 1, 1), seed=2)
@@ -255,6 +329,17 @@ def test_one_graph_gives_the_same_as_eager_mode():
         lambda image, params: effect.apply(image, params).image, fullgraph=True, backend="aot_eager"
     )
     assert_close(compiled(image, params), effect.apply(image, params).image, rtol=0, atol=2e-4)
+
+
+@pytest.mark.parametrize("which", range(3), ids=SEVERAL)
+def test_one_graph_draws_and_shows_the_same_as_eager_mode(which):
+    effect, image = several()[which], picture(4, 3, 24, 32)
+    torch.manual_seed(3)
+    expected = [effect(image) for _ in range(2)]
+    # The contract compiles each effect to machine code; here one graph must hold them all.
+    compiled = torch.compile(effect, fullgraph=True, backend="aot_eager")
+    torch.manual_seed(3)
+    assert_close([compiled(image) for _ in range(2)], expected, rtol=0, atol=2e-4)
 
 
 @pytest.mark.parametrize(

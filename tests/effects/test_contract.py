@@ -14,8 +14,19 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 from torch.utils.data import DataLoader, Dataset
 
-from torchrefract import Degraded, DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, UniformFog
+import torchrefract
+from torchrefract import (
+    Compose,
+    Degraded,
+    DivergenceFree,
+    LensDistortion,
+    ThinPlateSpline,
+    Turbulence,
+    UniformFog,
+    warp,
+)
 from torchrefract.effects.base import Effect
+from torchrefract.effects.refraction import WarpEffect
 
 DTYPES = [torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64]
 MAPS = ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission", "intensity")
@@ -124,6 +135,11 @@ def assert_same(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
         assert torch.equal(actual[name], value), name
 
 
+def test_every_effect_of_the_package_is_held_to_the_contract():
+    kinds = [kind for kind in vars(torchrefract).values() if isinstance(kind, type) and issubclass(kind, Effect)]
+    assert {kind for kind in kinds if not issubclass(kind, Compose)} == {case.make for case in EFFECTS.values()}
+
+
 def test_a_sample_does_not_depend_on_the_batch_around_it(case):
     effect, images, keys = case.strong(p=0.8), picture(16, 3, 33, 47), torch.arange(100, 116) * 2**33
     together = maps(effect.degrade(images, seed=7, keys=keys))
@@ -133,12 +149,13 @@ def test_a_sample_does_not_depend_on_the_batch_around_it(case):
         assert_same(some, {name: value[rows] for name, value in together.items()})
 
 
-def test_a_sample_does_not_depend_on_the_number_of_threads(case, on_threads):
-    effect, images = case.strong(), picture(1, 3, 151, 127)
+@pytest.mark.parametrize("batch", [1, 3])
+def test_a_sample_does_not_depend_on_the_number_of_threads(case, batch, on_threads):
+    effect, images = case.strong(), picture(batch, 3, 151, 127)
     results = []
     for threads in (1, 2, 3):
         on_threads(threads)
-        results.append(maps(effect.degrade(images, seed=7, keys=[5])))
+        results.append(maps(effect.degrade(images, seed=7, keys=range(5, 5 + batch))))
     for result in results[1:]:
         assert_same(result, results[0])
 
@@ -279,6 +296,20 @@ def test_every_type_shows_the_same_picture(case, dtype):
     assert_close(result, effect.degrade(image, seed=7).image.double(), rtol=0, atol=step + 1e-6)
 
 
+@pytest.mark.parametrize("size", [(1080, 1920), (2160, 3840)])
+def test_half_types_are_computed_in_single_precision_at_full_size(case, size):
+    effect = case.make()
+    # Levels that both half types hold exactly, so that one frame in single precision serves for both.
+    image = (255 * picture(1, 1, *size)).floor() / 256
+    params = effect.sample(image, seed=7)
+    expected = effect.apply(image, params).image
+    assert not torch.equal(expected, image)
+    for dtype in (torch.float16, torch.bfloat16):
+        found = effect.apply(image.to(dtype), params).image
+        assert found.isfinite().all()
+        assert torch.equal(found, expected.to(dtype))
+
+
 def test_maps_of_an_unbatched_image_are_unbatched(case):
     effect, image = case.strong(), picture(3, 20, 30)
     alone = maps(effect.degrade(image, seed=7, keys=[5]))
@@ -298,10 +329,17 @@ def test_any_number_of_channels_is_taken(case, channels):
 
 @pytest.mark.parametrize("size", [(1, 13), (13, 1), (31, 37), (2, 2)])
 def test_narrow_and_prime_frames_are_no_special_case(case, size):
-    degraded = case.strong().degrade(picture(2, 3, *size), seed=7)
+    effect, image = case.strong(), picture(2, 3, *size)
+    degraded = effect.degrade(image, seed=7)
     for name, value in maps(degraded).items():
         assert value.shape[2:] == size, name
         assert value.isfinite().all(), name
+    if degraded.flow is not None:
+        expected = warp(image, degraded.flow, padding=effect.padding, interpolation=effect.interpolation)[0]
+        assert torch.equal(degraded.image, expected)
+    if degraded.transmission is not None:
+        t, airlight = degraded.transmission, degraded.params.airlight[..., None, None]
+        assert_close(degraded.image, t * image + (1 - t) * airlight, rtol=0, atol=1e-6)
 
 
 def test_a_frame_of_one_pixel_does_not_move():
@@ -333,6 +371,28 @@ def test_poisoned_pixels_stay_local(case, poison):
     assert torch.equal(dirty.image[~touched], clean.image[~touched])
     assert not dirty.image[touched].isfinite().all()
     assert touched.sum() <= 25
+
+
+@pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
+def test_poisoned_pixels_leave_the_gradients_of_the_others_alone(case, poison, interpolation):
+    effect = case.strong()
+    if isinstance(effect, WarpEffect):
+        effect = case.strong(interpolation=interpolation)
+    params = effect.sample(picture(2, 3, 24, 32), seed=7)
+    gradients = []
+    for value in (0.5, poison):
+        image = (0.25 + picture(2, 3, 24, 32) / 2).index_put(tuple(torch.tensor([0, 1, 11, 13])), torch.tensor(value))
+        field = getattr(params, case.fields[0]).clone().requires_grad_()
+        degraded = effect.apply(image.requires_grad_(), params._replace(**{case.fields[0]: field}))
+        gradients.append(torch.autograd.grad(degraded.image.sum(), [image, field]))
+    (clean, clean_field), (dirty, dirty_field) = gradients
+    far = torch.ones(2, 3, 24, 32, dtype=torch.bool)
+    far[0, 1, 7:16, 9:18] = False
+    assert torch.equal(dirty[far], clean[far])
+    assert dirty.isfinite().all()
+    # Nor does one sample's poison reach the parameters of another.
+    assert torch.equal(dirty_field[1], clean_field[1])
 
 
 def test_params_replay_the_draw_bit_for_bit(case):
@@ -425,6 +485,32 @@ def test_nan_in_a_field_of_the_params_is_named(case):
         wrong.view(-1)[-1] = math.nan
         with pytest.raises(ValueError, match=rf"params\.{name} must"):
             effect.apply(image, params._replace(**{name: wrong}))
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf])
+def test_an_infinite_field_of_the_params_is_named(case, value):
+    effect, image = case.strong(), picture(2, 3, 8, 9)
+    params = effect.sample(image, seed=7)
+    for name in case.fields:
+        if (name, value) == ("visibility", math.inf):  # clear air
+            continue
+        wrong = getattr(params, name).clone()
+        wrong.view(-1)[-1] = value
+        with pytest.raises(ValueError, match=rf"params\.{name} must|points must"):
+            effect.apply(image, params._replace(**{name: wrong}))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_range_without_a_number_at_an_end_is_named(case, value):
+    names = [name for name, given in vars(case.strong()).items() if name.endswith("_range") and isinstance(given, tuple)]
+    assert len(names) >= 2
+    for name in names:
+        low, high = getattr(case.strong(), name)
+        for wrong in ((value, high), (low, value)):
+            if wrong == (low, math.inf) and name == "visibility_range":  # clear air
+                continue
+            with pytest.raises(ValueError, match=f"{name} must"):
+                case.make(**{name: wrong})
 
 
 def test_params_of_another_batch_are_named(case):

@@ -1,6 +1,5 @@
 """Two pictures of a training run: its curves over the epochs, and a panel of examples."""
 
-import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,16 +8,16 @@ from statistics import fmean
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
+from torchrefract.page import Page, as_drawn
 from torchrefract.restoration.files import replacing
 from torchrefract.restoration.history import metrics_rows
-from torchrefract.viz import flow_to_rgb, flow_wheel
+from torchrefract.viz import flow_to_rgb, flow_wheel, full_color_px, hatch_invalid
 
 _Columns = dict[str, dict[int, float]]  # name -> epoch -> value
 
@@ -36,8 +35,6 @@ _STYLES = (
     _Style("val/{}_identity", "do nothing", "#6b6b6b", "--"),
     _Style("val/{}_constant", "best constant flow", "#d95f02", "--"),
 )
-_DPI = 100
-_SMALLEST, _LARGEST = 320, 640  # px, the longer side of an image as drawn
 
 
 def save_curves(run: Path, out: Path, *, epe_unit: str = "px") -> None:
@@ -161,8 +158,8 @@ def _panel(rows: PanelRows) -> Figure:
     columns = _columns(rows, scale)
     lines = 1 + max(caption.count("\n") for caption in rows.captions)
     height, width = columns["clean"].shape[2:]
-    page = _Page(len(rows.clean), len(columns), height, width, lines)
-    figure = Figure(figsize=(page.size[0] / _DPI, page.size[1] / _DPI), dpi=_DPI, facecolor="white")
+    page = Page(len(rows.clean), len(columns), height, width, lines)
+    figure = page.figure()
     for j, (title, images) in enumerate(columns.items()):
         page.write(figure, title, page.left(j) + page.width / 2, 2 * page.text, ha="center", weight="bold")
         for i, image in enumerate(images):
@@ -181,90 +178,22 @@ def _columns(rows: PanelRows, scale: float) -> dict[str, Tensor]:
             derived[title] = flow_to_rgb(flow, max_px=scale)
     if len(derived) == 1:
         derived["|restored - clean| x 4"] = 4 * (rows.restored - rows.clean).abs()
-    hatched = {title: _hatch(_resize(image), rows.valid) for title, image in derived.items()}
-    return {"clean": _resize(rows.clean), "corrupted": _resize(rows.degraded)} | hatched
+    hatched = {title: hatch_invalid(as_drawn(image), rows.valid) for title, image in derived.items()}
+    return {"clean": as_drawn(rows.clean), "corrupted": as_drawn(rows.degraded)} | hatched
 
 
 def _full_color_px(rows: PanelRows) -> float:
-    """The longest valid true flow, rounded up to two digits; a stray prediction must not pale the truth."""
-    for flow in (rows.flow, rows.predicted_flow):
-        if flow is not None:
-            u, v = flow.detach().float().cpu().unbind(1)
-            magnitude = torch.hypot(u, v)
-            longest = torch.where(rows.valid.cpu()[:, 0] & magnitude.isfinite(), magnitude, 0).max().item()
-            if longest > 0:
-                step = 10.0 ** (math.floor(math.log10(longest)) - 1)
-                return math.ceil(longest / step) * step
-    return 1.0
+    """The scale of the true flow, if it moves anything; a stray prediction must not pale the truth."""
+    moving = [flow for flow in (rows.flow, rows.predicted_flow) if flow is not None and flow.any()]
+    return full_color_px(moving[0], rows.valid) if moving else 1.0
 
 
-def _resize(images: Tensor) -> Tensor:
-    """Small images repeat their pixels a whole number of times, large ones shrink; what is not finite turns gray."""
-    images = torch.where(images.isfinite(), images, 0.5).detach().float().cpu().clamp(0, 1)
-    height, width = images.shape[2:]
-    if max(height, width) <= _LARGEST:
-        factor = max(1, math.ceil(_SMALLEST / max(height, width)))
-        return images.repeat_interleave(factor, dim=2).repeat_interleave(factor, dim=3)
-    share = _LARGEST / max(height, width)
-    return F.interpolate(images, (max(1, round(height * share)), max(1, round(width * share))), mode="area")
-
-
-def _hatch(images: Tensor, valid: Tensor) -> Tensor:
-    """`images` in the pixels drawn, with gray stripes where `valid`, in its own pixels, is False."""
-    height, width = images.shape[2:]
-    period = max(8, max(height, width) // 40)
-    diagonal = torch.arange(height)[:, None] + torch.arange(width)
-    stripes = torch.where(diagonal % period < period // 2, 0.86, 0.62)
-    return torch.where(F.interpolate(valid.cpu().float(), (height, width), mode="nearest-exact") > 0, images, stripes)
-
-
-class _Page(NamedTuple):
-    """Where things lie, in px from the top left: whole pixels, so that drawing does not resample the images."""
-
-    rows: int
-    columns: int
-    height: int  # of an image, as drawn
-    width: int
-    caption_lines: int
-
-    @property
-    def text(self) -> int:
-        return max(self.height, self.width) // 20
-
-    @property
-    def pitch(self) -> int:
-        """From column to column; a narrow image still leaves room for its title."""
-        return max(self.width + self.text // 2, 12 * self.text)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return 2 * self.text + self.columns * self.pitch, self.top(self.rows) + 4 * self.text
-
-    def left(self, column: int) -> int:
-        return self.text + column * self.pitch + (self.pitch - self.width) // 2
-
-    def top(self, row: int) -> int:
-        caption = round((1.3 * self.caption_lines + 0.8) * self.text)
-        return 2 * self.text + row * (self.height + caption) + caption
-
-    def write(self, figure: Figure, text: str, x: float, y: float, *, ha: str = "left", weight: str = "normal") -> None:
-        where, size = (x / self.size[0], 1 - y / self.size[1]), 0.8 * self.text * 72 / _DPI
-        figure.text(*where, text, ha=ha, va="bottom", weight=weight, fontsize=size, parse_math=False)
-
-    def show(self, figure: Figure, image: Tensor, x: int, y: int) -> None:
-        (height, width), size = image.shape[1:], self.size
-        axes = figure.add_axes((x / size[0], 1 - (y + height) / size[1], width / size[0], height / size[1]))
-        axes.set_axis_off()
-        axes.imshow((255 * image).round().byte().movedim(0, -1).numpy(), interpolation="nearest", aspect="auto")
-
-
-def _draw_key(figure: Figure, page: _Page, rows: PanelRows, scale: float) -> None:
+def _draw_key(figure: Figure, page: Page, rows: PanelRows, scale: float) -> None:
     """A stripe below all rows: what hatching means and, where there is flow, the color wheel with its scale."""
     text, y = page.text, page.top(page.rows) - page.text
     if not rows.valid.all():
-        stripes = _hatch(torch.zeros(1, 3, page.height, page.width), torch.zeros(1, 1, 1, 1, dtype=torch.bool))[0]
-        page.show(figure, stripes[:, : 2 * text, : 3 * text], page.left(0), y + text)
-        page.write(figure, "not valid: lost in the corrupted image", page.left(0) + 4 * text, y + round(2.5 * text))
+        stripes = hatch_invalid(torch.zeros(1, 3, page.height, page.width), torch.zeros(1, 1, 1, 1, dtype=torch.bool))
+        page.explain(figure, stripes[0], "not valid: lost in the corrupted image", x=page.left(0), y=y + text)
     if rows.flow is None and rows.predicted_flow is None:
         return
     height, width = rows.clean.shape[2:]

@@ -1,5 +1,7 @@
 """Pixels and the sampler's coordinates: the one place that knows both."""
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 
@@ -34,10 +36,17 @@ def sampler_grid(flow: Tensor) -> Tensor:
 
     x' = clamp((2 x + 1) / W - 1 + 2 u / W, -4, 4),  y' likewise with v and H
     """
+    return next(sampler_grids(flow, rows=flow.shape[2]))
+
+
+def sampler_grids(flow: Tensor, *, rows: int) -> Iterator[Tensor]:
+    """The grid of `sampler_grid`, in bands of so many rows."""
     height, width = flow.shape[2:]
     x, y = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
-    u, v = flow.split(1, dim=1)
     # A pixel center sits at (i + 1/2) / n of the width, so an image of one pixel is no special case.
-    grid = torch.cat([(2 * x + 1) / width - 1 + u * (2 / width), (2 * y + 1) / height - 1 + v * (2 / height)], dim=1)
-    # One NaN in a grid with border padding ends the process in the sampler's backward.
-    return grid.nan_to_num(nan=_FAR, posinf=_FAR, neginf=-_FAR).clamp(-_FAR, _FAR).movedim(1, -1)
+    x, y = (2 * x + 1) / width - 1, (2 * y + 1) / height - 1
+    for band, middle in zip(flow.split(max(1, rows), dim=2), y.split(max(1, rows), dim=2), strict=True):
+        u, v = band.split(1, dim=1)
+        grid = torch.cat([x + u * (2 / width), middle + v * (2 / height)], dim=1)
+        # One NaN in a grid with border padding ends the process in the sampler's backward.
+        yield grid.nan_to_num(nan=_FAR, posinf=_FAR, neginf=-_FAR).clamp(-_FAR, _FAR).movedim(1, -1)

@@ -5,12 +5,15 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._checks import check_choice, check_flow, check_tensor
-from torchrefract.warping.grid import field_dtype, inside, sampler_grid
+from torchrefract.warping.grid import field_dtype, inside, sampler_grids
 
 PADDINGS = ("zeros", "border", "reflection")
 INTERPOLATIONS = ("nearest", "bilinear", "bicubic")
 # Above this, float32 coordinates of the sampler are off by more than 1/1000 px.
 _LARGEST_FLOAT32_SIDE = 8192
+# The kernel of this pair alone rounds by the layout of its grid, which bands of rows change.
+_WHOLE = ("bicubic", "reflection")
+_CACHED = 1 << 17  # positions of a grid that stay in a core's cache
 # Below this many output pixels a second thread costs more than it brings.
 _SMALLEST_SPLIT = 1 << 14
 
@@ -55,8 +58,10 @@ def look_up(image: Tensor, flow: Tensor, *, padding: str, interpolation: str) ->
     if image.numel() == 0:
         return image.clone()
     source = _as_field(image, flow)
-    grid = sampler_grid(flow.to(source.dtype))
-    warped = _sample(source, grid, padding=padding, interpolation=interpolation)
+    whole = (interpolation, padding) == _WHOLE
+    grids = sampler_grids(flow.to(source.dtype), rows=flow.shape[2] if whole else _rows_at_once(source, flow))
+    bands = [_sample(source, grid, padding=padding, interpolation=interpolation) for grid in grids]
+    warped = bands[0] if len(bands) == 1 else torch.cat(bands, dim=2)
     if interpolation == "bicubic":
         warped = _clamped(warped, source, padding)
     return _as_image(warped, image)
@@ -100,10 +105,17 @@ def _clamped(warped: Tensor, source: Tensor, padding: str) -> Tensor:
     return torch.where(warped.isfinite(), warped.clamp(low, high), warped)
 
 
+def _rows_at_once(source: Tensor, flow: Tensor) -> int:
+    """Rows whose grid stays in a core's cache, where nothing speaks for all at once."""
+    batch, _, height, width = flow.shape
+    # The backward pass keeps one gradient image a band.
+    if source.device.type != "cpu" or torch.compiler.is_compiling() or (source.requires_grad and torch.is_grad_enabled()):
+        return height
+    return max(1, _CACHED // max(1, batch * width))
+
+
 def _sample(source: Tensor, grid: Tensor, *, padding: str, interpolation: str) -> Tensor:
-    # The kernel of this pair alone rounds by the layout of its grid, which the bands change.
-    whole = (interpolation, padding) == ("bicubic", "reflection")
-    parts = 1 if whole else _parts(source, grid)
+    parts = 1 if (interpolation, padding) == _WHOLE else _parts(source, grid)
     if parts == 1:
         return F.grid_sample(source, grid, mode=interpolation, padding_mode=padding, align_corners=False)
     # The CPU sampler threads over the batch alone: bands of rows as a batch give the same bits on all threads.

@@ -14,12 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrefract._bands import join
+
 _WORD = 0xFFFFFFFF
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
 # Odd constants of the hash, as int32: 2^32 over the golden ratio, and the two of lowbias32.
 _HASH = (0x9E3779B1 - 2**32, 0x7FEB352D, 0x846CA68B - 2**32)
-_CACHED = 1 << 16  # numbers that stay in a core's cache
+_CACHED = 1 << 17  # numbers that stay in a core's cache
 _FEW = 8  # up to so many, Python computes faster than numpy
 
 
@@ -145,22 +147,28 @@ def _rounds(key0: Any, key1: Any, counter0: Any, counter1: Any) -> tuple[Any, An
 
 def _noise(key: Tensor, count: int) -> Tensor:
     # As int32, whose products drop what does not fit; a key above 2^31 is a negative number there.
-    a, b, c, d = (key - (key >> 31 << 32)).to(torch.int32)[:, :, None].unbind(1)
+    words = (key - (key >> 31 << 32)).to(torch.int32)[:, :, None].unbind(1)
     at_once = max(1, _CACHED // max(1, len(key)) if key.device.type == "cpu" else count)
-    parts = []
-    for start in range(0, count, at_once):
-        index = torch.arange(start, min(start + at_once, count), dtype=torch.int32, device=key.device) * _HASH[0]
-        uniform = (_hash(index, a, b) >> 9 & 0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
-        radius, angle = uniform.log_().mul_(-2).sqrt_(), _hash(index, c, d).float().mul_(math.pi * 2.0**-31)
-        parts.append(torch.stack([radius * angle.cos(), radius * angle.sin()], dim=1))
-    return torch.cat(parts, dim=2) if parts else torch.empty(key.shape[0], 2, 0, device=key.device)
+    bands = (_noise_between(words, start, min(start + at_once, count)) for start in range(0, max(1, count), at_once))
+    return join(bands, dim=2, length=count)
+
+
+def _noise_between(words: tuple[Tensor, ...], start: int, end: int) -> Tensor:
+    a, b, c, d = words
+    index = torch.arange(start, end, dtype=torch.int32, device=a.device) * _HASH[0]
+    uniform = ((_hash(index, a, b) >> 9) & 0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
+    radius, angle = uniform.log_().mul_(-2).sqrt_(), _hash(index, c, d).float().mul_(math.pi * 2.0**-31)
+    return torch.stack([radius * angle.cos(), radius * angle.sin()], dim=1)
 
 
 def _hash(index: Tensor, a: Tensor, b: Tensor) -> Tensor:
     x = index + a
-    x = (x ^ x >> 16 & 0xFFFF) * _HASH[1] + b
-    x = (x ^ x >> 15 & 0x1FFFF) * _HASH[2]
-    return x ^ x >> 16 & 0xFFFF
+    x ^= (x >> 16) & 0xFFFF
+    x = x.mul_(_HASH[1]).add_(b)
+    x ^= (x >> 15) & 0x1FFFF
+    x.mul_(_HASH[2])
+    x ^= (x >> 16) & 0xFFFF
+    return x
 
 
 def _few(count: int, *values: Tensor) -> list[list[int]] | None:

@@ -1,11 +1,13 @@
 """Gaussian random fields, sampled exactly on a torus that the frame is cut out of."""
 
 import math
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchrefract._bands import join
 from torchrefract.fields.covariance import REACH, covariance
 
 # Room round the torus in apertures: a smoothed field is correlated over sqrt(2) of them.
@@ -13,7 +15,7 @@ _APERTURE_REACH = 6.0
 # Larger tori cost gigabytes. With less room the covariance is off by up to twice what `Spectrum.clipped` tells.
 _MOST_POINTS = 1 << 24
 _ROUNDING = 1e-13  # of the transform, relative to the largest eigenvalue
-_CACHED = 1 << 16  # complex numbers that stay in a core's cache
+_CACHED = 1 << 17  # complex numbers that stay in a core's cache
 
 
 class Spectrum(NamedTuple):
@@ -91,11 +93,29 @@ def gaussian_random_field(noise: Tensor, shape: Tensor, *, height: int, width: i
 def _spectrum(
     size: tuple[int, int], length: Tensor, *, kind: str, aperture: Tensor | None, dtype: torch.dtype
 ) -> Spectrum:
+    values = _eigenvalues(size, length.double()[:, None, None], kind)
+    kept = values.clamp(min=0)
+    y, x = _half_axes(size, length.device)
+    smooth_y, smooth_x = _smoothing(y / size[0], aperture), _smoothing(x / size[1], aperture)
+    weight_y = _multiplicity(size[0], length.device)[:, None] * smooth_y.square()
+    weight_x = _multiplicity(size[1], length.device) * smooth_x.square()
+
+    def total(eigenvalues: Tensor) -> Tensor:  # of all points of the torus; by rows, which no threads share
+        return ((eigenvalues * weight_x).sum(dim=2, keepdim=True) * weight_y).sum(dim=1, keepdim=True)
+
+    variance = total(kept)
+    clipped = 1 - variance / (2 * variance - total(values))
+    amplitude = _root(kept).to(dtype) * (smooth_y / variance.sqrt()).to(dtype) * smooth_x.to(dtype)
+    return Spectrum(amplitude, clipped[:, 0, 0].to(dtype))
+
+
+def _eigenvalues(size: tuple[int, int], length: Tensor, kind: str) -> Tensor:
+    """(B, Ht / 2 + 1, Wt / 2 + 1), for a length of (B, 1, 1)."""
     # The covariance is even along both axes, so a quarter of it holds everything. Smooth ones need float64: their
     # eigenvalues span sixteen powers of ten.
-    length = length.double()[:, None, None]
-    y, x = (torch.arange(n // 2 + 1, dtype=torch.float64, device=length.device) for n in size)
-    y = y[:, None]
+    y, x = _half_axes(size, length.device)
+    if kind == "exponential":
+        return _transform(_transform(covariance((x * x + y * y).sqrt(), length, kind), size[1], -1), size[0], -2)
     # A smooth covariance of the shortest way round the torus has a kink half-way, and so negative eigenvalues. Summed
     # over the ways round it has none; on a torus too short for it, the sum would be off by more.
     others = (REACH[kind] * length <= min(size)).double()
@@ -106,25 +126,32 @@ def _spectrum(
         )
         values = _transform(rows, size[0], -2) * _transform(columns, size[1], -1)
     else:
-        values = covariance((x * x + y * y).sqrt(), length, kind)
-        if kind != "exponential":
-            x2, y2, far_x2, far_y2 = x * x, y * y, (size[1] - x).square(), (size[0] - y).square()
-            squares = (far_x2 + y2, x2 + far_y2, far_x2 + far_y2)
-            values = values + others * sum(covariance(square.sqrt(), length, kind) for square in squares)
-        values = _transform(_transform(values, size[1], -1), size[0], -2)
+        x2, y2, far_x2, far_y2 = x * x, y * y, (size[1] - x).square(), (size[0] - y).square()
+        near, *far = (
+            covariance(square.sqrt(), length, kind) for square in (x2 + y2, far_x2 + y2, x2 + far_y2, far_x2 + far_y2)
+        )
+        values = _transform(_transform(near + others * sum(far), size[1], -1), size[0], -2)
     # What rounding leaves is no eigenvalue: the slope of its root would be anything.
-    values = torch.where(values.abs() > _ROUNDING * values.amax(dim=(1, 2), keepdim=True), values, 0)
-    if aperture is not None:
-        a = (2 * math.pi * aperture.double()[:, None, None]).square()
-        values = values * torch.exp(-a * (y / size[0]).square()) * torch.exp(-a * (x / size[1]).square())
-    count = _multiplicity(size[0], length.device)[:, None] * _multiplicity(size[1], length.device)
-    total = (count * values.abs()).sum(dim=(1, 2))
-    kept = values.clamp(min=0)
-    variance = (count * kept).sum(dim=(1, 2), keepdim=True)  # of all points of the torus together
-    share = kept / variance
+    return torch.where(values.abs() > _ROUNDING * values.amax(dim=(1, 2), keepdim=True), values, 0)
+
+
+def _half_axes(size: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
+    y, x = (torch.arange(n // 2 + 1, dtype=torch.float64, device=device) for n in size)
+    return y[:, None], x
+
+
+def _smoothing(frequency: Tensor, aperture: Tensor | None) -> Tensor:
+    """What a Gaussian aperture leaves of the amplitude at frequencies in cycles per px."""
+    if aperture is None:
+        return torch.ones_like(frequency)
+    return torch.exp(-0.5 * (2 * math.pi * aperture.double()[:, None, None] * frequency).square())
+
+
+def _root(values: Tensor) -> Tensor:
+    if not (values.requires_grad and torch.is_grad_enabled()):
+        return values.sqrt()
     # The root of zero has no slope, and a frequency that is not there needs none.
-    amplitude = torch.where(share > 0, share, 1).sqrt() * (share > 0)
-    return Spectrum(amplitude.to(dtype), (1 - variance[:, 0, 0] / total).to(dtype))
+    return torch.where(values > 0, values, 1).sqrt() * (values > 0)
 
 
 def _transform(values: Tensor, count: int, dim: int) -> Tensor:
@@ -144,19 +171,24 @@ def _fields(noise: Tensor, shape: Tensor, height: int, width: int) -> Tensor:
 
 
 def _field(noise: Tensor, shape: Tensor, height: int, width: int) -> Tensor:
-    rows, columns = noise.shape[2:]
-    shape = _whole(shape, -1)
-    place = torch.arange(rows, device=noise.device)
-    place = torch.minimum(place, rows - place)
+    rows = noise.shape[2]
     # Rows and then columns at a time stay in the cache, and only what the frame needs is kept of them.
-    at_once = _at_once(noise, columns)
-    parts = []
-    for index, part in zip(place.split(at_once), noise.split(at_once, dim=2), strict=True):
-        weighted = part * shape[:, index].unsqueeze(1)
-        parts.append(torch.fft.fft(torch.complex(weighted[:, 0], weighted[:, 1]), dim=2)[:, :, :width])
-    parts = torch.cat(parts, dim=1).split(_at_once(noise, rows), dim=2)
-    parts = [torch.view_as_real(torch.fft.fft(part, dim=1)[:, :height]).movedim(-1, 1) for part in parts]
-    return torch.cat(parts, dim=3)
+    half = join(_shaped_rows(noise, shape, width), dim=1, length=rows)
+    bands = (
+        torch.view_as_real(torch.fft.fft(band, dim=1)[:, :height]).movedim(-1, 1)
+        for band in half.split(_at_once(noise, rows), dim=2)
+    )
+    return join(bands, dim=3, length=width)
+
+
+def _shaped_rows(noise: Tensor, shape: Tensor, width: int) -> Iterator[Tensor]:
+    rows, columns = noise.shape[2:]
+    most, middle = _at_once(noise, columns), shape.shape[1]
+    starts = [*range(0, middle, most), *range(middle, rows, most)]
+    for start, end in zip(starts, [*starts[1:], rows], strict=True):
+        part = shape[:, start:end] if end <= middle else shape[:, rows - end + 1 : rows - start + 1].flip(1)
+        weighted = noise[:, :, start:end] * _whole(part, -1).unsqueeze(1)
+        yield torch.fft.fft(torch.complex(weighted[:, 0], weighted[:, 1]), dim=2)[:, :, :width]
 
 
 def _whole(half: Tensor, dim: int) -> Tensor:

@@ -4,6 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchrefract._bands import join
 from torchrefract._checks import check_choice, check_flow, check_tensor
 from torchrefract.warping.grid import field_dtype, inside, sampler_grids
 
@@ -60,8 +61,8 @@ def look_up(image: Tensor, flow: Tensor, *, padding: str, interpolation: str) ->
     source = _as_field(image, flow)
     whole = (interpolation, padding) == _WHOLE
     grids = sampler_grids(flow.to(source.dtype), rows=flow.shape[2] if whole else _rows_at_once(source, flow))
-    bands = [_sample(source, grid, padding=padding, interpolation=interpolation) for grid in grids]
-    warped = bands[0] if len(bands) == 1 else torch.cat(bands, dim=2)
+    bands = (_sample(source, grid, padding=padding, interpolation=interpolation) for grid in grids)
+    warped = join(bands, dim=2, length=flow.shape[2])
     if interpolation == "bicubic":
         warped = _clamped(warped, source, padding)
     return _as_image(warped, image)
@@ -109,7 +110,11 @@ def _rows_at_once(source: Tensor, flow: Tensor) -> int:
     """Rows whose grid stays in a core's cache, where nothing speaks for all at once."""
     batch, _, height, width = flow.shape
     # The backward pass keeps one gradient image a band.
-    if source.device.type != "cpu" or torch.compiler.is_compiling() or (source.requires_grad and torch.is_grad_enabled()):
+    if (
+        source.device.type != "cpu"
+        or torch.compiler.is_compiling()
+        or (source.requires_grad and torch.is_grad_enabled())
+    ):
         return height
     return max(1, _CACHED // max(1, batch * width))
 

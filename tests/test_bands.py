@@ -1,0 +1,31 @@
+import pytest
+import torch
+
+from torchrefract._bands import join
+
+
+@pytest.mark.parametrize("dim", [1, 2])
+@pytest.mark.parametrize("sizes", [[5], [2, 2, 1], [1, 4]])
+def test_bands_are_joined_in_order(dim, sizes):
+    whole = torch.randn(2, 5, 5)
+    assert torch.equal(join(whole.split(sizes, dim=dim), dim=dim, length=5), whole)
+
+
+def test_each_band_is_placed_before_the_next_is_made():
+    memory = torch.empty(1, 2)
+    bands = (memory.fill_(i) for i in range(3))
+    assert join(bands, dim=0, length=3).tolist() == [[0, 0], [1, 1], [2, 2]]
+
+
+def test_gradients_reach_every_band():
+    bands = [torch.randn(2, 3, requires_grad=True) for _ in range(3)]
+    weights = torch.randn(6, 3)
+    (join(bands, dim=0, length=6) * weights).sum().backward()
+    for i, band in enumerate(bands):
+        assert band.grad is not None
+        assert torch.equal(band.grad, weights[2 * i : 2 * i + 2])
+
+
+def test_bands_of_many_samples_are_joined_under_vmap():
+    values = torch.randn(4, 6, 3)
+    assert torch.equal(torch.vmap(lambda value: join(value.split(2), dim=0, length=6))(values), values)

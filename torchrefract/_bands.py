@@ -1,0 +1,32 @@
+"""Work in bands that stay in a core's cache."""
+
+from collections.abc import Iterable
+from itertools import chain
+
+import torch
+from torch import Tensor
+
+
+def join(bands: Iterable[Tensor], *, dim: int, length: int) -> Tensor:
+    """The bands one after the other along a dimension, of which they fill `length`.
+
+    Without gradients each is copied to its place before the next is made, so that all of them use the same memory.
+
+    Args:
+        bands: at least one.
+        dim: the dimension.
+        length: of the result along it.
+    """
+    iterator = iter(bands)
+    first = next(iterator)
+    if first.shape[dim] == length:
+        return first
+    if first.requires_grad and torch.is_grad_enabled():
+        return torch.cat([first, *iterator], dim=dim)
+    shape = list(first.shape)
+    shape[dim] = length
+    whole, start = first.new_empty(shape), 0
+    for band in chain([first], iterator):
+        whole.narrow(dim, start, band.shape[dim]).copy_(band)
+        start += band.shape[dim]
+    return whole

@@ -1,29 +1,32 @@
 """Bad lenses, hot air, fog and sun as differentiable layers, and the maps that undo them.
 
 Every effect is an `nn.Module` from images to images: `LensDistortion`, `Turbulence`, `ThinPlateSpline`,
-`DivergenceFree`, `UniformFog`, and `Compose` and `OneOf` of them. Beside `effect(image)` there is
+`DivergenceFree`, `Rectification`, `UniformFog`, and `Compose` and `OneOf` of them. Beside `effect(image)` there is
 `effect.degrade(image, seed=…, keys=…)`, which returns a `Degraded` with the flow, the flow back, masks and the drawn
 parameters, and `effect.apply(image, params)`, which replays a draw. `warp`, `invert_flow` and `compose_flows` work on
 flows, which are backward and in pixels: out(p) = image(p + flow(p)).
 """
 
+from torchrefract.cameras.models import Camera
 from torchrefract.effects.compose import Compose, ComposeParams, OneOf
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams
 from torchrefract.effects.fog import FogParams, UniformFog
 from torchrefract.effects.lens import LensDistortion, LensParams
+from torchrefract.effects.rectification import Rectification, RectificationParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence, TurbulenceParams
 from torchrefract.labels.boxes import warp_boxes
 from torchrefract.labels.maps import warp_depth, warp_mask
 from torchrefract.labels.points import warp_points
 from torchrefract.labels.targets import warp_labels
-from torchrefract.types import Degraded, Frame, Pair
+from torchrefract.types import Degraded, Folding, Frame, Pair
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.invert import invert_flow
-from torchrefract.warping.jacobian import Folding, folding, jacobian_determinant
+from torchrefract.warping.jacobian import folding, jacobian_determinant
 from torchrefract.warping.resample import warp
 
 __all__ = [
+    "Camera",
     "Compose",
     "ComposeParams",
     "Degraded",
@@ -36,6 +39,8 @@ __all__ = [
     "LensParams",
     "OneOf",
     "Pair",
+    "Rectification",
+    "RectificationParams",
     "ThinPlateParams",
     "ThinPlateSpline",
     "Turbulence",

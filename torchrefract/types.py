@@ -20,6 +20,13 @@ class Inverse(NamedTuple):
     residual: Map  # (B, 1, H, W), px: by how much it misses
 
 
+class Folding(NamedTuple):
+    """What folding does to each sample of a batch."""
+
+    fraction: Tensor  # (B,), share of the pixels that lie on a fold
+    min_determinant: Tensor  # (B,), smallest Jacobian determinant, <= 0 where the map folds
+
+
 class Frame(NamedTuple):
     """A clean frame, or a batch of them, before any corruption.
 
@@ -58,6 +65,8 @@ class Degraded:
     valid: (B, 1, H, W), bool, the pixels that show what the clean image holds.
     restore_flow: (B, 2, H, W), px, warp(image, restore_flow) = clean on restore_valid; None without a flow.
     restore_valid: (B, 1, H, W), bool; None without a flow.
+    folding: share of the pixels that lie on a fold of the flow, and its smallest Jacobian determinant, (B,) each,
+        counted on `valid`; None without a flow.
     restore_residual: (B, 1, H, W), px, how far from its place each pixel is looked up when both flows are applied;
         None without a flow.
     transmission: (B, 1, H, W) in [0, 1], the share of the clean light that arrives; None without such a map.
@@ -75,6 +84,7 @@ class Degraded:
         valid: Map,
         flow: Map | None = None,
         restore: Callable[[], Inverse] | None = None,
+        folding: Callable[[], Folding] | None = None,
         transmission: Map | None = None,
         intensity: Map | None = None,
     ):
@@ -87,6 +97,7 @@ class Degraded:
             "intensity": intensity,
         }
         self._restore = restore
+        self._fold = folding
 
     @property
     def valid(self) -> Tensor:
@@ -97,6 +108,11 @@ class Degraded:
     def flow(self) -> Any:
         """The flow that makes the image from the clean one."""
         return self._read("flow")
+
+    @cached_property
+    def folding(self) -> Any:
+        """How much of the image is folded."""
+        return None if self._fold is None else self._fold()
 
     @property
     def transmission(self) -> Any:
@@ -150,6 +166,7 @@ class Degraded:
             valid=lambda: function(self.valid),
             flow=later("flow"),
             restore=None if self._restore is None else restore,
+            folding=None if self._fold is None else lambda: Folding(*map(function, self.folding)),
             transmission=later("transmission"),
             intensity=later("intensity"),
         )
@@ -164,4 +181,5 @@ class Degraded:
         """All maps computed: what is still to be computed cannot travel to another process."""
         restored = self._restored
         kept = None if restored is None else restored._replace(residual=self.restore_residual)
-        return self.__dict__ | {"_maps": {n: self._read(n) for n in self._maps}, "_restore": None, "_restored": kept}
+        computed = {"_maps": {n: self._read(n) for n in self._maps}, "_restored": kept, "folding": self.folding}
+        return self.__dict__ | computed | {"_restore": None, "_fold": None}

@@ -232,9 +232,9 @@ def test_a_sample_does_not_depend_on_what_others_draw(which):
 
 @pytest.mark.parametrize("which", range(3), ids=SEVERAL)
 def test_a_sample_does_not_depend_on_the_number_of_threads(which, on_threads):
-    effect, image = several()[which], picture(3, 3, 151, 127)
+    effect, image = several()[which], picture(2, 3, 129, 131)
     results = []
-    for threads in (1, 2, 3):
+    for threads in (1, 3):
         on_threads(threads)
         results.append(maps(effect.degrade(image, seed=7)))
     for result in results[1:]:
@@ -331,11 +331,13 @@ def test_one_graph_gives_the_same_as_eager_mode():
     assert_close(compiled(image, params), effect.apply(image, params).image, rtol=0, atol=2e-4)
 
 
-@pytest.mark.parametrize("which", range(3), ids=SEVERAL)
-def test_one_graph_draws_and_shows_the_same_as_eager_mode(which):
-    effect, image = several()[which], picture(4, 3, 24, 32)
+@pytest.mark.parametrize("kind", [Compose, OneOf])
+def test_one_graph_draws_and_shows_the_same_as_eager_mode(kind):
+    effects = [ThinPlateSpline(padding="border", p=0.7), UniformFog(p=0.7), Turbulence(p=0.7), DivergenceFree(p=0.7)]
+    effect, image = kind(effects), picture(4, 3, 24, 32)
     torch.manual_seed(3)
     expected = [effect(image) for _ in range(2)]
+    assert not torch.equal(*expected)
     # The contract compiles each effect to machine code; here one graph must hold them all.
     compiled = torch.compile(effect, fullgraph=True, backend="aot_eager")
     torch.manual_seed(3)

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from torchrefract import draws
 from torchrefract._checks import check_choice, check_number, is_true
-from torchrefract.effects.base import Effect
+from torchrefract.effects.base import Effect, column
 from torchrefract.effects.refraction import Moved, WarpEffect, learns, moving, only, sees
 from torchrefract.types import Degraded
 from torchrefract.warping.compose import compose_flows
@@ -39,7 +39,7 @@ class Compose(Effect):
 
     Args:
         effects: at least one; compositions may be nested.
-        padding, interpolation: of the look-ups; None takes those of the last warp of each.
+        padding, interpolation: of the look-ups; None takes those of the last warp that moves the sample.
         p: chance that a sample is degraded at all.
 
     Raises:
@@ -172,7 +172,7 @@ class _Walk:
         self.padding, self.interpolation = padding, interpolation
         self.waiting: Tensor | None = None  # the composite flow of the warps that wait
         self.active = self.gate = torch.zeros(image.shape[0], dtype=torch.bool, device=image.device)
-        self.last: WarpEffect | None = None
+        self.modes: dict[tuple[str, str], Tensor] = {}  # of the look-up: the samples that ask for it, (B,), bool
         self.moved: list[tuple[WarpEffect, Any, Moved]] = []
         self.total: Callable[[], Tensor] | None = None
         self.valid: Callable[[], Tensor] = self._everywhere
@@ -192,7 +192,8 @@ class _Walk:
         else:
             self.waiting = only(compose_flows(before, moved.flow), before, moved.active, params)
         self.valid = lambda: moved.exists & inside(moved.flow) & sees(valid(), moved.flow)
-        self.active, self.gate, self.last = self.active | moved.active, self.gate | params.gate, effect
+        self.active, self.gate = self.active | moved.active, self.gate | params.gate
+        self._choose(effect, moved.active)
         self.moved.append((effect, params, moved))
 
     def shade(self, effect: Effect, params: Any) -> None:
@@ -227,13 +228,11 @@ class _Walk:
 
     def _look_up(self) -> None:
         """What waits is done."""
-        flow, last = self.waiting, self.last
-        if flow is None or last is None:
+        flow = self.waiting
+        if flow is None:
             return
         active, group, total = self.active, _Group(self.gate, flow), self.total
-        padding, interpolation = self.padding or last.padding, self.interpolation or last.interpolation
-        warped = look_up(self.image, flow, padding=padding, interpolation=interpolation)
-        self.image = only(warped, self.image, active, group)
+        self.image = only(self._looked_up(flow), self.image, active, group)
         if self.depth is not None:
             near = look_up(self.depth, flow.detach(), padding="border", interpolation="nearest")
             self.depth = only(near, self.depth, active, group)
@@ -250,15 +249,35 @@ class _Walk:
             (lambda: flow) if total is None else (lambda: only(compose_flows(total(), flow), total(), active, group))
         )
         self.waiting, self.active, self.gate = None, torch.zeros_like(active), torch.zeros_like(active)
+        self.modes = {}
+
+    def _choose(self, effect: WarpEffect, active: Tensor) -> None:
+        """The samples that an effect moves are looked up as it asks, unless the whole composition says how."""
+        mode = self.padding or effect.padding, self.interpolation or effect.interpolation
+        asked = self.modes.pop(mode, torch.zeros_like(active))
+        self.modes = {other: samples & ~active for other, samples in self.modes.items()} | {mode: asked | active}
+
+    def _looked_up(self, flow: Tensor) -> Tensor:
+        warped = None
+        for (padding, interpolation), samples in reversed(self.modes.items()):
+            if warped is not None and is_true(samples.any) is False:
+                continue
+            found = look_up(self.image, flow, padding=padding, interpolation=interpolation)
+            warped = found if warped is None else torch.where(column(samples), found, warped)
+        return cast(Tensor, warped)
 
     def _undo(self) -> tuple[Tensor, Tensor]:
-        total: Tensor | None = None
-        known = self._everywhere()
+        total, known, done = self._still(), self._everywhere(), torch.zeros_like(self.active)
         for effect, params, moved in self.moved:
             back, exists = effect.gated_undo(params, moved)
-            known = exists if total is None else known & sees(exists, total)
-            total = back if total is None else compose_flows(back, total)
-        return self._still() if total is None else total, known
+            # A flow that is zero is left out, not looked up: a sample must not depend on what moves the others.
+            both, last = column(done & moved.active), column(moved.active)
+            if is_true(both.any) is not False:
+                exists = torch.where(both, known & sees(exists, total), exists)
+                back = torch.where(both, compose_flows(back, total), back)
+            known, total = torch.where(last, exists, known), torch.where(last, back, total)
+            done = done | moved.active
+        return total, known
 
     def _still(self) -> Tensor:
         batch, _, height, width = self.image.shape

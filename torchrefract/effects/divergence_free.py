@@ -103,8 +103,8 @@ class DivergenceFree(WarpEffect):
         if self.normalize == "theory":
             displacement = displacement / curl_rms(params.length, self.covariance)[:, None, None, None]
         elif self.normalize == "max":
-            longest = displacement.norm(dim=1, keepdim=True).amax(dim=(2, 3), keepdim=True)
-            displacement = displacement / longest.clamp(min=1e-12)
+            longest = displacement.square().sum(dim=1, keepdim=True).amax(dim=(2, 3), keepdim=True)
+            displacement = displacement / longest.clamp(min=1e-24).sqrt()
         return params.amplitude[:, None, None, None] * displacement
 
     def moves(self, params: DivergenceFreeParams) -> Tensor:

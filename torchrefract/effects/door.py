@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import check_tensor
+from torchrefract.warping.resample import is_channels_last
 
 
 def check_image(image: Tensor) -> None:
@@ -29,7 +30,6 @@ def leave(result: Tensor, image: Tensor, *, untouched: bool) -> Tensor:
         return image
     if image.dtype is torch.uint8:
         result = (result * 255).round().clamp(0, 255)
-    # Contiguous images of one channel or pixel count as both formats; only a real channels_last one asks for it.
-    last = image.ndim == 4 and not image.is_contiguous() and image.is_contiguous(memory_format=torch.channels_last)
+    last = image.ndim == 4 and is_channels_last(image)
     result = result.to(image.dtype).contiguous(memory_format=torch.channels_last if last else torch.contiguous_format)
     return result if image.ndim == 4 else result[0]

@@ -1,7 +1,7 @@
 """The lens of a cheap dashcam."""
 
 import warnings
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -103,16 +103,7 @@ class LensDistortion(WarpEffect):
 
     def check(self, params: LensParams, image: Tensor) -> None:
         """Raise for lenses that are none."""
-        for name, width, what in (("coefficients", 12, _MODEL), ("focal", 2, "fx, fy"), ("center", 2, "x, y")):
-            value = getattr(params, name)
-            if value.shape != (image.shape[0], width):
-                raise ValueError(f"params.{name} must have shape (B, {width}), {what}, got {tuple(value.shape)}")
-        bound = _LARGEST_COEFFICIENT
-        check_all(
-            "params.coefficients", f"lie in [-{bound:g}, {bound:g}]", params.coefficients, lambda v: v.abs() <= bound
-        )
-        check_all("params.focal", "be positive and finite", params.focal, lambda v: (v > 0) & v.isfinite())
-        check_all("params.center", "be finite", params.center, torch.isfinite)
+        check_lens(params, image.shape[0])
 
     def compute(self, image: Tensor, params: LensParams, depth: Tensor | None) -> Degraded:
         """The batch looked up along the flow; a lens that folds is told."""
@@ -121,19 +112,19 @@ class LensDistortion(WarpEffect):
 
     def flow(self, params: LensParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
         """The flow of `lens_flow`, and where it exists."""
-        return lens_flow(*_in_px(params, height, width), height=height, width=width)
+        return lens_flow(*in_px(params, height, width), height=height, width=width)
 
     def undo(self, params: LensParams, flow: Tensor) -> tuple[Tensor, Tensor]:
         """The flow of `lens_restore_flow`, and where it exists; the closed form needs no flow."""
         height, width = flow.shape[2:]
-        return lens_restore_flow(*_in_px(params, height, width), height=height, width=width)
+        return lens_restore_flow(*in_px(params, height, width), height=height, width=width)
 
     def moves(self, params: LensParams) -> Tensor:
         """The samples with a coefficient that is not zero."""
         return (params.coefficients != 0).any(dim=1)
 
     def _check_fold(self, params: LensParams, height: int, width: int) -> None:
-        camera = _in_px(params, height, width)
+        camera = in_px(params, height, width)
 
         def folds() -> Tensor:
             return (params.gate & folds_inside(*camera, height=height, width=width)).any()
@@ -146,6 +137,19 @@ class LensDistortion(WarpEffect):
         warnings.warn(f"{rule}: pixels beyond have no preimage and are padded, not valid", stacklevel=2)
 
 
-def _in_px(params: LensParams, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+def check_lens(params: Any, batch: int) -> None:
+    """Raise for parameters with `coefficients`, `focal` and `center` that are no lens."""
+    for name, width, what in (("coefficients", 12, _MODEL), ("focal", 2, "fx, fy"), ("center", 2, "x, y")):
+        value = getattr(params, name)
+        if value.shape != (batch, width):
+            raise ValueError(f"params.{name} must have shape (B, {width}), {what}, got {tuple(value.shape)}")
+    bound = _LARGEST_COEFFICIENT
+    check_all("params.coefficients", f"lie in [-{bound:g}, {bound:g}]", params.coefficients, lambda v: v.abs() <= bound)
+    check_all("params.focal", "be positive and finite", params.focal, lambda v: (v > 0) & v.isfinite())
+    check_all("params.center", "be finite", params.center, torch.isfinite)
+
+
+def in_px(params: Any, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The coefficients, and in px the focal lengths and the principal point, of such parameters."""
     middle = torch.tensor([width - 1, height - 1], dtype=params.center.dtype, device=params.center.device) / 2
     return params.coefficients, params.focal * width, middle + params.center * width

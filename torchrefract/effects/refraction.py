@@ -11,8 +11,9 @@ from torchrefract._checks import check_choice, is_true
 from torchrefract.effects.base import Effect, column
 from torchrefract.types import Degraded, Inverse, Map
 from torchrefract.warping.compose import compose_flows
-from torchrefract.warping.grid import field_dtype, inside
+from torchrefract.warping.grid import field_dtype, inside, length
 from torchrefract.warping.invert import invert_flow
+from torchrefract.warping.jacobian import folding
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, look_up
 
 
@@ -97,10 +98,17 @@ def moving(
     def restore() -> Inverse:
         back, known = undo()
         sound = known & inside(back) & sees(result.valid, back)
-        return Inverse(back, sound, lambda: compose_flows(cast(Tensor, result.flow), back).norm(dim=1, keepdim=True))
+        return Inverse(back, sound, lambda: length(compose_flows(cast(Tensor, result.flow), back)))
 
     result = Degraded(
-        image, params, valid=valid, flow=flow, restore=restore, transmission=transmission, intensity=intensity
+        image,
+        params,
+        valid=valid,
+        flow=flow,
+        restore=restore,
+        folding=lambda: folding(cast(Tensor, result.flow), result.valid),
+        transmission=transmission,
+        intensity=intensity,
     )
     return result
 
@@ -157,4 +165,5 @@ def identity(image: Tensor, params: Any) -> Degraded:
         valid=lambda: everywhere,
         flow=lambda: still,
         restore=lambda: Inverse(still, everywhere, lambda: still[:, :1]),
+        folding=lambda: folding(still),
     )

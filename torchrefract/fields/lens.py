@@ -5,6 +5,7 @@ from torch import Tensor
 
 from torchrefract._checks import is_true
 from torchrefract.cameras.distortion import (
+    ALL_TERMS,
     RadialLimit,
     Terms,
     distort_polynomial,
@@ -69,13 +70,27 @@ def frame_limit(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: 
 def folds_inside(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> Tensor:
     """(B,), bool: part of the border of the frame has no preimage; arguments as for `lens_flow`."""
     limit = frame_limit(coefficients, focal, center, height=height, width=width)
+    c = coefficients.detach()[:, :, None, None, None]
+    x_d, y_d = _border(focal.detach(), center.detach(), height, width)
+    return ~undistort_polynomial(x_d, y_d, c, limit=limit)[2].flatten(1).all(dim=1)
+
+
+def shows_folded(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> Tensor:
+    """(B,), bool: the lens shows part of the border of the clean frame folded over; arguments as for `lens_flow`."""
+    limit = frame_limit(coefficients, focal, center, height=height, width=width)
+    c = coefficients.detach()[:, :, None, None, None]
+    x, y = _border(focal.detach(), center.detach(), height, width)
+    return ~_unfolded(x, y, c, limit, ALL_TERMS).flatten(1).all(dim=1)
+
+
+def _border(focal: Tensor, center: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """x and y, (B, 1, 1, N), of points on the border of the frame."""
     steps = torch.linspace(0, 1, _BORDER, dtype=focal.dtype, device=focal.device)
     ends = torch.tensor([0, 1], dtype=focal.dtype, device=focal.device)
     sides = torch.cat([torch.cartesian_prod(steps, ends), torch.cartesian_prod(ends, steps)])
     size = torch.tensor([width - 1, height - 1], dtype=focal.dtype, device=focal.device)
-    x_d, y_d = ((sides * size - center[:, None]) / focal[:, None]).detach()[:, None, None].unbind(-1)
-    c = coefficients.detach()[:, :, None, None, None]
-    return ~undistort_polynomial(x_d, y_d, c, limit=limit)[2].flatten(1).all(dim=1)
+    x, y = ((sides * size - center[:, None]) / focal[:, None])[:, None, None].unbind(-1)
+    return x, y
 
 
 def _corner_radius(focal: Tensor, center: Tensor, height: int, width: int) -> Tensor:
@@ -121,11 +136,16 @@ def _restore_flow_of_rows(
     x: Tensor, y: Tensor, c: Tensor, focal: Tensor, limit: RadialLimit, terms: Terms
 ) -> tuple[Tensor, Tensor]:
     x_d, y_d = distort_polynomial(x, y, c, terms)
+    exists = _unfolded(x, y, c, limit, terms)
+    return _as_flow(x_d - x, y_d - y, exists, x, y, focal), exists
+
+
+def _unfolded(x: Tensor, y: Tensor, c: Tensor, limit: RadialLimit, terms: Terms) -> Tensor:
     with torch.no_grad():
         exists = x * x + y * y <= limit.radius.square()
         if terms.bent:
             exists &= jacobian_polynomial(x, y, c, terms).determinant > 0
-    return _as_flow(x_d - x, y_d - y, exists, x, y, focal), exists
+        return exists
 
 
 def _attach(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, c: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:

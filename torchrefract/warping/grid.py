@@ -31,6 +31,11 @@ def inside(flow: Tensor) -> Tensor:
     return on_x & (v >= -_TOLERANCE - y) & (v <= height - 1 + _TOLERANCE - y)
 
 
+def length(flow: Tensor) -> Tensor:
+    """(B, 1, H, W), px: sqrt(u^2 + v^2), without gradient, and to the same bits in any batch, as `norm` is not."""
+    return flow.detach().square().sum(dim=1, keepdim=True).sqrt()
+
+
 def sampler_grid(flow: Tensor) -> Tensor:
     """(B, H, W, 2): the positions p + flow(p) as F.grid_sample(align_corners=False) wants them, finite in any case.
 

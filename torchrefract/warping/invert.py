@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import check_count, check_flow, check_positive
-from torchrefract.warping.grid import field_dtype, inside, pixel_axes
+from torchrefract.warping.grid import field_dtype, inside, length, pixel_axes
 from torchrefract.warping.resample import look_up
 
 
@@ -46,7 +46,7 @@ def invert_flow(flow: Tensor, *, steps: int = 6, tolerance_px: float = 0.05) -> 
             error, jacobian = _residual(table, inverse)
             inverse = inverse - _solve(jacobian, error)
         error, jacobian = _residual(table, inverse)
-        residual = error.norm(dim=1, keepdim=True)
+        residual = length(error)
         solution = inverse
         solved = (residual <= tolerance_px) & (_determinant(jacobian) > 0) & inside(solution)
         # Nothing is known where a hole in the flow would have been read.

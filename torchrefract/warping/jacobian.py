@@ -1,19 +1,11 @@
 """How a flow stretches the image, and where it folds it."""
 
-from typing import NamedTuple
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._checks import check_flow
-
-
-class Folding(NamedTuple):
-    """What folding does to each sample of a batch."""
-
-    fraction: Tensor  # (B,), share of the pixels that lie on a fold
-    min_determinant: Tensor  # (B,), smallest Jacobian determinant, <= 0 where the map folds
+from torchrefract.types import Folding
 
 
 def jacobian_determinant(flow: Tensor) -> Tensor:
@@ -43,9 +35,23 @@ def jacobian_determinant(flow: Tensor) -> Tensor:
     return torch.stack(determinants, dim=1).amin(dim=1, keepdim=True)
 
 
-def folding(flow: Tensor) -> Folding:
-    """The share of folded pixels and the smallest determinant of each sample of a flow (B, 2, H, W) in px."""
-    determinant = jacobian_determinant(flow).flatten(1)
+def folding(flow: Tensor, valid: Tensor | None = None) -> Folding:
+    """The share of folded pixels and the smallest determinant of each sample.
+
+    Args:
+        flow: (B, 2, H, W), px.
+        valid: (B, 1, H, W), bool, where the flow means something; a pixel counts if it and its neighbors are valid.
+            None for everywhere.
+
+    Returns:
+        fraction: (B,), of all pixels.
+        min_determinant: (B,), that of `jacobian_determinant`; inf where no pixel counts.
+    """
+    determinant = jacobian_determinant(flow)
+    if valid is not None:
+        lost = F.max_pool2d((~valid).to(flow.dtype), kernel_size=3, stride=1, padding=1) > 0
+        determinant = torch.where(lost, torch.inf, determinant)
+    determinant = determinant.flatten(1)
     return Folding((determinant <= 0).to(determinant.dtype).mean(dim=1), determinant.amin(dim=1))
 
 

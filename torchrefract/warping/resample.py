@@ -68,6 +68,17 @@ def look_up(image: Tensor, flow: Tensor, *, padding: str, interpolation: str) ->
     return _as_image(warped, image)
 
 
+def is_channels_last(image: Tensor) -> bool:
+    """Whether the image (B, C, H, W) lies in memory in that format and in no other."""
+    # A batch of one, or one channel, counts as both formats; only a real channels_last image asks for its own.
+    if image.is_contiguous():
+        return False
+    try:
+        return image.is_contiguous(memory_format=torch.channels_last)
+    except RuntimeError:  # inside torch.vmap a sample has no format
+        return False
+
+
 def _check_fit(image: Tensor, flow: Tensor) -> None:
     check_flow("flow", flow)
     if image.ndim != 4:
@@ -90,8 +101,7 @@ def _as_image(warped: Tensor, image: Tensor) -> Tensor:
     if not image.is_floating_point():
         limits = (0, 1) if image.dtype is torch.bool else (torch.iinfo(image.dtype).min, torch.iinfo(image.dtype).max)
         warped = warped.round().clamp(*limits)
-    # A batch of one, or one channel, counts as both formats; only a real channels_last image asks for its own.
-    if not image.is_contiguous() and image.is_contiguous(memory_format=torch.channels_last):
+    if is_channels_last(image):
         return warped.to(image.dtype, memory_format=torch.channels_last)
     return warped.to(image.dtype)
 

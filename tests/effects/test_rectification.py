@@ -1,0 +1,156 @@
+import copy
+import math
+import pickle
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchrefract import Camera, Compose, LensDistortion, Rectification, RectificationParams, compose_flows, warp
+from torchrefract.warping.grid import inside
+
+# A car's camera, from a calibration with 20 chessboards.
+DASHCAM = Camera(
+    width=1280, height=720, fx=1161.0, fy=1157.0, cx=676.0, cy=388.3, coefficients=(-0.281, 0.168, 8e-4, -4e-4, -0.05)
+)
+SMALL = Camera(width=48, height=27, fx=43.0, fy=42.5, cx=25.0, cy=14.1, coefficients=(-0.281, 0.168, 8e-4, -4e-4))
+
+
+def smooth(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    y, x = (torch.arange(n, dtype=torch.float64) / n for n in shape[-2:])
+    waves = [torch.sin(7 * x + 3 * c) * torch.cos(5 * y[:, None] - c) for c in range(shape[-3])]
+    return (0.5 + 0.4 * torch.stack(waves)).expand(shape).to(dtype).clone()
+
+
+@pytest.mark.parametrize("share", [1, 2])
+def test_the_flow_is_opencvs_map(share):
+    height, width = DASHCAM.height // share, DASHCAM.width // share
+    effect = Rectification(DASHCAM)
+    image = torch.zeros(1, 1, height, width, dtype=torch.float64)
+    flow = effect.degrade(image, seed=0).flow[0]
+    # A frame of half the size: pixel centers are whole numbers, so the principal point keeps its half pixel.
+    fx, fy = DASHCAM.fx / share, DASHCAM.fy / share
+    cx, cy = ((c + 0.5) / share - 0.5 for c in (DASHCAM.cx, DASHCAM.cy))
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    vector = np.array(DASHCAM.coefficients)
+    theirs = cv2.initUndistortRectifyMap(matrix, vector, np.empty(0), matrix, (width, height), cv2.CV_32FC1)
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    ours = flow + torch.stack([x, y])
+    worst = (ours - torch.from_numpy(np.stack(theirs)).double()).abs().max().item()
+    print(f"largest difference from OpenCV's map at {width}x{height}: {worst:.1e} px")
+    assert worst < 1e-3
+    assert ours.sub(torch.stack([x, y])).abs().max() > 20 / share
+
+
+def test_the_flow_back_undoes_it():
+    made = Rectification(SMALL).degrade(torch.zeros(2, 1, 27, 48, dtype=torch.float64), seed=0)
+    # Read in closed form at the place that the flow back points to.
+    y, x = torch.meshgrid(torch.arange(27.0).double(), torch.arange(48.0).double(), indexing="ij")
+    at = made.restore_flow + torch.stack([x, y])
+    u, v = (at[:, 0] - SMALL.cx) / SMALL.fx, (at[:, 1] - SMALL.cy) / SMALL.fy
+    k1, k2, p1, p2 = SMALL.coefficients
+    r2 = u * u + v * v
+    radial = 1 + k1 * r2 + k2 * r2 * r2
+    back = torch.stack(
+        [
+            SMALL.fx * (u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)) + SMALL.cx - x,
+            SMALL.fy * (v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v) + SMALL.cy - y,
+        ],
+        dim=1,
+    )
+    assert back.abs().max() < 1e-9
+    assert made.restore_valid.double().mean() > 0.8
+
+
+def test_with_a_lens_behind_it_the_frame_is_looked_up_once():
+    raw = smooth(2, 3, 270, 480)
+    camera = Camera(width=480, height=270, fx=430.0, fy=425.0, cx=250.0, cy=141.0, coefficients=(-0.281, 0.168, 0, 0))
+    scene = Compose([Rectification(camera), LensDistortion()])
+    d = scene.degrade(raw, seed=3)
+    rectify, lens = scene.effects
+    assert isinstance(rectify, Rectification)
+    assert isinstance(lens, LensDistortion)
+    first = rectify.apply(raw, d.params.children[0])
+    then = lens.apply(raw, d.params.children[1])
+    assert torch.equal(d.flow, compose_flows(first.flow, then.flow))
+    assert torch.equal(d.image, warp(raw, d.flow)[0])
+    # The pair to learn from: from the degraded frame back to the rectified one.
+    back, exists = lens.restore_flow(d.params.children[1], height=270, width=480)
+    restored, _ = warp(d.image, back, interpolation="bicubic")
+    # The degraded frame shows nothing where the raw one ends.
+    seen = warp(d.valid.float(), back)[0] > 0.999
+    good = exists & inside(back) & seen & first.valid
+    error = (restored - first.image).square()[good.expand_as(raw)].mean().item()
+    assert good.double().mean() > 0.6
+    assert -10 * math.log10(error) > 60
+    # The other flow back leads to the raw frame.
+    restored, _ = warp(d.image, d.restore_flow, interpolation="bicubic")
+    error = (restored - raw).square()[d.restore_valid.expand_as(raw)].mean().item()
+    assert -10 * math.log10(error) > 60
+
+
+def test_every_sample_is_that_of_a_batch_of_one():
+    image = torch.rand(5, 3, 27, 48)
+    effect = Rectification(SMALL, p=0.5)
+    together = effect.degrade(image, seed=5)
+    assert 0 < together.params.gate.sum() < 5
+    for i in range(5):
+        alone = effect.degrade(image[i], seed=5, keys=[i])
+        for name in ("image", "flow", "valid", "restore_flow", "restore_valid"):
+            assert torch.equal(getattr(alone, name), getattr(together, name)[i]), name
+    assert torch.equal(together.image[~together.params.gate], image[~together.params.gate])
+
+
+def test_one_graph_gives_the_same_as_eager_mode():
+    effect, image = Rectification(SMALL), smooth(2, 3, 27, 48)
+    assert_close(torch.compile(effect, fullgraph=True)(image), effect(image), rtol=0, atol=2e-4)
+
+
+def test_gradients_of_the_camera_are_those_of_finite_differences():
+    effect, image = Rectification(SMALL), smooth(1, 1, 27, 48, dtype=torch.float64)
+    params = effect.sample(image, seed=0)
+
+    def rectified(coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
+        return effect.apply(image, RectificationParams(params.gate, coefficients, focal, center)).image
+
+    values = [value.clone().requires_grad_() for value in params[1:]]
+    assert torch.autograd.gradcheck(rectified, values, fast_mode=True)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value))])
+def test_it_is_copied_whole(copied):
+    image = smooth(2, 3, 27, 48)
+    assert torch.equal(copied(Rectification(SMALL))(image), Rectification(SMALL)(image))
+
+
+def test_a_camera_without_distortion_leaves_the_frame():
+    image = torch.rand(2, 3, 27, 48)
+    still = Camera(width=48, height=27, fx=43.0, fy=42.5, cx=25.0, cy=14.1, coefficients=(0.0,) * 5)
+    assert torch.equal(Rectification(still)(image), image)
+
+
+def test_a_model_that_folds_inside_the_frame_is_told():
+    folding = Camera(width=48, height=27, fx=24.0, fy=24.0, cx=23.5, cy=13.0, coefficients=(-0.4, 0.0, 0.0, 0.0))
+    with pytest.warns(UserWarning, match="camera: the model folds back inside the frame"):
+        made = Rectification(folding).degrade(torch.rand(1, 3, 27, 48), seed=0)
+    # d r (1 - 0.4 r^2) / dr = 0 at r^2 = 1 / 1.2.
+    y, x = torch.meshgrid(torch.arange(27.0), torch.arange(48.0), indexing="ij")
+    r2 = ((x - 23.5).square() + (y - 13).square()) / 24**2
+    clear = (r2 - 1 / 1.2).abs() > 1e-4
+    assert torch.equal(made.valid[0, 0][clear], (r2 < 1 / 1.2)[clear])
+
+
+def test_frames_of_another_shape_raise():
+    with pytest.raises(ValueError, match="image must have the shape of the camera's frames, 48 x 27 px, got 48 x 48"):
+        Rectification(SMALL)(torch.rand(1, 3, 48, 48))
+
+
+def test_what_is_no_camera_raises():
+    with pytest.raises(TypeError, match="camera must be a Camera, got dict"):
+        Rectification({"fx": 1.0})  # pyright: ignore[reportArgumentType]
+    tilted = Camera(width=48, height=27, fx=43.0, fy=42.5, cx=25.0, cy=14.1, coefficients=(0.0,) * 13 + (0.1,))
+    with pytest.raises(ValueError, match="tau_x and tau_y of zero"):
+        Rectification(tilted)

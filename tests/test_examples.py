@@ -13,7 +13,7 @@ EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("0*.py"))
 def test_an_example_is_short_and_draws_its_picture(script: Path, tmp_path: Path):
     assert len(script.read_text().splitlines()) <= 60
     picture = tmp_path / "picture.png"
-    subprocess.run([sys.executable, script, picture], check=True, cwd=tmp_path)
+    subprocess.run([sys.executable, script, picture], check=True, cwd=tmp_path, timeout=300)
     pixels = np.asarray(Image.open(picture).convert("RGB"))
     assert min(pixels.shape[:2]) >= 200
     assert pixels.std() > 20

@@ -20,6 +20,8 @@ from torchrefract import (
     Degraded,
     DivergenceFree,
     LensDistortion,
+    OneOf,
+    Rectification,
     ThinPlateSpline,
     Turbulence,
     UniformFog,
@@ -136,8 +138,10 @@ def assert_same(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
 
 
 def test_every_effect_of_the_package_is_held_to_the_contract():
-    kinds = [kind for kind in vars(torchrefract).values() if isinstance(kind, type) and issubclass(kind, Effect)]
-    assert {kind for kind in kinds if not issubclass(kind, Compose)} == {case.make for case in EFFECTS.values()}
+    kinds = {kind for kind in vars(torchrefract).values() if isinstance(kind, type) and issubclass(kind, Effect)}
+    # Compositions and what draws nothing have tests of their own.
+    others = {Compose, OneOf, Rectification}
+    assert kinds - others == {case.make for case in EFFECTS.values()}
 
 
 def test_a_sample_does_not_depend_on_the_batch_around_it(case):
@@ -149,7 +153,7 @@ def test_a_sample_does_not_depend_on_the_batch_around_it(case):
         assert_same(some, {name: value[rows] for name, value in together.items()})
 
 
-@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("batch", [1, 2])
 def test_a_sample_does_not_depend_on_the_number_of_threads(case, batch, on_threads):
     effect, images = case.strong(), picture(batch, 3, 151, 127)
     results = []
@@ -502,7 +506,9 @@ def test_an_infinite_field_of_the_params_is_named(case, value):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_range_without_a_number_at_an_end_is_named(case, value):
-    names = [name for name, given in vars(case.strong()).items() if name.endswith("_range") and isinstance(given, tuple)]
+    names = [
+        name for name, given in vars(case.strong()).items() if name.endswith("_range") and isinstance(given, tuple)
+    ]
     assert len(names) >= 2
     for name in names:
         low, high = getattr(case.strong(), name)

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import DivergenceFree, jacobian_determinant
+from torchrefract import DivergenceFree, folding, jacobian_determinant, warp
 from torchrefract.fields.covariance import COVARIANCES
 
 GENTLE: dict[str, Any] = {"amplitude_range": (3.0, 3.0), "length_range": (12.0, 20.0)}
@@ -58,6 +58,39 @@ def test_steps_keep_areas_better_and_the_map_one_to_one():
     assert ratios[0].amin() < 0 < ratios[1].amin()
     change = [(ratio.clamp(min=0.05).log().square().mean().sqrt()) for ratio in ratios]
     assert change[1] < 0.5 * change[0]
+
+
+def test_the_change_of_areas_is_what_the_stream_function_predicts():
+    # det - 1 = psi_xx psi_yy - psi_xy^2 without a divergence: of mean 0 and, for a Gaussian psi of standard deviation
+    # amplitude times length, of standard deviation sqrt(12) (amplitude / length)^2 by Wick's theorem.
+    amplitude, length = 2.0, 20.0
+    effect = DivergenceFree(amplitude_range=(amplitude, amplitude), length_range=(length, length))
+    flow = effect.degrade(torch.zeros(40, 1, 120, 160, dtype=torch.float64), seed=1).flow
+    change = jacobian_determinant(flow) - 1
+    expected = 12**0.5 * (amplitude / length) ** 2
+    assert change.std().item() == pytest.approx(expected, rel=0.1)
+    # The smallest of four corners is told, so a little below none.
+    assert -0.5 * expected < change.mean().item() < 0
+
+
+def test_an_amplitude_that_folds_is_told_and_its_folds_are_not_valid():
+    image = torch.rand(2, 3, 64, 96, generator=torch.Generator().manual_seed(0))
+    calm, wild = (
+        DivergenceFree(amplitude_range=(a, a), length_range=(12.0, 12.0)).degrade(image, seed=1) for a in (1.0, 40.0)
+    )
+    assert not folding(calm.flow).fraction.any()
+    assert (folding(calm.flow).min_determinant > 0).all()
+    assert (folding(wild.flow).fraction > 0.1).all()
+    assert (folding(wild.flow).min_determinant < -1).all()
+    assert wild.image.isfinite().all()
+    assert wild.restore_flow.isfinite().all()
+    assert wild.restore_valid.double().mean() < 0.5 < calm.restore_valid.double().mean()
+    assert wild.restore_residual[wild.restore_valid].max() < 0.05
+    # What is valid is brought back: the coordinates themselves, up to the bilinear reading of them.
+    ramp = torch.arange(96.0).expand(2, 1, 64, 96)
+    there, _ = warp(ramp, wild.flow)
+    back, _ = warp(there, wild.restore_flow)
+    assert (back - ramp)[wild.restore_valid].abs().max() < 0.05
 
 
 def test_one_step_is_the_displacement_itself():

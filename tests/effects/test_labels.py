@@ -61,6 +61,16 @@ def test_an_image_of_torchvision_comes_back_as_one():
     assert mirrored["boxes"].tolist() == [[46.0, 20.0, 66.0, 40.0], [16.0, 5.0, 36.0, 15.0]]
 
 
+def test_an_effect_that_is_off_leaves_the_labels_as_they_are():
+    image, target = sample()
+    for effect in (LensDistortion(p=0.0), Turbulence(amplitude_range=(0, 0)), Compose([ThinPlateSpline()], p=0.0)):
+        result, moved = effect(image, target)
+        assert torch.equal(result, image)
+        assert moved.keys() == target.keys()
+        for name in ("boxes", "masks", "points", "labels"):
+            assert torch.equal(moved[name], target[name]), name
+
+
 def test_light_moves_no_label():
     image, target = sample()
     result, moved = UniformFog()(image, target)

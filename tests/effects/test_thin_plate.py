@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from scipy.interpolate import RBFInterpolator
 from torch.testing import assert_close
 
 from torchrefract import ThinPlateParams, ThinPlateSpline
@@ -29,6 +30,31 @@ def test_drawn_plates_have_a_lattice_over_the_frame_and_normal_displacements():
     assert params.displacement.mean().abs() < 0.06
     sides = torch.corrcoef(params.displacement.flatten(0, 1).T)
     assert sides[0, 1].abs() < 0.04
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_nine_hundred_points_bend_the_frame_as_scipys_spline_does(dtype):
+    effect, image = ThinPlateSpline(lattice=(30, 30)), torch.zeros(1, 1, 90, 160, dtype=dtype)
+    degraded = effect.degrade(image, seed=1)
+    points, displacement = (degraded.params[i][0].double().numpy() for i in (1, 2))
+    x, y = torch.arange(0, 160, 7), torch.arange(0, 90, 5)
+    at = torch.cartesian_prod(x, y)
+    expected = RBFInterpolator(points, displacement, kernel="thin_plate_spline")(at.double().numpy())
+    found = degraded.flow[0, :, at[:, 1], at[:, 0]].T.double()
+    assert (found - torch.from_numpy(expected)).abs().max() < (1e-3 if dtype == torch.float32 else 1e-6)
+
+
+def test_control_points_on_pixels_have_finite_gradients():
+    # Those of a drawn lattice lie on the corner pixels, and these on others too.
+    points = torch.tensor([[[0.0, 0.0], [11.0, 0.0], [0.0, 7.0], [11.0, 7.0], [5.0, 3.0], [6.0, 3.0]]])
+    displacement = torch.full_like(points, 0.3).mul(torch.arange(6.0).view(1, 6, 1))
+    params = plate(points, displacement)
+    inputs = [params.points.requires_grad_(), params.displacement.requires_grad_(), params.smoothing.requires_grad_()]
+    degraded = ThinPlateSpline().apply(torch.rand(1, 1, 8, 12), params)
+    loss = degraded.image.square().sum() + degraded.restore_flow.square().sum()
+    for gradient in torch.autograd.grad(loss, inputs):
+        assert gradient.isfinite().all()
+        assert gradient.any()
 
 
 def test_smoothing_leads_to_the_plane_of_least_squares():

@@ -36,12 +36,21 @@ def test_normalized_by_the_image_every_frame_has_the_amplitude_itself():
     assert_close(flow.std(dim=(2, 3), correction=0), torch.full((3, 2), 0.3), rtol=1e-4, atol=0)
 
 
-def test_a_field_longer_than_the_frame_stays_finite():
-    for normalize in ("theory", "image"):
-        effect = Turbulence(length_range=(900.0, 900.0), covariance="gaussian", normalize=normalize)
-        degraded = effect.degrade(torch.rand(2, 3, 32, 48), seed=1)
-        assert degraded.flow.isfinite().all()
-        assert degraded.flow.abs().max() < 8
+@pytest.mark.parametrize("covariance", COVARIANCES)
+@pytest.mark.parametrize("normalize", ["theory", "image"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_field_of_ten_frames_stays_finite(covariance, normalize, dtype):
+    effect = Turbulence(amplitude_range=(1, 1), length_range=(180, 180), covariance=covariance, normalize=normalize)
+    image = torch.rand(2, 3, 12, 18, dtype=dtype)
+    params = effect.sample(image, seed=1)
+    length = params.length.clone().requires_grad_()
+    degraded = effect.apply(image, params._replace(length=length))
+    assert degraded.image.isfinite().all()
+    assert degraded.flow.isfinite().all()
+    # One standard deviation, or where each frame is stretched to it, at most six.
+    assert degraded.flow.abs().max() < 6
+    assert torch.autograd.grad(degraded.image.sum(), length)[0].isfinite().all()
+    assert degraded.restore_flow[degraded.restore_valid.expand_as(degraded.restore_flow)].isfinite().all()
 
 
 def test_white_noise_has_the_amplitude_too():
@@ -94,6 +103,8 @@ def test_wrong_arguments_raise(options, rule):
     ("field", "value", "rule"),
     [
         ("length", 0.0, "params.length must be above 0"),
+        ("length", -1.0, "params.length must be above 0"),
+        ("length", math.nan, "params.length must not be NaN"),
         ("amplitude", -1.0, "params.amplitude must be at least 0"),
         ("aperture", math.inf, "params.aperture must be at least 0 and finite"),
     ],

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import draws
+from torchrefract import draws, warp
 from torchrefract.fields.covariance import COVARIANCES
 from torchrefract.fields.gaussian import gaussian_random_field, spectrum, torus
 from torchrefract.fields.stream import curl, curl_rms
@@ -81,6 +81,8 @@ def test_a_constant_moves_nothing_at_all(value, dtype):
     flow = curl(torch.full((2, 1, 9, 14), value, dtype=dtype))
     assert flow.shape == (2, 2, 7, 12)
     assert not flow.any()
+    image = torch.rand(2, 3, 7, 12, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    assert_close(warp(image, flow)[0], image, rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize("kind", COVARIANCES)

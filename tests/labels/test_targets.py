@@ -267,6 +267,16 @@ def test_keypoints_that_are_not_seen_lie_off_the_canvas_and_are_told():
     assert v2.SanitizeKeyPoints()({"points": singles})["points"].tolist() == [[5.0, 10.0], [50.0, 30.0], [0.0, 0.0]]
 
 
+def test_keypoints_on_the_outer_half_of_the_border_pixels_are_on_the_canvas():
+    rows = torch.tensor([[63.4, 20.0], [30.0, 35.4], [-0.4, -0.4], [63.6, 20.0], [5.0, 36.0]])
+    points, flags = tv.KeyPoints(rows, canvas_size=SIZE), torch.ones(5)
+    moved = warp_labels({"points": points, "visible": flags}, torch.zeros(2, *SIZE))
+    assert torch.equal(moved["points"], points)
+    assert moved["visible"].tolist() == [1, 1, 1, 0, 0]
+    mirrored = warp_labels(points, hflip())
+    assert_close(mirrored[:3].as_subclass(Tensor), F.horizontal_flip(points)[:3].as_subclass(Tensor))
+
+
 def test_a_list_of_samples_has_a_flow_for_each():
     flows = torch.stack([SHIFT, hflip()])
     samples = [(tv.Image(torch.rand(3, *SIZE, generator=generator())), detection()) for _ in range(2)]

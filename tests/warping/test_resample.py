@@ -276,6 +276,15 @@ def test_the_layout_in_memory_changes_nothing_and_is_kept():
     assert warp(strided, flipped)[0].is_contiguous()
 
 
+def test_a_map_over_images_and_flows_of_any_layout_is_each_of_them_alone():
+    images, flows = noise(3, 1, 2, 16, 12).float().mT, random_flow(3, 16, 12).float()[:, None].mT
+    together, valid = torch.vmap(warp)(images, flows)
+    for i in range(3):
+        alone, seen = warp(images[i], flows[i])
+        assert_close(together[i], alone, rtol=0, atol=1e-6)
+        assert torch.equal(valid[i], seen)
+
+
 def test_an_unbatched_image_is_a_batch_of_one():
     image, flow = noise(3, 12, 16).float(), random_flow(1, 12, 16)[0].float()
     warped, valid = warp(image, flow)
@@ -303,6 +312,40 @@ def test_coordinates_of_large_frames_are_right_to_a_thousandth_of_a_pixel(size, 
     expected = (expected if size[1] > size[0] else expected[:, None]).expand(1, 1, *size)
     assert_close(warped, expected, rtol=0, atol=1e-3 - 1e-5)
     assert valid.sum() == valid.numel() // max(size) * (max(size) - shift)
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_at_8k_a_frame_that_does_not_move_stays_to_a_thousandth_of_a_pixel(axis):
+    height, width = 4320, 7680
+    # The coordinate itself, as the distance from the nearest multiple of 128: fp32 holds that to 1e-5.
+    place = torch.arange(width) if axis == "x" else torch.arange(height)[:, None]
+    image = ((place % 128) - 64).abs().float().expand(1, 1, height, width)
+    still = torch.zeros(1, 1, 1, 1).expand(1, 2, height, width)
+    warped, valid = warp(image, still)
+    assert (warped - image).abs().max() < 1e-3
+    assert valid.all()
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_a_line_of_40000_pixels_that_does_not_move_stays_to_a_thousandth_of_a_pixel(axis):
+    size = (1, 40000) if axis == "x" else (40000, 1)
+    ramp = torch.arange(40000.0).view(1, 1, *size)
+    for padding in PADDINGS:
+        warped, valid = warp(ramp, torch.zeros(1, 2, *size), padding=padding)
+        assert (warped - ramp).abs().max() < 1e-3
+        assert valid.all()
+
+
+@pytest.mark.parametrize("padding", PADDINGS)
+@pytest.mark.parametrize("interpolation", INTERPOLATIONS)
+def test_a_large_sample_does_not_depend_on_the_batch_around_it(padding, interpolation):
+    # So large that the look-up takes some rows at a time, and how many depends on the batch.
+    image, flow = noise(3, 2, 263, 701).float(), random_flow(3, 263, 701).float()
+    together, valid = warp(image, flow, padding=padding, interpolation=interpolation)
+    for i in range(3):
+        alone, seen = warp(image[i], flow[i], padding=padding, interpolation=interpolation)
+        assert torch.equal(alone, together[i])
+        assert torch.equal(seen, valid[i])
 
 
 @pytest.mark.parametrize("padding", PADDINGS)

@@ -17,7 +17,7 @@ from torch.utils import _pytree as pytree
 from torchrefract._checks import check_choice, check_flag, check_tensor
 from torchrefract.labels.boxes import check_policy, warp_boxes, warp_outlines
 from torchrefract.labels.maps import warp_mask
-from torchrefract.labels.points import warp_points
+from torchrefract.labels.points import STEPS, TOLERANCE_PX, check_rows, land, on_frame
 from torchrefract.labels.rows import companions, hide, is_tv, kept, siblings_of, wrapped
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, warp
 
@@ -150,10 +150,13 @@ def _move_keypoints(keypoints: Any, flow: Tensor) -> _Moved:
     _check_canvas(keypoints, flow)
     plain, batch = keypoints.as_subclass(Tensor), _batched(flow)
     _check_batch(plain, flow)
-    points, visible = warp_points(plain.reshape(batch.shape[0], plain[..., 0].numel() // batch.shape[0], 2), batch)
-    height, width = flow.shape[-2:]
-    outside = (points < -0.5).any(dim=-1) | (points[..., 0] > width - 0.5) | (points[..., 1] > height - 0.5)
-    points = torch.where((visible | outside)[..., None], points, -1)
+    rows = plain.reshape(batch.shape[0], plain[..., 0].numel() // batch.shape[0], 2)
+    check_rows("keypoints", rows, batch, 2)
+    points, found, upright = land(rows, batch, STEPS, TOLERANCE_PX)
+    # A keypoint may lie on the outer half of a pixel at the border, which has no center beyond it.
+    on_canvas = on_frame(points, batch, 0.5)
+    visible = found & upright & on_canvas
+    points = torch.where((visible | ~on_canvas)[..., None], points, -1)
     value = _cast(points.reshape(plain.shape), plain.dtype)
     return _Moved(wrapped(value, keypoints), visible.reshape(plain.shape[:-1]))
 

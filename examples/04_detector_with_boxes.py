@@ -1,0 +1,59 @@
+"""An effect inside a detector: in training it corrupts the batch, on its device, and the boxes move along.
+
+A sign is painted on each frame, so that the boxes can be held against what the corrupted frames show of it.
+"""
+
+import sys
+
+import torch
+from torch import Tensor, nn
+from torchvision import tv_tensors
+from torchvision.models.detection import fasterrcnn_mobilenet_v3_large_320_fpn
+from torchvision.ops import box_iou, masks_to_boxes
+from torchvision.utils import draw_bounding_boxes, make_grid, save_image
+
+import torchrefract as tr
+from torchrefract.data.road_scenes import render_road_scenes
+
+SIZE = (160, 288)
+SIGNS = torch.tensor([[20, 12, 80, 52], [215, 20, 275, 60], [15, 100, 75, 150], [200, 95, 280, 150]])
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+
+
+class RobustDetector(nn.Module):
+    """A detector that trains on corrupted frames, and looks at frames as they are."""
+
+    def __init__(self):
+        super().__init__()
+        self.effect = tr.Compose([tr.Turbulence(), tr.LensDistortion(padding="border")])
+        self.detector = fasterrcnn_mobilenet_v3_large_320_fpn(
+            weights=None, weights_backbone=None, num_classes=2, min_size=SIZE[0]
+        )
+
+    def forward(self, images: Tensor, targets: list[dict] | None = None) -> dict[str, Tensor] | list[dict]:
+        if self.training:
+            images, targets = self.effect(images, targets)
+        return self.detector(list(images), targets)
+
+
+torch.manual_seed(0)
+frames, targets = render_road_scenes(torch.arange(4), *SIZE)[0], []
+for frame, sign in zip(frames, SIGNS, strict=True):
+    frame[:, sign[1] : sign[3], sign[0] : sign[2]] = torch.tensor([1.0, 0.0, 1.0])[:, None, None]
+    box = tv_tensors.BoundingBoxes(sign[None].float(), format="XYXY", canvas_size=SIZE, device=DEVICE)  # pyright: ignore[reportCallIssue]  # torchvision's overloads
+    targets.append({"boxes": box, "labels": torch.ones(1, dtype=torch.int64, device=DEVICE)})
+frames, model = frames.to(DEVICE), RobustDetector().to(DEVICE).train()
+optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3)
+for step in range(4):
+    optimizer.zero_grad()
+    loss = torch.stack(list(model(frames, targets).values())).sum()
+    loss.backward()
+    optimizer.step()
+    print(f"step {step}: loss {loss.item():.2f}")
+corrupted, moved = model.effect(frames, targets)
+seen = masks_to_boxes(corrupted[:, ::2].amin(dim=1) - corrupted[:, 1] > 0.5) + torch.tensor([0, 0, 1, 1], device=DEVICE)
+for name, boxes in (("moved", moved), ("unmoved", targets)):
+    fit = [box_iou(target["boxes"], one[None]).item() for target, one in zip(boxes, seen, strict=True)]
+    print(f"IoU of the {name} boxes with what is seen:", *(f"{value:.3f}" for value in fit))
+shown = [draw_bounding_boxes(image, one["boxes"], colors="yellow") for image, one in zip(corrupted, moved, strict=True)]
+save_image(make_grid(torch.stack(shown), nrow=2), sys.argv[1] if len(sys.argv) > 1 else "detector_with_boxes.png")

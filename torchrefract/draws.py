@@ -109,7 +109,8 @@ def noise(key: Tensor, count: int) -> Tensor:
 
 def call_seed() -> Tensor:
     """(), int64: a fresh seed from torch's global generator, in eager mode and under torch.compile alike."""
-    return torch.ops.torchrefract.call_seed.default()
+    # Calling the operator loads what compilers need, a second of work that eager mode does without.
+    return torch.ops.torchrefract.call_seed.default() if torch.compiler.is_compiling() else _new_seed()
 
 
 def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
@@ -181,6 +182,10 @@ def _few(count: int, *values: Tensor) -> list[list[int]] | None:
         return None
 
 
+def _new_seed() -> Tensor:
+    return torch.randint(-(2**63), 2**63 - 1, (), dtype=torch.int64)
+
+
 def _words(value: Any) -> tuple[Any, Any]:
     return (value >> 32) & _WORD, value & _WORD
 
@@ -188,7 +193,7 @@ def _words(value: Any) -> tuple[Any, Any]:
 @torch.library.custom_op("torchrefract::call_seed", mutates_args=(), tags=(torch.Tag.nondeterministic_seeded,))
 def _call_seed() -> Tensor:
     # An operator of its own: the compiler neither folds it to a constant nor swaps in its own random numbers.
-    return torch.randint(-(2**63), 2**63 - 1, (), dtype=torch.int64)
+    return _new_seed()
 
 
 @_call_seed.register_fake

@@ -71,6 +71,21 @@ def test_an_effect_that_is_off_leaves_the_labels_as_they_are():
             assert torch.equal(moved[name], target[name]), name
 
 
+def test_labels_of_what_stays_where_it_is_are_not_clipped():
+    image = torch.rand(3, 40, 56)
+    outside = tv_tensors.BoundingBoxes(
+        torch.tensor([[-5.0, -5, 20, 20], [60, 5, 70, 9]]), format="XYXY", canvas_size=(40, 56)
+    )  # pyright: ignore[reportCallIssue]  # torchvision's overloads
+    second = tv_tensors.Image(torch.rand(3, 40, 56))
+    target = {"boxes": outside, "labels": torch.arange(2), "second": second}
+    _, kept = LensDistortion(p=0.0)(image, target)
+    assert torch.equal(kept["boxes"], outside)
+    assert torch.equal(kept["second"], second)
+    _, moved = LensDistortion()(image, target)
+    assert moved["labels"].tolist() == [0]
+    assert not torch.equal(moved["second"], second)
+
+
 def test_light_moves_no_label():
     image, target = sample()
     result, moved = UniformFog()(image, target)

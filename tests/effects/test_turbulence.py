@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from torchrefract import Turbulence, folding
+from torchrefract import DivergenceFree, Turbulence, folding
+from torchrefract.fields import gaussian
 from torchrefract.fields.covariance import COVARIANCES
 
 CALM: dict[str, Any] = {"amplitude_range": (0.3, 0.3), "length_range": (12.0, 12.0), "aperture_range": (2.0, 2.0)}
@@ -118,3 +119,16 @@ def test_air_that_is_none_raises(field, value, rule):
         effect.apply(image, params._replace(length=torch.ones(2, 1)))
     with pytest.raises(ValueError, match=r"params\.key must be \(B, 4\) of int64"):
         effect.apply(image, params._replace(key=torch.zeros(2, 3, dtype=torch.int64)))
+
+
+@pytest.mark.parametrize("effect", [Turbulence, DivergenceFree])
+def test_a_length_that_no_torus_has_room_for_is_told(effect, monkeypatch):
+    monkeypatch.setattr(gaussian, "_MOST_POINTS", 1 << 12)
+    long = effect(length_range=(60.0, 60.0), covariance="gaussian")
+    with pytest.warns(UserWarning, match=r"length must be short enough for a torus of .*% of the spectrum .* 60 px"):
+        made = long.degrade(torch.rand(2, 1, 27, 48), seed=0)
+    assert made.flow.isfinite().all()
+    assert made.flow.std() > 0.1
+    # What is not drawn is not told, and there is room for less.
+    effect(length_range=(60.0, 60.0), covariance="gaussian", p=0.0).degrade(torch.rand(2, 1, 27, 48), seed=0)
+    effect(length_range=(4.0, 4.0), amplitude_range=(0.1, 0.1)).degrade(torch.rand(2, 1, 27, 48), seed=0)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_number
+from torchrefract._checks import check_all, check_number, is_true
 from torchrefract.effects.door import check_image, enter, leave
 from torchrefract.labels.rows import is_tv, wrapped
 from torchrefract.labels.targets import warp_labels
@@ -42,7 +42,11 @@ class Effect(nn.Module, ABC):
         result = wrapped(degraded.image, image) if is_tv(image, "Image") else degraded.image
         if not target:
             return result
-        return result, target[0] if degraded.flow is None else warp_labels(target[0], degraded.flow)
+        flow = degraded.flow
+        # Labels of what stays where it is are not clipped or filtered either.
+        if flow is None or is_true((flow == 0).all):
+            return result, target[0]
+        return result, warp_labels(target[0], flow)
 
     def degrade(
         self,

@@ -271,12 +271,13 @@ class _Walk:
         for effect, params, moved in self.moved:
             back, exists = effect.gated_undo(params, moved)
             # A flow that is zero is left out, not looked up: a sample must not depend on what moves the others.
-            both, last = column(done & moved.active), column(moved.active)
+            moves = params.gate if learns(params) else moved.active
+            both, last = column(done & moves), column(moves)
             if is_true(both.any) is not False:
                 exists = torch.where(both, known & sees(exists, total), exists)
                 back = torch.where(both, compose_flows(back, total), back)
             known, total = torch.where(last, exists, known), torch.where(last, back, total)
-            done = done | moved.active
+            done = done | moves
         return total, known
 
     def _still(self) -> Tensor:

@@ -8,10 +8,9 @@ from torch import Tensor
 from torchrefract import draws
 from torchrefract._checks import check_choice, check_count, check_range
 from torchrefract.effects.base import params_to
+from torchrefract.effects.random_field import check_field_params, random_field
 from torchrefract.effects.refraction import WarpEffect
-from torchrefract.effects.turbulence import check_field_params
 from torchrefract.fields.covariance import COVARIANCES
-from torchrefract.fields.gaussian import gaussian_random_field, spectrum, torus
 from torchrefract.fields.stream import curl, curl_rms
 from torchrefract.types import Range
 from torchrefract.warping.compose import compose_flows
@@ -49,6 +48,9 @@ class DivergenceFree(WarpEffect):
 
     Raises:
         ValueError: an argument outside its range.
+
+    Warns:
+        UserWarning: a length that the largest torus has no room for (on the CPU).
 
     Source: the torchrefract paper; Bridson, Houriham, Nordenstam, "Curl-noise for procedural fluid flow", ACM
     Transactions on Graphics 26 (2007).
@@ -94,11 +96,8 @@ class DivergenceFree(WarpEffect):
 
     def displacement(self, params: DivergenceFreeParams, *, height: int, width: int) -> Tensor:
         """(B, 2, H, W), px: what is followed in `steps` parts; the curl itself."""
-        size = torus(height + 2, width + 2, length=self.length_range[1], kind=self.covariance)
-        dtype = params.amplitude.dtype
-        shape = spectrum(size, params.length, kind=self.covariance, dtype=dtype).amplitude
-        noise = draws.noise(params.key, size[0] * size[1]).view(-1, 2, *size).to(dtype)
-        psi = gaussian_random_field(noise, shape, height=height + 2, width=width + 2)[:, :1]
+        longest = self.length_range[1]
+        psi = random_field(params, kind=self.covariance, longest=longest, height=height + 2, width=width + 2)[:, :1]
         displacement = curl(psi)
         if self.normalize == "theory":
             displacement = displacement / curl_rms(params.length, self.covariance)[:, None, None, None]

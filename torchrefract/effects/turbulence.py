@@ -1,18 +1,17 @@
 """Hot air over a road."""
 
 import warnings
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_choice, check_range, is_true
+from torchrefract._checks import check_choice, check_range, is_true
 from torchrefract.effects.base import params_to
+from torchrefract.effects.random_field import check_field_params, random_field
 from torchrefract.effects.refraction import WarpEffect
 from torchrefract.fields.covariance import COVARIANCES, slope_rms
-from torchrefract.fields.gaussian import gaussian_random_field, spectrum, torus
 from torchrefract.types import Range
 
 # A field folds first where a slope of five standard deviations reaches 1.
@@ -53,7 +52,8 @@ class Turbulence(WarpEffect):
         ValueError: an argument outside its range.
 
     Warns:
-        UserWarning: an amplitude from which on the field folds the image (on the CPU).
+        UserWarning: an amplitude from which on the field folds the image (on the CPU); a
+            length that the largest torus has no room for.
 
     Source: the torchrefract paper; Dietrich and Newsam, SIAM J. Sci. Comput. 18 (1997), for the sampling.
     """
@@ -91,12 +91,8 @@ class Turbulence(WarpEffect):
     def flow(self, params: TurbulenceParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
         """The flow, and where it exists: everywhere."""
         self._check_folds(params)
-        aperture = self.aperture_range[1]
-        size = torus(height, width, length=self.length_range[1], kind=self.covariance, aperture=aperture)
-        dtype = params.amplitude.dtype
-        shape = spectrum(size, params.length, kind=self.covariance, aperture=params.aperture, dtype=dtype).amplitude
-        noise = draws.noise(params.key, size[0] * size[1]).view(-1, 2, *size).to(dtype)
-        field = gaussian_random_field(noise, shape, height=height, width=width)
+        reach = {"longest": self.length_range[1], "widest": self.aperture_range[1]}
+        field = random_field(params, kind=self.covariance, **reach, height=height, width=width)
         if self.normalize == "image":
             field = field - field.mean(dim=(2, 3), keepdim=True)
             field = field / field.square().mean(dim=(2, 3), keepdim=True).clamp(min=1e-12).sqrt()
@@ -118,16 +114,3 @@ class Turbulence(WarpEffect):
                 "field): restore_valid leaves folded pixels out; a larger length_range or aperture_range folds less",
                 stacklevel=2,
             )
-
-
-def check_field_params(params: Any, *, at_least_zero: Sequence[str]) -> None:
-    """Raise for parameters of a random field with a `length` and a `key` that are none."""
-    for name in (*at_least_zero, "length"):
-        if getattr(params, name).ndim != 1:
-            raise ValueError(f"params.{name} must have shape (B,), got {tuple(getattr(params, name).shape)}")
-    if params.key.shape[1:] != (4,) or params.key.dtype is not torch.int64:
-        raise ValueError(f"params.key must be (B, 4) of int64, got {tuple(params.key.shape)} of {params.key.dtype}")
-    for name in at_least_zero:
-        value = getattr(params, name)
-        check_all(f"params.{name}", "be at least 0 and finite", value, lambda v: v.isfinite() & (v >= 0))
-    check_all("params.length", "be above 0 and finite", params.length, lambda v: v.isfinite() & (v > 0))

@@ -8,6 +8,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning import Trainer
 
+import torchrefract
 from torchrefract import presets
 from torchrefract._config import CONFIG_DIR
 from torchrefract.data.module import PairData
@@ -78,6 +79,19 @@ def test_the_gpu_trains_in_bfloat16(tmp_path):
 def test_an_evaluation_composes_what_the_training_did(tmp_path):
     words = ("+task=deweather", "seed=3")
     assert composed(tmp_path, *words, command="eval") == composed(tmp_path, *words)
+
+
+def test_a_preview_shows_every_effect_unless_a_scene_is_chosen():
+    with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
+        plain, chosen = compose("preview"), compose("preview", overrides=["scene=cape_town_fog"])
+    assert plain.scene is None
+    assert chosen.scene._target_ == "torchrefract.presets.cape_town_fog"
+    assert chosen.effects == plain.effects
+    made = [instantiate(plain.effects[name]) for name in plain.effects]
+    public = [value for value in vars(torchrefract).values() if isinstance(value, type) and issubclass(value, Effect)]
+    # One chooses, the other mends.
+    assert {type(effect) for effect in made} == {*public} - {torchrefract.OneOf, torchrefract.Rectification}
+    assert [type(effect).__name__ for effect in made] == list(plain.effects)
 
 
 @pytest.mark.parametrize("scene", options("scene"))

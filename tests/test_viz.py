@@ -6,7 +6,15 @@ import torch
 from matplotlib import colormaps
 from torch.testing import assert_close
 
-from torchrefract.viz import checkerboard, flow_to_rgb, flow_wheel, transmission_to_rgb
+from torchrefract.viz import (
+    checkerboard,
+    flow_to_rgb,
+    flow_wheel,
+    full_color_px,
+    hatch_invalid,
+    mark_folded,
+    transmission_to_rgb,
+)
 
 
 def arrow(u: float, v: float, *, max_px: float | None = 1.0) -> torch.Tensor:
@@ -145,3 +153,68 @@ def test_wrong_arguments_are_refused():
         flow_wheel(0)
     with pytest.raises(ValueError, match="cell must be at least 1, got 0"):
         checkerboard(4, 4, cell=0)
+
+
+def mask(size: tuple[int, int], *places: tuple[int, int]) -> torch.Tensor:
+    """(1, 1, *size), bool: True at the places."""
+    value = torch.zeros(1, 1, *size, dtype=torch.bool)
+    for row, column in places:
+        value[0, 0, row, column] = True
+    return value
+
+
+def test_a_round_scale_is_the_longest_valid_flow_rounded_up_to_two_digits():
+    flow = torch.zeros(1, 2, 2, 3)
+    flow[0, :, 0, 0] = torch.tensor([3.0, -4.01])  # 5.008
+    flow[0, 0, 1, 1] = 80.0
+    flow[0, 1, 1, 2] = math.inf
+    assert full_color_px(flow, ~mask((2, 3), (1, 1))) == pytest.approx(5.1)
+    assert full_color_px(flow, ~mask((2, 3))) == 80
+    assert full_color_px(1e-3 * flow, ~mask((2, 3), (1, 1))) == pytest.approx(0.0051)
+    assert full_color_px(flow, mask((2, 3), (0, 1))) == 1
+
+
+def test_stripes_cover_what_is_not_valid_and_nothing_else():
+    image = torch.rand(1, 3, 40, 60, dtype=torch.float64)
+    valid = ~mask((2, 3), (0, 1), (1, 2))  # each of its pixels is 20 x 20 of the picture
+    hatched = hatch_invalid(image, valid)
+    covered = torch.kron((~valid)[0, 0].double(), torch.ones(20, 20, dtype=torch.float64)).bool()
+    assert torch.equal(hatched[0][:, ~covered], image[0][:, ~covered])
+    center = hatch_invalid(torch.zeros(1, 3, 2, 2), ~mask((6, 6), (1, 4), (3, 0)))  # (1, 4) is the center of 3 x 3
+    assert (center[0, 0] > 0).tolist() == [[False, True], [False, False]]
+    for stripe in (hatched[0, :, :20, 20:40], hatched[0, :, 20:, 40:]):
+        assert torch.equal(stripe, stripe[:1].expand(3, -1, -1))
+        row = stripe[0, 0]
+        assert_close(row.unique(), torch.tensor([0.62, 0.86], dtype=torch.float64), atol=1e-6, rtol=0)
+        assert torch.equal(row[8:], row[:-8])  # the period is 8 px
+        assert torch.equal(stripe[0, 1:, :-1], stripe[0, :-1, 1:])  # along the diagonal
+
+
+def test_folded_pixels_are_mixed_with_magenta_and_nothing_else_changes():
+    image = torch.rand(1, 3, 5, 7, dtype=torch.float64)
+    folded = mask((5, 7), (0, 0), (3, 6))
+    marked = mark_folded(image, folded)
+    there = folded[0, 0]
+    magenta = torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)[:, None]
+    assert_close(marked[0][:, there], 0.25 * image[0][:, there] + 0.75 * magenta)
+    assert torch.equal(marked[0][:, ~there], image[0][:, ~there])
+
+
+def test_one_folded_pixel_outlives_shrinking_and_keeps_its_place_in_enlarging():
+    small, large = torch.zeros(1, 3, 4, 6), torch.zeros(1, 3, 36, 48)
+    folded = mask((12, 18), (5, 13))  # 3 x 3 of its pixels are one of the small picture
+    assert mark_folded(small, folded)[0, 0].nonzero().tolist() == [[1, 4]]
+    expected = torch.kron(mask((12, 16), (5, 13))[0, 0].float(), torch.ones(3, 3))
+    assert torch.equal(mark_folded(large, mask((12, 16), (5, 13)))[0, 0] > 0, expected > 0)
+
+
+def test_masks_that_do_not_fit_are_refused():
+    image, valid = torch.rand(2, 3, 4, 5), torch.ones(2, 1, 4, 5, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"valid must have shape \(2, 1, h, w\), got \(1, 1, 4, 5\)"):
+        hatch_invalid(image, valid[:1])
+    with pytest.raises(TypeError, match="folded must be of type bool"):
+        mark_folded(image, valid.float())
+    with pytest.raises(ValueError, match=r"image must have shape \(B, 3, H, W\)"):
+        mark_folded(image[:, :1], valid)
+    with pytest.raises(ValueError, match=r"valid must have shape \(2, 1, 4, 5\), got \(2, 1, 2, 5\)"):
+        full_color_px(image[:, :2], valid[:, :, :2])

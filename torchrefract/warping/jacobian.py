@@ -35,6 +35,11 @@ def jacobian_determinant(flow: Tensor) -> Tensor:
     return torch.stack(determinants, dim=1).amin(dim=1, keepdim=True)
 
 
+def folded(flow: Tensor, valid: Tensor | None = None) -> Tensor:
+    """(B, 1, H, W), bool: the pixels that lie on a fold; arguments as for `folding`."""
+    return _known_determinant(flow, valid) <= 0
+
+
 def folding(flow: Tensor, valid: Tensor | None = None) -> Folding:
     """The share of folded pixels and the smallest determinant of each sample.
 
@@ -47,12 +52,16 @@ def folding(flow: Tensor, valid: Tensor | None = None) -> Folding:
         fraction: (B,), of all pixels.
         min_determinant: (B,), that of `jacobian_determinant`; inf where no pixel counts.
     """
-    determinant = jacobian_determinant(flow)
-    if valid is not None:
-        lost = F.max_pool2d((~valid).to(flow.dtype), kernel_size=3, stride=1, padding=1) > 0
-        determinant = torch.where(lost, torch.inf, determinant)
-    determinant = determinant.flatten(1)
+    determinant = _known_determinant(flow, valid).flatten(1)
     return Folding((determinant <= 0).to(determinant.dtype).mean(dim=1), determinant.amin(dim=1))
+
+
+def _known_determinant(flow: Tensor, valid: Tensor | None) -> Tensor:
+    determinant = jacobian_determinant(flow)
+    if valid is None:
+        return determinant
+    lost = F.max_pool2d((~valid).to(flow.dtype), kernel_size=3, stride=1, padding=1) > 0
+    return torch.where(lost, torch.inf, determinant)
 
 
 def _difference(flow: Tensor, dim: int, forward: bool) -> Tensor:

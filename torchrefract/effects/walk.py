@@ -1,0 +1,159 @@
+"""An image on its way through several effects: warps that follow one another are looked up together."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
+
+import torch
+from torch import Tensor
+
+from torchrefract._checks import is_true
+from torchrefract.effects.base import Effect, column
+from torchrefract.effects.refraction import Moved, WarpEffect, learns, moving, only, sees
+from torchrefract.types import Degraded
+from torchrefract.warping.compose import compose_flows
+from torchrefract.warping.grid import field_dtype, inside
+from torchrefract.warping.resample import look_up
+
+
+class _Group(NamedTuple):
+    """Warps that one look-up does together, as `only` reads parameters."""
+
+    gate: Tensor
+    flow: Tensor
+
+
+class Walk:
+    """An image on its way through effects; warps wait until something needs the image."""
+
+    def __init__(self, image: Tensor, depth: Tensor | None, padding: str | None, interpolation: str | None):
+        self.image, self.depth = image, depth
+        self.padding, self.interpolation = padding, interpolation
+        self.waiting: Tensor | None = None  # the composite flow of the warps that wait
+        self.active = self.gate = torch.zeros(image.shape[0], dtype=torch.bool, device=image.device)
+        self.modes: dict[tuple[str, str], Tensor] = {}  # of the look-up: the samples that ask for it, (B,), bool
+        self.moved: list[tuple[WarpEffect, Any, Moved]] = []
+        self.total: Callable[[], Tensor] | None = None
+        self.valid: Callable[[], Tensor] = self._everywhere
+        self.transmission: Callable[[], Tensor] | None = None
+        self.intensity: Callable[[], Tensor] | None = None
+        self.refracts = False
+
+    def move(self, effect: WarpEffect, params: Any) -> None:
+        """One more warp waits."""
+        self.refracts = True
+        if is_true((params.gate & effect.moves(params)).any) is False and not learns(params):
+            return
+        moved = effect.gated(params, height=self.image.shape[2], width=self.image.shape[3])
+        before, valid = self.waiting, self.valid
+        if before is None:
+            self.waiting = moved.flow
+        else:
+            self.waiting = only(compose_flows(before, moved.flow), before, moved.active, params)
+        self.valid = lambda: moved.exists & inside(moved.flow) & sees(valid(), moved.flow)
+        self.active, self.gate = self.active | moved.active, self.gate | params.gate
+        self._choose(effect, moved.active)
+        self.moved.append((effect, params, moved))
+
+    def shade(self, effect: Effect, params: Any) -> None:
+        """The image in other light, after the warps that wait."""
+        self._look_up()
+        shaded = effect.compute(self.image, params, self.depth)
+        valid, intensity, transmission = self.valid, self.intensity, self.transmission
+        self.image = shaded.image
+        self.valid = lambda: valid() & shaded.valid
+        passed, added = shaded.has("transmission"), shaded.has("intensity")
+        if passed:
+            self.transmission = lambda: _product(transmission, shaded.transmission)
+        if added or (passed and intensity is not None):
+            self.intensity = lambda: _sum(intensity, shaded.transmission, shaded.intensity)
+
+    def arrive(self, params: Any) -> Degraded:
+        """What has become of the image, with all maps."""
+        self._look_up()
+        if not self.refracts:
+            return Degraded(
+                self.image, params, valid=self.valid, transmission=self.transmission, intensity=self.intensity
+            )
+        return moving(
+            self.image,
+            params,
+            flow=self._still if self.total is None else self.total,
+            valid=self.valid,
+            undo=self._undo,
+            transmission=self.transmission,
+            intensity=self.intensity,
+        )
+
+    def _look_up(self) -> None:
+        """What waits is done."""
+        flow = self.waiting
+        if flow is None:
+            return
+        active, group, total = self.active, _Group(self.gate, flow), self.total
+        self.image = only(self._looked_up(flow), self.image, active, group)
+        if self.depth is not None:
+            near = look_up(self.depth, flow.detach(), padding="border", interpolation="nearest")
+            self.depth = only(near, self.depth, active, group)
+
+        def moved_along(value: Callable[[], Tensor] | None) -> Callable[[], Tensor] | None:
+            if value is None:
+                return None
+            return lambda: only(
+                look_up(value(), flow, padding="border", interpolation="bilinear"), value(), active, group
+            )
+
+        self.transmission, self.intensity = moved_along(self.transmission), moved_along(self.intensity)
+        self.total = (
+            (lambda: flow) if total is None else (lambda: only(compose_flows(total(), flow), total(), active, group))
+        )
+        self.waiting, self.active, self.gate = None, torch.zeros_like(active), torch.zeros_like(active)
+        self.modes = {}
+
+    def _choose(self, effect: WarpEffect, active: Tensor) -> None:
+        """The samples that an effect moves are looked up as it asks, unless the whole composition says how."""
+        mode = self.padding or effect.padding, self.interpolation or effect.interpolation
+        asked = self.modes.pop(mode, torch.zeros_like(active))
+        self.modes = {other: samples & ~active for other, samples in self.modes.items()} | {mode: asked | active}
+
+    def _looked_up(self, flow: Tensor) -> Tensor:
+        warped = None
+        for (padding, interpolation), samples in reversed(self.modes.items()):
+            if warped is not None and is_true(samples.any) is False:
+                continue
+            found = look_up(self.image, flow, padding=padding, interpolation=interpolation)
+            warped = found if warped is None else torch.where(column(samples), found, warped)
+        return cast(Tensor, warped)
+
+    def _undo(self) -> tuple[Tensor, Tensor]:
+        total, known, done = self._still(), self._everywhere(), torch.zeros_like(self.active)
+        for effect, params, moved in self.moved:
+            back, exists = effect.gated_undo(params, moved)
+            # A flow that is zero is left out, not looked up: a sample must not depend on what moves the others.
+            moves = params.gate if learns(params) else moved.active
+            both, last = column(done & moves), column(moves)
+            if is_true(both.any) is not False:
+                exists = torch.where(both, known & sees(exists, total), exists)
+                back = torch.where(both, compose_flows(back, total), back)
+            known, total = torch.where(last, exists, known), torch.where(last, back, total)
+            done = done | moves
+        return total, known
+
+    def _still(self) -> Tensor:
+        batch, _, height, width = self.image.shape
+        return torch.zeros(batch, 2, height, width, dtype=field_dtype(self.image.dtype), device=self.image.device)
+
+    def _everywhere(self) -> Tensor:
+        batch, _, height, width = self.image.shape
+        return torch.ones(batch, 1, height, width, dtype=torch.bool, device=self.image.device)
+
+
+def _product(before: Callable[[], Tensor] | None, value: Tensor | None) -> Tensor:
+    return cast(Tensor, value) if before is None else before() * cast(Tensor, value)
+
+
+def _sum(before: Callable[[], Tensor] | None, passed: Tensor | None, added: Tensor | None) -> Tensor:
+    """Light added so far, as much of it as comes through, and what is added now."""
+    if before is None:
+        return cast(Tensor, added)
+    arrives = before() if passed is None else before() * passed
+    return arrives if added is None else arrives + added

@@ -20,6 +20,7 @@ from torchrefract import DivergenceFree, LensDistortion, ThinPlateSpline, Turbul
 from torchrefract.data.images import EXTENSIONS, read_image
 from torchrefract.effects.refraction import WarpEffect
 from torchrefract.restoration.files import replacing
+from torchrefract.warping.grid import length
 
 EFFECTS: dict[str, Callable[[str], WarpEffect]] = {
     "LensDistortion": lambda mode: LensDistortion(interpolation=mode),
@@ -64,7 +65,7 @@ def measure(name: str, frames: list[Tensor]) -> Row:
         by_mode = {m: EFFECTS[name](m).degrade(clean, seed=7, keys=[key]) for m in ("bilinear", "bicubic")}
         made = by_mode["bilinear"]
         flow, back, valid = made.flow, made.restore_flow, made.restore_valid
-        residual = compose_flows(flow.double(), back.double()).norm(dim=1, keepdim=True)[valid].max()
+        residual = length(compose_flows(flow.double(), back.double()))[valid].max()
         restored = {mode: warp(d.image, back, interpolation=mode)[0] for mode, d in by_mode.items()}
         images = (made.image, warp(made.image, -flow)[0], restored["bilinear"], restored["bicubic"])
         found.append([residual, valid.double().mean(), *(psnr(image, clean, valid) for image in images)])

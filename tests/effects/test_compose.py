@@ -73,7 +73,8 @@ def test_the_flow_is_the_composite_of_the_flows():
     effect = Compose(effects)
     params = effect.sample(image, seed=3)
     flows = [child.flow(own, height=48, width=64)[0] for child, own in zip(effects, params.children, strict=True)]
-    flow = reduce(compose_flows, flows)
+    # From the last to the first, so that each flow is read once.
+    flow = reduce(lambda then, first: compose_flows(first, then), reversed(flows))
     found = effect.apply(image, params)
     assert torch.equal(found.flow, flow)
     assert torch.equal(found.image, warp(image, flow)[0])

@@ -30,7 +30,7 @@ class ComposeParams(NamedTuple):
 class Compose(Effect):
     """Effects one after the other, the first nearest to the scene.
 
-        flow(p) = f_n(p) + f_(n-1)(p + f_n(p)) + ...
+        flow(p) = d_1,  d_i = d_(i+1) + f_i(p + d_(i+1)),  d_n = f_n(p)
 
     Warps that follow one another look the image up once, along the composite of their flows, so that the image is
     blurred once. Effects of light between them keep their place: the image is looked up before, and their maps move

@@ -1,6 +1,6 @@
 """An image on its way through several effects: warps that follow one another are looked up together."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -15,11 +15,21 @@ from torchrefract.warping.grid import field_dtype, inside
 from torchrefract.warping.resample import look_up
 
 
-class _Group(NamedTuple):
-    """Warps that one look-up does together, as `only` reads parameters."""
+class _Step(NamedTuple):
+    """One warp, or several as one, as `only` reads parameters."""
 
-    gate: Tensor
-    flow: Tensor
+    gate: Tensor  # (B,), bool: the sample is degraded by one of them
+    active: Tensor  # (B,), bool: and is moved
+    flow: Tensor  # (B, 2, H, W), px
+
+
+def _composite(steps: Sequence[_Step]) -> _Step:
+    """Warps in a row as one. Each flow is read once, where the later ones look; what is read twice is blurred twice."""
+    *earlier, last = steps
+    for step in reversed(earlier):
+        flow = only(compose_flows(step.flow, last.flow), step.flow, last.active, last)
+        last = _Step(step.gate | last.gate, step.active | last.active, flow)
+    return last
 
 
 class Walk:
@@ -28,11 +38,10 @@ class Walk:
     def __init__(self, image: Tensor, depth: Tensor | None, padding: str | None, interpolation: str | None):
         self.image, self.depth = image, depth
         self.padding, self.interpolation = padding, interpolation
-        self.waiting: Tensor | None = None  # the composite flow of the warps that wait
-        self.active = self.gate = torch.zeros(image.shape[0], dtype=torch.bool, device=image.device)
+        self.done: list[_Step] = []
+        self.waiting: list[_Step] = []
         self.modes: dict[tuple[str, str], Tensor] = {}  # of the look-up: the samples that ask for it, (B,), bool
         self.moved: list[tuple[WarpEffect, Any, Moved]] = []
-        self.total: Callable[[], Tensor] | None = None
         self.valid: Callable[[], Tensor] = self._everywhere
         self.transmission: Callable[[], Tensor] | None = None
         self.intensity: Callable[[], Tensor] | None = None
@@ -44,13 +53,9 @@ class Walk:
         if is_true((params.gate & effect.moves(params)).any) is False and not learns(params):
             return
         moved = effect.gated(params, height=self.image.shape[2], width=self.image.shape[3])
-        before, valid = self.waiting, self.valid
-        if before is None:
-            self.waiting = moved.flow
-        else:
-            self.waiting = only(compose_flows(before, moved.flow), before, moved.active, params)
+        valid = self.valid
+        self.waiting.append(_Step(params.gate, moved.active, moved.flow))
         self.valid = lambda: moved.exists & inside(moved.flow) & sees(valid(), moved.flow)
-        self.active, self.gate = self.active | moved.active, self.gate | params.gate
         self._choose(effect, moved.active)
         self.moved.append((effect, params, moved))
 
@@ -77,7 +82,7 @@ class Walk:
         return moving(
             self.image,
             params,
-            flow=self._still if self.total is None else self.total,
+            flow=lambda: _composite(self.done).flow if self.done else self._still(),
             valid=self.valid,
             undo=self._undo,
             transmission=self.transmission,
@@ -86,28 +91,25 @@ class Walk:
 
     def _look_up(self) -> None:
         """What waits is done."""
-        flow = self.waiting
-        if flow is None:
+        if not self.waiting:
             return
-        active, group, total = self.active, _Group(self.gate, flow), self.total
-        self.image = only(self._looked_up(flow), self.image, active, group)
+        group = _composite(self.waiting)
+        self.image = only(self._looked_up(group.flow), self.image, group.active, group)
         if self.depth is not None:
-            near = look_up(self.depth, flow.detach(), padding="border", interpolation="nearest")
-            self.depth = only(near, self.depth, active, group)
+            near = look_up(self.depth, group.flow.detach(), padding="border", interpolation="nearest")
+            self.depth = only(near, self.depth, group.active, group)
 
         def moved_along(value: Callable[[], Tensor] | None) -> Callable[[], Tensor] | None:
             if value is None:
                 return None
             return lambda: only(
-                look_up(value(), flow, padding="border", interpolation="bilinear"), value(), active, group
+                look_up(value(), group.flow, padding="border", interpolation="bilinear"), value(), group.active, group
             )
 
         self.transmission, self.intensity = moved_along(self.transmission), moved_along(self.intensity)
-        self.total = (
-            (lambda: flow) if total is None else (lambda: only(compose_flows(total(), flow), total(), active, group))
-        )
-        self.waiting, self.active, self.gate = None, torch.zeros_like(active), torch.zeros_like(active)
-        self.modes = {}
+        # A group that comes first has its composite already.
+        self.done = [*self.done, *self.waiting] if self.done else [group]
+        self.waiting, self.modes = [], {}
 
     def _choose(self, effect: WarpEffect, active: Tensor) -> None:
         """The samples that an effect moves are looked up as it asks, unless the whole composition says how."""
@@ -125,7 +127,8 @@ class Walk:
         return cast(Tensor, warped)
 
     def _undo(self) -> tuple[Tensor, Tensor]:
-        total, known, done = self._still(), self._everywhere(), torch.zeros_like(self.active)
+        total, known = self._still(), self._everywhere()
+        done = torch.zeros(total.shape[0], dtype=torch.bool, device=total.device)
         for effect, params, moved in self.moved:
             back, exists = effect.gated_undo(params, moved)
             # A flow that is zero is left out, not looked up: a sample must not depend on what moves the others.

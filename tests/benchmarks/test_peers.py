@@ -1,0 +1,140 @@
+import importlib
+import json
+import sys
+from types import ModuleType
+
+import peers
+import pytest
+import timing
+import torch
+from timing import Spread, Timing
+from torch.testing import assert_close
+
+SIZE = (168, 200)
+
+
+@pytest.fixture
+def ramps():
+    """A frame (1, 3, H, W) whose channels tell where a pixel came from: x and y in px, and a constant."""
+    height, width = SIZE
+    y, x = torch.meshgrid(torch.arange(height).float(), torch.arange(width).float(), indexing="ij")
+    return torch.stack([x, y, torch.ones_like(x)])[None]
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """Makes peers present or missing, whatever is installed."""
+
+    def only(*names: str) -> dict[str, ModuleType]:
+        found = {name: ModuleType(name) for name in names}
+
+        def import_module(name: str) -> ModuleType:
+            if name in found:
+                return found[name]
+            raise ModuleNotFoundError(f"No module named {name!r}")
+
+        monkeypatch.setattr(importlib, "import_module", import_module)
+        return found
+
+    monkeypatch.setenv("NO_ALBUMENTATIONS_UPDATE", "1")
+    return only
+
+
+def timed(name: str, ratio: float) -> Timing:
+    return Timing(name, 1, Spread(ratio, ratio, ratio), {timing.GRID_SAMPLE: Spread(ratio, ratio, ratio)})
+
+
+def test_a_peer_that_is_not_installed_is_told_with_what_installs_it(installed):
+    modules = installed("kornia", "cv2")
+    found, missing = peers.find_peers()
+    assert found == {"cv2": modules["cv2"], "kornia": modules["kornia"]}
+    assert [line.split()[0] for line in missing] == ["torchvision", "albumentations"]
+    assert missing[0] == (
+        "torchvision is left out (No module named 'torchvision'); to have it: pip install torchvision"
+    )
+    assert "--no-deps albumentations" in missing[1]
+
+
+def test_albumentations_is_not_let_on_the_network(installed, monkeypatch):
+    monkeypatch.delenv("NO_ALBUMENTATIONS_UPDATE")
+    installed()
+    peers.find_peers()
+    assert peers.os.environ["NO_ALBUMENTATIONS_UPDATE"] == "1"
+
+
+def test_without_peers_ours_remain(ramps):
+    names = list(peers.candidates(ramps, {}))
+    assert names[:2] == [timing.GRID_SAMPLE, timing.COPY]
+    assert {name.split(": ")[0] for name in names[2:]} == set(peers.JOBS)
+    assert all(": ours " in name for name in names[2:])
+
+
+def test_candidates_come_by_job_and_keep_the_size_of_the_frame(monkeypatch):
+    monkeypatch.setenv("NO_ALBUMENTATIONS_UPDATE", "1")
+    height, width = 88, 96
+    found, _ = peers.find_peers()
+    candidates = peers.candidates(torch.rand(1, 3, height, width), found)
+    jobs = [name.split(": ")[0] for name in list(candidates)[2:]]
+    assert jobs == sorted(jobs, key=peers.JOBS.index)
+    for name, call in candidates.items():
+        image = torch.as_tensor(call())
+        assert tuple(image.shape) in {(1, 3, height, width), (height, width, 3)}, name
+
+
+@pytest.mark.parametrize(("peer", "draws"), [("kornia", 8), ("torchvision", 2)])
+def test_the_fields_of_the_peers_move_about_a_pixel(ramps, peer, draws):
+    pytest.importorskip(peer)
+    torch.manual_seed(0)
+    own = {"kornia": peers._kornia, "torchvision": peers._torchvision}[peer]
+    call = next(call for name, call in own(ramps).items() if name.startswith("field"))
+    inner = (..., slice(70, -70), slice(70, -70))  # away from what lies outside
+    moved = torch.stack([(torch.as_tensor(call()) - ramps)[inner][0, :2] for _ in range(draws)])
+    # A draw shows a handful of independent displacements, which is why this is no sharper.
+    assert 0.5 < moved.square().mean().sqrt() < 1.6
+
+
+def test_lenses_in_closed_form_do_what_the_peers_do(ramps):
+    pytest.importorskip("kornia")
+    cv2 = pytest.importorskip("cv2")
+    ours = torch.as_tensor(peers._ours(ramps)["lens: ours closed form"]())
+    kornia = torch.as_tensor(peers._kornia(ramps)["lens: kornia undistort_image"]())
+    opencv = torch.as_tensor(
+        peers._opencv(cv2, ramps[0].movedim(0, -1).contiguous().numpy())[
+            "lens: OpenCV initUndistortRectifyMap + remap"
+        ]()
+    ).movedim(-1, 0)[None]
+    inner = (..., slice(20, -20), slice(20, -20))
+    assert (ours - ramps)[inner].abs().max() > 1
+    assert_close(ours[inner], kornia[inner], atol=2e-3, rtol=0)
+    assert_close(ours[inner], opencv[inner], atol=2e-3, rtol=0)
+
+
+def test_a_slow_candidate_is_looked_at_three_times(monkeypatch):
+    clock = iter(range(1000))
+    monkeypatch.setattr(peers.benchmark, "timer", lambda: float(next(clock)))
+    calls = []
+    found = peers.glance("slow", lambda: calls.append("slow"), {"reference": lambda: calls.append("reference")})
+    assert calls.count("slow") == 3
+    assert calls.count("reference") == 9
+    assert found == Timing("slow", 1, Spread(1e3, 1e3, 1e3), {"reference": Spread(1, 1, 1)})
+
+
+def test_each_of_ours_is_told_beside_the_peers_at_the_same_job():
+    ratios = {"lens: ours A": 8.0, "lens: kornia B": 9.0, "lens: OpenCV C": 0.7, "fog: ours D": 0.3, "fog: E": 38.0}
+    lens, fog = peers.standings([timed(name, ratio) for name, ratio in ratios.items()])
+    assert lens == "lens: ours A 8 x; faster: OpenCV C 0.7 x; slower: kornia B 9 x"
+    assert fog == "fog: ours D 0.3 x; faster: none; slower: E 38 x"
+
+
+def test_the_command_measures_what_is_there(monkeypatch, tmp_path, capsys, on_threads):
+    on_threads(1)
+    monkeypatch.setattr(timing, "_STRETCH_S", 0.0)
+    monkeypatch.setattr(peers, "find_peers", lambda: ({}, ["kornia is left out"]))
+    out = tmp_path / "peers.json"
+    monkeypatch.setattr(sys, "argv", ["peers.py", "--size", "24x40", "--threads", "1", "--out", str(out)])
+    peers.main()
+    printed = capsys.readouterr().out
+    assert "kornia is left out" in printed
+    assert "fog: ours UniformFog" in printed
+    names = [row["name"] for row in json.loads(out.read_text())["timings"]]
+    assert "spline: ours ThinPlateSpline" in names

@@ -114,7 +114,7 @@ def test_normal_numbers_are_normal():
 @pytest.mark.parametrize("count", [4, 40])  # as whole numbers, and as arrays
 def test_the_ends_of_the_range_are_open_and_their_normals_finite(monkeypatch, word, count):
     monkeypatch.setattr(draws, "_rounds", lambda *numbers: (sum(numbers) * 0 + word,) * 2)
-    source = draws.Stream(*words(0, 0))
+    source = draws.Stream(words(0, 0))
     numbers = draws.uniform(source, count)
     assert (numbers == (2.0**-24 if word == 0 else 1 - 2.0**-24)).all()
     assert draws.normal(source, count).abs().max() <= math.sqrt(48 * math.log(2)) * (1 + 1e-6)

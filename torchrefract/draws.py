@@ -7,14 +7,15 @@ Source: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3
 """
 
 import math
-from itertools import chain
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchrefract._bands import join
+from torchrefract.types import Range
 
 _WORD = 0xFFFFFFFF
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
@@ -25,60 +26,105 @@ _CACHED = 1 << 17  # numbers that stay in a core's cache
 _FEW = 8  # up to so many, Python computes faster than numpy
 
 
-class Stream(NamedTuple):
-    """Where the random numbers of each sample come from: two words of 32 bits a sample, each (B,), int64."""
+class Stream:
+    """Where the random numbers of each sample come from: two words of 32 bits a sample.
 
-    high: Tensor
-    low: Tensor
-    lane: int = 0  # numbers of different lanes are independent
+    Args:
+        words: (B, 2), as whole numbers, or as two tensors (B,), int64.
+        lane: numbers of different lanes are independent.
+    """
+
+    def __init__(self, words: Sequence[tuple[int, int]] | tuple[Tensor, Tensor], lane: int = 0):
+        self._words = words
+        self.lane = lane
+
+    @property
+    def few(self) -> Sequence[tuple[int, int]] | None:
+        """The words as whole numbers, where that is what they are."""
+        return None if self._tensors else cast(Sequence[tuple[int, int]], self._words)
+
+    @property
+    def high(self) -> Tensor:
+        """(B,), int64."""
+        return self._word(0)
+
+    @property
+    def low(self) -> Tensor:
+        """(B,), int64."""
+        return self._word(1)
 
     def at(self, lane: int) -> "Stream":
         """The same samples, in another lane."""
-        return self._replace(lane=lane)
+        return Stream(self._words, lane)
+
+    @property
+    def _tensors(self) -> bool:
+        return len(self._words) > 0 and isinstance(self._words[0], Tensor)
+
+    def _word(self, which: int) -> Tensor:
+        if self._tensors:
+            return cast(tuple[Tensor, Tensor], self._words)[which]
+        return torch.tensor([pair[which] for pair in cast(Sequence[tuple[int, int]], self._words)], dtype=torch.int64)
 
 
-def stream(seed: int | Tensor, keys: Tensor) -> Stream:
+def stream(seed: int | Tensor, keys: Tensor | range, *, device: torch.device | None = None) -> Stream:
     """The stream of each sample.
 
     Args:
         seed: a whole number or a tensor of one, int64; of larger numbers the lowest 64 bits count.
-        keys: (B,), int64.
+        keys: (B,), int64, or a range of so many whole numbers.
+        device: for a range.
     """
     if not isinstance(seed, Tensor):
         # Two's complement, so that every Python integer has its 64 bits.
-        seed = torch.full((), (seed + 2**63) % 2**64 - 2**63, dtype=torch.int64, device=keys.device)
-    if (few := _few(len(keys), seed, keys)) is not None:
-        (start,), numbers = few
-        high, low = zip(*(_rounds(*_words(start), *_words(number)) for number in numbers), strict=True)
-        return Stream(torch.tensor(high), torch.tensor(low))
-    return Stream(*threefry(_words(seed.long()), _words(keys.long())))
+        seed = (seed + 2**63) % 2**64 - 2**63
+    if (few := _few(seed, keys, device)) is not None:
+        start, numbers = few
+        return Stream([_rounds(*_words(start), *_words(number)) for number in numbers])
+    if isinstance(keys, range):
+        keys = torch.arange(keys.start, keys.stop, device=device)
+    start = seed.long() if isinstance(seed, Tensor) else torch.full((), seed, dtype=torch.int64, device=keys.device)
+    return Stream(threefry(_words(start), _words(keys.long())))
 
 
 def fold(parent: Stream) -> Stream:
     """Streams of their own for what is nested in a lane."""
+    if parent.few is not None:
+        return Stream([_rounds(high, low, _WORD, parent.lane) for high, low in parent.few])
     zero = torch.zeros_like(parent.low)
-    return Stream(*threefry((parent.high, parent.low), (zero + _WORD, zero + parent.lane)))
+    return Stream(threefry((parent.high, parent.low), (zero + _WORD, zero + parent.lane)))
 
 
 def uniform(source: Stream, count: int) -> Tensor:
     """(B, count), float32, uniform in the open interval (0, 1), on a lattice of 2^23 values."""
-    pairs = (count + 1) // 2
-    if (few := _few(pairs * len(source.low), source.high, source.low)) is not None:
-        rows = []
-        for high, low in zip(*few, strict=True):
-            words = zip(*(_rounds(high, low, i, source.lane) for i in range(pairs)), strict=True)
-            rows.append([((word >> 9) + 0.5) * 2.0**-23 for word in chain.from_iterable(words)][:count])
-        return torch.tensor(rows, dtype=torch.float32)
-    counter = torch.arange(pairs, dtype=torch.int64, device=source.low.device)
+    if (few := source.few) is not None and _blocks(count) * len(few) <= _FEW:
+        return torch.from_numpy(_uniform_few(few, count, source.lane))
+    counter = torch.arange(_blocks(count), dtype=torch.int64, device=source.low.device)
     lane = torch.full_like(counter, source.lane)
     words = threefry((source.high[:, None], source.low[:, None]), (counter, lane))
     return (torch.cat(words, dim=1)[:, :count] >> 9).float().add(0.5).mul(2.0**-23)
 
 
+def between(source: Stream, ranges: Sequence[Range], *, dtype: torch.dtype) -> Tensor:
+    """(B, n), low + (high - low) u of each range, u as by `uniform`.
+
+    Args:
+        source: of the numbers.
+        ranges: n of them.
+        dtype: float32 or float64.
+    """
+    if (few := source.few) is not None and _blocks(len(ranges)) * len(few) <= _FEW:
+        # A handful of numbers: numpy's operations start several times as fast, and round alike.
+        kind = np.float64 if dtype is torch.float64 else np.float32
+        low, high = np.array(ranges, dtype=kind).T
+        return torch.from_numpy(low + (high - low) * _uniform_few(few, len(ranges), source.lane).astype(kind))
+    low, high = torch.tensor(ranges, dtype=dtype, device=source.low.device).unbind(1)
+    return low + (high - low) * uniform(source, len(ranges)).to(dtype)
+
+
 def normal(source: Stream, count: int) -> Tensor:
     """(B, count), float32, standard normal (Box and Muller 1958), up to 5.7 in magnitude."""
-    pairs = (count + 1) // 2
-    radius, angle = uniform(source, 2 * pairs).chunk(2, dim=1)
+    radius, angle = uniform(source, 2 * _blocks(count)).chunk(2, dim=1)
     radius, angle = (-2 * radius.log()).sqrt(), 2 * math.pi * angle
     return torch.cat([radius * angle.cos(), radius * angle.sin()], dim=1)[:, :count]
 
@@ -172,14 +218,30 @@ def _hash(index: Tensor, a: Tensor, b: Tensor) -> Tensor:
     return x
 
 
-def _few(count: int, *values: Tensor) -> list[list[int]] | None:
-    """The values as whole numbers where a draw of so many blocks is faster in Python than to start on tensors."""
-    if not 0 < count <= _FEW or torch.compiler.is_compiling() or values[0].device.type != "cpu":
+def _few(seed: int | Tensor, keys: Tensor | range, device: torch.device | None) -> tuple[int, Sequence[int]] | None:
+    """Seed and keys as whole numbers where so few draws are faster in Python than to start on tensors."""
+    where = keys.device if isinstance(keys, Tensor) else torch.device(device or "cpu")
+    if not 0 < len(keys) <= _FEW or torch.compiler.is_compiling() or where.type != "cpu":
         return None
     try:
-        return [value.reshape(-1).tolist() for value in values]
+        start = int(seed) if isinstance(seed, Tensor) else seed
+        return start, keys if isinstance(keys, range) else [int(key) for key in keys.tolist()]
     except RuntimeError:  # inside torch.vmap no sample has values of its own
         return None
+
+
+def _blocks(count: int) -> int:
+    """Each gives two numbers."""
+    return (count + 1) // 2
+
+
+def _uniform_few(words: Sequence[tuple[int, int]], count: int, lane: int) -> np.ndarray:
+    rows = []
+    for high, low in words:
+        blocks = (_rounds(high, low, i, lane) for i in range(_blocks(count)))
+        first, second = zip(*blocks, strict=True)
+        rows.append([((word >> 9) + 0.5) * 2.0**-23 for word in (*first, *second)[:count]])
+    return np.array(rows, dtype=np.float32)
 
 
 def _new_seed() -> Tensor:

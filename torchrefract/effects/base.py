@@ -80,7 +80,8 @@ class Effect(nn.Module, ABC):
         """The parameters of one draw for this image, a NamedTuple of tensors; `place` is that in a pipeline."""
         check_image(image)
         batch = 1 if image.ndim == 3 else image.shape[0]
-        source = draws.stream(draws.call_seed() if seed is None else _seed(seed), _keys(keys, batch, image.device))
+        seed = draws.call_seed() if seed is None else _seed(seed)
+        source = draws.stream(seed, _keys(keys, batch, image.device), device=image.device)
         return self.draw(source.at(place), image if image.ndim == 4 else image[None])
 
     def apply(  # pyright: ignore[reportIncompatibleMethodOverride]  # nn.Module has taken the name; both uses work
@@ -118,10 +119,8 @@ class Effect(nn.Module, ABC):
 
     def _uniform(self, source: draws.Stream, ranges: Sequence[Range], image: Tensor) -> tuple[Tensor, Tensor]:
         """The gate, (B,), bool, and a value out of each range, (B, n)."""
-        values = draws.uniform(source, 1 + len(ranges))
-        gate, values = values[:, 0] < self.p, values[:, 1:].to(field_dtype(image.dtype))
-        low, high = torch.tensor(ranges, dtype=values.dtype, device=values.device).unbind(1)
-        return gate, low + (high - low) * values
+        values = draws.between(source, [(0.0, 1.0), *ranges], dtype=field_dtype(image.dtype))
+        return values[:, 0].float() < self.p, values[:, 1:]
 
     def check_params(self, params: Any, image: Tensor) -> None:
         """Raise unless these are parameters of this effect for the batch (B, C, H, W)."""
@@ -151,9 +150,9 @@ def _seed(seed: int | Tensor) -> int | Tensor:
     return seed
 
 
-def _keys(keys: Tensor | Sequence[int] | None, batch: int, device: torch.device) -> Tensor:
+def _keys(keys: Tensor | Sequence[int] | None, batch: int, device: torch.device) -> Tensor | range:
     if keys is None:
-        return torch.arange(batch, device=device)
+        return range(batch)
     keys = torch.as_tensor(keys, device=device)
     if keys.is_floating_point() or keys.is_complex() or keys.dtype is torch.bool:
         raise TypeError(f"keys must be whole numbers, got {keys.dtype}")

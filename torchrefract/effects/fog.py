@@ -82,8 +82,9 @@ class UniformFog(RadianceEffect):
         span = (1 / high, 1 / low) if inverse else (low, high)
         gate, values = self._uniform(source, [span, self.deviation_range], image)
         visibility = 1 / values[:, 0] if inverse else values[:, 0]
-        airlight = torch.tensor(self._airlight(image.shape[1]), dtype=values.dtype, device=values.device)
-        return FogParams(gate, visibility, values[:, 1], airlight.repeat(image.shape[0], 1))
+        batch, channels = image.shape[:2]
+        airlight = torch.tensor([self._airlight(channels)] * batch, dtype=values.dtype, device=values.device)
+        return FogParams(gate, visibility, values[:, 1], airlight.view(batch, channels))
 
     def check(self, params: FogParams, image: Tensor) -> None:
         """Raise for fogs that are none."""

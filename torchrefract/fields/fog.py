@@ -8,7 +8,7 @@ from torch import Tensor
 
 # exp(-800) is 0 in float64 and float32 alike, and its gradient is 0, not NaN.
 _OPAQUE = 800.0
-# Farther than anything; an infinite depth times an extinction of zero would be NaN.
+# Farther than anything.
 _FARTHEST = 1e12
 
 
@@ -22,7 +22,8 @@ def extinction(visibility: Tensor, threshold: float) -> Tensor:
 
 def transmission(depth: Tensor, k: Tensor) -> Tensor:
     """t = exp(-k d), the share of light that arrives from d meters through an extinction k in 1/m; they broadcast."""
-    return torch.exp(-(k * depth.clamp(max=_FARTHEST)).clamp(max=_OPAQUE))
+    # An infinite depth times an extinction of zero would be NaN.
+    return torch.exp((-k * depth.clamp(max=_FARTHEST)).clamp(min=-_OPAQUE))
 
 
 def veil(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
@@ -38,10 +39,13 @@ def veil(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
         return torch.lerp(airlight, image, t)
     # With a number for each row, lerp does not vectorize. A batch norm that is not training is one such pass,
     # x w + b for each channel; each row is a channel here.
-    t, added = t.expand(*image.shape[:3], 1), airlight * (1 - t)
-    mean, variance = image.new_zeros(rows), image.new_ones(rows)
-    lines, added = image.contiguous().view(1, rows, image.shape[3]), added.expand_as(t)
-    return F.batch_norm(lines, mean, variance, t.reshape(rows), added.reshape(rows), eps=0.0).view(image.shape)
+    t = t.expand(-1, -1, image.shape[2], -1)
+    added = (airlight * (1 - t)).expand(*image.shape[:3], 1)
+    # The mean of zero serves as the variance too, beside an epsilon of 1.
+    lines, zero = image.reshape(1, rows, image.shape[3]), image.new_zeros(rows)
+    return F.batch_norm(lines, zero, zero, t.expand_as(added).reshape(rows), added.reshape(rows), eps=1.0).view_as(
+        image
+    )
 
 
 def linear_depth(height: int, max_depth: float, *, dtype: torch.dtype, device: torch.device) -> Tensor:

@@ -108,7 +108,7 @@ class UniformFog(RadianceEffect):
             depth = depth.to(dtype).nan_to_num(nan=0.0, posinf=torch.inf).clamp(min=0)
         k = extinction(params.visibility.to(dtype), self.threshold) * (1 + params.deviation.to(dtype))
         t = transmission(depth, k.view(-1, 1, 1, 1))
-        airlight = params.airlight.to(dtype)[:, :, None, None]
+        airlight = params.airlight.to(dtype).view(*image.shape[:2], 1, 1)
         return Shaded(self._blend(image, t, airlight), valid=lambda: t >= 1 / 255, transmission=t)
 
     def _blend(self, image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:

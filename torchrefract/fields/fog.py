@@ -42,7 +42,7 @@ def veil(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
     t = t.expand(-1, -1, image.shape[2], -1)
     added = (airlight * (1 - t)).expand(*image.shape[:3], 1)
     # The mean of zero serves as the variance too, beside an epsilon of 1.
-    lines, zero = image.reshape(1, rows, image.shape[3]), image.new_zeros(rows)
+    lines, zero = image.contiguous().view(1, rows, image.shape[3]), image.new_zeros(rows)
     return F.batch_norm(lines, zero, zero, t.expand_as(added).reshape(rows), added.reshape(rows), eps=1.0).view_as(
         image
     )

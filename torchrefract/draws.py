@@ -22,7 +22,7 @@ _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
 # Odd constants of the hash, as int32: 2^32 over the golden ratio, and the two of lowbias32.
 _HASH = (0x9E3779B1 - 2**32, 0x7FEB352D, 0x846CA68B - 2**32)
-_CACHED = 1 << 17  # numbers that stay in a core's cache
+_CACHED = 1 << 18  # numbers that stay in a core's cache
 _FEW = 8  # up to so many, Python computes faster than numpy
 
 

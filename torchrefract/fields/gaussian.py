@@ -15,7 +15,7 @@ _APERTURE_REACH = 6.0
 # Larger tori cost gigabytes. With less room the covariance is off by up to twice what `Spectrum.clipped` tells.
 _MOST_POINTS = 1 << 24
 _ROUNDING = 1e-13  # of the transform, relative to the largest eigenvalue
-_CACHED = 1 << 17  # complex numbers that stay in a core's cache
+_CACHED = 1 << 18  # complex numbers that stay in a core's cache
 
 
 class Spectrum(NamedTuple):

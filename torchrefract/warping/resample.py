@@ -14,7 +14,7 @@ INTERPOLATIONS = ("nearest", "bilinear", "bicubic")
 _LARGEST_FLOAT32_SIDE = 8192
 # The kernel of this pair alone rounds by the layout of its grid, which bands of rows change.
 _WHOLE = ("bicubic", "reflection")
-_CACHED = 1 << 17  # positions of a grid that stay in a core's cache
+_CACHED = 1 << 18  # positions of a grid that stay in a core's cache
 # Below this many output pixels a second thread costs more than it brings.
 _SMALLEST_SPLIT = 1 << 14
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from arguments import count, frame_of, size
 from timing import (
     COPY,
     FEWEST_REPEATS,
@@ -26,7 +27,6 @@ from timing import (
 from torch import Tensor
 
 from torchrefract import DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, UniformFog
-from torchrefract.data.images import fit, read_image
 
 WHAT = (
     "Whole effects through the public API, with a new draw in every call: effect(image) without gradients; 'all maps' "
@@ -47,7 +47,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.manual_seed(0)
     try:
-        frame = _frame(args.real, args.size).expand(args.batch, -1, -1, -1).contiguous().to(args.device)
+        frame = frame_of(args.real, args.size).expand(args.batch, -1, -1, -1).contiguous().to(args.device)
     except (ValueError, RuntimeError) as error:
         parser.error(str(error))
     conditions = Conditions.now(frame, threads=args.threads, repeats=args.repeats)
@@ -106,36 +106,16 @@ def _forward_and_backward(effect: LensDistortion | UniformFog, frame: Tensor) ->
     return call
 
 
-def _frame(path: Path | None, size: tuple[int, int]) -> Tensor:
-    return torch.rand(1, 3, *size) if path is None else fit(read_image(path), size)[None]
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--size", type=_size, default=(1080, 1920), help="height x width of the frame, 1080x1920")
-    parser.add_argument("--batch", type=_count(1), default=1, help="frames at once, 1")
-    parser.add_argument("--threads", type=_count(1), default=2, help="threads of torch on the CPU, 2")
-    parser.add_argument("--repeats", type=_count(FEWEST_REPEATS), default=FEWEST_REPEATS, help="rounds, 15 or more")
+    parser.add_argument("--size", type=size, default=(1080, 1920), help="height x width of the frame, 1080x1920")
+    parser.add_argument("--batch", type=count(1), default=1, help="frames at once, 1")
+    parser.add_argument("--threads", type=count(1), default=2, help="threads of torch on the CPU, 2")
+    parser.add_argument("--repeats", type=count(FEWEST_REPEATS), default=FEWEST_REPEATS, help="rounds, 15 or more")
     parser.add_argument("--real", type=Path, help="a picture to use as the frame, instead of noise")
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"), help="cpu, or cuda")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "effects.json", help="the JSON")
     return parser
-
-
-def _size(text: str) -> tuple[int, int]:
-    height, cross, width = text.partition("x")
-    if not (cross and height.isdecimal() and width.isdecimal() and int(height) and int(width)):
-        raise argparse.ArgumentTypeError(f"must be HEIGHTxWIDTH in px, got {text!r}")
-    return int(height), int(width)
-
-
-def _count(low: int) -> Callable[[str], int]:
-    def count(text: str) -> int:
-        if not text.isdecimal() or int(text) < low:
-            raise argparse.ArgumentTypeError(f"must be a whole number of at least {low}, got {text!r}")
-        return int(text)
-
-    return count
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any
 
 import torch
-from effects import _count, _frame, _size
+from arguments import count, frame_of, size
 from timing import (
     COPY,
     FEWEST_REPEATS,
@@ -87,7 +87,7 @@ def main() -> None:
     torch.manual_seed(0)
     torch.set_num_threads(args.threads)
     try:
-        frame = _frame(args.real, args.size).contiguous()
+        frame = frame_of(args.real, args.size).contiguous()
     except (ValueError, RuntimeError) as error:
         parser.error(str(error))
     peers, missing = find_peers()
@@ -295,9 +295,9 @@ def _ranked(ratios: Mapping[str, float]) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--size", type=_size, default=(1080, 1920), help="height x width of the frame, 1080x1920")
-    parser.add_argument("--threads", type=_count(1), default=2, help="threads of torch and OpenCV, 2")
-    parser.add_argument("--repeats", type=_count(FEWEST_REPEATS), default=FEWEST_REPEATS, help="rounds, 15 or more")
+    parser.add_argument("--size", type=size, default=(1080, 1920), help="height x width of the frame, 1080x1920")
+    parser.add_argument("--threads", type=count(1), default=2, help="threads of torch and OpenCV, 2")
+    parser.add_argument("--repeats", type=count(FEWEST_REPEATS), default=FEWEST_REPEATS, help="rounds, 15 or more")
     parser.add_argument("--real", type=Path, help="a picture to use as the frame, instead of noise")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "peers.json", help="the JSON")
     return parser

@@ -1,6 +1,7 @@
 import json
 import sys
 
+import composites
 import one_resample
 import pytest
 import torch
@@ -9,7 +10,7 @@ from PIL import Image
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import Compose
+from torchrefract import Compose, compose_flows
 from torchrefract.warping.grid import pixel_axes
 
 SIZE = (120, 160)
@@ -18,7 +19,7 @@ SIZE = (120, 160)
 @pytest.fixture
 def still() -> Tensor:
     """The positions (1, 2, H, W) of the pixels, fp64."""
-    return one_resample.positions(torch.zeros(1, 2, *SIZE))
+    return composites.positions(torch.zeros(1, 2, *SIZE))
 
 
 def smooth_frame(height: int, width: int) -> Tensor:
@@ -35,7 +36,7 @@ def test_the_reference_of_translation_and_scaling_is_the_analytic_composite(stil
     middle = torch.tensor([70.0, 55.0], dtype=torch.float64).view(1, 2, 1, 1)
     shift = torch.tensor([1.3, -2.7], dtype=torch.float64).view(1, 2, 1, 1)
     scaling = 0.02 * (still - middle)
-    found = one_resample.composite([scaling, shift.expand_as(still), scaling], one_resample.spline_read)
+    found = composites.composite([scaling, shift.expand_as(still), scaling])
     # Scaled about the middle, shifted, scaled again.
     once = middle + 1.02 * (still - middle) + shift
     truth = middle + 1.02 * (once - middle) - still
@@ -48,22 +49,22 @@ def test_the_order_of_flows_is_that_of_compose(still):
     made = one_resample.scene(frame, 3)
     flow = Compose(one_resample.warps()).apply(frame, made.params).flow
     assert one_resample.error_px(flow, made.flow) < 0.1
-    backward = one_resample.composite(made.flows[::-1], one_resample.spline_read)
+    backward = composites.composite(made.flows[::-1])
     assert one_resample.error_px(backward.float(), made.flow) > 1
 
 
-@pytest.mark.parametrize("read", [one_resample.spline_read, one_resample.bilinear_read])
-def test_a_composite_reads_the_first_flow_where_the_second_looks(still, read):
+@pytest.mark.parametrize("compose", [lambda *flows: composites.composite(flows), compose_flows])
+def test_a_composite_reads_the_first_flow_where_the_second_looks(still, compose):
     # Linear flows are read exactly by both.
     first = torch.cat([still[:, 1:] / 8, -still[:, :1] / 16], dim=1)
     then = torch.full_like(first, 2.5)
     truth = then + torch.cat([(still[:, 1:] + 2.5) / 8, -(still[:, :1] + 2.5) / 16], dim=1)
-    assert_close(inner(one_resample.composite([first, then], read), 36), inner(truth, 36), atol=1e-9, rtol=0)
+    assert_close(inner(compose(first, then), 36), inner(truth, 36), atol=1e-9, rtol=0)
 
 
 def test_closed_forms_are_the_flows_of_the_effects(still):
     made = one_resample.scene(smooth_frame(*SIZE), 1)
-    known = one_resample.closed_forms(made.params, height=SIZE[0], width=SIZE[1])
+    known = composites.closed_forms(made.params, height=SIZE[0], width=SIZE[1])
     assert_close(known["lens"](still), made.flows[0], atol=1e-9, rtol=0)
     assert_close(known["plate"](still), made.flows[2], atol=1e-9, rtol=0)
     sine = known["sine"](still)
@@ -73,12 +74,11 @@ def test_closed_forms_are_the_flows_of_the_effects(still):
 
 def test_splines_read_a_thin_plate_far_better_than_bilinear_look_ups():
     made = one_resample.scene(smooth_frame(*SIZE), 2)
-    known = one_resample.closed_forms(made.params, height=SIZE[0], width=SIZE[1])
+    known = composites.closed_forms(made.params, height=SIZE[0], width=SIZE[1])
     plate, then = made.flows[2:]
-    truth = then + known["plate"](one_resample.positions(then))
+    truth = then + known["plate"](composites.positions(then))
     spline, bilinear = (
-        one_resample.error_px(one_resample.composite([plate, then], read), truth)
-        for read in (one_resample.spline_read, one_resample.bilinear_read)
+        one_resample.error_px(flow, truth) for flow in (composites.composite([plate, then]), compose_flows(plate, then))
     )
     # At a control point the plate has no second derivative, and no reading is exact.
     assert spline < bilinear / 10
@@ -91,7 +91,7 @@ def test_compositions_in_closed_form_keep_the_bar():
     assert errors["in closed form, lens, then sine"] < 2e-3
     # A bilinear reading of a sine is off by up to (2 pi / wavelength)^2 / 8 of its amplitude on each axis; it is 0 in
     # none of these, so a comparison of the truth with itself would show.
-    bound = one_resample.SINE_PX * (2 * torch.pi / one_resample.SINE_WAVELENGTH_PX) ** 2 / 8 * 2**0.5
+    bound = composites.SINE_PX * (2 * torch.pi / composites.SINE_WAVELENGTH_PX) ** 2 / 8 * 2**0.5
     assert bound / 4 < errors["in closed form, sine, then lens"] < bound + 1e-4
 
 

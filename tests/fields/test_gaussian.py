@@ -174,6 +174,39 @@ def test_the_variogram_of_samples_is_the_theoretical_one(kind, length, frame, la
         assert both == pytest.approx(exact, rel=0.03)
 
 
+def gstools_model(kind: str, length: float):
+    """The same covariance in the conventions of GSTools: exp(-pi / 4 (h / L)^2), and sqrt(nu) h / L for Matern."""
+    gstools = pytest.importorskip("gstools")
+    nu = {"matern32": 1.5, "matern52": 2.5}.get(kind)
+    if nu is not None:
+        return gstools.Matern(dim=2, var=1, len_scale=length / math.sqrt(2), nu=nu)
+    model, stretch = {"exponential": (gstools.Exponential, 1), "gaussian": (gstools.Gaussian, math.sqrt(math.pi / 2))}[
+        kind
+    ]
+    return model(dim=2, var=1, len_scale=stretch * length)
+
+
+@pytest.mark.parametrize("kind", COVARIANCES)
+def test_the_covariance_is_that_of_gstools(kind):
+    h = torch.linspace(0, 90, 181, dtype=torch.float64)
+    theirs = torch.from_numpy(gstools_model(kind, 11.0).covariance(h.numpy()))
+    assert_close(covariance(h, one(11.0), kind), theirs, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", COVARIANCES)
+def test_the_variogram_by_gstools_is_that_of_its_model(kind):
+    gstools = pytest.importorskip("gstools")
+    length, lags = 5.0, 12
+    found = fields(24, 131, 160, length=length, kind=kind).flatten(0, 1).double()
+    # The least its estimator can do: pairs along each axis, of every field.
+    estimates = [gstools.vario_estimate_axis(one.numpy(), axis) for one in found for axis in ("x", "y")]
+    gamma = torch.stack([torch.from_numpy(estimate[1 : lags + 1]) for estimate in estimates]).mean(dim=0)
+    expected = torch.from_numpy(gstools_model(kind, length).variogram(torch.arange(1.0, lags + 1).numpy()))
+    worst = ((gamma - expected).abs() / expected).max().item()
+    print(f"{kind}: variogram of 48 fields by GSTools within {worst:.1%} of its model")
+    assert worst < 0.03
+
+
 def test_the_variogram_of_long_correlations_is_the_theoretical_one():
     # Of 200 px only the exponential field has enough independent pieces: those of its roughness.
     found = fields(20, 131, 240, length=200.0, kind="exponential").double()

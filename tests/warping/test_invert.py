@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from scipy import ndimage
@@ -203,3 +205,26 @@ def test_options_out_of_range_raise(options, rule):
 def test_what_is_no_flow_raises():
     with pytest.raises(ValueError, match=r"flow must have shape \(B, 2, H, W\)"):
         invert_flow(torch.zeros(1, 3, 5, 6))
+
+
+@pytest.mark.parametrize(("amplitude_px", "length"), [(4.0, 20.0), (3.0, 12.0)])
+def test_the_inverse_is_that_of_simpleitk(pixels, waves, amplitude_px, length):
+    itk = pytest.importorskip("SimpleITK")
+    x, y = pixels(*SIZE)
+    flow = waves(x, y, amplitude_px, length)
+    field = itk.GetImageFromArray(flow[0].movedim(0, -1).numpy(), isVector=True)
+    # Its own defaults stop at a tenth of a pixel.
+    theirs = itk.InvertDisplacementField(
+        field, maximumNumberOfIterations=200, maxErrorToleranceThreshold=1e-5, meanErrorToleranceThreshold=1e-6
+    )
+    expected = torch.from_numpy(itk.GetArrayFromImage(theirs)).movedim(-1, 0)[None]
+    inverse, valid, _ = invert_flow(flow)
+    # It holds the border still, which reaches as far inward as displacements do.
+    margin = 2 * math.ceil(amplitude_px) + 2
+    inner = torch.zeros_like(valid)
+    inner[..., margin:-margin, margin:-margin] = True
+    worst = (inverse - expected).norm(dim=1, keepdim=True)[valid & inner].max().item()
+    print(f"{amplitude_px} px, wavelength {length} px: within {worst:.1e} px of SimpleITK's inverse")
+    assert (valid & inner).double().mean() > 0.5
+    assert (expected + flow).abs().max() > 0.5  # it is another thing than -flow
+    assert worst < 1e-2

@@ -21,6 +21,41 @@ def shared_data() -> Path:
     return folder
 
 
+class Agreement(NamedTuple):
+    """How far something is from an independent oracle at most, and how far it may be."""
+
+    error: float
+    bar: float
+    unit: str
+
+
+_ORACLES = pytest.StashKey[dict[str, Agreement]]()
+
+
+@pytest.fixture
+def oracle(request) -> Callable[..., None]:
+    """Asserts that two tensors agree within a bar, and keeps the largest error for the summary of the run."""
+    kept = request.config.stash.setdefault(_ORACLES, {})
+
+    def agree(what: str, found: Tensor, expected: Tensor, bar: float, *, unit: str = "px", scale: float = 1.0) -> None:
+        assert found.shape == expected.shape
+        assert found.isfinite().all()
+        error = ((found.double() - expected.double()).abs() * scale).amax().item()
+        kept[what] = Agreement(max(error, kept[what].error if what in kept else 0.0), bar, unit)
+        assert error <= bar, f"{what}: {error:.2e} {unit}, bar {bar:g}"
+
+    return agree
+
+
+def pytest_terminal_summary(terminalreporter, config) -> None:
+    """What the oracles said, each with its largest error."""
+    kept = config.stash.get(_ORACLES, {})
+    if kept:
+        terminalreporter.section("largest error against each oracle")
+        for what, found in sorted(kept.items()):
+            terminalreporter.write_line(f"{what:74} {found.error:8.1e} {found.unit:3} (bar {found.bar:g})")
+
+
 @pytest.fixture
 def on_threads() -> Iterator[Callable[[int], None]]:
     """Sets the number of torch's threads, for the length of a test."""

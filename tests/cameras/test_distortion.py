@@ -76,12 +76,13 @@ def radial_growth(k: list[float]) -> np.polynomial.Polynomial:
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_distorted_points_agree_with_opencv(name):
+def test_distorted_points_agree_with_opencv(name, oracle):
     x, y = points()
-    expected = by_opencv(x, y, LENSES[name])
-    assert_close(distort_polynomial(x, y, lens(LENSES[name])), expected, rtol=0, atol=1e-9 / FOCAL)
-    single = distort_polynomial(x.float(), y.float(), lens(LENSES[name], torch.float32))
-    assert_close([d.double() for d in single], list(expected), rtol=0, atol=2e-3 / FOCAL)
+    expected = torch.stack(by_opencv(x, y, LENSES[name]))
+    found = torch.stack(distort_polynomial(x, y, lens(LENSES[name])))
+    oracle("lens forward, cv2.projectPoints, fp64", found, expected, 1e-9, scale=FOCAL)
+    found = torch.stack(distort_polynomial(x.float(), y.float(), lens(LENSES[name], torch.float32)))
+    oracle("lens forward, cv2.projectPoints, fp32", found, expected, 2e-3, scale=FOCAL)
 
 
 @pytest.mark.parametrize("name", HIGH_ORDERS)
@@ -93,28 +94,30 @@ def test_high_orders_are_a_polynomial_up_to_r12(name):
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_undistorted_points_agree_with_opencv(name):
+def test_undistorted_points_agree_with_opencv(name, oracle):
     x, y = points(0.7)
     observed = torch.stack([x[0], y[0]], dim=1).numpy()[:, None]
     expected = cv2.undistortPoints(observed, np.eye(3), opencv_vector(LENSES[name]), criteria=CRITERIA)[:, 0].T
     c = lens(LENSES[name])
     x_u, y_u, exists = undistort_polynomial(x, y, c, limit=limit_of(c))
     assert exists.all()
-    assert_close(torch.cat([x_u, y_u]), torch.from_numpy(expected.copy()), rtol=0, atol=1e-6 / FOCAL)
+    expected = torch.from_numpy(expected.copy())
+    oracle("lens inverse, cv2.undistortPoints, fp64", torch.cat([x_u, y_u]), expected, 1e-6, scale=FOCAL)
 
 
 @pytest.mark.parametrize("name", [*LENSES, *HIGH_ORDERS])
 @pytest.mark.parametrize(("dtype", "tolerance_px"), [(torch.float64, 1e-9), (torch.float32, 4e-3)])
-def test_what_is_undistorted_distorts_back(name, dtype, tolerance_px):
+def test_what_is_undistorted_distorts_back(name, dtype, tolerance_px, oracle):
     x, y = (p.to(dtype) for p in points(0.7))
     c = lens((LENSES | HIGH_ORDERS)[name], dtype)
     x_u, y_u, exists = undistort_polynomial(x, y, c, limit=limit_of(c))
     assert exists.all()
-    assert_close(distort_polynomial(x_u, y_u, c), (x, y), rtol=0, atol=tolerance_px / FOCAL)
+    back, kind = torch.stack(distort_polynomial(x_u, y_u, c)), str(dtype).replace("torch.float", "fp")
+    oracle(f"lens inverse, own round trip, {kind}", back, torch.stack([x, y]), tolerance_px, scale=FOCAL)
 
 
 @pytest.mark.parametrize("name", HIGH_ORDERS)
-def test_high_orders_are_inverted_as_by_a_root_finder(name):
+def test_high_orders_are_inverted_as_by_a_root_finder(name, oracle):
     k = [HIGH_ORDERS[name].get(f"k{i}", 0.0) for i in range(1, 7)]
 
     def distorted(r: float) -> float:
@@ -129,7 +132,9 @@ def test_high_orders_are_inverted_as_by_a_root_finder(name):
     x, y, exists = undistort_polynomial(x_d, x_d / 0.6 * 0.8, c, limit=limit)
     assert exists.all()
     expected = torch.tensor(expected, dtype=torch.float64)[None]
-    assert_close((x, y), (0.6 * expected, 0.8 * expected), rtol=0, atol=1e-6 / FOCAL)
+    found = torch.stack([x, y])
+    expected = torch.stack([0.6 * expected, 0.8 * expected])
+    oracle("lens inverse, brentq in r, fp64", found, expected, 1e-6, scale=FOCAL)
 
 
 @pytest.mark.parametrize("k1", [1.0, 2.0, 5.0, 10.0])

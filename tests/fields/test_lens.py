@@ -75,7 +75,7 @@ def test_a_barrel_looks_outward_and_is_undone_by_looking_inward(pixels):
 
 
 @pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-3), (torch.float32, 1e-3)])
-def test_the_dense_flow_back_is_opencvs_map_for_rectifying(pixels, dtype, atol):
+def test_the_dense_flow_back_is_opencvs_map_for_rectifying(pixels, dtype, atol, oracle):
     # OpenCV's map tells for each pixel of the undistorted frame where to look in the distorted one.
     height, width = 720, 1280
     at = small_camera(BARREL, height, width)
@@ -83,10 +83,11 @@ def test_the_dense_flow_back_is_opencvs_map_for_rectifying(pixels, dtype, atol):
     maps = cv2.initUndistortRectifyMap(matrix, vector, None, matrix, (width, height), cv2.CV_32FC1)
     flow, _ = lens_restore_flow(*(t.to(dtype) for t in at), height=height, width=width)
     looked_up = flow[0].double() + torch.stack(pixels(height, width))
-    assert_close(looked_up, torch.from_numpy(np.stack(maps)).double(), rtol=0, atol=atol)
+    kind = str(dtype).replace("torch.float", "fp")
+    oracle(f"lens dense map, cv2.initUndistortRectifyMap, {kind}", looked_up, torch.from_numpy(np.stack(maps)), atol)
 
 
-def test_single_precision_is_right_to_a_fraction_of_a_pixel_at_4k():
+def test_single_precision_is_right_to_a_fraction_of_a_pixel_at_4k(oracle):
     # Strips that hold the corners and the center stand for the frame.
     height, width = 2160, 3840
     at = camera({"k1": -0.25, "k2": 0.09, "k3": -0.01}, (3000.0, 3000.0), (1925.0, 1070.0))
@@ -97,7 +98,7 @@ def test_single_precision_is_right_to_a_fraction_of_a_pixel_at_4k():
             single, exists = field(*(t.float() for t in shifted), height=2, width=width)
             assert single.dtype == torch.float32
             assert exists.all()
-            assert_close(single.double(), exact, rtol=0, atol=2e-3)
+            oracle(f"{field.__name__} at 4K, fp32 against fp64", single, exact, 2e-3)
     # Four times the farthest corner is as far as preimages are looked for.
     reach = frame_limit(torch.zeros_like(at[0]), *at[1:], height=height, width=width).radius.item()
     assert reach == pytest.approx(4 * math.hypot(1925, 1089) / 3000)

@@ -38,7 +38,7 @@ def solve_waves(waves, x: Tensor, y: Tensor, amplitude_px: float, length: float)
 
 
 @pytest.mark.parametrize(("amplitude_px", "length"), [(5.0, 40.0), (4.0, 20.0), (1.0, 8.0), (0.02, 60.0)])
-def test_the_inverse_of_waves_is_the_analytic_one_up_to_interpolation(pixels, waves, amplitude_px, length):
+def test_the_inverse_of_waves_is_the_analytic_one_up_to_interpolation(pixels, waves, amplitude_px, length, oracle):
     x, y = pixels(*SIZE)
     flow = waves(x, y, amplitude_px, length)
     inverse, valid, _ = invert_flow(flow, steps=20)
@@ -50,6 +50,8 @@ def test_the_inverse_of_waves_is_the_analytic_one_up_to_interpolation(pixels, wa
     assert (inverse - exact).norm(dim=1, keepdim=True)[valid].max() <= 2**0.5 * floor
     if length == 60.0:
         assert floor < 1.5e-6
+        inside = valid.expand_as(exact)
+        oracle("inverse of a weak wave, 60 Newton steps", inverse[inside], exact[inside], 1e-6)
 
 
 def test_an_affine_flow_is_inverted_exactly(pixels):
@@ -208,7 +210,7 @@ def test_what_is_no_flow_raises():
 
 
 @pytest.mark.parametrize(("amplitude_px", "length"), [(4.0, 20.0), (3.0, 12.0)])
-def test_the_inverse_is_that_of_simpleitk(pixels, waves, amplitude_px, length):
+def test_the_inverse_is_that_of_simpleitk(pixels, waves, amplitude_px, length, oracle):
     itk = pytest.importorskip("SimpleITK")
     x, y = pixels(*SIZE)
     flow = waves(x, y, amplitude_px, length)
@@ -223,8 +225,7 @@ def test_the_inverse_is_that_of_simpleitk(pixels, waves, amplitude_px, length):
     margin = 2 * math.ceil(amplitude_px) + 2
     inner = torch.zeros_like(valid)
     inner[..., margin:-margin, margin:-margin] = True
-    worst = (inverse - expected).norm(dim=1, keepdim=True)[valid & inner].max().item()
-    print(f"{amplitude_px} px, wavelength {length} px: within {worst:.1e} px of SimpleITK's inverse")
+    at = (valid & inner).expand_as(inverse)
+    oracle("inverse, SimpleITK", inverse[at], expected[at], 1e-2)
     assert (valid & inner).double().mean() > 0.5
     assert (expected + flow).abs().max() > 0.5  # it is another thing than -flow
-    assert worst < 1e-2

@@ -53,17 +53,17 @@ def by_opencv(image: Tensor, flow: Tensor, interpolation: int, border: int = cv2
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("padding", PADDINGS)
 @pytest.mark.parametrize(("interpolation", "order"), [("bilinear", 1), ("nearest", 0)])
-def test_double_precision_agrees_with_scipy(size, padding, interpolation, order):
+def test_double_precision_agrees_with_scipy(size, padding, interpolation, order, oracle):
     image, flow = noise(2, 3, *size), random_flow(2, *size)
     warped, _ = warp(image, flow, padding=padding, interpolation=interpolation)
-    assert_close(warped, by_scipy(image, flow, order, padding), rtol=0, atol=1e-12)
+    oracle("sampling, map_coordinates, fp64", warped, by_scipy(image, flow, order, padding), 1e-12, unit="")
 
 
 @pytest.mark.parametrize("padding", CV2_BORDERS)
-def test_bilinear_single_precision_agrees_with_opencv(padding):
+def test_bilinear_single_precision_agrees_with_opencv(padding, oracle):
     image, flow = noise(1, 3, 270, 480).float(), random_flow(1, 270, 480).float()
     expected = by_opencv(image, flow, cv2.INTER_LINEAR, CV2_BORDERS[padding])
-    assert_close(warp(image, flow, padding=padding)[0], expected, rtol=0, atol=5e-4)
+    oracle("sampling, cv2.remap, fp32", warp(image, flow, padding=padding)[0], expected, 5e-4, unit="")
 
 
 def test_bicubic_agrees_with_opencv_up_to_the_clamp():

@@ -30,11 +30,11 @@ def invert_flow(flow: Tensor, *, steps: int = 6, tolerance_px: float = 0.05) -> 
     Raises:
         ValueError: a flow of another shape, no step, a tolerance that is not positive.
 
-    Newton and the fixed point inverse <- -flow(p + inverse) end in the same inverse, as smooth to all printed digits and
-    valid on the same pixels. To 1e-3 px on 99.9 % of them Newton takes 1 to 2 steps on the effects' defaults and 3 on
-    strong ones (21 to 25, and 33 bare grid_samples), the fixed point 3 to 12 and 12 to 30 (17 to 33 and 33 to 64); on a
-    strong lens (k1 = -0.4) it is still 17 px off after 30. Newton's steps hardly depend on the flow, so their number
-    can be fixed; 6 leave room. Measured by benchmarks/inverses.py on frames of 1280 x 720.
+    Newton and the fixed point inverse <- -flow(p + inverse) end in the same inverse, equally smooth, valid on the same
+    pixels. To 1e-3 px on 99.9 % of them Newton takes 1 to 2 steps on the effects' defaults and 3 on strong ones (21 to
+    25, and 33 bare grid_samples), the fixed point 3 to 12 and 12 to 30 (17 to 33, and 33 to 64); on a strong lens
+    (k1 = -0.4) it is still 17 px off after 30. Newton's steps hardly depend on the flow, so their number can be fixed;
+    6 leave room. Measured by benchmarks/inverses.py on frames of 1280 x 720.
 
     Source: Chen, Lu, Chen, Ruchala, Olivera, "A simple fixed-point approach to invert a deformation field", Medical
     Physics 35 (2008), for the equation and the fixed point.

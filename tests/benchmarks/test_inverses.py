@@ -127,6 +127,6 @@ def test_the_command_prints_a_table_for_each_effect(monkeypatch, tmp_path, capsy
     plate = content["effects"]["ThinPlateSpline"]
     assert [(row["method"], row["steps"]) for row in plate] == [
         (FIXED_POINT, 1), (FIXED_POINT, 4), (NEWTON, 1), (NEWTON, 2)
-    ]  # fmt: skip
+    ]  # fmt: skip  # one line for each row of a table
     assert all(row["ratio"] > 0 and row["spline_px"] > 0 for row in plate)
     assert content["conditions"]["frame"] == [1, 3, *SIZE]

@@ -83,7 +83,7 @@ def test_candidates_come_by_job_and_keep_the_size_of_the_frame(monkeypatch):
 
 @pytest.mark.parametrize(("peer", "draws"), [("kornia", 8), ("torchvision", 2)])
 def test_the_fields_of_the_peers_move_about_a_pixel(ramps, peer, draws):
-    pytest.importorskip(peer)
+    pytest.importorskip(peer, reason="a peer that is not installed cannot be held against ours")
     torch.manual_seed(0)
     own = {"kornia": peers._kornia, "torchvision": peers._torchvision}[peer]
     call = next(call for name, call in own(ramps).items() if name.startswith("field"))
@@ -94,8 +94,8 @@ def test_the_fields_of_the_peers_move_about_a_pixel(ramps, peer, draws):
 
 
 def test_lenses_in_closed_form_do_what_the_peers_do(ramps):
-    pytest.importorskip("kornia")
-    cv2 = pytest.importorskip("cv2")
+    pytest.importorskip("kornia", reason="kornia is in the extra train")
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is in the extra calibration")
     ours = torch.as_tensor(peers._ours(ramps)["lens: ours closed form"]())
     kornia = torch.as_tensor(peers._kornia(ramps)["lens: kornia undistort_image"]())
     opencv = torch.as_tensor(

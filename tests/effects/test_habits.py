@@ -37,17 +37,17 @@ def effect(request) -> Effect:
 
 @pytest.fixture(scope="session")
 def transforms() -> Any:
-    return pytest.importorskip("torchvision.transforms")
+    return pytest.importorskip("torchvision.transforms", reason="torchvision is in the extra test")
 
 
 @pytest.fixture(scope="session")
 def v2() -> Any:
-    return pytest.importorskip("torchvision.transforms.v2")
+    return pytest.importorskip("torchvision.transforms.v2", reason="torchvision is in the extra test")
 
 
 @pytest.fixture(scope="session")
 def tv_tensors() -> Any:
-    return pytest.importorskip("torchvision.tv_tensors")
+    return pytest.importorskip("torchvision.tv_tensors", reason="torchvision is in the extra test")
 
 
 def picture(*shape: int) -> Tensor:
@@ -128,7 +128,7 @@ def test_an_effect_is_a_layer_among_layers(effect):
 
 @pytest.mark.parametrize("name", ["ImageSequential", "AugmentationSequential"])
 def test_a_container_of_kornia_takes_an_effect_between_its_augmentations(effect, name):
-    augmentation = pytest.importorskip("kornia.augmentation")
+    augmentation = pytest.importorskip("kornia.augmentation", reason="kornia is in the extra train")
     options = {} if name == "ImageSequential" else {"data_keys": ["input"]}
     flip, scale = augmentation.RandomHorizontalFlip(p=1.0), augmentation.Normalize(0.5, 0.5)
     pipeline = getattr(augmentation.container, name)(flip, effect, scale, **options)

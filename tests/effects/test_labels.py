@@ -7,8 +7,8 @@ from torch import Tensor, nn
 from torchrefract import Compose, LensDistortion, ThinPlateSpline, Turbulence, UniformFog, warp_points
 from torchrefract.effects.base import Effect
 
-tv_tensors = pytest.importorskip("torchvision.tv_tensors")
-transforms = pytest.importorskip("torchvision.transforms.v2")
+tv_tensors = pytest.importorskip("torchvision.tv_tensors", reason="torchvision is in the extra test")
+transforms = pytest.importorskip("torchvision.transforms.v2", reason="torchvision is in the extra test")
 
 EFFECTS = [LensDistortion(), Turbulence(), ThinPlateSpline(), Compose([Turbulence(), UniformFog(), LensDistortion()])]
 

@@ -148,7 +148,7 @@ def test_frames_of_another_shape_raise():
 
 def test_what_is_no_camera_raises():
     with pytest.raises(TypeError, match="camera must be a Camera, got dict"):
-        Rectification({"fx": 1.0})  # pyright: ignore[reportArgumentType]
+        Rectification({"fx": 1.0})  # pyright: ignore[reportArgumentType]  # the wrong type is the point
     tilted = Camera(width=48, height=27, fx=43.0, fy=42.5, cx=25.0, cy=14.1, coefficients=(0.0,) * 13 + (0.1,))
     with pytest.raises(ValueError, match="tau_x and tau_y of zero"):
         Rectification(tilted)

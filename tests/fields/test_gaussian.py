@@ -1,5 +1,7 @@
 import math
+from typing import Any
 
+import gstools
 import pytest
 import torch
 from scipy import special
@@ -176,9 +178,8 @@ def test_the_variogram_of_samples_is_the_theoretical_one(kind, length, frame, la
         oracle(what, both / exact, torch.ones_like(both), 0.03, unit="")
 
 
-def gstools_model(kind: str, length: float):
+def gstools_model(kind: str, length: float) -> Any:
     """The same covariance in the conventions of GSTools: exp(-pi / 4 (h / L)^2), and sqrt(nu) h / L for Matern."""
-    gstools = pytest.importorskip("gstools")
     nu = {"matern32": 1.5, "matern52": 2.5}.get(kind)
     if nu is not None:
         return gstools.Matern(dim=2, var=1, len_scale=length / math.sqrt(2), nu=nu)
@@ -196,7 +197,6 @@ def test_the_covariance_is_that_of_gstools(kind, oracle):
 
 @pytest.mark.parametrize("kind", COVARIANCES)
 def test_the_variogram_by_gstools_is_that_of_its_model(kind, oracle):
-    gstools = pytest.importorskip("gstools")
     length, lags = 5.0, 12
     found = fields(24, 131, 160, length=length, kind=kind).flatten(0, 1).double()
     # The least its estimator can do: pairs along each axis, of every field.

@@ -199,7 +199,7 @@ BOXES = torch.zeros(2, 3, 4)
         (lambda: warp_boxes(torch.zeros(2, 3, 5), FLOW), ValueError, r"boxes must have shape \(B, N, 4\)"),
         (lambda: warp_boxes(BOXES, FLOW, min_area=-1.0), ValueError, "min_area must be a number of at least 0"),
         (lambda: warp_boxes(BOXES, FLOW, min_visibility=1.5), ValueError, r"min_visibility must be .* \[0, 1\]"),
-        (lambda: warp_boxes(BOXES, FLOW, clip=1), TypeError, "clip must be True or False"),  # pyright: ignore
+        (lambda: warp_boxes(BOXES, FLOW, clip=1), TypeError, "clip must be True or False"),  # pyright: ignore[reportArgumentType]  # the point
         (lambda: warp_boxes(BOXES, FLOW, samples=1), ValueError, "samples must be at least 2, got 1"),
         (
             lambda: warp_boxes(BOXES - torch.arange(4), FLOW),

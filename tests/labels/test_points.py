@@ -263,7 +263,7 @@ ONE = torch.zeros(2, 5, 6)
 @pytest.mark.parametrize(
     ("call", "kind", "rule"),
     [
-        (lambda: warp_points([1.0, 2.0], FLOW), TypeError, "points_xy must be a tensor, got list"),  # pyright: ignore
+        (lambda: warp_points([1.0, 2.0], FLOW), TypeError, "points_xy must be a tensor, got list"),  # pyright: ignore[reportArgumentType]  # the point
         (lambda: warp_points(torch.zeros(2, 3, 3), FLOW), ValueError, r"points_xy must have shape \(B, N, 2\)"),
         (lambda: warp_points(torch.zeros(3, 2), FLOW), ValueError, r"points_xy must have shape \(B, N, 2\)"),
         (lambda: warp_points(torch.zeros(1, 3, 2), FLOW[None]), ValueError, r"flow must have shape \(B, 2, H, W\)"),

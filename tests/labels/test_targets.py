@@ -13,9 +13,9 @@ from torch.testing import assert_close
 from torchrefract import warp, warp_boxes, warp_mask, warp_points
 from torchrefract.labels.targets import warp_labels
 
-tv = pytest.importorskip("torchvision.tv_tensors")
-F = pytest.importorskip("torchvision.transforms.v2.functional")
-v2 = pytest.importorskip("torchvision.transforms.v2")
+tv = pytest.importorskip("torchvision.tv_tensors", reason="torchvision is in the extra test")
+F = pytest.importorskip("torchvision.transforms.v2.functional", reason="torchvision is in the extra test")
+v2 = pytest.importorskip("torchvision.transforms.v2", reason="torchvision is in the extra test")
 
 SIZE = (36, 64)
 PLAIN_FORMATS = ["XYXY", "XYWH", "CXCYWH"]
@@ -325,15 +325,15 @@ def test_gradients_reach_soft_labels_and_the_flow(wave):
 
 def test_unknown_types_raise_and_are_named():
     class Skeleton(tv.TVTensor):
-        pass
+        """Of torchvision's kind, and none of its types."""
 
     class Tagged(Tensor):
-        pass
+        """A tensor of somebody's own type."""
 
     class Polygons:
-        pass
+        """No tensor at all."""
 
-    picture = pytest.importorskip("PIL.Image").new("RGB", (SIZE[1], SIZE[0]))
+    picture = pytest.importorskip("PIL.Image", reason="pillow is in the extra train").new("RGB", (SIZE[1], SIZE[0]))
     for leaf in (
         torch.rand(3, 2).as_subclass(Skeleton),
         torch.rand(2).as_subclass(Tagged),
@@ -347,7 +347,7 @@ def test_unknown_types_raise_and_are_named():
 
 def test_a_subclass_of_a_known_type_is_moved_and_kept():
     class Road(tv.Mask):
-        pass
+        """A mask by another name."""
 
     mask = torch.randint(0, 5, SIZE, generator=generator()).as_subclass(Road)
     moved = warp_labels(mask, hflip())

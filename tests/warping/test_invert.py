@@ -1,6 +1,7 @@
 import math
 
 import pytest
+import SimpleITK
 import torch
 from scipy import ndimage
 from torch import Tensor
@@ -211,15 +212,14 @@ def test_what_is_no_flow_raises():
 
 @pytest.mark.parametrize(("amplitude_px", "length"), [(4.0, 20.0), (3.0, 12.0)])
 def test_the_inverse_is_that_of_simpleitk(pixels, waves, amplitude_px, length, oracle):
-    itk = pytest.importorskip("SimpleITK")
     x, y = pixels(*SIZE)
     flow = waves(x, y, amplitude_px, length)
-    field = itk.GetImageFromArray(flow[0].movedim(0, -1).numpy(), isVector=True)
+    field = SimpleITK.GetImageFromArray(flow[0].movedim(0, -1).numpy(), isVector=True)
     # Its own defaults stop at a tenth of a pixel.
-    theirs = itk.InvertDisplacementField(
+    theirs = SimpleITK.InvertDisplacementField(
         field, maximumNumberOfIterations=200, maxErrorToleranceThreshold=1e-5, meanErrorToleranceThreshold=1e-6
     )
-    expected = torch.from_numpy(itk.GetArrayFromImage(theirs)).movedim(-1, 0)[None]
+    expected = torch.from_numpy(SimpleITK.GetArrayFromImage(theirs)).movedim(-1, 0)[None]
     inverse, valid, _ = invert_flow(flow)
     # It holds the border still, which reaches as far inward as displacements do.
     margin = 2 * math.ceil(amplitude_px) + 2

@@ -81,7 +81,7 @@ def candidates(frame: Tensor) -> dict[str, Candidate]:
 def bars(timings: Sequence[Timing]) -> list[Bar]:
     """The limits, beside what was measured."""
     ratios = {timing.name: timing.ratios[GRID_SAMPLE].median for timing in timings}
-    return [Bar(name, GRID_SAMPLE, limit, ratios[name]) for name, limit in LIMITS.items()]
+    return [Bar(name, ratios[name], "<=", limit, f"x {GRID_SAMPLE}") for name, limit in LIMITS.items()]
 
 
 def _all_maps(lens: LensDistortion, frame: Tensor) -> tuple[Tensor | None, ...]:

@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from composites import closed_forms, composite, positions, spline_read
 from roundtrip import psnr
-from timing import Conditions
+from timing import Bar, Conditions
 from torch import Tensor
 
 from torchrefract import (
@@ -49,26 +49,6 @@ SEED = 7
 MARGIN_PX = 12  # a quintic spline has forgotten the border there, and so have four bicubic look-ups
 COMPOSED = "all four, as composed"
 CLOSED = "in closed form"
-
-
-@dataclass(frozen=True)
-class Bar:
-    """What an issue asks for, beside what was measured."""
-
-    name: str
-    value: float
-    sign: str  # ">=" or "<="
-    limit: float
-    unit: str
-
-    @property
-    def holds(self) -> bool:
-        """Whether the measured value keeps the limit."""
-        return self.value >= self.limit if self.sign == ">=" else self.value <= self.limit
-
-    def __str__(self) -> str:
-        verdict = "holds" if self.holds else "DOES NOT HOLD"
-        return f"{self.name}: {self.value:.3g} {self.unit}, bar {self.sign} {self.limit:g} {self.unit}: {verdict}"
 
 
 @dataclass(frozen=True)

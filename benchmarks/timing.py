@@ -62,21 +62,22 @@ class Timing:
 
 @dataclass(frozen=True)
 class Bar:
-    """A limit that an issue sets: the multiple of a reference that a candidate may take."""
+    """What an issue asks for, beside what was measured."""
 
     name: str
-    reference: str
+    value: float
+    sign: str  # ">=" or "<="
     limit: float
-    ratio: float
+    unit: str
 
     @property
     def holds(self) -> bool:
-        """Whether the measured median keeps within the limit."""
-        return self.ratio <= self.limit
+        """Whether the measured value keeps the limit."""
+        return self.value >= self.limit if self.sign == ">=" else self.value <= self.limit
 
     def __str__(self) -> str:
         verdict = "holds" if self.holds else "DOES NOT HOLD"
-        return f"{self.name}: {_digits(self.ratio)} x {self.reference}, bar <= {self.limit:g} x: {verdict}"
+        return f"{self.name}: {_digits(self.value)} {self.unit}, bar {self.sign} {self.limit:g} {self.unit}: {verdict}"
 
 
 @dataclass(frozen=True)

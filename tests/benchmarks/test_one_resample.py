@@ -5,8 +5,8 @@ import composites
 import one_resample
 import pytest
 import torch
-from one_resample import Bar
 from PIL import Image
+from timing import Bar
 from torch import Tensor
 from torch.testing import assert_close
 

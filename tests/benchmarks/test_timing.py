@@ -146,7 +146,7 @@ def test_the_references_do_a_look_up_and_a_copy():
 
 def test_a_saved_run_holds_everything(tmp_path, conditions):
     path = tmp_path / "new" / "run.json"
-    save(path, [timed()], conditions, what="one effect", bars=[Bar("effect", "reference", 3.0, 2.0)])
+    save(path, [timed()], conditions, what="one effect", bars=[Bar("effect", 2.0, "<=", 3.0, "x reference")])
     content = json.loads(path.read_text())
     assert content["what"] == "one effect"
     assert content["timings"] == [
@@ -157,7 +157,9 @@ def test_a_saved_run_holds_everything(tmp_path, conditions):
             "ratios": {"reference": {"median": 2.0, "lower": 1.9, "upper": 2.1}},
         }
     ]
-    assert content["bars"] == [{"name": "effect", "reference": "reference", "limit": 3.0, "ratio": 2.0, "holds": True}]
+    assert content["bars"] == [
+        {"name": "effect", "value": 2.0, "sign": "<=", "limit": 3.0, "unit": "x reference", "holds": True}
+    ]
     keys = "date commit device cpu load torch python opencv threads repeats frame dtype"
     assert list(content["conditions"]) == keys.split()
     assert content["conditions"]["frame"] == [2, 3, 5, 7]
@@ -190,7 +192,7 @@ def test_without_a_repository_there_is_no_commit(monkeypatch):
 
 @pytest.mark.parametrize(("ratio", "holds"), [(0.25, True), (0.2501, False)])
 def test_a_bar_holds_up_to_its_limit(ratio, holds):
-    bar = Bar("fog", "reference", 0.25, ratio)
+    bar = Bar("fog", ratio, "<=", 0.25, "x reference")
     assert bar.holds is holds
     assert ("DOES NOT HOLD" in str(bar)) is not holds
 

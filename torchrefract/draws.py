@@ -14,15 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._bands import join
 from torchrefract.types import Range
 
 _WORD = 0xFFFFFFFF
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
-# Odd constants of the hash, as int32: 2^32 over the golden ratio, and the two of lowbias32.
-_HASH = (0x9E3779B1 - 2**32, 0x7FEB352D, 0x846CA68B - 2**32)
-_CACHED = 1 << 18  # numbers that stay in a core's cache
 _FEW = 8  # up to so many, Python computes faster than numpy
 
 
@@ -136,23 +132,6 @@ def noise_key(source: Stream) -> Tensor:
     return torch.stack([child.high, child.low, *threefry((child.high, child.low), (zero, zero))], dim=1)
 
 
-def noise(key: Tensor, count: int) -> Tensor:
-    """(B, 2, count), float32, white noise, standard normal, up to 5.8 in magnitude.
-
-    For millions of numbers: the i-th pair of a sample is a hash of i under its key, two rounds of multiply and
-    xor-shift on 32 bits, and Box and Muller's transform of it.
-
-    Args:
-        key: (B, 4), int64, of `noise_key`.
-        count: pairs to a sample.
-
-    Source: Wellons, "Prospecting for hash functions" (2018), for the constants; Box and Muller 1958.
-    """
-    if torch.compiler.is_compiling():
-        return torch.ops.torchrefract.noise(key, count)
-    return _noise(key, count)
-
-
 def call_seed() -> Tensor:
     """(), int64: a fresh seed from torch's global generator, in eager mode and under torch.compile alike."""
     # Calling the operator loads what compilers need, a second of work that eager mode does without.
@@ -190,32 +169,6 @@ def _rounds(key0: Any, key1: Any, counter0: Any, counter1: Any) -> tuple[Any, An
         x = (x + keys[(group + 1) % 3]) & _WORD
         y = y + keys[(group + 2) % 3] + group + 1
     return x, y & _WORD
-
-
-def _noise(key: Tensor, count: int) -> Tensor:
-    # As int32, whose products drop what does not fit; a key above 2^31 is a negative number there.
-    words = (key - (key >> 31 << 32)).to(torch.int32)[:, :, None].unbind(1)
-    at_once = max(1, _CACHED // max(1, len(key)) if key.device.type == "cpu" else count)
-    bands = (_noise_between(words, start, min(start + at_once, count)) for start in range(0, max(1, count), at_once))
-    return join(bands, dim=2, length=count)
-
-
-def _noise_between(words: tuple[Tensor, ...], start: int, end: int) -> Tensor:
-    a, b, c, d = words
-    index = torch.arange(start, end, dtype=torch.int32, device=a.device) * _HASH[0]
-    uniform = ((_hash(index, a, b) >> 9) & 0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
-    radius, angle = uniform.log_().mul_(-2).sqrt_(), _hash(index, c, d).float().mul_(math.pi * 2.0**-31)
-    return torch.stack([radius * angle.cos(), radius * angle.sin()], dim=1)
-
-
-def _hash(index: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    x = index + a
-    x ^= (x >> 16) & 0xFFFF
-    x = x.mul_(_HASH[1]).add_(b)
-    x ^= (x >> 15) & 0x1FFFF
-    x.mul_(_HASH[2])
-    x ^= (x >> 16) & 0xFFFF
-    return x
 
 
 def _few(seed: int | Tensor, keys: Tensor | range, device: torch.device | None) -> tuple[int, Sequence[int]] | None:
@@ -270,11 +223,3 @@ _threefry_op = torch.library.custom_op("torchrefract::threefry", _threefry, muta
 def _(key0: Tensor, key1: Tensor, counter0: Tensor, counter1: Tensor) -> tuple[Tensor, Tensor]:
     shape = torch.broadcast_shapes(key0.shape, key1.shape, counter0.shape, counter1.shape)
     return counter0.new_empty(shape), counter0.new_empty(shape)
-
-
-_noise_op = torch.library.custom_op("torchrefract::noise", _noise, mutates_args=())
-
-
-@_noise_op.register_fake
-def _(key: Tensor, count: int) -> Tensor:
-    return key.new_empty((key.shape[0], 2, count), dtype=torch.float32)

@@ -8,7 +8,7 @@ from scipy import special
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import draws
+from torchrefract import draws, white_noise
 from torchrefract.fields import gaussian
 from torchrefract.fields.covariance import COVARIANCES, covariance, slope_rms
 from torchrefract.fields.gaussian import (
@@ -48,7 +48,9 @@ def distances(height: int, width: int) -> Tensor:
 
 
 def noise(count: int, size: tuple[int, int], seed: int = 3) -> Tensor:
-    return draws.noise(draws.noise_key(draws.stream(seed, torch.arange(count))), size[0] * size[1]).view(-1, 2, *size)
+    return white_noise.noise(draws.noise_key(draws.stream(seed, torch.arange(count))), size[0] * size[1]).view(
+        -1, 2, *size
+    )
 
 
 def fields(pairs: int, height: int, width: int, *, length: float, kind: str) -> Tensor:
@@ -462,7 +464,7 @@ def test_compiled_code_gives_the_same_field_and_gradient(kind, backend):
 
     def field(length: Tensor, aperture: Tensor) -> Tensor:
         shape = spectrum(size, length, kind=kind, aperture=aperture, dtype=torch.float32)
-        numbers = draws.noise(key, size[0] * size[1]).view(-1, 2, *size)
+        numbers = white_noise.noise(key, size[0] * size[1]).view(-1, 2, *size)
         return gaussian_random_field(numbers, shape.amplitude, height=9, width=14)
 
     inputs = [torch.tensor(pair, requires_grad=True) for pair in ((4.0, 2.0), (0.5, 1.0))]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import draws, warp
+from torchrefract import draws, warp, white_noise
 from torchrefract.fields.covariance import COVARIANCES
 from torchrefract.fields.gaussian import gaussian_random_field, spectrum, torus
 from torchrefract.fields.stream import curl, curl_rms
@@ -20,7 +20,7 @@ def random_field(kind: str, length: float, *, samples: int, height: int, width: 
     lengths = torch.full((samples,), length, dtype=torch.float64)
     shape = spectrum(size, lengths, kind=kind, dtype=torch.float64).amplitude
     key = draws.noise_key(draws.stream(11, torch.arange(samples)))
-    noise = draws.noise(key, size[0] * size[1]).view(-1, 2, *size).double()
+    noise = white_noise.noise(key, size[0] * size[1]).view(-1, 2, *size).double()
     return gaussian_random_field(noise, shape, height=height, width=width).flatten(0, 1)[:, None]
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract import draws
+from torchrefract import white_noise
 from torchrefract._checks import check_all, read
 from torchrefract.fields.gaussian import gaussian_random_field, spectrum, torus
 
@@ -42,7 +42,7 @@ def random_field(
             f"{params.length.max().item():g} px",
             stacklevel=2,
         )
-    noise = draws.noise(params.key, size[0] * size[1]).view(-1, 2, *size).to(dtype)
+    noise = white_noise.noise(params.key, size[0] * size[1]).view(-1, 2, *size).to(dtype)
     return gaussian_random_field(noise, shape, height=height, width=width)
 
 

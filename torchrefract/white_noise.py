@@ -1,0 +1,110 @@
+"""White noise by the million: numbers that are a hash of where they stand, under the key of a sample."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchrefract._bands import join
+
+_WORD = 0xFFFFFFFF
+# Odd constants of the hash, as int32: 2^32 over the golden ratio, and the two of lowbias32.
+_HASH = (0x9E3779B1 - 2**32, 0x7FEB352D, 0x846CA68B - 2**32)
+_CACHED = 1 << 18  # numbers that stay in a core's cache
+
+
+def noise(key: Tensor, count: int) -> Tensor:
+    """(B, 2, count), float32, white noise, standard normal, up to 5.8 in magnitude.
+
+    For millions of numbers: the i-th pair of a sample is a hash of i under its key, two rounds of multiply and
+    xor-shift on 32 bits, and Box and Muller's transform of it.
+
+    Args:
+        key: (B, 4), int64, of `noise_key`.
+        count: pairs to a sample.
+
+    Source: Wellons, "Prospecting for hash functions" (2018), for the constants; Box and Muller 1958.
+    """
+    if torch.compiler.is_compiling():
+        return torch.ops.torchrefract.noise(key, count)
+    return _noise(key, count)
+
+
+def lattice(key: Tensor, axes: Sequence[Tensor], count: int) -> Tensor:
+    """(B, count, n1, ..., nd), float32, uniform in (0, 1): `count` numbers for each node of a lattice.
+
+    A node's numbers are a hash of its whole coordinates, so that a window of an endless lattice is any part of it.
+
+    Args:
+        key: (B, 4), int64, of `noise_key`.
+        axes: d of them, (B, ni), int64, the coordinates along each axis; their lowest 32 bits count.
+        count: numbers to a node.
+
+    Source: as for `noise`.
+    """
+    if torch.compiler.is_compiling():
+        return torch.ops.torchrefract.lattice(key, list(axes), count)
+    return _lattice(key, axes, count)
+
+
+def _as_int32(words: Tensor) -> Tensor:
+    # Products of int32 drop what does not fit; a word above 2^31 is a negative number there.
+    return ((words & _WORD) - ((words & _WORD) >> 31 << 32)).to(torch.int32)
+
+
+def _lattice(key: Tensor, axes: Sequence[Tensor], count: int) -> Tensor:
+    each = torch.arange(count, device=key.device).expand(len(key), -1)
+    a, b, c, d = _as_int32(key).view(-1, 4, *[1] * (len(axes) + 1)).unbind(1)
+    node = torch.zeros_like(a)
+    for i, axis in enumerate((*axes, each), start=2):
+        shape = [1] * (len(axes) + 2)
+        shape[0], shape[i if i < len(shape) else 1] = len(key), axis.shape[1]
+        # Each axis in a round of its own, under both halves of the key in turn.
+        node = _hash(node + _as_int32(axis).view(shape) * _HASH[0], *((a, b) if i % 2 else (c, d)))
+    return ((node >> 9) & 0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
+
+
+def _lattice_list(key: Tensor, axes: list[Tensor], count: int) -> Tensor:
+    return _lattice(key, axes, count)
+
+
+def _noise(key: Tensor, count: int) -> Tensor:
+    words = _as_int32(key)[:, :, None].unbind(1)
+    at_once = max(1, _CACHED // max(1, len(key)) if key.device.type == "cpu" else count)
+    bands = (_noise_between(words, start, min(start + at_once, count)) for start in range(0, max(1, count), at_once))
+    return join(bands, dim=2, length=count)
+
+
+def _noise_between(words: tuple[Tensor, ...], start: int, end: int) -> Tensor:
+    a, b, c, d = words
+    index = torch.arange(start, end, dtype=torch.int32, device=a.device) * _HASH[0]
+    uniform = ((_hash(index, a, b) >> 9) & 0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
+    radius, angle = uniform.log_().mul_(-2).sqrt_(), _hash(index, c, d).float().mul_(math.pi * 2.0**-31)
+    return torch.stack([radius * angle.cos(), radius * angle.sin()], dim=1)
+
+
+def _hash(index: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    x = index + a
+    x ^= (x >> 16) & 0xFFFF
+    x = x.mul_(_HASH[1]).add_(b)
+    x ^= (x >> 15) & 0x1FFFF
+    x.mul_(_HASH[2])
+    x ^= (x >> 16) & 0xFFFF
+    return x
+
+
+_noise_op = torch.library.custom_op("torchrefract::noise", _noise, mutates_args=())
+
+
+@_noise_op.register_fake
+def _(key: Tensor, count: int) -> Tensor:
+    return key.new_empty((key.shape[0], 2, count), dtype=torch.float32)
+
+
+_lattice_op = torch.library.custom_op("torchrefract::lattice", _lattice_list, mutates_args=())
+
+
+@_lattice_op.register_fake
+def _(key: Tensor, axes: list[Tensor], count: int) -> Tensor:
+    return key.new_empty((key.shape[0], count, *(axis.shape[1] for axis in axes)), dtype=torch.float32)

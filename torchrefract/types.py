@@ -59,7 +59,7 @@ class Pair(NamedTuple):
 class Degraded:
     """What an effect makes of an image, with the maps that tell how; maps are computed when they are first read.
 
-    image: as the input, (B, C, H, W) or (C, H, W); the maps lose their batch dimension with it.
+    image: as the input, (B, C, H, W), (C, H, W) or (B, T, C, H, W); the maps have the same dimensions before C.
     params: what was drawn, a NamedTuple of tensors with a leading batch dimension.
     flow: (B, 2, H, W), px, makes the image from the clean one; None for an effect that moves nothing.
     valid: (B, 1, H, W), bool, the pixels that show what the clean image holds.
@@ -70,10 +70,12 @@ class Degraded:
     restore_residual: (B, 1, H, W), px, how far from its place each pixel is looked up when both flows are applied;
         None without a flow.
     transmission: (B, 1, H, W) in [0, 1], the share of the clean light that arrives; None without such a map.
+    extinction: (B, 1, H, W), 1/m, of the air, its mean along the ray of each pixel (the paper's k-map); None without
+        such a map.
     intensity: (B, 1, H, W), light added; None without such a map.
 
-    Each map is given as a tensor or as a function that computes it. Those that can be None are typed Any: whoever knows
-    the effect knows which maps it has.
+    Of clips, (B, T, ...), the maps have the dimension of time too. Each map is given as a tensor or as a function that
+    computes it. Those that can be None are typed Any: whoever knows the effect knows which maps it has.
     """
 
     def __init__(
@@ -86,6 +88,7 @@ class Degraded:
         restore: Callable[[], Inverse] | None = None,
         folding: Callable[[], Folding] | None = None,
         transmission: Map | None = None,
+        extinction: Map | None = None,
         intensity: Map | None = None,
     ):
         self.image = image
@@ -94,6 +97,7 @@ class Degraded:
             "valid": valid,
             "flow": flow,
             "transmission": transmission,
+            "extinction": extinction,
             "intensity": intensity,
         }
         self._restore = restore
@@ -118,6 +122,11 @@ class Degraded:
     def transmission(self) -> Any:
         """The share of the clean light that arrives."""
         return self._read("transmission")
+
+    @property
+    def extinction(self) -> Any:
+        """The extinction of the air, in 1/m."""
+        return self._read("extinction")
 
     @property
     def intensity(self) -> Any:
@@ -168,6 +177,7 @@ class Degraded:
             restore=None if self._restore is None else restore,
             folding=None if self._fold is None else lambda: Folding(*map(function, self.folding)),
             transmission=later("transmission"),
+            extinction=later("extinction"),
             intensity=later("intensity"),
         )
 

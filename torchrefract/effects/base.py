@@ -9,7 +9,8 @@ from torch import Tensor, nn
 
 from torchrefract import draws
 from torchrefract._checks import check_all, check_number, is_true
-from torchrefract.effects.door import check_image, enter, leave
+from torchrefract.effects.door import Layout, check_depth_fits, check_image, enter, leave
+from torchrefract.effects.rows import at_frames
 from torchrefract.labels.rows import is_tv, wrapped
 from torchrefract.labels.targets import warp_labels
 from torchrefract.types import Degraded, Range
@@ -21,6 +22,10 @@ class Effect(nn.Module, ABC):
 
     Images are (B, C, H, W) or (C, H, W), floating in [0, 1] or uint8, and come back in shape, type and memory format
     as they were. A sample that the effect leaves alone comes back bit for bit.
+
+    Clips are (B, T, C, H, W), or a `Video` of torchvision, (T, C, H, W). A clip is one sample: what an effect draws
+    holds for all its frames, fields of air and fog move and change from frame to frame, and frame t alone, by the same
+    seed and key and `frame=t`, is that of the clip.
 
     Args:
         p: chance that a sample is degraded at all, in [0, 1].
@@ -39,13 +44,16 @@ class Effect(nn.Module, ABC):
         if len(target) > 1:
             raise TypeError(f"target must be one, of any nesting, got {len(target)}")
         degraded = self.degrade(image)
-        result = wrapped(degraded.image, image) if is_tv(image, "Image") else degraded.image
+        tv = is_tv(image, "Image") or is_tv(image, "Video")
+        result = wrapped(degraded.image, image) if tv else degraded.image
         if not target:
             return result
         flow = degraded.flow
         # Labels of what stays where it is are not clipped or filtered either.
         if flow is None or is_true((flow == 0).all):
             return result, target[0]
+        if flow.ndim == 5:
+            raise TypeError("target must be None beside several clips: warp_labels moves that of each, got one for all")
         return result, warp_labels(target[0], flow)
 
     def degrade(
@@ -55,19 +63,22 @@ class Effect(nn.Module, ABC):
         seed: int | Tensor | None = None,
         keys: Tensor | Sequence[int] | None = None,
         depth: Tensor | None = None,
+        frame: float | Tensor = 0,
     ) -> Degraded:
         """The image degraded, with the maps of what was done.
 
         Args:
-            image: (B, C, H, W) or (C, H, W), floating in [0, 1] or uint8.
+            image: (B, C, H, W) or (C, H, W), floating in [0, 1] or uint8; clips, (B, T, C, H, W).
             seed: of the draw; None takes one from torch's global generator.
             keys: (B,), whole numbers: sample i depends on (seed, keys[i]) alone; None counts from 0.
-            depth: (B, 1, H, W) or (1, H, W), m, for the effects that ask for it.
+            depth: (B, 1, H, W) or (1, H, W), m, for the effects that ask for it; of clips (B, T, 1, H, W), or
+                (B, 1, 1, H, W) if it is the same in all frames.
+            frame: the number of the image in its clip, or of a clip's first frame; a number, or (B,).
 
         Raises:
             ValueError, TypeError: arguments that do not fit.
         """
-        return self._run(image, self.sample(image, seed=seed, keys=keys), depth)
+        return self._run(image, self.sample(image, seed=seed, keys=keys, frame=frame), depth)
 
     def sample(
         self,
@@ -76,32 +87,36 @@ class Effect(nn.Module, ABC):
         seed: int | Tensor | None = None,
         keys: Tensor | Sequence[int] | None = None,
         place: int = 0,
+        frame: float | Tensor = 0,
     ) -> Any:
         """The parameters of one draw for this image, a NamedTuple of tensors; `place` is that in a pipeline."""
-        check_image(image)
-        batch = 1 if image.ndim == 3 else image.shape[0]
+        layout = check_image(image)
         seed = draws.call_seed() if seed is None else _seed(seed)
-        source = draws.stream(seed, _keys(keys, batch, image.device), device=image.device)
-        return self.draw(source.at(place), image if image.ndim == 4 else image[None])
+        source = draws.stream(seed, _keys(keys, layout.batch, image.device), device=image.device)
+        params = self.draw(source.at(place), _samples(image, layout))
+        return at_frames(params, lambda: _frames(frame, image, layout))
 
     def apply(  # pyright: ignore[reportIncompatibleMethodOverride]  # nn.Module has taken the name; both uses work
-        self, image: Any, params: Any = None, *, depth: Tensor | None = None
+        self, image: Any, params: Any = None, *, depth: Tensor | None = None, frame: float | Tensor | None = None
     ) -> Any:
         """The image degraded by parameters that are given, as by those of an earlier draw -> Degraded.
 
-        With a function as its one argument this is `nn.Module.apply`, so that an effect can sit inside a model.
+        With `frame` they are those of the same draw at another frame of its clip. With a function as its one argument
+        this is `nn.Module.apply`, so that an effect can sit inside a model.
         """
         if params is None and callable(image) and not isinstance(image, Tensor):
             return super().apply(cast(Callable[[nn.Module], None], image))
-        check_image(image)
-        self.check_params(params, image if image.ndim == 4 else image[None])
+        layout = check_image(image)
+        self.check_params(params, _samples(image, layout))
+        if frame is not None:
+            params = at_frames(params, lambda: _frames(frame, image, layout))
         return self._run(image, params, depth)
 
     params_type: type[Any]
 
     @abstractmethod
     def draw(self, source: draws.Stream, image: Tensor) -> Any:
-        """The parameters of a batch (B, C, H, W), drawn from the streams of its samples."""
+        """The parameters of a batch (B, C, H, W), drawn from the streams of its samples; a `frame` among them is 0."""
 
     @abstractmethod
     def check(self, params: Any, image: Tensor) -> None:
@@ -109,13 +124,15 @@ class Effect(nn.Module, ABC):
 
     @abstractmethod
     def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
-        """The batch (B, C, H, W), floating, degraded by checked parameters."""
+        """The rows (N, C, H, W), floating, degraded by checked parameters of B samples, of N / B frames each."""
 
     def _run(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
-        batched = enter(image)
-        result = self.compute(batched, params, _batched_depth(depth, image))
-        result.image = leave(result.image, image, untouched=result.image is batched)
-        return result if image.ndim == 4 else result.map(lambda value: value[0])
+        layout = check_image(image)
+        rows = enter(image)
+        _check_frames(params, layout)
+        result = self.compute(rows, params, None if depth is None else check_depth_fits(depth, image, layout))
+        result.image = leave(result.image, image, untouched=result.image is rows)
+        return result if image.ndim == 4 and not layout.is_clip else result.map(layout.unrolled)
 
     def _uniform(self, source: draws.Stream, ranges: Sequence[Range], image: Tensor) -> tuple[Tensor, Tensor]:
         """The gate, (B,), bool, and a value out of each range, (B, n)."""
@@ -161,16 +178,30 @@ def _keys(keys: Tensor | Sequence[int] | None, batch: int, device: torch.device)
     return keys.reshape(-1)
 
 
-def _batched_depth(depth: Tensor | None, image: Tensor) -> Tensor | None:
-    if depth is None:
-        return None
-    if not isinstance(depth, Tensor) or not depth.is_floating_point():
-        raise TypeError(f"depth must be a floating tensor, got {getattr(depth, 'dtype', type(depth).__name__)}")
-    if depth.shape != (*image.shape[:-3], 1, *image.shape[-2:]):
+def _samples(image: Tensor, layout: Layout) -> Tensor:
+    """(B, C, H, W): the first frame of each sample."""
+    return image.reshape(layout.batch, layout.frames, *image.shape[-3:])[:, 0]
+
+
+def _frames(first: float | Tensor, image: Tensor, layout: Layout) -> Tensor:
+    """(B, T), the numbers of the frames."""
+    dtype = field_dtype(image.dtype)
+    start = torch.as_tensor(first, dtype=dtype, device=image.device)
+    if start.ndim > 1 or (start.ndim == 1 and start.shape[0] not in (1, layout.batch)):
+        raise ValueError(f"frame must be a number, or one for each of {layout.batch} samples, got {tuple(start.shape)}")
+    check_all("frame", "be finite", start, torch.isfinite)
+    return start.view(-1, 1).expand(layout.batch, 1) + torch.arange(layout.frames, dtype=dtype, device=image.device)
+
+
+def _check_frames(params: Any, layout: Layout) -> None:
+    """Raise unless the parameters are for as many frames as there are."""
+    for child in getattr(params, "children", ()):
+        _check_frames(child, layout)
+    if "frame" in params._fields and params.frame.shape != (layout.batch, layout.frames):
         raise ValueError(
-            f"depth must have one channel of the size of the image {tuple(image.shape)}, got {tuple(depth.shape)}"
+            f"params.frame must have shape {(layout.batch, layout.frames)}, a number for each frame of each sample (or "
+            f"give frame=, that of the first), got {tuple(params.frame.shape)}"
         )
-    return depth if image.ndim == 4 else depth[None]
 
 
 def params_to(params: Any, *args: Any, **kwargs: Any) -> Any:
@@ -179,8 +210,3 @@ def params_to(params: Any, *args: Any, **kwargs: Any) -> Any:
     return type(params)(
         *(new.to(old.dtype) if not old.is_floating_point() else new for old, new in zip(params, floating, strict=True))
     )
-
-
-def column(flags: Tensor) -> Tensor:
-    """(B, 1, 1, 1) of (B,)."""
-    return flags.view(-1, 1, 1, 1)

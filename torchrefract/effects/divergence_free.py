@@ -8,8 +8,10 @@ from torch import Tensor
 from torchrefract import draws
 from torchrefract._checks import check_choice, check_count, check_range
 from torchrefract.effects.base import params_to
+from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
 from torchrefract.effects.random_field import check_field_params, random_field
 from torchrefract.effects.refraction import WarpEffect
+from torchrefract.effects.rows import column, spread
 from torchrefract.fields.covariance import COVARIANCES
 from torchrefract.fields.stream import curl, curl_rms
 from torchrefract.types import Range
@@ -22,6 +24,9 @@ class DivergenceFreeParams(NamedTuple):
     gate: Tensor  # (B,), bool: the sample is degraded
     amplitude: Tensor  # (B,), px, of the displacement as `normalize` has it
     length: Tensor  # (B,), px, correlation length of the stream function
+    wind: Tensor  # (B, 2), px per frame, that psi drifts to the right and down
+    decorrelation: Tensor  # (B,), frames, above 0; inf for a field that only drifts
+    frame: Tensor  # (B, T), number of each frame in its clip
     key: Tensor  # (B, 4), int64, of the white noise
 
     to = params_to
@@ -30,7 +35,8 @@ class DivergenceFreeParams(NamedTuple):
 class DivergenceFree(WarpEffect):
     """A frame stirred by a displacement without divergence, the curl of a Gaussian random stream function.
 
-        flow = amplitude (D_y psi, -D_x psi) / rms,  Cov(psi(p), psi(p + h)) = C(|h| / length)
+        flow = amplitude (D_y psi, -D_x psi) / rms,
+        Cov(psi_t(p), psi_s(q)) = C(|p - q - wind (t - s)| / length) exp(-((t - s) / decorrelation)^2), t, s frames
 
     D is the central difference, so the divergence taken with central differences is zero to round-off. The map itself
     keeps areas to first order only: det(I + grad flow) differs from 1 by the square of the slope. With `steps` the
@@ -39,6 +45,8 @@ class DivergenceFree(WarpEffect):
     Args:
         amplitude_range: px, 0 or above.
         length_range: px, correlation length of psi, above 0.
+        wind_x_range, wind_y_range: px per frame, of the drift over a clip, to the right and down.
+        decorrelation_range: frames, above 0, inf for swirls that only drift; one over it is drawn uniformly.
         covariance: of psi: "gaussian", "matern52", "matern32" or "exponential"; psi of the last has no slope, so that
             the flow is nearly white.
         normalize: "theory" divides by the standard deviation that each component has over all fields, "max" by the
@@ -61,6 +69,9 @@ class DivergenceFree(WarpEffect):
         *,
         amplitude_range: Range = (2.0, 6.0),
         length_range: Range = (40.0, 100.0),
+        wind_x_range: Range = (-1.0, 1.0),
+        wind_y_range: Range = (-1.0, 1.0),
+        decorrelation_range: Range = (15.0, 45.0),
         covariance: str = "gaussian",
         normalize: str = "theory",
         steps: int = 1,
@@ -71,6 +82,9 @@ class DivergenceFree(WarpEffect):
         super().__init__(padding=padding, interpolation=interpolation, p=p)
         self.amplitude_range = check_range("amplitude_range", amplitude_range, low=0.0, high=1e4)
         self.length_range = check_range("length_range", length_range, low=1e-3, high=1e6)
+        self.wind_x_range = check_wind("wind_x_range", wind_x_range)
+        self.wind_y_range = check_wind("wind_y_range", wind_y_range)
+        self.decorrelation_range = check_decorrelation(decorrelation_range)
         self.covariance = check_choice("covariance", covariance, COVARIANCES)
         self.normalize = check_choice("normalize", normalize, ("theory", "max", "none"))
         self.steps = check_count("steps", steps)
@@ -79,15 +93,17 @@ class DivergenceFree(WarpEffect):
 
     def draw(self, source: draws.Stream, image: Tensor) -> DivergenceFreeParams:
         """One stream function a sample, every number uniform in its range."""
-        gate, values = self._uniform(source, (self.amplitude_range, self.length_range), image)
-        return DivergenceFreeParams(gate, values[:, 0], values[:, 1], draws.noise_key(source))
+        motion = motion_ranges(self.wind_x_range, self.wind_y_range, decorrelation=self.decorrelation_range)
+        gate, values = self._uniform(source, (self.amplitude_range, self.length_range, *motion), image)
+        swirls, motion = values[:, :2].unbind(1), drawn_motion(values[:, 2:])
+        return DivergenceFreeParams(gate, *swirls, **motion, key=draws.noise_key(source))
 
     def check(self, params: DivergenceFreeParams, image: Tensor) -> None:
         """Raise for swirls that are none."""
         check_field_params(params, at_least_zero=("amplitude",))
 
     def flow(self, params: DivergenceFreeParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
-        """The flow, and where it exists: everywhere."""
+        """The flow, frame by frame, and where it exists: everywhere."""
         displacement = self.displacement(params, height=height, width=width)
         flow = part = displacement / self.steps
         for _ in range(self.steps - 1):
@@ -95,16 +111,16 @@ class DivergenceFree(WarpEffect):
         return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
 
     def displacement(self, params: DivergenceFreeParams, *, height: int, width: int) -> Tensor:
-        """(B, 2, H, W), px: what is followed in `steps` parts; the curl itself."""
+        """(B T, 2, H, W), px: what is followed in `steps` parts; the curl itself."""
         longest = self.length_range[1]
         psi = random_field(params, kind=self.covariance, longest=longest, height=height + 2, width=width + 2)[:, :1]
         displacement = curl(psi)
         if self.normalize == "theory":
-            displacement = displacement / curl_rms(params.length, self.covariance)[:, None, None, None]
+            displacement = displacement / column(spread(curl_rms(params.length, self.covariance), psi.shape[0]))
         elif self.normalize == "max":
             longest = displacement.square().sum(dim=1, keepdim=True).amax(dim=(2, 3), keepdim=True)
             displacement = displacement / longest.clamp(min=1e-24).sqrt()
-        return params.amplitude[:, None, None, None] * displacement
+        return column(spread(params.amplitude, displacement.shape[0])) * displacement
 
     def moves(self, params: DivergenceFreeParams) -> Tensor:
         """The samples with an amplitude."""

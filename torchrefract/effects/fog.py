@@ -10,6 +10,7 @@ from torchrefract import draws
 from torchrefract._checks import check_all, check_flag, check_number, check_range
 from torchrefract.effects.base import params_to
 from torchrefract.effects.radiance import RadianceEffect, Shaded
+from torchrefract.effects.rows import alike, column, spread
 from torchrefract.fields.fog import extinction, linear_depth, linear_to_srgb, srgb_to_linear, transmission, veil
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
@@ -98,6 +99,10 @@ class UniformFog(RadianceEffect):
         check_all("params.deviation", "be above -1", params.deviation, lambda v: (v > -1) & v.isfinite())
         check_all("params.airlight", "be finite", params.airlight, torch.isfinite)
 
+    def acts(self, params: FogParams) -> Tensor:
+        """The samples with an air that is not clear."""
+        return params.visibility != torch.inf
+
     def shade(self, image: Tensor, params: FogParams, depth: Tensor | None) -> Shaded:
         """The batch behind the fog."""
         dtype = field_dtype(image.dtype)
@@ -107,9 +112,11 @@ class UniformFog(RadianceEffect):
             check_all("depth", "be at least 0, in m", depth, lambda v: v >= 0)
             depth = depth.to(dtype).nan_to_num(nan=0.0, posinf=torch.inf).clamp(min=0)
         k = extinction(params.visibility.to(dtype), self.threshold) * (1 + params.deviation.to(dtype))
-        t = transmission(depth, k.view(-1, 1, 1, 1))
-        airlight = params.airlight.to(dtype).view(*image.shape[:2], 1, 1)
-        return Shaded(self._blend(image, t, airlight), valid=lambda: t >= 1 / 255, transmission=t)
+        k, depth = (column(k), depth) if depth.shape[0] == 1 else alike(column(k), depth)
+        t = transmission(depth, k)
+        airlight = params.airlight.to(dtype)[:, :, None, None]
+        rows = [spread(value, image.shape[0]) for value in (t, airlight)]
+        return Shaded(self._blend(image, *rows), valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
 
     def _blend(self, image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
         if not self.linear_light:

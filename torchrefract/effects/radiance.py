@@ -8,17 +8,23 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import is_true
-from torchrefract.effects.base import Effect, column
+from torchrefract.effects.base import Effect
+from torchrefract.effects.rows import column, only, spread
 from torchrefract.types import Degraded, Map
 
 
 class Shaded(NamedTuple):
-    """What a radiance effect makes of a batch."""
+    """What a radiance effect makes of a batch, in rows for each frame; maps also in one row for each clip."""
 
     image: Tensor
     valid: Callable[[], Tensor]
-    transmission: Tensor | None = None
-    intensity: Tensor | None = None
+    transmission: Map | None = None
+    extinction: Map | None = None
+    intensity: Map | None = None
+
+
+# What the maps say where nothing is changed.
+_CLEAR = {"transmission": 1.0, "extinction": 0.0, "intensity": 0.0}
 
 
 class RadianceEffect(Effect):
@@ -26,28 +32,38 @@ class RadianceEffect(Effect):
 
     @abstractmethod
     def shade(self, image: Tensor, params: Any, depth: Tensor | None) -> Shaded:
-        """The batch (B, C, H, W) in other light."""
+        """The rows (N, C, H, W) in other light."""
+
+    @abstractmethod
+    def acts(self, params: Any) -> Tensor:
+        """(B,), bool: the samples whose parameters change anything at all."""
 
     def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
-        """The batch in other light, where the gate is open."""
-        if depth is not None and is_true(params.gate.any) is False:
+        """The rows in other light, where the gate is open."""
+        active = params.gate & self.acts(params)
+        if depth is not None and is_true(active.any) is False:
             depth = None  # and nobody looks at its values
         shaded = self.shade(image, params, depth)
-        size = (image.shape[0], 1, *image.shape[2:])
+        height, width = image.shape[2:]
 
-        def gated(value: Tensor | None, off: float) -> Map | None:
+        def where_active(value: Tensor, off: float | bool) -> Tensor:
+            value = value if is_true(active.all) else _choose(value, off, active)
+            return value.expand(-1, 1, height, width)
+
+        def gated(name: str) -> Map | None:
+            value = getattr(shaded, name)
             if value is None:
                 return None
-            return lambda: _gated(value, torch.full_like(value, off), params.gate).expand(size)
+            return lambda: where_active(value() if callable(value) else value, _CLEAR[name])
 
         return Degraded(
-            _gated(shaded.image, image, params.gate),
+            only(shaded.image, image, active, params),
             params,
-            valid=lambda: (shaded.valid() | ~column(params.gate)).expand(size),
-            transmission=gated(shaded.transmission, 1.0),
-            intensity=gated(shaded.intensity, 0.0),
+            valid=lambda: where_active(shaded.valid(), True),
+            **{name: gated(name) for name in _CLEAR},
         )
 
 
-def _gated(changed: Tensor, same: Tensor, gate: Tensor) -> Tensor:
-    return changed if is_true(gate.all) else torch.where(column(gate), changed, same)
+def _choose(value: Tensor, off: float | bool, active: Tensor) -> Tensor:
+    rows = max(value.shape[0], active.shape[0])
+    return torch.where(column(spread(active, rows)), spread(value, rows), off)

@@ -1,7 +1,7 @@
 """What the effects of random fields share."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -9,6 +9,9 @@ from torch import Tensor
 
 from torchrefract import white_noise
 from torchrefract._checks import check_all, read
+from torchrefract.effects.motion import check_motion, is_still
+from torchrefract.effects.rows import spread
+from torchrefract.fields.evolution import evolved, turn_rates
 from torchrefract.fields.gaussian import gaussian_random_field, spectrum, torus
 
 # A covariance that is off by twice this is told.
@@ -18,10 +21,11 @@ _CLIPPED = 1e-3
 def random_field(
     params: Any, *, kind: str, longest: float, widest: float | None = None, height: int, width: int
 ) -> Tensor:
-    """Two independent fields (B, 2, H, W) of variance 1, from parameters with a `length`, a `key`, maybe an `aperture`.
+    """Two independent fields (B T, 2, H, W) of variance 1, from parameters that `check_field_params` takes.
 
     Args:
-        params: a NamedTuple of tensors; its `amplitude` gives the type.
+        params: a NamedTuple of tensors with a `length`, a `key`, a `frame` and more, maybe an `aperture`; its
+            `amplitude` gives the type.
         kind: of the covariance.
         longest: px, the longest correlation length that may be drawn.
         widest: px, the widest aperture; None for parameters without one.
@@ -42,18 +46,47 @@ def random_field(
             f"{params.length.max().item():g} px",
             stacklevel=2,
         )
+    fields = [gaussian_random_field(*one, height=height, width=width) for one in _noises(params, shape, size)]
+    return fields[0] if len(fields) == 1 else torch.cat(fields)
+
+
+def _noises(params: Any, shape: Tensor, size: tuple[int, int]) -> Iterator[tuple[Tensor, Tensor]]:
+    """The noise of the torus and the spectrum it is shaped by, for one frame after the other where there are several.
+
+    All samples at once, if no clip asks for so much memory.
+    """
+    dtype, frames = params.amplitude.dtype, params.frame.shape[1]
     noise = white_noise.noise(params.key, size[0] * size[1]).view(-1, 2, *size).to(dtype)
-    return gaussian_random_field(noise, shape, height=height, width=width)
+    if is_still(params):
+        yield noise, shape
+        return
+    rates = turn_rates(params.key, size, dtype=dtype)
+    if frames == 1 or torch.compiler.is_compiling():
+        rows = noise.shape[0] * frames
+        options = {name: spread(getattr(params, name), rows) for name in ("wind", "decorrelation")}
+        moved = evolved(spread(noise, rows), spread(rates, rows), frame=params.frame.reshape(-1), **options)
+        yield moved, spread(shape, rows)
+        return
+    for i in range(noise.shape[0]):
+        own = {name: getattr(params, name)[i : i + 1] for name in ("wind", "decorrelation")}
+        for frame in params.frame[i].split(1):
+            yield evolved(noise[i : i + 1], rates[i : i + 1], frame=frame, **own), shape[i : i + 1]
 
 
 def check_field_params(params: Any, *, at_least_zero: Sequence[str]) -> None:
-    """Raise for parameters of a random field with a `length` and a `key` that are none."""
+    """Raise for parameters of a random field with a `length`, a `key` and what moves them that are none."""
     for name in (*at_least_zero, "length"):
         if getattr(params, name).ndim != 1:
             raise ValueError(f"params.{name} must have shape (B,), got {tuple(getattr(params, name).shape)}")
-    if params.key.shape[1:] != (4,) or params.key.dtype is not torch.int64:
-        raise ValueError(f"params.key must be (B, 4) of int64, got {tuple(params.key.shape)} of {params.key.dtype}")
+    check_key(params)
+    check_motion(params, axes=2)
     for name in at_least_zero:
         value = getattr(params, name)
         check_all(f"params.{name}", "be at least 0 and finite", value, lambda v: v.isfinite() & (v >= 0))
     check_all("params.length", "be above 0 and finite", params.length, lambda v: v.isfinite() & (v > 0))
+
+
+def check_key(params: Any) -> None:
+    """Raise unless there is a `key` of a hash."""
+    if params.key.shape[1:] != (4,) or params.key.dtype is not torch.int64:
+        raise ValueError(f"params.key must be (B, 4) of int64, got {tuple(params.key.shape)} of {params.key.dtype}")

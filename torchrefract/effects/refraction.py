@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import check_choice, is_true
-from torchrefract.effects.base import Effect, column
+from torchrefract.effects.base import Effect
+from torchrefract.effects.rows import alike, column, learns, only, spread
 from torchrefract.types import Degraded, Inverse, Map
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import field_dtype, inside, length
@@ -33,7 +34,7 @@ class WarpEffect(Effect):
 
     @abstractmethod
     def flow(self, params: Any, *, height: int, width: int) -> tuple[Tensor, Tensor]:
-        """The flow (B, 2, H, W) in px, and where it exists, (B, 1, H, W), bool."""
+        """The flow (B, 2, H, W) in px, and where it exists, (B, 1, H, W), bool; B T rows if it changes over a clip."""
 
     def restore_flow(self, params: Any, *, height: int, width: int) -> tuple[Tensor, Tensor]:
         """The flow that undoes `flow`, and where it exists."""
@@ -50,8 +51,8 @@ class WarpEffect(Effect):
 
     def gated(self, params: Any, *, height: int, width: int) -> "Moved":
         """The flow, zero for the samples that the effect leaves alone."""
-        active = params.gate & self.moves(params) & (height * width > 1)
         flow, exists = self.flow(params, height=height, width=width)
+        active = spread(params.gate & self.moves(params) & (height * width > 1), flow.shape[0])
         return Moved(only(flow, 0.0, active, params), exists | ~column(active), active)
 
     def gated_undo(self, params: Any, moved: "Moved") -> tuple[Tensor, Tensor]:
@@ -65,7 +66,8 @@ class WarpEffect(Effect):
         if is_true((params.gate & self.moves(params)).any) is False and not learns(params):
             return identity(image, params)
         moved = self.gated(params, height=height, width=width)
-        warped = look_up(image, moved.flow, padding=self.padding, interpolation=self.interpolation)
+        flow = spread(moved.flow, image.shape[0])
+        warped = look_up(image, flow, padding=self.padding, interpolation=self.interpolation)
         return moving(
             only(warped, image, moved.active, params),
             params,
@@ -76,11 +78,15 @@ class WarpEffect(Effect):
 
 
 class Moved(NamedTuple):
-    """What an effect moves."""
+    """What an effect moves, in one row for each clip or for each frame."""
 
     flow: Tensor  # (B, 2, H, W), px
     exists: Tensor  # (B, 1, H, W), bool
     active: Tensor  # (B,), bool: the samples that are moved at all
+
+    def spread(self, rows: int) -> "Moved":
+        """The same in so many rows."""
+        return Moved(*(spread(value, rows) for value in self))
 
 
 def moving(
@@ -90,8 +96,7 @@ def moving(
     flow: Callable[[], Tensor],
     valid: Callable[[], Tensor],
     undo: Callable[[], tuple[Tensor, Tensor]],
-    transmission: Map | None = None,
-    intensity: Map | None = None,
+    **light: Map,
 ) -> Degraded:
     """What an effect with a flow hands over; `restore_valid` is where the flow back exists and sees valid pixels."""
 
@@ -107,51 +112,15 @@ def moving(
         flow=flow,
         restore=restore,
         folding=lambda: folding(cast(Tensor, result.flow), result.valid),
-        transmission=transmission,
-        intensity=intensity,
+        **light,
     )
     return result
 
 
 def sees(good: Tensor, flow: Tensor) -> Tensor:
     """(B, 1, H, W), bool: all pixels that a look-up along the flow mixes are good, but for weights below 1/1000."""
+    good, flow = alike(good, flow)
     return look_up(good.to(flow.dtype), flow, padding="zeros", interpolation="bilinear") > 0.999
-
-
-class _Swap(torch.autograd.Function):
-    """The first tensor forward, the gradient of the second backward."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(value: Tensor, path: Tensor) -> Tensor:
-        return value.view_as(value)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        return None
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return None, gradient
-
-
-def only(changed: Tensor, same: Tensor | float, active: Tensor, params: Any) -> Tensor:
-    """`changed` for the active samples and `same`, bit for bit, for the others.
-
-    A sample at strength zero keeps the gradient of its parameters: descent must be able to start there.
-    """
-    if is_true(active.all):
-        return changed
-    value = torch.where(column(active), changed, same)
-    if not learns(params):
-        return value
-    return cast(Tensor, _Swap.apply(value.detach(), torch.where(column(params.gate), changed, same)))
-
-
-def learns(params: Any) -> bool:
-    """Whether a gradient of the parameters is asked for."""
-    return torch.is_grad_enabled() and any(value.requires_grad for value in params)
 
 
 def identity(image: Tensor, params: Any) -> Degraded:

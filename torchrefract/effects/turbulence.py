@@ -9,8 +9,10 @@ from torch import Tensor
 from torchrefract import draws
 from torchrefract._checks import check_choice, check_range, is_true
 from torchrefract.effects.base import params_to
+from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
 from torchrefract.effects.random_field import check_field_params, random_field
 from torchrefract.effects.refraction import WarpEffect
+from torchrefract.effects.rows import column, spread
 from torchrefract.fields.covariance import COVARIANCES, slope_rms
 from torchrefract.types import Range
 
@@ -25,6 +27,9 @@ class TurbulenceParams(NamedTuple):
     amplitude: Tensor  # (B,), px, standard deviation of each component of the flow
     length: Tensor  # (B,), px, correlation length
     aperture: Tensor  # (B,), px, standard deviation of the Gaussian that averages the field
+    wind: Tensor  # (B, 2), px per frame, that the field drifts to the right and down
+    decorrelation: Tensor  # (B,), frames, above 0; inf for a field that only drifts
+    frame: Tensor  # (B, T), number of each frame in its clip
     key: Tensor  # (B, 4), int64, of the white noise
 
     to = params_to
@@ -33,7 +38,8 @@ class TurbulenceParams(NamedTuple):
 class Turbulence(WarpEffect):
     """A frame seen through turbulent air: a Gaussian random field of displacements (the paper's "Perlin distortion").
 
-        flow = amplitude R,  Cov(R(p), R(p + h)) = C(|h| / length), smoothed by the aperture, Var R = 1
+        flow = amplitude R_t,  t and s frames of a clip,  C smoothed by the aperture,  Var R = 1,
+        Cov(R_t(p), R_s(q)) = C(|p - q - wind (t - s)| / length) exp(-((t - s) / decorrelation)^2)
 
     The two components are independent. The exponential covariance has no slope: it folds the image from an amplitude of
     0.14 sqrt(length) px on, unless an aperture smooths it, as the pupil of a real lens does. `restore_flow` is found by
@@ -43,6 +49,8 @@ class Turbulence(WarpEffect):
         amplitude_range: px, standard deviation of each component, 0 or above.
         length_range: px, correlation length, above 0.
         aperture_range: px, 0 or above.
+        wind_x_range, wind_y_range: px per frame, of the drift over a clip, to the right and down.
+        decorrelation_range: frames, above 0, inf for air that only drifts; one over it is drawn uniformly.
         covariance: "exponential", "gaussian", "matern32" or "matern52".
         normalize: "theory" gives the amplitude to all fields together, "image" to each: its mean is subtracted and its
             standard deviation divided by, which inflates fields that are longer than the frame.
@@ -55,7 +63,8 @@ class Turbulence(WarpEffect):
         UserWarning: an amplitude from which on the field folds the image (on the CPU); a
             length that the largest torus has no room for.
 
-    Source: the torchrefract paper; Dietrich and Newsam, SIAM J. Sci. Comput. 18 (1997), for the sampling.
+    Source: the torchrefract paper; Dietrich and Newsam, SIAM J. Sci. Comput. 18 (1997), for the sampling. Of air that a
+    wind carries: Taylor, "The spectrum of turbulence", Proc. Royal Society A 164 (1938).
     """
 
     def __init__(
@@ -64,6 +73,9 @@ class Turbulence(WarpEffect):
         amplitude_range: Range = (0.5, 1.5),
         length_range: Range = (20.0, 60.0),
         aperture_range: Range = (2.0, 3.0),
+        wind_x_range: Range = (-1.0, 1.0),
+        wind_y_range: Range = (-1.0, 0.0),
+        decorrelation_range: Range = (6.0, 15.0),
         covariance: str = "exponential",
         normalize: str = "theory",
         padding: str = "reflection",
@@ -74,6 +86,9 @@ class Turbulence(WarpEffect):
         self.amplitude_range = check_range("amplitude_range", amplitude_range, low=0.0, high=1e4)
         self.length_range = check_range("length_range", length_range, low=1e-3, high=1e6)
         self.aperture_range = check_range("aperture_range", aperture_range, low=0.0, high=1e4)
+        self.wind_x_range = check_wind("wind_x_range", wind_x_range)
+        self.wind_y_range = check_wind("wind_y_range", wind_y_range)
+        self.decorrelation_range = check_decorrelation(decorrelation_range)
         self.covariance = check_choice("covariance", covariance, COVARIANCES)
         self.normalize = check_choice("normalize", normalize, ("theory", "image"))
 
@@ -81,22 +96,25 @@ class Turbulence(WarpEffect):
 
     def draw(self, source: draws.Stream, image: Tensor) -> TurbulenceParams:
         """One air a sample, every number uniform in its range."""
-        gate, values = self._uniform(source, (self.amplitude_range, self.length_range, self.aperture_range), image)
-        return TurbulenceParams(gate, values[:, 0], values[:, 1], values[:, 2], draws.noise_key(source))
+        motion = motion_ranges(self.wind_x_range, self.wind_y_range, decorrelation=self.decorrelation_range)
+        ranges = (self.amplitude_range, self.length_range, self.aperture_range, *motion)
+        gate, values = self._uniform(source, ranges, image)
+        air, motion = values[:, :3].unbind(1), drawn_motion(values[:, 3:])
+        return TurbulenceParams(gate, *air, **motion, key=draws.noise_key(source))
 
     def check(self, params: TurbulenceParams, image: Tensor) -> None:
         """Raise for air that is none."""
         check_field_params(params, at_least_zero=("amplitude", "aperture"))
 
     def flow(self, params: TurbulenceParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
-        """The flow, and where it exists: everywhere."""
+        """The flow, frame by frame, and where it exists: everywhere."""
         self._check_folds(params)
         reach = {"longest": self.length_range[1], "widest": self.aperture_range[1]}
         field = random_field(params, kind=self.covariance, **reach, height=height, width=width)
         if self.normalize == "image":
             field = field - field.mean(dim=(2, 3), keepdim=True)
             field = field / field.square().mean(dim=(2, 3), keepdim=True).clamp(min=1e-12).sqrt()
-        flow = params.amplitude[:, None, None, None] * field
+        flow = column(spread(params.amplitude, field.shape[0])) * field
         return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
 
     def moves(self, params: TurbulenceParams) -> Tensor:

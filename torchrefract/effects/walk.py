@@ -7,12 +7,17 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import is_true
-from torchrefract.effects.base import Effect, column
-from torchrefract.effects.refraction import Moved, WarpEffect, learns, moving, only, sees
+from torchrefract.effects.base import Effect
+from torchrefract.effects.refraction import Moved, WarpEffect, moving, sees
+from torchrefract.effects.rows import column, learns, only, spread
 from torchrefract.types import Degraded
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import field_dtype, inside
 from torchrefract.warping.resample import look_up
+
+_Combine = Callable[[Tensor, Tensor], Tensor]
+# How the maps of several effects of light make one.
+_COMBINED: dict[str, _Combine] = {"transmission": torch.mul, "intensity": torch.add, "extinction": torch.add}
 
 
 class _Step(NamedTuple):
@@ -43,8 +48,7 @@ class Walk:
         self.modes: dict[tuple[str, str], Tensor] = {}  # of the look-up: the samples that ask for it, (B,), bool
         self.moved: list[tuple[WarpEffect, Any, Moved]] = []
         self.valid: Callable[[], Tensor] = self._everywhere
-        self.transmission: Callable[[], Tensor] | None = None
-        self.intensity: Callable[[], Tensor] | None = None
+        self.light: dict[str, Callable[[], Tensor]] = {}  # the maps of light, by their names in `Degraded`
         self.refracts = False
 
     def move(self, effect: WarpEffect, params: Any) -> None:
@@ -52,42 +56,52 @@ class Walk:
         self.refracts = True
         if is_true((params.gate & effect.moves(params)).any) is False and not learns(params):
             return
-        moved = effect.gated(params, height=self.image.shape[2], width=self.image.shape[3])
-        valid = self.valid
-        self.waiting.append(_Step(params.gate, moved.active, moved.flow))
+        rows, _, height, width = self.image.shape
+        own = effect.gated(params, height=height, width=width)
+        moved, valid = own.spread(rows), self.valid
+        self.waiting.append(_Step(spread(params.gate, rows), moved.active, moved.flow))
         self.valid = lambda: moved.exists & inside(moved.flow) & sees(valid(), moved.flow)
         self._choose(effect, moved.active)
-        self.moved.append((effect, params, moved))
+        self.moved.append((effect, params, own))
 
     def shade(self, effect: Effect, params: Any) -> None:
         """The image in other light, after the warps that wait."""
         self._look_up()
         shaded = effect.compute(self.image, params, self.depth)
-        valid, intensity, transmission = self.valid, self.intensity, self.transmission
+        rows, before, valid = self.image.shape[0], dict(self.light), self.valid
         self.image = shaded.image
-        self.valid = lambda: valid() & shaded.valid
-        passed, added = shaded.has("transmission"), shaded.has("intensity")
-        if passed:
-            self.transmission = lambda: _product(transmission, shaded.transmission)
-        if added or (passed and intensity is not None):
-            self.intensity = lambda: _sum(intensity, shaded.transmission, shaded.intensity)
+        self.valid = lambda: valid() & spread(shaded.valid, rows)
+
+        def now(name: str) -> Callable[[], Tensor] | None:
+            return (lambda: spread(getattr(shaded, name), rows)) if shaded.has(name) else None
+
+        passed = now("transmission")
+        if "intensity" in before and passed is not None:  # of the light added before, so much comes through
+            added = before["intensity"]
+            before["intensity"] = lambda: added() * passed()
+        self.light = before
+        for name, combine in _COMBINED.items():
+            self._add(name, now(name), combine)
 
     def arrive(self, params: Any) -> Degraded:
         """What has become of the image, with all maps."""
         self._look_up()
         if not self.refracts:
-            return Degraded(
-                self.image, params, valid=self.valid, transmission=self.transmission, intensity=self.intensity
-            )
+            return Degraded(self.image, params, valid=self.valid, **self.light)
         return moving(
             self.image,
             params,
             flow=lambda: _composite(self.done).flow if self.done else self._still(),
             valid=self.valid,
             undo=self._undo,
-            transmission=self.transmission,
-            intensity=self.intensity,
+            **self.light,
         )
+
+    def _add(self, name: str, value: Callable[[], Tensor] | None, combine: _Combine) -> None:
+        """One more effect's share in a map of light."""
+        before = self.light.get(name)
+        if value is not None:
+            self.light[name] = value if before is None else lambda: combine(before(), value())
 
     def _look_up(self) -> None:
         """What waits is done."""
@@ -96,17 +110,16 @@ class Walk:
         group = _composite(self.waiting)
         self.image = only(self._looked_up(group.flow), self.image, group.active, group)
         if self.depth is not None:
+            self.depth = spread(self.depth, self.image.shape[0])
             near = look_up(self.depth, group.flow.detach(), padding="border", interpolation="nearest")
             self.depth = only(near, self.depth, group.active, group)
 
-        def moved_along(value: Callable[[], Tensor] | None) -> Callable[[], Tensor] | None:
-            if value is None:
-                return None
+        def moved_along(value: Callable[[], Tensor]) -> Callable[[], Tensor]:
             return lambda: only(
                 look_up(value(), group.flow, padding="border", interpolation="bilinear"), value(), group.active, group
             )
 
-        self.transmission, self.intensity = moved_along(self.transmission), moved_along(self.intensity)
+        self.light = {name: moved_along(value) for name, value in self.light.items()}
         # A group that comes first has its composite already.
         self.done = [*self.done, *self.waiting] if self.done else [group]
         self.waiting, self.modes = [], {}
@@ -130,9 +143,9 @@ class Walk:
         total, known = self._still(), self._everywhere()
         done = torch.zeros(total.shape[0], dtype=torch.bool, device=total.device)
         for effect, params, moved in self.moved:
-            back, exists = effect.gated_undo(params, moved)
+            back, exists = (spread(value, total.shape[0]) for value in effect.gated_undo(params, moved))
             # A flow that is zero is left out, not looked up: a sample must not depend on what moves the others.
-            moves = params.gate if learns(params) else moved.active
+            moves = spread(params.gate if learns(params) else moved.active, total.shape[0])
             both, last = column(done & moves), column(moves)
             if is_true(both.any) is not False:
                 exists = torch.where(both, known & sees(exists, total), exists)
@@ -148,15 +161,3 @@ class Walk:
     def _everywhere(self) -> Tensor:
         batch, _, height, width = self.image.shape
         return torch.ones(batch, 1, height, width, dtype=torch.bool, device=self.image.device)
-
-
-def _product(before: Callable[[], Tensor] | None, value: Tensor | None) -> Tensor:
-    return cast(Tensor, value) if before is None else before() * cast(Tensor, value)
-
-
-def _sum(before: Callable[[], Tensor] | None, passed: Tensor | None, added: Tensor | None) -> Tensor:
-    """Light added so far, as much of it as comes through, and what is added now."""
-    if before is None:
-        return cast(Tensor, added)
-    arrives = before() if passed is None else before() * passed
-    return arrives if added is None else arrives + added

@@ -1,0 +1,69 @@
+"""Where depth comes from for an effect that is given none."""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchrefract._checks import check_number, check_positive
+from torchrefract.fields.depth import ground_plane_depth, linear_depth
+
+
+class DepthProvider(ABC):
+    """What knows the depth of a frame from its size alone; derive your own from it."""
+
+    @abstractmethod
+    def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+        """(1, 1, H, W), or (1, 1, H, 1) for rows of one depth, m along the camera's axis, inf for the sky."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearDepth(DepthProvider):
+    """The paper's depth, by row: d(y) = (1 - (y + 1/2) / H) max_depth.
+
+    max_depth: m, at the top edge of the frame, at least 0.
+    """
+
+    max_depth: float = 160.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "max_depth", check_number("max_depth", self.max_depth, low=0.0))
+
+    def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+        return linear_depth(height, self.max_depth, dtype=dtype, device=device)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundPlaneDepth(DepthProvider):
+    """A flat road below the horizon, by row: the depth along the camera's axis, not along each pixel's ray.
+
+    camera_height: m, above the road.
+    focal: focal length of a pinhole, widths of the frame.
+    horizon: where the horizon lies, 0 at the top edge of the frame and 1 at its bottom edge; it may lie outside, in
+        [-10, 10].
+    far: m, the largest depth, which is also that of the sky; may be inf.
+    """
+
+    camera_height: float = 1.3
+    focal: float = 0.9
+    horizon: float = 0.45
+    far: float = 200.0
+
+    def __post_init__(self) -> None:
+        for name in ("camera_height", "focal"):
+            object.__setattr__(self, name, check_positive(name, getattr(self, name)))
+        object.__setattr__(self, "horizon", check_number("horizon", self.horizon, low=-10.0, high=10.0))
+        object.__setattr__(self, "far", check_number("far", self.far, low=1e-6, high=math.inf))
+
+    def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+        return ground_plane_depth(
+            height,
+            camera_height=self.camera_height,
+            focal_px=self.focal * width,
+            horizon=self.horizon,
+            far=self.far,
+            dtype=dtype,
+            device=device,
+        )

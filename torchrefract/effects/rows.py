@@ -1,0 +1,83 @@
+"""Rows: inside an effect the frames of a clip lie one after the other, (B T, ...).
+
+What is the same in all frames of a clip has one row for each clip until it meets what is not.
+"""
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from torchrefract._checks import is_true
+
+
+def spread(value: Tensor, rows: int) -> Tensor:
+    """The value with each row for as many frames as make `rows` of them; one row alone is not copied."""
+    if value.shape[0] == rows or value.shape[0] == 0:
+        return value
+    if value.shape[0] == 1:
+        return value.expand(rows, *value.shape[1:])
+    return value.repeat_interleave(rows // value.shape[0], dim=0)
+
+
+def alike(*values: Tensor) -> list[Tensor]:
+    """The values with as many rows as the one of them that has most."""
+    rows = max(value.shape[0] for value in values)
+    return [spread(value, rows) for value in values]
+
+
+def at_frames(params: Any, frames: Callable[[], Tensor]) -> Any:
+    """The parameters of the same draw at other frames, (B, T), of the clips; those without a `frame` stay."""
+    if "children" in params._fields:
+        return params._replace(children=tuple(at_frames(child, frames) for child in params.children))
+    return params._replace(frame=frames()) if "frame" in params._fields else params
+
+
+def column(flags: Tensor) -> Tensor:
+    """(B, 1, 1, 1) of (B,)."""
+    return flags.view(-1, 1, 1, 1)
+
+
+class _Swap(torch.autograd.Function):
+    """The first tensor forward, the gradient of the second backward."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(value: Tensor, path: Tensor) -> Tensor:
+        return value.view_as(value)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        return None
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return None, gradient
+
+
+def only(changed: Tensor, same: Tensor | float, active: Tensor, params: Any) -> Tensor:
+    """`changed` for the active samples and `same`, bit for bit, for the others.
+
+    A sample at strength zero keeps the gradient of its parameters: descent must be able to start there.
+
+    Args:
+        changed: (N, ...).
+        same: (N, ...), or a number.
+        active: (N,) or (B,), bool: the samples that the effect changes at all.
+        params: (B,) of everything; those of open gates keep their gradient.
+    """
+    if is_true(active.all):
+        return changed
+    rows = changed.shape[0]
+    value = torch.where(column(spread(active, rows)), changed, same)
+    if not learns(params):
+        return value
+    path = torch.where(column(spread(params.gate, rows)), changed, same)
+    return cast(Tensor, _Swap.apply(value.detach(), path))
+
+
+def learns(params: Any) -> bool:
+    """Whether a gradient of the parameters is asked for."""
+    return torch.is_grad_enabled() and any(value.requires_grad for value in params)

@@ -569,7 +569,9 @@ def test_ranges_the_wrong_way_round_raise(case):
 
 @pytest.mark.parametrize("shape", [(8, 9), (1, 1, 2, 3, 8, 9), (3, 0, 9), (2, 0, 8, 9)])
 def test_what_has_not_the_shape_of_an_image_raises(case, shape):
-    with pytest.raises(ValueError, match=r"image must have shape \(B, C, H, W\), \(C, H, W\) or, of clips, \(B, T, C, H, W\)"):
+    with pytest.raises(
+        ValueError, match=r"image must have shape \(B, C, H, W\), \(C, H, W\) or, of clips, \(B, T, C, H, W\)"
+    ):
         case.strong()(torch.zeros(shape))
 
 

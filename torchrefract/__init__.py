@@ -10,6 +10,7 @@ flows, which are backward and in pixels: out(p) = image(p + flow(p)).
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.compose import Compose, ComposeParams, OneOf
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams
+from torchrefract.effects.flare import FlareParams, LensFlare
 from torchrefract.effects.fog import FogParams, UniformFog
 from torchrefract.effects.lens import LensDistortion, LensParams
 from torchrefract.effects.rectification import Rectification, RectificationParams
@@ -32,10 +33,12 @@ __all__ = [
     "Degraded",
     "DivergenceFree",
     "DivergenceFreeParams",
+    "FlareParams",
     "FogParams",
     "Folding",
     "Frame",
     "LensDistortion",
+    "LensFlare",
     "LensParams",
     "OneOf",
     "Pair",

@@ -20,6 +20,7 @@ EFFECTS: dict[str, Effect] = {
     "turbulence": tr.Turbulence(**AIR, **FAST),
     "thin plate": tr.ThinPlateSpline(amplitude_range=(1.0, 2.0)),
     "divergence-free": tr.DivergenceFree(**AIR, **FAST, steps=2),
+    "flare": tr.LensFlare(drift_x_range=(0.01, 0.02)),
     "fog": tr.UniformFog(),
 }
 EFFECTS["compose"] = tr.Compose(list(EFFECTS.values()))

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrefract import draws
 from torchrefract._checks import check_all, check_flag, check_number, check_range
 from torchrefract.effects.base import params_to
+from torchrefract.effects.color import check_color, each_channel
 from torchrefract.effects.radiance import RadianceEffect, Shaded
 from torchrefract.effects.rows import alike, column, spread
 from torchrefract.fields.fog import extinction, linear_depth, linear_to_srgb, srgb_to_linear, transmission, veil
@@ -68,7 +69,7 @@ class UniformFog(RadianceEffect):
         super().__init__(p=p)
         self.visibility_range = check_range("visibility_range", visibility_range, low=1e-6, high=torch.inf)
         self.deviation_range = check_range("deviation_range", deviation_range, low=-0.999, high=0.999)
-        self.airlight = None if airlight is None else _check_airlight(airlight)
+        self.airlight = None if airlight is None else check_color("airlight", airlight, high=1.0)
         self.threshold = check_number("threshold", threshold, low=1e-6, high=1 - 1e-6)
         self.max_depth = check_number("max_depth", max_depth, low=0.0)
         self.linear_light = check_flag("linear_light", linear_light)
@@ -128,13 +129,4 @@ class UniformFog(RadianceEffect):
         if self.airlight is None:
             gray = sum(weight * value for weight, value in zip(_REC_709, _PAPER_AIRLIGHT, strict=True))
             return _PAPER_AIRLIGHT if channels == 3 else [gray] * channels
-        if len(self.airlight) not in (1, channels):
-            raise ValueError(f"airlight must have 1 number or {channels}, one for each channel, got {self.airlight}")
-        return self.airlight * channels if len(self.airlight) == 1 else self.airlight
-
-
-def _check_airlight(airlight: float | Sequence[float]) -> tuple[float, ...]:
-    values = airlight if isinstance(airlight, Sequence) else [airlight]
-    if not values:
-        raise ValueError("airlight must have at least one number, got none")
-    return tuple(check_number("airlight", value, low=0.0, high=1.0) for value in values)
+        return each_channel("airlight", self.airlight, channels)

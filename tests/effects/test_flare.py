@@ -1,0 +1,176 @@
+import math
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchrefract import FlareParams, LensFlare
+
+SIZE = (24, 32)
+DIAGONAL = math.hypot(*SIZE)
+
+
+def picture(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
+
+
+def sun(
+    image: Tensor, *, center: tuple[float, float] = (0.4, 0.2), radius: float = 0.3, strength: float = 0.6
+) -> FlareParams:
+    """The same sun for each image, white."""
+    batch, channels = image.shape[:2]
+
+    def row(*values: float) -> Tensor:
+        return torch.tensor([values] * batch, dtype=image.dtype)
+
+    gate = torch.ones(batch, dtype=torch.bool)
+    one = (row(radius)[:, 0], row(strength)[:, 0])
+    return FlareParams(gate, row(*center), *one, row(*[1.0] * channels), row(0.0, 0.0), row(0.0))
+
+
+def expected_mask(center: tuple[float, float], radius: float) -> Tensor:
+    """m, by the paper's formula, the center from the upper left corner of the frame."""
+    height, width = SIZE
+    y, x = np.mgrid[:height, :width]
+    distance = np.hypot(x + 0.5 - center[0] * width, y + 0.5 - center[1] * height)
+    return torch.from_numpy(np.exp(-0.5 * (distance / (radius * DIAGONAL)) ** 2))
+
+
+@pytest.mark.parametrize("center", [(0.4, 0.2), (-0.5, 1.5), (0.5 / SIZE[1], 0.5 / SIZE[0])])
+def test_the_image_is_what_the_formulas_say(center, oracle):
+    image = picture(2, 3, *SIZE)
+    m = expected_mask(center, 0.3)
+    params = sun(image, center=center)
+    degraded = LensFlare().apply(image, params)
+    added = image + 0.6 * m
+    oracle("flare, image", degraded.image, added.clamp(0, 1), 1e-12, unit="")
+    assert_close(degraded.intensity, (0.6 * m).expand(2, 1, -1, -1), rtol=0, atol=1e-12)
+    assert torch.equal(degraded.valid, (added <= 1).all(dim=1, keepdim=True))
+    assert degraded.flow is None
+    assert degraded.transmission is None
+    unclipped = LensFlare(clip=False).apply(image, params)
+    oracle("flare, image", unclipped.image, added, 1e-12, unit="")
+    assert torch.equal(unclipped.valid, degraded.valid)
+    screen = LensFlare(blend="screen").apply(image, params)
+    oracle("flare, image", screen.image, 1 - (1 - image) * (1 - 0.6 * m), 1e-12, unit="")
+    assert screen.valid.all()
+
+
+def test_the_intensity_takes_the_flare_off_again_where_it_is_valid():
+    image = picture(2, 3, *SIZE)
+    effect = LensFlare(color=(1.0, 0.8, 0.5))
+    d = effect.degrade(image, seed=3)
+    assert 0.1 < d.valid.double().mean() < 0.9
+    restored = d.image - d.intensity * d.params.color[..., None, None]
+    assert_close(torch.where(d.valid, restored, image), image, rtol=0, atol=1e-12)
+    lost = ~d.valid.expand_as(image) & (d.image == 1)
+    assert (restored < image - 1e-6)[lost].any()
+
+
+def test_a_sun_too_strong_for_a_second_exposure_is_not_valid():
+    image = picture(1, 3, *SIZE)
+    d = LensFlare(blend="screen").apply(image, sun(image, strength=3.0))
+    assert d.image.max() == 1
+    assert torch.equal(d.valid, 3 * expected_mask((0.4, 0.2), 0.3)[None, None] <= 1 - 1 / 255)
+
+
+def test_draws_fill_the_intervals_of_the_paper():
+    params = LensFlare().sample(torch.zeros(4000, 3, 4, 4), seed=1)
+    drawn = {"x": params.center[:, 0], "y": params.center[:, 1], "rho": params.radius, "beta": params.strength}
+    for name, (low, high) in {"x": (0.3, 0.7), "y": (0.0, 0.3), "rho": (0.25, 0.35), "beta": (0.55, 0.65)}.items():
+        assert low <= drawn[name].min() < low + 0.01 * (high - low)
+        assert high >= drawn[name].max() > high - 0.01 * (high - low)
+    assert (params.color == 1).all()
+
+
+@pytest.mark.parametrize("off", [{"radius": 0.0}, {"strength": 0.0}])
+def test_without_a_sun_even_values_out_of_range_stay(off):
+    image = 3 * picture(2, 3, *SIZE) - 1
+    d = LensFlare().apply(image, sun(image, **off))
+    assert torch.equal(d.image, image)
+    assert not d.intensity.any()
+    assert d.valid.all()
+
+
+def test_a_white_image_stays_white_and_passes_no_gradient():
+    image = torch.ones(1, 3, *SIZE, dtype=torch.float64, requires_grad=True)
+    params = sun(image)
+    strength = params.strength.requires_grad_()
+    d = LensFlare().apply(image, params._replace(strength=strength))
+    assert (d.image == 1).all()
+    for gradient in torch.autograd.grad(d.image.sum(), [image, strength]):
+        assert not gradient.any()
+    assert not d.valid.any()
+
+
+@pytest.mark.parametrize("options", [{}, {"clip": False}, {"blend": "screen"}])
+def test_gradients_are_those_of_finite_differences(options):
+    # Dark enough that nothing saturates, where the slope jumps; one sun has its center on a pixel.
+    image = 0.3 * picture(2, 3, 5, 7)
+    params = sun(image)._replace(center=torch.tensor([[3.5 / 7, 2.5 / 5], [0.31, 0.17]], dtype=torch.float64))
+    effect = LensFlare(**options)
+    names = ("center", "radius", "strength", "color", "drift", "frame")
+
+    def shine(image: Tensor, *values: Tensor) -> Tensor:
+        return effect.apply(image, params._replace(**dict(zip(names, values, strict=True)))).image
+
+    values = [image, *(getattr(params, name) for name in names)]
+    values[-1] = values[-1] + 2.0
+    values[-2] = values[-2] + 0.01
+    assert torch.autograd.gradcheck(shine, [value.clone().requires_grad_() for value in values])
+
+
+def test_the_sun_drifts_over_a_clip():
+    clip = torch.zeros(1, 5, 3, *SIZE)
+    effect = LensFlare(drift_x_range=(2 / SIZE[1],) * 2, drift_y_range=(1 / SIZE[0],) * 2)
+    intensity = effect.degrade(clip, seed=3).intensity[0, :, 0]
+    for earlier, later in pairwise(intensity):
+        assert_close(later[1:, 2:], earlier[:-1, :-2], rtol=0, atol=1e-6)
+        assert (later - earlier).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("options", "rule"),
+    [
+        ({"radius_range": (-0.1, 0.2)}, r"radius_range must be \(low, high\)"),
+        ({"strength_range": (-0.1, 0.2)}, r"strength_range must be \(low, high\)"),
+        ({"center_x_range": (math.nan, 0.2)}, "center_x_range must"),
+        ({"color": (-0.1, 0.2, 0.3)}, "color must be a number in"),
+        ({"color": ()}, "color must have at least one number, got none"),
+        ({"blend": "multiply"}, "blend must be one of add, screen, got 'multiply'"),
+    ],
+)
+def test_arguments_out_of_range_raise(options: dict[str, Any], rule: str):
+    with pytest.raises(ValueError, match=rule):
+        LensFlare(**options)
+
+
+def test_a_flag_that_is_none_raises():
+    with pytest.raises(TypeError, match="clip must be True or False, got 1"):
+        LensFlare(clip=1)  # pyright: ignore[reportArgumentType]  # that is what is wrong
+
+
+def test_a_color_for_other_channels_raises():
+    with pytest.raises(ValueError, match="color must have 1 number or 4, one for each channel"):
+        LensFlare(color=(1.0, 0.9, 0.8)).degrade(picture(1, 4, 2, 2), seed=7)
+
+
+@pytest.mark.parametrize("field", ["radius", "strength", "color"])
+def test_negative_params_raise(field):
+    image = picture(2, 3, 4, 5)
+    params = sun(image)
+    wrong = getattr(params, field).clone()
+    wrong.view(-1)[-1] = -0.25
+    with pytest.raises(ValueError, match=rf"params\.{field} must be at least 0 and finite, got -0\.25"):
+        LensFlare().apply(image, params._replace(**{field: wrong}))
+
+
+def test_a_sun_outside_the_frame_shines_in():
+    image = torch.zeros(1, 3, *SIZE)
+    d = LensFlare(center_x_range=(-0.2, -0.2), center_y_range=(-0.3, -0.3)).degrade(image, seed=1)
+    assert d.intensity[0, 0, 0, 0] == d.intensity.max() > 0.2
+    assert d.valid.all()

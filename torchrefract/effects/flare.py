@@ -1,0 +1,155 @@
+"""The sun in the lens."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrefract import draws
+from torchrefract._bands import join
+from torchrefract._checks import check_all, check_choice, check_flag, check_range
+from torchrefract.effects.base import params_to
+from torchrefract.effects.color import check_color, each_channel
+from torchrefract.effects.motion import check_frame
+from torchrefract.effects.radiance import RadianceEffect, Shaded
+from torchrefract.effects.rows import column, spread
+from torchrefract.fields.flare import flare_axes
+from torchrefract.types import Range
+from torchrefract.warping.grid import field_dtype
+
+_CACHED = 1 << 17  # numbers of an image that stay in a core's cache
+_FARTHEST = 1e4  # widths and heights
+
+
+class FlareParams(NamedTuple):
+    """The suns of a batch."""
+
+    gate: Tensor  # (B,), bool: the sample is degraded
+    center: Tensor  # (B, 2), in widths and heights of the frame, from its upper left corner
+    radius: Tensor  # (B,), rho, in diagonals of the frame, 0 or above
+    strength: Tensor  # (B,), beta, light added at the center, 0 or above
+    color: Tensor  # (B, C), of the sun, relative, 0 or above
+    drift: Tensor  # (B, 2), widths and heights per frame, of the center over a clip
+    frame: Tensor  # (B, T), number of each frame in its clip
+
+    to = params_to
+
+
+class LensFlare(RadianceEffect):
+    """The sun shining into the lens: a Gaussian veil of light.
+
+        I = clip(I_clean + beta color m, 0, 1),  m = exp(-(d / r)^2 / 2),  r = radius sqrt(W^2 + H^2),  beta = strength
+
+    d is the distance to the center in px. `intensity` is beta m; `valid` are the pixels that do not saturate, where the
+    clean image is I - beta color m. With `blend="screen"` it is I = 1 - (1 - I_clean) (1 - min(beta color m, 1)), which
+    never saturates, and a pixel is valid where 1/255 of its contrast is left. In a clip the sun drifts with the car.
+
+    Args:
+        center_x_range, center_y_range: of the sun, in widths and heights from the upper left corner of the frame, on
+            it or not.
+        radius_range: rho, in diagonals of the frame; 0 is no flare.
+        strength_range: beta; 0 is no flare.
+        color: of the sun, relative to `strength`, one number for each channel or one for all.
+        blend: "add" or "screen".
+        clip: hold the result of "add" in [0, 1]; without, it is linear in everything.
+        drift_x_range, drift_y_range: widths and heights per frame of a clip.
+        p: chance that a sample is degraded at all.
+
+    Raises:
+        ValueError: an argument outside its range; a color that does not fit the channels.
+
+    Source: the torchrefract paper; the intervals of rho and beta are those it writes, 0.3 and 0.6 +- 0.05.
+    """
+
+    def __init__(
+        self,
+        *,
+        center_x_range: Range = (0.3, 0.7),
+        center_y_range: Range = (0.0, 0.3),
+        radius_range: Range = (0.25, 0.35),
+        strength_range: Range = (0.55, 0.65),
+        color: float | Sequence[float] = 1.0,
+        blend: str = "add",
+        clip: bool = True,
+        drift_x_range: Range = (-0.002, 0.002),
+        drift_y_range: Range = (0.0, 0.0),
+        p: float = 1.0,
+    ):
+        super().__init__(p=p)
+        for name, value in {
+            "center_x_range": center_x_range,
+            "center_y_range": center_y_range,
+            "drift_x_range": drift_x_range,
+            "drift_y_range": drift_y_range,
+        }.items():
+            setattr(self, name, check_range(name, value, low=-_FARTHEST, high=_FARTHEST))
+        self.radius_range = check_range("radius_range", radius_range, low=0.0, high=_FARTHEST)
+        self.strength_range = check_range("strength_range", strength_range, low=0.0, high=1e3)
+        self.color = check_color("color", color, high=1e3)
+        self.blend = check_choice("blend", blend, ("add", "screen"))
+        self.clip = check_flag("clip", clip)
+
+    params_type = FlareParams
+
+    def draw(self, source: draws.Stream, image: Tensor) -> FlareParams:
+        """One sun a sample, every number uniform in its range."""
+        places = [getattr(self, f"{name}_range") for name in ("center_x", "center_y", "drift_x", "drift_y")]
+        gate, values = self._uniform(source, [*places, self.radius_range, self.strength_range], image)
+        color = values.new_tensor(each_channel("color", self.color, image.shape[1])).repeat(image.shape[0], 1)
+        first = torch.zeros_like(values[:, :1])
+        return FlareParams(gate, values[:, :2], values[:, 4], values[:, 5], color, values[:, 2:4], first)
+
+    def check(self, params: FlareParams, image: Tensor) -> None:
+        """Raise for suns that are none."""
+        batch, channels = image.shape[:2]
+        sizes = {"center": (batch, 2), "drift": (batch, 2), "color": (batch, channels), "radius": (batch,)}
+        for name, size in (sizes | {"strength": (batch,)}).items():
+            if getattr(params, name).shape != size:
+                raise ValueError(f"params.{name} must have shape {size}, got {tuple(getattr(params, name).shape)}")
+        check_frame(params)
+        for name in ("center", "drift"):
+            check_all(f"params.{name}", "be finite", getattr(params, name), torch.isfinite)
+        for name in ("radius", "strength", "color"):
+            value = getattr(params, name)
+            check_all(f"params.{name}", "be at least 0 and finite", value, lambda v: v.isfinite() & (v >= 0))
+
+    def acts(self, params: FlareParams) -> Tensor:
+        """The samples with a sun."""
+        return (params.radius != 0) & (params.strength != 0)
+
+    def shade(self, image: Tensor, params: FlareParams, depth: Tensor | None) -> Shaded:
+        """The rows in the light of the sun."""
+        rows, _, height, width = image.shape
+        dtype = field_dtype(image.dtype)
+        size = torch.tensor([width, height], dtype=dtype, device=image.device)
+        share = params.center[:, None] + params.frame[:, :, None] * params.drift[:, None]
+        center = share.to(dtype).reshape(-1, 2) * size - 0.5
+        radius = spread(params.radius.to(dtype), rows) * size.square().sum().sqrt()
+        along_x, along_y = flare_axes(center, radius, height=height, width=width)
+        along_y = along_y * column(spread(params.strength.to(dtype), rows))
+        color = spread(params.color.to(dtype), rows)[:, :, None, None]
+        bands = self._bands(image, along_x, along_y * color)
+        return Shaded(
+            join(bands, dim=2, length=height),
+            valid=lambda: self._valid(image, along_x, along_y * color),
+            intensity=lambda: along_y * along_x,
+        )
+
+    def _bands(self, image: Tensor, along_x: Tensor, along_y: Tensor) -> Iterator[Tensor]:
+        """The shaded image, in bands of rows that stay in the cache until they are clipped."""
+        batch, channels, height, width = image.shape
+        whole = image.device.type != "cpu" or torch.compiler.is_compiling() or image.numel() == 0
+        at_once = height if whole else max(1, _CACHED // (batch * channels * width))
+        for band, light in zip(image.split(at_once, dim=2), along_y.split(at_once, dim=2), strict=True):
+            if self.blend == "screen":
+                yield torch.addcmul(band, 1 - band, (light * along_x).clamp(max=1))
+            elif self.clip:
+                yield torch.addcmul(band, light, along_x).clamp(0, 1)
+            else:
+                yield torch.addcmul(band, light, along_x)
+
+    def _valid(self, image: Tensor, along_x: Tensor, light: Tensor) -> Tensor:
+        if self.blend == "screen":
+            return (light * along_x <= 1 - 1 / 255).all(dim=1, keepdim=True)
+        return (torch.addcmul(image, light, along_x) <= 1).all(dim=1, keepdim=True)

@@ -1,0 +1,32 @@
+"""The veil of light that the sun throws over a lens."""
+
+import torch
+from torch import Tensor
+
+
+def flare_axes(center: Tensor, radius: Tensor, *, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """The two factors of m(x, y) = exp(-((x - cx)^2 + (y - cy)^2) / (2 r^2)), 1 at the center and e^-1/2 at r.
+
+    Args:
+        center: (B, 2), px, cx and cy, pixel centers being whole numbers; anywhere, also outside the frame.
+        radius: (B,), px; 0 is no flare: both factors are 0.
+        height, width: px.
+
+    Returns:
+        along x, (B, 1, 1, W), and along y, (B, 1, H, 1); their product is m.
+    """
+    x = torch.arange(width, dtype=center.dtype, device=center.device).view(1, 1, 1, width)
+    y = torch.arange(height, dtype=center.dtype, device=center.device).view(1, 1, height, 1)
+    # Squares, since the root of the distance has no slope at the center.
+    shines = radius > 0
+    sharpness = torch.where(shines, 0.5 / torch.where(shines, radius, 1).square(), 0)
+    cx, cy, sharpness, shines = (value.view(-1, 1, 1, 1) for value in (*center.unbind(1), sharpness, shines))
+    along = (torch.exp(-sharpness * (axis - middle).square()) for axis, middle in ((x, cx), (y, cy)))
+    along_x, along_y = (torch.where(shines, factor, 0) for factor in along)
+    return along_x, along_y
+
+
+def flare_mask(center: Tensor, radius: Tensor, *, height: int, width: int) -> Tensor:
+    """(B, 1, H, W), m of `flare_axes`, in [0, 1]; arguments as there."""
+    along_x, along_y = flare_axes(center, radius, height=height, width=width)
+    return along_y * along_x

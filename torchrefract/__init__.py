@@ -9,6 +9,8 @@ flows, which are backward and in pixels: out(p) = image(p + flow(p)).
 
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.compose import Compose, ComposeParams, OneOf
+from torchrefract.effects.defog import remove_fog
+from torchrefract.effects.depth import DepthProvider, GroundPlaneDepth, LinearDepth
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams
 from torchrefract.effects.flare import FlareParams, LensFlare
 from torchrefract.effects.fog import FogParams, UniformFog
@@ -16,6 +18,13 @@ from torchrefract.effects.lens import LensDistortion, LensParams
 from torchrefract.effects.rectification import Rectification, RectificationParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence, TurbulenceParams
+from torchrefract.fields.depth import (
+    check_depth,
+    depth_from_disparity,
+    depth_from_inverse,
+    depth_from_normalized,
+    ray_distance,
+)
 from torchrefract.labels.boxes import warp_boxes
 from torchrefract.labels.maps import warp_depth, warp_mask
 from torchrefract.labels.points import warp_points
@@ -31,15 +40,18 @@ __all__ = [
     "Compose",
     "ComposeParams",
     "Degraded",
+    "DepthProvider",
     "DivergenceFree",
     "DivergenceFreeParams",
     "FlareParams",
     "FogParams",
     "Folding",
     "Frame",
+    "GroundPlaneDepth",
     "LensDistortion",
     "LensFlare",
     "LensParams",
+    "LinearDepth",
     "OneOf",
     "Pair",
     "Rectification",
@@ -49,10 +61,16 @@ __all__ = [
     "Turbulence",
     "TurbulenceParams",
     "UniformFog",
+    "check_depth",
     "compose_flows",
+    "depth_from_disparity",
+    "depth_from_inverse",
+    "depth_from_normalized",
     "folding",
     "invert_flow",
     "jacobian_determinant",
+    "ray_distance",
+    "remove_fog",
     "warp",
     "warp_boxes",
     "warp_depth",

@@ -1,6 +1,6 @@
 """Plain values that cross layers."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any, NamedTuple, cast
 
@@ -10,6 +10,7 @@ Range = tuple[float, float]
 
 
 Map = Tensor | Callable[[], Tensor]
+_LIGHT = ("transmission", "extinction", "intensity")
 
 
 class Inverse(NamedTuple):
@@ -87,18 +88,15 @@ class Degraded:
         flow: Map | None = None,
         restore: Callable[[], Inverse] | None = None,
         folding: Callable[[], Folding] | None = None,
-        transmission: Map | None = None,
-        extinction: Map | None = None,
-        intensity: Map | None = None,
+        light: Mapping[str, Map] | None = None,
     ):
         self.image = image
         self.params = params
         self._maps: dict[str, Map | None] = {
             "valid": valid,
             "flow": flow,
-            "transmission": transmission,
-            "extinction": extinction,
-            "intensity": intensity,
+            **dict.fromkeys(_LIGHT),
+            **(light or {}),
         }
         self._restore = restore
         self._fold = folding
@@ -176,9 +174,7 @@ class Degraded:
             flow=later("flow"),
             restore=None if self._restore is None else restore,
             folding=None if self._fold is None else lambda: Folding(*map(function, self.folding)),
-            transmission=later("transmission"),
-            extinction=later("extinction"),
-            intensity=later("intensity"),
+            light={name: value for name in _LIGHT if (value := later(name)) is not None},
         )
 
     def _read(self, name: str) -> Tensor | None:

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from torchrefract.fields.fog import extinction, linear_depth, linear_to_srgb, srgb_to_linear, transmission, veil
+from torchrefract.fields.fog import extinction, linear_to_srgb, srgb_to_linear, transmission, veil
 
 
 def srgb_by_the_standard(linear: np.ndarray) -> np.ndarray:
@@ -51,12 +51,6 @@ def test_the_veil_is_exact_at_both_ends():
     assert torch.equal(veil(image, torch.zeros(2, 1, 4, 5), airlight), airlight.expand_as(image))
     middle = veil(image, torch.full((2, 1, 4, 1), 0.25), airlight)
     assert_close(middle, 0.25 * image + 0.75 * airlight)
-
-
-def test_depth_runs_from_the_far_top_row_to_the_near_bottom_row():
-    depth = linear_depth(4, 160.0, dtype=torch.float64, device=torch.device("cpu"))
-    assert depth.flatten().tolist() == [140.0, 100.0, 60.0, 20.0]
-    assert depth.shape == (1, 1, 4, 1)
 
 
 def test_stored_values_and_linear_light_agree_with_the_standard():

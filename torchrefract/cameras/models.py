@@ -1,7 +1,7 @@
 """A camera that has been calibrated."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torchrefract._checks import check_choice, check_count, check_number, check_positive
@@ -60,6 +60,29 @@ class Camera:
         if skew != 0:
             raise ValueError(f"matrix must have no skew, got {skew:g}")
         return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=tuple(_flat(coefficients)))
+
+    def resized(self, *, width: int, height: int) -> "Camera":
+        """The camera of the same frames, reduced or enlarged to another size.
+
+            fx' = s fx,  cx' = (W' - 1) / 2 + s (cx - (W - 1) / 2),  s = W' / W,  likewise fy and cy with the same s
+
+        Raises:
+            ValueError: a size of another ratio of the sides.
+        """
+        ratio = self.height / self.width
+        # A frame of one pixel, and one row more or less, have no ratio to speak of.
+        if abs(height - width * ratio) > max(1.0, ratio):
+            raise ValueError(
+                f"image must have the shape of the camera's frames, {self.width} x {self.height} px, got "
+                f"{width} x {height}"
+            )
+        scale = width / self.width
+        focal = {"fx": self.fx * scale, "fy": self.fy * scale}
+        # The middle of the frame stays the middle, also where a row more or less was rounded away.
+        middle = {"cx": (self.width - 1) / 2, "cy": (self.height - 1) / 2}
+        center = {"cx": (width - 1) / 2, "cy": (height - 1) / 2}
+        moved = {name: center[name] + (getattr(self, name) - middle[name]) * scale for name in center}
+        return replace(self, width=width, height=height, **focal, **moved)
 
     def polynomial(self) -> tuple[float, ...]:
         """The coefficients as those of "polynomial12".

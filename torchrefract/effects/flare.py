@@ -1,6 +1,6 @@
 """The sun in the lens."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -13,12 +13,11 @@ from torchrefract.effects.base import params_to
 from torchrefract.effects.color import check_color, each_channel
 from torchrefract.effects.motion import check_frame
 from torchrefract.effects.radiance import RadianceEffect, Shaded
-from torchrefract.effects.rows import column, spread
+from torchrefract.effects.rows import bands, column, spread
 from torchrefract.fields.flare import flare_axes
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 
-_CACHED = 1 << 17  # numbers of an image that stay in a core's cache
 _FARTHEST = 1e4  # widths and heights
 
 
@@ -129,25 +128,19 @@ class LensFlare(RadianceEffect):
         along_x, along_y = flare_axes(center, radius, height=height, width=width)
         along_y = along_y * column(spread(params.strength.to(dtype), rows))
         color = spread(params.color.to(dtype), rows)[:, :, None, None]
-        bands = self._bands(image, along_x, along_y * color)
+        # Clipped while it is in the cache.
+        made = (self._shine(band, light, along_x) for band, light in bands(image, along_y * color))
         return Shaded(
-            join(bands, dim=2, length=height),
+            join(made, dim=2, length=height),
             valid=lambda: self._valid(image, along_x, along_y * color),
             intensity=lambda: along_y * along_x,
         )
 
-    def _bands(self, image: Tensor, along_x: Tensor, along_y: Tensor) -> Iterator[Tensor]:
-        """The shaded image, in bands of rows that stay in the cache until they are clipped."""
-        batch, channels, height, width = image.shape
-        whole = image.device.type != "cpu" or torch.compiler.is_compiling() or image.numel() == 0
-        at_once = height if whole else max(1, _CACHED // (batch * channels * width))
-        for band, light in zip(image.split(at_once, dim=2), along_y.split(at_once, dim=2), strict=True):
-            if self.blend == "screen":
-                yield torch.addcmul(band, 1 - band, (light * along_x).clamp(max=1))
-            elif self.clip:
-                yield torch.addcmul(band, light, along_x).clamp(0, 1)
-            else:
-                yield torch.addcmul(band, light, along_x)
+    def _shine(self, band: Tensor, light: Tensor, along_x: Tensor) -> Tensor:
+        if self.blend == "screen":
+            return torch.addcmul(band, 1 - band, (light * along_x).clamp(max=1))
+        added = torch.addcmul(band, light, along_x)
+        return added.clamp(0, 1) if self.clip else added
 
     def _valid(self, image: Tensor, along_x: Tensor, light: Tensor) -> Tensor:
         if self.blend == "screen":

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -51,7 +51,7 @@ class RadianceEffect(Effect):
             return value.expand(-1, 1, height, width)
 
         def gated(name: str) -> Map | None:
-            value = getattr(shaded, name)
+            value = cast(Map | None, getattr(shaded, name))
             if value is None:
                 return None
             return lambda: where_active(value() if callable(value) else value, _CLEAR[name])
@@ -60,7 +60,7 @@ class RadianceEffect(Effect):
             only(shaded.image, image, active, params),
             params,
             valid=lambda: where_active(shaded.valid(), True),
-            **{name: gated(name) for name in _CLEAR},
+            light={name: value for name in _CLEAR if (value := gated(name)) is not None},
         )
 
 

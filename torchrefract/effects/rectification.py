@@ -98,13 +98,7 @@ class Rectification(WarpEffect):
 
     def flow(self, params: RectificationParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
         """The flow of `lens_restore_flow`, and where it exists."""
-        ratio = self.camera.height / self.camera.width
-        # A frame of one pixel, and one row more or less, have no ratio to speak of.
-        if abs(height - width * ratio) > max(1.0, ratio):
-            raise ValueError(
-                f"image must have the shape of the camera's frames, {self.camera.width} x {self.camera.height} px, got "
-                f"{width} x {height}"
-            )
+        self.camera.resized(width=width, height=height)  # raises for another shape
         return lens_restore_flow(*in_px(params, height, width), height=height, width=width)
 
     def undo(self, params: RectificationParams, flow: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,7 +1,7 @@
 """What every effect that moves pixels is: a flow, the flow back, and one look-up."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -96,7 +96,7 @@ def moving(
     flow: Callable[[], Tensor],
     valid: Callable[[], Tensor],
     undo: Callable[[], tuple[Tensor, Tensor]],
-    **light: Map,
+    light: Mapping[str, Map] | None = None,
 ) -> Degraded:
     """What an effect with a flow hands over; `restore_valid` is where the flow back exists and sees valid pixels."""
 
@@ -112,7 +112,7 @@ def moving(
         flow=flow,
         restore=restore,
         folding=lambda: folding(cast(Tensor, result.flow), result.valid),
-        **light,
+        light=light,
     )
     return result
 

@@ -87,14 +87,14 @@ class Walk:
         """What has become of the image, with all maps."""
         self._look_up()
         if not self.refracts:
-            return Degraded(self.image, params, valid=self.valid, **self.light)
+            return Degraded(self.image, params, valid=self.valid, light=self.light)
         return moving(
             self.image,
             params,
             flow=lambda: _composite(self.done).flow if self.done else self._still(),
             valid=self.valid,
             undo=self._undo,
-            **self.light,
+            light=self.light,
         )
 
     def _add(self, name: str, value: Callable[[], Tensor] | None, combine: _Combine) -> None:

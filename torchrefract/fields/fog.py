@@ -48,19 +48,18 @@ def veil(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
     )
 
 
-def linear_depth(height: int, max_depth: float, *, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(1, 1, H, 1), m: d(y) = (1 - (y + 1/2) / H) D_max, from the far top row to the near bottom row."""
-    half = max_depth / (2 * height)
-    return torch.linspace(max_depth - half, half, height, dtype=dtype, device=device).view(1, 1, height, 1)
-
-
 def srgb_to_linear(value: Tensor) -> Tensor:
     """Linear light of stored values in [0, 1], any shape. Source: IEC 61966-2-1."""
     low = value / 12.92
-    return torch.where(value <= 0.04045, low, ((value.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4)
+    return torch.where(value <= 0.04045, low, _power((value.clamp(min=0.04045) + 0.055) / 1.055, 2.4))
 
 
 def linear_to_srgb(value: Tensor) -> Tensor:
     """Stored values of linear light in [0, 1], any shape. Source: IEC 61966-2-1."""
-    high = 1.055 * value.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
+    high = 1.055 * _power(value.clamp(min=0.0031308), 1 / 2.4) - 0.055
     return torch.where(value <= 0.0031308, 12.92 * value, high)
+
+
+def _power(value: Tensor, exponent: float) -> Tensor:
+    """value^exponent of what is above 0, to the same bits in any batch, as `pow` is not."""
+    return torch.exp(exponent * torch.log(value))

@@ -1,0 +1,273 @@
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchrefract.data.road_scenes import render_road_scenes
+from torchrefract.fields.depth import (
+    check_depth,
+    depth_from_disparity,
+    depth_from_inverse,
+    depth_from_normalized,
+    ground_plane_depth,
+    linear_depth,
+    ray_distance,
+)
+
+HERE = {"dtype": torch.float64, "device": torch.device("cpu")}
+INTRINSICS: dict[str, Any] = {"fx": 11.0, "fy": 9.0, "cx": 4.3, "cy": 2.9}
+
+
+def number(low: float, high: float, *shape: int) -> Tensor:
+    return low + (high - low) * torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+def real_depths(shared_data) -> list[Tensor]:
+    """The depth of two real roads, interpolated from lidar."""
+    paths = sorted((shared_data / "references").glob("*/depth_dense_derived_640x360.png"))
+    assert len(paths) == 2
+    pictures = [np.float64(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)) for path in paths]
+    return [torch.from_numpy(np.where(p == 65535, np.inf, p / 256))[None, None] for p in pictures]
+
+
+def test_linear_depth_runs_from_the_far_top_row_to_the_near_bottom_row():
+    depth = linear_depth(4, 160.0, **HERE)
+    assert depth.flatten().tolist() == [140.0, 100.0, 60.0, 20.0]
+    assert depth.shape == (1, 1, 4, 1)
+
+
+@pytest.mark.parametrize("height", [1, 90, 1081])
+@pytest.mark.parametrize("pitch", [-0.2, 0.0, 0.05, 0.7])
+@pytest.mark.parametrize("far", [60.0, math.inf])
+def test_the_ground_is_where_the_rays_of_a_pitched_camera_meet_it(height, pitch, far):
+    focal, above, middle = 1.7 * height, 1.3, (height - 1) / 2
+    # The camera's axes down and ahead, in the world's (down, ahead).
+    down = np.array([math.cos(pitch), -math.sin(pitch)])
+    ahead = np.array([math.sin(pitch), math.cos(pitch)])
+    level = np.array([0.0, 1.0])
+    row = middle + focal * (level @ down) / (level @ ahead)
+    expected = np.full(height, far)
+    for y in range(height):
+        fall = ((y - middle) / focal * down + ahead)[0]
+        if fall > 0:  # the ray has 1 m ahead of the camera for each unit of its length
+            expected[y] = min(above / fall, far)
+    options = {"camera_height": above, "focal_px": focal, "horizon": (row + 0.5) / height, "far": far}
+    depth = ground_plane_depth(height, **options, **HERE)
+    assert_close(depth, torch.from_numpy(expected).view(1, 1, height, 1), rtol=1e-9, atol=0)
+    single = ground_plane_depth(height, **options, dtype=torch.float32, device=torch.device("cpu"))
+    assert torch.equal(single, depth.float())
+
+
+def test_the_row_of_the_horizon_is_as_far_as_the_sky():
+    depth = ground_plane_depth(10, camera_height=2.0, focal_px=8.0, horizon=0.45, far=math.inf, **HERE).flatten()
+    assert depth[:5].isinf().all()
+    assert depth[5:].tolist() == pytest.approx([2 * math.hypot(8, 0.5) / rows for rows in range(1, 6)])
+
+
+@pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-14), (torch.float32, 1e-6), (torch.float16, 1e-6)])
+def test_the_ray_distance_is_the_length_of_the_vector_to_the_point(dtype, rtol):
+    depth = number(1.0, 90.0, 2, 1, 6, 9).to(dtype)
+    depth[1, 0, 2, 3] = math.inf
+    v, u = np.mgrid[:6, :9]
+    for sample in (0, 1):
+        fx, fy, cx, cy = (value + sample for value in INTRINSICS.values())
+        ray = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)])
+        expected = torch.from_numpy(np.linalg.norm(ray, axis=0)) * depth[sample, 0].double()
+        numbers = ray_distance(depth, fx=fx, fy=fy, cx=cx, cy=cy)
+        assert_close(numbers[sample, 0].double(), expected, rtol=rtol, atol=0)
+        tensors: dict[str, Any] = {name: value + torch.arange(2).double() for name, value in INTRINSICS.items()}
+        assert_close(ray_distance(depth, **tensors)[sample, 0].double(), expected, rtol=rtol, atol=0)
+
+
+def test_rows_of_one_depth_are_stretched_over_the_width():
+    rows = number(1.0, 90.0, 1, 1, 6, 1)
+    focal = torch.tensor([7.0, 12.0])
+    found = ray_distance(rows, fx=focal, fy=9.0, cx=4.0, cy=2.5, width=9)
+    assert torch.equal(found, ray_distance(rows.expand(2, -1, -1, 9), fx=focal, fy=9.0, cx=4.0, cy=2.5))
+
+
+def test_gradients_of_the_ray_distance_are_those_of_finite_differences():
+    values = [number(1.0, 90.0, 2, 1, 3, 4), *(value + number(0.0, 1.0, 2) for value in INTRINSICS.values())]
+
+    def distance(depth, fx, fy, cx, cy):
+        return ray_distance(depth, fx=fx, fy=fy, cx=cx, cy=cy)
+
+    assert torch.autograd.gradcheck(distance, [value.requires_grad_() for value in values])
+
+
+def test_the_sky_gives_the_intrinsics_no_gradient():
+    depth = torch.full((1, 1, 6, 9), math.inf, dtype=torch.float64).requires_grad_()
+    intrinsics: dict[str, Any] = {
+        name: torch.tensor([value]).double().requires_grad_() for name, value in INTRINSICS.items()
+    }
+    distance = ray_distance(depth, **intrinsics)
+    assert distance.isinf().all()
+    for gradient in torch.autograd.grad(distance.sum(), [depth, *intrinsics.values()]):
+        assert gradient.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("changed", "error", "rule"),
+    [
+        ({"depth": torch.ones(6, 9)}, ValueError, r"depth must have shape \(B, 1, H, W\) or"),
+        ({"depth": torch.ones(2, 1, 6, 9).int()}, TypeError, "depth must be of a floating type"),
+        ({"width": 8}, ValueError, "depth must be 1 or 8 px wide"),
+        ({"fx": 0.0}, ValueError, "fx must be above 0"),
+        ({"fy": torch.tensor([9.0, -9.0])}, ValueError, "fy must be above 0, in px, got -9"),
+        ({"fx": torch.tensor([9.0, math.inf])}, ValueError, "fx must be finite"),
+        ({"cx": math.nan}, ValueError, "cx must not be NaN"),
+        ({"cy": torch.zeros(3)}, ValueError, r"cy must be a number or have shape \(2,\), got \(3,\)"),
+    ],
+)
+def test_what_is_no_camera_raises(changed, error, rule):
+    with pytest.raises(error, match=rule):
+        ray_distance(**({"depth": torch.ones(2, 1, 6, 9)} | INTRINSICS | changed))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_converters_are_their_formulas_and_exact_at_both_ends(dtype):
+    value = torch.cat([torch.tensor([0.0, 1.0]), number(0.0, 1.0, 20)]).to(dtype)
+    v = value.double().numpy()
+    with np.errstate(divide="ignore"):
+        wanted = [360.5 / v, 2 + 78 * v, 1 / (v / 2 + (1 - v) / 80), 2 / v]
+    found = [
+        depth_from_disparity(value, focal_px=721.0, baseline=0.5),
+        depth_from_normalized(value, near=2.0, far=80.0),
+        depth_from_inverse(value, near=2.0, far=80.0),
+        depth_from_inverse(value, near=2.0, far=math.inf),
+    ]
+    for depth, expected in zip(found, wanted, strict=True):
+        assert_close(depth, torch.from_numpy(expected).to(dtype))
+    assert found[0][0] == found[3][0] == math.inf
+    assert found[1][:2].tolist() == [2.0, 80.0]
+    assert found[2][:2].tolist() == [80.0, 2.0]
+
+
+def test_gradients_of_the_converters_are_those_of_finite_differences_and_finite_at_infinity():
+    functions = (
+        lambda v: depth_from_disparity(100 * v, focal_px=721.0, baseline=0.5),
+        lambda v: depth_from_normalized(v, near=2.0, far=80.0),
+        lambda v: depth_from_inverse(v, near=2.0, far=math.inf),
+    )
+    for function in functions:
+        assert torch.autograd.gradcheck(function, number(0.1, 0.9, 7).requires_grad_())
+        far = torch.tensor([0.0, 1e-30, 1e-12]).requires_grad_()
+        (gradient,) = torch.autograd.grad(function(far).sum(), far)
+        assert gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("wrong", [-0.25, math.nan, -math.inf])
+def test_values_of_no_map_raise(wrong):
+    value = torch.tensor([0.5, wrong])
+    with pytest.raises(ValueError, match="disparity must be at least 0, in px, got"):
+        depth_from_disparity(value, focal_px=1.0, baseline=1.0)
+    for convert in (depth_from_normalized, depth_from_inverse):
+        with pytest.raises(ValueError, match=r"value must be in \[0, 1\], got"):
+            convert(value, near=1.0, far=2.0)
+        with pytest.raises(ValueError, match=r"value must be in \[0, 1\], got 1\.5"):
+            convert(torch.tensor(1.5), near=1.0, far=2.0)
+        with pytest.raises(TypeError, match="value must be of a floating type"):
+            convert(torch.tensor(1), near=1.0, far=2.0)
+        with pytest.raises(ValueError, match="far must be above near = 2, got 2"):
+            convert(value, near=2.0, far=2.0)
+
+
+def refused(depth: Tensor) -> str:
+    with pytest.raises(ValueError, match="depth must be in m, not") as error:
+        check_depth(depth)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("size", [(64, 112), (128, 224), (96, 40)])
+def test_the_depth_of_road_scenes_passes_and_what_is_none_does_not(size):
+    _, depth = render_road_scenes(torch.arange(20), *size)
+    check_depth(depth)
+    check_depth(depth.clamp(max=80.0))
+    for sample in depth.split(1):
+        assert "not disparity or inverse depth" in refused(360.5 / sample)
+        assert "not normalized" in refused(sample.amin() / sample)
+        farthest = sample[sample.isfinite()].amax()
+        assert "not normalized" in refused((sample / farthest).clamp(max=1.0))
+        assert "not normalized" in refused(sample / farthest)
+
+
+def test_the_depth_of_real_roads_passes_and_what_is_none_does_not(shared_data):
+    for depth in real_depths(shared_data):
+        for kind in (torch.float64, torch.float32, torch.float16):
+            check_depth(depth.to(kind))
+        check_depth(depth.clamp(max=80.0))
+        check_depth(depth.nan_to_num(posinf=0.0))  # as where 0 is no measurement
+        assert "not disparity or inverse depth" in refused(360.5 / depth)
+        assert "not disparity or inverse depth" in refused(1000 / depth)
+
+
+def test_depths_that_look_odd_but_are_in_meters_pass():
+    ramp = torch.linspace(0, 1, 200).view(1, 1, -1, 1).expand(1, 1, 200, 300)
+    for depth in (0 * ramp, 0 * ramp + 0.5, 0 * ramp + 1, 1 + 149 * ramp, 150 * ramp, 160 * (1 - ramp), ramp / 0):
+        check_depth(depth.nan_to_num(posinf=math.inf))
+    check_depth(torch.zeros(0, 1, 4, 5))
+    check_depth(torch.tensor([[[[0.0, 9.0]]]]))
+
+
+def test_only_what_lies_in_the_unit_range_everywhere_is_normalized():
+    depth = number(0.0, 1.0, 1, 1, 700, 900)
+    depth[0, 0, 1, 1] = 1.5  # between the rows and columns that are looked at first
+    check_depth(depth)
+    depth[0, 0, 1, 1] = 0.5
+    low, high = depth.amin().item(), depth.amax().item()
+    assert refused(depth).endswith(f"got values in [{low:g}, {high:g}]")
+
+
+def test_each_sample_and_clip_is_judged_by_itself():
+    depth = number(1.0, 90.0, 3, 1, 20, 30)
+    depth[1] /= 100
+    assert refused(depth).endswith(f"got values in [{depth[1].amin():g}, {depth[1].amax():g}]")
+    clips = number(1.0, 90.0, 2, 5, 1, 40, 30)
+    check_depth(clips)
+    clips[1] = torch.linspace(-60, 90, 40).clamp(min=0).double().view(40, 1)  # of a road below a horizon
+    assert "not disparity or inverse depth" in refused(clips)
+    clips[1] /= 100
+    assert "not normalized" in refused(clips)
+
+
+@pytest.mark.parametrize("wrong", [-1.0, math.nan, -math.inf])
+def test_what_is_negative_or_nan_raises_wherever_it_lies(wrong):
+    depth = number(1.0, 90.0, 2, 1, 300, 400)
+    depth[1, 0, 1, 399] = wrong
+    with pytest.raises(ValueError, match=f"range must be at least 0, in m, got {wrong:g}"):
+        check_depth(depth, name="range")
+
+
+def test_a_graph_a_device_and_vmap_are_never_waited_for():
+    depth, focal = number(1.0, 90.0, 2, 1, 6, 9), torch.tensor([8.0, 9.0]).double()
+
+    def distance(depth, fx):
+        check_depth(depth)
+        depth = depth_from_inverse(depth / 90, near=1.0, far=math.inf) + depth_from_normalized(
+            depth / 90, near=1, far=9
+        )
+        depth = depth_from_disparity(depth, focal_px=9.0, baseline=0.5)
+        road = ground_plane_depth(6, camera_height=1.3, focal_px=9.0, horizon=0.2, far=50.0, **HERE)
+        return ray_distance(torch.minimum(depth, road), fx=fx, fy=9.0, cx=4.0, cy=2.0)
+
+    together = distance(depth, focal)
+    assert_close(torch.compile(distance, fullgraph=True)(depth, focal), together)
+    mapped = torch.vmap(lambda depth, fx: distance(depth[None], fx)[0])(depth, focal)
+    assert_close(mapped, together)
+    # On a device that holds no values, reading one would raise.
+    check_depth(torch.empty(2, 1, 6, 9, device="meta"))
+    depth_from_disparity(torch.empty(2, 1, 6, 9, device="meta"), focal_px=9.0, baseline=0.5)
+
+
+def test_a_sample_does_not_depend_on_the_batch_or_the_threads(on_threads):
+    depth, focal = number(1.0, 90.0, 5, 1, 181, 319).float(), number(8.0, 9.0, 5)
+    on_threads(1)
+    alone = [ray_distance(depth[i : i + 1], fx=focal[i : i + 1], fy=9.0, cx=4.0, cy=2.0) for i in range(5)]
+    for threads in (1, 2, 3):
+        on_threads(threads)
+        assert torch.equal(ray_distance(depth, fx=focal, fy=9.0, cx=4.0, cy=2.0), torch.cat(alone))

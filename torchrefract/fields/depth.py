@@ -1,0 +1,261 @@
+"""Depth in meters: of a flat road, along the rays, out of other units, and what is no depth at all."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchrefract._checks import check_all, check_number, check_positive, check_tensor, read
+from torchrefract.warping.grid import field_dtype, pixel_axes
+
+# Farther than anything: from here on a depth is infinite, and has no gradient.
+_FARTHEST = 1e12
+# So many values of a sample tell what kind of map it is; fewer than these of its upper half tell nothing.
+_LOOKED_AT = 128 * 128
+_ENOUGH = 128
+
+
+def linear_depth(height: int, max_depth: float, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(1, 1, H, 1), m: d(y) = (1 - (y + 1/2) / H) D_max, from the far top row to the near bottom row."""
+    half = max_depth / (2 * height)
+    return torch.linspace(max_depth - half, half, height, dtype=dtype, device=device).view(1, 1, height, 1)
+
+
+def ground_plane_depth(
+    height: int,
+    *,
+    camera_height: float,
+    focal_px: float,
+    horizon: float,
+    far: float,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Tensor:
+    """The depth of a flat road below the horizon, along the camera's axis; `far` at the horizon and above it.
+
+        z(y) = min(h sqrt(f^2 + (c_y - y_h)^2) / (y - y_h), far),  y_h = horizon H - 1/2,  c_y = (H - 1) / 2
+
+    The camera is a pinhole that looks down by theta, tan(theta) = (c_y - y_h) / f, so sqrt(...) is f / cos(theta).
+
+    Args:
+        height: px, of the frame, whose middle is the principal point.
+        camera_height: m, h, above the road.
+        focal_px: f.
+        horizon: where the horizon lies, 0 at the top edge of the frame and 1 at its bottom edge.
+        far: m, the largest depth; may be inf.
+
+    Returns:
+        (1, 1, H, 1), m.
+    """
+    y_h = horizon * height - 0.5
+    # Next to the horizon float32 would lose the digits of the difference.
+    below = torch.arange(height, dtype=torch.float64, device=device) - y_h
+    z = camera_height * math.hypot(focal_px, (height - 1) / 2 - y_h) / below.clamp(min=0)
+    return z.clamp(max=far).to(dtype).view(1, 1, height, 1)
+
+
+def ray_distance(
+    depth: Tensor,
+    *,
+    fx: float | Tensor,
+    fy: float | Tensor,
+    cx: float | Tensor,
+    cy: float | Tensor,
+    width: int | None = None,
+) -> Tensor:
+    """The distance along each pixel's ray of a depth along the camera's axis.
+
+        d = z sqrt((1 + ((v - cy) / fy)^2) + ((u - cx) / fx)^2),  inf where z is
+
+    Args:
+        depth: (B, 1, H, W), or (B, 1, H, 1) for rows of one depth, m.
+        fx, fy, cx, cy: px, focal lengths and principal point of a pinhole; a number, or (B,).
+        width: px, of the frame; None is that of the depth.
+
+    Returns:
+        (B, 1, H, W), m, float32, or float64 for such a depth.
+
+    Raises:
+        ValueError: a shape that does not fit, a focal length that is not above 0, an intrinsic that is not finite.
+        TypeError: a depth that is no floating tensor.
+    """
+    _check_rows("depth", depth, width)
+    z = depth.to(field_dtype(depth.dtype))
+    columns, rows = pixel_axes(z.shape[2], width or z.shape[3], dtype=z.dtype, device=z.device)
+    x = (columns - _intrinsic("cx", cx, z)) / _focal("fx", fx, z)
+    y = (rows - _intrinsic("cy", cy, z)) / _focal("fy", fy, z)
+    stretch = ((1 + y * y) + x * x).sqrt()
+    if not any(isinstance(value, Tensor) for value in (fx, fy, cx, cy)):
+        return z * stretch
+    # The gradient of an intrinsic would be inf times 0 at the sky.
+    sky = z.isinf()
+    return torch.where(sky, z, torch.where(sky, 0, z) * stretch)
+
+
+def depth_from_disparity(disparity: Tensor, *, focal_px: float, baseline: float) -> Tensor:
+    """Depth of the disparity of a rectified stereo pair.
+
+        z = (f b) / disparity,  inf where the disparity is 0, or z would be above 1e12 m
+
+    Args:
+        disparity: px, at least 0, of any shape.
+        focal_px: f, of the rectified pair, at the size of the disparity.
+        baseline: m, b, between the two cameras.
+
+    Returns:
+        As the disparity, m, float32, or float64 for such a disparity.
+
+    Raises:
+        ValueError: a disparity that is negative or NaN (on the CPU); a focal length or baseline that is not above 0.
+        TypeError: a disparity that is no floating tensor.
+    """
+    product = check_positive("focal_px", focal_px) * check_positive("baseline", baseline)
+    check_all("disparity", "be at least 0, in px", check_floating("disparity", disparity), lambda d: d >= 0)
+    return _quotient(product, disparity.to(field_dtype(disparity.dtype)))
+
+
+def depth_from_normalized(value: Tensor, *, near: float, far: float) -> Tensor:
+    """Depth of a map in which 0 is near, 1 is far and all between is linear in depth.
+
+        z = near + value (far - near)
+
+    Args:
+        value: in [0, 1], of any shape.
+        near, far: m, 0 <= near < far, both finite.
+
+    Returns:
+        As the value, m, float32, or float64 for such a value.
+
+    Raises:
+        ValueError: a value outside [0, 1] or NaN (on the CPU); a near or far out of range.
+        TypeError: a value that is no floating tensor.
+    """
+    near, far = check_number("near", near, low=0.0), check_number("far", far)
+    return near + _unit(value, near, far) * (far - near)
+
+
+def depth_from_inverse(value: Tensor, *, near: float, far: float) -> Tensor:
+    """Depth of a map in which 1 is near, 0 is far and all between is linear in inverse depth.
+
+        z = 1 / (value / near + (1 - value) / far),  inf where that would be above 1e12 m
+
+    Monocular networks such as MiDaS give such maps, once they are scaled to [0, 1].
+
+    Args:
+        value: in [0, 1], of any shape.
+        near, far: m, 0 < near < far; far may be inf.
+
+    Returns:
+        As the value, m, float32, or float64 for such a value.
+
+    Raises:
+        ValueError: a value outside [0, 1] or NaN (on the CPU); a near or far out of range.
+        TypeError: a value that is no floating tensor.
+
+    Source: Ranftl et al., "Towards Robust Monocular Depth Estimation", IEEE TPAMI 44 (2022).
+    """
+    near, far = check_positive("near", near), check_number("far", far, low=0.0, high=math.inf)
+    value = _unit(value, near, far)
+    return _quotient(1.0, value / near + (1 - value) / far)
+
+
+def check_depth(depth: Tensor, *, name: str = "depth") -> None:
+    """Raise for a depth that is not in meters, where looking costs no wait for a device.
+
+    Each sample, or clip, is judged by itself. Refused are what is negative or NaN, what looks normalized (all that is
+    finite lies in [0, 1], and is not the same everywhere), and what looks like disparity or inverse depth: nothing is
+    inf, a tenth of the upper half is at most 2 % of the largest value, and the median of the lowest quarter is at least
+    20 % of it. Frames of a few pixels are not judged by the latter.
+
+    Args:
+        depth: (B, 1, H, W) or (B, T, 1, H, W), m, inf for the sky.
+        name: of the argument, for the message.
+
+    Raises:
+        ValueError: a depth that is none.
+    """
+    lowest = read(lambda: depth.detach().amin()) if depth.numel() else None
+    if lowest is None:
+        return
+    if not lowest >= 0:  # NaN is not either
+        check_all(name, "be at least 0, in m", depth, lambda v: v >= 0)
+    for sample in depth.detach():
+        seen = _sampled(sample)
+        if _in_unit_range(seen) and (ends := _in_unit_range(sample)):
+            raise ValueError(
+                f"{name} must be in m, not normalized (see depth_from_normalized and depth_from_inverse), "
+                f"got values in [{ends[0]:g}, {ends[1]:g}]"
+            )
+        _refuse_inverse(name, seen.double())
+
+
+def check_floating(name: str, value: Tensor) -> Tensor:
+    if not check_tensor(name, value).is_floating_point():
+        raise TypeError(f"{name} must be of a floating type, got {value.dtype}")
+    return value
+
+
+def _check_rows(name: str, depth: Tensor, width: int | None) -> None:
+    if check_floating(name, depth).ndim != 4 or depth.shape[1] != 1:
+        raise ValueError(f"{name} must have shape (B, 1, H, W) or (B, 1, H, 1), got {tuple(depth.shape)}")
+    if width is not None and depth.shape[3] not in (1, width):
+        raise ValueError(f"{name} must be 1 or {width} px wide, as the frame, got {tuple(depth.shape)}")
+
+
+def _focal(name: str, value: float | Tensor, like: Tensor) -> float | Tensor:
+    if isinstance(value, Tensor):
+        check_all(name, "be above 0, in px", value, lambda f: f > 0)
+        return _intrinsic(name, value, like)
+    return check_positive(name, value)
+
+
+def _intrinsic(name: str, value: float | Tensor, like: Tensor) -> float | Tensor:
+    """A number, or a column (B, 1, 1, 1) of the type of `like`."""
+    if not isinstance(value, Tensor):
+        return check_number(name, value)
+    if value.ndim > 1 or (like.shape[0] != 1 and value.numel() not in (1, like.shape[0])):
+        raise ValueError(f"{name} must be a number or have shape ({like.shape[0]},), got {tuple(value.shape)}")
+    check_all(name, "be finite", value, torch.isfinite)
+    return value.to(like.dtype).view(-1, 1, 1, 1)
+
+
+def _quotient(numerator: float, denominator: Tensor) -> Tensor:
+    """numerator / denominator, inf beyond the farthest; its gradient is finite everywhere."""
+    near = denominator > numerator / _FARTHEST
+    return torch.where(near, numerator / torch.where(near, denominator, 1), torch.inf)
+
+
+def _unit(value: Tensor, near: float, far: float) -> Tensor:
+    if not near < far:
+        raise ValueError(f"far must be above near = {near:g}, got {far:g}")
+    check_all("value", "be in [0, 1]", check_floating("value", value), lambda v: (v >= 0) & (v <= 1))
+    return value.to(field_dtype(value.dtype))
+
+
+def _sampled(sample: Tensor) -> Tensor:
+    """(T, h, w): some rows and columns, about _LOOKED_AT values in all."""
+    height, width = sample.shape[-2:]
+    side = max(16, math.isqrt(_LOOKED_AT // sample.shape[:-2].numel()))
+    return sample[..., :: -(-height // side), :: -(-width // side)].flatten(0, -3).contiguous()
+
+
+def _in_unit_range(values: Tensor) -> tuple[float, float] | None:
+    """The ends of what is finite, if they lie in [0, 1] and differ."""
+    low = values.amin().item()
+    if low >= 1:
+        return None
+    high = torch.where(values.isinf(), low, values).amax().item()
+    return (low, high) if low < high <= 1 else None
+
+
+def _refuse_inverse(name: str, seen: Tensor) -> None:
+    top, bottom = seen[:, : seen.shape[1] // 2], seen[:, -max(1, seen.shape[1] // 4) :]
+    largest = seen.amax().item()
+    if top.numel() < _ENOUGH or largest == math.inf:
+        return
+    share, median = (top <= 0.02 * largest).double().mean().item(), bottom.median().item()
+    if share >= 0.1 and 0 < 0.2 * largest <= median:
+        raise ValueError(
+            f"{name} must be in m, not disparity or inverse depth, where 0 is far (see depth_from_disparity and "
+            f"depth_from_inverse), got {share:.0%} of the upper half near 0 over a median of {median:g} at the bottom"
+        )

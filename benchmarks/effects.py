@@ -26,7 +26,18 @@ from timing import (
 )
 from torch import Tensor
 
-from torchrefract import DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, UniformFog
+from torchrefract import (
+    DivergenceFree,
+    GroundPlaneDepth,
+    HeterogeneousFog,
+    LensDistortion,
+    LensFlare,
+    ThinPlateSpline,
+    Turbulence,
+    UniformFog,
+)
+from torchrefract.draws import noise_key, stream
+from torchrefract.fields.perlin import octave, perlin_noise
 
 WHAT = (
     "Whole effects through the public API, with a new draw in every call: effect(image) without gradients; 'all maps' "
@@ -35,9 +46,11 @@ WHAT = (
     "'radial' is a lens without decentring, which needs no Newton steps in the plane. On the CPU the bare grid_sample "
     "threads over the batch alone; the effects use all threads on one frame too."
 )
-LENS, RADIAL, FOG = "LensDistortion", "LensDistortion radial", "UniformFog"
+LENS, RADIAL, FOG, FLARE = "LensDistortion", "LensDistortion radial", "UniformFog", "LensFlare"
+PERLIN, DRIFTS, SPACE = "Perlin noise, 6 octaves", "HeterogeneousFog", "HeterogeneousFog in space"
 TURBULENCE, SPLINE, SWIRL = "Turbulence, length 20 px", "ThinPlateSpline, 16 points", "DivergenceFree, length 20 px"
-LIMITS = {LENS: 20.0, FOG: 0.25, TURBULENCE: 10.0, SPLINE: 20.0, SWIRL: 10.0}  # multiples of the bare grid_sample
+# Multiples of the bare grid_sample.
+LIMITS = {LENS: 20.0, TURBULENCE: 10.0, SPLINE: 20.0, SWIRL: 10.0, FOG: 0.15, FLARE: 0.25, DRIFTS: 1.8, PERLIN: 1.5}
 BARS = "bars, set for 1x3x1080x1920 float32 on 2 threads:"
 
 
@@ -68,9 +81,16 @@ def candidates(frame: Tensor) -> dict[str, Candidate]:
         TURBULENCE: Turbulence(length_range=(20.0, 20.0)),
         SPLINE: ThinPlateSpline(),
         SWIRL: DivergenceFree(length_range=(20.0, 20.0)),
+        FLARE: LensFlare(),
+        DRIFTS: HeterogeneousFog(),
+        SPACE: HeterogeneousFog(mode="ray", depth=GroundPlaneDepth()),
     }
     for name, effect in {LENS: lens, RADIAL: radial, FOG: fog, **others}.items():
         found[name] = lambda effect=effect: effect(frame)
+    depth = torch.linspace(1, 200, frame.shape[3], device=frame.device).expand(len(frame), 1, frame.shape[2], -1)
+    for name, effect in ((FOG, fog), (DRIFTS, others[DRIFTS]), (SPACE, others[SPACE])):
+        found[f"{name}, with a depth map"] = lambda effect=effect: effect.degrade(frame, depth=depth)
+    found[PERLIN] = lambda: _perlin(frame)
     found[f"{LENS}, all maps"] = lambda: _all_maps(lens, frame)
     for name, effect in ((LENS, lens), (RADIAL, radial), (FOG, fog)):
         found[f"{name}, to params, forward"] = lambda effect=effect: _forward(effect, frame)
@@ -82,6 +102,28 @@ def bars(timings: Sequence[Timing]) -> list[Bar]:
     """The limits, beside what was measured."""
     ratios = {timing.name: timing.ratios[GRID_SAMPLE].median for timing in timings}
     return [Bar(name, ratios[name], "<=", limit, f"x {GRID_SAMPLE}") for name, limit in LIMITS.items()]
+
+
+def _perlin(frame: Tensor) -> Tensor:
+    """The noise of the paper's fog, lattices and all."""
+    batch, _, height, width = frame.shape
+    key, fog = noise_key(stream(0, range(batch))).to(frame.device), HeterogeneousFog()
+    zero = frame.new_zeros(batch)
+    octaves = [
+        octave(
+            key,
+            i,
+            period=scale * width / fog.reference_width,
+            height=height,
+            width=width,
+            frame=zero,
+            wind=torch.stack([zero, zero], dim=1),
+            decorrelation=zero + 1,
+            dtype=frame.dtype,
+        )
+        for i, scale in enumerate(fog.scales)
+    ]
+    return perlin_noise(octaves, frame.new_tensor(fog.weights).expand(batch, -1))
 
 
 def _all_maps(lens: LensDistortion, frame: Tensor) -> tuple[Tensor | None, ...]:

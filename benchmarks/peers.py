@@ -1,4 +1,4 @@
-"""What warps and fog cost here and at the peers, as multiples of one bare F.grid_sample on the same frame.
+"""What warps and weather cost here and at the peers, as multiples of one bare F.grid_sample on the same frame.
 
 python benchmarks/peers.py [--size 1080x1920] [--threads 2] [--repeats 15] [--real PATH]
                            [--out benchmarks/results/peers.json]
@@ -33,7 +33,16 @@ from timing import (
 from torch import Tensor
 from torch.utils import benchmark
 
-from torchrefract import DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, UniformFog, warp
+from torchrefract import (
+    DivergenceFree,
+    HeterogeneousFog,
+    LensDistortion,
+    LensFlare,
+    ThinPlateSpline,
+    Turbulence,
+    UniformFog,
+    warp,
+)
 from torchrefract.fields.lens import lens_restore_flow
 
 WHAT = (
@@ -50,6 +59,8 @@ WHAT = (
     "Spline: a thin plate through 16 points displaced by about 5 px; kornia's RandomThinPlateSpline has 5 points, so "
     "its functions stand beside it with 16. "
     "Fog: ours by depth; RandomFog paints some hundred translucent circles and blurs the frame. "
+    "Drifts: ours change the extinction of fog by depth; the peers' plasma brightens the frame by a fractal. "
+    "Flare: ours is a Gaussian veil; RandomSunFlare paints circles. "
     "By their own documentation albumentations moves masks, boxes and keypoints with its three warps; torchvision "
     "moves boxes by the negated displacement, which it calls an approximation; kornia's elastic and spline "
     "augmentations have no transform matrix and no inverse. "
@@ -65,9 +76,15 @@ INSTALL = {
         "pydantic-core typing-inspection annotated-types, with FOLDER on PYTHONPATH"
     ),
 }
-JOBS = ("lens", "field", "spline", "fog")
+JOBS = ("lens", "field", "spline", "fog", "drifts", "flare")
 # Half a second to several seconds a call: few rounds, or the run takes more than five minutes.
-SLOW = ("field: torchvision ElasticTransform", "spline: kornia warp_image_tps", "fog: albumentations RandomFog")
+SLOW = (
+    "field: torchvision ElasticTransform",
+    "spline: kornia warp_image_tps",
+    "fog: albumentations RandomFog",
+    "drifts: kornia RandomPlasmaBrightness",
+    "drifts: albumentations PlasmaBrightnessContrast",
+)
 LOOKS = 3
 
 LENGTH_PX = 20.0
@@ -185,6 +202,9 @@ def _ours(frame: Tensor) -> dict[str, Candidate]:
         "field: ours DivergenceFree": DivergenceFree(amplitude_range=field, length_range=length),
         "spline: ours ThinPlateSpline": ThinPlateSpline(amplitude_range=(SPLINE_PX, SPLINE_PX)),
         "fog: ours UniformFog": UniformFog(),
+        "drifts: ours HeterogeneousFog": HeterogeneousFog(),
+        "drifts: ours HeterogeneousFog, in space": HeterogeneousFog(mode="ray"),
+        "flare: ours LensFlare": LensFlare(),
     }
     found: dict[str, Candidate] = {name: lambda effect=effect: effect(frame) for name, effect in effects.items()}
     height, width = frame.shape[2:]
@@ -210,6 +230,7 @@ def _kornia(frame: Tensor) -> dict[str, Candidate]:
     strength = tuple((FIELD_PX / _BLURRED * to_sampler).tolist())
     side = torch.linspace(-1, 1, 4)
     points = torch.cartesian_prod(side, side)[None]
+    plasma = augmentation.RandomPlasmaBrightness(p=1.0)
     five = augmentation.RandomThinPlateSpline(scale=math.sqrt(3) * SPLINE_PX * 2 / width, p=1.0)
 
     def elastic() -> Tensor:
@@ -226,6 +247,7 @@ def _kornia(frame: Tensor) -> dict[str, Candidate]:
         "field: kornia elastic_transform2d": elastic,
         "spline: kornia RandomThinPlateSpline, 5 points": lambda: five(frame),
         "spline: kornia warp_image_tps": sixteen,
+        "drifts: kornia RandomPlasmaBrightness": lambda: plasma(frame),
     }
 
 
@@ -249,6 +271,8 @@ def _albumentations(package: Any, pixels: Any) -> dict[str, Candidate]:
             scale_range=(share, share), num_control_points=4, p=1.0
         ),
         "fog: albumentations RandomFog": package.RandomFog(p=1.0),
+        "drifts: albumentations PlasmaBrightnessContrast": package.PlasmaBrightnessContrast(p=1.0),
+        "flare: albumentations RandomSunFlare": package.RandomSunFlare(p=1.0),
     }
     return {name: lambda chosen=chosen: chosen(image=pixels)["image"] for name, chosen in transforms.items()}
 

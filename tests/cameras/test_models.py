@@ -71,3 +71,25 @@ def test_what_is_no_camera_raises(options, error, rule):
 def test_what_is_no_camera_matrix_raises(matrix, rule):
     with pytest.raises(ValueError, match=rule):
         Camera.from_opencv(matrix, [0.0] * 4, width=64, height=36)
+
+
+@pytest.mark.parametrize("size", [(640, 360), (1920, 1080), (1280, 720), (427, 240)])
+def test_a_resized_camera_sees_the_same_rays_through_the_same_places_of_the_frame(size):
+    camera = Camera(width=1280, height=720, fx=1161.0, fy=1157.0, cx=676.0, cy=388.3, coefficients=(0.1, 0, 0, 0))
+    width, height = size
+    other = camera.resized(width=width, height=height)
+    assert (other.width, other.height, other.coefficients) == (width, height, camera.coefficients)
+    for share in (0.0, 0.3, 1.0):  # of the frame, from its left edge and from its middle down
+        u, v = share * 1280 - 0.5, (719 + share * 500) / 2
+        x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+        u, v = share * width - 0.5, (height - 1 + share * 500 * width / 1280) / 2
+        assert (u - other.cx) / other.fx == pytest.approx(x, abs=1e-12)
+        assert (v - other.cy) / other.fy == pytest.approx(y, abs=1e-12)
+
+
+def test_a_camera_is_not_stretched():
+    camera = Camera(width=1280, height=720, fx=1161.0, fy=1157.0, cx=676.0, cy=388.3, coefficients=(0.1, 0, 0, 0))
+    with pytest.raises(
+        ValueError, match="image must have the shape of the camera's frames, 1280 x 720 px, got 640 x 480"
+    ):
+        camera.resized(width=640, height=480)

@@ -5,6 +5,7 @@ import math
 import pickle
 import random
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from torchrefract import (
     Compose,
     Degraded,
     DivergenceFree,
+    HeterogeneousFog,
     LensDistortion,
     LensFlare,
     OneOf,
@@ -35,6 +37,7 @@ DTYPES = [torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float
 MAPS = ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission", "extinction", "intensity")
 NO_RANGE = (0.0, 0.0)
 MOTION = ("wind", "decorrelation", "frame")
+DRIFTS = ("visibility", "deviation", "airlight", "weights", "contrast", *MOTION)
 ENDLESS = {"visibility", "decorrelation"}  # clear air, and a field that only drifts
 
 
@@ -104,6 +107,20 @@ EFFECTS = {
         alive="strength",
         fields=("center", "radius", "strength", "color", "drift", "frame"),
     ),
+    "drifts": Case(
+        HeterogeneousFog,
+        strongest={"visibility_range": (20.0, 60.0), "deviation_range": (-0.5, 0.5), "airlight": (0.9, 0.7, 0.8)},
+        still={"visibility_range": (math.inf, math.inf)},
+        alive=None,
+        fields=DRIFTS,
+    ),
+    "drifts in space": Case(
+        partial(HeterogeneousFog, mode="ray"),
+        strongest={"visibility_range": (20.0, 60.0), "wind_z_range": (-1.0, 0.0), "airlight": (0.9, 0.7, 0.8)},
+        still={"visibility_range": (math.inf, math.inf)},
+        alive=None,
+        fields=DRIFTS,
+    ),
     "fog": Case(
         UniformFog,
         strongest={"visibility_range": (20.0, 60.0), "deviation_range": (-0.5, 0.5), "airlight": (0.9, 0.7, 0.8)},
@@ -151,7 +168,7 @@ def test_every_effect_of_the_package_is_held_to_the_contract():
     kinds = {kind for kind in vars(torchrefract).values() if isinstance(kind, type) and issubclass(kind, Effect)}
     # Compositions and what draws nothing have tests of their own.
     others = {Compose, OneOf, Rectification}
-    assert kinds - others == {case.make for case in EFFECTS.values()}
+    assert kinds - others == {getattr(case.make, "func", case.make) for case in EFFECTS.values()}
 
 
 def test_a_sample_does_not_depend_on_the_batch_around_it(case):
@@ -442,6 +459,17 @@ def test_params_change_type_together_but_for_their_flags(case):
     assert {value.device.type for value in params.to("meta")} == {"meta"}
 
 
+def test_params_of_a_smaller_type_are_still_those_of_the_draw(case):
+    image = picture(3, 3, 8, 9, dtype=torch.float64)
+    params = case.strong(p=0.5).sample(image, seed=7)
+    for name, value in params.to(torch.float32)._asdict().items():
+        exact = getattr(params, name)
+        if exact.is_floating_point():
+            assert_close(value.double(), exact, rtol=1e-6, atol=0)
+        else:
+            assert torch.equal(value, exact), name
+
+
 def test_gradients_of_params_and_image_are_those_of_finite_differences(case):
     effect = case.strong()
     image = picture(2, 3, 4, 6, dtype=torch.float64)
@@ -636,6 +664,6 @@ def test_the_state_of_a_model_is_saved_and_loaded(case):
 
 def test_an_effect_shows_its_arguments(case):
     text = repr(case.strong(p=0.25))
-    assert text.startswith(f"{case.make.__name__}(")  # pyright: ignore[reportFunctionMemberAccess]
+    assert text.startswith(f"{type(case.strong()).__name__}(")
     for name in (*case.strongest, "p=0.25"):
         assert name in text

@@ -8,7 +8,7 @@ from scipy import stats
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import FogParams, LinearDepth, UniformFog
+from torchrefract import Camera, FogParams, LinearDepth, UniformFog
 
 PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)
 
@@ -240,3 +240,31 @@ def test_gradients_are_those_of_finite_differences(linear_light):
 
     inputs = [image, depth, params.visibility, params.deviation, params.airlight]
     assert torch.autograd.gradcheck(fogged, [value.clone().requires_grad_() for value in inputs])
+
+
+def test_a_blend_of_radiance_has_the_same_bits_in_every_batch_and_on_every_thread(on_threads):
+    image, effect = picture(5, 3, 131, 119).float(), UniformFog(linear_light=True)
+    together = effect.degrade(image, seed=7).image
+    for threads in (1, 2, 3):
+        on_threads(threads)
+        assert torch.equal(effect.degrade(image, seed=7).image, together)
+        for i in range(5):
+            assert torch.equal(effect.degrade(image[i : i + 1], seed=7, keys=[i]).image, together[i : i + 1])
+
+
+@pytest.mark.parametrize("size", [(36, 64), (72, 128)])
+def test_a_known_camera_turns_depth_into_the_distance_along_each_ray(size):
+    camera = Camera(width=128, height=72, fx=90.0, fy=110.0, cx=50.0, cy=40.0, coefficients=(0.0,) * 4)
+    image, depth = picture(2, 3, *size), 5 + 80 * picture(2, 1, *size)
+    d = UniformFog(camera=camera).degrade(image, seed=7, depth=depth)
+    scale = size[1] / 128
+    y, x = np.mgrid[: size[0], : size[1]]
+    x = (x - ((50 + 0.5) * scale - 0.5)) / (90 * scale)
+    y = (y - ((40 + 0.5) * scale - 0.5)) / (110 * scale)
+    distance = depth * torch.from_numpy(np.sqrt(1 + x * x + y * y))
+    k = -math.log(0.05) / 100 * (1 + d.params.deviation)[:, None, None, None]
+    assert_close(d.transmission, torch.exp(-k * distance), rtol=0, atol=1e-12)
+    assert_close(d.extinction, k.expand_as(depth), rtol=0, atol=1e-15)
+    rows = UniformFog(camera=camera, depth=LinearDepth(max_depth=90.0)).degrade(image, seed=7).transmission
+    ramp = torch.tensor([(1 - (i + 0.5) / size[0]) * 90 for i in range(size[0])], dtype=torch.float64)[:, None]
+    assert_close(rows, torch.exp(-k * ramp * torch.from_numpy(np.sqrt(1 + x * x + y * y))), rtol=0, atol=1e-12)

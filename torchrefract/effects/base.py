@@ -130,7 +130,13 @@ class Effect(nn.Module, ABC):
         layout = check_image(image)
         rows = enter(image)
         _check_frames(params, layout)
-        result = self.compute(rows, params, None if depth is None else check_depth_fits(depth, image, layout))
+        fitting = None if depth is None else check_depth_fits(depth, image, layout)
+        if torch.is_autocast_enabled(image.device.type):
+            # Fields are never half, and matrix products would be.
+            with torch.autocast(image.device.type, enabled=False):
+                result = self.compute(rows, params, fitting)
+        else:
+            result = self.compute(rows, params, fitting)
         result.image = leave(result.image, image, untouched=result.image is rows)
         return result if image.ndim == 4 and not layout.is_clip else result.map(layout.unrolled)
 
@@ -180,6 +186,8 @@ def _keys(keys: Tensor | Sequence[int] | None, batch: int, device: torch.device)
 
 def _samples(image: Tensor, layout: Layout) -> Tensor:
     """(B, C, H, W): the first frame of each sample."""
+    if not layout.is_clip:
+        return image if image.ndim == 4 else image[None]
     return image.reshape(layout.batch, layout.frames, *image.shape[-3:])[:, 0]
 
 
@@ -205,8 +213,12 @@ def _check_frames(params: Any, layout: Layout) -> None:
 
 
 def params_to(params: Any, *args: Any, **kwargs: Any) -> Any:
-    """The parameters with each tensor moved as by `Tensor.to`; a change of type leaves flags as they are."""
-    floating = [value.to(*args, **kwargs) for value in params]
-    return type(params)(
-        *(new.to(old.dtype) if not old.is_floating_point() else new for old, new in zip(params, floating, strict=True))
-    )
+    """The parameters with each tensor moved as by `Tensor.to`; flags and keys keep their type, and so their bits."""
+    return type(params)(*(moved(value, *args, **kwargs) for value in params))
+
+
+def moved(value: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+    """The tensor moved as by `Tensor.to`; what is not floating keeps its type."""
+    floating = value if value.is_floating_point() else torch.empty(0, device=value.device)
+    target = floating.to(*args, **kwargs)
+    return target if value.is_floating_point() else value.to(target.device)

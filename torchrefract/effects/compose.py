@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from torchrefract import draws
 from torchrefract._checks import check_choice, check_number
-from torchrefract.effects.base import Effect
+from torchrefract.effects.base import Effect, moved
 from torchrefract.effects.refraction import WarpEffect
 from torchrefract.effects.walk import Walk
 from torchrefract.types import Degraded
@@ -23,8 +23,9 @@ class ComposeParams(NamedTuple):
 
     def to(self, *args: Any, **kwargs: Any) -> "ComposeParams":
         """All tensors moved as by `Tensor.to`; a change of type leaves flags as they are."""
-        gate = self.gate.to(*args, **kwargs).to(self.gate.dtype)
-        return ComposeParams(gate, tuple(child.to(*args, **kwargs) for child in self.children))
+        return ComposeParams(
+            moved(self.gate, *args, **kwargs), tuple(child.to(*args, **kwargs) for child in self.children)
+        )
 
 
 class Compose(Effect):

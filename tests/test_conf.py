@@ -99,8 +99,8 @@ def test_a_scene_is_the_preset_of_its_name(scene):
     made = instantiate(OmegaConf.load(CONF / "scene" / f"{scene}.yaml"))
     expected = getattr(presets, scene)()
     assert isinstance(made, Effect)
-    assert (type(made), made.extra_repr()) == (type(expected), expected.extra_repr())
-    assert "range=(" in made.extra_repr()
+    assert (type(made), repr(made)) == (type(expected), repr(expected))
+    assert "range=(" in repr(made)
 
 
 def test_every_preset_has_a_scene():

@@ -14,6 +14,7 @@ from torchrefract.effects.depth import DepthProvider, GroundPlaneDepth, LinearDe
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams
 from torchrefract.effects.flare import FlareParams, LensFlare
 from torchrefract.effects.fog import FogParams, UniformFog
+from torchrefract.effects.heterogeneous_fog import HeterogeneousFog, HeterogeneousFogParams
 from torchrefract.effects.lens import LensDistortion, LensParams
 from torchrefract.effects.rectification import Rectification, RectificationParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
@@ -48,6 +49,8 @@ __all__ = [
     "Folding",
     "Frame",
     "GroundPlaneDepth",
+    "HeterogeneousFog",
+    "HeterogeneousFogParams",
     "LensDistortion",
     "LensFlare",
     "LensParams",

@@ -22,6 +22,8 @@ EFFECTS: dict[str, Effect] = {
     "divergence-free": tr.DivergenceFree(**AIR, **FAST, steps=2),
     "flare": tr.LensFlare(drift_x_range=(0.01, 0.02)),
     "fog": tr.UniformFog(),
+    "drifts": tr.HeterogeneousFog(wind_x_range=(5.0, 9.0), decorrelation_range=(2.0, 4.0)),
+    "drifts in space": tr.HeterogeneousFog(mode="ray", wind_z_range=(-2.0, -1.0), decorrelation_range=(2.0, 4.0)),
 }
 EFFECTS["compose"] = tr.Compose(list(EFFECTS.values()))
 EFFECTS["one of"] = tr.OneOf(list(EFFECTS.values()))

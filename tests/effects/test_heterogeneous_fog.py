@@ -1,0 +1,307 @@
+import math
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchrefract import Camera, GroundPlaneDepth, HeterogeneousFog, LinearDepth, UniformFog, remove_fog
+from torchrefract.data.road_scenes import render_road_scenes
+from torchrefract.fields.perlin import octave, perlin_noise
+
+SIZE = (36, 64)
+PAPER = {"scales": (4, 8, 16, 32, 64, 128), "weights": (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)}
+
+
+def picture(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
+
+
+def rows_of_the_paper(height: int) -> Tensor:
+    return torch.tensor([(1 - (y + 0.5) / height) * 160.0 for y in range(height)], dtype=torch.float64)[:, None]
+
+
+def mean_extinction(params: Any) -> Tensor:
+    return -math.log(0.05) / params.visibility * (1 + params.deviation)
+
+
+# --- the paper's mode
+
+
+@pytest.mark.parametrize(("unit", "width"), [("px", 1920.0), ("px", 64.0), ("cells", 1920.0)])
+def test_the_maps_and_the_image_are_what_the_formulas_say(unit, width, oracle):
+    effect = HeterogeneousFog(scale_unit=unit, reference_width=width, visibility_range=(50.0, 150.0))
+    image = picture(3, 3, *SIZE)
+    d = effect.degrade(image, seed=4)
+    periods = [SIZE[1] / s if unit == "cells" else s * SIZE[1] / width for s in PAPER["scales"]]
+    still = {"frame": torch.zeros(3), "wind": torch.zeros(3, 2), "decorrelation": torch.full((3,), math.inf)}
+    mixed = torch.zeros(3, 1, *SIZE, dtype=torch.float64)
+    for i, (period, weight) in enumerate(zip(periods, PAPER["weights"], strict=True)):
+        options = {"period": period, "height": SIZE[0], "width": SIZE[1], "dtype": torch.float64}
+        noise = perlin_noise([octave(d.params.key, i, **options, **still)], torch.ones(3, 1, dtype=torch.float64))
+        mixed += weight * (noise / math.sqrt(0.5) + 1) / 2
+    mixed /= sum(PAPER["weights"])
+    k = mean_extinction(d.params)[:, None, None, None] * mixed / mixed.mean(dim=(2, 3), keepdim=True)
+    t = torch.exp(-k * rows_of_the_paper(SIZE[0]))
+    airlight = torch.tensor([220, 220, 235], dtype=torch.float64)[:, None, None] / 255
+    oracle("heterogeneous fog, k-map in 1/m", d.extinction, k, 1e-12, unit="")
+    oracle("heterogeneous fog, transmission", d.transmission, t, 1e-12, unit="")
+    oracle("heterogeneous fog, image", d.image, image * t + airlight * (1 - t), 1e-12, unit="")
+    assert torch.equal(d.valid, d.transmission >= 1 / 255)
+    single = effect.apply(image.float(), d.params.to(torch.float32))
+    oracle("heterogeneous fog, image in float32", single.image, d.image.float(), 1e-6, unit="")
+    assert d.extinction.std() > 0.05 * d.extinction.mean()
+
+
+@pytest.mark.parametrize("options", [{}, {"mode": "ray"}, {"normalize": "image"}])
+def test_the_mean_extinction_is_that_of_the_visibility(options):
+    effect = HeterogeneousFog(visibility_range=(40.0, 200.0), deviation_range=(-0.3, 0.3), **options)
+    d = effect.degrade(picture(8, 3, *SIZE), seed=4)
+    assert_close(d.extinction.mean(dim=(1, 2, 3)), mean_extinction(d.params), rtol=1e-9, atol=0)
+    assert (d.extinction.std(dim=(2, 3)) > 0.02 * d.extinction.mean(dim=(2, 3))).all()
+
+
+@pytest.mark.parametrize("options", [{}, {"mode": "ray"}])
+def test_the_mean_of_the_ensemble_is_that_of_the_visibility_over_many_fogs(options):
+    effect = HeterogeneousFog(mean="ensemble", deviation_range=(0.0, 0.0), **options)
+    k = effect.degrade(picture(400, 1, 18, 32), seed=4).extinction
+    expected = -math.log(0.05) / 100
+    assert k.mean().item() == pytest.approx(expected, rel=0.02)
+    assert (k.mean(dim=(1, 2, 3)) - expected).abs().max() > 0.005 * expected
+
+
+def test_cells_across_the_frame_are_periods_of_its_share_of_the_width():
+    image = picture(2, 3, *SIZE)
+    cells = HeterogeneousFog(scale_unit="cells", scales=(4.0, 10.0), weights=(1.0, 2.0)).degrade(image, seed=1)
+    periods = [SIZE[1] / 4, SIZE[1] / 10]
+    px = HeterogeneousFog(scales=periods, weights=(1.0, 2.0), reference_width=SIZE[1]).degrade(image, seed=1)
+    assert_close(cells.image, px.image, rtol=0, atol=1e-12)
+
+
+def test_a_scale_is_the_same_share_of_every_frame():
+    effect = HeterogeneousFog(scales=(160.0,), weights=(1.0,), depth=LinearDepth(max_depth=50.0))
+    large = effect.degrade(torch.zeros(1, 1, 108, 192, dtype=torch.float64), seed=1).extinction
+    small = effect.degrade(torch.zeros(1, 1, 36, 64, dtype=torch.float64), seed=1).extinction
+    assert_close(large[..., 1::3, 1::3], small, rtol=2e-3, atol=0)
+
+
+def test_each_noise_is_stretched_to_its_extremes_in_the_frame():
+    effect = HeterogeneousFog(normalize="image", scales=(400.0,), weights=(3.0,), mean="ensemble")
+    k = effect.degrade(picture(4, 1, *SIZE), seed=1)
+    q = k.extinction / mean_extinction(k.params)[:, None, None, None]
+    assert_close(q.amin(dim=(1, 2, 3)), torch.zeros(4, dtype=torch.float64), rtol=0, atol=1e-12)
+    assert_close(q.amax(dim=(1, 2, 3)), torch.full((4,), 2.0, dtype=torch.float64), rtol=0, atol=1e-12)
+
+
+def test_only_the_ratio_of_the_weights_counts():
+    image = picture(2, 3, *SIZE)
+    one, five = (
+        HeterogeneousFog(scales=(40.0, 90.0, 200.0), weights=[f * w for w in (0.5, 0.0, 0.3)]).degrade(image, seed=1)
+        for f in (1, 5)
+    )
+    assert_close(one.image, five.image, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.37, 1e3, 1e6, 7.31])
+def test_odd_scales_are_finite_and_keep_the_mean(scale):
+    effect = HeterogeneousFog(scales=(scale,), weights=(1.0,), reference_width=SIZE[1])
+    for normalize in ("theory", "image"):
+        effect.normalize = normalize
+        d = effect.degrade(picture(2, 3, *SIZE), seed=1)
+        assert d.image.isfinite().all()
+        assert (d.extinction >= 0).all()
+        assert_close(d.extinction.mean(dim=(1, 2, 3)), mean_extinction(d.params), rtol=1e-9, atol=0)
+
+
+def test_a_fog_of_one_scale_far_larger_than_the_frame_is_uniform():
+    image = picture(2, 3, *SIZE)
+    d = HeterogeneousFog(scales=(1e11,), weights=(1.0,)).degrade(image, seed=1)
+    uniform = UniformFog().apply(image, UniformFog.params_type(*d.params[:4]))
+    assert_close(d.image, uniform.image, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("options", [{}, {"mode": "ray"}, {"normalize": "image"}])
+def test_a_frame_of_one_pixel_has_the_mean_extinction(options):
+    d = HeterogeneousFog(**options).degrade(picture(3, 3, 1, 1), seed=1)
+    assert_close(d.extinction[:, 0, 0, 0], mean_extinction(d.params), rtol=1e-9, atol=0)
+
+
+# --- in space
+
+
+@pytest.mark.parametrize("kind", ["rows", "map", "plane", "camera"])
+def test_a_constant_field_in_space_is_uniform_fog(kind):
+    image, depth = picture(2, 3, *SIZE), 300 * picture(2, 1, *SIZE)
+    depth[0, 0, :10] = math.inf
+    depth[1, 0, 4, 5:9] = 0
+    given = {"depth": depth} if kind in ("map", "camera") else {}
+    options: dict[str, Any] = {"depth": GroundPlaneDepth()} if kind == "plane" else {}
+    if kind == "camera":
+        options["camera"] = Camera(width=1280, height=720, fx=900, fy=950, cx=600, cy=380, coefficients=(0,) * 4)
+    d = HeterogeneousFog(mode="ray", contrast_range=(0.0, 0.0), **options).degrade(image, seed=1, **given)
+    uniform = UniformFog(**options).apply(image, UniformFog.params_type(*d.params[:4]), **given)
+    assert_close(d.image, uniform.image, rtol=0, atol=1e-6)
+    assert_close(d.transmission, uniform.transmission, rtol=0, atol=1e-6)
+
+
+def test_the_visibility_of_fog_in_space_is_kept_over_frames_and_draws():
+    effect = HeterogeneousFog(mode="ray", mean="ensemble", deviation_range=(0.0, 0.0), wind_z_range=(-3.0, -3.0))
+    depth = torch.full((30, 1, 1, *SIZE), 250.0)
+    k = effect.degrade(torch.zeros(30, 4, 1, *SIZE), seed=3, depth=depth, frame=10.0).extinction
+    visibility = -math.log(0.05) / k.mean()
+    assert visibility.item() == pytest.approx(100, rel=0.02)
+
+
+def test_stronger_contrast_in_space_is_more_uneven():
+    spreads = []
+    for contrast in (0.0, 0.3, 0.6, 1.2):
+        effect = HeterogeneousFog(mode="ray", contrast_range=(contrast, contrast))
+        k = effect.degrade(torch.zeros(4, 1, *SIZE, dtype=torch.float64), seed=3).extinction
+        spreads.append((k.std(dim=(1, 2, 3)) / k.mean(dim=(1, 2, 3))).mean().item())
+    assert spreads[0] < 1e-9
+    assert all(later > 1.5 * earlier for earlier, later in pairwise(spreads[1:]))
+    assert spreads[2] > 0.05
+
+
+def layer(effect: HeterogeneousFog, near: float, far: float, frames: int) -> Tensor:
+    """(T, H, W): what the fog between two distances adds to the optical depth, its mean taken out."""
+    clip = torch.zeros(1, frames, 1, 90, 160, dtype=torch.float64)
+    params = effect.sample(clip, seed=5)
+    thickness = []
+    for distance in (near, far):
+        depth = torch.full((1, 1, 1, 90, 160), distance, dtype=torch.float64)
+        thickness.append(effect.apply(clip, params, depth=depth).extinction[0, :, 0] * distance)
+    added = thickness[1] - thickness[0]
+    return added - added.mean(dim=(1, 2), keepdim=True)
+
+
+def drift_px(fields: Tensor) -> float:
+    """px per frame, to the right, by which the first field matches the last best."""
+    first, last = fields[0].numpy(), fields[-1].numpy()
+    shifts = np.arange(0, 60)
+
+    def match(s: int) -> float:
+        a, b = first[:, : first.shape[1] - s].ravel(), last[:, s:].ravel()
+        return float(np.corrcoef(a, b)[0, 1])
+
+    return float(shifts[np.argmax([match(s) for s in shifts])]) / (len(fields) - 1)
+
+
+def test_near_drifts_pass_faster_than_far_ones():
+    still = {"contrast_range": (0.5, 0.5), "decorrelation_range": (math.inf, math.inf), "mean": "ensemble"}
+    effect = HeterogeneousFog(mode="ray", wind_x_range=(0.5, 0.5), **still)
+    # A pinhole of 0.9 widths, 144 px here: 0.5 m per frame are 72 px m / distance.
+    near, far = drift_px(layer(effect, 14.0, 18.0, 9)), drift_px(layer(effect, 110.0, 125.0, 41))
+    assert near == pytest.approx(72 / 16, rel=0.15)
+    assert far == pytest.approx(72 / 117.5, rel=0.15)
+    assert near > 5 * far
+
+
+@pytest.mark.parametrize("mode", ["image", "ray"])
+def test_with_the_true_depth_of_a_scene_near_things_stay_and_far_ones_vanish(mode):
+    image, depth = render_road_scenes(torch.arange(4), 54, 96)
+    d = HeterogeneousFog(mode=mode).degrade(image, seed=1, depth=depth)
+    assert_close(d.transmission, torch.exp(-d.extinction * depth), rtol=1e-5, atol=1e-7)
+    change = (d.image - image).abs().mean(dim=1, keepdim=True)
+    assert change[depth < 6].mean() < 0.1
+    assert (d.image - d.params.airlight[..., None, None]).abs().amax(dim=1, keepdim=True)[depth > 250].max() < 0.02
+    assert d.valid[depth < 50].all()
+    assert not d.valid[depth.isinf()].any()
+
+
+@pytest.mark.parametrize("mode", ["image", "ray"])
+def test_the_fog_is_removed_in_closed_form(mode):
+    image = picture(2, 3, *SIZE)
+    d = HeterogeneousFog(mode=mode, visibility_range=(150.0, 150.0)).degrade(image, seed=1)
+    clean, valid = remove_fog(d.image, d.transmission, d.params.airlight)
+    assert torch.equal(valid, d.valid)
+    assert_close(torch.where(valid, clean, image), image, rtol=0, atol=1e-6)
+
+
+# --- ends of the domain, bad input
+
+
+@pytest.mark.parametrize("mode", ["image", "ray"])
+def test_clear_air_changes_nothing_and_a_wall_of_fog_shows_its_color(mode):
+    image = picture(2, 3, *SIZE)
+    effect = HeterogeneousFog(mode=mode)
+    params = effect.sample(image, seed=1)
+    clear = effect.apply(image, params._replace(visibility=torch.full((2,), math.inf, dtype=torch.float64)))
+    assert torch.equal(clear.image, image)
+    assert (clear.transmission == 1).all()
+    visibility = torch.full((2,), 1e-3, dtype=torch.float64, requires_grad=True)
+    wall = effect.apply(image, params._replace(visibility=visibility))
+    assert torch.equal(wall.image, params.airlight[..., None, None].expand_as(image))
+    assert torch.autograd.grad(wall.image.sum(), visibility)[0].isfinite().all()
+    depth = torch.zeros(2, 1, *SIZE, dtype=torch.float64)
+    assert torch.equal(effect.apply(image, params, depth=depth).image, image)
+    assert not effect.apply(image, params, depth=depth + math.inf).transmission.any()
+
+
+@pytest.mark.parametrize(
+    ("options", "rule"),
+    [
+        ({"mode": "volume"}, "mode must be one of image, ray, got 'volume'"),
+        ({"scales": (4.0, 0.0), "weights": (1.0, 1.0)}, "scales must be above 0, got 0"),
+        ({"scales": (4.0, -2.0), "weights": (1.0, 1.0)}, "scales must be above 0, got -2"),
+        ({"scales": (math.nan,), "weights": (1.0,)}, "scales must not be NaN"),
+        ({"scales": (), "weights": ()}, "scales must be at least one number above 0, got none"),
+        ({"weights": ()}, r"weights must be one number for each of 6 scales, got \(\)"),
+        ({"weights": (1.0,)}, "weights must be one number for each of 6 scales"),
+        ({"scales": (4.0,)}, "weights must be one number for each of 1 scales, got None"),
+        ({"weights": (1.0, 1.0, 1.0, 1.0, 1.0, -0.1)}, "weights must be a number of at least 0, got -0.1"),
+        ({"weights": (0.0,) * 6}, "weights must have a sum above 0"),
+        ({"scale_unit": "m"}, "scale_unit must be one of px, cells, got 'm'"),
+        ({"normalize": "max"}, "normalize must be one of theory, image"),
+        ({"mean": "time"}, "mean must be one of image, ensemble"),
+        ({"contrast_range": (-0.1, 0.2)}, "contrast_range must be"),
+        ({"wind_z_range": (-1.0, 0.0)}, r"wind_z_range must be \(0, 0\) in the image, which has no depth"),
+        ({"decorrelation_range": (0.0, 1.0)}, "decorrelation_range must be"),
+        ({"reach": 0.0}, "reach must be"),
+        ({"visibility_range": (0.0, 1.0)}, "visibility_range must be"),
+    ],
+)
+def test_arguments_out_of_range_raise(options: dict[str, Any], rule: str):
+    with pytest.raises(ValueError, match=rule):
+        HeterogeneousFog(**options)
+
+
+@pytest.mark.parametrize("wrong", [{"depth": 100.0}, {"camera": "dashcam"}, {"linear_light": 1}])
+def test_arguments_of_another_kind_raise(wrong: dict[str, Any]):
+    (name,) = wrong
+    with pytest.raises(TypeError, match=f"{name} must be"):
+        HeterogeneousFog(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "rule"),
+    [
+        ("weights", -0.1, "be at least 0 and finite"),
+        ("contrast", -0.1, "be at least 0 and finite"),
+        ("decorrelation", 0.0, "be above 0"),
+        ("visibility", 0.0, "be above 0"),
+    ],
+)
+def test_params_out_of_range_raise(field, value, rule):
+    image, effect = picture(2, 3, 8, 9), HeterogeneousFog()
+    params = effect.sample(image, seed=1)
+    wrong = getattr(params, field).clone()
+    wrong.view(-1)[-1] = value
+    with pytest.raises(ValueError, match=rf"params\.{field} must {rule}"):
+        effect.apply(image, params._replace(**{field: wrong}))
+    with pytest.raises(ValueError, match=r"params\.weights must have a sum above 0, got 0"):
+        effect.apply(image, params._replace(weights=torch.zeros(2, 6)))
+
+
+@pytest.mark.parametrize("depth", [-1.0, math.nan])
+def test_a_depth_that_is_none_raises(depth):
+    image = picture(1, 3, 8, 9)
+    with pytest.raises(ValueError, match="depth must be at least 0, in m"):
+        HeterogeneousFog().degrade(image, depth=torch.full((1, 1, 8, 9), depth))
+    with pytest.raises(ValueError, match="depth must be in m, not normalized"):
+        HeterogeneousFog().degrade(image, depth=picture(1, 1, 8, 9))
+    with pytest.raises(ValueError, match="depth must have one channel of the size of the image"):
+        HeterogeneousFog().degrade(image, depth=torch.ones(1, 1, 9, 8))

@@ -1,0 +1,285 @@
+"""Fog in drifts and holes."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrefract import draws
+from torchrefract._bands import join
+from torchrefract._checks import check_all, check_choice, check_number, check_positive, check_range
+from torchrefract.cameras.models import Camera
+from torchrefract.effects.air import check_fog_params, make_air
+from torchrefract.effects.base import params_to
+from torchrefract.effects.depth import DepthProvider
+from torchrefract.effects.fog import check_visibility, drawn_visibility, visibility_span
+from torchrefract.effects.motion import check_decorrelation, check_motion, check_wind, drawn_motion, motion_ranges
+from torchrefract.effects.radiance import RadianceEffect, Shaded
+from torchrefract.effects.random_field import check_key
+from torchrefract.effects.rows import bands, column, frame_mean, spread
+from torchrefract.fields.fog import extinction, transmission
+from torchrefract.fields.fog_volume import path_mean
+from torchrefract.fields.perlin import Octave, perlin_mean, perlin_noise
+from torchrefract.fields.perlin import octave as perlin_octave
+from torchrefract.types import Range
+from torchrefract.warping.grid import field_dtype
+
+# The paper's table of scales, with the weights that go with them.
+_PAPER_SCALES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+_PAPER_WEIGHTS = (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)
+# Drifts of fog over a road: most of the variance in those as long as a few cars.
+_ROAD_SCALES = (12.0, 24.0, 48.0, 96.0)
+_ROAD_WEIGHTS = (0.2, 0.3, 0.3, 0.2)
+_FOCAL = 0.9  # widths, where no camera is known
+
+
+class HeterogeneousFogParams(NamedTuple):
+    """The fogs of a batch."""
+
+    gate: Tensor  # (B,), bool: the sample is degraded
+    visibility: Tensor  # (B,), m, above 0, of the mean extinction; inf is clear air
+    deviation: Tensor  # (B,), relative deviation of the mean extinction, above -1
+    airlight: Tensor  # (B, C), in [0, 1], as stored in the image
+    weights: Tensor  # (B, K), of the scales, at least 0 and not all 0
+    contrast: Tensor  # (B,), standard deviation of the logarithm of the extinction in space, 0 or above
+    wind: Tensor  # (B, 3), per frame, to the right, down and ahead: m in space; px of the reference in the image
+    decorrelation: Tensor  # (B,), frames, above 0; inf for fog that only drifts
+    frame: Tensor  # (B, T), number of each frame in its clip
+    key: Tensor  # (B, 4), int64, of the noise
+
+    to = params_to
+
+
+class HeterogeneousFog(RadianceEffect):
+    """Fog whose density changes from place to place.
+
+        I = I_clean t + A (1 - t),  t = exp(-k d),  k = k0 (1 + deviation) q / <q>,  k0 = -ln(threshold) / V
+
+    In the mode "image", the paper's, q is the sum of the weights times Perlin noise at each scale, in the plane of the
+    image: q = sum w_i (n_i / sqrt(1/2) + 1) / 2 / sum w_i. In the mode "ray" q is the mean along the ray of each pixel
+    up to its depth, through a field in space, exp(contrast g), g a sum of noises of unit variance: fog has depth, near
+    drifts pass faster than far ones. <q> is the mean over the frame, so that V is that of the mean extinction, as in
+    `UniformFog`. `transmission` is t, `extinction` is k, `valid` where t >= 1/255.
+
+    Args:
+        mode: "image" or "ray".
+        scales: of the noise, above 0; None is the paper's 4, 8, 16, 32, 64, 128 in the image, 12, 24, 48, 96 in space.
+        weights: one for each scale, 0 or above, not all 0; None are those that go with the scales of None.
+        scale_unit: of the scales in the image, "px" (periods, px of a frame `reference_width` wide) or "cells"
+            (periods across the frame); in space they are in m.
+        reference_width: px, see `scale_unit` and the wind.
+        normalize: of each noise in the image: "theory" maps its bounds +-sqrt(1/2) to [0, 1], "image" its smallest and
+            largest value in the frame, as the paper has it, without a gradient of these.
+        mean: <q> is that over the "image", or over all of the "ensemble": 1/2 in the image; 1 in space, where it is
+            1 % less at a contrast of 1, 11 % at 2.
+        contrast_range: standard deviation of ln q at a point in space, in [0, 2]; 0 is a uniform fog.
+        reach: m, from which on fog in space is uniform.
+        wind_x_range, wind_y_range, wind_z_range: of the drift per frame of a clip, to the right, down and ahead, as
+            seen from the camera: m in space, where a car that goes v m per frame sees -v ahead; px of the reference in
+            the image, which has no z.
+        decorrelation_range: frames, above 0, inf for fog that only drifts; one over it is drawn uniformly.
+        visibility_range, deviation_range, airlight, threshold, depth, camera, linear_light, p: as for `UniformFog`; the
+            rays of space are those of the camera, or of a pinhole of 0.9 widths.
+
+    Raises:
+        ValueError: an argument outside its range; as for `UniformFog`.
+
+    Source: the torchrefract paper; Zdrojewska, "Real time rendering of heterogenous fog based on the graphics hardware
+    acceleration", CESCG 2004; in space, Wronski, "Volumetric fog", SIGGRAPH 2014, for the volume before the camera.
+    """
+
+    def __init__(
+        self,
+        *,
+        mode: str = "image",
+        visibility_range: Range = (100.0, 100.0),
+        deviation_range: Range = (-0.05, 0.05),
+        airlight: float | Sequence[float] | None = None,
+        threshold: float = 0.05,
+        depth: DepthProvider | None = None,
+        camera: Camera | None = None,
+        linear_light: bool = False,
+        scales: Sequence[float] | None = None,
+        weights: Sequence[float] | None = None,
+        scale_unit: str = "px",
+        reference_width: float = 1920.0,
+        normalize: str = "theory",
+        mean: str = "image",
+        contrast_range: Range = (0.5, 0.8),
+        reach: float = 400.0,
+        wind_x_range: Range = (-0.1, 0.1),
+        wind_y_range: Range = (0.0, 0.0),
+        wind_z_range: Range = (0.0, 0.0),
+        decorrelation_range: Range = (60.0, 150.0),
+        p: float = 1.0,
+    ):
+        super().__init__(p=p)
+        self.mode = check_choice("mode", mode, ("image", "ray"))
+        self.visibility_range = check_visibility(visibility_range)
+        self.deviation_range = check_range("deviation_range", deviation_range, low=-0.999, high=0.999)
+        self.air = make_air(
+            airlight=airlight, threshold=threshold, depth=depth, camera=camera, linear_light=linear_light
+        )
+        self.scales, self.weights = _check_scales(scales, weights, mode=mode)
+        self.scale_unit = check_choice("scale_unit", scale_unit, ("px", "cells"))
+        self.reference_width = check_positive("reference_width", reference_width)
+        self.normalize = check_choice("normalize", normalize, ("theory", "image"))
+        self.mean = check_choice("mean", mean, ("image", "ensemble"))
+        self.contrast_range = check_range("contrast_range", contrast_range, low=0.0, high=2.0)
+        self.reach = check_number("reach", reach, low=1.0, high=1e5)
+        self.wind_x_range = check_wind("wind_x_range", wind_x_range)
+        self.wind_y_range = check_wind("wind_y_range", wind_y_range)
+        self.wind_z_range = check_wind("wind_z_range", wind_z_range)
+        if mode == "image" and self.wind_z_range != (0.0, 0.0):
+            raise ValueError(f"wind_z_range must be (0, 0) in the image, which has no depth, got {self.wind_z_range}")
+        self.decorrelation_range = check_decorrelation(decorrelation_range)
+
+    params_type = HeterogeneousFogParams
+
+    def draw(self, source: draws.Stream, image: Tensor) -> HeterogeneousFogParams:
+        """One fog a sample, every number uniform in its range."""
+        winds = (self.wind_x_range, self.wind_y_range, self.wind_z_range)
+        ranges = [visibility_span(self.visibility_range), self.deviation_range, self.contrast_range]
+        ranges += motion_ranges(*winds, decorrelation=self.decorrelation_range)
+        gate, values = self._uniform(source, ranges, image)
+        return HeterogeneousFogParams(
+            gate,
+            drawn_visibility(values[:, 0], self.visibility_range),
+            values[:, 1],
+            self.air.light(image, values.dtype),
+            values.new_tensor(self.weights).repeat(image.shape[0], 1),
+            values[:, 2],
+            **drawn_motion(values[:, 3:]),
+            key=draws.noise_key(source),
+        )
+
+    def check(self, params: HeterogeneousFogParams, image: Tensor) -> None:
+        """Raise for fogs that are none."""
+        check_fog_params(params, image)
+        check_key(params)
+        check_motion(params, axes=3)
+        if params.weights.shape[1:] != (len(self.scales),):
+            raise ValueError(f"params.weights must be (B, {len(self.scales)}), got {tuple(params.weights.shape)}")
+        if params.contrast.ndim != 1:
+            raise ValueError(f"params.contrast must have shape (B,), got {tuple(params.contrast.shape)}")
+        for name in ("weights", "contrast"):
+            value = getattr(params, name)
+            check_all(f"params.{name}", "be at least 0 and finite", value, lambda v: v.isfinite() & (v >= 0))
+        check_all("params.weights", "have a sum above 0", params.weights.sum(dim=1), lambda v: v > 0)
+
+    def acts(self, params: HeterogeneousFogParams) -> Tensor:
+        """The samples whose air is not clear."""
+        return params.visibility != torch.inf
+
+    def shade(self, image: Tensor, params: HeterogeneousFogParams, depth: Tensor | None) -> Shaded:
+        """The rows behind the fog."""
+        rows, _, height, _ = image.shape
+        dtype = field_dtype(image.dtype)
+        distance = self.air.distance(image, depth)
+        mean_k = extinction(params.visibility.to(dtype), self.air.threshold) * (1 + params.deviation.to(dtype))
+        k = self._relative(params, distance, image) * column(spread(mean_k, rows))
+        airlight = params.airlight.to(dtype)
+        distance = spread(distance, rows) if distance.shape[0] > 1 else distance
+
+        def blended(band: Tensor, k_band: Tensor, distance_band: Tensor) -> Tensor:
+            return self.air.blended(band, transmission(distance_band, k_band), airlight)
+
+        def t() -> Tensor:
+            return transmission(distance, k)
+
+        made = join((blended(*band) for band in bands(image, k, distance)), dim=2, length=height)
+        return Shaded(made, valid=lambda: t() >= 1 / 255, transmission=t, extinction=k)
+
+    def _relative(self, params: HeterogeneousFogParams, distance: Tensor, image: Tensor) -> Tensor:
+        """(N, 1, H, W), q / <q>, for as many rows as the image has."""
+        rows, _, height, width = image.shape
+        dtype = field_dtype(image.dtype)
+        names = ("key", "weights", "contrast", "wind", "decorrelation")
+        key, weights, contrast, wind, decorrelation = (spread(getattr(params, name), rows) for name in names)
+        frame, share = params.frame.reshape(-1), weights.to(dtype) / weights.to(dtype).sum(dim=1, keepdim=True)
+        if self.mode == "image":
+            octaves = [
+                perlin_octave(
+                    key,
+                    i,
+                    period=period,
+                    height=height,
+                    width=width,
+                    frame=frame,
+                    wind=wind[:, :2] * (width / self.reference_width),
+                    decorrelation=decorrelation,
+                    dtype=dtype,
+                )
+                for i, period in enumerate(self._periods(width))
+            ]
+            return self._in_image(octaves, share)
+        focal, center = self._pinhole(height, width)
+        q = path_mean(
+            key,
+            spread(distance, rows) if distance.shape[0] > 1 else distance,
+            height=height,
+            width=width,
+            focal=focal,
+            center=center,
+            scales=self.scales,
+            weights=share,
+            contrast=contrast.to(dtype),
+            frame=frame,
+            wind=wind,
+            decorrelation=decorrelation,
+            reach=self.reach,
+            dtype=dtype,
+        )
+        return q / frame_mean(q) if self.mean == "image" else q
+
+    def _in_image(self, octaves: Sequence[Octave], share: Tensor) -> Tensor:
+        """q / <q> of the paper's noise, for weights (N, K) of sum 1."""
+        if self.normalize == "image":
+            parts = [column(w) * _stretched(octave) for octave, w in zip(octaves, share.unbind(1), strict=True)]
+            q = sum(parts[1:], parts[0])
+            return q / frame_mean(q) if self.mean == "image" else 2 * q
+        # q = 1/2 + n / sqrt(2), with the noise n: divided by its mean before it is made, which spares a pass.
+        mean = 0.5 + perlin_mean(octaves, share) / math.sqrt(2) if self.mean == "image" else share.new_full((1,), 0.5)
+        noise = perlin_noise(octaves, share / (math.sqrt(2) * mean[:, None]))
+        offset = column(0.5 / mean)
+        return noise + offset if noise.requires_grad or torch.compiler.is_compiling() else noise.add_(offset)
+
+    def _periods(self, width: int) -> list[float]:
+        """Of the noises, px."""
+        if self.scale_unit == "cells":
+            return [width / scale for scale in self.scales]
+        return [scale * width / self.reference_width for scale in self.scales]
+
+    def _pinhole(self, height: int, width: int) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Focal lengths and principal point, px."""
+        if self.air.camera is None:
+            return (_FOCAL * width, _FOCAL * width), ((width - 1) / 2, (height - 1) / 2)
+        camera = self.air.camera.resized(width=width, height=height)
+        return (camera.fx, camera.fy), (camera.cx, camera.cy)
+
+
+def _check_scales(
+    scales: Sequence[float] | None, weights: Sequence[float] | None, *, mode: str
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    paper = mode == "image"
+    if scales is None:
+        scales = _PAPER_SCALES if paper else _ROAD_SCALES
+        weights = (_PAPER_WEIGHTS if paper else _ROAD_WEIGHTS) if weights is None else weights
+    scales = tuple(check_positive("scales", scale) for scale in scales)
+    if not scales:
+        raise ValueError("scales must be at least one number above 0, got none")
+    if weights is None or len(weights) != len(scales):
+        raise ValueError(f"weights must be one number for each of {len(scales)} scales, got {weights}")
+    weights = tuple(check_number("weights", weight, low=0.0) for weight in weights)
+    if sum(weights) <= 0:
+        raise ValueError(f"weights must have a sum above 0, got {weights}")
+    return scales, weights
+
+
+def _stretched(octave: Octave) -> Tensor:
+    """(N, 1, H, W), the noise from its smallest value in the frame, at 0, to its largest, at 1."""
+    noise = perlin_noise([octave], octave.x.new_ones(octave.x.shape[0], 1))
+    low, high = noise.detach().amin(dim=(2, 3), keepdim=True), noise.detach().amax(dim=(2, 3), keepdim=True)
+    return torch.where(high > low, (noise - low) / torch.where(high > low, high - low, 1), 0.5)

@@ -1,0 +1,257 @@
+"""Perlin's gradient noise in the plane, on lattices that drift and turn from frame to frame."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrefract._bands import join
+from torchrefract._checks import is_true
+from torchrefract.white_noise import lattice
+
+# Multiples of the golden ratio stay away from each other, modulo 1: octaves share no lines of nodes.
+_GOLDEN = (5**0.5 - 1) / 2
+# Pixels that are made of the same nodes: as many rows, and up to so many columns.
+_BAND = 36
+_STRIPE = 128
+
+
+class Octave(NamedTuple):
+    """The part of a lattice that a frame sees, and where its pixels lie in it."""
+
+    gradient: Tensor  # (N, 2, m, n), g_x and g_y at the nodes
+    x: Tensor  # (N, W), float64, of each column of pixels, in cells from the first node, evenly spaced in [0, n - 1]
+    y: Tensor  # (N, H), float64, of each row, in [0, m - 1]
+
+
+def octave(
+    key: Tensor,
+    index: int,
+    *,
+    period: float,
+    height: int,
+    width: int,
+    frame: Tensor,
+    wind: Tensor,
+    decorrelation: Tensor,
+    dtype: torch.dtype,
+) -> Octave:
+    """One octave at one frame of a clip: unit gradients that turn, at nodes that go with the wind.
+
+        g = (cos a, sin a),  a = 2 pi u1 + omega t,  omega = 2 erfinv(2 u2 - 1) / decorrelation
+        x = (column + 1/2 - wind_x t) / period + phase_x - column of the first node,  y likewise
+        phase = frac(key / 2^32 + (index + 1) (sqrt(5) - 1) / 2)
+
+    u1 and u2 are uniform, a hash of the node's place in an endless lattice. omega is normal, so what goes with the wind
+    is correlated with itself after t frames by E cos(omega t) = exp(-(t / decorrelation)^2), and its magnitude stays.
+
+    Args:
+        key: (N, 4), int64, of `noise_key`.
+        index: of the octave; octaves of different indices are independent.
+        period: px, above 0, between two nodes.
+        height, width: of the frame, px.
+        frame: (N,), t.
+        wind: (N, 2), px per frame, to the right and down.
+        decorrelation: (N,), frames, above 0; inf for gradients that stay.
+        dtype: of the gradients.
+
+    Source: Perlin and Neyret, "Flow noise", SIGGRAPH 2001, technical sketches, for the turning.
+    """
+    phase = (2.0**-32 * key[:, :2].double() + (index + 1) * _GOLDEN).frac()
+    origin = (0.5 - wind.double() * frame.double()[:, None]) / period + phase
+    first = origin.detach().floor()
+    places, nodes = [], [torch.full((len(key), 1), index, device=key.device)]
+    for size, place, node in zip((width, height), (origin - first).unbind(1), first.long().unbind(1), strict=True):
+        places.append(place[:, None] + torch.arange(size, dtype=torch.float64, device=key.device) / period)
+        nodes.append(node[:, None] + torch.arange(math.ceil(size / period) + 2, device=key.device))
+    angle = 2 * math.pi * _turns(key, nodes, frame=frame, decorrelation=decorrelation, dtype=dtype)
+    # In memory column by column, as `perlin_noise` looks them up.
+    return Octave(torch.stack([angle.cos(), angle.sin()], dim=1).mT, *places)
+
+
+def perlin_noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
+    """(N, 1, H, W), the sum of the noises of octaves of one frame, each times its weight.
+
+        noise = sum over the 4 nodes around (x, y) of h(p) h(q) (g_x p + g_y q),  (p, q) = (x, y) - node,
+        h(p) = 1 - fade(|p|),  fade(s) = 6 s^5 - 15 s^4 + 10 s^3
+
+    It is 0 at the nodes, with the gradient g, has two continuous derivatives, and is at most sqrt(1/2).
+
+    Args:
+        octaves: at least one.
+        weights: (N, octaves).
+
+    Source: Perlin, "Improving noise", SIGGRAPH 2002.
+    """
+    with torch.autocast(weights.device.type, enabled=False):  # it would round the products of matrices
+        return _by_sample(_noise, octaves, weights).unsqueeze(1)
+
+
+def perlin_mean(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
+    """(N,), the mean of `perlin_noise` over the frame, from the nodes alone, to round-off."""
+    return _by_sample(_mean, octaves, weights)
+
+
+class _Beside(NamedTuple):
+    """The two nodes beside each pixel along an axis."""
+
+    node: Tensor  # (N, octaves, 2, pixels)
+    weight: Tensor  # (N, 2, octaves, 2, pixels), h and h p
+
+
+class _Blocks(NamedTuple):
+    """Blocks of pixels along an axis, and S nodes that suffice for all in one, octave by octave."""
+
+    node: Tensor  # (N, blocks, S)
+    weight: Tensor  # (N, 2, blocks, S, size), h and h p
+    counts: list[int]  # how many of the S nodes are those of each octave
+
+
+def _turns(key: Tensor, nodes: Sequence[Tensor], *, frame: Tensor, decorrelation: Tensor, dtype: torch.dtype) -> Tensor:
+    """(N, n, m), the angles of the gradients over 2 pi."""
+    if not _has_slope(frame, decorrelation) and is_true((frame / decorrelation == 0).all):
+        return lattice(key, nodes, 1)[:, 0, 0].to(dtype)
+    start, speed = lattice(key, nodes, 2)[:, :, 0].unbind(1)
+    elapsed = (frame.double() / (math.pi * decorrelation.double()))[:, None, None]
+    # Whole turns are dropped before the type gets narrow: after a long time they are many.
+    return start.to(dtype) + ((2 * speed - 1).double().erfinv() * elapsed).frac().to(dtype)
+
+
+def _by_sample(function: Callable[..., Tensor], octaves: Sequence[Octave], weights: Tensor) -> Tensor:
+    weights = weights.to(octaves[0].gradient.dtype)
+    if len(weights) < 2 or weights.device.type != "cpu" or torch.compiler.is_compiling():
+        return function(octaves, weights)
+    # Sums of several samples at once might round in another way than those of one.
+    parts = (
+        function([Octave(*(part[i : i + 1] for part in each)) for each in octaves], weights[i : i + 1])
+        for i in range(len(weights))
+    )
+    return join(parts, dim=0, length=len(weights))
+
+
+def _noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
+    """(N, H, W), by two products of matrices for each octave: first along the rows of nodes, then across them."""
+    batch, height, width = len(weights), octaves[0].y.shape[1], octaves[0].x.shape[1]
+    if 0 in (batch, height, width):
+        return weights.new_zeros(batch, height, width)
+    y = _blocks(_rows(octaves), _sizes(octaves, 2), size=min(_BAND, height), dtype=weights.dtype)
+    x = _blocks(_columns(octaves), _sizes(octaves, 3), size=_stripe(width), dtype=weights.dtype)
+    parts = zip(octaves, x.node.split(x.counts, dim=2), x.weight.split(x.counts, dim=3), strict=True)
+    lines = [_lines(each.gradient, nodes, across) for each, nodes, across in parts]
+    table = join(lines, dim=0, length=sum(len(each) for each in lines))
+    index = _line_numbers(y, lines=[len(each) for each in lines], stripes=x.node.shape[1])
+    down = (y.weight * _spread(weights, y.counts)[:, None, None, :, None]).movedim(1, 2).flatten(2, 3).flatten(0, 1).mT
+    # What stays in the cache is faster, but its gradient costs one of the table for each band.
+    one_by_one = weights.device.type == "cpu" and not torch.compiler.is_compiling() and not _has_slope(table)
+    at_once = 1 if one_by_one else len(down)
+    bands = (
+        torch.bmm(weight, table.index_select(0, numbers.flatten()).view(len(weight), weight.shape[2], -1))
+        for weight, numbers in zip(down.split(at_once), index.split(at_once), strict=True)
+    )
+    image = join(bands, dim=0, length=len(down))
+    return image.view(batch, -1, image.shape[2])[:, :height, :width].contiguous()
+
+
+def _lines(gradient: Tensor, nodes: Tensor, across: Tensor) -> Tensor:
+    """(N 2 stripes m, size): g_x h p and g_y h, summed along each row of nodes, at each column of pixels."""
+    batch, _, m, n = gradient.shape
+    lane = n * torch.arange(2 * batch, device=nodes.device).view(batch, 2, 1, 1)
+    chosen = gradient.mT.reshape(-1, m).index_select(0, (nodes[:, None] + lane).flatten())
+    return torch.bmm(chosen.unflatten(0, (-1, nodes.shape[2])).mT, across.flatten(0, 2)).flatten(0, 1)
+
+
+def _line_numbers(y: _Blocks, *, lines: Sequence[int], stripes: int) -> Tensor:
+    """(N bands, 2 S stripes): where in the table of all octaves stand the lines that a band of pixels needs."""
+    batch = len(y.node)
+    lane = torch.arange(2 * batch * stripes, device=y.node.device).view(batch, 1, 2, 1, stripes)
+    ends = [[sum(lines[:i]) for i in range(len(lines))], [count // (2 * batch * stripes) for count in lines]]
+    start, length = _spread(torch.tensor(ends, device=y.node.device), y.counts)
+    return ((y.node + start)[:, :, None, :, None] + length[:, None] * lane).flatten(0, 1).flatten(1)
+
+
+def _mean(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
+    y = _totals(_rows(octaves), _sizes(octaves, 2), weights.dtype)
+    x = _totals(_columns(octaves), _sizes(octaves, 3), weights.dtype)
+    means = []
+    for each, across, down in zip(octaves, x, y, strict=True):
+        lines = (each.gradient * across[:, :, None]).sum(dim=3)
+        means.append((lines * down).sum(dim=2).sum(dim=1))
+    return (torch.stack(means, dim=1) * weights).sum(dim=1)
+
+
+def _totals(beside: _Beside, counts: list[int], dtype: torch.dtype) -> Sequence[Tensor]:
+    """Of each octave (N, 2, nodes): the means of h and h p over the pixels."""
+    start = torch.tensor([sum(counts[:i]) for i in range(len(counts))], device=beside.node.device)
+    node = (beside.node + start[:, None, None])[:, None].expand_as(beside.weight)
+    none = beside.weight.new_zeros((*node.shape[:2], sum(counts)))
+    total = none.scatter_add(2, node.flatten(2), beside.weight.flatten(2))
+    return (total / beside.node.shape[3]).to(dtype).split(counts, dim=2)
+
+
+def _sizes(octaves: Sequence[Octave], dim: int) -> list[int]:
+    return [each.gradient.shape[dim] for each in octaves]
+
+
+def _rows(octaves: Sequence[Octave]) -> _Beside:
+    return _beside([each.y for each in octaves], _sizes(octaves, 2))
+
+
+def _columns(octaves: Sequence[Octave]) -> _Beside:
+    """Those of x with h p first, as g_x goes with h p of x and h of y, and g_y with h of x and h p of y."""
+    node, weight = _beside([each.x for each in octaves], _sizes(octaves, 3))
+    return _Beside(node, weight.flip(1))
+
+
+def _beside(positions: Sequence[Tensor], counts: Sequence[int]) -> _Beside:
+    position = torch.stack(list(positions), dim=1)
+    last = torch.tensor([n - 2 for n in counts], device=position.device)[:, None]
+    node = position.detach().long().clamp(min=0).minimum(last)
+    p = position - node
+    fade = p * p * p * (p * (6 * p - 15) + 10)
+    hat = torch.stack([1 - fade, fade], dim=2)
+    weight = torch.stack([hat, hat * torch.stack([p, p - 1], dim=2)], dim=1)
+    return _Beside(torch.stack([node, node + 1], dim=2), weight)
+
+
+def _blocks(beside: _Beside, counts: Sequence[int], *, size: int, dtype: torch.dtype) -> _Blocks:
+    batch, _, _, length = beside.node.shape
+    blocks = -(-length // size)
+    node, weight = (_padded(t, blocks * size).unflatten(-1, (blocks, size)) for t in beside)
+    # As evenly spaced pixels cannot need more.
+    count = [min(n, math.ceil((size - 1) * (n - 1) / max(1, length - 1) + 1e-6) + 2) for n in counts]
+    device = node.device
+    last, start = torch.tensor(
+        [[n - k for n, k in zip(counts, count, strict=True)], [sum(count[:i]) for i in range(len(count))]],
+        device=device,
+    )
+    first = node[:, :, 0].amin(dim=3).minimum(last[:, None])
+    place = (node - first[:, :, None, :, None] + start[:, None, None, None]).movedim(3, 1).flatten(2, 3)
+    weight = weight.to(dtype).movedim(4, 2).flatten(3, 4)
+    none = weight.new_zeros((batch, 2, blocks, sum(count), size))
+    step = torch.tensor([j for k in count for j in range(k)], device=device)
+    nodes = _spread(first.mT, count) + step
+    return _Blocks(nodes, none.scatter(3, place[:, None].expand_as(weight), weight), count)
+
+
+def _spread(values: Tensor, count: Sequence[int]) -> Tensor:
+    """(..., S), of each node, from values (..., octaves)."""
+    owner = [i for i, k in enumerate(count) for _ in range(k)]
+    return values.index_select(-1, torch.tensor(owner, device=values.device))
+
+
+def _padded(values: Tensor, length: int) -> Tensor:
+    """As many as `length`, by repeating the last."""
+    more = length - values.shape[-1]
+    return torch.cat([values, values[..., -1:].expand(*values.shape[:-1], more)], dim=-1) if more else values
+
+
+def _stripe(width: int) -> int:
+    """A width of stripes that divides that of the frame, where there is any."""
+    divisors = (size for size in range(_STRIPE, _STRIPE // 2, -1) if width % size == 0)
+    return next(divisors, min(_STRIPE, width))
+
+
+def _has_slope(*tensors: Tensor) -> bool:
+    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)

@@ -1,6 +1,6 @@
 """Named scenes: each says which phenomena it has, and nothing else.
 
-`severity` runs from 1 (hardly seen) over 3 (what the place is known for) to 5 (hardly anything is seen), in the quantity
+`severity` runs from 1 (hardly seen) over 3 (what the place is known for) to 5 (hardly anything is seen), in a quantity
 that each scene states, so that a model's score can be drawn over it.
 
 Scenes that move pixels count in px of a frame `width` wide; give the width of yours.
@@ -26,6 +26,8 @@ SEVERITIES = (1, 2, 3, 4, 5)
 _REFERENCE_WIDTH = 1920.0
 _DUST = (0.78, 0.71, 0.61)  # of laterite in the air
 _LOW_SUN = (1.0, 0.94, 0.82)
+# Dashcams point somewhat upward, and each another way.
+_ROAD = GroundPlaneDepth(horizon=0.55, spread=0.1)
 _Chosen = TypeVar("_Chosen")
 
 
@@ -66,7 +68,7 @@ def cape_town_fog(severity: int = 3) -> HeterogeneousFog:
     return HeterogeneousFog(
         mode="ray",
         visibility_range=visibility,
-        depth=GroundPlaneDepth(),
+        depth=_ROAD,
         contrast_range=(0.4, 0.8),
         wind_x_range=(-0.1, 0.1),
         wind_z_range=(-0.65, -0.45),
@@ -105,7 +107,7 @@ def unpaved_road(severity: int = 3, *, width: float = _REFERENCE_WIDTH) -> Compo
         mode="ray",
         visibility_range=visibility,
         airlight=_DUST,
-        depth=GroundPlaneDepth(),
+        depth=_ROAD,
         scales=(6.0, 12.0, 24.0, 48.0),
         weights=(0.2, 0.3, 0.3, 0.2),
         contrast_range=(0.7, 1.1),

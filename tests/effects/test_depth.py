@@ -37,7 +37,7 @@ def test_a_point_of_the_road_is_seen_in_the_row_of_its_depth(size):
 
 
 def test_a_frame_of_another_resolution_shows_the_same_road():
-    road = GroundPlaneDepth(far=1e4)
+    road = GroundPlaneDepth(horizon=0.45, far=1e4)
     small, large = depth_of(road, 90, 160).flatten(), depth_of(road, 270, 480).flatten()
     assert_close(large[1::3], small, rtol=1e-9, atol=0)
     assert (small[:40] == 1e4).all()

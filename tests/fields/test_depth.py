@@ -271,3 +271,19 @@ def test_a_sample_does_not_depend_on_the_batch_or_the_threads(on_threads):
     for threads in (1, 2, 3):
         on_threads(threads)
         assert torch.equal(ray_distance(depth, fx=focal, fy=9.0, cx=4.0, cy=2.0), torch.cat(alone))
+
+
+def test_a_spread_averages_inverse_depth_over_horizons():
+    options = {"camera_height": 1.4, "focal_px": 40.0, "far": math.inf, **HERE}
+    found = ground_plane_depth(24, horizon=0.4, spread=0.15, **options).flatten()
+    y_h, s = 0.4 * 24 - 0.5, 0.15 * 24
+    distance = 1.4 * math.hypot(40.0, 11.5 - y_h)
+    shifts = np.linspace(-9, 9, 200_001)
+    share = np.exp(-0.5 * shifts**2)
+    share /= share.sum()
+    inverse = [(share * np.maximum(y - y_h - s * shifts, 0)).sum() / distance for y in range(24)]
+    assert_close(1 / found, torch.tensor(inverse, dtype=torch.float64), rtol=1e-6, atol=1e-12)
+    sharp = ground_plane_depth(24, horizon=0.4, **options).flatten()
+    assert_close(found[-1:], sharp[-1:], rtol=1e-4, atol=0)
+    assert (found[:9].isfinite() & sharp[:9].isinf()).all()
+    assert (found.diff() < 0).all()

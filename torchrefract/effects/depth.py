@@ -43,18 +43,22 @@ class GroundPlaneDepth(DepthProvider):
     focal: focal length of a pinhole, widths of the frame.
     horizon: where the horizon lies, 0 at the top edge of the frame and 1 at its bottom edge; it may lie outside, in
         [-10, 10].
+    spread: standard deviation of the horizon, in heights of the frame, in [0, 10], where it is not known well: depth
+        then grows smoothly toward it and above it, instead of jumping there.
     far: m, the largest depth, which is also that of the sky; may be inf.
     """
 
     camera_height: float = 1.3
     focal: float = 0.9
-    horizon: float = 0.45
+    horizon: float = 0.5
+    spread: float = 0.0
     far: float = 200.0
 
     def __post_init__(self) -> None:
         for name in ("camera_height", "focal"):
             object.__setattr__(self, name, check_positive(name, getattr(self, name)))
         object.__setattr__(self, "horizon", check_number("horizon", self.horizon, low=-10.0, high=10.0))
+        object.__setattr__(self, "spread", check_number("spread", self.spread, low=0.0, high=10.0))
         object.__setattr__(self, "far", check_number("far", self.far, low=1e-6, high=math.inf))
 
     def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -63,6 +67,7 @@ class GroundPlaneDepth(DepthProvider):
             camera_height=self.camera_height,
             focal_px=self.focal * width,
             horizon=self.horizon,
+            spread=self.spread,
             far=self.far,
             dtype=dtype,
             device=device,

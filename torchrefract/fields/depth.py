@@ -27,21 +27,25 @@ def ground_plane_depth(
     camera_height: float,
     focal_px: float,
     horizon: float,
+    spread: float = 0.0,
     far: float,
     dtype: torch.dtype,
     device: torch.device,
 ) -> Tensor:
     """The depth of a flat road below the horizon, along the camera's axis; `far` at the horizon and above it.
 
-        z(y) = min(h sqrt(f^2 + (c_y - y_h)^2) / (y - y_h), far),  y_h = horizon H - 1/2,  c_y = (H - 1) / 2
+        z(y) = min(h sqrt(f^2 + (c_y - y_h)^2) / b, far),  y_h = horizon H - 1/2,  c_y = (H - 1) / 2
+        b = max(y - y_h, 0),  or with s = spread H > 0 its mean (y - y_h) Phi(u) + s phi(u),  u = (y - y_h) / s
 
-    The camera is a pinhole that looks down by theta, tan(theta) = (c_y - y_h) / f, so sqrt(...) is f / cos(theta).
+    The camera is a pinhole that looks down by theta, tan(theta) = (c_y - y_h) / f, so sqrt(...) is f / cos(theta). With
+    a spread inverse depth is averaged over horizons that are normally distributed.
 
     Args:
         height: px, of the frame, whose middle is the principal point.
         camera_height: m, h, above the road.
         focal_px: f.
         horizon: where the horizon lies, 0 at the top edge of the frame and 1 at its bottom edge.
+        spread: standard deviation of that, 0 or above.
         far: m, the largest depth; may be inf.
 
     Returns:
@@ -50,8 +54,18 @@ def ground_plane_depth(
     y_h = horizon * height - 0.5
     # Next to the horizon float32 would lose the digits of the difference.
     below = torch.arange(height, dtype=torch.float64, device=device) - y_h
-    z = camera_height * math.hypot(focal_px, (height - 1) / 2 - y_h) / below.clamp(min=0)
+    z = camera_height * math.hypot(focal_px, (height - 1) / 2 - y_h) / _mean_positive(below, spread * height)
     return z.clamp(max=far).to(dtype).view(1, 1, height, 1)
+
+
+def _mean_positive(value: Tensor, deviation: float) -> Tensor:
+    """The mean of max(X, 0) for a normal X of this mean and deviation."""
+    if deviation == 0:
+        return value.clamp(min=0)
+    u = value / deviation
+    density = torch.exp(-0.5 * u * u) / math.sqrt(2 * math.pi)
+    # Far above the horizon rounding could leave less than nothing.
+    return (value * torch.special.ndtr(u) + deviation * density).clamp(min=0)
 
 
 def ray_distance(

@@ -14,8 +14,9 @@ from torchrefract.white_noise import lattice
 # Multiples of the golden ratio stay away from each other, modulo 1: octaves share no lines of nodes.
 _GOLDEN = (5**0.5 - 1) / 2
 # Pixels that are made of the same nodes: as many rows, and up to so many columns.
-_BAND = 36
+_BAND = 24
 _STRIPE = 128
+_AT_ONCE = 4  # bands, whose nodes stay in a core's cache
 
 
 class Octave(NamedTuple):
@@ -143,9 +144,9 @@ def _noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
     table = join(lines, dim=0, length=sum(len(each) for each in lines))
     index = _line_numbers(y, lines=[len(each) for each in lines], stripes=x.node.shape[1])
     down = (y.weight * _spread(weights, y.counts)[:, None, None, :, None]).movedim(1, 2).flatten(2, 3).flatten(0, 1).mT
-    # What stays in the cache is faster, but its gradient costs one of the table for each band.
-    one_by_one = weights.device.type == "cpu" and not torch.compiler.is_compiling() and not _has_slope(table)
-    at_once = 1 if one_by_one else len(down)
+    # A gradient costs one of the whole table each time that bands are looked up in it.
+    few = weights.device.type == "cpu" and not torch.compiler.is_compiling() and not _has_slope(table)
+    at_once = _AT_ONCE if few else len(down)
     bands = (
         torch.bmm(weight, table.index_select(0, numbers.flatten()).view(len(weight), weight.shape[2], -1))
         for weight, numbers in zip(down.split(at_once), index.split(at_once), strict=True)

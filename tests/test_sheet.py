@@ -1,5 +1,6 @@
 import math
 import re
+from typing import Any
 
 import matplotlib.image
 import numpy as np
@@ -10,7 +11,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import torchrefract as tr
-from torchrefract.sheet import SheetRow, drawn, make_row, sheet
+from torchrefract.page import as_drawn
+from torchrefract.sheet import Scale, SheetRow, drawn, make_row, sheet
 from torchrefract.viz import checkerboard, flow_to_rgb, flow_wheel, transmission_to_rgb
 from torchrefract.warping.jacobian import folded
 
@@ -18,6 +20,7 @@ SIZE = (32, 40)  # drawn with 8 x 8 px for each
 SWIRL = tr.DivergenceFree(amplitude_range=(1.0, 1.0), length_range=(12.0, 12.0))
 FOLDING = tr.DivergenceFree(amplitude_range=(4.0, 4.0), length_range=(8.0, 8.0))
 FOG = tr.UniformFog(visibility_range=(100.0, 100.0))
+SUN = tr.LensFlare(strength_range=(0.5, 0.5))
 
 
 @pytest.fixture
@@ -62,7 +65,7 @@ def test_each_column_holds_what_the_effect_makes_of_the_frame(frame):
     board = SWIRL.apply(checkerboard(*SIZE, cell=2), d.params).image
     assert_close(row.checkerboard[:, valid], enlarged(board[0])[:, valid])
     assert row.map is not None
-    assert_close(row.map[:, valid], enlarged(flow_to_rgb(d.flow, max_px=row.scale_px)[0])[:, valid])
+    assert_close(row.map[:, valid], enlarged(flow_to_rgb(d.flow, max_px=row.scales[0].top)[0])[:, valid])
     restored = tr.warp(d.image, d.restore_flow, interpolation="bicubic")[0].clamp(0, 1)
     assert row.restored is not None
     assert_close(row.restored[:, back], enlarged(restored[0])[:, back])
@@ -91,7 +94,7 @@ def test_scores_are_those_of_the_pixels_that_can_be_restored(frame):
     restored = tr.warp(d.image, d.restore_flow, interpolation="bicubic")[0]
     longest = d.flow.norm(dim=1)[d.valid[:, 0]].max().item()
     assert number(r"longest displacement ([\d.]+) px", row.scores) == pytest.approx(longest, rel=0.005)
-    assert longest <= (row.scale_px or 0) <= 1.1 * longest
+    assert longest <= row.scales[0].top <= 1.1 * longest
     share = d.restore_valid.float().mean().item()
     assert number(r"([\d.]+)% valid", row.scores) == pytest.approx(100 * share, abs=0.051)
     for name, image in (("corrupted", d.image), ("restored", restored)):
@@ -99,29 +102,87 @@ def test_scores_are_those_of_the_pixels_that_can_be_restored(frame):
         assert found == pytest.approx(psnr(image, frame, d.restore_valid), abs=0.051)
 
 
-def test_light_has_a_map_of_its_transmission_and_no_flow_to_undo(frame):
+def test_fog_has_a_map_of_its_transmission_and_is_removed_from_8_bits(frame):
     depth = torch.full((1, 1, *SIZE), 50.0)
     depth[..., 20:] = math.inf
     row = make_row("fog", FOG, frame=frame, seed=1, depth=depth)
     d = FOG.degrade(frame, seed=1, depth=depth)
-    assert (row.map_name, row.scale_px, row.restored) == ("transmission", None, None)
+    assert row.scales == (Scale("transmission", 1.0),)
     near = enlarged(d.valid[0, 0])
     assert near.float().mean() == 0.5
     board = FOG.apply(checkerboard(*SIZE, cell=2), d.params, depth=depth).image
     assert_close(row.checkerboard[:, near], enlarged(board[0])[:, near])
     assert row.map is not None
-    assert_close(row.map[:, near], enlarged(transmission_to_rgb(d.transmission)[0])[:, near])
-    assert_close(row.map[:, ~near].unique(), torch.tensor([0.62, 0.86]))
-    assert row.scores == f"50.0% valid; {psnr(d.image, frame, d.valid):.1f} dB corrupted"
+    assert_close(row.map, enlarged(transmission_to_rgb(d.transmission)[0]))
+    airlight = d.params.airlight.view(1, 3, 1, 1)
+    removed = airlight + ((255 * d.image).round() / 255 - airlight) / d.transmission
+    assert row.restored is not None
+    assert_close(row.restored[:, near], enlarged(removed[0].clamp(0, 1))[:, near])
+    for picture in (row.checkerboard, row.restored):
+        assert_close(picture[:, ~near].unique(), torch.tensor([0.62, 0.86]))
+    before, after = psnr(d.image, frame, d.valid), psnr(removed, frame, d.valid)
+    assert after > before + 10
+    assert row.scores == f"50.0% valid; {before:.1f} dB corrupted, {after:.1f} dB restored from 8 bits"
     shown = texts(sheet([row], title="fog"))
-    assert {"transmission", "0", "1", "no flow to undo"} < set(shown)
-    assert not any("full color" in text for text in shown)
+    assert {"0", "1 transmission"} < set(shown)
+    assert not any("full color" in text or "undo" in text for text in shown)
+
+
+def test_fog_in_linear_light_is_removed_in_it(frame):
+    fog = tr.UniformFog(visibility_range=(300.0, 300.0), linear_light=True)
+    d = fog.degrade(frame, seed=1)
+    stored = (255 * d.image).round() / 255
+    removed, valid = tr.remove_fog(stored, d.transmission, d.params.airlight, linear_light=True)
+    assert f"{psnr(removed, frame, valid):.1f} dB restored" in make_row("fog", fog, frame=frame, seed=1).scores
+
+
+def test_fog_in_drifts_shows_its_extinction_beside_its_transmission(frame):
+    fog = tr.HeterogeneousFog(visibility_range=(100.0, 100.0))
+    row = make_row("drifts", fog, frame=frame, seed=1)
+    d = fog.degrade(frame, seed=1)
+    top = row.scales[1].top
+    assert row.scales == (Scale("transmission", 1.0), Scale("extinction", top))
+    assert d.extinction.max() <= top <= 1.1 * d.extinction.max()
+    left, right = (transmission_to_rgb(light)[0] for light in (d.transmission, d.extinction / top))
+    assert row.map is not None
+    assert_close(row.map, enlarged(torch.cat([left[..., :20], right[..., 20:]], dim=-1)))
+    assert {"1 transmission (left)", f"{top:g}/m extinction (right)"} < set(texts(sheet([row], title="drifts")))
+
+
+def test_a_flare_has_a_map_of_its_intensity_with_its_own_scale_and_nothing_to_undo(frame):
+    row = make_row("sun", SUN, frame=frame, seed=1)
+    d = SUN.degrade(frame, seed=1)
+    (scale,) = row.scales
+    assert (scale.name, row.restored) == ("intensity", None)
+    assert d.intensity.max() <= scale.top <= 1.1 * d.intensity.max()
+    assert not d.valid.all()
+    assert row.map is not None
+    assert_close(row.map, enlarged(transmission_to_rgb(d.intensity / scale.top)[0]))
+    assert row.scores == f"{d.valid.float().mean():.1%} valid; {psnr(d.image, frame, d.valid):.1f} dB corrupted"
+    assert {"no flow to undo", f"{scale.top:g} intensity"} < set(texts(sheet([row], title="sun")))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_of_several_lights_the_one_that_was_drawn_is_mapped(frame, seed):
+    effect = tr.OneOf([FOG, SUN])
+    fog, sun = (child.gate.item() for child in effect.degrade(frame, seed=seed).params.children)
+    assert fog != sun
+    row = make_row("one", effect, frame=frame, seed=seed)
+    assert [scale.name for scale in row.scales] == ["transmission" if fog else "intensity"]
+    assert row.restored is None
+
+
+def test_what_is_left_alone_is_told_so(frame):
+    row = make_row("fog", tr.UniformFog(p=0.0), frame=frame, seed=0)
+    assert row.title == "fog: left alone"
+    assert torch.equal(row.corrupted, row.frame)
+    assert row.scales == (Scale("transmission", 1.0),)
 
 
 def test_fog_behind_a_lens_says_that_the_light_stays(frame):
     effect = tr.Compose([FOG, tr.LensDistortion()])
     row = make_row("both", effect, frame=frame, seed=1)
-    assert row.map_name == "flow"
+    assert [scale.name for scale in row.scales] == ["flow"]
     assert "dB restored, the light left as it is" in row.scores
     assert "light" not in make_row("lens", tr.LensDistortion(), frame=frame, seed=1).scores
 
@@ -142,14 +203,34 @@ def test_an_effect_that_leaves_nothing_to_restore_has_no_score(frame):
 def test_what_was_drawn_is_said_with_its_units(frame):
     lens = tr.LensDistortion(k1_range=(-0.25, -0.25), k2_range=(0.0, 0.0), p1_range=(0, 0), focal_range=(0.8, 0.8))
     params = lens.sample(frame, seed=0)
+    params = params._replace(center=torch.zeros_like(params.center))
     words = drawn(lens, params._replace(coefficients=params.coefficients * (params.coefficients.abs() > 0.01)))
     assert words == "k1 -0.25, focal length 0.80 widths"
-    air = tr.Turbulence(amplitude_range=(2.3, 2.3), length_range=(31.0, 31.0), aperture_range=(0.0, 0.0))
+    still: dict[str, Any] = {"wind_x_range": (0.0, 0.0), "wind_y_range": (0.0, 0.0)}
+    air = tr.Turbulence(amplitude_range=(2.3, 2.3), length_range=(31.0, 31.0), aperture_range=(0.0, 0.0), **still)
     assert drawn(air, air.sample(frame, seed=0)) == "amplitude 2.3 px, length 31 px"
+    air = tr.Turbulence(amplitude_range=(2.3, 2.3), length_range=(31.0, 31.0), wind_x_range=(1.5, 1.5))
+    assert "wind (1.5, " in drawn(air, air.sample(frame, seed=0))
     plate = tr.ThinPlateSpline(lattice=(2, 3))
     params = plate.sample(frame, seed=0)
     moved = params._replace(displacement=torch.full_like(params.displacement, -2.0))
     assert drawn(plate, moved) == "6 points moved by 2 px rms in x and y"
+
+
+def test_one_name_is_said_by_what_it_means(frame):
+    sun = tr.LensFlare(center_x_range=(0.25, 0.25), center_y_range=(0.5, 0.5), radius_range=(0.3, 0.3))
+    words = "sun at 0.25 widths, 0.50 heights, radius 0.3 diagonals, strength 0."
+    assert drawn(sun, sun.sample(frame, seed=0)).startswith(words)
+    lens = tr.LensDistortion(k1_range=(-0.2, -0.2), center_x_range=(0.02, 0.02), center_y_range=(-0.01, -0.01))
+    assert drawn(lens, lens.sample(frame, seed=0)).endswith("center off by (0.02, -0.01) widths")
+    numbers: dict[str, Any] = {
+        "visibility_range": (90.0, 90.0),
+        "contrast_range": (0.5, 0.5),
+        "wind_x_range": (0.3, 0.3),
+    }
+    plane, space = tr.HeterogeneousFog(**numbers), tr.HeterogeneousFog(mode="ray", wind_z_range=(-1, -1), **numbers)
+    assert drawn(plane, plane.sample(frame, seed=0)) == "visibility 90 m, wind (0.3, 0) px/frame"
+    assert drawn(space, space.sample(frame, seed=0)) == "visibility 90 m, contrast 0.5, wind (0.3, 0, -1) m/frame"
 
 
 def test_effects_that_leave_a_frame_alone_say_so(frame):
@@ -166,11 +247,11 @@ def test_a_sheet_shows_its_rows_in_order_each_with_its_own_scale(frame):
     figure = sheet(rows, title="frame.png, 40 x 32 px")
     shown = texts(figure)
     assert shown[0] == "frame.png, 40 x 32 px"
-    assert shown[1:6] == ["frame", "corrupted", "checkerboard", "UV map", "restored"]
-    assert [text for text in shown if text.startswith("full color")] == [
-        f"full color = {row.scale_px:g} px" for row in rows
+    assert shown[1:6] == ["frame", "corrupted", "checkerboard", "map", "restored"]
+    assert [text for text in shown if text.startswith("UV: full color")] == [
+        f"UV: full color = {row.scales[0].top:g} px" for row in rows
     ]
-    assert rows[0].scale_px != rows[1].scale_px
+    assert rows[0].scales != rows[1].scales
     drawn_there = pictures(figure)
     for i, row in enumerate(rows):
         cells = (row.frame, row.corrupted, row.checkerboard, row.map, row.restored)
@@ -179,6 +260,11 @@ def test_a_sheet_shows_its_rows_in_order_each_with_its_own_scale(frame):
             assert torch.equal(picture, (255 * cell).round().byte())
         wheel = drawn_there[6 * i + 5]
         assert torch.equal(wheel, (255 * flow_wheel(wheel.shape[1])).round().byte())
+
+
+@pytest.mark.parametrize(("side", "drawn_side"), [(1, 320), (40, 320), (250, 250), (319, 319), (480, 480), (481, 480)])
+def test_a_frame_is_drawn_with_whole_pixels_and_no_larger_than_asked_for(side, drawn_side):
+    assert max(as_drawn(torch.rand(1, 3, side, 7 if side > 7 else 1), largest=480).shape) == drawn_side
 
 
 def test_a_large_frame_is_degraded_in_its_own_pixels_and_shrunk_by_area():
@@ -194,6 +280,7 @@ def test_a_large_frame_is_degraded_in_its_own_pixels_and_shrunk_by_area():
 def test_nothing_overlaps_and_nothing_leaves_the_page(size):
     frame = torch.rand(1, 3, *size)
     effects = {"LensDistortion": tr.LensDistortion(), "fog": FOG, "Compose": tr.Compose([FOG, SWIRL, FOLDING])}
+    effects |= {"HeterogeneousFog": tr.HeterogeneousFog(), "LensFlare": SUN}
     figure = sheet([make_row(name, e, frame=frame, seed=0) for name, e in effects.items()], title="frame.png")
     figure.canvas.draw()
     boxes = [axes.get_window_extent() for axes in figure.axes] + [text.get_window_extent() for text in figure.texts]

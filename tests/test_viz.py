@@ -13,6 +13,7 @@ from torchrefract.viz import (
     full_color_px,
     hatch_invalid,
     mark_folded,
+    rounded_up,
     transmission_to_rgb,
 )
 
@@ -172,6 +173,20 @@ def test_a_round_scale_is_the_longest_valid_flow_rounded_up_to_two_digits():
     assert full_color_px(flow, ~mask((2, 3))) == 80
     assert full_color_px(1e-3 * flow, ~mask((2, 3), (1, 1))) == pytest.approx(0.0051)
     assert full_color_px(flow, mask((2, 3), (0, 1))) == 1
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [(0.0, 1), (56.1, 57), (5.008, 5.1), (0.29, 0.29), (0.0331, 0.034), (99.01, 100), (123456, 130000), (1e-9, 1e-9)],
+)
+def test_a_number_for_a_legend_has_two_digits_and_is_not_below(value, expected):
+    assert rounded_up(value) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
+def test_what_is_no_number_for_a_legend_is_refused(value):
+    with pytest.raises(ValueError, match="value must be a finite number of at least 0, got"):
+        rounded_up(value)
 
 
 def test_stripes_cover_what_is_not_valid_and_nothing_else():

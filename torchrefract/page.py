@@ -19,7 +19,7 @@ def as_drawn(images: Tensor, *, largest: int = 640) -> Tensor:
 
     Args:
         images: (B, C, H, W), floating in [0, 1]; values outside are clamped.
-        largest: px, the longer side of what is returned, at least 320.
+        largest: px, the longer side of what is returned at most, at least 320.
 
     Returns:
         (B, C, h, w), float32 in [0, 1], on the CPU.
@@ -27,7 +27,8 @@ def as_drawn(images: Tensor, *, largest: int = 640) -> Tensor:
     images = torch.where(images.isfinite(), images, 0.5).detach().float().cpu().clamp(0, 1)
     height, width = images.shape[2:]
     if max(height, width) <= largest:
-        factor = max(1, math.ceil(_SMALLEST / max(height, width)))
+        side = max(height, width)
+        factor = min(math.ceil(_SMALLEST / side), largest // side)
         return images.repeat_interleave(factor, dim=2).repeat_interleave(factor, dim=3)
     share = largest / max(height, width)
     return F.interpolate(images, (max(1, round(height * share)), max(1, round(width * share))), mode="area")
@@ -43,6 +44,7 @@ class Page(NamedTuple):
     caption_lines: int  # above each row
     header_lines: int = 2  # above the first caption
     footer_lines: int = 4  # below the last row and as much space as a caption
+    narrowest: int = 12  # lines, from column to column: a narrow image still leaves room for its title
 
     @property
     def text(self) -> int:
@@ -51,8 +53,8 @@ class Page(NamedTuple):
 
     @property
     def pitch(self) -> int:
-        """From column to column; a narrow image still leaves room for its title."""
-        return max(self.width + self.text // 2, 12 * self.text)
+        """From column to column."""
+        return max(self.width + self.text // 2, self.narrowest * self.text)
 
     @property
     def size(self) -> tuple[int, int]:

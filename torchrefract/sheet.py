@@ -1,4 +1,4 @@
-"""A sheet of effects on one frame, one a row: frame, corrupted, checkerboard, UV map, restored."""
+"""A sheet of effects on one frame, one a row: frame, corrupted, checkerboard, map, restored."""
 
 import textwrap
 import warnings
@@ -10,8 +10,11 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchrefract.cameras.distortion import POLYNOMIAL12
+from torchrefract.effects.air import Air
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
+from torchrefract.effects.defog import remove_fog
+from torchrefract.effects.flare import LensFlare
 from torchrefract.page import Page, as_drawn
 from torchrefract.restoration.metrics import psnr
 from torchrefract.types import Degraded
@@ -22,13 +25,14 @@ from torchrefract.viz import (
     full_color_px,
     hatch_invalid,
     mark_folded,
+    rounded_up,
     transmission_to_rgb,
 )
 from torchrefract.warping.grid import length
 from torchrefract.warping.jacobian import folded
 from torchrefract.warping.resample import warp
 
-_COLUMNS = ("frame", "corrupted", "checkerboard", "UV map", "restored")
+_COLUMNS = ("frame", "corrupted", "checkerboard", "map", "restored")
 _LARGEST = 480  # px, the longer side of an image as drawn
 _CELLS = 20  # squares of the checkerboard along the longer side
 _UNTOUCHED = "left alone"
@@ -40,7 +44,23 @@ _WORDS: dict[str, Callable[[Tensor], str]] = {
     "coefficients": lambda row: ", ".join(f"{k} {v:.2g}" for k, v in zip(POLYNOMIAL12, row.tolist(), strict=True) if v),
     "focal": lambda row: f"focal length {row[0]:.2f} widths",
     "visibility": lambda value: f"visibility {value:.3g} m",
+    "contrast": lambda value: f"contrast {value:.2g}",
+    "sun": lambda place: f"sun at {place[0]:.2f} widths, {place[1]:.2f} heights",
+    "radius": lambda value: f"radius {value:.2g} diagonals",
+    "strength": lambda value: f"strength {value:.2g}",
+    "center": lambda moved: f"center off by ({moved[0]:.1g}, {moved[1]:.1g}) widths",
+    "wind": lambda wind: f"wind ({wind[0]:.2g}, {wind[1]:.2g}) px/frame",
+    "wind in space": lambda wind: f"wind ({', '.join(f'{v:.2g}' for v in wind.tolist())}) m/frame",
 }
+_UNITS = {"extinction": "/m"}
+_OFF = {"transmission": 1.0, "intensity": 0.0}  # where nothing is changed
+
+
+class Scale(NamedTuple):
+    """A map, and what its last color stands for."""
+
+    name: str  # in `Degraded`
+    top: float  # px of a flow in full color, or so much light
 
 
 class SheetRow(NamedTuple):
@@ -51,16 +71,15 @@ class SheetRow(NamedTuple):
     frame: Tensor
     corrupted: Tensor
     checkerboard: Tensor
-    map_name: str  # what the map shows
     map: Tensor | None
-    scale_px: float | None  # px of full color, of a map that shows a flow
+    scales: tuple[Scale, ...]  # of the map, one for each half if there are two
     restored: Tensor | None
 
 
 def make_row(name: str, effect: Effect, *, frame: Tensor, seed: int, depth: Tensor | None = None) -> SheetRow:
     """The row of an effect: what `effect.degrade(frame, seed=seed, depth=depth)` makes of a frame, and its maps.
 
-        restored = warp(corrupted, restore_flow), bicubic
+        restored = warp(corrupted, restore_flow), bicubic; of a fog alone, remove_fog(round(255 corrupted) / 255)
 
     The checkerboard goes through the same draw; its folded pixels are marked. Its, the map's and the restored frame's
     pixels that are not valid are hatched. All is computed in the pixels of the frame, and shrunk to be drawn.
@@ -81,19 +100,16 @@ def make_row(name: str, effect: Effect, *, frame: Tensor, seed: int, depth: Tens
         warnings.simplefilter("ignore", UserWarning)  # of folds, which the sheet shows
         degraded = effect.degrade(frame, seed=seed, depth=depth)
         bent = effect.apply(board, degraded.params, depth=depth).image
-    map_name, map_image, scale_px = _map(degraded)
-    restored = warp(degraded.image, degraded.restore_flow, interpolation="bicubic")[0] if _moves(degraded) else None
-    folds = _folded(degraded)
+    scales, restored, folds = map_scales(degraded), _restored(effect, degraded), _folded(degraded)
     return SheetRow(
         title=": ".join(filter(None, (name, drawn(effect, degraded.params)))),
         scores=_scores(degraded, frame, restored=restored, folds=folds),
         frame=_shrunk(frame)[0],
         corrupted=_shrunk(degraded.image)[0],
         checkerboard=mark_folded(hatch_invalid(_shrunk(bent), degraded.valid), folds)[0],
-        map_name=map_name,
-        map=None if map_image is None else hatch_invalid(_shrunk(map_image), degraded.valid)[0],
-        scale_px=scale_px,
-        restored=None if restored is None else hatch_invalid(_shrunk(restored), degraded.restore_valid)[0],
+        map=map_picture(degraded, scales, largest=_LARGEST) if scales else None,
+        scales=scales,
+        restored=None if restored is None else hatch_invalid(_shrunk(restored.image), restored.valid)[0],
     )
 
 
@@ -104,8 +120,49 @@ def drawn(effect: Effect, params: Any) -> str:
         return " + ".join(leaves) or _UNTOUCHED
     if not params.gate[0]:
         return _UNTOUCHED
-    values = {name: value[0] for name, value in zip(params._fields, params, strict=True)}
+    values = _named(effect, {name: value[0] for name, value in zip(params._fields, params, strict=True)})
     return ", ".join(words(values[name]) for name, words in _WORDS.items() if name in values and values[name].any())
+
+
+def map_scales(degraded: Degraded) -> tuple[Scale, ...]:
+    """The maps to show of what was done: its flow, else its light; an extinction where it is not the same everywhere.
+
+    The scale of a flow is that of its valid pixels, that of an intensity or extinction their largest value.
+    """
+    if _moves(degraded):
+        return (Scale("flow", full_color_px(degraded.flow, degraded.valid)),)
+    present = [name for name in _OFF if degraded.has(name)]
+    acting = [name for name in present if (getattr(degraded, name) != _OFF[name]).any()]
+    light = (acting or present or [None])[0]
+    if light == "intensity":
+        return (Scale(light, rounded_up(degraded.intensity.amax().item())),)
+    if light is None:
+        return ()
+    k = degraded.extinction if degraded.has("extinction") else torch.zeros(1)
+    varied = (Scale("extinction", rounded_up(k.amax().item())),) if k.amax() > 1.001 * k.amin() else ()
+    return (Scale(light, 1.0), *varied)
+
+
+def map_picture(degraded: Degraded, scales: Sequence[Scale], *, largest: int) -> Tensor:
+    """The map of the first sample as it is drawn: of two maps the left half of the one, the right half of the other.
+
+    A flow is hatched where it is not valid; light is known everywhere.
+
+    Args:
+        degraded: a batch of images.
+        scales: of `map_scales`, at least one.
+        largest: px, the longer side of what is returned at most, at least 320.
+
+    Returns:
+        (3, h, w), in [0, 1].
+    """
+    if scales[0].name == "flow":
+        rgb = flow_to_rgb(degraded.flow[:1], max_px=scales[0].top)
+        return hatch_invalid(as_drawn(rgb, largest=largest), degraded.valid[:1])[0]
+    lights = (as_drawn(getattr(degraded, scale.name)[:1] / scale.top, largest=largest) for scale in scales)
+    first, *others = (transmission_to_rgb(light)[0] for light in lights)
+    middle = first.shape[2] // 2
+    return torch.cat([first[..., :middle], others[0][..., middle:]], dim=2) if others else first
 
 
 def sheet(rows: Sequence[SheetRow], *, title: str) -> Figure:
@@ -117,7 +174,7 @@ def sheet(rows: Sequence[SheetRow], *, title: str) -> Figure:
     """
     page = Page(len(rows), len(_COLUMNS), *rows[0].frame.shape[1:], caption_lines=1, header_lines=4, footer_lines=1)
     # A letter is about half as wide as a line is high; a caption ends where the legend of the map begins.
-    letters = 2 * _COLUMNS.index("UV map") * page.pitch // page.text
+    letters = 2 * _COLUMNS.index("map") * page.pitch // page.text
     captions = [(textwrap.wrap(row.title, letters), textwrap.wrap(row.scores, letters)) for row in rows]
     page = page._replace(caption_lines=max(len(head) + len(tail) for head, tail in captions))
     figure = page.figure()
@@ -146,33 +203,53 @@ def _folded(degraded: Degraded) -> Tensor:
     return folded(degraded.flow, degraded.valid) if _moves(degraded) else torch.zeros_like(degraded.valid)
 
 
-def _map(degraded: Degraded) -> tuple[str, Tensor | None, float | None]:
-    """What there is to map, its picture, and the scale of a flow."""
+class _Restored(NamedTuple):
+    image: Tensor  # (1, 3, H, W)
+    valid: Tensor  # (1, 1, H, W), bool
+    how: str  # beside its score
+
+
+def _restored(effect: Effect, degraded: Degraded) -> _Restored | None:
+    """What undoing the flow, or the fog, gives back; None where there is nothing to undo."""
     if _moves(degraded):
-        scale_px = full_color_px(degraded.flow, degraded.valid)
-        return "flow", flow_to_rgb(degraded.flow, max_px=scale_px), scale_px
-    for name in ("transmission", "intensity"):
-        if degraded.has(name):
-            return name, transmission_to_rgb(getattr(degraded, name)), None
-    return "nothing", None, None
+        shaded = degraded.has("transmission") or degraded.has("intensity")
+        image = warp(degraded.image, degraded.restore_flow, interpolation="bicubic")[0]
+        return _Restored(image, degraded.restore_valid, "restored, the light left as it is" if shaded else "restored")
+    air = getattr(effect, "air", None)
+    if not isinstance(air, Air):
+        return None
+    # Of the float image it would be exact, which no file is.
+    stored = (255 * degraded.image.clamp(0, 1)).round() / 255
+    t, airlight = degraded.transmission, degraded.params.airlight
+    return _Restored(*remove_fog(stored, t, airlight, linear_light=air.linear_light), "restored from 8 bits")
 
 
-def _scores(degraded: Degraded, frame: Tensor, *, restored: Tensor | None, folds: Tensor) -> str:
-    """What happened to the pixels that count: those that can be restored or, without a flow, those that are valid."""
-    valid = degraded.valid if restored is None else degraded.restore_valid
+def _scores(degraded: Degraded, frame: Tensor, *, restored: _Restored | None, folds: Tensor) -> str:
+    """What happened to the pixels that count: those that can be restored or, if nothing can be undone, are valid."""
+    valid = degraded.valid if restored is None else restored.valid
     texts = [f"{valid.float().mean().item():.1%} valid"]
     if valid.any():
         texts.append(f"{psnr(degraded.image, frame, valid).item():.1f} dB corrupted")
-    if restored is not None:
+    if _moves(degraded):
         longest = (length(degraded.flow) * degraded.valid).max().item()
         texts.insert(0, f"longest displacement {longest:.3g} px")
     if restored is not None and valid.any():
-        shaded = degraded.has("transmission") or degraded.has("intensity")
-        rest = ", the light left as it is" if shaded else ""
-        texts[-1] += f", {psnr(restored, frame, valid).item():.1f} dB restored{rest}"
+        texts[-1] += f", {psnr(restored.image, frame, valid).item():.1f} dB {restored.how}"
     if folds.any():
         texts.append(f"{100 * folds.float().mean().item():.2g}% folded")
     return "; ".join(texts)
+
+
+def _named(effect: Effect, values: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The values by their names in `_WORDS`, where one name means several things."""
+    mode = getattr(effect, "mode", None)  # of a fog that is not the same everywhere
+    if mode == "image":
+        values.pop("contrast", None)  # which only a fog in space has
+    if mode == "ray":
+        values["wind in space"] = values.pop("wind")
+    if isinstance(effect, LensFlare):
+        values["sun"] = values.pop("center")
+    return values
 
 
 def _draw_row(figure: Figure, page: Page, row: SheetRow, i: int) -> None:
@@ -183,25 +260,25 @@ def _draw_row(figure: Figure, page: Page, row: SheetRow, i: int) -> None:
         else:
             text = "no flow to undo" if _COLUMNS[j] == "restored" else "nothing to map"
             page.write(figure, text, page.left(j) + page.width / 2, page.top(i) + page.height / 2, ha="center")
-    if row.map is not None:
-        _draw_legend(figure, page, row, i)
+    draw_legend(figure, page, row.scales, x=page.left(_COLUMNS.index("map")), y=page.top(i))
 
 
-def _draw_legend(figure: Figure, page: Page, row: SheetRow, i: int) -> None:
-    """Above the map: the color wheel with its scale, or the colors from 0 to 1."""
-    text, x = page.text, page.left(_COLUMNS.index("UV map"))
-    y = page.top(i) - 3 * text
-    if row.scale_px is not None:
+def draw_legend(figure: Figure, page: Page, scales: Sequence[Scale], *, x: int, y: int) -> None:
+    """Above a map with its upper left corner at x and y: the color wheel, or the colors of light, with their scale."""
+    text = page.text
+    if scales and scales[0].name == "flow":
         size = round(2.6 * text)
-        page.show(figure, flow_wheel(size), x, y)
-        page.write(figure, f"full color = {row.scale_px:g} px", x + size + text / 2, y + 1.3 * text)
-        page.write(figure, "darker = longer", x + size + text / 2, y + 2.6 * text)
+        page.show(figure, flow_wheel(size), x, y - 3 * text)
+        page.write(figure, f"UV: full color = {scales[0].top:g} px", x + size + text / 2, y - 1.7 * text)
+        page.write(figure, "darker = longer", x + size + text / 2, y - 0.4 * text)
         return
-    bar = transmission_to_rgb(torch.linspace(0, 1, 6 * text).expand(1, 1, text, -1))[0]
-    page.write(figure, row.map_name, x + text, y + 1.2 * text)
-    page.write(figure, "0", x, y + 2.6 * text)
-    page.show(figure, bar, x + text, y + round(1.5 * text))
-    page.write(figure, "1", x + 7.4 * text, y + 2.6 * text)
+    bar = transmission_to_rgb(torch.linspace(0, 1, 3 * text).expand(1, 1, text, -1))[0]
+    for i, scale in enumerate(reversed(scales)):
+        line = y - (0.4 + 1.3 * i) * text
+        page.write(figure, "0", x, line)
+        page.show(figure, bar, x + text, round(line - 1.1 * text))
+        side = "" if len(scales) == 1 else " (right)" if i == 0 else " (left)"
+        page.write(figure, f"{scale.top:g}{_UNITS.get(scale.name, '')} {scale.name}{side}", x + 4.4 * text, line)
 
 
 def _draw_key(figure: Figure, page: Page) -> None:

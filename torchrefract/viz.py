@@ -65,8 +65,6 @@ def flow_to_rgb(flow: Tensor, *, max_px: float | None = None) -> Tensor:
 def full_color_px(flow: Tensor, valid: Tensor) -> float:
     """A round `max_px` for `flow_to_rgb`: the longest flow that is valid, rounded up to two digits.
 
-        step = 10^(floor(log10(longest)) - 1),  full_color_px = ceil(longest / step) step
-
     Args:
         flow: (B, 2, H, W), px.
         valid: (B, 1, H, W), bool, the pixels that count; what is not finite never does.
@@ -78,11 +76,24 @@ def full_color_px(flow: Tensor, valid: Tensor) -> float:
     _check_mask("valid", valid, flow)
     u, v = _at_least_float32(flow).unbind(1)
     magnitude = torch.hypot(u, v)
-    longest = F.pad(magnitude[valid[:, 0] & magnitude.isfinite()], (0, 1)).amax().item()
-    if longest == 0:
+    return rounded_up(F.pad(magnitude[valid[:, 0] & magnitude.isfinite()], (0, 1)).amax().item())
+
+
+def rounded_up(value: float) -> float:
+    """A number for a legend: the value rounded up to two digits, 1 for 0.
+
+        digits = 1 - floor(log10(value)),  rounded_up = ceil(value 10^digits) / 10^digits
+
+    Args:
+        value: 0 or above, and finite.
+    """
+    if not 0 <= value < math.inf:
+        raise ValueError(f"value must be a finite number of at least 0, got {value}")
+    if value == 0:
         return 1.0
-    step = 10.0 ** (math.floor(math.log10(longest)) - 1)
-    return math.ceil(longest / step) * step
+    digits = 1 - math.floor(math.log10(value))
+    # What has two digits stays as it is, whatever the last bit of the product.
+    return math.ceil(round(value * 10.0**digits, 6)) / 10.0**digits
 
 
 def flow_wheel(size: int) -> Tensor:

@@ -48,20 +48,15 @@ def lattice(key: Tensor, axes: Sequence[Tensor], count: int) -> Tensor:
     return _lattice(key, axes, count)
 
 
-def _as_int32(words: Tensor) -> Tensor:
-    # Products of int32 drop what does not fit; a word above 2^31 is a negative number there.
-    return ((words & _WORD) - ((words & _WORD) >> 31 << 32)).to(torch.int32)
-
-
 def _lattice(key: Tensor, axes: Sequence[Tensor], count: int) -> Tensor:
     each = torch.arange(count, device=key.device).expand(len(key), -1)
-    a, b, c, d = _as_int32(key).view(-1, 4, *[1] * (len(axes) + 1)).unbind(1)
+    a, b, c, d = key.to(torch.int32).view(-1, 4, *[1] * (len(axes) + 1)).unbind(1)
     node = torch.zeros_like(a)
     for i, axis in enumerate((*axes, each), start=2):
         shape = [1] * (len(axes) + 2)
         shape[0], shape[i if i < len(shape) else 1] = len(key), axis.shape[1]
         # Each axis in a round of its own, under both halves of the key in turn.
-        node = _hash(node + _as_int32(axis).view(shape) * _HASH[0], *((a, b) if i % 2 else (c, d)))
+        node = _hash(node + axis.to(torch.int32).view(shape) * _HASH[0], *((a, b) if i % 2 else (c, d)))
     return ((node >> 9) & 0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
 
 
@@ -70,7 +65,7 @@ def _lattice_list(key: Tensor, axes: list[Tensor], count: int) -> Tensor:
 
 
 def _noise(key: Tensor, count: int) -> Tensor:
-    words = _as_int32(key)[:, :, None].unbind(1)
+    words = key.to(torch.int32)[:, :, None].unbind(1)
     at_once = max(1, _CACHED // max(1, len(key)) if key.device.type == "cpu" else count)
     bands = (_noise_between(words, start, min(start + at_once, count)) for start in range(0, max(1, count), at_once))
     return join(bands, dim=2, length=count)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import draws, white_noise
-from torchrefract.fields.perlin import Octave, octave, perlin_mean, perlin_noise
+from torchrefract.fields.perlin import Octave, octave, perlin_noise
 
 PERIODS = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 WEIGHTS = (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)
@@ -167,17 +167,6 @@ def test_curvature_does_not_jump_between_cells_as_it_would_with_a_cubic_fade():
         assert bend_jump(of_corners(lambda s: 3 * s**2 - 2 * s**3), step) > 0.5
 
 
-@pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-15), (torch.float32, 2e-7)])
-@pytest.mark.parametrize("size", [(240, 421), (37, 1), (1, 300), (5, 5)])
-def test_the_mean_is_that_of_the_noise(size, dtype, atol):
-    octaves = frame_of(keys(1, 2), PERIODS, *size, frame=5.0, wind=(0.4, 3.0), decorrelation=60.0, dtype=dtype)
-    weights = torch.tensor([WEIGHTS, WEIGHTS[::-1]], dtype=dtype)
-    found = perlin_mean(octaves, weights)
-    assert found.dtype == dtype
-    expected = perlin_noise(octaves, weights).double().mean(dim=(1, 2, 3))
-    assert_close(found.double(), expected, rtol=0, atol=atol)
-
-
 @pytest.mark.parametrize("elapsed", [6.0, 30.0, 60.0, 90.0])
 def test_what_is_left_of_the_noise_after_a_while_is_the_gaussian_of_it(elapsed):
     decorrelation, start = 60.0, 1e4
@@ -231,7 +220,6 @@ def test_part_of_a_frame_shows_what_the_frame_shows_there(size):
         parts.append(Octave(nodes, x - column, y - row))
     found = perlin_noise(parts, weights_of(1, PERIODS))
     assert_close(found, whole[:, :, top : top + size[0], left : left + size[1]], rtol=0, atol=1e-12)
-    assert_close(perlin_mean(parts, weights_of(1, PERIODS)), found.mean(dim=(1, 2, 3)), rtol=0, atol=1e-14)
 
 
 def test_octaves_and_keys_differ():
@@ -268,7 +256,7 @@ def test_every_sample_of_a_batch_is_made_by_itself_bit_for_bit(size, periods, dt
         moved = (motion[name][chosen] for name in ("frame", "wind", "decorrelation"))
         octaves = frame_of(key[chosen], periods, *size, *moved, dtype=dtype)
         weights = torch.rand(4, len(periods), generator=torch.Generator().manual_seed(1))[chosen]
-        return [perlin_noise(octaves, weights), perlin_mean(octaves, weights), *itertools.chain(*octaves)]
+        return [perlin_noise(octaves, weights), *itertools.chain(*octaves)]
 
     together = made([0, 1, 2, 3])
     for chosen in ([0], [1], [2], [3], [3, 1, 0], [2, 2]):
@@ -283,7 +271,7 @@ def test_threads_do_not_change_a_bit(size, on_threads):
         on_threads(threads)
         octaves = frame_of(keys(1), PERIODS, *size, frame=2.5, wind=(1.1, 0.4), decorrelation=50.0, dtype=torch.float32)
         weights = weights_of(1, PERIODS)
-        found.append([perlin_noise(octaves, weights), perlin_mean(octaves, weights), *itertools.chain(*octaves)])
+        found.append([perlin_noise(octaves, weights), *itertools.chain(*octaves)])
     for other in found[1:]:
         assert all(torch.equal(a, b) for a, b in zip(other, found[0], strict=True))
 
@@ -294,8 +282,7 @@ def test_gradients_need_no_other_noise():
     assert torch.equal(perlin_noise(octaves, weights.clone().requires_grad_()), perlin_noise(octaves, weights))
 
 
-@pytest.mark.parametrize("function", [perlin_noise, perlin_mean])
-def test_gradients_of_the_noise_are_those_of_finite_differences(function):
+def test_gradients_of_the_noise_are_those_of_finite_differences():
     generator = torch.Generator().manual_seed(2)
     weights = torch.rand(2, 2, generator=generator, dtype=torch.float64)
     # Off the nodes and on them, where the noise is smooth as well.
@@ -304,7 +291,7 @@ def test_gradients_of_the_noise_are_those_of_finite_differences(function):
     parts = [directions(2, 3, 3, seed=3), x, y, directions(2, 3, 4, seed=4), 1.3 * x, 0.7 * y]
 
     def made(weights: Tensor, *parts: Tensor) -> Tensor:
-        return function([Octave(*parts[:3]), Octave(*parts[3:])], weights)
+        return perlin_noise([Octave(*parts[:3]), Octave(*parts[3:])], weights)
 
     inputs = [tensor.requires_grad_() for tensor in (weights, *parts)]
     assert torch.autograd.gradcheck(made, inputs)
@@ -340,7 +327,7 @@ def moving_noise(key: Tensor, frame: Tensor, wind: Tensor, decorrelation: Tensor
     octaves = [
         octave(key, i, period=p, height=80, width=140, **motion, dtype=torch.float32) for i, p in enumerate((2.5, 30.0))
     ]
-    return perlin_noise(octaves, weights) + perlin_mean(octaves, weights).view(-1, 1, 1, 1)
+    return perlin_noise(octaves, weights)
 
 
 def arguments() -> tuple[Tensor, ...]:
@@ -386,5 +373,4 @@ def test_frames_of_any_size_are_finite(size, periods):
         assert found.dtype == torch.float32
         assert found.isfinite().all()
         if 0 not in size:
-            assert perlin_mean(octaves, weights_of(count, periods)).isfinite().all()
             assert not count or found.abs().max() > 0

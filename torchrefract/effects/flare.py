@@ -7,13 +7,12 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._bands import join
 from torchrefract._checks import check_all, check_choice, check_flag, check_range
 from torchrefract.effects.base import params_to
 from torchrefract.effects.color import check_color, each_channel
 from torchrefract.effects.motion import check_frame
 from torchrefract.effects.radiance import RadianceEffect, Shaded
-from torchrefract.effects.rows import bands, column, spread
+from torchrefract.effects.rows import column, spread
 from torchrefract.fields.flare import flare_axes
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
@@ -128,19 +127,20 @@ class LensFlare(RadianceEffect):
         along_x, along_y = flare_axes(center, radius, height=height, width=width)
         along_y = along_y * column(spread(params.strength.to(dtype), rows))
         color = spread(params.color.to(dtype), rows)[:, :, None, None]
-        # Clipped while it is in the cache.
-        made = (self._shine(band, light, along_x) for band, light in bands(image, along_y * color))
         return Shaded(
-            join(made, dim=2, length=height),
+            self._shine(image, along_y * color, along_x),
             valid=lambda: self._valid(image, along_x, along_y * color),
             intensity=lambda: along_y * along_x,
         )
 
-    def _shine(self, band: Tensor, light: Tensor, along_x: Tensor) -> Tensor:
+    def _shine(self, image: Tensor, light: Tensor, along_x: Tensor) -> Tensor:
         if self.blend == "screen":
-            return torch.addcmul(band, 1 - band, (light * along_x).clamp(max=1))
-        added = torch.addcmul(band, light, along_x)
-        return added.clamp(0, 1) if self.clip else added
+            return torch.addcmul(image, 1 - image, (light * along_x).clamp(max=1))
+        added = torch.addcmul(image, light, along_x)
+        if not self.clip:
+            return added
+        # Without gradients nobody else needs the sum.
+        return added.clamp(0, 1) if added.requires_grad or torch.compiler.is_compiling() else added.clamp_(0, 1)
 
     def _valid(self, image: Tensor, along_x: Tensor, light: Tensor) -> Tensor:
         if self.blend == "screen":

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._bands import join
 from torchrefract._checks import check_all, check_choice, check_number, check_positive, check_range
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.air import check_fog_params, make_air
@@ -18,10 +17,10 @@ from torchrefract.effects.fog import check_visibility, drawn_visibility, visibil
 from torchrefract.effects.motion import check_decorrelation, check_motion, check_wind, drawn_motion, motion_ranges
 from torchrefract.effects.radiance import RadianceEffect, Shaded
 from torchrefract.effects.random_field import check_key
-from torchrefract.effects.rows import bands, column, frame_mean, spread
+from torchrefract.effects.rows import column, frame_mean, scaled_, spread
 from torchrefract.fields.fog import extinction, transmission
 from torchrefract.fields.fog_volume import path_mean
-from torchrefract.fields.perlin import Octave, perlin_mean, perlin_noise
+from torchrefract.fields.perlin import Octave, perlin_noise
 from torchrefract.fields.perlin import octave as perlin_octave
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
@@ -175,25 +174,20 @@ class HeterogeneousFog(RadianceEffect):
 
     def shade(self, image: Tensor, params: HeterogeneousFogParams, depth: Tensor | None) -> Shaded:
         """The rows behind the fog."""
-        rows, _, height, _ = image.shape
-        dtype = field_dtype(image.dtype)
+        rows, dtype = image.shape[0], field_dtype(image.dtype)
         distance = self.air.distance(image, depth)
         mean_k = extinction(params.visibility.to(dtype), self.air.threshold) * (1 + params.deviation.to(dtype))
-        k = self._relative(params, distance, image) * column(spread(mean_k, rows))
-        airlight = params.airlight.to(dtype)
+        k = self._extinction(params, distance, image, column(spread(mean_k, rows)))
         distance = spread(distance, rows) if distance.shape[0] > 1 else distance
-
-        def blended(band: Tensor, k_band: Tensor, distance_band: Tensor) -> Tensor:
-            return self.air.blended(band, transmission(distance_band, k_band), airlight)
 
         def t() -> Tensor:
             return transmission(distance, k)
 
-        made = join((blended(*band) for band in bands(image, k, distance)), dim=2, length=height)
-        return Shaded(made, valid=lambda: t() >= 1 / 255, transmission=t, extinction=k)
+        blended = self.air.blended(image, t(), params.airlight.to(dtype))
+        return Shaded(blended, valid=lambda: t() >= 1 / 255, transmission=t, extinction=k)
 
-    def _relative(self, params: HeterogeneousFogParams, distance: Tensor, image: Tensor) -> Tensor:
-        """(N, 1, H, W), q / <q>, for as many rows as the image has."""
+    def _extinction(self, params: HeterogeneousFogParams, distance: Tensor, image: Tensor, mean_k: Tensor) -> Tensor:
+        """(N, 1, H, W), 1/m, mean_k q / <q>, for as many rows as the image has."""
         rows, _, height, width = image.shape
         dtype = field_dtype(image.dtype)
         names = ("key", "weights", "contrast", "wind", "decorrelation")
@@ -214,7 +208,7 @@ class HeterogeneousFog(RadianceEffect):
                 )
                 for i, period in enumerate(self._periods(width))
             ]
-            return self._in_image(octaves, share)
+            return self._in_image(octaves, share, mean_k)
         focal, center = self._pinhole(height, width)
         q = path_mean(
             key,
@@ -232,19 +226,18 @@ class HeterogeneousFog(RadianceEffect):
             reach=self.reach,
             dtype=dtype,
         )
-        return q / frame_mean(q) if self.mean == "image" else q
+        return q * (mean_k / frame_mean(q) if self.mean == "image" else mean_k)
 
-    def _in_image(self, octaves: Sequence[Octave], share: Tensor) -> Tensor:
-        """q / <q> of the paper's noise, for weights (N, K) of sum 1."""
+    def _in_image(self, octaves: Sequence[Octave], share: Tensor, mean_k: Tensor) -> Tensor:
+        """mean_k q / <q> of the paper's noise, for weights (N, K) of sum 1."""
         if self.normalize == "image":
             parts = [column(w) * _stretched(octave) for octave, w in zip(octaves, share.unbind(1), strict=True)]
             q = sum(parts[1:], parts[0])
-            return q / frame_mean(q) if self.mean == "image" else 2 * q
-        # q = 1/2 + n / sqrt(2), with the noise n: divided by its mean before it is made, which spares a pass.
-        mean = 0.5 + perlin_mean(octaves, share) / math.sqrt(2) if self.mean == "image" else share.new_full((1,), 0.5)
-        noise = perlin_noise(octaves, share / (math.sqrt(2) * mean[:, None]))
-        offset = column(0.5 / mean)
-        return noise + offset if noise.requires_grad or torch.compiler.is_compiling() else noise.add_(offset)
+            return q * (mean_k / frame_mean(q) if self.mean == "image" else 2 * mean_k)
+        # q = 1/2 + n / sqrt(2), with the noise n.
+        noise = perlin_noise(octaves, share)
+        mean_k = mean_k / (0.5 + frame_mean(noise) / math.sqrt(2)) if self.mean == "image" else 2 * mean_k
+        return scaled_(noise, math.sqrt(0.5) * mean_k, 0.5 * mean_k)
 
     def _periods(self, width: int) -> list[float]:
         """Of the noises, px."""

@@ -3,15 +3,13 @@
 What is the same in all frames of a clip has one row for each clip until it meets what is not.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from torchrefract._checks import is_true
-
-_CACHED = 1 << 17  # numbers of an image that stay in a core's cache
 
 
 def spread(value: Tensor, rows: int) -> Tensor:
@@ -36,18 +34,17 @@ def at_frames(params: Any, frames: Callable[[], Tensor]) -> Any:
     return params._replace(frame=frames()) if "frame" in params._fields else params
 
 
-def bands(image: Tensor, *maps: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """An image (N, C, H, W) and maps (N or 1, C or 1, H, W or 1) in bands of rows that stay in a core's cache."""
-    height = image.shape[2]
-    whole = image.device.type != "cpu" or torch.compiler.is_compiling() or image.numel() == 0
-    at_once = height if whole else max(1, _CACHED * height // image.numel())
-    return zip(*(value.split(at_once, dim=2) for value in (image, *maps)), strict=True)
-
-
 def frame_mean(value: Tensor) -> Tensor:
     """(N, 1, 1, 1), the mean over the frame of (N, 1, H, W), to the same bits in any batch and on any thread."""
     # By rows, which no threads share.
     return value.sum(dim=3, keepdim=True).sum(dim=2, keepdim=True) / (value.shape[2] * value.shape[3])
+
+
+def scaled_(value: Tensor, scale: Tensor, offset: Tensor) -> Tensor:
+    """scale value + offset, in the memory of a value that nobody else needs, if no gradient is asked for."""
+    if torch.compiler.is_compiling() or any(t.requires_grad for t in (value, scale, offset)):
+        return value * scale + offset
+    return value.mul_(scale).add_(offset)
 
 
 def column(flags: Tensor) -> Tensor:

@@ -6,8 +6,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-# exp(-800) is 0 in float64 and float32 alike, and its gradient is 0, not NaN.
-_OPAQUE = 800.0
 # Farther than anything.
 _FARTHEST = 1e12
 
@@ -22,8 +20,8 @@ def extinction(visibility: Tensor, threshold: float) -> Tensor:
 
 def transmission(depth: Tensor, k: Tensor) -> Tensor:
     """t = exp(-k d), the share of light that arrives from d meters through an extinction k in 1/m; they broadcast."""
-    # An infinite depth times an extinction of zero would be NaN.
-    return torch.exp((-k * depth.clamp(max=_FARTHEST)).clamp(min=-_OPAQUE))
+    # An infinite depth times an extinction of zero would be NaN, and so would be the slope of an infinite product.
+    return torch.exp(k * -depth.clamp(max=_FARTHEST))
 
 
 def veil(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:

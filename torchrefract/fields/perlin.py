@@ -90,11 +90,6 @@ def perlin_noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
         return _by_sample(_noise, octaves, weights).unsqueeze(1)
 
 
-def perlin_mean(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
-    """(N,), the mean of `perlin_noise` over the frame, from the nodes alone, to round-off."""
-    return _by_sample(_mean, octaves, weights)
-
-
 class _Beside(NamedTuple):
     """The two nodes beside each pixel along an axis."""
 
@@ -170,25 +165,6 @@ def _line_numbers(y: _Blocks, *, lines: Sequence[int], stripes: int) -> Tensor:
     ends = [[sum(lines[:i]) for i in range(len(lines))], [count // (2 * batch * stripes) for count in lines]]
     start, length = _spread(torch.tensor(ends, device=y.node.device), y.counts)
     return ((y.node + start)[:, :, None, :, None] + length[:, None] * lane).flatten(0, 1).flatten(1)
-
-
-def _mean(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
-    y = _totals(_rows(octaves), _sizes(octaves, 2), weights.dtype)
-    x = _totals(_columns(octaves), _sizes(octaves, 3), weights.dtype)
-    means = []
-    for each, across, down in zip(octaves, x, y, strict=True):
-        lines = (each.gradient * across[:, :, None]).sum(dim=3)
-        means.append((lines * down).sum(dim=2).sum(dim=1))
-    return (torch.stack(means, dim=1) * weights).sum(dim=1)
-
-
-def _totals(beside: _Beside, counts: list[int], dtype: torch.dtype) -> Sequence[Tensor]:
-    """Of each octave (N, 2, nodes): the means of h and h p over the pixels."""
-    start = torch.tensor([sum(counts[:i]) for i in range(len(counts))], device=beside.node.device)
-    node = (beside.node + start[:, None, None])[:, None].expand_as(beside.weight)
-    none = beside.weight.new_zeros((*node.shape[:2], sum(counts)))
-    total = none.scatter_add(2, node.flatten(2), beside.weight.flatten(2))
-    return (total / beside.node.shape[3]).to(dtype).split(counts, dim=2)
 
 
 def _sizes(octaves: Sequence[Octave], dim: int) -> list[int]:

@@ -1,5 +1,6 @@
 """The sun in the lens."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -94,7 +95,8 @@ class LensFlare(RadianceEffect):
         """One sun a sample, every number uniform in its range."""
         places = [getattr(self, f"{name}_range") for name in ("center_x", "center_y", "drift_x", "drift_y")]
         gate, values = self._uniform(source, [*places, self.radius_range, self.strength_range], image)
-        color = values.new_tensor(each_channel("color", self.color, image.shape[1])).repeat(image.shape[0], 1)
+        colors = [each_channel("color", self.color, image.shape[1])] * image.shape[0]
+        color = torch.tensor(colors, dtype=values.dtype, device=values.device).view(image.shape[:2])
         first = torch.zeros_like(values[:, :1])
         return FlareParams(gate, values[:, :2], values[:, 4], values[:, 5], color, values[:, 2:4], first)
 
@@ -120,10 +122,10 @@ class LensFlare(RadianceEffect):
         """The rows in the light of the sun."""
         rows, _, height, width = image.shape
         dtype = field_dtype(image.dtype)
-        size = torch.tensor([width, height], dtype=dtype, device=image.device)
         share = params.center[:, None] + params.frame[:, :, None] * params.drift[:, None]
-        center = share.to(dtype).reshape(-1, 2) * size - 0.5
-        radius = spread(params.radius.to(dtype), rows) * size.square().sum().sqrt()
+        x, y = share.to(dtype).reshape(-1, 2).unbind(1)
+        center = torch.stack([x * width - 0.5, y * height - 0.5], dim=1)
+        radius = spread(params.radius.to(dtype), rows) * math.hypot(width, height)
         along_x, along_y = flare_axes(center, radius, height=height, width=width)
         along_y = along_y * column(spread(params.strength.to(dtype), rows))
         color = spread(params.color.to(dtype), rows)[:, :, None, None]

@@ -17,8 +17,8 @@ from torchrefract.effects.fog import check_visibility, drawn_visibility, visibil
 from torchrefract.effects.motion import check_decorrelation, check_motion, check_wind, drawn_motion, motion_ranges
 from torchrefract.effects.radiance import RadianceEffect, Shaded
 from torchrefract.effects.random_field import check_key
-from torchrefract.effects.rows import column, frame_mean, scaled_, spread
-from torchrefract.fields.fog import extinction, transmission
+from torchrefract.effects.rows import column, frame_mean, spread
+from torchrefract.fields.fog import drifting_transmission, extinction
 from torchrefract.fields.fog_volume import path_mean
 from torchrefract.fields.perlin import Octave, perlin_noise
 from torchrefract.fields.perlin import octave as perlin_octave
@@ -148,7 +148,9 @@ class HeterogeneousFog(RadianceEffect):
             drawn_visibility(values[:, 0], self.visibility_range),
             values[:, 1],
             self.air.light(image, values.dtype),
-            values.new_tensor(self.weights).repeat(image.shape[0], 1),
+            torch.tensor([self.weights] * image.shape[0], dtype=values.dtype, device=values.device).view(
+                -1, len(self.scales)
+            ),
             values[:, 2],
             **drawn_motion(values[:, 3:]),
             key=draws.noise_key(source),
@@ -177,17 +179,19 @@ class HeterogeneousFog(RadianceEffect):
         rows, dtype = image.shape[0], field_dtype(image.dtype)
         distance = self.air.distance(image, depth)
         mean_k = extinction(params.visibility.to(dtype), self.air.threshold) * (1 + params.deviation.to(dtype))
-        k = self._extinction(params, distance, image, column(spread(mean_k, rows)))
+        noise, share, offset = self._field(params, distance, image)
+        mean_k = column(spread(mean_k, rows))
         distance = spread(distance, rows) if distance.shape[0] > 1 else distance
+        t = drifting_transmission(distance, noise, share * mean_k, offset * mean_k)
+        blended = self.air.blended(image, t, params.airlight.to(dtype))
 
-        def t() -> Tensor:
-            return transmission(distance, k)
+        def k() -> Tensor:
+            return noise * (share * mean_k) + offset * mean_k
 
-        blended = self.air.blended(image, t(), params.airlight.to(dtype))
-        return Shaded(blended, valid=lambda: t() >= 1 / 255, transmission=t, extinction=k)
+        return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
 
-    def _extinction(self, params: HeterogeneousFogParams, distance: Tensor, image: Tensor, mean_k: Tensor) -> Tensor:
-        """(N, 1, H, W), 1/m, mean_k q / <q>, for as many rows as the image has."""
+    def _field(self, params: HeterogeneousFogParams, distance: Tensor, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A noise n, (N, 1, H, W), a row for each of the image, and a and b, (N, 1, 1, 1), of q / <q> = a n + b."""
         rows, _, height, width = image.shape
         dtype = field_dtype(image.dtype)
         names = ("key", "weights", "contrast", "wind", "decorrelation")
@@ -208,7 +212,7 @@ class HeterogeneousFog(RadianceEffect):
                 )
                 for i, period in enumerate(self._periods(width))
             ]
-            return self._in_image(octaves, share, mean_k)
+            return self._in_image(octaves, share)
         focal, center = self._pinhole(height, width)
         q = path_mean(
             key,
@@ -226,18 +230,21 @@ class HeterogeneousFog(RadianceEffect):
             reach=self.reach,
             dtype=dtype,
         )
-        return q * (mean_k / frame_mean(q) if self.mean == "image" else mean_k)
+        return q, self._inverse_mean(q, 1.0), q.new_zeros(1, 1, 1, 1)
 
-    def _in_image(self, octaves: Sequence[Octave], share: Tensor, mean_k: Tensor) -> Tensor:
-        """mean_k q / <q> of the paper's noise, for weights (N, K) of sum 1."""
+    def _in_image(self, octaves: Sequence[Octave], share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The paper's noise, for weights (N, K) of sum 1."""
         if self.normalize == "image":
             parts = [column(w) * _stretched(octave) for octave, w in zip(octaves, share.unbind(1), strict=True)]
             q = sum(parts[1:], parts[0])
-            return q * (mean_k / frame_mean(q) if self.mean == "image" else 2 * mean_k)
+            return q, self._inverse_mean(q, 0.5), q.new_zeros(1, 1, 1, 1)
         # q = 1/2 + n / sqrt(2), with the noise n.
         noise = perlin_noise(octaves, share)
-        mean_k = mean_k / (0.5 + frame_mean(noise) / math.sqrt(2)) if self.mean == "image" else 2 * mean_k
-        return scaled_(noise, math.sqrt(0.5) * mean_k, 0.5 * mean_k)
+        mean = 0.5 + frame_mean(noise) / math.sqrt(2) if self.mean == "image" else noise.new_full((1, 1, 1, 1), 0.5)
+        return noise, math.sqrt(0.5) / mean, 0.5 / mean
+
+    def _inverse_mean(self, q: Tensor, ensemble: float) -> Tensor:
+        return 1 / frame_mean(q) if self.mean == "image" else q.new_full((1, 1, 1, 1), 1 / ensemble)
 
     def _periods(self, width: int) -> list[float]:
         """Of the noises, px."""

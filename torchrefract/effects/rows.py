@@ -40,13 +40,6 @@ def frame_mean(value: Tensor) -> Tensor:
     return value.sum(dim=3, keepdim=True).sum(dim=2, keepdim=True) / (value.shape[2] * value.shape[3])
 
 
-def scaled_(value: Tensor, scale: Tensor, offset: Tensor) -> Tensor:
-    """scale value + offset, in the memory of a value that nobody else needs, if no gradient is asked for."""
-    if torch.compiler.is_compiling() or any(t.requires_grad for t in (value, scale, offset)):
-        return value * scale + offset
-    return value.mul_(scale).add_(offset)
-
-
 def column(flags: Tensor) -> Tensor:
     """(B, 1, 1, 1) of (B,)."""
     return flags.view(-1, 1, 1, 1)

@@ -9,7 +9,7 @@ def flare_axes(center: Tensor, radius: Tensor, *, height: int, width: int) -> tu
 
     Args:
         center: (B, 2), px, cx and cy, pixel centers being whole numbers; anywhere, also outside the frame.
-        radius: (B,), px; 0 is no flare: both factors are 0.
+        radius: (B,), px; 0 is no flare: the factor along y is 0.
         height, width: px.
 
     Returns:
@@ -19,11 +19,10 @@ def flare_axes(center: Tensor, radius: Tensor, *, height: int, width: int) -> tu
     y = torch.arange(height, dtype=center.dtype, device=center.device).view(1, 1, height, 1)
     # Squares, since the root of the distance has no slope at the center.
     shines = radius > 0
-    sharpness = torch.where(shines, 0.5 / torch.where(shines, radius, 1).square(), 0)
-    cx, cy, sharpness, shines = (value.view(-1, 1, 1, 1) for value in (*center.unbind(1), sharpness, shines))
-    along = (torch.exp(-sharpness * (axis - middle).square()) for axis, middle in ((x, cx), (y, cy)))
-    along_x, along_y = (torch.where(shines, factor, 0) for factor in along)
-    return along_x, along_y
+    blunt = -2 * torch.where(shines, radius, 1).square()
+    cx, cy, blunt, shines = (value.view(-1, 1, 1, 1) for value in (*center.unbind(1), blunt, shines))
+    along_x, along_y = torch.exp((x - cx).square() / blunt), torch.exp((y - cy).square() / blunt)
+    return along_x, torch.where(shines, along_y, 0)
 
 
 def flare_mask(center: Tensor, radius: Tensor, *, height: int, width: int) -> Tensor:

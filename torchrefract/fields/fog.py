@@ -20,8 +20,20 @@ def extinction(visibility: Tensor, threshold: float) -> Tensor:
 
 def transmission(depth: Tensor, k: Tensor) -> Tensor:
     """t = exp(-k d), the share of light that arrives from d meters through an extinction k in 1/m; they broadcast."""
-    # An infinite depth times an extinction of zero would be NaN, and so would be the slope of an infinite product.
-    return torch.exp(k * -depth.clamp(max=_FARTHEST))
+    return torch.exp(k * -_finite(depth))
+
+
+def drifting_transmission(depth: Tensor, noise: Tensor, scale: Tensor, offset: Tensor) -> Tensor:
+    """t = exp(-(scale n + offset) d), through an extinction that is a noise n, in two passes where d is by row.
+
+    Args:
+        depth: (N or 1, 1, H, W or 1), m.
+        noise: (N, 1, H, W).
+        scale, offset: (N, 1, 1, 1), 1/m.
+    """
+    distance = -_finite(depth)
+    argument = linear(noise, scale * distance, offset * distance)
+    return torch.exp(argument) if argument.requires_grad or torch.compiler.is_compiling() else argument.exp_()
 
 
 def veil(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
@@ -32,18 +44,35 @@ def veil(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
         t: (B, 1, H or 1, W or 1), in [0, 1].
         airlight: (B, C, 1, 1).
     """
-    rows = math.prod(image.shape[:3])
-    if rows == 0 or t.shape[3] > 1 or image.device.type != "cpu" or torch.compiler.is_compiling():
+    if not _by_row(image, t):
         return torch.lerp(airlight, image, t)
-    # With a number for each row, lerp does not vectorize. A batch norm that is not training is one such pass,
+    return linear(image, t, airlight * (1 - t))
+
+
+def linear(value: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
+    """value scale + shift; scale and shift broadcast to the value, (B, C, H, W)."""
+    if not _by_row(value, scale, shift):
+        return torch.addcmul(shift, value, scale)
+    # With a number for each row, no pass of that kind vectorizes. A batch norm that is not training is one that does,
     # x w + b for each channel; each row is a channel here.
-    t = t.expand(-1, -1, image.shape[2], -1)
-    added = (airlight * (1 - t)).expand(*image.shape[:3], 1)
+    size = (*value.shape[:3], 1)
+    rows = value.shape[0] * value.shape[1] * value.shape[2]
     # The mean of zero serves as the variance too, beside an epsilon of 1.
-    lines, zero = image.contiguous().view(1, rows, image.shape[3]), image.new_zeros(rows)
-    return F.batch_norm(lines, zero, zero, t.expand_as(added).reshape(rows), added.reshape(rows), eps=1.0).view_as(
-        image
-    )
+    lines, zero = value.contiguous().view(1, rows, value.shape[3]), value.new_zeros(rows)
+    weight, bias = (number.expand(size).reshape(rows) for number in (scale, shift))
+    return F.batch_norm(lines, zero, zero, weight, bias, eps=1.0).view_as(value)
+
+
+def _by_row(value: Tensor, *numbers: Tensor) -> bool:
+    """Whether there is a number for each row of a value on the CPU."""
+    if value.numel() == 0 or value.device.type != "cpu" or torch.compiler.is_compiling():
+        return False
+    return all(number.shape[3] == 1 for number in numbers)
+
+
+def _finite(depth: Tensor) -> Tensor:
+    # An infinite depth times an extinction of zero would be NaN, and so would be the slope of an infinite product.
+    return depth.clamp(max=_FARTHEST)
 
 
 def srgb_to_linear(value: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from torchrefract.effects.motion import check_decorrelation, check_motion, check
 from torchrefract.effects.radiance import RadianceEffect, Shaded
 from torchrefract.effects.random_field import check_key
 from torchrefract.effects.rows import column, frame_mean, spread
-from torchrefract.fields.fog import drifting_transmission, extinction
+from torchrefract.fields.fog import drifting_transmission_, extinction
 from torchrefract.fields.fog_volume import path_mean
 from torchrefract.fields.perlin import Octave, perlin_noise
 from torchrefract.fields.perlin import octave as perlin_octave
@@ -179,15 +179,20 @@ class HeterogeneousFog(RadianceEffect):
         rows, dtype = image.shape[0], field_dtype(image.dtype)
         distance = self.air.distance(image, depth)
         mean_k = extinction(params.visibility.to(dtype), self.air.threshold) * (1 + params.deviation.to(dtype))
-        noise, share, offset = self._field(params, distance, image)
         mean_k = column(spread(mean_k, rows))
         distance = spread(distance, rows) if distance.shape[0] > 1 else distance
-        t = drifting_transmission(distance, noise, share * mean_k, offset * mean_k)
-        blended = self.air.blended(image, t, params.airlight.to(dtype))
+
+        def field() -> tuple[Tensor, Tensor, Tensor]:
+            noise, share, offset = self._field(params, distance, image)
+            return noise, share * mean_k, offset * mean_k
 
         def k() -> Tensor:
-            return noise * (share * mean_k) + offset * mean_k
+            # Made again for who asks: kept, it would be a third of the image for who does not.
+            noise, scale, offset = field()
+            return noise * scale + offset
 
+        t = drifting_transmission_(distance, *field())
+        blended = self.air.blended(image, t, params.airlight.to(dtype))
         return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
 
     def _field(self, params: HeterogeneousFogParams, distance: Tensor, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:

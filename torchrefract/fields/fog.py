@@ -23,8 +23,8 @@ def transmission(depth: Tensor, k: Tensor) -> Tensor:
     return torch.exp(k * -_finite(depth))
 
 
-def drifting_transmission(depth: Tensor, noise: Tensor, scale: Tensor, offset: Tensor) -> Tensor:
-    """t = exp(-(scale n + offset) d), through an extinction that is a noise n, in two passes where d is by row.
+def drifting_transmission_(depth: Tensor, noise: Tensor, scale: Tensor, offset: Tensor) -> Tensor:
+    """t = exp(-(scale n + offset) d), through an extinction that is a noise n; in its memory if it has no gradient.
 
     Args:
         depth: (N or 1, 1, H, W or 1), m.
@@ -32,8 +32,10 @@ def drifting_transmission(depth: Tensor, noise: Tensor, scale: Tensor, offset: T
         scale, offset: (N, 1, 1, 1), 1/m.
     """
     distance = -_finite(depth)
-    argument = linear(noise, scale * distance, offset * distance)
-    return torch.exp(argument) if argument.requires_grad or torch.compiler.is_compiling() else argument.exp_()
+    scale, offset = scale * distance, offset * distance
+    if torch.compiler.is_compiling() or any(value.requires_grad for value in (noise, scale, offset)):
+        return torch.exp(noise * scale + offset)
+    return noise.mul_(scale).add_(offset).exp_()
 
 
 def veil(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:

@@ -132,8 +132,9 @@ def _noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
     batch, height, width = len(weights), octaves[0].y.shape[1], octaves[0].x.shape[1]
     if 0 in (batch, height, width):
         return weights.new_zeros(batch, height, width)
-    y = _blocks(_rows(octaves), _sizes(octaves, 2), size=min(_BAND, height), dtype=weights.dtype)
-    x = _blocks(_columns(octaves), _sizes(octaves, 3), size=_stripe(width), dtype=weights.dtype)
+    y_counts, x_counts = _sizes(octaves, 2), _sizes(octaves, 3)
+    y = _blocks(_rows(octaves), y_counts, size=_short(min(_BAND, height), y_counts, height), dtype=weights.dtype)
+    x = _blocks(_columns(octaves), x_counts, size=_short(_stripe(width), x_counts, width), dtype=weights.dtype)
     parts = zip(octaves, x.node.split(x.counts, dim=2), x.weight.split(x.counts, dim=3), strict=True)
     lines = [_lines(each.gradient, nodes, across) for each, nodes, across in parts]
     table = join(lines, dim=0, length=sum(len(each) for each in lines))
@@ -222,6 +223,11 @@ def _padded(values: Tensor, length: int) -> Tensor:
     """As many as `length`, by repeating the last."""
     more = length - values.shape[-1]
     return torch.cat([values, values[..., -1:].expand(*values.shape[:-1], more)], dim=-1) if more else values
+
+
+def _short(size: int, counts: Sequence[int], length: int) -> int:
+    """A size of blocks for which no product has so many terms that threads share them, and round in another way."""
+    return max(1, min(size, size * length // max(counts)))
 
 
 def _stripe(width: int) -> int:

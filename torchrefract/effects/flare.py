@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract import draws
@@ -141,8 +142,10 @@ class LensFlare(RadianceEffect):
         added = torch.addcmul(image, light, along_x)
         if not self.clip:
             return added
-        # Without gradients nobody else needs the sum.
-        return added.clamp(0, 1) if added.requires_grad or torch.compiler.is_compiling() else added.clamp_(0, 1)
+        if added.requires_grad or torch.compiler.is_compiling():
+            return added.clamp(0, 1)
+        # Nobody else needs the sum; this is a clamp in place that torch.vmap knows.
+        return F.hardtanh(added, 0.0, 1.0, inplace=True)
 
     def _valid(self, image: Tensor, along_x: Tensor, light: Tensor) -> Tensor:
         if self.blend == "screen":

@@ -2,6 +2,7 @@ import math
 from itertools import pairwise
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -219,6 +220,51 @@ def test_the_fog_is_removed_in_closed_form(mode):
     clean, valid = remove_fog(d.image, d.transmission, d.params.airlight)
     assert torch.equal(valid, d.valid)
     assert_close(torch.where(valid, clean, image), image, rtol=0, atol=1e-6)
+
+
+def test_the_transmission_through_measured_depth_is_that_of_the_formula(shared_data):
+    for name in ("clear_road_lidar", "haze_road_lidar"):
+        stored = cv2.imread(
+            str(shared_data / "references" / name / "depth_dense_derived_640x360.png"), cv2.IMREAD_UNCHANGED
+        )
+        depth = torch.from_numpy(np.where(stored == 65535, np.inf, stored / 256.0))[None, None]
+        camera = Camera(width=640, height=360, fx=705.8, fy=704.4, cx=308.2, cy=198.8, coefficients=(0.0,) * 4)
+        y, x = np.mgrid[:360, :640]
+        along = torch.from_numpy(np.sqrt(1 + ((x - 308.2) / 705.8) ** 2 + ((y - 198.8) / 704.4) ** 2))
+        for effect in (
+            UniformFog(camera=camera),
+            HeterogeneousFog(camera=camera),
+            HeterogeneousFog(mode="ray", camera=camera),
+        ):
+            d = effect.degrade(picture(1, 3, 360, 640), seed=1, depth=depth)
+            assert_close(d.transmission, torch.exp(-d.extinction * depth * along), rtol=0, atol=1e-12)
+            assert d.transmission[depth < 8].min() > 0.6
+            assert d.transmission[depth > 200].max() < 0.02
+
+
+@pytest.mark.parametrize("mode", ["image", "ray"])
+def test_gradients_of_everything_and_of_depth_are_those_of_finite_differences(mode):
+    image, depth = picture(2, 3, 4, 5), 10 + 80 * picture(2, 1, 4, 5)
+    effect = HeterogeneousFog(mode=mode)
+    params = effect.sample(image, seed=3, frame=2.5)
+    names = ("visibility", "deviation", "airlight", "weights", "contrast", "wind", "decorrelation", "frame")
+
+    def fogged(image: Tensor, depth: Tensor, *values: Tensor) -> Tensor:
+        return effect.apply(image, params._replace(**dict(zip(names, values, strict=True))), depth=depth).image
+
+    inputs = [image, depth, *(getattr(params, name).clone() for name in names)]
+    assert torch.autograd.gradcheck(fogged, [value.requires_grad_() for value in inputs])
+
+
+@pytest.mark.parametrize("mode", ["image", "ray"])
+def test_fog_in_a_clip_neither_pulses_nor_jumps(mode):
+    effect = HeterogeneousFog(mode=mode, decorrelation_range=(20.0, 20.0), wind_x_range=(0.2, 0.2))
+    k = effect.degrade(torch.zeros(2, 60, 1, 72, 128), seed=3).extinction[:, :, 0].double()
+    steps = k.diff(dim=1).square().mean(dim=(2, 3)).sqrt()
+    assert (steps.amax(dim=1) / steps.median(dim=1).values).max() < 2
+    spread = k.std(dim=(2, 3))
+    assert (spread.amax(dim=1) / spread.amin(dim=1)).max() < 2.5
+    assert_close(k.mean(dim=(2, 3)), k.mean(dim=(1, 2, 3))[:, None].expand(-1, 60), rtol=1e-5, atol=0)
 
 
 # --- ends of the domain, bad input

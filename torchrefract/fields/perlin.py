@@ -136,9 +136,9 @@ def _noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
     y = _blocks(_rows(octaves), y_counts, size=_short(min(_BAND, height), y_counts, height), dtype=weights.dtype)
     x = _blocks(_columns(octaves), x_counts, size=_short(_stripe(width), x_counts, width), dtype=weights.dtype)
     parts = zip(octaves, x.node.split(x.counts, dim=2), x.weight.split(x.counts, dim=3), strict=True)
-    lines = [_lines(each.gradient, nodes, across) for each, nodes, across in parts]
-    table = join(lines, dim=0, length=sum(len(each) for each in lines))
-    index = _line_numbers(y, lines=[len(each) for each in lines], stripes=x.node.shape[1])
+    lines = [2 * batch * x.node.shape[1] * m for m in y_counts]
+    table = join((_lines(each.gradient, *beside) for each, *beside in parts), dim=0, length=sum(lines))
+    index = _line_numbers(y, lines=lines, stripes=x.node.shape[1])
     down = (y.weight * _spread(weights, y.counts)[:, None, None, :, None]).movedim(1, 2).flatten(2, 3).flatten(0, 1).mT
     # A gradient costs one of the whole table each time that bands are looked up in it.
     few = weights.device.type == "cpu" and not torch.compiler.is_compiling() and not _has_slope(table)

@@ -8,7 +8,7 @@ import sys
 
 import torch
 import torch.nn.functional as F
-from kornia.filters import canny
+from kornia.filters import sobel
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -28,7 +28,7 @@ SCENES = {
 
 def model(images: Tensor) -> Tensor:
     """(B, 1, H, W), bool: the edges."""
-    return canny(images)[1] > 0
+    return sobel(images).amax(dim=1, keepdim=True) > 0.08
 
 
 def score(clean: Tensor, degraded: tr.Degraded) -> float:
@@ -42,15 +42,13 @@ def score(clean: Tensor, degraded: tr.Degraded) -> float:
     return (2 * recall * precision / (recall + precision).clamp(min=1e-6)).item()
 
 
-frames, depth = render_road_scenes(torch.arange(12), *SIZE)
+frames, depth = render_road_scenes(torch.arange(6), *SIZE)
 figure = Figure(figsize=(7, 4), dpi=120, layout="constrained")
 axes = figure.subplots()
 for name, scene in SCENES.items():
     curve = [score(frames, scene(s).degrade(frames, seed=1, depth=depth)) for s in presets.SEVERITIES]
     axes.plot(presets.SEVERITIES, curve, marker="o", label=name)
     print(f"{name:20}", *(f"{value:.2f}" for value in curve))
-axes.set(
-    xlabel="severity", ylabel="edges found again (F1)", xticks=presets.SEVERITIES, ylim=(0, 1), title="Canny edges"
-)
+axes.set(xlabel="severity", ylabel="edges found again (F1)", xticks=presets.SEVERITIES, ylim=(0, 1))
 axes.legend(frameon=False)
 figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "robustness_curve.png")

@@ -21,6 +21,14 @@ def shared_data() -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True)
+def fresh_compiler(request) -> Iterator[None]:
+    """All effects share the code of `forward`, and a process compiles the same code for eight kinds of them at most."""
+    yield
+    if "graph" in request.node.name:
+        torch.compiler.reset()
+
+
 class Agreement(NamedTuple):
     """How far something is from an independent oracle at most, and how far it may be."""
 

@@ -13,8 +13,8 @@ from torchrefract.effects.base import Effect
 from torchrefract.types import Degraded
 
 MAPS = ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission", "extinction", "intensity")
-AIR = {"amplitude_range": (0.5, 1.0), "length_range": (6.0, 9.0)}
-FAST = {"wind_x_range": (-2.0, 2.0), "wind_y_range": (-2.0, 2.0), "decorrelation_range": (2.0, 4.0)}
+AIR: dict[str, Any] = {"amplitude_range": (0.5, 1.0), "length_range": (6.0, 9.0)}
+FAST: dict[str, Any] = {"wind_x_range": (-2.0, 2.0), "wind_y_range": (-2.0, 2.0), "decorrelation_range": (2.0, 4.0)}
 EFFECTS: dict[str, Effect] = {
     "lens": tr.LensDistortion(),
     "turbulence": tr.Turbulence(**AIR, **FAST),
@@ -187,7 +187,7 @@ def fields(effect: Effect, frames: Tensor, *, size: tuple[int, int], keys: int) 
 
 @pytest.mark.parametrize("kind", [tr.Turbulence, tr.DivergenceFree])
 def test_a_field_forgets_itself_in_its_decorrelation_time(kind):
-    still = {"wind_x_range": (0.0, 0.0), "wind_y_range": (0.0, 0.0)}
+    still: dict[str, Any] = {"wind_x_range": (0.0, 0.0), "wind_y_range": (0.0, 0.0)}
     effect = kind(amplitude_range=(0.1, 0.1), length_range=(4.0, 4.0), decorrelation_range=(12.0, 12.0), **still)
     found = fields(effect, torch.arange(60), size=(128, 128), keys=6).flatten(2)
     power = found.square().mean()
@@ -212,7 +212,11 @@ def test_a_field_neither_pulses_nor_jumps(kind):
 
 
 def test_the_wind_carries_a_field_that_does_not_change():
-    wind = {"wind_x_range": (3.0, 3.0), "wind_y_range": (-2.0, -2.0), "decorrelation_range": (math.inf, math.inf)}
+    wind: dict[str, Any] = {
+        "wind_x_range": (3.0, 3.0),
+        "wind_y_range": (-2.0, -2.0),
+        "decorrelation_range": (math.inf, math.inf),
+    }
     effect = tr.Turbulence(amplitude_range=(1.0, 1.0), length_range=(5.0, 5.0), **wind)
     found = fields(effect, torch.tensor([0.0, 4.0, 1e5, 1e5 + 4]), size=(40, 60), keys=1)[0]
     for first, second in (found[:2], found[2:]):

@@ -126,7 +126,7 @@ def test_gradients_are_those_of_finite_differences(options):
 
 def test_the_sun_drifts_over_a_clip():
     clip = torch.zeros(1, 5, 3, *SIZE)
-    effect = LensFlare(drift_x_range=(2 / SIZE[1],) * 2, drift_y_range=(1 / SIZE[0],) * 2)
+    effect = LensFlare(drift_x_range=(2 / SIZE[1], 2 / SIZE[1]), drift_y_range=(1 / SIZE[0], 1 / SIZE[0]))
     intensity = effect.degrade(clip, seed=3).intensity[0, :, 0]
     for earlier, later in pairwise(intensity):
         assert_close(later[1:, 2:], earlier[:-1, :-2], rtol=0, atol=1e-6)

@@ -38,10 +38,14 @@ def test_the_maps_and_the_image_are_what_the_formulas_say(unit, width, oracle):
     image = picture(3, 3, *SIZE)
     d = effect.degrade(image, seed=4)
     periods = [SIZE[1] / s if unit == "cells" else s * SIZE[1] / width for s in PAPER["scales"]]
-    still = {"frame": torch.zeros(3), "wind": torch.zeros(3, 2), "decorrelation": torch.full((3,), math.inf)}
+    still: dict[str, Any] = {
+        "frame": torch.zeros(3),
+        "wind": torch.zeros(3, 2),
+        "decorrelation": torch.full((3,), math.inf),
+    }
     mixed = torch.zeros(3, 1, *SIZE, dtype=torch.float64)
     for i, (period, weight) in enumerate(zip(periods, PAPER["weights"], strict=True)):
-        options = {"period": period, "height": SIZE[0], "width": SIZE[1], "dtype": torch.float64}
+        options: dict[str, Any] = {"period": period, "height": SIZE[0], "width": SIZE[1], "dtype": torch.float64}
         noise = perlin_noise([octave(d.params.key, i, **options, **still)], torch.ones(3, 1, dtype=torch.float64))
         mixed += weight * (noise / math.sqrt(0.5) + 1) / 2
     mixed /= sum(PAPER["weights"])
@@ -182,17 +186,21 @@ def layer(effect: HeterogeneousFog, near: float, far: float, frames: int) -> Ten
 def drift_px(fields: Tensor) -> float:
     """px per frame, to the right, by which the first field matches the last best."""
     first, last = fields[0].numpy(), fields[-1].numpy()
-    shifts = np.arange(0, 60)
+    shifts = range(60)
 
     def match(s: int) -> float:
         a, b = first[:, : first.shape[1] - s].ravel(), last[:, s:].ravel()
         return float(np.corrcoef(a, b)[0, 1])
 
-    return float(shifts[np.argmax([match(s) for s in shifts])]) / (len(fields) - 1)
+    return max(shifts, key=match) / (len(fields) - 1)
 
 
 def test_near_drifts_pass_faster_than_far_ones():
-    still = {"contrast_range": (0.5, 0.5), "decorrelation_range": (math.inf, math.inf), "mean": "ensemble"}
+    still: dict[str, Any] = {
+        "contrast_range": (0.5, 0.5),
+        "decorrelation_range": (math.inf, math.inf),
+        "mean": "ensemble",
+    }
     effect = HeterogeneousFog(mode="ray", wind_x_range=(0.5, 0.5), **still)
     # A pinhole of 0.9 widths, 144 px here: 0.5 m per frame are 72 px m / distance.
     near, far = drift_px(layer(effect, 14.0, 18.0, 9)), drift_px(layer(effect, 110.0, 125.0, 41))
@@ -224,9 +232,8 @@ def test_the_fog_is_removed_in_closed_form(mode):
 
 def test_the_transmission_through_measured_depth_is_that_of_the_formula(shared_data):
     for name in ("clear_road_lidar", "haze_road_lidar"):
-        stored = cv2.imread(
-            str(shared_data / "references" / name / "depth_dense_derived_640x360.png"), cv2.IMREAD_UNCHANGED
-        )
+        path = shared_data / "references" / name / "depth_dense_derived_640x360.png"
+        stored: Any = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         depth = torch.from_numpy(np.where(stored == 65535, np.inf, stored / 256.0))[None, None]
         camera = Camera(width=640, height=360, fx=705.8, fy=704.4, cx=308.2, cy=198.8, coefficients=(0.0,) * 4)
         y, x = np.mgrid[:360, :640]

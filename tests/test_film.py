@@ -153,7 +153,7 @@ def test_few_pages_are_in_memory_at_a_time(tmp_path, frame, monkeypatch, suffix)
     class Page(np.ndarray):
         """An array that a set of weak references takes."""
 
-        __hash__ = object.__hash__  # pyright: ignore[reportAssignmentType]
+        __hash__ = object.__hash__  # pyright: ignore[reportAssignmentType]  # a class with __eq__ has none of its own
 
     def pages(self: Film, times: Iterable[int]) -> Iterator[np.ndarray]:
         for page in original(self, times):

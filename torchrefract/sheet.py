@@ -81,8 +81,8 @@ def make_row(name: str, effect: Effect, *, frame: Tensor, seed: int, depth: Tens
 
         restored = warp(corrupted, restore_flow), bicubic; of a fog alone, remove_fog(round(255 corrupted) / 255)
 
-    The checkerboard goes through the same draw; its folded pixels are marked. Its, the map's and the restored frame's
-    pixels that are not valid are hatched. All is computed in the pixels of the frame, and shrunk to be drawn.
+    The checkerboard goes through the same draw; its folded pixels are marked. Its pixels, those of a flow's map and of
+    the restored frame that are not valid are hatched. All is computed in the frame's pixels, and shrunk to be drawn.
 
     Args:
         name: what the row is called.
@@ -166,7 +166,7 @@ def map_picture(degraded: Degraded, scales: Sequence[Scale], *, largest: int) ->
 
 
 def sheet(rows: Sequence[SheetRow], *, title: str) -> Figure:
-    """The rows below a title, as a picture; above each UV map is its own scale.
+    """The rows below a title, as a picture; above each map is its own scale.
 
     Args:
         rows: at least one, all of one frame.

@@ -221,7 +221,7 @@ class HeterogeneousFog(RadianceEffect):
         focal, center = self._pinhole(height, width)
         q = path_mean(
             key,
-            spread(distance, rows) if distance.shape[0] > 1 else distance,
+            distance,
             height=height,
             width=width,
             focal=focal,

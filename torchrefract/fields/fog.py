@@ -46,30 +46,17 @@ def veil(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
         t: (B, 1, H or 1, W or 1), in [0, 1].
         airlight: (B, C, 1, 1).
     """
-    if not _by_row(image, t):
+    on_cpu = image.device.type == "cpu" and not torch.compiler.is_compiling()
+    if image.numel() == 0 or t.shape[3] > 1 or not on_cpu:
         return torch.lerp(airlight, image, t)
-    return linear(image, t, airlight * (1 - t))
-
-
-def linear(value: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
-    """value scale + shift; scale and shift broadcast to the value, (B, C, H, W)."""
-    if not _by_row(value, scale, shift):
-        return torch.addcmul(shift, value, scale)
-    # With a number for each row, no pass of that kind vectorizes. A batch norm that is not training is one that does,
+    # With a number for each row, lerp does not vectorize. A batch norm that is not training is one such pass,
     # x w + b for each channel; each row is a channel here.
-    size = (*value.shape[:3], 1)
-    rows = value.shape[0] * value.shape[1] * value.shape[2]
+    size = (*image.shape[:3], 1)
+    lines = image.contiguous().view(1, -1, image.shape[3])
+    weight, bias = (number.expand(size).reshape(-1) for number in (t, airlight * (1 - t)))
     # The mean of zero serves as the variance too, beside an epsilon of 1.
-    lines, zero = value.contiguous().view(1, rows, value.shape[3]), value.new_zeros(rows)
-    weight, bias = (number.expand(size).reshape(rows) for number in (scale, shift))
-    return F.batch_norm(lines, zero, zero, weight, bias, eps=1.0).view_as(value)
-
-
-def _by_row(value: Tensor, *numbers: Tensor) -> bool:
-    """Whether there is a number for each row of a value on the CPU."""
-    if value.numel() == 0 or value.device.type != "cpu" or torch.compiler.is_compiling():
-        return False
-    return all(number.shape[3] == 1 for number in numbers)
+    zero = torch.zeros_like(bias)
+    return F.batch_norm(lines, zero, zero, weight, bias, eps=1.0).view_as(image)
 
 
 def _finite(depth: Tensor) -> Tensor:

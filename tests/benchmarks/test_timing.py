@@ -1,7 +1,10 @@
 import json
+import platform
 import subprocess
+import sys
 from dataclasses import FrozenInstanceError
 from itertools import groupby
+from pathlib import Path
 
 import pytest
 import timing
@@ -10,6 +13,8 @@ from timing import Bar, Conditions, Spread, Timing, measure, references, save, t
 from torch.testing import assert_close
 
 from torchrefract.warping import resample
+
+BENCHMARKS = Path(timing.__file__).parent
 
 
 class FakeClock:
@@ -160,7 +165,7 @@ def test_a_saved_run_holds_everything(tmp_path, conditions):
     assert content["bars"] == [
         {"name": "effect", "value": 2.0, "sign": "<=", "limit": 3.0, "unit": "x reference", "holds": True}
     ]
-    keys = "date commit device cpu load torch python opencv threads repeats frame dtype"
+    keys = "date commit device cpu keeps_freed_memory load torch python opencv threads repeats frame dtype"
     assert list(content["conditions"]) == keys.split()
     assert content["conditions"]["frame"] == [2, 3, 5, 7]
     assert content["conditions"]["torch"] == torch.__version__
@@ -212,3 +217,21 @@ def test_large_ratios_are_printed_in_full():
 def test_a_timing_cannot_be_changed():
     with pytest.raises(FrozenInstanceError):
         timed().name = "other"  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can be told to keep freed memory")
+def test_freed_memory_stays_with_the_process():
+    script = """
+import resource, torch, timing
+faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+def work():
+    for _ in range(5):
+        kept = [torch.ones(6_000_000) for _ in range(3)]
+work(); start = faults(); work(); by_default = faults() - start
+assert timing.keep_freed_memory()
+work(); start = faults(); work(); print(by_default, faults() - start)
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=BENCHMARKS, capture_output=True, text=True, check=True)
+    by_default, kept = map(int, done.stdout.split())
+    assert by_default > 10_000
+    assert kept < 100

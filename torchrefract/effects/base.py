@@ -78,7 +78,8 @@ class Effect(nn.Module, ABC):
         Raises:
             ValueError, TypeError: arguments that do not fit.
         """
-        return self._run(image, self.sample(image, seed=seed, keys=keys, frame=frame), depth)
+        layout = check_image(image)
+        return self._run(image, layout, self._sample(image, layout, seed, keys, 0, frame), depth)
 
     def sample(
         self,
@@ -90,7 +91,17 @@ class Effect(nn.Module, ABC):
         frame: float | Tensor = 0,
     ) -> Any:
         """The parameters of one draw for this image, a NamedTuple of tensors; `place` is that in a pipeline."""
-        layout = check_image(image)
+        return self._sample(image, check_image(image), seed, keys, place, frame)
+
+    def _sample(
+        self,
+        image: Tensor,
+        layout: Layout,
+        seed: int | Tensor | None,
+        keys: Tensor | Sequence[int] | None,
+        place: int,
+        frame: float | Tensor,
+    ) -> Any:
         seed = draws.call_seed() if seed is None else _seed(seed)
         source = draws.stream(seed, _keys(keys, layout.batch, image.device), device=image.device)
         params = self.draw(source.at(place), _samples(image, layout))
@@ -110,7 +121,7 @@ class Effect(nn.Module, ABC):
         self.check_params(params, _samples(image, layout))
         if frame is not None:
             params = at_frames(params, lambda: _frames(frame, image, layout))
-        return self._run(image, params, depth)
+        return self._run(image, layout, params, depth)
 
     params_type: type[Any]
 
@@ -126,8 +137,7 @@ class Effect(nn.Module, ABC):
     def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """The rows (N, C, H, W), floating, degraded by checked parameters of B samples, of N / B frames each."""
 
-    def _run(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
-        layout = check_image(image)
+    def _run(self, image: Tensor, layout: Layout, params: Any, depth: Tensor | None) -> Degraded:
         rows = enter(image)
         _check_frames(params, layout)
         fitting = None if depth is None else check_depth_fits(depth, image, layout)
@@ -193,12 +203,16 @@ def _samples(image: Tensor, layout: Layout) -> Tensor:
 
 def _frames(first: float | Tensor, image: Tensor, layout: Layout) -> Tensor:
     """(B, T), the numbers of the frames."""
-    dtype = field_dtype(image.dtype)
-    start = torch.as_tensor(first, dtype=dtype, device=image.device)
+    options: Any = {"dtype": field_dtype(image.dtype), "device": image.device}
+    if not isinstance(first, Tensor):
+        first = check_number("frame", first)
+        if layout.frames == 1:
+            return torch.full((layout.batch, 1), first, **options)
+    start = torch.as_tensor(first, **options)
     if start.ndim > 1 or (start.ndim == 1 and start.shape[0] not in (1, layout.batch)):
         raise ValueError(f"frame must be a number, or one for each of {layout.batch} samples, got {tuple(start.shape)}")
     check_all("frame", "be finite", start, torch.isfinite)
-    return start.view(-1, 1).expand(layout.batch, 1) + torch.arange(layout.frames, dtype=dtype, device=image.device)
+    return start.view(-1, 1).expand(layout.batch, 1) + torch.arange(layout.frames, **options)
 
 
 def _check_frames(params: Any, layout: Layout) -> None:

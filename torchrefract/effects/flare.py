@@ -124,8 +124,7 @@ class LensFlare(RadianceEffect):
         rows, _, height, width = image.shape
         dtype = field_dtype(image.dtype)
         share = params.center[:, None] + params.frame[:, :, None] * params.drift[:, None]
-        x, y = share.to(dtype).reshape(-1, 2).unbind(1)
-        center = torch.stack([x * width - 0.5, y * height - 0.5], dim=1)
+        center = share.to(dtype).reshape(-1, 2) * share.new_tensor((width, height), dtype=dtype) - 0.5
         radius = spread(params.radius.to(dtype), rows) * math.hypot(width, height)
         along_x, along_y = flare_axes(center, radius, height=height, width=width)
         along_y = along_y * column(spread(params.strength.to(dtype), rows))

@@ -3,7 +3,6 @@
 import math
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 # Farther than anything.
@@ -46,17 +45,10 @@ def veil(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
         t: (B, 1, H or 1, W or 1), in [0, 1].
         airlight: (B, C, 1, 1).
     """
-    on_cpu = image.device.type == "cpu" and not torch.compiler.is_compiling()
-    if image.numel() == 0 or t.shape[3] > 1 or not on_cpu:
-        return torch.lerp(airlight, image, t)
-    # With a number for each row, lerp does not vectorize. A batch norm that is not training is one such pass,
-    # x w + b for each channel; each row is a channel here.
-    size = (*image.shape[:3], 1)
-    lines = image.contiguous().view(1, -1, image.shape[3])
-    weight, bias = (number.expand(size).reshape(-1) for number in (t, airlight * (1 - t)))
-    # The mean of zero serves as the variance too, beside an epsilon of 1.
-    zero = torch.zeros_like(bias)
-    return F.batch_norm(lines, zero, zero, weight, bias, eps=1.0).view_as(image)
+    if t.shape[3] == 1:
+        # With two numbers for each row the loop over a row's pixels is not vectorized: one is written out, once.
+        airlight = airlight.expand(-1, -1, -1, image.shape[3]).contiguous()
+    return torch.lerp(airlight, image, t)
 
 
 def _finite(depth: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from torchrefract._checks import read
 
 POLYNOMIAL12 = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
 _NODES = 2048
+_SMALLEST_RADIAL = 0.1  # of a first guess
 
 
 class Terms(NamedTuple):
@@ -120,6 +121,30 @@ def undistort_polynomial(
         if terms.bent:
             room = torch.minimum(room, _slopes(x, y, r2, g, c, terms).determinant)
         return x.nan_to_num(0, 0, 0), y.nan_to_num(0, 0, 0), room >= 0
+
+
+def newton_undistort(
+    x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, steps: int, terms: Terms = ALL_TERMS
+) -> tuple[Tensor, Tensor]:
+    """The points that `distort_polynomial` maps to (x_d, y_d), for lenses that fold nowhere near; without gradient.
+
+    So many Newton steps in the plane, from the distorted point over the radial part taken there.
+
+    Args:
+        x_d, y_d: (B, ...), on the plane z = 1.
+        coefficients: (B, 12, ...), k1 ... k6, p1, p2, s1 ... s4.
+        steps: 0 or more.
+        terms: those to compute.
+    """
+    with torch.no_grad():
+        c = coefficients.unbind(1)
+        radial = _radial(x_d * x_d + y_d * y_d, c, terms.radial).clamp(min=_SMALLEST_RADIAL)
+        x, y = x_d / radial, y_d / radial
+        for _ in range(steps):
+            (reached_x, reached_y), r2, g = _distorted(x, y, c, terms)
+            step_x, step_y = _slopes(x, y, r2, g, c, terms).solve(reached_x - x_d, reached_y - y_d)
+            x, y = x - step_x, y - step_y
+        return x, y
 
 
 class RadialLimit(NamedTuple):

@@ -121,7 +121,11 @@ class Effect(nn.Module, ABC):
         self.check_params(params, _samples(image, layout))
         if frame is not None:
             params = at_frames(params, lambda: _frames(frame, image, layout))
-        return self._run(image, layout, params, depth)
+        return self.fitted(params)._run(image, layout, params, depth)
+
+    def fitted(self, params: Any) -> "Effect":
+        """The effect that takes parameters which are given: itself, unless it relies on its own ranges."""
+        return self
 
     params_type: type[Any]
 

@@ -1,6 +1,7 @@
 """Several effects in a row, with one look-up for all warps that follow one another; or one out of several."""
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -101,6 +102,15 @@ class Compose(Effect):
             else:
                 walk.shade(effect, own)
         return walk.arrive(params)
+
+    def fitted(self, params: ComposeParams) -> "Compose":
+        """The composition, with each effect that relies on ranges which its parameters lie outside of exact."""
+        effects = [effect.fitted(child) for effect, child in zip(self._effects(), params.children, strict=True)]
+        if all(new is old for new, old in zip(effects, self._effects(), strict=True)):
+            return self
+        fitted = copy(self)
+        fitted._modules = {**self._modules, "effects": nn.ModuleList(effects)}
+        return fitted
 
     def leaves(self, params: ComposeParams) -> Iterator[tuple[Effect, Any]]:
         """The effects that are no compositions, in order, with their parameters."""

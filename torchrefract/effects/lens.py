@@ -1,18 +1,22 @@
 """The lens of a cheap dashcam."""
 
 import warnings
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
 
 from torchrefract import draws
 from torchrefract._checks import check_all, check_flag, check_range, is_true
-from torchrefract.cameras.distortion import POLYNOMIAL12
+from torchrefract.cameras.distortion import ALL_TERMS, POLYNOMIAL12
 from torchrefract.effects.base import params_to
+from torchrefract.effects.lens_plan import covers, kept_terms, lens_plan
+from torchrefract.effects.plan import Plan
 from torchrefract.effects.refraction import WarpEffect
-from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow
+from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, smooth_lens_flow
+from torchrefract.fields.lens_bounds import LensRanges
 from torchrefract.types import Degraded, Range
+from torchrefract.warping.lattice import Lattice
 
 _LARGEST_COEFFICIENT = 100.0
 _MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors are another model in another order)"
@@ -47,7 +51,7 @@ class LensDistortion(WarpEffect):
         aspect_range: fy / fx, above 0.
         center_x_range, center_y_range: offset of the principal point from the center of the frame, in widths.
         strict: raise, instead of warning, where the model folds back inside the frame (on the CPU).
-        padding, interpolation, p: as for every warp.
+        padding, interpolation, tolerance_px, p: as for every warp.
 
     Raises:
         ValueError: an argument outside its range; a lens that folds inside the frame, if `strict`.
@@ -77,9 +81,10 @@ class LensDistortion(WarpEffect):
         strict: bool = False,
         padding: str = "zeros",
         interpolation: str = "bilinear",
+        tolerance_px: float | None = None,
         p: float = 1.0,
     ):
-        super().__init__(padding=padding, interpolation=interpolation, p=p)
+        super().__init__(padding=padding, interpolation=interpolation, tolerance_px=tolerance_px, p=p)
         radial = (k1_range, k2_range, k3_range, k4_range, k5_range, k6_range)
         others = (p1_range, p2_range, s1_range, s2_range, s3_range, s4_range)
         for name, value in zip(POLYNOMIAL12, radial + others, strict=True):
@@ -105,9 +110,26 @@ class LensDistortion(WarpEffect):
         """Raise for lenses that are none."""
         check_lens(params, image.shape[0])
 
+    def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
+        """The plan of `lens_plan`."""
+        return lens_plan(self._ranges(), height, width, self.tolerance_px, dtype is torch.float64)
+
+    def covers(self, params: LensParams) -> Tensor:
+        """Whether the lenses lie in the ranges."""
+        return covers(self._ranges(), params.coefficients, params.focal, params.center)
+
+    def nodes(self, params: LensParams, plan: Plan, lattice: Lattice) -> Tensor:
+        """The flow of `smooth_lens_flow`."""
+        x, y = lattice.axes(dtype=params.focal.dtype, device=params.focal.device)
+        terms = ALL_TERMS if params.coefficients.requires_grad else kept_terms(plan)
+        camera = in_px(params, lattice.height, lattice.width)
+        return smooth_lens_flow(*camera, x, y, steps=cast(int, plan.steps), terms=terms)
+
     def compute(self, image: Tensor, params: LensParams, depth: Tensor | None) -> Degraded:
         """The batch looked up along the flow; a lens that folds is told."""
-        self._check_fold(params, *image.shape[2:])
+        height, width = image.shape[2:]
+        if self.planned(height, width, params.focal.dtype).stride == 1:  # no other plan has lenses that fold
+            self._check_fold(params, height, width)
         return super().compute(image, params, depth)
 
     def flow(self, params: LensParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -122,6 +144,10 @@ class LensDistortion(WarpEffect):
     def moves(self, params: LensParams) -> Tensor:
         """The samples with a coefficient that is not zero."""
         return (params.coefficients != 0).any(dim=1)
+
+    def _ranges(self) -> LensRanges:
+        others = (self.focal_range, self.aspect_range, self.center_x_range, self.center_y_range)
+        return LensRanges(tuple(getattr(self, f"{name}_range") for name in POLYNOMIAL12), *others)
 
     def _check_fold(self, params: LensParams, height: int, width: int) -> None:
         camera = in_px(params, height, width)

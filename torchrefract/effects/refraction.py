@@ -2,19 +2,23 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, cast
+from copy import copy
+from functools import cached_property
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from torchrefract._checks import check_choice, is_true
 from torchrefract.effects.base import Effect
+from torchrefract.effects.plan import Plan, check_size, check_tolerance
 from torchrefract.effects.rows import alike, column, learns, only, spread
 from torchrefract.types import Degraded, Inverse, Map
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import field_dtype, inside, length
 from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.jacobian import folding
+from torchrefract.warping.lattice import Lattice, SmoothFlow
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, look_up
 
 
@@ -24,17 +28,63 @@ class WarpEffect(Effect):
     Args:
         padding: what lies outside the frame: "zeros", "border" or "reflection".
         interpolation: "nearest", "bilinear" or "bicubic".
+        tolerance_px: how far the flow may be from the exact one, px, anywhere and for all parameters in the ranges of
+            the effect, so that it can be computed on a coarser lattice, see `plan`; None is exact.
         p: chance that a sample is degraded at all.
     """
 
-    def __init__(self, *, padding: str = "zeros", interpolation: str = "bilinear", p: float = 1.0):
+    def __init__(
+        self,
+        *,
+        padding: str = "zeros",
+        interpolation: str = "bilinear",
+        tolerance_px: float | None = None,
+        p: float = 1.0,
+    ):
         super().__init__(p=p)
+        self.tolerance_px = check_tolerance(tolerance_px)
         self.padding = check_choice("padding", padding, PADDINGS)
         self.interpolation = check_choice("interpolation", interpolation, INTERPOLATIONS)
 
     @abstractmethod
     def flow(self, params: Any, *, height: int, width: int) -> tuple[Tensor, Tensor]:
         """The flow (B, 2, H, W) in px, and where it exists, (B, 1, H, W), bool; B T rows if it changes over a clip."""
+
+    def plan(self, height: int, width: int, *, dtype: torch.dtype = torch.float32) -> Plan:
+        """What the effect does for frames of this size under its tolerance; printed, too.
+
+        Args:
+            height, width: px, of the frame.
+            dtype: of the image.
+
+        Raises:
+            ValueError: a frame without a pixel; a tolerance below the rounding of positions in such a frame.
+        """
+        check_size(height, width)
+        plan = self.planned(height, width, field_dtype(dtype))
+        print(plan)
+        return plan
+
+    def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
+        """The plan for fields of a type, from the ranges alone."""
+        why = "no tolerance" if self.tolerance_px is None else "no bound is known for this effect"
+        return Plan(height, width, self.tolerance_px, 1, 0.0, why)
+
+    def fitted(self, params: Any) -> "WarpEffect":
+        """The effect itself; an exact one for parameters outside the ranges that its plan is for."""
+        if self.tolerance_px is None or is_true(lambda: self.covers(params)) is not False:
+            return self
+        exact = copy(self)
+        exact.tolerance_px = None
+        return exact
+
+    def covers(self, params: Any) -> Tensor:
+        """(), bool: all parameters lie in the ranges that the plan is for."""
+        return params.gate.new_ones(())
+
+    def nodes(self, params: Any, plan: Plan, lattice: Lattice) -> Tensor:
+        """(B, 2, n, m), px: the flow at the nodes of the plan's lattice, where it exists everywhere."""
+        raise NotImplementedError(f"{type(self).__name__} has no plan with a lattice")
 
     def restore_flow(self, params: Any, *, height: int, width: int) -> tuple[Tensor, Tensor]:
         """The flow that undoes `flow`, and where it exists."""
@@ -49,11 +99,25 @@ class WarpEffect(Effect):
     def moves(self, params: Any) -> Tensor:
         """(B,), bool: the samples whose parameters move anything at all."""
 
+    def stirs(self, params: Any, height: int, width: int) -> bool:
+        """Whether a sample may be moved, or a gradient is asked for that could move it."""
+        if learns(params):
+            return True
+        if self.planned(height, width, _field_type(params)).stride == 0:
+            return False
+        return is_true((params.gate & self.moves(params)).any) is not False
+
     def gated(self, params: Any, *, height: int, width: int) -> "Moved":
         """The flow, zero for the samples that the effect leaves alone."""
-        flow, exists = self.flow(params, height=height, width=width)
-        active = spread(params.gate & self.moves(params) & (height * width > 1), flow.shape[0])
-        return Moved(only(flow, 0.0, active, params), exists | ~column(active), active)
+        plan = self.planned(height, width, _field_type(params))
+        active = params.gate & self.moves(params) & (height * width > 1)
+        if plan.lattice is None:
+            flow, exists = self.flow(params, height=height, width=width)
+            active = spread(active, flow.shape[0])
+            return Moved(only(flow, 0.0, active, params), exists | ~column(active), active)
+        nodes = self.nodes(params, plan, plan.lattice)
+        active = spread(active, nodes.shape[0])
+        return Moved(SmoothFlow(only(nodes, 0.0, active, params), plan.lattice), column(active).new_ones(1), active)
 
     def gated_undo(self, params: Any, moved: "Moved") -> tuple[Tensor, Tensor]:
         """The flow that undoes `gated`, and where it exists."""
@@ -63,11 +127,11 @@ class WarpEffect(Effect):
     def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """The batch looked up along the flow."""
         height, width = image.shape[2:]
-        if is_true((params.gate & self.moves(params)).any) is False and not learns(params):
+        if not self.stirs(params, height, width):
             return identity(image, params)
         moved = self.gated(params, height=height, width=width)
-        flow = spread(moved.flow, image.shape[0])
-        warped = look_up(image, flow, padding=self.padding, interpolation=self.interpolation)
+        path = moved.spread(image.shape[0]).path
+        warped = look_up(image, path, padding=self.padding, interpolation=self.interpolation)
         return moving(
             only(warped, image, moved.active, params),
             params,
@@ -77,16 +141,27 @@ class WarpEffect(Effect):
         )
 
 
-class Moved(NamedTuple):
-    """What an effect moves, in one row for each clip or for each frame."""
+class Moved:
+    """What an effect moves, in one row for each clip or for each frame.
 
-    flow: Tensor  # (B, 2, H, W), px
-    exists: Tensor  # (B, 1, H, W), bool
-    active: Tensor  # (B,), bool: the samples that are moved at all
+    path: (B, 2, H, W), px, the flow, or the flow on a lattice.
+    exists: bool, of (B, 1, H, W) or what broadcasts to it.
+    active: (B,), bool: the samples that are moved at all.
+    """
+
+    def __init__(self, path: Tensor | SmoothFlow, exists: Tensor, active: Tensor):
+        self.path, self.exists, self.active = path, exists, active
+
+    @cached_property
+    def flow(self) -> Tensor:
+        """(B, 2, H, W), px."""
+        return self.path.dense() if isinstance(self.path, SmoothFlow) else self.path
 
     def spread(self, rows: int) -> "Moved":
         """The same in so many rows."""
-        return Moved(*(spread(value, rows) for value in self))
+        if rows == len(self.active):
+            return self
+        return Moved(_spread_path(self.path, rows), spread(self.exists, rows), spread(self.active, rows))
 
 
 def moving(
@@ -136,3 +211,13 @@ def identity(image: Tensor, params: Any) -> Degraded:
         restore=lambda: Inverse(still, everywhere, lambda: still[:, :1]),
         folding=lambda: folding(still),
     )
+
+
+def _field_type(params: Any) -> torch.dtype:
+    return next(value.dtype for value in params if value.is_floating_point())
+
+
+def _spread_path(path: Tensor | SmoothFlow, rows: int) -> Tensor | SmoothFlow:
+    if isinstance(path, SmoothFlow):
+        return SmoothFlow(spread(path.nodes, rows), path.lattice)
+    return spread(path, rows)

@@ -54,9 +54,9 @@ class Walk:
     def move(self, effect: WarpEffect, params: Any) -> None:
         """One more warp waits."""
         self.refracts = True
-        if is_true((params.gate & effect.moves(params)).any) is False and not learns(params):
-            return
         rows, _, height, width = self.image.shape
+        if not effect.stirs(params, height, width):
+            return
         own = effect.gated(params, height=height, width=width)
         moved, valid = own.spread(rows), self.valid
         self.waiting.append(_Step(spread(params.gate, rows), moved.active, moved.flow))

@@ -10,6 +10,7 @@ from torchrefract.cameras.distortion import (
     Terms,
     distort_polynomial,
     jacobian_polynomial,
+    newton_undistort,
     radial_limit,
     undistort_polynomial,
     used_terms,
@@ -61,6 +62,28 @@ def lens_restore_flow(
     return _stacked([_restore_flow_of_rows(x, rows, c, focal, limit, terms) for rows in bands])
 
 
+def smooth_lens_flow(
+    coefficients: Tensor, focal: Tensor, center: Tensor, x: Tensor, y: Tensor, *, steps: int, terms: Terms
+) -> Tensor:
+    """The flow of `lens_flow` at any places, for lenses that fold nowhere near, by so many Newton steps.
+
+    Args:
+        coefficients, focal, center: as for `lens_flow`.
+        x, y: (1, 1, 1, m) and (1, 1, n, 1), px.
+        steps: of `newton_undistort`.
+        terms: those to compute.
+
+    Returns:
+        (B, 2, n, m), px.
+    """
+    c = coefficients[:, :, None, None, None]
+    x_d, y_d = _on_plane((x, y), focal, center)
+    found_x, found_y = newton_undistort(x_d.detach(), y_d.detach(), c.detach(), steps=steps, terms=terms)
+    if torch.is_grad_enabled() and (c.requires_grad or x_d.requires_grad):
+        found_x, found_y = _attach(found_x, found_y, x_d, y_d, c, terms)
+    return torch.cat([found_x - x_d, found_y - y_d], dim=1) * focal[:, :, None, None]
+
+
 def frame_limit(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> RadialLimit:
     """How far the radial part can be inverted, looked for as far as the frame asks; arguments as for `lens_flow`."""
     corner = _corner_radius(focal.detach(), center.detach(), height, width)
@@ -104,9 +127,14 @@ def _corner_radius(focal: Tensor, center: Tensor, height: int, width: int) -> Te
 def _normalized(
     coefficients: Tensor, focal: Tensor, center: Tensor, height: int, width: int
 ) -> tuple[Tensor, Terms, Tensor, Tensor]:
-    axes = pixel_axes(height, width, dtype=focal.dtype, device=focal.device)
-    x, y = ((axis - center[:, i, None, None, None]) / focal[:, i, None, None, None] for i, axis in enumerate(axes))
+    x, y = _on_plane(pixel_axes(height, width, dtype=focal.dtype, device=focal.device), focal, center)
     return coefficients[:, :, None, None, None], used_terms(coefficients), x, y
+
+
+def _on_plane(axes: tuple[Tensor, Tensor], focal: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
+    """Places in px on the plane z = 1."""
+    x, y = ((axis - center[:, i, None, None, None]) / focal[:, i, None, None, None] for i, axis in enumerate(axes))
+    return x, y
 
 
 def _rows_at_once(x: Tensor, height: int) -> int:

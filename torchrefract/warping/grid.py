@@ -39,7 +39,7 @@ def length(flow: Tensor) -> Tensor:
 def sampler_grid(flow: Tensor) -> Tensor:
     """(B, H, W, 2): the positions p + flow(p) as F.grid_sample(align_corners=False) wants them, finite in any case.
 
-    x' = clamp((2 x + 1) / W - 1 + 2 u / W, -4, 4),  y' likewise with v and H
+    Those of `sampler_positions`, within [-4, 4].
     """
     return next(sampler_grids(flow, rows=flow.shape[2]))
 
@@ -48,10 +48,27 @@ def sampler_grids(flow: Tensor, *, rows: int) -> Iterator[Tensor]:
     """The grid of `sampler_grid`, in bands of so many rows."""
     height, width = flow.shape[2:]
     x, y = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
+    for band, middle in zip(flow.split(max(1, rows), dim=2), y.split(max(1, rows), dim=2), strict=True):
+        yield finite(sampler_positions(band, x, middle, height=height, width=width), _FAR).movedim(1, -1)
+
+
+def sampler_positions(flow: Tensor, x: Tensor, y: Tensor, *, height: int, width: int) -> Tensor:
+    """(B, 2, n, m): the positions p + flow(p) in the coordinates of F.grid_sample.
+
+        x' = (2 x + 1) / W - 1 + 2 u / W,  y' likewise with v and H
+
+    Args:
+        flow: (B, 2, n, m), px.
+        x, y: (1, 1, 1, m) and (1, 1, n, 1), px, where the flow is.
+        height, width: px, of the frame.
+    """
     # A pixel center sits at (i + 1/2) / n of the width, so an image of one pixel is no special case.
     x, y = (2 * x + 1) / width - 1, (2 * y + 1) / height - 1
-    for band, middle in zip(flow.split(max(1, rows), dim=2), y.split(max(1, rows), dim=2), strict=True):
-        u, v = band.split(1, dim=1)
-        grid = torch.cat([x + u * (2 / width), middle + v * (2 / height)], dim=1)
-        # One NaN in a grid with border padding ends the process in the sampler's backward.
-        yield grid.nan_to_num(nan=_FAR, posinf=_FAR, neginf=-_FAR).clamp(-_FAR, _FAR).movedim(1, -1)
+    u, v = flow.split(1, dim=1)
+    return torch.cat([x + u * (2 / width), y + v * (2 / height)], dim=1)
+
+
+def finite(positions: Tensor, limit: float) -> Tensor:
+    """The positions within a limit; what is no number lies there."""
+    # One NaN in a grid with border padding ends the process in the sampler's backward.
+    return positions.nan_to_num(nan=limit, posinf=limit, neginf=-limit).clamp(-limit, limit)

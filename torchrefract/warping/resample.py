@@ -1,5 +1,7 @@
 """Looking an image up along a flow: the one call of F.grid_sample."""
 
+from collections.abc import Iterable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -7,6 +9,7 @@ from torch import Tensor
 from torchrefract._bands import join
 from torchrefract._checks import check_choice, check_flow, check_tensor
 from torchrefract.warping.grid import field_dtype, inside, sampler_grids
+from torchrefract.warping.lattice import SmoothFlow
 
 PADDINGS = ("zeros", "border", "reflection")
 INTERPOLATIONS = ("nearest", "bilinear", "bicubic")
@@ -54,15 +57,16 @@ def warp(
     return look_up(image, flow, padding=padding, interpolation=interpolation), inside(flow)
 
 
-def look_up(image: Tensor, flow: Tensor, *, padding: str, interpolation: str) -> Tensor:
+def look_up(image: Tensor, flow: Tensor | SmoothFlow, *, padding: str, interpolation: str) -> Tensor:
     """The image (B, C, H, W) at p + flow(p), flow being (B, 2, H, W) in px; the arguments are taken as checked."""
     if image.numel() == 0:
         return image.clone()
-    source = _as_field(image, flow)
-    whole = (interpolation, padding) == _WHOLE
-    grids = sampler_grids(flow.to(source.dtype), rows=flow.shape[2] if whole else _rows_at_once(source, flow))
-    bands = (_sample(source, grid, padding=padding, interpolation=interpolation) for grid in grids)
-    warped = join(bands, dim=2, length=flow.shape[2])
+    source = _as_field(image, flow.nodes if isinstance(flow, SmoothFlow) else flow)
+    bands = (
+        _sample(source, grid, padding=padding, interpolation=interpolation)
+        for grid in _grids(source, flow, whole=(interpolation, padding) == _WHOLE)
+    )
+    warped = join(bands, dim=2, length=image.shape[2])
     if interpolation == "bicubic":
         warped = _clamped(warped, source, padding)
     return _as_image(warped, image)
@@ -114,6 +118,12 @@ def _clamped(warped: Tensor, source: Tensor, padding: str) -> Tensor:
     if padding == "zeros":
         low, high = low.clamp(max=0), high.clamp(min=0)
     return torch.where(warped.isfinite(), warped.clamp(low, high), warped)
+
+
+def _grids(source: Tensor, flow: Tensor | SmoothFlow, *, whole: bool) -> Iterable[Tensor]:
+    if isinstance(flow, SmoothFlow):
+        return [flow.sampler_grid(source.dtype)]
+    return sampler_grids(flow.to(source.dtype), rows=flow.shape[2] if whole else _rows_at_once(source, flow))
 
 
 def _rows_at_once(source: Tensor, flow: Tensor) -> int:

@@ -1,0 +1,84 @@
+"""What a lens will compute under a tolerance."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from torchrefract.cameras.distortion import POLYNOMIAL12, Terms
+from torchrefract.effects.plan import STRIDES, Plan, check_reachable, coarsest
+from torchrefract.fields.lens_bounds import LensRanges, lens_errors, moved_by_terms
+from torchrefract.types import Range
+from torchrefract.warping.lattice import Lattice
+
+# Of the tolerance: for the terms that are left out and for Newton's method; the rest is for the cubics.
+_DROPPED, _NEWTON = 0.2, 0.1
+# Farther from the center the sampler of an exact flow clamps positions.
+_MOST_STRETCH = 3.0
+# What goes together or not at all, the least important first.
+_GROUPS = (range(8, 12), range(6, 8), (5,), (4,), (3,), (2,), (1,), (0,))
+
+
+def covers(ranges: LensRanges, coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
+    """(), bool: lenses (B, 12), (B, 2), (B, 2) all lie in the ranges, but for rounding."""
+    values = torch.cat([coefficients, focal[:, :1], focal[:, 1:] / focal[:, :1], center], dim=1)
+    low, high = torch.tensor([*ranges.coefficients, *ranges[1:]], dtype=values.dtype, device=values.device).unbind(1)
+    room = 1e-5 * torch.maximum(low.abs(), high.abs())
+    return ((values >= low - room) & (values <= high + room)).all()
+
+
+@lru_cache(maxsize=256)
+def lens_plan(ranges: LensRanges, height: int, width: int, tolerance: float | None, double: bool) -> Plan:
+    """The plan for frames of a size, in float64 or in float32."""
+
+    def exact(why: str) -> Plan:
+        return Plan(height, width, tolerance, 1, 0.0, why)
+
+    if tolerance is None:
+        return exact("no tolerance")
+    room = check_reachable(tolerance, height=height, width=width, double=double)
+    if all(limits == (0.0, 0.0) for limits in ranges.coefficients):
+        return Plan(height, width, tolerance, 0, 0.0, "no coefficient is other than zero")
+    finest = Lattice(height, width, STRIDES[0])
+    moved = moved_by_terms(ranges, finest)
+    if moved is None:
+        return exact("a lens of the ranges may fold inside the frame")
+    kept, dropped = _terms(ranges.coefficients, moved, _DROPPED * room)
+    left_out = sum(size for _, size in dropped)
+    if not kept:
+        return Plan(height, width, tolerance, 0, left_out, "it moves too little", dropped=dropped)
+
+    def attempt(stride: int) -> Plan | None:
+        lattice = Lattice(height, width, stride)
+        errors = lens_errors(ranges, lattice) if moved_by_terms(ranges, lattice) else None
+        if errors is None or errors.stretch > _MOST_STRETCH or left_out + errors.cubic > (1 - _NEWTON) * room:
+            return None
+        steps = next((n for n, error in enumerate(errors.newton) if error <= _NEWTON * room), None)
+        if steps is None:
+            return None
+        error = left_out + errors.cubic + errors.newton[steps] + tolerance - room
+        return Plan(height, width, tolerance, stride, error, "cubics between", steps, kept, dropped)
+
+    return coarsest(attempt) or exact("the lenses of the ranges bend too much for cubics")
+
+
+def kept_terms(plan: Plan) -> Terms:
+    """Those of the polynomial that a plan keeps."""
+    kept = [POLYNOMIAL12.index(name) for name in plan.kept]
+    radial = max((i + 1 for i in kept if i < 6), default=0)
+    return Terms(radial, any(i in (6, 7) for i in kept), any(i > 7 for i in kept), round=False)
+
+
+def _terms(
+    ranges: Sequence[Range], moved: Sequence[float], room: float
+) -> tuple[tuple[str, ...], tuple[tuple[str, float], ...]]:
+    """The names of the terms to keep, and those to drop with what they could move, px."""
+    dropped: list[int] = []
+    for group in _GROUPS:
+        here = [i for i in group if ranges[i] != (0.0, 0.0)]
+        if sum(moved[i] for i in (*dropped, *here)) > room:
+            break
+        dropped += here
+    kept = [i for i in range(12) if ranges[i] != (0.0, 0.0) and i not in dropped]
+    return tuple(POLYNOMIAL12[i] for i in kept), tuple((POLYNOMIAL12[i], moved[i]) for i in dropped)

@@ -1,0 +1,98 @@
+"""What an effect will do for a frame of some size, under a tolerance."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torchrefract._checks import check_count, check_number
+from torchrefract.warping.lattice import Lattice
+
+_SMALLEST, _LARGEST = 1e-6, 64.0  # px
+# Positions in float32 are off by so many units of the last place of the longer side.
+_ROUNDING = {False: 16 * 2.0**-24, True: 16 * 2.0**-53}
+# Px between nodes, from fine to coarse.
+STRIDES = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 28, 32, 40, 48, 56, 64, 80, 96, 112, 128)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How an effect computes its flow for frames of one size.
+
+    height, width: px, of the frame.
+    tolerance_px: how far the flow may be from the exact one anywhere; None is exact.
+    stride: px between the nodes at which the flow is computed; 1 is every pixel, and exact; 0 is no flow at all.
+    error_px: how far the flow is from the exact one at most.
+    steps: of Newton's method, where there is one.
+    kept: the terms that are computed.
+    dropped: those that are not, each with how far it could have moved a pixel, px.
+    resamples: how often the image is looked up.
+    why: what decided.
+    """
+
+    height: int
+    width: int
+    tolerance_px: float | None
+    stride: int
+    error_px: float
+    why: str
+    steps: int | None = None
+    kept: tuple[str, ...] = ()
+    dropped: tuple[tuple[str, float], ...] = ()
+    resamples: int = 1
+
+    @property
+    def lattice(self) -> Lattice | None:
+        """Where the flow is computed; None for every pixel, or for none."""
+        return Lattice(self.height, self.width, self.stride) if self.stride > 1 else None
+
+    def __str__(self) -> str:
+        flow = {0: "not computed", 1: "at every pixel"}.get(self.stride, f"every {self.stride} px")
+        lines = [
+            f"frame          {self.height} x {self.width} px",
+            f"tolerance      {'none: exact' if self.tolerance_px is None else f'{self.tolerance_px:g} px'}",
+            f"flow           {flow} ({self.why})",
+            f"error at most  {self.error_px:.2g} px",
+            f"resamples      {self.resamples}",
+        ]
+        if self.steps is not None:
+            lines.append(f"Newton steps   {self.steps}")
+        if self.kept:
+            lines.append(f"terms kept     {', '.join(self.kept)}")
+        lines += [f"term dropped   {name}, which moves up to {moved:.2g} px" for name, moved in self.dropped]
+        return "\n".join(lines)
+
+
+def check_tolerance(value: float | None) -> float | None:
+    """A tolerance in px, or None."""
+    return None if value is None else check_number("tolerance_px", value, low=_SMALLEST, high=_LARGEST)
+
+
+def check_size(height: int, width: int) -> None:
+    """Raise for frames without a pixel."""
+    check_count("height", height)
+    check_count("width", width)
+
+
+def check_reachable(tolerance: float, *, height: int, width: int, double: bool) -> float:
+    """What a tolerance leaves beside the rounding of positions in a frame.
+
+    Raises:
+        ValueError: nothing.
+    """
+    rounding = _ROUNDING[double] * max(height, width)
+    if tolerance < 2 * rounding:
+        kind = "float64" if double else "float32"
+        raise ValueError(
+            f"tolerance_px must be at least {2 * rounding:.2g} px for {kind} positions in a frame of {height} x "
+            f"{width} px (None is exact), got {tolerance:g}"
+        )
+    return tolerance - rounding
+
+
+def coarsest(attempt: Callable[[int], Plan | None]) -> Plan | None:
+    """The plan with the largest stride for which there is one; what is too coarse stays so at larger strides."""
+    found, low, high = None, 0, len(STRIDES)
+    while low < high:
+        middle = (low + high) // 2
+        plan = attempt(STRIDES[middle])
+        found, low, high = (plan, middle + 1, high) if plan else (found, low, middle)
+    return found

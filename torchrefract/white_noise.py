@@ -31,6 +31,13 @@ def noise(key: Tensor, count: int) -> Tensor:
     return _noise(key, count)
 
 
+def noise_at(key: Tensor, places: Tensor) -> Tensor:
+    """(B, 2, n), float32: the pairs of `noise` at (n,) places, int64, counted from 0."""
+    if torch.compiler.is_compiling():
+        return torch.ops.torchrefract.noise_at(key, places)
+    return _noise_at(key, places)
+
+
 def lattice(key: Tensor, axes: Sequence[Tensor], count: int) -> Tensor:
     """(B, count, n1, ..., nd), float32, uniform in (0, 1): `count` numbers for each node of a lattice.
 
@@ -72,8 +79,16 @@ def _noise(key: Tensor, count: int) -> Tensor:
 
 
 def _noise_between(words: tuple[Tensor, ...], start: int, end: int) -> Tensor:
+    return _pairs(words, torch.arange(start, end, dtype=torch.int32, device=words[0].device))
+
+
+def _noise_at(key: Tensor, places: Tensor) -> Tensor:
+    return _pairs(key.to(torch.int32)[:, :, None].unbind(1), places.to(torch.int32))
+
+
+def _pairs(words: tuple[Tensor, ...], places: Tensor) -> Tensor:
     a, b, c, d = words
-    index = torch.arange(start, end, dtype=torch.int32, device=a.device) * _HASH[0]
+    index = places * _HASH[0]
     uniform = ((_hash(index, a, b) >> 9) & 0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
     radius, angle = uniform.log_().mul_(-2).sqrt_(), _hash(index, c, d).float().mul_(math.pi * 2.0**-31)
     return torch.stack([radius * angle.cos(), radius * angle.sin()], dim=1)
@@ -95,6 +110,14 @@ _noise_op = torch.library.custom_op("torchrefract::noise", _noise, mutates_args=
 @_noise_op.register_fake
 def _(key: Tensor, count: int) -> Tensor:
     return key.new_empty((key.shape[0], 2, count), dtype=torch.float32)
+
+
+_noise_at_op = torch.library.custom_op("torchrefract::noise_at", _noise_at, mutates_args=())
+
+
+@_noise_at_op.register_fake
+def _(key: Tensor, places: Tensor) -> Tensor:
+    return key.new_empty((key.shape[0], 2, places.shape[0]), dtype=torch.float32)
 
 
 _lattice_op = torch.library.custom_op("torchrefract::lattice", _lattice_list, mutates_args=())

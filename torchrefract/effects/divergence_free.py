@@ -1,6 +1,6 @@
 """A warp that swirls: its displacement has no divergence."""
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -8,14 +8,18 @@ from torch import Tensor
 from torchrefract import draws
 from torchrefract._checks import check_choice, check_count, check_range
 from torchrefract.effects.base import params_to
+from torchrefract.effects.field_plan import FieldPlan, FieldRanges, field_plan
 from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
-from torchrefract.effects.random_field import check_field_params, random_field
+from torchrefract.effects.plan import Plan, lies_in
+from torchrefract.effects.random_field import check_field_params, field_on_lattice, random_field
 from torchrefract.effects.refraction import WarpEffect
 from torchrefract.effects.rows import column, spread
 from torchrefract.fields.covariance import COVARIANCES
+from torchrefract.fields.modes import Modes
 from torchrefract.fields.stream import curl, curl_rms
 from torchrefract.types import Range
 from torchrefract.warping.compose import compose_flows
+from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
 
 
 class DivergenceFreeParams(NamedTuple):
@@ -52,7 +56,8 @@ class DivergenceFree(WarpEffect):
         normalize: "theory" divides by the standard deviation that each component has over all fields, "max" by the
             longest displacement in the frame, "none" by nothing: amplitude is then in px per unit of slope.
         steps: parts that the displacement is followed in.
-        padding, interpolation, p: as for every warp.
+        padding, interpolation, tolerance_px, p: as for every warp; Gaussian fields followed in one step, normalized by
+            theory, have a coarser lattice: psi's, so that the divergence stays zero.
 
     Raises:
         ValueError: an argument outside its range.
@@ -77,9 +82,10 @@ class DivergenceFree(WarpEffect):
         steps: int = 1,
         padding: str = "reflection",
         interpolation: str = "bilinear",
+        tolerance_px: float | None = None,
         p: float = 1.0,
     ):
-        super().__init__(padding=padding, interpolation=interpolation, p=p)
+        super().__init__(padding=padding, interpolation=interpolation, tolerance_px=tolerance_px, p=p)
         self.amplitude_range = check_range("amplitude_range", amplitude_range, low=0.0, high=1e4)
         self.length_range = check_range("length_range", length_range, low=1e-3, high=1e6)
         self.wind_x_range = check_wind("wind_x_range", wind_x_range)
@@ -121,6 +127,25 @@ class DivergenceFree(WarpEffect):
             longest = displacement.square().sum(dim=1, keepdim=True).amax(dim=(2, 3), keepdim=True)
             displacement = displacement / longest.clamp(min=1e-24).sqrt()
         return column(spread(params.amplitude, displacement.shape[0])) * displacement
+
+    def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
+        """The plan of `field_plan` for Gaussian fields, normalized by theory, in one step; all others are exact."""
+        if self.covariance != "gaussian" or self.normalize != "theory" or self.steps > 1:
+            return super().planned(height, width, dtype)
+        ranges = FieldRanges(self.amplitude_range, self.length_range, (0.0, 0.0), stream=True)
+        return field_plan(ranges, height, width, self.tolerance_px, dtype is torch.float64)
+
+    def covers(self, params: DivergenceFreeParams) -> Tensor:
+        """Whether the swirls lie in the ranges."""
+        return lies_in(params.amplitude, self.amplitude_range) & lies_in(params.length, self.length_range)
+
+    def on_lattice(self, params: DivergenceFreeParams, plan: Plan) -> SmoothFlow:
+        """The curl of psi between nodes, of the frequencies that the plan keeps."""
+        modes, lattice = cast(FieldPlan, plan).modes, cast(Lattice, plan.lattice)
+        # The psi of the exact flow has a row and a column of its own around the frame.
+        psi = field_on_lattice(params, cast(Modes, modes), lattice, aperture=False, offset=1)[:, :1]
+        scale = params.amplitude / curl_rms(params.length, self.covariance)
+        return StreamFlow(column(spread(scale, psi.shape[0])) * psi, lattice)
 
     def moves(self, params: DivergenceFreeParams) -> Tensor:
         """The samples with an amplitude."""

@@ -16,7 +16,7 @@ from torchrefract.effects.refraction import WarpEffect
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, smooth_lens_flow
 from torchrefract.fields.lens_bounds import LensRanges
 from torchrefract.types import Degraded, Range
-from torchrefract.warping.lattice import Lattice
+from torchrefract.warping.lattice import Lattice, SmoothFlow
 
 _LARGEST_COEFFICIENT = 100.0
 _MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors are another model in another order)"
@@ -118,12 +118,13 @@ class LensDistortion(WarpEffect):
         """Whether the lenses lie in the ranges."""
         return covers(self._ranges(), params.coefficients, params.focal, params.center)
 
-    def nodes(self, params: LensParams, plan: Plan, lattice: Lattice) -> Tensor:
+    def on_lattice(self, params: LensParams, plan: Plan) -> SmoothFlow:
         """The flow of `smooth_lens_flow`."""
-        x, y = lattice.axes(dtype=params.focal.dtype, device=params.focal.device)
+        lattice = cast(Lattice, plan.lattice)
+        x, y = lattice.places(dtype=params.focal.dtype, device=params.focal.device)
         terms = ALL_TERMS if params.coefficients.requires_grad else kept_terms(plan)
         camera = in_px(params, lattice.height, lattice.width)
-        return smooth_lens_flow(*camera, x, y, steps=cast(int, plan.steps), terms=terms)
+        return SmoothFlow(smooth_lens_flow(*camera, x, y, steps=cast(int, plan.steps), terms=terms), lattice)
 
     def compute(self, image: Tensor, params: LensParams, depth: Tensor | None) -> Degraded:
         """The batch looked up along the flow; a lens that folds is told."""

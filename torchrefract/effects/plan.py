@@ -3,7 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from torchrefract._checks import check_count, check_number
+from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice
 
 _SMALLEST, _LARGEST = 1e-6, 64.0  # px
@@ -25,6 +28,7 @@ class Plan:
     kept: the terms that are computed.
     dropped: those that are not, each with how far it could have moved a pixel, px.
     resamples: how often the image is looked up.
+    before: nodes that the lattice has before the frame.
     why: what decided.
     """
 
@@ -38,11 +42,12 @@ class Plan:
     kept: tuple[str, ...] = ()
     dropped: tuple[tuple[str, float], ...] = ()
     resamples: int = 1
+    before: int = 1
 
     @property
     def lattice(self) -> Lattice | None:
         """Where the flow is computed; None for every pixel, or for none."""
-        return Lattice(self.height, self.width, self.stride) if self.stride > 1 else None
+        return Lattice(self.height, self.width, self.stride, self.before) if self.stride > 1 else None
 
     def __str__(self) -> str:
         flow = {0: "not computed", 1: "at every pixel"}.get(self.stride, f"every {self.stride} px")
@@ -96,3 +101,9 @@ def coarsest(attempt: Callable[[int], Plan | None]) -> Plan | None:
         plan = attempt(STRIDES[middle])
         found, low, high = (plan, middle + 1, high) if plan else (found, low, middle)
     return found
+
+
+def lies_in(values: Tensor, limits: Range) -> Tensor:
+    """(), bool: all values lie in a range, but for rounding."""
+    room = 1e-5 * max(map(abs, limits))
+    return ((values >= limits[0] - room) & (values <= limits[1] + room)).all()

@@ -13,6 +13,8 @@ from torchrefract.effects.motion import check_motion, is_still
 from torchrefract.effects.rows import spread
 from torchrefract.fields.evolution import evolved, turn_rates
 from torchrefract.fields.gaussian import gaussian_random_field, spectrum, torus
+from torchrefract.fields.modes import Modes, evolved_modes, mode_amplitude, mode_field, mode_noise, mode_turn_rates
+from torchrefract.warping.lattice import Lattice
 
 # A covariance that is off by twice this is told.
 _CLIPPED = 1e-3
@@ -71,6 +73,29 @@ def _noises(params: Any, shape: Tensor, size: tuple[int, int]) -> Iterator[tuple
         own = {name: getattr(params, name)[i : i + 1] for name in ("wind", "decorrelation")}
         for frame in params.frame[i].split(1):
             yield evolved(noise[i : i + 1], rates[i : i + 1], frame=frame, **own), shape[i : i + 1]
+
+
+def field_on_lattice(params: Any, modes: Modes, lattice: Lattice, *, aperture: bool, offset: int = 0) -> Tensor:
+    """The fields of `random_field` with a Gaussian covariance, (B T, 2, n, m), at the nodes of a lattice.
+
+    Args:
+        params: as for `random_field`.
+        modes: the frequencies to keep.
+        lattice: where.
+        aperture: whether the parameters have one.
+        offset: px, of the frame within that of `random_field`, along both axes.
+    """
+    dtype, rows = params.amplitude.dtype, params.frame.numel()
+    noise = mode_noise(params.key, modes, dtype=dtype)
+    if not is_still(params):
+        rates = spread(mode_turn_rates(params.key, modes, dtype=dtype), rows)
+        options = {name: spread(getattr(params, name), rows) for name in ("wind", "decorrelation")}
+        noise = evolved_modes(spread(noise, rows), rates, modes, frame=params.frame.reshape(-1), **options)
+    width = params.aperture if aperture else None
+    amplitude = mode_amplitude(modes, params.length, aperture=width, dtype=dtype)
+    down, across = (spread(values, noise.shape[0]) for values in amplitude)
+    places = ([place + offset for place in axis] for axis in lattice.axes)
+    return mode_field(noise, (down, across), modes, *places)
 
 
 def check_field_params(params: Any, *, at_least_zero: Sequence[str]) -> None:

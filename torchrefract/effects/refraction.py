@@ -18,7 +18,7 @@ from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import field_dtype, inside, length
 from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.jacobian import folding
-from torchrefract.warping.lattice import Lattice, SmoothFlow
+from torchrefract.warping.lattice import SmoothFlow
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, look_up
 
 
@@ -82,8 +82,8 @@ class WarpEffect(Effect):
         """(), bool: all parameters lie in the ranges that the plan is for."""
         return params.gate.new_ones(())
 
-    def nodes(self, params: Any, plan: Plan, lattice: Lattice) -> Tensor:
-        """(B, 2, n, m), px: the flow at the nodes of the plan's lattice, where it exists everywhere."""
+    def on_lattice(self, params: Any, plan: Plan) -> SmoothFlow:
+        """The flow on the plan's lattice, where it exists everywhere."""
         raise NotImplementedError(f"{type(self).__name__} has no plan with a lattice")
 
     def restore_flow(self, params: Any, *, height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -115,9 +115,10 @@ class WarpEffect(Effect):
             flow, exists = self.flow(params, height=height, width=width)
             active = spread(active, flow.shape[0])
             return Moved(only(flow, 0.0, active, params), exists | ~column(active), active)
-        nodes = self.nodes(params, plan, plan.lattice)
-        active = spread(active, nodes.shape[0])
-        return Moved(SmoothFlow(only(nodes, 0.0, active, params), plan.lattice), column(active).new_ones(1), active)
+        path = self.on_lattice(params, plan)
+        active = spread(active, path.nodes.shape[0])
+        path = path.with_nodes(only(path.nodes, 0.0, active, params))
+        return Moved(path, active.new_ones(1, 1, 1, 1), active)
 
     def gated_undo(self, params: Any, moved: "Moved") -> tuple[Tensor, Tensor]:
         """The flow that undoes `gated`, and where it exists."""
@@ -219,5 +220,5 @@ def _field_type(params: Any) -> torch.dtype:
 
 def _spread_path(path: Tensor | SmoothFlow, rows: int) -> Tensor | SmoothFlow:
     if isinstance(path, SmoothFlow):
-        return SmoothFlow(spread(path.nodes, rows), path.lattice)
+        return path.with_nodes(spread(path.nodes, rows))
     return spread(path, rows)

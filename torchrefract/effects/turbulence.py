@@ -1,7 +1,7 @@
 """Hot air over a road."""
 
 import warnings
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -9,12 +9,16 @@ from torch import Tensor
 from torchrefract import draws
 from torchrefract._checks import check_choice, check_range, is_true
 from torchrefract.effects.base import params_to
+from torchrefract.effects.field_plan import FieldPlan, FieldRanges, field_plan
 from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
-from torchrefract.effects.random_field import check_field_params, random_field
+from torchrefract.effects.plan import Plan, lies_in
+from torchrefract.effects.random_field import check_field_params, field_on_lattice, random_field
 from torchrefract.effects.refraction import WarpEffect
 from torchrefract.effects.rows import column, spread
 from torchrefract.fields.covariance import COVARIANCES, slope_rms
+from torchrefract.fields.modes import Modes
 from torchrefract.types import Range
+from torchrefract.warping.lattice import Lattice, SmoothFlow
 
 # A field folds first where a slope of five standard deviations reaches 1.
 _FOLD = 0.2
@@ -54,7 +58,7 @@ class Turbulence(WarpEffect):
         covariance: "exponential", "gaussian", "matern32" or "matern52".
         normalize: "theory" gives the amplitude to all fields together, "image" to each: its mean is subtracted and its
             standard deviation divided by, which inflates fields that are longer than the frame.
-        padding, interpolation, p: as for every warp.
+        padding, interpolation, tolerance_px, p: as for every warp; only Gaussian fields have a coarser lattice.
 
     Raises:
         ValueError: an argument outside its range.
@@ -80,9 +84,10 @@ class Turbulence(WarpEffect):
         normalize: str = "theory",
         padding: str = "reflection",
         interpolation: str = "bilinear",
+        tolerance_px: float | None = None,
         p: float = 1.0,
     ):
-        super().__init__(padding=padding, interpolation=interpolation, p=p)
+        super().__init__(padding=padding, interpolation=interpolation, tolerance_px=tolerance_px, p=p)
         self.amplitude_range = check_range("amplitude_range", amplitude_range, low=0.0, high=1e4)
         self.length_range = check_range("length_range", length_range, low=1e-3, high=1e6)
         self.aperture_range = check_range("aperture_range", aperture_range, low=0.0, high=1e4)
@@ -116,6 +121,28 @@ class Turbulence(WarpEffect):
             field = field / field.square().mean(dim=(2, 3), keepdim=True).clamp(min=1e-12).sqrt()
         flow = column(spread(params.amplitude, field.shape[0])) * field
         return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
+
+    def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
+        """The plan of `field_plan` for a Gaussian covariance; all others are exact."""
+        if self.covariance != "gaussian" or self.normalize != "theory":
+            return super().planned(height, width, dtype)
+        ranges = FieldRanges(self.amplitude_range, self.length_range, self.aperture_range)
+        return field_plan(ranges, height, width, self.tolerance_px, dtype is torch.float64)
+
+    def covers(self, params: TurbulenceParams) -> Tensor:
+        """Whether the air lies in the ranges."""
+        return (
+            lies_in(params.amplitude, self.amplitude_range)
+            & lies_in(params.length, self.length_range)
+            & lies_in(params.aperture, self.aperture_range)
+        )
+
+    def on_lattice(self, params: TurbulenceParams, plan: Plan) -> SmoothFlow:
+        """The flow of the frequencies that the plan keeps."""
+        self._check_folds(params)
+        modes, lattice = cast(FieldPlan, plan).modes, cast(Lattice, plan.lattice)
+        field = field_on_lattice(params, cast(Modes, modes), lattice, aperture=True)
+        return SmoothFlow(column(spread(params.amplitude, field.shape[0])) * field, lattice)
 
     def moves(self, params: TurbulenceParams) -> Tensor:
         """The samples with an amplitude."""

@@ -36,8 +36,14 @@ def evolved(noise: Tensor, rates: Tensor, *, frame: Tensor, wind: Tensor, decorr
         wind: (B, 2), px per frame, to the right and down.
         decorrelation: (B,), frames, above 0; inf for a field that only drifts.
     """
-    height, width = noise.shape[2:]
-    ky, kx = (torch.fft.fftfreq(n, dtype=torch.float64, device=noise.device) for n in (height, width))
+    ky, kx = (torch.fft.fftfreq(n, dtype=torch.float64, device=noise.device) for n in noise.shape[2:])
+    return turned(noise, rates, ky, kx, frame=frame, wind=wind, decorrelation=decorrelation)
+
+
+def turned(
+    noise: Tensor, rates: Tensor, ky: Tensor, kx: Tensor, *, frame: Tensor, wind: Tensor, decorrelation: Tensor
+) -> Tensor:
+    """The noise (B, 2, n, m) of frequencies ky, (n,), and kx, (m,), in cycles per px, as `evolved` has it."""
     shift = 2 * math.pi * (frame.double()[:, None] * wind.double())[:, :, None]
     drift_x, drift_y = shift[:, :1] * kx, shift[:, 1:].mT * ky[:, None]
     # Whole turns are taken out in float64: later frames are as exact as the first.

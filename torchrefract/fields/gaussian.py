@@ -75,6 +75,24 @@ def spectrum(
     return Spectrum(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
+def axis_spectrum(size: int, length: Tensor, aperture: Tensor | None) -> Tensor:
+    """(B, size / 2 + 1), float64: the factor of `spectrum` along one axis, for a Gaussian covariance.
+
+    Args:
+        size: px, even, of the torus along the axis, with room for the length.
+        length: (B,), px.
+        aperture: (B,), px.
+    """
+    distance = torch.arange(size // 2 + 1, dtype=torch.float64, device=length.device)
+    ways = (distance, size - distance, size + distance)
+    near, *far = (covariance(h, length.double()[:, None], "gaussian") for h in ways)
+    values = _transform(near + sum(far), size, -1)
+    kept = torch.where(values > _ROUNDING * values.amax(dim=1, keepdim=True), values, 0)
+    smooth = _smoothing(distance / size, aperture).reshape(-1, size // 2 + 1)
+    variance = (kept * smooth.square() * _multiplicity(size, length.device)).sum(dim=1, keepdim=True)
+    return _root(kept) * smooth / variance.sqrt()
+
+
 def gaussian_random_field(noise: Tensor, shape: Tensor, *, height: int, width: int) -> Tensor:
     """Two independent fields (B, 2, H, W) of mean 0 and variance 1, with the covariance that a spectrum stands for.
 

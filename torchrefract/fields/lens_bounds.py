@@ -104,9 +104,8 @@ def _radius(ranges: LensRanges, lattice: Lattice) -> float:
     """Of the disc on the plane z = 1 that the nodes of a lattice see, for all lenses."""
     fx, aspect = ranges.focal[0], ranges.aspect[0]
     x, y = (max(map(abs, offset)) for offset in (ranges.center_x, ranges.center_y))
-    rows, columns = lattice.cells
-    across = max(lattice.width / 2 + lattice.stride, (columns + 1) * lattice.stride - lattice.width / 2)
-    down = max(lattice.height / 2 + lattice.stride, (rows + 1) * lattice.stride - lattice.height / 2)
+    rows, columns = lattice.axes
+    across, down = columns[-1] - (lattice.width - 1) / 2, rows[-1] - (lattice.height - 1) / 2
     return math.hypot((across / lattice.width + x) / fx, (down / lattice.width + y) / (fx * aspect))
 
 

@@ -1,57 +1,41 @@
-"""Smooth fields on a coarse lattice, and what lies between its nodes."""
+"""Smooth flows on a coarse lattice, and what lies between its nodes."""
 
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract.warping.grid import finite, sampler_positions
+from torchrefract.warping.grid import finite, pixel_axes, sampler_positions
 
-# Of the cubic through four nodes a unit apart, between the inner two: |f - p| <= 9/384 max |f''''|, and the largest sum
-# of the magnitudes of its weights.
-CUBIC_ERROR = 9 / 384
-CUBIC_GAIN = 1.25
-# In the sampler's coordinates: farther than a flow can lead that is computed on a lattice, and finite in all products.
+# In the sampler's coordinates: farther than a flow leads that is computed on a lattice, and finite in all products.
 _FARTHEST = 1e4
 
 
 class Lattice(NamedTuple):
-    """Nodes every `stride` px over a frame, one more before it and at least one more behind it along each axis."""
+    """Nodes every `stride` px over a frame, with those around it that its pixels take."""
 
     height: int  # px, of the frame
     width: int
     stride: int  # px
+    before: int = 1  # nodes before the frame along each axis
 
     @property
     def cells(self) -> tuple[int, int]:
         """How many strides it takes to cover the rows and the columns."""
         return -(-self.height // self.stride), -(-self.width // self.stride)
 
-    def axes(self, *, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    @property
+    def axes(self) -> tuple[range, range]:
+        """Px, of the rows and of the columns of nodes."""
+        start, s = -self.before * self.stride, self.stride
+        return range(start, (self.cells[0] + 2) * s, s), range(start, (self.cells[1] + 2) * s, s)
+
+    def places(self, *, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
         """x, (1, 1, 1, m), and y, (1, 1, n, 1), px, of the nodes."""
-        rows, columns = (
-            self.stride * (torch.arange(count + 3, dtype=dtype, device=device) - 1) for count in self.cells
-        )
-        return columns.view(1, 1, 1, -1), rows.view(1, 1, -1, 1)
-
-
-class SmoothFlow(NamedTuple):
-    """A flow that is known at the nodes of a lattice, and by `between_nodes` everywhere."""
-
-    nodes: Tensor  # (B, 2, n, m), px
-    lattice: Lattice
-
-    def dense(self) -> Tensor:
-        """(B, 2, H, W), px."""
-        return between_nodes(self.nodes, self.lattice)
-
-    def sampler_grid(self, dtype: torch.dtype) -> Tensor:
-        """(B, H, W, 2): where F.grid_sample(align_corners=False) looks; no flow of that size is written."""
-        x, y = self.lattice.axes(dtype=dtype, device=self.nodes.device)
-        size = {"height": self.lattice.height, "width": self.lattice.width}
-        # The identity is linear, so it may go through the cubics with the flow.
-        positions = finite(sampler_positions(self.nodes.to(dtype), x, y, **size), _FARTHEST)
-        return between_nodes(positions, self.lattice).movedim(1, -1)
+        y, x = (torch.arange(axis.start, axis.stop, axis.step, dtype=dtype, device=device) for axis in self.axes)
+        return x.view(1, 1, 1, -1), y.view(1, 1, -1, 1)
 
 
 def between_nodes(nodes: Tensor, lattice: Lattice) -> Tensor:
@@ -65,15 +49,12 @@ def between_nodes(nodes: Tensor, lattice: Lattice) -> Tensor:
 
     Args:
         nodes: (B, C, n, m), the field at the nodes of the lattice.
-        lattice: where they are.
+        lattice: where they are, one of them before the frame.
 
     Source: the remainder of Lagrange's interpolation; de Boor, "A practical guide to splines" (1978), chapter 2.
     """
-    batch, channels, rows, _ = nodes.shape
     weight = cubic_weights(lattice.stride, dtype=nodes.dtype, device=nodes.device)
-    lines = (nodes.unfold(3, 4, 1) @ weight.mT).reshape(batch, channels, rows, -1)[..., : lattice.width]
-    bands = weight @ lines.unfold(2, 4, 1).mT
-    return bands.reshape(batch, channels, -1, lattice.width)[:, :, : lattice.height]
+    return _down(_across(nodes, weight, lattice.width), weight, lattice.height)
 
 
 def cubic_weights(stride: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -87,3 +68,82 @@ def cubic_weights(stride: int, *, dtype: torch.dtype, device: torch.device) -> T
         before * here * next_ / 6,
     )
     return torch.stack(weights, dim=1).to(dtype)
+
+
+def slope_weights(stride: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(stride, 5): those of the nodes at -2 ... 2 for the central difference (f(+1 px) - f(-1 px)) / 2."""
+    weight = cubic_weights(stride, dtype=torch.float64, device=device)
+    none = torch.zeros_like(weight[:, :1])
+    own = torch.cat([none, weight], dim=1)  # of the nodes -2 ... 2
+    last, first = torch.cat([weight, none], dim=1)[-1:], torch.cat([none, none, weight], dim=1)[:1, :5]
+    return ((torch.cat([own[1:], first]) - torch.cat([last, own[:-1]])) / 2).to(dtype)
+
+
+@dataclass(frozen=True)
+class SmoothFlow:
+    """A flow that is known at the nodes of a lattice, and by `between_nodes` everywhere."""
+
+    nodes: Tensor  # (B, 2, n, m), px
+    lattice: Lattice
+
+    def with_nodes(self, nodes: Tensor) -> "SmoothFlow":
+        """The same flow with other nodes."""
+        return replace(self, nodes=nodes)
+
+    def dense(self) -> Tensor:
+        """(B, 2, H, W), px."""
+        return between_nodes(self.nodes, self.lattice)
+
+    def sampler_grid(self, dtype: torch.dtype) -> Tensor:
+        """(B, H, W, 2): where F.grid_sample(align_corners=False) looks; no flow of that size is written."""
+        x, y = self.lattice.places(dtype=dtype, device=self.nodes.device)
+        size = {"height": self.lattice.height, "width": self.lattice.width}
+        # The identity is linear, so it may go through the cubics with the flow.
+        positions = finite(sampler_positions(self.nodes.to(dtype), x, y, **size), _FARTHEST)
+        return between_nodes(positions, self.lattice).movedim(1, -1)
+
+
+class StreamFlow(SmoothFlow):
+    """The curl of a stream function that is known at the nodes of a lattice, (B, 1, n, m), px^2, two before the frame.
+
+        flow = (D_y psi, -D_x psi) of the psi that `between_nodes` has between them
+
+    D is the central difference, as in `curl`: the divergence taken with it vanishes, which that of a flow between nodes
+    of its own does not.
+    """
+
+    def dense(self) -> Tensor:
+        """(B, 2, H, W), px."""
+        return self._flow(self.nodes, (1.0, 1.0))
+
+    def sampler_grid(self, dtype: torch.dtype) -> Tensor:
+        """(B, H, W, 2): where F.grid_sample(align_corners=False) looks."""
+        height, width = self.lattice.height, self.lattice.width
+        x, y = pixel_axes(height, width, dtype=dtype, device=self.nodes.device)
+        still = torch.zeros((), dtype=dtype, device=self.nodes.device).expand(1, 2, 1, 1)
+        identity = sampler_positions(still, x[..., :1], y[..., :1, :], height=height, width=width)
+        grid = self._flow(finite(self.nodes.to(dtype), _FARTHEST), (2 / width, 2 / height))
+        grid[:, :1] += identity[:, :1] + x * (2 / width)
+        grid[:, 1:] += identity[:, 1:] + y * (2 / height)
+        return grid.movedim(1, -1)
+
+    def _flow(self, nodes: Tensor, scale: tuple[float, float]) -> Tensor:
+        """(D_y psi, -D_x psi), each times its scale."""
+        options = {"dtype": nodes.dtype, "device": nodes.device}
+        slope = slope_weights(self.lattice.stride, **options)
+        own = F.pad(cubic_weights(self.lattice.stride, **options), (1, 0))
+        along, across = _across(nodes, own, self.lattice.width), _across(nodes, slope, self.lattice.width)
+        lines = torch.cat([scale[0] * along, -scale[1] * across], dim=1)
+        return _down(lines, torch.stack([slope, own])[:, None], self.lattice.height)
+
+
+def _across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:
+    """(B, C, n, W) of (B, C, n, m), by weights (stride, taps)."""
+    cells = nodes.unfold(3, weight.shape[-1], 1) @ weight.mT
+    return cells.flatten(3)[..., :width]
+
+
+def _down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
+    """(B, C, H, W) of (B, C, n, W), by weights (stride, taps), or (C, 1, stride, taps)."""
+    bands = weight @ lines.unfold(2, weight.shape[-1], 1).mT
+    return bands.flatten(2, 3)[:, :, :height]

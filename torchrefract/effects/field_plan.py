@@ -1,0 +1,135 @@
+"""What the effects of random fields will compute under a tolerance: few frequencies, on a lattice.
+
+The error of what is left out and of the cubics between nodes is a Gaussian random field itself, whose variance the
+spectrum gives: at every pixel the two components of the error are longer than `_SIGMAS` deviations with a chance of
+exp(-_SIGMAS^2 / 2), 2e-11. Covariances with slower spectra than the Gaussian one have too many frequencies for this: an
+exponential field has no coarse lattice, it would be smoothed. They are computed exactly.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchrefract.effects.plan import Plan, check_reachable, coarsest
+from torchrefract.fields.covariance import REACH
+from torchrefract.fields.gaussian import torus
+from torchrefract.fields.modes import Modes
+from torchrefract.types import Range
+from torchrefract.warping.lattice import cubic_weights, slope_weights
+
+_SIGMAS = 7.0
+_REACH = 8.0  # deviations of the spectrum beyond which nothing is left of it
+_POINTS = 257
+# Of the tolerance, for frequencies that are left out.
+_DROPPED = 0.3
+# Fields of unit variance in float32 are off by so much.
+_ROUNDING = 4e-6
+# More frequencies than these take longer than Fourier transforms of all.
+_MOST_MODES = 1 << 18
+
+
+@dataclass(frozen=True)
+class FieldRanges:
+    """What a field is drawn from, px; of a stream function if `stream`, whose curl has unit variance."""
+
+    amplitude: Range
+    length: Range
+    aperture: Range
+    stream: bool = False
+
+
+@dataclass(frozen=True)
+class FieldPlan(Plan):
+    """A plan with the frequencies that are kept."""
+
+    modes: Modes | None = None
+
+
+@lru_cache(maxsize=256)
+def field_plan(ranges: FieldRanges, height: int, width: int, tolerance: float | None, double: bool) -> Plan:
+    """The plan for a Gaussian covariance and frames of a size, in float64 or in float32."""
+    plan = partial(Plan, height, width, tolerance)
+    if tolerance is None:
+        return plan(1, 0.0, "no tolerance")
+    room = check_reachable(tolerance, height=height, width=width, double=double)
+    most = _SIGMAS * ranges.amplitude[1]
+    if most <= room:
+        return plan(0, most, "it moves too little")
+    room -= 0.0 if double else _ROUNDING * most
+    if most > min(height, width) or room <= 0:
+        return plan(1, 0.0, "it moves too far for a lattice")
+    spectrum = _Spectrum.of(ranges)
+    modes = None if spectrum is None else _modes(ranges, height, width, spectrum.cutoff(_DROPPED * room / most))
+    if spectrum is None or modes is None:
+        return plan(1, 0.0, "the field has too many frequencies for a lattice")
+    counts = "{} x {} of {} x {} frequencies".format(*modes.counts, *modes.size)
+
+    def attempt(stride: int) -> Plan | None:
+        off = most * math.hypot(_DROPPED * room / most, spectrum.cubic_error(stride))
+        if off > room:
+            return None
+        before = 2 if ranges.stream else 1
+        return FieldPlan(height, width, tolerance, stride, off + tolerance - room, counts, before=before, modes=modes)
+
+    return coarsest(attempt) or plan(1, 0.0, "the field is too rough for cubics")
+
+
+def _modes(ranges: FieldRanges, height: int, width: int, cutoff: float) -> Modes | None:
+    """The frequencies up to a cutoff, in radians per px; None where there are too many, or one torus is too small."""
+    more = 2 if ranges.stream else 0
+    reach = {"length": ranges.length[1], "aperture": ranges.aperture[1]}
+    size = torus(height + more, width + more, kind="gaussian", **reach)
+    modes = Modes(size, *(math.ceil(cutoff * n / (2 * math.pi)) for n in size))
+    all_there = all(count < n for count, n in zip(modes.counts, size, strict=True))
+    # The sums round a torus that make a covariance periodic are taken where the length has room.
+    has_room = REACH["gaussian"] * ranges.length[1] <= min(size)
+    return modes if all_there and has_room and math.prod(modes.counts) <= _MOST_MODES else None
+
+
+class _Spectrum:
+    """The roughest field of the ranges, along one axis, at frequencies in radians per px."""
+
+    def __init__(self, k: np.ndarray, share: np.ndarray, stream: bool):
+        self.k, self.share, self.stream = k, share, stream
+        # What a frequency is multiplied by: the central difference of a stream function, or nothing.
+        self.target = 1j * np.sin(k) if stream else np.ones_like(k)
+        self.variance = self._total(np.abs(self.target) ** 2)
+
+    @classmethod
+    def of(cls, ranges: FieldRanges) -> "_Spectrum | None":
+        """That of the shortest length and the narrowest aperture; None where pixels are too coarse for it."""
+        deviation = 1 / math.hypot(ranges.length[0], math.sqrt(2) * ranges.aperture[0])
+        if _REACH * deviation > math.pi:
+            return None
+        k = np.linspace(-_REACH, _REACH, _POINTS)
+        share = np.exp(-0.5 * k * k)
+        return cls(deviation * k, share / share.sum(), ranges.stream)
+
+    def cutoff(self, error: float) -> float:
+        """The lowest frequency from which on all others together deviate by no more than this."""
+        kept = np.abs(self.k) <= np.abs(self.k)[:, None]
+        one, other = (kept * self.share * np.abs(self.target) ** 2).sum(axis=1), (kept * self.share).sum(axis=1)
+        left_out = np.sqrt(np.clip(1 - one * other / self.variance, 0, None))
+        return float(np.abs(self.k)[left_out <= max(error, left_out.min())].min())
+
+    def cubic_error(self, stride: int) -> float:
+        """The deviation of the largest error between nodes of a field of variance 1."""
+        options = {"dtype": torch.float64, "device": torch.device("cpu")}
+        own = self._transfer(cubic_weights(stride, **options).numpy(), stride)
+        along = self._transfer(slope_weights(stride, **options).numpy(), stride) if self.stream else own
+        agrees = self._total(self.target.conj() * along)[:, None] * self._total(own)
+        power = self._total(np.abs(along) ** 2)[:, None] * self._total(np.abs(own) ** 2)
+        return math.sqrt(max(0.0, float((1 + (power - 2 * agrees.real) / self.variance).max())))
+
+    def _transfer(self, weights: np.ndarray, stride: int) -> np.ndarray:
+        """(stride, k): what is made of a wave of height 1 at each pixel of a cell."""
+        count = weights.shape[1]
+        place = np.arange(3 - count, 3) - np.arange(stride)[:, None] / stride
+        return np.einsum("tj,tjk->tk", weights, np.exp(1j * stride * place[:, :, None] * self.k))
+
+    def _total(self, values: np.ndarray) -> Any:
+        return (values * self.share).sum(axis=-1)

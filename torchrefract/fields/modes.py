@@ -1,0 +1,99 @@
+"""Gaussian random fields of few frequencies: those of `gaussian_random_field`, at any rows and columns."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrefract import white_noise
+from torchrefract.fields.evolution import turned
+from torchrefract.fields.gaussian import axis_spectrum
+
+
+class Modes(NamedTuple):
+    """The lowest frequencies of a torus: -rows ... rows and -columns ... columns periods."""
+
+    size: tuple[int, int]  # (Ht, Wt), px, of the torus
+    rows: int
+    columns: int
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """How many along each axis."""
+        return 2 * self.rows + 1, 2 * self.columns + 1
+
+
+def mode_noise(key: Tensor, modes: Modes, *, dtype: torch.dtype) -> Tensor:
+    """(B, 2, My, Mx): the white noise of these frequencies, as in `white_noise.noise` of the whole torus."""
+    return white_noise.noise_at(key, _places(modes, key.device).flatten()).unflatten(2, modes.counts).to(dtype)
+
+
+def mode_turn_rates(key: Tensor, modes: Modes, *, dtype: torch.dtype) -> Tensor:
+    """(B, My, Mx), the rates of these frequencies, as in `turn_rates` of the whole torus."""
+    half = modes.size[0] * modes.size[1] // 2
+    place = _places(modes, key.device).flatten()
+    pairs = white_noise.noise_at(key.flip(1), place % half)
+    return torch.where(place < half, pairs[:, 0], pairs[:, 1]).unflatten(1, modes.counts).to(dtype)
+
+
+def evolved_modes(
+    noise: Tensor, rates: Tensor, modes: Modes, *, frame: Tensor, wind: Tensor, decorrelation: Tensor
+) -> Tensor:
+    """The noise (B, 2, My, Mx) at a later frame; as `evolved` of the whole torus."""
+    frequency = [k / n for k, n in zip(_numbers(modes, noise.device), modes.size, strict=True)]
+    return turned(noise, rates, *frequency, frame=frame, wind=wind, decorrelation=decorrelation)
+
+
+def mode_amplitude(
+    modes: Modes, length: Tensor, *, aperture: Tensor | None, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """(B, My) and (B, Mx), whose product is the amplitude of a Gaussian covariance's `spectrum` at each frequency."""
+    sides = zip(modes.size, _numbers(modes, length.device), strict=True)
+    rows, columns = (axis_spectrum(n, length, aperture)[:, k.abs()].to(dtype) for n, k in sides)
+    return rows, columns
+
+
+def mode_field(
+    noise: Tensor, amplitude: tuple[Tensor, Tensor], modes: Modes, rows: Sequence[int], columns: Sequence[int]
+) -> Tensor:
+    """Two independent fields (B, 2, n, m) at rows and columns of pixels, by two products of matrices.
+
+        field = Re, Im of sum_k amplitude_k (n1_k + i n2_k) exp(-2 pi i k . p / size)
+
+    Args:
+        noise: (B, 2, My, Mx).
+        amplitude: (B, My) and (B, Mx).
+        modes: their frequencies.
+        rows, columns: px, whole numbers.
+    """
+    options = {"dtype": noise.dtype, "device": noise.device}
+    weighted = noise * (amplitude[0][:, None, :, None] * amplitude[1][:, None, None, :])
+    real, imaginary = weighted.unbind(1)
+    ky, kx = _numbers(modes, noise.device)
+    cos_x, sin_x = _waves(kx, columns, modes.size[1], **options)
+    cos_y, sin_y = _waves(ky, rows, modes.size[0], **options)
+    both = torch.cat([torch.cat([real, imaginary], dim=2), torch.cat([imaginary, -real], dim=2)], dim=1)
+    along = both @ torch.cat([cos_x, sin_x])
+    across = torch.cat([torch.cat([cos_y, sin_y]).mT, torch.cat([-sin_y, cos_y]).mT])
+    return (across @ along).unflatten(1, (2, len(rows)))
+
+
+def _waves(k: Tensor, places: Sequence[int], size: int, **options: Any) -> tuple[Tensor, Tensor]:
+    """cos and sin of 2 pi k p / size, (M, n)."""
+    where = torch.tensor(list(places), device=k.device)
+    # Whole turns are taken out of whole numbers, exactly.
+    angle = (k[:, None] * where).remainder(size).to(**options) * (2 * math.pi / size)
+    return angle.cos(), angle.sin()
+
+
+def _numbers(modes: Modes, device: torch.device) -> tuple[Tensor, Tensor]:
+    rows, columns = (torch.arange(-most, most + 1, device=device) for most in (modes.rows, modes.columns))
+    return rows, columns
+
+
+def _places(modes: Modes, device: torch.device) -> Tensor:
+    """(My, Mx): where each frequency stands among those of the torus."""
+    ky, kx = _numbers(modes, device)
+    return ky[:, None].remainder(modes.size[0]) * modes.size[1] + kx.remainder(modes.size[1])

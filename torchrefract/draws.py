@@ -19,6 +19,7 @@ from torchrefract.types import Range
 _WORD = 0xFFFFFFFF
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
+LARGEST_NORMAL = 5.8  # in magnitude
 _FEW = 8  # up to so many, Python computes faster than numpy
 
 
@@ -119,7 +120,7 @@ def between(source: Stream, ranges: Sequence[Range], *, dtype: torch.dtype) -> T
 
 
 def normal(source: Stream, count: int) -> Tensor:
-    """(B, count), float32, standard normal (Box and Muller 1958), up to 5.7 in magnitude."""
+    """(B, count), float32, standard normal (Box and Muller 1958), below `LARGEST_NORMAL` in magnitude."""
     radius, angle = uniform(source, 2 * _blocks(count)).chunk(2, dim=1)
     radius, angle = (-2 * radius.log()).sqrt(), 2 * math.pi * angle
     return torch.cat([radius * angle.cos(), radius * angle.sin()], dim=1)[:, :count]

@@ -1,6 +1,7 @@
 """A warp that bends the frame like a thin plate."""
 
-from typing import NamedTuple
+import math
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -8,9 +9,12 @@ from torch import Tensor
 from torchrefract import draws
 from torchrefract._checks import check_all, check_count, check_range
 from torchrefract.effects.base import params_to
+from torchrefract.effects.plan import Plan, lies_in
+from torchrefract.effects.plate_plan import plate_plan
 from torchrefract.effects.refraction import WarpEffect
-from torchrefract.fields.spline import check_points, fit_spline, spline_flow
+from torchrefract.fields.spline import check_points, fit_spline, spline_at, spline_flow
 from torchrefract.types import Range
+from torchrefract.warping.lattice import Lattice, SmoothFlow
 
 
 class ThinPlateParams(NamedTuple):
@@ -36,7 +40,7 @@ class ThinPlateSpline(WarpEffect):
         amplitude_range: px, standard deviation of the displacements, 0 or above.
         lattice: (rows, columns) of control points, each at least 2.
         smoothing_range: 0 goes through the points exactly; larger bends less, in units of the points' rms radius.
-        padding, interpolation, p: as for every warp.
+        padding, interpolation, tolerance_px, p: as for every warp; plates with own points are exact.
 
     Raises:
         ValueError: an argument outside its range; points that are fewer than three, the same, or on one line.
@@ -52,9 +56,10 @@ class ThinPlateSpline(WarpEffect):
         smoothing_range: Range = (0.0, 0.0),
         padding: str = "reflection",
         interpolation: str = "bilinear",
+        tolerance_px: float | None = None,
         p: float = 1.0,
     ):
-        super().__init__(padding=padding, interpolation=interpolation, p=p)
+        super().__init__(padding=padding, interpolation=interpolation, tolerance_px=tolerance_px, p=p)
         self.amplitude_range = check_range("amplitude_range", amplitude_range, low=0.0, high=1e4)
         rows, columns = lattice
         self.lattice = (check_count("lattice", rows, low=2), check_count("lattice", columns, low=2))
@@ -96,6 +101,26 @@ class ThinPlateSpline(WarpEffect):
         spline = fit_spline(params.points, params.displacement, params.smoothing)
         flow = spline_flow(spline, height=height, width=width, dtype=params.points.dtype)
         return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
+
+    def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
+        """The plan of `plate_plan`."""
+        double = dtype is torch.float64
+        amplitude = self.amplitude_range[1]
+        return plate_plan(amplitude, self.lattice, self.smoothing_range, height, width, self.tolerance_px, double)
+
+    def covers(self, params: ThinPlateParams) -> Tensor:
+        """Whether the points are as many as drawn ones, displaced and smoothed as those can be."""
+        if params.points.shape[1] != math.prod(self.lattice):
+            return params.gate.new_zeros(())
+        most = draws.LARGEST_NORMAL * self.amplitude_range[1]
+        return lies_in(params.displacement, (-most, most)) & lies_in(params.smoothing, self.smoothing_range)
+
+    def on_lattice(self, params: ThinPlateParams, plan: Plan) -> SmoothFlow:
+        """The flow of `spline_at`."""
+        lattice, dtype = cast(Lattice, plan.lattice), params.points.dtype
+        spline = fit_spline(params.points, params.displacement, params.smoothing)
+        x, y = lattice.places(dtype=torch.float64, device=params.points.device)
+        return SmoothFlow(spline_at(spline, x, y, dtype=dtype), lattice)
 
     def moves(self, params: ThinPlateParams) -> Tensor:
         """The samples with a displaced point."""

@@ -67,9 +67,13 @@ def fit_spline(points: Tensor, displacement: Tensor, smoothing: Tensor) -> Splin
 
 def spline_flow(spline: Spline, *, height: int, width: int, dtype: torch.dtype) -> Tensor:
     """The flow (B, 2, H, W) in px that a spline has at each pixel, computed in float64."""
-    x, y = (axis.flatten() for axis in pixel_axes(height, width, dtype=torch.float64, device=spline.points.device))
-    x = ((x - spline.center[:, :, 0]) / spline.scale[:, :, 0])[:, None]
-    y = ((y - spline.center[:, :, 1]) / spline.scale[:, :, 0])[:, :, None]
+    return spline_at(spline, *pixel_axes(height, width, dtype=torch.float64, device=spline.points.device), dtype=dtype)
+
+
+def spline_at(spline: Spline, x: Tensor, y: Tensor, *, dtype: torch.dtype) -> Tensor:
+    """The flow (B, 2, n, m) in px at places x, (1, 1, 1, m), and y, (1, 1, n, 1), px, computed in float64."""
+    x = ((x.double().flatten() - spline.center[:, :, 0]) / spline.scale[:, :, 0])[:, None]
+    y = ((y.double().flatten() - spline.center[:, :, 1]) / spline.scale[:, :, 0])[:, :, None]
     if torch.compiler.is_compiling():  # one loop over the pixels, whose sums need no memory
         px, py, wu, wv = torch.cat([spline.points, spline.weights / 2], dim=2)[..., None, None].unbind(2)
         kernel = _kernel(_square(x[:, None] - px, y[:, None] - py))

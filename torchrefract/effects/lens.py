@@ -129,7 +129,7 @@ class LensDistortion(WarpEffect):
     def compute(self, image: Tensor, params: LensParams, depth: Tensor | None) -> Degraded:
         """The batch looked up along the flow; a lens that folds is told."""
         height, width = image.shape[2:]
-        if self.planned(height, width, params.focal.dtype).stride == 1:  # no other plan has lenses that fold
+        if self.plan_for(params, height, width).stride == 1:  # no other plan has lenses that fold
             self._check_fold(params, height, width)
         return super().compute(image, params, depth)
 

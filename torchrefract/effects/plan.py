@@ -1,7 +1,7 @@
 """What an effect will do for a frame of some size, under a tolerance."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
@@ -13,7 +13,7 @@ _SMALLEST, _LARGEST = 1e-6, 64.0  # px
 # Positions in float32 are off by so many units of the last place of the longer side.
 _ROUNDING = {False: 16 * 2.0**-24, True: 16 * 2.0**-53}
 # Px between nodes, from fine to coarse.
-STRIDES = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 28, 32, 40, 48, 56, 64, 80, 96, 112, 128)
+STRIDES = (*range(2, 8), *(share << octave for octave in range(1, 7) for share in (4, 5, 6, 7)), 512)
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class Plan:
     dropped: those that are not, each with how far it could have moved a pixel, px.
     resamples: how often the image is looked up.
     before: nodes that the lattice has before the frame.
+    lattice: where the flow is computed; None for every pixel, or for none.
     why: what decided.
     """
 
@@ -43,11 +44,11 @@ class Plan:
     dropped: tuple[tuple[str, float], ...] = ()
     resamples: int = 1
     before: int = 1
+    lattice: Lattice | None = field(init=False)
 
-    @property
-    def lattice(self) -> Lattice | None:
-        """Where the flow is computed; None for every pixel, or for none."""
-        return Lattice(self.height, self.width, self.stride, self.before) if self.stride > 1 else None
+    def __post_init__(self) -> None:
+        lattice = Lattice(self.height, self.width, self.stride, self.before) if self.stride > 1 else None
+        object.__setattr__(self, "lattice", lattice)
 
     def __str__(self) -> str:
         flow = {0: "not computed", 1: "at every pixel"}.get(self.stride, f"every {self.stride} px")

@@ -65,6 +65,10 @@ class WarpEffect(Effect):
         print(plan)
         return plan
 
+    def plan_for(self, params: Any, height: int, width: int) -> Plan:
+        """The plan for the type of these parameters."""
+        return _constant(self, height, width, next(value.dtype for value in params if value.is_floating_point()))
+
     def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
         """The plan for fields of a type, from the ranges alone."""
         why = "no tolerance" if self.tolerance_px is None else "no bound is known for this effect"
@@ -103,13 +107,13 @@ class WarpEffect(Effect):
         """Whether a sample may be moved, or a gradient is asked for that could move it."""
         if learns(params):
             return True
-        if self.planned(height, width, _field_type(params)).stride == 0:
+        if self.plan_for(params, height, width).stride == 0:
             return False
         return is_true((params.gate & self.moves(params)).any) is not False
 
     def gated(self, params: Any, *, height: int, width: int) -> "Moved":
         """The flow, zero for the samples that the effect leaves alone."""
-        plan = self.planned(height, width, _field_type(params))
+        plan = self.plan_for(params, height, width)
         active = params.gate & self.moves(params) & (height * width > 1)
         if plan.lattice is None:
             flow, exists = self.flow(params, height=height, width=width)
@@ -214,8 +218,10 @@ def identity(image: Tensor, params: Any) -> Degraded:
     )
 
 
-def _field_type(params: Any) -> torch.dtype:
-    return next(value.dtype for value in params if value.is_floating_point())
+@torch.compiler.assume_constant_result
+def _constant(effect: WarpEffect, height: int, width: int, dtype: torch.dtype) -> Plan:
+    # Compilers take the plan as it is, and need not follow how it was made.
+    return effect.planned(height, width, dtype)
 
 
 def _spread_path(path: Tensor | SmoothFlow, rows: int) -> Tensor | SmoothFlow:

@@ -2,8 +2,8 @@
 
 The inverse of a polynomial in the plane has no closed form, and bounds of its derivatives by those of the polynomial
 are a hundred times too large where a barrel comes near to folding. So errors are measured, in float64, for lenses at
-the corners of the ranges (where they are largest for every family of lenses tried) and for draws inside, in the middle
-of cells all over the frame, and taken `_MARGIN` times. That no lens in the ranges folds is proved.
+the corners of the ranges (where they are largest for every family of lenses tried) and for draws inside, in cells all
+over the frame, and taken `_MARGIN` times. That no lens in the ranges folds is proved.
 """
 
 import itertools
@@ -21,7 +21,9 @@ from torchrefract.warping.lattice import Lattice, cubic_weights
 
 _MARGIN = 1.5
 _MOST_CORNERS, _DRAWS = 128, 16
-_CELLS = 6  # along each axis
+_FEW_CELLS, _MANY_CELLS = 6, 24  # along each axis
+_WORST = 8  # lenses that are looked at in many cells
+_INSIDE = ((0.5, 0.5), (0.25, 0.25), (0.25, 0.75), (0.75, 0.25), (0.75, 0.75))  # of a cell, x and y
 _MOST_STEPS = 8
 # A map that grows by less than this, compared with no lens, is near to a fold: nothing is smooth there.
 _FLATTEST = 0.05
@@ -79,25 +81,41 @@ def moved_by_terms(ranges: LensRanges, lattice: Lattice) -> tuple[float, ...] | 
 @lru_cache(maxsize=1024)
 def lens_errors(ranges: LensRanges, lattice: Lattice) -> LensErrors | None:
     """The errors on a lattice; None where one of the lenses that were tried folds."""
-    c, focal, center = _lenses(ranges, lattice)
-    at, cells = _nodes_and_middles(lattice)
+    (c, focal, center), radius = _lenses(ranges, lattice), _radius(ranges, lattice)
+    first = _measured(c, focal, center, lattice, radius=radius, cells=_FEW_CELLS)
+    if first is None:
+        return None
+    # The worst of them are looked at more closely.
+    worst = first[0].argsort(descending=True)[:_WORST]
+    found = _measured(c[worst], focal[worst], center[worst], lattice, radius=radius, cells=_MANY_CELLS)
+    if found is None:
+        return None
+    cubic, newton, stretch = (torch.cat(both, dim=-1).amax(dim=-1) for both in zip(first, found, strict=True))
+    return LensErrors(_MARGIN * cubic.item(), tuple((_MARGIN * newton).tolist()), stretch.item())
+
+
+def _measured(
+    c: Tensor, focal: Tensor, center: Tensor, lattice: Lattice, *, radius: float, cells: int
+) -> tuple[Tensor, Tensor, Tensor] | None:
+    """For each of N lenses the three numbers of `LensErrors`, (N,), (steps, N) and (N,); None if one of them folds."""
+    at, count = _nodes_and_places(lattice, cells)
     x, y = ((at[:, i] - center[:, i]) / focal[:, i] for i in range(2))
-    one, radius = x.new_ones(len(x)), _radius(ranges, lattice)
+    one = x.new_ones(len(x))
     limit = radial_limit(c, 16 * radius * one, 1.5 * radius * one)
     found_x, found_y, exists = undistort_polynomial(x, y, c, limit=limit)
     if not exists.all():
         return None
     flow = torch.stack([(found_x - x) * focal[:, 0], (found_y - y) * focal[:, 1]])
-    nodes, middle = flow.unflatten(2, (cells, 17)).split([16, 1], dim=3)
-    weight = cubic_weights(2, dtype=nodes.dtype, device=nodes.device)[1]
-    off = nodes @ torch.outer(weight, weight).flatten() - middle[..., 0]
+    nodes, places = flow.unflatten(2, (count, -1)).split([16, len(_INSIDE)], dim=3)
+    u, v = nodes @ _weights_inside().mT - places
+    off = torch.hypot(u, v).flatten(1).amax(dim=1)
     newton = []
     for steps in range(_MOST_STEPS + 1):
         near = newton_undistort(x, y, c, steps=steps, terms=ALL_TERMS)
         error = torch.hypot((near[0] - found_x) * focal[:, 0], (near[1] - found_y) * focal[:, 1])
-        newton.append(_MARGIN * error.nan_to_num(nan=math.inf).amax().item())
+        newton.append(error.nan_to_num(nan=math.inf).amax(dim=1))
     stretch = torch.hypot(found_x, found_y) / torch.hypot(x, y).clamp(min=1e-9)
-    return LensErrors(_MARGIN * torch.hypot(*off).amax().item(), tuple(newton), stretch.amax().item())
+    return off, torch.stack(newton), stretch.amax(dim=1)
 
 
 def _radius(ranges: LensRanges, lattice: Lattice) -> float:
@@ -129,13 +147,19 @@ def _lenses(ranges: LensRanges, lattice: Lattice) -> tuple[Tensor, Tensor, Tenso
     return lenses[:, :12], focal, middle + lattice.width * lenses[:, 14:]
 
 
-def _nodes_and_middles(lattice: Lattice) -> tuple[Tensor, int]:
-    """(1, 2, 17 n), px: of n cells all over the frame the 16 nodes that it takes, and the middle; and n."""
+def _nodes_and_places(lattice: Lattice, most: int) -> tuple[Tensor, int]:
+    """(1, 2, n (16 + places)), px: of n cells all over the frame the 16 nodes around and places inside; and n."""
     axes = [
-        lattice.stride * torch.linspace(0, count - 1, min(count, _CELLS), dtype=torch.float64).round()
+        lattice.stride * torch.linspace(0, count - 1, min(count, most), dtype=torch.float64).round()
         for count in reversed(lattice.cells)
     ]
-    steps = lattice.stride * torch.arange(-1, 3, dtype=torch.float64)
-    around = torch.cat([torch.cartesian_prod(steps, steps), torch.full((1, 2), lattice.stride / 2)])
-    corners = torch.cartesian_prod(*axes)
+    steps = torch.arange(-1, 3, dtype=torch.float64)
+    around = lattice.stride * torch.cat([torch.cartesian_prod(steps, steps), steps.new_tensor(_INSIDE)])
+    corners = torch.cartesian_prod(*axes).view(-1, 2)
     return (corners[:, None] + around).flatten(0, 1).mT[None], len(corners)
+
+
+def _weights_inside() -> Tensor:
+    """(places, 16)."""
+    quarters = cubic_weights(4, dtype=torch.float64, device=torch.device("cpu"))
+    return torch.stack([torch.outer(quarters[round(4 * x)], quarters[round(4 * y)]).flatten() for x, y in _INSIDE])

@@ -11,6 +11,8 @@ from torchrefract.warping.grid import finite, pixel_axes, sampler_positions
 
 # In the sampler's coordinates: farther than a flow leads that is computed on a lattice, and finite in all products.
 _FARTHEST = 1e4
+# Up to so many nodes along an axis one product with all of them is faster than one for each cell.
+_FEW_ROWS, _FEW_COLUMNS = 24, 64
 
 
 class Lattice(NamedTuple):
@@ -134,16 +136,30 @@ class StreamFlow(SmoothFlow):
         own = F.pad(cubic_weights(self.lattice.stride, **options), (1, 0))
         along, across = _across(nodes, own, self.lattice.width), _across(nodes, slope, self.lattice.width)
         lines = torch.cat([scale[0] * along, -scale[1] * across], dim=1)
-        return _down(lines, torch.stack([slope, own])[:, None], self.lattice.height)
+        return _down(lines, torch.stack([slope, own]), self.lattice.height)
 
 
 def _across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:
     """(B, C, n, W) of (B, C, n, m), by weights (stride, taps)."""
+    if nodes.shape[3] <= _FEW_COLUMNS:
+        return nodes @ _matrix(weight, nodes.shape[3], width).mT
     cells = nodes.unfold(3, weight.shape[-1], 1) @ weight.mT
     return cells.flatten(3)[..., :width]
 
 
 def _down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
-    """(B, C, H, W) of (B, C, n, W), by weights (stride, taps), or (C, 1, stride, taps)."""
-    bands = weight @ lines.unfold(2, weight.shape[-1], 1).mT
+    """(B, C, H, W) of (B, C, n, W), by weights (stride, taps), or (C, stride, taps)."""
+    if lines.shape[2] <= _FEW_ROWS:
+        return _matrix(weight, lines.shape[2], height) @ lines
+    bands = weight.unsqueeze(-3) @ lines.unfold(2, weight.shape[-1], 1).mT
     return bands.flatten(2, 3)[:, :, :height]
+
+
+def _matrix(weight: Tensor, nodes: int, length: int) -> Tensor:
+    """(..., length, nodes): the weights (..., stride, taps) of each pixel's own nodes, among all of them."""
+    *lead, stride, taps = weight.shape
+    cells = nodes - taps + 1
+    # One cell's rows again and again, each time one longer than there are nodes: so they move on by one.
+    rows = F.pad(weight, (0, cells)).repeat(*[1] * len(lead), 1, cells)
+    own = rows[..., : cells * nodes].reshape(*lead, stride, cells, nodes)
+    return own.transpose(-3, -2).reshape(*lead, cells * stride, nodes)[..., :length, :]

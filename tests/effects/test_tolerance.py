@@ -2,9 +2,11 @@ import math
 import warnings
 from typing import Any
 
+import numpy as np
 import pytest
 import tolerance
 import torch
+from scipy.interpolate import lagrange
 from torch.testing import assert_close
 
 from torchrefract import Compose, DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, UniformFog
@@ -238,14 +240,21 @@ def test_cubics_come_out_as_they_are(stride):
 
 @pytest.mark.parametrize("stride", [2, 3, 8])
 def test_a_stream_between_nodes_has_the_curl_of_psi_between_nodes(stride):
-    lattice = Lattice(37, 53, stride, before=2)
-    x, y = lattice.places(dtype=torch.float64, device=torch.device("cpu"))
-    nodes = torch.randn(2, 1, y.numel(), x.numel(), dtype=torch.float64)
-    # A frame larger by a cell on each side, so that it starts at the second node before this one.
-    around = between_nodes(nodes, Lattice(37 + 2 * stride, 53 + 2 * stride, stride))
-    psi = around[:, :, stride - 1 : stride + 38, stride - 1 : stride + 54]
+    lattice = Lattice(37, 53, stride, before=3, after=2)
+    nodes = torch.randn(2, 1, *map(len, lattice.axes), dtype=torch.float64)
+
+    def between(count: int, size: int) -> np.ndarray:
+        """(size + 2, count), by SciPy: the polynomial through the three nodes on either side of a pixel."""
+        weights = np.zeros((size + 2, count))
+        for row, place in zip(weights, range(-1, size + 1), strict=True):
+            cell, inside = divmod(place, stride)
+            row[cell + 1 : cell + 7] = [lagrange(np.arange(-2, 4), one)(inside / stride) for one in np.eye(6)]
+        return weights
+
+    rows, columns = between(nodes.shape[2], 37), between(nodes.shape[3], 53)
+    psi = torch.from_numpy(rows) @ nodes @ torch.from_numpy(columns).mT
     flow = StreamFlow(nodes, lattice)
-    assert_close(flow.dense(), curl(psi), rtol=0, atol=1e-14)
+    assert_close(flow.dense(), curl(psi), rtol=0, atol=1e-12)
     assert_close(flow.sampler_grid(torch.float64), sampler_grid(flow.dense()), rtol=0, atol=1e-14)
 
 

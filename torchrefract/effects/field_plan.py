@@ -19,7 +19,7 @@ from torchrefract.fields.covariance import REACH
 from torchrefract.fields.gaussian import torus
 from torchrefract.fields.modes import Modes
 from torchrefract.types import Range
-from torchrefract.warping.lattice import cubic_weights, slope_weights
+from torchrefract.warping.lattice import STREAM_NODES, lagrange_weights, slope_weights
 
 _SIGMAS = 7.0
 _REACH = 8.0  # deviations of the spectrum beyond which nothing is left of it
@@ -69,13 +69,14 @@ def field_plan(ranges: FieldRanges, height: int, width: int, tolerance: float | 
     counts = "{} x {} of {} x {} frequencies".format(*modes.counts, *modes.size)
 
     def attempt(stride: int) -> Plan | None:
-        off = most * math.hypot(_DROPPED * room / most, spectrum.cubic_error(stride))
+        off = most * math.hypot(_DROPPED * room / most, spectrum.error_between(stride))
         if off > room:
             return None
-        before = 2 if ranges.stream else 1
-        return FieldPlan(height, width, tolerance, stride, off + tolerance - room, counts, before=before, modes=modes)
+        before, after = (STREAM_NODES // 2, STREAM_NODES // 2 - 1) if ranges.stream else (1, 1)
+        error = off + tolerance - room
+        return FieldPlan(height, width, tolerance, stride, error, counts, before=before, after=after, modes=modes)
 
-    return coarsest(attempt) or plan(1, 0.0, "the field is too rough for cubics")
+    return coarsest(attempt) or plan(1, 0.0, "the field is too rough for a lattice")
 
 
 def _modes(ranges: FieldRanges, height: int, width: int, cutoff: float) -> Modes | None:
@@ -116,11 +117,13 @@ class _Spectrum:
         left_out = np.sqrt(np.clip(1 - one * other / self.variance, 0, None))
         return float(np.abs(self.k)[left_out <= max(error, left_out.min())].min())
 
-    def cubic_error(self, stride: int) -> float:
+    def error_between(self, stride: int) -> float:
         """The deviation of the largest error between nodes of a field of variance 1."""
         options = {"dtype": torch.float64, "device": torch.device("cpu")}
-        own = self._transfer(cubic_weights(stride, **options).numpy(), stride)
-        along = self._transfer(slope_weights(stride, **options).numpy(), stride) if self.stream else own
+        nodes = STREAM_NODES if self.stream else 4
+        own = along = self._transfer(lagrange_weights(stride, nodes, **options).numpy(), stride)
+        if self.stream:
+            along = self._transfer(slope_weights(stride, nodes, **options).numpy(), stride)
         agrees = self._total(self.target.conj() * along)[:, None] * self._total(own)
         power = self._total(np.abs(along) ** 2)[:, None] * self._total(np.abs(own) ** 2)
         return math.sqrt(max(0.0, float((1 + (power - 2 * agrees.real) / self.variance).max())))
@@ -128,7 +131,7 @@ class _Spectrum:
     def _transfer(self, weights: np.ndarray, stride: int) -> np.ndarray:
         """(stride, k): what is made of a wave of height 1 at each pixel of a cell."""
         count = weights.shape[1]
-        place = np.arange(3 - count, 3) - np.arange(stride)[:, None] / stride
+        place = np.arange(count) - (count - 1) // 2 - np.arange(stride)[:, None] / stride
         return np.einsum("tj,tjk->tk", weights, np.exp(1j * stride * place[:, :, None] * self.k))
 
     def _total(self, values: np.ndarray) -> Any:

@@ -28,7 +28,7 @@ class Plan:
     kept: the terms that are computed.
     dropped: those that are not, each with how far it could have moved a pixel, px.
     resamples: how often the image is looked up.
-    before: nodes that the lattice has before the frame.
+    before, after: nodes that the lattice has before the frame and behind its last cell.
     lattice: where the flow is computed; None for every pixel, or for none.
     why: what decided.
     """
@@ -44,11 +44,12 @@ class Plan:
     dropped: tuple[tuple[str, float], ...] = ()
     resamples: int = 1
     before: int = 1
+    after: int = 1
     lattice: Lattice | None = field(init=False)
 
     def __post_init__(self) -> None:
-        lattice = Lattice(self.height, self.width, self.stride, self.before) if self.stride > 1 else None
-        object.__setattr__(self, "lattice", lattice)
+        place = (self.height, self.width, self.stride, self.before, self.after)
+        object.__setattr__(self, "lattice", Lattice(*place) if self.stride > 1 else None)
 
     def __str__(self) -> str:
         flow = {0: "not computed", 1: "at every pixel"}.get(self.stride, f"every {self.stride} px")

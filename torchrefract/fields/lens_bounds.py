@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchrefract.cameras.distortion import ALL_TERMS, newton_undistort, radial_limit, undistort_polynomial
 from torchrefract.types import Range
-from torchrefract.warping.lattice import Lattice, cubic_weights
+from torchrefract.warping.lattice import Lattice, lagrange_weights
 
 _MARGIN = 1.5
 _MOST_CORNERS, _DRAWS = 128, 16
@@ -161,5 +161,5 @@ def _nodes_and_places(lattice: Lattice, most: int) -> tuple[Tensor, int]:
 
 def _weights_inside() -> Tensor:
     """(places, 16)."""
-    quarters = cubic_weights(4, dtype=torch.float64, device=torch.device("cpu"))
+    quarters = lagrange_weights(4, 4, dtype=torch.float64, device=torch.device("cpu"))
     return torch.stack([torch.outer(quarters[round(4 * x)], quarters[round(4 * y)]).flatten() for x, y in _INSIDE])

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from torchrefract.warping.grid import finite, pixel_axes, sampler_positions
 
+# Slopes of cubics are not smooth enough from cell to cell.
+STREAM_NODES = 6
 # In the sampler's coordinates: farther than a flow leads that is computed on a lattice, and finite in all products.
 _FARTHEST = 1e4
 # Up to so many nodes along an axis one product with all of them is faster than one for each cell.
@@ -22,6 +24,7 @@ class Lattice(NamedTuple):
     width: int
     stride: int  # px
     before: int = 1  # nodes before the frame along each axis
+    after: int = 1  # and behind the last cell
 
     @property
     def cells(self) -> tuple[int, int]:
@@ -32,7 +35,8 @@ class Lattice(NamedTuple):
     def axes(self) -> tuple[range, range]:
         """Px, of the rows and of the columns of nodes."""
         start, s = -self.before * self.stride, self.stride
-        return range(start, (self.cells[0] + 2) * s, s), range(start, (self.cells[1] + 2) * s, s)
+        rows, columns = (range(start, (count + self.after) * s + 1, s) for count in self.cells)
+        return rows, columns
 
     def places(self, *, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
         """x, (1, 1, 1, m), and y, (1, 1, n, 1), px, of the nodes."""
@@ -55,29 +59,27 @@ def between_nodes(nodes: Tensor, lattice: Lattice) -> Tensor:
 
     Source: the remainder of Lagrange's interpolation; de Boor, "A practical guide to splines" (1978), chapter 2.
     """
-    weight = cubic_weights(lattice.stride, dtype=nodes.dtype, device=nodes.device)
+    weight = lagrange_weights(lattice.stride, 4, dtype=nodes.dtype, device=nodes.device)
     return _down(_across(nodes, weight, lattice.width), weight, lattice.height)
 
 
-def cubic_weights(stride: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(stride, 4): the weights of the nodes at -1, 0, 1, 2 for the pixels at 0, 1 / stride, 2 / stride ..."""
-    t = torch.arange(stride, dtype=torch.float64, device=device) / stride
-    before, here, next_, after = t + 1, t, t - 1, t - 2
-    weights = (
-        -here * next_ * after / 6,
-        before * next_ * after / 2,
-        -before * here * after / 2,
-        before * here * next_ / 6,
-    )
-    return torch.stack(weights, dim=1).to(dtype)
+def lagrange_weights(stride: int, count: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(stride, count): weights of `count` nodes, an even number, for the pixels at 0, 1 / stride, 2 / stride ...
+
+    Of the polynomial through the nodes at 1 - count / 2 ... count / 2.
+    """
+    nodes = torch.arange(1 - count // 2, count // 2 + 1, dtype=torch.float64, device=device)
+    t = torch.arange(stride, dtype=torch.float64, device=device)[:, None] / stride
+    others = torch.stack([nodes[nodes != node] for node in nodes])
+    return ((t[..., None] - others) / (nodes[:, None] - others)).prod(dim=2).to(dtype)
 
 
-def slope_weights(stride: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(stride, 5): those of the nodes at -2 ... 2 for the central difference (f(+1 px) - f(-1 px)) / 2."""
-    weight = cubic_weights(stride, dtype=torch.float64, device=device)
-    none = torch.zeros_like(weight[:, :1])
-    own = torch.cat([none, weight], dim=1)  # of the nodes -2 ... 2
-    last, first = torch.cat([weight, none], dim=1)[-1:], torch.cat([none, none, weight], dim=1)[:1, :5]
+def slope_weights(stride: int, count: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(stride, count + 1): those of the nodes at -count / 2 ... count / 2 for (f(+1 px) - f(-1 px)) / 2 of the same."""
+    weight = lagrange_weights(stride, count, dtype=torch.float64, device=device)
+    own = F.pad(weight, (1, 0))
+    # The pixel before belongs to the cell before, whose nodes are one farther to the left; the one behind to the next.
+    last, first = F.pad(weight[-1:], (0, 1)), F.pad(weight[:1], (2, 0))[:, :-1]
     return ((torch.cat([own[1:], first]) - torch.cat([last, own[:-1]])) / 2).to(dtype)
 
 
@@ -106,9 +108,11 @@ class SmoothFlow:
 
 
 class StreamFlow(SmoothFlow):
-    """The curl of a stream function that is known at the nodes of a lattice, (B, 1, n, m), px^2, two before the frame.
+    """The curl of a stream function that is known at the nodes of a lattice, (B, 1, n, m), px^2.
 
-        flow = (D_y psi, -D_x psi) of the psi that `between_nodes` has between them
+        flow = (D_y psi, -D_x psi) of psi between nodes, by polynomials through six of them along each axis
+
+    The lattice has three nodes before the frame and two behind its last cell.
 
     D is the central difference, as in `curl`: the divergence taken with it vanishes, which that of a flow between nodes
     of its own does not.
@@ -132,8 +136,8 @@ class StreamFlow(SmoothFlow):
     def _flow(self, nodes: Tensor, scale: tuple[float, float]) -> Tensor:
         """(D_y psi, -D_x psi), each times its scale."""
         options = {"dtype": nodes.dtype, "device": nodes.device}
-        slope = slope_weights(self.lattice.stride, **options)
-        own = F.pad(cubic_weights(self.lattice.stride, **options), (1, 0))
+        slope = slope_weights(self.lattice.stride, STREAM_NODES, **options)
+        own = F.pad(lagrange_weights(self.lattice.stride, STREAM_NODES, **options), (1, 0))
         along, across = _across(nodes, own, self.lattice.width), _across(nodes, slope, self.lattice.width)
         lines = torch.cat([scale[0] * along, -scale[1] * across], dim=1)
         return _down(lines, torch.stack([slope, own]), self.lattice.height)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from arguments import count, frame_of, size
 from timing import (
     COPY,
@@ -27,6 +28,7 @@ from timing import (
 from torch import Tensor
 
 from torchrefract import (
+    Compose,
     DivergenceFree,
     GroundPlaneDepth,
     HeterogeneousFog,
@@ -37,20 +39,31 @@ from torchrefract import (
     UniformFog,
 )
 from torchrefract.draws import noise_key, stream
+from torchrefract.effects.refraction import WarpEffect
 from torchrefract.fields.perlin import octave, perlin_noise
+from torchrefract.warping.grid import sampler_grid
 
 WHAT = (
     "Whole effects through the public API, with a new draw in every call: effect(image) without gradients; 'all maps' "
     "is degrade() with flow, valid, restore_flow and restore_valid; 'to params' asks for the gradient of every drawn "
     "number (of a lens all 12 coefficients, so that none is skipped as zero), forward alone or forward and backward. "
     "'radial' is a lens without decentring, which needs no Newton steps in the plane. On the CPU the bare grid_sample "
-    "threads over the batch alone; the effects use all threads on one frame too."
+    "threads over the batch alone; the effects use all threads on one frame too. Within 0.05 px the flow is computed "
+    "on a lattice: one mild lens, and fields of 40 px and longer; the image asks for its gradient, forward alone. How "
+    "long the sampler takes depends on the flow, so it stands beside them with the flow of that lens, ready made."
 )
 LENS, RADIAL, FOG, FLARE = "LensDistortion", "LensDistortion radial", "UniformFog", "LensFlare"
 PERLIN, DRIFTS, SPACE = "Perlin noise, 6 octaves", "HeterogeneousFog", "HeterogeneousFog in space"
 TURBULENCE, SPLINE, SWIRL = "Turbulence, length 20 px", "ThinPlateSpline, 16 points", "DivergenceFree, length 20 px"
+TOLERANCE_PX = 0.05
+SAME_FLOW = "bare grid_sample, the mild lens"
+MILD, PLATE, AIR, STREAM, ALL_FOUR = (
+    f"{name} within {TOLERANCE_PX} px"
+    for name in ("mild lens", "thin plate, 16 points,", "Gaussian air, 40 px,", "swirls, 40 px,", "all four")
+)
 # Multiples of the bare grid_sample.
 LIMITS = {LENS: 20.0, TURBULENCE: 10.0, SPLINE: 20.0, SWIRL: 10.0, FOG: 0.15, FLARE: 0.25, DRIFTS: 1.8, PERLIN: 1.5}
+LIMITS |= {MILD: 0.8, PLATE: 0.85, AIR: 0.9, STREAM: 0.9, ALL_FOUR: 1.4}
 BARS = "bars, set for 1x3x1080x1920 float32 on 2 threads:"
 
 
@@ -87,6 +100,7 @@ def candidates(frame: Tensor) -> dict[str, Candidate]:
     }
     for name, effect in {LENS: lens, RADIAL: radial, FOG: fog, **others}.items():
         found[name] = lambda effect=effect: effect(frame)
+    found |= _tolerant(frame)
     depth = torch.linspace(1, 200, frame.shape[3], device=frame.device).expand(len(frame), 1, frame.shape[2], -1)
     for name, effect in ((FOG, fog), (DRIFTS, others[DRIFTS]), (SPACE, others[SPACE])):
         found[f"{name}, with a depth map"] = lambda effect=effect: effect.degrade(frame, depth=depth)
@@ -95,6 +109,27 @@ def candidates(frame: Tensor) -> dict[str, Candidate]:
     for name, effect in ((LENS, lens), (RADIAL, radial), (FOG, fog)):
         found[f"{name}, to params, forward"] = lambda effect=effect: _forward(effect, frame)
         found[f"{name}, to params, forward + backward"] = _forward_and_backward(effect, frame)
+    return found
+
+
+def _tolerant(frame: Tensor) -> dict[str, Candidate]:
+    """The warps under a tolerance."""
+    mild = LensDistortion(
+        k1_range=(-0.25, -0.25), k2_range=(0.09, 0.09), focal_range=(0.9, 0.9), tolerance_px=TOLERANCE_PX
+    )
+    warps: dict[str, WarpEffect] = {
+        MILD: mild,
+        PLATE: ThinPlateSpline(tolerance_px=TOLERANCE_PX),
+        AIR: Turbulence(covariance="gaussian", length_range=(40.0, 60.0), tolerance_px=TOLERANCE_PX),
+        STREAM: DivergenceFree(length_range=(40.0, 60.0), tolerance_px=TOLERANCE_PX),
+    }
+    grid = sampler_grid(mild.degrade(frame, seed=0).flow).contiguous()
+    found: dict[str, Candidate] = {
+        SAME_FLOW: lambda: F.grid_sample(frame, grid, mode="bilinear", align_corners=False),
+    }
+    learning = frame.clone().requires_grad_()
+    for name, effect in (warps | {ALL_FOUR: Compose(list(warps.values()))}).items():
+        found[name] = lambda effect=effect: effect(learning)
     return found
 
 

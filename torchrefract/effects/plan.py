@@ -83,7 +83,7 @@ def check_reachable(tolerance: float, *, height: int, width: int, double: bool) 
     """What a tolerance leaves beside the rounding of positions in a frame.
 
     Raises:
-        ValueError: nothing.
+        ValueError: a tolerance that leaves nothing.
     """
     rounding = _ROUNDING[double] * max(height, width)
     if tolerance < 2 * rounding:

@@ -15,10 +15,10 @@ from torchrefract.cameras.distortion import (
     Terms,
     distort_polynomial,
     jacobian_polynomial,
-    radial_limit,
     undistort_polynomial,
     used_terms,
 )
+from torchrefract.cameras.radial import radial_limit
 
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 FOCAL = 2000.0

@@ -7,7 +7,7 @@ import torch
 from torch.testing import assert_close
 
 from torchrefract import DivergenceFree, Turbulence, folding
-from torchrefract.fields import gaussian
+from torchrefract.fields import torus
 from torchrefract.fields.covariance import COVARIANCES
 
 CALM: dict[str, Any] = {"amplitude_range": (0.3, 0.3), "length_range": (12.0, 12.0), "aperture_range": (2.0, 2.0)}
@@ -123,7 +123,7 @@ def test_air_that_is_none_raises(field, value, rule):
 
 @pytest.mark.parametrize("effect", [Turbulence, DivergenceFree])
 def test_a_length_that_no_torus_has_room_for_is_told(effect, monkeypatch):
-    monkeypatch.setattr(gaussian, "_MOST_POINTS", 1 << 12)
+    monkeypatch.setattr(torus, "_MOST_POINTS", 1 << 12)
     long = effect(length_range=(60.0, 60.0), covariance="gaussian")
     with pytest.warns(UserWarning, match=r"length must be short enough for a torus of .*% of the spectrum .* 60 px"):
         made = long.degrade(torch.rand(2, 1, 27, 48), seed=0)

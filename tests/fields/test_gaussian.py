@@ -9,14 +9,14 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import draws, white_noise
-from torchrefract.fields import gaussian
+from torchrefract.fields import torus as torus_module
 from torchrefract.fields.covariance import COVARIANCES, covariance, slope_rms
 from torchrefract.fields.gaussian import (
     Spectrum,
     gaussian_random_field,
     spectrum,
-    torus,
 )
+from torchrefract.fields.torus import torus
 
 # Correlation lengths from edge to edge round the torus.
 REACH = {"exponential": 8, "gaussian": 5, "matern32": 6, "matern52": 6}
@@ -238,7 +238,7 @@ def test_a_field_of_no_length_is_white_noise(kind):
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("kind", COVARIANCES)
 def test_a_length_of_ten_frames_is_finite_and_near_its_covariance(monkeypatch, kind, dtype):
-    monkeypatch.setattr(gaussian, "_MOST_POINTS", 1 << 16)
+    monkeypatch.setattr(torus_module, "_MOST_POINTS", 1 << 16)
     frame, length = (40, 64), 640.0
     size = torus(*frame, length=length, kind=kind)
     lengths = torch.tensor([length], dtype=dtype, requires_grad=True)

@@ -8,8 +8,9 @@ from torch.testing import assert_close
 
 from torchrefract import draws, warp, white_noise
 from torchrefract.fields.covariance import COVARIANCES
-from torchrefract.fields.gaussian import gaussian_random_field, spectrum, torus
+from torchrefract.fields.gaussian import gaussian_random_field, spectrum
 from torchrefract.fields.stream import curl, curl_rms
+from torchrefract.fields.torus import torus
 
 PRECISION = [(torch.float64, 1e-12), (torch.float32, 1e-4)]
 

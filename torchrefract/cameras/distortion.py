@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import read
+from torchrefract.cameras.radial import RadialLimit, radial, radial_slope
 
 POLYNOMIAL12 = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
-_NODES = 2048
 _SMALLEST_RADIAL = 0.1  # of a first guess
 
 
@@ -57,8 +57,8 @@ def used_terms(coefficients: Tensor) -> Terms:
     if values is None:
         return ALL_TERMS
     used = [any(row[i] for row in values) for i in range(12)]
-    radial = max((i + 1 for i in range(6) if used[i]), default=0)
-    return Terms(radial, any(used[6:8]), any(used[8:]), not all(any(row[6:]) for row in values))
+    order = max((i + 1 for i in range(6) if used[i]), default=0)
+    return Terms(order, any(used[6:8]), any(used[8:]), not all(any(row[6:]) for row in values))
 
 
 def distort_polynomial(x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms = ALL_TERMS) -> tuple[Tensor, Tensor]:
@@ -87,7 +87,7 @@ def jacobian_polynomial(x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms
 
 
 def undistort_polynomial(
-    x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, limit: "RadialLimit", terms: Terms = ALL_TERMS
+    x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, limit: RadialLimit, terms: Terms = ALL_TERMS
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The points that `distort_polynomial` maps to (x_d, y_d), without gradient, and which of them exist.
 
@@ -138,87 +138,13 @@ def newton_undistort(
     """
     with torch.no_grad():
         c = coefficients.unbind(1)
-        radial = _radial(x_d * x_d + y_d * y_d, c, terms.radial).clamp(min=_SMALLEST_RADIAL)
-        x, y = x_d / radial, y_d / radial
+        shrunk = radial(x_d * x_d + y_d * y_d, c, terms.radial).clamp(min=_SMALLEST_RADIAL)
+        x, y = x_d / shrunk, y_d / shrunk
         for _ in range(steps):
             (reached_x, reached_y), r2, g = _distorted(x, y, c, terms)
             step_x, step_y = _slopes(x, y, r2, g, c, terms).solve(reached_x - x_d, reached_y - y_d)
             x, y = x - step_x, y - step_y
         return x, y
-
-
-class RadialLimit(NamedTuple):
-    """How far out the radial part of a lens can be inverted, and a table of its inverse.
-
-    radius: (B, 1, ...), the largest radius before distortion, on the plane z = 1.
-    image_radius: (B, 1, ...), the largest radius after distortion that the table covers.
-    folds: (B,), bool: the radial part stops growing there; otherwise it was only followed so far.
-    table: (B, 2049), the radius before distortion at r_d = image_radius (1 - (1 - i / 2048)^2): where the map folds,
-        the inverse grows as a square root, and on these nodes it is smooth.
-    """
-
-    radius: Tensor
-    image_radius: Tensor
-    folds: Tensor
-    table: Tensor
-
-    def look_up(self, r_d: Tensor) -> Tensor:
-        """The radius (B, ...) that the radial part maps to r_d, from the table; `radius` where there is none."""
-        place = _NODES * (1 - (1 - r_d / self.image_radius).clamp(min=0).sqrt())
-        node = place.long().clamp(0, _NODES - 1)
-        flat = node.flatten(1)
-        low = self.table.gather(1, flat).view(node.shape)
-        high = self.table.gather(1, flat + 1).view(node.shape)
-        return torch.lerp(low, high, place - node)
-
-
-def radial_limit(coefficients: Tensor, reach: Tensor, image_reach: Tensor) -> RadialLimit:
-    """The limit of the radial part of (B, 12, ...) coefficients.
-
-    The limit is the first root of d/dr [r (1 + sum k_i r^2i)], found on a lattice that is refined twice.
-
-    Args:
-        coefficients: (B, 12, ...).
-        reach: (B,), the radius up to which a root is looked for, on the plane z = 1.
-        image_reach: (B,), the radius after distortion up to which the inverse is asked for.
-    """
-    with torch.no_grad():
-        k = coefficients.flatten(1)[:, :6, None].unbind(1)
-        folds = _falls(reach[:, None] * _steps(reach), k).any(dim=1)
-        radius, width = torch.zeros_like(reach), reach
-        for _ in range(3):
-            first = _falls(radius[:, None] + width[:, None] * _steps(reach), k).long().argmax(dim=1)
-            width = width / _NODES
-            radius = torch.where(folds, radius + (first - 1).clamp(min=0) * width, reach)
-        r, r_d = _lattice(radius, k)
-        # Only what is asked for goes into the table, which is finer so.
-        last = (r_d < image_reach[:, None]).sum(dim=1, keepdim=True).clamp(max=_NODES)
-        r, r_d = _lattice(r.gather(1, last)[:, 0], k)
-        image_radius = r_d[:, -1]
-        table = _inverse_table(r, r_d)
-        shape = (-1,) + (1,) * (coefficients.ndim - 2)
-        return RadialLimit(radius.view(shape), image_radius.view(shape), folds, table)
-
-
-def _falls(r: Tensor, k: tuple[Tensor, ...]) -> Tensor:
-    return _radial(r * r, k, 6) + 2 * r * r * _radial_slope(r * r, k, 6) <= 0
-
-
-def _lattice(radius: Tensor, k: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    r = radius[:, None] * _steps(radius)
-    return r, r * _radial(r * r, k, 6)
-
-
-def _inverse_table(r: Tensor, r_d: Tensor) -> Tensor:
-    nodes = r_d[:, -1:] * (1 - (1 - _steps(r[:, 0])).square())
-    node = torch.searchsorted(r_d.contiguous(), nodes.contiguous()).clamp(1, _NODES)
-    low, high = r_d.gather(1, node - 1), r_d.gather(1, node)
-    share = ((nodes - low) / (high - low).clamp(min=torch.finfo(r.dtype).tiny)).clamp(0, 1)
-    return torch.lerp(r.gather(1, node - 1), r.gather(1, node), share)
-
-
-def _steps(like: Tensor) -> Tensor:
-    return torch.arange(_NODES + 1, dtype=like.dtype, device=like.device) / _NODES
 
 
 def _radial_start(r_d: Tensor, c: tuple[Tensor, ...], limit: RadialLimit, terms: Terms) -> Tensor:
@@ -230,9 +156,9 @@ def _radial_start(r_d: Tensor, c: tuple[Tensor, ...], limit: RadialLimit, terms:
         return start
     for _ in range(3 if r.dtype is torch.float64 else 2):
         r2 = r * r
-        radial = _radial(r2, c, terms.radial)
-        growth = radial + 2 * r2 * _radial_slope(r2, c, terms.radial)
-        step = (r * radial - r_d) / growth.clamp(min=torch.finfo(r.dtype).eps)
+        shrunk = radial(r2, c, terms.radial)
+        growth = shrunk + 2 * r2 * radial_slope(r2, c, terms.radial)
+        step = (r * shrunk - r_d) / growth.clamp(min=torch.finfo(r.dtype).eps)
         r = torch.minimum((r - step).clamp(min=0), limit.radius)
     return torch.where(_is_bent(c), start, r) if terms.bent else r
 
@@ -265,7 +191,7 @@ def _distorted(
     """
     p1, p2, s1, s2, s3, s4 = c[6:]
     r2 = x * x + y * y
-    g = _radial(r2, c, terms.radial)
+    g = radial(r2, c, terms.radial)
     if not terms.bent:
         return (x * g, y * g), r2, g
     if terms.tangential:
@@ -277,7 +203,7 @@ def _distorted(
 def _slopes(x: Tensor, y: Tensor, r2: Tensor, g: Tensor, c: tuple[Tensor, ...], terms: Terms) -> Jacobian:
     """The derivatives of the distorted point, by what `_distorted` has computed already."""
     p1, p2, s1, s2, s3, s4 = c[6:]
-    slope = _radial_slope(r2, c, terms.radial)
+    slope = radial_slope(r2, c, terms.radial)
     along_x, along_y = slope * x, slope * y
     cross = along_x * y
     if not terms.bent:
@@ -292,23 +218,3 @@ def _slopes(x: Tensor, y: Tensor, r2: Tensor, g: Tensor, c: tuple[Tensor, ...], 
         2 * (cross + b * x + p2 * y),
         g + 2 * y * (along_y + (p1 + b)),
     )
-
-
-def _radial(r2: Tensor, k: tuple[Tensor, ...], order: int) -> Tensor:
-    """1 + sum k_i r^2i."""
-    if order == 0:
-        return torch.ones_like(r2)
-    value = k[order - 1] * r2
-    for i in reversed(range(order - 1)):
-        value = (k[i] + value) * r2
-    return 1 + value
-
-
-def _radial_slope(r2: Tensor, k: tuple[Tensor, ...], order: int) -> Tensor:
-    """The derivative of `_radial` with respect to r^2: sum i k_i r^(2i - 2)."""
-    if order == 0:
-        return torch.zeros_like(r2)
-    value = order * k[order - 1]
-    for i in reversed(range(order - 1)):
-        value = (i + 1) * k[i] + r2 * value
-    return value

@@ -16,8 +16,8 @@ import torch
 
 from torchrefract.effects.plan import Plan, check_reachable, coarsest
 from torchrefract.fields.covariance import REACH
-from torchrefract.fields.gaussian import torus
 from torchrefract.fields.modes import Modes
+from torchrefract.fields.torus import torus
 from torchrefract.types import Range
 from torchrefract.warping.lattice import STREAM_NODES, lagrange_weights, slope_weights
 

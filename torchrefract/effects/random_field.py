@@ -12,8 +12,9 @@ from torchrefract._checks import check_all, read
 from torchrefract.effects.motion import check_motion, is_still
 from torchrefract.effects.rows import spread
 from torchrefract.fields.evolution import evolved, turn_rates
-from torchrefract.fields.gaussian import gaussian_random_field, spectrum, torus
+from torchrefract.fields.gaussian import gaussian_random_field, spectrum
 from torchrefract.fields.modes import Modes, evolved_modes, mode_amplitude, mode_field, mode_noise, mode_turn_rates
+from torchrefract.fields.torus import torus
 from torchrefract.warping.lattice import Lattice
 
 # A covariance that is off by twice this is told.

@@ -3,7 +3,6 @@
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from copy import copy
-from functools import cached_property
 from typing import Any, cast
 
 import torch
@@ -156,11 +155,15 @@ class Moved:
 
     def __init__(self, path: Tensor | SmoothFlow, exists: Tensor, active: Tensor):
         self.path, self.exists, self.active = path, exists, active
+        self._flow = None if isinstance(path, SmoothFlow) else path
 
-    @cached_property
+    @property
     def flow(self) -> Tensor:
         """(B, 2, H, W), px."""
-        return self.path.dense() if isinstance(self.path, SmoothFlow) else self.path
+        # Compilers cannot enter the lock of a cached property.
+        if self._flow is None:
+            self._flow = cast(SmoothFlow, self.path).dense()
+        return self._flow
 
     def spread(self, rows: int) -> "Moved":
         """The same in so many rows."""

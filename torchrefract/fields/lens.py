@@ -6,15 +6,14 @@ from torch import Tensor
 from torchrefract._checks import is_true
 from torchrefract.cameras.distortion import (
     ALL_TERMS,
-    RadialLimit,
     Terms,
     distort_polynomial,
     jacobian_polynomial,
     newton_undistort,
-    radial_limit,
     undistort_polynomial,
     used_terms,
 )
+from torchrefract.cameras.radial import RadialLimit, radial_limit
 from torchrefract.warping.grid import pixel_axes
 
 # The preimage of a pixel is looked for up to so many half-diagonals of the frame; beyond, nothing of it is seen.

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract.cameras.distortion import ALL_TERMS, newton_undistort, radial_limit, undistort_polynomial
+from torchrefract.cameras.distortion import ALL_TERMS, newton_undistort, undistort_polynomial
+from torchrefract.cameras.radial import radial_limit
 from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice, lagrange_weights
 

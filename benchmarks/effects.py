@@ -39,7 +39,7 @@ from torchrefract import (
     UniformFog,
 )
 from torchrefract.draws import noise_key, stream
-from torchrefract.effects.refraction import WarpEffect
+from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.fields.perlin import octave, perlin_noise
 from torchrefract.warping.grid import sampler_grid
 
@@ -117,7 +117,7 @@ def _tolerant(frame: Tensor) -> dict[str, Candidate]:
     mild = LensDistortion(
         k1_range=(-0.25, -0.25), k2_range=(0.09, 0.09), focal_range=(0.9, 0.9), tolerance_px=TOLERANCE_PX
     )
-    warps: dict[str, WarpEffect] = {
+    warps: dict[str, LatticeWarp] = {
         MILD: mild,
         PLATE: ThinPlateSpline(tolerance_px=TOLERANCE_PX),
         AIR: Turbulence(covariance="gaussian", length_range=(40.0, 60.0), tolerance_px=TOLERANCE_PX),

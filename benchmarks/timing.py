@@ -6,8 +6,8 @@ bring memory and caches to the state that steady use of that candidate alone wou
 several times in it.
 
 Where the C library allows, memory that is freed stays with the process. By default glibc gives it back and takes it
-anew once enough is free at the top of its heap, which depends on what ran before: a result of 25 MB, written to memory
-that is new each time, costs some 5 ms of page faults more on top of any candidate that is unlucky.
+anew once enough is free at the top of its heap, which depends on what ran before: page faults would then be counted
+against any candidate that is unlucky.
 """
 
 import ctypes

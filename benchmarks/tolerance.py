@@ -22,7 +22,7 @@ from arguments import count
 
 from torchrefract import DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence
 from torchrefract.cameras.distortion import POLYNOMIAL12
-from torchrefract.effects.refraction import WarpEffect
+from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.restoration.files import replacing
 
 TOLERANCES = (1.0, 0.3, 0.1, 0.03, 0.01)
@@ -101,7 +101,7 @@ def summary(name: str, trials: list[Trial]) -> str:
     )
 
 
-def _lens(dice: random.Random) -> tuple[type[WarpEffect], dict[str, Any]]:
+def _lens(dice: random.Random) -> tuple[type[LatticeWarp], dict[str, Any]]:
     ranges = {f"{name}_range": (0.0, 0.0) for name in POLYNOMIAL12}
     for i in range(dice.randint(1, 3)):
         ranges[f"k{i + 1}_range"] = _signed(dice, 1e-4, 0.5)
@@ -113,7 +113,7 @@ def _lens(dice: random.Random) -> tuple[type[WarpEffect], dict[str, Any]]:
     return LensDistortion, ranges | {"focal_range": _range(dice, 0.4, 4.0), "aspect_range": _range(dice, 0.8, 1.25)}
 
 
-def _plate(dice: random.Random) -> tuple[type[WarpEffect], dict[str, Any]]:
+def _plate(dice: random.Random) -> tuple[type[LatticeWarp], dict[str, Any]]:
     smoothing = (0.0, 0.0) if dice.random() < 0.5 else _range(dice, 1e-6, 1.0)
     lattice = (dice.randint(2, 8), dice.randint(2, 8))
     return ThinPlateSpline, {
@@ -123,7 +123,7 @@ def _plate(dice: random.Random) -> tuple[type[WarpEffect], dict[str, Any]]:
     }
 
 
-def _turbulence(dice: random.Random) -> tuple[type[WarpEffect], dict[str, Any]]:
+def _turbulence(dice: random.Random) -> tuple[type[LatticeWarp], dict[str, Any]]:
     return Turbulence, {
         "amplitude_range": _range(dice, 0.01, 30.0),
         "length_range": _range(dice, 1.0, 300.0),
@@ -132,14 +132,14 @@ def _turbulence(dice: random.Random) -> tuple[type[WarpEffect], dict[str, Any]]:
     }
 
 
-def _swirl(dice: random.Random) -> tuple[type[WarpEffect], dict[str, Any]]:
+def _swirl(dice: random.Random) -> tuple[type[LatticeWarp], dict[str, Any]]:
     return DivergenceFree, {
         "amplitude_range": _range(dice, 0.01, 30.0),
         "length_range": _range(dice, 2.0, 300.0),
     }
 
 
-CONFIGURATIONS: dict[str, Callable[[random.Random], tuple[type[WarpEffect], dict[str, Any]]]] = {
+CONFIGURATIONS: dict[str, Callable[[random.Random], tuple[type[LatticeWarp], dict[str, Any]]]] = {
     "LensDistortion": _lens,
     "ThinPlateSpline": _plate,
     "Turbulence": _turbulence,

@@ -10,13 +10,13 @@ from scipy.interpolate import lagrange
 from torch.testing import assert_close
 
 from torchrefract import Compose, DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, UniformFog
-from torchrefract.effects.refraction import WarpEffect
+from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.fields.stream import curl
 from torchrefract.warping.grid import sampler_grid
 from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow, between_nodes
 
 SIZE = (96, 144)
-ARGUMENTS: dict[str, tuple[type[WarpEffect], dict[str, Any]]] = {
+ARGUMENTS: dict[str, tuple[type[LatticeWarp], dict[str, Any]]] = {
     "lens": (LensDistortion, {"k2_range": (0.09, 0.12), "focal_range": (0.9, 1.1)}),
     "plate": (ThinPlateSpline, {"amplitude_range": (0.5, 1.0)}),
     "turbulence": (Turbulence, {"covariance": "gaussian"}),
@@ -24,7 +24,7 @@ ARGUMENTS: dict[str, tuple[type[WarpEffect], dict[str, Any]]] = {
 }
 
 
-def made(name: str, px: float | None) -> WarpEffect:
+def made(name: str, px: float | None) -> LatticeWarp:
     kind, arguments = ARGUMENTS[name]
     return kind(**arguments, tolerance_px=px)
 

@@ -9,10 +9,10 @@ from torchrefract import draws
 from torchrefract._checks import check_choice, check_count, check_range
 from torchrefract.effects.base import params_to
 from torchrefract.effects.field_plan import FieldPlan, FieldRanges, field_plan
+from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
 from torchrefract.effects.plan import Plan, lies_in
 from torchrefract.effects.random_field import check_field_params, field_on_lattice, random_field
-from torchrefract.effects.refraction import WarpEffect
 from torchrefract.effects.rows import column, spread
 from torchrefract.fields.covariance import COVARIANCES
 from torchrefract.fields.modes import Modes
@@ -36,7 +36,7 @@ class DivergenceFreeParams(NamedTuple):
     to = params_to
 
 
-class DivergenceFree(WarpEffect):
+class DivergenceFree(LatticeWarp):
     """A frame stirred by a displacement without divergence, the curl of a Gaussian random stream function.
 
         flow = amplitude (D_y psi, -D_x psi) / rms,
@@ -137,7 +137,8 @@ class DivergenceFree(WarpEffect):
 
     def covers(self, params: DivergenceFreeParams) -> Tensor:
         """Whether the swirls lie in the ranges."""
-        return lies_in(params.amplitude, self.amplitude_range) & lies_in(params.length, self.length_range)
+        values = torch.stack([params.amplitude, params.length], dim=1)
+        return lies_in(values, [self.amplitude_range, self.length_range])
 
     def on_lattice(self, params: DivergenceFreeParams, plan: Plan) -> SmoothFlow:
         """The curl of psi between nodes, of the frequencies that the plan keeps."""

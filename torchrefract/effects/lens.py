@@ -10,9 +10,9 @@ from torchrefract import draws
 from torchrefract._checks import check_all, check_flag, check_range, is_true
 from torchrefract.cameras.distortion import ALL_TERMS, POLYNOMIAL12
 from torchrefract.effects.base import params_to
+from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.lens_plan import covers, kept_terms, lens_plan
 from torchrefract.effects.plan import Plan
-from torchrefract.effects.refraction import WarpEffect
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, smooth_lens_flow
 from torchrefract.fields.lens_bounds import LensRanges
 from torchrefract.types import Degraded, Range
@@ -33,7 +33,7 @@ class LensParams(NamedTuple):
     to = params_to
 
 
-class LensDistortion(WarpEffect):
+class LensDistortion(LatticeWarp):
     """A frame as seen through a lens of the extended Brown-Conrady model, the polynomial of the paper.
 
         x_d = x (1 + sum k_i r^2i) + 2 p1 x y + p2 (r^2 + 2 x^2) + s1 r^2 + s2 r^4

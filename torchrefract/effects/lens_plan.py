@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrefract.cameras.distortion import POLYNOMIAL12, Terms
-from torchrefract.effects.plan import STRIDES, Plan, check_reachable, coarsest
+from torchrefract.effects.plan import STRIDES, Plan, check_reachable, coarsest, lies_in
 from torchrefract.fields.lens_bounds import LensRanges, lens_errors, moved_by_terms
 from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice
@@ -23,9 +23,7 @@ _GROUPS = (range(8, 12), range(6, 8), (5,), (4,), (3,), (2,), (1,), (0,))
 def covers(ranges: LensRanges, coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
     """(), bool: lenses (B, 12), (B, 2), (B, 2) all lie in the ranges, but for rounding."""
     values = torch.cat([coefficients, focal[:, :1], focal[:, 1:] / focal[:, :1], center], dim=1)
-    low, high = torch.tensor([*ranges.coefficients, *ranges[1:]], dtype=values.dtype, device=values.device).unbind(1)
-    room = 1e-5 * torch.maximum(low.abs(), high.abs())
-    return ((values >= low - room) & (values <= high + room)).all()
+    return lies_in(values, [*ranges.coefficients, *ranges[1:]])
 
 
 @lru_cache(maxsize=256)

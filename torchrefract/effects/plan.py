@@ -1,8 +1,9 @@
 """What an effect will do for a frame of some size, under a tolerance."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+import torch
 from torch import Tensor
 
 from torchrefract._checks import check_count, check_number
@@ -105,7 +106,8 @@ def coarsest(attempt: Callable[[int], Plan | None]) -> Plan | None:
     return found
 
 
-def lies_in(values: Tensor, limits: Range) -> Tensor:
-    """(), bool: all values lie in a range, but for rounding."""
-    room = 1e-5 * max(map(abs, limits))
-    return ((values >= limits[0] - room) & (values <= limits[1] + room)).all()
+def lies_in(values: Tensor, ranges: Sequence[Range]) -> Tensor:
+    """(), bool: all values (B, n) lie in the n ranges, but for rounding."""
+    low, high = torch.tensor(ranges, dtype=values.dtype, device=values.device).unbind(1)
+    room = 1e-5 * torch.maximum(low.abs(), high.abs())
+    return ((values >= low - room) & (values <= high + room)).all()

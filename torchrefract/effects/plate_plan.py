@@ -6,17 +6,20 @@ give. Cubics leave nothing of the affine part. The kernel r^2 ln r has no second
 their error falls with the square of the stride alone; so that is where it is looked at, `_MARGIN` times.
 """
 
+import itertools
 from functools import lru_cache, partial
 
 import numpy as np
+import torch
 
 from torchrefract.effects.plan import Plan, check_reachable, coarsest
 from torchrefract.types import Range
+from torchrefract.warping.lattice import lagrange_weights
 
 _SIGMAS = 7.0  # the two components of the error are longer with a chance of exp(-_SIGMAS^2 / 2), 2e-11
 _MARGIN = 1.25
 _MOST_POINTS = 64  # that errors are looked at
-_INSIDE = (1 / 6, 1 / 2, 5 / 6)  # of a cell
+_INSIDE = (1, 3, 5)  # sixths of a cell
 
 
 @lru_cache(maxsize=256)
@@ -76,10 +79,10 @@ def _deviation(points: tuple[int, int], smoothing: float, height: int, width: in
     nodes = np.stack(np.meshgrid(np.arange(-1, 3), np.arange(-1, 3)), axis=-1).reshape(-1, 2)
     known = _kernel(corners[:, None, None] + step * nodes[:, None] - unit)  # (cells, 16, N)
     largest = 0.0
-    for place in np.stack(np.meshgrid(_INSIDE, _INSIDE), axis=-1).reshape(-1, 2):
-        x, y = (_cubic(t) for t in place)
-        between = np.einsum("j,cjn->cn", np.outer(y, x).ravel(), known)
-        error = (_kernel(corners[:, None] + step * place - unit) - between) @ weights
+    cubic = lagrange_weights(6, 4, dtype=torch.float64, device=torch.device("cpu")).numpy()
+    for x, y in itertools.product(_INSIDE, repeat=2):
+        between = np.einsum("j,cjn->cn", np.outer(cubic[y], cubic[x]).ravel(), known)
+        error = (_kernel(corners[:, None] + step * np.array([x, y]) / 6 - unit) - between) @ weights
         largest = max(largest, float(np.sqrt((error**2).sum(axis=1)).max()))
     return largest
 
@@ -87,15 +90,3 @@ def _deviation(points: tuple[int, int], smoothing: float, height: int, width: in
 def _kernel(offset: np.ndarray) -> np.ndarray:
     square = (offset**2).sum(axis=-1)
     return 0.5 * square * np.log(np.where(square > 0, square, 1))
-
-
-def _cubic(t: float) -> np.ndarray:
-    """The weights of nodes at -1, 0, 1, 2."""
-    before, here, next_, after = t + 1, t, t - 1, t - 2
-    weights = (
-        -here * next_ * after / 6,
-        before * next_ * after / 2,
-        -before * here * after / 2,
-        before * here * next_ / 6,
-    )
-    return np.array(weights)

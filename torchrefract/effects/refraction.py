@@ -2,7 +2,6 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from copy import copy
 from typing import Any, cast
 
 import torch
@@ -10,7 +9,6 @@ from torch import Tensor
 
 from torchrefract._checks import check_choice, is_true
 from torchrefract.effects.base import Effect
-from torchrefract.effects.plan import Plan, check_size, check_tolerance
 from torchrefract.effects.rows import alike, column, learns, only, spread
 from torchrefract.types import Degraded, Inverse, Map
 from torchrefract.warping.compose import compose_flows
@@ -27,67 +25,17 @@ class WarpEffect(Effect):
     Args:
         padding: what lies outside the frame: "zeros", "border" or "reflection".
         interpolation: "nearest", "bilinear" or "bicubic".
-        tolerance_px: how far the flow may be from the exact one, px, anywhere and for all parameters in the ranges of
-            the effect, so that it can be computed on a coarser lattice, see `plan`; None is exact.
         p: chance that a sample is degraded at all.
     """
 
-    def __init__(
-        self,
-        *,
-        padding: str = "zeros",
-        interpolation: str = "bilinear",
-        tolerance_px: float | None = None,
-        p: float = 1.0,
-    ):
+    def __init__(self, *, padding: str = "zeros", interpolation: str = "bilinear", p: float = 1.0):
         super().__init__(p=p)
-        self.tolerance_px = check_tolerance(tolerance_px)
         self.padding = check_choice("padding", padding, PADDINGS)
         self.interpolation = check_choice("interpolation", interpolation, INTERPOLATIONS)
 
     @abstractmethod
     def flow(self, params: Any, *, height: int, width: int) -> tuple[Tensor, Tensor]:
         """The flow (B, 2, H, W) in px, and where it exists, (B, 1, H, W), bool; B T rows if it changes over a clip."""
-
-    def plan(self, height: int, width: int, *, dtype: torch.dtype = torch.float32) -> Plan:
-        """What the effect does for frames of this size under its tolerance; printed, too.
-
-        Args:
-            height, width: px, of the frame.
-            dtype: of the image.
-
-        Raises:
-            ValueError: a frame without a pixel; a tolerance below the rounding of positions in such a frame.
-        """
-        check_size(height, width)
-        plan = self.planned(height, width, field_dtype(dtype))
-        print(plan)
-        return plan
-
-    def plan_for(self, params: Any, height: int, width: int) -> Plan:
-        """The plan for the type of these parameters."""
-        return _constant(self, height, width, next(value.dtype for value in params if value.is_floating_point()))
-
-    def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
-        """The plan for fields of a type, from the ranges alone."""
-        why = "no tolerance" if self.tolerance_px is None else "no bound is known for this effect"
-        return Plan(height, width, self.tolerance_px, 1, 0.0, why)
-
-    def fitted(self, params: Any) -> "WarpEffect":
-        """The effect itself; an exact one for parameters outside the ranges that its plan is for."""
-        if self.tolerance_px is None or is_true(lambda: self.covers(params)) is not False:
-            return self
-        exact = copy(self)
-        exact.tolerance_px = None
-        return exact
-
-    def covers(self, params: Any) -> Tensor:
-        """(), bool: all parameters lie in the ranges that the plan is for."""
-        return params.gate.new_ones(())
-
-    def on_lattice(self, params: Any, plan: Plan) -> SmoothFlow:
-        """The flow on the plan's lattice, where it exists everywhere."""
-        raise NotImplementedError(f"{type(self).__name__} has no plan with a lattice")
 
     def restore_flow(self, params: Any, *, height: int, width: int) -> tuple[Tensor, Tensor]:
         """The flow that undoes `flow`, and where it exists."""
@@ -104,24 +52,17 @@ class WarpEffect(Effect):
 
     def stirs(self, params: Any, height: int, width: int) -> bool:
         """Whether a sample may be moved, or a gradient is asked for that could move it."""
-        if learns(params):
-            return True
-        if self.plan_for(params, height, width).stride == 0:
-            return False
-        return is_true((params.gate & self.moves(params)).any) is not False
+        return is_true((params.gate & self.moves(params)).any) is not False or learns(params)
 
     def gated(self, params: Any, *, height: int, width: int) -> "Moved":
         """The flow, zero for the samples that the effect leaves alone."""
-        plan = self.plan_for(params, height, width)
-        active = params.gate & self.moves(params) & (height * width > 1)
-        if plan.lattice is None:
-            flow, exists = self.flow(params, height=height, width=width)
-            active = spread(active, flow.shape[0])
-            return Moved(only(flow, 0.0, active, params), exists | ~column(active), active)
-        path = self.on_lattice(params, plan)
-        active = spread(active, path.nodes.shape[0])
-        path = path.with_nodes(only(path.nodes, 0.0, active, params))
-        return Moved(path, active.new_ones(1, 1, 1, 1), active)
+        flow, exists = self.flow(params, height=height, width=width)
+        active = spread(self.active(params, height, width), flow.shape[0])
+        return Moved(only(flow, 0.0, active, params), exists | ~column(active), active)
+
+    def active(self, params: Any, height: int, width: int) -> Tensor:
+        """(B,), bool: the samples that are moved at all."""
+        return params.gate & self.moves(params) & (height * width > 1)
 
     def gated_undo(self, params: Any, moved: "Moved") -> tuple[Tensor, Tensor]:
         """The flow that undoes `gated`, and where it exists."""
@@ -219,12 +160,6 @@ def identity(image: Tensor, params: Any) -> Degraded:
         restore=lambda: Inverse(still, everywhere, lambda: still[:, :1]),
         folding=lambda: folding(still),
     )
-
-
-@torch.compiler.assume_constant_result
-def _constant(effect: WarpEffect, height: int, width: int, dtype: torch.dtype) -> Plan:
-    # Compilers take the plan as it is, and need not follow how it was made.
-    return effect.planned(height, width, dtype)
 
 
 def _spread_path(path: Tensor | SmoothFlow, rows: int) -> Tensor | SmoothFlow:

@@ -9,9 +9,9 @@ from torch import Tensor
 from torchrefract import draws
 from torchrefract._checks import check_all, check_count, check_range
 from torchrefract.effects.base import params_to
+from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.plan import Plan, lies_in
 from torchrefract.effects.plate_plan import plate_plan
-from torchrefract.effects.refraction import WarpEffect
 from torchrefract.fields.spline import check_points, fit_spline, spline_at, spline_flow
 from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice, SmoothFlow
@@ -28,7 +28,7 @@ class ThinPlateParams(NamedTuple):
     to = params_to
 
 
-class ThinPlateSpline(WarpEffect):
+class ThinPlateSpline(LatticeWarp):
     """A frame bent by a thin-plate spline: the smoothest flow that moves given points as told.
 
         flow(p) = a1 + a2 x + a3 y + sum w_i U(|p - p_i|),  U(r) = r^2 ln r,  sum w = sum w x = sum w y = 0
@@ -113,7 +113,8 @@ class ThinPlateSpline(WarpEffect):
         if params.points.shape[1] != math.prod(self.lattice):
             return params.gate.new_zeros(())
         most = draws.LARGEST_NORMAL * self.amplitude_range[1]
-        return lies_in(params.displacement, (-most, most)) & lies_in(params.smoothing, self.smoothing_range)
+        displaced = lies_in(params.displacement.reshape(-1, 1), [(-most, most)])
+        return displaced & lies_in(params.smoothing[:, None], [self.smoothing_range])
 
     def on_lattice(self, params: ThinPlateParams, plan: Plan) -> SmoothFlow:
         """The flow of `spline_at`."""

@@ -10,10 +10,10 @@ from torchrefract import draws
 from torchrefract._checks import check_choice, check_range, is_true
 from torchrefract.effects.base import params_to
 from torchrefract.effects.field_plan import FieldPlan, FieldRanges, field_plan
+from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
 from torchrefract.effects.plan import Plan, lies_in
 from torchrefract.effects.random_field import check_field_params, field_on_lattice, random_field
-from torchrefract.effects.refraction import WarpEffect
 from torchrefract.effects.rows import column, spread
 from torchrefract.fields.covariance import COVARIANCES, slope_rms
 from torchrefract.fields.modes import Modes
@@ -39,7 +39,7 @@ class TurbulenceParams(NamedTuple):
     to = params_to
 
 
-class Turbulence(WarpEffect):
+class Turbulence(LatticeWarp):
     """A frame seen through turbulent air: a Gaussian random field of displacements (the paper's "Perlin distortion").
 
         flow = amplitude R_t,  t and s frames of a clip,  C smoothed by the aperture,  Var R = 1,
@@ -131,11 +131,8 @@ class Turbulence(WarpEffect):
 
     def covers(self, params: TurbulenceParams) -> Tensor:
         """Whether the air lies in the ranges."""
-        return (
-            lies_in(params.amplitude, self.amplitude_range)
-            & lies_in(params.length, self.length_range)
-            & lies_in(params.aperture, self.aperture_range)
-        )
+        values = torch.stack([params.amplitude, params.length, params.aperture], dim=1)
+        return lies_in(values, [self.amplitude_range, self.length_range, self.aperture_range])
 
     def on_lattice(self, params: TurbulenceParams, plan: Plan) -> SmoothFlow:
         """The flow of the frequencies that the plan keeps."""

@@ -1,9 +1,9 @@
 """How far off a lens is on a lattice, and after some of Newton's steps, for all lenses in given ranges.
 
 The inverse of a polynomial in the plane has no closed form, and bounds of its derivatives by those of the polynomial
-are a hundred times too large where a barrel comes near to folding. So errors are measured, in float64, for lenses at
-the corners of the ranges (where they are largest for every family of lenses tried) and for draws inside, in cells all
-over the frame, and taken `_MARGIN` times. That no lens in the ranges folds is proved.
+are far too large where a barrel comes near to folding. So errors are measured, in float64, for lenses at the corners of
+the ranges and for draws inside, in cells all over the frame, and taken `_MARGIN` times. That is no proof, but is tried
+at random by benchmarks/tolerance.py. That no lens in the ranges folds is proved.
 """
 
 import itertools

@@ -1,0 +1,98 @@
+"""Warps whose flow can be computed on a lattice, under a tolerance."""
+
+from abc import abstractmethod
+from copy import copy
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrefract._checks import is_true
+from torchrefract.effects.plan import Plan, check_size, check_tolerance
+from torchrefract.effects.refraction import Moved, WarpEffect
+from torchrefract.effects.rows import learns, only, spread
+from torchrefract.warping.grid import field_dtype
+from torchrefract.warping.lattice import SmoothFlow
+
+
+class LatticeWarp(WarpEffect):
+    """A warp with a plan.
+
+    Args:
+        padding, interpolation, p: as for every warp.
+        tolerance_px: how far the flow may be from the exact one, px, anywhere and for all parameters in the ranges of
+            the effect, so that it can be computed on a coarser lattice, see `plan`; None is exact.
+    """
+
+    def __init__(
+        self,
+        *,
+        padding: str = "zeros",
+        interpolation: str = "bilinear",
+        tolerance_px: float | None = None,
+        p: float = 1.0,
+    ):
+        super().__init__(padding=padding, interpolation=interpolation, p=p)
+        self.tolerance_px = check_tolerance(tolerance_px)
+
+    def plan(self, height: int, width: int, *, dtype: torch.dtype = torch.float32) -> Plan:
+        """What the effect does for frames of this size under its tolerance; printed, too.
+
+        Args:
+            height, width: px, of the frame.
+            dtype: of the image.
+
+        Raises:
+            ValueError: a frame without a pixel; a tolerance below the rounding of positions in such a frame.
+        """
+        check_size(height, width)
+        plan = self.planned(height, width, field_dtype(dtype))
+        print(plan)
+        return plan
+
+    def plan_for(self, params: Any, height: int, width: int) -> Plan:
+        """The plan for the type of these parameters."""
+        return _constant(self, height, width, next(value.dtype for value in params if value.is_floating_point()))
+
+    def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
+        """The plan for fields of a type, from the ranges alone."""
+        why = "no tolerance" if self.tolerance_px is None else "no bound is known for these arguments"
+        return Plan(height, width, self.tolerance_px, 1, 0.0, why)
+
+    def fitted(self, params: Any) -> "LatticeWarp":
+        """The effect itself; an exact one for parameters outside the ranges that its plan is for."""
+        if self.tolerance_px is None or is_true(lambda: self.covers(params)) is not False:
+            return self
+        exact = copy(self)
+        exact.tolerance_px = None
+        return exact
+
+    @abstractmethod
+    def covers(self, params: Any) -> Tensor:
+        """(), bool: all parameters lie in the ranges that the plan is for."""
+
+    @abstractmethod
+    def on_lattice(self, params: Any, plan: Plan) -> SmoothFlow:
+        """The flow on the plan's lattice, where it exists everywhere."""
+
+    def stirs(self, params: Any, height: int, width: int) -> bool:
+        """Whether a sample may be moved by more than the tolerance, or a gradient is asked for."""
+        if learns(params):
+            return True
+        return self.plan_for(params, height, width).stride > 0 and super().stirs(params, height, width)
+
+    def gated(self, params: Any, *, height: int, width: int) -> Moved:
+        """The flow, zero for the samples that the effect leaves alone."""
+        plan = self.plan_for(params, height, width)
+        if plan.lattice is None:
+            return super().gated(params, height=height, width=width)
+        path = self.on_lattice(params, plan)
+        active = spread(self.active(params, height, width), path.nodes.shape[0])
+        path = path.with_nodes(only(path.nodes, 0.0, active, params))
+        return Moved(path, active.new_ones(1, 1, 1, 1), active)
+
+
+@torch.compiler.assume_constant_result
+def _constant(effect: LatticeWarp, height: int, width: int, dtype: torch.dtype) -> Plan:
+    # Compilers take the plan as it is, and need not follow how it was made.
+    return effect.planned(height, width, dtype)

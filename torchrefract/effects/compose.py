@@ -10,9 +10,12 @@ from torch import Tensor, nn
 from torchrefract import draws
 from torchrefract._checks import check_choice, check_number
 from torchrefract.effects.base import Effect, moved
+from torchrefract.effects.compose_plan import ComposePlan, compose_plan
+from torchrefract.effects.plan import Ask, check_size, check_tolerance
 from torchrefract.effects.refraction import WarpEffect
 from torchrefract.effects.walk import Walk
 from torchrefract.types import Degraded
+from torchrefract.warping.grid import field_dtype
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS
 
 
@@ -41,6 +44,9 @@ class Compose(Effect):
     Args:
         effects: at least one; compositions may be nested.
         padding, interpolation: of the look-ups; None takes those of the last warp that moves the sample.
+        tolerance_px: how far the composite of all flows may be from the exact one, px, see `plan`; effects without a
+            tolerance of their own stay exact. None composes the flows as each effect computes it. Of compositions
+            inside others that of the outermost counts.
         p: chance that a sample is degraded at all.
 
     Raises:
@@ -53,6 +59,7 @@ class Compose(Effect):
         *,
         padding: str | None = None,
         interpolation: str | None = None,
+        tolerance_px: float | None = None,
         p: float = 1.0,
     ):
         super().__init__(p=p)
@@ -66,6 +73,7 @@ class Compose(Effect):
         self.interpolation = (
             None if interpolation is None else check_choice("interpolation", interpolation, INTERPOLATIONS)
         )
+        self.tolerance_px = check_tolerance(tolerance_px)
 
     params_type = ComposeParams
 
@@ -96,12 +104,34 @@ class Compose(Effect):
     def compute(self, image: Tensor, params: ComposeParams, depth: Tensor | None) -> Degraded:
         """The batch through all effects."""
         walk = Walk(image, depth, self.padding, self.interpolation)
-        for effect, own in self.leaves(params):
+        height, width = image.shape[2:]
+        plans = _constant(self, height, width, field_dtype(image.dtype)).plans
+        for (effect, own), plan in zip(self.leaves(params), plans, strict=True):
             if isinstance(effect, WarpEffect):
-                walk.move(effect, own)
+                walk.move(effect, own, plan)
             else:
                 walk.shade(effect, own)
         return walk.arrive(params)
+
+    def plan(self, height: int, width: int, *, dtype: torch.dtype = torch.float32) -> ComposePlan:
+        """What the composition does for frames of this size under its tolerance; printed, too.
+
+        Args:
+            height, width: px, of the frame.
+            dtype: of the image.
+
+        Raises:
+            ValueError: a frame without a pixel; a tolerance below the rounding of positions in such a frame.
+        """
+        check_size(height, width)
+        plan = self.planned(height, width, field_dtype(dtype))
+        print(plan)
+        return plan
+
+    def planned(self, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
+        """The plan for fields of a type."""
+        ask = Ask(height, width, self.tolerance_px, dtype is torch.float64)
+        return compose_plan(list(self._chances(1.0)), ask)
 
     def fitted(self, params: ComposeParams) -> "Compose":
         """The composition, with each effect that relies on ranges which its parameters lie outside of exact."""
@@ -127,6 +157,14 @@ class Compose(Effect):
         drawn = (effect.draw(inner.at(i), image) for i, effect in enumerate(self._effects()))
         return ComposeParams(gate, tuple(_closed(child, own) for child, own in zip(drawn, gates, strict=True)))
 
+    def _chances(self, p: float) -> Iterator[tuple[Effect, float]]:
+        """The effects that are no compositions, in order, and the chance that each acts."""
+        for effect in self._effects():
+            if isinstance(effect, Compose):
+                yield from effect._chances(p * self.p)
+            else:
+                yield effect, p * self.p * effect.p
+
     def _effects(self) -> Iterator[Effect]:
         return cast(Iterator[Effect], iter(self.effects))
 
@@ -137,7 +175,7 @@ class OneOf(Compose):
     Args:
         effects: to choose from.
         weights: how often each is chosen, relative to one another, above 0; None chooses all alike.
-        padding, interpolation, p: as for `Compose`.
+        padding, interpolation, tolerance_px, p: as for `Compose`.
 
     Raises:
         ValueError, TypeError: as for `Compose`; weights that are not one positive number for each effect.
@@ -150,9 +188,10 @@ class OneOf(Compose):
         weights: Sequence[float] | None = None,
         padding: str | None = None,
         interpolation: str | None = None,
+        tolerance_px: float | None = None,
         p: float = 1.0,
     ):
-        super().__init__(effects, padding=padding, interpolation=interpolation, p=p)
+        super().__init__(effects, padding=padding, interpolation=interpolation, tolerance_px=tolerance_px, p=p)
         weights = [1.0] * len(effects) if weights is None else weights
         if len(weights) != len(effects):
             raise ValueError(f"weights must be one number for each of {len(effects)} effects, got {len(weights)}")
@@ -172,3 +211,9 @@ def _closed(params: Any, gate: Tensor) -> Any:
     if isinstance(params, ComposeParams):
         return ComposeParams(params.gate & gate, tuple(_closed(child, gate) for child in params.children))
     return params._replace(gate=params.gate & gate)
+
+
+@torch.compiler.assume_constant_result
+def _constant(effect: Compose, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
+    # Compilers take the plan as it is, and need not follow how it was made.
+    return effect.planned(height, width, dtype)

@@ -11,7 +11,7 @@ from torchrefract.effects.base import params_to
 from torchrefract.effects.field_plan import FieldPlan, FieldRanges, field_plan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
-from torchrefract.effects.plan import Plan, lies_in
+from torchrefract.effects.plan import Ask, Plan, lies_in
 from torchrefract.effects.random_field import check_field_params, field_on_lattice, random_field
 from torchrefract.effects.rows import column, spread
 from torchrefract.fields.covariance import COVARIANCES
@@ -128,12 +128,12 @@ class DivergenceFree(LatticeWarp):
             displacement = displacement / longest.clamp(min=1e-24).sqrt()
         return column(spread(params.amplitude, displacement.shape[0])) * displacement
 
-    def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
+    def plan_within(self, ask: Ask) -> Plan:
         """The plan of `field_plan` for Gaussian fields, normalized by theory, in one step; all others are exact."""
         if self.covariance != "gaussian" or self.normalize != "theory" or self.steps > 1:
-            return super().planned(height, width, dtype)
+            return super().plan_within(ask)
         ranges = FieldRanges(self.amplitude_range, self.length_range, (0.0, 0.0), stream=True)
-        return field_plan(ranges, height, width, self.tolerance_px, dtype is torch.float64)
+        return field_plan(ranges, ask)
 
     def covers(self, params: DivergenceFreeParams) -> Tensor:
         """Whether the swirls lie in the ranges."""

@@ -8,20 +8,20 @@ exponential field has no coarse lattice, it would be smoothed. They are computed
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
 
-from torchrefract.effects.plan import Plan, check_reachable, coarsest
+from torchrefract.effects.plan import Ask, Plan, coarsest
 from torchrefract.fields.covariance import REACH
 from torchrefract.fields.modes import Modes
 from torchrefract.fields.torus import torus
 from torchrefract.types import Range
 from torchrefract.warping.lattice import STREAM_NODES, lagrange_weights, slope_weights
 
-_SIGMAS = 7.0
+_SIGMAS, _SLOPE_SIGMAS = 7.0, 4.0
 _REACH = 8.0  # deviations of the spectrum beyond which nothing is left of it
 _POINTS = 257
 # Of the tolerance, for frequencies that are left out.
@@ -50,40 +50,41 @@ class FieldPlan(Plan):
 
 
 @lru_cache(maxsize=256)
-def field_plan(ranges: FieldRanges, height: int, width: int, tolerance: float | None, double: bool) -> Plan:
-    """The plan for a Gaussian covariance and frames of a size, in float64 or in float32."""
-    plan = partial(Plan, height, width, tolerance)
-    if tolerance is None:
-        return plan(1, 0.0, "no tolerance")
-    room = check_reachable(tolerance, height=height, width=width, double=double)
-    most = _SIGMAS * ranges.amplitude[1]
+def field_plan(ranges: FieldRanges, ask: Ask) -> Plan:
+    """The plan for a Gaussian covariance."""
+    if ask.tolerance_px is None:
+        return ask.plan(1, 0.0, "no tolerance")
+    tolerance, room, most = ask.tolerance_px, ask.room(), _SIGMAS * ranges.amplitude[1]
     if most <= room:
-        return plan(0, most, "it moves too little")
-    room -= 0.0 if double else _ROUNDING * most
-    if most > min(height, width) or room <= 0:
-        return plan(1, 0.0, "it moves too far for a lattice")
+        return ask.plan(0, most, "it moves too little", random=True)
+    room -= 0.0 if ask.double else _ROUNDING * most
+    if most > min(ask.height, ask.width) or room <= 0:
+        return ask.plan(1, 0.0, "it moves too far for a lattice")
     spectrum = _Spectrum.of(ranges)
-    modes = None if spectrum is None else _modes(ranges, height, width, spectrum.cutoff(_DROPPED * room / most))
+    modes = None if spectrum is None else _modes(ranges, ask, spectrum.cutoff(_DROPPED * room / most))
     if spectrum is None or modes is None:
-        return plan(1, 0.0, "the field has too many frequencies for a lattice")
+        return ask.plan(1, 0.0, "the field has too many frequencies for a lattice")
+    # Errors and slopes are not at their largest in one place.
+    slope = _SLOPE_SIGMAS * ranges.amplitude[1] * spectrum.slope()
+    more = {"modes": modes, "slope": slope, "random": True}
+    if ranges.stream:
+        more |= {"before": STREAM_NODES // 2, "after": STREAM_NODES // 2 - 1}
     counts = "{} x {} of {} x {} frequencies".format(*modes.counts, *modes.size)
 
     def attempt(stride: int) -> Plan | None:
         off = most * math.hypot(_DROPPED * room / most, spectrum.error_between(stride))
         if off > room:
             return None
-        before, after = (STREAM_NODES // 2, STREAM_NODES // 2 - 1) if ranges.stream else (1, 1)
-        error = off + tolerance - room
-        return FieldPlan(height, width, tolerance, stride, error, counts, before=before, after=after, modes=modes)
+        return FieldPlan(ask.height, ask.width, tolerance, stride, off + tolerance - room, counts, **more)
 
-    return coarsest(attempt) or plan(1, 0.0, "the field is too rough for a lattice")
+    return coarsest(attempt) or ask.plan(1, 0.0, "the field is too rough for a lattice")
 
 
-def _modes(ranges: FieldRanges, height: int, width: int, cutoff: float) -> Modes | None:
+def _modes(ranges: FieldRanges, ask: Ask, cutoff: float) -> Modes | None:
     """The frequencies up to a cutoff, in radians per px; None where there are too many, or one torus is too small."""
     more = 2 if ranges.stream else 0
     reach = {"length": ranges.length[1], "aperture": ranges.aperture[1]}
-    size = torus(height + more, width + more, kind="gaussian", **reach)
+    size = torus(ask.height + more, ask.width + more, kind="gaussian", **reach)
     modes = Modes(size, *(math.ceil(cutoff * n / (2 * math.pi)) for n in size))
     all_there = all(count < n for count, n in zip(modes.counts, size, strict=True))
     # The sums round a torus that make a covariance periodic are taken where the length has room.
@@ -94,7 +95,7 @@ def _modes(ranges: FieldRanges, height: int, width: int, cutoff: float) -> Modes
 class _Spectrum:
     """The roughest field of the ranges, along one axis, at frequencies in radians per px."""
 
-    def __init__(self, k: np.ndarray, share: np.ndarray, stream: bool):
+    def __init__(self, k: np.ndarray, share: np.ndarray, *, stream: bool):
         self.k, self.share, self.stream = k, share, stream
         # What a frequency is multiplied by: the central difference of a stream function, or nothing.
         self.target = 1j * np.sin(k) if stream else np.ones_like(k)
@@ -108,7 +109,11 @@ class _Spectrum:
             return None
         k = np.linspace(-_REACH, _REACH, _POINTS)
         share = np.exp(-0.5 * k * k)
-        return cls(deviation * k, share / share.sum(), ranges.stream)
+        return cls(deviation * k, share / share.sum(), stream=ranges.stream)
+
+    def slope(self) -> float:
+        """The deviation of the steepest derivative of a field of variance 1, in 1/px."""
+        return math.sqrt(self._total(np.abs(self.target * self.k) ** 2) / self.variance)
 
     def cutoff(self, error: float) -> float:
         """The lowest frequency from which on all others together deviate by no more than this."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import is_true
-from torchrefract.effects.plan import Plan, check_size, check_tolerance
+from torchrefract.effects.plan import Ask, Plan, check_size, check_tolerance
 from torchrefract.effects.refraction import Moved, WarpEffect
 from torchrefract.effects.rows import learns, only, spread
 from torchrefract.warping.grid import field_dtype
@@ -55,9 +55,12 @@ class LatticeWarp(WarpEffect):
         return _constant(self, height, width, next(value.dtype for value in params if value.is_floating_point()))
 
     def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
-        """The plan for fields of a type, from the ranges alone."""
-        why = "no tolerance" if self.tolerance_px is None else "no bound is known for these arguments"
-        return Plan(height, width, self.tolerance_px, 1, 0.0, why)
+        """The plan for fields of a type."""
+        return self.plan_within(Ask(height, width, self.tolerance_px, dtype is torch.float64))
+
+    def plan_within(self, ask: Ask) -> Plan:
+        """The plan that is asked for, from the ranges alone."""
+        return ask.plan(1, 0.0, "no tolerance" if ask.tolerance_px is None else "no bound is known for these arguments")
 
     def fitted(self, params: Any) -> "LatticeWarp":
         """The effect itself; an exact one for parameters outside the ranges that its plan is for."""
@@ -75,15 +78,16 @@ class LatticeWarp(WarpEffect):
     def on_lattice(self, params: Any, plan: Plan) -> SmoothFlow:
         """The flow on the plan's lattice, where it exists everywhere."""
 
-    def stirs(self, params: Any, height: int, width: int) -> bool:
+    def stirs(self, params: Any, height: int, width: int, plan: Plan | None = None) -> bool:
         """Whether a sample may be moved by more than the tolerance, or a gradient is asked for."""
         if learns(params):
             return True
-        return self.plan_for(params, height, width).stride > 0 and super().stirs(params, height, width)
+        plan = plan or self.plan_for(params, height, width)
+        return plan.stride > 0 and super().stirs(params, height, width)
 
-    def gated(self, params: Any, *, height: int, width: int) -> Moved:
-        """The flow, zero for the samples that the effect leaves alone."""
-        plan = self.plan_for(params, height, width)
+    def gated(self, params: Any, *, height: int, width: int, plan: Plan | None = None) -> Moved:
+        """The flow, zero for the samples that the effect leaves alone, by its own plan or by one that is given."""
+        plan = plan or self.plan_for(params, height, width)
         if plan.lattice is None:
             return super().gated(params, height=height, width=width)
         path = self.on_lattice(params, plan)

@@ -12,7 +12,7 @@ from torchrefract.cameras.distortion import ALL_TERMS, POLYNOMIAL12
 from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.lens_plan import covers, kept_terms, lens_plan
-from torchrefract.effects.plan import Plan
+from torchrefract.effects.plan import Ask, Plan
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, smooth_lens_flow
 from torchrefract.fields.lens_bounds import LensRanges
 from torchrefract.types import Degraded, Range
@@ -110,9 +110,9 @@ class LensDistortion(LatticeWarp):
         """Raise for lenses that are none."""
         check_lens(params, image.shape[0])
 
-    def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
+    def plan_within(self, ask: Ask) -> Plan:
         """The plan of `lens_plan`."""
-        return lens_plan(self._ranges(), height, width, self.tolerance_px, dtype is torch.float64)
+        return lens_plan(self._ranges(), ask)
 
     def covers(self, params: LensParams) -> Tensor:
         """Whether the lenses lie in the ranges."""

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrefract.cameras.distortion import POLYNOMIAL12, Terms
-from torchrefract.effects.plan import STRIDES, Plan, check_reachable, coarsest, lies_in
+from torchrefract.effects.plan import STRIDES, Ask, Plan, coarsest, lies_in
 from torchrefract.fields.lens_bounds import LensRanges, lens_errors, moved_by_terms
 from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice
@@ -27,28 +27,23 @@ def covers(ranges: LensRanges, coefficients: Tensor, focal: Tensor, center: Tens
 
 
 @lru_cache(maxsize=256)
-def lens_plan(ranges: LensRanges, height: int, width: int, tolerance: float | None, double: bool) -> Plan:
-    """The plan for frames of a size, in float64 or in float32."""
-
-    def exact(why: str) -> Plan:
-        return Plan(height, width, tolerance, 1, 0.0, why)
-
-    if tolerance is None:
-        return exact("no tolerance")
-    room = check_reachable(tolerance, height=height, width=width, double=double)
+def lens_plan(ranges: LensRanges, ask: Ask) -> Plan:
+    """The plan for lenses of these ranges."""
+    if ask.tolerance_px is None:
+        return ask.plan(1, 0.0, "no tolerance")
+    tolerance, room = ask.tolerance_px, ask.room()
     if all(limits == (0.0, 0.0) for limits in ranges.coefficients):
-        return Plan(height, width, tolerance, 0, 0.0, "no coefficient is other than zero")
-    finest = Lattice(height, width, STRIDES[0])
-    moved = moved_by_terms(ranges, finest)
+        return ask.plan(0, 0.0, "no coefficient is other than zero")
+    moved = moved_by_terms(ranges, Lattice(ask.height, ask.width, STRIDES[0]))
     if moved is None:
-        return exact("a lens of the ranges may fold inside the frame")
+        return ask.plan(1, 0.0, "a lens of the ranges may fold inside the frame")
     kept, dropped = _terms(ranges.coefficients, moved, _DROPPED * room)
     left_out = sum(size for _, size in dropped)
     if not kept:
-        return Plan(height, width, tolerance, 0, left_out, "it moves too little", dropped=dropped)
+        return ask.plan(0, left_out, "it moves too little", dropped=dropped)
 
     def attempt(stride: int) -> Plan | None:
-        lattice = Lattice(height, width, stride)
+        lattice = Lattice(ask.height, ask.width, stride)
         errors = lens_errors(ranges, lattice) if moved_by_terms(ranges, lattice) else None
         if errors is None or errors.stretch > _MOST_STRETCH or left_out + errors.cubic > (1 - _NEWTON) * room:
             return None
@@ -56,9 +51,10 @@ def lens_plan(ranges: LensRanges, height: int, width: int, tolerance: float | No
         if steps is None:
             return None
         error = left_out + errors.cubic + errors.newton[steps] + tolerance - room
-        return Plan(height, width, tolerance, stride, error, "cubics between", steps, kept, dropped)
+        more = {"slope": errors.slope, "steps": steps, "kept": kept, "dropped": dropped}
+        return ask.plan(stride, error, "cubics between", **more)
 
-    return coarsest(attempt) or exact("the lenses of the ranges bend too much for cubics")
+    return coarsest(attempt) or ask.plan(1, 0.0, "the lenses of the ranges bend too much for cubics")
 
 
 def kept_terms(plan: Plan) -> Terms:

@@ -1,7 +1,9 @@
 """What an effect will do for a frame of some size, under a tolerance."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -18,6 +20,49 @@ STRIDES = (*range(2, 8), *(share << octave for octave in range(1, 7) for share i
 
 
 @dataclass(frozen=True)
+class Ask:
+    """What a plan is asked for.
+
+    height, width: px, of the frame.
+    tolerance_px: as for `Plan`.
+    double: of fields in float64, not float32.
+    """
+
+    height: int
+    width: int
+    tolerance_px: float | None
+    double: bool
+
+    def plan(self, stride: int, error_px: float, why: str, **more: Any) -> "Plan":
+        """A plan with what was asked for."""
+        return Plan(self.height, self.width, self.tolerance_px, stride, error_px, why, **more)
+
+    @property
+    def rounding(self) -> float:
+        """Of positions in such a frame, px."""
+        return _ROUNDING[self.double] * max(self.height, self.width)
+
+    @property
+    def reachable(self) -> bool:
+        """Whether rounding leaves enough of the tolerance."""
+        return self.tolerance_px is None or self.tolerance_px >= 2 * self.rounding
+
+    def room(self) -> float:
+        """What the tolerance leaves beside rounding, px.
+
+        Raises:
+            ValueError: a tolerance that leaves too little.
+        """
+        if not self.reachable:
+            kind = "float64" if self.double else "float32"
+            raise ValueError(
+                f"tolerance_px must be at least {2 * self.rounding:.2g} px for {kind} positions in a frame of "
+                f"{self.height} x {self.width} px (None is exact), got {self.tolerance_px:g}"
+            )
+        return cast(float, self.tolerance_px) - self.rounding
+
+
+@dataclass(frozen=True)
 class Plan:
     """How an effect computes its flow for frames of one size.
 
@@ -29,6 +74,8 @@ class Plan:
     kept: the terms that are computed.
     dropped: those that are not, each with how far it could have moved a pixel, px.
     resamples: how often the image is looked up.
+    random: whether the error is that of a chance, independent of those of other effects.
+    slope: how much the flow differs from pixel to pixel, px, at most; inf where that is not known.
     before, after: nodes that the lattice has before the frame and behind its last cell.
     lattice: where the flow is computed; None for every pixel, or for none.
     why: what decided.
@@ -44,6 +91,8 @@ class Plan:
     kept: tuple[str, ...] = ()
     dropped: tuple[tuple[str, float], ...] = ()
     resamples: int = 1
+    random: bool = False
+    slope: float = math.inf
     before: int = 1
     after: int = 1
     lattice: Lattice | None = field(init=False)
@@ -52,12 +101,16 @@ class Plan:
         place = (self.height, self.width, self.stride, self.before, self.after)
         object.__setattr__(self, "lattice", Lattice(*place) if self.stride > 1 else None)
 
-    def __str__(self) -> str:
+    def summary(self) -> str:
+        """Where the flow is computed, and why there."""
         flow = {0: "not computed", 1: "at every pixel"}.get(self.stride, f"every {self.stride} px")
+        return f"{flow} ({self.why})"
+
+    def __str__(self) -> str:
         lines = [
             f"frame          {self.height} x {self.width} px",
             f"tolerance      {'none: exact' if self.tolerance_px is None else f'{self.tolerance_px:g} px'}",
-            f"flow           {flow} ({self.why})",
+            f"flow           {self.summary()}",
             f"error at most  {self.error_px:.2g} px",
             f"resamples      {self.resamples}",
         ]
@@ -78,22 +131,6 @@ def check_size(height: int, width: int) -> None:
     """Raise for frames without a pixel."""
     check_count("height", height)
     check_count("width", width)
-
-
-def check_reachable(tolerance: float, *, height: int, width: int, double: bool) -> float:
-    """What a tolerance leaves beside the rounding of positions in a frame.
-
-    Raises:
-        ValueError: a tolerance that leaves nothing.
-    """
-    rounding = _ROUNDING[double] * max(height, width)
-    if tolerance < 2 * rounding:
-        kind = "float64" if double else "float32"
-        raise ValueError(
-            f"tolerance_px must be at least {2 * rounding:.2g} px for {kind} positions in a frame of {height} x "
-            f"{width} px (None is exact), got {tolerance:g}"
-        )
-    return tolerance - rounding
 
 
 def coarsest(attempt: Callable[[int], Plan | None]) -> Plan | None:

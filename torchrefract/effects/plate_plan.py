@@ -7,74 +7,86 @@ their error falls with the square of the stride alone; so that is where it is lo
 """
 
 import itertools
-from functools import lru_cache, partial
+from functools import lru_cache
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
 
-from torchrefract.effects.plan import Plan, check_reachable, coarsest
+from torchrefract.effects.plan import Ask, Plan, coarsest
 from torchrefract.types import Range
 from torchrefract.warping.lattice import lagrange_weights
 
 _SIGMAS = 7.0  # the two components of the error are longer with a chance of exp(-_SIGMAS^2 / 2), 2e-11
+_SLOPE_SIGMAS = 4.0
 _MARGIN = 1.25
 _MOST_POINTS = 64  # that errors are looked at
 _INSIDE = (1, 3, 5)  # sixths of a cell
 
 
 @lru_cache(maxsize=256)
-def plate_plan(
-    amplitude: float,
-    points: tuple[int, int],
-    smoothing: Range,
-    height: int,
-    width: int,
-    tolerance: float | None,
-    double: bool,
-) -> Plan:
-    """The plan for frames of a size, in float64 or in float32.
+def plate_plan(amplitude: float, points: tuple[int, int], smoothing: Range, ask: Ask) -> Plan:
+    """The plan for plates.
 
     Args:
         amplitude: px, the largest.
         points: rows and columns of control points, corner to corner.
         smoothing: the range.
-        height, width, tolerance, double: of the frame.
+        ask: for what.
     """
-    plan = partial(Plan, height, width, tolerance)
-    if tolerance is None:
-        return plan(1, 0.0, "no tolerance")
-    room = check_reachable(tolerance, height=height, width=width, double=double)
-    most = 2 * _SIGMAS * amplitude
+    if ask.tolerance_px is None:
+        return ask.plan(1, 0.0, "no tolerance")
+    room, most = ask.room(), 2 * _SIGMAS * amplitude
     if most <= room:
-        return plan(0, most, "it moves too little")
-    if most > min(height, width):
-        return plan(1, 0.0, "it moves too far for a lattice")
+        return ask.plan(0, most, "it moves too little", random=True)
+    if most > min(ask.height, ask.width):
+        return ask.plan(1, 0.0, "it moves too far for a lattice")
+    plates = [(points, value, ask.height, ask.width) for value in set(smoothing)]
+    # Errors and slopes are not at their largest in one place.
+    slope = _SLOPE_SIGMAS * amplitude * max(_slope(_plate(*plate)) for plate in plates)
 
     def attempt(stride: int) -> Plan | None:
-        deviation = max(_deviation(points, value, height, width, stride) for value in set(smoothing))
-        off = _MARGIN * _SIGMAS * amplitude * deviation
-        return plan(stride, off + tolerance - room, "kinks of the second derivative") if off <= room else None
+        off = _MARGIN * _SIGMAS * amplitude * max(_deviation(plate, stride) for plate in plates)
+        if off > room:
+            return None
+        error = off + cast(float, ask.tolerance_px) - room
+        return ask.plan(stride, error, "kinks of the second derivative", random=True, slope=slope)
 
-    return coarsest(attempt) or plan(1, 0.0, "the plate bends too much for cubics")
+    return coarsest(attempt) or ask.plan(1, 0.0, "the plate bends too much for cubics")
 
 
-@lru_cache(maxsize=1024)
-def _deviation(points: tuple[int, int], smoothing: float, height: int, width: int, stride: int) -> float:
-    """Of the largest error between nodes, for displacements of deviation 1."""
+class _Plate(NamedTuple):
+    """A lattice of N control points, in units of their rms radius."""
+
+    points: np.ndarray  # (N, 2)
+    center: np.ndarray  # (2,), px
+    scale: float  # px, of the unit
+    weights: np.ndarray  # (N + 3, N): of the kernels and of 1, x, y, one column for each point that is displaced by 1
+    looked_at: np.ndarray  # (n, 2), px: some of the points, at which the kernels have kinks
+
+
+@lru_cache(maxsize=64)
+def _plate(points: tuple[int, int], smoothing: float, height: int, width: int) -> _Plate:
     y, x = (np.linspace(0, max(size - 1, 1), count) for size, count in zip((height, width), points, strict=True))
     at = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1).reshape(-1, 2)
     center = at.mean(axis=0)
-    scale = np.sqrt(((at - center) ** 2).sum(axis=1).mean())
-    unit, step = (at - center) / scale, stride / scale
-    # The weights of the kernels, one column for each point that is displaced.
+    scale = float(np.sqrt(((at - center) ** 2).sum(axis=1).mean()))
+    unit = (at - center) / scale
     plane = np.column_stack([np.ones(len(unit)), unit])
     kernel = _kernel(unit[:, None] - unit) + smoothing * np.eye(len(unit))
     system = np.block([[kernel, plane], [plane.T, np.zeros((3, 3))]])
-    weights = np.linalg.solve(system, np.eye(len(unit) + 3))[: len(unit), : len(unit)]
-    # Cells around some of the points, where the kernels have kinks.
-    chosen = at[np.unique(np.linspace(0, len(at) - 1, min(len(at), _MOST_POINTS)).round().astype(int))]
+    weights = np.linalg.solve(system, np.eye(len(unit) + 3))[:, : len(unit)]
+    chosen = np.unique(np.linspace(0, len(at) - 1, min(len(at), _MOST_POINTS)).round().astype(int))
+    return _Plate(unit, center, scale, weights, at[chosen])
+
+
+@lru_cache(maxsize=1024)
+def _deviation(plate: tuple[tuple[int, int], float, int, int], stride: int) -> float:
+    """Of the largest error between nodes, for displacements of deviation 1; arguments as for `_plate`."""
+    unit, center, scale, weights, looked_at = _plate(*plate)
+    step = stride / scale
     around = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
-    cells = np.unique((np.floor(chosen / stride)[:, None] + around).reshape(-1, 2), axis=0)
+    cells = np.unique((np.floor(looked_at / stride)[:, None] + around).reshape(-1, 2), axis=0)
     corners = (cells * stride - center) / scale
     nodes = np.stack(np.meshgrid(np.arange(-1, 3), np.arange(-1, 3)), axis=-1).reshape(-1, 2)
     known = _kernel(corners[:, None, None] + step * nodes[:, None] - unit)  # (cells, 16, N)
@@ -82,9 +94,19 @@ def _deviation(points: tuple[int, int], smoothing: float, height: int, width: in
     cubic = lagrange_weights(6, 4, dtype=torch.float64, device=torch.device("cpu")).numpy()
     for x, y in itertools.product(_INSIDE, repeat=2):
         between = np.einsum("j,cjn->cn", np.outer(cubic[y], cubic[x]).ravel(), known)
-        error = (_kernel(corners[:, None] + step * np.array([x, y]) / 6 - unit) - between) @ weights
+        error = (_kernel(corners[:, None] + step * np.array([x, y]) / 6 - unit) - between) @ weights[: len(unit)]
         largest = max(largest, float(np.sqrt((error**2).sum(axis=1)).max()))
     return largest
+
+
+def _slope(plate: _Plate) -> float:
+    """The deviation of the steepest slope, for displacements of deviation 1."""
+    pixel = np.array([[[1.0, 0.0]], [[-1.0, 0.0]], [[0.0, 1.0]], [[0.0, -1.0]]])
+    at = (plate.looked_at + pixel - plate.center) / plate.scale  # (4, n, 2)
+    plane = np.concatenate([np.ones_like(at[..., :1]), at], axis=-1)
+    right, left, down, up = np.concatenate([_kernel(at[:, :, None] - plate.points), plane], axis=-1) @ plate.weights
+    slopes = np.stack([right - left, down - up]) / 2
+    return float(np.sqrt((slopes**2).sum(axis=-1)).max())
 
 
 def _kernel(offset: np.ndarray) -> np.ndarray:

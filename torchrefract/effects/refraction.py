@@ -15,7 +15,7 @@ from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import field_dtype, inside, length
 from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.jacobian import folding
-from torchrefract.warping.lattice import SmoothFlow
+from torchrefract.warping.lattice import SmoothFlow, dense
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, look_up
 
 
@@ -96,14 +96,14 @@ class Moved:
 
     def __init__(self, path: Tensor | SmoothFlow, exists: Tensor, active: Tensor):
         self.path, self.exists, self.active = path, exists, active
-        self._flow = None if isinstance(path, SmoothFlow) else path
+        self._flow: Tensor | None = None
 
     @property
     def flow(self) -> Tensor:
         """(B, 2, H, W), px."""
         # Compilers cannot enter the lock of a cached property.
         if self._flow is None:
-            self._flow = cast(SmoothFlow, self.path).dense()
+            self._flow = dense(self.path)
         return self._flow
 
     def spread(self, rows: int) -> "Moved":

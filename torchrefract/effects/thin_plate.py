@@ -10,7 +10,7 @@ from torchrefract import draws
 from torchrefract._checks import check_all, check_count, check_range
 from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
-from torchrefract.effects.plan import Plan, lies_in
+from torchrefract.effects.plan import Ask, Plan, lies_in
 from torchrefract.effects.plate_plan import plate_plan
 from torchrefract.fields.spline import check_points, fit_spline, spline_at, spline_flow
 from torchrefract.types import Range
@@ -102,11 +102,9 @@ class ThinPlateSpline(LatticeWarp):
         flow = spline_flow(spline, height=height, width=width, dtype=params.points.dtype)
         return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
 
-    def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
+    def plan_within(self, ask: Ask) -> Plan:
         """The plan of `plate_plan`."""
-        double = dtype is torch.float64
-        amplitude = self.amplitude_range[1]
-        return plate_plan(amplitude, self.lattice, self.smoothing_range, height, width, self.tolerance_px, double)
+        return plate_plan(self.amplitude_range[1], self.lattice, self.smoothing_range, ask)
 
     def covers(self, params: ThinPlateParams) -> Tensor:
         """Whether the points are as many as drawn ones, displaced and smoothed as those can be."""

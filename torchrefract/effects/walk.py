@@ -1,5 +1,7 @@
 """An image on its way through several effects: warps that follow one another are looked up together."""
 
+import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
 
@@ -8,13 +10,17 @@ from torch import Tensor
 
 from torchrefract._checks import is_true
 from torchrefract.effects.base import Effect
+from torchrefract.effects.lattice_warp import LatticeWarp
+from torchrefract.effects.plan import Plan
 from torchrefract.effects.refraction import Moved, WarpEffect, moving, sees
 from torchrefract.effects.rows import column, learns, only, spread
 from torchrefract.types import Degraded
 from torchrefract.warping.compose import compose_flows
-from torchrefract.warping.grid import field_dtype, inside
-from torchrefract.warping.resample import look_up
+from torchrefract.warping.grid import Positions, field_dtype, inside
+from torchrefract.warping.lattice import SmoothFlow, dense
+from torchrefract.warping.resample import follow, grid_of, look_up, sampler_dtype
 
+_Flow = Tensor | SmoothFlow
 _Combine = Callable[[Tensor, Tensor], Tensor]
 # How the maps of several effects of light make one.
 _COMBINED: dict[str, _Combine] = {"transmission": torch.mul, "intensity": torch.add, "extinction": torch.add}
@@ -25,15 +31,28 @@ class _Step(NamedTuple):
 
     gate: Tensor  # (B,), bool: the sample is degraded by one of them
     active: Tensor  # (B,), bool: and is moved
-    flow: Tensor  # (B, 2, H, W), px
+    path: _Flow | Positions  # the flow, (B, 2, H, W), px, or in another form
 
 
-def _composite(steps: Sequence[_Step]) -> _Step:
+def _exact(steps: Sequence[_Step]) -> _Step:
     """Warps in a row as one. Each flow is read once, where the later ones look; what is read twice is blurred twice."""
-    *earlier, last = steps
+    *earlier, last = (step._replace(path=dense(cast(_Flow, step.path))) for step in steps)
     for step in reversed(earlier):
-        flow = only(compose_flows(step.flow, last.flow), step.flow, last.active, last)
+        own = cast(Tensor, step.path)
+        flow = only(compose_flows(own, cast(Tensor, last.path)), own, last.active, last)
         last = _Step(step.gate | last.gate, step.active | last.active, flow)
+    return last
+
+
+def _on_grid(steps: Sequence[_Step], dtype: torch.dtype) -> _Step:
+    """The same in the sampler's own positions: faster, and off by their rounding."""
+    *earlier, last = steps
+    grid = grid_of(cast(_Flow, last.path), dtype)
+    for step in reversed(earlier):
+        own = cast(_Flow, step.path)
+        both = follow(own, grid)
+        grid = both if is_true(last.active.all) else only(both, grid_of(own, dtype), last.active, last)
+        last = _Step(step.gate | last.gate, step.active | last.active, Positions(grid))
     return last
 
 
@@ -43,7 +62,7 @@ class Walk:
     def __init__(self, image: Tensor, depth: Tensor | None, padding: str | None, interpolation: str | None):
         self.image, self.depth = image, depth
         self.padding, self.interpolation = padding, interpolation
-        self.done: list[_Step] = []
+        self.done: list[list[_Step]] = []  # those that were looked up together
         self.waiting: list[_Step] = []
         self.modes: dict[tuple[str, str], Tensor] = {}  # of the look-up: the samples that ask for it, (B,), bool
         self.moved: list[tuple[WarpEffect, Any, Moved]] = []
@@ -51,15 +70,16 @@ class Walk:
         self.light: dict[str, Callable[[], Tensor]] = {}  # the maps of light, by their names in `Degraded`
         self.refracts = False
 
-    def move(self, effect: WarpEffect, params: Any) -> None:
+    def move(self, effect: WarpEffect, params: Any, plan: Plan | None) -> None:
         """One more warp waits."""
         self.refracts = True
         rows, _, height, width = self.image.shape
-        if not effect.stirs(params, height, width):
+        planned = {"plan": plan} if isinstance(effect, LatticeWarp) else {}
+        if not effect.stirs(params, height, width, **planned):
             return
-        own = effect.gated(params, height=height, width=width)
+        own = effect.gated(params, height=height, width=width, **planned)
         moved, valid = own.spread(rows), self.valid
-        self.waiting.append(_Step(spread(params.gate, rows), moved.active, moved.flow))
+        self.waiting.append(_Step(spread(params.gate, rows), moved.active, moved.path))
         self.valid = lambda: moved.exists & inside(moved.flow) & sees(valid(), moved.flow)
         self._choose(effect, moved.active)
         self.moved.append((effect, params, own))
@@ -91,11 +111,18 @@ class Walk:
         return moving(
             self.image,
             params,
-            flow=lambda: _composite(self.done).flow if self.done else self._still(),
+            flow=self._flow,
             valid=self.valid,
             undo=self._undo,
             light=self.light,
         )
+
+    def _flow(self) -> Tensor:
+        """(B, 2, H, W), px: of all that is done."""
+        if not self.done:
+            return self._still()
+        first, *others = self.done
+        return cast(Tensor, _exact([_exact(first), *itertools.chain.from_iterable(others)]).path)
 
     def _add(self, name: str, value: Callable[[], Tensor] | None, combine: _Combine) -> None:
         """One more effect's share in a map of light."""
@@ -107,22 +134,30 @@ class Walk:
         """What waits is done."""
         if not self.waiting:
             return
-        group = _composite(self.waiting)
-        self.image = only(self._looked_up(group.flow), self.image, group.active, group)
+        group = self._composite()
+        self.image = only(self._looked_up(group.path), self.image, group.active, group)
         if self.depth is not None:
             self.depth = spread(self.depth, self.image.shape[0])
-            near = look_up(self.depth, group.flow.detach(), padding="border", interpolation="nearest")
+            near = look_up(self.depth, group.path.detach(), padding="border", interpolation="nearest")
             self.depth = only(near, self.depth, group.active, group)
 
         def moved_along(value: Callable[[], Tensor]) -> Callable[[], Tensor]:
             return lambda: only(
-                look_up(value(), group.flow, padding="border", interpolation="bilinear"), value(), group.active, group
+                look_up(value(), group.path, padding="border", interpolation="bilinear"), value(), group.active, group
             )
 
         self.light = {name: moved_along(value) for name, value in self.light.items()}
-        # A group that comes first has its composite already.
-        self.done = [*self.done, *self.waiting] if self.done else [group]
+        self.done.append([group] if isinstance(group.path, Tensor) and not self.done else self.waiting)
         self.waiting, self.modes = [], {}
+
+    def _composite(self) -> _Step:
+        """What waits, as one."""
+        if len(self.waiting) == 1:
+            return self.waiting[0]
+        if all(isinstance(step.path, Tensor) for step in self.waiting):
+            return _exact(self.waiting)
+        flows = functools.reduce(torch.promote_types, [step.path.dtype for step in self.waiting])
+        return _on_grid(self.waiting, sampler_dtype(self.image, flows))
 
     def _choose(self, effect: WarpEffect, active: Tensor) -> None:
         """The samples that an effect moves are looked up as it asks, unless the whole composition says how."""
@@ -130,7 +165,7 @@ class Walk:
         asked = self.modes.pop(mode, torch.zeros_like(active))
         self.modes = {other: samples & ~active for other, samples in self.modes.items()} | {mode: asked | active}
 
-    def _looked_up(self, flow: Tensor) -> Tensor:
+    def _looked_up(self, flow: _Flow | Positions) -> Tensor:
         warped = None
         for (padding, interpolation), samples in reversed(self.modes.items()):
             if warped is not None and is_true(samples.any) is False:

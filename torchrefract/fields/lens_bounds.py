@@ -48,6 +48,7 @@ class LensErrors(NamedTuple):
     cubic: float  # px, between the nodes of a lattice
     newton: tuple[float, ...]  # px, after 0, 1, 2 ... steps of `newton_undistort`
     stretch: float  # how many times as far from the center a node is looked up at most
+    slope: float  # of the flow from node to node, px per px
 
 
 def moved_by_terms(ranges: LensRanges, lattice: Lattice) -> tuple[float, ...] | None:
@@ -91,14 +92,17 @@ def lens_errors(ranges: LensRanges, lattice: Lattice) -> LensErrors | None:
     found = _measured(c[worst], focal[worst], center[worst], lattice, radius=radius, cells=_MANY_CELLS)
     if found is None:
         return None
-    cubic, newton, stretch = (torch.cat(both, dim=-1).amax(dim=-1) for both in zip(first, found, strict=True))
-    return LensErrors(_MARGIN * cubic.item(), tuple((_MARGIN * newton).tolist()), stretch.item())
+    largest = (torch.cat(both, dim=-1).amax(dim=-1) for both in zip(first, found, strict=True))
+    cubic, newton, stretch, slope = largest
+    return LensErrors(
+        _MARGIN * cubic.item(), tuple((_MARGIN * newton).tolist()), stretch.item(), _MARGIN * slope.item()
+    )
 
 
 def _measured(
     c: Tensor, focal: Tensor, center: Tensor, lattice: Lattice, *, radius: float, cells: int
-) -> tuple[Tensor, Tensor, Tensor] | None:
-    """For each of N lenses the three numbers of `LensErrors`, (N,), (steps, N) and (N,); None if one of them folds."""
+) -> tuple[Tensor, ...] | None:
+    """For each of N lenses the numbers of `LensErrors`, (N,), those after steps (steps, N); None if one folds."""
     at, count = _nodes_and_places(lattice, cells)
     x, y = ((at[:, i] - center[:, i]) / focal[:, i] for i in range(2))
     one = x.new_ones(len(x))
@@ -116,7 +120,14 @@ def _measured(
         error = torch.hypot((near[0] - found_x) * focal[:, 0], (near[1] - found_y) * focal[:, 1])
         newton.append(error.nan_to_num(nan=math.inf).amax(dim=1))
     stretch = torch.hypot(found_x, found_y) / torch.hypot(x, y).clamp(min=1e-9)
-    return off, torch.stack(newton), stretch.amax(dim=1)
+    return off, torch.stack(newton), stretch.amax(dim=1), _slope(nodes, lattice.stride)
+
+
+def _slope(nodes: Tensor, stride: int) -> Tensor:
+    """(N,): the largest slope along an axis, from corner to corner of the cells, of flows (2, N, cells, 16)."""
+    grids = nodes.unflatten(3, (4, 4))[..., 1:3, 1:3]
+    slopes = [torch.diff(grids, dim=dim).square().sum(dim=0).sqrt().flatten(1).amax(dim=1) for dim in (3, 4)]
+    return torch.maximum(*slopes) / stride
 
 
 def _radius(ranges: LensRanges, lattice: Lattice) -> float:

@@ -1,14 +1,35 @@
 """Pixels and the sampler's coordinates: the one place that knows both."""
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 # F.grid_sample spans [-1, 1]; four of these lie well outside whatever the padding, and keep every product finite.
-_FAR = 4.0
+FAR = 4.0
 # Positions this near to the border pixels count as inside: rounding of fp32 coordinates, 1/1000 px.
 _TOLERANCE = 1e-3
+
+
+class Positions(NamedTuple):
+    """Where F.grid_sample(align_corners=False) looks, finite."""
+
+    grid: Tensor  # (B, H, W, 2)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the grid."""
+        return self.grid.dtype
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether the grid has a gradient."""
+        return self.grid.requires_grad
+
+    def detach(self) -> "Positions":
+        """The same without its gradient."""
+        return Positions(self.grid.detach())
 
 
 def field_dtype(dtype: torch.dtype) -> torch.dtype:
@@ -49,7 +70,7 @@ def sampler_grids(flow: Tensor, *, rows: int) -> Iterator[Tensor]:
     height, width = flow.shape[2:]
     x, y = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
     for band, middle in zip(flow.split(max(1, rows), dim=2), y.split(max(1, rows), dim=2), strict=True):
-        yield finite(sampler_positions(band, x, middle, height=height, width=width), _FAR).movedim(1, -1)
+        yield finite(sampler_positions(band, x, middle, height=height, width=width), FAR).movedim(1, -1)
 
 
 def sampler_positions(flow: Tensor, x: Tensor, y: Tensor, *, height: int, width: int) -> Tensor:

@@ -90,6 +90,20 @@ class SmoothFlow:
     nodes: Tensor  # (B, 2, n, m), px
     lattice: Lattice
 
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the nodes."""
+        return self.nodes.dtype
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether the nodes have a gradient."""
+        return self.nodes.requires_grad
+
+    def detach(self) -> "SmoothFlow":
+        """The same flow without its gradient."""
+        return self.with_nodes(self.nodes.detach())
+
     def with_nodes(self, nodes: Tensor) -> "SmoothFlow":
         """The same flow with other nodes."""
         return replace(self, nodes=nodes)
@@ -141,6 +155,11 @@ class StreamFlow(SmoothFlow):
         along, across = _across(nodes, own, self.lattice.width), _across(nodes, slope, self.lattice.width)
         lines = torch.cat([scale[0] * along, -scale[1] * across], dim=1)
         return _down(lines, torch.stack([slope, own]), self.lattice.height)
+
+
+def dense(flow: Tensor | SmoothFlow) -> Tensor:
+    """(B, 2, H, W), px, of a flow in either form."""
+    return flow.dense() if isinstance(flow, SmoothFlow) else flow
 
 
 def _across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:

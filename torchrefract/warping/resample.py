@@ -8,8 +8,8 @@ from torch import Tensor
 
 from torchrefract._bands import join
 from torchrefract._checks import check_choice, check_flow, check_tensor
-from torchrefract.warping.grid import field_dtype, inside, sampler_grids
-from torchrefract.warping.lattice import SmoothFlow
+from torchrefract.warping.grid import FAR, Positions, field_dtype, finite, inside, sampler_grid, sampler_grids
+from torchrefract.warping.lattice import SmoothFlow, dense
 
 PADDINGS = ("zeros", "border", "reflection")
 INTERPOLATIONS = ("nearest", "bilinear", "bicubic")
@@ -57,11 +57,11 @@ def warp(
     return look_up(image, flow, padding=padding, interpolation=interpolation), inside(flow)
 
 
-def look_up(image: Tensor, flow: Tensor | SmoothFlow, *, padding: str, interpolation: str) -> Tensor:
+def look_up(image: Tensor, flow: Tensor | SmoothFlow | Positions, *, padding: str, interpolation: str) -> Tensor:
     """The image (B, C, H, W) at p + flow(p), flow being (B, 2, H, W) in px; the arguments are taken as checked."""
     if image.numel() == 0:
         return image.clone()
-    source = _as_field(image, flow.nodes if isinstance(flow, SmoothFlow) else flow)
+    source = image.to(sampler_dtype(image, flow.dtype))
     bands = (
         _sample(source, grid, padding=padding, interpolation=interpolation)
         for grid in _grids(source, flow, whole=(interpolation, padding) == _WHOLE)
@@ -70,6 +70,27 @@ def look_up(image: Tensor, flow: Tensor | SmoothFlow, *, padding: str, interpola
     if interpolation == "bicubic":
         warped = _clamped(warped, source, padding)
     return _as_image(warped, image)
+
+
+def sampler_dtype(image: Tensor, dtype: torch.dtype) -> torch.dtype:
+    """The type that an image is looked up in along a flow of a type."""
+    large = max(image.shape[2:]) > _LARGEST_FLOAT32_SIDE
+    # The CPU sampler of half types is wrong above 2^15 pixels, and no type of 16 bits holds a coordinate.
+    return torch.float64 if large else torch.promote_types(field_dtype(image.dtype), dtype)
+
+
+def grid_of(flow: Tensor | SmoothFlow, dtype: torch.dtype) -> Tensor:
+    """(B, H, W, 2): where F.grid_sample(align_corners=False) looks along a flow in either form, finite."""
+    return flow.sampler_grid(dtype) if isinstance(flow, SmoothFlow) else sampler_grid(flow.to(dtype))
+
+
+def follow(first: Tensor | SmoothFlow, grid: Tensor) -> Tensor:
+    """(B, H, W, 2): the grid of two warps in a row, from that of the second; as by `compose_flows`."""
+    flow = dense(first).to(grid.dtype)
+    height, width = flow.shape[2:]
+    read = _sample(flow, grid, padding="border", interpolation="bilinear").movedim(1, -1)
+    both = torch.addcmul(grid, read, read.new_tensor((2 / width, 2 / height)))
+    return both if isinstance(first, SmoothFlow) else finite(both, FAR)
 
 
 def is_channels_last(image: Tensor) -> bool:
@@ -95,12 +116,6 @@ def _check_fit(image: Tensor, flow: Tensor) -> None:
         )
 
 
-def _as_field(image: Tensor, flow: Tensor) -> Tensor:
-    large = max(image.shape[2:]) > _LARGEST_FLOAT32_SIDE
-    # The CPU sampler of half types is wrong above 2^15 pixels, and no type of 16 bits holds a coordinate.
-    return image.to(torch.float64 if large else torch.promote_types(field_dtype(image.dtype), flow.dtype))
-
-
 def _as_image(warped: Tensor, image: Tensor) -> Tensor:
     if not image.is_floating_point():
         limits = (0, 1) if image.dtype is torch.bool else (torch.iinfo(image.dtype).min, torch.iinfo(image.dtype).max)
@@ -120,7 +135,9 @@ def _clamped(warped: Tensor, source: Tensor, padding: str) -> Tensor:
     return torch.where(warped.isfinite(), warped.clamp(low, high), warped)
 
 
-def _grids(source: Tensor, flow: Tensor | SmoothFlow, *, whole: bool) -> Iterable[Tensor]:
+def _grids(source: Tensor, flow: Tensor | SmoothFlow | Positions, *, whole: bool) -> Iterable[Tensor]:
+    if isinstance(flow, Positions):
+        return [flow.grid]
     if isinstance(flow, SmoothFlow):
         return [flow.sampler_grid(source.dtype)]
     return sampler_grids(flow.to(source.dtype), rows=flow.shape[2] if whole else _rows_at_once(source, flow))

@@ -1,0 +1,222 @@
+import math
+import random
+from typing import Any
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from torchrefract import Compose, DivergenceFree, LensDistortion, OneOf, ThinPlateSpline, Turbulence, UniformFog
+from torchrefract.effects.compose_plan import ComposePlan
+from torchrefract.effects.lattice_warp import LatticeWarp
+from torchrefract.effects.plan import Plan
+
+SIZE = (96, 130)
+
+
+def lens(tolerance: float | None) -> LensDistortion:
+    ranges: dict[str, Any] = {"k1_range": (-0.12, -0.05), "k2_range": (0.0, 0.01), "focal_range": (0.9, 1.1)}
+    return LensDistortion(**ranges, tolerance_px=tolerance)
+
+
+def swirls(tolerance: float | None) -> DivergenceFree:
+    return DivergenceFree(amplitude_range=(0.5, 1.0), length_range=(25.0, 40.0), tolerance_px=tolerance)
+
+
+def parts(tolerance: float | None) -> list[LatticeWarp]:
+    air: dict[str, Any] = {"covariance": "gaussian", "amplitude_range": (0.5, 1.0), "length_range": (20.0, 30.0)}
+    plate = ThinPlateSpline(amplitude_range=(0.5, 1.0), tolerance_px=tolerance)
+    return [lens(tolerance), plate, Turbulence(**air, tolerance_px=tolerance), swirls(tolerance)]
+
+
+def image(batch: int = 2) -> torch.Tensor:
+    return torch.rand(batch, 3, *SIZE, generator=torch.Generator().manual_seed(1))
+
+
+def of_warps(plan: ComposePlan) -> list[Plan]:
+    return [part for part in plan.plans if part is not None]
+
+
+def strides(plan: ComposePlan) -> list[int]:
+    return [part.stride for part in of_warps(plan)]
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_the_composite_is_within_the_tolerance_everywhere(seed):
+    dice = random.Random(seed)
+    tolerance = dice.choice((1.0, 0.3, 0.1, 0.03))
+    chosen = [dice.randrange(4) for _ in range(dice.randint(2, 4))]
+    height, width = dice.randint(64, 200), dice.randint(64, 300)
+    effects = Compose([parts(64.0)[i] for i in chosen], tolerance_px=tolerance)
+    frame = torch.zeros(2, 1, height, width)
+    found = effects.degrade(frame, seed=seed)
+    exact = Compose([parts(None)[i] for i in chosen]).apply(frame, found.params)
+    error = (found.flow - exact.flow).norm(dim=1).amax()
+    plan = effects.planned(height, width, torch.float32)
+    assert error <= plan.error_px <= tolerance
+    assert tolerance < 1 or max(strides(plan)) > 1
+
+
+def test_the_image_is_looked_up_along_the_composite():
+    effects = Compose(parts(64.0), tolerance_px=0.1)
+    x, y = torch.arange(SIZE[1]).double(), torch.arange(SIZE[0]).double()[:, None]
+    ramps = torch.stack([x.expand(SIZE), y.expand(SIZE)])[None]
+    found = effects.degrade(ramps, seed=3)
+    # A ramp shows where it was looked up.
+    seen = found.valid[:, :, 8:-8, 8:-8].expand(-1, 2, -1, -1)
+    assert seen.float().mean() > 0.9
+    missed = (found.image - ramps - found.flow)[:, :, 8:-8, 8:-8][seen]
+    assert missed.abs().max() < 1e-9
+
+
+def test_a_smaller_tolerance_asks_for_more():
+    fine, coarse = (Compose(parts(64.0), tolerance_px=px).planned(1080, 1920, torch.float32) for px in (0.05, 1.0))
+    assert all(a < b for a, b in zip(strides(fine), strides(coarse), strict=True))
+    assert fine.error_px < coarse.error_px
+
+
+def test_an_error_counts_as_much_as_the_slopes_before_it_stretch_it():
+    (alone,) = of_warps(Compose([swirls(64.0)], tolerance_px=0.3).planned(540, 960, torch.float32))
+    both = Compose([lens(64.0), swirls(64.0)], tolerance_px=0.3).planned(540, 960, torch.float32)
+    first, behind = of_warps(both)
+    assert first.slope > 0
+    # One error of a chance and one that is none share the tolerance in halves.
+    assert behind.tolerance_px == pytest.approx(0.15 / (1 + first.slope), rel=0.05)
+    assert alone.tolerance_px == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("effect", parts(0.1), ids=lambda effect: type(effect).__name__)
+def test_slopes_are_no_steeper_than_planned(effect):
+    flow = effect.degrade(torch.zeros(8, 1, 240, 320), seed=1).flow
+    steepest = max(flow.diff(dim=dim).square().sum(dim=1).amax().sqrt().item() for dim in (2, 3))
+    slope = effect.planned(240, 320, torch.float32).slope
+    assert 0.2 * slope < steepest <= slope
+
+
+def test_what_follows_a_rough_warp_is_exact():
+    rough = Turbulence(tolerance_px=0.1)
+    before, after = parts(0.1)[1:3]
+    plan = Compose([before, rough, after], tolerance_px=0.3).planned(*SIZE, torch.float32)
+    assert strides(plan)[0] > 1
+    assert strides(plan)[1:] == [1, 1]
+    assert "whose slope is not known" in of_warps(plan)[2].why
+
+
+def test_an_effect_without_a_tolerance_stays_exact():
+    effects = parts(0.1)
+    effects[2].tolerance_px = None
+    assert strides(Compose(effects, tolerance_px=0.1).planned(*SIZE, torch.float32))[2] == 1
+
+
+def test_parameters_outside_the_ranges_are_exact():
+    wild = Compose(parts(None)).sample(image(), seed=2)
+    other = wild.children[0]._replace(coefficients=2 * wild.children[0].coefficients)
+    wild = wild._replace(children=(other, *wild.children[1:]))
+    found = Compose(parts(64.0), tolerance_px=0.1).apply(image(), wild)
+    exact = Compose(parts(None)).apply(image(), wild)
+    assert_close(found.flow, exact.flow, rtol=0, atol=1e-4)
+
+
+def test_the_plan_is_printed_and_names_what_is_dropped(capsys):
+    still = DivergenceFree(amplitude_range=(0.0, 0.0), tolerance_px=0.1)
+    off = Turbulence(p=0.0)
+    plan = Compose([*parts(0.1)[:2], UniformFog(), still, off], tolerance_px=0.1).plan(*SIZE)
+    told = capsys.readouterr().out
+    assert told.strip() == str(plan)
+    assert strides(plan)[2:] == [0, 0]
+    assert plan.plans[2] is None
+    assert plan.resamples == 1
+    lines = told.splitlines()
+    assert lines[-3].split() == ["UniformFog", "moves", "nothing"]
+    assert lines[-2].split(maxsplit=1) == ["DivergenceFree", "not computed (it moves too little)"]
+    assert lines[-1].split(maxsplit=1) == ["Turbulence", "not computed (its p is 0)"]
+
+
+def test_a_composition_that_is_off_computes_nothing():
+    plan = Compose([Compose(parts(0.1), p=0.0)], tolerance_px=0.1).planned(*SIZE, torch.float32)
+    assert strides(plan) == [0] * 4
+    assert plan.resamples == 0
+
+
+def test_light_between_warps_takes_two_resamples():
+    first, then = parts(0.1)[:2]
+    assert Compose([first, UniformFog(), then], tolerance_px=0.1).planned(*SIZE, torch.float32).resamples == 2
+
+
+def test_without_a_tolerance_each_effect_keeps_its_own():
+    plan = Compose(parts(0.1)).planned(*SIZE, torch.float32)
+    assert strides(plan) == [part.planned(*SIZE, torch.float32).stride for part in parts(0.1)]
+    assert plan.error_px == math.inf
+
+
+def test_depth_and_maps_of_light_move_along_as_with_exact_flows():
+    depth = torch.linspace(1, 100, SIZE[1]).expand(2, 1, *SIZE)
+    first, second, third, _ = parts(64.0)
+    found = Compose([first, second, UniformFog(), third], tolerance_px=0.1).degrade(image(), seed=2, depth=depth)
+    first, second, third, _ = parts(None)
+    exact = Compose([first, second, UniformFog(), third]).apply(image(), found.params, depth=depth)
+    seen = exact.valid[..., 4:-4, 4:-4]
+    near = (found.transmission - exact.transmission)[..., 4:-4, 4:-4].abs()
+    # A position that is off by little may be nearest to the next pixel, whose depth is 0.8 m greater.
+    assert near[seen].mean() < 1e-3
+    assert (found.flow - exact.flow).norm(dim=1).amax() <= 0.1
+
+
+def test_a_sample_does_not_depend_on_the_others():
+    effects = OneOf([Compose(parts(64.0)), *parts(64.0)[:2]], tolerance_px=0.1)
+    together = effects.degrade(image(12), seed=5)
+    gates = torch.stack([own.gate for _, own in effects.leaves(together.params)], dim=1)
+    assert len(gates.unique(dim=0)) == 3
+    for i in range(12):
+        alone = effects.degrade(image(12)[i : i + 1], seed=5, keys=[i])
+        assert torch.equal(alone.image[0], together.image[i])
+        assert torch.equal(alone.flow[0], together.flow[i])
+
+
+def test_gradients_are_those_of_the_exact_composite_within_the_tolerance():
+    params = Compose(parts(None)).sample(image().double(), seed=2)
+    weight = torch.rand(2, 3, *SIZE, dtype=torch.float64)
+    # A smooth picture: that of white noise has a gradient which is as rough.
+    smooth = torch.sin(torch.arange(SIZE[1]).double() / 9).expand(2, 3, *SIZE)
+    slopes = []
+    for effects in (Compose(parts(64.0), tolerance_px=0.01), Compose(parts(None))):
+        amplitude = params.children[2].amplitude.clone().requires_grad_()
+        focal = params.children[0].focal.clone().requires_grad_()
+        first, second, third, fourth = params.children
+        children = (first._replace(focal=focal), second, third._replace(amplitude=amplitude), fourth)
+        degraded = effects.apply(smooth, params._replace(children=children)).image
+        slopes.append(torch.autograd.grad((weight * degraded).mean(), [amplitude, focal]))
+    for coarse, exact in zip(*slopes, strict=True):
+        assert_close(coarse, exact, rtol=0, atol=0.05 * exact.abs().max().item())
+
+
+def test_one_graph_gives_the_same():
+    effects = Compose([*parts(64.0), UniformFog()], tolerance_px=0.1)
+
+    def degraded(frame: torch.Tensor, seed: torch.Tensor) -> torch.Tensor:
+        return effects.degrade(frame, seed=seed).image
+
+    compiled = torch.compile(degraded, fullgraph=True, backend="aot_eager")
+    assert_close(compiled(image(), torch.tensor(4)), degraded(image(), torch.tensor(4)), rtol=0, atol=5e-4)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, 1e6])
+def test_a_tolerance_that_is_none_raises(value):
+    with pytest.raises(ValueError, match="tolerance_px must"):
+        Compose(parts(0.1), tolerance_px=value)
+
+
+def test_a_tolerance_below_rounding_raises_and_says_what_can_be_kept():
+    with pytest.raises(ValueError, match=r"tolerance_px must be at least 0.00\d+ px for float32 positions"):
+        Compose(parts(0.1), tolerance_px=1e-5).plan(1080, 1920)
+
+
+def test_a_share_below_rounding_is_exact():
+    plan = Compose(parts(64.0), tolerance_px=0.004).planned(1080, 1920, torch.float32)
+    assert 1 in strides(plan)
+    assert plan.error_px <= 0.004
+
+
+def test_a_plan_of_no_frame_raises():
+    with pytest.raises(ValueError, match="height must be at least 1"):
+        Compose(parts(0.1), tolerance_px=0.1).plan(0, 10)

@@ -3,6 +3,8 @@ import json
 import sys
 from types import ModuleType
 
+import peer_fields
+import peer_warps
 import peers
 import pytest
 import timing
@@ -48,11 +50,11 @@ def test_a_peer_that_is_not_installed_is_told_with_what_installs_it(installed):
     modules = installed("kornia", "cv2")
     found, missing = peers.find_peers()
     assert found == {"cv2": modules["cv2"], "kornia": modules["kornia"]}
-    assert [line.split()[0] for line in missing] == ["torchvision", "albumentations"]
+    assert [line.split()[0] for line in missing] == ["torchvision", "torch_tps", "gstools", "albumentations"]
     assert missing[0] == (
         "torchvision is left out (No module named 'torchvision'); to have it: pip install torchvision"
     )
-    assert "--no-deps albumentations" in missing[1]
+    assert "--no-deps albumentations" in missing[-1]
 
 
 def test_albumentations_is_not_let_on_the_network(installed, monkeypatch):
@@ -70,6 +72,7 @@ def test_without_peers_ours_remain(ramps):
 
 
 def test_candidates_come_by_job_and_keep_the_size_of_the_frame(monkeypatch):
+    monkeypatch.setattr(peer_fields, "MODES", 10)
     monkeypatch.setenv("NO_ALBUMENTATIONS_UPDATE", "1")
     height, width = 88, 96
     found, _ = peers.find_peers()
@@ -81,42 +84,61 @@ def test_candidates_come_by_job_and_keep_the_size_of_the_frame(monkeypatch):
         assert tuple(image.shape) in {(1, 3, height, width), (height, width, 3)}, name
 
 
+@pytest.fixture
+def wide(ramps):
+    """The same frame (1, 3, H, W) as HxWx3 of float32, which OpenCV looks up without rounding."""
+    return ramps[0].movedim(0, -1).contiguous().numpy()
+
+
 @pytest.mark.parametrize(("peer", "draws"), [("kornia", 8), ("torchvision", 2)])
 def test_the_fields_of_the_peers_move_about_a_pixel(ramps, peer, draws):
     pytest.importorskip(peer, reason="a peer that is not installed cannot be held against ours")
     torch.manual_seed(0)
-    own = {"kornia": peers._kornia, "torchvision": peers._torchvision}[peer]
-    call = next(call for name, call in own(ramps).items() if name.startswith("field"))
+    own = {"kornia": peer_fields._kornia, "torchvision": peer_fields._torchvision}[peer]
+    (call,) = own(ramps).values()
     inner = (..., slice(70, -70), slice(70, -70))  # away from what lies outside
     moved = torch.stack([(torch.as_tensor(call()) - ramps)[inner][0, :2] for _ in range(draws)])
     # A draw shows a handful of independent displacements, which is why this is no sharper.
     assert 0.5 < moved.square().mean().sqrt() < 1.6
 
 
-def test_lenses_in_closed_form_do_what_the_peers_do(ramps):
+def test_the_fields_of_the_paper_have_a_deviation_of_a_pixel_over_the_frame(wide, monkeypatch):
+    gstools, cv2 = (pytest.importorskip(name, reason="the stack of the paper") for name in ("gstools", "cv2"))
+    monkeypatch.setattr(peer_fields, "MODES", 50)
+    (call,) = peer_fields._paper(gstools, cv2, wide).values()
+    first, second = (torch.from_numpy(call() - wide)[4:-4, 4:-4, :2] for _ in range(2))
+    # The frame's own edge is left out here and not in what they divide by.
+    assert_close(first.std(dim=(0, 1)), torch.ones(2), atol=0.1, rtol=0)
+    assert (first - second).abs().max() > 1  # a new draw in each call
+
+
+def test_the_spline_of_torch_tps_is_the_one_through_its_points(ramps):
+    package = pytest.importorskip("torch_tps", reason="a peer that is not installed cannot be held against ours")
+    torch.manual_seed(0)
+    (call,) = peer_warps._torch_tps(package, ramps).values()
+    moved = (torch.as_tensor(call()) - ramps)[0, :2]
+    torch.manual_seed(0)
+    told = peer_warps.SPLINE_PX * torch.randn(16, 2)
+    # Of the lattice of 4 x 4 points, x first, the four inner ones whose look-up stays in the frame.
+    at = [(column, row) for column in (1, 2) for row in (1, 2)]
+    height, width = SIZE
+    for column, row in at:
+        x, y = column * (width - 1) / 3, row * (height - 1) / 3
+        near = moved[:, round(y), round(x)]
+        assert_close(near, told[4 * column + row], atol=0.5, rtol=0)  # a point lies between pixels
+
+
+def test_lenses_in_closed_form_do_what_the_peers_do(ramps, wide):
     pytest.importorskip("kornia", reason="kornia is in the extra train")
     cv2 = pytest.importorskip("cv2", reason="OpenCV is in the extra calibration")
-    ours = torch.as_tensor(peers._ours(ramps)["lens: ours closed form"]())
-    kornia = torch.as_tensor(peers._kornia(ramps)["lens: kornia undistort_image"]())
-    opencv = torch.as_tensor(
-        peers._opencv(cv2, ramps[0].movedim(0, -1).contiguous().numpy())[
-            "lens: OpenCV initUndistortRectifyMap + remap"
-        ]()
-    ).movedim(-1, 0)[None]
+    ours = torch.as_tensor(peer_warps._ours(ramps)["lens: ours closed form"]())
+    kornia = torch.as_tensor(peer_warps._kornia(ramps)["lens: kornia undistort_image"]())
+    (call,) = peer_warps._opencv(cv2, wide).values()
+    opencv = torch.as_tensor(call()).movedim(-1, 0)[None]
     inner = (..., slice(20, -20), slice(20, -20))
     assert (ours - ramps)[inner].abs().max() > 1
     assert_close(ours[inner], kornia[inner], atol=2e-3, rtol=0)
     assert_close(ours[inner], opencv[inner], atol=2e-3, rtol=0)
-
-
-def test_a_slow_candidate_is_looked_at_three_times(monkeypatch):
-    clock = iter(range(1000))
-    monkeypatch.setattr(peers.benchmark, "timer", lambda: float(next(clock)))
-    calls = []
-    found = peers.glance("slow", lambda: calls.append("slow"), {"reference": lambda: calls.append("reference")})
-    assert calls.count("slow") == 3
-    assert calls.count("reference") == 9
-    assert found == Timing("slow", 1, Spread(1e3, 1e3, 1e3), {"reference": Spread(1, 1, 1)})
 
 
 def test_each_of_ours_is_told_beside_the_peers_at_the_same_job():

@@ -1,0 +1,47 @@
+"""The effects that several scripts time."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from torchrefract import (
+    Compose,
+    DivergenceFree,
+    GroundPlaneDepth,
+    HeterogeneousFog,
+    LensDistortion,
+    LensFlare,
+    ThinPlateSpline,
+    Turbulence,
+    UniformFog,
+)
+from torchrefract.effects.base import Effect
+from torchrefract.effects.lattice_warp import LatticeWarp
+
+TOLERANCE_PX = 0.05
+LENS, PLATE, AIR, SWIRLS = "mild lens", "thin plate", "Gaussian air", "swirls"
+FOG, DRIFTS, SPACE, FLARE = "fog", "drifts of fog", "fog in space", "flare"
+# Flows that are smooth enough for a lattice; to be called with `tolerance_px` and other arguments of a warp.
+SMOOTH: Mapping[str, Callable[..., LatticeWarp]] = {
+    LENS: partial(LensDistortion, k1_range=(-0.25, -0.25), k2_range=(0.09, 0.09), focal_range=(0.9, 0.9)),
+    PLATE: ThinPlateSpline,
+    AIR: partial(Turbulence, covariance="gaussian", length_range=(40.0, 60.0)),
+    SWIRLS: partial(DivergenceFree, length_range=(40.0, 60.0)),
+}
+WEATHER: Mapping[str, Callable[..., Effect]] = {
+    FOG: UniformFog,
+    DRIFTS: HeterogeneousFog,
+    SPACE: partial(HeterogeneousFog, mode="ray", depth=GroundPlaneDepth()),
+    FLARE: LensFlare,
+}
+
+
+def effects(tolerance_px: float | None = TOLERANCE_PX) -> dict[str, Effect]:
+    """The smooth warps within a tolerance, and the weather, by name."""
+    warps = {name: make(tolerance_px=tolerance_px) for name, make in SMOOTH.items()}
+    return {**warps, **{name: make() for name, make in WEATHER.items()}}
+
+
+def all_warps(count: int = len(SMOOTH), **arguments: Any) -> Compose:
+    """The first few of the smooth warps, in one look-up; `arguments` are those of each."""
+    return Compose([make(**arguments) for make in list(SMOOTH.values())[:count]])

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from arguments import count, frame_of, size
+from subjects import SMOOTH, TOLERANCE_PX, all_warps
 from timing import (
     COPY,
     FEWEST_REPEATS,
@@ -28,7 +29,6 @@ from timing import (
 from torch import Tensor
 
 from torchrefract import (
-    Compose,
     DivergenceFree,
     GroundPlaneDepth,
     HeterogeneousFog,
@@ -39,7 +39,6 @@ from torchrefract import (
     UniformFog,
 )
 from torchrefract.draws import noise_key, stream
-from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.fields.perlin import octave, perlin_noise
 from torchrefract.warping.grid import sampler_grid
 
@@ -55,12 +54,8 @@ WHAT = (
 LENS, RADIAL, FOG, FLARE = "LensDistortion", "LensDistortion radial", "UniformFog", "LensFlare"
 PERLIN, DRIFTS, SPACE = "Perlin noise, 6 octaves", "HeterogeneousFog", "HeterogeneousFog in space"
 TURBULENCE, SPLINE, SWIRL = "Turbulence, length 20 px", "ThinPlateSpline, 16 points", "DivergenceFree, length 20 px"
-TOLERANCE_PX = 0.05
 SAME_FLOW = "bare grid_sample, the mild lens"
-MILD, PLATE, AIR, STREAM, ALL_FOUR = (
-    f"{name} within {TOLERANCE_PX} px"
-    for name in ("mild lens", "thin plate, 16 points,", "Gaussian air, 40 px,", "swirls, 40 px,", "all four")
-)
+MILD, PLATE, AIR, STREAM, ALL_FOUR = (f"{name} within {TOLERANCE_PX} px" for name in (*SMOOTH, "all four warps"))
 # Multiples of the bare grid_sample.
 LIMITS = {LENS: 20.0, TURBULENCE: 10.0, SPLINE: 20.0, SWIRL: 10.0, FOG: 0.15, FLARE: 0.25, DRIFTS: 1.8, PERLIN: 1.5}
 LIMITS |= {MILD: 0.8, PLATE: 0.85, AIR: 0.9, STREAM: 0.9, ALL_FOUR: 1.4}
@@ -114,21 +109,13 @@ def candidates(frame: Tensor) -> dict[str, Candidate]:
 
 def _tolerant(frame: Tensor) -> dict[str, Candidate]:
     """The warps under a tolerance."""
-    mild = LensDistortion(
-        k1_range=(-0.25, -0.25), k2_range=(0.09, 0.09), focal_range=(0.9, 0.9), tolerance_px=TOLERANCE_PX
-    )
-    warps: dict[str, LatticeWarp] = {
-        MILD: mild,
-        PLATE: ThinPlateSpline(tolerance_px=TOLERANCE_PX),
-        AIR: Turbulence(covariance="gaussian", length_range=(40.0, 60.0), tolerance_px=TOLERANCE_PX),
-        STREAM: DivergenceFree(length_range=(40.0, 60.0), tolerance_px=TOLERANCE_PX),
-    }
-    grid = sampler_grid(mild.degrade(frame, seed=0).flow).contiguous()
+    warps = {f"{name} within {TOLERANCE_PX} px": make(tolerance_px=TOLERANCE_PX) for name, make in SMOOTH.items()}
+    grid = sampler_grid(warps[MILD].degrade(frame, seed=0).flow).contiguous()
     found: dict[str, Candidate] = {
         SAME_FLOW: lambda: F.grid_sample(frame, grid, mode="bilinear", align_corners=False),
     }
     learning = frame.clone().requires_grad_()
-    for name, effect in (warps | {ALL_FOUR: Compose(list(warps.values()))}).items():
+    for name, effect in {**warps, ALL_FOUR: all_warps(tolerance_px=TOLERANCE_PX)}.items():
         found[name] = lambda effect=effect: effect(learning)
     return found
 

@@ -32,3 +32,11 @@ def count(low: int) -> Callable[[str], int]:
         return int(text)
 
     return read
+
+
+def shape(text: str) -> tuple[int, ...]:
+    """BATCHxCHANNELSxHEIGHTxWIDTH."""
+    sides = text.split("x")
+    if len(sides) != 4 or not all(side.isdecimal() and int(side) for side in sides):
+        raise argparse.ArgumentTypeError(f"must be BATCHxCHANNELSxHEIGHTxWIDTH, got {text!r}")
+    return tuple(int(side) for side in sides)

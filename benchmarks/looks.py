@@ -1,7 +1,7 @@
 """Slow candidates: few rounds each, or a run would take an hour.
 
-A candidate is slow if its second call still takes `SLOW_S` or more. One whose first call takes `ENDLESS_S` or more is
-called no second time: that call is its only round.
+A candidate is slow if its second call still takes `SLOW_S`, or what a script sets instead, or more. One whose first
+call takes `ENDLESS_S` or more is called no second time: that call is its only round.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,12 @@ LOOKS = 3
 
 
 def timed(
-    found: Mapping[str, Candidate], *, repeats: int, threads: int, held_against: Sequence[str] = (GRID_SAMPLE, COPY)
+    found: Mapping[str, Candidate],
+    *,
+    repeats: int,
+    threads: int,
+    held_against: Sequence[str] = (GRID_SAMPLE, COPY),
+    slow_s: float = SLOW_S,
 ) -> tuple[list[Timing], list[str]]:
     """What each candidate takes, in their order, the slow ones by a few looks, and a line about each of these.
 
@@ -24,7 +29,7 @@ def timed(
     """
     references = {name: found[name] for name in held_against}
     first = {name: _trial(call) for name, call in found.items()}
-    quick = {name: call for name, call in found.items() if first[name] < SLOW_S or name in references}
+    quick = {name: call for name, call in found.items() if first[name] < slow_s or name in references}
     timings = {t.name: t for t in measure(quick, references=held_against, repeats=repeats, threads=threads)}
     notes = []
     for name, call in found.items():

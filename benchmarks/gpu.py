@@ -1,0 +1,134 @@
+"""What effects cost on a GPU, eager and compiled, and whether they do there what they do on the CPU.
+
+python benchmarks/gpu.py [--shape 16x3x1080x1920] [--repeats 15] [--device cuda] [--out benchmarks/results/gpu.json]
+
+Without the device this is one line on standard error and exit code 1: a run that measured nothing is no success.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from arguments import count, shape
+from subjects import SMOOTH, TOLERANCE_PX, effects
+from timing import COPY, FEWEST_REPEATS, GRID_SAMPLE, Bar, Candidate, Conditions, Timing, measure, references, table
+from torch import Tensor
+
+from torchrefract.effects.base import Effect
+from torchrefract.restoration.files import replacing
+from torchrefract.warping.grid import length
+
+WHAT = (
+    "effect(image) with a new draw in every call, without gradients, in multiples of a bare F.grid_sample of the same "
+    "batch; 'compiled' is torch.compile(effect, fullgraph=True). Bytes per second count what no effect can avoid, the "
+    "image read once and written once, beside those of a copy of it, which is the ceiling. Agreement: the largest "
+    "difference between the device and the CPU for one frame and the same draw, of the flow in px, of the image of an "
+    "effect of light in 8-bit levels."
+)
+SHAPE = (16, 3, 1080, 1920)
+AGREE_PX = 1e-3
+AGREE_LEVELS = 0.05
+SEED = 7
+
+
+def main() -> None:
+    """Measure, print and save; where a bar does not hold it is said, and is no failure of this command."""
+    args = _parser().parse_args()
+    if args.device.type == "cuda" and not torch.cuda.is_available():
+        print(f"error: {args.device} must be a device of this machine, and torch sees no GPU here", file=sys.stderr)
+        raise SystemExit(1)
+    torch.manual_seed(0)
+    frames = torch.rand(args.shape).to(args.device)
+    chosen = subjects()
+    conditions = Conditions.now(frames, threads=torch.get_num_threads(), repeats=args.repeats)
+    print(WHAT, end="\n\n", flush=True)
+    bars = agreement(chosen, frames[:1])
+    timings = measure(
+        candidates(chosen, frames, backend=args.backend),
+        references=(GRID_SAMPLE, COPY),
+        repeats=args.repeats,
+        threads=torch.get_num_threads(),
+    )
+    speeds = bytes_per_second(timings, frames)
+    print(table(timings, conditions), "", *traffic(speeds), "", *bars, sep="\n")
+    save(args.out, timings, conditions, bars=bars, speeds=speeds)
+    print(f"written to {args.out}")
+
+
+def subjects() -> dict[str, Effect]:
+    """The effects, the warps within a tolerance and exact."""
+    return {**effects(TOLERANCE_PX), **{f"{name}, exact": make() for name, make in SMOOTH.items()}}
+
+
+def candidates(chosen: Mapping[str, Effect], frames: Tensor, *, backend: str = "inductor") -> dict[str, Candidate]:
+    """Each effect on a batch (B, C, H, W), eager and compiled; the references come first."""
+    found = references(frames)
+    for name, effect in chosen.items():
+        found[name] = lambda effect=effect: effect(frames)
+        compiled: Any = torch.compile(effect, fullgraph=True, backend=backend)
+        found[f"{name}, compiled"] = lambda compiled=compiled: compiled(frames)
+    return found
+
+
+def agreement(chosen: Mapping[str, Effect], frame: Tensor) -> list[Bar]:
+    """How far each effect on the device of a frame (1, C, H, W) is from itself on the CPU."""
+    return [_agreement(name, effect, frame) for name, effect in chosen.items()]
+
+
+def _agreement(name: str, effect: Effect, frame: Tensor) -> Bar:
+    params = effect.sample(frame.cpu(), seed=SEED)
+    there, here = effect.apply(frame, params.to(frame.device)), effect.apply(frame.cpu(), params)
+    if here.flow is not None:
+        return Bar(f"{name} as on the CPU", length(there.flow.cpu() - here.flow).max().item(), "<=", AGREE_PX, "px")
+    off = 255 * (there.image.cpu() - here.image).abs().max().item()
+    return Bar(f"{name} as on the CPU", off, "<=", AGREE_LEVELS, "levels")
+
+
+def bytes_per_second(timings: Sequence[Timing], frames: Tensor) -> dict[str, float]:
+    """Of each candidate: the batch read and written, over its median time."""
+    return {t.name: 2 * frames.nbytes / (1e-3 * t.milliseconds.median) for t in timings}
+
+
+def traffic(speeds: Mapping[str, float]) -> list[str]:
+    """The speeds for a person to read."""
+    ceiling = speeds[COPY]
+    return [f"{name:40} {speed / 1e9:8.1f} GB/s, {speed / ceiling:.2f} of a copy" for name, speed in speeds.items()]
+
+
+def save(
+    path: Path,
+    timings: Sequence[Timing],
+    conditions: Conditions,
+    *,
+    bars: Sequence[Bar],
+    speeds: Mapping[str, float],
+) -> None:
+    """A run as JSON, the file there whole or not at all."""
+    content = {
+        "what": WHAT,
+        "conditions": asdict(conditions),
+        "timings": [asdict(timing) | {"bytes_per_second": speeds[timing.name]} for timing in timings],
+        "bars": [asdict(bar) | {"holds": bar.holds} for bar in bars],
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--shape", type=shape, default=SHAPE, help="batch x channels x height x width, 16x3x1080x1920")
+    parser.add_argument("--repeats", type=count(FEWEST_REPEATS), default=FEWEST_REPEATS, help="rounds, 15 or more")
+    parser.add_argument("--device", type=torch.device, default=torch.device("cuda"), help="cuda")
+    parser.add_argument("--backend", default="inductor", help="of torch.compile, inductor")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "gpu.json", help="the JSON")
+    return parser
+
+
+if __name__ == "__main__":
+    main()

@@ -44,18 +44,16 @@ def main() -> None:
         raise SystemExit(1)
     torch.manual_seed(0)
     frames = torch.rand(args.shape).to(args.device)
+    # Effects share the code of their `forward`, of which a process compiles few kinds by default.
+    torch._dynamo.config.recompile_limit = 64
     chosen = subjects()
     conditions = Conditions.now(frames, threads=torch.get_num_threads(), repeats=args.repeats)
     print(WHAT, end="\n\n", flush=True)
     bars = agreement(chosen, frames[:1])
-    timings = measure(
-        candidates(chosen, frames, backend=args.backend),
-        references=(GRID_SAMPLE, COPY),
-        repeats=args.repeats,
-        threads=torch.get_num_threads(),
-    )
+    found, failed = working(candidates(chosen, frames, backend=args.backend))
+    timings = measure(found, references=(GRID_SAMPLE, COPY), repeats=args.repeats, threads=torch.get_num_threads())
     speeds = bytes_per_second(timings, frames)
-    print(table(timings, conditions), "", *traffic(speeds), "", *bars, sep="\n")
+    print(table(timings, conditions), *failed, "", *traffic(speeds), "", *bars, sep="\n")
     save(args.out, timings, conditions, bars=bars, speeds=speeds)
     print(f"written to {args.out}")
 
@@ -73,6 +71,18 @@ def candidates(chosen: Mapping[str, Effect], frames: Tensor, *, backend: str = "
         compiled: Any = torch.compile(effect, fullgraph=True, backend=backend)
         found[f"{name}, compiled"] = lambda compiled=compiled: compiled(frames)
     return found
+
+
+def working(found: Mapping[str, Candidate]) -> tuple[dict[str, Candidate], list[str]]:
+    """The candidates that can be called, and a line about each that cannot: one failure must not cost the others."""
+    kept, failed = {}, []
+    for name, call in found.items():
+        try:
+            call()
+            kept[name] = call
+        except Exception as error:
+            failed.append(f"{name} is left out: {type(error).__name__}: {str(error).splitlines()[0]}")
+    return kept, failed
 
 
 def agreement(chosen: Mapping[str, Effect], frame: Tensor) -> list[Bar]:

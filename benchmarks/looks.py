@@ -49,6 +49,20 @@ def glance(name: str, slow: Candidate, held_against: Mapping[str, Candidate]) ->
     return _spread_of(name, [(seconds(slow), _references(held_against)) for _ in range(LOOKS)])
 
 
+def alternate(found: Mapping[str, Candidate], *, reference: str, rounds: int) -> list[Timing]:
+    """What very slow candidates take: median, least and most of rounds in which each is called once, in turn.
+
+    Args:
+        found: what to call, by name; each is called once before.
+        reference: the one that ratios are taken to.
+        rounds: how many.
+    """
+    for call in found.values():
+        call()
+    taken = [{name: seconds(call) for name, call in found.items()} for _ in range(rounds)]
+    return [_spread_of(name, [(times[name], {reference: times[reference]}) for times in taken]) for name in found]
+
+
 def seconds(call: Candidate, *, before: int = 0) -> float:
     """s, of one call, after so many that are not timed."""
     for _ in range(before):

@@ -63,10 +63,11 @@ def _draw_panel(axes: Axes, title: str, points: Sequence[Point]) -> None:
         shown = [(point.time, max(point.error, FLOOR)) for point in own]
         axes.plot(*zip(*shown, strict=True), "o", color=color, markersize=5, label=series)
         for i, (point, place) in enumerate(zip(own, shown, strict=True)):
-            # Neighbors of a sweep lie close to one another: every other label goes to the left.
-            offset, side = ((-5, -3), "right") if i % 2 else ((5, -3), "left")
-            style = {"textcoords": "offset points", "fontsize": 8, "color": color, "ha": side}
-            axes.annotate(point.label, place, offset, **style)
+            # Neighbors on a front lie close to one another: every other label goes to the left. All others lean.
+            left = point.joined and i % 2 == 1
+            offset, turned = ((-5, -3) if left else (5, -3), 0) if point.joined else ((2, 4), 40)
+            style = {"fontsize": 8, "color": color, "ha": "right" if left else "left", "rotation": turned}
+            axes.annotate(point.label, place, offset, textcoords="offset points", rotation_mode="anchor", **style)
     _dress(axes, title, [point.time for point in points])
 
 

@@ -31,8 +31,6 @@ def candidates(frame: Tensor, pixels: Any, peers: Mapping[str, ModuleType]) -> d
         found |= _kornia(frame)
     if "torchvision" in peers:
         found |= _torchvision(frame)
-    if "albumentations" in peers:
-        found |= _albumentations(peers["albumentations"], pixels)
     if "gstools" in peers and "cv2" in peers:
         found |= _paper(peers["gstools"], peers["cv2"], pixels)
     return found
@@ -71,13 +69,14 @@ def _torchvision(frame: Tensor) -> dict[str, Candidate]:
     return {"field: torchvision ElasticTransform": lambda: elastic(frame)}
 
 
-def _albumentations(package: Any, pixels: Any) -> dict[str, Candidate]:
+def albumentations(package: Any) -> dict[str, Any]:
+    """The transforms, by job and name."""
     strength = _LARGEST_NORMAL * FIELD_PX / _BLURRED
-    exact = package.ElasticTransform(alpha=strength, sigma=LENGTH_PX, p=1.0)
-    rough = package.ElasticTransform(alpha=_LARGEST_NORMAL * FIELD_PX * _TAPS, sigma=LENGTH_PX, approximate=True, p=1.0)
     return {
-        "field: albumentations ElasticTransform": lambda: exact(image=pixels)["image"],
-        "field: albumentations ElasticTransform, approximate": lambda: rough(image=pixels)["image"],
+        "field: albumentations ElasticTransform": package.ElasticTransform(alpha=strength, sigma=LENGTH_PX, p=1.0),
+        "field: albumentations ElasticTransform, approximate": package.ElasticTransform(
+            alpha=_LARGEST_NORMAL * FIELD_PX * _TAPS, sigma=LENGTH_PX, approximate=True, p=1.0
+        ),
     }
 
 

@@ -27,8 +27,6 @@ def candidates(frame: Tensor, pixels: Any, peers: Mapping[str, ModuleType]) -> d
         found |= _kornia(frame)
     if "torch_tps" in peers:
         found |= _torch_tps(peers["torch_tps"], frame)
-    if "albumentations" in peers:
-        found |= _albumentations(peers["albumentations"], pixels)
     if "cv2" in peers:
         found |= _opencv(peers["cv2"], pixels)
     return found
@@ -96,13 +94,14 @@ def _torch_tps(package: Any, frame: Tensor) -> dict[str, Candidate]:
     return {"spline: torch-tps ThinPlateSpline + grid_sample": sixteen}
 
 
-def _albumentations(package: Any, pixels: Any) -> dict[str, Candidate]:
-    share = 10 * SPLINE_PX / pixels.shape[1]
-    lens = package.OpticalDistortion(distort_limit=(_K1, _K1), p=1.0)
-    spline = package.ThinPlateSpline(scale_range=(share, share), num_control_points=4, p=1.0)
+def albumentations(package: Any, width: int) -> dict[str, Any]:
+    """The transforms for a frame of a width in px, by job and name."""
+    share = 10 * SPLINE_PX / width
     return {
-        "lens: albumentations OpticalDistortion": lambda: lens(image=pixels)["image"],
-        "spline: albumentations ThinPlateSpline": lambda: spline(image=pixels)["image"],
+        "lens: albumentations OpticalDistortion": package.OpticalDistortion(distort_limit=(_K1, _K1), p=1.0),
+        "spline: albumentations ThinPlateSpline": package.ThinPlateSpline(
+            scale_range=(share, share), num_control_points=4, p=1.0
+        ),
     }
 
 

@@ -11,14 +11,12 @@ from torch import Tensor
 from torchrefract import HeterogeneousFog, LensFlare, UniformFog
 
 
-def candidates(frame: Tensor, pixels: Any, peers: Mapping[str, ModuleType]) -> dict[str, Candidate]:
-    """Weather on a frame (1, 3, H, W), and on the same as uint8 HxWx3, by job and name."""
+def candidates(frame: Tensor, peers: Mapping[str, ModuleType]) -> dict[str, Candidate]:
+    """Weather on a frame (1, 3, H, W), by job and name."""
     found = _ours(frame)
     if "kornia" in peers:
         plasma = importlib.import_module("kornia.augmentation").RandomPlasmaBrightness(p=1.0)
         found["drifts: kornia RandomPlasmaBrightness"] = lambda: plasma(frame)
-    if "albumentations" in peers:
-        found |= _albumentations(peers["albumentations"], pixels)
     return found
 
 
@@ -32,10 +30,10 @@ def _ours(frame: Tensor) -> dict[str, Candidate]:
     return {name: lambda effect=effect: effect(frame) for name, effect in effects.items()}
 
 
-def _albumentations(package: Any, pixels: Any) -> dict[str, Candidate]:
-    transforms = {
+def albumentations(package: Any) -> dict[str, Any]:
+    """The transforms, by job and name."""
+    return {
         "fog: albumentations RandomFog": package.RandomFog(p=1.0),
         "drifts: albumentations PlasmaBrightnessContrast": package.PlasmaBrightnessContrast(p=1.0),
         "flare: albumentations RandomSunFlare": package.RandomSunFlare(p=1.0),
     }
-    return {name: lambda chosen=chosen: chosen(image=pixels)["image"] for name, chosen in transforms.items()}

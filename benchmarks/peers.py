@@ -12,6 +12,7 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import peer_fields
 import peer_warps
@@ -105,10 +106,20 @@ def versions(peers: Mapping[str, ModuleType]) -> str:
 def candidates(frame: Tensor, peers: Mapping[str, ModuleType]) -> dict[str, Candidate]:
     """What is compared on a frame (1, 3, H, W), by job and name; the references come first."""
     pixels = (frame[0].movedim(0, -1) * 255).round().byte().contiguous().numpy()
-    found: dict[str, Candidate] = {}
-    for kind in (peer_warps, peer_fields, peer_weather):
-        found |= kind.candidates(frame, pixels, peers)
+    found = peer_warps.candidates(frame, pixels, peers) | peer_fields.candidates(frame, pixels, peers)
+    found |= peer_weather.candidates(frame, peers)
+    for name, chosen in albumentations(peers, frame.shape[3]).items():
+        found[name] = lambda chosen=chosen: chosen(image=pixels)["image"]
     return references(frame) | {name: found[name] for name in sorted(found, key=_job)}
+
+
+def albumentations(peers: Mapping[str, ModuleType], width: int) -> dict[str, Any]:
+    """Its transforms for frames of a width in px, by job and name; none where it is not installed."""
+    if "albumentations" not in peers:
+        return {}
+    package = peers["albumentations"]
+    found = peer_warps.albumentations(package, width) | peer_fields.albumentations(package)
+    return found | peer_weather.albumentations(package)
 
 
 def standings(timings: Sequence[Timing]) -> list[str]:

@@ -56,6 +56,15 @@ def test_what_differs_from_the_cpu_is_told():
     assert not off.holds
 
 
+def test_what_cannot_be_called_is_left_out_and_told():
+    def fail() -> None:
+        raise RuntimeError("out of memory\nwith a long report")
+
+    kept, failed = gpu.working({"fine": lambda: None, "broken": fail})
+    assert list(kept) == ["fine"]
+    assert failed == ["broken is left out: RuntimeError: out of memory"]
+
+
 def test_a_shape_has_four_sides():
     assert shape("16x3x1080x1920") == (16, 3, 1080, 1920)
     for text in ("3x4x5", "1x3x0x5", "1x3xax5"):
@@ -66,6 +75,7 @@ def test_a_shape_has_four_sides():
 def test_the_command_times_eager_and_compiled_graphs(monkeypatch, tmp_path, capsys, on_threads):
     on_threads(1)
     monkeypatch.setattr(timing, "_STRETCH_S", 0.0)
+    monkeypatch.setattr(torch._dynamo.config, "recompile_limit", torch._dynamo.config.recompile_limit)
     monkeypatch.setattr(gpu, "subjects", lambda: {"flare": LensFlare(), "plate": ThinPlateSpline()})
     out = tmp_path / "new" / "gpu.json"
     words = ["gpu.py", "--device", "cpu", "--shape", "2x3x24x32", "--backend", "eager", "--out", str(out)]

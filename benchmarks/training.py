@@ -1,0 +1,135 @@
+"""What effects cost in training: with gradients, and beside a step of the ResUNet.
+
+python benchmarks/training.py [--batch 16] [--size 256x256] [--threads 2] [--repeats 15] [--rounds 5]
+                              [--encoder tu-resnet34] [--out benchmarks/results/training.json]
+"""
+
+import argparse
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+
+import torch
+from arguments import count, size
+from looks import alternate
+from subjects import effects
+from timing import FEWEST_REPEATS, GRID_SAMPLE, Bar, Candidate, Conditions, Timing, measure, references, table
+from torch import Tensor
+
+from torchrefract import presets
+from torchrefract.data.module import make_pair
+from torchrefract.data.road_scenes import render_road_scenes
+from torchrefract.effects.base import Effect
+from torchrefract.restoration.files import replacing
+from torchrefract.restoration.models.resunet import ResUNet
+from torchrefract.restoration.tasks import Deweather, Task, Undistort
+from torchrefract.types import Frame
+
+WHAT = (
+    "First: effect(image) with a new draw in every call, the gradient of the image asked for, forward and backward, in "
+    "multiples of a bare F.grid_sample of the same batch with the same gradient; warps within 0.05 px. Then: a step of "
+    "training, forward, loss, backward and AdamW, of the ResUNet from pairs made before, and the same with the pairs "
+    "made on the fly (degraded image, flow back and where it is valid), in turn; median, least and most of the rounds."
+)
+BARE = f"{GRID_SAMPLE}, forward + backward"
+BEFORE, FLY = "step, pairs made before", "step, pairs made on the fly"
+EFFECT_LIMIT, STEP_LIMIT = 1.3, 1.10
+SEED = 7
+TASKS: Mapping[str, tuple[Callable[[], Task], Callable[[], Effect]]] = {
+    "undistort, cheap_dashcam": (Undistort, presets.cheap_dashcam),
+    "deweather, cape_town_fog": (Deweather, presets.cape_town_fog),
+}
+
+
+def main() -> None:
+    """Measure, print and save; where a bar does not hold it is said, and is no failure of this command."""
+    args = _parser().parse_args()
+    torch.set_num_threads(args.threads)
+    torch.manual_seed(0)
+    keys = torch.arange(args.batch)
+    image, depth = render_road_scenes(keys, *args.size, seed=SEED)
+    conditions = Conditions.now(image, threads=args.threads, repeats=args.repeats)
+    print(WHAT, end="\n\n", flush=True)
+    found = candidates(image, effects())
+    timings = measure(found, references=(BARE,), repeats=args.repeats, threads=args.threads)
+    held = [Bar(t.name, t.ratios[BARE].median, "<=", EFFECT_LIMIT, "x bare") for t in timings if t.name != BARE]
+    print(table(timings, conditions), "", *held, "", sep="\n", flush=True)
+    trained = {}
+    for name, (task, scene) in TASKS.items():
+        steps = training_steps(Frame(image, keys, depth), task(), scene(), encoder=args.encoder)
+        trained[name] = alternate(steps, reference=BEFORE, rounds=args.rounds)
+        held.append(Bar(name, trained[name][1].ratios[BEFORE].median, "<=", STEP_LIMIT, f"x the {BEFORE}"))
+        print(table(trained[name], conditions).partition("\n\n")[2], held[-1], "", sep="\n", flush=True)
+    _save(args.out, timings, conditions, bars=held, trained=trained)
+    print(f"written to {args.out}")
+
+
+def candidates(frames: Tensor, chosen: Mapping[str, Effect]) -> dict[str, Candidate]:
+    """The effects on a batch (B, C, H, W) with a gradient, forward and backward; the reference comes first."""
+    image = frames.clone().requires_grad_()
+    upstream = torch.rand_like(frames)
+    forward: dict[str, Candidate] = {BARE: references(image)[GRID_SAMPLE]}
+    for name, effect in chosen.items():
+        forward[name] = lambda effect=effect: effect(image)
+
+    def backward(call: Candidate) -> Tensor:
+        return torch.autograd.grad(torch.as_tensor(call()), image, upstream)[0]
+
+    return {name: partial(backward, call) for name, call in forward.items()}
+
+
+def training_steps(frames: Frame, task: Task, scene: Effect, *, encoder: str) -> dict[str, Candidate]:
+    """A step with the pairs made before, and one that makes them."""
+    network = ResUNet(task.channels, encoder=encoder).train()
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4)
+    made = make_pair(frames, scene, seed=SEED)
+    seeds = iter(range(1 << 30))
+
+    def step(on_the_fly: bool) -> Tensor:
+        pair = make_pair(frames, scene, seed=next(seeds)) if on_the_fly else made
+        loss = task.loss(task.restore(network(pair.degraded), pair.degraded), pair)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        return loss
+
+    return {BEFORE: lambda: step(False), FLY: lambda: step(True)}
+
+
+def _save(
+    path: Path,
+    timings: Sequence[Timing],
+    conditions: Conditions,
+    *,
+    bars: Sequence[Bar],
+    trained: Mapping[str, Sequence[Timing]],
+) -> None:
+    content = {
+        "what": WHAT,
+        "conditions": asdict(conditions),
+        "timings": [asdict(timing) for timing in timings],
+        "steps": {name: [asdict(timing) for timing in found] for name, found in trained.items()},
+        "bars": [asdict(bar) | {"holds": bar.holds} for bar in bars],
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--batch", type=count(1), default=16, help="frames at once, 16")
+    parser.add_argument("--size", type=size, default=(256, 256), help="height x width of the frames, 256x256")
+    parser.add_argument("--threads", type=count(1), default=2, help="threads of torch on the CPU, 2")
+    parser.add_argument("--repeats", type=count(FEWEST_REPEATS), default=FEWEST_REPEATS, help="rounds, 15 or more")
+    parser.add_argument("--rounds", type=count(1), default=5, help="of steps, 5")
+    parser.add_argument("--encoder", default="tu-resnet34", help="of the ResUNet, tu-resnet34")
+    out = Path(__file__).parent / "results" / "training.json"
+    parser.add_argument("--out", type=Path, default=out, help="the JSON")
+    return parser
+
+
+if __name__ == "__main__":
+    main()

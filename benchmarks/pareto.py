@@ -75,11 +75,11 @@ def _dress(axes: Axes, title: str, times: Sequence[float]) -> None:
     axes.set(xscale="log", yscale="log")
     middle, half = (max(times) * min(times)) ** 0.5, max((max(times) / min(times)) ** 0.5, 1.5)
     axes.set_xlim(middle / half**1.5, middle * half**1.5)
-    axes.set_ylim(FLOOR / 3, 100)
+    axes.set_ylim(FLOOR / 3, 1000)  # with room for the legend
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_title(title, fontsize=11)
     axes.grid(color="#e4e4e4", linewidth=0.8)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(loc="upper right", frameon=False, fontsize=8)

@@ -146,6 +146,14 @@ def table(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
+def point(row: Row) -> Point:
+    """The row in its panel; an effect that is held against itself is a series of its own, told by the legend alone."""
+    if row.against == ITSELF:
+        return Point("", f"{row.knob} {row.value}", row.ratio, row.mean_levels, row.front)
+    series = row.knob if row.against == DENSE else f"{row.knob}, against {row.against}"
+    return Point(row.value, series, row.ratio, row.mean_levels, row.front)
+
+
 def save(folder: Path, rows: Sequence[Row], conditions: Conditions, *, frames: int) -> None:
     """The rows as CSV and JSON, and their picture; `frames` is how many the errors are over."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -159,10 +167,7 @@ def save(folder: Path, rows: Sequence[Row], conditions: Conditions, *, frames: i
         path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     panels: dict[str, list[Point]] = {}
     for row in rows:
-        joined = row.front and row.against != ITSELF
-        series = row.knob if row.against == DENSE else f"{row.knob}, against {row.against}"
-        point = Point(row.value, series, row.ratio, row.mean_levels, joined)
-        panels.setdefault(row.effect, []).append(point)
+        panels.setdefault(row.effect, []).append(point(row))
     draw(
         folder / "tradeoff.png",
         panels,

@@ -2,6 +2,7 @@ import csv
 import json
 import math
 import sys
+from dataclasses import replace
 from functools import partial
 
 import accuracy
@@ -109,6 +110,14 @@ def test_every_effect_is_there_in_every_tolerance():
         assert effect.tolerance_px == sweeps.TOLERANCES_PX[0]
         assert type(effect) is type(make())
     assert set(subjects.WEATHER) < set(SWEEPS)
+
+
+def test_kinds_are_series_of_their_own_in_the_picture():
+    row = tradeoff.Row("air", "covariance", "gaussian", sweeps.ITSELF, 1.0, 1.0, 1.0, None, None, 0.1, 0.01, 90.0, True)
+    assert tradeoff.point(row)[:2] == ("", "covariance gaussian")
+    within = replace(row, knob="tolerance_px", value="0.1", against=sweeps.DENSE, front=False)
+    assert tradeoff.point(within) == ("0.1", "tolerance_px", 1.0, 0.01, False)
+    assert tradeoff.point(replace(within, against="16 steps")).series == "tolerance_px, against 16 steps"
 
 
 def test_frames_are_cut_to_the_size_and_small_ones_left_out(tmp_path):

@@ -44,7 +44,6 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "memory.json", help="the JSON")
     args = parser.parse_args()
     torch.manual_seed(0)
-    os.environ.setdefault("KINETO_LOG_LEVEL", "9")  # the profiler talks about itself
     try:
         frame = frame_of(args.real, args.size).contiguous()
     except (ValueError, RuntimeError) as error:
@@ -87,6 +86,7 @@ def weather(names: Sequence[str] | dict[str, float]) -> list[str]:
 
 def peak_bytes(call: Callable[[], object]) -> int:
     """The most that a call holds at once; what it returns is among it."""
+    os.environ.setdefault("KINETO_LOG_LEVEL", "9")  # the profiler talks about itself
     call()  # what is kept for later calls is none of this one's
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as run:
         made = call()

@@ -1,16 +1,20 @@
 """What all fogs share: the light of the air, the distance through it, and the blend of both."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
+from torchrefract._bands import join
 from torchrefract._checks import check_all, check_flag, check_number
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.color import check_color, each_channel
 from torchrefract.effects.depth import DepthProvider, LinearDepth
+from torchrefract.effects.light_plan import Blend
+from torchrefract.effects.plan import lies_in
 from torchrefract.effects.rows import spread
 from torchrefract.fields.depth import check_depth, ray_distance
 from torchrefract.fields.fog import linear_to_srgb, srgb_to_linear, veil
@@ -18,9 +22,12 @@ from torchrefract.warping.grid import field_dtype
 
 _PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)
 _REC_709 = (0.2126, 0.7152, 0.0722)
+_GRAY = sum(weight * value for weight, value in zip(_REC_709, _PAPER_AIRLIGHT, strict=True))
+_CACHED = 1 << 18  # values of an image that stay in a core's cache, a few times over
 
 
-@dataclass(frozen=True, kw_only=True)
+# Compared by identity: a depth provider may be of any kind.
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Air:
     """The air between the camera and the scene; fields as the arguments of `UniformFog`, checked."""
 
@@ -38,12 +45,26 @@ class Air:
             raise TypeError(f"camera must be a Camera, got {type(self.camera).__name__}")
         check_flag("linear_light", self.linear_light)
 
+    @property
+    def colors(self) -> tuple[float, ...]:
+        """All numbers that the airlight may have."""
+        return (*_PAPER_AIRLIGHT, _GRAY) if self.airlight is None else tuple(self.airlight)
+
+    @property
+    def blend(self) -> Blend:
+        """What an error of t does to an image."""
+        return Blend(self.colors, self.linear_light)
+
+    def covers(self, airlight: Tensor) -> Tensor:
+        """(), bool: the colors (B, C) lie between those of this air."""
+        ends = (min(self.colors), max(self.colors))
+        return lies_in(airlight, [ends] * airlight.shape[1])
+
     def light(self, image: Tensor, dtype: torch.dtype) -> Tensor:
         """(B, C): the airlight for each image of a batch."""
         batch, channels = image.shape[:2]
         if self.airlight is None:
-            gray = sum(weight * value for weight, value in zip(_REC_709, _PAPER_AIRLIGHT, strict=True))
-            color = _PAPER_AIRLIGHT if channels == 3 else [gray] * channels
+            color = _PAPER_AIRLIGHT if channels == 3 else [_GRAY] * channels
         else:
             color = each_channel("airlight", self.airlight, channels)
         return torch.tensor([color] * batch, dtype=dtype, device=image.device).view(batch, channels)
@@ -62,6 +83,37 @@ class Air:
         camera = self.camera.resized(width=width, height=height)
         return ray_distance(depth, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy, width=width)
 
+    def distance_at(self, squares: Sequence[float], image: Tensor) -> Tensor:
+        """(1, 1, H, n), m, for rows of one depth, where ((column - cx) / fx)^2 is one of n numbers."""
+        dtype, (height, width) = field_dtype(image.dtype), image.shape[2:]
+        camera = cast(Camera, self.camera).resized(width=width, height=height)
+        y = (torch.arange(height, dtype=dtype, device=image.device) - camera.cy) / camera.fy
+        stretch = ((1 + y * y)[:, None] + y.new_tensor(squares)).sqrt()
+        return self.depth(height, width, dtype=dtype, device=image.device) * stretch
+
+    def in_bands(self, image: Tensor, t: Tensor, airlight: Tensor, bands: Sequence[tuple[str, int, int]]) -> Tensor:
+        """As `blended`, of the bands of a plan."""
+        if len(bands) == 1 and bands[0][0] == "computed":
+            return self.blended(image, t, airlight)
+        color = spread(airlight, image.shape[0])[:, :, None, None]
+        learns = torch.is_grad_enabled() and any(value.requires_grad for value in (image, t))
+        few = not learns and image.device.type == "cpu" and not torch.compiler.is_compiling()
+        step = max(1, _CACHED // max(1, image.numel() // image.shape[2])) if few else image.shape[2]
+
+        def parts() -> Iterator[Tensor]:
+            for kind, start, stop in bands:
+                for i in range(start, stop, step) if kind == "computed" else (start,):
+                    end = min(i + step, stop) if kind == "computed" else stop
+                    rows = image[:, :, i:end]
+                    if kind == "computed":
+                        yield self.blended(rows, t[:, :, i:end], airlight)
+                    else:
+                        yield rows if kind == "left" else color.expand_as(rows).to(image.dtype)
+
+        if learns:  # some parts have a slope, and others none
+            return torch.cat(list(parts()), dim=2)
+        return join(parts(), dim=2, length=image.shape[2])
+
     def blended(self, image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
         """I t + A (1 - t), of rows (N, C, H, W), with t and the airlight (B, C) in as many rows or fewer."""
         rows = image.shape[0]
@@ -70,6 +122,28 @@ class Air:
             return veil(image, t, airlight)
         blended = linear_to_srgb(veil(srgb_to_linear(image), t, srgb_to_linear(airlight)))
         return torch.where(t == 1, image, blended)
+
+
+@lru_cache(maxsize=64)
+def distances(air: Air, height: int, width: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """m, of the nearest and of the farthest pixel in each row, by the air's own depth."""
+    found = air.distance(torch.empty(1, 1, height, width, dtype=torch.float64), None)[0, 0]
+    return tuple(found.amin(dim=1).tolist()), tuple(found.amax(dim=1).tolist())
+
+
+@lru_cache(maxsize=64)
+def squares(air: Air, height: int, width: int) -> tuple[float, float, float] | None:
+    """The lowest and the highest ((column - cx) / fx)^2, and the lowest ((row - cy) / fy)^2; None without a camera.
+
+    None, too, for a depth that is not by row.
+    """
+    options: Any = {"dtype": torch.float64, "device": torch.device("cpu")}
+    if air.camera is None or air.depth(height, width, **options).shape[3] != 1:
+        return None
+    camera = air.camera.resized(width=width, height=height)
+    x = ((torch.arange(width, **options) - camera.cx) / camera.fx).square()
+    y = ((torch.arange(height, **options) - camera.cy) / camera.fy).square()
+    return x.min().item(), x.max().item(), y.min().item()
 
 
 def make_air(

@@ -12,14 +12,20 @@ from torchrefract import draws
 from torchrefract._checks import check_all, check_choice, check_flag, check_range
 from torchrefract.effects.base import params_to
 from torchrefract.effects.color import check_color, each_channel
+from torchrefract.effects.flare_plan import FlarePlan, Suns, flare_plan, reach
 from torchrefract.effects.motion import check_frame
-from torchrefract.effects.radiance import RadianceEffect, Shaded
+from torchrefract.effects.plan import lies_in
+from torchrefract.effects.planned_light import PlannedLight
+from torchrefract.effects.radiance import Shaded
 from torchrefract.effects.rows import column, spread
 from torchrefract.fields.flare import flare_axes
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 
 _FARTHEST = 1e4  # widths and heights
+_ROUNDING = 2e-5
+# Of the frame: with more to compute, reading and writing it once more costs more than it saves.
+_CLIPPED, _SCREENED = 1 / 3, 0.6
 
 
 class FlareParams(NamedTuple):
@@ -36,7 +42,7 @@ class FlareParams(NamedTuple):
     to = params_to
 
 
-class LensFlare(RadianceEffect):
+class LensFlare(PlannedLight):
     """The sun shining into the lens: a Gaussian veil of light.
 
         I = clip(I_clean + beta color m, 0, 1),  m = exp(-(d / r)^2 / 2),  r = radius sqrt(W^2 + H^2),  beta = strength
@@ -54,6 +60,8 @@ class LensFlare(RadianceEffect):
         blend: "add" or "screen".
         clip: hold the result of "add" in [0, 1]; without, it is linear in everything.
         drift_x_range, drift_y_range: widths and heights per frame of a clip.
+        tolerance: how far the image may be from the exact one, levels of 1/255, so that only the part of the frame is
+            computed that the flare reaches; see `plan`; None is exact.
         p: chance that a sample is degraded at all.
 
     Raises:
@@ -74,9 +82,10 @@ class LensFlare(RadianceEffect):
         clip: bool = True,
         drift_x_range: Range = (-0.002, 0.002),
         drift_y_range: Range = (0.0, 0.0),
+        tolerance: float | None = None,
         p: float = 1.0,
     ):
-        super().__init__(p=p)
+        super().__init__(tolerance=tolerance, p=p)
         for name, value in {
             "center_x_range": center_x_range,
             "center_y_range": center_y_range,
@@ -119,6 +128,25 @@ class LensFlare(RadianceEffect):
         """The samples with a sun."""
         return (params.radius != 0) & (params.strength != 0)
 
+    def covers(self, params: FlareParams) -> Tensor:
+        """(), bool: all suns lie in the ranges."""
+        names = ("center_x", "center_y", "radius", "strength", "drift_x", "drift_y")
+        values = torch.stack([*params.center.T, params.radius, params.strength, *params.drift.T], dim=1)
+        ends = [(min(self.color), max(self.color))] * params.color.shape[1]
+        return lies_in(values, [getattr(self, f"{name}_range") for name in names]) & lies_in(params.color, ends)
+
+    def planned(self, height: int, width: int, dtype: torch.dtype, *, any_depth: bool = False) -> FlarePlan:
+        """The plan for images of a type, from the ranges alone; depth is nothing to a flare."""
+        suns = Suns(
+            reach(self.center_x_range, self.drift_x_range, width),
+            reach(self.center_y_range, self.drift_y_range, height),
+            radius=self.radius_range[1] * math.hypot(width, height) * (1 + _ROUNDING),
+            strength=self.strength_range[1] * max(self.color) * (1 + _ROUNDING),
+            worth=_SCREENED if self.blend == "screen" else _CLIPPED if self.clip else 0.0,
+            bounded=self.clip or self.blend == "screen",
+        )
+        return flare_plan(suns, height, width, self.tolerance, dtype is torch.float64)
+
     def shade(self, image: Tensor, params: FlareParams, depth: Tensor | None) -> Shaded:
         """The rows in the light of the sun."""
         rows, _, height, width = image.shape
@@ -129,8 +157,19 @@ class LensFlare(RadianceEffect):
         along_x, along_y = flare_axes(center, radius, height=height, width=width)
         along_y = along_y * column(spread(params.strength.to(dtype), rows))
         color = spread(params.color.to(dtype), rows)[:, :, None, None]
+        plan: FlarePlan = self.plan_for(params, image, depth)
+        shone = image
+        if plan.part is None:
+            shone = self._shine(image, along_y * color, along_x)
+        elif plan.acts:
+            top, bottom, left, right = plan.part
+            part = image[:, :, top:bottom, left:right]
+            shone = image.clone()
+            shone[:, :, top:bottom, left:right] = self._shine(
+                part, along_y[:, :, top:bottom] * color, along_x[..., left:right]
+            )
         return Shaded(
-            self._shine(image, along_y * color, along_x),
+            shone,
             valid=lambda: self._valid(image, along_x, along_y * color),
             intensity=lambda: along_y * along_x,
         )

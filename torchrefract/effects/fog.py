@@ -1,7 +1,8 @@
 """Fog of one density."""
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -9,14 +10,19 @@ from torch import Tensor
 from torchrefract import draws
 from torchrefract._checks import check_range
 from torchrefract.cameras.models import Camera
-from torchrefract.effects.air import check_fog_params, make_air
+from torchrefract.effects.air import Air, check_fog_params, distances, make_air, squares
 from torchrefract.effects.base import params_to
 from torchrefract.effects.depth import DepthProvider
-from torchrefract.effects.radiance import RadianceEffect, Shaded
+from torchrefract.effects.fog_plan import FogPlan, Fogs, fog_plan
+from torchrefract.effects.plan import lies_in
+from torchrefract.effects.planned_light import PlannedLight
+from torchrefract.effects.radiance import Shaded
 from torchrefract.effects.rows import alike, column
 from torchrefract.fields.fog import extinction, transmission
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
+
+_ROUNDING = 2e-5
 
 
 class FogParams(NamedTuple):
@@ -30,7 +36,7 @@ class FogParams(NamedTuple):
     to = params_to
 
 
-class UniformFog(RadianceEffect):
+class UniformFog(PlannedLight):
     """Fog of one density, after Koschmieder.
 
         I = I_clean t + A (1 - t),  t = exp(-k d),  k = -ln(threshold) / V (1 + deviation)
@@ -47,6 +53,9 @@ class UniformFog(RadianceEffect):
         depth: what gives d where no depth is passed in; None is `LinearDepth()`, the paper's ramp over the rows.
         camera: of the frames; with it depth is taken along its axis and turned into the distance along each ray.
         linear_light: blend radiance, not stored values (sRGB).
+        tolerance: how far the image may be from the exact one, levels of 1/255, so that rows that are all clear or all
+            fog are left out, and t is a polynomial along the rows of a camera; see `plan`; None is exact. Maps stay
+            exact, and so does fog before a depth that is passed in.
         p: chance that a sample is degraded at all.
 
     Raises:
@@ -66,9 +75,10 @@ class UniformFog(RadianceEffect):
         depth: DepthProvider | None = None,
         camera: Camera | None = None,
         linear_light: bool = False,
+        tolerance: float | None = None,
         p: float = 1.0,
     ):
-        super().__init__(p=p)
+        super().__init__(tolerance=tolerance, p=p)
         self.visibility_range = check_visibility(visibility_range)
         self.deviation_range = check_range("deviation_range", deviation_range, low=-0.999, high=0.999)
         self.air = make_air(
@@ -91,15 +101,82 @@ class UniformFog(RadianceEffect):
         """The samples whose air is not clear."""
         return params.visibility != torch.inf
 
+    def covers(self, params: FogParams) -> Tensor:
+        """(), bool: all fogs lie in the ranges."""
+        return fogs_lie_in(params, extinctions(self), self.air)
+
+    def planned(self, height: int, width: int, dtype: torch.dtype, *, any_depth: bool = False) -> FogPlan:
+        """The plan for images of a type, from the ranges alone; for the depth of the effect, or for any."""
+        fogs = None
+        if self.tolerance is not None and not any_depth:
+            near, far = distances(self.air, height, width)
+            fogs = Fogs(extinctions(self), near, far, squares(self.air, height, width), self.air.blend)
+        return fog_plan(fogs, height, width, self.tolerance, self.air.linear_light, dtype is torch.float64)
+
     def shade(self, image: Tensor, params: FogParams, depth: Tensor | None) -> Shaded:
         """The rows behind the fog."""
         dtype = field_dtype(image.dtype)
-        distance = self.air.distance(image, depth)
-        k = column(extinction(params.visibility.to(dtype), self.air.threshold) * (1 + params.deviation.to(dtype)))
-        k, distance = (k, distance) if distance.shape[0] == 1 else alike(k, distance)
-        t = transmission(distance, k)
-        blended = self.air.blended(image, t, params.airlight.to(dtype))
-        return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
+        k = column(mean_extinction(params, self.air, dtype))
+        plan: FogPlan = self.plan_for(params, image, depth)
+
+        def through(distance: Tensor) -> Tensor:
+            return transmission(distance, k) if distance.shape[0] == 1 else transmission(*alike(distance, k))
+
+        def exact() -> Tensor:
+            return through(self.air.distance(image, depth))
+
+        if not plan.acts:
+            return Shaded(image, valid=lambda: exact() >= 1 / 255, transmission=exact, extinction=k)
+        if plan.nodes is None:
+            t = exact()
+            blended = self.air.in_bands(image, t, params.airlight.to(dtype), plan.bands)
+            return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
+        places, weights = along_columns(self.air, image, plan.nodes)
+        t = through(self.air.distance_at(places, image)) @ weights
+        blended = self.air.in_bands(image, t, params.airlight.to(dtype), plan.bands)
+        return Shaded(blended, valid=lambda: exact() >= 1 / 255, transmission=exact, extinction=k)
+
+
+def extinctions(fog: Any) -> Range:
+    """1/m, of the fogs in the ranges of an effect, with room for rounding."""
+    (near, far), (thin, dense) = fog.visibility_range, fog.deviation_range
+    scale = -math.log(fog.air.threshold)
+    return scale / far * (1 + thin) * (1 - _ROUNDING), scale / near * (1 + dense) * (1 + _ROUNDING)
+
+
+def mean_extinction(params: Any, air: Air, dtype: torch.dtype) -> Tensor:
+    """(B,), 1/m, of fogs with a `visibility` and a `deviation`."""
+    return extinction(params.visibility.to(dtype), air.threshold) * (1 + params.deviation.to(dtype))
+
+
+def fogs_lie_in(params: Any, span: Range, air: Air) -> Tensor:
+    """(), bool: fogs have an extinction in a range, and the light of this air."""
+    k = mean_extinction(params, air, params.visibility.dtype)
+    return lies_in(k[:, None], [span]) & air.covers(params.airlight)
+
+
+def along_columns(air: Air, image: Tensor, count: int) -> tuple[list[float], Tensor]:
+    """Where t is computed in each row, as squares of tangents, and the weights of these, (count, W).
+
+    At the zeros of a Chebyshev polynomial, and with the weights of Lagrange's.
+    """
+    height, width = image.shape[2:]
+    camera = cast(Camera, air.camera).resized(width=width, height=height)
+    options: Any = {"dtype": torch.float64, "device": image.device}
+    # Computed from numbers alone, for compilers, too.
+    low, high = (
+        f(abs(x - camera.cx) / camera.fx for x in (0, width - 1, min(max(round(camera.cx), 0), width - 1))) ** 2
+        for f in (min, max)
+    )
+    zeros = [math.cos(math.pi * (2 * j + 1) / (2 * count)) for j in range(count)]
+    at = ((torch.arange(width, **options) - camera.cx) / camera.fx).square()
+    u = (2 * at - low - high) / max(high - low, 1e-12)
+    weights = []
+    for j in range(count):
+        others = [(u - zero) / (zeros[j] - zero) for i, zero in enumerate(zeros) if i != j]
+        weights.append(math.prod(others, start=torch.ones_like(u)))
+    places = [(low + high) / 2 + zero * (high - low) / 2 for zero in zeros]
+    return places, torch.stack(weights).to(field_dtype(image.dtype))
 
 
 def check_visibility(value: Range) -> Range:

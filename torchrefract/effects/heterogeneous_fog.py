@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,27 +10,33 @@ from torch import Tensor
 from torchrefract import draws
 from torchrefract._checks import check_all, check_choice, check_number, check_positive, check_range
 from torchrefract.cameras.models import Camera
-from torchrefract.effects.air import check_fog_params, make_air
+from torchrefract.effects.air import check_fog_params, distances, make_air
 from torchrefract.effects.base import params_to
 from torchrefract.effects.depth import DepthProvider
-from torchrefract.effects.fog import check_visibility, drawn_visibility, visibility_span
+from torchrefract.effects.drift_plan import DriftPlan, Drifts, drift_plan, space_plan
+from torchrefract.effects.fog import (
+    check_visibility,
+    drawn_visibility,
+    extinctions,
+    fogs_lie_in,
+    mean_extinction,
+    visibility_span,
+)
 from torchrefract.effects.motion import check_decorrelation, check_motion, check_wind, drawn_motion, motion_ranges
-from torchrefract.effects.radiance import RadianceEffect, Shaded
+from torchrefract.effects.plan import lies_in
+from torchrefract.effects.planned_light import PlannedLight
+from torchrefract.effects.radiance import Shaded
 from torchrefract.effects.random_field import check_key
 from torchrefract.effects.rows import column, frame_mean, spread
-from torchrefract.fields.fog import drifting_transmission_, extinction
+from torchrefract.effects.scales import check_scales
+from torchrefract.fields.fog import drifting_transmission_, transmission
 from torchrefract.fields.fog_volume import path_mean
-from torchrefract.fields.perlin import Octave, perlin_noise
+from torchrefract.fields.perlin import Nodes, Octave, perlin_noise
 from torchrefract.fields.perlin import octave as perlin_octave
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
+from torchrefract.warping.lattice import Lattice
 
-# The paper's table of scales, with the weights that go with them.
-_PAPER_SCALES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
-_PAPER_WEIGHTS = (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)
-# Drifts of fog over a road: most of the variance in those as long as a few cars.
-_ROAD_SCALES = (12.0, 24.0, 48.0, 96.0)
-_ROAD_WEIGHTS = (0.2, 0.3, 0.3, 0.2)
 _FOCAL = 0.9  # widths, where no camera is known
 
 
@@ -51,7 +57,7 @@ class HeterogeneousFogParams(NamedTuple):
     to = params_to
 
 
-class HeterogeneousFog(RadianceEffect):
+class HeterogeneousFog(PlannedLight):
     """Fog whose density changes from place to place.
 
         I = I_clean t + A (1 - t),  t = exp(-k d),  k = k0 (1 + deviation) q / <q>,  k0 = -ln(threshold) / V
@@ -79,6 +85,9 @@ class HeterogeneousFog(RadianceEffect):
             seen from the camera: m in space, where a car that goes v m per frame sees -v ahead; px of the reference in
             the image, which has no z.
         decorrelation_range: frames, above 0, inf for fog that only drifts; one over it is drawn uniformly.
+        tolerance: how far the image may be from the exact one, levels of 1/255, so that octaves in the image are left out
+            or known on a coarse lattice only, and fog whose drifts nobody sees is uniform; see `plan`; None is exact.
+            With normalize="image", in space, and where <q> may come near 0, drifts are computed exactly or not at all.
         visibility_range, deviation_range, airlight, threshold, depth, camera, linear_light, p: as for `UniformFog`; the
             rays of space are those of the camera, or of a pinhole of 0.9 widths.
 
@@ -112,16 +121,17 @@ class HeterogeneousFog(RadianceEffect):
         wind_y_range: Range = (0.0, 0.0),
         wind_z_range: Range = (0.0, 0.0),
         decorrelation_range: Range = (60.0, 150.0),
+        tolerance: float | None = None,
         p: float = 1.0,
     ):
-        super().__init__(p=p)
+        super().__init__(tolerance=tolerance, p=p)
         self.mode = check_choice("mode", mode, ("image", "ray"))
         self.visibility_range = check_visibility(visibility_range)
         self.deviation_range = check_range("deviation_range", deviation_range, low=-0.999, high=0.999)
         self.air = make_air(
             airlight=airlight, threshold=threshold, depth=depth, camera=camera, linear_light=linear_light
         )
-        self.scales, self.weights = _check_scales(scales, weights, mode=mode)
+        self.scales, self.weights = check_scales(scales, weights, mode=mode)
         self.scale_unit = check_choice("scale_unit", scale_unit, ("px", "cells"))
         self.reference_width = check_positive("reference_width", reference_width)
         self.normalize = check_choice("normalize", normalize, ("theory", "image"))
@@ -174,28 +184,57 @@ class HeterogeneousFog(RadianceEffect):
         """The samples whose air is not clear."""
         return params.visibility != torch.inf
 
+    def covers(self, params: HeterogeneousFogParams) -> Tensor:
+        """(), bool: all fogs lie in the ranges, and the weights are those of the effect."""
+        weights = params.weights / params.weights.sum(dim=1, keepdim=True)
+        shares = [(share, share) for share in self._shares()]
+        own = lies_in(weights, shares) & lies_in(params.contrast[:, None], [self.contrast_range])
+        return fogs_lie_in(params, extinctions(self), self.air) & own
+
+    def planned(self, height: int, width: int, dtype: torch.dtype, *, any_depth: bool = False) -> DriftPlan:
+        """The plan for images of a type, from the ranges alone; for the depth of the effect, or for any."""
+        farthest = (
+            0.0 if self.tolerance is None else math.inf if any_depth else max(distances(self.air, height, width)[1])
+        )
+        thickness = extinctions(self)[1] * min(farthest, 1e12)
+        periods = tuple(self._periods(width)) if self.mode == "image" else self.scales
+        drifts = Drifts(thickness, periods, self._shares(), self.mean == "image", self.air.blend)
+        if self.mode == "ray" or self.normalize == "image":
+            contrast = self.contrast_range[1] if self.mode == "ray" else None
+            return space_plan(drifts, contrast, height, width, self.tolerance, dtype is torch.float64)
+        return drift_plan(drifts, height, width, self.tolerance, dtype is torch.float64)
+
     def shade(self, image: Tensor, params: HeterogeneousFogParams, depth: Tensor | None) -> Shaded:
         """The rows behind the fog."""
         rows, dtype = image.shape[0], field_dtype(image.dtype)
+        plan: DriftPlan = self.plan_for(params, image, depth)
         distance = self.air.distance(image, depth)
-        mean_k = extinction(params.visibility.to(dtype), self.air.threshold) * (1 + params.deviation.to(dtype))
-        mean_k = column(spread(mean_k, rows))
+        mean_k = column(spread(mean_extinction(params, self.air, dtype), rows))
         distance = spread(distance, rows) if distance.shape[0] > 1 else distance
 
         def field() -> tuple[Tensor, Tensor, Tensor]:
-            noise, share, offset = self._field(params, distance, image)
+            noise, share, offset = self._field(params, distance, image, plan)
             return noise, share * mean_k, offset * mean_k
 
         def k() -> Tensor:
             # Made again for who asks: kept, it would be a third of the image for who does not.
+            if plan.is_uniform:
+                return mean_k
             noise, scale, offset = field()
             return noise * scale + offset
 
-        t = drifting_transmission_(distance, *field())
+        def through() -> Tensor:
+            return transmission(distance, mean_k) if plan.is_uniform else drifting_transmission_(distance, *field())
+
+        if not plan.acts:
+            return Shaded(image, valid=lambda: through() >= 1 / 255, transmission=through, extinction=k)
+        t = through()
         blended = self.air.blended(image, t, params.airlight.to(dtype))
         return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
 
-    def _field(self, params: HeterogeneousFogParams, distance: Tensor, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _field(
+        self, params: HeterogeneousFogParams, distance: Tensor, image: Tensor, plan: DriftPlan
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """A noise n, (N, 1, H, W), a row for each of the image, and a and b, (N, 1, 1, 1), of q / <q> = a n + b."""
         rows, _, height, width = image.shape
         dtype = field_dtype(image.dtype)
@@ -203,21 +242,8 @@ class HeterogeneousFog(RadianceEffect):
         key, weights, contrast, wind, decorrelation = (spread(getattr(params, name), rows) for name in names)
         frame, share = params.frame.reshape(-1), weights.to(dtype) / weights.to(dtype).sum(dim=1, keepdim=True)
         if self.mode == "image":
-            octaves = [
-                perlin_octave(
-                    key,
-                    i,
-                    period=period,
-                    height=height,
-                    width=width,
-                    frame=frame,
-                    wind=wind[:, :2] * (width / self.reference_width),
-                    decorrelation=decorrelation,
-                    dtype=dtype,
-                )
-                for i, period in enumerate(self._periods(width))
-            ]
-            return self._in_image(octaves, share)
+            motion = {"frame": frame, "wind": wind[:, :2] * (width / self.reference_width)}
+            return self._in_image(key, share, motion | {"decorrelation": decorrelation}, plan)
         focal, center = self._pinhole(height, width)
         q = path_mean(
             key,
@@ -237,16 +263,34 @@ class HeterogeneousFog(RadianceEffect):
         )
         return q, self._inverse_mean(q, 1.0), q.new_zeros(1, 1, 1, 1)
 
-    def _in_image(self, octaves: Sequence[Octave], share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _in_image(
+        self, key: Tensor, share: Tensor, motion: dict[str, Tensor], plan: DriftPlan
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """The paper's noise, for weights (N, K) of sum 1."""
+        periods = self._periods(plan.width)
+
+        def made(numbers: Sequence[int], height: int, width: int, **lattice: int) -> list[Octave]:
+            size: Any = {"height": height, "width": width, "dtype": share.dtype, **lattice}
+            return [perlin_octave(key, i, period=periods[i], **size, **motion) for i in numbers]
+
+        octaves = made(plan.fine, plan.height, plan.width)
         if self.normalize == "image":
             parts = [column(w) * _stretched(octave) for octave, w in zip(octaves, share.unbind(1), strict=True)]
             q = sum(parts[1:], parts[0])
             return q, self._inverse_mean(q, 0.5), q.new_zeros(1, 1, 1, 1)
+        nodes = None
+        if plan.coarse:
+            lattice = Lattice(plan.height, plan.width, plan.stride)
+            (rows, columns), stride = lattice.axes, plan.stride
+            known = made(plan.coarse, len(rows), len(columns), stride=stride, start=rows.start)
+            nodes = Nodes(perlin_noise(known, share[:, list(plan.coarse)]), lattice)
         # q = 1/2 + n / sqrt(2), with the noise n.
-        noise = perlin_noise(octaves, share)
+        noise = perlin_noise(octaves, share[:, list(plan.fine)], nodes=nodes)
         mean = 0.5 + frame_mean(noise) / math.sqrt(2) if self.mean == "image" else noise.new_full((1, 1, 1, 1), 0.5)
         return noise, math.sqrt(0.5) / mean, 0.5 / mean
+
+    def _shares(self) -> tuple[float, ...]:
+        return tuple(weight / sum(self.weights) for weight in self.weights)
 
     def _inverse_mean(self, q: Tensor, ensemble: float) -> Tensor:
         return 1 / frame_mean(q) if self.mean == "image" else q.new_full((1, 1, 1, 1), 1 / ensemble)
@@ -263,24 +307,6 @@ class HeterogeneousFog(RadianceEffect):
             return (_FOCAL * width, _FOCAL * width), ((width - 1) / 2, (height - 1) / 2)
         camera = self.air.camera.resized(width=width, height=height)
         return (camera.fx, camera.fy), (camera.cx, camera.cy)
-
-
-def _check_scales(
-    scales: Sequence[float] | None, weights: Sequence[float] | None, *, mode: str
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    paper = mode == "image"
-    if scales is None:
-        scales = _PAPER_SCALES if paper else _ROAD_SCALES
-        weights = (_PAPER_WEIGHTS if paper else _ROAD_WEIGHTS) if weights is None else weights
-    scales = tuple(check_positive("scales", scale) for scale in scales)
-    if not scales:
-        raise ValueError("scales must be at least one number above 0, got none")
-    if weights is None or len(weights) != len(scales):
-        raise ValueError(f"weights must be one number for each of {len(scales)} scales, got {weights}")
-    weights = tuple(check_number("weights", weight, low=0.0) for weight in weights)
-    if sum(weights) <= 0:
-        raise ValueError(f"weights must have a sum above 0, got {weights}")
-    return scales, weights
 
 
 def _stretched(octave: Octave) -> Tensor:

@@ -12,7 +12,7 @@ from torchrefract._checks import check_count, check_number
 from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice
 
-_SMALLEST, _LARGEST = 1e-6, 64.0  # px
+_SMALLEST, _LARGEST = 1e-6, 64.0  # px, or levels
 # Positions in float32 are off by so many units of the last place of the longer side.
 _ROUNDING = {False: 16 * 2.0**-24, True: 16 * 2.0**-53}
 # Px between nodes, from fine to coarse.
@@ -122,9 +122,9 @@ class Plan:
         return "\n".join(lines)
 
 
-def check_tolerance(value: float | None) -> float | None:
-    """A tolerance in px, or None."""
-    return None if value is None else check_number("tolerance_px", value, low=_SMALLEST, high=_LARGEST)
+def check_tolerance(value: float | None, *, name: str = "tolerance_px") -> float | None:
+    """A tolerance in px, or in levels of light, or None."""
+    return None if value is None else check_number(name, value, low=_SMALLEST, high=_LARGEST)
 
 
 def check_size(height: int, width: int) -> None:

@@ -57,7 +57,7 @@ class RadianceEffect(Effect):
             return lambda: where_active(value() if callable(value) else value, _CLEAR[name])
 
         return Degraded(
-            only(shaded.image, image, active, params),
+            image if shaded.image is image else only(shaded.image, image, active, params),
             params,
             valid=lambda: where_active(shaded.valid(), True),
             light={name: value for name in _CLEAR if (value := gated(name)) is not None},

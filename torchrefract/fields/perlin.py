@@ -1,7 +1,8 @@
 """Perlin's gradient noise in the plane, on lattices that drift and turn from frame to frame."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import torch
@@ -9,12 +10,13 @@ from torch import Tensor
 
 from torchrefract._bands import join
 from torchrefract._checks import is_true
+from torchrefract.warping.lattice import Lattice, along_rows, row_weights
 from torchrefract.white_noise import lattice
 
 # Multiples of the golden ratio stay away from each other, modulo 1: octaves share no lines of nodes.
 _GOLDEN = (5**0.5 - 1) / 2
 # Pixels that are made of the same nodes: as many rows, and up to so many columns.
-_BAND = 24
+BAND = 24
 _STRIPE = 128
 _AT_ONCE = 4  # bands, whose nodes stay in a core's cache
 
@@ -38,11 +40,13 @@ def octave(
     wind: Tensor,
     decorrelation: Tensor,
     dtype: torch.dtype,
+    stride: int = 1,
+    start: int = 0,
 ) -> Octave:
     """One octave at one frame of a clip: unit gradients that turn, at nodes that go with the wind.
 
         g = (cos a, sin a),  a = 2 pi u1 + omega t,  omega = 2 erfinv(2 u2 - 1) / decorrelation
-        x = (column + 1/2 - wind_x t) / period + phase_x - column of the first node,  y likewise
+        x = (start + stride column + 1/2 - wind_x t) / period + phase_x - column of the first node,  y likewise
         phase = frac(key / 2^32 + (index + 1) (sqrt(5) - 1) / 2)
 
     u1 and u2 are uniform, a hash of the node's place in an endless lattice. omega is normal, so what goes with the wind
@@ -52,27 +56,36 @@ def octave(
         key: (N, 4), int64, of `noise_key`.
         index: of the octave; octaves of different indices are independent.
         period: px, above 0, between two nodes.
-        height, width: of the frame, px.
+        height, width: rows and columns, px of the frame or nodes of a lattice.
         frame: (N,), t.
         wind: (N, 2), px per frame, to the right and down.
         decorrelation: (N,), frames, above 0; inf for gradients that stay.
         dtype: of the gradients.
+        stride, start: px, between rows or columns, and of the first of them.
 
     Source: Perlin and Neyret, "Flow noise", SIGGRAPH 2001, technical sketches, for the turning.
     """
     phase = (2.0**-32 * key[:, :2].double() + (index + 1) * _GOLDEN).frac()
-    origin = (0.5 - wind.double() * frame.double()[:, None]) / period + phase
+    origin = (start + 0.5 - wind.double() * frame.double()[:, None]) / period + phase
     first = origin.detach().floor()
     places, nodes = [], [torch.full((len(key), 1), index, device=key.device)]
     for size, place, node in zip((width, height), (origin - first).unbind(1), first.long().unbind(1), strict=True):
-        places.append(place[:, None] + torch.arange(size, dtype=torch.float64, device=key.device) / period)
-        nodes.append(node[:, None] + torch.arange(math.ceil(size / period) + 2, device=key.device))
+        along = torch.arange(size, dtype=torch.float64, device=key.device)
+        places.append(place[:, None] + along * stride / period)
+        nodes.append(node[:, None] + torch.arange(math.ceil(size * stride / period) + 2, device=key.device))
     angle = 2 * math.pi * _turns(key, nodes, frame=frame, decorrelation=decorrelation, dtype=dtype)
     # In memory column by column, as `perlin_noise` looks them up.
     return Octave(torch.stack([angle.cos(), angle.sin()], dim=1).mT, *places)
 
 
-def perlin_noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
+class Nodes(NamedTuple):
+    """A part of the noise that is known at the nodes of a lattice."""
+
+    value: Tensor  # (N, 1, n, m)
+    lattice: Lattice  # with one node before the frame
+
+
+def perlin_noise(octaves: Sequence[Octave], weights: Tensor, *, nodes: Nodes | None = None) -> Tensor:
     """(N, 1, H, W), the sum of the noises of octaves of one frame, each times its weight.
 
         noise = sum over the 4 nodes around (x, y) of h(p) h(q) (g_x p + g_y q),  (p, q) = (x, y) - node,
@@ -81,13 +94,14 @@ def perlin_noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
     It is 0 at the nodes, with the gradient g, has two continuous derivatives, and is at most sqrt(1/2).
 
     Args:
-        octaves: at least one.
+        octaves: at least one, or none where there are nodes.
         weights: (N, octaves).
+        nodes: what else is added, cubics between them.
 
     Source: Perlin, "Improving noise", SIGGRAPH 2002.
     """
     with torch.autocast(weights.device.type, enabled=False):  # it would round the products of matrices
-        return _by_sample(_noise, octaves, weights).unsqueeze(1)
+        return _by_sample(_noise, octaves, weights, nodes).unsqueeze(1)
 
 
 class _Beside(NamedTuple):
@@ -115,31 +129,44 @@ def _turns(key: Tensor, nodes: Sequence[Tensor], *, frame: Tensor, decorrelation
     return start.to(dtype) + ((2 * speed - 1).double().erfinv() * elapsed).frac().to(dtype)
 
 
-def _by_sample(function: Callable[..., Tensor], octaves: Sequence[Octave], weights: Tensor) -> Tensor:
-    weights = weights.to(octaves[0].gradient.dtype)
+def _by_sample(
+    function: Callable[..., Tensor], octaves: Sequence[Octave], weights: Tensor, nodes: Nodes | None
+) -> Tensor:
+    weights = weights.to(octaves[0].gradient.dtype if nodes is None else nodes.value.dtype)
     if len(weights) < 2 or weights.device.type != "cpu" or torch.compiler.is_compiling():
-        return function(octaves, weights)
+        return function(octaves, weights, nodes)
+
+    def alone(i: int) -> Tensor:
+        mine = None if nodes is None else nodes._replace(value=nodes.value[i : i + 1])
+        return function([Octave(*(part[i : i + 1] for part in each)) for each in octaves], weights[i : i + 1], mine)
+
     # Sums of several samples at once might round in another way than those of one.
-    parts = (
-        function([Octave(*(part[i : i + 1] for part in each)) for each in octaves], weights[i : i + 1])
-        for i in range(len(weights))
-    )
+    parts = (alone(i) for i in range(len(weights)))
     return join(parts, dim=0, length=len(weights))
 
 
-def _noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
+class _Lines(NamedTuple):
+    """What bands of pixels are made of: lines as wide as a stripe of pixels, and their weights."""
+
+    parts: Iterable[Tensor]  # of the table, (lines, stripe)
+    count: int  # lines in all parts
+    index: Tensor  # (N bands, terms stripes), of the lines that a band needs
+    weight: Tensor  # (N bands, rows of a band, terms)
+
+
+def _noise(octaves: Sequence[Octave], weights: Tensor, nodes: Nodes | None) -> Tensor:
     """(N, H, W), by two products of matrices for each octave: first along the rows of nodes, then across them."""
-    batch, height, width = len(weights), octaves[0].y.shape[1], octaves[0].x.shape[1]
+    batch, (height, width) = len(weights), _frame(octaves, nodes)
     if 0 in (batch, height, width):
         return weights.new_zeros(batch, height, width)
     y_counts, x_counts = _sizes(octaves, 2), _sizes(octaves, 3)
-    y = _blocks(_rows(octaves), y_counts, size=_short(min(_BAND, height), y_counts, height), dtype=weights.dtype)
-    x = _blocks(_columns(octaves), x_counts, size=_short(_stripe(width), x_counts, width), dtype=weights.dtype)
-    parts = zip(octaves, x.node.split(x.counts, dim=2), x.weight.split(x.counts, dim=3), strict=True)
-    lines = [2 * batch * x.node.shape[1] * m for m in y_counts]
-    table = join((_lines(each.gradient, *beside) for each, *beside in parts), dim=0, length=sum(lines))
-    index = _line_numbers(y, lines=lines, stripes=x.node.shape[1])
-    down = (y.weight * _spread(weights, y.counts)[:, None, None, :, None]).movedim(1, 2).flatten(2, 3).flatten(0, 1).mT
+    band, stripe = _short(min(BAND, height), y_counts, height), _short(_stripe(width), x_counts, width)
+    found = [_of_octaves(octaves, weights, band=band, stripe=stripe)] if octaves else []
+    found += [] if nodes is None else [_of_nodes(nodes, band=band, stripe=stripe)]
+    table = join(chain(*(each.parts for each in found)), dim=0, length=sum(each.count for each in found))
+    index, down = found[0].index, found[0].weight
+    for each in found[1:]:
+        index, down = torch.cat([index, found[0].count + each.index], dim=1), torch.cat([down, each.weight], dim=2)
     # A gradient costs one of the whole table each time that bands are looked up in it.
     few = weights.device.type == "cpu" and not torch.compiler.is_compiling() and not _has_slope(table)
     at_once = _AT_ONCE if few else len(down)
@@ -149,6 +176,40 @@ def _noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
     )
     image = join(bands, dim=0, length=len(down))
     return image.view(batch, -1, image.shape[2])[:, :height, :width].contiguous()
+
+
+def _of_octaves(octaves: Sequence[Octave], weights: Tensor, *, band: int, stripe: int) -> _Lines:
+    y = _blocks(_rows(octaves), _sizes(octaves, 2), size=band, dtype=weights.dtype)
+    x = _blocks(_columns(octaves), _sizes(octaves, 3), size=stripe, dtype=weights.dtype)
+    parts = zip(octaves, x.node.split(x.counts, dim=2), x.weight.split(x.counts, dim=3), strict=True)
+    lines = [2 * len(weights) * x.node.shape[1] * m for m in _sizes(octaves, 2)]
+    index = _line_numbers(y, lines=lines, stripes=x.node.shape[1])
+    down = (y.weight * _spread(weights, y.counts)[:, None, None, :, None]).movedim(1, 2).flatten(2, 3).flatten(0, 1).mT
+    return _Lines((_lines(each.gradient, *beside) for each, *beside in parts), sum(lines), index, down)
+
+
+def _of_nodes(nodes: Nodes, *, band: int, stripe: int) -> _Lines:
+    """Lines through all rows of nodes, and cubics between these."""
+    batch, _, rows, _ = nodes.value.shape
+    lattice, device = nodes.lattice, nodes.value.device
+    across = along_rows(nodes.value, lattice)[:, 0]
+    stripes, bands = -(-lattice.width // stripe), -(-lattice.height // band)
+    table = _padded(across, stripes * stripe).view(-1, stripe)
+    # So many rows of nodes suffice for any band.
+    terms = min(rows, (band + lattice.stride - 2) // lattice.stride + 4)
+    first = (torch.arange(bands, device=device) * band // lattice.stride).clamp(max=rows - terms)
+    own = first[:, None] + torch.arange(terms, device=device)
+    weight = _padded(row_weights(nodes.value, lattice).mT, bands * band).mT.view(bands, band, rows)
+    weight = weight.gather(2, own[:, None].expand(-1, band, -1)).expand(batch, -1, -1, -1).flatten(0, 1)
+    line = torch.arange(batch, device=device).view(-1, 1, 1, 1) * rows + own[..., None]
+    index = (line * stripes + torch.arange(stripes, device=device)).flatten(0, 1).flatten(1)
+    return _Lines([table], len(table), index, weight)
+
+
+def _frame(octaves: Sequence[Octave], nodes: Nodes | None) -> tuple[int, int]:
+    if nodes is None:
+        return octaves[0].y.shape[1], octaves[0].x.shape[1]
+    return nodes.lattice.height, nodes.lattice.width
 
 
 def _lines(gradient: Tensor, nodes: Tensor, across: Tensor) -> Tensor:
@@ -227,7 +288,7 @@ def _padded(values: Tensor, length: int) -> Tensor:
 
 def _short(size: int, counts: Sequence[int], length: int) -> int:
     """A size of blocks for which no product has so many terms that threads share them, and round in another way."""
-    return max(1, min(size, size * length // max(counts)))
+    return max(1, min(size, size * length // max(counts, default=1)))
 
 
 def _stripe(width: int) -> int:

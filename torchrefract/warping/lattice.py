@@ -63,6 +63,17 @@ def between_nodes(nodes: Tensor, lattice: Lattice) -> Tensor:
     return _down(_across(nodes, weight, lattice.width), weight, lattice.height)
 
 
+def along_rows(nodes: Tensor, lattice: Lattice) -> Tensor:
+    """(B, C, n, W), the field of `between_nodes` in the rows of nodes, at every column of pixels."""
+    return _across(nodes, lagrange_weights(lattice.stride, 4, dtype=nodes.dtype, device=nodes.device), lattice.width)
+
+
+def row_weights(like: Tensor, lattice: Lattice) -> Tensor:
+    """(H, n), of the rows of nodes for each row of pixels, in the type of a tensor."""
+    weight = lagrange_weights(lattice.stride, 4, dtype=like.dtype, device=like.device)
+    return _matrix(weight, len(lattice.axes[0]), lattice.height)
+
+
 def lagrange_weights(stride: int, count: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
     """(stride, count): weights of `count` nodes, an even number, for the pixels at 0, 1 / stride, 2 / stride ...
 

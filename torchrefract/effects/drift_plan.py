@@ -1,0 +1,247 @@
+"""What fog in drifts will compute under a tolerance: fewer octaves, and the long ones of them on a lattice.
+
+With q = 1/2 + n / sqrt(2) and m = <q> fog is t = exp(-x r), x = k0 (1 + deviation) d, r = q / m. Another noise n + e has
+another mean, m + f, and r changes by
+
+    |r' - r| = |e' - r f'| / (m + f'),  e' = e / sqrt(2),  f' = <e> / sqrt(2)
+    |t' - t| <= exp(-x r_low) (1 - exp(-x |e'| / m_low)) + |f'| / m_low max over y of y exp(-y)
+
+where r_low is the smaller of q / m and (q + e') / m, at least 0. e and n are sub-Gaussian, see `perlin_bounds`: they lie
+in the ellipse of their variances and their covariance, `_SIGMAS` deviations wide, at a pixel, and means likewise; e is
+also bounded. Over that ellipse and over all x up to that of the farthest pixel the bound is looked for.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import NamedTuple
+
+import numpy as np
+
+from torchrefract.effects.light_plan import Blend, LightPlan, check_level_reachable, whole
+from torchrefract.effects.plan import STRIDES
+from torchrefract.fields.perlin import BAND
+from torchrefract.fields.perlin3d import VARIANCE as VARIANCE_IN_SPACE
+from torchrefract.fields.perlin_bounds import LARGEST, VARIANCE, Error, error_between, error_without, mean_variance
+
+_SIGMAS = 7.0
+_MARGIN = 1.05  # for what lies between the x and the places that are looked at
+# A mean nearer to zero than this has no bound of its own.
+_LEAST_MEAN = 0.1
+# Fewer products than this of all are worth a step more.
+_WORTH = 0.95
+# Of noise in space, in the middle of a cell: half its diagonal.
+_LARGEST_IN_SPACE = math.sqrt(0.75)
+_HALF = math.sqrt(0.5)  # of q over that of n
+
+
+@dataclass(frozen=True)
+class Drifts:
+    """What fog in the image is made of.
+
+    thickness: the largest k0 (1 + deviation) d, inf for a depth that is not known.
+    periods: px, of the octaves.
+    shares: of each in the noise, of sum 1.
+    of_image: <q> is that over the image, else 1/2.
+    """
+
+    thickness: float
+    periods: tuple[float, ...]
+    shares: tuple[float, ...]
+    of_image: bool
+    blend: Blend
+
+
+@dataclass(frozen=True)
+class DriftPlan(LightPlan):
+    """A plan with the octaves that are computed at every pixel, and those on a lattice.
+
+    fine, coarse: their numbers.
+    stride: px, between the nodes of the lattice; 1 is none.
+    """
+
+    fine: tuple[int, ...] = ()
+    coarse: tuple[int, ...] = ()
+    stride: int = 1
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether no drifts are left."""
+        return not (self.fine or self.coarse)
+
+
+class _Choice(NamedTuple):
+    fine: tuple[int, ...]
+    coarse: tuple[int, ...]
+    stride: int
+    error: float
+
+
+@lru_cache(maxsize=256)
+def drift_plan(drifts: Drifts, height: int, width: int, tolerance: float | None, double: bool) -> DriftPlan:
+    """The plan for frames of a size, in float64 or in float32."""
+    octaves = tuple(range(len(drifts.periods)))
+
+    def plan(error: float, why: str, choice: _Choice | None = None) -> DriftPlan:
+        fine, coarse, stride = (octaves, (), 1) if choice is None else choice[:3]
+        kept = tuple(_name(drifts, i) for i in octaves if i in (*fine, *coarse))
+        dropped = tuple(
+            (_name(drifts, i), _error(drifts, {i: None}, height, width)) for i in octaves if i not in (*fine, *coarse)
+        )
+        details = [("on a lattice", ", ".join(_name(drifts, i) for i in coarse) + f", every {stride} px")]
+        return DriftPlan(
+            height, width, tolerance, error, why, whole("computed", height), kept, dropped,
+            details=tuple(details) if coarse else (), fine=fine, coarse=coarse, stride=stride,
+        )  # fmt: skip
+
+    if tolerance is None:
+        return plan(0.0, "no tolerance")
+    room = check_level_reachable(tolerance, linear=drifts.blend.linear, double=double)
+    least = _lowest_mean(drifts, height, width)
+    if least >= _LEAST_MEAN and (seen := _whole(drifts, 1 / least)) <= room:
+        dropped = (("fog", seen),)
+        left = whole("left", height)
+        return DriftPlan(height, width, tolerance, seen, "it is too thin", left, dropped=dropped, fine=octaves)
+    if least < _LEAST_MEAN:
+        return plan(0.0, "the mean over the frame may come near 0")
+    best = min(_choices(drifts, height, width, room), key=lambda choice: _work(drifts, choice, height), default=None)
+    everything = _work(drifts, _Choice(octaves, (), 1, 0.0), height)
+    if best is None or _work(drifts, best, height) > _WORTH * everything:
+        return plan(0.0, "no octave can be left out or made coarser")
+    return plan(best.error + tolerance - room, "what octaves can move", best)
+
+
+@lru_cache(maxsize=256)
+def space_plan(
+    drifts: Drifts, contrast: float | None, height: int, width: int, tolerance: float | None, double: bool
+) -> DriftPlan:
+    """That of fog whose drifts are computed exactly or not at all.
+
+    In space q = exp(c g - c^2 / 2) with |g| <= G, so that q / <q> is between exp(-2 c G) and exp(2 c G), or, of the
+    ensemble, between exp(-c G - c^2 / 2) and exp(c G), at every point and so along every ray.
+
+    Args:
+        drifts: their periods are of no matter here.
+        contrast: the largest; None is not known.
+        height, width, tolerance, double: of the frame.
+    """
+    octaves = tuple(range(len(drifts.shares)))
+    plan = partial(DriftPlan, height, width, tolerance)
+    computed = whole("computed", height)
+    if tolerance is None:
+        return plan(0.0, "no tolerance", computed, fine=octaves)
+    room = check_level_reachable(tolerance, linear=drifts.blend.linear, double=double)
+    if contrast is None:
+        return plan(0.0, "each noise is stretched to its extremes", computed, fine=octaves)
+    root = math.sqrt(VARIANCE_IN_SPACE * sum(share**2 for share in drifts.shares))
+    most = contrast * min(_SIGMAS, _LARGEST_IN_SPACE * sum(drifts.shares) / root)
+    low, high = (-2 * most, 2 * most) if drifts.of_image else (-most - contrast**2 / 2, most)
+    if (seen := _whole(drifts, math.exp(high))) <= room:
+        left = whole("left", height)
+        return plan(seen, "it is too thin", left, dropped=(("fog", seen),), fine=octaves)
+    x = np.geomspace(1e-4, 1, 200) * min(drifts.thickness, 1e5)
+    uniform = np.exp(-x)
+    ends = [np.exp(-x * math.exp(end)) for end in (low, high)]
+    moved = _MARGIN * max(float((abs(t - uniform) * drifts.blend.slope(np.maximum(t, uniform))).max()) for t in ends)
+    if moved > room:
+        return plan(0.0, "drifts in space have no coarser form with a bound", computed, fine=octaves)
+    return plan(moved + tolerance - room, "its drifts are too faint", computed, dropped=(("drifts", moved),))
+
+
+def _whole(drifts: Drifts, ratio: float) -> float:
+    """Levels, by which the whole fog can move the image, where q / <q> is at most so large."""
+    return float(drifts.blend.left(np.exp(-np.array([drifts.thickness * ratio])))[0])
+
+
+def _choices(drifts: Drifts, height: int, width: int, room: float) -> list[_Choice]:
+    """What keeps the room: so many octaves of the least weight dropped, so many of the longest on the widest lattice."""
+    by_share = sorted(range(len(drifts.shares)), key=lambda i: drifts.shares[i])
+    found = []
+    for dropped in range(len(by_share) + 1):
+        out = dict.fromkeys(by_share[:dropped])
+        error = _error(drifts, out, height, width)
+        if error > room:
+            break
+        kept = sorted(by_share[dropped:], key=lambda i: -drifts.periods[i])
+        found.append(_Choice(tuple(kept), (), 1, error))
+        for coarse in range(1, len(kept) + 1):
+            attempt = _coarsest(drifts, out, kept[:coarse], height, width, room)
+            if attempt is None:
+                break
+            stride, error = attempt
+            found.append(_Choice(tuple(kept[coarse:]), tuple(kept[:coarse]), stride, error))
+    return found
+
+
+def _coarsest(
+    drifts: Drifts, out: dict[int, None], coarse: Sequence[int], height: int, width: int, room: float
+) -> tuple[int, float] | None:
+    """The largest stride, and its error, for octaves on a lattice."""
+    found, low, high = None, 0, sum(stride <= min(drifts.periods[i] for i in coarse) for stride in STRIDES)
+    while low < high:
+        middle = (low + high) // 2
+        error = _error(drifts, out | dict.fromkeys(coarse, STRIDES[middle]), height, width)
+        found, low, high = ((STRIDES[middle], error), middle + 1, high) if error <= room else (found, low, middle)
+    return found
+
+
+def _work(drifts: Drifts, choice: _Choice, height: int) -> float:
+    """Multiplications for each pixel; see `perlin_noise`."""
+    band = min(BAND, height)
+    lines = sum(2 * (math.ceil((band - 1) / drifts.periods[i]) + 2) for i in choice.fine)
+    if choice.coarse:
+        lines += (band + choice.stride - 2) // choice.stride + 4 + 8 * len(choice.coarse) / choice.stride**2
+    return lines
+
+
+def _error(drifts: Drifts, changed: dict[int, int | None], height: int, width: int) -> float:
+    """Levels, by which the image can be off where octaves are dropped (None) or known every so many px."""
+    if not changed:
+        return 0.0
+    parts = [(drifts.shares[i], _part(drifts.periods[i], stride, height, width)) for i, stride in changed.items()]
+    variance = sum(share**2 * part.variance for share, part in parts)
+    covariance = sum(share**2 * part.covariance for share, part in parts)
+    if variance == 0:
+        return 0.0
+    deviation = math.sqrt(variance)
+    most = min(_SIGMAS, sum(share * part.largest for share, part in parts) / deviation)
+    own = sum(share**2 for share in drifts.shares) * VARIANCE
+    z = np.linspace(0, most, 25)
+    beside = np.sqrt(max(own - covariance**2 / variance, 0.0) * (_SIGMAS**2 - z**2))
+    lowest = 0.5 - _HALF * np.minimum(covariance / deviation * z + beside, LARGEST)
+    off = _HALF * deviation * z
+    mean = _HALF * _SIGMAS * math.sqrt(sum(share**2 * part.mean for share, part in parts)) if drifts.of_image else 0.0
+    least, greatest = _mean_bounds(drifts, height, width)
+    least = least - mean
+    if least <= 0:
+        return math.inf
+    r_low, r_off = np.maximum(lowest - off, 0) / greatest, off / least
+    x = np.geomspace(1e-4, 1, 60) * min(drifts.thickness, 1e5)
+    at = np.exp(-x * r_low[:, None])
+    moved = (at * -np.expm1(-x * r_off[:, None]) * drifts.blend.slope(at)).max()
+    y = np.linspace(0, 1, 60)[1:] * min(1.0, drifts.thickness * greatest / least)
+    moved += mean / least * (y * np.exp(-y) * drifts.blend.slope(np.exp(-y))).max()
+    return _MARGIN * float(moved)
+
+
+def _part(period: float, stride: int | None, height: int, width: int) -> Error:
+    return error_without(period, height, width) if stride is None else error_between(period, stride, height, width)
+
+
+def _lowest_mean(drifts: Drifts, height: int, width: int) -> float:
+    return _mean_bounds(drifts, height, width)[0]
+
+
+def _mean_bounds(drifts: Drifts, height: int, width: int) -> tuple[float, float]:
+    """Of <q>."""
+    if not drifts.of_image:
+        return 0.5, 0.5
+    pairs = zip(drifts.shares, drifts.periods, strict=True)
+    variance = sum(share**2 * mean_variance(period, height, width) for share, period in pairs)
+    off = _HALF * min(_SIGMAS * math.sqrt(variance), LARGEST)
+    return 0.5 - off, 0.5 + off
+
+
+def _name(drifts: Drifts, octave: int) -> str:
+    return f"octave of {drifts.periods[octave]:g} px"

@@ -1,0 +1,111 @@
+"""What fog of one density will compute under a tolerance.
+
+Rows so near that no draw dims them visibly may be left as they are, where that saves more than it costs; rows so far
+that nothing comes through may be filled with the airlight. Along a row, in front of a camera, t is exp(-x sqrt(c + u))
+with u = ((column - cx) / fx)^2, c = 1 + ((row - cy) / fy)^2 and x = k z, a completely monotone function of u: the
+derivatives alternate in sign and are largest where u is smallest. So the polynomial through its values at the n zeros
+of a Chebyshev polynomial over u_low ... u_high is off by
+
+    |error| <= 2 ((u_high - u_low) / 4)^n a_n,  exp(-x sqrt(c + u_low - v)) = sum over n of a_n v^n
+    a_0 = exp(-x s),  a_1 = a_0 x / (2 s),  a_(n+2) = (x^2 a_n + (4 n + 2) (n + 1) a_(n+1)) / (4 s^2 (n + 1) (n + 2))
+
+with s = sqrt(c + u_low); the recurrence is 4 (c - v) f'' - 2 f' = x^2 f, and all a_n fall with c.
+
+Source: the remainder of Chebyshev interpolation; Schilling, Song and Vondracek, "Bernstein functions" (2010), theorem
+3.7, for exp(-x g) of a Bernstein function g such as a root.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from torchrefract.effects.light_plan import Blend, LightPlan, bands_of, check_level_reachable, whole
+
+_MOST_NODES = 8
+_MARGIN = 1.02  # for what lies between the x that are looked at
+_WORTH = 0.05  # of the rows
+
+
+@dataclass(frozen=True)
+class FogPlan(LightPlan):
+    """A plan with the columns at which t is computed in each row.
+
+    nodes: how many; None is each.
+    """
+
+    nodes: int | None = None
+
+
+@dataclass(frozen=True)
+class Fogs:
+    """What fog of one density is made of.
+
+    extinction: 1/m, the lowest and the highest.
+    near, far: m, in each row.
+    squares: of the tangents, along columns, (lowest, highest), and the lowest along rows; None where t is the same in a
+        row, or of no form.
+    """
+
+    extinction: tuple[float, float]
+    near: tuple[float, ...]
+    far: tuple[float, ...]
+    squares: tuple[float, float, float] | None
+    blend: Blend
+
+
+@lru_cache(maxsize=64)
+def fog_plan(
+    fogs: Fogs | None, height: int, width: int, tolerance: float | None, linear: bool, double: bool
+) -> FogPlan:
+    """The plan for frames of a size, in float64 or in float32; None are fogs of any depth."""
+    if tolerance is None:
+        return FogPlan(height, width, None, 0.0, "no tolerance", whole("computed", height))
+    room = check_level_reachable(tolerance, linear=linear, double=double)
+    if fogs is None:
+        return FogPlan(height, width, tolerance, 0.0, "the depth is not known before", whole("computed", height))
+    with np.errstate(invalid="ignore"):  # an infinite depth in clear air
+        near, far = (np.nan_to_num(np.exp(-k * np.minimum(d, 1e12))) for k, d in (
+            (fogs.extinction[0], np.array(fogs.near)), (fogs.extinction[1], np.array(fogs.far)),
+        ))  # fmt: skip
+    left, filled = fogs.blend.left(far), fogs.blend.filled(near)
+    nodes, error = _nodes(fogs, room)
+    # What is neither left nor filled is read and written once: leaving it saves nothing by itself.
+    cheap = not linear and nodes is None and fogs.squares is None and (left > room).any()
+    bands = bands_of((left <= room) & (not cheap), filled <= room)
+    if sum(stop - start for kind, start, stop in bands if kind != "computed") < _WORTH * height:
+        bands = whole("computed", height)
+    moved = {"left": left, "filled": filled, "computed": np.full(height, error)}
+    found = max(float(moved[kind][start:stop].max()) for kind, start, stop in bands)
+    dropped = tuple(
+        (f"fog in rows {start} to {stop - 1}" if kind == "left" else f"the scene in rows {start} to {stop - 1}",
+         float(moved[kind][start:stop].max()))
+        for kind, start, stop in bands if kind != "computed"
+    )  # fmt: skip
+    details = (("columns", f"t at {nodes} of {width} in each row"),) if nodes else ()
+    exact = nodes is None and len(bands) == 1 and bands[0][0] == "computed"
+    why = "every row is seen through fog" if exact else "what fog can move"
+    error = 0.0 if exact else found + tolerance - room
+    return FogPlan(height, width, tolerance, error, why, bands, dropped=dropped, details=details, nodes=nodes)
+
+
+def _nodes(fogs: Fogs, room: float) -> tuple[int | None, float]:
+    """How many columns suffice, and what they leave, levels."""
+    if fogs.squares is None:
+        return None, 0.0
+    low, high, rows = fogs.squares
+    square = 1 + rows + low
+    # Beyond that t is none.
+    most = min(fogs.extinction[1] * max(fogs.far), 1e3)
+    x = np.geomspace(1e-4, 1, 200) * most
+    steepness = fogs.blend.slope(np.exp(-x * math.sqrt(square)))
+    before = np.exp(-x * math.sqrt(square))
+    term = before * x / (2 * math.sqrt(square))
+    for n in range(1, _MOST_NODES + 1):
+        error = _MARGIN * 2 * ((high - low) / 4) ** n * float((term * steepness).max())
+        if error <= room:
+            return n, error
+        following = (x * x * before + (4 * n - 2) * n * term) / (4 * square * n * (n + 1))
+        before, term = term, following
+    return None, 0.0

@@ -1,0 +1,76 @@
+"""Effects of light that compute only what a tolerance asks for."""
+
+from abc import abstractmethod
+from copy import copy
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrefract._checks import is_true
+from torchrefract.effects.light_plan import LightPlan
+from torchrefract.effects.plan import check_size, check_tolerance
+from torchrefract.effects.radiance import RadianceEffect
+from torchrefract.effects.rows import learns
+from torchrefract.warping.grid import field_dtype
+
+
+class PlannedLight(RadianceEffect):
+    """An effect of light with a plan.
+
+    Args:
+        tolerance: how far an image in [0, 1] may be from the exact one, in levels of 1/255, anywhere and for all
+            parameters in the ranges of the effect, see `plan`; None is exact. It counts before the image is rounded to
+            its own type.
+        p: as for every effect.
+    """
+
+    def __init__(self, *, tolerance: float | None = None, p: float = 1.0):
+        super().__init__(p=p)
+        self.tolerance = check_tolerance(tolerance, name="tolerance")
+
+    def plan(self, height: int, width: int, *, dtype: torch.dtype = torch.float32) -> LightPlan:
+        """What the effect does for frames of this size under its tolerance, if no depth is passed in; printed, too.
+
+        Args:
+            height, width: px, of the frame.
+            dtype: of the image.
+
+        Raises:
+            ValueError: a frame without a pixel; a tolerance below the rounding of such images.
+        """
+        check_size(height, width)
+        plan = self.planned(height, width, field_dtype(dtype))
+        print(plan)
+        return plan
+
+    def fitted(self, params: Any) -> "PlannedLight":
+        """The effect itself; an exact one for parameters outside the ranges that its plan is for."""
+        if self.tolerance is None or is_true(lambda: self.covers(params)) is not False:
+            return self
+        return self.exact()
+
+    def exact(self) -> "PlannedLight":
+        """The effect without a tolerance."""
+        exact = copy(self)
+        exact.tolerance = None
+        return exact
+
+    def plan_for(self, params: Any, image: Tensor, depth: Tensor | None) -> Any:
+        """The plan for rows (N, C, H, W); an exact one where a gradient of the parameters is asked for."""
+        effect = self.exact() if self.tolerance is not None and learns(params) else self
+        return _constant(effect, *image.shape[2:], field_dtype(image.dtype), depth is not None)
+
+    @abstractmethod
+    def planned(self, height: int, width: int, dtype: torch.dtype, *, any_depth: bool = False) -> LightPlan:
+        """The plan for images of a type, from the ranges alone; for the depth of the effect, or for any."""
+
+    @abstractmethod
+    def covers(self, params: Any) -> Tensor:
+        """(), bool: all parameters lie in the ranges that the plan is for."""
+
+
+@torch.compiler.assume_constant_result
+def _constant(effect: PlannedLight, height: int, width: int, dtype: torch.dtype, any_depth: bool) -> LightPlan:
+    # Compilers take the plan as it is, and need not follow how it was made.
+    return effect.planned(height, width, dtype, any_depth=any_depth)

@@ -1,0 +1,31 @@
+"""The scales of fog in drifts."""
+
+from collections.abc import Sequence
+
+from torchrefract._checks import check_number, check_positive
+
+# The paper's table of scales, with the weights that go with them.
+_PAPER_SCALES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+_PAPER_WEIGHTS = (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)
+# Drifts of fog over a road: most of the variance in those as long as a few cars.
+_ROAD_SCALES = (12.0, 24.0, 48.0, 96.0)
+_ROAD_WEIGHTS = (0.2, 0.3, 0.3, 0.2)
+
+
+def check_scales(
+    scales: Sequence[float] | None, weights: Sequence[float] | None, *, mode: str
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Scales and as many weights; None are those of the paper in the image, and of a road in space."""
+    paper = mode == "image"
+    if scales is None:
+        scales = _PAPER_SCALES if paper else _ROAD_SCALES
+        weights = (_PAPER_WEIGHTS if paper else _ROAD_WEIGHTS) if weights is None else weights
+    scales = tuple(check_positive("scales", scale) for scale in scales)
+    if not scales:
+        raise ValueError("scales must be at least one number above 0, got none")
+    if weights is None or len(weights) != len(scales):
+        raise ValueError(f"weights must be one number for each of {len(scales)} scales, got {weights}")
+    weights = tuple(check_number("weights", weight, low=0.0) for weight in weights)
+    if sum(weights) <= 0:
+        raise ValueError(f"weights must have a sum above 0, got {weights}")
+    return scales, weights

@@ -1,0 +1,133 @@
+"""How far Perlin noise in the plane can be from what is computed of it.
+
+Whatever is linear in the noise, such as its value at a pixel, what cubics between the nodes of a lattice leave of it
+and its mean over a frame, is a sum of products g . c over the nodes of Perlin's lattice, of independent unit gradients g
+and vectors c that are known. Its variance is sum |c|^2 / 2, and as E exp(x cos a) = I_0(x) <= exp(x^2 / 4) for a uniform
+angle a, it is beyond k deviations with a chance of at most 2 exp(-k^2 / 2), whatever the vectors. It is never beyond
+sum |c|, which is at most sqrt(2 n) deviations for n nodes. Noise is a sum of products of functions of x and of y,
+
+    n = sum over nodes of g_x a(x) h(y) + g_y h(x) a(y),  a(p) = h(p) p
+
+so all variances are products of sums along one axis. Phases are drawn: the largest variance of some phases counts.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from torchrefract.warping.lattice import lagrange_weights
+
+LARGEST = math.sqrt(0.5)
+# Of the noise in the middle of a cell, where it is largest: 4 nodes, h^2 = 1/16, |p|^2 = 1/2.
+VARIANCE = 1 / 16
+_PHASES = 12
+_PLACES = 6  # at most, between two nodes of the lattice
+
+
+class Error(NamedTuple):
+    """What is left of noise of height 1 where it is computed in another way: found - noise."""
+
+    variance: float  # at the worst pixel
+    covariance: float  # of error and noise, at the worst pixel, its size
+    mean: float  # variance of the error of the mean over the frame
+    largest: float  # that it can be at all
+
+
+class _Products(NamedTuple):
+    """Sums along one axis, over the nodes, for each phase and place."""
+
+    h: np.ndarray  # h h
+    a: np.ndarray  # a a
+
+    def variance(self) -> np.ndarray:
+        """(x, y): sum |c|^2 / 2 of the products of every place along x with every place along y."""
+        return (self.a[:, None] * self.h + self.h[:, None] * self.a) / 2
+
+    def of_frame(self, other: "_Products") -> np.ndarray:
+        """The same for this along y and another along x."""
+        return (other.a[:, None] * self.h + other.h[:, None] * self.a) / 2
+
+
+@lru_cache(maxsize=4096)
+def error_between(period: float, stride: int, height: int, width: int) -> Error:
+    """Of cubics between nodes every `stride` px, for noise of a period in px."""
+    noise, found, both = _between(period, stride)
+    variance = (noise.variance() + found.variance() - 2 * both.variance()).max()
+    covariance = np.abs(both.variance() - noise.variance()).max()
+    y, x = (_means(period, size, stride) for size in (height, width))
+    mean = (y[0].of_frame(x[0]) + y[1].of_frame(x[1]) - 2 * y[2].of_frame(x[2])).max()
+    nodes = (math.ceil(3 * stride / period) + 2) ** 2
+    return Error(variance, covariance, max(mean, 0.0), math.sqrt(2 * nodes * variance))
+
+
+@lru_cache(maxsize=4096)
+def error_without(period: float, height: int, width: int) -> Error:
+    """Of no noise at all."""
+    return Error(VARIANCE, VARIANCE, mean_variance(period, height, width), LARGEST)
+
+
+@lru_cache(maxsize=4096)
+def mean_variance(period: float, height: int, width: int) -> float:
+    """Of the mean of the noise over a frame."""
+    y, x = (_means(period, size, 1)[0] for size in (height, width))
+    return float(y.of_frame(x).max())
+
+
+def _between(period: float, stride: int) -> tuple[_Products, _Products, _Products]:
+    """Of noise, of cubics between nodes, and of one times the other; a row for each phase and place."""
+    places = np.unique(np.linspace(0, stride - 1, min(stride, _PLACES)).round().astype(int))
+    cubic = lagrange_weights(stride, 4, dtype=torch.float64, device=torch.device("cpu")).numpy()[places]
+    phase = np.arange(_PHASES)[:, None, None] / _PHASES
+    # Four nodes around the pixel and the pixel itself, in periods from a node of Perlin's lattice.
+    around = np.broadcast_to(stride * np.arange(-1.0, 3.0), (len(places), 4))
+    at = (np.concatenate([around, places[:, None]], axis=1) + stride) / period + phase
+    node = np.arange(math.ceil(3 * stride / period) + 2)
+    h, a = _hat(at[..., None] - node)
+    own = h[:, :, 4], a[:, :, 4]
+    between = tuple(np.einsum("tj,ptjn->ptn", cubic, value[:, :, :4]) for value in (h, a))
+    return _products(own, own), _products(between, between), _products(own, between)
+
+
+def _means(period: float, size: int, stride: int) -> tuple[_Products, _Products, _Products]:
+    """As `_between`, of means over an axis of a frame."""
+    pixels = np.arange(size)
+    cells = -(-size // stride)
+    cubic = lagrange_weights(stride, 4, dtype=torch.float64, device=torch.device("cpu")).numpy()
+    weight = np.zeros(cells + 3)
+    np.add.at(weight, pixels[:, None] // stride + np.arange(4), cubic[pixels % stride])
+    nodes = (np.arange(cells + 3) - 1) * stride
+    phases = np.arange(_PHASES) / _PHASES
+    own = _mean(pixels, np.ones(size), period, phases, size)
+    between = own if stride == 1 else _mean(nodes, weight, period, phases, size)
+    return _products(own, own), _products(between, between), _products(own, between)
+
+
+def _mean(at: np.ndarray, weight: np.ndarray, period: float, phases: np.ndarray, size: int) -> tuple[np.ndarray, ...]:
+    """(phases, nodes), of h and a, the weighted sum over places in px, over the size."""
+    found = []
+    for phase in phases:
+        place = at / period + phase + 3.0 * size / period  # all above 0
+        node = np.floor(place).astype(int)
+        (h0, a0), (h1, a1) = _hat(place - node), _hat(place - node - 1)
+        count = math.ceil(6.0 * size / period) + 6
+        sums = [
+            np.bincount(node, weight * first, count) + np.bincount(node + 1, weight * second, count)
+            for first, second in ((h0, h1), (a0, a1))
+        ]
+        found.append(np.stack(sums) / size)
+    h, a = np.stack(found, axis=1)
+    return h, a
+
+
+def _products(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> _Products:
+    return _Products(*((p * q).sum(axis=-1).ravel() for p, q in zip(one, other, strict=True)))
+
+
+def _hat(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """h and a."""
+    s = np.minimum(np.abs(p), 1)
+    h = 1 - s**3 * (s * (6 * s - 15) + 10)
+    return h, h * p

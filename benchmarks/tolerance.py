@@ -75,7 +75,7 @@ def main() -> None:
 def attempt(name: str, seed: int) -> Trial:
     """One random configuration of an effect."""
     dice = random.Random(f"{name} {seed}")
-    height, width = (round(_log(dice, low, high)) for low, high in zip(SMALLEST, LARGEST, strict=True))
+    height, width = (round(log_uniform(dice, low, high)) for low, high in zip(SMALLEST, LARGEST, strict=True))
     tolerance = dice.choice(TOLERANCES)
     make, arguments = CONFIGURATIONS[name](dice)
     effect, exact = make(tolerance_px=tolerance, **arguments), make(**arguments)
@@ -110,14 +110,14 @@ def _lens(dice: random.Random) -> tuple[type[LatticeWarp], dict[str, Any]]:
             ranges[f"{name}_range"] = _signed(dice, 1e-5, 0.03)
     for axis in "xy":
         ranges[f"center_{axis}_range"] = _signed(dice, 1e-3, 0.1)
-    return LensDistortion, ranges | {"focal_range": _range(dice, 0.4, 4.0), "aspect_range": _range(dice, 0.8, 1.25)}
+    return LensDistortion, ranges | {"focal_range": span(dice, 0.4, 4.0), "aspect_range": span(dice, 0.8, 1.25)}
 
 
 def _plate(dice: random.Random) -> tuple[type[LatticeWarp], dict[str, Any]]:
-    smoothing = (0.0, 0.0) if dice.random() < 0.5 else _range(dice, 1e-6, 1.0)
+    smoothing = (0.0, 0.0) if dice.random() < 0.5 else span(dice, 1e-6, 1.0)
     lattice = (dice.randint(2, 8), dice.randint(2, 8))
     return ThinPlateSpline, {
-        "amplitude_range": _range(dice, 0.01, 30.0),
+        "amplitude_range": span(dice, 0.01, 30.0),
         "lattice": lattice,
         "smoothing_range": smoothing,
     }
@@ -125,17 +125,17 @@ def _plate(dice: random.Random) -> tuple[type[LatticeWarp], dict[str, Any]]:
 
 def _turbulence(dice: random.Random) -> tuple[type[LatticeWarp], dict[str, Any]]:
     return Turbulence, {
-        "amplitude_range": _range(dice, 0.01, 30.0),
-        "length_range": _range(dice, 1.0, 300.0),
-        "aperture_range": _range(dice, 0.01, 10.0),
+        "amplitude_range": span(dice, 0.01, 30.0),
+        "length_range": span(dice, 1.0, 300.0),
+        "aperture_range": span(dice, 0.01, 10.0),
         "covariance": "gaussian",
     }
 
 
 def _swirl(dice: random.Random) -> tuple[type[LatticeWarp], dict[str, Any]]:
     return DivergenceFree, {
-        "amplitude_range": _range(dice, 0.01, 30.0),
-        "length_range": _range(dice, 2.0, 300.0),
+        "amplitude_range": span(dice, 0.01, 30.0),
+        "length_range": span(dice, 2.0, 300.0),
     }
 
 
@@ -147,19 +147,20 @@ CONFIGURATIONS: dict[str, Callable[[random.Random], tuple[type[LatticeWarp], dic
 }
 
 
-def _log(dice: random.Random, low: float, high: float) -> float:
+def log_uniform(dice: random.Random, low: float, high: float) -> float:
+    """A positive number, of uniform logarithm."""
     return math.exp(dice.uniform(math.log(low), math.log(high)))
 
 
-def _range(dice: random.Random, low: float, high: float) -> tuple[float, float]:
+def span(dice: random.Random, low: float, high: float) -> tuple[float, float]:
     """A range of positive numbers: one of them, or up to twice as large at its end."""
-    start = _log(dice, low, high)
+    start = log_uniform(dice, low, high)
     return (start, start) if dice.random() < 0.3 else (start, min(high, start * dice.uniform(1, 2)))
 
 
 def _signed(dice: random.Random, low: float, high: float) -> tuple[float, float]:
     """A range on either side of zero, or round it."""
-    start, end = _range(dice, low, high)
+    start, end = span(dice, low, high)
     return dice.choice(((start, end), (-end, -start), (-end, end)))
 
 

@@ -23,6 +23,7 @@ from torchrefract.warping.grid import field_dtype
 _PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)
 _REC_709 = (0.2126, 0.7152, 0.0722)
 _GRAY = sum(weight * value for weight, value in zip(_REC_709, _PAPER_AIRLIGHT, strict=True))
+_FOCAL = 0.9  # widths, where no camera is known
 _CACHED = 1 << 18  # values of an image that stay in a core's cache, a few times over
 
 
@@ -82,6 +83,13 @@ class Air:
             return depth
         camera = self.camera.resized(width=width, height=height)
         return ray_distance(depth, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy, width=width)
+
+    def pinhole(self, height: int, width: int) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Focal lengths and principal point, px; of a frame in the middle where no camera is known."""
+        if self.camera is None:
+            return (_FOCAL * width, _FOCAL * width), ((width - 1) / 2, (height - 1) / 2)
+        camera = self.camera.resized(width=width, height=height)
+        return (camera.fx, camera.fy), (camera.cx, camera.cy)
 
     def distance_at(self, squares: Sequence[float], image: Tensor) -> Tensor:
         """(1, 1, H, n), m, for rows of one depth, where ((column - cx) / fx)^2 is one of n numbers."""

@@ -1,36 +1,44 @@
 """What fog in drifts will compute under a tolerance: fewer octaves, and the long ones of them on a lattice.
 
-With q = 1/2 + n / sqrt(2) and m = <q> fog is t = exp(-x r), x = k0 (1 + deviation) d, r = q / m. Another noise n + e has
-another mean, m + f, and r changes by
+With q = 1/2 + n / sqrt(2) and m = <q> fog is t = exp(-x r), x = k0 (1 + deviation) d, r = q / m. Another noise n + e
+has another mean, m + f, and r changes by
 
     |r' - r| = |e' - r f'| / (m + f'),  e' = e / sqrt(2),  f' = <e> / sqrt(2)
     |t' - t| <= exp(-x r_low) (1 - exp(-x |e'| / m_low)) + |f'| / m_low max over y of y exp(-y)
 
-where r_low is the smaller of q / m and (q + e') / m, at least 0. e and n are sub-Gaussian, see `perlin_bounds`: they lie
-in the ellipse of their variances and their covariance, `_SIGMAS` deviations wide, at a pixel, and means likewise; e is
-also bounded. Over that ellipse and over all x up to that of the farthest pixel the bound is looked for.
+where r_low is the smaller of q / m and (q + e') / m, at least 0. e and n are sub-Gaussian, see `perlin_bounds`: at a
+pixel they lie in the ellipse of their variances and their covariance, `_SIGMAS` deviations wide, and neither is beyond
+its own `largest_sum`; means likewise. Over that and over all x up to that of the farthest pixel the bound is looked
+for.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
 
-from torchrefract.effects.light_plan import Blend, LightPlan, check_level_reachable, whole
+from torchrefract.effects.light_plan import Blend, LightPlan, check_level_reachable, thicknesses, whole
 from torchrefract.effects.plan import STRIDES
 from torchrefract.fields.perlin import BAND
 from torchrefract.fields.perlin3d import VARIANCE as VARIANCE_IN_SPACE
-from torchrefract.fields.perlin_bounds import LARGEST, VARIANCE, Error, error_between, error_without, mean_variance
+from torchrefract.fields.perlin_bounds import (
+    VARIANCE,
+    Error,
+    error_between,
+    error_without,
+    largest_sum,
+    mean_variance,
+)
 
 _SIGMAS = 7.0
 _MARGIN = 1.05  # for what lies between the x and the places that are looked at
 # A mean nearer to zero than this has no bound of its own.
 _LEAST_MEAN = 0.1
 # Fewer products than this of all are worth a step more.
-_WORTH = 0.95
+_WORTH = 0.97
 # Of noise in space, in the middle of a cell: half its diagonal.
 _LARGEST_IN_SPACE = math.sqrt(0.75)
 _HALF = math.sqrt(0.5)  # of q over that of n
@@ -59,16 +67,17 @@ class DriftPlan(LightPlan):
 
     fine, coarse: their numbers.
     stride: px, between the nodes of the lattice; 1 is none.
+    is_uniform: no drifts are left.
     """
 
     fine: tuple[int, ...] = ()
     coarse: tuple[int, ...] = ()
     stride: int = 1
+    is_uniform: bool = field(init=False)
 
-    @property
-    def is_uniform(self) -> bool:
-        """Whether no drifts are left."""
-        return not (self.fine or self.coarse)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "is_uniform", not (self.fine or self.coarse))
 
 
 class _Choice(NamedTuple):
@@ -140,7 +149,7 @@ def space_plan(
     if (seen := _whole(drifts, math.exp(high))) <= room:
         left = whole("left", height)
         return plan(seen, "it is too thin", left, dropped=(("fog", seen),), fine=octaves)
-    x = np.geomspace(1e-4, 1, 200) * min(drifts.thickness, 1e5)
+    x = thicknesses(drifts.thickness)
     uniform = np.exp(-x)
     ends = [np.exp(-x * math.exp(end)) for end in (low, high)]
     moved = _MARGIN * max(float((abs(t - uniform) * drifts.blend.slope(np.maximum(t, uniform))).max()) for t in ends)
@@ -155,7 +164,7 @@ def _whole(drifts: Drifts, ratio: float) -> float:
 
 
 def _choices(drifts: Drifts, height: int, width: int, room: float) -> list[_Choice]:
-    """What keeps the room: so many octaves of the least weight dropped, so many of the longest on the widest lattice."""
+    """What keeps the room: some octaves of the least weight dropped, some of the longest on the widest lattice."""
     by_share = sorted(range(len(drifts.shares)), key=lambda i: drifts.shares[i])
     found = []
     for dropped in range(len(by_share) + 1):
@@ -205,11 +214,13 @@ def _error(drifts: Drifts, changed: dict[int, int | None], height: int, width: i
     if variance == 0:
         return 0.0
     deviation = math.sqrt(variance)
-    most = min(_SIGMAS, sum(share * part.largest for share, part in parts) / deviation)
+    most = largest_sum([share**2 * part.variance for share, part in parts], [part.nodes for _, part in parts], _SIGMAS)
+    most = min(_SIGMAS, most / deviation)
     own = sum(share**2 for share in drifts.shares) * VARIANCE
     z = np.linspace(0, most, 25)
     beside = np.sqrt(max(own - covariance**2 / variance, 0.0) * (_SIGMAS**2 - z**2))
-    lowest = 0.5 - _HALF * np.minimum(covariance / deviation * z + beside, LARGEST)
+    deepest = largest_sum([VARIANCE * share**2 for share in drifts.shares], [4] * len(drifts.shares), _SIGMAS)
+    lowest = 0.5 - _HALF * np.minimum(covariance / deviation * z + beside, deepest)
     off = _HALF * deviation * z
     mean = _HALF * _SIGMAS * math.sqrt(sum(share**2 * part.mean for share, part in parts)) if drifts.of_image else 0.0
     least, greatest = _mean_bounds(drifts, height, width)
@@ -217,7 +228,7 @@ def _error(drifts: Drifts, changed: dict[int, int | None], height: int, width: i
     if least <= 0:
         return math.inf
     r_low, r_off = np.maximum(lowest - off, 0) / greatest, off / least
-    x = np.geomspace(1e-4, 1, 60) * min(drifts.thickness, 1e5)
+    x = thicknesses(drifts.thickness)
     at = np.exp(-x * r_low[:, None])
     moved = (at * -np.expm1(-x * r_off[:, None]) * drifts.blend.slope(at)).max()
     y = np.linspace(0, 1, 60)[1:] * min(1.0, drifts.thickness * greatest / least)
@@ -239,7 +250,7 @@ def _mean_bounds(drifts: Drifts, height: int, width: int) -> tuple[float, float]
         return 0.5, 0.5
     pairs = zip(drifts.shares, drifts.periods, strict=True)
     variance = sum(share**2 * mean_variance(period, height, width) for share, period in pairs)
-    off = _HALF * min(_SIGMAS * math.sqrt(variance), LARGEST)
+    off = _HALF * min(_SIGMAS * math.sqrt(variance), _HALF)
     return 0.5 - off, 0.5 + off
 
 

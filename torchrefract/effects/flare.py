@@ -138,8 +138,10 @@ class LensFlare(PlannedLight):
     def planned(self, height: int, width: int, dtype: torch.dtype, *, any_depth: bool = False) -> FlarePlan:
         """The plan for images of a type, from the ranges alone; depth is nothing to a flare."""
         suns = Suns(
-            reach(self.center_x_range, self.drift_x_range, width),
-            reach(self.center_y_range, self.drift_y_range, height),
+            *(
+                reach(getattr(self, f"center_{axis}_range"), getattr(self, f"drift_{axis}_range"), size)
+                for axis, size in (("x", width), ("y", height))
+            ),
             radius=self.radius_range[1] * math.hypot(width, height) * (1 + _ROUNDING),
             strength=self.strength_range[1] * max(self.color) * (1 + _ROUNDING),
             worth=_SCREENED if self.blend == "screen" else _CLIPPED if self.clip else 0.0,

@@ -21,7 +21,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from torchrefract.effects.light_plan import Blend, LightPlan, bands_of, check_level_reachable, whole
+from torchrefract.effects.light_plan import Blend, LightPlan, bands_of, check_level_reachable, thicknesses, whole
 
 _MOST_NODES = 8
 _MARGIN = 1.02  # for what lies between the x that are looked at
@@ -96,9 +96,7 @@ def _nodes(fogs: Fogs, room: float) -> tuple[int | None, float]:
         return None, 0.0
     low, high, rows = fogs.squares
     square = 1 + rows + low
-    # Beyond that t is none.
-    most = min(fogs.extinction[1] * max(fogs.far), 1e3)
-    x = np.geomspace(1e-4, 1, 200) * most
+    x = thicknesses(fogs.extinction[1] * min(max(fogs.far), 1e12))
     steepness = fogs.blend.slope(np.exp(-x * math.sqrt(square)))
     before = np.exp(-x * math.sqrt(square))
     term = before * x / (2 * math.sqrt(square))

@@ -28,7 +28,7 @@ from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.radiance import Shaded
 from torchrefract.effects.random_field import check_key
 from torchrefract.effects.rows import column, frame_mean, spread
-from torchrefract.effects.scales import check_scales
+from torchrefract.effects.scales import check_scales, chosen, stretched
 from torchrefract.fields.fog import drifting_transmission_, transmission
 from torchrefract.fields.fog_volume import path_mean
 from torchrefract.fields.perlin import Nodes, Octave, perlin_noise
@@ -36,8 +36,6 @@ from torchrefract.fields.perlin import octave as perlin_octave
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 from torchrefract.warping.lattice import Lattice
-
-_FOCAL = 0.9  # widths, where no camera is known
 
 
 class HeterogeneousFogParams(NamedTuple):
@@ -85,9 +83,10 @@ class HeterogeneousFog(PlannedLight):
             seen from the camera: m in space, where a car that goes v m per frame sees -v ahead; px of the reference in
             the image, which has no z.
         decorrelation_range: frames, above 0, inf for fog that only drifts; one over it is drawn uniformly.
-        tolerance: how far the image may be from the exact one, levels of 1/255, so that octaves in the image are left out
-            or known on a coarse lattice only, and fog whose drifts nobody sees is uniform; see `plan`; None is exact.
-            With normalize="image", in space, and where <q> may come near 0, drifts are computed exactly or not at all.
+        tolerance: how far the image may be from the exact one, levels of 1/255, so that octaves in the image are left
+            out or known on a coarse lattice only, and fog whose drifts nobody sees is uniform; see `plan`; None is
+            exact. In space drifts are computed exactly or not at all; with normalize="image", and where <q> may come
+            near 0, exactly.
         visibility_range, deviation_range, airlight, threshold, depth, camera, linear_light, p: as for `UniformFog`; the
             rays of space are those of the camera, or of a pinhole of 0.9 widths.
 
@@ -242,9 +241,9 @@ class HeterogeneousFog(PlannedLight):
         key, weights, contrast, wind, decorrelation = (spread(getattr(params, name), rows) for name in names)
         frame, share = params.frame.reshape(-1), weights.to(dtype) / weights.to(dtype).sum(dim=1, keepdim=True)
         if self.mode == "image":
-            motion = {"frame": frame, "wind": wind[:, :2] * (width / self.reference_width)}
+            motion: dict[str, Any] = {"frame": frame, "wind": wind[:, :2] * (width / self.reference_width)}
             return self._in_image(key, share, motion | {"decorrelation": decorrelation}, plan)
-        focal, center = self._pinhole(height, width)
+        focal, center = self.air.pinhole(height, width)
         q = path_mean(
             key,
             distance,
@@ -264,7 +263,7 @@ class HeterogeneousFog(PlannedLight):
         return q, self._inverse_mean(q, 1.0), q.new_zeros(1, 1, 1, 1)
 
     def _in_image(
-        self, key: Tensor, share: Tensor, motion: dict[str, Tensor], plan: DriftPlan
+        self, key: Tensor, share: Tensor, motion: dict[str, Any], plan: DriftPlan
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The paper's noise, for weights (N, K) of sum 1."""
         periods = self._periods(plan.width)
@@ -275,17 +274,17 @@ class HeterogeneousFog(PlannedLight):
 
         octaves = made(plan.fine, plan.height, plan.width)
         if self.normalize == "image":
-            parts = [column(w) * _stretched(octave) for octave, w in zip(octaves, share.unbind(1), strict=True)]
+            parts = [column(w) * stretched(octave) for octave, w in zip(octaves, share.unbind(1), strict=True)]
             q = sum(parts[1:], parts[0])
             return q, self._inverse_mean(q, 0.5), q.new_zeros(1, 1, 1, 1)
         nodes = None
         if plan.coarse:
             lattice = Lattice(plan.height, plan.width, plan.stride)
-            (rows, columns), stride = lattice.axes, plan.stride
-            known = made(plan.coarse, len(rows), len(columns), stride=stride, start=rows.start)
-            nodes = Nodes(perlin_noise(known, share[:, list(plan.coarse)]), lattice)
+            rows, columns = lattice.axes
+            known = made(plan.coarse, len(rows), len(columns), stride=rows.step, start=rows.start)
+            nodes = Nodes(perlin_noise(known, chosen(share, plan.coarse)), lattice)
         # q = 1/2 + n / sqrt(2), with the noise n.
-        noise = perlin_noise(octaves, share[:, list(plan.fine)], nodes=nodes)
+        noise = perlin_noise(octaves, chosen(share, plan.fine), nodes=nodes)
         mean = 0.5 + frame_mean(noise) / math.sqrt(2) if self.mean == "image" else noise.new_full((1, 1, 1, 1), 0.5)
         return noise, math.sqrt(0.5) / mean, 0.5 / mean
 
@@ -300,17 +299,3 @@ class HeterogeneousFog(PlannedLight):
         if self.scale_unit == "cells":
             return [width / scale for scale in self.scales]
         return [scale * width / self.reference_width for scale in self.scales]
-
-    def _pinhole(self, height: int, width: int) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Focal lengths and principal point, px."""
-        if self.air.camera is None:
-            return (_FOCAL * width, _FOCAL * width), ((width - 1) / 2, (height - 1) / 2)
-        camera = self.air.camera.resized(width=width, height=height)
-        return (camera.fx, camera.fy), (camera.cx, camera.cy)
-
-
-def _stretched(octave: Octave) -> Tensor:
-    """(N, 1, H, W), the noise from its smallest value in the frame, at 0, to its largest, at 1."""
-    noise = perlin_noise([octave], octave.x.new_ones(octave.x.shape[0], 1))
-    low, high = noise.detach().amin(dim=(2, 3), keepdim=True), noise.detach().amax(dim=(2, 3), keepdim=True)
-    return torch.where(high > low, (noise - low) / torch.where(high > low, high - low, 1), 0.5)

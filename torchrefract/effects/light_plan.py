@@ -1,11 +1,12 @@
 """What an effect that changes light will do for a frame of some size, under a tolerance in levels.
 
-A level is 1/255 of the range of an image in [0, 1]. Where an image in other light is I t + A (1 - t), an error e of t moves
-it by |A - I| e <= max(A, 1 - A) e; in linear light by S' of the darkest that it can be times that, S being the curve of
-sRGB, which is steepest in the dark and concave: two values that are apart by x come out apart by S(x) at most.
+A level is 1/255 of the range of an image in [0, 1]. Where an image in other light is I t + A (1 - t), an error e of t
+moves it by |A - I| e <= max(A, 1 - A) e; in linear light by at most S' of the darkest that it can be times that. S, the
+curve of sRGB, is steepest in the dark and concave: two values that are apart by x come out apart by S(x) at most.
 """
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -27,6 +28,8 @@ class LightPlan:
         or "filled" with the airlight.
     kept: the terms that are computed.
     dropped: those that are not, each with how far it could have moved the image, levels.
+    details: what else is to be printed, by name.
+    acts: any row is another than in the image that came in.
     """
 
     height: int
@@ -38,11 +41,11 @@ class LightPlan:
     kept: tuple[str, ...] = ()
     dropped: tuple[tuple[str, float], ...] = ()
     details: tuple[tuple[str, str], ...] = field(default=(), kw_only=True)
+    acts: bool = field(init=False)
 
-    @property
-    def acts(self) -> bool:
-        """Whether any row is another than in the image that came in."""
-        return any(kind != "left" for kind, _, _ in self.bands)
+    def __post_init__(self) -> None:
+        # Compilers read fields, not properties.
+        object.__setattr__(self, "acts", any(kind != "left" for kind, _, _ in self.bands))
 
     def __str__(self) -> str:
         lines = [
@@ -68,6 +71,13 @@ class LightPlan:
 def whole(kind: str, height: int) -> tuple[tuple[str, int, int], ...]:
     """All rows of one kind."""
     return ((kind, 0, height),)
+
+
+def thicknesses(most: float) -> np.ndarray:
+    """Optical thicknesses up to the largest, close enough to one another to look for the largest of a smooth bound."""
+    # Beyond that nothing of any light is left.
+    most = min(most, 1e5)
+    return np.geomspace(1e-5 * min(most, 1.0), most, 200) if most > 0 else np.zeros(1)
 
 
 def check_level_reachable(tolerance: float, *, linear: bool, double: bool, scale: float = 1.0) -> float:
@@ -96,7 +106,7 @@ def bands_of(left: np.ndarray, filled: np.ndarray) -> tuple[tuple[str, int, int]
     """Rows of one kind after another, from (H,) flags of what may be left and what may be filled."""
     kinds = np.where(left, "left", np.where(filled, "filled", "computed"))
     starts = [0, *(np.flatnonzero(kinds[1:] != kinds[:-1]) + 1).tolist(), len(kinds)]
-    return tuple((str(kinds[start]), start, stop) for start, stop in zip(starts, starts[1:], strict=False))
+    return tuple((str(kinds[start]), start, stop) for start, stop in pairwise(starts))
 
 
 @dataclass(frozen=True)

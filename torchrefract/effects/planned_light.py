@@ -59,7 +59,7 @@ class PlannedLight(RadianceEffect):
     def plan_for(self, params: Any, image: Tensor, depth: Tensor | None) -> Any:
         """The plan for rows (N, C, H, W); an exact one where a gradient of the parameters is asked for."""
         effect = self.exact() if self.tolerance is not None and learns(params) else self
-        return _constant(effect, *image.shape[2:], field_dtype(image.dtype), depth is not None)
+        return _constant(effect, image.shape[2], image.shape[3], field_dtype(image.dtype), depth is not None)
 
     @abstractmethod
     def planned(self, height: int, width: int, dtype: torch.dtype, *, any_depth: bool = False) -> LightPlan:

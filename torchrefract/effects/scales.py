@@ -1,8 +1,12 @@
-"""The scales of fog in drifts."""
+"""The scales of fog in drifts, and its noise at some of them."""
 
 from collections.abc import Sequence
 
+import torch
+from torch import Tensor
+
 from torchrefract._checks import check_number, check_positive
+from torchrefract.fields.perlin import Octave, perlin_noise
 
 # The paper's table of scales, with the weights that go with them.
 _PAPER_SCALES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
@@ -29,3 +33,16 @@ def check_scales(
     if sum(weights) <= 0:
         raise ValueError(f"weights must have a sum above 0, got {weights}")
     return scales, weights
+
+
+def chosen(share: Tensor, octaves: Sequence[int]) -> Tensor:
+    """(N, octaves) of (N, K)."""
+    # A list as an index would make a device wait.
+    return torch.stack([share[:, i] for i in octaves], dim=1) if octaves else share[:, :0]
+
+
+def stretched(octave: Octave) -> Tensor:
+    """(N, 1, H, W), the noise from its smallest value in the frame, at 0, to its largest, at 1."""
+    noise = perlin_noise([octave], octave.x.new_ones(octave.x.shape[0], 1))
+    low, high = noise.detach().amin(dim=(2, 3), keepdim=True), noise.detach().amax(dim=(2, 3), keepdim=True)
+    return torch.where(high > low, (noise - low) / torch.where(high > low, high - low, 1), 0.5)

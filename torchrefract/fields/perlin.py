@@ -149,24 +149,25 @@ class _Lines(NamedTuple):
     """What bands of pixels are made of: lines as wide as a stripe of pixels, and their weights."""
 
     parts: Iterable[Tensor]  # of the table, (lines, stripe)
-    count: int  # lines in all parts
-    index: Tensor  # (N bands, terms stripes), of the lines that a band needs
+    total: int  # lines in all parts
+    needed: Tensor  # (N bands, terms stripes), of the lines that a band needs
     weight: Tensor  # (N bands, rows of a band, terms)
 
 
 def _noise(octaves: Sequence[Octave], weights: Tensor, nodes: Nodes | None) -> Tensor:
     """(N, H, W), by two products of matrices for each octave: first along the rows of nodes, then across them."""
-    batch, (height, width) = len(weights), _frame(octaves, nodes)
+    batch = len(weights)
+    height, width = nodes.lattice[:2] if nodes else (octaves[0].y.shape[1], octaves[0].x.shape[1])
     if 0 in (batch, height, width):
         return weights.new_zeros(batch, height, width)
     y_counts, x_counts = _sizes(octaves, 2), _sizes(octaves, 3)
     band, stripe = _short(min(BAND, height), y_counts, height), _short(_stripe(width), x_counts, width)
     found = [_of_octaves(octaves, weights, band=band, stripe=stripe)] if octaves else []
     found += [] if nodes is None else [_of_nodes(nodes, band=band, stripe=stripe)]
-    table = join(chain(*(each.parts for each in found)), dim=0, length=sum(each.count for each in found))
-    index, down = found[0].index, found[0].weight
+    table = join(chain(*(each.parts for each in found)), dim=0, length=sum(each.total for each in found))
+    index, down = found[0].needed, found[0].weight
     for each in found[1:]:
-        index, down = torch.cat([index, found[0].count + each.index], dim=1), torch.cat([down, each.weight], dim=2)
+        index, down = torch.cat([index, found[0].total + each.needed], dim=1), torch.cat([down, each.weight], dim=2)
     # A gradient costs one of the whole table each time that bands are looked up in it.
     few = weights.device.type == "cpu" and not torch.compiler.is_compiling() and not _has_slope(table)
     at_once = _AT_ONCE if few else len(down)
@@ -194,7 +195,7 @@ def _of_nodes(nodes: Nodes, *, band: int, stripe: int) -> _Lines:
     lattice, device = nodes.lattice, nodes.value.device
     across = along_rows(nodes.value, lattice)[:, 0]
     stripes, bands = -(-lattice.width // stripe), -(-lattice.height // band)
-    table = _padded(across, stripes * stripe).view(-1, stripe)
+    table = _padded(across, stripes * stripe).reshape(-1, stripe)
     # So many rows of nodes suffice for any band.
     terms = min(rows, (band + lattice.stride - 2) // lattice.stride + 4)
     first = (torch.arange(bands, device=device) * band // lattice.stride).clamp(max=rows - terms)
@@ -204,12 +205,6 @@ def _of_nodes(nodes: Nodes, *, band: int, stripe: int) -> _Lines:
     line = torch.arange(batch, device=device).view(-1, 1, 1, 1) * rows + own[..., None]
     index = (line * stripes + torch.arange(stripes, device=device)).flatten(0, 1).flatten(1)
     return _Lines([table], len(table), index, weight)
-
-
-def _frame(octaves: Sequence[Octave], nodes: Nodes | None) -> tuple[int, int]:
-    if nodes is None:
-        return octaves[0].y.shape[1], octaves[0].x.shape[1]
-    return nodes.lattice.height, nodes.lattice.width
 
 
 def _lines(gradient: Tensor, nodes: Tensor, across: Tensor) -> Tensor:

@@ -1,10 +1,10 @@
 """How far Perlin noise in the plane can be from what is computed of it.
 
 Whatever is linear in the noise, such as its value at a pixel, what cubics between the nodes of a lattice leave of it
-and its mean over a frame, is a sum of products g . c over the nodes of Perlin's lattice, of independent unit gradients g
-and vectors c that are known. Its variance is sum |c|^2 / 2, and as E exp(x cos a) = I_0(x) <= exp(x^2 / 4) for a uniform
-angle a, it is beyond k deviations with a chance of at most 2 exp(-k^2 / 2), whatever the vectors. It is never beyond
-sum |c|, which is at most sqrt(2 n) deviations for n nodes. Noise is a sum of products of functions of x and of y,
+and its mean over a frame, is a sum of products g . c over the nodes of Perlin's lattice, of independent unit gradients
+g and vectors c that are known. Its variance is sum |c|^2 / 2, and as E exp(x cos a) = I_0(x) <= exp(x^2 / 4) for a
+uniform angle a, it is beyond k deviations with a chance of at most 2 exp(-k^2 / 2), whatever the vectors. It is never
+beyond sum |c|, which is at most sqrt(2 n) deviations for n nodes. Noise is a sum of products of functions of x and y,
 
     n = sum over nodes of g_x a(x) h(y) + g_y h(x) a(y),  a(p) = h(p) p
 
@@ -12,6 +12,7 @@ so all variances are products of sums along one axis. Phases are drawn: the larg
 """
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -20,7 +21,6 @@ import torch
 
 from torchrefract.warping.lattice import lagrange_weights
 
-LARGEST = math.sqrt(0.5)
 # Of the noise in the middle of a cell, where it is largest: 4 nodes, h^2 = 1/16, |p|^2 = 1/2.
 VARIANCE = 1 / 16
 _PHASES = 12
@@ -33,7 +33,7 @@ class Error(NamedTuple):
     variance: float  # at the worst pixel
     covariance: float  # of error and noise, at the worst pixel, its size
     mean: float  # variance of the error of the mean over the frame
-    largest: float  # that it can be at all
+    nodes: int  # that it depends on
 
 
 class _Products(NamedTuple):
@@ -51,6 +51,29 @@ class _Products(NamedTuple):
         return (other.a[:, None] * self.h + other.h[:, None] * self.a) / 2
 
 
+def largest_sum(variances: Sequence[float], nodes: Sequence[int], sigmas: float) -> float:
+    """What a sum of independent terms, linear in noises, exceeds with a chance of exp(-sigmas^2 / 2) at most.
+
+        min over y of (sigmas^2 / 2 + sum of n ln I_0(y sqrt(2 variance / n))) / y
+
+    It is at most sigmas deviations, and at most sum sqrt(2 n variance), which no term can exceed.
+
+    Args:
+        variances: of the terms.
+        nodes: n, that each depends on.
+
+    Source: Chernoff's bound; ln I_0 of a root is concave, so equally long vectors are the worst.
+    """
+    scale = np.sqrt(2 * np.array(variances) / np.array(nodes))
+    most = float((np.array(nodes) * scale).sum())
+    if most == 0:
+        return 0.0
+    # Beyond 600 the function I_0 has no number.
+    y = np.geomspace(1e-3, 1, 200)[:, None] * (600 / scale.max())
+    logarithm = (np.array(nodes) * np.log(np.i0(y * scale))).sum(axis=1)
+    return min(float(((sigmas**2 / 2 + logarithm) / y[:, 0]).min()), most)
+
+
 @lru_cache(maxsize=4096)
 def error_between(period: float, stride: int, height: int, width: int) -> Error:
     """Of cubics between nodes every `stride` px, for noise of a period in px."""
@@ -60,13 +83,13 @@ def error_between(period: float, stride: int, height: int, width: int) -> Error:
     y, x = (_means(period, size, stride) for size in (height, width))
     mean = (y[0].of_frame(x[0]) + y[1].of_frame(x[1]) - 2 * y[2].of_frame(x[2])).max()
     nodes = (math.ceil(3 * stride / period) + 2) ** 2
-    return Error(variance, covariance, max(mean, 0.0), math.sqrt(2 * nodes * variance))
+    return Error(float(variance), float(covariance), max(float(mean), 0.0), nodes)
 
 
 @lru_cache(maxsize=4096)
 def error_without(period: float, height: int, width: int) -> Error:
     """Of no noise at all."""
-    return Error(VARIANCE, VARIANCE, mean_variance(period, height, width), LARGEST)
+    return Error(VARIANCE, VARIANCE, mean_variance(period, height, width), 4)
 
 
 @lru_cache(maxsize=4096)

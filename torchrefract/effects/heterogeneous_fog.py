@@ -192,9 +192,8 @@ class HeterogeneousFog(PlannedLight):
 
     def planned(self, height: int, width: int, dtype: torch.dtype, *, any_depth: bool = False) -> DriftPlan:
         """The plan for images of a type, from the ranges alone; for the depth of the effect, or for any."""
-        farthest = (
-            0.0 if self.tolerance is None else math.inf if any_depth else max(distances(self.air, height, width)[1])
-        )
+        known = self.tolerance is not None and not any_depth
+        farthest = max(distances(self.air, height, width)[1]) if known else math.inf
         thickness = extinctions(self)[1] * min(farthest, 1e12)
         periods = tuple(self._periods(width)) if self.mode == "image" else self.scales
         drifts = Drifts(thickness, periods, self._shares(), self.mean == "image", self.air.blend)

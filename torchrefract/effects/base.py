@@ -129,6 +129,11 @@ class Effect(nn.Module, ABC):
 
     params_type: type[Any]
 
+    @property
+    def takes_levels(self) -> bool:
+        """Whether `compute` takes the levels of uint8 as they are, not as numbers in [0, 1]."""
+        return False
+
     @abstractmethod
     def draw(self, source: draws.Stream, image: Tensor) -> Any:
         """The parameters of a batch (B, C, H, W), drawn from the streams of its samples; a `frame` among them is 0."""
@@ -139,10 +144,13 @@ class Effect(nn.Module, ABC):
 
     @abstractmethod
     def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
-        """The rows (N, C, H, W), floating, degraded by checked parameters of B samples, of N / B frames each."""
+        """The rows (N, C, H, W), floating, degraded by checked parameters of B samples, of N / B frames each.
+
+        They are uint8 where images are and the effect takes levels.
+        """
 
     def _run(self, image: Tensor, layout: Layout, params: Any, depth: Tensor | None) -> Degraded:
-        rows = enter(image)
+        rows = enter(image, levels=self.takes_levels)
         _check_frames(params, layout)
         fitting = None if depth is None else check_depth_fits(depth, image, layout)
         if torch.is_autocast_enabled(image.device.type):
@@ -151,7 +159,7 @@ class Effect(nn.Module, ABC):
                 result = self.compute(rows, params, fitting)
         else:
             result = self.compute(rows, params, fitting)
-        result.image = leave(result.image, image, untouched=result.image is rows)
+        result.image = leave(result.image, image, rows)
         return result if image.ndim == 4 and not layout.is_clip else result.map(layout.unrolled)
 
     def _uniform(self, source: draws.Stream, ranges: Sequence[Range], image: Tensor) -> tuple[Tensor, Tensor]:

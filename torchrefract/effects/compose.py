@@ -16,7 +16,7 @@ from torchrefract.effects.refraction import WarpEffect
 from torchrefract.effects.walk import Walk
 from torchrefract.types import Degraded
 from torchrefract.warping.grid import field_dtype
-from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS
+from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, RESAMPLERS
 
 
 class ComposeParams(NamedTuple):
@@ -43,7 +43,7 @@ class Compose(Effect):
 
     Args:
         effects: at least one; compositions may be nested.
-        padding, interpolation: of the look-ups; None takes those of the last warp that moves the sample.
+        padding, interpolation, resampler: of the look-ups; None takes those of the last warp that moves the sample.
         tolerance_px: how far the composite of all flows may be from the exact one, px, see `plan`; effects without a
             tolerance of their own stay exact. None composes the flows as each effect computes it. Of compositions
             inside others that of the outermost counts.
@@ -59,6 +59,7 @@ class Compose(Effect):
         *,
         padding: str | None = None,
         interpolation: str | None = None,
+        resampler: str | None = None,
         tolerance_px: float | None = None,
         p: float = 1.0,
     ):
@@ -73,9 +74,15 @@ class Compose(Effect):
         self.interpolation = (
             None if interpolation is None else check_choice("interpolation", interpolation, INTERPOLATIONS)
         )
+        self.resampler = None if resampler is None else check_choice("resampler", resampler, RESAMPLERS)
         self.tolerance_px = check_tolerance(tolerance_px)
 
     params_type = ComposeParams
+
+    @property
+    def takes_levels(self) -> bool:
+        """Whether all its effects do."""
+        return all(effect.takes_levels for effect in self._effects())
 
     def draw(self, source: draws.Stream, image: Tensor) -> ComposeParams:
         """Each effect's draw, from streams of their own."""
@@ -103,7 +110,7 @@ class Compose(Effect):
 
     def compute(self, image: Tensor, params: ComposeParams, depth: Tensor | None) -> Degraded:
         """The batch through all effects."""
-        walk = Walk(image, depth, self.padding, self.interpolation)
+        walk = Walk(image, depth, self.padding, self.interpolation, self.resampler)
         height, width = image.shape[2:]
         plans = _constant(self, height, width, field_dtype(image.dtype)).plans
         for (effect, own), plan in zip(self.leaves(params), plans, strict=True):
@@ -175,7 +182,7 @@ class OneOf(Compose):
     Args:
         effects: to choose from.
         weights: how often each is chosen, relative to one another, above 0; None chooses all alike.
-        padding, interpolation, tolerance_px, p: as for `Compose`.
+        padding, interpolation, resampler, tolerance_px, p: as for `Compose`.
 
     Raises:
         ValueError, TypeError: as for `Compose`; weights that are not one positive number for each effect.
@@ -188,10 +195,12 @@ class OneOf(Compose):
         weights: Sequence[float] | None = None,
         padding: str | None = None,
         interpolation: str | None = None,
+        resampler: str | None = None,
         tolerance_px: float | None = None,
         p: float = 1.0,
     ):
-        super().__init__(effects, padding=padding, interpolation=interpolation, tolerance_px=tolerance_px, p=p)
+        options = {"padding": padding, "interpolation": interpolation, "resampler": resampler}
+        super().__init__(effects, **options, tolerance_px=tolerance_px, p=p)
         weights = [1.0] * len(effects) if weights is None else weights
         if len(weights) != len(effects):
             raise ValueError(f"weights must be one number for each of {len(effects)} effects, got {len(weights)}")

@@ -44,7 +44,7 @@ def remove_fog(
     clean = _clear(foggy, torch.where(valid, t, 1), a, linear_light)
     clean = torch.where(valid & (t < 1), clean, foggy)
     valid = valid.expand(foggy.shape[0], 1, *foggy.shape[2:])
-    return leave(clean, image, untouched=False), layout.unrolled(valid)
+    return leave(clean, image, foggy), layout.unrolled(valid)
 
 
 def _clear(image: Tensor, t: Tensor, airlight: Tensor, linear_light: bool) -> Tensor:

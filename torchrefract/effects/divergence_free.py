@@ -56,8 +56,8 @@ class DivergenceFree(LatticeWarp):
         normalize: "theory" divides by the standard deviation that each component has over all fields, "max" by the
             longest displacement in the frame, "none" by nothing: amplitude is then in px per unit of slope.
         steps: parts that the displacement is followed in.
-        padding, interpolation, tolerance_px, p: as for every warp; Gaussian fields followed in one step, normalized by
-            theory, have a coarser lattice: psi's, so that the divergence stays zero.
+        padding, interpolation, resampler, tolerance_px, p: as for every warp; Gaussian fields followed in one step,
+            normalized by theory, have a coarser lattice: psi's, so that the divergence stays zero.
 
     Raises:
         ValueError: an argument outside its range.
@@ -82,10 +82,13 @@ class DivergenceFree(LatticeWarp):
         steps: int = 1,
         padding: str = "reflection",
         interpolation: str = "bilinear",
+        resampler: str = "auto",
         tolerance_px: float | None = None,
         p: float = 1.0,
     ):
-        super().__init__(padding=padding, interpolation=interpolation, tolerance_px=tolerance_px, p=p)
+        super().__init__(
+            padding=padding, interpolation=interpolation, resampler=resampler, tolerance_px=tolerance_px, p=p
+        )
         self.amplitude_range = check_range("amplitude_range", amplitude_range, low=0.0, high=1e4)
         self.length_range = check_range("length_range", length_range, low=1e-3, high=1e6)
         self.wind_x_range = check_wind("wind_x_range", wind_x_range)

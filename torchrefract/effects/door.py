@@ -79,20 +79,20 @@ def check_depth_fits(depth: Any, image: Tensor, layout: Layout) -> Tensor:
     return depth.reshape(-1, *size)
 
 
-def enter(image: Tensor) -> Tensor:
-    """(N, C, H, W), float32 or float64, in [0, 1]."""
+def enter(image: Tensor, *, levels: bool = False) -> Tensor:
+    """(N, C, H, W), float32 or float64, in [0, 1]; with `levels` uint8 stays as it is."""
     rows = image if image.ndim == 4 else image.reshape(-1, *image.shape[-3:])
     if image.dtype is torch.uint8:
-        return rows.float() / 255
+        return rows if levels else rows.float() / 255
     return rows if image.dtype is torch.float64 else rows.float()
 
 
-def leave(result: Tensor, image: Tensor, *, untouched: bool) -> Tensor:
-    """The result (N, C, H, W) in the shape, type and memory format of the image that came in."""
-    if untouched:
+def leave(result: Tensor, image: Tensor, rows: Tensor) -> Tensor:
+    """The result (N, C, H, W) in the shape, type and memory format of the image that came in as these rows."""
+    if result is rows:
         return image
-    if image.dtype is torch.uint8:
+    if image.dtype is torch.uint8 and result.is_floating_point():
         result = (result * 255).round().clamp(0, 255)
-    last = image.ndim == 4 and is_channels_last(image)
+    last = is_channels_last(rows)
     result = result.to(image.dtype).contiguous(memory_format=torch.channels_last if last else torch.contiguous_format)
     return result if image.ndim == 4 else result.view(image.shape)

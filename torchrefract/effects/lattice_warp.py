@@ -19,7 +19,7 @@ class LatticeWarp(WarpEffect):
     """A warp with a plan.
 
     Args:
-        padding, interpolation, p: as for every warp.
+        padding, interpolation, resampler, p: as for every warp.
         tolerance_px: how far the flow may be from the exact one, px, anywhere and for all parameters in the ranges of
             the effect, so that it can be computed on a coarser lattice, see `plan`; None is exact.
     """
@@ -29,10 +29,11 @@ class LatticeWarp(WarpEffect):
         *,
         padding: str = "zeros",
         interpolation: str = "bilinear",
+        resampler: str = "auto",
         tolerance_px: float | None = None,
         p: float = 1.0,
     ):
-        super().__init__(padding=padding, interpolation=interpolation, p=p)
+        super().__init__(padding=padding, interpolation=interpolation, resampler=resampler, p=p)
         self.tolerance_px = check_tolerance(tolerance_px)
 
     def plan(self, height: int, width: int, *, dtype: torch.dtype = torch.float32) -> Plan:

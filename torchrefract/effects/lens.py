@@ -51,7 +51,7 @@ class LensDistortion(LatticeWarp):
         aspect_range: fy / fx, above 0.
         center_x_range, center_y_range: offset of the principal point from the center of the frame, in widths.
         strict: raise, instead of warning, where the model folds back inside the frame (on the CPU).
-        padding, interpolation, tolerance_px, p: as for every warp.
+        padding, interpolation, resampler, tolerance_px, p: as for every warp.
 
     Raises:
         ValueError: an argument outside its range; a lens that folds inside the frame, if `strict`.
@@ -81,10 +81,13 @@ class LensDistortion(LatticeWarp):
         strict: bool = False,
         padding: str = "zeros",
         interpolation: str = "bilinear",
+        resampler: str = "auto",
         tolerance_px: float | None = None,
         p: float = 1.0,
     ):
-        super().__init__(padding=padding, interpolation=interpolation, tolerance_px=tolerance_px, p=p)
+        super().__init__(
+            padding=padding, interpolation=interpolation, resampler=resampler, tolerance_px=tolerance_px, p=p
+        )
         radial = (k1_range, k2_range, k3_range, k4_range, k5_range, k6_range)
         others = (p1_range, p2_range, s1_range, s2_range, s3_range, s4_range)
         for name, value in zip(POLYNOMIAL12, radial + others, strict=True):

@@ -46,7 +46,7 @@ class Rectification(WarpEffect):
 
     Args:
         camera: of the frames, which may have another size with the same ratio of the sides.
-        padding, interpolation, p: as for every warp.
+        padding, interpolation, resampler, p: as for every warp.
 
     Raises:
         ValueError: a camera whose distortion is no polynomial; frames of another shape than the camera's.
@@ -55,8 +55,16 @@ class Rectification(WarpEffect):
         UserWarning: the model folds back inside the frame (on the CPU): pixels beyond are padded, not valid.
     """
 
-    def __init__(self, camera: Camera, *, padding: str = "zeros", interpolation: str = "bilinear", p: float = 1.0):
-        super().__init__(padding=padding, interpolation=interpolation, p=p)
+    def __init__(
+        self,
+        camera: Camera,
+        *,
+        padding: str = "zeros",
+        interpolation: str = "bilinear",
+        resampler: str = "auto",
+        p: float = 1.0,
+    ):
+        super().__init__(padding=padding, interpolation=interpolation, resampler=resampler, p=p)
         if not isinstance(camera, Camera):
             raise TypeError(f"camera must be a Camera, got {type(camera).__name__}")
         camera.polynomial()

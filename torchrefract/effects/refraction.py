@@ -16,7 +16,7 @@ from torchrefract.warping.grid import field_dtype, inside, length
 from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.jacobian import folding
 from torchrefract.warping.lattice import SmoothFlow, dense
-from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, look_up
+from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, RESAMPLERS, look_up
 
 
 class WarpEffect(Effect):
@@ -25,13 +25,22 @@ class WarpEffect(Effect):
     Args:
         padding: what lies outside the frame: "zeros", "border" or "reflection".
         interpolation: "nearest", "bilinear" or "bicubic".
+        resampler: "auto", "grid_sample" or "opencv", as for `warp`.
         p: chance that a sample is degraded at all.
     """
 
-    def __init__(self, *, padding: str = "zeros", interpolation: str = "bilinear", p: float = 1.0):
+    def __init__(
+        self, *, padding: str = "zeros", interpolation: str = "bilinear", resampler: str = "auto", p: float = 1.0
+    ):
         super().__init__(p=p)
         self.padding = check_choice("padding", padding, PADDINGS)
         self.interpolation = check_choice("interpolation", interpolation, INTERPOLATIONS)
+        self.resampler = check_choice("resampler", resampler, RESAMPLERS)
+
+    @property
+    def takes_levels(self) -> bool:
+        """It does: a look-up rounds what it finds."""
+        return True
 
     @abstractmethod
     def flow(self, params: Any, *, height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -76,7 +85,8 @@ class WarpEffect(Effect):
             return identity(image, params)
         moved = self.gated(params, height=height, width=width)
         path = moved.spread(image.shape[0]).path
-        warped = look_up(image, path, padding=self.padding, interpolation=self.interpolation)
+        options = {"padding": self.padding, "interpolation": self.interpolation, "resampler": self.resampler}
+        warped = look_up(image, path, **options)
         return moving(
             only(warped, image, moved.active, params),
             params,

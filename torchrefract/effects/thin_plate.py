@@ -40,7 +40,7 @@ class ThinPlateSpline(LatticeWarp):
         amplitude_range: px, standard deviation of the displacements, 0 or above.
         lattice: (rows, columns) of control points, each at least 2.
         smoothing_range: 0 goes through the points exactly; larger bends less, in units of the points' rms radius.
-        padding, interpolation, tolerance_px, p: as for every warp; plates with own points are exact.
+        padding, interpolation, resampler, tolerance_px, p: as for every warp; plates with own points are exact.
 
     Raises:
         ValueError: an argument outside its range; points that are fewer than three, the same, or on one line.
@@ -56,10 +56,13 @@ class ThinPlateSpline(LatticeWarp):
         smoothing_range: Range = (0.0, 0.0),
         padding: str = "reflection",
         interpolation: str = "bilinear",
+        resampler: str = "auto",
         tolerance_px: float | None = None,
         p: float = 1.0,
     ):
-        super().__init__(padding=padding, interpolation=interpolation, tolerance_px=tolerance_px, p=p)
+        super().__init__(
+            padding=padding, interpolation=interpolation, resampler=resampler, tolerance_px=tolerance_px, p=p
+        )
         self.amplitude_range = check_range("amplitude_range", amplitude_range, low=0.0, high=1e4)
         rows, columns = lattice
         self.lattice = (check_count("lattice", rows, low=2), check_count("lattice", columns, low=2))

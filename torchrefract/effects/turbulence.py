@@ -58,7 +58,8 @@ class Turbulence(LatticeWarp):
         covariance: "exponential", "gaussian", "matern32" or "matern52".
         normalize: "theory" gives the amplitude to all fields together, "image" to each: its mean is subtracted and its
             standard deviation divided by, which inflates fields that are longer than the frame.
-        padding, interpolation, tolerance_px, p: as for every warp; only Gaussian fields have a coarser lattice.
+        padding, interpolation, resampler, tolerance_px, p: as for every warp; only Gaussian fields have a coarser
+            lattice.
 
     Raises:
         ValueError: an argument outside its range.
@@ -84,10 +85,13 @@ class Turbulence(LatticeWarp):
         normalize: str = "theory",
         padding: str = "reflection",
         interpolation: str = "bilinear",
+        resampler: str = "auto",
         tolerance_px: float | None = None,
         p: float = 1.0,
     ):
-        super().__init__(padding=padding, interpolation=interpolation, tolerance_px=tolerance_px, p=p)
+        super().__init__(
+            padding=padding, interpolation=interpolation, resampler=resampler, tolerance_px=tolerance_px, p=p
+        )
         self.amplitude_range = check_range("amplitude_range", amplitude_range, low=0.0, high=1e4)
         self.length_range = check_range("length_range", length_range, low=1e-3, high=1e6)
         self.aperture_range = check_range("aperture_range", aperture_range, low=0.0, high=1e4)

@@ -59,12 +59,19 @@ def _on_grid(steps: Sequence[_Step], dtype: torch.dtype) -> _Step:
 class Walk:
     """An image on its way through effects; warps wait until something needs the image."""
 
-    def __init__(self, image: Tensor, depth: Tensor | None, padding: str | None, interpolation: str | None):
+    def __init__(
+        self,
+        image: Tensor,
+        depth: Tensor | None,
+        padding: str | None,
+        interpolation: str | None,
+        resampler: str | None,
+    ):
         self.image, self.depth = image, depth
-        self.padding, self.interpolation = padding, interpolation
+        self.padding, self.interpolation, self.resampler = padding, interpolation, resampler
         self.done: list[list[_Step]] = []  # those that were looked up together
         self.waiting: list[_Step] = []
-        self.modes: dict[tuple[str, str], Tensor] = {}  # of the look-up: the samples that ask for it, (B,), bool
+        self.modes: dict[tuple[str, str, str], Tensor] = {}  # of the look-up: the samples that ask for it, (B,), bool
         self.moved: list[tuple[WarpEffect, Any, Moved]] = []
         self.valid: Callable[[], Tensor] = self._everywhere
         self.light: dict[str, Callable[[], Tensor]] = {}  # the maps of light, by their names in `Degraded`
@@ -161,16 +168,21 @@ class Walk:
 
     def _choose(self, effect: WarpEffect, active: Tensor) -> None:
         """The samples that an effect moves are looked up as it asks, unless the whole composition says how."""
-        mode = self.padding or effect.padding, self.interpolation or effect.interpolation
+        mode = (
+            self.padding or effect.padding,
+            self.interpolation or effect.interpolation,
+            self.resampler or effect.resampler,
+        )
         asked = self.modes.pop(mode, torch.zeros_like(active))
         self.modes = {other: samples & ~active for other, samples in self.modes.items()} | {mode: asked | active}
 
     def _looked_up(self, flow: _Flow | Positions) -> Tensor:
         warped = None
-        for (padding, interpolation), samples in reversed(self.modes.items()):
+        for (padding, interpolation, resampler), samples in reversed(self.modes.items()):
             if warped is not None and is_true(samples.any) is False:
                 continue
-            found = look_up(self.image, flow, padding=padding, interpolation=interpolation)
+            options = {"padding": padding, "interpolation": interpolation, "resampler": resampler}
+            found = look_up(self.image, flow, **options)
             warped = found if warped is None else torch.where(column(samples), found, warped)
         return cast(Tensor, warped)
 

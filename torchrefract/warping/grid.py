@@ -89,6 +89,21 @@ def sampler_positions(flow: Tensor, x: Tensor, y: Tensor, *, height: int, width:
     return torch.cat([x + u * (2 / width), y + v * (2 / height)], dim=1)
 
 
+def pixel_positions(grid: Tensor, *, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """x and y, each (...), px: where F.grid_sample looks, by its own steps on the CPU and so to its bits.
+
+        x = (x' + 1) W / 2 - 1/2 with one rounding after x' + 1,  y likewise with H
+
+    Args:
+        grid: (..., 2), as of `sampler_grid`.
+        height, width: px, of the frame.
+    """
+    # The product and the difference are one fused operation in the sampler, and so is `alpha` in `add`.
+    half = torch.tensor(-0.5, dtype=grid.dtype, device=grid.device)
+    x, y = grid.unbind(-1)
+    return torch.add(half, x + 1, alpha=width / 2), torch.add(half, y + 1, alpha=height / 2)
+
+
 def finite(positions: Tensor, limit: float) -> Tensor:
     """The positions within a limit; what is no number lies there."""
     # One NaN in a grid with border padding ends the process in the sampler's backward.

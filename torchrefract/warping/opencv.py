@@ -1,0 +1,122 @@
+"""Looking an image up by OpenCV's remap, where that is F.grid_sample but for the rounding of float32.
+
+From version 5 on remap takes the positions of images of 1, 3 or 4 channels as they are; before, it rounded to 1/32 px.
+"""
+
+import importlib
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
+from itertools import product
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from torchrefract.warping.grid import pixel_positions
+
+_PADDINGS = {"zeros": "BORDER_CONSTANT", "border": "BORDER_REPLICATE"}
+_INTERPOLATIONS = {"nearest": "INTER_NEAREST", "bilinear": "INTER_LINEAR"}
+_CHANNELS = (1, 3, 4)
+_OLDEST = 5
+# So few positions stay in a core's cache, and neither torch nor OpenCV shares them among threads of its own.
+_AT_ONCE = 1 << 15
+
+
+def obstacle(image: Tensor, flow: Tensor, *, padding: str, interpolation: str, positions: torch.dtype) -> str | None:
+    """Why OpenCV cannot look the image up as F.grid_sample does, None where it can.
+
+    Args:
+        image: (B, C, H, W).
+        flow: what decides on the positions.
+        padding, interpolation: of the look-up.
+        positions: the type that F.grid_sample takes the positions in.
+    """
+    if torch.compiler.is_compiling():
+        return "under torch.compile"
+    if padding not in _PADDINGS or interpolation not in _INTERPOLATIONS:
+        return f"for {padding} padding and {interpolation} interpolation"
+    if image.dtype not in (torch.float32, torch.uint8) or image.shape[1] not in _CHANNELS:
+        return f"for an image of {image.shape[1]} channels, {image.dtype}"
+    if positions is not torch.float32:
+        return f"for positions that are {positions}"
+    return _withheld(image) or _withheld(flow) or _missing()
+
+
+def remapped(image: Tensor, grids: Iterable[Tensor], *, padding: str, interpolation: str) -> Tensor:
+    """The image (B, C, H, W) of float32 or uint8, in channels_last format, looked up along the sampler's grid.
+
+    Bytes are rounded to the nearest. Each look-up takes as many threads as torch has, and leaves OpenCV's own alone.
+
+    Args:
+        image: of which `obstacle` has nothing to say.
+        grids: (B, n, W, 2), bands of rows of the grid, one below the other.
+        padding, interpolation: of the look-up.
+    """
+    cv2 = _opencv()
+    options = {
+        "interpolation": getattr(cv2, _INTERPOLATIONS[interpolation]),
+        "borderMode": getattr(cv2, _PADDINGS[padding]),
+        "hint": cv2.ALGO_HINT_ACCURATE,
+    }
+    source = image.detach().contiguous(memory_format=torch.channels_last)
+    out = torch.empty_like(source)
+    remap, start = partial(cv2.remap, **options), 0
+    for grid in grids:
+        _remap_rows(remap, _pictures(source), _pictures(out)[:, start : start + grid.shape[1]], grid)
+        start += grid.shape[1]
+    return out
+
+
+def _remap_rows(remap: Any, source: np.ndarray, out: np.ndarray, grid: Tensor) -> None:
+    batch, height, width = grid.shape[:3]
+    rows = max(1, _AT_ONCE // width)
+    bands = list(product(range(batch), range(0, height, rows)))
+
+    def work(part: int) -> None:
+        for i, start in bands[part::threads]:
+            band = slice(start, start + rows)
+            x, y = pixel_positions(grid[i, band], height=source.shape[1], width=source.shape[2])
+            remap(source[i], x.numpy(), y.numpy(), dst=out[i, band])
+
+    threads = min(torch.get_num_threads(), len(bands))
+    if threads == 1:
+        work(0)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(work, range(threads)))
+
+
+def _pictures(image: Tensor) -> np.ndarray:
+    """(B, H, W, C), or (B, H, W) of one channel, as OpenCV has it: the same memory."""
+    pixels = image.movedim(1, -1).numpy()
+    return pixels[..., 0] if image.shape[1] == 1 else pixels
+
+
+def _withheld(value: Tensor) -> str | None:
+    """Why the numbers of a tensor are not there to be read, None where they are."""
+    if value.device.type != "cpu":
+        return f"on {value.device.type}"
+    if (value.requires_grad and torch.is_grad_enabled()) or forward_ad.unpack_dual(value).tangent is not None:
+        return "where a gradient is asked for"
+    try:
+        value.detach().numpy()
+    except RuntimeError:
+        return "inside torch.func"
+    return None
+
+
+def _missing() -> str | None:
+    return None if _opencv() else f"without OpenCV {_OLDEST} or later (opencv-contrib-python-headless>={_OLDEST})"
+
+
+@cache
+def _opencv() -> Any:
+    """OpenCV, None where it is missing or rounds positions."""
+    try:
+        cv2 = importlib.import_module("cv2")
+    except ImportError:
+        return None
+    return cv2 if int(cv2.__version__.partition(".")[0]) >= _OLDEST else None

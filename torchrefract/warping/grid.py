@@ -10,6 +10,7 @@ from torch import Tensor
 FAR = 4.0
 # Positions this near to the border pixels count as inside: rounding of fp32 coordinates, 1/1000 px.
 _TOLERANCE = 1e-3
+_HALF = torch.tensor(-0.5, dtype=torch.float32, device="cpu")
 
 
 class Positions(NamedTuple):
@@ -89,19 +90,20 @@ def sampler_positions(flow: Tensor, x: Tensor, y: Tensor, *, height: int, width:
     return torch.cat([x + u * (2 / width), y + v * (2 / height)], dim=1)
 
 
-def pixel_positions(grid: Tensor, *, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """x and y, each (...), px: where F.grid_sample looks, by its own steps on the CPU and so to its bits.
+def pixel_positions(grid: Tensor, *, height: int, width: int, out: Tensor) -> Tensor:
+    """(2, n, m), px: x and y where F.grid_sample looks on the CPU, float32, by its own steps and so to its bits.
 
-        x = (x' + 1) W / 2 - 1/2 with one rounding after x' + 1,  y likewise with H
+        x = (x' + 1) W / 2 - 1/2, rounded after x' + 1 and at the end,  y likewise with H
 
     Args:
-        grid: (..., 2), as of `sampler_grid`.
+        grid: (n, m, 2), as of `sampler_grid`.
         height, width: px, of the frame.
+        out: (2, n, m), where they are written.
     """
-    # The product and the difference are one fused operation in the sampler, and so is `alpha` in `add`.
-    half = torch.tensor(-0.5, dtype=grid.dtype, device=grid.device)
-    x, y = grid.unbind(-1)
-    return torch.add(half, x + 1, alpha=width / 2), torch.add(half, y + 1, alpha=height / 2)
+    for place, into, size in zip(grid.unbind(-1), out, (width, height), strict=True):
+        # Product and difference are one fused operation in the sampler, and with `alpha` they are one here.
+        torch.add(_HALF, torch.add(place, 1, out=into), alpha=size / 2, out=into)
+    return out
 
 
 def finite(positions: Tensor, limit: float) -> Tensor:

@@ -21,7 +21,7 @@ _PADDINGS = {"zeros": "BORDER_CONSTANT", "border": "BORDER_REPLICATE"}
 _INTERPOLATIONS = {"nearest": "INTER_NEAREST", "bilinear": "INTER_LINEAR"}
 _CHANNELS = (1, 3, 4)
 _OLDEST = 5
-# So few positions stay in a core's cache, and neither torch nor OpenCV shares them among threads of its own.
+# So few positions stay in a core's cache, and neither PyTorch nor OpenCV shares them among threads of its own.
 _AT_ONCE = 1 << 15
 
 
@@ -62,7 +62,9 @@ def remapped(image: Tensor, grids: Iterable[Tensor], *, padding: str, interpolat
         "hint": cv2.ALGO_HINT_ACCURATE,
     }
     source = image.detach().contiguous(memory_format=torch.channels_last)
-    out = torch.empty_like(source)
+    batch, channels, height, width = source.shape
+    # Not `empty_like`, which gives a frame of one pixel strides that OpenCV cannot write to.
+    out = source.new_empty(batch, height, width, channels).movedim(-1, 1)
     remap, start = partial(cv2.remap, **options), 0
     for grid in grids:
         _remap_rows(remap, _pictures(source), _pictures(out)[:, start : start + grid.shape[1]], grid)
@@ -76,10 +78,12 @@ def _remap_rows(remap: Any, source: np.ndarray, out: np.ndarray, grid: Tensor) -
     bands = list(product(range(batch), range(0, height, rows)))
 
     def work(part: int) -> None:
+        room = grid.new_empty(2, min(rows, height), width)
         for i, start in bands[part::threads]:
-            band = slice(start, start + rows)
-            x, y = pixel_positions(grid[i, band], height=source.shape[1], width=source.shape[2])
-            remap(source[i], x.numpy(), y.numpy(), dst=out[i, band])
+            band = slice(start, min(height, start + rows))
+            size = {"height": source.shape[1], "width": source.shape[2]}
+            x, y = pixel_positions(grid[i, band], **size, out=room[:, : band.stop - start]).numpy()
+            remap(source[i], x, y, dst=out[i, band])
 
     threads = min(torch.get_num_threads(), len(bands))
     if threads == 1:
@@ -109,7 +113,11 @@ def _withheld(value: Tensor) -> str | None:
 
 
 def _missing() -> str | None:
-    return None if _opencv() else f"without OpenCV {_OLDEST} or later (opencv-contrib-python-headless>={_OLDEST})"
+    return (
+        None
+        if _opencv()
+        else f"without OpenCV {_OLDEST} or later (pip install 'opencv-contrib-python-headless>={_OLDEST}')"
+    )
 
 
 @cache

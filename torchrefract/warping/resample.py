@@ -45,9 +45,9 @@ def warp(
         padding: what lies outside: "zeros", "border" or "reflection" (of positions up to 3/2 frames off the center).
         interpolation: "nearest", "bilinear" or "bicubic" (a = -3/4, clamped to the range of the image's values).
         resampler: "grid_sample", of PyTorch; "opencv", for float32 or uint8 of 1, 3 or 4 channels on the CPU, without
-            gradients, neither reflection nor bicubic; or "auto", OpenCV for such images of 3 or 4 channels in
-            channels_last format where it is installed. The two agree to 1e-6 of the range of the image's values, before
-            rounding: of uint8 some values in a million that lie so near to a half differ by one level.
+            gradients, neither reflection nor bicubic; or "auto", OpenCV from version 5 on, where it is installed, for
+            such uint8 in channels_last format. The two agree to 1e-6 of the range of the values before these are
+            rounded: bytes differ, by one level, where they lie so near to a half.
 
     Returns:
         image of the same shape, type and memory format, and valid, (B, 1, H, W) or (1, H, W), bool.
@@ -153,9 +153,9 @@ def _known(flow: Tensor | SmoothFlow | Positions) -> Tensor:
 
 
 def _suits_opencv(image: Tensor) -> bool:
-    """Whether a sample looks the same to OpenCV in every batch, and as OpenCV has it."""
-    # One channel lies in both formats: whether its neighbors do would decide on its last bit.
-    return image.shape[1] in (3, 4) and is_channels_last(image[:1])
+    """Whether OpenCV is faster: for bytes that lie in memory as it has them."""
+    # Of floats PyTorch is. One sample is asked, so that the batch around it changes nothing.
+    return image.dtype is torch.uint8 and is_channels_last(image[:1])
 
 
 def _as_image(warped: Tensor, image: Tensor) -> Tensor:
@@ -167,8 +167,11 @@ def _as_image(warped: Tensor, image: Tensor) -> Tensor:
 
 def _laid_out(warped: Tensor, image: Tensor) -> Tensor:
     """The warped image in the type and the memory format of the image."""
-    last = is_channels_last(image)
-    return warped.to(image.dtype, memory_format=torch.channels_last if last else torch.contiguous_format)
+    layout = torch.channels_last if is_channels_last(image) else torch.contiguous_format
+    # `to` with a format copies what has the type and the format already.
+    if warped.dtype is image.dtype:
+        return warped.contiguous(memory_format=layout)
+    return warped.to(image.dtype, memory_format=layout)
 
 
 def _clamped(warped: Tensor, source: Tensor, padding: str) -> Tensor:

@@ -22,7 +22,7 @@ _K1, _K2, _P, _FOCAL = -0.25, 0.09, 0.0005, 0.9
 
 def candidates(frame: Tensor, pixels: Any, peers: Mapping[str, ModuleType]) -> dict[str, Candidate]:
     """Lenses and splines on a frame (1, 3, H, W), and on the same as uint8 HxWx3, by job and name."""
-    found = _ours(frame)
+    found = _ours(frame, pixels)
     if "kornia" in peers:
         found |= _kornia(frame)
     if "torch_tps" in peers:
@@ -32,13 +32,14 @@ def candidates(frame: Tensor, pixels: Any, peers: Mapping[str, ModuleType]) -> d
     return found
 
 
-def _ours(frame: Tensor) -> dict[str, Candidate]:
+def _ours(frame: Tensor, pixels: Any) -> dict[str, Candidate]:
     strength: dict[str, Any] = {"amplitude_range": (SPLINE_PX, SPLINE_PX)}
     one: dict[str, Any] = {"k1_range": (_K1, _K1), "k2_range": (_K2, _K2), "focal_range": (_FOCAL, _FOCAL)}
     within = f"within {TOLERANCE_PX} px"
+    mild, of_opencv = LensDistortion(**one, tolerance_px=TOLERANCE_PX), torch.from_numpy(pixels).permute(2, 0, 1)
     effects = {
         "lens: ours LensDistortion": LensDistortion(),
-        f"lens: ours LensDistortion, the peers' lens {within}": LensDistortion(**one, tolerance_px=TOLERANCE_PX),
+        f"lens: ours LensDistortion, the peers' lens {within}": mild,
         "spline: ours ThinPlateSpline": ThinPlateSpline(**strength),
         f"spline: ours ThinPlateSpline {within}": ThinPlateSpline(**strength, tolerance_px=TOLERANCE_PX),
     }
@@ -52,7 +53,10 @@ def _ours(frame: Tensor) -> dict[str, Candidate]:
         flow, _ = lens_restore_flow(coefficients, focal, center, height=height, width=width)
         return warp(frame, flow)[0]
 
-    return found | {"lens: ours closed form": closed_form}
+    return found | {
+        f"lens: ours LensDistortion on bytes, {within}": lambda: mild(of_opencv).permute(1, 2, 0),
+        "lens: ours closed form": closed_form,
+    }
 
 
 def _kornia(frame: Tensor) -> dict[str, Candidate]:

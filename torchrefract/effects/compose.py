@@ -11,7 +11,8 @@ from torchrefract import draws
 from torchrefract._checks import check_choice, check_number
 from torchrefract.effects.base import Effect, moved
 from torchrefract.effects.compose_plan import ComposePlan, compose_plan
-from torchrefract.effects.plan import Ask, check_size, check_tolerance
+from torchrefract.effects.plan import Ask, Plan, check_size, check_tolerance
+from torchrefract.effects.radiance import RadianceEffect
 from torchrefract.effects.refraction import WarpEffect
 from torchrefract.effects.walk import Walk
 from torchrefract.types import Degraded
@@ -115,9 +116,9 @@ class Compose(Effect):
         plans = _constant(self, height, width, field_dtype(image.dtype)).plans
         for (effect, own), plan in zip(self.leaves(params), plans, strict=True):
             if isinstance(effect, WarpEffect):
-                walk.move(effect, own, plan)
+                walk.move(effect, own, cast(Plan, plan))
             else:
-                walk.shade(effect, own)
+                walk.shade(cast(RadianceEffect, effect), own, plan)
         return walk.arrive(params)
 
     def plan(self, height: int, width: int, *, dtype: torch.dtype = torch.float32) -> ComposePlan:

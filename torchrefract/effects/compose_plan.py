@@ -10,11 +10,15 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
-from typing import NamedTuple
+from typing import NamedTuple, cast
+
+import torch
 
 from torchrefract.effects.base import Effect
 from torchrefract.effects.lattice_warp import LatticeWarp
+from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.plan import Ask, Plan
+from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.refraction import WarpEffect
 
 
@@ -25,7 +29,7 @@ class ComposePlan:
     height, width: px, of the frame.
     tolerance_px: how far the composite may be from the exact one; None composes the flows as they are.
     names: of the effects, in order.
-    plans: of each effect; None for those that move nothing.
+    plans: of each effect.
     error_px: how far the composite is off at most; inf where that is not known.
     resamples: how often the image is looked up.
     """
@@ -34,7 +38,7 @@ class ComposePlan:
     width: int
     tolerance_px: float | None
     names: tuple[str, ...]
-    plans: tuple[Plan | None, ...]
+    plans: tuple[Plan | LightPlan, ...]
     error_px: float
     resamples: int
 
@@ -48,7 +52,7 @@ class ComposePlan:
         ]
         widest = max(map(len, self.names))
         for name, plan in zip(self.names, self.plans, strict=True):
-            lines.append(f"{name:{widest}}  {'moves nothing' if plan is None else plan.summary()}")
+            lines.append(f"{name:{widest}}  {plan.summary()}")
         return "\n".join(lines)
 
 
@@ -87,14 +91,21 @@ def compose_plan(effects: Sequence[tuple[Effect, float]], ask: Ask) -> ComposePl
         ask.room()
         plans = _shared(warps, ask)
         error = _total((plan.error_px, plan.random) for plan in plans)
+    resamples = len({warp.group for warp, plan in zip(warps, plans, strict=True) if plan.stride > 0})
     by_place = {warp.place: plan for warp, plan in zip(warps, plans, strict=True)}
-    for place, (effect, p) in enumerate(effects):
-        if isinstance(effect, WarpEffect) and p == 0:
-            by_place[place] = ask.plan(0, 0.0, "its p is 0")
-    resamples = len({warp.group for warp in warps if by_place[warp.place].stride > 0})
+    found = tuple(
+        by_place[place] if place in by_place else _other_plan(effect, p, ask)
+        for place, (effect, p) in enumerate(effects)
+    )
     names = tuple(type(effect).__name__ for effect, _ in effects)
-    found = tuple(by_place.get(place) for place in range(len(effects)))
     return ComposePlan(ask.height, ask.width, ask.tolerance_px, names, found, error, resamples)
+
+
+def _other_plan(effect: Effect, p: float, ask: Ask) -> Plan | LightPlan:
+    """Of an effect that moves nothing."""
+    if p == 0:
+        return ask.plan(0, 0.0, "its p is 0")
+    return cast(PlannedLight, effect).planned(ask.height, ask.width, torch.float64 if ask.double else torch.float32)
 
 
 def _warps(effects: Sequence[tuple[Effect, float]]) -> Iterator[_Warp]:

@@ -100,6 +100,7 @@ class LensFlare(PlannedLight):
         self.clip = check_flag("clip", clip)
 
     params_type = FlareParams
+    maps = ("intensity",)
 
     def draw(self, source: draws.Stream, image: Tensor) -> FlareParams:
         """One sun a sample, every number uniform in its range."""

@@ -86,6 +86,7 @@ class UniformFog(PlannedLight):
         )
 
     params_type = FogParams
+    maps = ("transmission", "extinction")
 
     def draw(self, source: draws.Stream, image: Tensor) -> FogParams:
         """One fog a sample; V and the deviation are uniform in their ranges."""

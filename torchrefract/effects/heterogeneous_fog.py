@@ -145,6 +145,7 @@ class HeterogeneousFog(PlannedLight):
         self.decorrelation_range = check_decorrelation(decorrelation_range)
 
     params_type = HeterogeneousFogParams
+    maps = ("transmission", "extinction")
 
     def draw(self, source: draws.Stream, image: Tensor) -> HeterogeneousFogParams:
         """One fog a sample, every number uniform in its range."""

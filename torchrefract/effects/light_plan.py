@@ -47,11 +47,15 @@ class LightPlan:
         # Compilers read fields, not properties.
         object.__setattr__(self, "acts", any(kind != "left" for kind, _, _ in self.bands))
 
+    def summary(self) -> str:
+        """Which rows are computed, and why those."""
+        return f"{self._light()} ({self.why})"
+
     def __str__(self) -> str:
         lines = [
             f"frame          {self.height} x {self.width} px",
             f"tolerance      {'none: exact' if self.tolerance is None else f'{self.tolerance:g} levels of 1/255'}",
-            f"light          {self._light()} ({self.why})",
+            f"light          {self.summary()}",
             f"error at most  {self.error:.2g} levels",
         ]
         lines += [f"{name:<15}{value}" for name, value in self.details]

@@ -101,6 +101,11 @@ class Plan:
         place = (self.height, self.width, self.stride, self.before, self.after)
         object.__setattr__(self, "lattice", Lattice(*place) if self.stride > 1 else None)
 
+    @property
+    def acts(self) -> bool:
+        """Whether anything is computed."""
+        return self.stride > 0
+
     def summary(self) -> str:
         """Where the flow is computed, and why there."""
         flow = {0: "not computed", 1: "at every pixel"}.get(self.stride, f"every {self.stride} px")

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from torchrefract._checks import is_true
 from torchrefract.effects.base import Effect
-from torchrefract.effects.rows import column, only, spread
+from torchrefract.effects.rows import column, learns, only, spread
 from torchrefract.types import Degraded, Map
+from torchrefract.warping.grid import field_dtype
 
 
 class Shaded(NamedTuple):
@@ -28,7 +29,12 @@ _CLEAR = {"transmission": 1.0, "extinction": 0.0, "intensity": 0.0}
 
 
 class RadianceEffect(Effect):
-    """An effect that changes light and moves nothing."""
+    """An effect that changes light and moves nothing.
+
+    maps: the names of those of `Degraded` that it has.
+    """
+
+    maps: tuple[str, ...]
 
     @abstractmethod
     def shade(self, image: Tensor, params: Any, depth: Tensor | None) -> Shaded:
@@ -38,8 +44,14 @@ class RadianceEffect(Effect):
     def acts(self, params: Any) -> Tensor:
         """(B,), bool: the samples whose parameters change anything at all."""
 
+    def stirs(self, params: Any) -> bool:
+        """Whether a sample may be changed, or a gradient is asked for that could change it."""
+        return is_true((params.gate & self.acts(params)).any) is not False or learns(params)
+
     def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """The rows in other light, where the gate is open."""
+        if not self.stirs(params):
+            return self._unchanged(image, params)
         active = params.gate & self.acts(params)
         if depth is not None and is_true(active.any) is False:
             depth = None  # and nobody looks at its values
@@ -62,6 +74,16 @@ class RadianceEffect(Effect):
             valid=lambda: where_active(shaded.valid(), True),
             light={name: value for name in _CLEAR if (value := gated(name)) is not None},
         )
+
+    def _unchanged(self, image: Tensor, params: Any) -> Degraded:
+        """The rows as they are, with maps that say so."""
+        size = (image.shape[0], 1, *image.shape[2:])
+
+        def everywhere(value: float | bool, dtype: torch.dtype) -> Map:
+            return lambda: torch.full((), value, dtype=dtype, device=image.device).expand(size)
+
+        light = {name: everywhere(_CLEAR[name], field_dtype(image.dtype)) for name in self.maps}
+        return Degraded(image, params, valid=everywhere(True, torch.bool), light=light)
 
 
 def _choose(value: Tensor, off: float | bool, active: Tensor) -> Tensor:

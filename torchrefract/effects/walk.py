@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import is_true
-from torchrefract.effects.base import Effect
 from torchrefract.effects.lattice_warp import LatticeWarp
+from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.plan import Plan
+from torchrefract.effects.radiance import RadianceEffect
 from torchrefract.effects.refraction import Moved, WarpEffect, moving, sees
 from torchrefract.effects.rows import column, learns, only, spread
 from torchrefract.types import Degraded
@@ -77,7 +78,7 @@ class Walk:
         self.light: dict[str, Callable[[], Tensor]] = {}  # the maps of light, by their names in `Degraded`
         self.refracts = False
 
-    def move(self, effect: WarpEffect, params: Any, plan: Plan | None) -> None:
+    def move(self, effect: WarpEffect, params: Any, plan: Plan) -> None:
         """One more warp waits."""
         self.refracts = True
         rows, _, height, width = self.image.shape
@@ -91,9 +92,11 @@ class Walk:
         self._choose(effect, moved.active)
         self.moved.append((effect, params, own))
 
-    def shade(self, effect: Effect, params: Any) -> None:
-        """The image in other light, after the warps that wait."""
-        self._look_up()
+    def shade(self, effect: RadianceEffect, params: Any, plan: Plan | LightPlan) -> None:
+        """The image in other light, after the warps that wait; if that is planned to be none, they go on waiting."""
+        # By the plan: where some samples are in other light and some are not, all are looked up alike.
+        if plan.acts or effect.stirs(params):
+            self._look_up()
         shaded = effect.compute(self.image, params, self.depth)
         rows, before, valid = self.image.shape[0], dict(self.light), self.valid
         self.image = shaded.image

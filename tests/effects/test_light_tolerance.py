@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import Camera, Compose, GroundPlaneDepth, HeterogeneousFog, LensFlare, LinearDepth, UniformFog
+from torchrefract.effects.depth import DepthProvider
 from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.fields.perlin import octave, perlin_noise
@@ -344,3 +345,18 @@ def test_a_flare_leaves_what_it_does_not_reach():
     assert rows[-1] < bottom < SIZE[0]
     assert 0 < left <= columns[0]
     assert columns[-1] < right < SIZE[1]
+
+
+def test_a_depth_provider_without_a_hash_has_a_plan():
+    class Wall(DepthProvider):
+        __hash__ = None  # pyright: ignore[reportAssignmentType]  # as a class that only says what it equals
+
+        def __eq__(self, other: object) -> bool:
+            return self is other
+
+        def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+            return torch.full((1, 1, height, width), 2e3, dtype=dtype, device=device)
+
+    plan = UniformFog(depth=Wall(), tolerance=1.0).planned(*SIZE, torch.float32)
+    assert plan.bands == (("filled", 0, SIZE[0]),)
+    assert "that of the air alone" in str(plan)

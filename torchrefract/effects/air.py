@@ -27,12 +27,11 @@ _FOCAL = 0.9  # widths, where no camera is known
 _CACHED = 1 << 18  # values of an image that stay in a core's cache, a few times over
 
 
-# Compared by identity: a depth provider may be of any kind.
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
 class Air:
     """The air between the camera and the scene; fields as the arguments of `UniformFog`, checked."""
 
-    airlight: Sequence[float] | None
+    airlight: tuple[float, ...] | None
     threshold: float
     depth: DepthProvider
     camera: Camera | None
@@ -45,6 +44,10 @@ class Air:
         if self.camera is not None and not isinstance(self.camera, Camera):
             raise TypeError(f"camera must be a Camera, got {type(self.camera).__name__}")
         check_flag("linear_light", self.linear_light)
+
+    def __hash__(self) -> int:
+        # Without the depth: not every provider has a hash.
+        return hash((self.airlight, self.threshold, self.camera, self.linear_light))
 
     @property
     def colors(self) -> tuple[float, ...]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
 
 from torchrefract import (
     Compose,
@@ -42,6 +41,7 @@ def effects(tolerance_px: float | None = TOLERANCE_PX) -> dict[str, Effect]:
     return {**warps, **{name: make() for name, make in WEATHER.items()}}
 
 
-def all_warps(count: int = len(SMOOTH), **arguments: Any) -> Compose:
-    """The first few of the smooth warps, in one look-up; `arguments` are those of each."""
-    return Compose([make(**arguments) for make in list(SMOOTH.values())[:count]])
+def all_warps(count: int = len(SMOOTH), *, tolerance_px: float | None = None) -> Compose:
+    """The first few of the smooth warps, in one look-up, their composite within a tolerance."""
+    warps = [make(tolerance_px=tolerance_px) for make in list(SMOOTH.values())[:count]]
+    return Compose(warps, tolerance_px=tolerance_px)

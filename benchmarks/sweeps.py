@@ -12,6 +12,7 @@ from subjects import AIR, DRIFTS, FLARE, FOG, LENS, PLATE, SMOOTH, SPACE, SWIRLS
 from torchrefract.effects.base import Effect
 
 TOLERANCES_PX = (0.01, 0.02, 0.05, 0.1, 0.3, 1.0)
+TOLERANCES_LEVELS = (0.1, 0.3, 1.0)
 LOOK_UPS = ("nearest", "bilinear", "bicubic")
 DENSE, ITSELF = "float64", "itself in float64"
 FEW_STEPS, MANY_STEPS = (1, 2, 4, 8), 16
@@ -52,6 +53,12 @@ def _warp(name: str) -> list[Variant]:
     return _tolerances(SMOOTH[name]) + _look_ups(SMOOTH[name])
 
 
+def _levels(make: Callable[..., Effect]) -> list[Variant]:
+    """Tolerances of the image."""
+    within = (Variant("tolerance", f"{level:g}", partial(make, tolerance=level), make) for level in TOLERANCES_LEVELS)
+    return [Variant("tolerance", "None", make, make), *within]
+
+
 def _kinds(make: Callable[..., Effect], knob: str, *kinds: str) -> list[Variant]:
     """Effects that differ, each held against itself."""
     return [Variant(knob, kind, one := partial(make, **{knob: kind}), one, ITSELF) for kind in kinds]
@@ -86,18 +93,14 @@ def _lights(make: Callable[..., Effect]) -> list[Variant]:
     ]
 
 
-def _itself(make: Callable[..., Effect]) -> Variant:
-    return Variant("type", "float32", make, make)
-
-
 SWEEPS: Mapping[str, list[Variant]] = {
     LENS: _warp(LENS),
     PLATE: _warp(PLATE),
     AIR: _warp(AIR) + _kinds(SMOOTH[AIR], "covariance", "matern52", "matern32", "exponential"),
     SWIRLS: _warp(SWIRLS) + _steps(SMOOTH[SWIRLS]),
     "all four warps": _tolerances(all_warps),
-    FOG: [_itself(WEATHER[FOG]), *_lights(WEATHER[FOG])],
-    DRIFTS: [_itself(WEATHER[DRIFTS]), *_octaves(DRIFTS), *_kinds(WEATHER[DRIFTS], "normalize", "image")],
-    SPACE: [_itself(WEATHER[SPACE]), *_octaves(SPACE)],
-    FLARE: [_itself(WEATHER[FLARE]), *_kinds(WEATHER[FLARE], "blend", "screen")],
+    FOG: [*_levels(WEATHER[FOG]), *_lights(WEATHER[FOG])],
+    DRIFTS: [*_levels(WEATHER[DRIFTS]), *_octaves(DRIFTS), *_kinds(WEATHER[DRIFTS], "normalize", "image")],
+    SPACE: [*_levels(WEATHER[SPACE]), *_octaves(SPACE)],
+    FLARE: [*_levels(WEATHER[FLARE]), *_kinds(WEATHER[FLARE], "blend", "screen")],
 }

@@ -20,12 +20,15 @@ from typing import Any
 import torch
 from arguments import count
 
-from torchrefract import DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence
+from torchrefract import Compose, DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence
 from torchrefract.cameras.distortion import POLYNOMIAL12
+from torchrefract.effects.compose_plan import ComposePlan
 from torchrefract.effects.lattice_warp import LatticeWarp
+from torchrefract.effects.plan import Plan
 from torchrefract.restoration.files import replacing
 
 TOLERANCES = (1.0, 0.3, 0.1, 0.03, 0.01)
+LARGEST_TOLERANCE = 64.0  # px, that an effect takes
 RESULTS = Path(__file__).parent / "results"
 SMALLEST, LARGEST = (64, 64), (1080, 1920)
 # Of what is allowed: the median error must be no smaller, or a coarser plan would have done.
@@ -40,7 +43,7 @@ class Trial:
     height: int
     width: int
     tolerance_px: float
-    stride: int  # of the plan; 1 is exact, 0 no flow
+    stride: int  # of the plan, the largest of a composition; 1 is exact, 0 no flow
     bound_px: float  # that the plan states
     error_px: float
 
@@ -85,7 +88,13 @@ def attempt(name: str, seed: int) -> Trial:
         warnings.simplefilter("ignore")  # folds are no matter here
         off = effect.degrade(image, seed=seed).flow - exact.degrade(image, seed=seed).flow
     error = off.square().sum(dim=1).amax().sqrt().item()
-    return Trial(name, height, width, tolerance, plan.stride, plan.error_px, error)
+    return Trial(name, height, width, tolerance, _stride(plan), plan.error_px, error)
+
+
+def _stride(plan: Plan | ComposePlan) -> int:
+    if isinstance(plan, Plan):
+        return plan.stride
+    return max(part.stride for part in plan.plans if isinstance(part, Plan))
 
 
 def summary(name: str, trials: list[Trial]) -> str:
@@ -139,11 +148,23 @@ def _swirl(dice: random.Random) -> tuple[type[LatticeWarp], dict[str, Any]]:
     }
 
 
-CONFIGURATIONS: dict[str, Callable[[random.Random], tuple[type[LatticeWarp], dict[str, Any]]]] = {
+def _composition(dice: random.Random) -> tuple[Callable[..., Compose], dict[str, Any]]:
+    """Two to four warps, as much as they may be off each only together."""
+    chosen = [dice.choice((_lens, _plate, _turbulence, _swirl))(dice) for _ in range(dice.randint(2, 4))]
+
+    def make(tolerance_px: float | None = None) -> Compose:
+        own = None if tolerance_px is None else LARGEST_TOLERANCE
+        return Compose([kind(**ranges, tolerance_px=own) for kind, ranges in chosen], tolerance_px=tolerance_px)
+
+    return make, {}
+
+
+CONFIGURATIONS: dict[str, Callable[[random.Random], tuple[Callable[..., LatticeWarp | Compose], dict[str, Any]]]] = {
     "LensDistortion": _lens,
     "ThinPlateSpline": _plate,
     "Turbulence": _turbulence,
     "DivergenceFree": _swirl,
+    "Compose": _composition,
 }
 
 

@@ -40,9 +40,7 @@ def test_errors_grow_with_the_tolerance_and_stay_within_it(road, name):
     assert exact.largest_px < 1e-3
     assert exact.mean_levels < 1e-3
     pairs = zip(sweeps.TOLERANCES_PX, within, strict=True)
-    # Each of the four warps together has a tolerance of its own.
-    parts = len(subjects.SMOOTH) if name == "all four warps" else 1
-    assert all(exact.largest_px < (error.largest_px or 0) <= parts * px for px, error in pairs)
+    assert all(exact.largest_px < (error.largest_px or 0) <= px for px, error in pairs)
     for quantity in ("largest_px", "mean_px", "mean_levels", "square"):
         values = [getattr(error, quantity) for error in (exact, *within)]
         assert values == sorted(values), quantity

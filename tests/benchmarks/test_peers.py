@@ -131,7 +131,7 @@ def test_the_spline_of_torch_tps_is_the_one_through_its_points(ramps):
 def test_lenses_in_closed_form_do_what_the_peers_do(ramps, wide):
     pytest.importorskip("kornia", reason="kornia is in the extra train")
     cv2 = pytest.importorskip("cv2", reason="OpenCV is in the extra calibration")
-    ours = torch.as_tensor(peer_warps._ours(ramps)["lens: ours closed form"]())
+    ours = torch.as_tensor(peer_warps._ours(ramps, wide)["lens: ours closed form"]())
     kornia = torch.as_tensor(peer_warps._kornia(ramps)["lens: kornia undistort_image"]())
     (call,) = peer_warps._opencv(cv2, wide).values()
     opencv = torch.as_tensor(call()).movedim(-1, 0)[None]

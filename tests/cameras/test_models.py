@@ -53,7 +53,11 @@ def test_what_no_polynomial_has_raises(place):
         ({"cx": np.inf}, ValueError, "cx must be a number"),
         ({"width": 0}, ValueError, "width must be at least 1, got 0"),
         ({"height": 36.0}, TypeError, "height must be a whole number"),
-        ({"model": "fisheye"}, ValueError, "model must be one of polynomial12, opencv, got 'fisheye'"),
+        (
+            {"model": "pinhole"},
+            ValueError,
+            "model must be one of polynomial12, opencv, fisheye, division, got 'pinhole'",
+        ),
     ],
 )
 def test_what_is_no_camera_raises(options, error, rule):

@@ -3,6 +3,7 @@
 All functions here take x and y apart, of any shapes that broadcast with coefficients viewed as (B, 12, 1, ...).
 """
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -49,6 +50,15 @@ class Jacobian(NamedTuple):
         """J^-1 (a, b), with the determinant held above zero."""
         scale = 1 / self.determinant.clamp(min=1e-6)
         return (self.yy * a - self.xy * b) * scale, (self.xx * b - self.yx * a) * scale
+
+    def after(self, first: "Jacobian") -> "Jacobian":
+        """The product J first: the derivatives of one map after another."""
+        return Jacobian(
+            self.xx * first.xx + self.xy * first.yx,
+            self.xx * first.xy + self.xy * first.yy,
+            self.yx * first.xx + self.yy * first.yx,
+            self.yx * first.xy + self.yy * first.yy,
+        )
 
 
 def used_terms(coefficients: Tensor) -> Terms:
@@ -151,16 +161,31 @@ def _radial_start(r_d: Tensor, c: tuple[Tensor, ...], limit: RadialLimit, terms:
     """The inverse of the radial part: exact for lenses without other terms, to start from for the others."""
     if terms.radial == 0:
         return r_d
-    start = r = limit.look_up(r_d)
+    start = limit.look_up(r_d)
     if not terms.round:
         return start
+    r = newton_radius(r_d, start, limit, lambda r2: (radial(r2, c, terms.radial), radial_slope(r2, c, terms.radial)))
+    return torch.where(_is_bent(c), start, r) if terms.bent else r
+
+
+def newton_radius(
+    r_d: Tensor, start: Tensor, limit: RadialLimit, parts: Callable[[Tensor], tuple[Tensor, Tensor]]
+) -> Tensor:
+    """The radius r with r g(r^2) = r_d, by Newton steps (2, in float64 3) from a start that is good to 1e-6.
+
+    Args:
+        r_d, start: (B, ...).
+        limit: how far the radial part can be inverted.
+        parts: from r^2 to g and its derivative with respect to r^2.
+    """
+    r = start
     for _ in range(3 if r.dtype is torch.float64 else 2):
         r2 = r * r
-        shrunk = radial(r2, c, terms.radial)
-        growth = shrunk + 2 * r2 * radial_slope(r2, c, terms.radial)
+        shrunk, slope = parts(r2)
+        growth = shrunk + 2 * r2 * slope
         step = (r * shrunk - r_d) / growth.clamp(min=torch.finfo(r.dtype).eps)
         r = torch.minimum((r - step).clamp(min=0), limit.radius)
-    return torch.where(_is_bent(c), start, r) if terms.bent else r
+    return r
 
 
 def _bend(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, coefficients: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:
@@ -189,21 +214,34 @@ def _distorted(
 
     x_d = x g + r^2 (p2 + s1 + s2 r^2),  y_d = y g + r^2 (p1 + s3 + s4 r^2),  g = 1 + sum k_i r^2i + 2 p1 y + 2 p2 x
     """
-    p1, p2, s1, s2, s3, s4 = c[6:]
     r2 = x * x + y * y
-    g = radial(r2, c, terms.radial)
+    point, g = bent(x, y, r2, radial(r2, c, terms.radial), c[6:], terms)
+    return point, r2, g
+
+
+def bent(
+    x: Tensor, y: Tensor, r2: Tensor, g: Tensor, others: Sequence[Tensor], terms: Terms
+) -> tuple[tuple[Tensor, Tensor], Tensor]:
+    """The point distorted by a radial part g and by the others, p1, p2, s1 ... s4; and g with 2 p1 y + 2 p2 x."""
+    p1, p2, s1, s2, s3, s4 = others
     if not terms.bent:
-        return (x * g, y * g), r2, g
+        return (x * g, y * g), g
     if terms.tangential:
         g = g + 2 * p1 * y + 2 * p2 * x
     a, b = (p2 + s1 + s2 * r2, p1 + s3 + s4 * r2) if terms.prism else (p2, p1)
-    return (x * g + r2 * a, y * g + r2 * b), r2, g
+    return (x * g + r2 * a, y * g + r2 * b), g
 
 
 def _slopes(x: Tensor, y: Tensor, r2: Tensor, g: Tensor, c: tuple[Tensor, ...], terms: Terms) -> Jacobian:
     """The derivatives of the distorted point, by what `_distorted` has computed already."""
-    p1, p2, s1, s2, s3, s4 = c[6:]
-    slope = radial_slope(r2, c, terms.radial)
+    return bent_slopes(x, y, r2, g, radial_slope(r2, c, terms.radial), c[6:], terms)
+
+
+def bent_slopes(
+    x: Tensor, y: Tensor, r2: Tensor, g: Tensor, slope: Tensor, others: Sequence[Tensor], terms: Terms
+) -> Jacobian:
+    """The derivatives of the point of `bent`: g as it returns it, slope that of the radial part by r^2."""
+    p1, p2, s1, s2, s3, s4 = others
     along_x, along_y = slope * x, slope * y
     cross = along_x * y
     if not terms.bent:
@@ -218,3 +256,15 @@ def _slopes(x: Tensor, y: Tensor, r2: Tensor, g: Tensor, c: tuple[Tensor, ...], 
         2 * (cross + b * x + p2 * y),
         g + 2 * y * (along_y + (p1 + b)),
     )
+
+
+def implicit(point: tuple[Tensor, Tensor], error: tuple[Tensor, Tensor], jacobian: Jacobian) -> tuple[Tensor, Tensor]:
+    """A solved point with the gradient of the exact inverse: one Newton step of length zero.
+
+    Args:
+        point: x and y, solved without gradient.
+        error: what the model makes of the point, less what it should be, with gradient.
+        jacobian: of the model there, held fixed.
+    """
+    step_x, step_y = jacobian.solve(error[0] - error[0].detach(), error[1] - error[1].detach())
+    return point[0] - step_x, point[1] - step_y

@@ -1,11 +1,14 @@
 """The radial part of a lens, and how far out it can be inverted."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 _NODES = 2048
+_FARTHEST = 1e3  # on the plane z = 1
+_DOUBLINGS = 12  # of the radius after distortion, in search of the radius before it
 
 
 class RadialLimit(NamedTuple):
@@ -51,23 +54,51 @@ def radial_limit(coefficients: Tensor, reach: Tensor, image_reach: Tensor) -> Ra
             first = _falls(radius[:, None] + width[:, None] * _steps(reach), k).long().argmax(dim=1)
             width = width / _NODES
             radius = torch.where(folds, radius + (first - 1).clamp(min=0) * width, reach)
-        r, r_d = _lattice(radius, k)
-        # Only what is asked for goes into the table, which is finer so.
-        last = (r_d < image_reach[:, None]).sum(dim=1, keepdim=True).clamp(max=_NODES)
-        r, r_d = _lattice(r.gather(1, last)[:, 0], k)
-        image_radius = r_d[:, -1]
-        table = _inverse_table(r, r_d)
         shape = (-1,) + (1,) * (coefficients.ndim - 2)
-        return RadialLimit(radius.view(shape), image_radius.view(shape), folds, table)
+        return _tabulated(radius, folds, image_reach, lambda r: r * radial(r * r, k, 6), shape)
+
+
+def limit_of_curve(radius: Tensor, image_reach: Tensor, curve: Callable[[Tensor], Tensor]) -> RadialLimit:
+    """The limit of any radial part that grows up to a radius that is known.
+
+    Args:
+        radius: (B,), up to which it grows; inf where it always does.
+        image_reach: (B,), the radius after distortion up to which the inverse is asked for.
+        curve: from radii (B, n) before distortion to those after it.
+
+    Returns:
+        The limit, each tensor of it with one dimension behind B.
+    """
+    with torch.no_grad():
+        powers = torch.arange(_DOUBLINGS + 1, dtype=radius.dtype, device=radius.device).exp2()
+        radii = torch.minimum(image_reach[:, None] * powers, radius[:, None])
+        first = (curve(radii) < image_reach[:, None]).sum(dim=1, keepdim=True).clamp(max=_DOUBLINGS)
+        reach = radii.gather(1, first)[:, 0]
+        limit = _tabulated(reach, reach == radius, image_reach, curve, (-1, 1))
+        return limit._replace(radius=radius[:, None])
+
+
+def reach_of(r_d: Tensor) -> Tensor:
+    """(B,), how far a table must reach for radii (B, N) after distortion."""
+    none = r_d.new_zeros(r_d.shape[0], 1)
+    # What is farther than a lens shows anything must not make the table coarse.
+    return 1.1 * torch.cat([none, r_d], dim=1).clamp(max=_FARTHEST).amax(dim=1).clamp(min=1e-3)
+
+
+def _tabulated(
+    radius: Tensor, folds: Tensor, image_reach: Tensor, curve: Callable[[Tensor], Tensor], shape: tuple[int, ...]
+) -> RadialLimit:
+    r = radius[:, None] * _steps(radius)
+    # Only what is asked for goes into the table, which is finer so.
+    last = (curve(r) < image_reach[:, None]).sum(dim=1, keepdim=True).clamp(max=_NODES)
+    r = r.gather(1, last) * _steps(radius)
+    r_d = curve(r)
+    image_radius = r_d[:, -1]
+    return RadialLimit(radius.view(shape), image_radius.view(shape), folds, _inverse_table(r, r_d))
 
 
 def _falls(r: Tensor, k: tuple[Tensor, ...]) -> Tensor:
     return radial(r * r, k, 6) + 2 * r * r * radial_slope(r * r, k, 6) <= 0
-
-
-def _lattice(radius: Tensor, k: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    r = radius[:, None] * _steps(radius)
-    return r, r * radial(r * r, k, 6)
 
 
 def _inverse_table(r: Tensor, r_d: Tensor) -> Tensor:
@@ -93,7 +124,7 @@ def radial(r2: Tensor, k: tuple[Tensor, ...], order: int) -> Tensor:
 
 
 def radial_slope(r2: Tensor, k: tuple[Tensor, ...], order: int) -> Tensor:
-    """The derivative of `_radial` with respect to r^2: sum i k_i r^(2i - 2)."""
+    """The derivative of `radial` with respect to r^2: sum i k_i r^(2i - 2)."""
     if order == 0:
         return torch.zeros_like(r2)
     value = order * k[order - 1]

@@ -8,6 +8,7 @@ from torchrefract.cameras.distortion import (
     ALL_TERMS,
     Terms,
     distort_polynomial,
+    implicit,
     jacobian_polynomial,
     newton_undistort,
     undistort_polynomial,
@@ -176,13 +177,11 @@ def _unfolded(x: Tensor, y: Tensor, c: Tensor, limit: RadialLimit, terms: Terms)
 
 
 def _attach(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, c: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:
-    """(x, y) with the gradient of the exact inverse: one Newton step of length zero, its Jacobian held fixed."""
+    """(x, y) with the gradient of the exact inverse."""
     with torch.no_grad():
         jacobian = jacobian_polynomial(x, y, c, terms)
     reached_x, reached_y = distort_polynomial(x, y, c, terms)
-    error_x, error_y = reached_x - x_d, reached_y - y_d
-    step_x, step_y = jacobian.solve(error_x - error_x.detach(), error_y - error_y.detach())
-    return x - step_x, y - step_y
+    return implicit((x, y), (reached_x - x_d, reached_y - y_d), jacobian)
 
 
 def _as_flow(u: Tensor, v: Tensor, exists: Tensor, x: Tensor, y: Tensor, focal: Tensor) -> Tensor:

@@ -19,8 +19,8 @@ from subjects import SMOOTH, TOLERANCE_PX, effects
 from timing import COPY, FEWEST_REPEATS, GRID_SAMPLE, Bar, Candidate, Conditions, Timing, measure, references, table
 from torch import Tensor
 
+from torchrefract._files import replacing
 from torchrefract.effects.base import Effect
-from torchrefract.restoration.files import replacing
 from torchrefract.warping.grid import length
 
 WHAT = (

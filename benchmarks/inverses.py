@@ -19,9 +19,9 @@ from timing import FEWEST_REPEATS, GRID_SAMPLE, Candidate, Conditions, Timing, m
 from torch import Tensor
 
 from torchrefract import ThinPlateParams, invert_flow
+from torchrefract._files import replacing
 from torchrefract.data.images import EXTENSIONS, image_size
 from torchrefract.fields.spline import evaluate_spline, fit_spline
-from torchrefract.restoration.files import replacing
 from torchrefract.warping.grid import inside, length, pixel_axes
 from torchrefract.warping.resample import look_up
 

@@ -23,8 +23,8 @@ from arguments import count
 from tolerance import LEAST_SHARE, RESULTS, SMALLEST, TOLERANCES, log_uniform
 
 from torchrefract import Camera, GroundPlaneDepth, HeterogeneousFog, LensFlare, LinearDepth, UniformFog
+from torchrefract._files import replacing
 from torchrefract.effects.planned_light import PlannedLight
-from torchrefract.restoration.files import replacing
 
 _Made = tuple[type[PlannedLight], dict[str, Any]]
 

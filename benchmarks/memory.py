@@ -27,7 +27,7 @@ from torchrefract import (
     Turbulence,
     UniformFog,
 )
-from torchrefract.restoration.files import replacing
+from torchrefract._files import replacing
 
 WHAT = (
     "The most memory that torch holds at any moment of effect(image), the result included, the image not, without "

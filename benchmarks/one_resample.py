@@ -29,9 +29,9 @@ from torchrefract import (
     Turbulence,
     compose_flows,
 )
+from torchrefract._files import replacing
 from torchrefract.data.images import EXTENSIONS, read_image
 from torchrefract.effects.refraction import WarpEffect
-from torchrefract.restoration.files import replacing
 from torchrefract.warping.grid import inside, length
 
 WHAT = (

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from torchrefract.restoration.files import replacing
+from torchrefract._files import replacing
 
 # What is drawn at the foot of a panel: errors that small are rounding, or none at all.
 FLOOR = 1e-5

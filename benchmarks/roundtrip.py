@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from torchrefract import DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, compose_flows, warp
+from torchrefract._files import replacing
 from torchrefract.data.images import EXTENSIONS, read_image
 from torchrefract.effects.refraction import WarpEffect
-from torchrefract.restoration.files import replacing
 from torchrefract.warping.grid import length
 
 EFFECTS: dict[str, Callable[[str], WarpEffect]] = {

@@ -19,8 +19,8 @@ from memory import peak_bytes
 from subjects import SMOOTH, TOLERANCE_PX, all_warps, effects
 from timing import FEWEST_REPEATS, GRID_SAMPLE, Conditions, references
 
+from torchrefract._files import replacing
 from torchrefract.effects.base import Effect
-from torchrefract.restoration.files import replacing
 
 WHAT = (
     "effect(image) with a new draw in every call, without gradients, float32; warps within 0.05 px, or exact where it "

@@ -28,7 +28,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils import benchmark
 
-from torchrefract.restoration.files import replacing
+from torchrefract._files import replacing
 from torchrefract.warping.grid import pixel_axes, sampler_grid
 
 Candidate = Callable[[], object]

@@ -21,11 +21,11 @@ import torch
 from arguments import count
 
 from torchrefract import Compose, DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence
+from torchrefract._files import replacing
 from torchrefract.cameras.distortion import POLYNOMIAL12
 from torchrefract.effects.compose_plan import ComposePlan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.plan import Plan
-from torchrefract.restoration.files import replacing
 
 TOLERANCES = (1.0, 0.3, 0.1, 0.03, 0.01)
 LARGEST_TOLERANCE = 64.0  # px, that an effect takes

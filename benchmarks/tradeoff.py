@@ -24,9 +24,9 @@ from sweeps import DENSE, ITSELF, SWEEPS, Variant
 from timing import FEWEST_REPEATS, GRID_SAMPLE, Candidate, Conditions, Spread, references
 from torch import Tensor
 
+from torchrefract._files import replacing
 from torchrefract.data.images import EXTENSIONS, fit, image_size, read_image
 from torchrefract.data.road_scenes import render_road_scenes
-from torchrefract.restoration.files import replacing
 
 WHAT = (
     "Each effect with each value of its knobs, float32, on whole frames, with the parameters of one draw a frame, held "

@@ -19,10 +19,10 @@ from timing import FEWEST_REPEATS, GRID_SAMPLE, Bar, Candidate, Conditions, Timi
 from torch import Tensor
 
 from torchrefract import presets
+from torchrefract._files import replacing
 from torchrefract.data.module import make_pair
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
-from torchrefract.restoration.files import replacing
 from torchrefract.restoration.models.resunet import ResUNet
 from torchrefract.restoration.tasks import Deweather, Task, Undistort
 from torchrefract.types import Frame

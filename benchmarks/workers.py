@@ -20,8 +20,8 @@ from torch import Tensor
 from torch.utils import benchmark
 from torch.utils.data import DataLoader, Dataset
 
+from torchrefract._files import replacing
 from torchrefract.effects.base import Effect
-from torchrefract.restoration.files import replacing
 
 WHAT = (
     "Multiples: measured inside the worker, on a frame 1x3xHxW float32, with a new draw in every call and no "

@@ -22,10 +22,10 @@ from pytorch_lightning import LightningModule, Trainer, seed_everything
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
 from torchrefract._config import CONFIG_DIR
+from torchrefract._files import replacing
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.module import PairData
 from torchrefract.restoration.checkpoints import CheckpointError, check_fits, read_checkpoint
-from torchrefract.restoration.files import replacing
 
 _INFORMING = ("--help", "-h", "--hydra-help", "--info", "--shell-completion", "-sc")
 _SEEDS = 2**32  # as many as numpy takes

@@ -18,12 +18,12 @@ from torch import Tensor
 from torchrefract._checks import check_count, check_number, check_positive
 from torchrefract._command import UsageError, check_seed, command, job, make, naming, with_picture
 from torchrefract._config import CONFIG_DIR
+from torchrefract._files import replacing
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, check_size, fit, image_size, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
 from torchrefract.fields.depth import check_depth
 from torchrefract.film import Footage, formats, make_film, save_film
-from torchrefract.restoration.files import replacing
 from torchrefract.sheet import make_row, sheet
 
 _RENDERED = (540, 960)  # height and width

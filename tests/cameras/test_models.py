@@ -1,6 +1,12 @@
+import math
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
 
 from torchrefract import Camera
 
@@ -97,3 +103,100 @@ def test_a_camera_is_not_stretched():
         ValueError, match="image must have the shape of the camera's frames, 1280 x 720 px, got 640 x 480"
     ):
         camera.resized(width=640, height=480)
+
+
+LENSES = {
+    "polynomial12": (-0.3, 0.15, -0.02, 0.01, 0.003, -0.001, 1e-3, 2e-3, 3e-3, 1e-3, -2e-3, 4e-3),
+    "opencv": (-0.3, 0.15, 1e-3, 2e-3, -0.02, 0.02, 0.01, 0.005, 3e-3, 1e-3, -2e-3, 4e-3, 0.03, -0.05),
+    "fisheye": (-0.12, 0.043, -0.0088, -0.0037),
+    "division": (-0.3,),
+}
+BIG = {"width": 64, "height": 36, "fx": 40.0, "fy": 41.0, "cx": 30.3, "cy": 18.4}
+RAYS = torch.tensor([[0.3, 0.2, 1.0], [-0.4, 0.1, 1.2], [0.0, -0.3, 0.9], [0.5, 0.4, 2.0]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize(
+    ("change", "ray", "pixel"),
+    [
+        # What lay at pixel (u, v) lies at (u - left, v - top) of the part.
+        (lambda c: c.cropped(left=7, top=3, width=50, height=20), (1, 1), lambda p: p - torch.tensor([7.0, 3.0])),
+        # Pixel i of W is pixel W - 1 - i of the mirrored frame, which shows the mirrored world.
+        (lambda c: c.flipped("horizontal"), (-1, 1), lambda p: torch.stack([63 - p[:, 0], p[:, 1]], dim=1)),
+        (lambda c: c.flipped("vertical"), (1, -1), lambda p: torch.stack([p[:, 0], 35 - p[:, 1]], dim=1)),
+        # A pixel covers [i - 1/2, i + 1/2], so the edge of the frame is at -1/2 in every size.
+        (lambda c: c.resized(width=192, height=108), (1, 1), lambda p: 3 * (p + 0.5) - 0.5),
+    ],
+    ids=["cropped", "flipped left to right", "flipped top to bottom", "resized"],
+)
+def test_a_changed_camera_shows_every_ray_where_the_changed_frame_does(
+    model: str, change: Callable[[Camera], Camera], ray: tuple[int, int], pixel: Callable[[Tensor], Tensor]
+):
+    camera = Camera(**BIG, coefficients=LENSES[model], model=model)
+    seen = camera.project(RAYS)
+    moved = change(camera).project(RAYS * torch.tensor([*ray, 1.0], dtype=torch.float64))
+    assert seen.valid.all()
+    assert moved.valid.all()
+    assert_close(moved.points, pixel(seen.points), rtol=0, atol=1e-11)
+
+
+def test_a_camera_flipped_twice_is_itself():
+    camera = Camera(**BIG, coefficients=LENSES["opencv"])
+    for direction in ("horizontal", "vertical"):
+        twice = camera.flipped(direction).flipped(direction)
+        assert twice.coefficients == camera.coefficients
+        assert (twice.cx, twice.cy) == pytest.approx((camera.cx, camera.cy), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("part", "rule"),
+    [
+        ({"left": 10, "top": 0, "width": 60, "height": 36}, "left must leave 60 of the frame's 64 px, got 10"),
+        ({"left": 0, "top": 30, "width": 64, "height": 7}, "top must leave 7 of the frame's 36 px, got 30"),
+        ({"left": -1, "top": 0, "width": 4, "height": 4}, "left must be at least 0, got -1"),
+        ({"left": 0, "top": 0, "width": 4, "height": 0}, "height must be at least 1, got 0"),
+    ],
+)
+def test_a_part_that_is_not_in_the_frame_raises(part, rule):
+    with pytest.raises(ValueError, match=rule):
+        Camera(**BIG, coefficients=LENSES["division"], model="division").cropped(**part)
+
+
+def test_a_direction_that_is_none_raises():
+    with pytest.raises(ValueError, match="direction must be one of horizontal, vertical, got 'diagonal'"):
+        Camera(**BIG, coefficients=(0.0,) * 4).flipped("diagonal")
+
+
+def test_how_much_of_a_frame_a_lens_covers_is_the_share_inside_its_circle():
+    # A barrel of one coefficient shows r_d up to 2 / (3 sqrt(-3 k1)).
+    camera = Camera(width=201, height=201, fx=100.0, fy=100.0, cx=100.0, cy=100.0, coefficients=(-0.4, 0.0, 0.0, 0.0))
+    assert camera.valid_radius == pytest.approx(1 / math.sqrt(1.2))
+    edge = 2 / 3 / math.sqrt(1.2)
+    assert camera.coverage() == pytest.approx(math.pi * edge**2 / 4, abs=0.005)
+    with pytest.raises(
+        ValueError, match=r"camera must not fold back inside its frame, got opencv with rays for 28.6.%"
+    ):
+        camera.check_covers()
+    Camera(**BIG, coefficients=LENSES["division"], model="division").check_covers()
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [
+        ("opencv", (-1e30, 0.0, 0.0, 0.0)),
+        ("opencv", (0.0, 0.0, 0.0, 0.0, 0.0, -1e30, 0.0, 0.0)),
+        ("polynomial12", (0.0, -1e30, *(0.0,) * 10)),
+        ("fisheye", (-1e30, 0.0, 0.0, 0.0)),
+        ("division", (1e30,)),
+        ("division", (-1e30,)),
+    ],
+)
+def test_a_lens_that_shows_less_than_a_pixel_raises(model, coefficients):
+    with pytest.raises(ValueError, match="coefficients must leave at least one pixel that does not fold back"):
+        Camera(**BIG, coefficients=coefficients, model=model)
+
+
+@pytest.mark.parametrize("model", ["fisheye", "division"])
+def test_what_is_no_polynomial_says_how_to_make_one(model):
+    with pytest.raises(ValueError, match=r"model must be polynomial12, or opencv .*convert\(camera.* got " + model):
+        Camera(**BIG, coefficients=LENSES[model], model=model).polynomial()

@@ -31,12 +31,12 @@ def fisheye_image(x: Tensor, y: Tensor, z: Tensor, k: Sequence[Tensor]) -> tuple
     with torch.no_grad():
         r2 = x * x + y * y
         axis = r2 <= _CENTER * (r2 + z * z)
-        seen = torch.atan2(r2.sqrt(), z) <= _most(k)[:, None]
+        seen = _angle(r2.sqrt(), z) <= _most(k)[:, None]
         seen = seen & ~(axis & (z <= 0))
         off = seen & ~axis
     x, y, z = (torch.where(seen, a, b) for a, b in ((x, 0.0), (y, 0.0), (z, 1.0)))
     r = torch.where(off, x * x + y * y, 1.0).sqrt()
-    scale = torch.where(off, distort_angle(torch.atan2(r, z), k) / r, 1 / torch.where(off, 1.0, z))
+    scale = torch.where(off, distort_angle(_angle(r, z), k) / r, 1 / torch.where(off, 1.0, z))
     return scale * x, scale * y, seen
 
 
@@ -57,6 +57,13 @@ def fisheye_ray(x_d: Tensor, y_d: Tensor, k: Sequence[Tensor]) -> tuple[tuple[Te
         seen = ~off | (missed <= _MISSES[theta.dtype] * (1 + theta_d))
     scale = torch.where(off, theta.sin() / theta_d, 1.0)
     return (scale * x_d, scale * y_d, torch.where(off, theta.cos(), 1.0)), seen
+
+
+def _angle(r: Tensor, z: Tensor) -> Tensor:
+    """atan2(r, z), r >= 0, but for rays of no length; torch.atan2 rounds by where in a row a number stands."""
+    steep = r > z
+    ratio = torch.where(steep, z, r) / torch.where(steep, r, torch.where(z > 0, z, 1.0))
+    return torch.where(steep, math.pi / 2 - ratio.atan(), ratio.atan())
 
 
 def _most(k: Sequence[Tensor]) -> Tensor:

@@ -141,10 +141,14 @@ class Camera:
         """The radius of `points.valid_radius`, on the plane z = 1 before distortion; of a fisheye its angle, rad."""
         return valid_radius(torch.tensor([self.coefficients], dtype=torch.float64), model=self.model).item()
 
+    def places(self, count: int) -> Tensor:
+        """(count^2, 2), px, float64: a lattice over the frame, from border to border."""
+        u, v = (torch.linspace(0, size - 1, count, dtype=torch.float64) for size in (self.width, self.height))
+        return torch.cartesian_prod(u, v)
+
     def coverage(self) -> float:
-        """The share of the frame that has rays, counted on 129 x 129 places from border to border."""
-        u, v = (torch.linspace(0, size - 1, _PLACES, dtype=torch.float64) for size in (self.width, self.height))
-        return self.unproject(torch.cartesian_prod(u, v)).valid.double().mean().item()
+        """The share of the frame that has rays, counted at 129 x 129 places from border to border."""
+        return self.unproject(self.places(_PLACES)).valid.double().mean().item()
 
     def check_covers(self) -> None:
         """Raise unless every place of the frame that `coverage` looks at has a ray."""
@@ -212,7 +216,7 @@ class Camera:
         """Raise for a lens that shows less than a pixel; by plain numbers, so that compilers can follow."""
         c = self.coefficients
         if self.model == "opencv":
-            growths = [growth_of_ratio((*c[:2], *c[4:5]), c[5:8])]
+            growths = [growth_of_ratio((*c[:2], *c[4:5]), c[5:8]), c[5:8]]
         elif self.model == "division":
             growths = [c, [-value for value in c]]
         else:

@@ -150,6 +150,16 @@ def valid_radius(coefficients: Tensor, *, model: str) -> Tensor:
     return fisheye_angle(c) if model == "fisheye" else first_root(-4 * c).sqrt()
 
 
+def image_of_rays(x: Tensor, y: Tensor, z: Tensor, coefficients: Tensor, model: str) -> tuple[Tensor, Tensor]:
+    """Where a model's formula puts rays (B, N), z above zero, on whichever sheet: unchecked, to fit models by."""
+    c = _columns(coefficients, model)
+    if model == "fisheye":
+        return fisheye_image(x, y, z, c)[:2]
+    if model == "division":
+        return distort_division(x / z, y / z, c[0])[:2]
+    return _model(x / z, y / z, c, model)[:2]
+
+
 def check_coefficients(coefficients: Tensor, model: str) -> None:
     """Raise unless these are coefficients (B, n) of the model."""
     check_choice("model", model, tuple(MODELS))

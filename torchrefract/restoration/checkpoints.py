@@ -9,7 +9,7 @@ import torch
 from pytorch_lightning.plugins.io import TorchCheckpointIO
 from torch import nn
 
-from torchrefract.restoration.files import replacing
+from torchrefract._files import replacing
 
 # What a damaged archive, or a file that is none, makes the readers raise.
 _DAMAGE = (zipfile.BadZipFile, pickle.UnpicklingError, EOFError, LookupError, OSError, RuntimeError, ValueError)

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
-from torchrefract.restoration.files import replacing
+from torchrefract._files import replacing
 
 METRICS, BEFORE = "metrics.csv", "metrics_before.csv"
 

@@ -14,8 +14,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
+from torchrefract._files import replacing
 from torchrefract.page import Page, as_drawn
-from torchrefract.restoration.files import replacing
 from torchrefract.restoration.history import metrics_rows
 from torchrefract.viz import flow_to_rgb, flow_wheel, full_color_px, hatch_invalid
 

@@ -1,6 +1,6 @@
 import pytest
 
-from torchrefract.restoration.files import replacing
+from torchrefract._files import replacing
 
 
 def test_the_old_file_is_there_until_the_new_one_is_whole(tmp_path):

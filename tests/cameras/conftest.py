@@ -1,0 +1,36 @@
+import json
+from collections.abc import Callable
+
+import pytest
+
+from torchrefract import Camera
+
+_MODELS = {"opencv5": "opencv", "rational8": "opencv", "thin-prism12": "opencv", "fisheye4": "fisheye"}
+
+
+@pytest.fixture(scope="session")
+def published(shared_data) -> dict[str, Camera]:
+    """The cameras of the shared table that have a focal length, by their ids."""
+    rows = json.loads((shared_data / "lenses.json").read_text())
+    return {
+        row["id"]: Camera(
+            width=int(row["width"]),
+            height=int(row["height"]),
+            **{name: float(row[name]) for name in ("fx", "fy", "cx", "cy")},
+            coefficients=tuple(row["coeffs"]) or (0.0,) * 4,
+            model=_MODELS.get(row["model"], "opencv"),
+        )
+        for row in rows
+        if row["fx"]
+    }
+
+
+@pytest.fixture
+def make_camera() -> Callable[..., Camera]:
+    """A camera of a model, of 640 x 480 px."""
+
+    def make(coefficients: tuple[float, ...], model: str = "opencv") -> Camera:
+        numbers = {"fx": 510.25, "fy": 505.75, "cx": 322.5, "cy": 237.125}
+        return Camera(width=640, height=480, **numbers, coefficients=coefficients, model=model)
+
+    return make

@@ -1,0 +1,88 @@
+import pytest
+import yaml
+
+from torchrefract.cameras.files.kalibr import read_kalibr, write_kalibr
+
+# The layout of Kalibr's wiki.
+TEXT = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.27, 0.067, 0.0008, 0.0001]
+  distortion_model: radtan
+  intrinsics: [461.6, 460.1, 362.6, 246.0]
+  resolution: [752, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1:
+  - [1.0, 0.0, 0.0, -0.11]
+  - [0.0, 1.0, 0.0, 0.0]
+  - [0.0, 0.0, 1.0, 0.0]
+  - [0.0, 0.0, 0.0, 1.0]
+  camera_model: pinhole
+  distortion_coeffs: [-0.013, 0.05, -0.045, 0.012]
+  distortion_model: equidistant
+  intrinsics: [458.6, 457.2, 367.2, 248.3]
+  resolution: [752, 480]
+cam2:
+  camera_model: pinhole
+  distortion_coeffs: []
+  distortion_model: none
+  intrinsics: [300.0, 300.0, 320.0, 240.0]
+  resolution: [640, 480]
+"""
+
+
+def test_a_chain_of_kalibr_is_read(tmp_path):
+    path = tmp_path / "camchain.yaml"
+    path.write_text(TEXT)
+    cameras = read_kalibr(path)
+    assert list(cameras) == ["cam0", "cam1", "cam2"]
+    first, second, third = cameras.values()
+    assert (first.width, first.height, first.fx, first.fy, first.cx, first.cy) == (752, 480, 461.6, 460.1, 362.6, 246.0)
+    assert (first.model, first.coefficients) == ("opencv", (-0.27, 0.067, 0.0008, 0.0001))
+    assert (second.model, second.coefficients) == ("fisheye", (-0.013, 0.05, -0.045, 0.012))
+    assert (third.model, third.coefficients) == ("opencv", (0.0,) * 4)
+
+
+def test_what_is_written_has_the_layout_of_kalibr_and_reads_back(tmp_path, make_camera):
+    path = tmp_path / "camchain.yaml"
+    cameras = {
+        "cam0": make_camera((-0.3, 0.1, 0.002, 1e-7)),
+        "cam1": make_camera((-0.01, 0.05, -0.04, 0.01), "fisheye"),
+    }
+    write_kalibr(path, cameras)
+    assert read_kalibr(path) == cameras
+    found, layout = yaml.safe_load(path.read_text()), yaml.safe_load(TEXT)
+    assert set(found["cam0"]) <= set(layout["cam0"])
+    assert [found[name]["distortion_model"] for name in cameras] == ["radtan", "equidistant"]
+    write_kalibr(path, {"cam0": make_camera((-0.3, 0.1, 0.002, 0.0, 0.0))})
+    assert read_kalibr(path)["cam0"] == make_camera((-0.3, 0.1, 0.002, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "rule"),
+    [
+        ("camera_model: pinhole", "camera_model: omni", "pinhole as the camera_model of cam0, got .* with 'omni'"),
+        ("radtan", "fov", "distortion_model of radtan, equidistant, none for cam0, got .* with 'fov'"),
+        ("[752, 480]", "[752]", "path must hold 2 numbers as resolution, got .* with 1"),
+        ("246.0]", "246.0, 1.0]", "path must hold 4 numbers as intrinsics"),
+        ("0.0001]", "]", "path must hold 4 numbers as distortion_coeffs, got .* with 3"),
+        ("-0.27", ".nan", "a camera, got .*camchain.yaml: coefficients must not be NaN"),
+        ("  intrinsics: [461.6, 460.1, 362.6, 246.0]\n", "", "path must hold intrinsics, got .* with cam_overlaps"),
+        ("cam0:\n", "units: px\ncam0:\n", "path must hold a camera as units, got .* with 'px'"),
+        ("[1]", "[1", "path must hold YAML"),
+    ],
+)
+def test_a_broken_file_is_named_with_what_is_wrong(old, new, rule, tmp_path):
+    path = tmp_path / "camchain.yaml"
+    assert old in TEXT
+    path.write_text(TEXT.replace(old, new, 1))
+    with pytest.raises(ValueError, match=rule):
+        read_kalibr(path)
+
+
+def test_what_kalibr_has_no_name_for_raises(tmp_path, make_camera):
+    with pytest.raises(ValueError, match=r"model opencv or fisheye .* got division"):
+        write_kalibr(tmp_path / "camchain.yaml", {"cam0": make_camera((-0.2,), "division")})
+    with pytest.raises(ValueError, match="camera must have at most 4 coefficients for this file"):
+        write_kalibr(tmp_path / "camchain.yaml", {"cam0": make_camera((-0.2, 0.0, 0.0, 0.0, 0.1))})

@@ -27,6 +27,7 @@ HEAVY = (
     "segmentation_models_pytorch",
     "timm",
     "torchvision",
+    "yaml",
 )
 IMPORT = "import sys, torchrefract; print([name for name in {names} if name in sys.modules])"
 
@@ -67,11 +68,13 @@ def test_a_wheel_carries_conf_as_it_lies(wheel):
     assert packed == {path.relative_to(conf).as_posix(): path.read_bytes() for path in conf.rglob("*.yaml")}
 
 
-def test_a_wheel_holds_every_module_and_nothing_else(wheel):
+def test_a_wheel_holds_every_module_the_table_of_lenses_and_nothing_else(wheel):
     names = {name for name in wheel.namelist() if ".dist-info/" not in name and "/conf/" not in name}
     package = ROOT / "torchrefract"
     expected = {path.relative_to(ROOT).as_posix() for path in package.rglob("*.py")}
-    assert names == {*expected, "torchrefract/py.typed"}
+    table = "torchrefract/cameras/lenses.csv"
+    assert names == {*expected, "torchrefract/py.typed", table}
+    assert wheel.read(table) == (ROOT / table).read_bytes()
 
 
 def test_an_installed_wheel_finds_its_own_conf(wheel, tmp_path):

@@ -6,10 +6,20 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import Camera, Compose, LensDistortion, Rectification, RectificationParams, compose_flows, warp
+from torchrefract import (
+    Camera,
+    Compose,
+    LensDistortion,
+    LensParams,
+    Rectification,
+    RectificationParams,
+    compose_flows,
+    warp,
+)
 from torchrefract.warping.grid import inside
 
 # A car's camera, from a calibration with 20 chessboards.
@@ -88,6 +98,46 @@ def test_with_a_lens_behind_it_the_frame_is_looked_up_once():
     restored, _ = warp(d.image, d.restore_flow, interpolation="bicubic")
     error = (restored - raw).square()[d.restore_valid.expand_as(raw)].mean().item()
     assert -10 * math.log10(error) > 60
+
+
+def places_by_opencv(params: LensParams) -> np.ndarray:
+    """(2, 720, 1280), px: where the raw frames of DASHCAM have what a lens of k1, k2, p1, p2 shows at each pixel."""
+    k, (fx, fy), (cx, cy) = (value[0].double().numpy() for value in params[1:])
+    assert not k[2:6].any()
+    assert not k[8:].any()
+    pixels = np.mgrid[:720, :1280][::-1].reshape(2, -1).T.astype(float)
+    seen = (pixels - [639.5 + 1280 * cx, 359.5 + 1280 * cy]) / [1280 * fx, 1280 * fy]
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
+    clean = cv2.undistortPoints(seen[:, None], np.eye(3), k[[0, 1, 6, 7]], criteria=criteria)[:, 0]
+    clean = clean * [1280 * fx, 1280 * fy] + [639.5 + 1280 * cx, 359.5 + 1280 * cy]
+    points = (clean - [DASHCAM.cx, DASHCAM.cy]) / [DASHCAM.fx, DASHCAM.fy]
+    space = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    zero, matrix = np.zeros(3), np.array(DASHCAM.matrix)
+    return cv2.projectPoints(space, zero, zero, matrix, np.array(DASHCAM.coefficients))[0][:, 0].T.reshape(2, 720, 1280)
+
+
+@pytest.mark.parametrize("name", ["ca280_pv_21", "ca280_straight_lines1", "ca280_test5"])
+def test_on_real_frames_one_look_up_keeps_more_than_two(shared_data, name):
+    # Frames of the camera that DASHCAM is a calibration of, as it delivered them.
+    picture = cv2.imread(str(shared_data / "fullres" / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE)
+    assert picture is not None
+    raw = torch.from_numpy(picture[:720, :1280]).double()[None, None] / 255
+    scene = Compose([Rectification(DASHCAM), LensDistortion()])
+    rectify, lens = scene.effects
+    assert isinstance(rectify, Rectification)
+    assert isinstance(lens, LensDistortion)
+    d = scene.degrade(raw, seed=3)
+    rectified = rectify.apply(raw, d.params.children[0]).image
+    twice = lens.apply(rectified, d.params.children[1]).image
+    # A spline of the fifth degree, read once at the places that OpenCV finds, is as good as the frame can be known.
+    u, v = places_by_opencv(d.params.children[1])
+    expected = torch.from_numpy(map_coordinates(raw[0, 0].numpy(), [v, u], order=5))
+    inside_all = torch.from_numpy((u > 8) & (u < 1271) & (v > 8) & (v < 711)) & d.valid[0, 0]
+    assert inside_all.double().mean() > 0.6
+    once, both = (
+        -10 * (found[0, 0] - expected)[inside_all].square().mean().log10().item() for found in (d.image, twice)
+    )
+    assert once > both + 2, (once, both)
 
 
 def test_every_sample_is_that_of_a_batch_of_one():

@@ -1,6 +1,7 @@
 """The lens of a cheap dashcam."""
 
 import warnings
+from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -9,9 +10,11 @@ from torch import Tensor
 from torchrefract import draws
 from torchrefract._checks import check_all, check_flag, check_range, is_true
 from torchrefract.cameras.distortion import ALL_TERMS, POLYNOMIAL12
+from torchrefract.cameras.models import Camera
 from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.lens_plan import covers, kept_terms, lens_plan
+from torchrefract.effects.lens_source import LensSource, correlated, jittered, listed
 from torchrefract.effects.plan import Ask, Plan
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, smooth_lens_flow
 from torchrefract.fields.lens_bounds import LensRanges
@@ -98,14 +101,89 @@ class LensDistortion(LatticeWarp):
         self.center_x_range = check_range("center_x_range", center_x_range, low=-10.0, high=10.0)
         self.center_y_range = check_range("center_y_range", center_y_range, low=-10.0, high=10.0)
         self.strict = check_flag("strict", strict)
+        self._source: LensSource | None = None
+
+    @classmethod
+    def from_camera(
+        cls,
+        camera: Camera,
+        *,
+        jitter: float = 0.0,
+        covariance: Any = None,
+        residual_px: float = 0.5,
+        strict: bool = False,
+        padding: str = "zeros",
+        interpolation: str = "bilinear",
+        resampler: str = "auto",
+        tolerance_px: float | None = None,
+        p: float = 1.0,
+    ) -> "LensDistortion":
+        """The lens of a calibrated camera, or those near to it.
+
+        Args:
+            camera: of any model; what is no polynomial is replaced by the nearest.
+            jitter: each number is drawn uniformly up to so large a share of itself off, in [0, 0.99]; focal length,
+                aspect, offset of the principal point, and each coefficient.
+            covariance: (4 + n, 4 + n), of fx, fy, cx, cy in px and n coefficients, in place of `jitter`: numbers are
+                off together, by uniform draws of that covariance. For cameras that are polynomials as they are.
+            residual_px: how far the polynomial may show a ray from where the camera does, px.
+            strict, padding, interpolation, resampler, tolerance_px, p: as for `LensDistortion`.
+
+        Raises:
+            ValueError: numbers out of range; a camera too far from a polynomial, or that folds inside its frame.
+        """
+        if covariance is None:
+            ranges, source = jittered(camera, jitter=jitter, residual_px=residual_px).ranges, None
+        elif jitter:
+            raise ValueError(f"jitter must be 0 beside a covariance, got {jitter}")
+        else:
+            source = correlated(camera, covariance)
+            ranges = source.ranges
+        warp: Any = {"padding": padding, "interpolation": interpolation, "resampler": resampler, "p": p}
+        made = cls(**cast(Any, ranges), strict=strict, tolerance_px=tolerance_px, **warp)
+        made._source = source
+        return made
+
+    @classmethod
+    def from_lenses(
+        cls,
+        table: Sequence[Camera] | None = None,
+        *,
+        residual_px: float = 0.5,
+        strict: bool = False,
+        padding: str = "zeros",
+        interpolation: str = "bilinear",
+        resampler: str = "auto",
+        tolerance_px: float | None = None,
+        p: float = 1.0,
+    ) -> "LensDistortion":
+        """One of several real lenses for each sample, each as often as another.
+
+        Args:
+            table: their cameras; None is the table of the package (`torchrefract.cameras.lens_table`).
+            residual_px: how far a polynomial may show a ray from where a camera of another model does, px; lenses of
+                the package's table that are farther off are left out, others raise.
+            strict, padding, interpolation, resampler, tolerance_px, p: as for `LensDistortion`.
+
+        Raises:
+            ValueError: an empty table; a camera too far from a polynomial, or that folds inside its frame.
+        """
+        source = listed(table, residual_px=residual_px)
+        warp: Any = {"padding": padding, "interpolation": interpolation, "resampler": resampler, "p": p}
+        made = cls(**cast(Any, source.ranges), strict=strict, tolerance_px=tolerance_px, **warp)
+        made._source = source
+        return made
 
     params_type = LensParams
 
     def draw(self, source: draws.Stream, image: Tensor) -> LensParams:
-        """One lens a sample, every number uniform in its range."""
-        ranges = [getattr(self, f"{name}_range") for name in POLYNOMIAL12]
-        ranges += [self.focal_range, self.aspect_range, self.center_x_range, self.center_y_range]
-        gate, values = self._uniform(source, ranges, image)
+        """One lens a sample: every number uniform in its range, or one of those of a table or a camera."""
+        if self._source is None:
+            box = self._ranges()
+            gate, values = self._uniform(source, [*box.coefficients, *box[1:]], image)
+        else:
+            gate, values = self._uniform(source, self._source.inputs, image)
+            values = self._source.lenses(values)
         fx, aspect = values[:, 12], values[:, 13]
         return LensParams(gate, values[:, :12], torch.stack([fx, fx * aspect], dim=1), values[:, 14:])
 
@@ -114,11 +192,13 @@ class LensDistortion(LatticeWarp):
         check_lens(params, image.shape[0])
 
     def plan_within(self, ask: Ask) -> Plan:
-        """The plan of `lens_plan`."""
-        return lens_plan(self._ranges(), ask)
+        """The plan of `lens_plan`, for all lenses of a table."""
+        return lens_plan(self._ranges(), ask) if self._source is None else self._source.plan(ask)
 
     def covers(self, params: LensParams) -> Tensor:
-        """Whether the lenses lie in the ranges."""
+        """Whether the lenses lie in the ranges, or near one of a table's."""
+        if self._source is not None:
+            return self._source.covers(params.coefficients, params.focal, params.center)
         return covers(self._ranges(), params.coefficients, params.focal, params.center)
 
     def on_lattice(self, params: LensParams, plan: Plan) -> SmoothFlow:

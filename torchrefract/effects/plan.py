@@ -150,6 +150,12 @@ def coarsest(attempt: Callable[[int], Plan | None]) -> Plan | None:
 
 def lies_in(values: Tensor, ranges: Sequence[Range]) -> Tensor:
     """(), bool: all values (B, n) lie in the n ranges, but for rounding."""
-    low, high = torch.tensor(ranges, dtype=values.dtype, device=values.device).unbind(1)
+    return lies_in_one(values, [ranges])
+
+
+def lies_in_one(values: Tensor, boxes: Sequence[Sequence[Range]]) -> Tensor:
+    """(), bool: each row of values (B, n) lies in one of the boxes of n ranges, but for rounding."""
+    low, high = torch.tensor(boxes, dtype=values.dtype, device=values.device).unbind(2)
     room = 1e-5 * torch.maximum(low.abs(), high.abs())
-    return ((values >= low - room) & (values <= high + room)).all()
+    inside = (values[:, None] >= low - room) & (values[:, None] <= high + room)
+    return inside.all(dim=2).any(dim=1).all()

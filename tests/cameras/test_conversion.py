@@ -8,7 +8,7 @@ import torch
 from scipy.optimize import least_squares as scipy_least_squares
 
 from torchrefract import Camera
-from torchrefract.cameras.convert import convert, least_squares
+from torchrefract.cameras.conversion import convert, least_squares
 
 ZERO = np.zeros(3)
 # Ten dashcams, phones, action and car cameras of the shared table.

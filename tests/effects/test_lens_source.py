@@ -1,0 +1,214 @@
+import copy
+import math
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchrefract import Camera, LensDistortion, LensParams
+from torchrefract.cameras.conversion import convert
+from torchrefract.cameras.lens_table import read_lenses
+
+CAR = Camera(
+    width=640, height=360, fx=560.0, fy=565.0, cx=325.0, cy=178.0, coefficients=(-0.25, 0.09, 1e-3, -8e-4, 0.0)
+)
+OTHERS = (
+    CAR,
+    replace(CAR, fx=500.0, fy=500.0, coefficients=(-0.1, 0.02, 0.0, 0.0)),
+    replace(CAR, coefficients=(0.08, -0.01, *(0.0,) * 10), model="polynomial12"),
+)
+FISHEYE = replace(CAR, coefficients=(-0.02, 0.05, -0.04, 0.01), model="fisheye")
+
+
+def by_hand(camera: Camera) -> list[float]:
+    """The 16 numbers of a lens."""
+    width = camera.width
+    center = [(camera.cx - (width - 1) / 2) / width, (camera.cy - (camera.height - 1) / 2) / width]
+    return [*camera.polynomial(), camera.fx / width, camera.fy / width, *center]
+
+
+def drawn(effect: LensDistortion, count: int, seed: int = 7) -> Tensor:
+    """(count, 16), float64."""
+    params = effect.sample(torch.zeros(count, 1, 1, 1, dtype=torch.float64), seed=seed)
+    return torch.cat([params.coefficients, params.focal, params.center], dim=1)
+
+
+def test_the_lens_of_a_camera_shows_every_ray_where_the_camera_does():
+    effect = LensDistortion.from_camera(CAR)
+    degraded = effect.degrade(torch.zeros(1, 1, 360, 640, dtype=torch.float64), seed=0)
+    pixels = torch.tensor([[0.0, 0.0], [639.0, 359.0], [100.0, 250.0]], dtype=torch.float64)
+    seen = CAR.project(CAR.unproject(pixels).points).points
+    assert_close(seen, pixels, rtol=0, atol=1e-9)
+    # The pinhole that shows the same rays in the clean frame.
+    rays = CAR.unproject(pixels).points
+    clean = rays[:, :2] / rays[:, 2:] * torch.tensor([560.0, 565.0]).double() + torch.tensor([325.0, 178.0]).double()
+    columns, rows = pixels.long().T
+    assert_close(pixels + degraded.flow[0][:, rows, columns].T, clean, rtol=0, atol=1e-8)
+
+
+def test_a_jitter_is_uniform_in_each_number_by_itself():
+    values, expected = drawn(LensDistortion.from_camera(CAR, jitter=0.1), 2000), by_hand(CAR)
+    aspect = values[:, 13] / values[:, 12]
+    for i, center in enumerate(expected):
+        column = aspect if i == 13 else values[:, i]
+        middle = CAR.fy / CAR.fx if i == 13 else center
+        if middle == 0:
+            assert not column.any()
+        else:
+            assert stats.kstest(((column / middle - 0.9) / 0.2).numpy(), "uniform").pvalue > 1e-4
+
+
+def test_a_covariance_is_that_of_the_draws():
+    deviations = np.array([4.0, 4.2, 2.0, 1.5, 0.01, 0.012, 2e-4, 1e-4, 0.02])
+    correlation = np.eye(9)
+    correlation[0, 1] = correlation[1, 0] = 0.98
+    correlation[4, 5] = correlation[5, 4] = -0.9
+    covariance = correlation * np.outer(deviations, deviations)
+    values = drawn(LensDistortion.from_camera(CAR, covariance=covariance), 40_000)
+    width = CAR.width
+    # fx, fy, cx, cy, k1, k2, p1, p2, k3.
+    found = values[:, (12, 13, 14, 15, 0, 1, 6, 7, 2)] * torch.tensor([width] * 4 + [1] * 5)
+    middle = torch.tensor([CAR.fx, CAR.fy, CAR.cx - 319.5, CAR.cy - 179.5, *CAR.coefficients], dtype=torch.float64)
+    assert (((found.mean(dim=0) - middle) / torch.from_numpy(deviations)).abs() < 0.03).all()
+    assert_close(found.std(dim=0) / torch.from_numpy(deviations), torch.ones(9).double(), rtol=0, atol=0.02)
+    found = torch.from_numpy(np.corrcoef(found.T.numpy()))
+    assert_close(found, torch.from_numpy(correlation), rtol=0, atol=0.03)
+    assert not values[:, (3, 4, 5, 8, 9, 10, 11)].any()
+
+
+def test_of_a_table_each_lens_is_drawn_as_often_as_another():
+    values = drawn(LensDistortion.from_lenses(OTHERS), 3000)
+    expected = torch.tensor([by_hand(camera) for camera in OTHERS], dtype=torch.float64)
+    which = (values[:, None] - expected).abs().amax(dim=2)
+    assert (which.amin(dim=1) < 1e-15).all()
+    counts = torch.bincount(which.argmin(dim=1), minlength=3)
+    assert stats.chisquare(counts.numpy()).pvalue > 1e-4
+
+
+def test_float32_draws_the_lens_that_float64_draws():
+    effect = LensDistortion.from_lenses([replace(CAR, fx=500.0 + i) for i in range(97)])
+    single = effect.sample(torch.zeros(500, 1, 1, 1), seed=3).focal[:, 0]
+    assert_close(single.double(), drawn(effect, 500, seed=3)[:, 12], rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: LensDistortion.from_camera(CAR, jitter=0.05, p=0.7),
+        lambda: LensDistortion.from_camera(CAR, covariance=np.diag([4.0] * 4 + [1e-4] * 5), p=0.7),
+        lambda: LensDistortion.from_lenses(OTHERS, p=0.7),
+    ],
+    ids=["jitter", "covariance", "table"],
+)
+def test_a_sample_depends_on_its_key_alone(make, on_threads):
+    image = torch.rand(5, 3, 36, 64)
+    effect = make()
+    together = effect.degrade(image, seed=5, keys=[3, 1, 4, 15, 9])
+    for threads in (1, 2, 3):
+        on_threads(threads)
+        for i, key in enumerate([3, 1, 4, 15, 9]):
+            alone = effect.degrade(image[i], seed=5, keys=[key])
+            assert torch.equal(alone.image, together.image[i])
+            assert torch.equal(alone.flow, together.flow[i])
+    for copied in (copy.deepcopy(effect), pickle.loads(pickle.dumps(effect))):
+        assert torch.equal(copied.degrade(image, seed=5, keys=[3, 1, 4, 15, 9]).image, together.image)
+
+
+def test_one_graph_draws_the_same_lenses():
+    image = torch.rand(3, 3, 36, 64)
+    effect = LensDistortion.from_lenses(OTHERS, tolerance_px=0.05)
+    torch.manual_seed(1)
+    expected = effect(image)
+    torch.manual_seed(1)
+    assert_close(torch.compile(effect, fullgraph=True)(image), expected, rtol=0, atol=2e-4)
+
+
+@pytest.mark.parametrize("tolerance", [0.3, 0.03])
+@pytest.mark.parametrize("table", [OTHERS, [CAR]], ids=["three", "one"])
+def test_under_a_tolerance_every_lens_of_a_table_stays_within_it(table, tolerance):
+    effect = LensDistortion.from_lenses(table, tolerance_px=tolerance)
+    plan = effect.plan(180, 320)
+    assert plan.stride > 1
+    assert plan.error_px <= tolerance
+    image = torch.zeros(12, 1, 180, 320)
+    params = effect.sample(image, seed=2)
+    made, exact = effect.apply(image, params), LensDistortion.from_lenses(table).apply(image, params)
+    assert len(params.coefficients.unique(dim=0)) == len(table)
+    assert (made.flow - exact.flow).norm(dim=1).max() <= tolerance
+
+
+def test_lenses_outside_the_table_are_taken_exactly():
+    effect = LensDistortion.from_lenses(OTHERS, tolerance_px=0.05)
+    image = torch.zeros(2, 1, 36, 64)
+    params = effect.sample(image, seed=0)
+    assert effect.fitted(params) is effect
+    other = params._replace(coefficients=0.5 * params.coefficients)
+    assert effect.fitted(other) is not effect
+    assert torch.equal(effect.apply(image, other).flow, LensDistortion().apply(image, other).flow)
+
+
+def test_a_table_with_a_lens_that_may_fold_is_exact_and_says_so():
+    # Far out on the frame this one hardly grows any more.
+    flat = replace(CAR, fx=570.0, fy=570.0, coefficients=(-0.33, 0.0, 0.0, 0.0))
+    plan = LensDistortion.from_lenses([CAR, flat], tolerance_px=0.1).plan(90, 160)
+    assert plan.stride == 1
+    assert "fold" in plan.why
+
+
+def test_the_table_of_the_package_is_drawn_from():
+    effect = LensDistortion.from_lenses()
+    near = [lens for lens in read_lenses() if lens.residual_px <= 0.5]
+    assert len(near) > 30
+    values = drawn(effect, 2000)
+    assert len(values.unique(dim=0)) == len({tuple(by_hand(lens.polynomial)) for lens in near if lens.polynomial})
+    assert LensDistortion.from_lenses(residual_px=0.0).sample(torch.zeros(1, 1, 4, 4), seed=0).gate.all()
+
+
+def test_a_fisheye_is_drawn_as_the_nearest_polynomial():
+    effect = LensDistortion.from_camera(FISHEYE, jitter=0.0)
+    expected = torch.tensor([by_hand(convert(FISHEYE, to="polynomial12").camera)], dtype=torch.float64)
+    assert_close(drawn(effect, 2), expected.expand(2, -1), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("camera", "options", "error", "rule"),
+    [
+        ({}, {}, TypeError, "camera must be a Camera, got dict"),
+        (CAR, {"jitter": 1.0}, ValueError, r"jitter must be a number in \[0, 0.99\], got 1"),
+        (CAR, {"jitter": math.nan}, ValueError, "jitter must not be NaN"),
+        (CAR, {"residual_px": -1.0}, ValueError, "residual_px must be a number of at least 0"),
+        (CAR, {"jitter": 0.1, "covariance": np.eye(9)}, ValueError, "jitter must be 0 beside a covariance, got 0.1"),
+        (CAR, {"covariance": np.eye(8)}, ValueError, r"covariance must have shape \(9, 9\), .* got \(8, 8\)"),
+        (CAR, {"covariance": np.full((9, 9), np.nan)}, ValueError, "covariance must be finite"),
+        (CAR, {"covariance": -np.eye(9)}, ValueError, "covariance must have no negative eigenvalue"),
+        (CAR, {"covariance": np.triu(np.ones((9, 9)))}, ValueError, "covariance must be symmetric"),
+        (FISHEYE, {"covariance": np.eye(8)}, ValueError, "model must be polynomial12, or opencv without"),
+        (FISHEYE, {"residual_px": 1e-4}, ValueError, "within residual_px = 0.0001 px of a polynomial, got fisheye"),
+        (replace(CAR, coefficients=(-0.6, 0.0, 0.0, 0.0)), {}, ValueError, "camera must show rays .* without folding"),
+        (replace(FISHEYE, fx=150.0, fy=150.0), {}, ValueError, "camera must show rays within 80 degrees"),
+    ],
+)  # fmt: skip  # one line for each
+def test_what_is_no_lens_raises(camera, options, error, rule):
+    with pytest.raises(error, match=rule):
+        LensDistortion.from_camera(camera, **options)
+
+
+def test_a_table_with_a_lens_that_is_none_names_it():
+    with pytest.raises(ValueError, match=r"table\[1\] must show rays .* without folding back, got opencv that does in"):
+        LensDistortion.from_lenses([CAR, replace(CAR, coefficients=(-0.6, 0.0, 0.0, 0.0))])
+    with pytest.raises(ValueError, match="table must hold a camera at least, got none"):
+        LensDistortion.from_lenses([])
+
+
+def test_gradients_reach_the_lens_of_a_table():
+    effect, image = LensDistortion.from_lenses(OTHERS), torch.rand(1, 1, 18, 32, dtype=torch.float64)
+    params = effect.sample(image, seed=0)
+    coefficients = params.coefficients.requires_grad_()
+    effect.apply(image, LensParams(params.gate, coefficients, params.focal, params.center)).image.sum().backward()
+    assert coefficients.grad is not None
+    assert coefficients.grad[0, :3].all()

@@ -86,7 +86,7 @@ def distort_angle(theta: Tensor, k: Sequence[Tensor]) -> Tensor:
 
 
 def undistort_angle(theta_d: Tensor, k: Sequence[Tensor], most: Tensor) -> Tensor:
-    """The angle that `distort_angle` maps to theta_d, by a table and 3 Newton steps; gradient of the exact inverse.
+    """The angle that `distort_angle` maps to theta_d, by a table and Newton steps, with the exact gradient.
 
     Args:
         theta_d: (B, N), >= 0.

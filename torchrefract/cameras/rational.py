@@ -38,7 +38,7 @@ def undistort_opencv(x_d: Tensor, y_d: Tensor, c: Sequence[Tensor], radius: Tens
     """The point that `distort_opencv` maps to (x_d, y_d), if there is one; without gradient.
 
     The tilt is taken back in closed form. A table gives the inverse of the radial part to 1e-6; from there go 3 Newton
-    steps along the radius and 8 in the plane.
+    steps (in float32 2) along the radius and 8 in the plane.
 
     Args:
         x_d, y_d: (B, N), on the plane z = 1.

@@ -1,6 +1,7 @@
 import itertools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ def frame_of(
     dtype: torch.dtype = torch.float64,
 ) -> list[Octave]:
     """The octaves of a frame; numbers stand for all samples."""
-    motion = {
+    motion: Any = {
         "frame": torch.as_tensor(frame, dtype=torch.float64).expand(len(key)),
         "wind": torch.as_tensor(wind, dtype=torch.float64).expand(len(key), 2),
         "decorrelation": torch.as_tensor(decorrelation, dtype=torch.float64).expand(len(key)),
@@ -323,7 +324,7 @@ def test_gradients_of_the_motion_are_those_of_finite_differences():
 
 
 def moving_noise(key: Tensor, frame: Tensor, wind: Tensor, decorrelation: Tensor, weights: Tensor) -> Tensor:
-    motion = {"frame": frame, "wind": wind, "decorrelation": decorrelation}
+    motion: Any = {"frame": frame, "wind": wind, "decorrelation": decorrelation}
     octaves = [
         octave(key, i, period=p, height=80, width=140, **motion, dtype=torch.float32) for i, p in enumerate((2.5, 30.0))
     ]

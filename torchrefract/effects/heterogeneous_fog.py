@@ -84,9 +84,8 @@ class HeterogeneousFog(PlannedLight):
             the image, which has no z.
         decorrelation_range: frames, above 0, inf for fog that only drifts; one over it is drawn uniformly.
         tolerance: how far the image may be from the exact one, levels of 1/255, so that octaves in the image are left
-            out or known on a coarse lattice only, and fog whose drifts nobody sees is uniform; see `plan`; None is
-            exact. In space drifts are computed exactly or not at all; with normalize="image", and where <q> may come
-            near 0, exactly.
+            out or known on a coarse lattice only, and fog whose drifts nobody sees is uniform; see `plan`. Exact are
+            None, normalize="image", and where <q> may come near 0; in space, drifts are so or not computed at all.
         visibility_range, deviation_range, airlight, threshold, depth, camera, linear_light, p: as for `UniformFog`; the
             rays of space are those of the camera, or of a pinhole of 0.9 widths.
 

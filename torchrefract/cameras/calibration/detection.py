@@ -88,9 +88,7 @@ def _chessboard(gray: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]
     return np.arange(len(corners)), corners.reshape(-1, 2)
 
 
-def _refined(
-    gray: np.ndarray, ids: np.ndarray, corners: np.ndarray, share: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _refined(gray: np.ndarray, ids: np.ndarray, corners: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
     """The corners refined in windows of that share of the distance to the next corner."""
     height, width = gray.shape
     moved, near, inside = corners.copy(), [], []

@@ -86,7 +86,7 @@ def _markers(picture: np.ndarray, dictionary: str) -> _Markers:
 
 
 def _smallest(dictionary: str, highest: int, *, like: str) -> str:
-    """The smallest dictionary that begins like this one and has a marker of that number; the one asked for if it has."""
+    """The smallest dictionary like this one that has a marker of that number, or the one asked for if that has."""
     kind = dictionary.rpartition("_")[0]
     if not kind.startswith(("DICT_4X4", "DICT_5X5", "DICT_6X6", "DICT_7X7")):
         return dictionary

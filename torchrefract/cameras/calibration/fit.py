@@ -64,9 +64,7 @@ def rms(errors: np.ndarray) -> float:
     return float(np.sqrt((errors**2).sum(axis=1).mean())) if len(errors) else 0.0
 
 
-def fit(
-    views: Sequence[View], board: Board, *, model: str, size: tuple[int, int], start: Lens | None = None
-) -> Fit:
+def fit(views: Sequence[View], board: Board, *, model: str, size: tuple[int, int], start: Lens | None = None) -> Fit:
     """The camera that OpenCV's calibration finds: the least squares of |corner found - corner projected|.
 
         deviation^2 = diag((J^T J)^-1) sum |error|^2 / (2 N - parameters),  J of all numbers and poses
@@ -92,7 +90,9 @@ def fit(
         raise ValueError(f"views must be enough for the model {model}, got {len(views)}: {reason}") from error
     if not np.isfinite(lens.numbers).all():
         raise ValueError(f"views must be enough for the model {model}, got {len(views)} that fit no camera")
-    errors = [image - project(lens, pose, points)[0] for points, pose, image in zip(objects, poses, images, strict=True)]
+    errors = [
+        image - project(lens, pose, points)[0] for points, pose, image in zip(objects, poses, images, strict=True)
+    ]
     return Fit(lens, _deviations(lens, poses, objects, errors), poses, errors)
 
 
@@ -181,9 +181,7 @@ def _poses(turns: Sequence[np.ndarray], moves: Sequence[np.ndarray]) -> list[np.
     return [np.concatenate([turn.ravel(), move.ravel()]) for turn, move in zip(turns, moves, strict=True)]
 
 
-def _deviations(
-    lens: Lens, poses: list[np.ndarray], objects: list[np.ndarray], errors: list[np.ndarray]
-) -> np.ndarray:
+def _deviations(lens: Lens, poses: list[np.ndarray], objects: list[np.ndarray], errors: list[np.ndarray]) -> np.ndarray:
     """Of `lens.numbers`; the poses, each of which matters to its own view alone, are eliminated."""
     count = len(lens.numbers)
     normal = np.zeros((count, count))

@@ -77,6 +77,11 @@ def with_picture(name: str, words: list[str]) -> list[str]:
     return [f"image={_quoted(word)}" if i in pictures else word for i, word in enumerate(words)]
 
 
+def as_they_are(name: str, words: list[str]) -> list[str]:
+    """The words of `python -m torchrefract.<name>`, where every one of them has its own name."""
+    return words
+
+
 def command(
     name: str, *, prepare: Callable[[str, list[str]], list[str]] = with_task
 ) -> Callable[[Callable[[], None]], Callable[[], None]]:

@@ -11,11 +11,11 @@ from torchrefract.cameras.calibration.boards import Board, Charuco
 from torchrefract.cameras.models import Camera
 
 CAMERA = Camera(
-    width=960, height=600, fx=420.0, fy=422.0, cx=487.3, cy=292.6, coefficients=(-0.25, 0.1, 0.004, -0.003, 0.03)
+    width=960, height=600, fx=470.0, fy=472.0, cx=487.3, cy=292.6, coefficients=(-0.25, 0.1, 0.006, -0.005, 0.03)
 )
 VIEWS = 30
 _FINE = 6  # rays along each side of a pixel
-_TILT, _TURN = 0.5, 0.4  # rad, the largest
+_TILT, _TURN = 0.4, 0.4  # rad, the largest
 # Of the frame: how wide the board is in front of a pinhole, and where along the sides its middle never is. Any part of
 # a ChArUco board can be seen, a chessboard as a whole.
 _PARTLY, _WHOLE = ((0.4, 0.6), 0.04), ((0.3, 0.45), 0.22)

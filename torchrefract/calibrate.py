@@ -1,0 +1,115 @@
+"""Calibrate a camera with pictures of a board: `python -m torchrefract.calibrate images=pictures squares=11x8`."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import hydra
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.progress import track
+
+from torchrefract._checks import check_choice, check_number
+from torchrefract._command import UsageError, as_they_are, command, job, make, naming
+from torchrefract._config import CONFIG_DIR
+from torchrefract._files import replacing
+from torchrefract.board_views import Look, look_at, main_size, pictures_of, shown_instead
+from torchrefract.calibration_report import Calibration, camera_of, write_looks, write_report
+from torchrefract.cameras.calibration.boards import Board
+from torchrefract.cameras.calibration.fit import FEWEST_VIEWS, MODELS, held_out
+from torchrefract.cameras.calibration.outliers import drop_outliers
+from torchrefract.cameras.calibration.synthetic import CAMERA, VIEWS, render_views
+from torchrefract.cameras.files.opencv import write_opencv
+
+_RENDERED = "synthetic"
+_NEEDED = FEWEST_VIEWS + 1  # views, so that each can be left out
+_LONGEST = 300  # letters of what is said of single pictures in one line
+_T = TypeVar("_T")
+
+
+@command("calibrate", prepare=as_they_are)
+@hydra.main(config_path=CONFIG_DIR, config_name="calibrate", version_base="1.3")
+@job
+def main(cfg: DictConfig) -> None:
+    """Find the corners, fit the camera, drop views that do not fit, write what came out."""
+    board = make(cfg, "board")
+    with naming("model"):
+        model = check_choice("model", str(cfg.model), MODELS)
+    with naming("drop_share"):
+        most = check_number("drop_share", cfg.drop_share, low=0.0, high=0.9)
+    out = Path(str(cfg.out))
+    with naming("out"):
+        out.mkdir(parents=True, exist_ok=True)
+    files = _rendered(board, out / "pictures") if str(cfg.images) == _RENDERED else pictures_of(Path(str(cfg.images)))
+    looks = _look(files, board, out)
+    try:
+        found = _calibrate(files, looks, board, model, most)
+    except (UsageError, ValueError) as error:
+        write_looks(board, looks, str(error), out)
+        raise UsageError(f"{error} ({out / 'report.md'} tells of each picture)") from error
+    write_opencv(out / "camera.yaml", found.camera)
+    write_report(found, {file.name: file for file in files}, out)
+    _tell(found, out)
+
+
+def _rendered(board: Board, folder: Path) -> list[Path]:
+    """Pictures of the board by a camera that is known, rendered unless they are there."""
+    mark, made_by = folder / "rendered.txt", f"{board.describe()}\n{CAMERA}\n"
+    if not mark.is_file() or mark.read_text(encoding="utf-8") != made_by:
+        folder.mkdir(exist_ok=True)
+        for name, picture, _ in _progress(render_views(board), VIEWS, "rendering"):
+            with replacing(folder / name) as path:
+                cv2.imwrite(str(path), picture)
+        with replacing(mark) as path:
+            path.write_text(made_by, encoding="utf-8")
+    return pictures_of(folder)
+
+
+def _look(files: Sequence[Path], board: Board, out: Path) -> list[Look]:
+    return list(_progress(look_at(files, board, out / "detections.jsonl"), len(files), "looking for the board"))
+
+
+def _calibrate(files: Sequence[Path], looks: Sequence[Look], board: Board, model: str, most: float) -> Calibration:
+    size = main_size(looks)
+    looks = [_of_size(look, size) for look in looks]
+    views = [look.view for look in looks if not look.reason]
+    if len(views) < _NEEDED:
+        reasons = "; ".join(f"{look.view.name}: {look.reason}" for look in looks if look.reason)
+        shown = shown_instead(files, looks, board)
+        raise UsageError(
+            f"images must show the board ({board.describe()}) in {_NEEDED} pictures at least, got {len(views)}"
+            f"{f'. {shown}' if shown else ''}{f'. {_cut(reasons)}' if reasons else ''}"
+        )
+    kept = drop_outliers(views, board, model=model, size=size, most=most)
+    held = held_out(kept.views, board, kept.fitted, size=size)
+    return Calibration(board, looks, kept, held, camera_of(kept.fitted, size))
+
+
+def _of_size(look: Look, size: tuple[int, int]) -> Look:
+    if look.reason or look.size == size:
+        return look
+    return look._replace(reason=f"{look.size[0]} x {look.size[1]} px, others are of {size[0]} x {size[1]}")
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} …"
+
+
+def _tell(found: Calibration, out: Path) -> None:
+    for name, reason in found.kept.dropped.items():
+        print(f"{name} dropped: {reason}")
+    print(
+        f"{out / 'camera.yaml'}: {found.fitted.lens.model} of {len(found.kept.views)} views in {len(found.looks)} "
+        f"pictures, rms {found.fitted.rms:.3f} px, on views held out {found.held_rms:.3f} px; see {out / 'report.md'}"
+    )
+
+
+def _progress(items: Iterable[_T], count: int, name: str) -> Iterable[_T]:
+    """The items, with a line of progress where somebody watches."""
+    console = Console(stderr=True)
+    return track(items, name, total=count, console=console, transient=True, disable=not console.is_terminal)
+
+
+if __name__ == "__main__":
+    main()

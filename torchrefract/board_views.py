@@ -90,7 +90,7 @@ def main_size(looks: Sequence[Look]) -> tuple[int, int]:
 
 
 def shown_instead(files: Sequence[Path], looks: Sequence[Look], board: Board) -> str:
-    """What the sharpest pictures without the board show in its place, of the first one that shows anything; or empty."""
+    """What the first of the sharpest pictures without the board that shows something shows instead; or empty."""
     paths = {file.name: file for file in files}
     failed = sorted((look for look in looks if look.reason and look.size != (0, 0)), key=lambda look: look.edges)
     for look in failed[:_ASKED]:

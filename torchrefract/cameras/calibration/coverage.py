@@ -21,7 +21,7 @@ def coverage(views: Sequence[View], size: tuple[int, int]) -> np.ndarray:
 
 
 def doubts(views: Sequence[View], fitted: Fit, camera: Camera) -> list[str]:
-    """What a calibration cannot know, in sentences: sides without corners, coefficients like zero, a model that folds."""
+    """What a calibration cannot know: sides without corners, coefficients like zero, a model that folds."""
     counts, found = coverage(views, (camera.width, camera.height)), []
     empty = [
         f"{side} ({np.sum(counts[part] == 0)} of {counts[part].size} parts)"

@@ -1,5 +1,6 @@
 """The corners of a board in a picture."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import cv2
@@ -11,11 +12,13 @@ FEWEST_CORNERS = 6
 SEARCH = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
 # Half the side of the window that a corner is refined in: of the way to the nearest marker, or of half a square, but
 # so many px, of which less tell little, if that is no larger share of a square.
-_CLEAR, _WINDOWS, _LEAST = 0.7, (5, 10), 0.2
+_CLEAR, _WINDOWS, _LEAST = 0.7, (5, 10), 0.15
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
 _FARTHEST = 0.05  # squares that a refinement may move a corner by, or 1 px
 _MISFIT = 0.2  # squares from where its neighbors say that a corner is
 _NEIGHBORS = 8
+_BESIDE = 0.1  # squares from a corner, along x and y, where its four squares are looked at
+_CONTRAST = 0.4  # of the median contrast of the corners that one must have
 _SURE = 0.75  # of the corners that a refinement must keep to be believed
 
 
@@ -33,7 +36,7 @@ def detect(gray: np.ndarray, board: Board, *, name: str = "") -> View:
     A ChArUco board is found by its markers, in the patterns and colors that it may have, whichever shows more; a
     chessboard by `findChessboardCornersSB`, or else by `findChessboardCorners`. Each corner is then refined in a window
     that holds little but its four squares, and left out if it moves far, lies at the border of the picture, or is not
-    where its neighbors say. Where many would move far, as on an overexposed board whose squares do not touch, all stay.
+    where its neighbors say, or is not where black and white cross, as behind a finger. Where many would move far, as on an overexposed board whose squares do not touch, all stay.
 
     Args:
         gray: (H, W), uint8.
@@ -52,6 +55,7 @@ def detect(gray: np.ndarray, board: Board, *, name: str = "") -> View:
     if len(ids):
         ids, corners = _refined(gray, ids, corners, _CLEAR * share)
         ids, corners = _consistent(board, ids, corners)
+        ids, corners = _crossed(gray, board, ids, corners)
     return View(name, ids, corners.astype(np.float64).reshape(-1, 2))
 
 
@@ -69,11 +73,13 @@ def both(value: str | bool) -> tuple[bool, ...]:
 
 def _markers_and_corners(gray: np.ndarray, board: Charuco) -> tuple[np.ndarray, np.ndarray]:
     best = np.empty(0, dtype=int), np.empty((0, 2))
+    one = cv2.aruco.CharucoParameters()
+    one.minMarkers = 1  # beside a corner, so that those near the border of the picture count; what misfits goes below
     legacies = both(board.legacy) if board.counts[1] % 2 == 0 else (False,)  # of odd rows both are the same
     for inverted in both(board.inverted):
         picture = 255 - gray if inverted else gray
         for legacy in legacies:
-            corners, ids, _, _ = cv2.aruco.CharucoDetector(board.opencv(legacy)).detectBoard(picture)
+            corners, ids, _, _ = cv2.aruco.CharucoDetector(board.opencv(legacy), one).detectBoard(picture)
             if ids is not None and len(ids) > len(best[0]):
                 best = ids.ravel(), corners.reshape(-1, 2)
     return best
@@ -125,14 +131,33 @@ def _consistent(board: Board, ids: np.ndarray, corners: np.ndarray) -> tuple[np.
 
 def _misfits(plane: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """(N,), squares, between each corner and where the homography of its neighbors puts it."""
-    apart = np.linalg.norm(plane[:, None] - plane[None], axis=2)
     spacings, errors = _spacings(corners), np.zeros(len(corners))
-    for k in range(len(corners)):
-        others = np.argsort(apart[k], kind="stable")[1 : _NEIGHBORS + 1]
-        if np.linalg.matrix_rank(plane[others] - plane[others].mean(axis=0)) < 2:
-            continue  # in a line they say nothing across it
-        matrix, _ = cv2.findHomography(plane[others], corners[others], 0)
+    for k, matrix in enumerate(_homographies(plane, corners)):
         if matrix is not None:
             place = cv2.perspectiveTransform(plane[None, k : k + 1], matrix).reshape(2)
             errors[k] = np.hypot(*(place - corners[k])) / spacings[k]
     return errors
+
+
+def _homographies(plane: np.ndarray, corners: np.ndarray) -> Iterator[np.ndarray | None]:
+    """From the board to the picture near each corner, by its neighbors; None where these are in a line."""
+    apart = np.linalg.norm(plane[:, None] - plane[None], axis=2)
+    for k in range(len(corners)):
+        others = np.argsort(apart[k], kind="stable")[1 : _NEIGHBORS + 1]
+        flat = np.linalg.matrix_rank(plane[others] - plane[others].mean(axis=0)) < 2
+        yield None if flat or len(others) < 4 else cv2.findHomography(plane[others], corners[others], 0)[0]
+
+
+def _crossed(gray: np.ndarray, board: Board, ids: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those where two squares are clearly darker than the two others."""
+    plane, gaps = board.corners(ids)[:, :2], np.full(len(ids), np.nan)
+    signs = np.array([(-1, -1), (1, 1), (-1, 1), (1, -1)])
+    for k, matrix in enumerate(_homographies(plane, corners)):
+        if matrix is not None:
+            around = np.vstack([plane[k], plane[k] + _BESIDE * board.square_mm * signs])
+            places = cv2.perspectiveTransform(around[None], matrix).reshape(-1, 2)
+            x, y = (places[1:] - places[0] + corners[k]).astype(np.float32).T
+            seen = cv2.remap(gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float).ravel()
+            gaps[k] = max(seen[:2].min() - seen[2:].max(), seen[2:].min() - seen[:2].max())
+    kept = np.isnan(gaps) | (gaps > _CONTRAST * np.nanmedian(gaps)) if not np.isnan(gaps).all() else gaps != 0
+    return ids[kept], corners[kept]

@@ -10,7 +10,7 @@ from torchrefract.cameras.calibration.detection import View
 from torchrefract.cameras.calibration.fit import FEWEST_VIEWS, Fit, errors_of, fit, rms
 
 _DEVIATIONS = 6.0  # of the other views' errors, by their median deviation
-_TIMES = 2.0  # the median of the others
+_TIMES = 3.0  # the median of the others
 _TO_SIGMA = 1.4826  # a normal distribution's standard deviation, in median deviations
 
 
@@ -49,7 +49,7 @@ class Kept(NamedTuple):
 def leave_each_out(views: Sequence[View], board: Board, fitted: Fit, *, size: tuple[int, int]) -> list[Left]:
     """What leaving each view out shows, in their order.
 
-        limit = max(2 m, m + 6 * 1.4826 median |e_j - m|),  m = median e_j,  e_j the rms of the other views
+        limit = max(3 m, m + 6 * 1.4826 median |e_j - m|),  m = median e_j,  e_j the rms of the other views
 
     Args:
         views, board, size: as for `fit`, one view more than it needs.

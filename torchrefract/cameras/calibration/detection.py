@@ -35,8 +35,9 @@ def detect(gray: np.ndarray, board: Board, *, name: str = "") -> View:
 
     A ChArUco board is found by its markers, in the patterns and colors that it may have, whichever shows more; a
     chessboard by `findChessboardCornersSB`, or else by `findChessboardCorners`. Each corner is then refined in a window
-    that holds little but its four squares, and left out if it moves far, lies at the border of the picture, or is not
-    where its neighbors say, or is not where black and white cross, as behind a finger. Where many would move far, as on an overexposed board whose squares do not touch, all stay.
+    that holds little but its four squares. Left out are those that move far, lie at the border of the picture, are not
+    where their neighbors say, or not where black and white cross, as behind a finger. Where many would move far, as on
+    an overexposed board whose squares do not touch, all stay where they were found.
 
     Args:
         gray: (H, W), uint8.

@@ -170,9 +170,9 @@ def _calibrate_fisheye(
     if start is not None:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
         matrix, vector = start.matrix.copy(), start.coefficients.copy()
-    points = [[p.reshape(-1, 1, p.shape[1]) for p in group] for group in (objects, images)]
+    on_board, in_picture = ([p.reshape(-1, 1, p.shape[1]) for p in group] for group in (objects, images))
     _, matrix, vector, turns, moves = cv2.fisheye.calibrate(
-        *points, size, matrix, vector.reshape(4, 1), flags=flags, criteria=_STOP
+        on_board, in_picture, size, matrix, vector.reshape(4, 1), flags=flags, criteria=_STOP
     )
     return Lens(model, matrix, vector.ravel()), _poses(turns, moves)
 

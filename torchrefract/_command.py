@@ -6,11 +6,11 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
@@ -20,6 +20,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from pytorch_lightning import LightningModule, Trainer, seed_everything
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
+from rich.console import Console
+from rich.progress import track
 
 from torchrefract._config import CONFIG_DIR
 from torchrefract._files import replacing
@@ -27,6 +29,7 @@ from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.module import PairData
 from torchrefract.restoration.checkpoints import CheckpointError, check_fits, read_checkpoint
 
+_T = TypeVar("_T")
 _INFORMING = ("--help", "-h", "--hydra-help", "--info", "--shell-completion", "-sc")
 _SEEDS = 2**32  # as many as numpy takes
 # Advice of libraries on what is meant so here.
@@ -171,6 +174,12 @@ def naming(part: str) -> Iterator[None]:
         yield
     except (ValueError, TypeError, OSError, MisconfigurationException) as error:
         raise UsageError(f"{part}: {error}") from error
+
+
+def progress(items: Iterable[_T], name: str, *, count: int) -> Iterable[_T]:
+    """The items, so many, with a line of progress of that name where somebody watches."""
+    console = Console(stderr=True)
+    return track(items, name, total=count, console=console, transient=True, disable=not console.is_terminal)
 
 
 def _is_picture(word: str) -> bool:

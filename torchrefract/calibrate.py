@@ -1,17 +1,14 @@
 """Calibrate a camera with pictures of a board: `python -m torchrefract.calibrate images=pictures squares=11x8`."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import cv2
 import hydra
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.progress import track
 
 from torchrefract._checks import check_choice, check_number
-from torchrefract._command import UsageError, as_they_are, command, job, make, naming
+from torchrefract._command import UsageError, as_they_are, command, job, make, naming, progress
 from torchrefract._config import CONFIG_DIR
 from torchrefract._files import replacing
 from torchrefract.board_views import Look, look_at, main_size, pictures_of, shown_instead
@@ -25,7 +22,6 @@ from torchrefract.cameras.files.opencv import write_opencv
 _RENDERED = "synthetic"
 _NEEDED = FEWEST_VIEWS + 1  # views, so that each can be left out
 _LONGEST = 300  # letters of what is said of single pictures in one line
-_T = TypeVar("_T")
 
 
 @command("calibrate", prepare=as_they_are)
@@ -58,7 +54,7 @@ def _rendered(board: Board, folder: Path) -> list[Path]:
     mark, made_by = folder / "rendered.txt", f"{board.describe()}\n{CAMERA}\n"
     if not mark.is_file() or mark.read_text(encoding="utf-8") != made_by:
         folder.mkdir(exist_ok=True)
-        for name, picture, _ in _progress(render_views(board), VIEWS, "rendering"):
+        for name, picture, _ in progress(render_views(board), "rendering", count=VIEWS):
             with replacing(folder / name) as path:
                 cv2.imwrite(str(path), picture)
         with replacing(mark) as path:
@@ -67,7 +63,7 @@ def _rendered(board: Board, folder: Path) -> list[Path]:
 
 
 def _look(files: Sequence[Path], board: Board, out: Path) -> list[Look]:
-    return list(_progress(look_at(files, board, out / "detections.jsonl"), len(files), "looking for the board"))
+    return list(progress(look_at(files, board, out / "detections.jsonl"), "looking for the board", count=len(files)))
 
 
 def _calibrate(files: Sequence[Path], looks: Sequence[Look], board: Board, model: str, most: float) -> Calibration:
@@ -103,12 +99,6 @@ def _tell(found: Calibration, out: Path) -> None:
         f"{out / 'camera.yaml'}: {found.fitted.lens.model} of {len(found.kept.views)} views in {len(found.looks)} "
         f"pictures, rms {found.fitted.rms:.3f} px, on views held out {found.held_rms:.3f} px; see {out / 'report.md'}"
     )
-
-
-def _progress(items: Iterable[_T], count: int, name: str) -> Iterable[_T]:
-    """The items, with a line of progress where somebody watches."""
-    console = Console(stderr=True)
-    return track(items, name, total=count, console=console, transient=True, disable=not console.is_terminal)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """Effects in motion: each beside its map, frame by frame, as an animation in a file."""
 
-import errno
-import os
 import struct
 import textwrap
 import warnings
@@ -18,20 +16,15 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image, features
 from PIL.GifImagePlugin import getdata, getheader
-from rich.console import Console
-from rich.progress import track
 from torch import Tensor
 
-from torchrefract._command import naming
+from torchrefract._command import naming, progress
 from torchrefract.effects.base import Effect
 from torchrefract.page import Page, as_drawn
 from torchrefract.sheet import Scale, draw_legend, drawn, map_picture, map_scales
 from torchrefract.types import Degraded
+from torchrefract.videos import write_video
 from torchrefract.viz import hatch_invalid
-
-# OpenCV and its FFmpeg write to the terminal on their own; what goes wrong is raised as an error.
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 _STACKED = 3  # effects below one another; more of them stand in pairs, and are drawn smaller
 _LARGEST = (480, 320)  # px, the longer side of an image as drawn, of few effects and of many
@@ -136,8 +129,7 @@ def save_film(film: Film, path: Path, *, fps: float, name: str) -> None:
     Raises:
         OSError: what cannot be written.
     """
-    console = Console(stderr=True)
-    times = track(range(film.footage.total), name, console=console, transient=True, disable=not console.is_terminal)
+    times = progress(range(film.footage.total), name, count=film.footage.total)
     _WRITERS[path.suffix.lower()](film, film.pages(times), path, fps)
 
 
@@ -274,19 +266,7 @@ def _chunk(stream: BinaryIO, name: bytes, data: bytes) -> None:
 
 def _write_mp4(film: Film, pages: Iterator[np.ndarray], path: Path, fps: float) -> None:
     height, width = film.backdrop.shape[:2]
-    codec = cv2.VideoWriter.fourcc(*"mp4v")
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, codec, fps, (width, height))
-    try:
-        for page in pages:
-            writer.write(page[..., ::-1])
-    finally:
-        writer.release()
-    # OpenCV says nothing when it fails.
-    found = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    whole = found.isOpened() and round(found.get(cv2.CAP_PROP_FRAME_COUNT)) == film.footage.total
-    found.release()
-    if not whole:
-        raise OSError(errno.EIO, "the video is not whole, as on a full disk")
+    write_video(pages, path, fps=fps, size=(width, height))
 
 
 _WRITERS: dict[str, Callable[[Film, Iterator[np.ndarray], Path, float], None]] = {

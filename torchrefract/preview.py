@@ -19,15 +19,15 @@ from torchrefract._checks import check_count, check_number, check_positive
 from torchrefract._command import UsageError, check_seed, command, job, make, naming, with_picture
 from torchrefract._config import CONFIG_DIR
 from torchrefract._files import replacing
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, check_size, fit, image_size, read_image
+from torchrefract.data.images import EXTENSIONS, check_size, fit, image_size, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
 from torchrefract.fields.depth import check_depth
 from torchrefract.film import Footage, formats, make_film, save_film
 from torchrefract.sheet import make_row, sheet
+from torchrefract.videos import VIDEOS, read_video
 
 _RENDERED = (540, 960)  # height and width
-_VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".gif")
 _FASTEST = 50.0  # frames a second: a GIF counts hundredths of a second, and 0 or 1 of them is no delay to many viewers
 _FARTHEST = 65535  # steps of a depth picture
 
@@ -115,11 +115,11 @@ def _read(path: Path, most: int) -> Footage:
         if not files:
             raise UsageError(f"image must be a folder that holds {', '.join(EXTENSIONS)}, got {path}")
         return Footage(len(files), lambda times: _of_one_size((t, files[t].name, read_image(files[t])) for t in times))
-    if path.suffix.lower() in _VIDEOS:
-        count = sum(1 for _ in _video(path, range(most)))
+    if path.suffix.lower() in VIDEOS:
+        count = sum(1 for _ in read_video(path, range(most)))
         if count == 0:
             raise UsageError(f"image must be a video with a frame that can be decoded, got {path}")
-        return Footage(count, lambda times: _video(path, times))
+        return Footage(count, lambda times: read_video(path, times))
     return _still(read_image(path)[None].contiguous(), most)
 
 
@@ -142,30 +142,6 @@ def _of_one_size(pictures: Iterable[tuple[int, str, Tensor]]) -> Iterator[tuple[
                 f"got {name} of {picture.shape[1]}x{picture.shape[2]}"
             )
         yield t, picture[None].contiguous()
-
-
-def _video(path: Path, times: Iterable[int]) -> Iterator[tuple[int, Tensor]]:
-    """The frames of a video, until it ends."""
-    _check_opens(path)
-    # By its whole path, since FFmpeg takes what is before a colon for a protocol.
-    capture, position = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG), 0
-    try:
-        for t in times:
-            while position < t + 1:
-                if not capture.grab():
-                    return
-                position += 1
-            pixels = torch.from_numpy(capture.retrieve()[1][..., ::-1].copy())
-            yield t, pixels.permute(2, 0, 1)[None].contiguous().float() / 255
-    finally:
-        capture.release()
-
-
-def _check_opens(path: Path) -> None:
-    try:
-        path.open("rb").close()
-    except OSError as error:
-        raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
 
 
 def _fitted(footage: Footage, size: tuple[int, int]) -> Footage:

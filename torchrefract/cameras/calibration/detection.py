@@ -36,8 +36,8 @@ def detect(gray: np.ndarray, board: Board, *, name: str = "") -> View:
     A ChArUco board is found by its markers, in the patterns and colors that it may have, whichever shows more; a
     chessboard by `findChessboardCornersSB`, or else by `findChessboardCorners`. Each corner is then refined in a window
     that holds little but its four squares. Left out are those that move far, lie at the border of the picture, are not
-    where their neighbors say, or not where black and white cross, as behind a finger. Where many would move far, as on
-    an overexposed board whose squares do not touch, all stay where they were found.
+    where their neighbors say, or, of a ChArUco board, not where black and white cross, as behind a finger. Where many
+    would move far, as on an overexposed board whose squares do not touch, all stay where they were found.
 
     Args:
         gray: (H, W), uint8.
@@ -56,7 +56,8 @@ def detect(gray: np.ndarray, board: Board, *, name: str = "") -> View:
     if len(ids):
         ids, corners = _refined(gray, ids, corners, _CLEAR * share)
         ids, corners = _consistent(board, ids, corners)
-        ids, corners = _crossed(gray, board, ids, corners)
+        if isinstance(board, Charuco):  # a chessboard was seen as a whole
+            ids, corners = _crossed(gray, board, ids, corners)
     return View(name, ids, corners.astype(np.float64).reshape(-1, 2))
 
 

@@ -35,19 +35,19 @@ def explain(gray: np.ndarray, view: View, board: Board) -> str:
     """Why a view that is not enough is none, in a few words."""
     width = edge_width(gray)
     blurred = f"; it is blurred, its sharpest edges are {width:.1f} px wide" if width > BLURRED else ""
-    if len(view.ids):
-        total = board.inner[0] * board.inner[1]
-        return f"{len(view.ids)} of {total} corners, {FEWEST_CORNERS} in two rows and columns are needed{blurred}"
     if isinstance(board, Charuco):
         mirrored = detect(np.ascontiguousarray(gray[:, ::-1]), board)
         if is_enough(mirrored, board):
             return f"mirrored: flipped from left to right it shows {len(mirrored.ids)} corners"
+    if len(view.ids):
+        total = board.inner[0] * board.inner[1]
+        return f"{len(view.ids)} of {total} corners, {FEWEST_CORNERS} in two rows and columns are needed{blurred}"
     return f"no board found{blurred}"
 
 
 def what_instead(gray: np.ndarray, board: Board) -> str:
     """The board that a picture shows where it does not show the one asked for, in words; empty if it shows none."""
-    return _other_charuco(gray, board) if isinstance(board, Charuco) else _other_chessboard(gray)
+    return _other_charuco(gray, board if isinstance(board, Charuco) else Charuco()) or _other_chessboard(gray)
 
 
 def _other_chessboard(gray: np.ndarray) -> str:
@@ -62,7 +62,7 @@ def _other_charuco(gray: np.ndarray, board: Charuco) -> str:
     tried = [_markers(picture, name) for picture in (gray, 255 - gray) for name in LARGEST_DICTIONARIES]
     found = max(tried, key=lambda one: len(one.corners))
     if len(found.corners) < _FEWEST_MARKERS:
-        return _other_chessboard(gray)
+        return ""
     low, high = int(found.ids.min()), int(found.ids.max())
     name = _smallest(found.dictionary, high, like=board.dictionary)
     color = "" if found.picture is gray else ", black and white exchanged"

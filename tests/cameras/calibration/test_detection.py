@@ -1,0 +1,85 @@
+import cv2
+import numpy as np
+import pytest
+
+from torchrefract.cameras.calibration.boards import Charuco, Chessboard
+from torchrefract.cameras.calibration.detection import View, detect, is_enough
+from torchrefract.cameras.calibration.synthetic import render_views
+
+
+def expected(camera, board, view, pose) -> np.ndarray:
+    matrix, vector = np.array(camera.matrix), np.array(camera.coefficients)
+    return cv2.projectPoints(board.corners(view.ids), pose[:3], pose[3:], matrix, vector)[0].reshape(-1, 2)
+
+
+def error(found, true) -> float:
+    return float(np.sqrt(((found - true) ** 2).sum(axis=1).mean()))
+
+
+def test_corners_are_found_to_a_tenth_of_a_pixel(rendered, small_board, small_camera):
+    for name, gray, pose in rendered:
+        view = detect(gray, small_board, name=name)
+        assert view.name == name
+        assert is_enough(view, small_board)
+        assert error(view.corners, expected(small_camera, small_board, view, pose)) < 0.1
+
+
+def test_a_chessboard_is_found_up_to_half_a_turn(small_camera):
+    board = Chessboard(squares="7x6", square_mm=30)
+    _, gray, pose = next(render_views(board, small_camera, count=1))
+    view = detect(gray, board)
+    true = expected(small_camera, board, view, pose)
+    assert len(view.ids) == 30
+    assert min(error(view.corners, true), error(view.corners, true[::-1])) < 0.1
+
+
+@pytest.mark.parametrize("squares", ["6x5", "5x6"])
+@pytest.mark.parametrize("legacy", [False, True])
+@pytest.mark.parametrize("inverted", [False, True])
+def test_pattern_and_colors_need_not_be_said(squares, legacy, inverted, small_camera):
+    known = {"squares": squares, "square_mm": 30, "marker_mm": 20, "dictionary": "DICT_4X4_50"}
+    shown = Charuco(**known, legacy=legacy, inverted=inverted)
+    _, gray, pose = next(render_views(shown, small_camera, count=1))
+    view = detect(gray, Charuco(**known))
+    assert is_enough(view, shown)
+    assert error(view.corners, expected(small_camera, shown, view, pose)) < 0.1
+    other = Charuco(**known, inverted=not inverted)
+    assert len(detect(gray, other).ids) == 0
+
+
+def test_corners_behind_a_finger_are_left_out(rendered, small_board, small_camera):
+    _, gray, pose = rendered[0]
+    whole = detect(gray, small_board)
+    middle = whole.corners.mean(axis=0)
+    covered = np.abs(whole.corners - middle).max(axis=1) < 40
+    x, y = middle.round().astype(int)
+    hidden = gray.copy()
+    hidden[y - 45 : y + 46, x - 45 : x + 46] = 130
+    view = detect(hidden, small_board)
+    assert covered.sum() >= 2
+    assert not set(whole.ids[covered].tolist()) & set(view.ids.tolist())
+    assert error(view.corners, expected(small_camera, small_board, view, pose)) < 0.15
+
+
+def test_an_overexposed_chessboard_keeps_its_corners(small_camera):
+    board = Chessboard(squares="7x6", square_mm=30)
+    _, gray, pose = next(render_views(board, small_camera, count=1))
+    bloomed = cv2.dilate(gray, np.ones((7, 7), np.uint8))  # white squares grow, so that black ones do not touch
+    view = detect(bloomed, board)
+    true = expected(small_camera, board, view, pose)
+    assert len(view.ids) == 30
+    assert min(error(view.corners, true), error(view.corners, true[::-1])) < 0.5
+
+
+def test_a_picture_without_a_board_shows_no_corner():
+    noise = np.random.default_rng(0).integers(0, 256, (200, 300), dtype=np.uint8)
+    for board in (Charuco(), Chessboard()):
+        assert detect(noise, board).corners.shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("ids", "enough"), [(range(6), False), ((0, 1, 2, 10, 11), False), ((0, 1, 2, 10, 11, 12), True)]
+)
+def test_six_corners_in_two_rows_are_enough(ids, enough):
+    view = View("", np.array(ids), np.zeros((len(ids), 2)))
+    assert is_enough(view, Charuco(squares="11x8")) == enough

@@ -1,0 +1,52 @@
+import cv2
+import numpy as np
+import torch
+
+from torchrefract.cameras.calibration import synthetic
+from torchrefract.cameras.calibration.boards import Chessboard
+from torchrefract.cameras.calibration.synthetic import Rays, rays_of, render_views
+from torchrefract.cameras.models import Camera
+
+
+def test_rays_between_pixels_are_those_of_the_camera(small_camera):
+    where = np.zeros((small_camera.height, small_camera.width), dtype=bool)
+    where[5:395:13, 5:635:13] = True
+    found = rays_of(small_camera).between(where)
+    steps = (np.arange(6) + 0.5) / 6 - 0.5
+    y, x = np.nonzero(where)
+    u, v = x[:, None, None] + steps[None, None], y[:, None, None] + steps[None, :, None]
+    pixels = torch.from_numpy(np.stack(np.broadcast_arrays(u, v), axis=-1).reshape(-1, 2))
+    rays = small_camera.unproject(pixels).points.numpy()
+    exact = (rays[:, :2] / rays[:, 2:]).reshape(found.shape)
+    assert np.abs(found - exact).max() * small_camera.fx < 1e-2
+    assert np.abs(found - exact).mean() * small_camera.fx < 1e-3
+
+
+def test_a_pixel_is_the_share_of_black_in_it(monkeypatch):
+    # A pinhole in front of the board: 1 mm is 1 px, and squares of 10.5 px end in the middle of every second pixel.
+    board = Chessboard(squares="6x4", square_mm=10.5)
+    camera = Camera(width=90, height=70, fx=100.0, fy=100.0, cx=0.0, cy=0.0, coefficients=(0.0,) * 4)
+    pose = np.array([0, 0, 0, 9.5, 11.5, 100.0])
+    monkeypatch.setattr(synthetic, "_pose", lambda *_: pose)
+    monkeypatch.setattr(synthetic, "_NOISE", 0.0)
+    _, picture, _ = next(render_views(board, camera, count=1))
+    # The share of each pixel by areas: along x and along y the parity is a product of signs.
+    edges = [np.clip(np.arange(n + 1) - 0.5 - start, 0, None) for n, start in ((90, 9.5), (70, 11.5))]
+    waves = [np.diff(np.abs((edge + 10.5) % 21 - 10.5)) for edge in edges]
+    x, y = slice(10, 9 + 63), slice(12, 11 + 42)
+    parity = np.outer(waves[1], waves[0])[y, x]
+    expected = 225 - (225 - 25) * (1 + parity) / 2
+    assert np.abs(picture[y, x] - expected).max() <= 1
+
+
+def test_the_board_goes_over_the_frame(small_board, small_camera):
+    middles = []
+    for _, _, pose in render_views(small_board, small_camera, count=6):
+        width, height = small_board.size_mm
+        middle = cv2.Rodrigues(pose[:3])[0] @ (width / 2, height / 2, 0) + pose[3:]
+        pixel = small_camera.project(torch.from_numpy(middle[None])).points[0]
+        middles.append(pixel.numpy() / (small_camera.width - 1, small_camera.height - 1))
+    x, y = np.array(middles).T
+    np.testing.assert_allclose(sorted(set(x.round(6))), 0.04 + 0.92 * np.array([1, 3, 5]) / 6, atol=1e-5)
+    np.testing.assert_allclose(sorted(set(y.round(6))), 0.04 + 0.92 * np.array([1, 3]) / 4, atol=1e-5)
+    assert isinstance(rays_of(small_camera), Rays)

@@ -11,6 +11,7 @@ from pytorch_lightning import Trainer
 import torchrefract
 from torchrefract import presets
 from torchrefract._config import CONFIG_DIR
+from torchrefract.cameras.calibration.boards import Charuco, Chessboard
 from torchrefract.data.module import PairData
 from torchrefract.effects.base import Effect
 from torchrefract.restoration.module import Restoration
@@ -92,6 +93,16 @@ def test_a_preview_shows_every_effect_unless_a_scene_is_chosen():
     # One chooses, the other mends.
     assert {type(effect) for effect in made} == {*public} - {torchrefract.OneOf, torchrefract.Rectification}
     assert [type(effect).__name__ for effect in made] == list(plain.effects)
+
+
+@pytest.mark.parametrize("command", ["calibrate", "make_board"])
+def test_a_board_is_that_of_its_class(command):
+    assert options("board") == ["charuco", "chessboard"]
+    for name, kind in (("charuco", Charuco), ("chessboard", Chessboard)):
+        with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
+            made = instantiate(compose(command, overrides=[f"board={name}"]).board)
+        assert type(made) is kind
+        assert made == kind()
 
 
 @pytest.mark.parametrize("scene", options("scene"))

@@ -30,8 +30,8 @@ _LONGEST = 300  # letters of what is said of single pictures in one line
 def main(cfg: DictConfig) -> None:
     """Find the corners, fit the camera, drop views that do not fit, write what came out."""
     board = make(cfg, "board")
-    with naming("model"):
-        model = check_choice("model", str(cfg.model), MODELS)
+    with naming("lens_model"):
+        model = check_choice("lens_model", str(cfg.lens_model), MODELS)
     with naming("drop_share"):
         most = check_number("drop_share", cfg.drop_share, low=0.0, high=0.9)
     out = Path(str(cfg.out))

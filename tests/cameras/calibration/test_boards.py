@@ -1,8 +1,7 @@
-import cv2
 import numpy as np
 import pytest
 
-from torchrefract.cameras.calibration.boards import Board, Charuco, Chessboard
+from torchrefract.cameras.calibration.boards import Charuco, Chessboard
 
 
 @pytest.mark.parametrize("legacy", [False, True])
@@ -66,5 +65,3 @@ def test_a_wrong_definition_is_an_error(words, message):
 
 def test_a_description_is_the_words_of_the_command():
     assert Chessboard(squares="9x6", square_mm=10.5).describe() == "board=chessboard squares=9x6 square_mm=10.5"
-    assert isinstance(Chessboard(), Board)
-    assert cv2.aruco.DICT_5X5_250 == getattr(cv2.aruco, Charuco().dictionary)

@@ -21,7 +21,7 @@ def test_noise_of_a_size_has_that_size(projected):
 
 
 def test_one_corner_off_its_line_counts_by_its_distance():
-    # Of points 0, d, 0 at -1, 0, 1 the best line is at d / 3: the squares sum to d^2 (1 + 4 + 1) / 9, with one to spare.
+    # Of 0, d, 0 at -1, 0, 1 the best line is at d / 3: the squares sum to d^2 (1 + 4 + 1) / 9, with one to spare.
     view = View("", np.array([0, 1, 2]), np.array([[-1.0, 0], [0, 0.01], [1, 0]]))
     assert straightness([view], BOARD) == pytest.approx(0.01 * np.sqrt(6) / 3, rel=1e-3)
 

@@ -20,6 +20,7 @@ _FLAGS = {
 MODELS = (*_FLAGS, "fisheye")
 FEWEST_VIEWS = 3  # of a fit; judging it takes one more
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-10)
+_NO_FIT = 0.05  # of the width of the frame, rms
 _STEPS = 30  # of a pose
 
 
@@ -93,7 +94,12 @@ def fit(views: Sequence[View], board: Board, *, model: str, size: tuple[int, int
     errors = [
         image - project(lens, pose, points)[0] for points, pose, image in zip(objects, poses, images, strict=True)
     ]
-    return Fit(lens, _deviations(lens, poses, objects, errors), poses, errors)
+    found = Fit(lens, _deviations(lens, poses, objects, errors), poses, errors)
+    if found.rms > _NO_FIT * size[0]:
+        raise ValueError(
+            f"views must be of one camera of the model {model}, got {len(views)} that leave {found.rms:.1f} px rms"
+        )
+    return found
 
 
 def project(lens: Lens, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -170,7 +176,7 @@ def _calibrate_fisheye(
     if start is not None:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
         matrix, vector = start.matrix.copy(), start.coefficients.copy()
-    on_board, in_picture = ([p.reshape(-1, 1, p.shape[1]) for p in group] for group in (objects, images))
+    on_board, in_picture = ([p[None] for p in group] for group in (objects, images))
     _, matrix, vector, turns, moves = cv2.fisheye.calibrate(
         on_board, in_picture, size, matrix, vector.reshape(4, 1), flags=flags, criteria=_STOP
     )

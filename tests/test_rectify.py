@@ -1,0 +1,155 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from torchrefract.cameras.files.opencv import read_opencv, write_opencv
+from torchrefract.cameras.models import Camera
+from torchrefract.fields.rectifying import rectifying_flow
+from torchrefract.videos import video_facts
+
+PINHOLE = {"width": 96, "height": 64, "fx": 70.0, "fy": 71.0, "cx": 46.2, "cy": 33.1}
+CAMERAS = {
+    "opencv": Camera(**PINHOLE, coefficients=(-0.2, 0.05, 0.002, -0.001)),
+    "rational": Camera(**PINHOLE, coefficients=(0.3, 0.05, 0.002, -0.001, 0.01, 0.5, 0.1, 0.02)),
+    "fisheye": Camera(**PINHOLE, coefficients=(-0.03, 0.01, -0.005, 0.001), model="fisheye"),
+}
+
+
+def waves() -> np.ndarray:
+    x, y = np.meshgrid(np.arange(96), np.arange(64))
+    channels = [127 + 100 * np.sin(x / (5 + c)) * np.cos(y / (7 - c)) for c in range(3)]
+    return np.stack(channels, axis=-1).round().astype(np.uint8)
+
+
+def maps(camera: Camera, zoom: float) -> tuple[np.ndarray, np.ndarray]:
+    matrix, vector, size = np.array(camera.matrix), np.array(camera.coefficients), (camera.width, camera.height)
+    new = matrix * np.array([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
+    if camera.model == "fisheye":
+        return cv2.fisheye.initUndistortRectifyMap(matrix, vector, np.eye(3), new, size, cv2.CV_32FC1)
+    return cv2.initUndistortRectifyMap(matrix, vector, np.eye(3), new, size, cv2.CV_32FC1)
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """Three pictures, in the folder that commands run in."""
+    (tmp_path / "raw").mkdir()
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / "raw" / f"{k}.png"), np.roll(waves(), 7 * k, axis=1))
+    write_opencv(tmp_path / "cam.yaml", CAMERAS["opencv"])
+    return tmp_path
+
+
+@pytest.mark.parametrize("zoom", [1.0, 0.7])
+@pytest.mark.parametrize("name", CAMERAS)
+def test_the_flow_is_opencvs_map(name, zoom, oracle):
+    flow, exists, pinhole = rectifying_flow(CAMERAS[name], zoom=zoom)
+    y, x = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
+    expected = torch.from_numpy(np.stack(maps(CAMERAS[name], zoom)))
+    oracle("rectifying flow, OpenCV's maps", flow[0] + torch.stack([x, y]), expected, 1e-3)
+    assert exists.all()
+    assert (pinhole.fx, pinhole.fy) == (zoom * 70.0, zoom * 71.0)
+    assert (pinhole.cx, pinhole.cy, pinhole.coefficients) == (46.2, 33.1, (0.0,) * 4)
+
+
+def test_rays_that_a_camera_does_not_show_are_outside():
+    # It folds where 1 - 3 * 1.2 r^2 = 0: at 0.527 focal lengths from its center.
+    camera = Camera(**PINHOLE, coefficients=(-1.2, 0.0, 0.0, 0.0))
+    flow, exists, _ = rectifying_flow(camera)
+    y, x = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
+    r2 = ((x - 46.2) / 70).square() + ((y - 33.1) / 71).square()
+    assert torch.equal(exists[0, 0], r2 < 1 / 3.6)
+    assert ((flow[0] + torch.stack([x, y]))[:, ~exists[0, 0]] < -1).all()
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_pictures_keep_their_names_and_lose_their_lens(call, folder, name):
+    write_opencv(folder / "cam.yaml", CAMERAS[name])
+    outcome = call("rectify", "input=raw", "camera=cam.yaml")
+    expected = "rectified: 3 rectified, 0 were there already, 0 skipped; their camera is rectified/camera.yaml\n"
+    assert (outcome.out, outcome.err) == (expected, "")
+    for k in range(3):
+        found = cv2.imread(str(folder / "rectified" / f"{k}.png"))
+        raw = np.roll(waves(), 7 * k, axis=1).astype(np.float32)
+        theirs = cv2.remap(raw, *maps(CAMERAS[name], 1.0), cv2.INTER_CUBIC)
+        error = np.abs(np.asarray(found) - theirs.clip(0, 255))[4:-4, 4:-4]
+        assert error.mean() < 1
+        assert np.abs(np.asarray(found) - raw)[4:-4, 4:-4].mean() > 5
+    assert read_opencv(folder / "rectified" / "camera.yaml") == rectifying_flow(CAMERAS[name])[2]
+
+
+def test_a_run_that_was_stopped_goes_on(call, folder):
+    assert call("rectify", "input=raw", "camera=cam.yaml", "out=out").code == 0
+    whole = (folder / "out" / "1.png").read_bytes()
+    (folder / "out" / "0.png").unlink()
+    (folder / "out" / "1.png").write_bytes(whole[: len(whole) // 2])
+    before = (folder / "out" / "2.png").stat().st_mtime_ns
+    outcome = call("rectify", "input=raw", "camera=cam.yaml", "out=out")
+    assert outcome.out.startswith("out: 2 rectified, 1 were there already, 0 skipped")
+    assert (folder / "out" / "1.png").read_bytes() == whole
+    assert (folder / "out" / "2.png").stat().st_mtime_ns == before
+
+
+def test_a_folder_of_another_camera_is_not_gone_on_with(call, folder):
+    assert call("rectify", "input=raw", "camera=cam.yaml", "out=out").code == 0
+    message = call("rectify", "input=raw", "camera=cam.yaml", "out=out", "zoom=0.5").message
+    assert message == "out must be a folder of the same camera and zoom, got out with another camera.yaml"
+
+
+def test_a_smaller_frame_has_a_smaller_camera(call, folder):
+    small = cv2.resize(waves(), (48, 32), interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(folder / "small.png"), small)
+    assert call("rectify", "input=small.png", "camera=cam.yaml", "out=out").code == 0
+    theirs = cv2.remap(
+        small.astype(np.float32), *maps(CAMERAS["opencv"].resized(width=48, height=32), 1.0), cv2.INTER_CUBIC
+    )
+    found = np.asarray(cv2.imread(str(folder / "out" / "small.png")))
+    assert np.abs(found - theirs.clip(0, 255))[4:-4, 4:-4].mean() < 1
+
+
+def test_a_video_is_rectified_frame_by_frame(call, folder):
+    writer = cv2.VideoWriter(str(folder / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 12, (96, 64))
+    for k in range(5):
+        writer.write(np.roll(waves(), 3 * k, axis=1))
+    writer.release()
+    assert call("rectify", "input=clip.avi", "camera=cam.yaml", "out=out").code == 0
+    assert video_facts(folder / "out" / "clip.mp4") == (5, 12.0)
+    frame = np.asarray(cv2.VideoCapture(str(folder / "out" / "clip.mp4")).read()[1]).astype(float)
+    theirs = cv2.remap(waves().astype(np.float32), *maps(CAMERAS["opencv"], 1.0), cv2.INTER_CUBIC)
+    assert np.abs(frame - theirs)[4:-4, 4:-4].mean() < 12  # two codecs in between
+    assert "0 rectified, 1 were there already" in call("rectify", "input=clip.avi", "camera=cam.yaml", "out=out").out
+
+
+def test_a_damaged_picture_is_named_and_skipped(call, folder):
+    (folder / "raw" / "1.png").write_bytes(b"")
+    outcome = call("rectify", "input=raw", "camera=cam.yaml", "out=out")
+    assert outcome.code == 0
+    assert outcome.err == "skipped: raw/1.png is empty (0 bytes)\n"
+    assert outcome.out.startswith("out: 2 rectified, 0 were there already, 1 skipped")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("input=raw",), "camera must be given, as in camera=…, got nothing"),
+        (
+            ("input=none", "camera=cam.yaml"),
+            "input must be a folder, a picture or a video, got none, which does not exist",
+        ),
+        (
+            ("input=raw", "camera=bad.yaml"),
+            "camera: path must hold a mapping of names to values, got bad.yaml with str",
+        ),
+        (("input=raw", "camera=cam.yaml", "zoom=0"), "zoom: zoom must be a number in [0.05, 20], got 0"),
+        (("input=raw", "camera=cam.yaml", "out=raw"), "out must be another folder than that of input, got raw"),
+        (("input=wide.png", "camera=cam.yaml"), "input must hold what can be rectified, got image must have the shape"),
+    ],
+)
+def test_a_wrong_word_is_one_line_of_error(call, folder, words, message):
+    (folder / "bad.yaml").write_text("no camera")
+    cv2.imwrite(str(folder / "wide.png"), np.zeros((10, 90, 3), np.uint8))
+    outcome = call("rectify", *words)
+    assert outcome.code == 1
+    assert outcome.err.splitlines()[-1].startswith(f"error: {message}")

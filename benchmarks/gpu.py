@@ -44,14 +44,14 @@ def main() -> None:
         raise SystemExit(1)
     torch.manual_seed(0)
     frames = torch.rand(args.shape).to(args.device)
-    # Effects share the code of their `forward`, of which a process compiles few kinds by default.
-    torch._dynamo.config.recompile_limit = 64
     chosen = subjects()
     conditions = Conditions.now(frames, threads=torch.get_num_threads(), repeats=args.repeats)
     print(WHAT, end="\n\n", flush=True)
     bars = agreement(chosen, frames[:1])
-    found, failed = working(candidates(chosen, frames, backend=args.backend))
-    timings = measure(found, references=(GRID_SAMPLE, COPY), repeats=args.repeats, threads=torch.get_num_threads())
+    # Effects share the code of their `forward`, of which a process compiles few kinds by default.
+    with torch._dynamo.config.patch(recompile_limit=64):
+        found, failed = working(candidates(chosen, frames, backend=args.backend))
+        timings = measure(found, references=(GRID_SAMPLE, COPY), repeats=args.repeats, threads=torch.get_num_threads())
     speeds = bytes_per_second(timings, frames)
     print(table(timings, conditions), *failed, "", *traffic(speeds), "", *bars, sep="\n")
     save(args.out, timings, conditions, bars=bars, speeds=speeds)

@@ -75,7 +75,6 @@ def test_a_shape_has_four_sides():
 def test_the_command_times_eager_and_compiled_graphs(monkeypatch, tmp_path, capsys, on_threads):
     on_threads(1)
     monkeypatch.setattr(timing, "_STRETCH_S", 0.0)
-    monkeypatch.setattr(torch._dynamo.config, "recompile_limit", torch._dynamo.config.recompile_limit)
     monkeypatch.setattr(gpu, "subjects", lambda: {"flare": LensFlare(), "plate": ThinPlateSpline()})
     out = tmp_path / "new" / "gpu.json"
     words = ["gpu.py", "--device", "cpu", "--shape", "2x3x24x32", "--backend", "eager", "--out", str(out)]

@@ -146,22 +146,21 @@ def test_the_command_writes_what_it_measures(monkeypatch, tmp_path, capsys, on_t
     monkeypatch.setattr(sys, "argv", words)
     tradeoff.main()
     printed = capsys.readouterr().out
-    assert "| flare | type | float32 |" in printed
+    assert "| flare | tolerance | None |" in printed
     with (tmp_path / "new" / "tradeoff.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [(row["effect"], row["value"]) for row in rows] == [
         *(("lens", value) for value in ("None", "0.05", "1")),
-        ("flare", "float32"),
-        ("flare", "screen"),
+        *(("flare", value) for value in ("None", "0.1", "0.3", "1", "screen")),
         ("still air", "None"),
     ]
     lens = [float(row["mean_px"]) for row in rows[:3]]
     assert lens == sorted(lens)
     assert all(float(row["ratio_lower"]) <= float(row["ratio"]) <= float(row["ratio_upper"]) for row in rows)
     assert rows[3]["largest_px"] == ""
-    assert float(rows[5]["psnr_db"]) == math.inf
+    assert float(rows[8]["psnr_db"]) == math.inf
     content = json.loads((tmp_path / "new" / "tradeoff.json").read_text())
-    assert content["rows"][5]["psnr_db"] is None
+    assert content["rows"][8]["psnr_db"] is None
     assert content["conditions"]["frame"] == [1, 3, *tradeoff.QUICK]
     # In each knob the most exact one is on the front, and so is the fastest.
     lens_rows = content["rows"][:3]

@@ -55,7 +55,7 @@ def test_the_camera_of_the_rendered_board_is_found(call, tmp_path):
     report = (tmp_path / "calibration" / "report.md").read_text()
     assert "30 views of 30 pictures" in report
     written = {path.name for path in (tmp_path / "calibration").iterdir()}
-    assert written == {"camera.yaml", "report.md", "coverage.png", "residuals.png", "detections.jsonl", "pictures"}
+    assert written == {"camera.yaml", "report.md", "coverage.png", "residuals.png", "detections.jsonl", "rendered"}
 
 
 def test_a_run_that_was_stopped_goes_on(call, pictures, tmp_path, monkeypatch):

@@ -37,7 +37,7 @@ def main(cfg: DictConfig) -> None:
     out = Path(str(cfg.out))
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
-    files = _rendered(board, out / "pictures") if str(cfg.images) == _RENDERED else pictures_of(Path(str(cfg.images)))
+    files = _rendered(board, out / "rendered") if str(cfg.images) == _RENDERED else pictures_of(Path(str(cfg.images)))
     looks = _look(files, board, out)
     try:
         found = _calibrate(files, looks, board, model, most)

@@ -45,4 +45,4 @@ def test_a_good_set_leaves_no_doubt(projected):
 
 
 def inside(corners: np.ndarray) -> np.ndarray:
-    return ((corners >= 0) & (corners < (800, 600))).all(axis=1)
+    return np.flatnonzero(np.logical_and(corners >= 0, corners < (800, 600)).all(axis=1))

@@ -66,9 +66,9 @@ def test_an_overexposed_chessboard_keeps_its_corners(small_camera):
     _, gray, pose = next(render_views(board, small_camera, count=1))
     bloomed = cv2.dilate(gray, np.ones((7, 7), np.uint8))  # white squares grow, so that black ones do not touch
     view = detect(bloomed, board)
-    true = expected(small_camera, board, view, pose)
+    ways = [expected(small_camera, board, view._replace(ids=ids), pose) for ids in (view.ids, 29 - view.ids)]
     assert len(view.ids) >= 28
-    assert min(error(view.corners, true), error(view.corners, true[::-1])) < 0.5
+    assert min(error(view.corners, way) for way in ways) < 0.5
 
 
 def test_a_picture_without_a_board_shows_no_corner():

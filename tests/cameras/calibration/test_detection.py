@@ -68,7 +68,7 @@ def test_an_overexposed_chessboard_keeps_its_corners(small_camera):
     view = detect(bloomed, board)
     ways = [expected(small_camera, board, view._replace(ids=ids), pose) for ids in (view.ids, 29 - view.ids)]
     assert len(view.ids) >= 28
-    assert min(error(view.corners, way) for way in ways) < 0.5
+    assert min(error(view.corners, way) for way in ways) < 1.5  # gaps of 6 px between squares of 22
 
 
 def test_a_picture_without_a_board_shows_no_corner():

@@ -80,7 +80,7 @@ def working(found: Mapping[str, Candidate]) -> tuple[dict[str, Candidate], list[
         try:
             call()
             kept[name] = call
-        except Exception as error:
+        except Exception as error:  # a compiler raises whatever it likes; which, is told beside the others' times
             failed.append(f"{name} is left out: {type(error).__name__}: {str(error).splitlines()[0]}")
     return kept, failed
 

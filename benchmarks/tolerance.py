@@ -12,7 +12,7 @@ import math
 import random
 import statistics
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -55,15 +55,33 @@ class Trial:
 
 def main() -> None:
     """Try, print and save; a tolerance that is not kept ends the command with 1."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    try_all(__doc__, CONFIGURATIONS, attempt, summary, out=RESULTS / "tolerance.json")
+
+
+def try_all(
+    words: str | None,
+    names: Iterable[str],
+    attempt: Callable[[str, int], Any],
+    summary: Callable[[str, list[Any]], str],
+    *,
+    out: Path,
+) -> None:
+    """The command: so many trials of each name, told and saved; one whose `share` is above 1 ends it with 1.
+
+    Args:
+        words: that open with what the command does.
+        names: of what is tried.
+        attempt: a trial, a dataclass with a `share`, of a name and a seed.
+        summary: the trials of a name, in words.
+        out: where the JSON goes by default.
+    """
+    parser = argparse.ArgumentParser(description=(words or "").splitlines()[0])
     parser.add_argument("--count", type=count(1), default=200, help="configurations of each effect, 200")
     parser.add_argument("--seed", type=count(0), default=0, help="of the configurations, 0")
-    parser.add_argument(
-        "--out", type=Path, default=Path(__file__).parent / "results" / "tolerance.json", help="the JSON"
-    )
+    parser.add_argument("--out", type=Path, default=out, help="the JSON")
     args = parser.parse_args()
-    trials: dict[str, list[Trial]] = {}
-    for name in CONFIGURATIONS:
+    trials: dict[str, list[Any]] = {}
+    for name in names:
         trials[name] = [attempt(name, args.seed + i) for i in range(args.count)]
         print(summary(name, trials[name]), flush=True)
     args.out.parent.mkdir(parents=True, exist_ok=True)

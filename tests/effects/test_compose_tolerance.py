@@ -6,7 +6,18 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from torchrefract import Compose, DivergenceFree, LensDistortion, OneOf, ThinPlateSpline, Turbulence, UniformFog
+from torchrefract import (
+    Compose,
+    DivergenceFree,
+    LensDistortion,
+    LensFlare,
+    OneOf,
+    Rectification,
+    ThinPlateSpline,
+    Turbulence,
+    UniformFog,
+)
+from torchrefract.cameras import Camera
 from torchrefract.effects.compose_plan import ComposePlan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.plan import Plan
@@ -219,3 +230,14 @@ def test_a_share_below_rounding_is_exact():
 def test_a_plan_of_no_frame_raises():
     with pytest.raises(ValueError, match="height must be at least 1"):
         Compose(parts(0.1), tolerance_px=0.1).plan(0, 10)
+
+
+def test_every_effect_has_a_plan(capsys):
+    camera = Camera(width=130, height=96, fx=100.0, fy=100.0, cx=64.5, cy=47.5, coefficients=(-0.1, 0.0, 0.0, 0.0))
+    for effect in (Rectification(camera), *parts(0.1), UniformFog(), LensFlare(), Compose(parts(0.1))):
+        plan = effect.plan(*SIZE)
+        assert (plan.height, plan.width) == SIZE
+        assert capsys.readouterr().out.strip() == str(plan)
+    plan = Compose([Rectification(camera), *parts(0.1)], tolerance_px=0.1).planned(*SIZE, torch.float32)
+    # The rectification is exact, and what follows it is, too.
+    assert strides(plan) == [1] * 5

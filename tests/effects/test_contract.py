@@ -191,7 +191,7 @@ def test_a_sample_does_not_depend_on_the_number_of_threads(case, batch, on_threa
         assert_same(result, results[0])
 
 
-@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")  # so do loaders on Linux
 def test_a_sample_does_not_depend_on_the_worker_that_loads_it(case):
     effect, images, keys = case.strong(p=0.8), picture(6, 3, 20, 30), torch.tensor([4, -1, 7, 2**40, 0, 3])
     expected = maps(effect.degrade(images, seed=7, keys=keys))

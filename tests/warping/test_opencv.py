@@ -73,8 +73,9 @@ def test_bytes_are_those_of_grid_sample_but_for_halves(size, padding, interpolat
 @pytest.mark.parametrize("padding", PADDINGS)
 def test_bytes_of_real_frames_differ_in_few_values_in_a_million(padding, shared_data):
     for path in sorted((shared_data / "fullres").glob("*.jpg"))[:6]:
-        pixels: np.ndarray = cv2.imread(str(path))[:1080, :1920]  # pyright: ignore[reportOptionalSubscript, reportAssignmentType]
-        image = torch.from_numpy(pixels).permute(2, 0, 1)
+        pixels = cv2.imread(str(path))
+        assert pixels is not None
+        image = torch.from_numpy(np.asarray(pixels)[:1080, :1920]).permute(2, 0, 1)
         lens = LensDistortion(padding=padding, tolerance_px=0.05)
         flow = lens.degrade(image, seed=0).flow
         assert flow is not None
@@ -304,7 +305,7 @@ class Frames(Dataset):
         return lens.degrade(levels(3, 151, 263, seed=i), seed=7, keys=[i]).image
 
 
-@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")  # it is what is tested
 @pytest.mark.parametrize("context", ["fork", "spawn"])
 def test_workers_of_a_loader_find_the_same(context):
     expected = torch.stack([Frames()[i] for i in range(3)])

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchrefract import draws
 from torchrefract._checks import check_all, check_number, is_true
 from torchrefract.effects.door import Layout, check_depth_fits, check_image, enter, leave
+from torchrefract.effects.plan import check_size
 from torchrefract.effects.rows import at_frames
 from torchrefract.labels.rows import is_tv, wrapped
 from torchrefract.labels.targets import warp_labels
@@ -128,6 +129,28 @@ class Effect(nn.Module, ABC):
         return self
 
     params_type: type[Any]
+
+    def plan(self, height: int, width: int, *, dtype: torch.dtype = torch.float32) -> Any:
+        """What the effect does for frames of this size under its tolerance, if no depth is passed in; printed, too.
+
+        Args:
+            height, width: px, of the frame.
+            dtype: of the image.
+
+        Returns:
+            `Plan` of a warp, `LightPlan`, or `ComposePlan`.
+
+        Raises:
+            ValueError: a frame without a pixel; a tolerance below the rounding of such a frame.
+        """
+        check_size(height, width)
+        plan = self.planned(height, width, field_dtype(dtype))
+        print(plan)
+        return plan
+
+    @abstractmethod
+    def planned(self, height: int, width: int, dtype: torch.dtype) -> Any:
+        """The plan for fields of a type, from the ranges alone."""
 
     @property
     def takes_levels(self) -> bool:

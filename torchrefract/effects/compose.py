@@ -11,7 +11,7 @@ from torchrefract import draws
 from torchrefract._checks import check_choice, check_number
 from torchrefract.effects.base import Effect, moved
 from torchrefract.effects.compose_plan import ComposePlan, compose_plan
-from torchrefract.effects.plan import Ask, Plan, check_size, check_tolerance
+from torchrefract.effects.plan import Ask, Plan, check_tolerance
 from torchrefract.effects.radiance import RadianceEffect
 from torchrefract.effects.refraction import WarpEffect
 from torchrefract.effects.walk import Walk
@@ -120,21 +120,6 @@ class Compose(Effect):
             else:
                 walk.shade(cast(RadianceEffect, effect), own, plan)
         return walk.arrive(params)
-
-    def plan(self, height: int, width: int, *, dtype: torch.dtype = torch.float32) -> ComposePlan:
-        """What the composition does for frames of this size under its tolerance; printed, too.
-
-        Args:
-            height, width: px, of the frame.
-            dtype: of the image.
-
-        Raises:
-            ValueError: a frame without a pixel; a tolerance below the rounding of positions in such a frame.
-        """
-        check_size(height, width)
-        plan = self.planned(height, width, field_dtype(dtype))
-        print(plan)
-        return plan
 
     def planned(self, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
         """The plan for fields of a type."""

@@ -64,7 +64,7 @@ class _Warp(NamedTuple):
     def plan(self, ask: Ask, tolerance: float) -> Plan:
         """Its plan under a tolerance, or under its own if that is less."""
         if not isinstance(self.effect, LatticeWarp):
-            return ask.plan(1, 0.0, "it has no lattice")
+            return self.effect.planned(ask.height, ask.width, torch.float64 if ask.double else torch.float32)
         own = self.effect.tolerance_px
         ask = replace(ask, tolerance_px=None if own is None else min(own, tolerance))
         if own is not None and not ask.reachable:

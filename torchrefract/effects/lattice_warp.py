@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import is_true
-from torchrefract.effects.plan import Ask, Plan, check_size, check_tolerance
+from torchrefract.effects.plan import Ask, Plan, check_tolerance
 from torchrefract.effects.refraction import Moved, WarpEffect
 from torchrefract.effects.rows import learns, only, spread
-from torchrefract.warping.grid import field_dtype
 from torchrefract.warping.lattice import SmoothFlow
 
 
@@ -35,21 +34,6 @@ class LatticeWarp(WarpEffect):
     ):
         super().__init__(padding=padding, interpolation=interpolation, resampler=resampler, p=p)
         self.tolerance_px = check_tolerance(tolerance_px)
-
-    def plan(self, height: int, width: int, *, dtype: torch.dtype = torch.float32) -> Plan:
-        """What the effect does for frames of this size under its tolerance; printed, too.
-
-        Args:
-            height, width: px, of the frame.
-            dtype: of the image.
-
-        Raises:
-            ValueError: a frame without a pixel; a tolerance below the rounding of positions in such a frame.
-        """
-        check_size(height, width)
-        plan = self.planned(height, width, field_dtype(dtype))
-        print(plan)
-        return plan
 
     def plan_for(self, params: Any, height: int, width: int) -> Plan:
         """The plan for the type of these parameters."""

@@ -133,16 +133,13 @@ class LensDistortion(LatticeWarp):
             ValueError: numbers out of range; a camera too far from a polynomial, or that folds inside its frame.
         """
         if covariance is None:
-            ranges, source = jittered(camera, jitter=jitter, residual_px=residual_px).ranges, None
+            lenses = jittered(camera, jitter=jitter, residual_px=residual_px).ranges
         elif jitter:
             raise ValueError(f"jitter must be 0 beside a covariance, got {jitter}")
         else:
-            source = correlated(camera, covariance)
-            ranges = source.ranges
-        warp: Any = {"padding": padding, "interpolation": interpolation, "resampler": resampler, "p": p}
-        made = cls(**cast(Any, ranges), strict=strict, tolerance_px=tolerance_px, **warp)
-        made._source = source
-        return made
+            lenses = correlated(camera, covariance)
+        warp = {"padding": padding, "interpolation": interpolation, "resampler": resampler, "p": p}
+        return cls._drawn_from(lenses, strict=strict, tolerance_px=tolerance_px, **warp)
 
     @classmethod
     def from_lenses(
@@ -168,10 +165,15 @@ class LensDistortion(LatticeWarp):
         Raises:
             ValueError: an empty table; a camera too far from a polynomial, or that folds inside its frame.
         """
-        source = listed(table, residual_px=residual_px)
-        warp: Any = {"padding": padding, "interpolation": interpolation, "resampler": resampler, "p": p}
-        made = cls(**cast(Any, source.ranges), strict=strict, tolerance_px=tolerance_px, **warp)
-        made._source = source
+        warp = {"padding": padding, "interpolation": interpolation, "resampler": resampler, "p": p}
+        return cls._drawn_from(listed(table, residual_px=residual_px), strict=strict, tolerance_px=tolerance_px, **warp)
+
+    @classmethod
+    def _drawn_from(cls, lenses: LensSource | dict[str, Range], **arguments: Any) -> "LensDistortion":
+        """Lenses of a source, or of ranges by their names."""
+        ranges = lenses.ranges if isinstance(lenses, LensSource) else lenses
+        made = cls(**ranges, **arguments)
+        made._source = lenses if isinstance(lenses, LensSource) else None
         return made
 
     params_type = LensParams

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchrefract._checks import is_true
 from torchrefract.effects.light_plan import LightPlan
-from torchrefract.effects.plan import check_size, check_tolerance
+from torchrefract.effects.plan import check_tolerance
 from torchrefract.effects.radiance import RadianceEffect
 from torchrefract.effects.rows import learns
 from torchrefract.warping.grid import field_dtype
@@ -28,21 +28,6 @@ class PlannedLight(RadianceEffect):
     def __init__(self, *, tolerance: float | None = None, p: float = 1.0):
         super().__init__(p=p)
         self.tolerance = check_tolerance(tolerance, name="tolerance")
-
-    def plan(self, height: int, width: int, *, dtype: torch.dtype = torch.float32) -> LightPlan:
-        """What the effect does for frames of this size under its tolerance, if no depth is passed in; printed, too.
-
-        Args:
-            height, width: px, of the frame.
-            dtype: of the image.
-
-        Raises:
-            ValueError: a frame without a pixel; a tolerance below the rounding of such images.
-        """
-        check_size(height, width)
-        plan = self.planned(height, width, field_dtype(dtype))
-        print(plan)
-        return plan
 
     def fitted(self, params: Any) -> "PlannedLight":
         """The effect itself; an exact one for parameters outside the ranges that its plan is for."""

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrefract._checks import check_choice, is_true
 from torchrefract.effects.base import Effect
+from torchrefract.effects.plan import Ask, Plan
 from torchrefract.effects.rows import alike, column, learns, only, spread
 from torchrefract.types import Degraded, Inverse, Map
 from torchrefract.warping.compose import compose_flows
@@ -54,6 +55,10 @@ class WarpEffect(Effect):
         """The flow that undoes a flow of these parameters, and where it exists: by Newton's method on the flow."""
         inverse, valid, _ = invert_flow(flow)
         return inverse, valid
+
+    def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
+        """That of an exact flow."""
+        return Ask(height, width, None, dtype is torch.float64).plan(1, 0.0, "it has no lattice")
 
     @abstractmethod
     def moves(self, params: Any) -> Tensor:

@@ -3,7 +3,8 @@
 All functions here take x and y apart, of any shapes that broadcast with coefficients viewed as (B, 12, 1, ...).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
 from typing import NamedTuple
 
 import torch
@@ -147,14 +148,21 @@ def newton_undistort(
         terms: those to compute.
     """
     with torch.no_grad():
-        c = coefficients.unbind(1)
-        shrunk = radial(x_d * x_d + y_d * y_d, c, terms.radial).clamp(min=_SMALLEST_RADIAL)
-        x, y = x_d / shrunk, y_d / shrunk
-        for _ in range(steps):
-            (reached_x, reached_y), r2, g = _distorted(x, y, c, terms)
-            step_x, step_y = _slopes(x, y, r2, g, c, terms).solve(reached_x - x_d, reached_y - y_d)
-            x, y = x - step_x, y - step_y
-        return x, y
+        return next(islice(newton_iterates(x_d, y_d, coefficients, terms=terms), steps, None))
+
+
+def newton_iterates(
+    x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, terms: Terms = ALL_TERMS
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """The points of `newton_undistort` after 0, 1, 2 ... steps, without end; arguments as there."""
+    c = coefficients.unbind(1)
+    shrunk = radial(x_d * x_d + y_d * y_d, c, terms.radial).clamp(min=_SMALLEST_RADIAL)
+    x, y = x_d / shrunk, y_d / shrunk
+    while True:
+        yield x, y
+        (reached_x, reached_y), r2, g = _distorted(x, y, c, terms)
+        step_x, step_y = _slopes(x, y, r2, g, c, terms).solve(reached_x - x_d, reached_y - y_d)
+        x, y = x - step_x, y - step_y
 
 
 def _radial_start(r_d: Tensor, c: tuple[Tensor, ...], limit: RadialLimit, terms: Terms) -> Tensor:

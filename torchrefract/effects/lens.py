@@ -195,7 +195,7 @@ class LensDistortion(LatticeWarp):
 
     def plan_within(self, ask: Ask) -> Plan:
         """The plan of `lens_plan`, for all lenses of a table."""
-        return lens_plan(self._ranges(), ask) if self._source is None else self._source.plan(ask)
+        return lens_plan((self._ranges(),) if self._source is None else self._source.boxes, ask)
 
     def covers(self, params: LensParams) -> Tensor:
         """Whether the lenses lie in the ranges, or near one of a table's."""

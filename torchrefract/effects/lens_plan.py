@@ -9,7 +9,6 @@ from torch import Tensor
 from torchrefract.cameras.distortion import POLYNOMIAL12, Terms
 from torchrefract.effects.plan import STRIDES, Ask, Plan, coarsest, lies_in
 from torchrefract.fields.lens_bounds import LensRanges, lens_errors, moved_by_terms
-from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice
 
 # Of the tolerance: for the terms that are left out and for Newton's method; the rest is for the cubics.
@@ -27,24 +26,25 @@ def covers(ranges: LensRanges, coefficients: Tensor, focal: Tensor, center: Tens
 
 
 @lru_cache(maxsize=256)
-def lens_plan(ranges: LensRanges, ask: Ask) -> Plan:
-    """The plan for lenses of these ranges."""
+def lens_plan(boxes: tuple[LensRanges, ...], ask: Ask) -> Plan:
+    """The plan for lenses that are drawn from any of the boxes."""
     if ask.tolerance_px is None:
         return ask.plan(1, 0.0, "no tolerance")
     tolerance, room = ask.tolerance_px, ask.room()
-    if all(limits == (0.0, 0.0) for limits in ranges.coefficients):
+    used = [any(box.coefficients[i] != (0.0, 0.0) for box in boxes) for i in range(12)]
+    if not any(used):
         return ask.plan(0, 0.0, "no coefficient is other than zero")
-    moved = moved_by_terms(ranges, Lattice(ask.height, ask.width, STRIDES[0]))
+    moved = moved_by_terms(boxes, Lattice(ask.height, ask.width, STRIDES[0]))
     if moved is None:
         return ask.plan(1, 0.0, "a lens of the ranges may fold inside the frame")
-    kept, dropped = _terms(ranges.coefficients, moved, _DROPPED * room)
+    kept, dropped = _terms(used, moved, _DROPPED * room)
     left_out = sum(size for _, size in dropped)
     if not kept:
         return ask.plan(0, left_out, "it moves too little", dropped=dropped)
 
     def attempt(stride: int) -> Plan | None:
         lattice = Lattice(ask.height, ask.width, stride)
-        errors = lens_errors(ranges, lattice) if moved_by_terms(ranges, lattice) else None
+        errors = lens_errors(boxes, lattice) if moved_by_terms(boxes, lattice) else None
         if errors is None or errors.stretch > _MOST_STRETCH or left_out + errors.cubic > (1 - _NEWTON) * room:
             return None
         steps = next((n for n, error in enumerate(errors.newton) if error <= _NEWTON * room), None)
@@ -65,14 +65,14 @@ def kept_terms(plan: Plan) -> Terms:
 
 
 def _terms(
-    ranges: Sequence[Range], moved: Sequence[float], room: float
+    used: Sequence[bool], moved: Sequence[float], room: float
 ) -> tuple[tuple[str, ...], tuple[tuple[str, float], ...]]:
     """The names of the terms to keep, and those to drop with what they could move, px."""
     dropped: list[int] = []
     for group in _GROUPS:
-        here = [i for i in group if ranges[i] != (0.0, 0.0)]
+        here = [i for i in group if used[i]]
         if sum(moved[i] for i in (*dropped, *here)) > room:
             break
         dropped += here
-    kept = [i for i in range(12) if ranges[i] != (0.0, 0.0) and i not in dropped]
+    kept = [i for i in range(12) if used[i] and i not in dropped]
     return tuple(POLYNOMIAL12[i] for i in kept), tuple((POLYNOMIAL12[i], moved[i]) for i in dropped)

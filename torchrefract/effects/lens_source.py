@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +14,7 @@ from torchrefract.cameras.conversion import convert
 from torchrefract.cameras.distortion import POLYNOMIAL12
 from torchrefract.cameras.lens_table import read_lenses
 from torchrefract.cameras.models import Camera
-from torchrefract.effects.lens_plan import lens_plan
-from torchrefract.effects.plan import Ask, Plan, lies_in_one
+from torchrefract.effects.plan import lies_in_one
 from torchrefract.fields.lens_bounds import LensRanges
 from torchrefract.types import Range
 
@@ -71,10 +69,6 @@ class LensSource(NamedTuple):
         """(), bool: each of B lenses lies in one of the boxes, but for rounding."""
         values = torch.cat([coefficients, focal[:, :1], focal[:, 1:] / focal[:, :1], center], dim=1)
         return lies_in_one(values, [[*box.coefficients, *box[1:]] for box in self.boxes])
-
-    def plan(self, ask: Ask) -> Plan:
-        """The finest of the plans for the boxes, with the most Newton steps and all terms that one of them keeps."""
-        return _joined(self.boxes, ask)
 
 
 def listed(table: Sequence[Camera] | None, *, residual_px: float) -> LensSource:
@@ -188,23 +182,3 @@ def _slopes(camera: Camera, size: int) -> np.ndarray:
 
 def _box(limits: Sequence[Range]) -> LensRanges:
     return LensRanges(tuple(limits[:12]), *limits[12:])
-
-
-@lru_cache(maxsize=64)
-def _joined(boxes: tuple[LensRanges, ...], ask: Ask) -> Plan:
-    plans = [lens_plan(box, ask) for box in boxes]
-    exact = next((plan for plan in plans if plan.stride == 1), None)
-    moving = [plan for plan in plans if plan.stride > 1]
-    if exact is not None or not moving:
-        return exact or max(plans, key=lambda plan: plan.error_px)
-    finest = min(moving, key=lambda plan: plan.stride)
-    kept = {name for plan in moving for name in plan.kept}
-    dropped = {name: px for plan in plans for name, px in sorted(plan.dropped, key=lambda term: term[1])}
-    return replace(
-        finest,
-        error_px=max(plan.error_px for plan in plans),
-        slope=max(plan.slope for plan in moving),
-        steps=max(plan.steps or 0 for plan in moving),
-        kept=tuple(name for name in POLYNOMIAL12 if name in kept),
-        dropped=tuple((name, dropped[name]) for name in POLYNOMIAL12 if name in dropped and name not in kept),
-    )

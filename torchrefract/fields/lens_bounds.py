@@ -1,13 +1,15 @@
 """How far off a lens is on a lattice, and after some of Newton's steps, for all lenses in given ranges.
 
-The inverse of a polynomial in the plane has no closed form, and bounds of its derivatives by those of the polynomial
-are far too large where a barrel comes near to folding. So errors are measured, in float64, for lenses at the corners of
-the ranges and for draws inside, in cells all over the frame, and taken `_MARGIN` times. That is no proof, but is tried
-at random by benchmarks/tolerance.py. That no lens in the ranges folds is proved.
+The error of the cubics between nodes follows from the fourth derivatives of the flow, see `between_nodes`. Those of the
+inverse of a polynomial have no closed form, and bounds by the derivatives of the polynomial are far too large where a
+barrel comes near to folding. So they are measured, in float64, as fourth differences over two strides, for lenses at
+the corners of the ranges and for draws inside, at places all over the nodes, and taken `_MARGIN` times. That is no
+proof, but is tried at random by benchmarks/tolerance.py. That no lens in the ranges folds is proved.
 """
 
 import itertools
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -15,17 +17,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract.cameras.distortion import ALL_TERMS, newton_undistort, undistort_polynomial
-from torchrefract.cameras.radial import radial_limit
+from torchrefract.cameras.distortion import newton_iterates, used_terms
 from torchrefract.types import Range
-from torchrefract.warping.lattice import Lattice, lagrange_weights
+from torchrefract.warping.lattice import Lattice
 
 _MARGIN = 1.5
 _MOST_CORNERS, _DRAWS = 128, 16
-_FEW_CELLS, _MANY_CELLS = 6, 24  # along each axis
-_WORST = 8  # lenses that are looked at in many cells
-_INSIDE = ((0.5, 0.5), (0.25, 0.25), (0.25, 0.75), (0.75, 0.25), (0.75, 0.75))  # of a cell, x and y
-_MOST_STEPS = 8
+_FEW, _MANY = 5, 17  # places along each axis
+_WORST = 8  # lenses that are looked at in many places
+_STENCIL, _FOURTH = (-2.0, -1.0, 0.0, 1.0, 2.0), (1.0, -4.0, 6.0, -4.0, 1.0)
+_SOLVED = 1e-12  # the last of Newton's steps, on the plane z = 1
+_MOST_STEPS, _STEPS_TO_SOLVE = 8, 16
 # A map that grows by less than this, compared with no lens, is near to a fold: nothing is smooth there.
 _FLATTEST = 0.05
 # Of each coefficient's own term: the power of the radius, and how far it moves a point on the unit circle at most.
@@ -51,8 +53,15 @@ class LensErrors(NamedTuple):
     slope: float  # of the flow from node to node, px per px
 
 
-def moved_by_terms(ranges: LensRanges, lattice: Lattice) -> tuple[float, ...] | None:
-    """How far each of the 12 coefficients alone may move a pixel, px; None where a lens of the ranges may fold.
+def moved_by_terms(boxes: Sequence[LensRanges], lattice: Lattice) -> tuple[float, ...] | None:
+    """How far each of the 12 coefficients alone may move a pixel, px; None where a lens of a box may fold."""
+    moved = [_moved_by_terms(box, lattice) for box in boxes]
+    sure = [found for found in moved if found is not None]
+    return tuple(map(max, zip(*sure, strict=True))) if len(sure) == len(moved) else None
+
+
+def _moved_by_terms(ranges: LensRanges, lattice: Lattice) -> tuple[float, ...] | None:
+    """Of one box.
 
     Along and across the radius r the radial part grows by f'(r) and f(r) / r, both least for the lowest coefficients,
     and the other terms take no more than t(r) of that. Where what is left is above zero the map has one inverse, since
@@ -81,15 +90,14 @@ def moved_by_terms(ranges: LensRanges, lattice: Lattice) -> tuple[float, ...] | 
 
 
 @lru_cache(maxsize=1024)
-def lens_errors(ranges: LensRanges, lattice: Lattice) -> LensErrors | None:
-    """The errors on a lattice; None where one of the lenses that were tried folds."""
-    (c, focal, center), radius = _lenses(ranges, lattice), _radius(ranges, lattice)
-    first = _measured(c, focal, center, lattice, radius=radius, cells=_FEW_CELLS)
+def lens_errors(boxes: tuple[LensRanges, ...], lattice: Lattice) -> LensErrors | None:
+    """The errors on a lattice of lenses in any of the boxes; None where one that was tried has no inverse."""
+    lenses = _Lenses.all(boxes, lattice)
+    first = _measured(lenses, lattice, _FEW)
     if first is None:
         return None
     # The worst of them are looked at more closely.
-    worst = first[0].argsort(descending=True)[:_WORST]
-    found = _measured(c[worst], focal[worst], center[worst], lattice, radius=radius, cells=_MANY_CELLS)
+    found = _measured(lenses.some(first[0].argsort(descending=True)[:_WORST]), lattice, _MANY)
     if found is None:
         return None
     largest = (torch.cat(both, dim=-1).amax(dim=-1) for both in zip(first, found, strict=True))
@@ -99,35 +107,81 @@ def lens_errors(ranges: LensRanges, lattice: Lattice) -> LensErrors | None:
     )
 
 
-def _measured(
-    c: Tensor, focal: Tensor, center: Tensor, lattice: Lattice, *, radius: float, cells: int
-) -> tuple[Tensor, ...] | None:
-    """For each of N lenses the numbers of `LensErrors`, (N,), those after steps (steps, N); None if one folds."""
-    at, count = _nodes_and_places(lattice, cells)
+class _Lenses(NamedTuple):
+    """N lenses."""
+
+    coefficients: Tensor  # (N, 12, 1)
+    focal: Tensor  # (N, 2, 1), px
+    center: Tensor  # (N, 2, 1), px
+
+    @classmethod
+    def all(cls, boxes: Sequence[LensRanges], lattice: Lattice) -> "_Lenses":
+        """Corners of each box, and lenses inside."""
+        values = torch.from_numpy(np.concatenate([_tried(box) for box in boxes]))[:, :, None]
+        middle = torch.tensor([[lattice.width - 1], [lattice.height - 1]], dtype=torch.float64) / 2
+        focal = lattice.width * torch.cat([values[:, 12:13], values[:, 12:13] * values[:, 13:14]], dim=1)
+        return cls(values[:, :12], focal, middle + lattice.width * values[:, 14:])
+
+    def some(self, which: Tensor) -> "_Lenses":
+        """Those in these places."""
+        return _Lenses(*(value[which] for value in self))
+
+
+def _measured(lenses: _Lenses, lattice: Lattice, places: int) -> tuple[Tensor, ...] | None:
+    """For each of N lenses the numbers of `LensErrors`, (N,), those after steps (steps, N); None without an inverse."""
+    c, focal, center = lenses
+    at = _stencils(lattice, places)
     x, y = ((at[:, i] - center[:, i]) / focal[:, i] for i in range(2))
-    one = x.new_ones(len(x))
-    limit = radial_limit(c, 16 * radius * one, 1.5 * radius * one)
-    found_x, found_y, exists = undistort_polynomial(x, y, c, limit=limit)
-    if not exists.all():
+    iterates = _solve(x, y, c)
+    if iterates is None:
         return None
+    found_x, found_y = iterates[-1]
+    newton = [
+        torch.hypot((near_x - found_x) * focal[:, 0], (near_y - found_y) * focal[:, 1]).amax(dim=1)
+        for near_x, near_y in (iterates[min(steps, len(iterates) - 1)] for steps in range(_MOST_STEPS + 1))
+    ]
     flow = torch.stack([(found_x - x) * focal[:, 0], (found_y - y) * focal[:, 1]])
-    nodes, places = flow.unflatten(2, (count, -1)).split([16, len(_INSIDE)], dim=3)
-    u, v = nodes @ _weights_inside().mT - places
-    off = torch.hypot(u, v).flatten(1).amax(dim=1)
-    newton = []
-    for steps in range(_MOST_STEPS + 1):
-        near = newton_undistort(x, y, c, steps=steps, terms=ALL_TERMS)
-        error = torch.hypot((near[0] - found_x) * focal[:, 0], (near[1] - found_y) * focal[:, 1])
-        newton.append(error.nan_to_num(nan=math.inf).amax(dim=1))
     stretch = torch.hypot(found_x, found_y) / torch.hypot(x, y).clamp(min=1e-9)
-    return off, torch.stack(newton), stretch.amax(dim=1), _slope(nodes, lattice.stride)
+    return _cubic(flow), torch.stack(newton), stretch.amax(dim=1), _slope(flow, lattice.stride / 2)
 
 
-def _slope(nodes: Tensor, stride: int) -> Tensor:
-    """(N,): the largest slope along an axis, from corner to corner of the cells, of flows (2, N, cells, 16)."""
-    grids = nodes.unflatten(3, (4, 4))[..., 1:3, 1:3]
-    slopes = [torch.diff(grids, dim=dim).square().sum(dim=0).sqrt().flatten(1).amax(dim=1) for dim in (3, 4)]
-    return torch.maximum(*slopes) / stride
+def _solve(x: Tensor, y: Tensor, c: Tensor) -> list[tuple[Tensor, Tensor]] | None:
+    """The iterates of `newton_undistort`, the last of which is exact; None where none is."""
+    room = _SOLVED * (1 + torch.hypot(x, y))
+    iterates: list[tuple[Tensor, Tensor]] = []
+    for found in itertools.islice(newton_iterates(x, y, c, terms=used_terms(c[..., 0])), _STEPS_TO_SOLVE):
+        iterates.append(found)
+        # What is not a number is never near enough.
+        if len(iterates) > 1 and all(
+            ((new - old).abs() <= room).all() for new, old in zip(found, iterates[-2], strict=True)
+        ):
+            return iterates
+    return None
+
+
+def _stencils(lattice: Lattice, places: int) -> Tensor:
+    """(1, 2, places^2 2 5), px: around places all over the nodes five along x and y, half a stride apart."""
+    step = lattice.stride / 2
+    rows, columns = (
+        torch.linspace(axis[0] + 2 * step, axis[-1] - 2 * step, places, dtype=torch.float64) for axis in lattice.axes
+    )
+    line = step * columns.new_tensor(_STENCIL)
+    offsets = torch.stack([torch.stack([line, 0 * line]), torch.stack([0 * line, line])])  # (2, 2, 5): axis, x and y
+    at = torch.cartesian_prod(columns, rows)[:, None, :, None] + offsets
+    return at.movedim(2, 0).flatten(1)[None]
+
+
+def _cubic(flow: Tensor) -> Tensor:
+    """(N,), px: the bound of `between_nodes` for flows (2, N, stencils 2 5)."""
+    differences = flow.unflatten(2, (-1, 2, 5)) @ flow.new_tensor(_FOURTH)
+    along_x, along_y = torch.hypot(*differences).amax(dim=1).unbind(1)
+    return 9 / 384 * 2**4 * (along_x + 5 / 4 * along_y)
+
+
+def _slope(flow: Tensor, step: float) -> Tensor:
+    """(N,): the largest slope along an axis, of flows (2, N, stencils 2 5)."""
+    differences = torch.hypot(*torch.diff(flow.unflatten(2, (-1, 5)), dim=3))
+    return differences.flatten(1).amax(dim=1) / step
 
 
 def _radius(ranges: LensRanges, lattice: Lattice) -> float:
@@ -139,39 +193,20 @@ def _radius(ranges: LensRanges, lattice: Lattice) -> float:
     return math.hypot((across / lattice.width + x) / fx, (down / lattice.width + y) / (fx * aspect))
 
 
-def _lenses(ranges: LensRanges, lattice: Lattice) -> tuple[Tensor, Tensor, Tensor]:
-    """Coefficients, (N, 12, 1), focal lengths and centers, (N, 2, 1), px: corners of the ranges and lenses inside."""
+def _tried(ranges: LensRanges) -> np.ndarray:
+    """(N, 16): corners of the ranges, and lenses inside."""
     # All displacements fall faster than 1 / focal.
     limits = np.array([*ranges.coefficients, (ranges.focal[0], ranges.focal[0]), *ranges[2:]])
     wide = np.flatnonzero(limits[:, 0] != limits[:, 1])
+    if not len(wide):
+        return limits[None, :, 0]
     random = np.random.default_rng(0)
     if 2 ** len(wide) <= _MOST_CORNERS:
-        corners = np.array(list(itertools.product((0.0, 1.0), repeat=len(wide)))).reshape(2 ** len(wide), len(wide))
+        corners = np.array(list(itertools.product((0.0, 1.0), repeat=len(wide))))
     else:
         corners = random.integers(0, 2, (_MOST_CORNERS, len(wide))).astype(float)
         corners[:2] = [[0.0], [1.0]]
     shares = np.concatenate([corners, random.random((_DRAWS, len(wide)))])
     values = np.repeat(limits[None, :, 0], len(shares), axis=0)
     values[:, wide] += shares * (limits[wide, 1] - limits[wide, 0])
-    lenses = torch.from_numpy(values)[:, :, None]
-    middle = torch.tensor([[lattice.width - 1], [lattice.height - 1]], dtype=torch.float64) / 2
-    focal = lattice.width * torch.cat([lenses[:, 12:13], lenses[:, 12:13] * lenses[:, 13:14]], dim=1)
-    return lenses[:, :12], focal, middle + lattice.width * lenses[:, 14:]
-
-
-def _nodes_and_places(lattice: Lattice, most: int) -> tuple[Tensor, int]:
-    """(1, 2, n (16 + places)), px: of n cells all over the frame the 16 nodes around and places inside; and n."""
-    axes = [
-        lattice.stride * torch.linspace(0, count - 1, min(count, most), dtype=torch.float64).round()
-        for count in reversed(lattice.cells)
-    ]
-    steps = torch.arange(-1, 3, dtype=torch.float64)
-    around = lattice.stride * torch.cat([torch.cartesian_prod(steps, steps), steps.new_tensor(_INSIDE)])
-    corners = torch.cartesian_prod(*axes).view(-1, 2)
-    return (corners[:, None] + around).flatten(0, 1).mT[None], len(corners)
-
-
-def _weights_inside() -> Tensor:
-    """(places, 16)."""
-    quarters = lagrange_weights(4, 4, dtype=torch.float64, device=torch.device("cpu"))
-    return torch.stack([torch.outer(quarters[round(4 * x)], quarters[round(4 * y)]).flatten() for x, y in _INSIDE])
+    return values

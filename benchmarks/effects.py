@@ -43,13 +43,14 @@ from torchrefract.fields.perlin import octave, perlin_noise
 from torchrefract.warping.grid import sampler_grid
 
 WHAT = (
-    "Whole effects through the public API, with a new draw in every call: effect(image) without gradients; 'all maps' "
-    "is degrade() with flow, valid, restore_flow and restore_valid; 'to params' asks for the gradient of every drawn "
-    "number (of a lens all 12 coefficients, so that none is skipped as zero), forward alone or forward and backward. "
-    "'radial' is a lens without decentring, which needs no Newton steps in the plane. On the CPU the bare grid_sample "
-    "threads over the batch alone; the effects use all threads on one frame too. Within 0.05 px the flow is computed "
-    "on a lattice: one mild lens, and fields of 40 px and longer; the image asks for its gradient, forward alone. How "
-    "long the sampler takes depends on the flow, so it stands beside them with the flow of that lens, ready made."
+    "Whole effects through the public API, exact, with a new draw in every call: effect(image) without gradients; 'all"
+    " maps' is degrade() with flow, valid, restore_flow and restore_valid; 'to params' asks for the gradient of every "
+    "drawn number (of a lens all 12 coefficients, so that none is skipped as zero), forward alone or forward and "
+    "backward. 'radial' is a lens without decentring, which needs no Newton steps in the plane. On the CPU the bare "
+    "grid_sample threads over the batch alone; the effects use all threads on one frame too. Within 0.05 px the flow "
+    "is computed on a lattice: one mild lens, and fields of 40 px and longer; the image asks for its gradient, forward"
+    " alone. How long the sampler takes depends on the flow, so it stands beside them with the flow of that lens, "
+    "ready made."
 )
 LENS, RADIAL, FOG, FLARE = "LensDistortion", "LensDistortion radial", "UniformFog", "LensFlare"
 PERLIN, DRIFTS, SPACE = "Perlin noise, 6 octaves", "HeterogeneousFog", "HeterogeneousFog in space"
@@ -82,13 +83,13 @@ def main() -> None:
 
 def candidates(frame: Tensor) -> dict[str, Candidate]:
     """What is compared on a frame (B, C, H, W), by name; the references come first."""
-    lens, fog = LensDistortion(), UniformFog()
-    radial = LensDistortion(p1_range=(0.0, 0.0), p2_range=(0.0, 0.0))
+    lens, fog = LensDistortion(tolerance_px=None), UniformFog()
+    radial = LensDistortion(p1_range=(0.0, 0.0), p2_range=(0.0, 0.0), tolerance_px=None)
     found = references(frame)
     others = {
         TURBULENCE: Turbulence(length_range=(20.0, 20.0)),
-        SPLINE: ThinPlateSpline(),
-        SWIRL: DivergenceFree(length_range=(20.0, 20.0)),
+        SPLINE: ThinPlateSpline(tolerance_px=None),
+        SWIRL: DivergenceFree(length_range=(20.0, 20.0), tolerance_px=None),
         FLARE: LensFlare(),
         DRIFTS: HeterogeneousFog(),
         SPACE: HeterogeneousFog(mode="ray", depth=GroundPlaneDepth()),

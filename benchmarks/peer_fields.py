@@ -44,7 +44,7 @@ def _ours(frame: Tensor) -> dict[str, Candidate]:
         f"field: ours Turbulence, Gaussian {within}": Turbulence(
             **ranges, covariance="gaussian", tolerance_px=TOLERANCE_PX
         ),
-        "field: ours DivergenceFree": DivergenceFree(**ranges),
+        "field: ours DivergenceFree, exact": DivergenceFree(**ranges, tolerance_px=None),
         f"field: ours DivergenceFree {within}": DivergenceFree(**ranges, tolerance_px=TOLERANCE_PX),
     }
     return {name: lambda effect=effect: effect(frame) for name, effect in effects.items()}

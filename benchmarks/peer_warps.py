@@ -38,9 +38,9 @@ def _ours(frame: Tensor, pixels: Any) -> dict[str, Candidate]:
     within = f"within {TOLERANCE_PX} px"
     mild, of_opencv = LensDistortion(**one, tolerance_px=TOLERANCE_PX), torch.from_numpy(pixels).permute(2, 0, 1)
     effects = {
-        "lens: ours LensDistortion": LensDistortion(),
+        "lens: ours LensDistortion, exact": LensDistortion(tolerance_px=None),
         f"lens: ours LensDistortion, the peers' lens {within}": mild,
-        "spline: ours ThinPlateSpline": ThinPlateSpline(**strength),
+        "spline: ours ThinPlateSpline, exact": ThinPlateSpline(**strength, tolerance_px=None),
         f"spline: ours ThinPlateSpline {within}": ThinPlateSpline(**strength, tolerance_px=TOLERANCE_PX),
     }
     found: dict[str, Candidate] = {name: lambda effect=effect: effect(frame) for name, effect in effects.items()}

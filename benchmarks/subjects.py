@@ -19,13 +19,14 @@ from torchrefract.effects.lattice_warp import LatticeWarp
 
 TOLERANCE_PX = 0.05
 LENS, PLATE, AIR, SWIRLS = "mild lens", "thin plate", "Gaussian air", "swirls"
+_exact = partial(partial, tolerance_px=None)
 FOG, DRIFTS, SPACE, FLARE = "fog", "drifts of fog", "fog in space", "flare"
-# Flows that are smooth enough for a lattice; to be called with `tolerance_px` and other arguments of a warp.
+# Flows that are smooth enough for a lattice, exact; to be called with `tolerance_px` and other arguments of a warp.
 SMOOTH: Mapping[str, Callable[..., LatticeWarp]] = {
-    LENS: partial(LensDistortion, k1_range=(-0.25, -0.25), k2_range=(0.09, 0.09), focal_range=(0.9, 0.9)),
-    PLATE: ThinPlateSpline,
-    AIR: partial(Turbulence, covariance="gaussian", length_range=(40.0, 60.0)),
-    SWIRLS: partial(DivergenceFree, length_range=(40.0, 60.0)),
+    LENS: _exact(LensDistortion, k1_range=(-0.25, -0.25), k2_range=(0.09, 0.09), focal_range=(0.9, 0.9)),
+    PLATE: _exact(ThinPlateSpline),
+    AIR: _exact(Turbulence, covariance="gaussian", length_range=(40.0, 60.0)),
+    SWIRLS: _exact(DivergenceFree, length_range=(40.0, 60.0)),
 }
 WEATHER: Mapping[str, Callable[..., Effect]] = {
     FOG: UniformFog,

@@ -28,7 +28,6 @@ from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.plan import Plan
 
 TOLERANCES = (1.0, 0.3, 0.1, 0.03, 0.01)
-LARGEST_TOLERANCE = 64.0  # px, that an effect takes
 RESULTS = Path(__file__).parent / "results"
 SMALLEST, LARGEST = (64, 64), (1080, 1920)
 # Of what is allowed: the median error must be no smaller, or a coarser plan would have done.
@@ -99,7 +98,7 @@ def attempt(name: str, seed: int) -> Trial:
     height, width = (round(log_uniform(dice, low, high)) for low, high in zip(SMALLEST, LARGEST, strict=True))
     tolerance = dice.choice(TOLERANCES)
     make, arguments = CONFIGURATIONS[name](dice)
-    effect, exact = make(tolerance_px=tolerance, **arguments), make(**arguments)
+    effect, exact = make(tolerance_px=tolerance, **arguments), make(tolerance_px=None, **arguments)
     plan = effect.planned(height, width, torch.float32)
     image = torch.zeros(2, 1, height, width)
     with warnings.catch_warnings():
@@ -167,12 +166,11 @@ def _swirl(dice: random.Random) -> tuple[type[LatticeWarp], dict[str, Any]]:
 
 
 def _composition(dice: random.Random) -> tuple[Callable[..., Compose], dict[str, Any]]:
-    """Two to four warps, as much as they may be off each only together."""
+    """Two to four warps."""
     chosen = [dice.choice((_lens, _plate, _turbulence, _swirl))(dice) for _ in range(dice.randint(2, 4))]
 
-    def make(tolerance_px: float | None = None) -> Compose:
-        own = None if tolerance_px is None else LARGEST_TOLERANCE
-        return Compose([kind(**ranges, tolerance_px=own) for kind, ranges in chosen], tolerance_px=tolerance_px)
+    def make(tolerance_px: float | None) -> Compose:
+        return Compose([kind(**ranges) for kind, ranges in chosen], tolerance_px=tolerance_px)
 
     return make, {}
 

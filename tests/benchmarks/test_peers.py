@@ -159,4 +159,4 @@ def test_the_command_measures_what_is_there(monkeypatch, tmp_path, capsys, on_th
     assert "kornia is left out" in printed
     assert "fog: ours UniformFog" in printed
     names = [row["name"] for row in json.loads(out.read_text())["timings"]]
-    assert "spline: ours ThinPlateSpline" in names
+    assert "spline: ours ThinPlateSpline, exact" in names

@@ -70,7 +70,7 @@ def test_one_look_up_shows_what_many_show():
 
 def test_the_flow_is_the_composite_of_the_flows():
     image, effects = picture(2, 3, 48, 64), warps()
-    effect = Compose(effects)
+    effect = Compose(effects, tolerance_px=None)
     params = effect.sample(image, seed=3)
     flows = [child.flow(own, height=48, width=64)[0] for child, own in zip(effects, params.children, strict=True)]
     # From the last to the first, so that each flow is read once.
@@ -85,7 +85,7 @@ def test_analytic_flows_compose_to_2_thousandths_of_a_pixel():
         LensDistortion(k1_range=(k, k), k2_range=(0.1, 0.1), p1_range=(0, 0), p2_range=(0, 0)) for k in (-0.2, -0.1)
     ]
     image = torch.zeros(1, 1, 540, 960, dtype=torch.float64)
-    effect = Compose(lens)
+    effect = Compose(lens, tolerance_px=None)
     params = effect.sample(image, seed=0)
     first, then = params.children
     # The second lens looks up at q, and the first lens looks up from there, both by their own exact inverse.
@@ -130,7 +130,7 @@ def test_the_flow_back_brings_the_image_back():
 def test_fog_between_warps_keeps_its_place_and_its_map_moves_along():
     image, depth = picture(1, 3, 48, 64, dtype=torch.float64), 20 + 100 * picture(1, 1, 48, 64, dtype=torch.float64)
     before, fog, after = LensDistortion(**LENS), UniformFog(visibility_range=(90, 90)), ThinPlateSpline()
-    effect = Compose([before, fog, after], padding="border")
+    effect = Compose([before, fog, after], padding="border", tolerance_px=None)
     params = effect.sample(image, seed=3)
     found = effect.apply(image, params, depth=depth)
     flows = [child.flow(params.children[i], height=48, width=64)[0] for i, child in ((0, before), (2, after))]

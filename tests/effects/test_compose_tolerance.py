@@ -153,10 +153,13 @@ def test_light_between_warps_takes_two_resamples():
     assert Compose([first, UniformFog(), then], tolerance_px=0.1).planned(*SIZE, torch.float32).resamples == 2
 
 
-def test_without_a_tolerance_each_effect_keeps_its_own():
-    plan = Compose(parts(0.1)).planned(*SIZE, torch.float32)
-    assert strides(plan) == [part.planned(*SIZE, torch.float32).stride for part in parts(0.1)]
-    assert plan.error_px == math.inf
+def test_without_a_tolerance_all_is_exact_whatever_the_effects_have():
+    effects = Compose(parts(0.1), tolerance_px=None)
+    plan = effects.planned(*SIZE, torch.float32)
+    assert strides(plan) == [1, 1, 1, 1]
+    assert plan.error_px == 0
+    found = effects.degrade(image(), seed=1)
+    assert torch.equal(found.flow, Compose(parts(None), tolerance_px=None).apply(image(), found.params).flow)
 
 
 def test_depth_and_maps_of_light_move_along_as_with_exact_flows():

@@ -1,5 +1,6 @@
 import math
 import warnings
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -207,6 +208,18 @@ def test_a_tolerance_below_rounding_raises_and_says_what_can_be_kept():
     with pytest.raises(ValueError, match=rule):
         effect(torch.zeros(1, 1, 1080, 1920))
     assert effect.plan(1080, 1920, dtype=torch.float64).stride >= 1
+
+
+@pytest.mark.parametrize("kind", [LensDistortion, ThinPlateSpline, Turbulence, DivergenceFree, Compose])
+def test_the_default_is_a_fiftieth_of_a_pixel_and_exact_where_rounding_is_more(kind):
+    effect = kind([DivergenceFree()]) if kind is Compose else kind()
+    assert effect.tolerance_px == 0.02
+    exact, found = (copy(effect) for _ in range(2))
+    exact.tolerance_px = None
+    large = found.planned(2, 40_000, torch.float32)
+    assert large.error_px == 0
+    assert str(large).splitlines()[1:] == str(exact.planned(2, 40_000, torch.float32)).splitlines()[1:]
+    assert found.planned(1080, 1920, torch.float32).tolerance_px == 0.02
 
 
 @pytest.mark.parametrize(("height", "width"), [(0, 10), (10, 0), (-1, 10)])

@@ -11,7 +11,7 @@ from torchrefract import draws
 from torchrefract._checks import check_choice, check_number
 from torchrefract.effects.base import Effect, moved
 from torchrefract.effects.compose_plan import ComposePlan, compose_plan
-from torchrefract.effects.plan import Ask, Plan, check_tolerance
+from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, check_tolerance
 from torchrefract.effects.radiance import RadianceEffect
 from torchrefract.effects.refraction import WarpEffect
 from torchrefract.effects.walk import Walk
@@ -45,9 +45,9 @@ class Compose(Effect):
     Args:
         effects: at least one; compositions may be nested.
         padding, interpolation, resampler: of the look-ups; None takes those of the last warp that moves the sample.
-        tolerance_px: how far the composite of all flows may be from the exact one, px, see `plan`; effects without a
-            tolerance of their own stay exact. None composes the flows as each effect computes it. Of compositions
-            inside others that of the outermost counts.
+        tolerance_px: how far the composite of all flows may be from the exact one, px, see `plan`; None is exact. It
+            takes the place of what the effects and compositions inside have, but an effect that has None stays exact.
+            As for warps, the default is exact in frames too large for it.
         p: chance that a sample is degraded at all.
 
     Raises:
@@ -61,7 +61,7 @@ class Compose(Effect):
         padding: str | None = None,
         interpolation: str | None = None,
         resampler: str | None = None,
-        tolerance_px: float | None = None,
+        tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ):
         super().__init__(p=p)
@@ -123,7 +123,7 @@ class Compose(Effect):
 
     def planned(self, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
         """The plan for fields of a type."""
-        ask = Ask(height, width, self.tolerance_px, dtype is torch.float64)
+        ask = Ask(height, width, self.tolerance_px, dtype is torch.float64).of_default
         return compose_plan(list(self._chances(1.0)), ask)
 
     def fitted(self, params: ComposeParams) -> "Compose":
@@ -182,7 +182,7 @@ class OneOf(Compose):
         padding: str | None = None,
         interpolation: str | None = None,
         resampler: str | None = None,
-        tolerance_px: float | None = None,
+        tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ):
         options = {"padding": padding, "interpolation": interpolation, "resampler": resampler}

@@ -27,10 +27,10 @@ class ComposePlan:
     """How a composition computes its flow for frames of one size.
 
     height, width: px, of the frame.
-    tolerance_px: how far the composite may be from the exact one; None composes the flows as they are.
+    tolerance_px: how far the composite may be from the exact one; None is exact.
     names: of the effects, in order.
     plans: of each effect.
-    error_px: how far the composite is off at most; inf where that is not known.
+    error_px: how far the composite is off at most.
     resamples: how often the image is looked up.
     """
 
@@ -43,11 +43,11 @@ class ComposePlan:
     resamples: int
 
     def __str__(self) -> str:
-        told = "none: each effect has its own" if self.tolerance_px is None else f"{self.tolerance_px:g} px"
+        told = "none: exact" if self.tolerance_px is None else f"{self.tolerance_px:g} px"
         lines = [
             f"frame          {self.height} x {self.width} px",
             f"tolerance      {told}",
-            f"error at most  {'not known' if self.error_px == math.inf else f'{self.error_px:.2g} px'}",
+            f"error at most  {self.error_px:.2g} px",
             f"resamples      {self.resamples}",
         ]
         widest = max(map(len, self.names))
@@ -61,13 +61,12 @@ class _Warp(NamedTuple):
     group: int  # of those that are looked up together
     effect: WarpEffect
 
-    def plan(self, ask: Ask, tolerance: float) -> Plan:
-        """Its plan under a tolerance, or under its own if that is less."""
+    def plan(self, ask: Ask, tolerance: float | None) -> Plan:
+        """Its plan under a tolerance, None for exact; if it has none of its own it stays exact."""
         if not isinstance(self.effect, LatticeWarp):
             return self.effect.planned(ask.height, ask.width, torch.float64 if ask.double else torch.float32)
-        own = self.effect.tolerance_px
-        ask = replace(ask, tolerance_px=None if own is None else min(own, tolerance))
-        if own is not None and not ask.reachable:
+        ask = replace(ask, tolerance_px=None if self.effect.tolerance_px is None else tolerance)
+        if not ask.reachable:
             return ask.plan(1, 0.0, "its share of the tolerance is below rounding")
         return self.effect.plan_within(ask)
 
@@ -84,13 +83,11 @@ def compose_plan(effects: Sequence[tuple[Effect, float]], ask: Ask) -> ComposePl
     """
     warps = list(_warps(effects))
     if ask.tolerance_px is None:
-        plans = [warp.plan(ask, math.inf) for warp in warps]
-        moving = [plan for plan in plans if plan.error_px > 0]
-        error = math.inf if len(moving) > 1 else sum(plan.error_px for plan in moving)
+        plans = [warp.plan(ask, None) for warp in warps]
     else:
         ask.room()
         plans = _shared(warps, ask)
-        error = _total((plan.error_px, plan.random) for plan in plans)
+    error = _total((plan.error_px, plan.random) for plan in plans)
     resamples = len({warp.group for warp, plan in zip(warps, plans, strict=True) if plan.stride > 0})
     by_place = {warp.place: plan for warp, plan in zip(warps, plans, strict=True)}
     found = tuple(

@@ -11,7 +11,7 @@ from torchrefract.effects.base import params_to
 from torchrefract.effects.field_plan import FieldPlan, FieldRanges, field_plan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
-from torchrefract.effects.plan import Ask, Plan, lies_in
+from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, lies_in
 from torchrefract.effects.random_field import check_field_params, field_on_lattice, random_field
 from torchrefract.effects.rows import column, spread
 from torchrefract.fields.covariance import COVARIANCES
@@ -83,7 +83,7 @@ class DivergenceFree(LatticeWarp):
         padding: str = "reflection",
         interpolation: str = "bilinear",
         resampler: str = "auto",
-        tolerance_px: float | None = None,
+        tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ):
         super().__init__(

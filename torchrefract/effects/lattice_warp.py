@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import is_true
-from torchrefract.effects.plan import Ask, Plan, check_tolerance
+from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, check_tolerance
 from torchrefract.effects.refraction import Moved, WarpEffect
 from torchrefract.effects.rows import learns, only, spread
 from torchrefract.warping.lattice import SmoothFlow
@@ -20,7 +20,8 @@ class LatticeWarp(WarpEffect):
     Args:
         padding, interpolation, resampler, p: as for every warp.
         tolerance_px: how far the flow may be from the exact one, px, anywhere and for all parameters in the ranges of
-            the effect, so that it can be computed on a coarser lattice, see `plan`; None is exact.
+            the effect, so that it can be computed on a coarser lattice, see `plan`; None is exact, and so is the
+            default in frames so large that float32 does not reach it, from about 10 000 px on.
     """
 
     def __init__(
@@ -29,7 +30,7 @@ class LatticeWarp(WarpEffect):
         padding: str = "zeros",
         interpolation: str = "bilinear",
         resampler: str = "auto",
-        tolerance_px: float | None = None,
+        tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ):
         super().__init__(padding=padding, interpolation=interpolation, resampler=resampler, p=p)
@@ -41,7 +42,7 @@ class LatticeWarp(WarpEffect):
 
     def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
         """The plan for fields of a type."""
-        return self.plan_within(Ask(height, width, self.tolerance_px, dtype is torch.float64))
+        return self.plan_within(Ask(height, width, self.tolerance_px, dtype is torch.float64).of_default)
 
     def plan_within(self, ask: Ask) -> Plan:
         """The plan that is asked for, from the ranges alone."""

@@ -15,7 +15,7 @@ from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.lens_plan import covers, kept_terms, lens_plan
 from torchrefract.effects.lens_source import LensSource, correlated, jittered, listed
-from torchrefract.effects.plan import Ask, Plan
+from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, smooth_lens_flow
 from torchrefract.fields.lens_bounds import LensRanges
 from torchrefract.types import Degraded, Range
@@ -85,7 +85,7 @@ class LensDistortion(LatticeWarp):
         padding: str = "zeros",
         interpolation: str = "bilinear",
         resampler: str = "auto",
-        tolerance_px: float | None = None,
+        tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ):
         super().__init__(
@@ -115,7 +115,7 @@ class LensDistortion(LatticeWarp):
         padding: str = "zeros",
         interpolation: str = "bilinear",
         resampler: str = "auto",
-        tolerance_px: float | None = None,
+        tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ) -> "LensDistortion":
         """The lens of a calibrated camera, or those near to it.
@@ -151,7 +151,7 @@ class LensDistortion(LatticeWarp):
         padding: str = "zeros",
         interpolation: str = "bilinear",
         resampler: str = "auto",
-        tolerance_px: float | None = None,
+        tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ) -> "LensDistortion":
         """One of several real lenses for each sample, each as often as another.

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import torch
@@ -12,6 +12,8 @@ from torchrefract._checks import check_count, check_number
 from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice
 
+# Of warps, px: nobody sees so little.
+TOLERANCE_PX = 0.02
 _SMALLEST, _LARGEST = 1e-6, 64.0  # px, or levels
 # Positions in float32 are off by so many units of the last place of the longer side.
 _ROUNDING = {False: 16 * 2.0**-24, True: 16 * 2.0**-53}
@@ -46,6 +48,12 @@ class Ask:
     def reachable(self) -> bool:
         """Whether rounding leaves enough of the tolerance."""
         return self.tolerance_px is None or self.tolerance_px >= 2 * self.rounding
+
+    @property
+    def of_default(self) -> "Ask":
+        """The same; without a tolerance where the default one is below rounding, which nobody has asked for."""
+        default = self.tolerance_px == TOLERANCE_PX and not self.reachable
+        return replace(self, tolerance_px=None) if default else self
 
     def room(self) -> float:
         """What the tolerance leaves beside rounding, px.

@@ -10,7 +10,7 @@ from torchrefract import draws
 from torchrefract._checks import check_all, check_count, check_range
 from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
-from torchrefract.effects.plan import Ask, Plan, lies_in
+from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, lies_in
 from torchrefract.effects.plate_plan import plate_plan
 from torchrefract.fields.spline import check_points, fit_spline, spline_at, spline_flow
 from torchrefract.types import Range
@@ -57,7 +57,7 @@ class ThinPlateSpline(LatticeWarp):
         padding: str = "reflection",
         interpolation: str = "bilinear",
         resampler: str = "auto",
-        tolerance_px: float | None = None,
+        tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ):
         super().__init__(

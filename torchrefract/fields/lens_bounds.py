@@ -1,10 +1,10 @@
 """How far off a lens is on a lattice, and after some of Newton's steps, for all lenses in given ranges.
 
-The error of the cubics between nodes follows from the fourth derivatives of the flow, see `between_nodes`. Those of the
-inverse of a polynomial have no closed form, and bounds by the derivatives of the polynomial are far too large where a
-barrel comes near to folding. So they are measured, in float64, as fourth differences over two strides, for lenses at
-the corners of the ranges and for draws inside, at places all over the nodes, and taken `_MARGIN` times. That is no
-proof, but is tried at random by benchmarks/tolerance.py. That no lens in the ranges folds is proved.
+The inverse of a polynomial in the plane has no closed form, and bounds of its derivatives by those of the polynomial
+are far too large where a barrel comes near to folding. So errors are measured, in float64, for lenses at the corners of
+the ranges and for draws inside, in the middle of cells all over the frame, where that of cubics is largest along each
+axis, and taken `_MARGIN` times. That is no proof, but is tried at random by benchmarks/tolerance.py. That no lens in
+the ranges folds is proved.
 """
 
 import itertools
@@ -21,11 +21,12 @@ from torchrefract.cameras.distortion import newton_iterates, used_terms
 from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice
 
-_MARGIN = 1.5
+_MARGIN = 1.2
 _MOST_CORNERS, _DRAWS = 128, 16
-_FEW, _MANY = 5, 17  # places along each axis
+_FEW_CELLS, _MANY_CELLS = 5, 17  # along each axis
 _WORST = 8  # lenses that are looked at in many places
-_STENCIL, _FOURTH = (-2.0, -1.0, 0.0, 1.0, 2.0), (1.0, -4.0, 6.0, -4.0, 1.0)
+# Strides from the corner of a cell, on a line through its middle; what the cubic of the four nodes misses there.
+_LINE, _MISSED = (-1.0, 0.0, 0.5, 1.0, 2.0), (-1 / 16, 9 / 16, -1.0, 9 / 16, -1 / 16)
 _SOLVED = 1e-12  # the last of Newton's steps, on the plane z = 1
 _MOST_STEPS, _STEPS_TO_SOLVE = 8, 16
 # A map that grows by less than this, compared with no lens, is near to a fold: nothing is smooth there.
@@ -93,11 +94,11 @@ def _moved_by_terms(ranges: LensRanges, lattice: Lattice) -> tuple[float, ...] |
 def lens_errors(boxes: tuple[LensRanges, ...], lattice: Lattice) -> LensErrors | None:
     """The errors on a lattice of lenses in any of the boxes; None where one that was tried has no inverse."""
     lenses = _Lenses.all(boxes, lattice)
-    first = _measured(lenses, lattice, _FEW)
+    first = _measured(lenses, lattice, _FEW_CELLS)
     if first is None:
         return None
     # The worst of them are looked at more closely.
-    found = _measured(lenses.some(first[0].argsort(descending=True)[:_WORST]), lattice, _MANY)
+    found = _measured(lenses.some(first[0].argsort(descending=True)[:_WORST]), lattice, _MANY_CELLS)
     if found is None:
         return None
     largest = (torch.cat(both, dim=-1).amax(dim=-1) for both in zip(first, found, strict=True))
@@ -127,10 +128,10 @@ class _Lenses(NamedTuple):
         return _Lenses(*(value[which] for value in self))
 
 
-def _measured(lenses: _Lenses, lattice: Lattice, places: int) -> tuple[Tensor, ...] | None:
+def _measured(lenses: _Lenses, lattice: Lattice, cells: int) -> tuple[Tensor, ...] | None:
     """For each of N lenses the numbers of `LensErrors`, (N,), those after steps (steps, N); None without an inverse."""
     c, focal, center = lenses
-    at = _stencils(lattice, places)
+    at = _lines(lattice, cells)
     x, y = ((at[:, i] - center[:, i]) / focal[:, i] for i in range(2))
     iterates = _solve(x, y, c)
     if iterates is None:
@@ -142,7 +143,7 @@ def _measured(lenses: _Lenses, lattice: Lattice, places: int) -> tuple[Tensor, .
     ]
     flow = torch.stack([(found_x - x) * focal[:, 0], (found_y - y) * focal[:, 1]])
     stretch = torch.hypot(found_x, found_y) / torch.hypot(x, y).clamp(min=1e-9)
-    return _cubic(flow), torch.stack(newton), stretch.amax(dim=1), _slope(flow, lattice.stride / 2)
+    return _cubic(flow), torch.stack(newton), stretch.amax(dim=1), _slope(flow, lattice.stride)
 
 
 def _solve(x: Tensor, y: Tensor, c: Tensor) -> list[tuple[Tensor, Tensor]] | None:
@@ -159,29 +160,30 @@ def _solve(x: Tensor, y: Tensor, c: Tensor) -> list[tuple[Tensor, Tensor]] | Non
     return None
 
 
-def _stencils(lattice: Lattice, places: int) -> Tensor:
-    """(1, 2, places^2 2 5), px: around places all over the nodes five along x and y, half a stride apart."""
-    step = lattice.stride / 2
-    rows, columns = (
-        torch.linspace(axis[0] + 2 * step, axis[-1] - 2 * step, places, dtype=torch.float64) for axis in lattice.axes
+def _lines(lattice: Lattice, most: int) -> Tensor:
+    """(1, 2, cells 2 5), px: for cells all over the frame the places `_LINE` along x, and along y."""
+    columns, rows = (
+        torch.linspace(0, count - 1, min(count, most), dtype=torch.float64).round() for count in lattice.cells[::-1]
     )
-    line = step * columns.new_tensor(_STENCIL)
-    offsets = torch.stack([torch.stack([line, 0 * line]), torch.stack([0 * line, line])])  # (2, 2, 5): axis, x and y
-    at = torch.cartesian_prod(columns, rows)[:, None, :, None] + offsets
-    return at.movedim(2, 0).flatten(1)[None]
+    line = columns.new_tensor(_LINE)
+    offsets = torch.stack([torch.stack([line, 0 * line + 0.5]), torch.stack([0 * line + 0.5, line])])
+    corners = torch.cartesian_prod(columns, rows)
+    at = corners[:, None, :, None] + offsets  # (cells, line, x and y, place)
+    return lattice.stride * at.movedim(2, 0).flatten(1)[None]
 
 
 def _cubic(flow: Tensor) -> Tensor:
-    """(N,), px: the bound of `between_nodes` for flows (2, N, stencils 2 5)."""
-    differences = flow.unflatten(2, (-1, 2, 5)) @ flow.new_tensor(_FOURTH)
-    along_x, along_y = torch.hypot(*differences).amax(dim=1).unbind(1)
-    return 9 / 384 * 2**4 * (along_x + 5 / 4 * along_y)
+    """(N,), px: what cubics miss of flows (2, N, cells 2 5) at most; those along y go through cubics along x."""
+    missed = flow.unflatten(2, (-1, 2, 5)) @ flow.new_tensor(_MISSED)
+    along_x, along_y = torch.hypot(*missed).unbind(2)
+    return (along_x + 5 / 4 * along_y).amax(dim=1)
 
 
-def _slope(flow: Tensor, step: float) -> Tensor:
-    """(N,): the largest slope along an axis, of flows (2, N, stencils 2 5)."""
-    differences = torch.hypot(*torch.diff(flow.unflatten(2, (-1, 5)), dim=3))
-    return differences.flatten(1).amax(dim=1) / step
+def _slope(flow: Tensor, stride: int) -> Tensor:
+    """(N,): the largest slope along an axis, of flows (2, N, cells 2 5)."""
+    steps = stride * torch.diff(flow.new_tensor(_LINE))
+    slopes = torch.hypot(*torch.diff(flow.unflatten(2, (-1, 5)), dim=3)) / steps
+    return slopes.flatten(1).amax(dim=1)
 
 
 def _radius(ranges: LensRanges, lattice: Lattice) -> float:

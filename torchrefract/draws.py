@@ -129,6 +129,8 @@ def normal(source: Stream, count: int) -> Tensor:
 def noise_key(source: Stream) -> Tensor:
     """(B, 4), int64, in [0, 2^32): what the white noise of each sample comes from."""
     child = fold(source)
+    if child.few is not None:
+        return torch.tensor([(*words, *_rounds(*words, 0, 0)) for words in child.few], dtype=torch.int64)
     zero = torch.zeros_like(child.low)
     return torch.stack([child.high, child.low, *threefry((child.high, child.low), (zero, zero))], dim=1)
 

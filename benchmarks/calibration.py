@@ -28,7 +28,7 @@ from torchrefract.cameras.calibration.fit import Fit, fit, held_out, rms
 from torchrefract.cameras.calibration.outliers import drop_outliers
 from torchrefract.cameras.calibration.straightness import straightness
 from torchrefract.cameras.models import Camera
-from torchrefract.fields.rectifying import rectifying_flow
+from torchrefract.fields.rectifying import camera_flow
 from torchrefract.warping.resample import warp
 
 _SAG = 0.01  # of the width of the frame
@@ -136,7 +136,7 @@ def _bent(gray: np.ndarray, view: View) -> np.ndarray:
 
 def _straight(views: list[View], pictures: dict[str, np.ndarray], board: Board, camera: Camera) -> tuple[float, float]:
     """How straight corners are before and after, of those found in both."""
-    flow, pairs = rectifying_flow(camera)[0], []
+    flow, pairs = camera_flow(camera)[0], []
     for view in views:
         image = torch.from_numpy(pictures[view.name])[None, None].float() / 255
         rectified = warp(image, flow, interpolation="bicubic")[0][0, 0]

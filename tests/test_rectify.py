@@ -7,7 +7,7 @@ import torch
 
 from torchrefract.cameras.files.opencv import read_opencv, write_opencv
 from torchrefract.cameras.models import Camera
-from torchrefract.fields.rectifying import rectifying_flow
+from torchrefract.fields.rectifying import camera_flow
 from torchrefract.videos import video_facts
 
 PINHOLE = {"width": 96, "height": 64, "fx": 70.0, "fy": 71.0, "cx": 46.2, "cy": 33.1}
@@ -45,7 +45,7 @@ def folder(tmp_path) -> Path:
 @pytest.mark.parametrize("zoom", [1.0, 0.7])
 @pytest.mark.parametrize("name", CAMERAS)
 def test_the_flow_is_opencvs_map(name, zoom, oracle):
-    flow, exists, pinhole = rectifying_flow(CAMERAS[name], zoom=zoom)
+    flow, exists, pinhole = camera_flow(CAMERAS[name], zoom=zoom)
     y, x = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
     expected = torch.from_numpy(np.stack(maps(CAMERAS[name], zoom)))
     oracle("rectifying flow, OpenCV's maps", flow[0] + torch.stack([x, y]), expected, 1e-3)
@@ -57,7 +57,7 @@ def test_the_flow_is_opencvs_map(name, zoom, oracle):
 def test_rays_that_a_camera_does_not_show_are_outside():
     # It folds where 1 - 3 * 1.2 r^2 = 0: at 0.527 focal lengths from its center.
     camera = Camera(**PINHOLE, coefficients=(-1.2, 0.0, 0.0, 0.0))
-    flow, exists, _ = rectifying_flow(camera)
+    flow, exists, _ = camera_flow(camera)
     y, x = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
     r2 = ((x - 46.2) / 70).square() + ((y - 33.1) / 71).square()
     assert torch.equal(exists[0, 0], r2 < 1 / 3.6)
@@ -77,7 +77,7 @@ def test_pictures_keep_their_names_and_lose_their_lens(call, folder, name):
         error = np.abs(np.asarray(found) - theirs.clip(0, 255))[4:-4, 4:-4]
         assert error.mean() < 1
         assert np.abs(np.asarray(found) - raw)[4:-4, 4:-4].mean() > 5
-    assert read_opencv(folder / "rectified" / "camera.yaml") == rectifying_flow(CAMERAS[name])[2]
+    assert read_opencv(folder / "rectified" / "camera.yaml") == camera_flow(CAMERAS[name])[2]
 
 
 def test_a_run_that_was_stopped_goes_on(call, folder):

@@ -19,7 +19,7 @@ from torchrefract._files import replacing
 from torchrefract.cameras.files.opencv import read_opencv, write_opencv
 from torchrefract.cameras.models import Camera
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, image_size, read_image
-from torchrefract.fields.rectifying import rectifying_flow
+from torchrefract.fields.rectifying import camera_flow
 from torchrefract.videos import VIDEOS, read_video, video_facts, write_video
 from torchrefract.warping.resample import warp
 
@@ -66,7 +66,7 @@ class _Lens:
         self.flow = lru_cache(maxsize=2)(self._flow)
 
     def _flow(self, height: int, width: int) -> Tensor:
-        return rectifying_flow(self.camera.resized(width=width, height=height), zoom=self.zoom)[0]
+        return camera_flow(self.camera.resized(width=width, height=height), zoom=self.zoom)[0]
 
     def __call__(self, frame: Tensor) -> np.ndarray:
         """A frame (1, 3, H, W) in [0, 1] rectified: (H, W, 3), uint8, RGB."""
@@ -95,7 +95,7 @@ def _target(file: Path) -> str:
 
 def _claim(out: Path, lens: _Lens) -> None:
     """Write the cameras before and after, or raise if the folder is of others, whose pictures would stay."""
-    pinhole = rectifying_flow(lens.camera, zoom=lens.zoom)[2]
+    pinhole = camera_flow(lens.camera, zoom=lens.zoom)[2]
     for path, camera in ((out / "lens.yaml", lens.camera), (out / "camera.yaml", pinhole)):
         if path.is_file():
             with naming("out"):

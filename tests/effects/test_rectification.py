@@ -35,6 +35,29 @@ def smooth(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
     return (0.5 + 0.4 * torch.stack(waves)).expand(shape).to(dtype).clone()
 
 
+PINHOLE = {"width": 48, "height": 27, "fx": 43.0, "fy": 42.5, "cx": 25.0, "cy": 14.1}
+# One of each model, and of OpenCV's one of each length.
+ALL = {
+    "opencv4": SMALL,
+    "opencv5": Camera(**PINHOLE, coefficients=(-0.281, 0.168, 8e-4, -4e-4, -0.05)),
+    "opencv8": Camera(**PINHOLE, coefficients=(0.6, 0.12, 1e-3, -5e-4, 0.01, 0.95, 0.25, 0.03)),
+    "opencv12": Camera(
+        **PINHOLE, coefficients=(-0.3, 0.15, 1e-3, 2e-3, -0.02, 0.02, 0.01, 0.005, 3e-3, 1e-3, -2e-3, 4e-3)
+    ),
+    "opencv14": Camera(
+        **PINHOLE, coefficients=(-0.3, 0.15, 1e-3, 2e-3, -0.02, 0.02, 0.01, 0.005, 3e-3, 1e-3, -2e-3, 4e-3, 0.03, -0.05)
+    ),
+    "fisheye": Camera(**PINHOLE, coefficients=(-0.12, 0.043, -0.0088, -0.0037), model="fisheye"),
+    "division": Camera(**PINHOLE, coefficients=(-0.2,), model="division"),
+    "polynomial12": Camera(
+        **PINHOLE,
+        coefficients=(-0.28, 0.16, -0.05, 1e-2, 1e-3, 1e-4, 1e-3, -2e-3, 3e-3, 1e-3, -2e-3, 4e-3),
+        model="polynomial12",
+    ),
+}
+every_model = pytest.mark.parametrize("camera", ALL.values(), ids=ALL)
+
+
 @pytest.mark.parametrize("share", [1, 2])
 def test_the_flow_is_opencvs_map(share, oracle):
     height, width = DASHCAM.height // share, DASHCAM.width // share
@@ -199,6 +222,8 @@ def test_frames_of_another_shape_raise():
 def test_what_is_no_camera_raises():
     with pytest.raises(TypeError, match="camera must be a Camera, got dict"):
         Rectification({"fx": 1.0})  # pyright: ignore[reportArgumentType]  # the wrong type is the point
-    tilted = Camera(width=48, height=27, fx=43.0, fy=42.5, cx=25.0, cy=14.1, coefficients=(0.0,) * 13 + (0.1,))
-    with pytest.raises(ValueError, match="tau_x and tau_y of zero"):
-        Rectification(tilted)
+    # 1 - 2 r^2 is zero at r = 0.707, 1 - 3 r^2 at 0.577; the upper left corner is at 0.67 focal lengths.
+    sizes = {"width": 48, "height": 27, "fx": 43.0, "fy": 42.5, "cx": 25.0, "cy": 14.1}
+    Rectification(Camera(**sizes, coefficients=(0.0,) * 5 + (-2.0, 0.0, 0.0)))
+    with pytest.raises(ValueError, match=r"above zero inside the frame, up to r = 0.6\d+, got zero at r = 0.577"):
+        Rectification(Camera(**sizes, coefficients=(0.0,) * 5 + (-3.0, 0.0, 0.0)))

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchrefract._checks import check_choice, check_number
 from torchrefract.cameras.models import Camera
-from torchrefract.cameras.points import MODELS, image_of_rays
+from torchrefract.cameras.points import image_of_rays
+from torchrefract.cameras.sheet import MODELS
 
 # Places along each side of the frame at which a model is fitted, and others at which it is measured.
 _FITTED, _MEASURED = 41, 129
@@ -66,8 +67,8 @@ def _exact(camera: Camera, to: str, count: int) -> Camera | None:
     """The camera itself, or its coefficients in another order, where that is all there is to do."""
     if to == camera.model:
         return camera if count == len(camera.coefficients) else None
-    plain = camera.model == "opencv" and not any(camera.coefficients[5:8]) and not any(camera.coefficients[12:])
-    return replace(camera, model=to, coefficients=camera.polynomial()) if to == "polynomial12" and plain else None
+    plain = to == "polynomial12" and camera.is_polynomial
+    return replace(camera, model=to, coefficients=camera.polynomial()) if plain else None
 
 
 def _fitted(camera: Camera, to: str, count: int, least_z: float) -> tuple[float, ...]:

@@ -15,7 +15,7 @@ _CENTER = 1e-14
 _MISSES = {torch.float32: 2e-6, torch.float64: 1e-12}  # of a solved angle, relative to 1 + theta_d
 
 
-def fisheye_image(x: Tensor, y: Tensor, z: Tensor, k: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+def fisheye_image(x: Tensor, y: Tensor, z: Tensor, k: Sequence[Tensor], most: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Where a fisheye shows rays.
 
         (x_d, y_d) = theta_d (x, y) / r,  theta = atan2(r, z),  r^2 = x^2 + y^2
@@ -23,6 +23,7 @@ def fisheye_image(x: Tensor, y: Tensor, z: Tensor, k: Sequence[Tensor]) -> tuple
     Args:
         x, y, z: (B, N), of any length.
         k: 4 of (B, 1).
+        most: (B,), rad, the angle up to which the polynomial grows, see `fisheye_angle`.
 
     Returns:
         x_d, y_d: (B, N), in focal lengths from the center; the center where there is no place.
@@ -31,7 +32,7 @@ def fisheye_image(x: Tensor, y: Tensor, z: Tensor, k: Sequence[Tensor]) -> tuple
     with torch.no_grad():
         r2 = x * x + y * y
         axis = r2 <= _CENTER * (r2 + z * z)
-        seen = _angle(r2.sqrt(), z) <= _most(k)[:, None]
+        seen = _angle(r2.sqrt(), z) <= most[:, None]
         seen = seen & ~(axis & (z <= 0))
         off = seen & ~axis
     x, y, z = (torch.where(seen, a, b) for a, b in ((x, 0.0), (y, 0.0), (z, 1.0)))
@@ -40,18 +41,21 @@ def fisheye_image(x: Tensor, y: Tensor, z: Tensor, k: Sequence[Tensor]) -> tuple
     return scale * x, scale * y, seen
 
 
-def fisheye_ray(x_d: Tensor, y_d: Tensor, k: Sequence[Tensor]) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
+def fisheye_ray(
+    x_d: Tensor, y_d: Tensor, k: Sequence[Tensor], most: Tensor
+) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
     """The rays of unit length that a fisheye shows at places, the inverse of `fisheye_image`, and which there are.
 
     Args:
         x_d, y_d: (B, N), in focal lengths from the center.
         k: 4 of (B, 1).
+        most: as for `fisheye_image`.
     """
     with torch.no_grad():
         off = x_d * x_d + y_d * y_d > _CENTER
         still = [value.detach() for value in k]
     theta_d = torch.where(off, x_d * x_d + y_d * y_d, 1.0).sqrt()
-    theta = undistort_angle(torch.where(off, theta_d, 0.0), k, _most(still))
+    theta = undistort_angle(torch.where(off, theta_d, 0.0), k, most)
     with torch.no_grad():
         missed = (distort_angle(theta, still) - theta_d).abs()
         seen = ~off | (missed <= _MISSES[theta.dtype] * (1 + theta_d))
@@ -64,10 +68,6 @@ def _angle(r: Tensor, z: Tensor) -> Tensor:
     steep = r > z
     ratio = torch.where(steep, z, r) / torch.where(steep, r, torch.where(z > 0, z, 1.0))
     return torch.where(steep, math.pi / 2 - ratio.atan(), ratio.atan())
-
-
-def _most(k: Sequence[Tensor]) -> Tensor:
-    return fisheye_angle(torch.cat(tuple(k), dim=1)).to(k[0].dtype)
 
 
 def distort_angle(theta: Tensor, k: Sequence[Tensor]) -> Tensor:

@@ -1,5 +1,6 @@
 """A camera: a pinhole behind a lens."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -8,8 +9,9 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import check_choice, check_count, check_number, check_positive, check_tensor
-from torchrefract.cameras.growth import falls_before, growth_of_powers, growth_of_ratio
-from torchrefract.cameras.points import MODELS, Mapped, distort, project, undistort, unproject, valid_radius
+from torchrefract.cameras.growth import falls_before, first_root, growth_of_powers, growth_of_ratio
+from torchrefract.cameras.points import Mapped, distort, project, undistort, unproject, valid_radius
+from torchrefract.cameras.sheet import MODELS
 
 # Along each side of the frame, where it is asked how much of it a model covers.
 _PLACES = 129
@@ -150,8 +152,25 @@ class Camera:
         """The share of the frame that has rays, counted at 129 x 129 places from border to border."""
         return self.unproject(self.places(_PLACES)).valid.double().mean().item()
 
+    def check_pole(self) -> None:
+        """Raise for the model "opencv" whose denominator is zero or below at a ray of the pinhole's frame.
+
+        There the lens shows nothing, however large its frames: no lens does that, and a fit to few corners does.
+        """
+        if self.model != "opencv" or not any(self.coefficients[5:8]):
+            return
+        sides = ((self.cx, self.width, self.fx), (self.cy, self.height, self.fy))
+        corner = math.hypot(*(max(abs(center), abs(size - 1 - center)) / focal for center, size, focal in sides))
+        pole = first_root(torch.tensor([self.coefficients[5:8]], dtype=torch.float64)).sqrt().item()
+        if pole <= corner:
+            raise ValueError(
+                f"coefficients must keep the denominator 1 + k4 r^2 + k5 r^4 + k6 r^6 above zero inside the frame, up "
+                f"to r = {corner:.4g}, got zero at r = {pole:.4g}"
+            )
+
     def check_covers(self) -> None:
-        """Raise unless every place of the frame that `coverage` looks at has a ray."""
+        """Raise unless every place of the frame that `coverage` looks at has a ray, and for `check_pole`."""
+        self.check_pole()
         share = self.coverage()
         if share < 1:
             raise ValueError(
@@ -181,6 +200,18 @@ class Camera:
         """Pixels (N, 2) or (B, N, 2) by `points.unproject`: the rays of unit length that they show."""
         return self._through("pixels", pixels, lambda p, c, **pinhole: unproject(p, c, model=self.model, **pinhole))
 
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether the lens moves nothing; that of a fisheye always does."""
+        return self.model != "fisheye" and not any(self.coefficients)
+
+    @property
+    def is_polynomial(self) -> bool:
+        """Whether `polynomial` has an answer: "polynomial12", or "opencv" without denominator and tilt."""
+        if self.model == "opencv":
+            return not any(self.coefficients[5:8]) and not any(self.coefficients[12:])
+        return self.model == "polynomial12"
+
     def polynomial(self) -> tuple[float, ...]:
         """The coefficients as those of "polynomial12".
 
@@ -195,14 +226,13 @@ class Camera:
                 f"model must be polynomial12, or opencv without denominator and tilt (convert(camera, "
                 f'to="polynomial12") finds the nearest polynomial), got {self.model}'
             )
-        k1, k2, p1, p2, k3, *others = (*self.coefficients, *(0.0,) * (14 - len(self.coefficients)))
-        denominator, prism, tilt = others[:3], others[3:7], others[7:]
-        if any(denominator) or any(tilt):
+        if not self.is_polynomial:
             raise ValueError(
                 "coefficients must have k4, k5, k6, tau_x and tau_y of zero: OpenCV's denominator and tilt are no "
                 f'polynomial (convert(camera, to="polynomial12") finds the nearest), got {self.coefficients}'
             )
-        return (k1, k2, k3, 0.0, 0.0, 0.0, p1, p2, *prism)
+        k1, k2, p1, p2, k3, *others = (*self.coefficients, *(0.0,) * (14 - len(self.coefficients)))
+        return (k1, k2, k3, 0.0, 0.0, 0.0, p1, p2, *others[3:7])
 
     def _through(self, name: str, points: Tensor, function: Callable[..., Mapped]) -> Mapped:
         if check_tensor(name, points).ndim not in (2, 3):

@@ -10,29 +10,9 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import check_all, check_choice, check_tensor
-from torchrefract.cameras.distortion import (
-    Jacobian,
-    distort_polynomial,
-    implicit,
-    jacobian_polynomial,
-    undistort_polynomial,
-)
-from torchrefract.cameras.division import distort_division, undistort_division
-from torchrefract.cameras.fisheye import fisheye_angle, fisheye_image, fisheye_ray
-from torchrefract.cameras.growth import first_root, growth_of_powers
-from torchrefract.cameras.radial import limit_of_curve, radial, reach_of
-from torchrefract.cameras.rational import (
-    OPENCV_COUNTS,
-    distort_opencv,
-    in_front,
-    opencv_radius,
-    undistort_opencv,
-)
-
-# How many coefficients each model has.
-MODELS = {"polynomial12": (12,), "opencv": OPENCV_COUNTS, "fisheye": (4,), "division": (1,)}
-_FARTHEST = 1e6  # on the plane z = 1; no lens shows what lies beyond
-_MISSES = {torch.float32: 2e-6, torch.float64: 1e-12}  # of a solved point, relative to 1 + r_d
+from torchrefract.cameras.division import distort_division
+from torchrefract.cameras.fisheye import fisheye_image
+from torchrefract.cameras.sheet import MODELS, columns, exact_radius, formula, image_of, on_plane, ray_of
 
 
 class Mapped(NamedTuple):
@@ -63,7 +43,8 @@ def distort(points: Tensor, coefficients: Tensor, *, model: str) -> Mapped:
     check_coefficients(coefficients, model)
     points, finite = _clean("points", points, 2, coefficients)
     x, y = points[..., 0], points[..., 1]
-    x_d, y_d, valid = _image(x, y, torch.ones_like(x), _columns(coefficients, model), model)
+    c, radius = columns(coefficients, model), _radius(coefficients, model)
+    x_d, y_d, valid = image_of(x, y, torch.ones_like(x), c, model, radius)
     return Mapped(torch.stack([x_d, y_d], dim=-1), valid & finite, torch.zeros_like(x_d))
 
 
@@ -82,11 +63,10 @@ def undistort(points: Tensor, coefficients: Tensor, *, model: str) -> Mapped:
     """
     check_coefficients(coefficients, model)
     points, finite = _clean("points", points, 2, coefficients)
-    c = _columns(coefficients, model)
-    ray, valid = _ray(points[..., 0], points[..., 1], c, model)
-    valid = valid & finite & (ray[2] > 1 / _FARTHEST)
-    x, y = (torch.where(valid, a, 0.0) / torch.where(valid, ray[2], 1.0) for a in ray[:2])
-    return Mapped(torch.stack([x, y], dim=-1), valid, _missed(x, y, torch.ones_like(x), points, c, model))
+    c, radius = columns(coefficients, model), _radius(coefficients, model)
+    ray, valid = ray_of(points[..., 0], points[..., 1], c, model, radius)
+    x, y, valid = on_plane(ray, valid & finite)
+    return Mapped(torch.stack([x, y], dim=-1), valid, _missed((x, y, torch.ones_like(x)), points, c, model, radius))
 
 
 def project(points: Tensor, coefficients: Tensor, *, focal: Tensor, center: Tensor, model: str) -> Mapped:
@@ -106,7 +86,7 @@ def project(points: Tensor, coefficients: Tensor, *, focal: Tensor, center: Tens
     _check_pinhole(focal, center, coefficients)
     points, finite = _clean("points", points, 3, coefficients)
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
-    x_d, y_d, valid = _image(x, y, z, _columns(coefficients, model), model)
+    x_d, y_d, valid = image_of(x, y, z, columns(coefficients, model), model, _radius(coefficients, model))
     pixels = torch.stack([x_d, y_d], dim=-1) * focal[:, None] + center[:, None]
     return Mapped(pixels, valid & finite, torch.zeros_like(x_d))
 
@@ -124,11 +104,12 @@ def unproject(pixels: Tensor, coefficients: Tensor, *, focal: Tensor, center: Te
     check_coefficients(coefficients, model)
     _check_pinhole(focal, center, coefficients)
     pixels, finite = _clean("pixels", pixels, 2, coefficients)
-    c, points = _columns(coefficients, model), (pixels - center[:, None]) / focal[:, None]
-    ray, valid = _ray(points[..., 0], points[..., 1], c, model)
+    c, radius = columns(coefficients, model), _radius(coefficients, model)
+    points = (pixels - center[:, None]) / focal[:, None]
+    ray, valid = ray_of(points[..., 0], points[..., 1], c, model, radius)
     valid = valid & finite
     rays = torch.stack([torch.where(valid, a, axis) for a, axis in zip(ray, (0.0, 0.0, 1.0), strict=True)], dim=-1)
-    missed = _missed(rays[..., 0], rays[..., 1], rays[..., 2], points, c, model, scale=focal)
+    missed = _missed(rays.unbind(-1), points, c, model, radius, scale=focal)
     return Mapped(rays / rays.square().sum(dim=-1, keepdim=True).sqrt(), valid, missed)
 
 
@@ -142,22 +123,17 @@ def valid_radius(coefficients: Tensor, *, model: str) -> Tensor:
         (B,), on the plane z = 1, before distortion, inf if there is no end; for a fisheye the angle, rad, pi at most.
     """
     check_coefficients(coefficients, model)
-    c = coefficients.detach().double()
-    if model == "polynomial12":
-        return first_root(torch.stack(growth_of_powers(c[:, :6].unbind(1)), dim=1)).sqrt()
-    if model == "opencv":
-        return opencv_radius(_padded(c))
-    return fisheye_angle(c) if model == "fisheye" else first_root(-4 * c).sqrt()
+    return exact_radius(coefficients, model)
 
 
 def image_of_rays(x: Tensor, y: Tensor, z: Tensor, coefficients: Tensor, model: str) -> tuple[Tensor, Tensor]:
     """Where a model's formula puts rays (B, N), z above zero, on whichever sheet: unchecked, to fit models by."""
-    c = _columns(coefficients, model)
+    c = columns(coefficients, model)
     if model == "fisheye":
-        return fisheye_image(x, y, z, c)[:2]
+        return fisheye_image(x, y, z, c, _radius(coefficients, model))[:2]
     if model == "division":
         return distort_division(x / z, y / z, c[0])[:2]
-    return _model(x / z, y / z, c, model)[:2]
+    return formula(x / z, y / z, c, model)[:2]
 
 
 def check_coefficients(coefficients: Tensor, model: str) -> None:
@@ -183,7 +159,7 @@ def _check_pinhole(focal: Tensor, center: Tensor, coefficients: Tensor) -> None:
 def _clean(name: str, points: Tensor, size: int, coefficients: Tensor) -> tuple[Tensor, Tensor]:
     """The points with numbers in place of NaN and infinity, and where they were numbers, (B, N)."""
     check_tensor(name, points)
-    if points.dtype not in _MISSES:
+    if points.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"{name} must be float32 or float64, got {points.dtype}")
     if points.ndim != 3 or points.shape[0] != coefficients.shape[0] or points.shape[2] != size:
         raise ValueError(f"{name} must have shape ({coefficients.shape[0]}, N, {size}), got {tuple(points.shape)}")
@@ -191,87 +167,22 @@ def _clean(name: str, points: Tensor, size: int, coefficients: Tensor) -> tuple[
     return torch.where(finite[..., None], points, 0.0), finite
 
 
-def _padded(coefficients: Tensor) -> Tensor:
-    """Coefficients of OpenCV's as 14 of them."""
-    return torch.cat([coefficients, coefficients.new_zeros(len(coefficients), 14 - coefficients.shape[1])], dim=1)
-
-
-def _columns(coefficients: Tensor, model: str) -> tuple[Tensor, ...]:
-    return (_padded(coefficients) if model == "opencv" else coefficients)[..., None].unbind(1)
-
-
-def _image(x: Tensor, y: Tensor, z: Tensor, c: Sequence[Tensor], model: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Where a lens shows rays, in focal lengths from the center, and which of them it does."""
-    if model == "fisheye":
-        return fisheye_image(x, y, z, c)
-    with torch.no_grad():
-        seen = (z > 0) & (torch.maximum(x.abs(), y.abs()) < _FARTHEST * z)
-    x, y = (torch.where(seen, a, 0.0) / torch.where(seen, z, 1.0) for a in (x, y))
-    if model == "division":
-        x_d, y_d, exists = distort_division(x, y, c[0])
-        return x_d, y_d, exists & seen
-    with torch.no_grad():
-        upright = _upright(x, y, [value.detach() for value in c], model) & seen
-    x, y = torch.where(upright, x, 0.0), torch.where(upright, y, 0.0)
-    x_d, y_d, _ = _model(x, y, c, model)
-    return torch.where(upright, x_d, 0.0), torch.where(upright, y_d, 0.0), upright
-
-
-def _ray(x_d: Tensor, y_d: Tensor, c: Sequence[Tensor], model: str) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
-    """The rays that a lens shows at places in focal lengths from the center, of any length, and which there are."""
-    if model == "fisheye":
-        return fisheye_ray(x_d, y_d, c)
-    if model == "division":
-        x, y, exists = undistort_division(x_d, y_d, c[0])
-        return (x, y, torch.ones_like(x)), exists
-    with torch.no_grad():
-        still = [value.detach() for value in c]
-        x, y, exists = _solved(x_d.detach(), y_d.detach(), still, model)
-        x, y = torch.where(exists, x, 0.0), torch.where(exists, y, 0.0)
-        jacobian = _model(x, y, still, model)[2]
-    reached_x, reached_y, _ = _model(x, y, c, model)
-    x, y = implicit((x, y), (reached_x - x_d, reached_y - y_d), jacobian)
-    return (x, y, torch.ones_like(x)), exists
+def _radius(coefficients: Tensor, model: str) -> Tensor:
+    """(B,), of the plane z = 1, in the type of the coefficients."""
+    return exact_radius(coefficients, model).to(coefficients.dtype)
 
 
 def _missed(
-    x: Tensor, y: Tensor, z: Tensor, points: Tensor, c: Sequence[Tensor], model: str, scale: Tensor | None = None
+    ray: Sequence[Tensor],
+    points: Tensor,
+    c: Sequence[Tensor],
+    model: str,
+    radius: Tensor,
+    scale: Tensor | None = None,
 ) -> Tensor:
     """(B, N), how far rays land from points (B, N, 2) in focal lengths."""
     with torch.no_grad():
-        x_d, y_d, _ = _image(x, y, z, c, model)
+        x, y, z = ray
+        x_d, y_d, _ = image_of(x, y, z, c, model, radius)
         error = torch.stack([x_d, y_d], dim=-1) - points
         return (error if scale is None else error * scale[:, None]).square().sum(dim=-1).sqrt()
-
-
-def _model(x: Tensor, y: Tensor, c: Sequence[Tensor], model: str) -> tuple[Tensor, Tensor, Jacobian]:
-    if model == "opencv":
-        return distort_opencv(x, y, c)
-    stacked = torch.stack(tuple(c), dim=1)
-    return *distort_polynomial(x, y, stacked), jacobian_polynomial(x, y, stacked)
-
-
-def _radius(c: Sequence[Tensor], model: str) -> Tensor:
-    """(B,), of the plane z = 1."""
-    return valid_radius(torch.cat(tuple(c), dim=1), model=model).to(c[0].dtype)
-
-
-def _upright(x: Tensor, y: Tensor, c: Sequence[Tensor], model: str) -> Tensor:
-    """(B, N), bool: points of the plane z = 1 on the sheet that holds the center."""
-    near = x * x + y * y <= _radius(c, model)[:, None].square()
-    if model == "opencv":
-        near = near & in_front(x, y, c)
-    return near & (_model(x, y, c, model)[2].determinant > 0)
-
-
-def _solved(x_d: Tensor, y_d: Tensor, c: Sequence[Tensor], model: str) -> tuple[Tensor, Tensor, Tensor]:
-    """The points that a polynomial or a ratio maps to others, and which there are."""
-    r_d, radius = (x_d * x_d + y_d * y_d).sqrt(), _radius(c, model)
-    if model == "polynomial12":
-        k = tuple(c[:6])
-        limit = limit_of_curve(radius, reach_of(r_d), lambda r: r * radial(r * r, k, 6))
-        return undistort_polynomial(x_d, y_d, torch.stack(tuple(c), dim=1), limit=limit)
-    x, y = undistort_opencv(x_d, y_d, c, radius)
-    reached_x, reached_y, _ = distort_opencv(x, y, c)
-    missed = torch.maximum((reached_x - x_d).abs(), (reached_y - y_d).abs())
-    return x, y, _upright(x, y, c, model) & (missed <= _MISSES[x.dtype] * (1 + r_d))

@@ -48,14 +48,29 @@ def radial_limit(coefficients: Tensor, reach: Tensor, image_reach: Tensor) -> Ra
     """
     with torch.no_grad():
         k = coefficients.flatten(1)[:, :6, None].unbind(1)
-        folds = _falls(reach[:, None] * _steps(reach), k).any(dim=1)
-        radius, width = torch.zeros_like(reach), reach
-        for _ in range(3):
-            first = _falls(radius[:, None] + width[:, None] * _steps(reach), k).long().argmax(dim=1)
-            width = width / _NODES
-            radius = torch.where(folds, radius + (first - 1).clamp(min=0) * width, reach)
+        radius, folds = first_fall(lambda r: _falls(r, k), reach)
         shape = (-1,) + (1,) * (coefficients.ndim - 2)
         return _tabulated(radius, folds, image_reach, lambda r: r * radial(r * r, k, 6), shape)
+
+
+def first_fall(falls: Callable[[Tensor], Tensor], reach: Tensor) -> tuple[Tensor, Tensor]:
+    """How far from the center a radial part grows, within a reach: on a lattice that is refined twice.
+
+    Args:
+        falls: from radii (B, n) to (B, n), bool: it does not grow there.
+        reach: (B,), up to which a fall is looked for.
+
+    Returns:
+        radius: (B,), before the first fall; the reach where there is none.
+        found: (B,), bool: there is one.
+    """
+    found = falls(reach[:, None] * _steps(reach)).any(dim=1)
+    radius, width = torch.zeros_like(reach), reach
+    for _ in range(3):
+        first = falls(radius[:, None] + width[:, None] * _steps(reach)).long().argmax(dim=1)
+        width = width / _NODES
+        radius = torch.where(found, radius + (first - 1).clamp(min=0) * width, reach)
+    return radius, found
 
 
 def limit_of_curve(radius: Tensor, image_reach: Tensor, curve: Callable[[Tensor], Tensor]) -> RadialLimit:

@@ -21,7 +21,7 @@ from torchrefract.fields.lens_bounds import LensRanges
 from torchrefract.types import Degraded, Range
 from torchrefract.warping.lattice import Lattice, SmoothFlow
 
-_LARGEST_COEFFICIENT = 100.0
+_LARGEST = 100.0  # coefficient
 _MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors are another model in another order)"
 
 
@@ -94,7 +94,7 @@ class LensDistortion(LatticeWarp):
         radial = (k1_range, k2_range, k3_range, k4_range, k5_range, k6_range)
         others = (p1_range, p2_range, s1_range, s2_range, s3_range, s4_range)
         for name, value in zip(POLYNOMIAL12, radial + others, strict=True):
-            bounds = {"low": -_LARGEST_COEFFICIENT, "high": _LARGEST_COEFFICIENT}
+            bounds = {"low": -_LARGEST, "high": _LARGEST}
             setattr(self, f"{name}_range", check_range(f"{name}_range", value, **bounds))
         self.focal_range = check_range("focal_range", focal_range, low=0.01, high=1000.0)
         self.aspect_range = check_range("aspect_range", aspect_range, low=0.01, high=100.0)
@@ -249,13 +249,12 @@ class LensDistortion(LatticeWarp):
         warnings.warn(f"{rule}: pixels beyond have no preimage and are padded, not valid", stacklevel=2)
 
 
-def check_lens(params: Any, batch: int) -> None:
-    """Raise for parameters with `coefficients`, `focal` and `center` that are no lens."""
-    for name, width, what in (("coefficients", 12, _MODEL), ("focal", 2, "fx, fy"), ("center", 2, "x, y")):
+def check_lens(params: Any, batch: int, *, count: int = 12, what: str = _MODEL, bound: float = _LARGEST) -> None:
+    """Raise for parameters with `coefficients`, `focal` and `center` that are no lens of so many coefficients."""
+    for name, width, meaning in (("coefficients", count, what), ("focal", 2, "fx, fy"), ("center", 2, "x, y")):
         value = getattr(params, name)
         if value.shape != (batch, width):
-            raise ValueError(f"params.{name} must have shape (B, {width}), {what}, got {tuple(value.shape)}")
-    bound = _LARGEST_COEFFICIENT
+            raise ValueError(f"params.{name} must have shape (B, {width}), {meaning}, got {tuple(value.shape)}")
     check_all("params.coefficients", f"lie in [-{bound:g}, {bound:g}]", params.coefficients, lambda v: v.abs() <= bound)
     check_all("params.focal", "be positive and finite", params.focal, lambda v: (v > 0) & v.isfinite())
     check_all("params.center", "be finite", params.center, torch.isfinite)

@@ -14,7 +14,7 @@ from torchrefract.warping.lattice import Lattice
 # Of the tolerance: for the terms that are left out and for Newton's method; the rest is for the cubics.
 _DROPPED, _NEWTON = 0.2, 0.1
 # Farther from the center the sampler of an exact flow clamps positions.
-_MOST_STRETCH = 3.0
+MOST_STRETCH = 3.0
 # What goes together or not at all, the least important first.
 _GROUPS = (range(8, 12), range(6, 8), (5,), (4,), (3,), (2,), (1,), (0,))
 
@@ -45,7 +45,7 @@ def lens_plan(boxes: tuple[LensRanges, ...], ask: Ask) -> Plan:
     def attempt(stride: int) -> Plan | None:
         lattice = Lattice(ask.height, ask.width, stride)
         errors = lens_errors(boxes, lattice) if moved_by_terms(boxes, lattice) else None
-        if errors is None or errors.stretch > _MOST_STRETCH or left_out + errors.cubic > (1 - _NEWTON) * room:
+        if errors is None or errors.stretch > MOST_STRETCH or left_out + errors.cubic > (1 - _NEWTON) * room:
             return None
         steps = next((n for n, error in enumerate(errors.newton) if error <= _NEWTON * room), None)
         if steps is None:

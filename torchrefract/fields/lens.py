@@ -5,7 +5,6 @@ from torch import Tensor
 
 from torchrefract._checks import is_true
 from torchrefract.cameras.distortion import (
-    ALL_TERMS,
     Terms,
     distort_polynomial,
     implicit,
@@ -18,7 +17,7 @@ from torchrefract.cameras.radial import RadialLimit, radial_limit
 from torchrefract.warping.grid import pixel_axes
 
 # The preimage of a pixel is looked for up to so many half-diagonals of the frame; beyond, nothing of it is seen.
-_REACH = 4.0
+REACH = 4.0
 # Points of each side of the frame at which a fold is looked for; folds begin at the border.
 _BORDER = 17
 
@@ -43,8 +42,8 @@ def lens_flow(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: in
     """
     c, terms, x_d, y_d = _normalized(coefficients, focal, center, height, width)
     limit = frame_limit(coefficients, focal, center, height=height, width=width)
-    bands = y_d.split(_rows_at_once(x_d, height), dim=2)
-    return _stacked([_flow_of_rows(x_d, rows, c, focal, limit, terms) for rows in bands])
+    bands = y_d.split(rows_at_once(x_d, height), dim=2)
+    return stacked([_flow_of_rows(x_d, rows, c, focal, limit, terms) for rows in bands])
 
 
 def lens_restore_flow(
@@ -58,8 +57,8 @@ def lens_restore_flow(
     """
     c, terms, x, y = _normalized(coefficients, focal, center, height, width)
     limit = frame_limit(coefficients, focal, center, height=height, width=width)
-    bands = y.split(_rows_at_once(x, height), dim=2)
-    return _stacked([_restore_flow_of_rows(x, rows, c, focal, limit, terms) for rows in bands])
+    bands = y.split(rows_at_once(x, height), dim=2)
+    return stacked([_restore_flow_of_rows(x, rows, c, focal, limit, terms) for rows in bands])
 
 
 def smooth_lens_flow(
@@ -77,7 +76,7 @@ def smooth_lens_flow(
         (B, 2, n, m), px.
     """
     c = coefficients[:, :, None, None, None]
-    x_d, y_d = _on_plane((x, y), focal, center)
+    x_d, y_d = axes_on_plane((x, y), focal, center)
     found_x, found_y = newton_undistort(x_d.detach(), y_d.detach(), c.detach(), steps=steps, terms=terms)
     if torch.is_grad_enabled() and (c.requires_grad or x_d.requires_grad):
         found_x, found_y = _attach(found_x, found_y, x_d, y_d, c, terms)
@@ -86,28 +85,20 @@ def smooth_lens_flow(
 
 def frame_limit(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> RadialLimit:
     """How far the radial part can be inverted, looked for as far as the frame asks; arguments as for `lens_flow`."""
-    corner = _corner_radius(focal.detach(), center.detach(), height, width)
-    return radial_limit(coefficients.detach()[:, :, None, None, None], _REACH * corner, 1.1 * corner)
+    corner = corner_radius(focal.detach(), center.detach(), height, width)
+    return radial_limit(coefficients.detach()[:, :, None, None, None], REACH * corner, 1.1 * corner)
 
 
 def folds_inside(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> Tensor:
     """(B,), bool: part of the border of the frame has no preimage; arguments as for `lens_flow`."""
     limit = frame_limit(coefficients, focal, center, height=height, width=width)
     c = coefficients.detach()[:, :, None, None, None]
-    x_d, y_d = _border(focal.detach(), center.detach(), height, width)
+    x_d, y_d = border(focal.detach(), center.detach(), height, width)
     return ~undistort_polynomial(x_d, y_d, c, limit=limit)[2].flatten(1).all(dim=1)
 
 
-def shows_folded(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> Tensor:
-    """(B,), bool: the lens shows part of the border of the clean frame folded over; arguments as for `lens_flow`."""
-    limit = frame_limit(coefficients, focal, center, height=height, width=width)
-    c = coefficients.detach()[:, :, None, None, None]
-    x, y = _border(focal.detach(), center.detach(), height, width)
-    return ~_unfolded(x, y, c, limit, ALL_TERMS).flatten(1).all(dim=1)
-
-
-def _border(focal: Tensor, center: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """x and y, (B, 1, 1, N), of points on the border of the frame."""
+def border(focal: Tensor, center: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """x and y, (B, 1, 1, N), on the plane z = 1, of points on the border of the frame."""
     steps = torch.linspace(0, 1, _BORDER, dtype=focal.dtype, device=focal.device)
     ends = torch.tensor([0, 1], dtype=focal.dtype, device=focal.device)
     sides = torch.cat([torch.cartesian_prod(steps, ends), torch.cartesian_prod(ends, steps)])
@@ -116,7 +107,7 @@ def _border(focal: Tensor, center: Tensor, height: int, width: int) -> tuple[Ten
     return x, y
 
 
-def _corner_radius(focal: Tensor, center: Tensor, height: int, width: int) -> Tensor:
+def corner_radius(focal: Tensor, center: Tensor, height: int, width: int) -> Tensor:
     """(B,), on the plane z = 1: the distance of the farthest corner of the frame."""
     size = torch.tensor([width - 1, height - 1], dtype=focal.dtype, device=focal.device)
     # Half a pixel at least, so that a frame of one pixel has a radius too.
@@ -127,24 +118,25 @@ def _corner_radius(focal: Tensor, center: Tensor, height: int, width: int) -> Te
 def _normalized(
     coefficients: Tensor, focal: Tensor, center: Tensor, height: int, width: int
 ) -> tuple[Tensor, Terms, Tensor, Tensor]:
-    x, y = _on_plane(pixel_axes(height, width, dtype=focal.dtype, device=focal.device), focal, center)
+    x, y = axes_on_plane(pixel_axes(height, width, dtype=focal.dtype, device=focal.device), focal, center)
     return coefficients[:, :, None, None, None], used_terms(coefficients), x, y
 
 
-def _on_plane(axes: tuple[Tensor, Tensor], focal: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
+def axes_on_plane(axes: tuple[Tensor, Tensor], focal: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
     """Places in px on the plane z = 1."""
     x, y = ((axis - center[:, i, None, None, None]) / focal[:, i, None, None, None] for i, axis in enumerate(axes))
     return x, y
 
 
-def _rows_at_once(x: Tensor, height: int) -> int:
+def rows_at_once(x: Tensor, height: int) -> int:
     """Rows whose temporaries stay in a core's cache; an accelerator, or a compiled graph, takes all at once."""
     if x.device.type != "cpu" or torch.compiler.is_compiling():
         return max(1, height)
     return max(1, (1 << 16) // max(1, x.shape[0] * x.shape[3]))
 
 
-def _stacked(bands: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+def stacked(bands: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Flows and where they exist, from those of bands of rows."""
     if len(bands) == 1:
         return bands[0]
     flows, exists = zip(*bands, strict=True)
@@ -187,5 +179,5 @@ def _attach(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, c: Tensor, terms: Te
 def _as_flow(u: Tensor, v: Tensor, exists: Tensor, x: Tensor, y: Tensor, focal: Tensor) -> Tensor:
     if not is_true(exists.all):
         # Where there is no answer, look outward past every frame: padded, never extrapolated.
-        u, v = torch.where(exists, u, 2 * _REACH * x.detach()), torch.where(exists, v, 2 * _REACH * y.detach())
+        u, v = torch.where(exists, u, 2 * REACH * x.detach()), torch.where(exists, v, 2 * REACH * y.detach())
     return torch.cat([u, v], dim=1) * focal[:, :, None, None]

@@ -131,7 +131,7 @@ class _Lenses(NamedTuple):
 def _measured(lenses: _Lenses, lattice: Lattice, cells: int) -> tuple[Tensor, ...] | None:
     """For each of N lenses the numbers of `LensErrors`, (N,), those after steps (steps, N); None without an inverse."""
     c, focal, center = lenses
-    at = _lines(lattice, cells)
+    at = lines_of_cells(lattice, cells)
     x, y = ((at[:, i] - center[:, i]) / focal[:, i] for i in range(2))
     iterates = _solve(x, y, c)
     if iterates is None:
@@ -143,7 +143,8 @@ def _measured(lenses: _Lenses, lattice: Lattice, cells: int) -> tuple[Tensor, ..
     ]
     flow = torch.stack([(found_x - x) * focal[:, 0], (found_y - y) * focal[:, 1]])
     stretch = torch.hypot(found_x, found_y) / torch.hypot(x, y).clamp(min=1e-9)
-    return _cubic(flow), torch.stack(newton), stretch.amax(dim=1), _slope(flow, lattice.stride)
+    cubic, slope = cubic_errors(flow, lattice.stride)
+    return cubic, torch.stack(newton), stretch.amax(dim=1), slope
 
 
 def _solve(x: Tensor, y: Tensor, c: Tensor) -> list[tuple[Tensor, Tensor]] | None:
@@ -160,7 +161,7 @@ def _solve(x: Tensor, y: Tensor, c: Tensor) -> list[tuple[Tensor, Tensor]] | Non
     return None
 
 
-def _lines(lattice: Lattice, most: int) -> Tensor:
+def lines_of_cells(lattice: Lattice, most: int) -> Tensor:
     """(1, 2, cells 2 5), px: for cells all over the frame the places `_LINE` along x, and along y."""
     columns, rows = (
         torch.linspace(0, count - 1, min(count, most), dtype=torch.float64).round() for count in lattice.cells[::-1]
@@ -172,18 +173,19 @@ def _lines(lattice: Lattice, most: int) -> Tensor:
     return lattice.stride * at.movedim(2, 0).flatten(1)[None]
 
 
-def _cubic(flow: Tensor) -> Tensor:
-    """(N,), px: what cubics miss of flows (2, N, cells 2 5) at most; those along y go through cubics along x."""
-    missed = flow.unflatten(2, (-1, 2, 5)) @ flow.new_tensor(_MISSED)
-    along_x, along_y = torch.hypot(*missed).unbind(2)
-    return (along_x + 5 / 4 * along_y).amax(dim=1)
+def cubic_errors(flow: Tensor, stride: int) -> tuple[Tensor, Tensor]:
+    """How far flows between nodes are off, px, and their largest slopes along an axis, px per px, of N lenses, (N,).
 
-
-def _slope(flow: Tensor, stride: int) -> Tensor:
-    """(N,): the largest slope along an axis, of flows (2, N, cells 2 5)."""
-    steps = stride * torch.diff(flow.new_tensor(_LINE))
-    slopes = torch.hypot(*torch.diff(flow.unflatten(2, (-1, 5)), dim=3)) / steps
-    return slopes.flatten(1).amax(dim=1)
+    Args:
+        flow: (2, N, cells 2 5), px, at the places of `lines_of_cells`.
+        stride: px, of the lattice.
+    """
+    lines = flow.unflatten(2, (-1, 2, 5))
+    along_x, along_y = torch.hypot(*(lines @ flow.new_tensor(_MISSED))).unbind(2)
+    # What is missed along y has gone through cubics along x.
+    missed = (along_x + 5 / 4 * along_y).amax(dim=1)
+    slopes = torch.hypot(*torch.diff(lines, dim=4)) / (stride * torch.diff(flow.new_tensor(_LINE)))
+    return missed, slopes.flatten(1).amax(dim=1)
 
 
 def _radius(ranges: LensRanges, lattice: Lattice) -> float:

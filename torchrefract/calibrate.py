@@ -1,5 +1,6 @@
 """Calibrate a camera with pictures of a board: `python -m torchrefract.calibrate images=pictures squares=11x8`."""
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,8 +13,9 @@ from torchrefract._command import UsageError, as_they_are, command, job, make, n
 from torchrefract._config import CONFIG_DIR
 from torchrefract._files import replacing
 from torchrefract.board_views import Look, look_at, main_size, pictures_of, shown_instead
-from torchrefract.calibration_report import Calibration, camera_of, write_looks, write_report
+from torchrefract.calibration_report import CAMERA_FILE, Calibration, camera_of, set_aside, write_looks, write_report
 from torchrefract.cameras.calibration.boards import Board
+from torchrefract.cameras.calibration.coverage import faults
 from torchrefract.cameras.calibration.fit import FEWEST_VIEWS, MODELS, held_out
 from torchrefract.cameras.calibration.outliers import drop_outliers
 from torchrefract.cameras.calibration.synthetic import CAMERA, VIEWS, render_views
@@ -42,9 +44,10 @@ def main(cfg: DictConfig) -> None:
     try:
         found = _calibrate(files, looks, board, model, most)
     except (UsageError, ValueError) as error:
-        write_looks(board, looks, str(error), out)
+        aside = set_aside(out)
+        write_looks(board, looks, str(error), aside, out)
         raise UsageError(f"{error} ({out / 'report.md'} tells of each picture)") from error
-    write_opencv(out / "camera.yaml", found.camera)
+    write_opencv(out / CAMERA_FILE, found.camera)
     write_report(found, {file.name: file for file in files}, out)
     _tell(found, out)
 
@@ -95,8 +98,10 @@ def _cut(text: str) -> str:
 def _tell(found: Calibration, out: Path) -> None:
     for name, reason in found.kept.dropped.items():
         print(f"{name} dropped: {reason}")
+    for fault in faults(found.camera):
+        print(f"warning: {fault}", file=sys.stderr)
     print(
-        f"{out / 'camera.yaml'}: {found.fitted.lens.model} of {len(found.kept.views)} views in {len(found.looks)} "
+        f"{out / CAMERA_FILE}: {found.fitted.lens.model} of {len(found.kept.views)} views in {len(found.looks)} "
         f"pictures, rms {found.fitted.rms:.3f} px, on views held out {found.held_rms:.3f} px; see {out / 'report.md'}"
     )
 

@@ -17,6 +17,8 @@ from torchrefract.cameras.calibration.outliers import Kept
 from torchrefract.cameras.calibration.straightness import rectified, straightness
 from torchrefract.cameras.models import Camera
 
+CAMERA_FILE = "camera.yaml"
+_PICTURES = ("coverage.png", "residuals.png")
 _DPI = 100
 _SHOWN = 12  # views whose corners are drawn, those that cost the others most
 _ACROSS = 4  # of them in a row
@@ -59,16 +61,43 @@ def write_report(found: Calibration, files: dict[str, Path], out: Path) -> None:
         files: the pictures by the names of their views.
         out: the folder.
     """
-    for name, figure in (("coverage.png", _coverage(found)), ("residuals.png", _residuals(found, files))):
+    for name, figure in zip(_PICTURES, (_coverage(found), _residuals(found, files)), strict=True):
         with replacing(out / name) as path:
             figure.savefig(path)
     _write(out / "report.md", _report(found))
 
 
-def write_looks(board: Board, looks: Sequence[Look], problem: str, out: Path) -> None:
-    """report.md of a calibration that could not be: the problem, and what was seen in each picture."""
+def set_aside(out: Path) -> str:
+    """What a calibration of before has left in a folder gets other names, so that it is not taken for that of today.
+
+    Returns:
+        The new name of its camera, or empty.
+    """
+    for name in (CAMERA_FILE, *_PICTURES):
+        path = out / name
+        if path.is_file():
+            path.replace(_before(path))
+    return _before(out / CAMERA_FILE).name if _before(out / CAMERA_FILE).is_file() else ""
+
+
+def write_looks(board: Board, looks: Sequence[Look], problem: str, aside: str, out: Path) -> None:
+    """report.md of a calibration that could not be: the problem, and what was seen in each picture.
+
+    Args:
+        board: that was looked for.
+        looks: at the pictures.
+        problem: why there is no camera.
+        aside: the name of the camera of a calibration before, or empty.
+        out: the folder.
+    """
     lines = ["# Calibration", "", f"There is no camera: {problem}", "", f"Board: `{board.describe()}`", ""]
+    if aside:
+        lines += [f"`{aside}` is of a calibration before.", ""]
     _write(out / "report.md", [*lines, *_table(("picture", "corners", "remark"), [_looked(look) for look in looks])])
+
+
+def _before(path: Path) -> Path:
+    return path.with_name(f"{path.stem}_before{path.suffix}")
 
 
 def _write(path: Path, lines: Sequence[str]) -> None:

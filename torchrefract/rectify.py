@@ -43,6 +43,10 @@ def main(cfg: DictConfig) -> None:
     if out.resolve() == (source if source.is_dir() else source.parent).resolve():
         raise UsageError(f"out must be another folder than that of input, got {out}")
     _claim(out, lens)
+    if lens.black:
+        print(
+            f"camera: {lens.black:.1%} of the frame has no ray and stays black: the model folds back", file=sys.stderr
+        )
     made, failed = 0, dict[Path, str]()
     for file in progress(files, "rectifying", count=len(files)):
         try:
@@ -63,6 +67,8 @@ class _Lens:
 
     def __init__(self, camera: Camera, zoom: float):
         self.camera, self.zoom = camera, zoom
+        _, exists, self.pinhole = camera_flow(camera, zoom=zoom)
+        self.black = 1 - exists.double().mean().item()  # share of the frame
         self.flow = lru_cache(maxsize=2)(self._flow)
 
     def _flow(self, height: int, width: int) -> Tensor:
@@ -95,8 +101,7 @@ def _target(file: Path) -> str:
 
 def _claim(out: Path, lens: _Lens) -> None:
     """Write the cameras before and after, or raise if the folder is of others, whose pictures would stay."""
-    pinhole = camera_flow(lens.camera, zoom=lens.zoom)[2]
-    for path, camera in ((out / "lens.yaml", lens.camera), (out / "camera.yaml", pinhole)):
+    for path, camera in ((out / "lens.yaml", lens.camera), (out / "camera.yaml", lens.pinhole)):
         if path.is_file():
             with naming("out"):
                 before = read_opencv(path)

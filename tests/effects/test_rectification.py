@@ -1,6 +1,9 @@
 import copy
 import math
 import pickle
+import warnings
+from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,7 +38,7 @@ def smooth(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
     return (0.5 + 0.4 * torch.stack(waves)).expand(shape).to(dtype).clone()
 
 
-PINHOLE = {"width": 48, "height": 27, "fx": 43.0, "fy": 42.5, "cx": 25.0, "cy": 14.1}
+PINHOLE: dict[str, Any] = {"width": 48, "height": 27, "fx": 43.0, "fy": 42.5, "cx": 25.0, "cy": 14.1}
 # One of each model, and of OpenCV's one of each length.
 ALL = {
     "opencv4": SMALL,
@@ -74,6 +77,71 @@ def test_the_flow_is_opencvs_map(share, oracle):
     ours = flow + torch.stack([x, y])
     oracle("rectification, cv2.initUndistortRectifyMap", ours, torch.from_numpy(np.stack(theirs)), 1e-3)
     assert ours.sub(torch.stack([x, y])).abs().max() > 20 / share
+
+
+def shown_at(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """(2, N), px: where a camera shows points (2, N) of the plane z = 1, by OpenCV or in closed form."""
+    matrix, vector, space = (
+        np.array(camera.matrix),
+        np.array(camera.coefficients),
+        np.vstack([points, 0 * points[:1] + 1]),
+    )
+    if camera.model == "fisheye":
+        return cv2.fisheye.projectPoints(space.T[:, None].copy(), np.zeros(3), np.zeros(3), matrix, vector)[0][:, 0].T
+    if camera.model == "opencv":
+        return cv2.projectPoints(space.T.copy(), np.zeros(3), np.zeros(3), matrix, vector)[0][:, 0].T
+    r2 = (points**2).sum(axis=0)
+    if camera.model == "division":
+        scaled = points * 2 / (1 + np.sqrt(1 - 4 * vector[0] * r2))
+    else:
+        (x, y), (p1, p2, s1, s2, s3, s4) = points, vector[6:]
+        g = 1 + sum(k * r2**i for i, k in enumerate(vector[:6], start=1))
+        bent_x = 2 * p1 * x * y + p2 * (r2 + 2 * x**2) + s1 * r2 + s2 * r2**2
+        bent_y = p1 * (r2 + 2 * y**2) + 2 * p2 * x * y + s3 * r2 + s4 * r2**2
+        scaled = points * g + np.stack([bent_x, bent_y])
+    return scaled * [[camera.fx], [camera.fy]] + [[camera.cx], [camera.cy]]
+
+
+@every_model
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_each_model_is_looked_up_where_its_camera_shows_the_ray(camera, dtype, oracle):
+    made = Rectification(camera).degrade(torch.zeros(1, 1, 27, 48, dtype=dtype), seed=0)
+    pixels = np.mgrid[:27, :48][::-1].reshape(2, -1).astype(float)
+    rays = (pixels - [[camera.cx], [camera.cy]]) / [[camera.fx], [camera.fy]]
+    ours = made.flow[0].double().reshape(2, -1) + torch.from_numpy(pixels)
+    bar = 1e-9 if dtype is torch.float64 else 1e-4
+    oracle(f"rectification of each model, {dtype}", ours, torch.from_numpy(shown_at(camera, rays)), bar)
+    # The flow back leads to the ray that the camera shows at the pixel.
+    clean = (made.restore_flow[0].double().reshape(2, -1).numpy() + pixels - [[camera.cx], [camera.cy]]) / [
+        [camera.fx],
+        [camera.fy],
+    ]
+    oracle(f"its flow back, {dtype}", torch.from_numpy(shown_at(camera, clean)), torch.from_numpy(pixels), bar)
+    assert made.restore_valid.double().mean() > 0.7
+
+
+@pytest.mark.parametrize("name", ["opencv8", "fisheye", "division"])
+def test_of_any_model_one_look_up_keeps_more_than_two(name):
+    camera = ALL[name].resized(width=480, height=270)
+    y, x = torch.meshgrid(torch.arange(270).double(), torch.arange(480).double(), indexing="ij")
+
+    def scene(u: Tensor, v: Tensor) -> Tensor:
+        return 0.5 + 0.4 * torch.sin(u / 2.3) * torch.cos(v / 2.9)  # fine, so that a look-up blurs it
+
+    raw = scene(x, y)[None, None]
+    both = Compose([Rectification(camera), LensDistortion()])
+    made = both.degrade(raw, seed=3)
+    first, then = (effect.apply(raw, params) for effect, params in zip(both.effects, made.params.children, strict=True))
+    twice = both.effects[1].apply(first.image, made.params.children[1]).image
+    clean = torch.stack([x, y]) + then.flow[0]
+    rays = (clean.reshape(2, -1).numpy() - [[camera.cx], [camera.cy]]) / [[camera.fx], [camera.fy]]
+    u, v = torch.from_numpy(shown_at(camera, rays)).view(2, 270, 480)
+    seen = made.valid[0, 0] & (u > 2) & (u < 477) & (v > 2) & (v < 267)
+    assert seen.double().mean() > 0.5
+    once, both_psnr = (
+        -10 * (found[0, 0] - scene(u, v))[seen].square().mean().log10().item() for found in (made.image, twice)
+    )
+    assert once > both_psnr + 2, (once, both_psnr)
 
 
 def test_the_flow_back_undoes_it():
@@ -163,25 +231,51 @@ def test_on_real_frames_one_look_up_keeps_more_than_two(shared_data, name):
     assert once > both + 2, (once, both)
 
 
-def test_every_sample_is_that_of_a_batch_of_one():
+@every_model
+def test_every_sample_is_that_of_a_batch_of_one(camera, on_threads):
     image = torch.rand(5, 3, 27, 48)
-    effect = Rectification(SMALL, p=0.5)
+    effect = Rectification(camera, p=0.5)
     together = effect.degrade(image, seed=5)
     assert 0 < together.params.gate.sum() < 5
+    maps = ("image", "flow", "valid", "restore_flow", "restore_valid")
     for i in range(5):
+        on_threads(1 + i % 3)
         alone = effect.degrade(image[i], seed=5, keys=[i])
-        for name in ("image", "flow", "valid", "restore_flow", "restore_valid"):
+        for name in maps:
             assert torch.equal(getattr(alone, name), getattr(together, name)[i]), name
     assert torch.equal(together.image[~together.params.gate], image[~together.params.gate])
 
 
-def test_one_graph_gives_the_same_as_eager_mode():
-    effect, image = Rectification(SMALL), smooth(2, 3, 27, 48)
+@pytest.mark.parametrize("name", ["opencv4", "opencv14", "fisheye"])
+def test_one_graph_gives_the_same_as_eager_mode(name):
+    effect, image = Rectification(ALL[name]), smooth(2, 3, 27, 48)
     assert_close(torch.compile(effect, fullgraph=True)(image), effect(image), rtol=0, atol=2e-4)
 
 
-def test_gradients_of_the_camera_are_those_of_finite_differences():
-    effect, image = Rectification(SMALL), smooth(1, 1, 27, 48, dtype=torch.float64)
+def test_one_graph_under_a_tolerance_gives_the_same_as_eager_mode():
+    effect, image = Rectification(ALL["opencv8"], tolerance_px=0.05), smooth(2, 3, 27, 48)
+    assert effect.plan(27, 48).stride > 1
+    assert_close(torch.compile(effect, fullgraph=True)(image), effect(image), rtol=0, atol=2e-4)
+
+
+@every_model
+def test_gradients_under_a_tolerance_are_near_to_exact_ones(camera):
+    image, found = smooth(1, 1, 27, 48, dtype=torch.float64), []
+    for tolerance in (None, 1e-3):
+        effect = Rectification(camera, tolerance_px=tolerance)
+        params = effect.sample(image, seed=0)
+        values = [value.requires_grad_() for value in params[1:]]
+        made = effect.apply(image, RectificationParams(params.gate, *values))
+        found.append(torch.autograd.grad((made.image * image.flip(3)).sum(), values))
+    assert effect.plan(27, 48).stride > 1
+    for exact, near in zip(*found, strict=True):
+        assert_close(near, exact, rtol=0, atol=0.01 * exact.abs().max().item())
+    assert not torch.equal(found[0][0], found[1][0])
+
+
+@every_model
+def test_gradients_of_the_camera_are_those_of_finite_differences(camera):
+    effect, image = Rectification(camera), smooth(1, 1, 27, 48, dtype=torch.float64)
     params = effect.sample(image, seed=0)
 
     def rectified(coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
@@ -189,6 +283,69 @@ def test_gradients_of_the_camera_are_those_of_finite_differences():
 
     values = [value.clone().requires_grad_() for value in params[1:]]
     assert torch.autograd.gradcheck(rectified, values, fast_mode=True)
+
+
+@every_model
+def test_gradients_of_the_flow_back_are_those_of_finite_differences(camera):
+    effect, image = Rectification(camera), smooth(1, 1, 9, 16, dtype=torch.float64)
+    params = effect.sample(image, seed=0)
+
+    def back(coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
+        made = RectificationParams(params.gate, coefficients, focal, center)
+        return effect.restore_flow(made, height=9, width=16)[0]
+
+    values = [value.clone().requires_grad_() for value in params[1:]]
+    assert torch.autograd.gradcheck(back, values, fast_mode=True)
+
+
+def random_camera(dice: np.random.Generator) -> Camera:
+    """Of any model, wide or narrow, from nearly straight to far from it."""
+    model = ("polynomial12", "opencv", "opencv", "fisheye", "division")[dice.integers(5)]
+    width, height = int(dice.integers(200, 700)), int(dice.integers(120, 500))
+    fx, cx, cy = width * dice.uniform(0.5, 1.5), width * dice.uniform(0.45, 0.55), height * dice.uniform(0.45, 0.55)
+    radial, small = dice.uniform(-0.3, 0.3, 6) / 3.0 ** np.arange(6), dice.normal(0, 2e-3, 6)
+    numbers = {
+        "polynomial12": [*radial, *small],
+        "opencv": [*radial[:2], *small[:2], radial[2], *dice.uniform(-0.2, 0.6, 3) / [1, 3, 9], *small[2:], 0.02, 0.01],
+        "fisheye": radial[:4] / 3,
+        "division": radial[:1] / 2,
+    }[model]
+    coefficients, fy = tuple(map(float, numbers)), fx * dice.uniform(0.98, 1.02)
+    return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=coefficients, model=model)
+
+
+def test_under_a_tolerance_every_camera_stays_within_it():
+    dice, planned = np.random.default_rng(6), 0
+    for _ in range(30):
+        camera, tolerance = random_camera(dice), float(10 ** dice.uniform(-3, -0.5))
+        image = torch.zeros(1, 1, camera.height, camera.width)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "camera: the model folds back")
+            near = Rectification(camera, tolerance_px=tolerance).degrade(image, seed=0)
+            exact = Rectification(camera).degrade(image.double(), seed=0)
+        plan = Rectification(camera, tolerance_px=tolerance).plan(camera.height, camera.width)
+        planned += plan.stride > 1
+        if plan.stride > 1:
+            assert exact.valid is not None
+            assert (near.flow - exact.flow).square().sum(dim=1).sqrt().max() <= plan.error_px <= tolerance
+    assert planned >= 20  # the others fold, or bend too much
+
+
+def test_the_plan_of_a_camera_is_of_frames_of_its_shape():
+    effect = Rectification(DASHCAM, tolerance_px=0.05)
+    assert effect.plan(720, 1280).stride > 8
+    assert effect.plan(720, 1280).slope < 0.5
+    with pytest.raises(ValueError, match="image must have the shape of the camera's frames"):
+        effect.plan(720, 720)
+
+
+def test_other_cameras_than_the_one_that_is_known_are_taken_exactly():
+    effect, exact = Rectification(DASHCAM, tolerance_px=0.1), Rectification(DASHCAM)
+    image = torch.rand(1, 1, 72, 128)
+    params = exact.sample(image, seed=0)
+    other = params._replace(coefficients=params.coefficients * 1.01)
+    assert not torch.equal(effect.apply(image, params).flow, exact.apply(image, params).flow)
+    assert torch.equal(effect.apply(image, other).flow, exact.apply(image, other).flow)
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value))])
@@ -214,6 +371,18 @@ def test_a_model_that_folds_inside_the_frame_is_told():
     assert torch.equal(made.valid[0, 0][clear], (r2 < 1 / 1.2)[clear])
 
 
+def test_a_fisheye_that_folds_inside_the_frame_is_told():
+    # theta (1 - 0.6 theta^2) falls from theta = 1 / sqrt(1.8) on: at tan(0.745) = 0.922 focal lengths.
+    folding = replace(ALL["fisheye"], fx=24.0, fy=24.0, coefficients=(-0.6, 0.0, 0.0, 0.0))
+    with pytest.warns(UserWarning, match="camera: the model folds back inside the frame"):
+        made = Rectification(folding).degrade(torch.rand(1, 3, 27, 48), seed=0)
+    y, x = torch.meshgrid(torch.arange(27.0), torch.arange(48.0), indexing="ij")
+    theta = torch.hypot(x - 25, y - 14.1).div(24).atan()
+    clear = (theta - 1.8**-0.5).abs() > 1e-4
+    assert 0.02 < (theta > 1.8**-0.5).double().mean() < 0.5
+    assert torch.equal(made.valid[0, 0][clear], (theta < 1.8**-0.5)[clear])
+
+
 def test_frames_of_another_shape_raise():
     with pytest.raises(ValueError, match="image must have the shape of the camera's frames, 48 x 27 px, got 48 x 48"):
         Rectification(SMALL)(torch.rand(1, 3, 48, 48))
@@ -223,7 +392,6 @@ def test_what_is_no_camera_raises():
     with pytest.raises(TypeError, match="camera must be a Camera, got dict"):
         Rectification({"fx": 1.0})  # pyright: ignore[reportArgumentType]  # the wrong type is the point
     # 1 - 2 r^2 is zero at r = 0.707, 1 - 3 r^2 at 0.577; the upper left corner is at 0.67 focal lengths.
-    sizes = {"width": 48, "height": 27, "fx": 43.0, "fy": 42.5, "cx": 25.0, "cy": 14.1}
-    Rectification(Camera(**sizes, coefficients=(0.0,) * 5 + (-2.0, 0.0, 0.0)))
+    Rectification(Camera(**PINHOLE, coefficients=(0.0,) * 5 + (-2.0, 0.0, 0.0)))
     with pytest.raises(ValueError, match=r"above zero inside the frame, up to r = 0.6\d+, got zero at r = 0.577"):
-        Rectification(Camera(**sizes, coefficients=(0.0,) * 5 + (-3.0, 0.0, 0.0)))
+        Rectification(Camera(**PINHOLE, coefficients=(0.0,) * 5 + (-3.0, 0.0, 0.0)))

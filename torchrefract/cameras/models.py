@@ -152,8 +152,8 @@ class Camera:
         """The share of the frame that has rays, counted at 129 x 129 places from border to border."""
         return self.unproject(self.places(_PLACES)).valid.double().mean().item()
 
-    def check_pole(self) -> None:
-        """Raise for the model "opencv" whose denominator is zero or below at a ray of the pinhole's frame.
+    def check_pole(self, name: str = "camera") -> None:
+        """Raise, under a name, for the model "opencv" whose denominator is zero or below at a ray of the pinhole's frame.
 
         There the lens shows nothing, however large its frames: no lens does that, and a fit to few corners does.
         """
@@ -164,8 +164,8 @@ class Camera:
         pole = first_root(torch.tensor([self.coefficients[5:8]], dtype=torch.float64)).sqrt().item()
         if pole <= corner:
             raise ValueError(
-                f"coefficients must keep the denominator 1 + k4 r^2 + k5 r^4 + k6 r^6 above zero inside the frame, up "
-                f"to r = {corner:.4g}, got zero at r = {pole:.4g}"
+                f"{name} must keep its denominator 1 + k4 r^2 + k5 r^4 + k6 r^6 above zero inside the frame, up to "
+                f"r = {corner:.4g} focal lengths, got zero at r = {pole:.4g}"
             )
 
     def check_covers(self) -> None:

@@ -142,10 +142,11 @@ def polynomial_of(name: str, camera: Camera, residual_px: float) -> Camera:
 
     Raises:
         TypeError: no camera.
-        ValueError: none is so near; the lens folds back inside the frame.
+        ValueError: none is so near; the lens folds back, or has a pole, inside the frame.
     """
     if not isinstance(camera, Camera):
         raise TypeError(f"{name} must be a Camera, got {type(camera).__name__}")
+    camera.check_pole(name)
     made = convert(camera, to="polynomial12")
     if made.covered < 1:
         raise ValueError(

@@ -41,6 +41,19 @@ def doubts(views: Sequence[View], fitted: Fit, camera: Camera) -> list[str]:
     ]
     if vague:
         found.append(f"These coefficients cannot be told from zero: {', '.join(vague)}; fewer may do.")
+    return [*found, *faults(camera)]
+
+
+def faults(camera: Camera) -> list[str]:
+    """What makes a camera useless in a part of its frame: a model that folds, a denominator that crosses zero."""
+    found = []
     if (share := camera.coverage()) < 1:
-        found.append(f"The model folds back inside the frame: {1 - share:.1%} of it has no ray.")
+        found.append(
+            f"The model folds back inside the frame: {1 - share:.1%} of it has no ray. Fewer coefficients, or corners "
+            "nearer to the border, may help."
+        )
+    try:
+        camera.check_pole()
+    except ValueError as error:
+        found.append(f"The model breaks down inside the frame: {error}. Fewer coefficients may help.")
     return found

@@ -153,9 +153,9 @@ class Camera:
         return self.unproject(self.places(_PLACES)).valid.double().mean().item()
 
     def check_pole(self, name: str = "camera") -> None:
-        """Raise, under a name, for the model "opencv" whose denominator is zero or below at a ray of the pinhole's frame.
+        """Raise, under a name, where OpenCV's denominator is zero or below at a ray of the pinhole's frame.
 
-        There the lens shows nothing, however large its frames: no lens does that, and a fit to few corners does.
+        No lens does that; a fit to few corners does.
         """
         if self.model != "opencv" or not any(self.coefficients[5:8]):
             return

@@ -16,7 +16,7 @@ from torchrefract.cameras.calibration.detection import View, detect, is_enough
 from torchrefract.cameras.calibration.diagnosis import edge_width, explain, what_instead
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, read_image
 
-_VERSION = 1  # of the file; another one is not read
+_VERSION = 2  # of the file; another one is not read
 _MOST_OF = 0.75  # of the pictures that must be of one size
 _ASKED = 3  # pictures that are asked what they show instead of the board
 

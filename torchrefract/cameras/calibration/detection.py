@@ -17,6 +17,7 @@ _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
 _FARTHEST = 0.05  # squares that a refinement may move a corner by, or 1 px
 _MISFIT = 0.2  # squares from where its neighbors say that a corner is
 _NEIGHBORS = 8
+_SMOOTHER = 0.9  # times as far off their neighbors, rms, corners as they were found are taken in place of refined ones
 _BESIDE = 0.1  # squares from a corner, along x and y, where its four squares are looked at
 _CONTRAST = 0.4  # of the median contrast of the corners that one must have
 _SURE = 0.75  # of the corners that a refinement must keep to be believed
@@ -37,7 +38,8 @@ def detect(gray: np.ndarray, board: Board, *, name: str = "") -> View:
     chessboard by `findChessboardCornersSB`, or else by `findChessboardCorners`. Each corner is then refined in a window
     that holds little but its four squares. Left out are those that move far, lie at the border of the picture, are not
     where their neighbors say, or, of a ChArUco board, not where black and white cross, as behind a finger. Where many
-    would move far, as on an overexposed board whose squares do not touch, all stay where they were found.
+    would move far, or corners of a chessboard be off their neighbors by more than before, as on an overexposed board
+    whose squares do not touch, all stay where they were found.
 
     Args:
         gray: (H, W), uint8.
@@ -54,7 +56,10 @@ def detect(gray: np.ndarray, board: Board, *, name: str = "") -> View:
         ids, corners = _chessboard(gray, board)
         share = 0.5
     if len(ids):
-        ids, corners = _refined(gray, ids, corners, _CLEAR * share)
+        refined = _refined(gray, ids, corners, _CLEAR * share)
+        # Those of ChArUco boards are found by way of their markers, and lie smoothly wherever they are.
+        if isinstance(board, Charuco) or _is_as_smooth(board, refined, (ids, corners)):
+            ids, corners = refined
         ids, corners = _consistent(board, ids, corners)
         if isinstance(board, Charuco):  # a chessboard was seen as a whole
             ids, corners = _crossed(gray, board, ids, corners)
@@ -111,6 +116,14 @@ def _refined(gray: np.ndarray, ids: np.ndarray, corners: np.ndarray, share: floa
         return ids, corners
     kept = np.logical_and(near, inside)
     return ids[kept], moved[kept]
+
+
+def _is_as_smooth(board: Board, new: tuple[np.ndarray, np.ndarray], old: tuple[np.ndarray, np.ndarray]) -> bool:
+    """Whether corners lie where their neighbors say, nearly as well as those of the same numbers did before."""
+    (ids, corners), before = new, old[1][np.isin(old[0], new[0])]
+    plane = board.corners(ids)[:, :2]
+    first, then = (np.square(_misfits(plane, places) * _spacings(places)).mean() for places in (before, corners))
+    return bool(first >= _SMOOTHER**2 * then)
 
 
 def _spacings(corners: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """What the commands share: one line for what a user can mend, a traceback for what only we can."""
 
+import difflib
 import errno
 import logging
 import os
@@ -31,6 +32,7 @@ from torchrefract.restoration.checkpoints import CheckpointError, check_fits, re
 
 _T = TypeVar("_T")
 _INFORMING = ("--help", "-h", "--hydra-help", "--info", "--shell-completion", "-sc")
+_UNKNOWN = re.compile(r"Could not override '(\w+)'")
 _SEEDS = 2**32  # as many as numpy takes
 # Advice of libraries on what is meant so here.
 _HINTS = (
@@ -96,7 +98,7 @@ def command(
             _quieten()
             # With this, Hydra hands on its errors instead of printing them in its own form.
             os.environ["HYDRA_FULL_ERROR"] = "1"
-            with _one_line_errors():
+            with _one_line_errors(name):
                 sys.argv[1:] = prepare(name, sys.argv[1:])
                 main()
 
@@ -192,8 +194,8 @@ def _quoted(text: str) -> str:
     return QuotedString(re.sub(r"(\\*)\$\{", r"\1\1\\${", text), Quote.single).with_quotes()
 
 
-def _mendable(error: Exception) -> str | None:
-    """One line for an error of the user's, None for one of ours."""
+def _mendable(error: Exception, name: str) -> str | None:
+    """One line for an error of the user's with the command of a name, None for one of ours."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, option = error.missing_cfg_file.rpartition("/")
         return f"{group} must be one of {', '.join(error.options or [])}, got {option}"
@@ -202,18 +204,42 @@ def _mendable(error: Exception) -> str | None:
     if isinstance(error, UnreadableImageError):
         return str(error).strip().splitlines()[-1].split("Error: ", 1)[-1]  # a worker prepends its traceback
     if isinstance(error, UsageError | CheckpointError | HydraException | OmegaConfBaseException):
-        return " ".join(str(error).split())
+        unknown = _UNKNOWN.match(str(error)) if name else None
+        return _no_option(name, unknown[1]) if unknown else " ".join(str(error).split())
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
         return f"{error.filename or 'a file'} could not be written: {error.strerror}"
     return None
 
 
+def _no_option(name: str, word: str) -> str:
+    """The error for a word before "=" that a command does not know."""
+    options = _options(name)
+    near = difflib.get_close_matches(word, options, n=1)
+    hint = f"; did you mean {near[0]}?" if near else ""
+    return f"an option must be one of {', '.join(options)}, got {word}{hint}"
+
+
+def _options(name: str) -> list[str]:
+    """The words before "=" that a command knows: of its configuration, and of the choices that add to it."""
+    plain = OmegaConf.load(Path(CONFIG_DIR, f"{name}.yaml"))
+    options = [str(key) for key in plain if key not in ("defaults", "hydra")]
+    said = dict(word.split("=", 1) for word in sys.argv[1:] if "=" in word)
+    for part in plain.defaults:
+        for group, choice in part.items() if isinstance(part, DictConfig) else ():
+            file = Path(CONFIG_DIR, str(group), f"{said.get(group, choice)}.yaml")
+            if group != "hydra" and not str(group).startswith("override"):
+                options.append(str(group))
+            if file.is_file() and file.read_text(encoding="utf-8").startswith("# @package _global_"):
+                options += [str(key) for key in OmegaConf.load(file)]
+    return list(dict.fromkeys(options))
+
+
 @contextmanager
-def _one_line_errors() -> Iterator[None]:
+def _one_line_errors(name: str = "") -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if (message := _mendable(error)) is None:
+        if (message := _mendable(error, name)) is None:
             raise
         print(f"error: {message}", file=sys.stderr)
         raise SystemExit(1) from error

@@ -38,7 +38,7 @@ def pictures_of(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise UsageError(f"images must be a folder of pictures, got {folder}, which is none")
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in EXTENSIONS)
+    files = sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in EXTENSIONS)
     if not files:
         raise UsageError(f"images must be a folder that holds {', '.join(EXTENSIONS)}, got {folder}")
     return files

@@ -85,7 +85,8 @@ def _files(source: Path) -> Sequence[Path]:
     if not source.exists():
         raise UsageError(f"input must be a folder, a picture or a video, got {source}, which does not exist")
     known = (*EXTENSIONS, *VIDEOS)
-    files = sorted(source.iterdir()) if source.is_dir() else [source]
+    # What is hidden is no picture of the user's, but a file that a stop has left half written.
+    files = sorted(source.glob("[!.]*")) if source.is_dir() else [source]
     files = [file for file in files if file.suffix.lower() in known]
     if not files:
         raise UsageError(f"input must be, or hold, {', '.join(known)}, got {source}")

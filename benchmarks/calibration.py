@@ -4,8 +4,10 @@ python benchmarks/calibration.py FOLDER [--sets caliscope_cam0 …] [--out bench
 
 FOLDER holds charuco/ and chessboard/, each with a reference.json, such as ../shared/data. "plain" is
 cv2.calibrateCamera on the corners as OpenCV's detectors give them, in all pictures of the stated size. Held-out errors
-are of five folds, px rms over corners. The bad view is a picture that is bent over the width of its board, by a
-hundredth of the frame's width in the middle, as by a sheet that hangs through. Straight: corners of a row or column off
+are of five folds, px rms over corners. Bad views are planted in place of a good one, one at a time: a picture bent over
+the width of its board, by a hundredth of the frame's width in the middle, as by a sheet that hangs through; corners as
+in a picture enlarged by a tenth about its middle; one corner 5 px off; two corners beside one another swapped; and the
+picture mirrored. Straight: corners of a row or column off
 the line through them, px rms, found in the pictures, and found again in the rectified ones, of those found in both.
 """
 
@@ -33,6 +35,7 @@ from torchrefract.warping.resample import warp
 
 _SAG = 0.01  # of the width of the frame
 _STILL = 0.7  # of the corners
+_LARGER, _OFF = 1.1, (3.0, 4.0)  # px
 _MODEL = "opencv5"
 
 
@@ -56,8 +59,7 @@ class Row:
     plain_rms: float
     plain_held: float
     reference_fx_percent: float | None  # of the published camera, where there is one
-    planted: str
-    found: list[str]
+    planted: dict[str, str]  # by what is bad: "named", "missed", or why it is no view
     bent: float
     straight: float
 
@@ -81,7 +83,7 @@ def measure(name: str, entry: dict[str, Any], folder: Path) -> Row:
     kept = drop_outliers(views, board, model=_MODEL, size=size)
     plain_views = [view for view in (_plain(gray, board, n) for n, gray in pictures.items()) if is_enough(view, board)]
     plain = fit(plain_views, board, model=_MODEL, size=size)
-    planted, found = _plant(views, pictures, board, size)
+    planted = _plant(views, pictures, board, size)
     fx, fy, cx, cy, *coefficients = kept.fitted.lens.numbers.tolist()
     published = entry.get("published")
     bent, straight = _straight(kept.views, pictures, board, camera_of(kept.fitted, size))
@@ -89,7 +91,7 @@ def measure(name: str, entry: dict[str, Any], folder: Path) -> Row:
         name, len(pictures), len(kept.views), list(kept.dropped), sum(len(view.ids) for view in kept.views),
         kept.fitted.rms, _held(kept.views, board, kept.fitted, size), fx, fy, cx, cy, coefficients,
         len(plain_views), plain.rms, _held(plain_views, board, plain, size),
-        100 * (fx / published["fx"] - 1) if published else None, planted, found, bent, straight,
+        100 * (fx / published["fx"] - 1) if published else None, planted, bent, straight,
     )  # fmt: skip
 
 
@@ -113,16 +115,36 @@ def _plain(gray: np.ndarray, board: Board, name: str) -> View:
     return View(name, ids.ravel(), corners.reshape(-1, 2).astype(np.float64))
 
 
-def _plant(
-    views: list[View], pictures: dict[str, np.ndarray], board: Board, size: tuple[int, int]
-) -> tuple[str, list[str]]:
-    """The first view that is still found when its picture is bent, and what is dropped when it is among the others."""
+def _plant(views: list[View], pictures: dict[str, np.ndarray], board: Board, size: tuple[int, int]) -> dict[str, str]:
+    """What each bad view comes to, in place of the first one that is still found when its picture is bent."""
     for view in views:
-        bad = detect(_bent(pictures[view.name], view), board, name=view.name)
-        if len(bad.ids) >= _STILL * len(view.ids):
-            among = [bad if other is view else other for other in views]
-            return view.name, list(drop_outliers(among, board, model=_MODEL, size=size).dropped)
-    return "", []
+        bent = detect(_bent(pictures[view.name], view), board, name=view.name)
+        if len(bent.ids) >= _STILL * len(view.ids):
+            mirrored = np.ascontiguousarray(pictures[view.name][:, ::-1])
+            bad = {"bent": bent, **bad_corners(view, size), "mirrored": detect(mirrored, board, name=view.name)}
+            return {what: _fate(one, views, board, size) for what, one in bad.items()}
+    return {}
+
+
+def bad_corners(view: View, size: tuple[int, int]) -> dict[str, View]:
+    """A view as of an enlarged picture, with one corner off, and with two corners swapped."""
+    middle, k = (np.array(size) - 1) / 2, len(view.ids) // 2
+    off, swapped = view.corners.copy(), view.corners.copy()
+    off[k] += _OFF
+    swapped[[k, k + 1]] = swapped[[k + 1, k]]
+    large = middle + _LARGER * (view.corners - middle)
+    return {
+        "enlarged": view._replace(corners=large),
+        "one off": view._replace(corners=off),
+        "swapped": view._replace(corners=swapped),
+    }
+
+
+def _fate(bad: View, views: list[View], board: Board, size: tuple[int, int]) -> str:
+    if not is_enough(bad, board):
+        return "no view"
+    among = [bad if view.name == bad.name else view for view in views]
+    return "named" if bad.name in drop_outliers(among, board, model=_MODEL, size=size).dropped else "missed"
 
 
 def _bent(gray: np.ndarray, view: View) -> np.ndarray:
@@ -152,7 +174,7 @@ def _show(row: Row) -> str:
     return (
         f"{row.name:16} {row.views:2}/{row.pictures:2} {row.corners:5} {row.rms:7.3f} {row.held:7.3f} "
         f"{row.plain_views:6} {row.plain_rms:6.3f} {row.plain_held:7.3f} {row.fx:8.1f} {reference:>9} "
-        f"{row.bent:7.3f} {row.straight:8.3f}  {'found' if row.planted in row.found else 'missed'}"
+        f"{row.bent:7.3f} {row.straight:8.3f}  {', '.join(f'{what} {fate}' for what, fate in row.planted.items())}"
     )
 
 
@@ -166,7 +188,7 @@ def main() -> None:
     )
     args = parser.parse_args()
     print("plain: OpenCV's corners, all views; bent, straight: before and after rectification; px rms")
-    print(f"{'set':16} views corners   rms    held  plain    rms    held       fx published    bent straight bad view")
+    print(f"{'set':16} views corners   rms    held  plain    rms    held       fx published    bent straight bad views")
     rows = []
     for kind in ("charuco", "chessboard"):
         entries = json.loads((args.folder / kind / "reference.json").read_text(encoding="utf-8"))

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
@@ -221,12 +221,12 @@ def _no_option(name: str, word: str) -> str:
 
 def _options(name: str) -> list[str]:
     """The words before "=" that a command knows: of its configuration, and of the choices that add to it."""
-    plain = OmegaConf.load(Path(CONFIG_DIR, f"{name}.yaml"))
+    plain = cast(DictConfig, OmegaConf.load(Path(CONFIG_DIR, f"{name}.yaml")))
     options = [str(key) for key in plain if key not in ("defaults", "hydra")]
     said = dict(word.split("=", 1) for word in sys.argv[1:] if "=" in word)
     for part in plain.defaults:
         for group, choice in part.items() if isinstance(part, DictConfig) else ():
-            file = Path(CONFIG_DIR, str(group), f"{said.get(group, choice)}.yaml")
+            file = Path(CONFIG_DIR, str(group), f"{said.get(str(group), choice)}.yaml")
             if group != "hydra" and not str(group).startswith("override"):
                 options.append(str(group))
             if file.is_file() and file.read_text(encoding="utf-8").startswith("# @package _global_"):

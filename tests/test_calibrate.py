@@ -1,5 +1,6 @@
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -115,6 +116,71 @@ def test_a_wrong_definition_says_what_was_found_and_keeps_it(call, pictures, tmp
     assert not (tmp_path / "calibration" / "camera.yaml").exists()
 
 
+def test_a_calibration_that_failed_leaves_no_camera_that_looks_like_its_own(call, pictures, tmp_path):
+    assert call("calibrate", *WORDS).code == 0
+    out = tmp_path / "calibration"
+    before = (out / "camera.yaml").read_text()
+    assert call("calibrate", *WORDS, "squares=5x6").code == 1
+    assert {path.name for path in out.iterdir()} == {
+        "camera_before.yaml", "coverage_before.png", "residuals_before.png", "report.md", "detections.jsonl",
+    }  # fmt: skip  # one line
+    assert (out / "camera_before.yaml").read_text() == before
+    assert "`camera_before.yaml` is of a calibration before." in (out / "report.md").read_text()
+    assert call("calibrate", *WORDS).code == 0
+    assert (out / "camera.yaml").read_text() == before
+
+
+def test_a_fit_that_failed_keeps_what_was_found(call, pictures, tmp_path, monkeypatch):
+    monkeypatch.setattr(cv2, "calibrateCamera", cameras_that_are_none)
+    message = call("calibrate", *WORDS).message
+    assert message.startswith("views must be enough for the model opencv4, got 9 that fit no camera")
+    report = (tmp_path / "calibration" / "report.md").read_text()
+    assert "There is no camera: views must be enough for the model opencv4" in report
+    assert min(kept(tmp_path / "calibration").values()) >= 6
+
+
+def cameras_that_are_none(objects, images, size, matrix, vector, **_):
+    still = [np.zeros((3, 1)) for _ in objects]
+    return 0.0, np.full((3, 3), np.nan), vector, still, still
+
+
+def test_a_model_that_folds_inside_the_frame_is_told(call, pictures, tmp_path, monkeypatch):
+    # It turns at r = 0.456, and the corner of the frame is at 0.99 focal lengths.
+    folding = replace(SMALL, coefficients=(-1.6, 0.0, 0.0, 0.0))
+    monkeypatch.setattr("torchrefract.calibrate.camera_of", lambda *_: folding)
+    outcome = call("calibrate", *WORDS)
+    line = f"The model folds back inside the frame: {1 - folding.coverage():.1%} of it has no ray. Fewer coefficients"
+    assert outcome.err.startswith(f"warning: {line}")
+    assert f"- {line}" in (tmp_path / "calibration" / "report.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda gray: gray[:, ::-1], r"view_00.png: mirrored: flipped from left to right it shows \d+ corners"),
+        (
+            lambda gray: cv2.GaussianBlur(gray, (0, 0), 8),
+            r"view_00.png: no board found; it is blurred, its sharpest edges are \d+\.\d px wide",
+        ),
+        (lambda gray: gray[:150, :150], r"view_\d+.png .* \d of 20 corners, 6 in two rows and columns are needed"),
+    ],
+    ids=["mirrored", "blurred", "few corners"],
+)
+def test_pictures_that_are_all_bad_are_told_apart(call, pictures, tmp_path, change, told):
+    for path in pictures.iterdir():
+        gray = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+        cv2.imwrite(str(path), np.ascontiguousarray(change(gray)))
+    message = call("calibrate", *WORDS).message
+    assert message.startswith("images must show the board (board=charuco squares=6x5 ")
+    assert re.search(told, f"{message}\n{(tmp_path / 'calibration' / 'report.md').read_text()}")
+
+
+def test_the_dictionary_that_would_fit_is_named(call, pictures):
+    message = call("calibrate", *WORDS, "dictionary=DICT_6X6_250").message
+    told = r"view_0\d.png shows \d+ markers of DICT_4X4_50, from number \d+ to \d+, with \d+ corners as on a board of"
+    assert re.search(rf"got 0. {told} squares=6x5", message)
+
+
 def test_too_few_views_say_how_many_there_are_and_keep_them(call, pictures, tmp_path):
     for path in sorted(pictures.iterdir())[3:]:
         path.unlink()
@@ -139,7 +205,11 @@ def test_pictures_of_many_sizes_are_no_camera(call, pictures, tmp_path):
         (("lens_model=opencv7",), "lens_model: lens_model must be one of opencv4, opencv5, .*, fisheye, got 'opencv7'"),
         (("drop_share=2",), "drop_share: drop_share must be a number in .*, got 2"),
         (("dictionary=DICT",), "board: dictionary must be one of DICT_.*, got 'DICT'"),
-        (("board=chessboard", "marker_mm=3"), "marker_mm"),
+        (
+            ("board=chessboard", "marker_mm=3"),
+            "an option must be one of images, lens_model, drop_share, out, board, squares, square_mm, got marker_mm",
+        ),
+        (("model=fisheye",), "an option must be one of images, .*, got model; did you mean lens_model\\?"),
     ],
 )
 def test_a_wrong_word_is_one_line_of_error(call, words, message):

@@ -123,6 +123,30 @@ def test_a_video_is_rectified_frame_by_frame(call, folder):
     assert "0 rectified, 1 were there already" in call("rectify", "input=clip.avi", "camera=cam.yaml", "out=out").out
 
 
+def test_a_model_that_folds_inside_the_frame_is_told(call, folder):
+    # At 0.527 focal lengths from its center, see above.
+    write_opencv(folder / "cam.yaml", Camera(**PINHOLE, coefficients=(-1.2, 0.0, 0.0, 0.0)))
+    outcome = call("rectify", "input=raw", "camera=cam.yaml")
+    y, x = np.mgrid[:64, :96]
+    black = ((x - 46.2) / 70) ** 2 + ((y - 33.1) / 71) ** 2 > 1 / 3.6
+    told = f"camera: {black.mean():.1%} of the frame has no ray and stays black: the model folds back\n"
+    assert (outcome.code, outcome.err) == (0, told)
+    assert not np.asarray(cv2.imread(str(folder / "rectified" / "0.png")))[black].any()
+
+
+def test_a_pole_inside_the_frame_stops_before_anything_is_written(call, folder):
+    write_opencv(folder / "cam.yaml", Camera(**PINHOLE, coefficients=(0.0,) * 5 + (-3.0, 0.0, 0.0)))
+    message = call("rectify", "input=raw", "camera=cam.yaml").message
+    assert message.startswith("camera: camera must keep its denominator 1 + k4 r^2 + k5 r^4 + k6 r^6 above zero inside")
+    assert not (folder / "rectified").exists()
+
+
+def test_what_a_stop_left_half_written_is_no_picture(call, folder):
+    (folder / "raw" / ".0-0123abcd.png").write_bytes(b"half")
+    outcome = call("rectify", "input=raw", "camera=cam.yaml")
+    assert (outcome.out[:24], outcome.err) == ("rectified: 3 rectified, ", "")
+
+
 def test_a_damaged_picture_is_named_and_skipped(call, folder):
     (folder / "raw" / "1.png").write_bytes(b"")
     outcome = call("rectify", "input=raw", "camera=cam.yaml", "out=out")
@@ -143,6 +167,15 @@ def test_a_damaged_picture_is_named_and_skipped(call, folder):
             ("input=raw", "camera=bad.yaml"),
             "camera: path must hold a mapping of names to values, got bad.yaml with str",
         ),
+        (
+            ("input=raw", "camera=broken.yaml"),
+            "camera: path must hold YAML, got broken.yaml: while parsing",
+        ),
+        (
+            ("input=raw", "camera=short.yaml"),
+            "camera: path must hold a camera, got short.yaml: coefficients must be 4 or 5 or 8 or 12 or 14 numbers for "
+            "the model opencv, got 3",
+        ),
         (("input=raw", "camera=cam.yaml", "zoom=0"), "zoom: zoom must be a number in [0.05, 20], got 0"),
         (("input=raw", "camera=cam.yaml", "out=raw"), "out must be another folder than that of input, got raw"),
         (("input=wide.png", "camera=cam.yaml"), "input must hold what can be rectified, got image must have the shape"),
@@ -150,6 +183,9 @@ def test_a_damaged_picture_is_named_and_skipped(call, folder):
 )
 def test_a_wrong_word_is_one_line_of_error(call, folder, words, message):
     (folder / "bad.yaml").write_text("no camera")
+    whole = (folder / "cam.yaml").read_text()
+    (folder / "broken.yaml").write_text(whole.replace(" ]", "", 1))
+    (folder / "short.yaml").write_text(whole.rsplit(",", 1)[0] + " ]\n")
     cv2.imwrite(str(folder / "wide.png"), np.zeros((10, 90, 3), np.uint8))
     outcome = call("rectify", *words)
     assert outcome.code == 1

@@ -180,6 +180,23 @@ def test_how_much_of_a_frame_a_lens_covers_is_the_share_inside_its_circle():
     Camera(**BIG, coefficients=LENSES["division"], model="division").check_covers()
 
 
+def test_a_pole_inside_the_frame_raises_where_it_is_asked_for():
+    # 1 - 2 r^2 is zero at r = 0.707; the corner of 201 x 201 px is at sqrt(2) 100 / f.
+    sizes = {"width": 201, "height": 201, "cx": 100.0, "cy": 100.0, "coefficients": (0.0,) * 5 + (-2.0, 0.0, 0.0)}
+    near = Camera(**sizes, fx=199.0, fy=199.0)
+    with pytest.raises(ValueError, match=r"camera must keep its denominator .* up to r = 0.7107 .* zero at r = 0.7071"):
+        near.check_pole()
+    with pytest.raises(ValueError, match="camera must keep its denominator"):
+        near.check_covers()
+    Camera(**sizes, fx=201.0, fy=201.0).check_pole()
+
+
+def test_what_moves_nothing_is_a_pinhole_but_no_fisheye():
+    assert Camera(**BIG, coefficients=(0.0,) * 8).is_pinhole
+    assert not Camera(**BIG, coefficients=(0.0,) * 4, model="fisheye").is_pinhole
+    assert not Camera(**BIG, coefficients=(0.0, 0.0, 1e-9, 0.0)).is_pinhole
+
+
 @pytest.mark.parametrize(
     ("model", "coefficients"),
     [

@@ -23,6 +23,7 @@ OTHERS = (
     replace(CAR, coefficients=(0.08, -0.01, *(0.0,) * 10), model="polynomial12"),
 )
 FISHEYE = replace(CAR, coefficients=(-0.02, 0.05, -0.04, 0.01), model="fisheye")
+POLE = (0.0,) * 5 + (-5.0, 0.0, 0.0)  # at r = 0.447
 
 
 def by_hand(camera: Camera) -> list[float]:
@@ -190,6 +191,7 @@ def test_a_fisheye_is_drawn_as_the_nearest_polynomial():
         (FISHEYE, {"covariance": np.eye(8)}, ValueError, "model must be polynomial12, or opencv without"),
         (FISHEYE, {"residual_px": 1e-4}, ValueError, "within residual_px = 0.0001 px of a polynomial, got fisheye"),
         (replace(CAR, coefficients=(-0.6, 0.0, 0.0, 0.0)), {}, ValueError, "camera must show rays .* without folding"),
+        (replace(CAR, coefficients=POLE), {}, ValueError, "camera must keep its denominator .* inside the frame"),
         (replace(FISHEYE, fx=150.0, fy=150.0), {}, ValueError, "camera must show rays within 80 degrees"),
     ],
 )  # fmt: skip  # one line for each
@@ -201,6 +203,8 @@ def test_what_is_no_lens_raises(camera, options, error, rule):
 def test_a_table_with_a_lens_that_is_none_names_it():
     with pytest.raises(ValueError, match=r"table\[1\] must show rays .* without folding back, got opencv that does in"):
         LensDistortion.from_lenses([CAR, replace(CAR, coefficients=(-0.6, 0.0, 0.0, 0.0))])
+    with pytest.raises(ValueError, match=r"table\[1\] must keep its denominator .* above zero inside the frame"):
+        LensDistortion.from_lenses([CAR, replace(CAR, coefficients=POLE)])
     with pytest.raises(ValueError, match="table must hold a camera at least, got none"):
         LensDistortion.from_lenses([])
 

@@ -64,7 +64,7 @@ every_model = pytest.mark.parametrize("camera", ALL.values(), ids=ALL)
 @pytest.mark.parametrize("share", [1, 2])
 def test_the_flow_is_opencvs_map(share, oracle):
     height, width = DASHCAM.height // share, DASHCAM.width // share
-    effect = Rectification(DASHCAM)
+    effect = Rectification(DASHCAM, tolerance_px=None)
     image = torch.zeros(1, 1, height, width, dtype=torch.float64)
     flow = effect.degrade(image, seed=0).flow[0]
     # A frame of half the size: pixel centers are whole numbers, so the principal point keeps its half pixel.
@@ -105,7 +105,7 @@ def shown_at(camera: Camera, points: np.ndarray) -> np.ndarray:
 @every_model
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_each_model_is_looked_up_where_its_camera_shows_the_ray(camera, dtype, oracle):
-    made = Rectification(camera).degrade(torch.zeros(1, 1, 27, 48, dtype=dtype), seed=0)
+    made = Rectification(camera, tolerance_px=None).degrade(torch.zeros(1, 1, 27, 48, dtype=dtype), seed=0)
     pixels = np.mgrid[:27, :48][::-1].reshape(2, -1).astype(float)
     rays = (pixels - [[camera.cx], [camera.cy]]) / [[camera.fx], [camera.fy]]
     ours = made.flow[0].double().reshape(2, -1) + torch.from_numpy(pixels)
@@ -167,7 +167,8 @@ def test_the_flow_back_undoes_it():
 def test_with_a_lens_behind_it_the_frame_is_looked_up_once():
     raw = smooth(2, 3, 270, 480)
     camera = Camera(width=480, height=270, fx=430.0, fy=425.0, cx=250.0, cy=141.0, coefficients=(-0.281, 0.168, 0, 0))
-    scene = Compose([Rectification(camera), LensDistortion()])
+    effects = [Rectification(camera, tolerance_px=None), LensDistortion(tolerance_px=None)]
+    scene = Compose(effects)
     d = scene.degrade(raw, seed=3)
     rectify, lens = scene.effects
     assert isinstance(rectify, Rectification)
@@ -275,7 +276,7 @@ def test_gradients_under_a_tolerance_are_near_to_exact_ones(camera):
 
 @every_model
 def test_gradients_of_the_camera_are_those_of_finite_differences(camera):
-    effect, image = Rectification(camera), smooth(1, 1, 27, 48, dtype=torch.float64)
+    effect, image = Rectification(camera, tolerance_px=None), smooth(1, 1, 27, 48, dtype=torch.float64)
     params = effect.sample(image, seed=0)
 
     def rectified(coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
@@ -287,7 +288,7 @@ def test_gradients_of_the_camera_are_those_of_finite_differences(camera):
 
 @every_model
 def test_gradients_of_the_flow_back_are_those_of_finite_differences(camera):
-    effect, image = Rectification(camera), smooth(1, 1, 9, 16, dtype=torch.float64)
+    effect, image = Rectification(camera, tolerance_px=None), smooth(1, 1, 9, 16, dtype=torch.float64)
     params = effect.sample(image, seed=0)
 
     def back(coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
@@ -322,7 +323,7 @@ def test_under_a_tolerance_every_camera_stays_within_it():
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "camera: the model folds back")
             near = Rectification(camera, tolerance_px=tolerance).degrade(image, seed=0)
-            exact = Rectification(camera).degrade(image.double(), seed=0)
+            exact = Rectification(camera, tolerance_px=None).degrade(image.double(), seed=0)
         plan = Rectification(camera, tolerance_px=tolerance).plan(camera.height, camera.width)
         planned += plan.stride > 1
         if plan.stride > 1:
@@ -340,7 +341,7 @@ def test_the_plan_of_a_camera_is_of_frames_of_its_shape():
 
 
 def test_other_cameras_than_the_one_that_is_known_are_taken_exactly():
-    effect, exact = Rectification(DASHCAM, tolerance_px=0.1), Rectification(DASHCAM)
+    effect, exact = Rectification(DASHCAM, tolerance_px=0.1), Rectification(DASHCAM, tolerance_px=None)
     image = torch.rand(1, 1, 72, 128)
     params = exact.sample(image, seed=0)
     other = params._replace(coefficients=params.coefficients * 1.01)
@@ -393,5 +394,7 @@ def test_what_is_no_camera_raises():
         Rectification({"fx": 1.0})  # pyright: ignore[reportArgumentType]  # the wrong type is the point
     # 1 - 2 r^2 is zero at r = 0.707, 1 - 3 r^2 at 0.577; the upper left corner is at 0.67 focal lengths.
     Rectification(Camera(**PINHOLE, coefficients=(0.0,) * 5 + (-2.0, 0.0, 0.0)))
-    with pytest.raises(ValueError, match=r"above zero inside the frame, up to r = 0.6\d+, got zero at r = 0.577"):
+    with pytest.raises(
+        ValueError, match=r"above zero inside the frame, up to r = 0.6\d+ focal lengths, got zero at r = 0.577"
+    ):
         Rectification(Camera(**PINHOLE, coefficients=(0.0,) * 5 + (-3.0, 0.0, 0.0)))

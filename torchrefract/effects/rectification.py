@@ -12,7 +12,7 @@ from torchrefract.cameras.models import Camera
 from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.lens import check_lens, in_px
-from torchrefract.effects.plan import Ask, Plan
+from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan
 from torchrefract.effects.rectification_plan import rectification_plan
 from torchrefract.fields.lens import lens_flow, lens_restore_flow
 from torchrefract.fields.rectifying import rectification_flow, rectification_restore_flow, shows_folded
@@ -70,7 +70,7 @@ class Rectification(LatticeWarp):
         padding: str = "zeros",
         interpolation: str = "bilinear",
         resampler: str = "auto",
-        tolerance_px: float | None = None,
+        tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ):
         super().__init__(

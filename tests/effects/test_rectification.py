@@ -332,6 +332,21 @@ def test_under_a_tolerance_every_camera_stays_within_it():
     assert planned >= 20  # the others fold, or bend too much
 
 
+@pytest.mark.parametrize("name", ["opencv8", "fisheye"])
+def test_a_composition_shares_its_tolerance_with_a_rectification(name):
+    camera = ALL[name].resized(width=480, height=270)
+    parts = [
+        [Rectification(camera, tolerance_px=t), LensDistortion(k1_range=(-0.25, -0.2), tolerance_px=t)]
+        for t in (1.0, None)
+    ]
+    near = Compose(parts[0], tolerance_px=0.1)
+    plan = near.plan(270, 480)
+    assert all(one.stride > 1 for one in plan.plans)
+    image = torch.rand(2, 1, 270, 480, dtype=torch.float64)
+    found, exact = (effect.degrade(image, seed=2).flow for effect in (near, Compose(parts[1])))
+    assert (found - exact).square().sum(dim=1).sqrt().max() <= plan.error_px <= 0.1
+
+
 def test_the_plan_of_a_camera_is_of_frames_of_its_shape():
     effect = Rectification(DASHCAM, tolerance_px=0.05)
     assert effect.plan(720, 1280).stride > 8

@@ -2,6 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
+from torchrefract.cameras.calibration import detection
 from torchrefract.cameras.calibration.boards import Charuco, Chessboard
 from torchrefract.cameras.calibration.detection import View, detect, is_enough
 from torchrefract.cameras.calibration.synthetic import render_views
@@ -69,6 +70,16 @@ def test_an_overexposed_chessboard_keeps_its_corners(small_camera):
     ways = [expected(small_camera, board, view._replace(ids=ids), pose) for ids in (view.ids, 29 - view.ids)]
     assert len(view.ids) >= 28
     assert min(error(view.corners, way) for way in ways) < 1.5  # gaps of 6 px between squares of 22
+
+
+@pytest.mark.parametrize(("noise", "taken"), [(1.0, False), (0.01, True)])
+def test_refined_corners_of_a_chessboard_are_taken_where_they_lie_as_smoothly(small_camera, monkeypatch, noise, taken):
+    board, dice = Chessboard(squares="7x6", square_mm=30), np.random.default_rng(0)
+    _, gray, _ = next(render_views(board, small_camera, count=1))
+    found = np.asarray(cv2.findChessboardCornersSB(gray, board.inner, flags=detection.SEARCH)[1]).reshape(-1, 2)
+    rough = found + dice.normal(0, noise, found.shape)
+    monkeypatch.setattr(detection, "_refined", lambda *_: (np.arange(30), rough))
+    np.testing.assert_allclose(detect(gray, board).corners, rough if taken else found, atol=1e-6)
 
 
 def test_a_picture_without_a_board_shows_no_corner():

@@ -11,10 +11,10 @@ import re
 import stat
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import torch
 from torch.utils.data import Dataset
@@ -30,6 +30,14 @@ _SHOWN = 3  # examples in a message
 _DATE = re.compile(r"(?:^|.*?[^0-9])(?:19|20)\d\d[-_.]?\d\d[-_.]?\d\d(?=[-_. T]?\d\d[-_.:]?\d\d[-_.:]?\d\d$)")
 _NUMBERED = re.compile(r"\d[A-Za-z]?$")
 _NUMBER = re.compile(r"[-_.\s\d]*\d[A-Za-z]?")
+
+
+class Placed(NamedTuple):
+    """Where a frame belongs."""
+
+    path: str  # below the root, in posix form
+    drive: str
+    split: str  # train, val, or empty where a root with given splits has it in neither
 
 
 class FrameFolder(Dataset[Frame]):
@@ -76,7 +84,7 @@ class FrameFolder(Dataset[Frame]):
         kept, self.skipped = _check_frames(self.root, sorted(drive_of), self.size)
         self.paths = [self.root / path for path in kept]
         self.drives = sorted({drive_of[path] for path in kept})
-        self.keys = [_hash(path) for path in kept]
+        self.keys = [path_key(path) for path in kept]
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -85,6 +93,26 @@ class FrameFolder(Dataset[Frame]):
         """Frame of an image (3, h, w), a key () and an empty depth, for no depth is known."""
         image = read_image(self.paths[index])
         return Frame(fit(image, self.size), torch.tensor(self.keys[index]), torch.empty(0))
+
+
+def place_frames(
+    root: Path, *, size: Sequence[int] | None, drive_by: str = "auto", val_share: float = 0.2, seed: int = 0
+) -> tuple[list[Placed], list[tuple[Path, str]]]:
+    """All frames of a root, in the order and the splits that `FrameFolder` gives them, and those that are unreadable.
+
+    A root with a single drive, which cannot be split, is all for training. Arguments and errors as for `FrameFolder`;
+    without a size, frames of any size will do.
+    """
+    options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
+    found = _find(root)
+    drive_of = _select(root, found, split="all", **options)
+    kept, skipped = _check_frames(root, sorted(drive_of), (1, 1) if size is None else check_size("size", size))
+    given = drive_by == "auto" and bool(_given_splits(root))
+    if not given and len(set(drive_of.values())) < 2:
+        return [Placed(path, drive_of[path], "train") for path in kept], skipped
+    val = _select(root, found, split="val", **options)
+    train = _select(root, found, split="train", **options) if given else drive_of.keys() - val.keys()
+    return [Placed(p, drive_of[p], "val" if p in val else "train" if p in train else "") for p in kept], skipped
 
 
 def name_prefix(stem: str) -> str:
@@ -123,7 +151,7 @@ def _find(root: Path) -> list[str]:
         raise FileNotFoundError(f"root must be a folder of frames, got {root}, which does not exist") from error
     if not is_folder:
         raise NotADirectoryError(f"root must be a folder of frames, got the file {root}; give the folder it lies in")
-    files = sorted(path.relative_to(root).as_posix() for path in _walk(root))
+    files = sorted(path.relative_to(root).as_posix() for path in walk(root))
     found = [file for file in files if file.lower().endswith(EXTENSIONS)]
     if not found:
         raise ValueError(
@@ -133,7 +161,8 @@ def _find(root: Path) -> list[str]:
     return found
 
 
-def _walk(root: Path) -> Iterator[Path]:
+def walk(root: Path) -> Iterator[Path]:
+    """The files below `root`, hidden ones aside; links are followed, each folder is visited once."""
     seen = set()
     for folder, subfolders, files in os.walk(root, followlinks=True, onerror=_refuse):
         status = os.stat(folder)
@@ -159,7 +188,7 @@ def _select(root: Path, found: list[str], *, split: str, drive_by: str, val_shar
     drive_of = _drives(found, drive_by)
     if split == "all":
         return drive_of
-    val = _val_drives(root, drive_of, val_share=val_share, seed=seed)
+    val = val_drives(root, drive_of, val_share=val_share, seed=seed)
     return {path: drive for path, drive in drive_of.items() if (drive in val) == (split == "val")}
 
 
@@ -199,7 +228,12 @@ def _drives(paths: list[str], drive_by: str, *, below: int = 0) -> dict[str, str
     return {path: "/".join(parts[:level]) or _NO_NAME for path, parts in folders.items()}
 
 
-def _val_drives(root: Path, drive_of: dict[str, str], *, val_share: float, seed: int) -> set[str]:
+def val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: float, seed: int) -> set[str]:
+    """The drives that go to val, by the drive of each frame.
+
+    Raises:
+        ValueError: fewer than two drives.
+    """
     frames = Counter(drive_of.values())
     if len(frames) < 2:
         raise ValueError(
@@ -213,7 +247,7 @@ def _val_drives(root: Path, drive_of: dict[str, str], *, val_share: float, seed:
         )
         warnings.warn(message, stacklevel=4)
     val, missing = set(), val_share * len(drive_of)
-    order = sorted(frames, key=lambda drive: _hash(f"{seed}/{drive}"))
+    order = sorted(frames, key=lambda drive: path_key(f"{seed}/{drive}"))
     for drive in order:
         if abs(missing - frames[drive]) < missing:
             val.add(drive)
@@ -258,6 +292,6 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:_SHOWN]) + more
 
 
-def _hash(text: str) -> int:
+def path_key(text: str) -> int:
     """A whole number below 2^63, the same on every machine; names that are no valid Unicode count by their bytes."""
     return int.from_bytes(hashlib.blake2b(os.fsencode(text), digest_size=8).digest(), "big") >> 1

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, cast
 
 import torch
 from pytorch_lightning import LightningDataModule
@@ -9,6 +10,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from torchrefract._checks import check_count
 from torchrefract.data.frame_folder import FrameFolder
+from torchrefract.data.paired_folder import PairedFolder
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.effects.base import Effect
 from torchrefract.types import Frame, Pair
@@ -24,8 +26,8 @@ class PairData(LightningDataModule):
     degraded alike each time. So a run that goes on after a stop sees what it would have seen.
 
     Args:
-        train, val: clean frames; val of drives that train has none of.
-        effect: what degrades them.
+        train, val: clean frames, or pairs from disk; val of drives that train has none of.
+        effect: what degrades them; None for pairs.
         batch_size: frames in a batch, of each device.
         workers: processes that read or render frames; 0 does it in the training process.
         seed: of the draws and of the order.
@@ -33,10 +35,10 @@ class PairData(LightningDataModule):
 
     def __init__(
         self,
-        train: Dataset[Frame],
-        val: Dataset[Frame],
+        train: Dataset[Frame] | Dataset[Pair],
+        val: Dataset[Frame] | Dataset[Pair],
         *,
-        effect: Effect,
+        effect: Effect | None,
         batch_size: int = 16,
         workers: int = 2,
         seed: int = 0,
@@ -55,21 +57,23 @@ class PairData(LightningDataModule):
             share = "" if ranks == 1 else f" that each of {ranks} processes has"
             raise ValueError(f"batch_size must be at most the {count} training frames{share}, got {self.batch_size}")
 
-    def train_dataloader(self) -> DataLoader[Frame]:
-        """Batches of frames in an order of the epoch."""
+    def train_dataloader(self) -> DataLoader[Any]:
+        """Batches of frames, or pairs, in an order of the epoch."""
         return self._loader(self.train, training=True)
 
-    def val_dataloader(self) -> DataLoader[Frame]:
-        """Batches of frames in their order."""
+    def val_dataloader(self) -> DataLoader[Any]:
+        """Batches of frames, or pairs, in their order."""
         return self._loader(self.val, training=False)
 
-    def on_after_batch_transfer(self, batch: Frame, dataloader_idx: int) -> Pair:
-        """The batch and its degraded copy, made on the device that it has come to."""
+    def on_after_batch_transfer(self, batch: Frame | Pair, dataloader_idx: int) -> Pair:
+        """The batch and its degraded copy, made on the device that it has come to; pairs as they are."""
+        if isinstance(batch, Pair) or self.effect is None:
+            return cast(Pair, batch)
         training = self.trainer is not None and self.trainer.training
         epoch = _FIRST_EPOCH + self.trainer.current_epoch if training and self.trainer else 0
         return make_pair(batch, self.effect, seed=(self.seed << 32) + epoch)
 
-    def _loader(self, frames: Dataset[Frame], *, training: bool) -> DataLoader[Frame]:
+    def _loader(self, frames: Dataset[Any], *, training: bool) -> DataLoader[Any]:
         ranks, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
         self.check_ranks(ranks)
         # Every rank its own frames, none twice in training; Lightning sets the epoch.
@@ -130,3 +134,9 @@ def frames(
         for split in ("train", "val")
     )
     return PairData(train, val, effect=effect, batch_size=batch_size, workers=workers, seed=seed)
+
+
+def pairs(*, root: str | Path, batch_size: int = 16, workers: int = 2, seed: int = 0) -> PairData:
+    """Pairs from disk, split by drive when they were made; arguments as for `PairedFolder` and `PairData`."""
+    train, val = (PairedFolder(root, split=split) for split in ("train", "val"))
+    return PairData(train, val, effect=None, batch_size=batch_size, workers=workers, seed=seed)

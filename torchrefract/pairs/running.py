@@ -1,0 +1,86 @@
+"""Units of pairs made by several processes, no more than a few of them at a time."""
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+
+import cv2
+import torch
+
+from torchrefract._command import UsageError
+from torchrefract.data.pair_manifest import PairRow
+from torchrefract.pairs.making import Job, Maker, Recipe
+from torchrefract.pairs.writing import Store
+
+_AHEAD = 2  # units for each worker, made or waiting
+
+
+def run(units: Iterable[Sequence[Job]], recipe: Recipe, store: Store, *, workers: int) -> Iterator[list[PairRow]]:
+    """Make and write units; yields the rows of each when it is written, in no order.
+
+    Args:
+        units: of `store`.
+        recipe: of the pairs.
+        store: where they go.
+        workers: processes; 0 makes them in this one.
+
+    Raises:
+        UsageError: a worker that died.
+        Exception: what a worker raised, after the others have finished what they are at.
+    """
+    if workers == 0:
+        maker = Maker(recipe)
+        yield from (store.write(unit, maker) for unit in units)
+        return
+    # Spawned, since a fork of a process with threads may hang.
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(recipe, store))
+    try:
+        waiting = set[Future[list[PairRow]]]()
+        for unit in units:
+            waiting.add(pool.submit(_write, unit))
+            if len(waiting) >= _AHEAD * workers:
+                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                yield from (future.result() for future in done)
+        while waiting:
+            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            yield from (future.result() for future in done)
+    except BrokenProcessPool as error:
+        raise UsageError(
+            f"workers must leave memory for each, got {workers} of which one was killed, as for lack of memory; what "
+            "is written stays, and the same command goes on"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+class _Worker:
+    """What a worker process keeps between units."""
+
+    maker: Maker
+    store: Store
+
+
+def _start(recipe: Recipe, store: Store) -> None:
+    # One thread each: as many workers as cores leave nothing for more.
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers itself
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _Worker.maker, _Worker.store = Maker(recipe), store
+
+
+def _end_with_parent() -> None:
+    """Else workers of a parent that was killed would wait for it for ever, or write beside its successor."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _write(unit: Sequence[Job]) -> list[PairRow]:
+    return _Worker.store.write(unit, _Worker.maker)

@@ -58,7 +58,7 @@ class _Asked(NamedTuple):
     recipe: Recipe
     sources: Sources
     settings: dict[str, Any]  # all that decides what is in which file
-    count: int
+    number: int  # of the pairs of the set
     license: str
     shard: _Shard
     workers: int
@@ -78,14 +78,14 @@ def main(cfg: DictConfig) -> None:
     asked, out = _asked(cfg), Path(str(cfg.out))
     with _room_on(out):
         about = {"license": asked.license, "made_with": _MADE_WITH}
-        before = claim(out, asked.settings, count=asked.count, about=about).get("made_with", _MADE_WITH)
+        before = claim(out, asked.settings, count=asked.number, about=about).get("made_with", _MADE_WITH)
         if before != _MADE_WITH:
             print(f"the pairs there were made with {before}, and new ones are with {_MADE_WITH}: bytes may differ")
         store = Folders(out) if asked.settings["tar"] is None else Tars(out, asked.settings["tar"])
         ledger = Ledger(out, *asked.shard)
-        there, damaged = ledger.open(lambda i: asked.shard.has(i, asked.count, store.unit), verify=asked.verify)
+        there, damaged = ledger.open(lambda i: asked.shard.has(i, asked.number, store.unit), verify=asked.verify)
         _tell(asked, there, damaged)
-        units = [unit for unit in asked.shard.units(asked.count, store.unit) if not there.issuperset(unit)]
+        units = [unit for unit in asked.shard.units(asked.number, store.unit) if not there.issuperset(unit)]
         if units:
             _check_room(asked, [number for unit in units for number in unit], store)
             jobs = ([asked.job(number) for number in unit] for unit in units)
@@ -100,11 +100,12 @@ def _asked(cfg: DictConfig) -> _Asked:
     recipe, options, shard, workers = _recipe(cfg), _options(cfg), _shard(cfg), _workers(cfg)
     sources = _sources(cfg, recipe)
     with naming("count"):
-        count = len(sources.frames) if cfg.count is None else check_count("count", cfg.count)
+        number = len(sources.frames) if cfg.count is None else check_count("count", cfg.count)
+    sources = sources.thinned(number)
     if not str(cfg.license).strip():
         raise UsageError("license must be that of the source, in words, got nothing")
     settings = {"scene": _scene(cfg), **options, "frames": len(sources.frames), "sources": sources.digest()}
-    return _Asked(recipe, sources, settings, count, str(cfg.license), shard, workers, cfg.verify)
+    return _Asked(recipe, sources, settings, number, str(cfg.license), shard, workers, cfg.verify)
 
 
 def _recipe(cfg: DictConfig) -> Recipe:
@@ -179,9 +180,9 @@ def _tell(asked: _Asked, there: set[int], damaged: int) -> None:
         print(f"{asked.sources.skipped} files of the source cannot be read")
     if len({frame.drive for frame in asked.sources.frames}) < 2:
         print("the source has a single drive, which cannot be split: all of it is for training")
-    if asked.count > frames:
-        times = -(-asked.count // frames)
-        print(f"{asked.count} pairs of {frames} frames: each frame is used up to {times} times, with new keys")
+    if asked.number > frames:
+        times = -(-asked.number // frames)
+        print(f"{asked.number} pairs of {frames} frames: each frame is used up to {times} times, with new keys")
     if damaged:
         print(f"{damaged} pairs were damaged or missing and are made again")
     if there:
@@ -203,9 +204,9 @@ def _check_room(asked: _Asked, missing: Sequence[int], store: Store) -> None:
 
 def _finish(asked: _Asked, out: Path, *, made: int) -> None:
     """The card, if all shards have made their pairs; and the last line."""
-    found = contents(row for row, _ in scan(manifests(out), lambda row: row.number < asked.count, torn=True))
+    found = contents(row for row, _ in scan(manifests(out), lambda row: row.number < asked.number, torn=True))
     there, unreadable = found.splits.total(), len(found.skipped)
-    missing = asked.count - there - unreadable
+    missing = asked.number - there - unreadable
     if there == 0 and not missing:
         raise UsageError(f"source must hold frames that can be read, got {found.skipped[0]}")
     if not missing:

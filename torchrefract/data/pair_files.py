@@ -58,10 +58,10 @@ def encode_pair(pair: PairArrays, form: str) -> dict[str, bytes]:
         ValueError: light of 2 or above as a PNG.
     """
     files = {f"{name}.png": _png(getattr(pair, name)[..., ::-1], _OF_PICTURES) for name in PICTURES}
-    if form == "safetensors":
-        return files | {f"{_TOGETHER}.safetensors": save({name: pair.maps[name] for name in sorted(pair.maps)})}
-    if form == "npz":
-        return files | {f"{_TOGETHER}.npz": _npz(pair.maps)}
+    if form != "png":
+        # safetensors writes memory as it lies.
+        arrays = {name: np.ascontiguousarray(pair.maps[name]) for name in sorted(pair.maps)}
+        return files | {f"{_TOGETHER}.{form}": _npz(arrays) if form == "npz" else save(arrays)}
     for name, value in pair.maps.items():
         files[f"{name}.png"] = _map_png(name, value, pair.maps)
     return files
@@ -141,10 +141,9 @@ def _png(pixels: np.ndarray, options: list[int]) -> bytes:
     return cv2.imencode(".png", np.ascontiguousarray(pixels), options)[1].tobytes()
 
 
-def _npz(maps: Mapping[str, np.ndarray]) -> bytes:
+def _npz(arrays: dict[str, Any]) -> bytes:
     """Not compressed, which flows of full precision hardly are; the archive has no time of its own."""
     stream = io.BytesIO()
-    arrays: dict[str, Any] = {name: maps[name] for name in sorted(maps)}
     np.savez(stream, **arrays)
     return stream.getvalue()
 

@@ -1,6 +1,7 @@
 """The card of a set of pairs: what is in it, how its files are read, and whose the frames are."""
 
 import io
+import math
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from torchrefract.cameras.distortion import POLYNOMIAL12
 from torchrefract.data.pair_manifest import PairRow
@@ -17,7 +19,7 @@ HISTOGRAMS = "parameters.png"
 
 _Values = Mapping[tuple[str, str], list["array[float]"]]
 
-_COLUMNS, _BINS = 4, 30
+_COLUMNS, _MOST_BINS = 4, 30
 _AXES = ("x", "y", "z")
 _UNITS = {
     "amplitude": "px",
@@ -27,9 +29,8 @@ _UNITS = {
     "visibility": "m",
     "focal": "widths of the frame",
     "radius": "diagonals of the frame",
-    "decorrelation": "frames",
 }
-_NOISE = "key"  # a parameter that means nothing by itself
+_UNSEEN = ("effect", "key", "frame", "wind", "drift", "decorrelation")  # no numbers, or none that a single frame shows
 _READ = {
     "clean.png": "8 bits, RGB: the frame",
     "corrupted.png": "8 bits, RGB: what the effects made of it",
@@ -127,12 +128,13 @@ def histograms(found: Contents) -> bytes | None:
     FigureCanvasAgg(figure)
     for i, (title, label, values) in enumerate(panels):
         axes = figure.add_subplot(rows, _COLUMNS, i + 1)
-        axes.hist(values, bins=_BINS, color="tab:blue")
+        axes.hist(values, bins=min(_MOST_BINS, math.isqrt(len(values)) + 1), color="tab:blue")
         axes.set_title(title, fontsize=9)
         axes.set_xlabel(label, fontsize=8)
         axes.set_ylabel("pairs" if i % _COLUMNS == 0 else "", fontsize=8)
         axes.tick_params(labelsize=7)
-        axes.ticklabel_format(useOffset=False)
+        axes.xaxis.set_major_locator(MaxNLocator(4))
+        axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
     return stream.getvalue()
@@ -141,7 +143,7 @@ def histograms(found: Contents) -> bytes | None:
 def _collect(effects: Sequence[Mapping[str, Any]], values: dict[tuple[str, str], list["array[float]"]]) -> None:
     for effect in effects:
         for name, value in effect.items():
-            if name not in ("effect", _NOISE):
+            if name not in _UNSEEN:
                 numbers = np.array(value, dtype=np.float64).ravel()  # of a word too: "inf"
                 columns = values[str(effect["effect"]), name]
                 columns.extend(array("d") for _ in range(len(numbers) - len(columns)))

@@ -34,6 +34,13 @@ class Sources(NamedTuple):
     frames: Sequence[Source]
     skipped: int  # files that cannot be read
 
+    def thinned(self, count: int) -> "Sources":
+        """So many of them at most, out of all parts of their order."""
+        total = len(self.frames)
+        return self._replace(
+            frames=self.frames if count >= total else [self.frames[i * total // count] for i in range(count)]
+        )
+
     def digest(self) -> str:
         """Changes with the names, drives, splits and sizes of the files."""
         whole = hashlib.sha256()

@@ -1,0 +1,159 @@
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from PIL import Image
+from torch.utils.data import DataLoader
+
+from torchrefract import Pair, presets
+from torchrefract._config import CONFIG_DIR
+from torchrefract.data.module import PairData, frames, pairs
+from torchrefract.data.pair_files import beyond, decode_flow, encode_flow
+from torchrefract.data.paired_folder import PairedFolder, PairStream
+from torchrefract.restoration.tasks import Undistort
+
+SIZE = (32, 48)
+SCENE = ("scene=paper_refractive", "scene.width=192")
+
+
+@pytest.fixture
+def source(tmp_path) -> Path:
+    """Sixteen pictures of four drives."""
+    dice = np.random.default_rng(1)
+    for number in range(16):
+        path = tmp_path / "frames" / f"drive{number // 4}" / f"{number}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(dice.integers(0, 256, (*SIZE, 3)).astype(np.uint8)).save(path)
+    return tmp_path / "frames"
+
+
+@pytest.fixture
+def made(call, source):
+    """Writes pairs of the pictures."""
+
+    def make(*more: str, out: str = "out", scene: tuple[str, ...] = SCENE) -> Path:
+        assert call("generate", *scene, f"source={source}", f"out={out}", "license=CC0", "workers=0", *more).code == 0
+        return source.parent / out
+
+    return make
+
+
+def during(data: PairData, *, training: bool) -> PairData:
+    """The data in the first epoch of a run."""
+    run = SimpleNamespace(training=training, current_epoch=0, world_size=1, global_rank=0)
+    data.trainer = run  # pyright: ignore[reportAttributeAccessIssue]  # what is read of a trainer, and no more
+    return data
+
+
+def batches(data: PairData, *, training: bool) -> list[Pair]:
+    during(data, training=training)
+    loader = data.train_dataloader() if training else data.val_dataloader()
+    return [data.on_after_batch_transfer(batch, 0) for batch in loader]
+
+
+@pytest.mark.parametrize("maps", ["png", "npz", "safetensors"])
+def test_pairs_from_disk_are_those_of_training_on_the_fly(made, source, maps):
+    out = made(f"maps={maps}")
+    options = {"batch_size": 4, "workers": 0}
+    stored = pairs(root=out, **options)
+    effect = presets.paper_refractive(width=192)
+    live = frames(root=source, effect=effect, size=SIZE, **options)
+    for training in (True, False):
+        for disk, fly in zip(batches(stored, training=training), batches(live, training=training), strict=True):
+            assert torch.equal(disk.key, fly.key)
+            assert torch.equal(disk.valid, fly.valid)
+            assert (disk.flow - fly.flow).abs().max() <= (0.5 / 64 if maps == "png" else 0)
+            assert torch.equal(disk.clean, fly.clean)
+            assert (disk.degraded - fly.degraded).abs().max() <= 0.5 / 255 + 1e-6
+
+
+def test_weather_from_disk_moves_nothing_and_is_valid_everywhere(made):
+    pair = PairedFolder(made(scene=("scene=paper_weather",)))[3]
+    assert torch.equal(pair.flow, torch.zeros(2, *SIZE))
+    assert pair.valid.all()
+    assert (pair.degraded - pair.clean).abs().mean() > 0.01
+
+
+def test_twenty_steps_of_training_from_disk_have_the_losses_of_training_on_the_fly(made, source):
+    stored = pairs(root=made("count=16"), batch_size=2, workers=0)
+    live = frames(root=source, effect=presets.paper_refractive(width=192), size=SIZE, batch_size=2, workers=0)
+    losses = []
+    for data in (stored, live):
+        torch.manual_seed(0)
+        task, network = Undistort(), torch.nn.Conv2d(3, 2, 5, padding=2)
+        optimizer, found = torch.optim.SGD(network.parameters(), lr=0.05), []
+        epoch = batches(data, training=True)
+        for batch in (epoch * 20)[:20]:
+            loss = task.loss(task.restore(network(batch.degraded), batch.degraded), batch)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            found.append(loss.item())
+        losses.append(torch.tensor(found))
+    # 1/255 of an image rounded, on the average a quarter of it, and 1/64 px of a flow likewise, in halves of 48 px.
+    assert (losses[0] - losses[1]).abs().max() <= 0.25 / 255 + 0.25 / 64 / 16
+    assert losses[1][-1] < losses[1][0]
+
+
+def test_the_configuration_of_the_data_makes_them(made):
+    cfg = OmegaConf.load(Path(CONFIG_DIR) / "data" / "pairs.yaml")
+    cfg = OmegaConf.merge({"seed": 3, "data": cfg}, {"data": {"root": str(made()), "batch_size": 3}})
+    data = instantiate(cfg)["data"]
+    assert isinstance(data, PairData)
+    assert (data.seed, data.batch_size) == (3, 3)
+    assert len(data.train) + len(data.val) == 16  # pyright: ignore[reportArgumentType]  # of known length
+
+
+def test_a_folder_and_tars_give_the_same_pairs(made):
+    folder, tars = PairedFolder(made()), PairedFolder(made("tar=5", out="tars"))
+    assert len(folder) == len(tars) == 16
+    for i in range(16):
+        for name, a, b in zip(Pair._fields, folder[i], tars[i], strict=True):
+            assert torch.equal(a, b), name
+
+
+def test_manifests_of_shards_put_together_are_one_set(made):
+    whole = made()
+    for shard in range(3):
+        out = made("shards=3", f"shard={shard}", out="shards")
+    texts = [path.read_text() for path in sorted(out.glob("manifest-*"), reverse=True)]
+    for path in out.glob("manifest-*"):
+        path.unlink()
+    (out / "manifest.jsonl").write_text("".join(texts))
+    one, several = PairedFolder(whole, split="val"), PairedFolder(out, split="val")
+    assert [one.row(i) for i in range(len(one))] == [several.row(i) for i in range(len(several))]
+
+
+@pytest.mark.parametrize(("workers", "ranks", "buffer"), [(0, 1, 1), (2, 1, 4), (0, 3, 16), (2, 2, 3)])
+def test_a_stream_gives_each_pair_once(made, workers, ranks, buffer):
+    out = made("tar=4")
+    keys = []
+    for rank in range(ranks):
+        stream = PairStream(out, buffer=buffer, rank=rank, ranks=ranks)
+        keys += [int(pair.key) for pair in DataLoader(stream, batch_size=None, num_workers=workers)]
+    expected = [int(pair.key) for pair in (PairedFolder(out)[i] for i in range(16))]
+    assert sorted(keys) == sorted(expected)
+    assert (keys == expected) == (buffer == 1)
+
+
+def test_a_stream_has_an_order_of_its_epoch(made):
+    stream = PairStream(made(), buffer=16, seed=5)
+    orders = []
+    for epoch in (0, 1, 0):
+        stream.set_epoch(epoch)
+        orders.append([int(pair.key) for pair in stream])
+    assert orders[0] == orders[2] != orders[1]
+
+
+def test_a_flow_beyond_the_range_is_marked():
+    flow = np.zeros((2, 1, 5), np.float32)
+    flow[0, 0], flow[1, 0] = [0, 511.98, 512, -512, -513], [0, 0, 0, 0, 0]
+    valid = np.array([[True, True, True, True, True]])
+    found, mask = decode_flow(encode_flow(flow, valid))
+    assert mask.tolist() == [[True, True, False, True, False]]
+    assert np.abs(found - flow)[:, mask].max() <= 1 / 128
+    assert beyond(flow, valid) == 2

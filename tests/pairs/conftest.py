@@ -1,0 +1,54 @@
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+SIZE = (32, 48)
+
+
+@pytest.fixture(scope="session")
+def frames(tmp_path_factory) -> Path:
+    """Twelve pictures of three drives, with waves and with grain, each its own."""
+    root = tmp_path_factory.mktemp("frames")
+    dice = np.random.default_rng(0)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    for number in range(12):
+        waves = [np.sin(x / (5 + number % 3) + c + number) * np.cos(y / 6 - c) for c in range(3)]
+        path = root / f"drive{number // 4}" / f"{number:03d}.png"
+        path.parent.mkdir(exist_ok=True)
+        pixels = 127 + 90 * np.stack(waves, axis=2) + dice.uniform(-30, 30, (*SIZE, 3))
+        Image.fromarray(pixels.round().astype(np.uint8)).save(path)
+    return root
+
+
+@pytest.fixture(scope="session")
+def words(frames) -> Callable[..., tuple[str, ...]]:
+    """The words of the command for the frames, made in the process that is asked, unless others are given."""
+
+    def of(out: Path | str, *more: str, scene: str = "paper_refractive") -> tuple[str, ...]:
+        chosen = (f"scene={scene}", "scene.width=192") if scene == "paper_refractive" else (f"scene={scene}",)
+        return (*chosen, f"source={frames}", f"out={out}", "license=CC0", "workers=0", *more)
+
+    return of
+
+
+@pytest.fixture(scope="session")
+def sums() -> Callable[[Path], dict[str, str]]:
+    """The checksum of each file of a set, hidden ones too."""
+
+    def of(out: Path) -> dict[str, str]:
+        files = sorted(path for path in out.rglob("*") if path.is_file())
+        return {path.relative_to(out).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+    return of
+
+
+@pytest.fixture(scope="session")
+def rows() -> Callable[[Path], list[Any]]:
+    """The rows of a manifest, as JSON has them."""
+    return lambda out: [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]

@@ -1,0 +1,178 @@
+"""What a user can mend is said in one line, and nothing is spoiled."""
+
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from torchrefract.data.pair_files import DamagedPairError
+from torchrefract.data.paired_folder import PairedFolder
+
+
+@pytest.fixture
+def disk(tmp_path) -> Iterator[Callable[[str], Path]]:
+    """Mounts a small file system of its own, with some options."""
+    mounted = list[Path]()
+
+    def mount(options: str) -> Path:
+        place = tmp_path / "disk"
+        place.mkdir()
+        tool = shutil.which("mount")
+        if tool is None or subprocess.run([tool, "-t", "tmpfs", "-o", options, "none", place], check=False).returncode:
+            pytest.skip("needs the right to mount a tmpfs")
+        mounted.append(place)
+        return place
+
+    yield mount
+    for place in mounted:
+        subprocess.run(["umount", place], check=True)
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("license=", "license must be that of the source"),
+        ("maps=jpg", "maps: maps must be one of png, npz, safetensors, got 'jpg'"),
+        ("count=0", "count: count must be at least 1, got 0"),
+        ("size=[0,4]", "size: size must be at least 1, got 0"),
+        ("size=[400,400]", "source: frames must be at least size = 400x400"),
+        ("source=nowhere", "source must be a folder of pictures or videos, or a video, got nowhere, which does not"),
+        ("shards=2", "shard must be given together with shards, got None of 2"),
+        ("tar=0", "tar: tar must be at least 1, got 0"),
+        ("workers=-1", "workers: workers must be at least 0, got -1"),
+        ("seed=3000000000", "seed must be below 2147483648, got 3000000000"),
+        ("verify=7", "verify: verify must be True or False, got 7"),
+        ("scene.severity=9", "scene: severity must be one of 1, 2, 3, 4, 5, got 9"),
+    ],
+)
+def test_a_wrong_word_is_refused_before_anything_is_written(call, words, tmp_path, word, message):
+    kept = [own for own in words("out") if own.partition("=")[0] != word.partition("=")[0]]
+    assert message in call("generate", *kept, word).message
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_shard_beyond_the_last_is_refused(call, words):
+    assert call("generate", *words("out", "shards=2", "shard=2")).message == "shard must be below shards = 2, got 2"
+
+
+def test_without_a_license_or_a_scene_there_are_no_pairs(call, words):
+    kept = words("out")
+    without = [word for word in kept if not word.startswith("license=")]
+    assert call("generate", *without).message == "license must be given, as in license=…, got nothing"
+    assert "scene" in call("generate", *(word for word in kept if not word.startswith("scene"))).message
+
+
+def test_a_folder_of_another_configuration_is_refused_with_the_difference(call, words, tmp_path, sums):
+    assert call("generate", *words("out", "count=12")).code == 0
+    before = sums(tmp_path / "out")
+    message = call("generate", *words("out", "count=12", "seed=5", "scene.severity=2")).message
+    assert "scene.severity is 3 there and 2 here, seed is 0 there and 5 here" in message
+    assert sums(tmp_path / "out") == before
+
+
+def test_a_folder_of_something_else_is_refused(call, words, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("words")
+    message = call("generate", *words("out")).message
+    assert message == "out must be a new folder or one of this command, got out, which holds thesis.tex"
+
+
+def test_pairs_are_not_written_among_their_sources(call, words, frames):
+    assert "out must lie outside of source" in call("generate", *words(frames / "pairs")).message
+    assert not (frames / "pairs").exists()
+
+
+def test_sources_that_changed_are_noticed(call, words, frames, tmp_path):
+    shutil.copytree(frames, tmp_path / "frames")
+    arguments = [word for word in words("out") if not word.startswith("source=")]
+    assert call("generate", *arguments, "source=frames").code == 0
+    (tmp_path / "frames" / "drive0" / "000.png").unlink()
+    message = call("generate", *arguments, "source=frames").message
+    assert re.search(r"frames is 12 there and 11 here, sources is \w+ there", message)
+
+
+def test_a_frame_that_cannot_be_decoded_is_left_out_and_said(call, words, frames, tmp_path, rows):
+    shutil.copytree(frames, tmp_path / "frames")
+    path = tmp_path / "frames" / "drive1" / "005.png"
+    data = bytearray(path.read_bytes())
+    data[200:240] = bytes(40)  # between a good header and a good end
+    path.write_bytes(data)
+    arguments = [*(word for word in words("out") if not word.startswith("source=")), "source=frames"]
+    outcome = call("generate", *arguments)
+    assert "11 there, 1 frames could not be read" in outcome.out
+    (row,) = [row for row in rows(tmp_path / "out") if row["skipped"]]
+    assert row["source"] == "drive1/005.png"
+    assert row["skipped"].startswith("drive1/005.png is damaged")
+    assert len(PairedFolder(tmp_path / "out")) == 11
+    assert "drive1/005.png is damaged" in (tmp_path / "out" / "README.md").read_text()
+    assert ": 0 pairs made" in call("generate", *arguments).out
+
+
+def test_links_that_make_a_loop_do_not_hang(call, words, frames, tmp_path):
+    shutil.copytree(frames, tmp_path / "frames")
+    (tmp_path / "frames" / "drive0" / "loop").symlink_to(tmp_path / "frames", target_is_directory=True)
+    arguments = [word for word in words("out") if not word.startswith("source=")]
+    assert ": 12 pairs made" in call("generate", *arguments, "source=frames").out
+
+
+def test_a_disk_that_is_too_small_is_refused_beforehand(call, words, disk):
+    place = disk("size=64k")
+    message = call("generate", *words(place / "out")).message
+    assert message.startswith("out must have room, got too little: 12 pairs take about")
+    assert not list(place.rglob("*.png"))
+
+
+def test_a_disk_that_becomes_full_leaves_whole_pairs_and_a_run_that_goes_on(call, words, disk, sums, monkeypatch):
+    place = disk("size=256k")
+    monkeypatch.setattr("torchrefract.generate._check_room", lambda *_: None)  # as where others write to the disk
+    message = call("generate", *words(place / "out")).message
+    assert "no space left on device" in message
+    assert "the same command goes on" in message
+    pictures = list(place.rglob("*.clean.png"))
+    assert 0 < len(pictures) < 12
+    assert all(np.asarray(Image.open(path)).shape == (32, 48, 3) for path in pictures)
+    assert not list(place.rglob("*.part"))
+    subprocess.run(["mount", "-o", "remount,size=8m", place], check=True)
+    assert call("generate", *words(place / "out")).code == 0
+    assert call("generate", *words("out")).code == 0
+    assert sums(place / "out") == sums(Path("out"))
+
+
+def test_a_folder_that_cannot_be_written_to_is_said(call, words, disk):
+    place = disk("ro,size=64k")
+    assert "Read-only file system" in call("generate", *words(place / "out")).message
+
+
+def test_an_output_that_is_a_file_is_said(call, words, tmp_path):
+    (tmp_path / "out").write_text("")
+    assert "out must be a folder that can be written to, got out (File exists)" in call("generate", *words("out")).message
+
+
+@pytest.mark.parametrize(
+    "path", ["../secret.png", "/etc/hostname", "pairs/../../x.clean.png", "pairs/00000\\\\x.png", "pairs/0/a/b.png"]
+)
+def test_a_manifest_that_leads_elsewhere_is_refused(call, words, tmp_path, path):
+    assert call("generate", *words("out", "count=2")).code == 0
+    manifest = tmp_path / "out" / "manifest.jsonl"
+    manifest.write_text(manifest.read_text().replace("pairs/00000/00000001.clean.png", path))
+    with pytest.raises(DamagedPairError, match="files must lie in pairs/ or tars/ beside the manifest, got"):
+        PairedFolder(tmp_path / "out")
+
+
+def test_a_damaged_pair_is_named_with_the_way_out(call, words, tmp_path):
+    assert call("generate", *words("out", "count=2")).code == 0
+    os.truncate(tmp_path / "out" / "pairs/00000/00000001.flow.png", 0)
+    os.truncate(tmp_path / "out" / "pairs/00000/00000001.restore_flow.png", 30)
+    with pytest.raises(DamagedPairError, match=r"pair 1 in .* must be whole, got .* is truncated; .* verify=true"):
+        PairedFolder(tmp_path / "out")[1]
+
+
+def test_a_folder_without_pairs_is_no_data_set(tmp_path):
+    with pytest.raises(ValueError, match=r"root must be a folder with manifest\.jsonl, got"):
+        PairedFolder(tmp_path)

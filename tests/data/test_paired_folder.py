@@ -27,7 +27,8 @@ def source(tmp_path) -> Path:
     for number in range(16):
         path = tmp_path / "frames" / f"drive{number // 4}" / f"{number}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(dice.integers(0, 256, (*SIZE, 3)).astype(np.uint8)).save(path)
+        coarse = Image.fromarray(dice.integers(0, 256, (8, 12, 3)).astype(np.uint8))
+        coarse.resize((SIZE[1], SIZE[0]), Image.Resampling.BICUBIC).save(path)
     return tmp_path / "frames"
 
 
@@ -58,10 +59,8 @@ def batches(data: PairData, *, training: bool) -> list[Pair]:
 @pytest.mark.parametrize("maps", ["png", "npz", "safetensors"])
 def test_pairs_from_disk_are_those_of_training_on_the_fly(made, source, maps):
     out = made(f"maps={maps}")
-    options = {"batch_size": 4, "workers": 0}
-    stored = pairs(root=out, **options)
-    effect = presets.paper_refractive(width=192)
-    live = frames(root=source, effect=effect, size=SIZE, **options)
+    stored = pairs(root=out, batch_size=4, workers=0)
+    live = frames(root=source, effect=presets.paper_refractive(width=192), size=SIZE, batch_size=4, workers=0)
     for training in (True, False):
         for disk, fly in zip(batches(stored, training=training), batches(live, training=training), strict=True):
             assert torch.equal(disk.key, fly.key)
@@ -85,9 +84,9 @@ def test_twenty_steps_of_training_from_disk_have_the_losses_of_training_on_the_f
     for data in (stored, live):
         torch.manual_seed(0)
         task, network = Undistort(), torch.nn.Conv2d(3, 2, 5, padding=2)
-        optimizer, found = torch.optim.SGD(network.parameters(), lr=0.05), []
+        optimizer, found = torch.optim.SGD(network.parameters(), lr=0.003), []
         epoch = batches(data, training=True)
-        for batch in (epoch * 20)[:20]:
+        for batch in (20 * epoch)[:20]:
             loss = task.loss(task.restore(network(batch.degraded), batch.degraded), batch)
             optimizer.zero_grad()
             loss.backward()
@@ -96,7 +95,7 @@ def test_twenty_steps_of_training_from_disk_have_the_losses_of_training_on_the_f
         losses.append(torch.tensor(found))
     # 1/255 of an image rounded, on the average a quarter of it, and 1/64 px of a flow likewise, in halves of 48 px.
     assert (losses[0] - losses[1]).abs().max() <= 0.25 / 255 + 0.25 / 64 / 16
-    assert losses[1][-1] < losses[1][0]
+    assert losses[1][-1] < 0.6 * losses[1][0]
 
 
 def test_the_configuration_of_the_data_makes_them(made):
@@ -118,8 +117,7 @@ def test_a_folder_and_tars_give_the_same_pairs(made):
 
 def test_manifests_of_shards_put_together_are_one_set(made):
     whole = made()
-    for shard in range(3):
-        out = made("shards=3", f"shard={shard}", out="shards")
+    out, *_ = [made("shards=3", f"shard={shard}", out="shards") for shard in range(3)]
     texts = [path.read_text() for path in sorted(out.glob("manifest-*"), reverse=True)]
     for path in out.glob("manifest-*"):
         path.unlink()

@@ -151,7 +151,9 @@ def test_a_folder_that_cannot_be_written_to_is_said(call, words, disk):
 
 def test_an_output_that_is_a_file_is_said(call, words, tmp_path):
     (tmp_path / "out").write_text("")
-    assert "out must be a folder that can be written to, got out (File exists)" in call("generate", *words("out")).message
+    assert (
+        "out must be a folder that can be written to, got out (File exists)" in call("generate", *words("out")).message
+    )
 
 
 @pytest.mark.parametrize(

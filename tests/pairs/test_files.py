@@ -113,7 +113,7 @@ def test_tars_are_read_by_webdataset(call, words, rows, sums, tmp_path):
     assert call("generate", *words("files", "count=7")).code == 0
     urls = sorted(str(path) for path in (tmp_path / "tars" / "tars").glob("*.tar"))
     assert len(urls) == 3
-    samples = list(webdataset.WebDataset(urls, shardshuffle=False))
+    samples = list(webdataset.compat.WebDataset(urls, shardshuffle=False))
     listed = rows(tmp_path / "files")
     assert [sample["__key__"] for sample in samples] == [f"{row['number']:08d}" for row in listed]
     for sample, row in zip(samples, listed, strict=True):

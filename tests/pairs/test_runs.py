@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,21 @@ def whole(tmp_path_factory, words) -> Path:
     return out
 
 
+def is_running(process: str) -> bool:
+    status = Path(f"/proc/{process}/stat")
+    try:
+        return status.read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
 def data_of(files: dict[str, str]) -> dict[str, str]:
     """The files but those of the manifest, which several shards have several of."""
     return {name: value for name, value in files.items() if not name.startswith("manifest")}
@@ -56,8 +72,12 @@ def test_a_run_that_is_killed_ends_as_if_it_never_was(tmp_path, words, sums, who
         while run.poll() is None and len(list(out.rglob("*.png"))) < before + 8:
             time.sleep(0.01)
         time.sleep(dice.uniform(0, 0.1))
+        own = Path(f"/proc/{run.pid}/task/{run.pid}/children")
+        children = own.read_text().split() if own.exists() else []
         run.send_signal(signal.SIGKILL)
         run.communicate()
+        # No worker outlives the run, or it would write beside the next one.
+        wait_for(lambda children=children: not any(is_running(child) for child in children))
     assert "are there already" in finished(started(*arguments))
     assert sums(out) == sums(whole)
 

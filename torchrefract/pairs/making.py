@@ -64,7 +64,7 @@ class Maker:
     def make(self, job: Job) -> Made:
         """The pair of a job; a frame that cannot be read gives none, and a row that says so."""
         try:
-            image = self._reader.read(job.source)[None]
+            image = self.read(job)
         except UnreadableImageError as error:
             return Made(self._row(job, (0, 0), skipped=str(error).replace(f"{self.recipe.root}/", "")), {})
         except ValueError as error:
@@ -85,6 +85,10 @@ class Maker:
         acted = acting(self.recipe.effect, degraded.params)
         files = {name: Stored("", len(value), hashlib.sha256(value).hexdigest()) for name, value in data.items()}
         return Made(self._row(job, tuple(image.shape[2:]), effects=acted, beyond=lost, files=files), data)
+
+    def read(self, job: Job) -> Tensor:
+        """The frame of a job, (1, 3, H, W), float32 in [0, 1]."""
+        return self._reader.read(job.source)[None]
 
     def _row(self, job: Job, size: tuple[int, ...], **rest: Any) -> PairRow:
         seed, key = draw_of(job.source, seed=self.recipe.seed, lap=job.lap)

@@ -1,0 +1,84 @@
+"""Frames of videos are those of the video, in whatever order they are asked for."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchrefract.data.images import UnreadableImageError
+from torchrefract.data.paired_folder import PairedFolder
+from torchrefract.pairs.sources import Reader, Source, draw_of, find_sources
+from torchrefract.videos import read_video, write_video
+
+OPTIONS = {"size": None, "every": 1, "drive_by": "auto", "val_share": 0.3, "seed": 0}
+FRAMES = 9
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory) -> Path:
+    """Three videos of nine frames each, of noise on a shade."""
+    root, dice = tmp_path_factory.mktemp("videos"), np.random.default_rng(0)
+    for name in ("a.mp4", "b.mp4", "c.mp4"):
+        pages = [dice.integers(20 * i, 20 * i + 60, (32, 48, 3)).astype(np.uint8) for i in range(FRAMES)]
+        assert write_video(pages, root / name, fps=10, size=(48, 32)) == FRAMES
+    return root
+
+
+def test_frames_are_those_of_the_video_forward_backward_and_across(videos):
+    plain = {name: [frame for _, frame in read_video(videos / name, range(FRAMES))] for name in ("a.mp4", "b.mp4")}
+    reader = Reader(videos, None)
+    for name, t in [("a.mp4", 0), ("a.mp4", 4), ("b.mp4", 4), ("b.mp4", 8), ("b.mp4", 2), ("a.mp4", 5), ("a.mp4", 5)]:
+        assert torch.equal(reader.read(Source(name, name, "train", t)), plain[name][t][0])
+
+
+def test_a_video_that_ends_early_is_named(videos):
+    reader = Reader(videos, None)
+    with pytest.raises(UnreadableImageError, match=r"a\.mp4 ends before its frame 9"):
+        reader.read(Source("a.mp4", "a", "train", FRAMES))
+    assert reader.read(Source("a.mp4", "a", "train", 1)).shape == (3, 32, 48)
+
+
+def test_each_video_is_a_drive_and_lies_in_one_split(videos):
+    found = find_sources(videos, **{**OPTIONS, "every": 2})
+    assert [(frame.path, frame.frame) for frame in found.frames] == [
+        (name, t) for name in ("a.mp4", "b.mp4", "c.mp4") for t in range(0, FRAMES, 2)
+    ]
+    splits = {drive: {frame.split for frame in found.frames if frame.drive == drive} for drive in ("a.mp4", "c.mp4")}
+    assert all(len(own) == 1 for own in splits.values())
+    assert {frame.split for frame in found.frames} == {"train", "val"}
+
+
+def test_a_source_that_is_used_again_has_a_new_key_and_no_key_is_used_twice(videos):
+    found = find_sources(videos, **OPTIONS)
+    keys = [draw_of(frame, seed=3, lap=lap)[1] for lap in range(3) for frame in found.frames]
+    assert len(set(keys)) == 3 * 3 * FRAMES
+    assert {draw_of(frame, seed=3, lap=0)[0] for frame in found.frames} == {3 << 32, (3 << 32) + 1}
+
+
+def test_fewer_pairs_than_frames_are_of_all_parts_of_the_source(videos):
+    found = find_sources(videos, **OPTIONS).thinned(6)
+    assert [frame.path for frame in found.frames] == ["a.mp4"] * 2 + ["b.mp4"] * 2 + ["c.mp4"] * 2
+
+
+def test_pairs_of_a_video_have_its_frames(call, videos, tmp_path):
+    words = ("scene=limpopo_sun_glare", f"source={videos / 'b.mp4'}", "out=out", "license=CC0", "workers=0", "every=4")
+    outcome = call("generate", *words, "count=5")
+    assert "the source has a single drive" in outcome.out
+    assert "5 pairs of 3 frames: each frame is used up to 2 times, with new keys" in outcome.out
+    folder = PairedFolder(tmp_path / "out")
+    times = [folder.row(i).frame for i in range(5)]
+    assert times == [0, 4, 8, 0, 4]
+    plain = [frame for _, frame in read_video(videos / "b.mp4", range(FRAMES))]
+    for i, t in enumerate((0, 4, 8, 0, 4)):
+        assert torch.equal(folder[i].clean, plain[t][0])
+    assert not torch.equal(folder[0].degraded, folder[3].degraded)
+
+
+def test_pictures_beside_videos_are_refused(call, videos, frames, tmp_path):
+    both = tmp_path / "both"
+    both.mkdir()
+    (both / "a.mp4").symlink_to(videos / "a.mp4")
+    (both / "a.png").symlink_to(frames / "drive0" / "000.png")
+    words = ("scene=limpopo_sun_glare", "source=both", "out=out", "license=CC0")
+    assert call("generate", *words).message == "source must hold pictures or videos, got both in both"

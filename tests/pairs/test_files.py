@@ -36,6 +36,7 @@ def made_again(row, frames, effect):
 def kitti(path: Path):
     """Flow and mask as the KITTI benchmark's kit defines them, u, v, valid in red, green, blue."""
     stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert stored is not None
     assert stored.dtype == np.uint16
     blue, green, red = np.moveaxis(stored.astype(np.float64), 2, 0)
     return np.stack([(red - 2**15) / 64, (green - 2**15) / 64]), blue > 0

@@ -44,6 +44,13 @@ def is_running(process: str) -> bool:
         return False
 
 
+def family(process: int | str) -> list[str]:
+    """All processes that came of one."""
+    own = Path(f"/proc/{process}/task/{process}/children")
+    children = own.read_text().split() if own.exists() else []
+    return [*children, *(later for child in children for later in family(child))]
+
+
 def wait_for(condition: Callable[[], bool]) -> None:
     end = time.monotonic() + 30
     while not condition():
@@ -72,8 +79,7 @@ def test_a_run_that_is_killed_ends_as_if_it_never_was(tmp_path, words, sums, who
         while run.poll() is None and len(list(out.rglob("*.png"))) < before + 8:
             time.sleep(0.01)
         time.sleep(dice.uniform(0, 0.1))
-        own = Path(f"/proc/{run.pid}/task/{run.pid}/children")
-        children = own.read_text().split() if own.exists() else []
+        children = family(run.pid)
         run.send_signal(signal.SIGKILL)
         run.communicate()
         # No worker outlives the run, or it would write beside the next one.

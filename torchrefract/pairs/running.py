@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.context import BaseContext
 
 import cv2
 import torch
@@ -36,9 +37,7 @@ def run(units: Iterable[Sequence[Job]], recipe: Recipe, store: Store, *, workers
         maker = Maker(recipe)
         yield from (store.write(unit, maker) for unit in units)
         return
-    # Spawned, since a fork of a process with threads may hang.
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(recipe, store))
+    pool = ProcessPoolExecutor(workers, mp_context=_context(), initializer=_start, initargs=(recipe, store))
     try:
         waiting = set[Future[list[PairRow]]]()
         for unit in units:
@@ -56,6 +55,18 @@ def run(units: Iterable[Sequence[Job]], recipe: Recipe, store: Store, *, workers
         ) from error
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _context() -> BaseContext:
+    """Workers are forked off a process that has imported what they need, and computed nothing yet.
+
+    A fork of this process, which has threads, may hang; spawned ones would each import everything anew.
+    """
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["torchrefract.generate"])
+    return context
 
 
 class _Worker:

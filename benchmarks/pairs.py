@@ -9,7 +9,6 @@ import hashlib
 import json
 import os
 import random
-import resource
 import signal
 import subprocess
 import sys
@@ -35,8 +34,8 @@ from torchrefract.pairs.sources import find_sources
 
 WHAT = (
     "A run of torchrefract.generate: pairs a second, its start among the time; the share of the cores' time that it "
-    "used; the memory of all its processes, shared pages counted once, sampled four times a second. And one pair on "
-    "one thread: read, degraded and encoded, beside reading the same frame and encoding the same arrays."
+    "used, and the memory of all its processes, shared pages counted once, both looked at four times a second. And one "
+    "pair on one thread: read, degraded and encoded, beside reading the same frame and encoding the same arrays."
 )
 LIMIT = 1.5
 BUSY = 0.85
@@ -102,17 +101,19 @@ def command(args: argparse.Namespace, out: Path) -> list[str]:
 
 def measured(words: Sequence[str], pairs: int, out: Path, *, cores: int) -> Run:
     """A run of the command."""
-    before, start, peak = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter(), 0
+    start, peak, used = time.perf_counter(), 0, dict[int, float]()
     with subprocess.Popen(words, stdout=subprocess.DEVNULL) as run:
         while run.poll() is None:
-            peak = max(peak, sum(map(_memory, _family(run.pid))))
+            family = _family(run.pid)
+            peak = max(peak, sum(map(_memory, family)))
+            # The system adds up what workers have used only for who waits for them, which a server of forks does not.
+            used |= {process: seconds for process in family if (seconds := _used(process))}
             time.sleep(_PAUSE)
-    seconds, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds = time.perf_counter() - start
     if run.returncode:
         raise SystemExit(f"the run ended with {run.returncode}")
-    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     disk = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
-    return Run(pairs, seconds, used / seconds / cores, peak, disk)
+    return Run(pairs, seconds, sum(used.values()) / seconds / cores, peak, disk)
 
 
 def killed(args: argparse.Namespace, room: Path, dice: random.Random) -> int:
@@ -184,6 +185,15 @@ def _memory(process: int) -> int:
     except OSError:
         return 0
     return sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+
+
+def _used(process: int) -> float:
+    """Seconds of a core that a process has used; 0 for one that is gone."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _parser() -> argparse.ArgumentParser:

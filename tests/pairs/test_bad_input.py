@@ -144,6 +144,16 @@ def test_a_disk_that_becomes_full_leaves_whole_pairs_and_a_run_that_goes_on(call
     assert sums(place / "out") == sums(Path("out"))
 
 
+def test_a_run_that_is_interrupted_says_how_to_go_on(call, words, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torchrefract.generate.run", interrupted)
+    outcome = call("generate", *words("out"))
+    assert (outcome.code, outcome.err) == (130, "")
+    assert outcome.out.endswith("stopped; the same command goes on\n")
+
+
 def test_a_folder_that_cannot_be_written_to_is_said(call, words, disk):
     place = disk("ro,size=64k")
     assert "Read-only file system" in call("generate", *words(place / "out")).message

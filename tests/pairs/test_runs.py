@@ -44,15 +44,19 @@ def is_running(process: str) -> bool:
         return False
 
 
+def children_of(process: int | str) -> list[str]:
+    own = Path(f"/proc/{process}/task/{process}/children")
+    return own.read_text().split() if own.exists() else []
+
+
 def family(process: int | str) -> list[str]:
     """All processes that came of one."""
-    own = Path(f"/proc/{process}/task/{process}/children")
-    children = own.read_text().split() if own.exists() else []
+    children = children_of(process)
     return [*children, *(later for child in children for later in family(child))]
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 30
+    end = time.monotonic() + 120
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
@@ -86,6 +90,18 @@ def test_a_run_that_is_killed_ends_as_if_it_never_was(tmp_path, words, sums, who
         wait_for(lambda children=children: not any(is_running(child) for child in children))
     assert "are there already" in finished(started(*arguments))
     assert sums(out) == sums(whole)
+
+
+def test_a_worker_that_is_killed_ends_the_run_with_a_reason(tmp_path, words):
+    out = tmp_path / "out"
+    run = started(*words(out, "count=4000", "workers=1"))
+    wait_for(lambda: run.poll() is not None or any(out.rglob("*.png")))
+    workers = set(family(run.pid)) - set(children_of(run.pid)) or set(children_of(run.pid))
+    for worker in workers:
+        os.kill(int(worker), signal.SIGKILL)
+    _, err = run.communicate(timeout=100)
+    assert run.returncode == 1
+    assert err.startswith("error: workers must leave memory for each, got 1 of which one was killed")
 
 
 @pytest.mark.parametrize("shards", [2, 5])

@@ -57,6 +57,7 @@ def test_every_task_makes_its_data_and_its_model(tmp_path, task):
     assert isinstance(model, Restoration)
     assert model.task.name == task
     assert (data.seed, len(data.train), len(data.val)) == (5, 512, 128)  # pyright: ignore[reportArgumentType]
+    assert data.effect is not None
     assert data.effect.extra_repr() == getattr(presets, cfg.scene._target_.rsplit(".", 1)[1])().extra_repr()
 
 
@@ -112,6 +113,14 @@ def test_a_scene_is_the_preset_of_its_name(scene):
     assert isinstance(made, Effect)
     assert (type(made), repr(made)) == (type(expected), repr(expected))
     assert "range=(" in repr(made)
+
+
+@pytest.mark.parametrize("scene", options("scene"))
+def test_pairs_are_written_of_every_scene(scene):
+    with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
+        cfg = compose("generate", overrides=[f"scene={scene}", "source=a", "out=b", "license=c"])
+    assert not OmegaConf.missing_keys(cfg)
+    assert isinstance(instantiate(cfg.scene), Effect)
 
 
 def test_every_preset_has_a_scene():

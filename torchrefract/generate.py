@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrefract._checks import check_choice, check_count, check_flag, check_number
 from torchrefract._command import UsageError, as_they_are, check_seed, command, job, make, naming
 from torchrefract._config import CONFIG_DIR
+from torchrefract._files import replacing
 from torchrefract.data.images import check_size
 from torchrefract.data.pair_files import FORMATS
 from torchrefract.data.pair_manifest import manifests, scan
@@ -28,7 +29,7 @@ from torchrefract.pairs.making import Job, Maker, Recipe
 from torchrefract.pairs.running import run
 from torchrefract.pairs.sources import Sources, find_sources
 from torchrefract.pairs.watching import watched
-from torchrefract.pairs.writing import Folders, Store, Tars, write_whole
+from torchrefract.pairs.writing import Folders, Store, Tars
 
 _TRIED = 4  # pairs that tell how much room the others will take
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -120,7 +121,7 @@ def _recipe(cfg: DictConfig) -> Recipe:
         maps = check_choice("maps", str(cfg.maps), FORMATS)
     source = Path(str(cfg.source)).expanduser()
     root = source.parent if source.is_file() else source
-    return Recipe(effect.requires_grad_(False), _scene(cfg)["name"], root, size, cfg.seed, maps)
+    return Recipe(effect, _scene(cfg)["name"], root, size, cfg.seed, maps)
 
 
 def _options(cfg: DictConfig) -> dict[str, Any]:
@@ -129,12 +130,15 @@ def _options(cfg: DictConfig) -> dict[str, Any]:
         tar = None if cfg.tar is None else check_count("tar", cfg.tar)
     with naming("every"):
         every = check_count("every", cfg.every)
+    with naming("drive_by"):
+        drive_by = check_choice("drive_by", str(cfg.drive_by), ("auto", "folder", "prefix"))
     with naming("val_share"):
-        share = check_number("val_share", cfg.val_share, low=0.0, high=1.0)
+        if not 0 < (share := check_number("val_share", cfg.val_share)) < 1:
+            raise UsageError(f"val_share must be between 0 and 1, got {share}")
     with naming("verify"):
         check_flag("verify", cfg.verify)
     size = None if cfg.size is None else list(cfg.size)
-    plain = {"seed": cfg.seed, "maps": str(cfg.maps), "drive_by": str(cfg.drive_by), "size": size}
+    plain = {"seed": cfg.seed, "maps": str(cfg.maps), "drive_by": drive_by, "size": size}
     return plain | {"tar": tar, "every": every, "val_share": share}
 
 
@@ -178,7 +182,7 @@ def _tell(asked: _Asked, there: set[int], damaged: int) -> None:
     frames = len(asked.sources.frames)
     if asked.sources.skipped:
         print(f"{asked.sources.skipped} files of the source cannot be read")
-    if len({frame.drive for frame in asked.sources.frames}) < 2:
+    if asked.sources.alone:
         print("the source has a single drive, which cannot be split: all of it is for training")
     if asked.number > frames:
         times = -(-asked.number // frames)
@@ -212,13 +216,19 @@ def _finish(asked: _Asked, out: Path, *, made: int) -> None:
     if not missing:
         picture = histograms(found)
         if picture is not None:
-            write_whole(out / HISTOGRAMS, picture)
+            _write(out / HISTOGRAMS, picture)
         pictured = picture is not None
         card = write_card(found, settings=asked.settings, license_of=asked.license, pictured=pictured)
-        write_whole(out / "README.md", card.encode())
+        _write(out / "README.md", card.encode())
     rest = f"{missing} are left to other shards" if missing else "README.md tells of them"
     skipped = f", {unreadable} frames could not be read" if unreadable else ""
     print(f"{out}: {made} pairs made, {there} there{skipped}; {rest}")
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Write a file that several shards may be writing at once."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
 
 
 @contextmanager

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from torchrefract._command import UsageError
+from torchrefract._files import replacing
 from torchrefract.data.pair_files import DamagedPairError
 from torchrefract.data.pair_manifest import PairRow, Place, lines_of, manifests, read_stored, scan
-from torchrefract.pairs.writing import hidden, write_whole
+from torchrefract.pairs.writing import hidden
 
 _CONFIG = "config.json"
 _AT_ONCE = 256  # rows that are looked at together
@@ -107,15 +108,19 @@ def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[
     out.mkdir(parents=True, exist_ok=True)
     wanted = json.loads(json.dumps(settings))
     path, before = out / _CONFIG, {}
+    # Looked for before the configuration is: another shard may be writing both.
+    others = sorted(file.name for file in out.iterdir() if not file.name.startswith("."))
     if path.is_file():
         before = _read(path)
         _check_same(before.get("settings", {}), wanted, out)
         if count < before.get("count", 0):
             raise UsageError(f"count must be at least that of the pairs in {out}, {before['count']}, got {count}")
-    elif others := sorted(file.name for file in out.iterdir() if not file.name.startswith(".")):
+    elif others:
         raise UsageError(f"out must be a new folder or one of this command, got {out}, which holds {others[0]}")
     document = {"settings": wanted, "count": count, **about}
-    write_whole(path, (json.dumps(document, indent=2) + "\n").encode())
+    if document != before:
+        with replacing(path) as temporary:
+            temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     return before
 
 

@@ -65,7 +65,8 @@ def _context() -> BaseContext:
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["torchrefract.generate"])
+    # All that the command imports beside itself, since each worker imports the command again.
+    context.set_forkserver_preload([__name__, "torchrefract.pairs.card", "torchrefract.pairs.ledger"])
     return context
 
 

@@ -33,6 +33,7 @@ class Sources(NamedTuple):
     root: Path
     frames: Sequence[Source]
     skipped: int  # files that cannot be read
+    alone: bool  # whether there is a single drive, which cannot be split
 
     def thinned(self, count: int) -> "Sources":
         """So many of them at most, out of all parts of their order."""
@@ -109,7 +110,8 @@ def find_sources(
     videos = [file for file in files if file.lower().endswith(VIDEOS)]
     if not videos:
         placed, skipped = place_frames(source, size=size, drive_by=drive_by, val_share=val_share, seed=seed)
-        return Sources(source, [Source(frame.path, frame.drive, frame.split) for frame in placed], len(skipped))
+        alone = len({(frame.drive, frame.split) for frame in placed}) < 2
+        return Sources(source, [Source(*frame) for frame in placed], len(skipped), alone)
     if any(file.lower().endswith(EXTENSIONS) for file in files):
         raise UsageError(f"source must hold pictures or videos, got both in {source}")
     return _videos(source, videos, every, val_share, seed)
@@ -126,7 +128,7 @@ def _videos(root: Path, paths: Sequence[str], every: int, val_share: float, seed
     several = len(set(drive_of.values())) > 1
     val = val_drives(root, drive_of, val_share=val_share, seed=seed) if several else set()
     found = [Source(path, drives[path] or ".", "val" if drives[path] in val else "train", t) for path, t in frames]
-    return Sources(root, found, sum(count == 0 for count in counts.values()))
+    return Sources(root, found, sum(count == 0 for count in counts.values()), not several)
 
 
 def draw_of(source: Source, *, seed: int, lap: int) -> tuple[int, int]:

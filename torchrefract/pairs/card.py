@@ -128,10 +128,10 @@ def histograms(found: Contents) -> bytes | None:
     FigureCanvasAgg(figure)
     for i, (title, label, values) in enumerate(panels):
         axes = figure.add_subplot(rows, _COLUMNS, i + 1)
-        axes.hist(values, bins=min(_MOST_BINS, math.isqrt(len(values)) + 1), color="tab:blue")
+        axes.hist(values, bins=min(_MOST_BINS, math.isqrt(len(values)) + 1), color="tab:blue", edgecolor="white")
         axes.set_title(title, fontsize=9)
         axes.set_xlabel(label, fontsize=8)
-        axes.set_ylabel("pairs" if i % _COLUMNS == 0 else "", fontsize=8)
+        axes.set_ylabel("count" if i % _COLUMNS == 0 else "", fontsize=8)
         axes.tick_params(labelsize=7)
         axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))

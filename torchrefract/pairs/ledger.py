@@ -36,7 +36,7 @@ class Ledger:
                 not agree are removed, and frames that could not be read are tried again.
 
         Returns:
-            the numbers of the pairs, and how many files were removed.
+            the numbers of the pairs that are kept, and how many others `verify` has found.
         """
         found, places, damaged = scan(manifests(self.out), lambda row: mine(row.number), torn=True), [], 0
         for rows, whole in _looked_at(found, self._sound if verify else self._there):
@@ -48,7 +48,7 @@ class Ledger:
                     for path in {file.path for file in row.files.values()}:
                         (self.out / path).unlink(missing_ok=True)
         self._write(places)
-        return {index for index, _ in places}, damaged
+        return {number for number, _ in places}, damaged
 
     def add(self, rows: Iterable[PairRow]) -> None:
         """Append the rows of pairs that are written."""
@@ -86,7 +86,7 @@ class Ledger:
             files = [(read_stored(self.out, file), file.sha256) for file in row.files.values()]
         except DamagedPairError:
             return False
-        return self._there(row) and all(hashlib.sha256(data).hexdigest() == sum for data, sum in files)
+        return self._there(row) and all(hashlib.sha256(data).hexdigest() == expected for data, expected in files)
 
 
 def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[str, Any]) -> dict[str, Any]:

@@ -76,15 +76,12 @@ class Maker:
             pair = PairArrays(_pixels(image), _pixels(degraded.image), _maps(degraded))
         with naming("maps"):
             data = encode_pair(pair, self.recipe.maps)
-        lost = {}
-        if self.recipe.maps == "png":
-            counts = {
-                name: beyond(pair.maps[name], pair.maps[mask]) for name, mask in FLOWS.items() if name in pair.maps
-            }
-            lost = {name: count for name, count in counts.items() if count}
-        acted = acting(self.recipe.effect, degraded.params)
-        files = {name: Stored("", len(value), hashlib.sha256(value).hexdigest()) for name, value in data.items()}
-        return Made(self._row(job, tuple(image.shape[2:]), effects=acted, beyond=lost, files=files), data)
+        rest = {
+            "effects": acting(self.recipe.effect, degraded.params),
+            "beyond": _beyond(pair) if self.recipe.maps == "png" else {},
+            "files": {name: Stored("", len(value), hashlib.sha256(value).hexdigest()) for name, value in data.items()},
+        }
+        return Made(self._row(job, tuple(image.shape[2:]), **rest), data)
 
     def read(self, job: Job) -> Tensor:
         """The frame of a job, (1, 3, H, W), float32 in [0, 1]."""
@@ -122,13 +119,14 @@ def _maps(degraded: Degraded) -> dict[str, np.ndarray]:
     maps = {"valid": degraded.valid[0, 0].numpy()}
     if degraded.has("flow"):
         maps["restore_valid"] = degraded.restore_valid[0, 0].numpy()
-    for name in FLOWS:
-        if degraded.has("flow"):
-            maps[name] = getattr(degraded, name)[0].float().contiguous().numpy()
-    for name in LIGHTS:
-        if degraded.has(name):
-            maps[name] = getattr(degraded, name)[0, 0].float().contiguous().numpy()
-    return maps
+        maps |= {name: getattr(degraded, name)[0].float().numpy() for name in FLOWS}
+    return maps | {name: getattr(degraded, name)[0, 0].float().numpy() for name in LIGHTS if degraded.has(name)}
+
+
+def _beyond(pair: PairArrays) -> dict[str, int]:
+    """How many valid pixels a PNG cannot hold, of the flows that have some."""
+    counts = {name: beyond(pair.maps[name], pair.maps[mask]) for name, mask in FLOWS.items() if name in pair.maps}
+    return {name: count for name, count in counts.items() if count}
 
 
 def _pixels(image: Tensor) -> np.ndarray:

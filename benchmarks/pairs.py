@@ -77,7 +77,8 @@ def main() -> None:
     print(f"{found.peak_bytes / 1e6:.0f} MB of memory at most, {found.disk_bytes / found.pairs / 1e6:.3f} MB a pair")
     print(f"one pair {1e3 * single.made:.1f} ms, bare {1e3 * single.bare:.1f} ms", *bars, sep="\n")
     if broken is not None:
-        print(f"after {args.kills} kills {broken} files differ from those of a run that was not killed")
+        shown = f": {', '.join(broken[:3])}" if broken else ""
+        print(f"after {args.kills} kills {len(broken)} files differ from those of a run that was not killed{shown}")
     content = {
         "what": WHAT,
         "words": words,
@@ -116,8 +117,8 @@ def measured(words: Sequence[str], pairs: int, out: Path, *, cores: int) -> Run:
     return Run(pairs, seconds, sum(used.values()) / seconds / cores, peak, disk)
 
 
-def killed(args: argparse.Namespace, room: Path, dice: random.Random) -> int:
-    """How many files of a run that is killed so often, at random moments, differ from those of the other one."""
+def killed(args: argparse.Namespace, room: Path, dice: random.Random) -> list[str]:
+    """The files of a run that is killed so often, at random moments, which differ from those of the other one."""
     words = command(args, room / "killed")
     for _ in range(args.kills):
         with subprocess.Popen(words, stdout=subprocess.DEVNULL) as run:
@@ -129,7 +130,7 @@ def killed(args: argparse.Namespace, room: Path, dice: random.Random) -> int:
             run.send_signal(signal.SIGKILL)
     subprocess.run(words, stdout=subprocess.DEVNULL, check=True)
     whole, broken = (_sums(room / name) for name in ("pairs", "killed"))
-    return len(set(whole.items()) ^ set(broken.items()))
+    return sorted({name for name, _ in whole.items() ^ broken.items()})
 
 
 def one_by_one(args: argparse.Namespace) -> Single:

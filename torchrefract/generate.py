@@ -103,7 +103,7 @@ def _asked(cfg: DictConfig) -> _Asked:
     with naming("count"):
         number = len(sources.frames) if cfg.count is None else check_count("count", cfg.count)
     sources = sources.thinned(number)
-    if not str(cfg.license).strip():
+    if not str(cfg.license or "").strip():
         raise UsageError("license must be that of the source, in words, got nothing")
     settings = {"scene": _scene(cfg), **options, "frames": len(sources.frames), "sources": sources.digest()}
     return _Asked(recipe, sources, settings, number, str(cfg.license), shard, workers, cfg.verify)

@@ -38,6 +38,7 @@ def disk(tmp_path) -> Iterator[Callable[[str], Path]]:
     ("word", "message"),
     [
         ("license=", "license must be that of the source"),
+        ("license=null", "license must be that of the source, in words, got nothing"),
         ("maps=jpg", "maps: maps must be one of png, npz, safetensors, got 'jpg'"),
         ("count=0", "count: count must be at least 1, got 0"),
         ("size=[0,4]", "size: size must be at least 1, got 0"),

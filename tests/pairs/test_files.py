@@ -95,6 +95,18 @@ def test_light_is_stored_in_16_bits(call, words, rows, frames, tmp_path):
     assert {"LensFlare", "HeterogeneousFog"} <= acted
 
 
+def test_a_composition_has_both_flows_and_light(call, words, rows, frames, tmp_path):
+    assert call("generate", *words("out", "count=2", scene="unpaved_road")).code == 0
+    for row in rows(tmp_path / "out"):
+        assert [effect["effect"] for effect in row["effects"]] == ["HeterogeneousFog", "Turbulence"]
+        _, d = made_again(row, frames, presets.unpaved_road())
+        stored = np.asarray(Image.open(tmp_path / "out" / row["files"]["transmission.png"]["path"])) / 65535
+        assert np.abs(stored - d.transmission[0, 0].numpy()).max() <= 0.5 / 65535 + 1e-6
+        flow, _ = kitti(tmp_path / "out" / row["files"]["flow.png"]["path"])
+        assert np.abs(flow - d.flow[0].double().numpy()).max() <= 1 / 128
+        assert np.abs(flow).max() > 1 / 64
+
+
 @pytest.mark.parametrize("form", ["npz", "safetensors"])
 def test_maps_in_full_precision_are_read_by_their_own_libraries(call, words, rows, frames, tmp_path, form):
     assert call("generate", *words("out", "count=3", f"maps={form}")).code == 0

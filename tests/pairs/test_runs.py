@@ -15,11 +15,15 @@ ROOT = Path(__file__).parents[2]
 COUNT = 30
 
 
-def started(*words: str, module: tuple[str, ...] = ("torchrefract.generate",)) -> subprocess.Popen[str]:
+def started(
+    *words: str, module: tuple[str, ...] = ("torchrefract.generate",), cwd: Path | None = None
+) -> subprocess.Popen[str]:
     """A run in a process of its own."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", *module, *words]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command, cwd=cwd, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def finished(run: subprocess.Popen[str]) -> str:
@@ -125,7 +129,8 @@ def test_shards_in_tars_make_the_same_tars(call, tmp_path, words, sums):
 
 def test_the_shards_of_a_multirun_are_the_set(tmp_path, words, sums, whole):
     out = tmp_path / "out"
-    finished(started("-m", *words(out, f"count={COUNT}", "shards=2", "shard=0,1")))
+    # Hydra leaves a file where it was started.
+    finished(started("-m", *words(out, f"count={COUNT}", "shards=2", "shard=0,1"), cwd=tmp_path))
     assert data_of(sums(out)) == data_of(sums(whole))
 
 

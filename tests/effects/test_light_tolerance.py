@@ -19,7 +19,8 @@ from torchrefract.warping.lattice import Lattice, between_nodes
 
 SIZE = (96, 144)
 CAMERA = Camera(width=144, height=96, fx=110.0, fy=110.0, cx=70.0, cy=50.0, coefficients=(0.0,) * 4)
-LONG: dict[str, Any] = {"scales": (40, 60, 90, 120), "weights": (1, 1, 1, 1), "reference_width": 144.0}
+# So many octaves that those on a lattice are worth its step.
+LONG: dict[str, Any] = {"scales": (12, *range(50, 140, 10)), "weights": (1,) * 10, "reference_width": 144.0}
 ARGUMENTS: dict[str, tuple[type[PlannedLight], dict[str, Any]]] = {
     "camera": (UniformFog, {"camera": CAMERA}),
     "dense": (UniformFog, {"visibility_range": (20.0, 25.0)}),

@@ -39,6 +39,8 @@ _MARGIN = 1.05  # for what lies between the x and the places that are looked at
 _LEAST_MEAN = 0.1
 # Fewer products than this of all are worth a step more.
 _WORTH = 0.97
+# What one more pass over the frame takes, in products for each pixel.
+_PASS = 16
 # Of noise in space, in the middle of a cell: half its diagonal.
 _LARGEST_IN_SPACE = math.sqrt(0.75)
 _HALF = math.sqrt(0.5)  # of q over that of n
@@ -200,7 +202,7 @@ def _work(drifts: Drifts, choice: _Choice, height: int) -> float:
     band = min(BAND, height)
     lines = sum(2 * (math.ceil((band - 1) / drifts.periods[i]) + 2) for i in choice.fine)
     if choice.coarse:
-        lines += (band + choice.stride - 2) // choice.stride + 4 + 8 * len(choice.coarse) / choice.stride**2
+        lines += _PASS + (band + choice.stride - 2) // choice.stride + 4 + 8 * len(choice.coarse) / choice.stride**2
     return lines
 
 

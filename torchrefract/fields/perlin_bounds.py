@@ -12,7 +12,7 @@ so all variances are products of sums along one axis. Phases are drawn: the larg
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -123,29 +123,29 @@ def _means(period: float, size: int, stride: int) -> tuple[_Products, _Products,
     np.add.at(weight, pixels[:, None] // stride + np.arange(4), cubic[pixels % stride])
     nodes = (np.arange(cells + 3) - 1) * stride
     phases = np.arange(_PHASES) / _PHASES
-    own = _mean(pixels, np.ones(size), period, phases, size)
-    between = own if stride == 1 else _mean(nodes, weight, period, phases, size)
+    reach = math.ceil(nodes[-1] / period)
+    own = _mean(pixels, np.ones(size), period, phases, reach) / size
+    between = own if stride == 1 else _mean(nodes, weight, period, phases, reach) / size
     return _products(own, own), _products(between, between), _products(own, between)
 
 
-def _mean(at: np.ndarray, weight: np.ndarray, period: float, phases: np.ndarray, size: int) -> tuple[np.ndarray, ...]:
-    """(phases, nodes), of h and a, the weighted sum over places in px, over the size."""
+def _mean(at: np.ndarray, weight: np.ndarray, period: float, phases: np.ndarray, reach: int) -> np.ndarray:
+    """(2, phases, nodes), of h and a, the weighted sum over places in px, up to `reach` periods to either side."""
     found = []
     for phase in phases:
-        place = at / period + phase + 3.0 * size / period  # all above 0
+        place = at / period + phase + reach  # none below 0
         node = np.floor(place).astype(int)
         (h0, a0), (h1, a1) = _hat(place - node), _hat(place - node - 1)
-        count = math.ceil(6.0 * size / period) + 6
+        count = 2 * reach + 3
         sums = [
             np.bincount(node, weight * first, count) + np.bincount(node + 1, weight * second, count)
             for first, second in ((h0, h1), (a0, a1))
         ]
-        found.append(np.stack(sums) / size)
-    h, a = np.stack(found, axis=1)
-    return h, a
+        found.append(np.stack(sums))
+    return np.stack(found, axis=1)
 
 
-def _products(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> _Products:
+def _products(one: Iterable[np.ndarray], other: Iterable[np.ndarray]) -> _Products:
     return _Products(*((p * q).sum(axis=-1).ravel() for p, q in zip(one, other, strict=True)))
 
 

@@ -87,6 +87,15 @@ def as_they_are(name: str, words: list[str]) -> list[str]:
     return words
 
 
+def with_text(option: str) -> Callable[[str, list[str]], list[str]]:
+    """For `command`: what is given for an option is a text, in which commas and brackets mean nothing."""
+
+    def prepare(name: str, words: list[str]) -> list[str]:
+        return [_as_text(word) if word.startswith(f"{option}=") else word for word in words]
+
+    return prepare
+
+
 def command(
     name: str, *, prepare: Callable[[str, list[str]], list[str]] = with_task
 ) -> Callable[[Callable[[], None]], Callable[[], None]]:
@@ -187,6 +196,12 @@ def progress(items: Iterable[_T], name: str, *, count: int) -> Iterable[_T]:
 def _is_picture(word: str) -> bool:
     # A name may hold what is not its own in Hydra's grammar, so a file that is there is always meant.
     return not word.startswith("-") and (os.path.isfile(word) or not ("=" in word or word.startswith("~")))
+
+
+def _as_text(word: str) -> str:
+    """The word with its value in quotes, unless it has some, or is nothing."""
+    option, _, text = word.partition("=")
+    return word if text in ("", "null") or text[0] in "'\"" else f"{option}={_quoted(text)}"
 
 
 def _quoted(text: str) -> str:

@@ -16,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from torchrefract._checks import check_choice, check_count, check_flag, check_number
-from torchrefract._command import UsageError, as_they_are, check_seed, command, job, make, naming
+from torchrefract._command import UsageError, check_seed, command, job, make, naming, with_text
 from torchrefract._config import CONFIG_DIR
 from torchrefract._files import replacing
 from torchrefract.data.images import check_size
@@ -71,7 +71,7 @@ class _Asked(NamedTuple):
         return Job(number, self.sources.frames[place], lap)
 
 
-@command("generate", prepare=as_they_are)
+@command("generate", prepare=with_text("license"))
 @hydra.main(config_path=CONFIG_DIR, config_name="generate", version_base="1.3")
 @job
 def main(cfg: DictConfig) -> None:

@@ -168,3 +168,11 @@ def test_the_card_counts_what_is_there_and_states_the_license(refractive, rows):
     for name in {row["effects"][0]["effect"] for row in listed}:
         assert f"| {name} | {sum(row['effects'][0]['effect'] == name for row in listed)} |" in card
     assert np.asarray(Image.open(refractive / "parameters.png")).std() > 10
+
+
+@pytest.mark.parametrize("license_of", ["CC BY 4.0, MIT (two sources)", "the owner's: ask [us]", "'in quotes, too'"])
+def test_a_license_is_any_text(call, words, tmp_path, license_of):
+    kept = [word for word in words("out", "count=4") if not word.startswith("license=")]
+    assert call("generate", *kept, f"license={license_of}").code == 0
+    stated = license_of.strip("'") if license_of[0] == "'" else license_of
+    assert f"as stated by who made this set:** {stated}\n" in (tmp_path / "out" / "README.md").read_text()

@@ -119,8 +119,8 @@ def test_maps_in_full_precision_are_read_by_their_own_libraries(call, words, row
             assert np.array_equal(value, getattr(d, name)[0].numpy().reshape(value.shape)), name
 
 
-# webdataset leaves the tars to the garbage collector to close.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # webdataset leaves its tars to the garbage collector to close,
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # where pytest wraps the same warning
 def test_tars_are_read_by_webdataset(call, words, rows, sums, tmp_path):
     assert call("generate", *words("tars", "count=7", "tar=3")).code == 0
     assert call("generate", *words("files", "count=7")).code == 0

@@ -13,7 +13,6 @@ from torchrefract._command import UsageError
 from torchrefract._files import replacing
 from torchrefract.data.pair_files import DamagedPairError
 from torchrefract.data.pair_manifest import PairRow, Place, lines_of, manifests, read_stored, scan
-from torchrefract.pairs.writing import hidden
 
 _CONFIG = "config.json"
 _AT_ONCE = 256  # rows that are looked at together
@@ -60,13 +59,8 @@ class Ledger:
         self._write([(row.number, place) for row, place in scan([self.path], lambda _: True, torn=True)])
 
     def _write(self, places: Sequence[tuple[int, Place]]) -> None:
-        temporary = hidden(self.path)
-        try:
-            with temporary.open("wb") as stream:
-                stream.writelines(lines_of(place for _, place in sorted(places)))
-            os.replace(temporary, self.path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with replacing(self.path, alone=True) as temporary, temporary.open("wb") as stream:
+            stream.writelines(lines_of(place for _, place in sorted(places)))
 
     def _there(self, row: PairRow) -> bool:
         """Whether the files of a pair have their sizes."""

@@ -7,12 +7,12 @@ short, which the next run sees by their sizes, or hold zeros, which verify=true 
 
 import io
 import json
-import os
 import tarfile
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 
+from torchrefract._files import replacing
 from torchrefract.data.pair_manifest import PairRow, pair_name
 from torchrefract.pairs.making import Job, Made, Maker
 
@@ -56,7 +56,8 @@ class Folders(Store):
         files = {}
         for suffix, data in made.data.items():
             file = made.row.files[suffix]._replace(path=f"{folder}/{made.row.name}.{suffix}")
-            write_whole(self.out / file.path, data)
+            with replacing(self.out / file.path, alone=True) as temporary:
+                temporary.write_bytes(data)
             files[suffix] = file
         return made.row._replace(files=files)
 
@@ -75,34 +76,16 @@ class Tars(Store):
         path = f"tars/{pair_name(jobs[0].number // self.unit)}.tar"
         target = self.out / path
         target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = hidden(target)
-        try:
-            with tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar:
-                rows = [_add_pair(tar, maker.make(job), path) for job in jobs]
-            os.replace(temporary, target)
-        finally:
-            temporary.unlink(missing_ok=True)
-        return rows
+        with (
+            replacing(target, alone=True) as temporary,
+            tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar,
+        ):
+            return [_add_pair(tar, maker.make(job), path) for job in jobs]
 
     def bytes_of(self, made: Made) -> int:
         """Its files, each with a head and filled up to 512 bytes."""
         sizes = [len(_about(made.row)), *map(len, made.data.values())]
         return sum(_HEAD + -(-size // _HEAD) * _HEAD for size in sizes)
-
-
-def hidden(path: Path) -> Path:
-    """The name that a file has until it is whole; the same each time, so that what a kill has left is written over."""
-    return path.with_name(f".{path.name}.part")
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file that is there whole or not at all, in a folder that exists."""
-    temporary = hidden(path)
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _about(row: PairRow) -> bytes:

@@ -1,11 +1,18 @@
 """The flow that undoes a flow, with a certificate."""
 
+import math
+
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_count, check_flow, check_positive
+from torchrefract._checks import check_count, check_flow, check_positive, is_true
 from torchrefract.warping.grid import field_dtype, inside, length, pixel_axes
 from torchrefract.warping.resample import look_up
+
+# Px: after so short a step the next one, a square of it, is below rounding.
+_NEAR = {torch.float32: 1e-3, torch.float64: 1e-6}
+# Of so many pixels one may be left on a fold, where no step helps.
+_FEW = 500
 
 
 def invert_flow(flow: Tensor, *, steps: int = 6, tolerance_px: float = 0.05) -> tuple[Tensor, Tensor, Tensor]:
@@ -19,7 +26,8 @@ def invert_flow(flow: Tensor, *, steps: int = 6, tolerance_px: float = 0.05) -> 
 
     Args:
         flow: (B, 2, H, W), px.
-        steps: Newton steps, at least 1.
+        steps: Newton steps at most, at least 1; a sample takes no more once all its pixels stay within 1e-3 px (1e-6 px
+            in float64), or the few of them that do not, one in 500, no longer become fewer.
         tolerance_px: the residual up to which a pixel counts as solved, px.
 
     Returns:
@@ -48,9 +56,14 @@ def invert_flow(flow: Tensor, *, steps: int = 6, tolerance_px: float = 0.05) -> 
     with torch.no_grad():
         table = torch.cat([flow, _gradient(flow)], dim=1)
         inverse = -flow
+        going, far = known.new_ones(known.shape[0], 1, 1, 1), math.prod(known.shape[2:])
         for _ in range(steps):
             error, jacobian = _residual(table, inverse)
-            inverse = inverse - _solve(jacobian, error)
+            step = _solve(jacobian, error)
+            inverse = torch.where(going, inverse - step, inverse)
+            going, far = _goes_on(step, going, far)
+            if is_true(going.any) is False:
+                break
         error, jacobian = _residual(table, inverse)
         residual = length(error)
         solution = inverse
@@ -81,6 +94,17 @@ def _cell_gradient(flow: Tensor, at: Tensor) -> Tensor:
         ends = (look_up(flow, end, padding="border", interpolation="bilinear") for end in (high, low))
         slopes.append(torch.sub(*ends))
     return torch.cat(slopes, dim=1)
+
+
+def _goes_on(step: Tensor, going: Tensor, before: Tensor | int) -> tuple[Tensor, Tensor]:
+    """(B, 1, 1, 1), bool: the samples that another step changes, and how many of their pixels were far from solved.
+
+    A sample that is done stays as it is, so that it does not depend on the others.
+    """
+    near = _NEAR[step.dtype]
+    far = (step.square().sum(dim=1, keepdim=True) > near**2).sum(dim=(2, 3), keepdim=True)
+    stuck = (far * _FEW <= math.prod(step.shape[2:])) & (far >= before)
+    return going & (far > 0) & ~stuck, far
 
 
 def _residual(table: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:

@@ -186,6 +186,57 @@ def test_a_sample_does_not_depend_on_the_others():
         assert torch.equal(alone.flow[0], together.flow[i])
 
 
+def test_one_of_several_has_the_whole_tolerance():
+    plan = OneOf(parts(64.0), tolerance_px=0.1).planned(540, 960, torch.float32)
+    alone = [Compose([part], tolerance_px=0.1).planned(540, 960, torch.float32) for part in parts(64.0)]
+    assert strides(plan) == [strides(own)[0] for own in alone]
+    assert max(strides(plan)) > 1
+    assert plan.error_px == max(own.error_px for own in alone)
+
+
+def test_one_of_several_beside_others_shares_with_them_alone():
+    air, plate = parts(64.0)[2], parts(64.0)[1]
+    both = Compose([OneOf([swirls(64.0), Turbulence(p=0.5)]), plate], tolerance_px=0.1)
+    # A turbulence of exponential covariance has no slope, so what follows it is exact.
+    first, *others = strides(both.planned(*SIZE, torch.float32))
+    assert first > 1
+    assert others == [1, 1]
+    smooth = Compose([OneOf([Compose([swirls(64.0), air]), swirls(64.0)]), plate], tolerance_px=0.1)
+    found = of_warps(smooth.planned(540, 960, torch.float32))
+    row = of_warps(Compose([swirls(64.0), air, plate], tolerance_px=0.1).planned(540, 960, torch.float32))
+    # The plate follows a row of two, or a single one: it gets the smaller share.
+    assert [part.stride for part in found[:2]] == [part.stride for part in row[:2]]
+    assert found[3].tolerance_px == pytest.approx(row[2].tolerance_px)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_one_of_several_is_within_the_tolerance(seed):
+    def effects(tolerance: float | None) -> Compose:
+        lens, plate, air, swirls = parts(tolerance)
+        return Compose([OneOf([lens, plate, Compose([air, swirls])]), parts(tolerance)[3]])
+
+    planned = effects(64.0)
+    planned.tolerance_px = 0.1
+    frame = torch.zeros(6, 1, *SIZE)
+    found = planned.degrade(frame, seed=seed)
+    exact = effects(None).apply(frame, found.params)
+    assert (found.flow - exact.flow).norm(dim=1).amax() <= planned.planned(*SIZE, torch.float32).error_px <= 0.1
+    assert not torch.equal(found.flow, exact.flow)
+
+
+def test_of_more_compositions_than_can_be_told_apart_all_count_as_acting_together():
+    many = Compose([OneOf(parts(64.0)) for _ in range(4)], tolerance_px=1.0).planned(*SIZE, torch.float32)
+    row = Compose([part for _ in range(4) for part in parts(64.0)], tolerance_px=1.0).planned(*SIZE, torch.float32)
+    assert [part.tolerance_px for part in of_warps(many)] == [part.tolerance_px for part in of_warps(row)]
+
+
+def test_one_of_several_is_exact_where_parameters_have_two_act():
+    params = Compose(parts(None)).sample(image(), seed=2)
+    found = OneOf(parts(64.0), tolerance_px=0.1).apply(image(), params)
+    exact = Compose(parts(None), tolerance_px=None).apply(image(), params)
+    assert torch.equal(found.flow, exact.flow)
+
+
 def test_gradients_are_those_of_the_exact_composite_within_the_tolerance():
     params = Compose(parts(None)).sample(image().double(), seed=2)
     weight = torch.rand(2, 3, *SIZE, dtype=torch.float64)

@@ -1,5 +1,7 @@
 """Several effects in a row, with one look-up for all warps that follow one another; or one out of several."""
 
+import itertools
+import math
 from collections.abc import Iterator, Sequence
 from copy import copy
 from typing import Any, NamedTuple, cast
@@ -8,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrefract import draws
-from torchrefract._checks import check_choice, check_number
+from torchrefract._checks import check_choice, check_number, is_true
 from torchrefract.effects.base import Effect, moved
 from torchrefract.effects.compose_plan import ComposePlan, compose_plan
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, check_tolerance
@@ -18,6 +20,8 @@ from torchrefract.effects.walk import Walk
 from torchrefract.types import Degraded
 from torchrefract.warping.grid import field_dtype
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, RESAMPLERS
+
+_MOST_SETS = 64  # of effects that act together, for each of which there is a plan
 
 
 class ComposeParams(NamedTuple):
@@ -124,7 +128,7 @@ class Compose(Effect):
     def planned(self, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
         """The plan for fields of a type."""
         ask = Ask(height, width, self.tolerance_px, dtype is torch.float64).of_default
-        return compose_plan(list(self._chances(1.0)), ask)
+        return compose_plan(list(self._chances(1.0)), self._together(), ask)
 
     def fitted(self, params: ComposeParams) -> "Compose":
         """The composition, with each effect that relies on ranges which its parameters lie outside of exact."""
@@ -158,6 +162,21 @@ class Compose(Effect):
             else:
                 yield effect, p * self.p * effect.p
 
+    def _together(self) -> list[tuple[int, ...]]:
+        """The effects that are no compositions, by their places in order, as sets that may act on one sample."""
+        first, sets = 0, list[list[tuple[int, ...]]]()
+        for effect in self._effects():
+            own = effect._together() if isinstance(effect, Compose) else [(0,)]
+            sets.append([tuple(first + place for place in places) for places in own])
+            first += 1 + max(itertools.chain.from_iterable(own))
+        return self._joined(sets)
+
+    def _joined(self, sets: Sequence[Sequence[tuple[int, ...]]]) -> list[tuple[int, ...]]:
+        """The sets of all children, from those of each."""
+        if math.prod(map(len, sets)) > _MOST_SETS:
+            return [tuple(sorted({place for own in sets for places in own for place in places}))]
+        return [tuple(itertools.chain.from_iterable(chosen)) for chosen in itertools.product(*sets)]
+
     def _effects(self) -> Iterator[Effect]:
         return cast(Iterator[Effect], iter(self.effects))
 
@@ -168,7 +187,7 @@ class OneOf(Compose):
     Args:
         effects: to choose from.
         weights: how often each is chosen, relative to one another, above 0; None chooses all alike.
-        padding, interpolation, resampler, tolerance_px, p: as for `Compose`.
+        padding, interpolation, resampler, tolerance_px, p: as for `Compose`; each effect has the whole tolerance.
 
     Raises:
         ValueError, TypeError: as for `Compose`; weights that are not one positive number for each effect.
@@ -199,6 +218,19 @@ class OneOf(Compose):
         ends = torch.tensor(self.weights, device=choice.device).cumsum(dim=0)[:-1]
         chosen = torch.bucketize(choice, ends, right=True)
         return self._draw_children(source, image, [gate & (chosen == i) for i in range(len(self.effects))], gate)
+
+    def fitted(self, params: ComposeParams) -> "Compose":
+        """As for `Compose`; exact, too, for parameters by which several effects act on a sample."""
+        acting = torch.stack([child.gate for child in params.children]).sum(dim=0)
+        fitted = super().fitted(params)
+        if self.tolerance_px is None or is_true((acting <= 1).all) is not False:
+            return fitted
+        exact = copy(fitted)
+        exact.tolerance_px = None
+        return exact
+
+    def _joined(self, sets: Sequence[Sequence[tuple[int, ...]]]) -> list[tuple[int, ...]]:
+        return list(itertools.chain.from_iterable(sets))
 
 
 def _closed(params: Any, gate: Tensor) -> Any:

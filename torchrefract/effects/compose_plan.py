@@ -3,7 +3,7 @@
 The composite d_1 of n flows, d_i = d_(i+1) + f_i(p + d_(i+1)), is off by e_1 at most, e_i = e_(i+1) (1 + L_i) + the
 error of f_i, L_i being the largest slope of f_i. So the error of each flow counts times the product of 1 + L of those
 before it, and what follows a flow whose slope is not known is computed exactly. Errors that are of a chance add as
-deviations do.
+deviations do. Of several effects that never act on one sample together, each has the whole tolerance.
 """
 
 import math
@@ -71,11 +71,12 @@ class _Warp(NamedTuple):
         return self.effect.plan_within(ask)
 
 
-def compose_plan(effects: Sequence[tuple[Effect, float]], ask: Ask) -> ComposePlan:
+def compose_plan(effects: Sequence[tuple[Effect, float]], together: Sequence[Sequence[int]], ask: Ask) -> ComposePlan:
     """The plan that is asked for.
 
     Args:
         effects: those that are no compositions, in order, and the chance that each acts.
+        together: their places, as sets that may act on one sample.
         ask: for what.
 
     Raises:
@@ -83,19 +84,19 @@ def compose_plan(effects: Sequence[tuple[Effect, float]], ask: Ask) -> ComposePl
     """
     warps = list(_warps(effects))
     if ask.tolerance_px is None:
-        plans = [warp.plan(ask, None) for warp in warps]
+        found, error = [_Share(0.0, warp.plan(ask, None)) for warp in warps], 0.0
     else:
         ask.room()
-        plans = _shared(warps, ask)
-    error = _total((plan.error_px, plan.random) for plan in plans)
+        found, error = _shared(warps, together, ask)
+    plans = [share.plan for share in found]
     resamples = len({warp.group for warp, plan in zip(warps, plans, strict=True) if plan.stride > 0})
     by_place = {warp.place: plan for warp, plan in zip(warps, plans, strict=True)}
-    found = tuple(
+    each = tuple(
         by_place[place] if place in by_place else _other_plan(effect, p, ask)
         for place, (effect, p) in enumerate(effects)
     )
     names = tuple(type(effect).__name__ for effect, _ in effects)
-    return ComposePlan(ask.height, ask.width, ask.tolerance_px, names, found, error, resamples)
+    return ComposePlan(ask.height, ask.width, ask.tolerance_px, names, each, error, resamples)
 
 
 def _other_plan(effect: Effect, p: float, ask: Ask) -> Plan | LightPlan:
@@ -117,31 +118,57 @@ def _warps(effects: Sequence[tuple[Effect, float]]) -> Iterator[_Warp]:
             group += 1
 
 
-def _shared(warps: Sequence[_Warp], ask: Ask) -> list[Plan]:
-    """The plan of each warp, its `error_px` as it counts in the composite."""
+class _Share(NamedTuple):
+    """A warp's part in a composite."""
+
+    tolerance: float  # px, that its flow may be off by; 0 is exact
+    plan: Plan  # for it
+    stretched: float = 1.0  # how often its error counts in the composite
+
+
+def _shared(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask) -> tuple[list[_Share], float]:
+    """What each warp gets, and how far the composite is off at most.
+
+    A warp of several sets gets the smallest of its shares, which is within the others. So that no flow counts as too
+    small in one set and has a slope in another, all act together where that would be.
+    """
+    sets = [[i for i, warp in enumerate(warps) if warp.place in places] for places in together]
+    tried = [_in_row([warps[i] for i in own], ask) for own in sets]
+    found, error = list[_Share | None]([None] * len(warps)), 0.0
+    for own, shares in zip(sets, tried, strict=True):
+        error = max(error, _total((share.plan.error_px * share.stretched, share.plan.random) for share in shares))
+        for i, share in zip(own, shares, strict=True):
+            before = found[i]
+            if before is not None and (before.plan.stride == 0) != (share.plan.stride == 0):
+                return _shared(warps, [[warp.place for warp in warps]], ask)
+            found[i] = share if before is None else min(before, share, key=lambda share: share.tolerance)
+    return [cast(_Share, share) for share in found], error
+
+
+def _in_row(warps: Sequence[_Warp], ask: Ask) -> list[_Share]:
+    """What each warp gets of those that act one after the other."""
     tolerance = ask.tolerance_px or 0.0
-    plans = [warp.plan(ask, tolerance / len(warps)) for warp in warps]
+    shares = [_Share(tolerance / len(warps), warp.plan(ask, tolerance / len(warps))) for warp in warps]
     for _ in warps:
-        still = [plan.stride == 0 for plan in plans]
-        plans = _shared_once(warps, plans, ask)
+        still = [share.plan.stride == 0 for share in shares]
+        shares = _shared_once(warps, shares, ask)
         # A flow that is too small to count under a larger share has given no slope yet.
-        if still == [plan.stride == 0 for plan in plans]:
+        if still == [share.plan.stride == 0 for share in shares]:
             break
-    return plans
+    return shares
 
 
-def _shared_once(warps: Sequence[_Warp], plans: Sequence[Plan], ask: Ask) -> list[Plan]:
+def _shared_once(warps: Sequence[_Warp], shares: Sequence[_Share], ask: Ask) -> list[_Share]:
     """The plans for shares of the tolerance that go by the slopes of earlier ones."""
-    smooth = list(takewhile(lambda both: both[1].stride != 1, zip(warps, plans, strict=True)))
-    share = (ask.tolerance_px or 0.0) / max(1.0, _total([(1.0, plan.random) for _, plan in smooth]))
-    found, before = [], 1.0
-    for warp, plan in smooth:
-        new = warp.plan(ask, share / before)
-        found.append(replace(new, error_px=before * new.error_px))
+    smooth = list(takewhile(lambda both: both[1].plan.stride != 1, zip(warps, shares, strict=True)))
+    whole = (ask.tolerance_px or 0.0) / max(1.0, _total([(1.0, share.plan.random) for _, share in smooth]))
+    found, before = list[_Share](), 1.0
+    for warp, last in smooth:
+        found.append(_Share(whole / before, warp.plan(ask, whole / before), before))
         # A flow that is not computed is too small to count.
-        before *= 1 + plan.slope if plan.stride > 0 else 1.0
-    follows = ask.plan(1, 0.0, "it follows a warp whose slope is not known")
-    return found + [plan if i == 0 else follows for i, plan in enumerate(plans[len(smooth) :])]
+        before *= 1 + last.plan.slope if last.plan.stride > 0 else 1.0
+    follows = _Share(0.0, ask.plan(1, 0.0, "it follows a warp whose slope is not known"))
+    return found + [share if i == 0 else follows for i, share in enumerate(shares[len(smooth) :])]
 
 
 def _total(errors: Iterable[tuple[float, bool]]) -> float:

@@ -231,6 +231,59 @@ def test_a_sample_does_not_depend_on_what_others_draw(which):
             assert torch.equal(alone[name], value[i]), (i, name)
 
 
+class Counted(ThinPlateSpline):
+    """Counts the samples that a flow, and a flow back, is computed for."""
+
+    rows: list[int]
+
+    def flow(self, params, *, height, width):
+        self.rows.append(len(params.gate))
+        return super().flow(params, height=height, width=width)
+
+    def undo(self, params, flow):
+        self.rows.append(len(flow))
+        return super().undo(params, flow)
+
+
+class Fog(UniformFog):
+    """Counts the rows that are put into fog."""
+
+    rows: list[int]
+
+    def shade(self, image, params, depth):
+        self.rows.append(len(image))
+        return super().shade(image, params, depth)
+
+
+@pytest.mark.parametrize("frames", [1, 3])
+def test_nothing_is_computed_for_samples_that_an_effect_leaves_alone(frames):
+    plate, fog = Counted(tolerance_px=None), Fog(depth=None)
+    plate.rows, fog.rows = [], []
+    image = picture(8, 3 * frames, 20, 30).view(8, frames, 3, 20, 30)
+    depth = torch.rand(8, frames, 1, 20, 30) * 50
+    effect = OneOf([plate, fog, DivergenceFree()])
+    found = effect.degrade(image, seed=1, depth=depth)
+    moved, foggy, _ = (int(child.gate.sum()) for child in found.params.children)
+    assert 0 < moved < 8
+    assert 0 < foggy < 8
+    assert found.restore_flow.shape == (8, frames, 2, 20, 30)
+    assert plate.rows[0] == moved
+    assert plate.rows[1] in (moved, moved * frames)
+    assert fog.rows == [foggy * frames]
+
+
+def test_a_gradient_of_parameters_is_the_same_for_samples_that_are_left_alone():
+    image = picture(6, 3, 20, 30).double()
+    effect = OneOf([ThinPlateSpline(), DivergenceFree()], tolerance_px=None)
+    params = effect.sample(image, seed=3)
+    learned = params.children[0].displacement.clone().requires_grad_()
+    with_gradient = params._replace(children=(params.children[0]._replace(displacement=learned), params.children[1]))
+    found = effect.apply(image, with_gradient).image
+    torch.testing.assert_close(found, effect.apply(image, params).image, rtol=0, atol=1e-12)
+    (slope,) = torch.autograd.grad(found.square().sum(), learned)
+    assert (slope != 0).flatten(1).any(dim=1).tolist() == params.children[0].gate.tolist()
+
+
 @pytest.mark.parametrize("which", range(3), ids=SEVERAL)
 def test_a_sample_does_not_depend_on_the_number_of_threads(which, on_threads):
     effect, image = several()[which], picture(2, 3, 129, 131)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrefract._checks import is_true
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, check_tolerance
 from torchrefract.effects.refraction import Moved, WarpEffect
-from torchrefract.effects.rows import learns, only, spread
+from torchrefract.effects.rows import learns, only, params_part, put, some, spread
 from torchrefract.warping.lattice import SmoothFlow
 
 
@@ -76,8 +76,13 @@ class LatticeWarp(WarpEffect):
         plan = plan or self.plan_for(params, height, width)
         if plan.lattice is None:
             return super().gated(params, height=height, width=width)
+        active = self.active(params, height, width)
+        if (index := some(active, params)) is not None:
+            path = self.on_lattice(params_part(params, index), plan)
+            path = path.with_nodes(put(path.nodes, index, 0.0, len(active)))
+            return Moved(path, active.new_ones(1, 1, 1, 1), spread(active, path.nodes.shape[0]))
         path = self.on_lattice(params, plan)
-        active = spread(self.active(params, height, width), path.nodes.shape[0])
+        active = spread(active, path.nodes.shape[0])
         path = path.with_nodes(only(path.nodes, 0.0, active, params))
         return Moved(path, active.new_ones(1, 1, 1, 1), active)
 

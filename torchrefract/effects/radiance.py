@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchrefract._checks import is_true
 from torchrefract.effects.base import Effect
-from torchrefract.effects.rows import column, learns, only, spread
+from torchrefract.effects.rows import column, learns, only, params_part, part, put, some, spread
 from torchrefract.types import Degraded, Map
 from torchrefract.warping.grid import field_dtype
 
@@ -55,11 +55,19 @@ class RadianceEffect(Effect):
         active = params.gate & self.acts(params)
         if depth is not None and is_true(active.any) is False:
             depth = None  # and nobody looks at its values
-        shaded = self.shade(image, params, depth)
+        index, batch = some(active, params), len(active)
+        if index is None:
+            shaded = self.shade(image, params, depth)
+        else:
+            few = None if depth is None else part(depth, index, batch)
+            shaded = self.shade(part(image, index, batch), params_part(params, index), few)
         height, width = image.shape[2:]
 
         def where_active(value: Tensor, off: float | bool) -> Tensor:
-            value = value if is_true(active.all) else _choose(value, off, active)
+            if index is not None:
+                value = put(value, index, off, batch)
+            elif is_true(active.all) is not True:
+                value = _choose(value, off, active)
             return value.expand(-1, 1, height, width)
 
         def gated(name: str) -> Map | None:
@@ -68,8 +76,12 @@ class RadianceEffect(Effect):
                 return None
             return lambda: where_active(value() if callable(value) else value, _CLEAR[name])
 
+        if index is not None:
+            shone = put(shaded.image, index, image, batch)
+        else:
+            shone = image if shaded.image is image else only(shaded.image, image, active, params)
         return Degraded(
-            image if shaded.image is image else only(shaded.image, image, active, params),
+            shone,
             params,
             valid=lambda: where_active(shaded.valid(), True),
             light={name: value for name in _CLEAR if (value := gated(name)) is not None},

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrefract._checks import check_choice, is_true
 from torchrefract.effects.base import Effect
 from torchrefract.effects.plan import Ask, Plan
-from torchrefract.effects.rows import alike, column, learns, only, spread
+from torchrefract.effects.rows import alike, column, learns, only, params_part, part, put, some, spread
 from torchrefract.types import Degraded, Inverse, Map
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import field_dtype, inside, length
@@ -70,8 +70,14 @@ class WarpEffect(Effect):
 
     def gated(self, params: Any, *, height: int, width: int) -> "Moved":
         """The flow, zero for the samples that the effect leaves alone."""
-        flow, exists = self.flow(params, height=height, width=width)
-        active = spread(self.active(params, height, width), flow.shape[0])
+        active = self.active(params, height, width)
+        index, batch = some(active, params), len(active)
+        if index is None:
+            flow, exists = self.flow(params, height=height, width=width)
+        else:
+            flow, exists = self.flow(params_part(params, index), height=height, width=width)
+            flow, exists = put(flow, index, 0.0, batch), put(exists, index, True, batch)
+        active = spread(active, flow.shape[0])
         return Moved(only(flow, 0.0, active, params), exists | ~column(active), active)
 
     def active(self, params: Any, height: int, width: int) -> Tensor:
@@ -80,6 +86,11 @@ class WarpEffect(Effect):
 
     def gated_undo(self, params: Any, moved: "Moved") -> tuple[Tensor, Tensor]:
         """The flow that undoes `gated`, and where it exists."""
+        active, batch = moved.active.view(len(params.gate), -1)[:, 0], len(params.gate)
+        index = some(active, params)
+        if index is not None:
+            back, known = self.undo(params_part(params, index), part(moved.flow, index, batch))
+            return put(back, index, 0.0, batch), put(known, index, True, batch)
         back, known = self.undo(params, moved.flow)
         return only(back, 0.0, moved.active, params), known | ~column(moved.active)
 

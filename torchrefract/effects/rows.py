@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true
+from torchrefract._checks import is_true, read
 
 
 def spread(value: Tensor, rows: int) -> Tensor:
@@ -82,6 +82,43 @@ def only(changed: Tensor, same: Tensor | float, active: Tensor, params: Any) -> 
         return value
     path = torch.where(column(spread(params.gate, rows)), changed, same)
     return cast(Tensor, _Swap.apply(value.detach(), path))
+
+
+def some(active: Tensor, params: Any) -> Tensor | None:
+    """(n,), the numbers of the samples that are active, so that the others need not be computed.
+
+    None where that would save nothing, cannot be told without waiting for a device, or where a gradient of the
+    parameters is asked for.
+    """
+    flags = None if learns(params) else read(lambda: active)
+    if flags is None or all(flags) or not any(flags):
+        return None
+    return torch.tensor([i for i, flag in enumerate(flags) if flag])
+
+
+def part(value: Tensor, index: Tensor, batch: int) -> Tensor:
+    """The rows of some samples of a batch; one row for all of them stays."""
+    frames, odd = divmod(value.shape[0], batch)
+    return value if odd else value[_at(index, frames)]
+
+
+def params_part(params: Any, index: Tensor) -> Any:
+    """The parameters of some samples."""
+    return type(params)(*(value[index] for value in params))
+
+
+def put(value: Tensor, index: Tensor, into: Tensor | float, batch: int) -> Tensor:
+    """The rows of some samples in their places of a batch, the others as they are in `into`, or of that number."""
+    value = spread(value, max(len(index), value.shape[0]))
+    frames = value.shape[0] // len(index)
+    if not isinstance(into, Tensor):
+        into = value.new_full((batch * frames, *value.shape[1:]), into)
+    return into.index_copy(0, _at(index, frames), value)
+
+
+def _at(index: Tensor, frames: int) -> Tensor:
+    """The numbers of the rows of some samples of so many frames each."""
+    return (frames * index[:, None] + torch.arange(frames)).flatten()
 
 
 def learns(params: Any) -> bool:

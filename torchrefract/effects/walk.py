@@ -2,8 +2,8 @@
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, cast
+from collections.abc import Callable
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -15,46 +15,15 @@ from torchrefract.effects.plan import Plan
 from torchrefract.effects.radiance import RadianceEffect
 from torchrefract.effects.refraction import Moved, WarpEffect, moving, sees
 from torchrefract.effects.rows import column, learns, only, spread
+from torchrefract.effects.steps import Flow, Step, exact, on_grid
 from torchrefract.types import Degraded
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import Positions, field_dtype, inside
-from torchrefract.warping.lattice import SmoothFlow, dense
-from torchrefract.warping.resample import follow, grid_of, look_up, sampler_dtype
+from torchrefract.warping.resample import look_up, sampler_dtype
 
-_Flow = Tensor | SmoothFlow
 _Combine = Callable[[Tensor, Tensor], Tensor]
 # How the maps of several effects of light make one.
 _COMBINED: dict[str, _Combine] = {"transmission": torch.mul, "intensity": torch.add, "extinction": torch.add}
-
-
-class _Step(NamedTuple):
-    """One warp, or several as one, as `only` reads parameters."""
-
-    gate: Tensor  # (B,), bool: the sample is degraded by one of them
-    active: Tensor  # (B,), bool: and is moved
-    path: _Flow | Positions  # the flow, (B, 2, H, W), px, or in another form
-
-
-def _exact(steps: Sequence[_Step]) -> _Step:
-    """Warps in a row as one. Each flow is read once, where the later ones look; what is read twice is blurred twice."""
-    *earlier, last = (step._replace(path=dense(cast(_Flow, step.path))) for step in steps)
-    for step in reversed(earlier):
-        own = cast(Tensor, step.path)
-        flow = only(compose_flows(own, cast(Tensor, last.path)), own, last.active, last)
-        last = _Step(step.gate | last.gate, step.active | last.active, flow)
-    return last
-
-
-def _on_grid(steps: Sequence[_Step], dtype: torch.dtype) -> _Step:
-    """The same in the sampler's own positions: faster, and off by their rounding."""
-    *earlier, last = steps
-    grid = grid_of(cast(_Flow, last.path), dtype)
-    for step in reversed(earlier):
-        own = cast(_Flow, step.path)
-        both = follow(own, grid)
-        grid = both if is_true(last.active.all) else only(both, grid_of(own, dtype), last.active, last)
-        last = _Step(step.gate | last.gate, step.active | last.active, Positions(grid))
-    return last
 
 
 class Walk:
@@ -70,8 +39,8 @@ class Walk:
     ):
         self.image, self.depth = image, depth
         self.padding, self.interpolation, self.resampler = padding, interpolation, resampler
-        self.done: list[list[_Step]] = []  # those that were looked up together
-        self.waiting: list[_Step] = []
+        self.done: list[list[Step]] = []  # those that were looked up together
+        self.waiting: list[Step] = []
         self.modes: dict[tuple[str, str, str], Tensor] = {}  # of the look-up: the samples that ask for it, (B,), bool
         self.moved: list[tuple[WarpEffect, Any, Moved]] = []
         self.valid: Callable[[], Tensor] = self._everywhere
@@ -87,7 +56,7 @@ class Walk:
             return
         own = effect.gated(params, height=height, width=width, **planned)
         moved, valid = own.spread(rows), self.valid
-        self.waiting.append(_Step(spread(params.gate, rows), moved.active, moved.path))
+        self.waiting.append(Step(spread(params.gate, rows), moved.active, moved.path))
         self.valid = lambda: moved.exists & inside(moved.flow) & sees(valid(), moved.flow)
         self._choose(effect, moved.active)
         self.moved.append((effect, params, own))
@@ -132,7 +101,7 @@ class Walk:
         if not self.done:
             return self._still()
         first, *others = self.done
-        return cast(Tensor, _exact([_exact(first), *itertools.chain.from_iterable(others)]).path)
+        return cast(Tensor, exact([exact(first), *itertools.chain.from_iterable(others)]).path)
 
     def _add(self, name: str, value: Callable[[], Tensor] | None, combine: _Combine) -> None:
         """One more effect's share in a map of light."""
@@ -160,14 +129,14 @@ class Walk:
         self.done.append([group] if isinstance(group.path, Tensor) and not self.done else self.waiting)
         self.waiting, self.modes = [], {}
 
-    def _composite(self) -> _Step:
+    def _composite(self) -> Step:
         """What waits, as one."""
         if len(self.waiting) == 1:
             return self.waiting[0]
         if all(isinstance(step.path, Tensor) for step in self.waiting):
-            return _exact(self.waiting)
+            return exact(self.waiting)
         flows = functools.reduce(torch.promote_types, [step.path.dtype for step in self.waiting])
-        return _on_grid(self.waiting, sampler_dtype(self.image, flows))
+        return on_grid(self.waiting, sampler_dtype(self.image, flows))
 
     def _choose(self, effect: WarpEffect, active: Tensor) -> None:
         """The samples that an effect moves are looked up as it asks, unless the whole composition says how."""
@@ -179,7 +148,7 @@ class Walk:
         asked = self.modes.pop(mode, torch.zeros_like(active))
         self.modes = {other: samples & ~active for other, samples in self.modes.items()} | {mode: asked | active}
 
-    def _looked_up(self, flow: _Flow | Positions) -> Tensor:
+    def _looked_up(self, flow: Flow | Positions) -> Tensor:
         warped = None
         for (padding, interpolation, resampler), samples in reversed(self.modes.items()):
             if warped is not None and is_true(samples.any) is False:

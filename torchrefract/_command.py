@@ -29,6 +29,7 @@ from torchrefract._files import replacing
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.module import PairData
 from torchrefract.restoration.checkpoints import CheckpointError, check_fits, read_checkpoint
+from torchrefract.restoration.finite import NotFiniteError
 
 _T = TypeVar("_T")
 _INFORMING = ("--help", "-h", "--hydra-help", "--info", "--shell-completion", "-sc")
@@ -218,7 +219,7 @@ def _mendable(error: Exception, name: str) -> str | None:
         return f"{error.full_key} must be given, as in {error.full_key}=…, got nothing"
     if isinstance(error, UnreadableImageError):
         return str(error).strip().splitlines()[-1].split("Error: ", 1)[-1]  # a worker prepends its traceback
-    if isinstance(error, UsageError | CheckpointError | HydraException | OmegaConfBaseException):
+    if isinstance(error, UsageError | CheckpointError | NotFiniteError | HydraException | OmegaConfBaseException):
         unknown = _UNKNOWN.match(str(error)) if name else None
         return _no_option(name, unknown[1]) if unknown else " ".join(str(error).split())
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):

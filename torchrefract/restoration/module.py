@@ -1,5 +1,6 @@
-"""One LightningModule for all tasks and networks."""
+"""What learns to restore pairs: what all networks share, and those that restore in one step."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -8,6 +9,7 @@ from diffusers.optimization import get_cosine_schedule_with_warmup
 from pytorch_lightning import LightningModule
 from torch import Tensor, nn
 
+from torchrefract.restoration.finite import check_finite
 from torchrefract.restoration.metrics import endpoint_error, psnr, ssim
 from torchrefract.restoration.tasks import Restored, Task
 from torchrefract.types import Pair
@@ -16,15 +18,15 @@ from torchrefract.warping.resample import warp
 _NOTHING: tuple[Tensor, ...] = (torch.zeros(0), torch.zeros(0))
 
 
-class Restoration(LightningModule):
+class Learner(LightningModule, ABC):
     """A network that learns to restore pairs.
 
-    Logged each epoch, for train and val: loss, PSNR in dB and, for a task with a flow, the endpoint error in px at
-    `metric_size`. For val also SSIM, and all scores of the degraded image as it is (`…_identity`) and of the mean flow
-    of the training set (`…_constant`).
+    Logged each epoch: the loss; for val, and for train where a restoration comes with the loss, PSNR in dB and, for a
+    task with a flow, the endpoint error in px at `metric_size`; for val also SSIM, and all scores of the degraded image
+    as it is (`…_identity`) and of the mean flow of the training set (`…_constant`).
 
     Args:
-        network: makes the network, given the number of channels to predict.
+        network: of this task.
         task: what is to be restored.
         lr: peak learning rate of AdamW, reached after `warmup_steps` and brought to zero by a cosine.
         weight_decay: of AdamW.
@@ -34,38 +36,54 @@ class Restoration(LightningModule):
 
     def __init__(
         self,
-        network: Callable[[int], nn.Module],
+        network: nn.Module,
         task: Task,
         *,
-        lr: float = 1e-3,
-        weight_decay: float = 1e-2,
-        warmup_steps: int = 50,
-        metric_size: Sequence[int] = (1080, 1920),
+        lr: float,
+        weight_decay: float,
+        warmup_steps: int,
+        metric_size: Sequence[int],
     ):
         super().__init__()
-        self.task = task
-        self.network = network(task.channels)
+        self.task, self.network = task, network
         self.lr, self.weight_decay, self.warmup_steps = lr, weight_decay, warmup_steps
         self.metric_size = (metric_size[0], metric_size[1])
         # For a rival without eyes: flows summed on valid pixels, and how many; of all ranks, and new ones of this one.
         self.flows, self.new_flows = _NOTHING, _NOTHING
 
-    def forward(self, degraded: Tensor) -> Restored:
-        """The restoration of images (B, 3, H, W) in [0, 1]."""
-        return self.task.restore(self.network(degraded), degraded)
+    @abstractmethod
+    def forward(self, degraded: Tensor, key: Tensor | None = None) -> Restored:
+        """The restoration of images (B, 3, H, W) in [0, 1].
+
+        Args:
+            degraded: the images.
+            key: (B,), int64, what draws of numbers depend on where a network needs some; None stands for zeros.
+        """
+
+    @abstractmethod
+    def learn(self, batch: Pair) -> tuple[Tensor, Restored | None]:
+        """The loss of a batch of training, and its restoration where that takes no more work."""
+
+    @abstractmethod
+    def judge(self, batch: Pair) -> tuple[Tensor, Restored]:
+        """The loss of a batch of validation, and its restoration."""
 
     def training_step(self, batch: Pair, _: int) -> Tensor:
-        """The loss of a batch."""
-        restored = self(batch.degraded)
-        loss = self.task.loss(restored, batch)
-        self._log("train", {"loss": loss} | self._scores(restored, batch), batch)
+        """The loss of a batch.
+
+        Raises:
+            NotFiniteError: a loss that is NaN or infinite.
+        """
+        loss, restored = self.learn(batch)
+        check_finite(loss, batch.key, step=self.global_step, epoch=self.current_epoch)
+        self._log("train", {"loss": loss} | ({} if restored is None else self._scores(restored, batch)), batch)
         self._count_flow(batch)
         return loss
 
     def validation_step(self, batch: Pair, _: int) -> dict[str, Any]:
         """The scores of a batch, beside those of rivals that need no network."""
-        restored = self(batch.degraded)
-        self._log("val", {"loss": self.task.loss(restored, batch)}, batch)
+        loss, restored = self.judge(batch)
+        self._log("val", {"loss": loss}, batch)
         rivals = {"": restored, "_identity": Restored(batch.degraded)}
         if restored.flow is not None:
             constant = self.constant_flow(batch.flow)
@@ -125,6 +143,42 @@ class Restoration(LightningModule):
         if len(self.new_flows[0]):
             ranks = (self.trainer.strategy.reduce(value.to(self.device), reduce_op="sum") for value in self.new_flows)
             self.flows, self.new_flows = _add(self.flows, tuple(ranks)), _NOTHING
+
+
+class Restoration(Learner):
+    """A network that restores an image in one step.
+
+    Args:
+        network: makes the network, given the number of channels to predict.
+        task: what is to be restored.
+        lr, weight_decay, warmup_steps, metric_size: as for `Learner`.
+    """
+
+    def __init__(
+        self,
+        network: Callable[[int], nn.Module],
+        task: Task,
+        *,
+        lr: float = 1e-3,
+        weight_decay: float = 1e-2,
+        warmup_steps: int = 50,
+        metric_size: Sequence[int] = (1080, 1920),
+    ):
+        options = {"lr": lr, "weight_decay": weight_decay, "warmup_steps": warmup_steps}
+        super().__init__(network(task.channels), task, metric_size=metric_size, **options)
+
+    def forward(self, degraded: Tensor, key: Tensor | None = None) -> Restored:
+        """The restoration of images (B, 3, H, W) in [0, 1]; no draw, so no key counts."""
+        return self.task.restore(self.network(degraded), degraded)
+
+    def learn(self, batch: Pair) -> tuple[Tensor, Restored]:
+        """The loss of the task, and the restoration."""
+        restored = self(batch.degraded)
+        return self.task.loss(restored, batch), restored
+
+    def judge(self, batch: Pair) -> tuple[Tensor, Restored]:
+        """The same as in training."""
+        return self.learn(batch)
 
 
 def _add(old: tuple[Tensor, ...], new: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrefract.restoration.history import carry_over
 from torchrefract.restoration.metrics import psnr
-from torchrefract.restoration.module import Restoration
+from torchrefract.restoration.module import Learner
 from torchrefract.restoration.report import PanelRows, save_curves, save_panel
 from torchrefract.restoration.tasks import Restored
 from torchrefract.types import Pair
@@ -52,7 +52,7 @@ class RunSummary(Callback):
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """The pictures, and the last lines."""
-        if self._rows is None or not trainer.is_global_zero or not isinstance(pl_module, Restoration):
+        if self._rows is None or not trainer.is_global_zero or not isinstance(pl_module, Learner):
             return
         height, width = pl_module.metric_size
         if stage == "fit":

@@ -1,0 +1,73 @@
+"""What a diffusion model makes out of noise: the restoration of each task, in numbers of about [-1, 1]."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
+from torchrefract.types import Pair
+from torchrefract.warping.resample import warp
+
+
+class Target(ABC):
+    """A restoration as `channels` maps."""
+
+    channels: int
+
+    @abstractmethod
+    def encode(self, pair: Pair, size: Sequence[int]) -> Tensor:
+        """(B, channels, H, W), within [-1, 1]: the true one of a pair, cut from a frame of `size` = (height, width)."""
+
+    @abstractmethod
+    def decode(self, target: Tensor, degraded: Tensor, size: Sequence[int]) -> Restored:
+        """The restoration of images (B, 3, H, W), cut from a frame of `size`."""
+
+
+class FlowTarget(Target):
+    """The flow that undoes a warp, flow / (limit (W, H)); the image is looked up along it. `limit`: of the task."""
+
+    channels = 2
+
+    def __init__(self, limit: float):
+        self.limit = limit
+
+    def encode(self, pair: Pair, size: Sequence[int]) -> Tensor:
+        """The flow in units of the largest one, larger ones cut off."""
+        # What no look-up can give back may be anything, and the network sees it beside what counts.
+        return (pair.flow / self._unit(pair.flow, size)).nan_to_num(0.0).clamp(-1, 1)
+
+    def decode(self, target: Tensor, degraded: Tensor, size: Sequence[int]) -> Restored:
+        """The image looked up along the flow."""
+        flow = target * self._unit(target, size)
+        return Restored(warp(degraded, flow, padding="border")[0], flow)
+
+    def _unit(self, like: Tensor, size: Sequence[int]) -> Tensor:
+        return self.limit * like.new_tensor([size[1], size[0]]).view(1, 2, 1, 1)
+
+
+class ImageTarget(Target):
+    """The clean image, 2 clean - 1."""
+
+    channels = 3
+
+    def encode(self, pair: Pair, size: Sequence[int]) -> Tensor:
+        """The clean image from -1 to 1."""
+        return 2 * pair.clean - 1
+
+    def decode(self, target: Tensor, degraded: Tensor, size: Sequence[int]) -> Restored:
+        """The image from 0 to 1."""
+        return Restored((target + 1) / 2)
+
+
+def target_of(task: Task) -> Target:
+    """What stands for the restoration of a task.
+
+    Raises:
+        TypeError: a task of another kind.
+    """
+    if isinstance(task, Undistort):
+        return FlowTarget(task.limit)
+    if isinstance(task, Deweather):
+        return ImageTarget()
+    raise TypeError(f"task must be Undistort or Deweather for a diffusion model, got {type(task).__name__}")

@@ -43,6 +43,7 @@ _HINTS = (
     ".*exists and is not empty.*",
     ".*dirpath has changed.*",
     "Glyph .* missing from font.*",
+    ".*local_dir_use_symlinks.*",
 )
 # The options of Hydra whose value is the next word.
 _TAKING = ("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--cfg", "-c", "--package", "-p")

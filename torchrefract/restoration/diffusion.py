@@ -21,6 +21,7 @@ from torchrefract.types import Pair
 from torchrefract.warping.grid import inside
 
 _NOISE_WEIGHT = 0.8
+_PREDICTIONS = ("v_prediction", "epsilon")
 
 
 class _Crop(NamedTuple):
@@ -33,12 +34,20 @@ class _Crop(NamedTuple):
 class Diffusion(Learner):
     """A conditional diffusion model of the restoration.
 
-        target_t = sqrt(a_t) target + sqrt(1 - a_t) noise,  found_0 = (target_t - sqrt(1 - a_t) found) / sqrt(a_t),
-        loss = 0.8 |found - noise|_1 + a_t |restored(found_0) - clean|^2
+        noisy = sqrt(a) target + sqrt(1 - a) noise
+        loss = 0.8 |found noise - noise|_1 + a |restored(found target) - clean|^2
 
-    on the valid pixels, with the noise found by the network at one of 1000 levels t, a_t falling by variances that grow
-    linearly from 0.0001 to 0.02. The target is the flow that undoes a warp, in units of the largest one that the task
-    allows, or the clean image from -1 to 1.
+    on the valid pixels, at one of 1000 levels of noise for each sample, a falling by variances that grow linearly from
+    0.0001 to 0.02. The target is the flow that undoes a warp, in units of the largest one that the task allows, or the
+    clean image from -1 to 1. What the network predicts gives both that are found:
+
+        "epsilon", the noise:                        found noise = predicted
+                                                     found target = (noisy - sqrt(1 - a) predicted) / sqrt(a)
+        "v_prediction", sqrt(a) noise - sqrt(1 - a) target:  found noise = sqrt(1 - a) noisy + sqrt(a) predicted
+                                                     found target = sqrt(a) noisy - sqrt(1 - a) predicted
+
+    Of the noise alone a small error in what is nearly noise is a large one in the target, which the degraded image
+    tells even there: with the velocity few steps do, after a short training too. Published weights predict the noise.
 
     The weights that validate, are saved, and restore are a moving average of those that learn. Noise, levels and crops
     depend on the seed, the step and the keys of a batch alone, and what `forward` draws on the seed and the key.
@@ -48,6 +57,7 @@ class Diffusion(Learner):
             and the conditions, as is `Denoiser`.
         task: Undistort or Deweather.
         lr, weight_decay, warmup_steps, metric_size: as for `Learner`.
+        prediction: "v_prediction" or "epsilon", what the network predicts.
         sampler: "ddim", "dpm_solver" or "ddpm", which wants many steps.
         steps: of the sampler in `forward` and in an evaluation, from 1 to 1000.
         val_steps: of the sampler in a validation during training.
@@ -56,10 +66,11 @@ class Diffusion(Learner):
         seed: of all draws.
 
     Raises:
-        ValueError: a number outside its range, a sampler that is not known.
+        ValueError: a number outside its range, a sampler or a prediction that is not known.
         TypeError: a number of the wrong kind, another task.
 
-    Source: Ho, Jain, Abbeel, "Denoising diffusion probabilistic models", NeurIPS 2020.
+    Source: Ho, Jain, Abbeel, "Denoising diffusion probabilistic models", NeurIPS 2020; Salimans, Ho, "Progressive
+    distillation for fast sampling of diffusion models", ICLR 2022, for the velocity.
     """
 
     def __init__(
@@ -71,6 +82,7 @@ class Diffusion(Learner):
         weight_decay: float = 1e-2,
         warmup_steps: int = 500,
         metric_size: Sequence[int] = (1080, 1920),
+        prediction: str = "v_prediction",
         sampler: str = "ddim",
         steps: int = 50,
         val_steps: int = 10,
@@ -82,6 +94,7 @@ class Diffusion(Learner):
         options = {"lr": lr, "weight_decay": weight_decay, "warmup_steps": warmup_steps}
         super().__init__(network(target.channels), task, metric_size=metric_size, **options)
         self.target = target
+        self.prediction = check_choice("prediction", prediction, _PREDICTIONS)
         self.sampler = check_choice("sampler", sampler, SAMPLERS)
         self.steps, self.val_steps = check_steps("steps", steps), check_steps("val_steps", val_steps)
         self.crop = None if crop is None else check_count("crop", crop)
@@ -143,17 +156,23 @@ class Diffusion(Learner):
         noise = normal(source.at(1), target)
         time = (uniform(source.at(2), 1)[:, 0] * LEVELS).long()
         noisy = self.levels.add_noise(target, noise, time)  # pyright: ignore[reportArgumentType]  # takes any int tensor
-        found = self.network(noisy, time, part.condition)
-        restored = self.target.decode(self._origin(noisy, found, time), pair.degraded, size)
-        kept = self.levels.alphas_cumprod.to(noisy)[time]
-        noise_error = masked_mean((found - noise).abs(), pair.valid)
+        found_noise, found = self._find(noisy, time, part.condition)
+        restored = self.target.decode(found, pair.degraded, size)
+        noise_error = masked_mean((found_noise - noise).abs(), pair.valid)
         image_error = masked_mean((restored.image - pair.clean).square(), pair.valid)
-        return (_NOISE_WEIGHT * noise_error + kept * image_error).mean()
+        return (_NOISE_WEIGHT * noise_error + self._kept(time) * image_error).mean()
 
-    def _origin(self, noisy: Tensor, noise: Tensor, time: Tensor) -> Tensor:
-        """The target without the noise."""
-        kept = self.levels.alphas_cumprod.to(noisy)[time].view(-1, 1, 1, 1)
-        return (noisy - (1 - kept).sqrt() * noise) / kept.sqrt()
+    def _find(self, noisy: Tensor, time: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
+        """The noise and the target."""
+        predicted = self.network(noisy, time, condition)
+        kept = self._kept(time).view(-1, 1, 1, 1)
+        signal, spread = kept.sqrt(), (1 - kept).sqrt()
+        if self.prediction == "epsilon":
+            return predicted, (noisy - spread * predicted) / signal
+        return spread * noisy + signal * predicted, signal * noisy - spread * predicted
+
+    def _kept(self, time: Tensor) -> Tensor:
+        return self.levels.alphas_cumprod.to(time.device)[time]
 
     @torch.no_grad()
     def _sample(self, degraded: Tensor, key: Tensor | None, *, steps: int) -> Restored:
@@ -162,7 +181,7 @@ class Diffusion(Learner):
         condition = conditions(degraded)
 
         def estimate(noisy: Tensor, time: Tensor) -> Tensor:
-            return self._origin(noisy, self.network(noisy, time, condition), time).clamp(-1, 1)
+            return self._find(noisy, time, condition)[1].clamp(-1, 1)
 
         # A lane of its own: the loss of the validation has drawn from the others.
         source = self._draws(key, 0).at(3)

@@ -55,7 +55,8 @@ class RunSummary(Callback):
         if self._rows is None or not trainer.is_global_zero or not isinstance(pl_module, Learner):
             return
         height, width = pl_module.metric_size
-        if stage == "fit":
+        # A trial of single batches has no log.
+        if stage == "fit" and not trainer.fast_dev_run:  # pyright: ignore[reportAttributeAccessIssue]  # set by a connector
             save_curves(self.run_dir, self.run_dir / "curves.png", epe_unit=f"px at {width}x{height}")
         save_panel(self._rows, self.run_dir / "panel.png")
         print("\n".join(summary(trainer.callback_metrics, pl_module.metric_size)))

@@ -104,9 +104,9 @@ def _published(name: str) -> UNet2DModel:
         return UNet2DModel.from_pretrained(name, low_cpu_mem_usage=False)
     except (OSError, ValueError, RuntimeError) as error:
         raise ValueError(
-            f"pretrained must be a repository of the hub that can be reached, or a folder with config.json and weights "
-            f"as UNet2DModel.save_pretrained writes them, got {name}; without a network, give such a folder, or "
-            "pretrained=null to start from random weights"
+            "pretrained must be null, a folder with the config.json and the weights that UNet2DModel.save_pretrained "
+            f"writes, or the name of such a repository on a hub that can be reached, got {name}: add "
+            "model.network.pretrained=null or model.network.pretrained=FOLDER"
         ) from error
 
 
@@ -117,6 +117,8 @@ def _take_over(network: UNet2DModel, published: UNet2DModel, name: str) -> None:
         if ours != theirs and not key.startswith("_"):
             raise ValueError(f"pretrained must be a network with {key} = {ours}, got {name}, where it is {theirs}")
     weights = published.state_dict()
+    # Of the inputs the target alone is like theirs; the image that comes after it is not.
+    weights["conv_in.weight"] = weights["conv_in.weight"][:, : network.config["out_channels"]]
     for key, ours in network.state_dict().items():
         theirs = weights[key]
         common = tuple(slice(min(sizes)) for sizes in zip(ours.shape, theirs.shape, strict=True))

@@ -3,6 +3,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -14,6 +15,8 @@ from torchrefract._config import CONFIG_DIR
 from torchrefract.cameras.calibration.boards import Charuco, Chessboard
 from torchrefract.data.module import PairData
 from torchrefract.effects.base import Effect
+from torchrefract.restoration.diffusion import Diffusion
+from torchrefract.restoration.models.denoiser import Denoiser
 from torchrefract.restoration.module import Restoration
 
 CONF = Path(CONFIG_DIR)
@@ -59,6 +62,21 @@ def test_every_task_makes_its_data_and_its_model(tmp_path, task):
     assert (data.seed, len(data.train), len(data.val)) == (5, 512, 128)  # pyright: ignore[reportArgumentType]
     assert data.effect is not None
     assert data.effect.extra_repr() == getattr(presets, cfg.scene._target_.rsplit(".", 1)[1])().extra_repr()
+
+
+@pytest.mark.parametrize(("name", "millions"), [("ddpm", 35.75), ("ddpm_cat256", 113.68)])
+@pytest.mark.parametrize("task", options("task"))
+def test_a_diffusion_model_has_the_size_of_its_name_and_the_defaults_of_its_class(tmp_path, task, name, millions):
+    cfg = composed(tmp_path, f"+task={task}", f"model={name}", "seed=5")
+    with torch.device("meta"):
+        model = instantiate(cfg.model)
+        plain = Diffusion(Denoiser, instantiate(cfg.task))
+    assert sum(parameter.numel() for parameter in model.parameters()) / 1e6 == pytest.approx(millions, abs=0.01)
+    assert model.task.name == task
+    assert model.seed == 5
+    named = {"lr", "weight_decay", "warmup_steps", "sampler", "steps", "val_steps", "crop", "ema_decay", "metric_size"}
+    assert {option: getattr(model, option) for option in named} == {option: getattr(plain, option) for option in named}
+    assert model.prediction == {"ddpm": "v_prediction", "ddpm_cat256": "epsilon"}[name]
 
 
 @pytest.mark.parametrize("trainer", ["cpu", "ddp"])

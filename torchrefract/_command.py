@@ -44,6 +44,7 @@ _HINTS = (
     ".*dirpath has changed.*",
     "Glyph .* missing from font.*",
     ".*local_dir_use_symlinks.*",
+    ".*callbacks used to create the checkpoint.*",
 )
 # The options of Hydra whose value is the next word.
 _TAKING = ("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--cfg", "-c", "--package", "-p")

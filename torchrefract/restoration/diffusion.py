@@ -24,11 +24,12 @@ _NOISE_WEIGHT = 0.8
 _PREDICTIONS = ("v_prediction", "epsilon")
 
 
-class _Crop(NamedTuple):
-    """Parts of a batch of pairs, with what a network is told of them."""
+class _Part(NamedTuple):
+    """What a network sees at once of a batch of pairs."""
 
     pair: Pair
     condition: Tensor
+    size: Sequence[int]  # height and width of the frames that it is cut from
 
 
 class Diffusion(Learner):
@@ -41,13 +42,12 @@ class Diffusion(Learner):
     0.0001 to 0.02. The target is the flow that undoes a warp, in units of the largest one that the task allows, or the
     clean image from -1 to 1. What the network predicts gives both that are found:
 
-        "epsilon", the noise:                        found noise = predicted
-                                                     found target = (noisy - sqrt(1 - a) predicted) / sqrt(a)
-        "v_prediction", sqrt(a) noise - sqrt(1 - a) target:  found noise = sqrt(1 - a) noisy + sqrt(a) predicted
-                                                     found target = sqrt(a) noisy - sqrt(1 - a) predicted
+        epsilon:       found noise = predicted,  found target = (noisy - sqrt(1 - a) predicted) / sqrt(a)
+        v_prediction:  found noise = sqrt(1 - a) noisy + sqrt(a) predicted,
+                       found target = sqrt(a) noisy - sqrt(1 - a) predicted
 
-    Of the noise alone a small error in what is nearly noise is a large one in the target, which the degraded image
-    tells even there: with the velocity few steps do, after a short training too. Published weights predict the noise.
+    Where there is little but noise, a small error of a predicted noise is a large one of the target, which the degraded
+    image tells all the same. So the velocity is the default; published weights predict the noise.
 
     The weights that validate, are saved, and restore are a moving average of those that learn. Noise, levels and crops
     depend on the seed, the step and the keys of a batch alone, and what `forward` draws on the seed and the key.
@@ -109,13 +109,11 @@ class Diffusion(Learner):
     def learn(self, batch: Pair) -> tuple[Tensor, None]:
         """The loss at a level for each sample; the step is part of the draw, so that none comes twice."""
         source = self._draws(batch.key, 1 + self.global_step)
-        return self._loss(self._cropped(batch, source.at(0)), source, size=batch.clean.shape[2:]), None
+        return self._loss(self._crop(_whole(batch), source.at(0)), source), None
 
     def judge(self, batch: Pair) -> tuple[Tensor, Restored]:
         """The loss on whole frames, of the same draws each time, and the restoration."""
-        loss = self._loss(
-            _Crop(batch, conditions(batch.degraded)), self._draws(batch.key, 0), size=batch.clean.shape[2:]
-        )
+        loss = self._loss(_whole(batch), self._draws(batch.key, 0))
         training = self.trainer.state.fn == TrainerFn.FITTING
         return loss, self._sample(batch.degraded, batch.key, steps=self.val_steps if training else self.steps)
 
@@ -132,10 +130,9 @@ class Diffusion(Learner):
         # The complement: the corruption of a batch is drawn by the same keys, and seeds that are not negative.
         return stream(~((self.seed << 32) + step), key)
 
-    def _cropped(self, pair: Pair, source: Stream) -> _Crop:
+    def _crop(self, whole: _Part, source: Stream) -> _Part:
         """A square of each sample, or all of a side that is shorter; look-ups that leave it are not valid."""
-        whole = _Crop(pair, conditions(pair.degraded))
-        height, width = pair.clean.shape[2:]
+        height, width = whole.size
         if self.crop is None or (height <= self.crop and width <= self.crop):
             return whole
         size = (min(self.crop, height), min(self.crop, width))
@@ -146,12 +143,13 @@ class Diffusion(Learner):
             rows = zip(value, corners, strict=True)
             return torch.stack([v[:, y : y + size[0], x : x + size[1]] for v, (y, x) in rows])
 
-        degraded, clean, flow, valid = (cut(value) for value in pair[:4])
-        return _Crop(Pair(degraded, clean, flow, valid & inside(flow), pair.key), cut(whole.condition))
+        degraded, clean, flow, valid = (cut(value) for value in whole.pair[:4])
+        pair = Pair(degraded, clean, flow, valid & inside(flow), whole.pair.key)
+        return _Part(pair, cut(whole.condition), whole.size)
 
-    def _loss(self, part: _Crop, source: Stream, *, size: Sequence[int]) -> Tensor:
-        """(), of parts of frames of a size."""
-        pair = part.pair
+    def _loss(self, part: _Part, source: Stream) -> Tensor:
+        """(), with noise and levels from a source."""
+        pair, size = part.pair, part.size
         target = self.target.encode(pair, size)
         noise = normal(source.at(1), target)
         time = (uniform(source.at(2), 1)[:, 0] * LEVELS).long()
@@ -188,3 +186,7 @@ class Diffusion(Learner):
         start = normal(source, condition[:, : self.target.channels])
         target = sample(start, estimate, source.at(4), name=self.sampler, steps=steps)
         return self.target.decode(target, degraded, degraded.shape[2:])
+
+
+def _whole(pair: Pair) -> _Part:
+    return _Part(pair, conditions(pair.degraded), pair.clean.shape[2:])

@@ -8,7 +8,7 @@ import torch
 from pytorch_lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from torchrefract.restoration.history import carry_over
+from torchrefract.restoration.history import carry_over, metrics_rows
 from torchrefract.restoration.metrics import psnr
 from torchrefract.restoration.module import Learner
 from torchrefract.restoration.report import PanelRows, save_curves, save_panel
@@ -56,7 +56,7 @@ class RunSummary(Callback):
             return
         height, width = pl_module.metric_size
         # A trial of single batches has no log.
-        if stage == "fit" and not trainer.fast_dev_run:  # pyright: ignore[reportAttributeAccessIssue]  # set by a connector
+        if stage == "fit" and any(metrics_rows(self.run_dir)):
             save_curves(self.run_dir, self.run_dir / "curves.png", epe_unit=f"px at {width}x{height}")
         save_panel(self._rows, self.run_dir / "panel.png")
         print("\n".join(summary(trainer.callback_metrics, pl_module.metric_size)))

@@ -46,7 +46,7 @@ def test_a_task_without_its_plus_is_told_of_the_plus(call, name):
     ("word", "message"),
     [
         ("+task=sharpen", "task must be one of deweather, undistort, got sharpen"),
-        ("model=unet", "model must be one of .*resunet.*, got unet"),
+        ("model=unet", "model must be one of ddpm, ddpm_cat256, resunet, segformer, got unet"),
         ("scene=london", "scene must be one of cape_town_fog, cheap_dashcam, highveld_heat_haze, .* got london"),
         ("data=video", "data must be one of frames, pairs, road_scenes, got video"),
         ("trainer=tpu", "trainer must be one of base, cpu, ddp, gpu, got tpu"),

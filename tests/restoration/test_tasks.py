@@ -122,6 +122,27 @@ def test_a_prediction_of_a_linear_field_keeps_its_place_at_any_size(size):
     assert (found - x)[:, 4:-4].abs().max() < 0.5
 
 
+@pytest.mark.parametrize("size", [(50, 81), (33, 17), (4, 4), (1, 1), (1, 8)])
+def test_a_prediction_of_cells_is_one_of_pixels_that_are_alike_in_a_cell(size):
+    generator = torch.Generator().manual_seed(0)
+    cells = 0.1 * torch.randn(2, 2, -(-size[0] // 4), -(-size[1] // 4), generator=generator)
+    pixels = cells.repeat_interleave(4, dim=2).repeat_interleave(4, dim=3)[:, :, : size[0], : size[1]]
+    image = torch.rand(2, 3, *size, generator=generator)
+    found, expected = (Undistort().restore(prediction, image) for prediction in (cells, pixels))
+    assert_close(found, expected)
+
+
+@pytest.mark.parametrize("size", [(50, 81), (33, 17)])
+def test_a_change_of_color_that_is_linear_in_the_centers_of_cells_is_so_in_pixels(size):
+    y, x = (1.5 + 4 * torch.arange(-(-side // 4)) for side in size)  # cells of 4 px from pixel 0 on
+    slopes = torch.tensor([[1e-3, 2e-3], [-2e-3, 0.0], [0.0, 1e-3]]).view(3, 2, 1, 1)
+    change = slopes[:, 0] * x + slopes[:, 1] * y[:, None]
+    degraded = torch.rand(1, 3, *size)
+    found = Deweather().restore(change[None], degraded).image - degraded
+    expected = slopes[:, 0] * torch.arange(size[1]) + slopes[:, 1] * torch.arange(size[0])[:, None]
+    assert_close(found[0, :, 6:-9, 6:-9], expected[:, 6:-9, 6:-9], rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("task", [Undistort(), Deweather()], ids=["undistort", "deweather"])
 def test_the_gradient_reaches_the_prediction_everywhere(task, distorted, foggy):
     pair = distorted if isinstance(task, Undistort) else foggy

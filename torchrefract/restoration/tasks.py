@@ -29,7 +29,12 @@ class Task(ABC):
 
     @abstractmethod
     def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
-        """The restoration that a prediction (B, channels, H, W) stands for."""
+        """The restoration that a prediction stands for.
+
+        Args:
+            prediction: (B, channels, H, W), or of cells of 4 px, (B, channels, ceil(H / 4), ceil(W / 4)).
+            degraded: (B, 3, H, W), in [0, 1].
+        """
 
     @abstractmethod
     def loss(self, restored: Restored, pair: Pair) -> Tensor:
@@ -41,8 +46,8 @@ class Undistort(Task):
 
         flow = limit tanh(prediction) (W, H),  loss = |warp(degraded, flow) - clean|_1 + |flow - true flow|_1,
 
-    on the valid pixels, the flow in units of half the frame as in [-1, 1]. The prediction is averaged over cells of
-    4 px and interpolated: a lens is smooth.
+    on the valid pixels, the flow in units of half the frame as in [-1, 1]. A prediction of pixels is averaged over
+    cells of 4 px, and that of cells interpolated: a lens is smooth.
 
     Args:
         limit: largest displacement in widths and heights of the frame.
@@ -56,11 +61,7 @@ class Undistort(Task):
 
     def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
         """The degraded image looked up along the predicted flow."""
-        height, width = degraded.shape[2:]
-        # Whole cells only, or the flow would be stretched along a side that 4 does not divide.
-        whole = F.pad(prediction.float(), (0, -width % _CELL, 0, -height % _CELL), mode="replicate")
-        coarse = F.avg_pool2d(whole, _CELL)
-        smooth = F.interpolate(coarse, size=whole.shape[2:], mode="bicubic", antialias=True)[:, :, :height, :width]
+        smooth = _between_cells(_cells(prediction.float(), degraded), degraded)
         flow = self.limit * torch.tanh(smooth) * _sizes(smooth)
         return Restored(warp(degraded, flow, padding="border")[0], flow)
 
@@ -83,11 +84,32 @@ class Deweather(Task):
 
     def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
         """The degraded image plus the predicted change."""
-        return Restored(degraded + prediction.float())
+        change = prediction.float()
+        return Restored(degraded + (change if _is_dense(change, degraded) else _between_cells(change, degraded)))
 
     def loss(self, restored: Restored, pair: Pair) -> Tensor:
         """L1 of the image."""
         return (restored.image - pair.clean).abs().mean()
+
+
+def _is_dense(prediction: Tensor, degraded: Tensor) -> bool:
+    return prediction.shape[2:] == degraded.shape[2:]
+
+
+def _cells(prediction: Tensor, degraded: Tensor) -> Tensor:
+    """The means of cells, where the prediction is not of cells already."""
+    if not _is_dense(prediction, degraded):
+        return prediction
+    height, width = degraded.shape[2:]
+    # Whole cells only, or the flow would be stretched along a side that 4 does not divide.
+    return F.avg_pool2d(F.pad(prediction, (0, -width % _CELL, 0, -height % _CELL), mode="replicate"), _CELL)
+
+
+def _between_cells(cells: Tensor, degraded: Tensor) -> Tensor:
+    """The values of pixels, interpolated between the centers of cells."""
+    height, width = degraded.shape[2:]
+    whole = F.interpolate(cells, size=[_CELL * side for side in cells.shape[2:]], mode="bicubic", antialias=True)
+    return whole[:, :, :height, :width]
 
 
 def _sizes(flow: Tensor) -> Tensor:

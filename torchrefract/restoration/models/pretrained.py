@@ -17,7 +17,8 @@ HUB = "imagenet"
 _CONFIG, _TENSORS = "config.json", "model.safetensors"
 _TIMM = "tu-"  # how segmentation-models-pytorch calls the encoders of timm
 _MIT_LICENSE = "NVIDIA Source Code License for SegFormer, non-commercial: for research and evaluation only"
-_DAMAGE = (SafetensorError, LookupError, OSError, RuntimeError, TypeError, ValueError)
+# What the libraries raise of an encoder that they do not know, and of a file that is damaged or of another one.
+_UNFIT = (SafetensorError, KeyError, RuntimeError, ValueError)
 
 
 class Weights(NamedTuple):
@@ -70,18 +71,15 @@ def load_network(architecture: Callable[..., Any], encoder: str, weights: Weight
     options = {"pretrained_cfg_overlay": {"file": str(weights.file)}} if weights and by_timm else {}
     try:
         network = architecture(encoder, encoder_weights=by_timm or None, in_channels=3, classes=channels, **options)
-    except (KeyError, RuntimeError) as error:
-        if by_timm:
-            raise _misfit(encoder, weights) from error
+        if weights is not None and not by_timm:
+            network.encoder.load_state_dict(load_file(weights.file))
+    except _UNFIT as error:
+        if weights is not None:
+            raise ValueError(f"pretrained must hold whole weights of {encoder}, got {weights.file}") from error
         raise ValueError(
             "encoder must be known to segmentation-models-pytorch, or to timm with tu- in front, and have features "
             f"at five scales, got {encoder}"
         ) from error
-    if weights is not None and not by_timm:
-        try:
-            network.encoder.load_state_dict(load_file(weights.file))
-        except _DAMAGE as error:
-            raise _misfit(encoder, weights) from error
     return network
 
 
@@ -91,10 +89,6 @@ def weights_license(encoder: str) -> str | None:
         config = timm.models.get_pretrained_cfg(encoder.removeprefix(_TIMM))
         return config and config.license
     return _MIT_LICENSE if encoder.startswith("mit_b") else None
-
-
-def _misfit(encoder: str, weights: Weights | None) -> ValueError:
-    return ValueError(f"pretrained must hold whole weights of {encoder}, got {weights and weights.file}")
 
 
 def _fetch(encoder: str) -> Path:

@@ -5,12 +5,14 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from diffusers.optimization import get_cosine_schedule_with_warmup
 from pytorch_lightning import LightningModule
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import ReduceLROnPlateau
 
+from torchrefract._checks import check_choice
 from torchrefract.restoration.finite import check_finite
 from torchrefract.restoration.metrics import endpoint_error, psnr, ssim
+from torchrefract.restoration.schedules import SCHEDULES, schedule
 from torchrefract.restoration.tasks import Restored, Task
 from torchrefract.types import Pair
 from torchrefract.warping.resample import warp
@@ -28,9 +30,10 @@ class Learner(LightningModule, ABC):
     Args:
         network: of this task.
         task: what is to be restored.
-        lr: peak learning rate of AdamW, reached after `warmup_steps` and brought to zero by a cosine.
+        lr: peak learning rate of AdamW.
         weight_decay: of AdamW.
-        warmup_steps: steps of linear warm-up.
+        warmup_steps: steps of linear warm-up of the schedule "cosine".
+        schedule: of the learning rate, "cosine" down to zero, or "plateau", halved where val/loss stays.
         metric_size: (height, width) of the frame whose pixels the endpoint error is given in.
     """
 
@@ -43,10 +46,12 @@ class Learner(LightningModule, ABC):
         weight_decay: float,
         warmup_steps: int,
         metric_size: Sequence[int],
+        schedule: str = "cosine",
     ):
         super().__init__()
         self.task, self.network = task, network
         self.lr, self.weight_decay, self.warmup_steps = lr, weight_decay, warmup_steps
+        self.schedule = check_choice("schedule", schedule, SCHEDULES)
         self.metric_size = (metric_size[0], metric_size[1])
         # For a rival without eyes: flows summed on valid pixels, and how many; of all ranks, and new ones of this one.
         self.flows, self.new_flows = _NOTHING, _NOTHING
@@ -110,11 +115,30 @@ class Learner(LightningModule, ABC):
         return (flow_sum / count.clamp(min=1)).to(like).expand_as(like)
 
     def configure_optimizers(self) -> Any:
-        """AdamW with a warm-up and a cosine."""
+        """AdamW with its schedule."""
         optimizer = torch.optim.AdamW(self.parameters(), lr=self.lr, weight_decay=self.weight_decay)
         steps = int(self.trainer.estimated_stepping_batches)
-        schedule = get_cosine_schedule_with_warmup(optimizer, min(self.warmup_steps, steps // 10), steps)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        scheduler = schedule(self.schedule, optimizer, warmup_steps=self.warmup_steps, steps=steps)
+        return {"optimizer": optimizer, "lr_scheduler": scheduler}
+
+    def on_fit_start(self) -> None:
+        """The seed of the run is kept."""
+        self.run_seed = torch.initial_seed()
+
+    def on_train_batch_start(self, batch: Pair, batch_idx: int) -> None:
+        """What a network drops depends on the seed of the run and on the step: a run that goes on drops the same."""
+        torch.manual_seed(self.run_seed + self.global_step)
+
+    def on_validation_epoch_end(self) -> None:
+        """A plateau is told the loss before the checkpoint is written: Lightning would do it after."""
+        plateau = self.lr_schedulers()
+        if isinstance(plateau, ReduceLROnPlateau) and not self.trainer.sanity_checking:
+            plateau.step(self.trainer.callback_metrics["val/loss"])
+
+    def lr_scheduler_step(self, scheduler: Any, metric: Any) -> None:
+        """A step of what is no plateau."""
+        if not isinstance(scheduler, ReduceLROnPlateau):
+            scheduler.step()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The task, and the flows counted so far, go along."""
@@ -151,7 +175,7 @@ class Restoration(Learner):
     Args:
         network: makes the network, given the number of channels to predict.
         task: what is to be restored.
-        lr, weight_decay, warmup_steps, metric_size: as for `Learner`.
+        lr, weight_decay, warmup_steps, schedule, metric_size: as for `Learner`.
     """
 
     def __init__(
@@ -162,9 +186,10 @@ class Restoration(Learner):
         lr: float = 1e-3,
         weight_decay: float = 1e-2,
         warmup_steps: int = 50,
+        schedule: str = "cosine",
         metric_size: Sequence[int] = (1080, 1920),
     ):
-        options = {"lr": lr, "weight_decay": weight_decay, "warmup_steps": warmup_steps}
+        options = {"lr": lr, "weight_decay": weight_decay, "warmup_steps": warmup_steps, "schedule": schedule}
         super().__init__(network(task.channels), task, metric_size=metric_size, **options)
 
     def forward(self, degraded: Tensor, key: Tensor | None = None) -> Restored:

@@ -33,6 +33,7 @@ from torchrefract.restoration.finite import NotFiniteError
 
 _T = TypeVar("_T")
 _INFORMING = ("--help", "-h", "--hydra-help", "--info", "--shell-completion", "-sc")
+_CHOOSING = ("+task=", "++task=", "+experiment=", "++experiment=")
 _UNKNOWN = re.compile(r"Could not override '(\w+)'")
 _SEEDS = 2**32  # as many as numpy takes
 # Advice of libraries on what is meant so here.
@@ -64,14 +65,17 @@ class UsageError(Exception):
 
 
 def with_task(name: str, words: list[str]) -> list[str]:
-    """The words of `python -m torchrefract.<name>` as they are, if they choose a task or only ask for information."""
+    """The words of `python -m torchrefract.<name>` as they are, if they choose a task or only ask for information.
+
+    An experiment chooses its task itself.
+    """
     if any(word in _INFORMING for word in words):
         return words
     listed = ", ".join(tasks())
     for word in words:
         if word.startswith("task="):
             raise UsageError(f"{word} needs a plus, since no task is chosen yet: python -m torchrefract.{name} +{word}")
-    if not any(word.startswith(("+task=", "++task=")) for word in words):
+    if not any(word.startswith(_CHOOSING) for word in words):
         raise UsageError(f"+task must be one of {listed}: python -m torchrefract.{name} +task={tasks()[-1]}, got none")
     return words
 

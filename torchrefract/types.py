@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any, NamedTuple, cast
 
+import torch
 from torch import Tensor
 
 Range = tuple[float, float]
@@ -48,6 +49,7 @@ class Pair(NamedTuple):
     flow: (B, 2, H, W), px, with warp(degraded, flow) = clean; zero where the corruption moves nothing.
     valid: (B, 1, H, W), bool, the pixels that the degraded image can still give back.
     key: (B,), int64, the key that the corruption was drawn with.
+    transmission: (B, 1, H, W) in [0, 1], the share of the clean light that arrives; (B, 0) where none is asked for.
     """
 
     degraded: Tensor
@@ -55,6 +57,7 @@ class Pair(NamedTuple):
     flow: Tensor
     valid: Tensor
     key: Tensor
+    transmission: Tensor = torch.empty(0)
 
 
 class Degraded:

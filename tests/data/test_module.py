@@ -6,7 +6,7 @@ from PIL import Image
 from pytorch_lightning import Trainer
 from torch.testing import assert_close
 
-from torchrefract import Frame, LensDistortion, Pair, UniformFog
+from torchrefract import Frame, LensDistortion, Pair, UniformFog, presets
 from torchrefract.data.module import PairData, frames, make_pair, road_scenes
 from torchrefract.data.road_scenes import RoadScenes
 
@@ -68,9 +68,38 @@ def test_a_pair_is_a_frame_and_what_the_effect_makes_of_it():
     expected = effect.degrade(image, seed=3, keys=[5, 9])
     assert expected.restore_flow is not None
     assert expected.restore_valid is not None
-    made = Pair(expected.image, image, expected.restore_flow, expected.restore_valid, torch.tensor([5, 9]))
+    key, none = torch.tensor([5, 9]), torch.empty(2, 0)
+    made = Pair(expected.image, image, expected.restore_flow, expected.restore_valid, key, none)
     for name, found, value in zip(Pair._fields, pair, made, strict=True):
         assert torch.equal(found, value), name
+
+
+@pytest.mark.parametrize(
+    "scene", [UniformFog(), UniformFog(p=0.5), presets.paper_weather()], ids=["fog", "some", "any"]
+)
+def test_a_pair_has_the_transmission_that_it_is_asked_for(scene):
+    image, keys = torch.rand(8, 3, *SIZE), torch.arange(8)
+    pair = make_pair(Frame(image, keys, torch.empty(8, 0)), scene, seed=3, transmission=True)
+    assert torch.equal(pair.transmission, scene.degrade(image, seed=3, keys=keys).transmission)
+    untouched = (pair.degraded == image).flatten(1).all(dim=1)
+    assert (pair.transmission[untouched] == 1).all()
+
+
+def test_data_asked_for_a_transmission_has_it_in_training_and_validation():
+    data = road_scenes(
+        effect=UniformFog(), size=SIZE, train_count=4, val_count=4, batch_size=2, workers=0, transmission=True
+    )
+    for training in (True, False):
+        for pair in pairs(during(data, training=training)):
+            assert pair.transmission.shape == (2, 1, *SIZE)
+            # More of the light comes through from the near road, at the bottom, than from the horizon.
+            assert (pair.transmission[..., -1, :] > pair.transmission[..., 0, :]).all()
+
+
+def test_an_effect_without_a_transmission_cannot_be_asked_for_it():
+    frame = Frame(torch.rand(2, 3, *SIZE), torch.arange(2), torch.empty(2, 0))
+    with pytest.raises(ValueError, match="effect must have a transmission, as fog has, got LensDistortion"):
+        make_pair(frame, LensDistortion(), seed=0, transmission=True)
 
 
 def test_a_pair_in_fog_moves_nothing_and_is_valid_everywhere():

@@ -77,6 +77,23 @@ def test_weather_from_disk_moves_nothing_and_is_valid_everywhere(made):
     assert (pair.degraded - pair.clean).abs().mean() > 0.01
 
 
+@pytest.mark.parametrize("maps", ["png", "safetensors"])
+def test_weather_from_disk_has_the_transmission_that_is_asked_for(made, source, maps):
+    out = made(f"maps={maps}", scene=("scene=paper_weather",))
+    stored = pairs(root=out, batch_size=4, workers=0, transmission=True)
+    scene = presets.paper_weather()
+    live = frames(root=source, effect=scene, size=SIZE, batch_size=4, workers=0, transmission=True)
+    for disk, fly in zip(batches(stored, training=True), batches(live, training=True), strict=True):
+        assert disk.transmission.shape == (4, 1, *SIZE)
+        assert (disk.transmission - fly.transmission).abs().max() <= (0.51 / 65535 if maps == "png" else 0)
+
+
+def test_pairs_without_a_transmission_cannot_be_asked_for_it(made):
+    folder = PairedFolder(made(), transmission=True)
+    with pytest.raises(ValueError, match="root must hold pairs with a transmission, as of fog, got 0 in "):
+        folder[0]
+
+
 def test_twenty_steps_of_training_from_disk_have_the_losses_of_training_on_the_fly(made, source):
     stored = pairs(root=made("count=16"), batch_size=2, workers=0)
     live = frames(root=source, effect=presets.paper_refractive(width=192), size=SIZE, batch_size=2, workers=0)

@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from torch.testing import assert_close
@@ -29,7 +31,8 @@ def foggy():
     clean = smooth(3)
     made = UniformFog().degrade(clean, seed=1)
     zero = torch.zeros(3, 2, *SIZE)
-    return Pair(made.image, clean, zero, torch.ones(3, 1, *SIZE, dtype=torch.bool), torch.arange(3))
+    everywhere = torch.ones(3, 1, *SIZE, dtype=torch.bool)
+    return Pair(made.image, clean, zero, everywhere, torch.arange(3), made.transmission)
 
 
 def per_image(value: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
@@ -61,6 +64,32 @@ def test_the_cost_of_a_deweathering_is_the_image_on_all_pixels(foggy):
     pair = foggy._replace(valid=torch.zeros_like(foggy.valid))
     offset = torch.tensor([0.1, -0.2, 0.6]).view(3, 1, 1, 1)
     assert_close(Deweather().loss(Restored(foggy.clean + offset), pair), torch.tensor(0.3))
+
+
+def test_a_wrong_transmission_costs_its_mean_error(foggy):
+    task = Deweather(transmission_head=True)
+    image, wrong = foggy.clean + 0.1, (foggy.transmission - 0.25).abs()
+    expected = 0.1 + (wrong - foggy.transmission).abs().double().mean()
+    assert_close(task.loss(Restored(image, transmission=wrong), foggy).double(), expected, rtol=1e-5, atol=0)
+    assert_close(Deweather().loss(Restored(image), foggy), torch.tensor(0.1))
+
+
+@pytest.mark.parametrize("cell", [1, 4])
+def test_the_last_channel_is_the_transmission_as_a_logistic(cell):
+    task, image = Deweather(transmission_head=True), torch.rand(2, 3, 32, 64)
+    prediction = torch.tensor([0.1, -0.2, 0.0, 1.5]).view(1, 4, 1, 1).expand(2, 4, 32 // cell, 64 // cell)
+    restored = task.restore(prediction, image)
+    assert task.channels == 4
+    assert_close(restored.image, image + torch.tensor([0.1, -0.2, 0.0]).view(3, 1, 1))
+    assert restored.transmission is not None
+    assert_close(restored.transmission, torch.full((2, 1, 32, 64), 1 / (1 + math.exp(-1.5))))
+
+
+def test_a_pair_without_a_transmission_is_named(foggy):
+    task, pair = Deweather(transmission_head=True), foggy._replace(transmission=torch.empty(3, 0))
+    restored = task.restore(torch.zeros(3, 4, *SIZE), foggy.degraded)
+    with pytest.raises(ValueError, match=r"pair must have a transmission .* data\.transmission=true, got none"):
+        task.loss(restored, pair)
 
 
 def test_the_true_flow_costs_what_its_look_up_blurs(distorted):

@@ -8,7 +8,7 @@ import torch
 from pytorch_lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
-from torchrefract._checks import check_count
+from torchrefract._checks import check_count, check_flag
 from torchrefract.data.frame_folder import FrameFolder
 from torchrefract.data.paired_folder import PairedFolder
 from torchrefract.data.road_scenes import RoadScenes
@@ -31,6 +31,7 @@ class PairData(LightningDataModule):
         batch_size: frames in a batch, of each device.
         workers: processes that read or render frames; 0 does it in the training process.
         seed: of the draws and of the order.
+        transmission: whether pairs made on the fly have theirs.
     """
 
     def __init__(
@@ -42,12 +43,14 @@ class PairData(LightningDataModule):
         batch_size: int = 16,
         workers: int = 2,
         seed: int = 0,
+        transmission: bool = False,
     ):
         super().__init__()
         self.train, self.val, self.effect = train, val, effect
         self.batch_size = check_count("batch_size", batch_size)
         self.workers = check_count("workers", workers, low=0)
         self.seed = check_count("seed", seed, low=0)
+        self.transmission = check_flag("transmission", transmission)
         self.check_ranks(1)
 
     def check_ranks(self, ranks: int) -> None:
@@ -71,7 +74,7 @@ class PairData(LightningDataModule):
             return cast(Pair, batch)
         training = self.trainer is not None and self.trainer.training
         epoch = _FIRST_EPOCH + self.trainer.current_epoch if training and self.trainer else 0
-        return make_pair(batch, self.effect, seed=(self.seed << 32) + epoch)
+        return make_pair(batch, self.effect, seed=(self.seed << 32) + epoch, transmission=self.transmission)
 
     def _loader(self, frames: Dataset[Any], *, training: bool) -> DataLoader[Any]:
         ranks, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
@@ -90,15 +93,22 @@ class PairData(LightningDataModule):
 
 
 @torch.no_grad()
-def make_pair(frames: Frame, effect: Effect, *, seed: int) -> Pair:
-    """A batch of frames and what an effect makes of it, on the device of the frames."""
+def make_pair(frames: Frame, effect: Effect, *, seed: int, transmission: bool = False) -> Pair:
+    """A batch of frames and what an effect makes of it, on the device of the frames; its transmission, if asked for.
+
+    Raises:
+        ValueError: a transmission is asked for, and the effect has none.
+    """
     depth = frames.depth if frames.depth.ndim == 4 else None
     degraded = effect.degrade(frames.image, seed=seed, keys=frames.key, depth=depth)
     flow, valid = degraded.restore_flow, degraded.restore_valid
     if flow is None or valid is None:
         like = frames.image[:, :1]
         flow, valid = torch.zeros_like(like).expand(-1, 2, -1, -1), torch.ones_like(like, dtype=torch.bool)
-    return Pair(degraded.image, frames.image, flow, valid, frames.key)
+    if transmission and not degraded.has("transmission"):
+        raise ValueError(f"effect must have a transmission, as fog has, got {effect}")
+    passed = degraded.transmission if transmission else frames.image.new_empty(len(frames.image), 0)
+    return Pair(degraded.image, frames.image, flow, valid, frames.key, passed)
 
 
 def road_scenes(
@@ -110,11 +120,13 @@ def road_scenes(
     batch_size: int = 16,
     workers: int = 2,
     seed: int = 0,
+    transmission: bool = False,
 ) -> PairData:
     """Pairs of rendered road scenes; arguments as for `RoadScenes` and `PairData`."""
     train = RoadScenes(train_count, size=size, seed=seed)
     val = RoadScenes(val_count, size=size, seed=seed, first=train_count)
-    return PairData(train, val, effect=effect, batch_size=batch_size, workers=workers, seed=seed)
+    options = {"batch_size": batch_size, "workers": workers, "seed": seed, "transmission": transmission}
+    return PairData(train, val, effect=effect, **options)
 
 
 def frames(
@@ -127,16 +139,20 @@ def frames(
     batch_size: int = 16,
     workers: int = 2,
     seed: int = 0,
+    transmission: bool = False,
 ) -> PairData:
     """Pairs of a folder's frames, split by drive; arguments as for `FrameFolder` and `PairData`."""
     train, val = (
         FrameFolder(root, size=size, split=split, drive_by=drive_by, val_share=val_share, seed=seed)
         for split in ("train", "val")
     )
-    return PairData(train, val, effect=effect, batch_size=batch_size, workers=workers, seed=seed)
+    options = {"batch_size": batch_size, "workers": workers, "seed": seed, "transmission": transmission}
+    return PairData(train, val, effect=effect, **options)
 
 
-def pairs(*, root: str | Path, batch_size: int = 16, workers: int = 2, seed: int = 0) -> PairData:
+def pairs(
+    *, root: str | Path, batch_size: int = 16, workers: int = 2, seed: int = 0, transmission: bool = False
+) -> PairData:
     """Pairs from disk, split by drive when they were made; arguments as for `PairedFolder` and `PairData`."""
-    train, val = (PairedFolder(root, split=split) for split in ("train", "val"))
+    train, val = (PairedFolder(root, split=split, transmission=transmission) for split in ("train", "val"))
     return PairData(train, val, effect=None, batch_size=batch_size, workers=workers, seed=seed)

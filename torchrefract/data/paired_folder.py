@@ -9,13 +9,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
-from torchrefract._checks import check_choice, check_count
-from torchrefract.data.pair_files import DamagedPairError, decode_pair
+from torchrefract._checks import check_choice, check_count, check_flag
+from torchrefract.data.pair_files import DamagedPairError, PairArrays, decode_pair
 from torchrefract.data.pair_manifest import PairRow, Place, lines_of, manifests, read_row, read_stored, scan
 from torchrefract.types import Pair
 
 _SPLITS = ("all", "train", "val")
 _NEEDED = ("restore_flow", "restore_valid")
+_PASSED = "transmission"
 
 
 class PairedFolder(Dataset[Pair]):
@@ -27,14 +28,17 @@ class PairedFolder(Dataset[Pair]):
     Args:
         root: the folder, with pairs/ or tars/ in it.
         split: "all", "train" or "val", by drive.
+        transmission: whether pairs are read with theirs.
 
     Raises:
-        ValueError: a folder without pairs of the split; a damaged manifest; in `[]`, a damaged file.
+        ValueError: a folder without pairs of the split; a damaged manifest; in `[]`, a damaged file, or a pair without
+            the transmission that is asked for.
     """
 
-    def __init__(self, root: str | Path, *, split: str = "all"):
+    def __init__(self, root: str | Path, *, split: str = "all", transmission: bool = False):
         self.root = Path(root).expanduser()
         self.split = check_choice("split", split, _SPLITS)
+        self.transmission = check_flag("transmission", transmission)
         self._manifests = manifests(self.root)
         if not self._manifests:
             raise ValueError(f"root must be a folder with manifest.jsonl, got {self.root}")
@@ -50,11 +54,15 @@ class PairedFolder(Dataset[Pair]):
         return len(self._places)
 
     def __getitem__(self, index: int) -> Pair:
-        """Pair of a degraded and a clean image (3, H, W), a flow (2, H, W), its mask (1, H, W) and a key ()."""
+        """Pair of a degraded and a clean image (3, H, W), a flow (2, H, W), its mask (1, H, W) and a key ().
+
+        And a transmission, (1, H, W), or (0,) where none is asked for.
+        """
         row = self.row(index)
         try:
             arrays = decode_pair(
-                {suffix: partial(read_stored, self.root, file) for suffix, file in row.files.items()}, _NEEDED
+                {suffix: partial(read_stored, self.root, file) for suffix, file in row.files.items()},
+                (*_NEEDED, _PASSED) if self.transmission else _NEEDED,
             )
         except DamagedPairError as error:
             raise DamagedPairError(
@@ -65,13 +73,23 @@ class PairedFolder(Dataset[Pair]):
         flow = arrays.maps.get("restore_flow", np.zeros((2, *size), np.float32))
         valid = arrays.maps["restore_valid"] if "restore_flow" in arrays.maps else np.ones(size, dtype=bool)
         degraded, clean = _image(arrays.corrupted), _image(arrays.clean)
-        return Pair(degraded, clean, torch.from_numpy(flow), torch.from_numpy(valid)[None], torch.tensor(row.key))
+        passed = self._passed(arrays, row)
+        return Pair(
+            degraded, clean, torch.from_numpy(flow), torch.from_numpy(valid)[None], torch.tensor(row.key), passed
+        )
 
     def row(self, index: int) -> PairRow:
         """What the manifest says of a pair of the split."""
         number, offset, length = self._places[index].tolist()
         (line,) = lines_of([Place(self._manifests[number], offset, length)])
         return read_row(line)
+
+    def _passed(self, arrays: PairArrays, row: PairRow) -> Tensor:
+        if not self.transmission:
+            return torch.empty(0)
+        if _PASSED not in arrays.maps:
+            raise ValueError(f"root must hold pairs with a transmission, as of fog, got {row.number} in {self.root}")
+        return torch.from_numpy(arrays.maps[_PASSED])[None]
 
     def _has(self, row: PairRow) -> bool:
         return not row.skipped and self.split in ("all", row.split)

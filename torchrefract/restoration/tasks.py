@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchrefract._checks import check_flag
 from torchrefract.restoration.metrics import masked_mean
 from torchrefract.types import Pair
 from torchrefract.warping.resample import warp
@@ -19,6 +20,7 @@ class Restored(NamedTuple):
 
     image: Tensor  # (B, 3, H, W)
     flow: Tensor | None = None  # (B, 2, H, W), px, of a task that predicts one
+    transmission: Tensor | None = None  # (B, 1, H, W) in (0, 1), of a task that predicts it
 
 
 class Task(ABC):
@@ -74,22 +76,42 @@ class Undistort(Task):
 
 
 class Deweather(Task):
-    """The clean image is predicted, as a change of the degraded one.
+    """The clean image is predicted, as a change of the degraded one, and, if wanted, the transmission of the air.
 
-    restored = degraded + prediction,  loss = |restored - clean|_1 on all pixels
+        restored = degraded + change,  t = 1 / (1 + exp(-last channel)),
+        loss = |restored - clean|_1 + |t - transmission|_1 on all pixels
+
+    Args:
+        transmission_head: whether there is a channel for t, and its term in the loss.
     """
 
     name = "deweather"
-    channels = 3
+
+    def __init__(self, *, transmission_head: bool = False):
+        self.transmission_head = check_flag("transmission_head", transmission_head)
+        self.channels = 4 if transmission_head else 3
 
     def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
         """The degraded image plus the predicted change."""
-        change = prediction.float()
-        return Restored(degraded + (change if _is_dense(change, degraded) else _between_cells(change, degraded)))
+        found = prediction.float()
+        found = found if _is_dense(found, degraded) else _between_cells(found, degraded)
+        passed = torch.sigmoid(found[:, 3:]) if self.transmission_head else None
+        return Restored(degraded + found[:, :3], transmission=passed)
 
     def loss(self, restored: Restored, pair: Pair) -> Tensor:
-        """L1 of the image."""
-        return (restored.image - pair.clean).abs().mean()
+        """L1 of the image and, if predicted, of the transmission.
+
+        Raises:
+            ValueError: a transmission is predicted, and the pair has none.
+        """
+        image_error = (restored.image - pair.clean).abs().mean()
+        if restored.transmission is None:
+            return image_error
+        if pair.transmission.shape != restored.transmission.shape:
+            raise ValueError(
+                "pair must have a transmission for transmission_head: set data.transmission=true, got none"
+            )
+        return image_error + (restored.transmission - pair.transmission).abs().mean()
 
 
 def _is_dense(prediction: Tensor, degraded: Tensor) -> bool:

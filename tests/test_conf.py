@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
+from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning import Trainer
 
@@ -18,12 +18,18 @@ from torchrefract.effects.base import Effect
 from torchrefract.restoration.diffusion import Diffusion
 from torchrefract.restoration.models.denoiser import Denoiser
 from torchrefract.restoration.module import Restoration
+from torchrefract.restoration.tasks import Task
 
 CONF = Path(CONFIG_DIR)
 
 
 def options(group: str) -> list[str]:
     return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+def presets_of(task: str) -> Effect:
+    """The scene that the paper has for a task."""
+    return presets.paper_refractive() if task == "undistort" else presets.paper_weather()
 
 
 def composed(tmp_path: Path, *words: str, command: str = "train") -> Any:
@@ -79,6 +85,44 @@ def test_a_diffusion_model_has_the_size_of_its_name_and_the_defaults_of_its_clas
     assert model.prediction == {"ddpm": "v_prediction", "ddpm_cat256": "epsilon"}[name]
 
 
+# Networks of the same kind that take a second, not a minute.
+TINY = {
+    "resunet": ["model.network.encoder=tu-resnet10t"],
+    "segformer": ["model.network.encoder=mit_b0"],
+}
+SCENES = ["data.size=[32,64]", "data.train_count=4", "data.val_count=2", "data.batch_size=2", "data.workers=0"]
+
+
+@pytest.mark.filterwarnings("ignore:.*does not have many workers", "ignore:.*LeafSpec")
+@pytest.mark.parametrize("task", options("task"))
+@pytest.mark.parametrize("model", sorted(TINY))
+def test_every_model_of_every_task_trains_and_validates(tmp_path, model, task):
+    cfg = composed(tmp_path, f"+task={task}", f"model={model}", *TINY[model], *SCENES, "+trainer.fast_dev_run=true")
+    cfg.trainer.callbacks, cfg.trainer.logger = [], False
+    data, made, trainer = (instantiate(cfg[part]) for part in ("data", "model", "trainer"))
+    before = [parameter.clone() for parameter in made.parameters()]
+    trainer.fit(made, data)
+    assert trainer.callback_metrics["val/loss"].isfinite()
+    assert any(not torch.equal(a, b) for a, b in zip(made.parameters(), before, strict=True))
+
+
+@pytest.mark.parametrize("model", sorted(TINY))
+def test_a_model_is_made_with_the_defaults_of_its_class(tmp_path, model):
+    cfg = composed(tmp_path, "+task=undistort", f"model={model}").model
+    network = instantiate(cfg.network)
+    for made, given in ((get_class(cfg._target_), cfg), (network.func, network.keywords)):
+        for name, parameter in inspect.signature(made).parameters.items():
+            if parameter.default is not parameter.empty:
+                assert given[name] == parameter.default, name
+
+
+def test_a_transmission_is_made_where_a_head_predicts_it(tmp_path):
+    plain, asked = (composed(tmp_path, "+task=deweather", f"task.transmission_head={head}") for head in (False, True))
+    assert (plain.data.transmission, asked.data.transmission) == (False, True)
+    assert (instantiate(plain.model).task.channels, instantiate(asked.model).task.channels) == (3, 4)
+    assert not composed(tmp_path, "+task=undistort").data.transmission
+
+
 @pytest.mark.parametrize("trainer", ["cpu", "ddp"])
 def test_every_trainer_writes_into_the_run_folder(tmp_path, trainer):
     made = instantiate(composed(tmp_path, "+task=undistort", f"trainer={trainer}").trainer)
@@ -94,6 +138,46 @@ def test_every_trainer_writes_into_the_run_folder(tmp_path, trainer):
 def test_the_gpu_trains_in_bfloat16(tmp_path):
     cfg = composed(tmp_path, "+task=undistort", "trainer=gpu")
     assert (cfg.trainer.accelerator, cfg.trainer.devices, cfg.trainer.precision) == ("gpu", 1, "bf16-mixed")
+
+
+# Section 4 of the paper.
+EPOCHS = {"undistort": 35, "deweather": 15}
+PROTOCOL = {"resunet": (16, 5e-5), "segformer": (16, 5e-5), "ddpm": (8, 1e-5)}
+
+
+@pytest.mark.parametrize("task", sorted(EPOCHS))
+@pytest.mark.parametrize("model", sorted(PROTOCOL))
+def test_the_experiments_of_table_1_follow_the_paper(tmp_path, model, task):
+    cfg = composed(tmp_path, f"+experiment=table1_{model}_{task}", "data.root=frames")
+    batch_size, lr = PROTOCOL[model]
+    assert instantiate(cfg.task).name == task
+    assert instantiate(cfg.scene).extra_repr() == presets_of(task).extra_repr()
+    assert (cfg.data.size, cfg.data.val_share, cfg.data.batch_size) == ([1080, 1920], 0.2, batch_size)
+    assert (cfg.trainer.max_epochs, cfg.trainer.precision, cfg.model.lr) == (EPOCHS[task], "bf16-mixed", lr)
+    assert cfg.model.network.pretrained is not None
+    if model == "ddpm":
+        assert (cfg.model.crop, cfg.model.warmup_steps) == (256, 500)
+    else:
+        assert cfg.model.schedule == "plateau"
+
+
+@pytest.mark.parametrize("experiment", [name for name in options("experiment") if name.endswith("_small")])
+def test_a_small_experiment_is_its_large_one_on_small_frames_without_weights(tmp_path, experiment):
+    small, large = (
+        composed(tmp_path, f"+experiment={name}", "data.root=frames")
+        for name in (experiment, experiment.removesuffix("_small"))
+    )
+    assert (small.scene._target_, small.task) == (large.scene._target_, large.task)
+    assert small.model._target_ == large.model._target_
+    assert small.scene.get("width", 256) == 256  # a scene that moves pixels does so by shares of the frame
+    assert (small.data.size, small.trainer.accelerator) == ([144, 256], "cpu")
+    assert small.model.network.pretrained is None
+    assert isinstance(instantiate(small.model).task, Task)
+
+
+def test_every_experiment_is_of_table_1():
+    names = {f"table1_{model}_{task}{form}" for model in PROTOCOL for task in EPOCHS for form in ("", "_small")}
+    assert {*options("experiment")} == names
 
 
 def test_an_evaluation_composes_what_the_training_did(tmp_path):

@@ -26,9 +26,10 @@ from rich.progress import track
 
 from torchrefract._config import CONFIG_DIR
 from torchrefract._files import replacing
+from torchrefract.data.fingerprint import fingerprint
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.module import PairData
-from torchrefract.restoration.checkpoints import CheckpointError, check_fits, read_checkpoint
+from torchrefract.restoration.checkpoints import CheckpointError, Origin, check_fits, read_checkpoint
 from torchrefract.restoration.finite import NotFiniteError
 
 _T = TypeVar("_T")
@@ -148,13 +149,23 @@ def make_job(cfg: DictConfig, *, needs_checkpoint: bool = False) -> Job:
     with naming("data"):
         made.data.check_ranks(made.trainer.world_size)
     if checkpoint is not None:
-        check_fits(checkpoint, made.model, path)
+        check_fits(checkpoint, made.model, path, config=cfg.model)
         if not needs_checkpoint:
             _check_unfinished(checkpoint["epoch"] + 1, made.trainer.max_epochs)
+    if not needs_checkpoint:
+        _add_origin(cfg, made)
     if made.trainer.is_global_zero:
         with replacing(Path(cfg.run_dir, "config.yaml")) as path:
             OmegaConf.save(cfg, path)
     return made
+
+
+def _add_origin(cfg: DictConfig, made: Job) -> None:
+    """Checkpoints of the run will say where they come from."""
+    data = fingerprint(made.data.train)
+    config = cast(dict[str, Any], OmegaConf.to_container(cfg, enum_to_str=True))
+    origin = Origin(config, data=data, licenses={"data": data["license"]})
+    made.trainer.callbacks.insert(0, origin)  # pyright: ignore[reportAttributeAccessIssue]  # a connector sets it
 
 
 def check_seed(seed: Any) -> int:

@@ -84,6 +84,10 @@ class PairedFolder(Dataset[Pair]):
         (line,) = lines_of([Place(self._manifests[number], offset, length)])
         return read_row(line)
 
+    def rows(self) -> Iterator[PairRow]:
+        """What the manifest says of all pairs of the split, in its order."""
+        return (row for row, _ in scan(self._manifests, self._has))
+
     def _passed(self, arrays: PairArrays, row: PairRow) -> Tensor:
         if not self.transmission:
             return torch.empty(0)

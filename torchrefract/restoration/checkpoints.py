@@ -2,10 +2,12 @@
 
 import pickle
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from pytorch_lightning import Callback, LightningModule, Trainer
 from pytorch_lightning.plugins.io import TorchCheckpointIO
 from torch import nn
 
@@ -39,8 +41,36 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             ) from error
 
 
-def read_checkpoint(path: Path, *, task: str) -> dict[str, Any]:
+class Origin(Callback):
+    """Checkpoints say where they come from, in plain values, which load with weights only.
+
+    Args:
+        config: the resolved configuration of the run.
+        data: what the model is trained on, as by `fingerprint`.
+        licenses: of what the model is made from, by what that is; None where it is not known.
+    """
+
+    def __init__(self, config: Mapping[str, Any], *, data: Mapping[str, Any], licenses: Mapping[str, str | None]):
+        self.origin = {"config": dict(config), "data": dict(data), "licenses": dict(licenses)}
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Configuration, data and licenses go along."""
+        checkpoint.update(self.origin)
+
+
+def model_name(model: Mapping[str, Any]) -> str:
+    """What the model of a configuration is called: its network, and the encoder of that, as "ResUNet (tu-resnet34)"."""
+    network = model.get("network", model)
+    name = str(network.get("_target_", "a network")).rsplit(".", 1)[-1]
+    return f"{name} ({network['encoder']})" if "encoder" in network else name
+
+
+def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
     """What the file holds, read without running code from it.
+
+    Args:
+        path: of the file.
+        task: that it must be of; None takes any.
 
     Raises:
         CheckpointError: no such file, a file that is no checkpoint or damaged, one of another task.
@@ -57,16 +87,26 @@ def read_checkpoint(path: Path, *, task: str) -> dict[str, Any]:
         raise CheckpointError(f"ckpt_path must be a whole checkpoint, got {path}, which is damaged or none") from error
     if not isinstance(checkpoint, dict) or not {"state_dict", "task"} <= checkpoint.keys():
         raise CheckpointError(f"ckpt_path must be a checkpoint of torchrefract, got {path}")
-    if checkpoint["task"] != task:
+    if task not in (None, checkpoint["task"]):
         raise CheckpointError(f"ckpt_path must be a checkpoint of the task {task}, got {path} of {checkpoint['task']}")
     return checkpoint
 
 
-def check_fits(checkpoint: dict[str, Any], model: nn.Module, path: Path) -> None:
-    """Raise CheckpointError unless the weights of the checkpoint at `path` are those of such a model."""
+def check_fits(
+    checkpoint: Mapping[str, Any], model: nn.Module, path: Path, *, config: Mapping[str, Any] | None = None
+) -> None:
+    """Raise CheckpointError unless the weights of the checkpoint at `path` are those of such a model.
+
+    `config`: what the model was made from, to name it beside that of the checkpoint.
+    """
     shapes = {name: value.shape for name, value in model.state_dict().items()}
     saved = {name: value.shape for name, value in checkpoint["state_dict"].items()}
-    if differing := sorted(name for name in shapes.keys() | saved.keys() if shapes.get(name) != saved.get(name)):
-        raise CheckpointError(
-            f"ckpt_path must be a checkpoint of the model that model= names, got {path}, where {differing[0]} differs"
-        )
+    differing = sorted(name for name in shapes.keys() | saved.keys() if shapes.get(name) != saved.get(name))
+    if not differing:
+        return
+    wanted, found = (model_name(part) for part in (config or {}, checkpoint.get("config", {}).get("model", {})))
+    if wanted != found and config and "config" in checkpoint:
+        raise CheckpointError(f"ckpt_path must be a checkpoint of {wanted}, which model= names, got {path} of {found}")
+    raise CheckpointError(
+        f"ckpt_path must be a checkpoint of the model that model= names, got {path}, where {differing[0]} differs"
+    )

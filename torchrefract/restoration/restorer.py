@@ -1,0 +1,107 @@
+"""Pictures of any size restored by a model that was trained at one."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchrefract._checks import check_choice, check_count
+from torchrefract.restoration.tasks import Restored
+from torchrefract.restoration.tiles import in_tiles
+from torchrefract.warping.resample import INTERPOLATIONS, warp
+from torchrefract.warping.resize import resize_flow, resize_image
+
+_RADIUS = 2  # px of the small picture: windows of the local fit
+_NOISE = 1e-4  # variance below which a window tells nothing of how the change depends on the picture
+
+
+class Restorer:
+    """Pictures restored at their own size.
+
+    The model sees each picture reduced to `size`. Of a model that predicts a flow the flow is brought to the size of
+    the picture, which is looked up along it once. Of another one the change that it makes is brought there: by
+    `with_change`, or, with a `tile`, the model sees tiles of the picture as it is, see `in_tiles`.
+
+    Args:
+        model: images (B, 3, H, W) in [0, 1] -> Restored.
+        size: (height, width) of the frames that it was trained on, px.
+        tile: (height, width), px; None for one look at the whole picture.
+        interpolation: of the look-up along a flow.
+        batch: tiles that are restored at once.
+
+    Raises:
+        ValueError: a size, tile or interpolation that is none; in a call, a tile with a model that predicts a flow.
+    """
+
+    def __init__(
+        self,
+        model: Callable[[Tensor], Restored],
+        *,
+        size: Sequence[int],
+        tile: Sequence[int] | None = None,
+        interpolation: str = "bicubic",
+        batch: int = 4,
+    ):
+        self.model = model
+        self.size = (check_count("size", size[0]), check_count("size", size[1]))
+        self.tile = None if tile is None else (check_count("tile", tile[0]), check_count("tile", tile[1]))
+        self.interpolation = check_choice("interpolation", interpolation, INTERPOLATIONS)
+        self.batch = check_count("batch", batch)
+
+    @torch.inference_mode()
+    def __call__(self, images: Sequence[Tensor]) -> list[Tensor]:
+        """Pictures (3, H, W) in [0, 1], of any sizes, restored."""
+        if self.tile is not None:
+            restored = [in_tiles(self._piece, image, tile=self.tile, batch=self.batch) for image in images]
+            return [image.clamp(0, 1) for image in restored]
+        small = torch.cat([resize_image(image[None], self.size) for image in images])
+        seen = self.model(small)
+        if seen.flow is None:
+            parts = zip(images, small.split(1), seen.image.split(1), strict=True)
+            whole = [with_change(image[None], before, after) for image, before, after in parts]
+        else:
+            whole = [self._along(image[None], flow) for image, flow in zip(images, seen.flow.split(1), strict=True)]
+        return [image[0].clamp(0, 1) for image in whole]
+
+    def _piece(self, tiles: Tensor) -> Tensor:
+        seen = self.model(tiles)
+        if seen.flow is not None:
+            raise ValueError("tile must be None for a model that predicts a flow, and so sees the whole picture")
+        return seen.image
+
+    def _along(self, image: Tensor, flow: Tensor) -> Tensor:
+        there = resize_flow(flow.to(image.dtype), image.shape[2:])
+        return warp(image, there, padding="border", interpolation=self.interpolation)[0]
+
+
+def with_change(image: Tensor, small: Tensor, restored: Tensor) -> Tensor:
+    """A picture changed as a small copy of it was.
+
+        out = image + a image + b,  a = cov(small, restored - small) / (var(small) + 1e-4),
+        b = mean(restored - small) - a mean(small)
+
+    in windows of 5 x 5 px of the small one; a and b are averaged over the same windows, and enlarged. So a change of
+    contrast, as of fog, is one of the fine details too, which the small copy does not hold.
+
+    Args:
+        image: (B, C, H, W).
+        small, restored: (B, C, h, w).
+
+    Returns:
+        (B, C, H, W).
+
+    Source: He, Sun, "Fast guided filter", arXiv:1505.00996 (2015), with the change in place of the image.
+    """
+    change = restored - small
+    mean, mean_change = _mean(small), _mean(change)
+    covariance = _mean(small * change) - mean * mean_change
+    a = covariance / (_mean(small * small) - mean * mean + _NOISE)
+    b = mean_change - a * mean
+    a, b = (F.interpolate(_mean(part), image.shape[2:], mode="bilinear") for part in (a, b))
+    return image + a * image + b
+
+
+def _mean(value: Tensor) -> Tensor:
+    """The mean over the window around each pixel, as far as that lies on the picture."""
+    return F.avg_pool2d(value, 2 * _RADIUS + 1, 1, _RADIUS, count_include_pad=False)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrefract._checks import check_choice, check_count
 from torchrefract.restoration.tasks import Restored
@@ -57,12 +57,12 @@ class Restorer:
             return [image.clamp(0, 1) for image in restored]
         small = torch.cat([resize_image(image[None], self.size) for image in images])
         seen = self.model(small)
-        if seen.flow is None:
-            parts = zip(images, small.split(1), seen.image.split(1), strict=True)
-            whole = [with_change(image[None], before, after) for image, before, after in parts]
-        else:
-            whole = [self._along(image[None], flow) for image, flow in zip(images, seen.flow.split(1), strict=True)]
-        return [image[0].clamp(0, 1) for image in whole]
+        whole = []
+        for i, image in enumerate(images):
+            one = Restored(seen.image[i : i + 1], None if seen.flow is None else seen.flow[i : i + 1])
+            options = {"small": small[i : i + 1], "interpolation": self.interpolation}
+            whole.append(at_own_size(one, image[None], **options).image[0])
+        return whole
 
     def _piece(self, tiles: Tensor) -> Tensor:
         seen = self.model(tiles)
@@ -70,9 +70,29 @@ class Restorer:
             raise ValueError("tile must be None for a model that predicts a flow, and so sees the whole picture")
         return seen.image
 
-    def _along(self, image: Tensor, flow: Tensor) -> Tensor:
-        there = resize_flow(flow.to(image.dtype), image.shape[2:])
-        return warp(image, there, padding="border", interpolation=self.interpolation)[0]
+
+class Restoring(nn.Module):
+    """A model with what brings its restoration to the size of the images; arguments as for `Restorer`."""
+
+    def __init__(self, model: nn.Module, *, size: Sequence[int], interpolation: str = "bicubic"):
+        super().__init__()
+        self.model = model
+        self.size = (check_count("size", size[0]), check_count("size", size[1]))
+        self.interpolation = check_choice("interpolation", interpolation, INTERPOLATIONS)
+
+    def forward(self, image: Tensor) -> tuple[Tensor, ...]:
+        """Images (B, 3, H, W) in [0, 1], of one size, restored, and the flow, px, of a model that predicts one."""
+        small = resize_image(image, self.size)
+        restored = at_own_size(self.model(small), image, small=small, interpolation=self.interpolation)
+        return tuple(part for part in restored if part is not None)
+
+
+def at_own_size(seen: Restored, image: Tensor, *, small: Tensor, interpolation: str) -> Restored:
+    """The restoration of images (B, 3, H, W), in [0, 1], from that of small copies of them (B, 3, h, w)."""
+    if seen.flow is None:
+        return Restored(with_change(image, small, seen.image).clamp(0, 1))
+    flow = resize_flow(seen.flow.to(image.dtype), image.shape[2:])
+    return Restored(warp(image, flow, padding="border", interpolation=interpolation)[0].clamp(0, 1), flow)
 
 
 def with_change(image: Tensor, small: Tensor, restored: Tensor) -> Tensor:

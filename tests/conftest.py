@@ -155,6 +155,30 @@ def trained(tmp_path_factory, spawn, small) -> Trained:
     return Trained(words, outcome, outcome.folder)
 
 
+@pytest.fixture(scope="session")
+def known_model(tmp_path_factory) -> Callable[..., Path]:
+    """Writes checkpoints of models that answer the same for every pixel, whatever they see."""
+
+    def write(task: str, answer: tuple[float, ...], *, size: tuple[int, int] = (32, 64)) -> Path:
+        checkpoints = importlib.import_module("torchrefract.restoration.checkpoints")
+        network = {"_target_": "torchrefract.restoration.models.resunet.ResUNet", "encoder": "tu-mobilenetv3_small_050"}
+        model = {
+            "_target_": "torchrefract.restoration.module.Restoration",
+            "task": {"_target_": f"torchrefract.restoration.tasks.{task.capitalize()}"},
+            "network": network | {"_partial_": True},
+        }
+        weights = importlib.import_module("hydra.utils").instantiate(model).state_dict()
+        # Its last layer starts at zero.
+        weights["network.network.segmentation_head.0.bias"][:] = torch.tensor(answer)
+        content = {"state_dict": weights, "task": task, "flows": (torch.zeros(0), torch.zeros(0))}
+        content |= {"config": {"model": model}, "data": {"size": [*size]}, "licenses": {"data": "CC0"}}
+        path = tmp_path_factory.mktemp("known") / "best.ckpt"
+        checkpoints.AtomicCheckpointIO().save_checkpoint(content, path)
+        return path
+
+    return write
+
+
 @pytest.fixture
 def call(monkeypatch, tmp_path, capsys, on_threads) -> Iterator[Callable[..., Outcome]]:
     """Runs a command in this process, on one thread, in the test's folder: no start to wait for."""

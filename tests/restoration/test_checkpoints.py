@@ -7,10 +7,20 @@ from typing import Any
 
 import pytest
 import torch
+from pytorch_lightning import Trainer
 from torch import nn
 
 from torchrefract.restoration import checkpoints
-from torchrefract.restoration.checkpoints import AtomicCheckpointIO, CheckpointError, check_fits, read_checkpoint
+from torchrefract.restoration.checkpoints import (
+    AtomicCheckpointIO,
+    CheckpointError,
+    Origin,
+    check_fits,
+    model_name,
+    read_checkpoint,
+)
+from torchrefract.restoration.module import Restoration
+from torchrefract.restoration.tasks import Undistort
 
 
 def content(value: float = 1.0, task: str = "undistort"):
@@ -205,3 +215,39 @@ def test_the_weights_of_another_model_do_not_fit(other):
         match=r"^ckpt_path must be a checkpoint of the model that model= names, got last.ckpt, where \d\..* differs$",
     ):
         check_fits({"state_dict": other.state_dict()}, model, Path("last.ckpt"))
+
+
+RESUNET = {"network": {"_target_": "torchrefract.restoration.models.resunet.ResUNet", "encoder": "tu-resnet34"}}
+SEGFORMER = {"network": {"_target_": "torchrefract.restoration.models.segformer.SegFormer", "encoder": "mit_b1"}}
+
+
+def test_the_weights_of_another_model_are_refused_by_both_names():
+    model, other = nn.Sequential(nn.Linear(8, 8)), nn.Sequential(nn.Linear(8, 9))
+    checkpoint = {"state_dict": other.state_dict(), "config": {"model": RESUNET}}
+    with pytest.raises(CheckpointError) as caught:
+        check_fits(checkpoint, model, Path("last.ckpt"), config=SEGFORMER)
+    wanted = "ckpt_path must be a checkpoint of SegFormer (mit_b1), which model= names"
+    assert str(caught.value) == f"{wanted}, got last.ckpt of ResUNet (tu-resnet34)"
+
+
+def test_a_model_is_called_by_its_network_and_encoder():
+    assert model_name(RESUNET) == "ResUNet (tu-resnet34)"
+    assert model_name({"network": {"_target_": "a.b.Unet"}}) == "Unet"
+    assert model_name({"_target_": "a.b.Diffusion", "steps": 3}) == "Diffusion"
+
+
+def test_a_checkpoint_says_where_it_comes_from(tmp_path):
+    config, data = {"model": {"lr": 1e-3, "size": [3, 4]}, "task": None}, {"frames": 3, "sha256": "00"}
+    trainer = Trainer(
+        callbacks=[Origin(config, data=data, licenses={"data": "CC0"})],
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        plugins=[AtomicCheckpointIO()],
+    )
+    trainer.strategy.connect(Restoration(lambda channels: nn.Linear(1, channels), Undistort()))
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    found = read_checkpoint(tmp_path / "last.ckpt")
+    assert (found["config"], found["data"], found["licenses"]) == (config, data, {"data": "CC0"})

@@ -12,8 +12,8 @@ from torchrefract.restoration.tiles import in_tiles
 from torchrefract.warping.resample import INTERPOLATIONS, warp
 from torchrefract.warping.resize import resize_flow, resize_image
 
-_RADIUS = 2  # px of the small picture: windows of the local fit
-_NOISE = 1e-4  # variance below which a window tells nothing of how the change depends on the picture
+_RADIUS = 1  # px of the small picture, of the windows that tell how a change depends on it
+_NOISE = 1e-5  # variance below which a window tells nothing: that of rounding to bytes
 
 
 class Restorer:
@@ -98,11 +98,11 @@ def at_own_size(seen: Restored, image: Tensor, *, small: Tensor, interpolation: 
 def with_change(image: Tensor, small: Tensor, restored: Tensor) -> Tensor:
     """A picture changed as a small copy of it was.
 
-        out = image + a image + b,  a = cov(small, restored - small) / (var(small) + 1e-4),
-        b = mean(restored - small) - a mean(small)
+        out = image + change + a (image - small),  change = restored - small,
+        a = cov(small, change) / (var(small) + 1e-5) in windows of 3 x 3 px
 
-    in windows of 5 x 5 px of the small one; a and b are averaged over the same windows, and enlarged. So a change of
-    contrast, as of fog, is one of the fine details too, which the small copy does not hold.
+    with all of the small copy enlarged. So a change of contrast, as of fog, is one of the fine details too, which the
+    small copy lacks.
 
     Args:
         image: (B, C, H, W).
@@ -111,15 +111,15 @@ def with_change(image: Tensor, small: Tensor, restored: Tensor) -> Tensor:
     Returns:
         (B, C, H, W).
 
-    Source: He, Sun, "Fast guided filter", arXiv:1505.00996 (2015), with the change in place of the image.
+    Source: after He, Sun, Tang, "Guided image filtering", IEEE TPAMI 35 (2013), whose a this is.
     """
     change = restored - small
-    mean, mean_change = _mean(small), _mean(change)
-    covariance = _mean(small * change) - mean * mean_change
+    mean = _mean(small)
+    covariance = _mean(small * change) - mean * _mean(change)
     a = covariance / (_mean(small * small) - mean * mean + _NOISE)
-    b = mean_change - a * mean
-    a, b = (F.interpolate(_mean(part), image.shape[2:], mode="bilinear") for part in (a, b))
-    return image + a * image + b
+    enlarged = F.interpolate(torch.cat([small, change, a], dim=1), image.shape[2:], mode="bilinear")
+    before, change, a = enlarged.chunk(3, dim=1)
+    return image + change + a * (image - before)
 
 
 def _mean(value: Tensor) -> Tensor:

@@ -1,0 +1,84 @@
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from torch.utils.data import Dataset
+
+from torchrefract.data.fingerprint import fingerprint
+from torchrefract.data.frame_folder import FrameFolder
+from torchrefract.data.paired_folder import PairedFolder
+from torchrefract.data.road_scenes import RoadScenes
+from torchrefract.types import Frame
+
+
+@pytest.fixture
+def frames(tmp_path) -> Path:
+    """Six pictures of two drives."""
+    dice = np.random.default_rng(0)
+    for number in range(6):
+        path = tmp_path / "frames" / f"drive{number // 3}" / f"{number}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(dice.integers(0, 256, (32, 48, 3)).astype(np.uint8)).save(path)
+    return tmp_path / "frames"
+
+
+def test_a_folder_is_told_by_the_names_and_sizes_of_its_files(frames):
+    told = fingerprint(FrameFolder(frames, size=(16, 24)))
+    lines = [f"drive{k // 3}/{k}.png {(frames / f'drive{k // 3}' / f'{k}.png').stat().st_size}\n" for k in range(6)]
+    assert told == {
+        "source": "FrameFolder",
+        "root": str(frames),
+        "frames": 6,
+        "drives": 2,
+        "size": [16, 24],
+        "license": None,
+        "sha256": hashlib.sha256("".join(lines).encode()).hexdigest(),
+    }
+    json.dumps(told)
+
+
+def test_another_file_or_name_is_another_folder(frames):
+    before = fingerprint(FrameFolder(frames, size=(16, 24)))["sha256"]
+    assert fingerprint(FrameFolder(frames, size=(32, 48)))["sha256"] == before
+    (frames / "drive0" / "0.png").rename(frames / "drive0" / "9.png")
+    renamed = fingerprint(FrameFolder(frames, size=(16, 24)))["sha256"]
+    with (frames / "drive0" / "9.png").open("ab") as stream:
+        stream.write(b"more")
+    assert len({before, renamed, fingerprint(FrameFolder(frames, size=(16, 24)))["sha256"]}) == 3
+
+
+def test_pairs_are_told_by_their_checksums_and_come_with_a_license(call, frames):
+    words = ("scene=paper_weather", f"source={frames}", "license=CC0", "workers=0")
+    for out, seed in (("one", 0), ("same", 0), ("other", 1)):
+        assert call("generate", *words, f"out={out}", f"seed={seed}").code == 0
+    one, same, other = (fingerprint(PairedFolder(frames.parent / name)) for name in ("one", "same", "other"))
+    assert (one["frames"], one["drives"], one["size"], one["license"]) == (6, 2, [32, 48], "CC0")
+    assert one["sha256"] == same["sha256"] != other["sha256"]
+    (frames.parent / "one" / "config.json").write_text("damaged")
+    assert fingerprint(PairedFolder(frames.parent / "one")) == one | {"license": None}
+    train = fingerprint(PairedFolder(frames.parent / "one", split="train"))
+    assert (train["frames"], train["drives"]) == (3, 1)
+
+
+def test_scenes_are_told_by_what_they_are_rendered_from():
+    told = fingerprint(RoadScenes(4, size=(16, 24)))
+    assert (told["root"], told["drives"], told["frames"], told["size"]) == (None, None, 4, [16, 24])
+    others = [RoadScenes(4, size=(16, 24), first=1), RoadScenes(4, size=(16, 24), seed=1), RoadScenes(5, size=(16, 24))]
+    assert len({told["sha256"], *(fingerprint(other)["sha256"] for other in others)}) == 4
+
+
+def test_a_set_of_the_users_own_is_told_by_its_name_and_length():
+    class Mine(Dataset[Frame]):
+        """Two frames."""
+
+        def __len__(self) -> int:
+            return 2
+
+        def __getitem__(self, index: int) -> Frame:
+            return RoadScenes(2, size=(16, 24))[index]
+
+    told = fingerprint(Mine())
+    assert (told["source"], told["frames"], told["size"], told["root"]) == ("Mine", 2, [16, 24], None)

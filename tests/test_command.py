@@ -35,6 +35,12 @@ def test_a_command_without_a_task_lists_the_tasks(call, name):
     assert f"python -m torchrefract.{name} +task=" in message
 
 
+def test_an_experiment_chooses_its_task_itself(call):
+    outcome = call("train", "+experiment=table1_segformer_deweather", "data.root=frames", "--cfg", "job")
+    assert OmegaConf.create(outcome.out).task._target_ == "torchrefract.restoration.tasks.Deweather"
+    assert "data.root" in call("train", "+experiment=table1_segformer_deweather_small", *BRIEFLY).message
+
+
 @pytest.mark.parametrize("name", ["train", "eval"])
 def test_a_task_without_its_plus_is_told_of_the_plus(call, name):
     message = call(name, "task=deweather", "seed=1").message

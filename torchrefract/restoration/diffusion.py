@@ -144,7 +144,7 @@ class Diffusion(Learner):
             return torch.stack([v[:, y : y + size[0], x : x + size[1]] for v, (y, x) in rows])
 
         degraded, clean, flow, valid = (cut(value) for value in whole.pair[:4])
-        pair = Pair(degraded, clean, flow, valid & inside(flow), whole.pair.key)
+        pair = whole.pair._replace(degraded=degraded, clean=clean, flow=flow, valid=valid & inside(flow))
         return _Part(pair, cut(whole.condition), whole.size)
 
     def _loss(self, part: _Part, source: Stream) -> Tensor:

@@ -16,8 +16,8 @@ from torchrefract.data.module import make_pair
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint
 from torchrefract.restoration.diffusion import Diffusion
+from torchrefract.restoration.finite import NotFiniteError
 from torchrefract.restoration.models.denoiser import Denoiser
-from torchrefract.restoration.module import Learner
 from torchrefract.restoration.tasks import Deweather, Undistort
 from torchrefract.types import Frame
 
@@ -182,12 +182,12 @@ def test_each_sample_and_each_step_has_a_level_and_a_noise_of_its_own_all_levels
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_training_is_the_same_from_the_same_seed_and_does_not_touch_other_draws(trainer, task):
+def test_training_is_the_same_from_the_same_seed_whatever_else_is_drawn(trainer, task):
     found = []
-    for seed in (4, 4, 5):
+    for seed, others in ((4, 1), (4, 2), (5, 1)):
         torch.manual_seed(3)
         model, losses = Diffusion(tiny, TASKS[task], seed=seed, lr=1e-3, crop=12), Losses()
-        torch.manual_seed(seed)
+        torch.manual_seed(others)
         trainer(max_epochs=1, callbacks=[losses]).fit(model, loader(pairs(task)))
         found.append(losses.seen)
     assert found[0] == found[1]
@@ -199,8 +199,8 @@ def test_overfitting_one_batch_lowers_the_loss_markedly(trainer, task):
     batches = pairs(task, 1, size=(32, 32), batch=2)
     torch.manual_seed(0)
     model, losses = Diffusion(tiny, TASKS[task], lr=5e-3, warmup_steps=5), Losses()
-    trainer(max_epochs=1, callbacks=[losses]).fit(model, loader(batches * 25))
-    assert np.mean(losses.seen[-5:]) < 0.5 * np.mean(losses.seen[:5])
+    trainer(max_epochs=1, callbacks=[losses]).fit(model, loader(batches * 40))
+    assert np.mean(losses.seen[-10:]) < 0.5 * np.mean(losses.seen[:5])
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -365,13 +365,9 @@ def test_mixed_precision_trains_and_restores_without_nan(trainer):
 def test_a_loss_that_is_not_a_number_stops_with_the_keys(trainer):
     batches = pairs("deweather", 1, first=40)
     with pytest.raises(
-        Exception, match=r"^loss must be finite, got nan in step 0 of epoch 0 for the keys 40, 41, 42, 43$"
+        NotFiniteError, match=r"^loss must be finite, got nan in step 0 of epoch 0 for the keys 40, 41, 42, 43$"
     ):
         trainer(max_epochs=1).fit(Diffusion(Broken, Deweather()), loader(batches))
-
-
-def test_a_diffusion_model_is_scored_and_logged_as_the_others_are():
-    assert isinstance(Diffusion(Guess, Undistort()), Learner)
 
 
 @pytest.mark.parametrize(

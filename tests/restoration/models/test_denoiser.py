@@ -1,4 +1,3 @@
-import json
 from functools import partial
 
 import huggingface_hub.constants
@@ -142,14 +141,16 @@ def test_a_name_on_a_hub_that_cannot_be_reached_names_the_option_that_avoids_it(
         tiny(2, pretrained="nobody/nothing")
 
 
-def test_what_a_hub_writes_has_the_layout_that_is_read(folder, tmp_path):
-    config = json.loads((tmp_path / "hub" / "config.json").read_text(encoding="utf-8"))
-    assert config["_class_name"] == "UNet2DModel"
-    assert config["in_channels"] == 3
-
-
-def test_scales_that_do_not_fit_are_named():
-    with pytest.raises(ValueError, match=r"attention must have one entry a scale, 2 in all, got \[True\]"):
-        Denoiser(2, widths=(8, 16), attention=(True,), groups=4)
-    with pytest.raises(ValueError, match=r"widths must be multiples of groups = 32, got \[8, 16\]"):
-        Denoiser(2, widths=(8, 16), attention=(False, True))
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"attention": (True,)}, r"attention must have an entry for each of widths = \[8, 16\], got \[True\]"),
+        ({"widths": (), "attention": ()}, r"attention must have an entry for each of widths = \[\], got \[\]"),
+        ({"groups": 32}, r"widths must be multiples of groups = 32, got \[8, 16\]"),
+        ({"groups": 0}, "groups must be at least 1, got 0"),
+        ({"layers": 0}, "layers must be at least 1, got 0"),
+    ],
+)
+def test_a_size_that_is_none_is_named(words, message):
+    with pytest.raises(ValueError, match=message):
+        Denoiser(2, **TINY | words)

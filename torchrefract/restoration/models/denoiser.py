@@ -7,15 +7,16 @@ import torch.nn.functional as F
 from diffusers import UNet2DModel
 from torch import Tensor, nn
 
+from torchrefract._checks import check_count
 from torchrefract.warping.grid import pixel_axes, sampler_positions
 
-CONDITIONS = 5  # the image, and the pixel coordinates
+_CONDITIONS = 5  # the image, and the pixel coordinates
 # Of the published network these follow from what is restored, and do not make it another one.
 _FREE = ("in_channels", "out_channels", "sample_size")
 
 
 class Denoiser(nn.Module):
-    """The noise in a noisy target, told from it, from its level of noise, and from what it belongs to.
+    """What `Diffusion` wants predicted of a noisy target, from it, its level of noise, and what it belongs to.
 
     The network of denoising diffusion models, by default that of 35.7 M parameters with its attention at the coarsest
     scale, where large frames can afford it. Weights that were trained before on pictures keep what they know: the
@@ -32,8 +33,8 @@ class Denoiser(nn.Module):
             on the hub, such as google/ddpm-cat-256, or a folder that `UNet2DModel.save_pretrained` wrote.
 
     Raises:
-        ValueError: widths and attention of different lengths, widths that the groups do not divide, pretrained weights
-            that cannot be had, or are those of another network.
+        ValueError: widths and attention of different lengths or empty, widths that the groups do not divide, pretrained
+            weights that cannot be had, or are those of another network.
 
     Source: Ho, Jain, Abbeel, "Denoising diffusion probabilistic models", NeurIPS 2020.
     """
@@ -49,17 +50,17 @@ class Denoiser(nn.Module):
         pretrained: str | None = None,
     ):
         super().__init__()
-        if len(widths) != len(attention):
-            raise ValueError(f"attention must have one entry a scale, {len(widths)} in all, got {list(attention)}")
-        if any(width % groups for width in widths):
+        if not len(widths) == len(attention) > 0:
+            raise ValueError(f"attention must have an entry for each of widths = {list(widths)}, got {list(attention)}")
+        if any(width % check_count("groups", groups) for width in widths):
             raise ValueError(f"widths must be multiples of groups = {groups}, got {list(widths)}")
         self.network = UNet2DModel(
-            in_channels=channels + CONDITIONS,
+            in_channels=channels + _CONDITIONS,
             out_channels=channels,
             block_out_channels=tuple(widths),
             down_block_types=tuple("AttnDownBlock2D" if at else "DownBlock2D" for at in attention),
             up_block_types=tuple("AttnUpBlock2D" if at else "UpBlock2D" for at in reversed(attention)),
-            layers_per_block=layers,
+            layers_per_block=check_count("layers", layers),
             norm_num_groups=groups,
             # As in the published network, where diffusers has other defaults.
             attention_head_dim=None,
@@ -74,7 +75,7 @@ class Denoiser(nn.Module):
             self.network.down_blocks.requires_grad_(False)
 
     def forward(self, noisy: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-        """(B, channels, H, W), float32: the noise.
+        """(B, channels, H, W), float32: the noise, or whatever else it was trained to predict.
 
         Args:
             noisy: (B, channels, H, W), the target with noise, of any size.

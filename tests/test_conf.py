@@ -80,7 +80,8 @@ def test_a_diffusion_model_has_the_size_of_its_name_and_the_defaults_of_its_clas
     assert sum(parameter.numel() for parameter in model.parameters()) / 1e6 == pytest.approx(millions, abs=0.01)
     assert model.task.name == task
     assert model.seed == 5
-    named = {"lr", "weight_decay", "warmup_steps", "sampler", "steps", "val_steps", "crop", "ema_decay", "metric_size"}
+    named = ["lr", "weight_decay", "warmup_steps", "schedule", "metric_size", "sampler", "steps", "val_steps", "crop"]
+    named.append("ema_decay")
     assert {option: getattr(model, option) for option in named} == {option: getattr(plain, option) for option in named}
     assert model.prediction == {"ddpm": "v_prediction", "ddpm_cat256": "epsilon"}[name]
 

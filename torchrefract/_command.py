@@ -31,6 +31,7 @@ from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.module import PairData
 from torchrefract.restoration.checkpoints import CheckpointError, Origin, check_fits, read_checkpoint
 from torchrefract.restoration.finite import NotFiniteError
+from torchrefract.restoration.models.pretrained import weights_license
 
 _T = TypeVar("_T")
 _INFORMING = ("--help", "-h", "--hydra-help", "--info", "--shell-completion", "-sc")
@@ -164,7 +165,9 @@ def _add_origin(cfg: DictConfig, made: Job) -> None:
     """Checkpoints of the run will say where they come from."""
     data = fingerprint(made.data.train)
     config = cast(dict[str, Any], OmegaConf.to_container(cfg, enum_to_str=True))
-    origin = Origin(config, data=data, licenses={"data": data["license"]})
+    network = cfg.model.network
+    weights = weights_license(network.encoder) if "encoder" in network and network.get("pretrained") else None
+    origin = Origin(config, data=data, licenses={"data": data["license"], "pretrained weights": weights})
     made.trainer.callbacks.insert(0, origin)  # pyright: ignore[reportAttributeAccessIssue]  # a connector sets it
 
 

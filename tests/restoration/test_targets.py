@@ -72,3 +72,8 @@ class Other(Task):
 def test_a_task_of_another_kind_is_named():
     with pytest.raises(TypeError, match="task must be Undistort or Deweather for a diffusion model, got Other"):
         target_of(Other())
+
+
+def test_a_transmission_is_not_a_part_of_the_target():
+    with pytest.raises(ValueError, match="task.transmission_head must be false for a diffusion model, got true"):
+        target_of(Deweather(transmission_head=True))

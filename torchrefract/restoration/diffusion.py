@@ -56,7 +56,7 @@ class Diffusion(Learner):
         network: makes the network, given the number of channels of the target; called with a noisy target, its level
             and the conditions, as is `Denoiser`.
         task: Undistort or Deweather.
-        lr, weight_decay, warmup_steps, metric_size: as for `Learner`.
+        lr, weight_decay, warmup_steps, schedule, metric_size: as for `Learner`.
         prediction: "v_prediction" or "epsilon", what the network predicts.
         sampler: "ddim", "dpm_solver" or "ddpm", which wants many steps.
         steps: of the sampler in `forward` and in an evaluation, from 1 to 1000.
@@ -81,6 +81,7 @@ class Diffusion(Learner):
         lr: float = 1e-5,
         weight_decay: float = 1e-2,
         warmup_steps: int = 500,
+        schedule: str = "cosine",
         metric_size: Sequence[int] = (1080, 1920),
         prediction: str = "v_prediction",
         sampler: str = "ddim",
@@ -91,7 +92,7 @@ class Diffusion(Learner):
         seed: int = 0,
     ):
         target = target_of(task)
-        options = {"lr": lr, "weight_decay": weight_decay, "warmup_steps": warmup_steps}
+        options = {"lr": lr, "weight_decay": weight_decay, "warmup_steps": warmup_steps, "schedule": schedule}
         super().__init__(network(target.channels), task, metric_size=metric_size, **options)
         self.target = target
         self.prediction = check_choice("prediction", prediction, _PREDICTIONS)

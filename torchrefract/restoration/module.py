@@ -45,8 +45,8 @@ class Learner(LightningModule, ABC):
         lr: float,
         weight_decay: float,
         warmup_steps: int,
+        schedule: str,
         metric_size: Sequence[int],
-        schedule: str = "cosine",
     ):
         super().__init__()
         self.task, self.network = task, network

@@ -65,9 +65,12 @@ def target_of(task: Task) -> Target:
 
     Raises:
         TypeError: a task of another kind.
+        ValueError: a task that has a transmission predicted, too.
     """
     if isinstance(task, Undistort):
         return FlowTarget(task.limit)
     if isinstance(task, Deweather):
+        if task.channels != ImageTarget.channels:
+            raise ValueError("task.transmission_head must be false for a diffusion model, got true")
         return ImageTarget()
     raise TypeError(f"task must be Undistort or Deweather for a diffusion model, got {type(task).__name__}")

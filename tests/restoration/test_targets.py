@@ -75,5 +75,5 @@ def test_a_task_of_another_kind_is_named():
 
 
 def test_a_transmission_is_not_a_part_of_the_target():
-    with pytest.raises(ValueError, match="task.transmission_head must be false for a diffusion model, got true"):
+    with pytest.raises(ValueError, match=r"task.transmission_head must be false for a diffusion model, got true"):
         target_of(Deweather(transmission_head=True))

@@ -221,7 +221,9 @@ def _seed(seed: int | Tensor) -> int | Tensor:
 def _keys(keys: Tensor | Sequence[int] | None, batch: int, device: torch.device) -> Tensor | range:
     if keys is None:
         return range(batch)
-    keys = torch.as_tensor(keys, device=device)
+    # An empty list has no type of its own.
+    dtype = None if isinstance(keys, Tensor) or len(keys) else torch.int64
+    keys = torch.as_tensor(keys, dtype=dtype, device=device)
     if keys.is_floating_point() or keys.is_complex() or keys.dtype is torch.bool:
         raise TypeError(f"keys must be whole numbers, got {keys.dtype}")
     if keys.reshape(-1).shape[0] != batch or keys.ndim > 1:

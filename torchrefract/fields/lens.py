@@ -148,16 +148,22 @@ def _flow_of_rows(
 ) -> tuple[Tensor, Tensor]:
     x, y, exists = undistort_polynomial(x_d.detach(), y_d.detach(), c.detach(), limit=limit, terms=terms)
     if torch.is_grad_enabled() and (c.requires_grad or x_d.requires_grad):
-        x, y = _attach(x, y, x_d, y_d, c, terms)
+        x, y = _attach(*_known(x, y, exists), x_d, y_d, c, terms)
     return _as_flow(x - x_d, y - y_d, exists, x_d, y_d, focal), exists
 
 
 def _restore_flow_of_rows(
     x: Tensor, y: Tensor, c: Tensor, focal: Tensor, limit: RadialLimit, terms: Terms
 ) -> tuple[Tensor, Tensor]:
-    x_d, y_d = distort_polynomial(x, y, c, terms)
     exists = _unfolded(x, y, c, limit, terms)
+    known = _known(x, y, exists) if torch.is_grad_enabled() and (c.requires_grad or x.requires_grad) else (x, y)
+    x_d, y_d = distort_polynomial(*known, c, terms)
     return _as_flow(x_d - x, y_d - y, exists, x, y, focal), exists
+
+
+def _known(x: Tensor, y: Tensor, exists: Tensor) -> tuple[Tensor, Tensor]:
+    """The points that exist; the others at the center, as zero times an infinite slope would be a gradient of NaN."""
+    return torch.where(exists, x, 0), torch.where(exists, y, 0)
 
 
 def _unfolded(x: Tensor, y: Tensor, c: Tensor, limit: RadialLimit, terms: Terms) -> Tensor:

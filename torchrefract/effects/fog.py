@@ -23,6 +23,7 @@ from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 
 _ROUNDING = 2e-5
+_ENDLESS = 1e30  # m, of a visibility that float32 hardly holds
 
 
 class FogParams(NamedTuple):
@@ -188,9 +189,9 @@ def check_visibility(value: Range) -> Range:
 def visibility_span(limits: Range) -> Range:
     """What a uniform number is drawn from for `drawn_visibility`."""
     # An infinite end has no uniform draw: 1/V is drawn there, as it has one.
-    return (1 / limits[1], 1 / limits[0]) if limits[1] == torch.inf else limits
+    return (1 / limits[1], 1 / limits[0]) if limits[1] > _ENDLESS else limits
 
 
 def drawn_visibility(value: Tensor, limits: Range) -> Tensor:
     """(B,), m, from a number of `visibility_span`."""
-    return 1 / value if limits[1] == torch.inf else value
+    return 1 / value if limits[1] > _ENDLESS else value

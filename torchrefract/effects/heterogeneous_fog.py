@@ -28,7 +28,7 @@ from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.radiance import Shaded
 from torchrefract.effects.random_field import check_key
 from torchrefract.effects.rows import column, frame_mean, spread
-from torchrefract.effects.scales import check_scales, chosen, stretched
+from torchrefract.effects.scales import check_scales, chosen, periods, stretched
 from torchrefract.fields.fog import drifting_transmission_, transmission
 from torchrefract.fields.fog_volume import path_mean
 from torchrefract.fields.perlin import Nodes, Octave, perlin_noise
@@ -195,8 +195,8 @@ class HeterogeneousFog(PlannedLight):
         known = self.tolerance is not None and not any_depth
         farthest = max(distances(self.air, height, width)[1]) if known else math.inf
         thickness = extinctions(self)[1] * min(farthest, 1e12)
-        periods = tuple(self._periods(width)) if self.mode == "image" else self.scales
-        drifts = Drifts(thickness, periods, self._shares(), self.mean == "image", self.air.blend)
+        lengths = self._periods(height, width) if self.mode == "image" else self.scales
+        drifts = Drifts(thickness, lengths, self._shares(), self.mean == "image", self.air.blend)
         if self.mode == "ray" or self.normalize == "image":
             contrast = self.contrast_range[1] if self.mode == "ray" else None
             return space_plan(drifts, contrast, height, width, self.tolerance, dtype is torch.float64)
@@ -265,11 +265,11 @@ class HeterogeneousFog(PlannedLight):
         self, key: Tensor, share: Tensor, motion: dict[str, Any], plan: DriftPlan
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The paper's noise, for weights (N, K) of sum 1."""
-        periods = self._periods(plan.width)
+        lengths = self._periods(plan.height, plan.width)
 
         def made(numbers: Sequence[int], height: int, width: int, **lattice: int) -> list[Octave]:
             size: Any = {"height": height, "width": width, "dtype": share.dtype, **lattice}
-            return [perlin_octave(key, i, period=periods[i], **size, **motion) for i in numbers]
+            return [perlin_octave(key, i, period=lengths[i], **size, **motion) for i in numbers]
 
         octaves = made(plan.fine, plan.height, plan.width)
         if self.normalize == "image":
@@ -293,8 +293,7 @@ class HeterogeneousFog(PlannedLight):
     def _inverse_mean(self, q: Tensor, ensemble: float) -> Tensor:
         return 1 / frame_mean(q) if self.mean == "image" else q.new_full((1, 1, 1, 1), 1 / ensemble)
 
-    def _periods(self, width: int) -> list[float]:
+    def _periods(self, height: int, width: int) -> tuple[float, ...]:
         """Of the noises, px."""
-        if self.scale_unit == "cells":
-            return [width / scale for scale in self.scales]
-        return [scale * width / self.reference_width for scale in self.scales]
+        size = {"height": height, "width": width}
+        return periods(self.scales, unit=self.scale_unit, reference_width=self.reference_width, **size)

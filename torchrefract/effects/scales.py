@@ -14,6 +14,8 @@ _PAPER_WEIGHTS = (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)
 # Drifts of fog over a road: most of the variance in those as long as a few cars.
 _ROAD_SCALES = (12.0, 24.0, 48.0, 96.0)
 _ROAD_WEIGHTS = (0.2, 0.3, 0.3, 0.2)
+# More would cost gigabytes.
+_MOST_NODES = 1 << 24
 
 
 def check_scales(
@@ -33,6 +35,28 @@ def check_scales(
     if sum(weights) <= 0:
         raise ValueError(f"weights must have a sum above 0, got {weights}")
     return scales, weights
+
+
+def periods(
+    scales: Sequence[float], *, unit: str, reference_width: float, height: int, width: int
+) -> tuple[float, ...]:
+    """Of the noises in a frame, px.
+
+    Args:
+        scales, unit, reference_width: as for `HeterogeneousFog`.
+        height, width: px, of the frame.
+
+    Raises:
+        ValueError: periods so short that the frame has more than 2^24 nodes, and more than four for each pixel.
+    """
+    found = tuple(width / scale if unit == "cells" else scale * width / reference_width for scale in scales)
+    most, shortest = max(_MOST_NODES, 4 * height * width), min(found)
+    if height * width > most * shortest * shortest:
+        raise ValueError(
+            f"scales must have periods of at least {(height * width / most) ** 0.5:.2g} px in a frame of "
+            f"{height} x {width} px, got {shortest:.2g} px"
+        )
+    return found
 
 
 def chosen(share: Tensor, octaves: Sequence[int]) -> Tensor:

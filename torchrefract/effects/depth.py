@@ -23,13 +23,13 @@ class DepthProvider(ABC):
 class LinearDepth(DepthProvider):
     """The paper's depth, by row: d(y) = (1 - (y + 1/2) / H) max_depth.
 
-    max_depth: m, at the top edge of the frame, at least 0.
+    max_depth: m, at the top edge of the frame, in [0, 1e12].
     """
 
     max_depth: float = 160.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "max_depth", check_number("max_depth", self.max_depth, low=0.0))
+        object.__setattr__(self, "max_depth", check_number("max_depth", self.max_depth, low=0.0, high=1e12))
 
     def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
         return linear_depth(height, self.max_depth, dtype=dtype, device=device)

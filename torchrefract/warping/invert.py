@@ -11,6 +11,8 @@ from torchrefract.warping.resample import look_up
 
 # Px: after so short a step the next one, a square of it, is below rounding.
 _NEAR = {torch.float32: 1e-3, torch.float64: 1e-6}
+# Px: flow from here on leads nowhere, and its square is a number still.
+_FARTHEST = 1e12
 # Of so many pixels one may be left on a fold, where no step helps.
 _FEW = 500
 
@@ -51,7 +53,7 @@ def invert_flow(flow: Tensor, *, steps: int = 6, tolerance_px: float = 0.05) -> 
     check_count("steps", steps)
     check_positive("tolerance_px", tolerance_px)
     flow = flow.to(field_dtype(flow.dtype))
-    known = flow.isfinite().all(dim=1, keepdim=True)
+    known = (flow.abs() <= _FARTHEST).all(dim=1, keepdim=True)
     flow = torch.where(known, flow, 0)
     with torch.no_grad():
         table = torch.cat([flow, _gradient(flow)], dim=1)

@@ -12,6 +12,11 @@ import torch
 from torch import Tensor
 
 
+def pytest_addoption(parser) -> None:
+    """How much of the stability contract is tried: a part in minutes, or all of it."""
+    parser.addoption("--extremes", choices=["part", "full"], default="part", help="full: many cases, large frames")
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real frames and lenses that lies beside the checkout of a developer."""

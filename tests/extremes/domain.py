@@ -1,0 +1,186 @@
+"""The whole domain that every effect says it takes, as hypothesis draws it."""
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from hypothesis import strategies as st
+from hypothesis.strategies import SearchStrategy
+from torch import Tensor
+
+import torchrefract as tr
+from torchrefract.effects.base import Effect
+from torchrefract.fields.covariance import COVARIANCES
+from torchrefract.types import Range
+from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS
+
+DTYPES = (torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64)
+_FIELD = {"wind_x_range": (-1e6, 1e6), "wind_y_range": (-1e6, 1e6), "decorrelation_range": (1e-3, math.inf)}
+_FOG = {"visibility_range": (1e-6, math.inf), "deviation_range": (-0.999, 0.999)}
+
+
+class Domain(NamedTuple):
+    """An effect, the bounds of its ranges, and the values of its other arguments."""
+
+    kind: type[Effect]
+    ranges: dict[str, Range]
+    others: dict[str, SearchStrategy[Any]]
+
+
+def _numbers(low: float, high: float, **options: Any) -> SearchStrategy[float]:
+    """Numbers over many powers of ten, with both ends and zero among them."""
+    ends = [value for value in (low, high, 0.0) if low <= value <= high]
+    near = st.floats(max(low, -3.0), min(high, 3.0)) if max(low, -3.0) <= min(high, 3.0) else st.nothing()
+    return st.one_of(near, st.floats(low, high, allow_nan=False, **options), st.sampled_from(ends))
+
+
+def _colors(high: float) -> SearchStrategy[float]:
+    return st.floats(0.0, high)
+
+
+_WARP = {
+    "padding": st.sampled_from(PADDINGS),
+    "interpolation": st.sampled_from(INTERPOLATIONS),
+    "tolerance_px": st.sampled_from([None, 0.02, 0.5]),
+}
+_AIR = {
+    "airlight": st.none() | _colors(1.0),
+    "threshold": st.floats(1e-6, 1 - 1e-6),
+    "linear_light": st.booleans(),
+    "tolerance": st.sampled_from([None, 0.5]),
+    "depth": st.one_of(
+        st.builds(tr.LinearDepth, max_depth=_numbers(0.0, 1e12)),
+        st.builds(
+            tr.GroundPlaneDepth,
+            camera_height=_numbers(1e-308, 1e308),
+            focal=_numbers(1e-308, 1e308),
+            horizon=_numbers(-10.0, 10.0),
+            spread=_numbers(0.0, 10.0),
+            far=_numbers(1e-6, math.inf),
+        ),
+    ),
+}
+DOMAINS = {
+    "lens": Domain(
+        tr.LensDistortion,
+        {
+            **{f"{name}_range": (-100.0, 100.0) for name in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")},
+            **{f"s{i}_range": (-100.0, 100.0) for i in range(1, 5)},
+            "focal_range": (0.01, 1000.0),
+            "aspect_range": (0.01, 100.0),
+            "center_x_range": (-10.0, 10.0),
+            "center_y_range": (-10.0, 10.0),
+        },
+        _WARP,
+    ),
+    "turbulence": Domain(
+        tr.Turbulence,
+        {"amplitude_range": (0.0, 1e4), "length_range": (1e-3, 1e6), "aperture_range": (0.0, 1e4), **_FIELD},
+        {
+            **_WARP,
+            "covariance": st.sampled_from(COVARIANCES),
+            "normalize": st.sampled_from(["theory", "image"]),
+        },
+    ),
+    "thin plate": Domain(
+        tr.ThinPlateSpline,
+        {"amplitude_range": (0.0, 1e4), "smoothing_range": (0.0, 1e12)},
+        {**_WARP, "lattice": st.tuples(st.integers(2, 6), st.integers(2, 6))},
+    ),
+    "divergence-free": Domain(
+        tr.DivergenceFree,
+        {"amplitude_range": (0.0, 1e4), "length_range": (1e-3, 1e6), **_FIELD},
+        {
+            **_WARP,
+            "covariance": st.sampled_from(COVARIANCES),
+            "normalize": st.sampled_from(["theory", "max", "none"]),
+            "steps": st.integers(1, 3),
+        },
+    ),
+    "uniform fog": Domain(tr.UniformFog, _FOG, _AIR),
+    "fog in drifts": Domain(
+        tr.HeterogeneousFog,
+        {
+            **_FOG,
+            "wind_x_range": (-1e6, 1e6),
+            "wind_y_range": (-1e6, 1e6),
+            "decorrelation_range": (1e-3, math.inf),
+            "contrast_range": (0.0, 2.0),
+        },
+        {
+            **_AIR,
+            "mode": st.sampled_from(["image", "ray"]),
+            "scale_unit": st.sampled_from(["px", "cells"]),
+            "reference_width": st.floats(1.0, 3e3),
+            "normalize": st.sampled_from(["theory", "image"]),
+            "mean": st.sampled_from(["image", "ensemble"]),
+            "reach": st.floats(1.0, 1e5),
+        },
+    ),
+    "flare": Domain(
+        tr.LensFlare,
+        {
+            **{f"{name}_{axis}_range": (-1e4, 1e4) for name in ("center", "drift") for axis in "xy"},
+            "radius_range": (0.0, 1e4),
+            "strength_range": (0.0, 1e3),
+        },
+        {
+            "color": _colors(1e3),
+            "blend": st.sampled_from(["add", "screen"]),
+            "clip": st.booleans(),
+            "tolerance": st.sampled_from([None, 0.5]),
+        },
+    ),
+}
+
+
+@st.composite
+def ranges(draw: Any, low: float, high: float) -> Range:
+    """A range within bounds."""
+    ends = sorted((draw(_numbers(low, high)), draw(_numbers(low, high))))
+    return ends[0], ends[1]
+
+
+@st.composite
+def options(draw: Any, name: str) -> dict[str, Any]:
+    """Arguments of an effect, any number of them, anywhere in its domain."""
+    domain = DOMAINS[name]
+    chosen = draw(st.sets(st.sampled_from(sorted([*domain.ranges, *domain.others])), max_size=6))
+    given = {key: draw(ranges(*domain.ranges[key])) for key in sorted(chosen) if key in domain.ranges}
+    return given | {key: draw(domain.others[key]) for key in sorted(chosen) if key in domain.others}
+
+
+@st.composite
+def images(draw: Any, *, dtypes: tuple[torch.dtype, ...] = DTYPES, batch: int = 3, side: int = 24) -> Tensor:
+    """Images of any type, size and layout: noise, two levels, or one."""
+    shape = (draw(st.integers(0, batch)), draw(st.sampled_from([1, 3, 4])), *draw(sizes(side)))
+    dtype = draw(st.sampled_from(dtypes))
+    values = torch.rand(shape, generator=torch.Generator().manual_seed(draw(st.integers(0, 9))), dtype=torch.float64)
+    kind = draw(st.sampled_from(["noise", "binary", "black", "white"]))
+    values = {"binary": values.round(), "black": values * 0, "white": values * 0 + 1}.get(kind, values)
+    image = (255 * values).round().to(dtype) if dtype is torch.uint8 else values.to(dtype)
+    return image.contiguous(memory_format=torch.channels_last) if draw(st.booleans()) else image
+
+
+def sizes(side: int) -> SearchStrategy[tuple[int, int]]:
+    """Of frames, lines and single pixels among them."""
+    return st.tuples(st.integers(1, side), st.integers(1, side))
+
+
+@st.composite
+def cameras(draw: Any, height: int, width: int) -> tr.Camera | None:
+    """A pinhole for frames of a size, or none."""
+    if draw(st.booleans()):
+        return None
+    fx, fy = draw(st.floats(1.0, 1e4)), draw(st.floats(1.0, 1e4))
+    cx, cy = draw(st.floats(-100.0, 200.0)), draw(st.floats(-100.0, 200.0))
+    return tr.Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=(0.0,) * 4)
+
+
+@st.composite
+def cases(draw: Any, name: str, *, fixed: dict[str, Any] | None = None, **image: Any) -> tuple[Effect, Tensor]:
+    """An effect anywhere in its domain, and images for it."""
+    frames, given = draw(images(**image)), draw(options(name))
+    if "airlight" in DOMAINS[name].others:
+        given["camera"] = draw(cameras(*frames.shape[2:]))
+    return DOMAINS[name].kind(**(given | (fixed or {}))), frames

@@ -24,8 +24,9 @@ def _lenses(**ranges: Any) -> Callable[..., tr.LensDistortion]:
 
 
 def _camera(**changed: Any) -> tr.Camera:
-    camera: dict[str, Any] = {"width": 201, "height": 201, "fx": 199.0, "fy": 199.0, "cx": 100.0, "cy": 100.0}
-    return tr.Camera(**(camera | {"coefficients": (0.0,) * 4} | changed))
+    numbers: dict[str, Any] = {"width": 201, "height": 201, "fx": 199.0, "fy": 199.0, "cx": 100.0, "cy": 100.0}
+    numbers["coefficients"] = (0.0,) * 4
+    return tr.Camera(**(numbers | changed))
 
 
 def _pole() -> tr.Camera:

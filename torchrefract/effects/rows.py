@@ -35,7 +35,7 @@ def at_frames(params: Any, frames: Callable[[], Tensor]) -> Any:
 
 
 def frame_mean(value: Tensor) -> Tensor:
-    """(N, 1, 1, 1), the mean over the frame of (N, 1, H, W), to the same bits in any batch and on any thread."""
+    """(N, C, 1, 1), the mean over the frame of (N, C, H, W), to the same bits in any batch and on any thread."""
     # By rows, which no threads share.
     return value.sum(dim=3, keepdim=True).sum(dim=2, keepdim=True) / (value.shape[2] * value.shape[3])
 

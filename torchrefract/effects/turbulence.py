@@ -14,7 +14,7 @@ from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, lies_in
 from torchrefract.effects.random_field import check_field_params, field_on_lattice, random_field
-from torchrefract.effects.rows import column, spread
+from torchrefract.effects.rows import column, frame_mean, spread
 from torchrefract.fields.covariance import COVARIANCES, slope_rms
 from torchrefract.fields.modes import Modes
 from torchrefract.types import Range
@@ -121,8 +121,9 @@ class Turbulence(LatticeWarp):
         reach = {"longest": self.length_range[1], "widest": self.aperture_range[1]}
         field = random_field(params, kind=self.covariance, **reach, height=height, width=width)
         if self.normalize == "image":
-            field = field - field.mean(dim=(2, 3), keepdim=True)
-            field = field / field.square().mean(dim=(2, 3), keepdim=True).clamp(min=1e-12).sqrt()
+            field = field.contiguous()  # sums over another layout round in another way, and a batch has its own
+            field = field - frame_mean(field)
+            field = field / frame_mean(field.square()).clamp(min=1e-12).sqrt()
         flow = column(spread(params.amplitude, field.shape[0])) * field
         return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
 

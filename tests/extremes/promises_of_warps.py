@@ -212,6 +212,13 @@ ROWS = (
         "clipped, and by how much is told",
         EFFECTS + "turbulence.py::test_a_length_that_no_torus_has_room_for_is_told",
     ),
+    Row(
+        "turbulence",
+        "each frame normalized by itself, of any size",
+        "=",
+        "a batch is each sample alone, bit for bit on the CPU",
+        HERE + "test_what_is_normalized_by_the_frame_is_so_in_any_batch",
+    ),
     Row("turbulence", "an amplitude that folds", "W", "one warning, however often it is called", TOLD, _WILD),
     Row("turbulence", "an amplitude that folds", "M", "folded pixels are not valid in `restore_flow`", MASKED, _WILD),
     Row(

@@ -246,3 +246,13 @@ def test_an_empty_list_of_keys_goes_with_a_batch_of_none():
     assert degraded.image.shape == (0, 3, 8, 9)
     with pytest.raises(ValueError, match="keys must have one key for each of the 2 images, got shape"):
         tr.LensDistortion().degrade(torch.zeros(2, 3, 8, 9), seed=7, keys=[])
+
+
+@pytest.mark.parametrize("covariance", ["exponential", "gaussian"])
+@pytest.mark.parametrize("size", [(2, 3), (7, 5), (11, 11)])
+def test_what_is_normalized_by_the_frame_is_so_in_any_batch(covariance, size):
+    effect = tr.Turbulence(normalize="image", covariance=covariance, amplitude_range=(0.1, 0.1))
+    image, keys = picture(3, 1, *size), [0, 5, 2**40]
+    together = effect.degrade(image, seed=7, keys=keys).flow
+    for i, key in enumerate(keys):
+        assert torch.equal(effect.degrade(image[i : i + 1], seed=7, keys=[key]).flow[0], together[i])

@@ -18,6 +18,12 @@ def pytest_addoption(parser) -> None:
 
 
 @pytest.fixture(scope="session")
+def full_extremes(request) -> bool:
+    """Whether all cases of tests/extremes are asked for."""
+    return request.config.getoption("--extremes") == "full"
+
+
+@pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real frames and lenses that lies beside the checkout of a developer."""
     folder = Path(__file__).parents[1].parent / "shared" / "data"

@@ -8,6 +8,7 @@ from torchrefract.cameras.files.documents import (
     numbers,
     read_text,
     shortened,
+    shown,
     unknown_model,
     whole,
     write_text,
@@ -67,10 +68,12 @@ def write_colmap(path: str | Path, cameras: Mapping[int, Camera]) -> None:
 
 def _camera(path: Path, words: list[str]) -> tuple[int, Camera]:
     if len(words) < 4:
-        raise ValueError(f"path must have a number, model, width and height in each line, got {path} with {words}")
+        raise ValueError(
+            f"path must have a number, model, width and height in each line, got {path} with {shown(words)}"
+        )
     number, width, height = (whole(path, "CAMERA_ID, WIDTH or HEIGHT", words[i]) for i in (0, 2, 3))
     if words[1] not in _READERS:
-        raise ValueError(f"path must have a camera model of {', '.join(_READERS)}, got {path} with {words[1]}")
+        raise ValueError(f"path must have a camera model of {', '.join(_READERS)}, got {path} with {words[1][:80]}")
     count, model, parts = _READERS[words[1]]
     (fx, fy, cx, cy), coefficients = parts(numbers(path, f"parameters of {words[1]}", words[4:], count=count))
     return number, camera_of(path, (width, height), (fx, fy, cx - _HALF, cy - _HALF), coefficients, model)

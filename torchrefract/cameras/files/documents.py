@@ -1,11 +1,24 @@
 """What the readers and writers of all formats share: text, numbers, and errors that name the file."""
 
+import reprlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from torchrefract._files import replacing
 from torchrefract.cameras.models import Camera
+
+# A list that YAML's aliases fold into itself is small in memory, and without end in print.
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxstring, _SHORT.maxother = 2, 14, 80, 80
+
+
+def shown(value: Any) -> str:
+    """A value of a file as an error prints it, short whatever the file holds."""
+    try:
+        return _SHORT.repr(value)
+    except ValueError:  # a whole number of more digits than Python prints
+        return type(value).__name__
 
 
 def read_text(path: Path) -> str:
@@ -48,8 +61,8 @@ def numbers(path: Path, name: str, values: Any, *, count: int | None = None) -> 
         if isinstance(values, str | Mapping):
             raise TypeError
         found = [float(value) for value in values]
-    except (TypeError, ValueError):
-        raise ValueError(f"path must hold numbers as {name}, got {path} with {values!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"path must hold numbers as {name}, got {path} with {shown(values)}") from None
     if count is not None and len(found) != count:
         raise ValueError(f"path must hold {count} numbers as {name}, got {path} with {len(found)}")
     return found
@@ -63,7 +76,7 @@ def whole(path: Path, name: str, value: Any) -> int:
     """
     (found,) = numbers(path, name, [value])
     if not found.is_integer():
-        raise ValueError(f"path must hold a whole number as {name}, got {path} with {value!r}")
+        raise ValueError(f"path must hold a whole number as {name}, got {path} with {shown(value)}")
     return int(found)
 
 

@@ -10,6 +10,7 @@ from torchrefract.cameras.files.documents import (
     numbers,
     read_text,
     shortened,
+    shown,
     unknown_model,
     whole,
     write_text,
@@ -48,13 +49,13 @@ def write_kalibr(path: str | Path, cameras: Mapping[str, Camera]) -> None:
 
 def _camera(path: Path, name: str, chain: Any) -> Camera:
     if not isinstance(chain, dict):
-        raise ValueError(f"path must hold a camera as {name}, got {path} with {chain!r}")
+        raise ValueError(f"path must hold a camera as {name}, got {path} with {shown(chain)}")
     kind, lens = entry(path, chain, "camera_model"), chain.get("distortion_model", "none")
     if kind != "pinhole":
-        raise ValueError(f"path must have pinhole as the camera_model of {name}, got {path} with {kind!r}")
-    if lens not in _MODELS:
+        raise ValueError(f"path must have pinhole as the camera_model of {name}, got {path} with {shown(kind)}")
+    if not isinstance(lens, str) or lens not in _MODELS:
         raise ValueError(
-            f"path must have a distortion_model of {', '.join(_MODELS)} for {name}, got {path} with {lens!r}"
+            f"path must have a distortion_model of {', '.join(_MODELS)} for {name}, got {path} with {shown(lens)}"
         )
     pinhole = numbers(path, "intrinsics", entry(path, chain, "intrinsics"), count=4)
     resolution = numbers(path, "resolution", entry(path, chain, "resolution"), count=2)

@@ -9,6 +9,7 @@ from torchrefract.cameras.files.documents import (
     entry,
     numbers,
     read_text,
+    shown,
     unknown_model,
     whole,
     write_text,
@@ -94,7 +95,7 @@ def _from_node(node: ElementTree.Element) -> Any:
 def _matrix(path: Path, document: Any, name: str, *, count: int | None = None) -> list[float]:
     matrix = entry(path, document, name)
     if not isinstance(matrix, dict) or "data" not in matrix:
-        raise ValueError(f"path must hold a matrix as {name}, got {path} with {matrix!r}")
+        raise ValueError(f"path must hold a matrix as {name}, got {path} with {shown(matrix)}")
     return numbers(path, name, matrix["data"], count=count)
 
 

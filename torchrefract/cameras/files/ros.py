@@ -9,6 +9,7 @@ from torchrefract.cameras.files.documents import (
     numbers,
     read_text,
     shortened,
+    shown,
     unknown_model,
     whole,
     write_text,
@@ -32,8 +33,8 @@ def read_ros(path: str | Path) -> Camera:
     document = parse_yaml(path, read_text(path))
     size = [whole(path, name, entry(path, document, name)) for name in ("image_width", "image_height")]
     name = entry(path, document, "distortion_model")
-    if name not in _MODELS:
-        raise ValueError(f"path must have a distortion_model of {', '.join(_MODELS)}, got {path} with {name!r}")
+    if not isinstance(name, str) or name not in _MODELS:
+        raise ValueError(f"path must have a distortion_model of {', '.join(_MODELS)}, got {path} with {shown(name)}")
     fx, skew, cx, _, fy, cy, *_ = _data(path, document, "camera_matrix", count=9)
     if skew != 0:
         raise ValueError(f"path must hold a camera_matrix without skew, got {path} with {skew:g}")
@@ -75,7 +76,7 @@ def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None
 def _data(path: Path, document: Any, name: str, *, count: int | None = None) -> list[float]:
     matrix = entry(path, document, name)
     if not isinstance(matrix, dict):
-        raise ValueError(f"path must hold rows, cols and data as {name}, got {path} with {matrix!r}")
+        raise ValueError(f"path must hold rows, cols and data as {name}, got {path} with {shown(matrix)}")
     return numbers(path, name, entry(path, matrix, "data"), count=count)
 
 

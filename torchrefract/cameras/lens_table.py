@@ -45,12 +45,15 @@ def read_lenses(path: str | Path | None = None) -> tuple[Lens, ...]:
         ValueError: a table without these columns or without rows; a row that is no lens, NaN included.
     """
     path = _SHIPPED if path is None else Path(path)
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
-        if missing:
-            raise ValueError(f"path must hold the columns {', '.join(COLUMNS)}, got {path} without {missing[0]}")
-        lenses = tuple(_lens(path, row) for row in reader)
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
+            if missing:
+                raise ValueError(f"path must hold the columns {', '.join(COLUMNS)}, got {path} without {missing[0]}")
+            lenses = tuple(_lens(path, row) for row in reader)
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise ValueError(f"path must hold a table as CSV in UTF-8, got {path}: {error}") from error
     if not lenses:
         raise ValueError(f"path must hold lenses, got {path} without rows")
     return lenses
@@ -68,7 +71,7 @@ def _lens(path: Path, row: dict[str, str]) -> Lens:
         residual = float(row["residual_px"] or 0.0)
         if not residual >= 0:
             raise ValueError(f"residual_px must be at least 0, got {residual}")
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:  # the last of lists in lists
         raise ValueError(f"path must hold lenses, got {path} with the row {row['id']}: {error}") from error
     return Lens(row["id"], title, camera, polynomial, residual, row["source"], row["licence"])
 

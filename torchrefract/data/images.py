@@ -44,6 +44,8 @@ def read_image(path: str | Path) -> Tensor:
     """
     data = _bytes(path)
     _check_whole(path, io.BytesIO(data), len(data))
+    # Where a header claims 30000 x 30000 pixels OpenCV would make them, though the file holds a hundred bytes.
+    _header_size(path, io.BytesIO(data))
     pixels = _decode(path, data)
     scale = np.iinfo(pixels.dtype).max
     return torch.from_numpy(pixels).to(torch.float32).div_(scale).permute(2, 0, 1)

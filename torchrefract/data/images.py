@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 from typing import BinaryIO
 
 import cv2
@@ -29,6 +30,8 @@ _START_OF_SCAN = 0xDA
 _BARE_MARKERS = (0x01, *range(0xD0, 0xD8))  # TEM and RST0 to RST7 carry no length
 _ORIENTATION = 0x0112
 _TURNED = (5, 6, 7, 8)  # EXIF orientations that swap height and width
+_QUIETING = Lock()
+_levels: list[int] = []  # OpenCV's log level before, once for each thread that has it off
 
 
 class UnreadableImageError(ValueError):
@@ -139,12 +142,17 @@ def _decode(path: str | Path, data: bytes) -> np.ndarray:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """OpenCV's log lines off: what they say is raised as an error."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    # The level is the process's own: of threads that read at once, the first sets it, and the last sets it back.
+    with _QUIETING:
+        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        _levels.append(_levels[0] if _levels else level)
     try:
         yield
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        with _QUIETING:
+            level = _levels.pop()
+            if not _levels:
+                cv2.utils.logging.setLogLevel(level)
 
 
 def _check_whole(path: str | Path, stream: BinaryIO, length: int) -> None:

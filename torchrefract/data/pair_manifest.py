@@ -1,6 +1,7 @@
 """The manifest of pairs on disk: a line of JSON for each pair, in files manifest*.jsonl that can be put together."""
 
 import json
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ _FILES = "manifest*.jsonl"
 # Nothing but these is ever opened: a manifest may come from anywhere.
 _PATH = re.compile(r"pairs/[0-9]+/[0-9]+\.[a-z_]+\.[a-z]+|tars/[0-9]+\.tar")
 _SUFFIX = re.compile(r"[a-z_]+\.[a-z]+")
+_END = 2**63  # of the whole numbers of 64 bits
 
 
 class Stored(NamedTuple):
@@ -75,14 +77,31 @@ def read_row(line: bytes) -> PairRow:
         document = json.loads(line)
         files = {suffix: Stored(**file) for suffix, file in document.pop("files").items()}
         row = PairRow(**document, files=files)
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise DamagedPairError(f"a row must be one of torchrefract.generate, got {line[:80]!r}") from error
+    if not _is_typed(row):
+        raise DamagedPairError(f"a row must hold values of the types of torchrefract.generate, got {line[:80]!r}")
     for suffix, file in row.files.items():
         if not isinstance(file.path, str) or not _PATH.fullmatch(file.path) or not _SUFFIX.fullmatch(suffix):
             raise DamagedPairError(
                 f"files must lie in pairs/ or tars/ beside the manifest, got {file.path!r} for {suffix!r}"
             )
     return row
+
+
+def _is_typed(row: PairRow) -> bool:
+    """Whether all values are of their types, and whole numbers no larger than files and tensors have them."""
+    counts = [row.number, row.height, row.width, *row.beyond.values()] if isinstance(row.beyond, dict) else [None]
+    counts += [number for file in row.files.values() for number in (file.bytes, file.offset)]
+    counts += [] if row.frame is None else [row.frame]
+    texts = (row.source, row.drive, row.split, row.scene, row.skipped, *(file.sha256 for file in row.files.values()))
+    return (
+        all(type(number) is int and 0 <= number < _END for number in counts)
+        and all(type(number) is int and -_END <= number < _END for number in (row.seed, row.key))
+        and all(isinstance(text, str) for text in texts)
+        and isinstance(row.effects, list)
+        and all(isinstance(effect, dict) for effect in row.effects)
+    )
 
 
 def manifests(root: Path) -> list[Path]:
@@ -142,7 +161,8 @@ def read_stored(root: Path, file: Stored) -> bytes:
     try:
         with (root / file.path).open("rb") as stream:
             stream.seek(file.offset)
-            data = stream.read(file.bytes)
+            # Room for as many bytes as are asked for is made before the first one is read.
+            data = stream.read(min(file.bytes, os.fstat(stream.fileno()).st_size))
     except OSError as error:
         raise DamagedPairError(f"{root / file.path} cannot be read ({error.strerror})") from error
     if len(data) != file.bytes:

@@ -5,6 +5,7 @@ bits. npz and safetensors files hold the maps as they were computed, in float32.
 """
 
 import io
+import zipfile
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
@@ -28,6 +29,11 @@ _TOGETHER = "maps"  # what the one file of an npz or safetensors pair is called
 _FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT]
 _OF_PICTURES = [*_FAST, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP]
 _OF_MAPS = [*_FAST, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
+
+
+# What readers of npz raise for damage depends on where it is; arrays larger than any memory are damage, too.
+_DAMAGE = (ValueError, OSError, EOFError, LookupError, ArithmeticError, RuntimeError, MemoryError, SyntaxError)
+_DAMAGE += (TypeError, zipfile.BadZipFile, SafetensorError, cv2.error)
 
 
 class DamagedPairError(ValueError):
@@ -149,6 +155,9 @@ def _npz(arrays: dict[str, Any]) -> bytes:
 
 
 def _read_npz(data: bytes) -> dict[str, np.ndarray]:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        if sum(member.file_size for member in archive.infolist()) > len(data):
+            raise ValueError("it claims more bytes than it has, and is not compressed")
     with np.load(io.BytesIO(data), allow_pickle=False) as archive:
         return {name: archive[name] for name in archive.files}
 
@@ -156,8 +165,7 @@ def _read_npz(data: bytes) -> dict[str, np.ndarray]:
 def _decode(suffix: str, data: bytes, read: Callable[[bytes], _T]) -> _T:
     try:
         return read(data)
-    # What readers of npz raise for damage depends on where it is.
-    except (ValueError, OSError, EOFError, LookupError, SafetensorError, cv2.error) as error:
+    except _DAMAGE as error:
         raise DamagedPairError(f"{suffix} is damaged ({error})") from error
 
 

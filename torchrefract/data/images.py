@@ -24,6 +24,7 @@ from torchrefract._checks import check_count, check_tensor
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 
 _TAIL = 4096  # bytes read first in the search for an end marker: nearly all files have it in the last few
+_PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"
 _JPEG_END = b"\xff\xd9"
 _START_OF_SCAN = 0xDA
@@ -47,6 +48,8 @@ def read_image(path: str | Path) -> Tensor:
     """
     data = _bytes(path)
     _check_whole(path, io.BytesIO(data), len(data))
+    if data.startswith(_PNG) and not png_fits(data):
+        raise UnreadableImageError(f"{path} is damaged: its parts are not as long as they say")
     # Where a header claims 30000 x 30000 pixels OpenCV would make them, though the file holds a hundred bytes.
     _header_size(path, io.BytesIO(data))
     pixels = _decode(path, data)
@@ -66,6 +69,17 @@ def image_size(path: str | Path) -> tuple[int, int]:
             return _header_size(path, stream)
     except OSError as error:
         raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
+
+
+def png_fits(data: bytes) -> bool:
+    """Whether every part of a PNG, up to its end, lies in the file: OpenCV makes room for as much as a part claims."""
+    position = len(_PNG) if data.startswith(_PNG) else len(data)
+    while position + 12 <= len(data):
+        end = position + 12 + int.from_bytes(data[position : position + 4], "big")
+        if data[position + 4 : position + 8] == _PNG_END[:4]:
+            return end <= len(data)
+        position = end
+    return False
 
 
 def fit(image: Tensor, size: Sequence[int]) -> Tensor:
@@ -162,7 +176,7 @@ def _check_whole(path: str | Path, stream: BinaryIO, length: int) -> None:
     head = stream.read(16)
     if head.startswith(b"\xff\xd8\xff"):
         whole = _contains(stream, _JPEG_END, _scan_start(stream, length), length)
-    elif head.startswith(b"\x89PNG\r\n\x1a\n"):
+    elif head.startswith(_PNG):
         whole = _contains(stream, _PNG_END, 8, length)
     elif head.startswith(b"RIFF") and head[8:12] == b"WEBP":
         whole = int.from_bytes(head[4:8], "little") + 8 <= length

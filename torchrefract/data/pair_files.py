@@ -14,6 +14,8 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from torchrefract.data.images import png_fits
+
 _T = TypeVar("_T")
 
 FORMATS = ("png", "npz", "safetensors")
@@ -23,6 +25,7 @@ MASKS = tuple(FLOWS.values())
 PICTURES = ("clean", "corrupted")
 
 _STEPS, _ZERO, _TOP = 64, 1 << 15, (1 << 16) - 1  # of a flow: steps of a px, the step of 0 px, the largest step
+_PACKED = 1032  # bytes that zlib makes one of at best
 _TOGETHER = "maps"  # what the one file of an npz or safetensors pair is called
 
 # The fastest level of zlib. Differences to the row above pack pictures best, those to the left neighbor maps.
@@ -170,6 +173,9 @@ def _decode(suffix: str, data: bytes, read: Callable[[bytes], _T]) -> _T:
 
 
 def _pixels(data: bytes, kind: type, channels: int) -> np.ndarray:
+    height, width = (int.from_bytes(data[i : i + 4], "big") for i in (20, 16))
+    if not png_fits(data) or height * width > _PACKED * len(data):
+        raise DamagedPairError("it is no PNG, or claims more than its bytes can hold")
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != kind or pixels.ndim != (3 if channels == 3 else 2):
         raise DamagedPairError(f"it is no PNG of {channels} channels of {np.dtype(kind).itemsize * 8} bits")

@@ -101,7 +101,7 @@ def check_points(points: Tensor) -> None:
         return ((torch.cdist(centered, centered) + own).amin(dim=(1, 2)) > _NEAREST * extent).all()
 
     def spread() -> Tensor:
-        return (torch.linalg.svdvals(centered)[:, 1] > _FLATTEST * extent).all()
+        return (torch.linalg.svdvals(centered.nan_to_num(0.0, 0.0, 0.0))[:, 1] > _FLATTEST * extent).all()
 
     if is_true(apart) is False:
         raise ValueError("points must differ from one another, got two that are the same")

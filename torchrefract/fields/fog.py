@@ -32,7 +32,11 @@ def drifting_transmission_(depth: Tensor, noise: Tensor, scale: Tensor, offset: 
     """
     distance = -_finite(depth)
     scale, offset = scale * distance, offset * distance
-    if torch.compiler.is_compiling() or any(value.requires_grad for value in (noise, scale, offset)):
+    if (
+        torch.compiler.is_compiling()
+        or _is_mapped(noise, scale)
+        or any(value.requires_grad for value in (noise, scale, offset))
+    ):
         return torch.exp(noise * scale + offset)
     return noise.mul_(scale).add_(offset).exp_()
 
@@ -49,6 +53,16 @@ def veil(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
         # With two numbers for each row the loop over a row's pixels is not vectorized: one is written out, once.
         airlight = airlight.expand(-1, -1, -1, image.shape[3]).contiguous()
     return torch.lerp(airlight, image, t)
+
+
+def _is_mapped(*values: Tensor) -> bool:
+    """Whether torch.vmap maps over one of them: what it hides from a sample may have a gradient."""
+    try:
+        for value in values:
+            value.data_ptr()
+    except RuntimeError:  # a sample has no memory of its own
+        return True
+    return False
 
 
 def _finite(depth: Tensor) -> Tensor:

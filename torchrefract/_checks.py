@@ -91,6 +91,11 @@ def is_true(predicate: Callable[[], Tensor]) -> bool | None:
     return None if values is None else bool(values)
 
 
+def or_else(value: Tensor, otherwise: float) -> Tensor:
+    """The value, and another one where it is not finite: what may not be read cannot be refused."""
+    return torch.where(value.isfinite(), value, otherwise)
+
+
 def read(tensor: Callable[[], Tensor]) -> Any:
     """The values of a tensor as a number or nested lists, or None where reading them would wait for a device."""
     if torch.compiler.is_compiling():

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_choice, check_flag, check_range
+from torchrefract._checks import check_all, check_choice, check_flag, check_range, or_else
 from torchrefract.effects.base import params_to
 from torchrefract.effects.color import check_color, each_channel
 from torchrefract.effects.flare_plan import FlarePlan, Suns, flare_plan, reach
@@ -155,11 +155,14 @@ class LensFlare(PlannedLight):
         rows, _, height, width = image.shape
         dtype = field_dtype(image.dtype)
         share = params.center[:, None] + params.frame[:, :, None] * params.drift[:, None]
-        center = share.to(dtype).reshape(-1, 2) * share.new_tensor((width, height), dtype=dtype) - 0.5
-        radius = spread(params.radius.to(dtype), rows) * math.hypot(width, height)
+        # Where nothing may be read, numbers that are none are no sun.
+        center = (
+            or_else(share.to(dtype), _FARTHEST).reshape(-1, 2) * share.new_tensor((width, height), dtype=dtype) - 0.5
+        )
+        radius = spread(or_else(params.radius.to(dtype), 0.0), rows) * math.hypot(width, height)
         along_x, along_y = flare_axes(center, radius, height=height, width=width)
-        along_y = along_y * column(spread(params.strength.to(dtype), rows))
-        color = spread(params.color.to(dtype), rows)[:, :, None, None]
+        along_y = along_y * column(spread(or_else(params.strength.to(dtype), 0.0), rows))
+        color = spread(or_else(params.color.to(dtype), 0.0), rows)[:, :, None, None]
         plan: FlarePlan = self.plan_for(params, image, depth)
         shone = image
         if plan.part is None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_range
+from torchrefract._checks import check_range, or_else
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.air import Air, check_fog_params, distances, make_air, squares
 from torchrefract.effects.base import params_to
@@ -24,6 +24,7 @@ from torchrefract.warping.grid import field_dtype
 
 _ROUNDING = 2e-5
 _ENDLESS = 1e30  # m, of a visibility that float32 hardly holds
+_OPAQUE = 1e20  # 1/m: through so much of it nothing comes, and its products with depths are finite
 
 
 class FogParams(NamedTuple):
@@ -131,11 +132,11 @@ class UniformFog(PlannedLight):
             return Shaded(image, valid=lambda: exact() >= 1 / 255, transmission=exact, extinction=k)
         if plan.nodes is None:
             t = exact()
-            blended = self.air.in_bands(image, t, params.airlight.to(dtype), plan.bands)
+            blended = self.air.in_bands(image, t, or_else(params.airlight.to(dtype), 0.0), plan.bands)
             return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
         places, weights = along_columns(self.air, image, plan.nodes)
         t = through(self.air.distance_at(places, image)) @ weights
-        blended = self.air.in_bands(image, t, params.airlight.to(dtype), plan.bands)
+        blended = self.air.in_bands(image, t, or_else(params.airlight.to(dtype), 0.0), plan.bands)
         return Shaded(blended, valid=lambda: exact() >= 1 / 255, transmission=exact, extinction=k)
 
 
@@ -147,8 +148,9 @@ def extinctions(fog: Any) -> Range:
 
 
 def mean_extinction(params: Any, air: Air, dtype: torch.dtype) -> Tensor:
-    """(B,), 1/m, of fogs with a `visibility` and a `deviation`."""
-    return extinction(params.visibility.to(dtype), air.threshold) * (1 + params.deviation.to(dtype))
+    """(B,), 1/m, of fogs with a `visibility` and a `deviation`; what is no number is a wall."""
+    k = extinction(params.visibility.to(dtype), air.threshold) * (1 + params.deviation.to(dtype))
+    return k.nan_to_num(nan=_OPAQUE).clamp(0, _OPAQUE)
 
 
 def fogs_lie_in(params: Any, span: Range, air: Air) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_choice, check_number, check_positive, check_range
+from torchrefract._checks import check_all, check_choice, check_number, check_positive, check_range, or_else
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.air import check_fog_params, distances, make_air
 from torchrefract.effects.base import params_to
@@ -22,13 +22,13 @@ from torchrefract.effects.fog import (
     mean_extinction,
     visibility_span,
 )
-from torchrefract.effects.motion import check_decorrelation, check_motion, check_wind, drawn_motion, motion_ranges
+from torchrefract.effects.motion import check_decorrelation, check_motion, check_wind, drawn_motion, motion_ranges, tame
 from torchrefract.effects.plan import lies_in
 from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.radiance import Shaded
 from torchrefract.effects.random_field import check_key
 from torchrefract.effects.rows import column, frame_mean, spread
-from torchrefract.effects.scales import check_scales, chosen, periods, stretched
+from torchrefract.effects.scales import check_scales, chosen, periods, shares, stretched
 from torchrefract.fields.fog import drifting_transmission_, transmission
 from torchrefract.fields.fog_volume import path_mean
 from torchrefract.fields.perlin import Nodes, Octave, perlin_noise
@@ -185,9 +185,8 @@ class HeterogeneousFog(PlannedLight):
 
     def covers(self, params: HeterogeneousFogParams) -> Tensor:
         """(), bool: all fogs lie in the ranges, and the weights are those of the effect."""
-        weights = params.weights / params.weights.sum(dim=1, keepdim=True)
-        shares = [(share, share) for share in self._shares()]
-        own = lies_in(weights, shares) & lies_in(params.contrast[:, None], [self.contrast_range])
+        limits = [(share, share) for share in self._shares()]
+        own = lies_in(shares(params.weights), limits) & lies_in(params.contrast[:, None], [self.contrast_range])
         return fogs_lie_in(params, extinctions(self), self.air) & own
 
     def planned(self, height: int, width: int, dtype: torch.dtype, *, any_depth: bool = False) -> DriftPlan:
@@ -227,7 +226,7 @@ class HeterogeneousFog(PlannedLight):
         if not plan.acts:
             return Shaded(image, valid=lambda: through() >= 1 / 255, transmission=through, extinction=k)
         t = through()
-        blended = self.air.blended(image, t, params.airlight.to(dtype))
+        blended = self.air.blended(image, t, or_else(params.airlight.to(dtype), 0.0))
         return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
 
     def _field(
@@ -238,7 +237,8 @@ class HeterogeneousFog(PlannedLight):
         dtype = field_dtype(image.dtype)
         names = ("key", "weights", "contrast", "wind", "decorrelation")
         key, weights, contrast, wind, decorrelation = (spread(getattr(params, name), rows) for name in names)
-        frame, share = params.frame.reshape(-1), weights.to(dtype) / weights.to(dtype).sum(dim=1, keepdim=True)
+        share = shares(weights.to(dtype))
+        frame, wind, decorrelation = tame(params.frame.reshape(-1), wind, decorrelation)
         if self.mode == "image":
             motion: dict[str, Any] = {"frame": frame, "wind": wind[:, :2] * (width / self.reference_width)}
             return self._in_image(key, share, motion | {"decorrelation": decorrelation}, plan)

@@ -5,11 +5,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_all, check_range, is_true
+from torchrefract._checks import check_all, check_range, is_true, or_else
 from torchrefract.types import Range
 
 _FASTEST = 1e6  # of the wind
 _SHORTEST = 1e-3  # frames
+_LONGEST = 1e9  # frames: with the fastest wind, places that float64 still tells apart
 
 
 def check_wind(name: str, value: Range) -> Range:
@@ -43,6 +44,12 @@ def check_motion(params: Any, *, axes: int) -> None:
     check_frame(params)
     check_all("params.wind", "be finite", params.wind, torch.isfinite)
     check_all("params.decorrelation", "be above 0", params.decorrelation, lambda v: v > 0)
+
+
+def tame(frame: Tensor, wind: Tensor, decorrelation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The three as they are; still, where they are no numbers and nothing may be read, or lead beyond float64."""
+    frame, wind = or_else(frame, 0.0).clamp(-_LONGEST, _LONGEST), or_else(wind, 0.0).clamp(-_FASTEST, _FASTEST)
+    return frame, wind, torch.where(decorrelation > 0, decorrelation.clamp(min=_SHORTEST), torch.inf)
 
 
 def check_frame(params: Any) -> None:

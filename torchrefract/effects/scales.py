@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_number, check_positive
+from torchrefract._checks import check_number, check_positive, or_else
 from torchrefract.fields.perlin import Octave, perlin_noise
 
 # The paper's table of scales, with the weights that go with them.
@@ -70,3 +70,10 @@ def stretched(octave: Octave) -> Tensor:
     noise = perlin_noise([octave], octave.x.new_ones(octave.x.shape[0], 1))
     low, high = noise.detach().amin(dim=(2, 3), keepdim=True), noise.detach().amax(dim=(2, 3), keepdim=True)
     return torch.where(high > low, (noise - low) / torch.where(high > low, high - low, 1), 0.5)
+
+
+def shares(weights: Tensor) -> Tensor:
+    """(N, K), weights over their sum; what is no weight, and may not be read, counts as none, and none as all alike."""
+    weights = or_else(weights, 0.0).clamp(min=0)
+    total = weights.sum(dim=1, keepdim=True)
+    return torch.where(total > 0, weights, 1.0) / torch.where(total > 0, total, weights.shape[1])

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._bands import join
+from torchrefract._checks import or_else
 from torchrefract.fields.perlin3d import VARIANCE, Rays, deviation_of_mean, noise_on_planes
 
 _CELLS = 48  # between rays, over the longer side of the frame
@@ -17,6 +18,7 @@ _SLICES = 48  # of the distance, in which means are kept
 # An octave fades out where rays come to lie so many of its periods apart, or planes as many times as many.
 _SPARSE, _SPARSEST = 0.4, 0.8
 _LONGER = 5.0
+_MOST_CONTRAST = 30.0  # from there on fog is all holes, and its exponentials leave float32
 _CACHED = 1 << 16  # pixels that stay in a core's cache, a few times over
 
 
@@ -141,7 +143,8 @@ def _excess(rays: Rays, fog: _Fog, *, scales: Sequence[float], reach: float, dty
     cell = max(rays.step_x, rays.step_y)
     apart = [max(cell * depth, length / _LONGER) for depth, length in zip(depths, lengths, strict=True)]
     weights, frame = fog.weights.double(), fog.frame.double()
-    share = weights * (fog.contrast.double() / (VARIANCE * weights.square().sum(dim=1)).sqrt())[:, None]
+    contrast = or_else(fog.contrast.double(), 0.0).clamp(0, _MOST_CONTRAST)
+    share = weights * (contrast / (VARIANCE * weights.square().sum(dim=1)).sqrt())[:, None]
     period, apart_m, length_m = (weights.new_tensor(value) for value in (scales, apart, lengths))
     amplitude = share[:, :, None] * _damping(apart_m / period[:, None], length_m / period[:, None])
     noise = noise_on_planes(

@@ -72,7 +72,7 @@ def _lens(path: Path, row: dict[str, str]) -> Lens:
         if not residual >= 0:
             raise ValueError(f"residual_px must be at least 0, got {residual}")
     except (TypeError, ValueError, OverflowError, RecursionError) as error:  # the last of lists in lists
-        raise ValueError(f"path must hold lenses, got {path} with the row {row['id']}: {error}") from error
+        raise ValueError(f"path must hold lenses, got {path} with the row {row['id']}: {str(error)[:400]}") from error
     return Lens(row["id"], title, camera, polynomial, residual, row["source"], row["licence"])
 
 

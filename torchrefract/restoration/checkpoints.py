@@ -1,7 +1,9 @@
 """Checkpoints: written whole or not at all, and looked at before they are used."""
 
 import pickle
+import struct
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,8 @@ from torch import nn
 from torchrefract._files import replacing
 
 # What a damaged archive, or a file that is none, makes the readers raise.
-_DAMAGE = (zipfile.BadZipFile, pickle.UnpicklingError, EOFError, LookupError, OSError, RuntimeError, ValueError)
+_DAMAGE = (zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, EOFError, LookupError, OSError, RuntimeError)
+_DAMAGE += (struct.error, ValueError, TypeError, AttributeError, ArithmeticError, AssertionError)
 
 
 class CheckpointError(Exception):
@@ -85,11 +88,19 @@ def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except _DAMAGE as error:
         raise CheckpointError(f"ckpt_path must be a whole checkpoint, got {path}, which is damaged or none") from error
-    if not isinstance(checkpoint, dict) or not {"state_dict", "task"} <= checkpoint.keys():
+    if not isinstance(checkpoint, dict) or not _has_parts(checkpoint):
         raise CheckpointError(f"ckpt_path must be a checkpoint of torchrefract, got {path}")
     if task not in (None, checkpoint["task"]):
         raise CheckpointError(f"ckpt_path must be a checkpoint of the task {task}, got {path} of {checkpoint['task']}")
     return checkpoint
+
+
+def _has_parts(checkpoint: dict[Any, Any]) -> bool:
+    """Whether there are weights by their names, and the name of a task."""
+    weights = checkpoint.get("state_dict")
+    if not isinstance(weights, dict) or not isinstance(checkpoint.get("task"), str):
+        return False
+    return all(isinstance(name, str) and isinstance(value, torch.Tensor) for name, value in weights.items())
 
 
 def check_fits(

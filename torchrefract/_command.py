@@ -23,6 +23,7 @@ from pytorch_lightning import LightningModule, Trainer, seed_everything
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from rich.console import Console
 from rich.progress import track
+from yaml import YAMLError
 
 from torchrefract._config import CONFIG_DIR
 from torchrefract._files import replacing
@@ -239,7 +240,8 @@ def _mendable(error: Exception, name: str) -> str | None:
         return f"{error.full_key} must be given, as in {error.full_key}=…, got nothing"
     if isinstance(error, UnreadableImageError):
         return str(error).strip().splitlines()[-1].split("Error: ", 1)[-1]  # a worker prepends its traceback
-    if isinstance(error, UsageError | CheckpointError | NotFiniteError | HydraException | OmegaConfBaseException):
+    told = UsageError | CheckpointError | NotFiniteError | HydraException | OmegaConfBaseException | YAMLError
+    if isinstance(error, told):
         unknown = _UNKNOWN.match(str(error)) if name else None
         return _no_option(name, unknown[1]) if unknown else " ".join(str(error).split())
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):

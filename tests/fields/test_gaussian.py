@@ -421,6 +421,13 @@ def test_gradients_of_a_field_are_those_of_finite_differences(kind):
     assert torch.autograd.gradgradcheck(field, inputs, rtol=1e-2, atol=1e-4)
 
 
+@pytest.mark.parametrize("batch", [1, 2])
+def test_compilers_are_told_the_layout_that_a_field_has(batch):
+    shape = spectrum((12, 10), torch.full((batch,), 0.8), kind="gaussian", dtype=torch.float32).amplitude
+    args = (noise(batch, (12, 10)), shape, 5, 4)
+    torch.library.opcheck(torch.ops.torchrefract.gaussian_random_field, args, test_utils="test_faketensor")
+
+
 def test_a_batch_of_none_stays_one():
     shape = spectrum((12, 10), torch.zeros(0), kind="matern32", aperture=torch.zeros(0), dtype=torch.float32)
     assert shape.amplitude.shape == (0, 7, 6)

@@ -226,7 +226,8 @@ _even_transform_op.register_autograd(_even_transform_gradient, setup_context=_ke
 
 @torch.library.custom_op("torchrefract::gaussian_random_field", mutates_args=())
 def _field_op(noise: Tensor, shape: Tensor, height: int, width: int) -> Tensor:
-    return _fields(noise, shape, height, width)
+    # Of one sample in one band the fields are a view, and compilers rely on the strides that the op below states.
+    return _fields(noise, shape, height, width).contiguous()
 
 
 @_field_op.register_fake

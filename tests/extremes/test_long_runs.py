@@ -31,8 +31,8 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "one of": lambda: tr.OneOf([tr.LensDistortion(), tr.HeterogeneousFog(), tr.ThinPlateSpline()]),
 }
 SIZE = (32, 48)
-CALLS = {False: 150, True: 10_000}
-GROWTH = 2.0  # MB: a leak of 100 bytes a call is found in the full run, and one of a small image in the short one
+CALLS = {False: 50, True: 3000}  # in a stretch
+GROWTH = 0.8  # MB in a stretch: half of what it would be if each call kept an image
 THREADS = 8
 
 
@@ -48,7 +48,6 @@ def picture(seed: int = 0, *, size: tuple[int, int] = SIZE, batch: int = 1) -> T
 
 def resident() -> float:
     """The memory that the process has, MB."""
-    gc.collect()
     return next(
         int(line.split()[1]) / 1024
         for line in Path("/proc/self/status").read_text().splitlines()
@@ -59,7 +58,8 @@ def resident() -> float:
 def tensors() -> int:
     """How many tensors there are."""
     gc.collect()
-    return sum(isinstance(value, Tensor) for value in gc.get_objects())
+    # By their types: to ask some of the objects for their class is to be warned of them.
+    return sum(issubclass(type(value), Tensor) for value in gc.get_objects())
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs a system that tells the memory of a process")
@@ -74,7 +74,7 @@ def test_the_memory_does_not_grow_with_the_number_of_calls(make, full_extremes):
         weight.grad = None
 
     calls = CALLS[full_extremes]
-    for key in range(calls // 3):
+    for key in range(max(20, 10_000 - 3 * calls if full_extremes else 0)):
         call(key)
     held = tensors()
     # What allocators keep comes in steps; what leaks grows in every stretch.
@@ -89,14 +89,12 @@ def test_the_memory_does_not_grow_with_the_number_of_calls(make, full_extremes):
 
 def test_new_sizes_and_new_effects_do_not_keep_memory(make):
     image = picture(size=(64, 64))
-    effect, held = make(), None
-    for i in range(300 if "Rectification" not in type(effect).__name__ else 1):
+    make().degrade(image[..., : SIZE[0], : SIZE[1]], seed=7)
+    held = tensors()
+    for i in range(24):
         # Plans are kept for a few hundred sizes; nothing with pixels is.
-        effect.degrade(image[..., : 16 + i % 48, : 16 + i // 7], seed=7)
-        if i == 0:
-            held = tensors()
-    del effect
-    assert held is not None
+        taller = 0 if make is EFFECTS["rectification"] else i
+        make().degrade(image[..., : SIZE[0] + taller, : SIZE[1]], seed=7)
     assert tensors() <= held + 2
 
 
@@ -115,20 +113,20 @@ class Samples(Dataset[dict[str, Any]]):
         return {
             "image": image,
             "worker": worker.id if worker else -1,
-            "resident": resident() if index % 50 < 2 else 0.0,
+            "resident": resident() if index % 40 < 8 else 0.0,
         }
 
 
 @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")  # so do loaders on Linux
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs a system that tells the memory of a process")
 def test_workers_load_the_samples_of_one_process_and_do_not_grow(full_extremes):
-    count = 20_000 if full_extremes else 1200
+    count = 20_000 if full_extremes else 480
     effect = tr.Compose([tr.LensDistortion(), tr.HeterogeneousFog(), tr.ThinPlateSpline(), tr.LensFlare(p=0.5)])
     samples = Samples(effect, count)
     found: dict[int, list[float]] = {}
     loader = DataLoader(samples, batch_size=8, num_workers=2, multiprocessing_context="fork")
     for number, batch in enumerate(loader):
-        if number % 10 == 0:
+        if number % 12 == 0:
             expected = torch.stack([samples[8 * number + i]["image"] for i in range(8)])
             assert torch.equal(batch["image"], expected)
         for worker, memory in zip(batch["worker"].tolist(), batch["resident"].tolist(), strict=True):
@@ -138,7 +136,7 @@ def test_workers_load_the_samples_of_one_process_and_do_not_grow(full_extremes):
     for memory in found.values():
         # After a quarter of the run everything that is kept once is there.
         start = memory[len(memory) // 4 :]
-        assert max(start[len(start) // 2 :]) - max(start[: len(start) // 2]) < GROWTH
+        assert max(start[len(start) // 2 :]) - max(start[: len(start) // 2]) < 2 * GROWTH
 
 
 def in_threads(function: Callable[[int], Any], count: int) -> list[Any]:
@@ -161,9 +159,9 @@ def maps(degraded: tr.Degraded) -> list[Tensor]:
 
 
 def test_threads_that_call_one_effect_get_what_one_thread_gets(make, full_extremes):
-    count = 2000 if full_extremes else 48
+    count = 2000 if full_extremes else 32
     # A new size for each stretch of calls, so that plans are made while others are read.
-    sizes = [(SIZE[0] + 4 * (i // 16 % 7), SIZE[1] + 6 * (i // 16 % 7)) for i in range(count)]
+    sizes = [(SIZE[0] + 4 * (i // 8 % 7), SIZE[1] + 6 * (i // 8 % 7)) for i in range(count)]
     if make is EFFECTS["rectification"]:
         sizes = [SIZE] * count
 

@@ -138,7 +138,7 @@ def _compared(
     found = []
     for way, dtype in ways.items():
         made = _made(effect, image.to(dtype), params, way)
-        px = None if flow is None else (_far(made[1], flow), _landing(made[0], made[1], flow))
+        px = None if flow is None else (far(made[1], flow), landing(made[0], made[1], flow))
         levels = None if light is None else 255 * (made[0].double() - light).abs().max().item()
         found.append(Error(name, way, *frame, *(px or (None, None)), levels))
     return found
@@ -158,11 +158,12 @@ def _made(effect: Effect, image: Tensor, params: Any, way: str) -> tuple[Tensor,
         return run(image, params)
 
 
-def _far(flow: Tensor, true: Tensor) -> float:
+def far(flow: Tensor, true: Tensor) -> float:
+    """How far a flow is from the true one at most, px."""
     return max(length(a.double() - b).max().item() for a, b in zip(flow.split(256, 2), true.split(256, 2), strict=True))
 
 
-def _landing(image: Tensor, flow: Tensor, true: Tensor) -> float:
+def landing(image: Tensor, flow: Tensor, true: Tensor) -> float:
     """How far from its place the sampler looks at most, px; where that place is in the frame."""
     height, width = flow.shape[2:]
     grid = sampler_grid(flow.to(sampler_dtype(image, flow.dtype)))

@@ -17,6 +17,12 @@ def pytest_addoption(parser) -> None:
     parser.addoption("--extremes", choices=["part", "full"], default="part", help="full: many cases, large frames")
 
 
+def pytest_configure() -> None:
+    """Of several processes each keeps to one thread, so that they do not wait for one another."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        torch.set_num_threads(1)
+
+
 @pytest.fixture(scope="session")
 def full_extremes(request) -> bool:
     """Whether all cases of tests/extremes are asked for."""

@@ -8,18 +8,17 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
+from torchrefract.restoration.models.places import places
 from torchrefract.restoration.models.pretrained import find_weights, load_network
-from torchrefract.warping.grid import pixel_axes
 
 _STRIDE = 32
 _MEAN, _STD = (0.5,) * 3, (0.25,) * 3  # of colors, where no weights ask for others
 
 
 class Located(nn.Module):
-    """A network of segmentation-models-pytorch that is given the pixel coordinates as two more channels.
+    """A network of segmentation-models-pytorch that is given the `places` of the pixels as two more channels.
 
-    Without them a convolution cannot know where it looks, and what a lens does depends on that. The last layer starts
-    at zero: before training the network does nothing.
+    The last layer starts at zero: before training the network does nothing.
 
     An encoder with pretrained weights is frozen, its running statistics and its dropout, too. Only what its first layer
     makes of the coordinates, nothing at the start, is learned.
@@ -75,10 +74,7 @@ class Located(nn.Module):
         if image.ndim != 4 or image.shape[1] != 3:
             raise ValueError(f"image must have shape (B, 3, H, W), got {tuple(image.shape)}")
         height, width = image.shape[2:]
-        x, y = pixel_axes(height, width, dtype=image.dtype, device=image.device)
-        x, y = ((2 * axis + 1) / size - 1 for axis, size in ((x, width), (y, height)))
-        size = (image.shape[0], 1, height, width)
-        inputs = torch.cat([(image - self.mean) / self.std, x.expand(size), y.expand(size)], dim=1)
+        inputs = torch.cat([(image - self.mean) / self.std, places(image)], dim=1)
         inputs = F.pad(inputs, (0, -width % _STRIDE, 0, -height % _STRIDE), mode="replicate")
         found = self.network(inputs.contiguous(memory_format=torch.channels_last))
         return found[:, :, : -(-height // self.cell), : -(-width // self.cell)]

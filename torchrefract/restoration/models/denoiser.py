@@ -8,7 +8,7 @@ from diffusers import UNet2DModel
 from torch import Tensor, nn
 
 from torchrefract._checks import check_count
-from torchrefract.warping.grid import pixel_axes, sampler_positions
+from torchrefract.restoration.models.places import places
 
 _CONDITIONS = 5  # the image, and the pixel coordinates
 # Of the published network these follow from what is restored, and do not make it another one.
@@ -89,14 +89,8 @@ class Denoiser(nn.Module):
 
 
 def conditions(image: Tensor) -> Tensor:
-    """(B, 5, H, W), in [-1, 1]: an image (B, 3, H, W) in [0, 1], and where its pixels lie on the frame, x and y.
-
-    Without the coordinates a convolution cannot know where it looks, and what a lens does depends on that.
-    """
-    height, width = image.shape[2:]
-    x, y = pixel_axes(height, width, dtype=image.dtype, device=image.device)
-    place = sampler_positions(image.new_zeros(1, 2, height, width), x, y, height=height, width=width)
-    return torch.cat([2 * image - 1, place.expand(len(image), -1, -1, -1)], dim=1)
+    """(B, 5, H, W), in [-1, 1]: an image (B, 3, H, W) in [0, 1], and the `places` of its pixels."""
+    return torch.cat([2 * image - 1, places(image)], dim=1)
 
 
 def _published(name: str) -> UNet2DModel:

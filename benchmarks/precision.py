@@ -3,7 +3,7 @@
 python benchmarks/precision.py [--sizes 256x256 1080x1920 2160x3840 4320x7680] [--draws 2]
                                [--out benchmarks/results/precision.json]
 
-The table is printed as Markdown. The default takes minutes and less than 16 GB on two cores.
+The table is printed as Markdown. A frame of 8K takes gigabytes in float64; `--sizes` leaves it out.
 """
 
 import argparse

@@ -172,8 +172,8 @@ def test_a_small_experiment_is_its_large_one_on_small_frames_without_weights(tmp
     )
     assert (small.scene._target_, small.task) == (large.scene._target_, large.task)
     assert small.model._target_ == large.model._target_
-    assert small.scene.get("width", 256) == 256  # a scene that moves pixels does so by shares of the frame
-    assert (small.data.size, small.trainer.accelerator) == ([144, 256], "cpu")
+    assert small.scene.get("width", 160) == 160  # a scene that moves pixels does so by shares of the frame
+    assert (small.data.size, small.trainer.accelerator) == ([96, 160], "cpu")
     assert small.model.network.pretrained is None
     assert isinstance(instantiate(small.model).task, Task)
 

@@ -98,7 +98,7 @@ def test_what_is_no_whole_number_is_no_count(value):
 
 def test_what_is_no_tensor_raises():
     with pytest.raises(TypeError, match="image must be a tensor, got list"):
-        check_tensor("image", [1.0])  # pyright: ignore[reportArgumentType]
+        check_tensor("image", [1.0])  # pyright: ignore[reportArgumentType]  # what is tested
 
 
 @pytest.mark.parametrize("shape", [(2, 3, 4), (1, 3, 4, 5), (2,), (1, 1, 2, 4, 5)])

@@ -65,7 +65,7 @@ def test_every_task_makes_its_data_and_its_model(tmp_path, task):
     assert isinstance(data, PairData)
     assert isinstance(model, Restoration)
     assert model.task.name == task
-    assert (data.seed, len(data.train), len(data.val)) == (5, 512, 128)  # pyright: ignore[reportArgumentType]
+    assert (data.seed, len(data.train), len(data.val)) == (5, 512, 128)  # pyright: ignore[reportArgumentType]  # of known length
     assert data.effect is not None
     assert data.effect.extra_repr() == getattr(presets, cfg.scene._target_.rsplit(".", 1)[1])().extra_repr()
 
@@ -131,7 +131,7 @@ def test_every_trainer_writes_into_the_run_folder(tmp_path, trainer):
     made = instantiate(composed(tmp_path, "+task=undistort", f"trainer={trainer}").trainer)
     assert isinstance(made, Trainer)
     assert made.checkpoint_callback is not None
-    assert made.checkpoint_callback.dirpath == str(tmp_path)  # pyright: ignore[reportAttributeAccessIssue]
+    assert made.checkpoint_callback.dirpath == str(tmp_path)  # pyright: ignore[reportAttributeAccessIssue]  # a ModelCheckpoint
     assert made.logger is not None
     assert Path(made.logger.log_dir or "") == tmp_path
     assert made.max_epochs == 6

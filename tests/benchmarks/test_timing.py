@@ -216,7 +216,7 @@ def test_large_ratios_are_printed_in_full():
 
 def test_a_timing_cannot_be_changed():
     with pytest.raises(FrozenInstanceError):
-        timed().name = "other"  # pyright: ignore[reportAttributeAccessIssue]
+        timed().name = "other"  # pyright: ignore[reportAttributeAccessIssue]  # what is tested
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can be told to keep freed memory")

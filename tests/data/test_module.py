@@ -39,7 +39,7 @@ def pairs(data: PairData) -> list[Pair]:
     assert data.trainer is not None
     loader = data.train_dataloader() if data.trainer.training else data.val_dataloader()
     if data.trainer.training:
-        loader.sampler.set_epoch(data.trainer.current_epoch)  # pyright: ignore[reportAttributeAccessIssue]
+        loader.sampler.set_epoch(data.trainer.current_epoch)  # pyright: ignore[reportAttributeAccessIssue]  # it is a DistributedSampler
     return [data.on_after_batch_transfer(Frame(*batch), 0) for batch in loader]
 
 
@@ -232,7 +232,7 @@ def test_lightning_itself_gets_the_same_pairs(first_epoch):
         enable_model_summary=False,
     )
     data.trainer = trainer
-    trainer.state.fn, trainer.training = "fit", True  # pyright: ignore[reportAttributeAccessIssue]
+    trainer.state.fn, trainer.training = "fit", True  # pyright: ignore[reportAttributeAccessIssue]  # a word for an enum
     frame = Frame(*next(iter(data.train_dataloader())))
     assert_same(by_key([data.on_after_batch_transfer(frame, 0)]), first_epoch)
 

@@ -45,7 +45,7 @@ def frames(shared_data) -> Tensor:
     """(3, 3, 360, 640): real frames, one from each of three drives."""
     names = ["ca_p1_*", "br_es_*", "us_losaltos_*"]
     paths = [sorted((shared_data / "frames" / "val").glob(f"{name}.jpg"))[0] for name in names]
-    pictures = [cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB) for path in paths]  # pyright: ignore
+    pictures = [cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB) for path in paths]  # pyright: ignore  # imread may give None
     return torch.stack([torch.from_numpy(picture).movedim(-1, 0) for picture in pictures]).float() / 255
 
 

@@ -169,7 +169,7 @@ def test_every_lens_of_a_batch_is_taken_by_itself():
     cameras = [small_camera(BARREL), camera({"k6": 0.1}, (50, 60), (30, 20)), camera({}, (40, 40), (31, 17))]
     together = tuple(torch.cat(parts) for parts in zip(*cameras, strict=True))
     for field in (lens_flow, lens_restore_flow):
-        flow, exists = field(*together, height=36, width=64)  # pyright: ignore[reportArgumentType]
+        flow, exists = field(*together, height=36, width=64)  # pyright: ignore[reportArgumentType]  # of a list
         for i, at in enumerate(cameras):
             alone, known = field(*at, height=36, width=64)
             # To rounding: terms that no lens of a batch has are not computed at all.

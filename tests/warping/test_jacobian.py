@@ -9,7 +9,7 @@ def test_an_affine_map_has_its_determinant_everywhere(pixels):
     x, y = pixels(6, 7)
     matrices = torch.tensor([[[0.2, -0.3], [0.1, 0.4]], [[-2.0, 0.0], [0.0, 0.0]], [[-1.0, 1.0], [-1.0, -1.0]]])
     flow = torch.einsum("bij,jhw->bihw", matrices.double(), torch.stack([x, y])) + 3
-    expected = torch.linalg.det(torch.eye(2) + matrices).double()  # pyright: ignore[reportCallIssue]
+    expected = torch.linalg.det(torch.eye(2) + matrices).double()  # pyright: ignore[reportCallIssue]  # missing in torch's annotations
     assert_close(jacobian_determinant(flow), expected.view(3, 1, 1, 1).expand(-1, -1, 6, 7), rtol=0, atol=1e-6)
     folds, least = folding(flow)
     assert_close(least, expected, rtol=0, atol=1e-6)

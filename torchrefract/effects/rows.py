@@ -59,7 +59,7 @@ class _Swap(torch.autograd.Function):
         return None
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]  # two inputs, two gradients
         return None, gradient
 
 

@@ -4,7 +4,8 @@ python benchmarks/table1.py --source FRAMES [--form small|paper] [--rows resunet
     [--frames 0] [--steps 10 50 250] [--sampled 8] [--threads 2] [--out benchmarks/results/table1]
 
 Rows whose training is in `--out` are loaded, what was stopped goes on, the others are trained. `--frames` of the drives
-held out are scored, 0 for all; of a diffusion model `--sampled`, with each number of steps.
+held out are scored, 0 for all; of a diffusion model `--sampled`, with each number of steps. The best constant flow
+knows which effect it undoes; the mix is the mean of its effects.
 """
 
 import argparse

@@ -127,9 +127,7 @@ def test_a_calibration_that_failed_leaves_no_camera_that_looks_like_its_own(call
     assert (out / "camera_before.yaml").read_text() == before
     assert "`camera_before.yaml` is of a calibration before." in (out / "report.md").read_text()
     assert call("calibrate", *WORDS).code == 0
-    # OpenCV adds up the views in the order in which its threads are done.
-    again, first = (read_opencv(out / f"{name}.yaml") for name in ("camera", "camera_before"))
-    assert [again.fx, again.cy, *again.coefficients] == pytest.approx([first.fx, first.cy, *first.coefficients])
+    assert (out / "camera.yaml").read_text() == before
 
 
 def test_a_fit_that_failed_keeps_what_was_found(call, pictures, tmp_path, monkeypatch):

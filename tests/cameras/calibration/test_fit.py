@@ -74,3 +74,15 @@ def test_two_views_are_too_few(projected):
     views = projected(BOARD, MATRIX, np.array(VECTORS["opencv5"]))[:2]
     with pytest.raises(ValueError, match="views must be at least 3, got 2"):
         fit(views, BOARD, model="opencv5", size=SIZE)
+
+
+def test_a_fit_has_the_same_bits_every_time_and_leaves_opencv_its_threads(projected):
+    views = projected(BOARD, MATRIX, np.array(VECTORS["opencv5"]), noise=0.2)
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    try:
+        found = {fit(views, BOARD, model="opencv5", size=SIZE).lens.matrix.tobytes() for _ in range(15)}
+        assert cv2.getNumThreads() == 2
+    finally:
+        cv2.setNumThreads(before)
+    assert len(found) == 1

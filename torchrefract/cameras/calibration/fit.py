@@ -1,6 +1,7 @@
 """A camera fitted to views of a board, and how far it can be trusted."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import cv2
@@ -164,7 +165,9 @@ def _calibrate_opencv(
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
         matrix, vector[: len(start.coefficients)] = start.matrix.copy(), start.coefficients
     points = [points.astype(np.float32) for points in objects], [points.astype(np.float32) for points in images]
-    _, matrix, vector, turns, moves = cv2.calibrateCamera(*points, size, matrix, vector, flags=flags, criteria=_STOP)
+    with _on_one_thread():
+        found = cv2.calibrateCamera(*points, size, matrix, vector, flags=flags, criteria=_STOP)
+    _, matrix, vector, turns, moves = found
     count = int(model.removeprefix("opencv"))
     return Lens(model, matrix, vector.ravel()[:count].copy()), _poses(turns, moves)
 
@@ -181,6 +184,17 @@ def _calibrate_fisheye(
         on_board, in_picture, size, matrix, vector.reshape(4, 1), flags=flags, criteria=_STOP
     )
     return Lens(model, matrix, vector.ravel()), _poses(turns, moves)
+
+
+@contextmanager
+def _on_one_thread() -> Iterator[None]:
+    """Several threads of OpenCV add up the views in the order in which they are done, another one in each run."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
 
 
 def _poses(turns: Sequence[np.ndarray], moves: Sequence[np.ndarray]) -> list[np.ndarray]:

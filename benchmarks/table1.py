@@ -10,6 +10,7 @@ knows which effect it undoes; the mix is the mean of its effects.
 
 import argparse
 import json
+import math
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -107,10 +108,10 @@ def _of_model(task: str, loaded: Loaded, pairs: dict[str, list[Pair]], args: arg
     model = loaded.model
     parameters = sum(parameter.numel() for parameter in model.network.parameters())  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]  # of every Learner
     sampled = isinstance(model, Diffusion)
+    few = {name: _thinned(batches, args.sampled if sampled else 0) for name, batches in pairs.items()}
     for steps in args.steps if sampled else [0]:
         if sampled:
             model.steps = steps
-        few = {name: _thinned(batches, args.sampled if sampled else 0) for name, batches in pairs.items()}
         each = {name: score(_restored(model, batches), batches) for name, batches in few.items()}
         call = partial(_call, model, next(iter(few.values()))[0].degraded[:1])
         milliseconds = 1e3 * median(seconds(call, before=i == 0) for i in range(3))
@@ -170,7 +171,7 @@ def _paper(name: str, psnr: float, epe: float | None) -> list[str]:
 
 
 def _or_none(value: float, form: str) -> str:
-    return "" if value != value else format(value, form)  # noqa: PLR0124  # NaN alone differs from itself
+    return "" if math.isnan(value) else format(value, form)
 
 
 def _frames(source: Path, size: tuple[int, int], most: int) -> list[Frame]:

@@ -13,6 +13,7 @@ from torchrefract.effects.base import Effect
 MAPS = ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission", "extinction", "intensity")
 FLOATS = (torch.float32, torch.float64)
 # Whoever asks for folds is told of them; here they are asked for.
+# Strong draws warn that they fold; `valid` leaves the folds out, and other tests hold the warning.
 pytestmark = [pytest.mark.filterwarnings("ignore::UserWarning"), pytest.mark.usefixtures("small_tori")]
 
 

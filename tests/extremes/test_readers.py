@@ -336,12 +336,16 @@ def merge_bomb(levels: int) -> bytes:
     return b"\n".join(maps) + b"\n"
 
 
-@pytest.mark.parametrize("name", ["ros.yaml", "kalibr.yaml"])
-@pytest.mark.parametrize("place", [b"640", b"500.0", b"plumb_bob", b"radtan", b"pinhole"])
+PLACES = {
+    "ros.yaml": [b"640", b"500.0", b"plumb_bob"],
+    "kalibr.yaml": [b"640", b"500.0", b"radtan", b"pinhole"],
+}
+
+
+@pytest.mark.parametrize(("name", "place"), [(name, place) for name, places in PLACES.items() for place in places])
 def test_aliases_fill_neither_memory_nor_message(name, place, camera_file, tmp_path):
     reader = camera_file(name)
-    if place not in reader.data:
-        pytest.skip(f"{name} has no {place.decode()}")
+    assert place in reader.data
     found = hold(reader, tmp_path / "bomb.yaml", bomb(9) + reader.data.replace(place, b"*a8", 1))
     assert "bomb.yaml" in str(found)
 

@@ -1,11 +1,10 @@
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from pytorch_lightning import Callback, LightningModule, Trainer
+from pytorch_lightning import Callback, LightningModule
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample
 from torch.testing import assert_close
@@ -14,7 +13,7 @@ from torch.utils.data import DataLoader
 from torchrefract import LensDistortion, Pair, UniformFog
 from torchrefract.data.module import make_pair
 from torchrefract.data.road_scenes import RoadScenes
-from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint
+from torchrefract.restoration.checkpoints import read_checkpoint
 from torchrefract.restoration.diffusion import Diffusion
 from torchrefract.restoration.finite import NotFiniteError
 from torchrefract.restoration.models.denoiser import Denoiser
@@ -25,6 +24,7 @@ SIZE = (16, 24)
 KEPT = np.cumprod(1 - np.linspace(1e-4, 0.02, 1000))
 TASKS = {"undistort": Undistort(0.1), "deweather": Deweather()}
 
+# Advice of Lightning on how to train, which small trainings do not follow; LeafSpec is of its own code.
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*does not have many workers", "ignore:.*no `val_dataloader`", "ignore:.*LeafSpec"
 )
@@ -68,21 +68,6 @@ def pairs(task: str, count: int = 2, *, first: int = 0, size: tuple[int, int] = 
 
 def loader(batches: list[Pair]) -> DataLoader[Pair]:
     return DataLoader(batches, batch_size=None)  # pyright: ignore[reportArgumentType]  # a list is a map-style dataset
-
-
-@pytest.fixture
-def trainer(tmp_path) -> Callable[..., Trainer]:
-    return partial(
-        Trainer,
-        accelerator="cpu",
-        default_root_dir=tmp_path,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        plugins=[AtomicCheckpointIO()],
-    )
 
 
 class Losses(Callback):

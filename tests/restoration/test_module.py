@@ -13,7 +13,7 @@ from torchrefract import LensDistortion, Pair, UniformFog
 from torchrefract.data.module import make_pair
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.effects.base import Effect
-from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint
+from torchrefract.restoration.checkpoints import read_checkpoint
 from torchrefract.restoration.models.resunet import ResUNet
 from torchrefract.restoration.module import Restoration
 from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
@@ -22,6 +22,7 @@ from torchrefract.types import Frame
 SIZE = (32, 64)
 BATCH = 4
 
+# Advice of Lightning on how to train, which small trainings do not follow; LeafSpec is of its own code.
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*does not have many workers", "ignore:.*no `val_dataloader`", "ignore:.*LeafSpec"
 )
@@ -59,21 +60,6 @@ def held():
 
 def loader(pairs: list[Pair]) -> DataLoader[Pair]:
     return DataLoader(pairs, batch_size=None)  # pyright: ignore[reportArgumentType]  # a list is a map-style dataset
-
-
-@pytest.fixture
-def trainer(tmp_path) -> Callable[..., Trainer]:
-    return partial(
-        Trainer,
-        accelerator="cpu",
-        default_root_dir=tmp_path,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        plugins=[AtomicCheckpointIO()],
-    )
 
 
 def mean_flow(pairs: list[Pair]) -> Tensor:

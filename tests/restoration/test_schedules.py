@@ -25,6 +25,7 @@ NETWORKS: dict[str, Callable[[int], nn.Module]] = {
     "segformer": partial(SegFormer, encoder="mit_b0"),  # which drops paths at random
 }
 
+# Advice of Lightning on how to train, which small trainings do not follow; LeafSpec is of its own code.
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*does not have many workers", "ignore:.*LeafSpec", "ignore:.*dirpath has changed"
 )

@@ -22,7 +22,7 @@ KINDS: dict[str, Callable[..., Located]] = {"mit_b0": SegFormer, "resnet18": Res
 
 of_every_kind = pytest.mark.parametrize("encoder", KINDS)
 # The test of the warning asks for it.
-pytestmark = pytest.mark.filterwarnings("ignore:the pretrained weights of mit_b")
+pytestmark = pytest.mark.filterwarnings("ignore:the pretrained weights of mit_b")  # of the license: a test holds it
 
 
 def classifier(encoder: str) -> Any:

@@ -1,6 +1,6 @@
 """How near restorations come, effect by effect, beside what needs no network: for benchmarks/table1.py."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple, cast
 
 import torch
@@ -62,8 +62,8 @@ def corrupted(frames: Iterable[Frame], effect: Effect) -> list[Pair]:
     return [make_pair(frame, effect, seed=_SEED) for frame in frames]
 
 
-def references(task: str, effect: Effect, frames: Iterable[Frame], pairs: list[Pair]) -> dict[str, Scores]:
-    """The scores of what needs no network: nothing, the best constant flow, and the true map."""
+def references(task: str, effect: Effect, frames: Iterable[Frame], pairs: list[Pair]) -> dict[str, Tensor]:
+    """The scores, as of `score`, of what needs no network: nothing, the best constant flow, and the true map."""
     if task == "undistort":
         constant = constant_flow(effect, pairs[0].clean)
         rivals: dict[str, Iterator[Restored]] = {
@@ -79,20 +79,20 @@ def references(task: str, effect: Effect, frames: Iterable[Frame], pairs: list[P
     return {name: score(restored, pairs) for name, restored in rivals.items()}
 
 
-def score(restored: Iterable[Restored], pairs: list[Pair]) -> Scores:
-    """The means over all frames of batches."""
+def score(restored: Iterable[Restored], pairs: list[Pair]) -> Tensor:
+    """(N, 6), float64, in the order of `Scores`: each frame of batches."""
     found = torch.cat([_scores(one, pair) for one, pair in zip(restored, pairs, strict=True)])
-    return Scores(*found.double().mean(dim=0).tolist())
+    return found.double().cpu()
 
 
-def mean(scores: Mapping[str, Scores]) -> Scores:
-    """The mean over effects, as over a mix that has them equally often."""
-    return Scores(*torch.tensor(list(scores.values()), dtype=torch.float64).mean(dim=0).tolist())
+def mean_of(frames: Tensor) -> Scores:
+    """The means over frames (N, 6)."""
+    return Scores(*frames.mean(dim=0).tolist())
 
 
 def constant_flow(effect: Effect, like: Tensor) -> Tensor:
     """(1, 2, H, W), px: the mean restore flow of other draws than the ones that are scored, on their valid pixels."""
-    keys = torch.arange(_CONSTANT_DRAWS).split(8)
+    keys = torch.arange(_CONSTANT_DRAWS, device=like.device).split(8)
     total, count = torch.zeros_like(like[:1, :2], dtype=torch.float64), torch.zeros_like(like[:1, :1])
     for some in keys:
         blank = Frame(like.new_zeros(len(some), *like.shape[1:]), some, torch.empty(0))
@@ -121,7 +121,7 @@ def _scores(restored: Restored, pair: Pair) -> Tensor:
     image_loss = masked_mean((image - pair.clean).abs(), pair.valid)
     flow_loss = epe = torch.full_like(image_loss, torch.nan)
     if restored.flow is not None:
-        size = torch.tensor([pair.flow.shape[3], pair.flow.shape[2]]).view(1, 2, 1, 1)
+        size = pair.flow.new_tensor([pair.flow.shape[3], pair.flow.shape[2]]).view(1, 2, 1, 1)
         flow_loss = masked_mean((restored.flow - pair.flow).abs() * 2 / size, pair.valid)
         epe = endpoint_error(restored.flow, pair.flow, pair.valid, size=METRIC_SIZE)
     loss = image_loss + flow_loss.nan_to_num()

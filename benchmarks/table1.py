@@ -1,11 +1,13 @@
 """The baselines on both tasks, effect by effect, beside what needs no network; and what the paper reports.
 
 python benchmarks/table1.py --source FRAMES [--form small|paper] [--rows resunet_undistort segformer_deweather ...]
-    [--frames 0] [--steps 10 50 250] [--sampled 8] [--threads 2] [--out benchmarks/results/table1]
+    [--frames 0] [--apart br_] [--steps 10 50 250] [--sampled 8] [--device cpu] [--threads 2]
+    [--out benchmarks/results/table1]
 
 Rows whose training is in `--out` are loaded, what was stopped goes on, the others are trained. `--frames` of the drives
 held out are scored, 0 for all; of a diffusion model `--sampled`, with each number of steps. The best constant flow
-knows which effect it undoes; the mix is the mean of its effects.
+knows which effect it undoes; the mix is the mean of its effects, told once more for the frames whose names begin with
+each of `--apart`, and for those of none.
 """
 
 import argparse
@@ -14,7 +16,7 @@ import math
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -22,7 +24,8 @@ from statistics import median
 import torch
 from arguments import count
 from looks import seconds
-from restoration_scores import METRIC_SIZE, MIX, Restore, Scores, corrupted, effects_of, mean, references, score
+from restoration_scores import METRIC_SIZE, MIX, Restore, Scores, corrupted, effects_of, mean_of, references, score
+from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
 from torchrefract._files import replacing
@@ -40,6 +43,8 @@ PAPER = {
     "deweather": {"ResUNet": (32.54, None), "SegFormer": (28.99, None), "DDPM": (30.80, None)},
 }
 _BATCH = 8
+_ALL = "all"
+_NONE = Scores(*[math.nan] * 6)
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,7 @@ class Line:
 
     task: str
     effect: str
+    which: str  # frames
     method: str
     scores: Scores
     frames: int
@@ -91,61 +97,65 @@ def scored(task: str, models: dict[str, Loaded], args: argparse.Namespace) -> It
     """The lines of a task: those of no network first, for each size of frames that models were trained on."""
     for size in dict.fromkeys(loaded.size for loaded in models.values()):
         own = {row: loaded for row, loaded in models.items() if loaded.size == size}
-        frames = _frames(args.source, size, args.frames)
+        held_out = FrameFolder(args.source, size=size, split="val")
+        frames = _frames(held_out, args.frames, args.device)
         effects = effects_of(task, size[1])
         pairs = {name: corrupted(frames, effect) for name, (effect, _) in effects.items()}
-        found = dict[str, dict[str, Scores]]()
+        groups = _groups(held_out, args.apart)
+        found = dict[str, dict[str, Tensor]]()
         for name, (effect, _) in effects.items():
             for rival, scores in references(task, effect, frames, pairs[name]).items():
                 found.setdefault(rival, {})[name] = scores
         for rival, each in found.items():
-            yield from _lines(task, rival, each, sum(len(frame.key) for frame in frames), size)
+            yield from _lines(Line(task, "", "", rival, _NONE, 0, size), each, _keys(frames), groups)
         for loaded in own.values():
-            yield from _of_model(task, loaded, pairs, args)
+            yield from _of_model(task, loaded, pairs, groups, args)
 
 
-def _of_model(task: str, loaded: Loaded, pairs: dict[str, list[Pair]], args: argparse.Namespace) -> Iterator[Line]:
-    model = loaded.model
+def _of_model(
+    task: str, loaded: Loaded, pairs: dict[str, list[Pair]], groups: dict[str, set[int]], args: argparse.Namespace
+) -> Iterator[Line]:
+    model = loaded.model.to(args.device)
     parameters = sum(parameter.numel() for parameter in model.network.parameters())  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]  # of every Learner
     sampled = isinstance(model, Diffusion)
     few = {name: _thinned(batches, args.sampled if sampled else 0) for name, batches in pairs.items()}
+    some = next(iter(few.values()))
     for steps in args.steps if sampled else [0]:
         if sampled:
             model.steps = steps
         each = {name: score(_restored(model, batches), batches) for name, batches in few.items()}
-        call = partial(_call, model, next(iter(few.values()))[0].degraded[:1])
+        # What has come to the CPU has been computed, on any device.
+        call = partial(_brought, model, some[0].degraded[:1])
         milliseconds = 1e3 * median(seconds(call, before=i == 0) for i in range(3))
         name = f"{loaded.name}, {steps} steps" if sampled else loaded.name
-        count = sum(len(pair.key) for pair in next(iter(few.values())))
-        yield from _lines(task, name, each, count, loaded.size, parameters, milliseconds)
+        line = Line(task, "", "", name, _NONE, 0, loaded.size, parameters, milliseconds)
+        yield from _lines(line, each, _keys(some), groups)
 
 
-def _lines(
-    task: str,
-    method: str,
-    each: dict[str, Scores],
-    frames: int,
-    size: tuple[int, int],
-    parameters: int | None = None,
-    milliseconds: float | None = None,
-) -> Iterator[Line]:
-    mixed = {name: each[name] for name, (_, in_mix) in effects_of(task, size[1]).items() if in_mix}
-    for effect, scores in {MIX: mean(mixed), **each}.items():
-        yield Line(task, effect, method, scores, frames, size, parameters, milliseconds)
+def _lines(of: Line, each: dict[str, Tensor], keys: list[int], groups: dict[str, set[int]]) -> Iterator[Line]:
+    """A method's lines: the mix of all frames, that of each group, and the effects; from scores frame by frame."""
+    effects = effects_of(of.task, of.size[1])
+    mixed = torch.stack([each[name] for name, (_, in_mix) in effects.items() if in_mix]).mean(dim=0)
+    for which, group in groups.items():
+        chosen = mixed[[key in group for key in keys]]
+        yield replace(of, effect=MIX, which=which, scores=mean_of(chosen), frames=len(chosen))
+    for effect, scores in each.items():
+        yield replace(of, effect=effect, which=_ALL, scores=mean_of(scores), frames=len(scores))
 
 
 def page(lines: Sequence[Line]) -> str:
     """The tables, one for each task and effect, in Markdown."""
     parts = []
-    for task, effect in dict.fromkeys((line.task, line.effect) for line in lines):
-        own = [line for line in lines if (line.task, line.effect) == (task, effect)]
+    for task, effect, which in dict.fromkeys((line.task, line.effect, line.which) for line in lines):
+        own = [line for line in lines if (line.task, line.effect, line.which) == (task, effect, which)]
         size = f"{own[0].size[1]}x{own[0].size[0]}"
         head = ["method", "L", "L_rec", "L_k", "PSNR (dB)", "SSIM", f"EPE (px at {METRIC_SIZE[1]}x{METRIC_SIZE[0]})"]
         head += ["x do nothing", "frames", "parameters", f"ms per frame of {size}"]
         rows = [head, ["---"] * len(head), *(_cells(line, own[0].scores) for line in own)]
-        if effect == MIX:
+        if effect == MIX and which == _ALL:
             rows += [_paper(name, *figures) for name, figures in PAPER[task].items()]
-        parts.append("\n".join([f"### {task}: {effect}", "", *("| " + " | ".join(row) + " |" for row in rows)]))
+        title = f"### {task}: {effect}" + ("" if which == _ALL else f", frames {which}")
+        parts.append("\n".join([title, "", *("| " + " | ".join(row) + " |" for row in rows)]))
     return "\n\n".join(parts)
 
 
@@ -174,19 +184,31 @@ def _or_none(value: float, form: str) -> str:
     return "" if math.isnan(value) else format(value, form)
 
 
-def _frames(source: Path, size: tuple[int, int], most: int) -> list[Frame]:
+def _frames(held_out: FrameFolder, most: int, device: torch.device) -> list[Frame]:
     """Batches of the frames of drives that no training has seen, or as many of them, evenly."""
-    held_out = FrameFolder(source, size=size, split="val")
-    chosen = _evenly(len(held_out), most)
-    return list(DataLoader(Subset(held_out, chosen), batch_size=_BATCH))
+    chosen = Subset(held_out, _evenly(len(held_out), most))
+    return [Frame(*(value.to(device) for value in batch)) for batch in DataLoader(chosen, batch_size=_BATCH)]
+
+
+def _groups(held_out: FrameFolder, prefixes: Sequence[str]) -> dict[str, set[int]]:
+    """The keys of all frames, and of those whose names begin alike, and of the others."""
+    names = {key: path.name for key, path in zip(held_out.keys, held_out.paths, strict=True)}
+    groups = {f"{start}*": {key for key, name in names.items() if name.startswith(start)} for start in prefixes}
+    others = {"others": set(names).difference(*groups.values())} if groups else {}
+    return {name: keys for name, keys in ({_ALL: set(names)} | groups | others).items() if keys}
+
+
+def _keys(batches: Sequence[Frame | Pair]) -> list[int]:
+    return [key for batch in batches for key in batch.key.tolist()]
 
 
 def _thinned(pairs: list[Pair], most: int) -> list[Pair]:
-    """So many of the frames of batches, evenly, each a batch; all of them for 0."""
+    """So many of the frames of batches, evenly, in new batches; all of them for 0."""
     if not most:
         return pairs
-    each = [Pair(*(value[i : i + 1] for value in pair)) for pair in pairs for i in range(len(pair.key))]
-    return [each[i] for i in _evenly(len(each), most)]
+    every = [torch.cat(values) for values in zip(*pairs, strict=True)]
+    chosen = torch.tensor(_evenly(len(every[0]), most), device=every[0].device)
+    return [Pair(*(value[some] for value in every)) for some in chosen.split(_BATCH)]
 
 
 def _evenly(count: int, most: int) -> list[int]:
@@ -195,8 +217,12 @@ def _evenly(count: int, most: int) -> list[int]:
 
 
 @torch.inference_mode()
-def _call(model: Restore, image: torch.Tensor) -> Restored:
+def _call(model: Restore, image: Tensor) -> Restored:
     return model(image)
+
+
+def _brought(model: Restore, image: Tensor) -> Tensor:
+    return _call(model, image).image.cpu()
 
 
 def _restored(model: Restore, pairs: Sequence[Pair]) -> Iterator[Restored]:
@@ -211,6 +237,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--frames", type=count(0), default=0, help="held-out frames that are scored, all")
     parser.add_argument("--steps", type=count(1), nargs="+", default=[10, 50, 250], help="of diffusion models")
     parser.add_argument("--sampled", type=count(1), default=8, help="frames that a diffusion model restores, 8")
+    parser.add_argument("--apart", nargs="+", default=[], help="beginnings of frames' names, each a kind of its own")
+    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"), help="that scores, cpu")
     parser.add_argument("--threads", type=count(1), default=2, help="2")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "table1", help="a folder")
     return parser

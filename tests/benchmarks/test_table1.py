@@ -7,7 +7,7 @@ import cv2
 import pytest
 import table1
 import torch
-from restoration_scores import MIX, Scores, constant_flow, corrupted, effects_of, mean, references, score
+from restoration_scores import MIX, Scores, constant_flow, corrupted, effects_of, mean_of, references, score
 from torch.testing import assert_close
 
 from torchrefract import LensDistortion, UniformFog
@@ -17,6 +17,7 @@ from torchrefract.restoration.tasks import Restored
 from torchrefract.types import Frame
 
 SIZE = (48, 80)
+PLAIN: dict[str, Any] = {"device": torch.device("cpu"), "apart": ["drive2"]}
 
 
 def frames(count: int = 3) -> list[Frame]:
@@ -28,7 +29,7 @@ def frames(count: int = 3) -> list[Frame]:
 def test_doing_nothing_is_off_by_the_flow_itself_and_the_true_flow_by_nothing():
     lens = LensDistortion(k1_range=(-0.3, -0.2))
     pairs = corrupted(frames(), lens)
-    found = references("undistort", lens, frames(), pairs)
+    found = {name: mean_of(each) for name, each in references("undistort", lens, frames(), pairs).items()}
     (pair,) = pairs
     # In px of 1920 x 1080, on valid pixels, the mean of the frames.
     length = (pair.flow * torch.tensor([1920 / 80, 1080 / 48]).view(1, 2, 1, 1)).norm(dim=1, keepdim=True)
@@ -50,7 +51,8 @@ def test_the_constant_flow_is_the_mean_of_many_others():
 def test_the_true_map_undoes_weather_as_far_as_eight_bits_allow(name):
     effect, in_mix = effects_of("deweather", SIZE[1])[name]
     assert in_mix
-    found = references("deweather", effect, frames(), corrupted(frames(), effect))
+    every = references("deweather", effect, frames(), corrupted(frames(), effect))
+    found = {name: mean_of(each) for name, each in every.items()}
     assert found["the true map"].psnr > found["do nothing"].psnr + 4
     assert math.isnan(found["the true map"].epe)
 
@@ -60,7 +62,7 @@ def test_losses_are_those_that_the_networks_learn_by():
     pairs = corrupted(frames(), lens)
     (pair,) = pairs
     flow = torch.full_like(pair.flow, 2.0)
-    found = score([Restored(pair.degraded, flow)], pairs)
+    found = mean_of(score([Restored(pair.degraded, flow)], pairs))
     image, halves = [], []
     for i in range(3):
         where = pair.valid[i, 0]
@@ -71,15 +73,28 @@ def test_losses_are_those_that_the_networks_learn_by():
     assert found.loss == pytest.approx(found.image_loss + found.flow_loss, rel=1e-6)
 
 
-def test_the_mix_is_the_mean_of_its_effects():
-    a, b = Scores(1, 1, 0, 10, 0.5, 3), Scores(3, 3, 0, 20, 0.7, 5)
-    assert mean({"a": a, "b": b}) == pytest.approx((2, 2, 0, 15, 0.6, 4))
+def test_the_mix_is_the_mean_of_its_effects_for_all_frames_and_for_each_kind():
+    of = table1.Line("deweather", "", "", "a method", Scores(*[math.nan] * 6), 0, SIZE)
+    effects = effects_of("deweather", SIZE[1])
+    # Each frame's score is a power of two: a sum tells which frames are in it.
+    each = {name: 2.0 ** torch.arange(4).double()[:, None].expand(4, 6) * (1 + i) for i, name in enumerate(effects)}
+    groups = {"all": {7, 8, 9, 11}, "br_*": {8, 11}, "others": {7, 9}}
+    lines = list(table1._lines(of, each, [7, 8, 9, 11], groups))
+    mix = {line.which: (line.scores.psnr, line.frames) for line in lines if line.effect == MIX}
+    assert mix == {"all": (2 * 15 / 4, 4), "br_*": (2 * (2 + 8) / 2, 2), "others": (2 * (1 + 4) / 2, 2)}
+    own = {line.effect: line.scores.psnr for line in lines if line.effect != MIX}
+    assert own == {name: (1 + i) * 15 / 4 for i, name in enumerate(effects)}
 
 
 def test_frames_are_taken_evenly():
     assert table1._evenly(10, 0) == list(range(10))
     assert table1._evenly(10, 3) == [0, 3, 6]
     assert table1._evenly(2, 5) == [0, 1]
+    lens = LensDistortion(k1_range=(-0.3, -0.2))
+    pairs = [pair for some in (frames(3), frames(2)) for pair in corrupted(some, lens)]
+    (thin,) = table1._thinned(pairs, 3)
+    assert thin.key.tolist() == [0, 1, 0]  # of 0 1 2 0 1
+    assert_close(thin.degraded, torch.stack([pairs[0].degraded[0], pairs[0].degraded[1], pairs[1].degraded[0]]))
 
 
 def folder(tmp_path: Path) -> Path:
@@ -97,11 +112,11 @@ def test_what_is_trained_is_loaded_and_the_page_tells_all(tmp_path, known_model)
     run.mkdir(parents=True)
     (run / "best.ckpt").write_bytes(made.read_bytes())
     (run / "curves.png").write_bytes(b"")
-    args = argparse.Namespace(source=folder(tmp_path), out=out, frames=0, form="small", steps=[2], sampled=1)
+    args = argparse.Namespace(source=folder(tmp_path), out=out, frames=0, form="small", steps=[2], sampled=1, **PLAIN)
     path = table1.trained("resunet_undistort", args)
     assert path == run / "best.ckpt"
     lines = list(table1.scored("undistort", {"resunet_undistort": load_model(path)}, args))
-    found = {(line.method, line.effect): line.scores for line in lines}
+    found = {(line.method, line.effect): line.scores for line in lines if line.which == "all"}
     model = next(line.method for line in lines if line.method.startswith("ResUNet"))
     # A network that answers 0 does nothing.
     for effect in (*effects_of("undistort", SIZE[1]), MIX):
@@ -109,7 +124,9 @@ def test_what_is_trained_is_loaded_and_the_page_tells_all(tmp_path, known_model)
     text = table1.page(lines)
     assert "### undistort: wide lens" in text
     assert "| paper: SegFormer, on its own frames |  |  |  | 16.29 |  | 69.82 |" in text
-    assert text.count("best constant flow") == 6
+    assert text.count("best constant flow") == 8
+    assert "### undistort: all of the paper's, frames drive2*" in text
+    assert {line.which: line.frames for line in lines} == {"all": 2, "drive2*": 1, "others": 1}
 
 
 def test_a_stopped_training_goes_on_and_what_is_not_there_is_trained(tmp_path, monkeypatch):
@@ -128,6 +145,6 @@ def test_a_stopped_training_goes_on_and_what_is_not_there_is_trained(tmp_path, m
 
 def test_fog_has_no_flow_and_its_cells_are_empty():
     found = references("deweather", UniformFog(), frames(), corrupted(frames(), UniformFog()))
-    line = table1.Line("deweather", "uniform fog", "do nothing", found["do nothing"], 3, SIZE)
-    cells = table1._cells(line, found["do nothing"])
+    scores = mean_of(found["do nothing"])
+    cells = table1._cells(table1.Line("deweather", "uniform fog", "all", "do nothing", scores, 3, SIZE), scores)
     assert cells[3] == cells[6] == cells[7] == ""

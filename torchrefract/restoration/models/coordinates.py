@@ -1,4 +1,4 @@
-"""What the feed-forward baselines share: pixel coordinates, a part for the whole frame, a start at doing nothing."""
+"""What the feed-forward baselines share: the coordinates of the pixels, any size of frame, a start at doing nothing."""
 
 from collections.abc import Callable
 from typing import Any, cast
@@ -8,8 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torchrefract.restoration.models.global_part import GlobalPart
-from torchrefract.restoration.models.places import place_axes, places
+from torchrefract.restoration.models.places import places
 from torchrefract.restoration.models.pretrained import find_weights, load_network
 
 _STRIDE = 32
@@ -19,8 +18,7 @@ _MEAN, _STD = (0.5,) * 3, (0.25,) * 3  # of colors, where no weights ask for oth
 class Located(nn.Module):
     """A network of segmentation-models-pytorch that is given the `places` of the pixels as two more channels.
 
-    What it predicts at each place is added to its `GlobalPart`. The last layers of both start at zero: before training
-    the network does nothing.
+    The last layer starts at zero: before training the network does nothing.
 
     An encoder with pretrained weights is frozen, its running statistics and its dropout, too. Only what its first layer
     makes of the coordinates, nothing at the start, is learned.
@@ -54,7 +52,6 @@ class Located(nn.Module):
         self.register_buffer("std", torch.tensor(std).view(1, 3, 1, 1))
         for parameter in self.network.segmentation_head.parameters():
             nn.init.zeros_(parameter)
-        self.whole = GlobalPart(self.network.encoder.out_channels[-1], channels)
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # missing in torch's annotations
         self.train()
 
@@ -72,17 +69,15 @@ class Located(nn.Module):
             image: (B, 3, H, W), in [0, 1].
 
         Returns:
-            (B, channels, ceil(H / cell), ceil(W / cell)), float32 or as the image.
+            (B, channels, ceil(H / cell), ceil(W / cell)).
         """
         if image.ndim != 4 or image.shape[1] != 3:
             raise ValueError(f"image must have shape (B, 3, H, W), got {tuple(image.shape)}")
         height, width = image.shape[2:]
         inputs = torch.cat([(image - self.mean) / self.std, places(image)], dim=1)
         inputs = F.pad(inputs, (0, -width % _STRIDE, 0, -height % _STRIDE), mode="replicate")
-        features = self.network.encoder(inputs.contiguous(memory_format=torch.channels_last))
-        found = self.network.segmentation_head(self.network.decoder(features))
-        found = found[:, :, : -(-height // self.cell), : -(-width // self.cell)]
-        return found + self.whole(features[-1], *place_axes(image, cell=self.cell))
+        found = self.network(inputs.contiguous(memory_format=torch.channels_last))
+        return found[:, :, : -(-height // self.cell), : -(-width // self.cell)]
 
 
 class _Beside(nn.Module):

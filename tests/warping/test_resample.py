@@ -276,6 +276,17 @@ def test_the_layout_in_memory_changes_nothing_and_is_kept():
     assert warp(strided, flipped)[0].is_contiguous()
 
 
+@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
+def test_vmap_over_flows_looks_one_image_up_along_each(layout):
+    image = noise(1, 3, 6, 8).float().contiguous(memory_format=layout)
+    flows = random_flow(4, 6, 8).float()[:, None]
+    found, valid = torch.vmap(lambda flow: warp(image, flow))(flows)
+    for i, flow in enumerate(flows):
+        expected, inside = warp(image, flow)
+        assert_close(found[i], expected, rtol=0, atol=1e-6)
+        assert torch.equal(valid[i], inside)
+
+
 def test_a_map_over_images_and_flows_of_any_layout_is_each_of_them_alone():
     images, flows = noise(3, 1, 2, 16, 12).float().mT, random_flow(3, 16, 12).float()[:, None].mT
     together, valid = torch.vmap(warp)(images, flows)

@@ -125,12 +125,16 @@ def follow(first: Tensor | SmoothFlow, grid: Tensor) -> Tensor:
 def is_channels_last(image: Tensor) -> bool:
     """Whether the image (B, C, H, W) lies in memory in that format and in no other."""
     # A batch of one, or one channel, counts as both formats; only a real channels_last image asks for its own.
-    if image.is_contiguous():
-        return False
+    return not image.is_contiguous() and _has_format(image) and image.is_contiguous(memory_format=torch.channels_last)
+
+
+def _has_format(image: Tensor) -> bool:
+    """Whether it can be said how the image lies in memory."""
     try:
-        return image.is_contiguous(memory_format=torch.channels_last)
+        image.is_contiguous(memory_format=torch.channels_last)
     except RuntimeError:  # inside torch.vmap a sample has no format
         return False
+    return True
 
 
 def _check_fit(image: Tensor, flow: Tensor) -> None:
@@ -167,7 +171,7 @@ def _as_image(warped: Tensor, image: Tensor) -> Tensor:
 
 def _laid_out(warped: Tensor, image: Tensor) -> Tensor:
     """The warped image in the type and the memory format of the image."""
-    layout = torch.channels_last if is_channels_last(image) else torch.contiguous_format
+    layout = torch.channels_last if is_channels_last(image) and _has_format(warped) else torch.contiguous_format
     # `to` with a format copies what has the type and the format already.
     if warped.dtype is image.dtype:
         return warped.contiguous(memory_format=layout)

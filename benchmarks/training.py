@@ -82,7 +82,7 @@ def candidates(frames: Tensor, chosen: Mapping[str, Effect]) -> dict[str, Candid
 
 def training_steps(frames: Frame, task: Task, scene: Effect, *, encoder: str) -> dict[str, Candidate]:
     """A step with the pairs made before, and one that makes them."""
-    network = ResUNet(task.channels, encoder=encoder).train()
+    network = ResUNet(task.channels, smooth=task.smooth, encoder=encoder).train()
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4)
     made = make_pair(frames, scene, seed=SEED)
     seeds = iter(range(1 << 30))

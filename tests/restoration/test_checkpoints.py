@@ -247,7 +247,7 @@ def test_a_checkpoint_says_where_it_comes_from(tmp_path):
         enable_model_summary=False,
         plugins=[AtomicCheckpointIO()],
     )
-    trainer.strategy.connect(Restoration(lambda channels: nn.Linear(1, channels), Undistort()))
+    trainer.strategy.connect(Restoration(lambda channels, smooth: nn.Linear(1, channels), Undistort()))
     trainer.save_checkpoint(tmp_path / "last.ckpt")
     found = read_checkpoint(tmp_path / "last.ckpt")
     assert (found["config"], found["data"], found["licenses"]) == (config, data, {"data": "CC0"})

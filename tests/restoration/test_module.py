@@ -31,7 +31,7 @@ pytestmark = pytest.mark.filterwarnings(
 class Flat(nn.Module):
     """The least that can learn: one number for each channel."""
 
-    def __init__(self, channels: int):
+    def __init__(self, channels: int, *, smooth: bool = False):
         super().__init__()
         self.answer = nn.Parameter(torch.zeros(channels, 1, 1))
 

@@ -18,7 +18,7 @@ from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
 from torchrefract.types import Frame
 
 SIZE = (32, 64)
-SMALL: dict[str, Callable[[int], nn.Module]] = {
+SMALL: dict[str, Callable[..., nn.Module]] = {
     "resunet": partial(ResUNet, encoder="tu-mobilenetv3_small_050"),
     "segformer": partial(SegFormer, encoder="mit_b0"),
 }
@@ -33,7 +33,7 @@ def batch(effect: Effect, count: int) -> Pair:
 def overfitted(network: str, task: Task, pair: Pair, *, steps: int, lr: float) -> Restored:
     """The restoration of a batch by a network that has seen it, and nothing else, for some steps."""
     torch.manual_seed(0)
-    model = SMALL[network](task.channels)
+    model = SMALL[network](task.channels, smooth=task.smooth)
     optimizer = torch.optim.AdamW(model.parameters())
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, steps)
     for _ in range(steps):

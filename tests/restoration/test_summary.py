@@ -82,7 +82,7 @@ def finished(
     drawn: list[PanelRows] = []
     monkeypatch.setattr(summary_module, "save_panel", lambda rows, out: drawn.append(rows))
     trainer: Any = SimpleNamespace(is_global_zero=rank == 0, callback_metrics=scores())
-    model, callback = Restoration(lambda channels: nn.Conv2d(3, channels, 1), task), RunSummary(str(tmp_path))
+    model, callback = Restoration(lambda channels, smooth: nn.Conv2d(3, channels, 1), task), RunSummary(str(tmp_path))
     for number, batch in enumerate(batches):
         flow = 2 * batch.flow if isinstance(task, Undistort) else None
         outputs = Restored(batch.clean + 0.01, flow)._asdict()
@@ -135,7 +135,11 @@ def test_a_run_that_validated_nothing_says_and_draws_nothing(tmp_path, monkeypat
 def test_a_training_leaves_both_pictures(tmp_path):
     (tmp_path / "metrics.csv").write_text("epoch,step,train/loss,val/loss\n0,3,,0.3\n0,3,0.5,\n1,7,,0.2\n1,7,0.4,\n")
     trainer: Any = SimpleNamespace(is_global_zero=True, callback_metrics=scores())
-    model, callback, batch = Restoration(lambda c: nn.Conv2d(3, c, 1), Undistort()), RunSummary(str(tmp_path)), pair()
+    model, callback, batch = (
+        Restoration(lambda c, smooth: nn.Conv2d(3, c, 1), Undistort()),
+        RunSummary(str(tmp_path)),
+        pair(),
+    )
     callback.on_validation_batch_end(trainer, model, Restored(batch.degraded, batch.flow)._asdict(), batch, 0)
     callback.teardown(trainer, model, "fit")
     for name in ("curves.png", "panel.png"):

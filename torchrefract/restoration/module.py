@@ -173,14 +173,14 @@ class Restoration(Learner):
     """A network that restores an image in one step.
 
     Args:
-        network: makes the network, given the number of channels to predict.
+        network: makes the network, given the number of channels to predict and whether they are `smooth`, as of `Task`.
         task: what is to be restored.
         lr, weight_decay, warmup_steps, schedule, metric_size: as for `Learner`.
     """
 
     def __init__(
         self,
-        network: Callable[[int], nn.Module],
+        network: Callable[..., nn.Module],
         task: Task,
         *,
         lr: float = 1e-3,
@@ -190,7 +190,7 @@ class Restoration(Learner):
         metric_size: Sequence[int] = (1080, 1920),
     ):
         options = {"lr": lr, "weight_decay": weight_decay, "warmup_steps": warmup_steps, "schedule": schedule}
-        super().__init__(network(task.channels), task, metric_size=metric_size, **options)
+        super().__init__(network(task.channels, smooth=task.smooth), task, metric_size=metric_size, **options)
 
     def forward(self, degraded: Tensor, key: Tensor | None = None) -> Restored:
         """The restoration of images (B, 3, H, W) in [0, 1]; no draw, so no key counts."""

@@ -24,10 +24,16 @@ class Restored(NamedTuple):
 
 
 class Task(ABC):
-    """What is to be restored. `name` is that of its file in conf/task, `channels` what the network has to predict."""
+    """What is to be restored.
+
+    name: that of its file in conf/task.
+    channels: how many maps the network has to predict.
+    smooth: whether these may be smooth over the whole frame.
+    """
 
     name: str
     channels: int
+    smooth = False
 
     @abstractmethod
     def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
@@ -57,6 +63,7 @@ class Undistort(Task):
 
     name = "undistort"
     channels = 2
+    smooth = True
 
     def __init__(self, limit: float = 0.25):
         self.limit = limit

@@ -3,13 +3,14 @@ from functools import partial
 
 import pytest
 import torch
+from numpy.polynomial import Chebyshev
 from torch.testing import assert_close
 
 from torchrefract.restoration.models.coordinates import Located
 from torchrefract.restoration.models.resunet import ResUNet
 from torchrefract.restoration.models.segformer import SegFormer
 
-SMALL: dict[str, Callable[[int], Located]] = {
+SMALL: dict[str, Callable[..., Located]] = {
     "resunet": partial(ResUNet, encoder="tu-resnet10t"),
     "segformer": partial(SegFormer, encoder="mit_b0"),
 }
@@ -18,10 +19,10 @@ SIZES = [(32, 64), (33, 17), (50, 37), (37, 20), (20, 30), (1, 1)]
 pytestmark = pytest.mark.parametrize("kind", SMALL)
 
 
-def drawn(kind: str, *, awake: bool = True) -> Located:
+def drawn(kind: str, *, awake: bool = True, smooth: bool = True) -> Located:
     """A network, whose last layer is drawn as after some training, if it is to be awake."""
     torch.manual_seed(0)
-    network = SMALL[kind](2).eval()
+    network = SMALL[kind](2, smooth=smooth).eval()
     for parameter in network.network.segmentation_head.parameters() if awake else ():
         torch.nn.init.normal_(parameter, std=0.1)
     return network
@@ -63,7 +64,8 @@ def test_it_sees_where_a_pixel_lies(kind):
 @torch.no_grad()
 def test_the_coordinates_run_from_border_to_border_whatever_the_size(kind, monkeypatch):
     network, seen = drawn(kind), []
-    monkeypatch.setattr(network.network, "forward", lambda inputs: (seen.append(inputs), inputs[:, :2])[1])
+    encode = network.network.encoder.forward
+    monkeypatch.setattr(network.network.encoder, "forward", lambda inputs: (seen.append(inputs), encode(inputs))[1])
     for height, width in ((64, 96), (33, 17)):
         image = torch.rand(1, 3, height, width)
         network(image)
@@ -72,6 +74,35 @@ def test_the_coordinates_run_from_border_to_border_whatever_the_size(kind, monke
         assert_close(x, ((2 * torch.arange(width) + 1) / width - 1).expand(height, width))
         assert_close(y, ((2 * torch.arange(height) + 1) / height - 1)[:, None].expand(height, width))
         assert all(side % 32 == 0 for side in seen[-1].shape[2:])
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("size", [(64, 96), (33, 50)])
+def test_what_is_said_of_the_whole_frame_is_added_at_the_centers_of_the_cells(kind, size):
+    network, image = drawn(kind), torch.rand(2, 3, *size)
+    assert network.whole is not None
+    before = network(image)
+    network.get_parameter("whole.layers.2.bias").copy_(bias := torch.randn(2 * len(network.whole.terms)))
+    found = (network(image) - before).double()
+    rows, columns = (torch.arange(count).double() for count in cells(network, size))
+    y, x = (
+        (network.cell * (2 * axis + 1) / side - 1).clamp(max=1)
+        for axis, side in zip((rows, columns), size, strict=True)
+    )
+    expected = torch.zeros(2, len(y), len(x), dtype=torch.float64)
+    for (i, j), *each in zip(network.whole.terms, *bias.double().view(2, -1), strict=True):
+        # T_n as a polynomial, by NumPy.
+        in_x, in_y = (torch.from_numpy(Chebyshev.basis(n)(axis.numpy())) for n, axis in ((i, x), (j, y)))
+        expected += torch.stack(each)[:, None, None] * in_y[:, None] * in_x
+    assert_close(found, expected.expand_as(found), rtol=0, atol=2e-4)
+
+
+@torch.no_grad()
+def test_what_is_said_of_the_whole_frame_is_in_float32_when_the_network_is_not(kind):
+    network, image = drawn(kind), torch.rand(1, 3, 64, 96)
+    network.get_parameter("whole.layers.2.bias").normal_()
+    with torch.autocast("cpu", torch.bfloat16):
+        assert network(image).dtype is torch.float32
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""What the feed-forward baselines share: the coordinates of the pixels, any size of frame, a start at doing nothing."""
+"""What the feed-forward baselines share: pixel coordinates, a part for the whole frame, a start at doing nothing."""
 
 from collections.abc import Callable
 from typing import Any, cast
@@ -8,7 +8,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torchrefract.restoration.models.places import places
+from torchrefract.restoration.models.global_part import GlobalPart
+from torchrefract.restoration.models.places import place_axes, places
 from torchrefract.restoration.models.pretrained import find_weights, load_network
 
 _STRIDE = 32
@@ -18,7 +19,8 @@ _MEAN, _STD = (0.5,) * 3, (0.25,) * 3  # of colors, where no weights ask for oth
 class Located(nn.Module):
     """A network of segmentation-models-pytorch that is given the `places` of the pixels as two more channels.
 
-    The last layer starts at zero: before training the network does nothing.
+    The last layer starts at zero: before training the network does nothing. So does what is added to its answer where
+    maps of the whole frame are wanted, a `GlobalPart`.
 
     An encoder with pretrained weights is frozen, its running statistics and its dropout, too. Only what its first layer
     makes of the coordinates, nothing at the start, is learned.
@@ -29,6 +31,7 @@ class Located(nn.Module):
         encoder: a name known to segmentation-models-pytorch; "tu-…" is timm's.
         pretrained: None, "imagenet" or a folder, as for `find_weights`.
         cell: side of the square of pixels that the architecture predicts one value for.
+        smooth: whether a `GlobalPart` is added, for what is smooth over the frame, as the flow of a lens.
 
     Raises:
         ValueError: an encoder that is not known, or not of this kind; weights that cannot be had.
@@ -38,7 +41,14 @@ class Located(nn.Module):
     std: Tensor
 
     def __init__(
-        self, architecture: Callable[..., Any], channels: int, *, encoder: str, pretrained: str | None, cell: int
+        self,
+        architecture: Callable[..., Any],
+        channels: int,
+        *,
+        encoder: str,
+        pretrained: str | None,
+        cell: int,
+        smooth: bool,
     ):
         super().__init__()
         weights = None if pretrained is None else find_weights(encoder, pretrained)
@@ -52,6 +62,7 @@ class Located(nn.Module):
         self.register_buffer("std", torch.tensor(std).view(1, 3, 1, 1))
         for parameter in self.network.segmentation_head.parameters():
             nn.init.zeros_(parameter)
+        self.whole = GlobalPart(self.network.encoder.out_channels[-1], channels) if smooth else None
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # missing in torch's annotations
         self.train()
 
@@ -69,15 +80,19 @@ class Located(nn.Module):
             image: (B, 3, H, W), in [0, 1].
 
         Returns:
-            (B, channels, ceil(H / cell), ceil(W / cell)).
+            (B, channels, ceil(H / cell), ceil(W / cell)), float32 or as the image.
         """
         if image.ndim != 4 or image.shape[1] != 3:
             raise ValueError(f"image must have shape (B, 3, H, W), got {tuple(image.shape)}")
         height, width = image.shape[2:]
         inputs = torch.cat([(image - self.mean) / self.std, places(image)], dim=1)
         inputs = F.pad(inputs, (0, -width % _STRIDE, 0, -height % _STRIDE), mode="replicate")
-        found = self.network(inputs.contiguous(memory_format=torch.channels_last))
-        return found[:, :, : -(-height // self.cell), : -(-width // self.cell)]
+        features = self.network.encoder(inputs.contiguous(memory_format=torch.channels_last))
+        found = self.network.segmentation_head(self.network.decoder(features))
+        found = found[:, :, : -(-height // self.cell), : -(-width // self.cell)]
+        if self.whole is None:
+            return found
+        return found + self.whole(features[-1], *place_axes(image, cell=self.cell))
 
 
 class _Beside(nn.Module):

@@ -11,5 +11,7 @@ class ResUNet(Located):
     Source: Ronneberger, Fischer, Brox, "U-Net", MICCAI 2015; He, Zhang, Ren, Sun, "Deep residual learning", CVPR 2016.
     """
 
-    def __init__(self, channels: int, *, encoder: str = "tu-resnet34", pretrained: str | None = None):
-        super().__init__(smp.Unet, channels, encoder=encoder, pretrained=pretrained, cell=1)
+    def __init__(
+        self, channels: int, *, encoder: str = "tu-resnet34", pretrained: str | None = None, smooth: bool = False
+    ):
+        super().__init__(smp.Unet, channels, encoder=encoder, pretrained=pretrained, cell=1, smooth=smooth)

@@ -15,5 +15,12 @@ class SegFormer(Located):
     Source: Xie, Wang, Yu, Anandkumar, Alvarez, Luo, "SegFormer", NeurIPS 2021.
     """
 
-    def __init__(self, channels: int, *, encoder: str = "mit_b1", pretrained: str | None = None):
-        super().__init__(partial(smp.Segformer, upsampling=1), channels, encoder=encoder, pretrained=pretrained, cell=4)
+    def __init__(self, channels: int, *, encoder: str = "mit_b1", pretrained: str | None = None, smooth: bool = False):
+        super().__init__(
+            partial(smp.Segformer, upsampling=1),
+            channels,
+            encoder=encoder,
+            pretrained=pretrained,
+            cell=4,
+            smooth=smooth,
+        )

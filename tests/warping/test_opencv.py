@@ -2,7 +2,6 @@ import importlib
 import io
 import math
 import types
-from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -192,10 +191,9 @@ def test_gradients_are_pytorchs(calls):
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:FutureWarning")  # of torch.func.jvp
 def test_forward_gradients_maps_and_graphs_are_pytorchs(calls):
     image, flow = levels(2, *FRAME), flows(2, *FRAME[1:])["short"]
-    with suppress(NotImplementedError):  # PyTorch's sampler has no forward gradients before 2.15
-        with forward_ad.dual_level():
-            warp(image, forward_ad.make_dual(flow, flow))
-        torch.func.jvp(lambda f: warp(image, f)[0].float(), (flow,), (flow,))
+    with forward_ad.dual_level():
+        warp(image, forward_ad.make_dual(flow, flow))
+    torch.func.jvp(lambda f: warp(image, f)[0].float(), (flow,), (flow,))
     torch.vmap(warp)(image, flow)
     torch.compile(warp, fullgraph=True, backend="eager")(image, flow)
     assert not calls

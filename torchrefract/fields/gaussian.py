@@ -155,10 +155,14 @@ def _transform(values: Tensor, count: int, dim: int) -> Tensor:
 
 
 def _even_transform(values: Tensor, count: int, dim: int) -> Tensor:
+    if values.shape[0] == 0:  # which PyTorch before 2.15 cannot transform
+        return values.clone()
     return torch.fft.hfft(values, n=count, dim=dim).narrow(dim, 0, count // 2 + 1)
 
 
 def _fields(noise: Tensor, shape: Tensor, height: int, width: int) -> Tensor:
+    if noise.shape[0] == 0:
+        return noise.new_zeros(0, 2, height, width)
     parts = [_field(*one, height, width) for one in zip(noise.split(1), shape.split(1), strict=True)]
     return parts[0] if len(parts) == 1 else torch.cat(parts)
 
@@ -239,6 +243,8 @@ def _(noise: Tensor, shape: Tensor, height: int, width: int) -> Tensor:
 def _field_gradients(slope: Tensor, noise: Tensor, shape: Tensor) -> tuple[Tensor, Tensor]:
     """What `_fields` passes back from the slope (B, 2, H, W) to its two inputs."""
     size = noise.shape[2:]
+    if noise.shape[0] == 0:
+        return torch.zeros_like(noise), torch.zeros_like(shape)
     weighted = torch.fft.fft2(torch.complex(slope[:, 0], -slope[:, 1]), s=tuple(size)).conj()
     weighted = torch.view_as_real(weighted.resolve_conj()).movedim(-1, 1)
     quarter = (noise * weighted).sum(dim=1)

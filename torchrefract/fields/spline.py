@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import check_all, is_true
+from torchrefract.fields.linear import solve
 from torchrefract.warping.grid import pixel_axes
 
 # Control points nearer than this share of their extent count as one.
@@ -60,8 +61,7 @@ def fit_spline(points: Tensor, displacement: Tensor, smoothing: Tensor) -> Splin
     corner = unit.new_zeros(unit.shape[0], 3, 3)
     system = torch.cat([torch.cat([kernel, plane], dim=2), torch.cat([plane.mT, corner], dim=2)], dim=1)
     right = torch.cat([displacement, displacement.new_zeros(unit.shape[0], 3, 2)], dim=1)
-    # solve_ex raises nothing, and so waits for no device.
-    solution = torch.linalg.solve_ex(system, right)[0]
+    solution = solve(system, right)
     return Spline(unit, solution[:, :count], solution[:, count:], center, scale)
 
 

@@ -91,18 +91,21 @@ def finished(
     return drawn
 
 
-def test_the_panel_shows_the_first_four_of_the_first_batch(tmp_path, monkeypatch):
+def test_the_panel_shows_four_of_the_first_batch_from_the_most_degraded_on(tmp_path, monkeypatch):
     first = pair()
+    off = torch.tensor([0.01, 0.1, 0.02, 0.2, 0.05, 0.04])
+    first = first._replace(degraded=first.clean + off.view(6, 1, 1, 1))
+    shown = [3, 1, 5, 2]  # of 3 1 4 5 2 0
     (rows,) = finished(tmp_path, monkeypatch, Undistort(), first, pair(seed=1))
-    assert torch.equal(rows.clean, first.clean[:4])
-    assert torch.equal(rows.degraded, first.degraded[:4])
-    assert torch.equal(rows.restored, first.clean[:4] + 0.01)
+    assert torch.equal(rows.clean, first.clean[shown])
+    assert torch.equal(rows.degraded, first.degraded[shown])
+    assert torch.equal(rows.restored, first.clean[shown] + 0.01)
     assert rows.flow is not None
     assert rows.predicted_flow is not None
-    assert torch.equal(rows.flow, first.flow[:4])
-    assert torch.equal(rows.predicted_flow, 2 * first.flow[:4])
+    assert torch.equal(rows.flow, first.flow[shown])
+    assert torch.equal(rows.predicted_flow, 2 * first.flow[shown])
     # Off by 0.1 is 20 dB, off by 0.01 is 40 dB.
-    assert rows.captions == ["20.0 -> 40.0 dB"] * 4
+    assert rows.captions == [f"{before} -> 40.0 dB" for before in ("14.0", "20.0", "28.0", "34.0")]
 
 
 def test_the_panel_of_a_task_without_a_flow_has_none(tmp_path, monkeypatch):

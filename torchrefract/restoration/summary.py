@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from pytorch_lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
@@ -46,7 +45,7 @@ class RunSummary(Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        """The first rows of the first batch are kept for the panel."""
+        """Some rows of the first batch are kept for the panel."""
         if batch_idx == 0:
             self._rows = _panel_rows(Restored(**outputs), batch)
 
@@ -85,24 +84,20 @@ def _scores(values: dict[str, float], suffix: str) -> str:
 
 
 def _panel_rows(restored: Restored, pair: Pair) -> PanelRows:
-    count = min(_ROWS, len(pair.clean))
+    """Rows of a batch, evenly from the most degraded sample on: of a mix, hardly two of one kind."""
+    before, after = (psnr(image, pair.clean, pair.valid) for image in (pair.degraded, restored.image))
+    count = len(pair.clean)
+    rows = before.argsort(stable=True)[[i * count // min(_ROWS, count) for i in range(min(_ROWS, count))]]
 
-    def first(value: Tensor) -> Tensor:
-        return value[:count].detach().float().cpu()
+    def chosen(value: Tensor) -> Tensor:
+        return value[rows].detach().float().cpu()
 
     return PanelRows(
-        degraded=first(pair.degraded),
-        clean=first(pair.clean),
-        restored=first(restored.image).clamp(0, 1),
-        valid=first(pair.valid) > 0,
-        captions=_captions(restored, pair, count),
-        flow=None if restored.flow is None else first(pair.flow),
-        predicted_flow=None if restored.flow is None else first(restored.flow),
+        degraded=chosen(pair.degraded),
+        clean=chosen(pair.clean),
+        restored=chosen(restored.image).clamp(0, 1),
+        valid=chosen(pair.valid) > 0,
+        captions=[f"{before[row]:.1f} -> {after[row]:.1f} dB" for row in rows.tolist()],
+        flow=None if restored.flow is None else chosen(pair.flow),
+        predicted_flow=None if restored.flow is None else chosen(restored.flow),
     )
-
-
-def _captions(restored: Restored, pair: Pair, count: int) -> list[str]:
-    before, after = (
-        psnr(image[:count], pair.clean[:count], pair.valid[:count]) for image in (pair.degraded, restored.image)
-    )
-    return [f"{a:.1f} -> {b:.1f} dB" for a, b in torch.stack([before, after], dim=1).tolist()]

@@ -1,8 +1,8 @@
 """The baselines on both tasks, effect by effect, beside what needs no network; and what the paper reports.
 
-python benchmarks/table1.py --source FRAMES [--form small|paper] [--rows resunet_undistort segformer_deweather ...]
+python benchmarks/table1.py --source FRAMES [--form small|gpu|paper] [--rows resunet_undistort segformer_deweather ...]
     [--frames 0] [--apart br_] [--steps 10 50 250] [--sampled 8] [--device cpu] [--threads 2]
-    [--out benchmarks/results/table1]
+    [--out benchmarks/results/table1_small]
 
 Rows whose training is in `--out` are loaded, what was stopped goes on, the others are trained. `--frames` of the drives
 held out are scored, 0 for all; of a diffusion model `--sampled`, with each number of steps. The best constant flow
@@ -42,6 +42,7 @@ PAPER = {
     "undistort": {"ResUNet": (23.24, 5.76), "SegFormer": (16.29, 69.82), "DDPM": (22.80, 6.01)},
     "deweather": {"ResUNet": (32.54, None), "SegFormer": (28.99, None), "DDPM": (30.80, None)},
 }
+_FORMS = {"small": "_small", "gpu": "_gpu", "paper": ""}  # of the experiments, by the ends of their names
 _BATCH = 8
 _ALL = "all"
 _NONE = Scores(*[math.nan] * 6)
@@ -65,6 +66,7 @@ class Line:
 def main() -> None:
     """Train or load, score, print and save."""
     args = _parser().parse_args()
+    args.out = args.out or Path(__file__).parent / "results" / f"table1_{args.form}"
     torch.set_num_threads(args.threads)
     lines = list[Line]()
     for task in TASKS:
@@ -87,7 +89,7 @@ def trained(row: str, args: argparse.Namespace) -> Path:
     if done is None:
         done = args.out / f"{row}_{len(runs)}"
         stopped = next((run / "last.ckpt" for run in reversed(runs) if (run / "last.ckpt").is_file()), None)
-        words = [f"+experiment=table1_{row}{'_small' if args.form == 'small' else ''}", f"data.root={args.source}"]
+        words = [f"+experiment=table1_{row}{_FORMS[args.form]}", f"data.root={args.source}"]
         words += [] if stopped is None else [f"ckpt_path={stopped}"]
         subprocess.run([sys.executable, "-m", "torchrefract.train", *words, f"hydra.run.dir={done}"], check=True)
     return done / "best.ckpt"
@@ -232,7 +234,7 @@ def _restored(model: Restore, pairs: Sequence[Pair]) -> Iterator[Restored]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--source", type=Path, required=True, help="a folder of frames, of several drives")
-    parser.add_argument("--form", choices=("small", "paper"), default="small", help="of the experiments, small")
+    parser.add_argument("--form", choices=_FORMS, default="small", help="of the experiments, small")
     parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS), help="all six")
     parser.add_argument("--frames", type=count(0), default=0, help="held-out frames that are scored, all")
     parser.add_argument("--steps", type=count(1), nargs="+", default=[10, 50, 250], help="of diffusion models")
@@ -240,7 +242,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--apart", nargs="+", default=[], help="beginnings of frames' names, each a kind of its own")
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"), help="that scores, cpu")
     parser.add_argument("--threads", type=count(1), default=2, help="2")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "table1", help="a folder")
+    parser.add_argument("--out", type=Path, help="a folder for trainings of one form, benchmarks/results/table1_FORM")
     return parser
 
 

@@ -164,16 +164,14 @@ def test_the_experiments_of_table_1_follow_the_paper(tmp_path, model, task):
         assert cfg.model.schedule == "plateau"
 
 
-@pytest.mark.parametrize("experiment", [name for name in options("experiment") if name.endswith("_small")])
-def test_a_small_experiment_is_its_large_one_on_small_frames_without_weights(tmp_path, experiment):
-    small, large = (
-        composed(tmp_path, f"+experiment={name}", "data.root=frames")
-        for name in (experiment, experiment.removesuffix("_small"))
-    )
+@pytest.mark.parametrize(("form", "size", "device"), [("small", [96, 160], "cpu"), ("gpu", [192, 320], "gpu")])
+@pytest.mark.parametrize("row", [f"table1_{model}_{task}" for model in PROTOCOL for task in EPOCHS])
+def test_a_small_experiment_is_its_large_one_on_small_frames_without_weights(tmp_path, row, form, size, device):
+    small, large = (composed(tmp_path, f"+experiment={name}", "data.root=frames") for name in (f"{row}_{form}", row))
     assert (small.scene._target_, small.task) == (large.scene._target_, large.task)
     assert small.model._target_ == large.model._target_
-    assert small.scene.get("width", 160) == 160  # a scene that moves pixels does so by shares of the frame
-    assert (small.data.size, small.trainer.accelerator) == ([96, 160], "cpu")
+    assert small.scene.get("width", size[1]) == size[1]  # a scene that moves pixels does so by shares of the frame
+    assert (small.data.size, small.trainer.accelerator) == (size, device)
     assert small.model.network.pretrained is None
     assert isinstance(instantiate(small.model).task, Task)
 
@@ -183,7 +181,7 @@ def test_every_model_has_a_tiny_form_to_try():
 
 
 def test_every_experiment_is_of_table_1():
-    names = {f"table1_{model}_{task}{form}" for model in PROTOCOL for task in EPOCHS for form in ("", "_small")}
+    names = {f"table1_{model}_{task}{form}" for model in PROTOCOL for task in EPOCHS for form in ("", "_small", "_gpu")}
     assert {*options("experiment")} == names
 
 

@@ -236,7 +236,7 @@ def _told(conversion: Conversion) -> dict[str, Any]:
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("lenses", type=Path, help="the table")
+    parser.add_argument("lenses", type=Path, help="the table, JSON")
     parser.add_argument("--step", type=count(1), default=8, help="px between pixels, 8")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "lenses.json", help="the JSON")
     parser.add_argument("--table", type=Path, help="the CSV to write")

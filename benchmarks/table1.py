@@ -129,7 +129,7 @@ def _of_model(
         # What has come to the CPU has been computed, on any device.
         call = partial(_brought, model, some[0].degraded[:1])
         milliseconds = 1e3 * median(seconds(call, before=i == 0) for i in range(3))
-        name = f"{loaded.name}, {steps} steps" if sampled else loaded.name
+        name = f"DDPM, {steps} steps" if sampled else loaded.name
         line = Line(task, "", "", name, _NONE, 0, loaded.size, parameters, milliseconds)
         yield from _lines(line, each, _keys(some), groups)
 

@@ -74,10 +74,12 @@ def mode_field(
     ky, kx = _numbers(modes, noise.device)
     cos_x, sin_x = _waves(kx, columns, modes.size[1], **options)
     cos_y, sin_y = _waves(ky, rows, modes.size[0], **options)
-    both = torch.cat([torch.cat([real, imaginary], dim=2), torch.cat([imaginary, -real], dim=2)], dim=1)
-    along = both @ torch.cat([cos_x, sin_x])
-    across = torch.cat([torch.cat([cos_y, sin_y]).mT, torch.cat([-sin_y, cos_y]).mT])
-    return (across @ along).unflatten(1, (2, len(rows)))
+    # Two products of a sample each time: a single one may round by the threads that share it.
+    both = torch.stack([torch.cat([real, imaginary], dim=2), torch.cat([imaginary, -real], dim=2)], dim=1).flatten(0, 1)
+    along = torch.bmm(both, torch.cat([cos_x, sin_x]).expand(both.shape[0], -1, -1))
+    along = along.unflatten(0, (-1, 2)).flatten(1, 2).unsqueeze(1)
+    across = torch.stack([torch.cat([cos_y, sin_y]).mT, torch.cat([-sin_y, cos_y]).mT])
+    return across @ along
 
 
 def _waves(k: Tensor, places: Sequence[int], size: int, **options: Any) -> tuple[Tensor, Tensor]:

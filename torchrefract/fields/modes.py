@@ -74,12 +74,18 @@ def mode_field(
     ky, kx = _numbers(modes, noise.device)
     cos_x, sin_x = _waves(kx, columns, modes.size[1], **options)
     cos_y, sin_y = _waves(ky, rows, modes.size[0], **options)
-    # Two products of a sample each time: a single one may round by the threads that share it.
-    both = torch.stack([torch.cat([real, imaginary], dim=2), torch.cat([imaginary, -real], dim=2)], dim=1).flatten(0, 1)
-    along = torch.bmm(both, torch.cat([cos_x, sin_x]).expand(both.shape[0], -1, -1))
-    along = along.unflatten(0, (-1, 2)).flatten(1, 2).unsqueeze(1)
-    across = torch.stack([torch.cat([cos_y, sin_y]).mT, torch.cat([-sin_y, cos_y]).mT])
-    return across @ along
+    both = torch.stack([torch.cat([real, imaginary], dim=2), torch.cat([imaginary, -real], dim=2)], dim=1)
+    in_x = torch.cat([cos_x, sin_x]).unsqueeze(0)
+    in_y = torch.stack([torch.cat([cos_y, sin_y]).mT, torch.cat([-sin_y, cos_y]).mT])
+
+    def fields(pairs: Tensor) -> Tensor:
+        along = torch.bmm(pairs.flatten(0, 1), in_x.expand(2 * pairs.shape[0], -1, -1))
+        return in_y @ along.unflatten(0, (-1, 2)).flatten(1, 2).unsqueeze(1)
+
+    if both.device.type != "cpu" or torch.compiler.is_compiling():
+        return fields(both)
+    # Two products of one sample at a time: other numbers of them may round by the batch, and one by the threads.
+    return torch.cat([fields(pair) for pair in both.split(1)])
 
 
 def _waves(k: Tensor, places: Sequence[int], size: int, **options: Any) -> tuple[Tensor, Tensor]:

@@ -115,7 +115,7 @@ def test_a_model_is_made_with_the_defaults_of_its_class(tmp_path, model):
     network = instantiate(cfg.network)
     for made, given in ((get_class(cfg._target_), cfg), (network.func, network.keywords)):
         for name, parameter in inspect.signature(made).parameters.items():
-            if parameter.default is not parameter.empty:
+            if parameter.default is not parameter.empty and name != "smooth":  # which the task says
                 assert given[name] == parameter.default, name
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrefract._bands import join
 from torchrefract.fields.covariance import REACH, covariance
 
-_ROUNDING = 1e-13  # of the transform, relative to the largest eigenvalue
+_ROUNDING = 5e-13  # of the transform, relative to the largest eigenvalue
 _CACHED = 1 << 18  # complex numbers that stay in a core's cache
 
 

@@ -80,7 +80,7 @@ class Located(nn.Module):
             image: (B, 3, H, W), in [0, 1].
 
         Returns:
-            (B, channels, ceil(H / cell), ceil(W / cell)), float32 or as the image.
+            (B, channels, ceil(H / cell), ceil(W / cell)); under autocast float32 if `smooth`, else half.
         """
         if image.ndim != 4 or image.shape[1] != 3:
             raise ValueError(f"image must have shape (B, 3, H, W), got {tuple(image.shape)}")

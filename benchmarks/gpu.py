@@ -1,6 +1,7 @@
 """What effects cost on a GPU, eager and compiled, and whether they do there what they do on the CPU.
 
-python benchmarks/gpu.py [--shape 16x3x1080x1920] [--repeats 15] [--device cuda] [--out benchmarks/results/gpu.json]
+python benchmarks/gpu.py [--shape 16x3x1080x1920] [--only fog "mild lens"] [--repeats 15] [--device cuda]
+    [--out benchmarks/results/gpu.json]
 
 Without the device this is one line on standard error and exit code 1: a run that measured nothing is no success.
 """
@@ -8,6 +9,7 @@ Without the device this is one line on standard error and exit code 1: a run tha
 import argparse
 import json
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -44,7 +46,7 @@ def main() -> None:
         raise SystemExit(1)
     torch.manual_seed(0)
     frames = torch.rand(args.shape).to(args.device)
-    chosen = subjects()
+    chosen = {name: effect for name, effect in subjects().items() if not args.only or name in args.only}
     conditions = Conditions.now(frames, threads=torch.get_num_threads(), repeats=args.repeats)
     print(WHAT, end="\n\n", flush=True)
     bars = agreement(chosen, frames[:1])
@@ -74,12 +76,17 @@ def candidates(chosen: Mapping[str, Effect], frames: Tensor, *, backend: str = "
 
 
 def working(found: Mapping[str, Candidate]) -> tuple[dict[str, Candidate], list[str]]:
-    """The candidates that can be called, and a line about each that cannot: one failure must not cost the others."""
+    """The candidates that can be called, and a line about each that cannot: one failure must not cost the others.
+
+    How long a first call takes is printed; a compiler is at work in it.
+    """
     kept, failed = {}, []
     for name, call in found.items():
+        start = time.perf_counter()
         try:
             call()
             kept[name] = call
+            print(f"{name}: first call {time.perf_counter() - start:.1f} s", flush=True)
         except Exception as error:  # a compiler raises whatever it likes; which, is told beside the others' times
             failed.append(f"{name} is left out: {type(error).__name__}: {str(error).splitlines()[0]}")
     return kept, failed
@@ -133,6 +140,7 @@ def save(
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--shape", type=shape, default=SHAPE, help="batch x channels x height x width, 16x3x1080x1920")
+    parser.add_argument("--only", nargs="+", choices=list(subjects()), help="some effects, by name; all")
     parser.add_argument("--repeats", type=count(FEWEST_REPEATS), default=FEWEST_REPEATS, help="rounds, 15 or more")
     parser.add_argument("--device", type=torch.device, default=torch.device("cuda"), help="cuda")
     parser.add_argument("--backend", default="inductor", help="of torch.compile, inductor")

@@ -4,6 +4,8 @@ import pytest
 import torch
 from scipy import stats
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from torchrefract import draws
 
@@ -33,6 +35,37 @@ def threefry_of_whole_numbers(key: tuple[int, int], counter: tuple[int, int]) ->
 
 def correlation(a: Tensor, b: Tensor) -> float:
     return torch.corrcoef(torch.stack([a.flatten(), b.flatten()]).double())[0, 1].item()
+
+
+class Calls(TorchDispatchMode):
+    """The operators that are called on the device "meta", which stands for one that is far."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = list[str]()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        values = tree_leaves((args, kwargs, result))
+        if any(isinstance(value, Tensor) and value.is_meta for value in values):
+            self.names.append(func.overloadpacket.__name__)
+        return result
+
+
+@pytest.mark.parametrize("keys", [range(3), range(30), torch.arange(30)], ids=["few", "many", "tensor"])
+def test_a_device_that_is_far_only_gets_copies(keys):
+    source = draws.stream(5, keys, device=torch.device("meta"))
+    with Calls() as calls:
+        found = [
+            draws.uniform(source, 4),
+            draws.between(source.at(1), [(0.0, 1.0)] * 3, dtype=torch.float64),
+            draws.normal(draws.fold(source), 4),
+            draws.noise_key(source),
+        ]
+    assert all(value.is_meta for value in found)
+    assert set(calls.names) <= {"_to_copy", "empty_strided", "copy_", "detach"}
+    assert len(calls.names) <= 3 * len(found)
+    assert not draws.uniform(source.to(torch.device("cpu")), 4).is_meta
 
 
 @pytest.mark.parametrize(

@@ -27,13 +27,20 @@ class Stream:
     """Where the random numbers of each sample come from: two words of 32 bits a sample.
 
     Args:
-        words: (B, 2), as whole numbers, or as two tensors (B,), int64.
+        words: (B, 2), as whole numbers, or as two tensors (B,), int64; numbers are computed where these are.
         lane: numbers of different lanes are independent.
+        device: that numbers are brought to; None is that of the words.
     """
 
-    def __init__(self, words: Sequence[tuple[int, int]] | tuple[Tensor, Tensor], lane: int = 0):
+    def __init__(
+        self,
+        words: Sequence[tuple[int, int]] | tuple[Tensor, Tensor],
+        lane: int = 0,
+        device: torch.device | None = None,
+    ):
         self._words = words
         self.lane = lane
+        self.device = device
 
     @property
     def few(self) -> Sequence[tuple[int, int]] | None:
@@ -52,7 +59,11 @@ class Stream:
 
     def at(self, lane: int) -> "Stream":
         """The same samples, in another lane."""
-        return Stream(self._words, lane)
+        return Stream(self._words, lane, self.device)
+
+    def to(self, device: torch.device | None) -> "Stream":
+        """The same numbers, brought to a device."""
+        return Stream(self._words, self.lane, device)
 
     @property
     def _tensors(self) -> bool:
@@ -65,41 +76,41 @@ class Stream:
 
 
 def stream(seed: int | Tensor, keys: Tensor | range, *, device: torch.device | None = None) -> Stream:
-    """The stream of each sample.
+    """The stream of each sample, computed on the CPU unless the seed or the keys are elsewhere.
+
+    An accelerator would start hundreds of operations on a few numbers, each of which takes longer than all of them do
+    on the CPU.
 
     Args:
         seed: a whole number or a tensor of one, int64; of larger numbers the lowest 64 bits count.
         keys: (B,), int64, or a range of so many whole numbers.
-        device: for a range.
+        device: that numbers are brought to; None is that of the seed or the keys.
     """
     if not isinstance(seed, Tensor):
         # Two's complement, so that every Python integer has its 64 bits.
         seed = (seed + 2**63) % 2**64 - 2**63
-    if (few := _few(seed, keys, device)) is not None:
+    if (few := _few(seed, keys)) is not None:
         start, numbers = few
-        return Stream([_rounds(*_words(start), *_words(number)) for number in numbers])
+        return Stream([_rounds(*_words(start), *_words(number)) for number in numbers], device=device)
     if isinstance(keys, range):
-        keys = torch.arange(keys.start, keys.stop, device=device)
+        keys = torch.arange(keys.start, keys.stop)
+    if isinstance(seed, Tensor) and seed.device.type != "cpu":
+        keys = keys.to(seed.device, non_blocking=True)
     start = seed.long() if isinstance(seed, Tensor) else torch.full((), seed, dtype=torch.int64, device=keys.device)
-    return Stream(threefry(_words(start), _words(keys.long())))
+    return Stream(threefry(_words(start), _words(keys.long())), device=device)
 
 
 def fold(parent: Stream) -> Stream:
     """Streams of their own for what is nested in a lane."""
     if parent.few is not None:
-        return Stream([_rounds(high, low, _WORD, parent.lane) for high, low in parent.few])
+        return Stream([_rounds(high, low, _WORD, parent.lane) for high, low in parent.few], device=parent.device)
     zero = torch.zeros_like(parent.low)
-    return Stream(threefry((parent.high, parent.low), (zero + _WORD, zero + parent.lane)))
+    return Stream(threefry((parent.high, parent.low), (zero + _WORD, zero + parent.lane)), device=parent.device)
 
 
 def uniform(source: Stream, count: int) -> Tensor:
     """(B, count), float32, uniform in the open interval (0, 1), on a lattice of 2^23 values."""
-    if (few := source.few) is not None and _blocks(count) * len(few) <= _FEW:
-        return torch.from_numpy(_uniform_few(few, count, source.lane))
-    counter = torch.arange(_blocks(count), dtype=torch.int64, device=source.low.device)
-    lane = torch.full_like(counter, source.lane)
-    words = threefry((source.high[:, None], source.low[:, None]), (counter, lane))
-    return (torch.cat(words, dim=1)[:, :count] >> 9).float().add(0.5).mul(2.0**-23)
+    return _brought(_uniform(source, count), source)
 
 
 def between(source: Stream, ranges: Sequence[Range], *, dtype: torch.dtype) -> Tensor:
@@ -114,25 +125,28 @@ def between(source: Stream, ranges: Sequence[Range], *, dtype: torch.dtype) -> T
         # A handful of numbers: numpy's operations start several times as fast, and round alike.
         kind = np.float64 if dtype is torch.float64 else np.float32
         low, high = np.array(ranges, dtype=kind).T
-        return torch.from_numpy(low + (high - low) * _uniform_few(few, len(ranges), source.lane).astype(kind))
+        values = torch.from_numpy(low + (high - low) * _uniform_few(few, len(ranges), source.lane).astype(kind))
+        return _brought(values, source)
     low, high = torch.tensor(ranges, dtype=dtype, device=source.low.device).unbind(1)
-    return low + (high - low) * uniform(source, len(ranges)).to(dtype)
+    return _brought(low + (high - low) * _uniform(source, len(ranges)).to(dtype), source)
 
 
 def normal(source: Stream, count: int) -> Tensor:
     """(B, count), float32, standard normal (Box and Muller 1958), below `LARGEST_NORMAL` in magnitude."""
-    radius, angle = uniform(source, 2 * _blocks(count)).chunk(2, dim=1)
+    radius, angle = _uniform(source, 2 * _blocks(count)).chunk(2, dim=1)
     radius, angle = (-2 * radius.log()).sqrt(), 2 * math.pi * angle
-    return torch.cat([radius * angle.cos(), radius * angle.sin()], dim=1)[:, :count]
+    return _brought(torch.cat([radius * angle.cos(), radius * angle.sin()], dim=1)[:, :count], source)
 
 
 def noise_key(source: Stream) -> Tensor:
     """(B, 4), int64, in [0, 2^32): what the white noise of each sample comes from."""
     child = fold(source)
     if child.few is not None:
-        return torch.tensor([(*words, *_rounds(*words, 0, 0)) for words in child.few], dtype=torch.int64)
-    zero = torch.zeros_like(child.low)
-    return torch.stack([child.high, child.low, *threefry((child.high, child.low), (zero, zero))], dim=1)
+        key = torch.tensor([(*words, *_rounds(*words, 0, 0)) for words in child.few], dtype=torch.int64)
+    else:
+        zero = torch.zeros_like(child.low)
+        key = torch.stack([child.high, child.low, *threefry((child.high, child.low), (zero, zero))], dim=1)
+    return _brought(key, source)
 
 
 def call_seed() -> Tensor:
@@ -174,10 +188,10 @@ def _rounds(key0: Any, key1: Any, counter0: Any, counter1: Any) -> tuple[Any, An
     return x, y & _WORD
 
 
-def _few(seed: int | Tensor, keys: Tensor | range, device: torch.device | None) -> tuple[int, Sequence[int]] | None:
+def _few(seed: int | Tensor, keys: Tensor | range) -> tuple[int, Sequence[int]] | None:
     """Seed and keys as whole numbers where so few draws are faster in Python than to start on tensors."""
-    where = keys.device if isinstance(keys, Tensor) else torch.device(device or "cpu")
-    if not 0 < len(keys) <= _FEW or torch.compiler.is_compiling() or where.type != "cpu":
+    on_cpu = all(not isinstance(value, Tensor) or value.device.type == "cpu" for value in (seed, keys))
+    if not 0 < len(keys) <= _FEW or torch.compiler.is_compiling() or not on_cpu:
         return None
     try:
         start = int(seed) if isinstance(seed, Tensor) else seed
@@ -189,6 +203,23 @@ def _few(seed: int | Tensor, keys: Tensor | range, device: torch.device | None) 
 def _blocks(count: int) -> int:
     """Each gives two numbers."""
     return (count + 1) // 2
+
+
+def _uniform(source: Stream, count: int) -> Tensor:
+    """`uniform`, where the words are."""
+    if (few := source.few) is not None and _blocks(count) * len(few) <= _FEW:
+        return torch.from_numpy(_uniform_few(few, count, source.lane))
+    counter = torch.arange(_blocks(count), dtype=torch.int64, device=source.low.device)
+    lane = torch.full_like(counter, source.lane)
+    words = threefry((source.high[:, None], source.low[:, None]), (counter, lane))
+    return (torch.cat(words, dim=1)[:, :count] >> 9).float().add(0.5).mul(2.0**-23)
+
+
+def _brought(value: Tensor, source: Stream) -> Tensor:
+    """The value on the device of a stream; a copy from the CPU waits for nothing."""
+    if source.device is None or source.device == value.device:
+        return value
+    return value.to(source.device, non_blocking=value.device.type == "cpu")
 
 
 def _uniform_few(words: Sequence[tuple[int, int]], count: int, lane: int) -> np.ndarray:

@@ -80,10 +80,23 @@ def test_the_command_times_eager_and_compiled_graphs(monkeypatch, tmp_path, caps
     words = ["gpu.py", "--device", "cpu", "--shape", "2x3x24x32", "--backend", "eager", "--out", str(out)]
     monkeypatch.setattr(sys, "argv", words)
     gpu.main()
-    assert "flare as on the CPU: 0 levels" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "flare as on the CPU: 0 levels" in said
+    assert "flare, compiled: first call" in said
     content = json.loads(out.read_text())
     names = [row["name"] for row in content["timings"]]
     assert names[2:] == ["flare", "flare, compiled", "plate", "plate, compiled"]
     for row in content["timings"]:
         nbytes = 2 * 2 * 3 * 24 * 32 * 4
         assert row["bytes_per_second"] == pytest.approx(1e3 * nbytes / row["milliseconds"]["median"])
+
+
+def test_effects_can_be_chosen(monkeypatch, tmp_path, on_threads):
+    on_threads(1)
+    monkeypatch.setattr(timing, "_STRETCH_S", 0.0)
+    monkeypatch.setattr(gpu, "subjects", lambda: {"flare": LensFlare(), "plate": ThinPlateSpline()})
+    out = tmp_path / "gpu.json"
+    words = ["gpu.py", "--device", "cpu", "--shape", "2x3x24x32", "--backend", "eager", "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", [*words, "--only", "plate"])
+    gpu.main()
+    assert [row["name"] for row in json.loads(out.read_text())["timings"]][2:] == ["plate", "plate, compiled"]

@@ -50,6 +50,14 @@ def by_key(batches: list[Pair]) -> dict[int, Pair]:
     return found
 
 
+def test_keys_stay_where_draws_are_computed():
+    frame = next(iter(during(scenes()).train_dataloader()))
+    moved = scenes().transfer_batch_to_device(Frame(*frame), torch.device("meta"), 0)
+    assert moved.image.is_meta
+    assert moved.depth.is_meta
+    assert torch.equal(moved.key, Frame(*frame).key)
+
+
 def assert_same(found: dict[int, Pair], expected: dict[int, Pair]) -> None:
     for key in found.keys() & expected.keys():
         for name, a, b in zip(Pair._fields, found[key], expected[key], strict=True):

@@ -248,7 +248,7 @@ def test_the_error_between_nodes_deviates_as_its_bound_says(period, stride):
     assert found.covariance <= math.sqrt(found.variance * VARIANCE) * (1 + 1e-9)
     exact = perlin_noise([octave(key, 0, height=size, width=size, **options)], torch.ones(count, 1))
     lattice = Lattice(size, size, stride)
-    rows, columns = lattice.axes
+    rows, columns = lattice.axes()
     place = {"stride": stride, "start": rows.start}
     known = perlin_noise(
         [octave(key, 0, height=len(rows), width=len(columns), **place, **options)], torch.ones(count, 1)

@@ -143,6 +143,16 @@ def test_one_graph_gives_the_same(name):
     )
 
 
+@every_warp
+def test_effects_of_one_kind_do_not_share_the_graph_of_one_plan(name):
+    for effect in (WARPS[name], made(name, None)):
+        compiled = torch.compile(effect, fullgraph=True, backend="eager")
+        torch.manual_seed(3)
+        found = compiled(image())
+        torch.manual_seed(3)
+        assert_close(found, effect(image()), rtol=0, atol=1e-6)
+
+
 def test_a_swirl_on_a_lattice_has_no_divergence():
     flow = WARPS["swirl"].degrade(image(), seed=1).flow
     assert WARPS["swirl"].planned(*SIZE, torch.float32).stride > 1
@@ -254,7 +264,7 @@ def test_cubics_come_out_as_they_are(stride):
 @pytest.mark.parametrize("stride", [2, 3, 8])
 def test_a_stream_between_nodes_has_the_curl_of_psi_between_nodes(stride):
     lattice = Lattice(37, 53, stride, before=3, after=2)
-    nodes = torch.randn(2, 1, *map(len, lattice.axes), dtype=torch.float64)
+    nodes = torch.randn(2, 1, *map(len, lattice.axes()), dtype=torch.float64)
 
     def between(count: int, size: int) -> np.ndarray:
         """(size + 2, count), by SciPy: the polynomial through the three nodes on either side of a pixel."""

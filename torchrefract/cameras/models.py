@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import check_choice, check_count, check_number, check_positive, check_tensor
+from torchrefract._constants import constant
 from torchrefract.cameras.growth import falls_before, first_root, growth_of_powers, growth_of_ratio
 from torchrefract.cameras.points import Mapped, distort, project, undistort, unproject, valid_radius
 from torchrefract.cameras.sheet import MODELS
@@ -181,7 +182,7 @@ class Camera:
     def tensors(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Coefficients (1, n), focal lengths (1, 2) and principal point (1, 2), px, of a tensor's type and device."""
         numbers = (self.coefficients, (self.fx, self.fy), (self.cx, self.cy))
-        coefficients, focal, center = (torch.tensor([row], dtype=like.dtype, device=like.device) for row in numbers)
+        coefficients, focal, center = (constant([row], dtype=like.dtype, device=like.device) for row in numbers)
         return coefficients, focal, center
 
     def distort(self, points: Tensor) -> Mapped:

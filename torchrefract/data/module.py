@@ -68,6 +68,10 @@ class PairData(LightningDataModule):
         """Batches of frames, or pairs, in their order."""
         return self._loader(self.val, training=False)
 
+    def transfer_batch_to_device(self, batch: Frame | Pair, device: torch.device, dataloader_idx: int) -> Frame | Pair:
+        """The batch on the device, but for its keys: draws are computed on the CPU, which would wait to have them."""
+        return super().transfer_batch_to_device(batch, device, dataloader_idx)._replace(key=batch.key)
+
     def on_after_batch_transfer(self, batch: Frame | Pair, dataloader_idx: int) -> Pair:
         """The batch and its degraded copy, made on the device that it has come to; pairs as they are."""
         if isinstance(batch, Pair) or self.effect is None:

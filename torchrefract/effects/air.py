@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrefract._bands import join
 from torchrefract._checks import check_all, check_flag, check_number
+from torchrefract._constants import constant
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.color import check_color, each_channel
 from torchrefract.effects.depth import DepthProvider, LinearDepth
@@ -71,7 +72,7 @@ class Air:
             color = _PAPER_AIRLIGHT if channels == 3 else [_GRAY] * channels
         else:
             color = each_channel("airlight", self.airlight, channels)
-        return torch.tensor([color] * batch, dtype=dtype, device=image.device).view(batch, channels)
+        return constant([color] * batch, dtype=dtype, device=image.device).view(batch, channels)
 
     def distance(self, image: Tensor, depth: Tensor | None) -> Tensor:
         """(1, B or N, 1, H, 1 or W), m: how far the light comes; along the rays where the camera is known."""
@@ -99,7 +100,7 @@ class Air:
         dtype, (height, width) = field_dtype(image.dtype), image.shape[2:]
         camera = cast(Camera, self.camera).resized(width=width, height=height)
         y = (torch.arange(height, dtype=dtype, device=image.device) - camera.cy) / camera.fy
-        stretch = ((1 + y * y)[:, None] + y.new_tensor(squares)).sqrt()
+        stretch = ((1 + y * y)[:, None] + constant(squares, dtype=y.dtype, device=y.device)).sqrt()
         return self.depth(height, width, dtype=dtype, device=image.device) * stretch
 
     def in_bands(self, image: Tensor, t: Tensor, airlight: Tensor, bands: Sequence[tuple[str, int, int]]) -> Tensor:

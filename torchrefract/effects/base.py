@@ -104,7 +104,7 @@ class Effect(nn.Module, ABC):
         frame: float | Tensor,
     ) -> Any:
         seed = draws.call_seed() if seed is None else _seed(seed)
-        source = draws.stream(seed, _keys(keys, layout.batch, image.device), device=image.device)
+        source = draws.stream(seed, _keys(keys, layout.batch), device=image.device)
         params = self.draw(source.at(place), _samples(image, layout))
         return at_frames(params, lambda: _frames(frame, image, layout))
 
@@ -218,12 +218,12 @@ def _seed(seed: int | Tensor) -> int | Tensor:
     return seed
 
 
-def _keys(keys: Tensor | Sequence[int] | None, batch: int, device: torch.device) -> Tensor | range:
+def _keys(keys: Tensor | Sequence[int] | None, batch: int) -> Tensor | range:
     if keys is None:
         return range(batch)
     # An empty list has no type of its own.
     dtype = None if isinstance(keys, Tensor) or len(keys) else torch.int64
-    keys = torch.as_tensor(keys, dtype=dtype, device=device)
+    keys = torch.as_tensor(keys, dtype=dtype)
     if keys.is_floating_point() or keys.is_complex() or keys.dtype is torch.bool:
         raise TypeError(f"keys must be whole numbers, got {keys.dtype}")
     if keys.reshape(-1).shape[0] != batch or keys.ndim > 1:

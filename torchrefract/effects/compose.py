@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchrefract import draws
 from torchrefract._checks import check_choice, check_number, is_true
+from torchrefract._constants import constant
 from torchrefract.effects.base import Effect, moved
 from torchrefract.effects.compose_plan import ComposePlan, compose_plan
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, check_tolerance
@@ -117,7 +118,7 @@ class Compose(Effect):
         """The batch through all effects."""
         walk = Walk(image, depth, self.padding, self.interpolation, self.resampler)
         height, width = image.shape[2:]
-        plans = _constant(self, height, width, field_dtype(image.dtype)).plans
+        plans = self._constant(id(self), height, width, field_dtype(image.dtype)).plans
         for (effect, own), plan in zip(self.leaves(params), plans, strict=True):
             if isinstance(effect, WarpEffect):
                 walk.move(effect, own, cast(Plan, plan))
@@ -129,6 +130,11 @@ class Compose(Effect):
         """The plan for fields of a type."""
         ask = Ask(height, width, self.tolerance_px, dtype is torch.float64).of_default
         return compose_plan(list(self._chances(1.0)), self._together(), ask)
+
+    @torch.compiler.assume_constant_result
+    def _constant(self, _: int, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
+        # As for `PlannedLight`.
+        return self.planned(height, width, dtype)
 
     def fitted(self, params: ComposeParams) -> "Compose":
         """The composition, with each effect that relies on ranges which its parameters lie outside of exact."""
@@ -215,9 +221,14 @@ class OneOf(Compose):
         """A choice for each sample, and each effect's draw."""
         values = draws.uniform(source, 2)
         gate, choice = values[:, 0] < self.p, values[:, 1] * sum(self.weights)
-        ends = torch.tensor(self.weights, device=choice.device).cumsum(dim=0)[:-1]
+        ends = constant(self.weights, device=choice.device).cumsum(dim=0)[:-1]
         chosen = torch.bucketize(choice, ends, right=True)
         return self._draw_children(source, image, [gate & (chosen == i) for i in range(len(self.effects))], gate)
+
+    @torch.compiler.assume_constant_result
+    def _constant(self, _: int, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
+        # As for `PlannedLight`.
+        return self.planned(height, width, dtype)
 
     def fitted(self, params: ComposeParams) -> "Compose":
         """As for `Compose`; exact, too, for parameters by which several effects act on a sample."""
@@ -238,9 +249,3 @@ def _closed(params: Any, gate: Tensor) -> Any:
     if isinstance(params, ComposeParams):
         return ComposeParams(params.gate & gate, tuple(_closed(child, gate) for child in params.children))
     return params._replace(gate=params.gate & gate)
-
-
-@torch.compiler.assume_constant_result
-def _constant(effect: Compose, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
-    # Compilers take the plan as it is, and need not follow how it was made.
-    return effect.planned(height, width, dtype)

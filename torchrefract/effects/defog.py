@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import check_all, check_flag
+from torchrefract._constants import constant
 from torchrefract.effects.color import check_color, each_channel
 from torchrefract.effects.door import Layout, check_image, enter, leave
 from torchrefract.effects.rows import spread
@@ -74,4 +75,4 @@ def _airlight(airlight: float | Sequence[float] | Tensor, image: Tensor, layout:
         check_all("airlight", "be finite", airlight, torch.isfinite)
         return spread(airlight.to(image.dtype).view(-1, channels), layout.rows)[:, :, None, None]
     numbers = each_channel("airlight", check_color("airlight", airlight, high=1.0), channels)
-    return torch.tensor(numbers, dtype=image.dtype, device=image.device)[:, None, None]
+    return constant(numbers, dtype=image.dtype, device=image.device)[:, None, None]

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrefract import draws
 from torchrefract._checks import check_all, check_choice, check_flag, check_range, or_else
+from torchrefract._constants import constant
 from torchrefract.effects.base import params_to
 from torchrefract.effects.color import check_color, each_channel
 from torchrefract.effects.flare_plan import FlarePlan, Suns, flare_plan, reach
@@ -107,7 +108,7 @@ class LensFlare(PlannedLight):
         places = [getattr(self, f"{name}_range") for name in ("center_x", "center_y", "drift_x", "drift_y")]
         gate, values = self._uniform(source, [*places, self.radius_range, self.strength_range], image)
         colors = [each_channel("color", self.color, image.shape[1])] * image.shape[0]
-        color = torch.tensor(colors, dtype=values.dtype, device=values.device).view(image.shape[:2])
+        color = constant(colors, dtype=values.dtype, device=values.device).view(image.shape[:2])
         first = torch.zeros_like(values[:, :1])
         return FlareParams(gate, values[:, :2], values[:, 4], values[:, 5], color, values[:, 2:4], first)
 
@@ -157,7 +158,9 @@ class LensFlare(PlannedLight):
         share = params.center[:, None] + params.frame[:, :, None] * params.drift[:, None]
         # Where nothing may be read, numbers that are none are no sun.
         center = (
-            or_else(share.to(dtype), _FARTHEST).reshape(-1, 2) * share.new_tensor((width, height), dtype=dtype) - 0.5
+            or_else(share.to(dtype), _FARTHEST).reshape(-1, 2)
+            * constant((width, height), dtype=dtype, device=share.device)
+            - 0.5
         )
         radius = spread(or_else(params.radius.to(dtype), 0.0), rows) * math.hypot(width, height)
         along_x, along_y = flare_axes(center, radius, height=height, width=width)

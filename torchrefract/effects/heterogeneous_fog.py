@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrefract import draws
 from torchrefract._checks import check_all, check_choice, check_number, check_positive, check_range, or_else
+from torchrefract._constants import constant
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.air import check_fog_params, distances, make_air
 from torchrefract.effects.base import params_to
@@ -157,7 +158,7 @@ class HeterogeneousFog(PlannedLight):
             drawn_visibility(values[:, 0], self.visibility_range),
             values[:, 1],
             self.air.light(image, values.dtype),
-            torch.tensor([self.weights] * image.shape[0], dtype=values.dtype, device=values.device).view(
+            constant([self.weights] * image.shape[0], dtype=values.dtype, device=values.device).view(
                 -1, len(self.scales)
             ),
             values[:, 2],
@@ -279,7 +280,7 @@ class HeterogeneousFog(PlannedLight):
         nodes = None
         if plan.coarse:
             lattice = Lattice(plan.height, plan.width, plan.stride)
-            rows, columns = lattice.axes
+            rows, columns = lattice.axes()
             known = made(plan.coarse, len(rows), len(columns), stride=rows.step, start=rows.start)
             nodes = Nodes(perlin_noise(known, chosen(share, plan.coarse)), lattice)
         # q = 1/2 + n / sqrt(2), with the noise n.

@@ -38,7 +38,13 @@ class LatticeWarp(WarpEffect):
 
     def plan_for(self, params: Any, height: int, width: int) -> Plan:
         """The plan for the type of these parameters."""
-        return _constant(self, height, width, next(value.dtype for value in params if value.is_floating_point()))
+        dtype = next(value.dtype for value in params if value.is_floating_point())
+        return self._constant(id(self), height, width, dtype)
+
+    @torch.compiler.assume_constant_result
+    def _constant(self, _: int, height: int, width: int, dtype: torch.dtype) -> Plan:
+        # As for `PlannedLight`.
+        return self.planned(height, width, dtype)
 
     def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
         """The plan for fields of a type."""
@@ -85,9 +91,3 @@ class LatticeWarp(WarpEffect):
         active = spread(active, path.nodes.shape[0])
         path = path.with_nodes(only(path.nodes, 0.0, active, params))
         return Moved(path, active.new_ones(1, 1, 1, 1), active)
-
-
-@torch.compiler.assume_constant_result
-def _constant(effect: LatticeWarp, height: int, width: int, dtype: torch.dtype) -> Plan:
-    # Compilers take the plan as it is, and need not follow how it was made.
-    return effect.planned(height, width, dtype)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrefract import draws
 from torchrefract._checks import check_all, check_flag, check_range, is_true
+from torchrefract._constants import constant
 from torchrefract.cameras.distortion import ALL_TERMS, POLYNOMIAL12
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.base import params_to
@@ -262,5 +263,5 @@ def check_lens(params: Any, batch: int, *, count: int = 12, what: str = _MODEL, 
 
 def in_px(params: Any, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
     """The coefficients, and in px the focal lengths and the principal point, of such parameters."""
-    middle = torch.tensor([width - 1, height - 1], dtype=params.center.dtype, device=params.center.device) / 2
+    middle = constant([width - 1, height - 1], dtype=params.center.dtype, device=params.center.device) / 2
     return params.coefficients, params.focal * width, middle + params.center * width

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import check_count, check_number
+from torchrefract._constants import constant
 from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice
 
@@ -163,7 +164,7 @@ def lies_in(values: Tensor, ranges: Sequence[Range]) -> Tensor:
 
 def lies_in_one(values: Tensor, boxes: Sequence[Sequence[Range]]) -> Tensor:
     """(), bool: each row of values (B, n) lies in one of the boxes of n ranges, but for rounding."""
-    low, high = torch.tensor(boxes, dtype=values.dtype, device=values.device).unbind(2)
+    low, high = constant(boxes, dtype=values.dtype, device=values.device).unbind(2)
     room = 1e-5 * torch.maximum(low.abs(), high.abs())
     inside = (values[:, None] >= low - room) & (values[:, None] <= high + room)
     return inside.all(dim=2).any(dim=1).all()

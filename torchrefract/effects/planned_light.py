@@ -43,8 +43,15 @@ class PlannedLight(RadianceEffect):
 
     def plan_for(self, params: Any, image: Tensor, depth: Tensor | None) -> Any:
         """The plan for rows (N, C, H, W); an exact one where a gradient of the parameters is asked for."""
-        effect = self.exact() if self.tolerance is not None and learns(params) else self
-        return _constant(effect, image.shape[2], image.shape[3], field_dtype(image.dtype), depth is not None)
+        exact = self.tolerance is not None and learns(params)
+        size = image.shape[2], image.shape[3]
+        return self._constant(id(self), *size, field_dtype(image.dtype), any_depth=depth is not None, exact=exact)
+
+    @torch.compiler.assume_constant_result
+    def _constant(self, _: int, height: int, width: int, dtype: torch.dtype, *, any_depth: bool, exact: bool) -> Any:
+        # Compilers take the plan as it is, and need not follow how it was made; that of PyTorch 2.11 from a method
+        # alone. What asks for the identity of this effect is not taken for another one's.
+        return (self.exact() if exact else self).planned(height, width, dtype, any_depth=any_depth)
 
     @abstractmethod
     def planned(self, height: int, width: int, dtype: torch.dtype, *, any_depth: bool = False) -> LightPlan:
@@ -53,9 +60,3 @@ class PlannedLight(RadianceEffect):
     @abstractmethod
     def covers(self, params: Any) -> Tensor:
         """(), bool: all parameters lie in the ranges that the plan is for."""
-
-
-@torch.compiler.assume_constant_result
-def _constant(effect: PlannedLight, height: int, width: int, dtype: torch.dtype, any_depth: bool) -> LightPlan:
-    # Compilers take the plan as it is, and need not follow how it was made.
-    return effect.planned(height, width, dtype, any_depth=any_depth)

@@ -95,7 +95,7 @@ def field_on_lattice(params: Any, modes: Modes, lattice: Lattice, *, aperture: b
     width = params.aperture if aperture else None
     amplitude = mode_amplitude(modes, params.length, aperture=width, dtype=dtype)
     down, across = (spread(values, noise.shape[0]) for values in amplitude)
-    places = ([place + offset for place in axis] for axis in lattice.axes)
+    places = ([place + offset for place in axis] for axis in lattice.axes())
     return mode_field(noise, (down, across), modes, *places)
 
 

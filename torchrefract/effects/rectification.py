@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchrefract import draws
 from torchrefract._checks import is_true
+from torchrefract._constants import constant
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
@@ -92,7 +93,7 @@ class Rectification(LatticeWarp):
         """The camera for every sample; only the gate is drawn."""
         gate = draws.uniform(source, 1)[:, 0] < self.p
         dtype, count = field_dtype(image.dtype), image.shape[0]
-        values = (torch.tensor([n], dtype=dtype, device=image.device).repeat(count, 1) for n in self._numbers())
+        values = (constant([n], dtype=dtype, device=image.device).repeat(count, 1) for n in self._numbers())
         return RectificationParams(gate, *values)
 
     def check(self, params: RectificationParams, image: Tensor) -> None:
@@ -110,7 +111,7 @@ class Rectification(LatticeWarp):
     def covers(self, params: RectificationParams) -> Tensor:
         """Whether the cameras are the one that is known, but for rounding."""
         found = torch.cat(params[1:], dim=1)
-        known = torch.tensor([n for row in self._numbers() for n in row], dtype=found.dtype, device=found.device)
+        known = constant([n for row in self._numbers() for n in row], dtype=found.dtype, device=found.device)
         return ((found - known).abs() <= _CLOSE * known.abs()).all()
 
     def on_lattice(self, params: RectificationParams, plan: Plan) -> SmoothFlow:

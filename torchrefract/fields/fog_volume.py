@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrefract._bands import join
 from torchrefract._checks import or_else
+from torchrefract._constants import constant
 from torchrefract.fields.perlin3d import VARIANCE, Rays, deviation_of_mean, noise_on_planes
 
 _CELLS = 48  # between rays, over the longer side of the frame
@@ -145,7 +146,9 @@ def _excess(rays: Rays, fog: _Fog, *, scales: Sequence[float], reach: float, dty
     weights, frame = fog.weights.double(), fog.frame.double()
     contrast = or_else(fog.contrast.double(), 0.0).clamp(0, _MOST_CONTRAST)
     share = weights * (contrast / (VARIANCE * weights.square().sum(dim=1)).sqrt())[:, None]
-    period, apart_m, length_m = (weights.new_tensor(value) for value in (scales, apart, lengths))
+    period, apart_m, length_m = (
+        constant(value, dtype=weights.dtype, device=weights.device) for value in (scales, apart, lengths)
+    )
     amplitude = share[:, :, None] * _damping(apart_m / period[:, None], length_m / period[:, None])
     noise = noise_on_planes(
         fog.key,

@@ -201,7 +201,8 @@ def _at_once(noise: Tensor, count: int) -> int:
 def _multiplicity(count: int, device: torch.device) -> Tensor:
     """How often each value of a half stands in the whole."""
     times = torch.full((count // 2 + 1,), 2.0, dtype=torch.float64, device=device)
-    times[0] = times[-1] = 1
+    times[:1].fill_(1)  # of slices: numbers put in one place are waited for by an accelerator
+    times[-1:].fill_(1)
     return times
 
 

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import is_true
+from torchrefract._constants import constant
 from torchrefract.cameras.distortion import (
     Terms,
     distort_polynomial,
@@ -100,16 +101,16 @@ def folds_inside(coefficients: Tensor, focal: Tensor, center: Tensor, *, height:
 def border(focal: Tensor, center: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
     """x and y, (B, 1, 1, N), on the plane z = 1, of points on the border of the frame."""
     steps = torch.linspace(0, 1, _BORDER, dtype=focal.dtype, device=focal.device)
-    ends = torch.tensor([0, 1], dtype=focal.dtype, device=focal.device)
+    ends = constant([0, 1], dtype=focal.dtype, device=focal.device)
     sides = torch.cat([torch.cartesian_prod(steps, ends), torch.cartesian_prod(ends, steps)])
-    size = torch.tensor([width - 1, height - 1], dtype=focal.dtype, device=focal.device)
+    size = constant([width - 1, height - 1], dtype=focal.dtype, device=focal.device)
     x, y = ((sides * size - center[:, None]) / focal[:, None])[:, None, None].unbind(-1)
     return x, y
 
 
 def corner_radius(focal: Tensor, center: Tensor, height: int, width: int) -> Tensor:
     """(B,), on the plane z = 1: the distance of the farthest corner of the frame."""
-    size = torch.tensor([width - 1, height - 1], dtype=focal.dtype, device=focal.device)
+    size = constant([width - 1, height - 1], dtype=focal.dtype, device=focal.device)
     # Half a pixel at least, so that a frame of one pixel has a radius too.
     farthest = torch.maximum(center.abs(), (size - center).abs()).clamp(min=0.5) / focal
     return farthest.square().sum(dim=1).sqrt()

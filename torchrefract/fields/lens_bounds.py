@@ -164,7 +164,7 @@ def _solve(x: Tensor, y: Tensor, c: Tensor) -> list[tuple[Tensor, Tensor]] | Non
 def lines_of_cells(lattice: Lattice, most: int) -> Tensor:
     """(1, 2, cells 2 5), px: for cells all over the frame the places `_LINE` along x, and along y."""
     columns, rows = (
-        torch.linspace(0, count - 1, min(count, most), dtype=torch.float64).round() for count in lattice.cells[::-1]
+        torch.linspace(0, count - 1, min(count, most), dtype=torch.float64).round() for count in lattice.cells()[::-1]
     )
     line = columns.new_tensor(_LINE)
     offsets = torch.stack([torch.stack([line, 0 * line + 0.5]), torch.stack([0 * line + 0.5, line])])
@@ -192,7 +192,7 @@ def _radius(ranges: LensRanges, lattice: Lattice) -> float:
     """Of the disc on the plane z = 1 that the nodes of a lattice see, for all lenses."""
     fx, aspect = ranges.focal[0], ranges.aspect[0]
     x, y = (max(map(abs, offset)) for offset in (ranges.center_x, ranges.center_y))
-    rows, columns = lattice.axes
+    rows, columns = lattice.axes()
     across, down = columns[-1] - (lattice.width - 1) / 2, rows[-1] - (lattice.height - 1) / 2
     return math.hypot((across / lattice.width + x) / fx, (down / lattice.width + y) / (fx * aspect))
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import white_noise
+from torchrefract._constants import constant
 from torchrefract.fields.evolution import turned
 from torchrefract.fields.gaussian import axis_spectrum
 
@@ -90,7 +91,7 @@ def mode_field(
 
 def _waves(k: Tensor, places: Sequence[int], size: int, **options: Any) -> tuple[Tensor, Tensor]:
     """cos and sin of 2 pi k p / size, (M, n)."""
-    where = torch.tensor(list(places), device=k.device)
+    where = constant(list(places), device=k.device)
     # Whole turns are taken out of whole numbers, exactly.
     angle = (k[:, None] * where).remainder(size).to(**options) * (2 * math.pi / size)
     return angle.cos(), angle.sin()

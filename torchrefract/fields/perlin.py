@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrefract._bands import join
 from torchrefract._checks import is_true
+from torchrefract._constants import constant
 from torchrefract.warping.lattice import Lattice, along_rows, row_weights
 from torchrefract.white_noise import lattice
 
@@ -220,7 +221,7 @@ def _line_numbers(y: _Blocks, *, lines: Sequence[int], stripes: int) -> Tensor:
     batch = len(y.node)
     lane = torch.arange(2 * batch * stripes, device=y.node.device).view(batch, 1, 2, 1, stripes)
     ends = [[sum(lines[:i]) for i in range(len(lines))], [count // (2 * batch * stripes) for count in lines]]
-    start, length = _spread(torch.tensor(ends, device=y.node.device), y.counts)
+    start, length = _spread(constant(ends, device=y.node.device), y.counts)
     return ((y.node + start)[:, :, None, :, None] + length[:, None] * lane).flatten(0, 1).flatten(1)
 
 
@@ -240,7 +241,7 @@ def _columns(octaves: Sequence[Octave]) -> _Beside:
 
 def _beside(positions: Sequence[Tensor], counts: Sequence[int]) -> _Beside:
     position = torch.stack(list(positions), dim=1)
-    last = torch.tensor([n - 2 for n in counts], device=position.device)[:, None]
+    last = constant([n - 2 for n in counts], device=position.device)[:, None]
     node = position.detach().long().clamp(min=0).minimum(last)
     p = position - node
     fade = p * p * p * (p * (6 * p - 15) + 10)
@@ -256,7 +257,7 @@ def _blocks(beside: _Beside, counts: Sequence[int], *, size: int, dtype: torch.d
     # As evenly spaced pixels cannot need more.
     count = [min(n, math.ceil((size - 1) * (n - 1) / max(1, length - 1) + 1e-6) + 2) for n in counts]
     device = node.device
-    last, start = torch.tensor(
+    last, start = constant(
         [[n - k for n, k in zip(counts, count, strict=True)], [sum(count[:i]) for i in range(len(count))]],
         device=device,
     )
@@ -264,7 +265,7 @@ def _blocks(beside: _Beside, counts: Sequence[int], *, size: int, dtype: torch.d
     place = (node - first[:, :, None, :, None] + start[:, None, None, None]).movedim(3, 1).flatten(2, 3)
     weight = weight.to(dtype).movedim(4, 2).flatten(3, 4)
     none = weight.new_zeros((batch, 2, blocks, sum(count), size))
-    step = torch.tensor([j for k in count for j in range(k)], device=device)
+    step = constant([j for k in count for j in range(k)], device=device)
     nodes = _spread(first.mT, count) + step
     return _Blocks(nodes, none.scatter(3, place[:, None].expand_as(weight), weight), count)
 
@@ -272,7 +273,7 @@ def _blocks(beside: _Beside, counts: Sequence[int], *, size: int, dtype: torch.d
 def _spread(values: Tensor, count: Sequence[int]) -> Tensor:
     """(..., S), of each node, from values (..., octaves)."""
     owner = [i for i, k in enumerate(count) for _ in range(k)]
-    return values.index_select(-1, torch.tensor(owner, device=values.device))
+    return values.index_select(-1, constant(owner, device=values.device))
 
 
 def _padded(values: Tensor, length: int) -> Tensor:

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract import white_noise
+from torchrefract._constants import constant
 
 # Of the noise below, over all gradients and all places in a cell: each of the 8 nodes adds a third of the mean of
 # (h(p) h(q) h(r))^2 (p^2 + q^2 + r^2); the mean of h^2 is 181 / 462, that of (h p)^2 is 535 / 18018.
@@ -86,13 +87,13 @@ def noise_on_planes(
     device = key.device
     boxes = [rays.box(depths[count - 1] / period) for count, period in zip(planes, periods, strict=True)]
     nodes = [[math.ceil(high - low) + 2 for low, high in box] for box in boxes]
-    low = torch.tensor([[end[0] for end in box] for box in boxes], dtype=torch.float64, device=device)
-    period = torch.tensor(periods, dtype=torch.float64, device=device)[:, None]
-    step = torch.arange(1, len(periods) + 1, device=device)[:, None] * low.new_tensor(_PHASES)
+    low = constant([[end[0] for end in box] for box in boxes], dtype=torch.float64, device=device)
+    period = constant(periods, dtype=torch.float64, device=device)[:, None]
+    step = torch.arange(1, len(periods) + 1, device=device)[:, None] * constant(_PHASES, dtype=low.dtype, device=device)
     origin = (key[:, None, :3].double() * 2.0**-32 + step).frac() - moved.double()[:, None] / period
     # The whole coordinates of the first node; float32 suffices for places from there on, wherever the wind has gone.
     first = (origin.detach() + low).floor()
-    axes = _axes(rays, low.new_tensor(depths) / period, origin - first, nodes, amplitude)
+    axes = _axes(rays, constant(depths, dtype=low.dtype, device=device) / period, origin - first, nodes, amplitude)
     gradients = _gradients(key, first.long(), nodes, turns, dtype=amplitude.dtype)
 
     def octave(i: int) -> Tensor:
@@ -139,7 +140,7 @@ def _axes(
     columns, rows = rays.slopes(depth.device)
     x, y, z = origin[..., None, None].unbind(2)
     places = (x + depth[..., None] * columns, y + depth[..., None] * rows, z + depth[:, None])
-    last = depth.new_tensor(nodes)[..., None, None] - 2
+    last = constant(nodes, dtype=depth.dtype, device=depth.device)[..., None, None] - 2
     x, y, z = (_beside(place, last[:, i], amplitude.dtype) for i, place in enumerate(places))
     factor = amplitude[..., None, None]
     return x, y._replace(hat=y.hat * factor, ramp=y.ramp * factor), z

@@ -13,6 +13,7 @@ from torchrefract.warping.grid import pixel_axes
 _NEAREST = 1e-6
 # A set flatter than this ratio of its two extents counts as a line.
 _FLATTEST = 1e-5
+_UNIT = 2
 _NOTHING = 1e-300
 _CACHED = 1 << 15  # numbers of eight bytes, a few times over, that stay in a core's cache
 
@@ -32,8 +33,9 @@ def fit_spline(points: Tensor, displacement: Tensor, smoothing: Tensor) -> Splin
 
         f(p) = a1 + a2 x + a3 y + sum w_i U(|p - p_i|),  U(r) = r^2 ln r,  sum w = sum w x = sum w y = 0
 
-    The system (K + smoothing I) w + P a = d, P' w = 0 is solved in float64, in coordinates whose
-    unit is the root mean square distance of the points from their center.
+    The system (K + smoothing I) w + P a = d, P' w = 0 is solved in float64. The smoothing is in units of the root mean
+    square distance of the points from their center; the coordinates are in units of twice that, where the kernels
+    between most points, and with them what rounds, are smallest.
 
     Args:
         points: (B, N, 2), px, x and y, N at least 3, not all on a line, no two the same.
@@ -50,8 +52,8 @@ def fit_spline(points: Tensor, displacement: Tensor, smoothing: Tensor) -> Splin
     center = points.mean(dim=1, keepdim=True)
     scale = (points - center).square().sum(dim=2).mean(dim=1)[:, None, None].clamp(min=1e-24).sqrt()
     # The choice of coordinates moves nothing but the smoothing, which is measured in them.
-    smoothing = smoothing.double()[:, None, None] * (scale / scale.detach()).square()
-    center, scale = center.detach(), scale.detach()
+    smoothing = smoothing.double()[:, None, None] * (scale / scale.detach()).square() / _UNIT**2
+    center, scale = center.detach(), _UNIT * scale.detach()
     unit = (points - center) / scale
     count = unit.shape[1]
     x, y = unit.unbind(2)
@@ -92,6 +94,8 @@ def check_points(points: Tensor) -> None:
     """Raise ValueError for control points (B, N, 2) that no spline goes through, where reading them costs nothing."""
     if points.shape[1] < 3:
         raise ValueError(f"points must be at least 3 to a sample, got {points.shape[1]}")
+    if points.device.type != "cpu":
+        return  # what follows would keep an accelerator busy, or waited for, and is not read
     check_all("points", "be finite", points, torch.isfinite)
     centered = (points - points.mean(dim=1, keepdim=True)).detach().double()
     extent = centered.norm(dim=2).amax(dim=1)

@@ -129,7 +129,7 @@ class Diffusion(Learner):
 
     def _draws(self, key: Tensor, step: int) -> Stream:
         # The complement: the corruption of a batch is drawn by the same keys, and seeds that are not negative.
-        return stream(~((self.seed << 32) + step), key)
+        return stream(~((self.seed << 32) + step), key, device=self.device)
 
     def _crop(self, whole: _Part, source: Stream) -> _Part:
         """A square of each sample, or all of a side that is shorter; look-ups that leave it are not valid."""
@@ -138,7 +138,7 @@ class Diffusion(Learner):
             return whole
         size = (min(self.crop, height), min(self.crop, width))
         room = torch.tensor([height - size[0] + 1, width - size[1] + 1])
-        corners = (uniform(source, 2).cpu() * room).long().tolist()
+        corners = (uniform(source.to(torch.device("cpu")), 2) * room).long().tolist()
 
         def cut(value: Tensor) -> Tensor:
             rows = zip(value, corners, strict=True)
@@ -176,7 +176,7 @@ class Diffusion(Learner):
     @torch.no_grad()
     def _sample(self, degraded: Tensor, key: Tensor | None, *, steps: int) -> Restored:
         if key is None:
-            key = torch.zeros(len(degraded), dtype=torch.int64, device=degraded.device)
+            key = torch.zeros(len(degraded), dtype=torch.int64)
         condition = conditions(degraded)
 
         def estimate(noisy: Tensor, time: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
+from torchrefract._constants import constant
 from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
 from torchrefract.types import Pair
 from torchrefract.warping.resample import warp
@@ -43,7 +44,7 @@ class FlowTarget(Target):
         return Restored(warp(degraded, flow, padding="border")[0], flow)
 
     def _unit(self, like: Tensor, size: Sequence[int]) -> Tensor:
-        return self.limit * like.new_tensor([size[1], size[0]]).view(1, 2, 1, 1)
+        return self.limit * constant([size[1], size[0]], dtype=like.dtype, device=like.device).view(1, 2, 1, 1)
 
 
 class ImageTarget(Target):

@@ -1,12 +1,14 @@
 """Smooth flows on a coarse lattice, and what lies between its nodes."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchrefract._constants import constant
 from torchrefract.warping.grid import finite, pixel_axes, sampler_positions
 
 # Slopes of cubics are not smooth enough from cell to cell.
@@ -26,21 +28,19 @@ class Lattice(NamedTuple):
     before: int = 1  # nodes before the frame along each axis
     after: int = 1  # and behind the last cell
 
-    @property
     def cells(self) -> tuple[int, int]:
         """How many strides it takes to cover the rows and the columns."""
         return -(-self.height // self.stride), -(-self.width // self.stride)
 
-    @property
     def axes(self) -> tuple[range, range]:
         """Px, of the rows and of the columns of nodes."""
         start, s = -self.before * self.stride, self.stride
-        rows, columns = (range(start, (count + self.after) * s + 1, s) for count in self.cells)
+        rows, columns = (range(start, (count + self.after) * s + 1, s) for count in self.cells())
         return rows, columns
 
     def places(self, *, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
         """x, (1, 1, 1, m), and y, (1, 1, n, 1), px, of the nodes."""
-        y, x = (torch.arange(axis.start, axis.stop, axis.step, dtype=dtype, device=device) for axis in self.axes)
+        y, x = (torch.arange(axis.start, axis.stop, axis.step, dtype=dtype, device=device) for axis in self.axes())
         return x.view(1, 1, 1, -1), y.view(1, 1, -1, 1)
 
 
@@ -71,7 +71,7 @@ def along_rows(nodes: Tensor, lattice: Lattice) -> Tensor:
 def row_weights(like: Tensor, lattice: Lattice) -> Tensor:
     """(H, n), of the rows of nodes for each row of pixels, in the type of a tensor."""
     weight = lagrange_weights(lattice.stride, 4, dtype=like.dtype, device=like.device)
-    return _matrix(weight, len(lattice.axes[0]), lattice.height)
+    return _matrix(weight, len(lattice.axes()[0]), lattice.height)
 
 
 def lagrange_weights(stride: int, count: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -79,10 +79,8 @@ def lagrange_weights(stride: int, count: int, *, dtype: torch.dtype, device: tor
 
     Of the polynomial through the nodes at 1 - count / 2 ... count / 2.
     """
-    nodes = torch.arange(1 - count // 2, count // 2 + 1, dtype=torch.float64, device=device)
-    t = torch.arange(stride, dtype=torch.float64, device=device)[:, None] / stride
-    others = torch.stack([nodes[nodes != node] for node in nodes])
-    return ((t[..., None] - others) / (nodes[:, None] - others)).prod(dim=2).to(dtype)
+    # From numbers, which an accelerator need not be waited for to have.
+    return constant(_lagrange(stride, count), dtype=dtype, device=device)
 
 
 def slope_weights(stride: int, count: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -171,6 +169,19 @@ class StreamFlow(SmoothFlow):
 def dense(flow: Tensor | SmoothFlow) -> Tensor:
     """(B, 2, H, W), px, of a flow in either form."""
     return flow.dense() if isinstance(flow, SmoothFlow) else flow
+
+
+@torch.compiler.assume_constant_result
+def _lagrange(stride: int, count: int) -> list[list[float]]:
+    return _computed_lagrange(stride, count)
+
+
+@lru_cache(maxsize=64)
+def _computed_lagrange(stride: int, count: int) -> list[list[float]]:
+    nodes = torch.arange(1 - count // 2, count // 2 + 1, dtype=torch.float64)
+    t = torch.arange(stride, dtype=torch.float64)[:, None] / stride
+    others = torch.stack([nodes[nodes != node] for node in nodes])
+    return ((t[..., None] - others) / (nodes[:, None] - others)).prod(dim=2).tolist()
 
 
 def _across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:

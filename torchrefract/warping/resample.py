@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchrefract._bands import join
 from torchrefract._checks import check_choice, check_flow, check_tensor
+from torchrefract._constants import constant
 from torchrefract.warping.grid import FAR, Positions, field_dtype, finite, inside, sampler_grid, sampler_grids
 from torchrefract.warping.lattice import SmoothFlow, dense
 from torchrefract.warping.opencv import obstacle, remapped
@@ -118,7 +119,7 @@ def follow(first: Tensor | SmoothFlow, grid: Tensor) -> Tensor:
     flow = dense(first).to(grid.dtype)
     height, width = flow.shape[2:]
     read = _sample(flow, grid, padding="border", interpolation="bilinear").movedim(1, -1)
-    both = torch.addcmul(grid, read, read.new_tensor((2 / width, 2 / height)))
+    both = torch.addcmul(grid, read, constant((2 / width, 2 / height), dtype=read.dtype, device=read.device))
     return both if isinstance(first, SmoothFlow) else finite(both, FAR)
 
 

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._checks import check_count, check_flow, check_tensor
+from torchrefract._constants import constant
 
 _GHOSTS = 2  # nodes beyond each border that a cubic may take
 
@@ -56,7 +57,7 @@ def resize_flow(flow: Tensor, size: Sequence[int]) -> Tensor:
     height, width = (check_count("size", side) for side in size)
     H, W = flow.shape[2:]
     down, across = (_weights(old, new, like=flow) for old, new in ((H, height), (W, width)))
-    scale = torch.tensor([width / W, height / H], dtype=flow.dtype, device=flow.device).view(1, 2, 1, 1)
+    scale = constant([width / W, height / H], dtype=flow.dtype, device=flow.device).view(1, 2, 1, 1)
     return down @ (flow @ across.mT) * scale
 
 

@@ -1,7 +1,7 @@
 """What effects cost on a GPU, eager and compiled, and whether they do there what they do on the CPU.
 
-python benchmarks/gpu.py [--shape 16x3x1080x1920] [--only fog "mild lens"] [--repeats 15] [--device cuda]
-    [--out benchmarks/results/gpu.json]
+python benchmarks/gpu.py [--shape 16x3x1080x1920] [--only fog "mild lens"] [--eager] [--repeats 15]
+    [--device cuda] [--out benchmarks/results/gpu.json]
 
 Without the device this is one line on standard error and exit code 1: a run that measured nothing is no success.
 """
@@ -52,7 +52,7 @@ def main() -> None:
     bars = agreement(chosen, frames[:1])
     # Effects share the code of their `forward`, of which a process compiles few kinds by default.
     with torch._dynamo.config.patch(recompile_limit=64):
-        found, failed = working(candidates(chosen, frames, backend=args.backend))
+        found, failed = working(candidates(chosen, frames, backend=args.backend, compiled=not args.eager))
         timings = measure(found, references=(GRID_SAMPLE, COPY), repeats=args.repeats, threads=torch.get_num_threads())
     speeds = bytes_per_second(timings, frames)
     print(table(timings, conditions), *failed, "", *traffic(speeds), "", *bars, sep="\n")
@@ -65,13 +65,16 @@ def subjects() -> dict[str, Effect]:
     return {**effects(TOLERANCE_PX), **{f"{name}, exact": make() for name, make in SMOOTH.items()}}
 
 
-def candidates(chosen: Mapping[str, Effect], frames: Tensor, *, backend: str = "inductor") -> dict[str, Candidate]:
-    """Each effect on a batch (B, C, H, W), eager and compiled; the references come first."""
+def candidates(
+    chosen: Mapping[str, Effect], frames: Tensor, *, backend: str = "inductor", compiled: bool = True
+) -> dict[str, Candidate]:
+    """Each effect on a batch (B, C, H, W), eager and, if wanted, compiled; the references come first."""
     found = references(frames)
     for name, effect in chosen.items():
         found[name] = lambda effect=effect: effect(frames)
-        compiled: Any = torch.compile(effect, fullgraph=True, backend=backend)
-        found[f"{name}, compiled"] = lambda compiled=compiled: compiled(frames)
+        if compiled:
+            graph: Any = torch.compile(effect, fullgraph=True, backend=backend)
+            found[f"{name}, compiled"] = lambda graph=graph: graph(frames)
     return found
 
 
@@ -141,6 +144,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--shape", type=shape, default=SHAPE, help="batch x channels x height x width, 16x3x1080x1920")
     parser.add_argument("--only", nargs="+", choices=list(subjects()), help="some effects, by name; all")
+    parser.add_argument("--eager", action="store_true", help="leave out the compiled ones, which take minutes to make")
     parser.add_argument("--repeats", type=count(FEWEST_REPEATS), default=FEWEST_REPEATS, help="rounds, 15 or more")
     parser.add_argument("--device", type=torch.device, default=torch.device("cuda"), help="cuda")
     parser.add_argument("--backend", default="inductor", help="of torch.compile, inductor")

@@ -100,3 +100,6 @@ def test_effects_can_be_chosen(monkeypatch, tmp_path, on_threads):
     monkeypatch.setattr(sys, "argv", [*words, "--only", "plate"])
     gpu.main()
     assert [row["name"] for row in json.loads(out.read_text())["timings"]][2:] == ["plate", "plate, compiled"]
+    monkeypatch.setattr(sys, "argv", [*words, "--only", "plate", "--eager"])
+    gpu.main()
+    assert [row["name"] for row in json.loads(out.read_text())["timings"]][2:] == ["plate"]

@@ -12,6 +12,7 @@ from contract import ROWS
 from domain import DTYPES
 from promises import KINDS, LEARNED, MASKED, NOTHING, REFUSED, TOLD
 from torch import Tensor
+from torch.testing import assert_close
 
 import torchrefract as tr
 from torchrefract.effects.refraction import WarpEffect
@@ -201,7 +202,9 @@ def test_shape_layout_and_channels_change_no_bit(name, dtype, device, product):
             same = (found.int() - expected.int()).abs().max() <= 1 if near else torch.equal(found, expected)
             assert same, (layout, channels, size)
         alone = effect.degrade(image[0], seed=7, keys=[0]).image
-        assert torch.equal(alone, expected[0]), (channels, size)
+        # Its products of matrices are other kernels for one image, which add in another order.
+        exact = {"rtol": 0, "atol": 0} if device == "cpu" else {}
+        assert_close(alone, expected[0], msg=f"{channels}, {size}", **exact)
 
 
 @pytest.mark.parametrize("device", DEVICES)

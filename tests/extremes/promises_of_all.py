@@ -34,8 +34,8 @@ ROWS = (
         "any",
         "1 x 1, 1 x N, prime sides; 1, 3, 4, 12 channels; channels_last, strided, unbatched; every type",
         "=",
-        "as the contiguous image, bit for bit; uint8 in channels_last, which OpenCV looks up, within one level; unbatched "
-        "on an accelerator to rounding",
+        "as the contiguous image, bit for bit; uint8 in channels_last, which OpenCV looks up, within one level; "
+        "unbatched on an accelerator to rounding",
         HERE + "test_shape_layout_and_channels_change_no_bit",
     ),
     Row("any", "1 x 1", "I", "a warp moves nothing", EACH + "a_frame_of_one_pixel_does_not_move"),

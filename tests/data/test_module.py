@@ -53,6 +53,7 @@ def by_key(batches: list[Pair]) -> dict[int, Pair]:
 def test_keys_stay_where_draws_are_computed():
     frame = next(iter(during(scenes()).train_dataloader()))
     moved = scenes().transfer_batch_to_device(Frame(*frame), torch.device("meta"), 0)
+    assert isinstance(moved, Frame)
     assert moved.image.is_meta
     assert moved.depth.is_meta
     assert torch.equal(moved.key, Frame(*frame).key)

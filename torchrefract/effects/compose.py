@@ -225,11 +225,6 @@ class OneOf(Compose):
         chosen = torch.bucketize(choice, ends, right=True)
         return self._draw_children(source, image, [gate & (chosen == i) for i in range(len(self.effects))], gate)
 
-    @torch.compiler.assume_constant_result
-    def _constant(self, _: int, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
-        # As for `PlannedLight`.
-        return self.planned(height, width, dtype)
-
     def fitted(self, params: ComposeParams) -> "Compose":
         """As for `Compose`; exact, too, for parameters by which several effects act on a sample."""
         acting = torch.stack([child.gate for child in params.children]).sum(dim=0)

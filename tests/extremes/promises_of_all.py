@@ -65,7 +65,8 @@ ROWS = (
         "any",
         "1080p; with `--extremes=full` 4K, 8K, 1 x 40 000, 40 000 x 1",
         "=",
-        "finite and in range, of the same type; each sample as alone",
+        "finite and in range, of the same type; each sample as alone; of one column a lens by default tells that it "
+        "folds, and the default scales of drifts raise; of one row or column swirls tell that they are cut short",
         HERE + "test_large_frames_are_finite_and_each_sample_is_as_alone",
     ),
     Row(

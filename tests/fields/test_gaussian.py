@@ -13,6 +13,7 @@ from torchrefract.fields import torus as torus_module
 from torchrefract.fields.covariance import COVARIANCES, covariance, slope_rms
 from torchrefract.fields.gaussian import (
     Spectrum,
+    axis_spectrum,
     gaussian_random_field,
     spectrum,
 )
@@ -491,3 +492,11 @@ def test_a_map_over_samples_gives_the_same_fields():
 
     expected = torch.stack([field(*one_sample) for one_sample in zip(lengths, apertures, numbers, strict=True)])
     assert_close(torch.func.vmap(field)(lengths, apertures, numbers), expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [640, 4608, 9216])
+def test_the_factor_of_an_axis_is_that_of_each_sample_alone(size):
+    length = torch.tensor([40.0, 85.4668, 3.0], dtype=torch.float64)
+    together = axis_spectrum(size, length, None)
+    for i in range(3):
+        assert torch.equal(axis_spectrum(size, length[i : i + 1], None)[0], together[i])

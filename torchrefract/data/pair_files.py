@@ -37,6 +37,7 @@ _OF_MAPS = [*_FAST, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
 # What readers of npz raise for damage depends on where it is; arrays larger than any memory are damage, too.
 _DAMAGE = (ValueError, OSError, EOFError, LookupError, ArithmeticError, RuntimeError, MemoryError, SyntaxError)
 _DAMAGE += (TypeError, zipfile.BadZipFile, SafetensorError, cv2.error)
+_MOST_SAID = 500  # characters of their messages
 
 
 class DamagedPairError(ValueError):
@@ -169,7 +170,8 @@ def _decode(suffix: str, data: bytes, read: Callable[[bytes], _T]) -> _T:
     try:
         return read(data)
     except _DAMAGE as error:
-        raise DamagedPairError(f"{suffix} is damaged ({error})") from error
+        # What a file says of itself, as long as it likes, may be part of the message.
+        raise DamagedPairError(f"{suffix} is damaged ({str(error)[:_MOST_SAID]})") from error
 
 
 def _pixels(data: bytes, kind: type, channels: int) -> np.ndarray:

@@ -61,7 +61,10 @@ def axis_spectrum(size: int, length: Tensor, aperture: Tensor | None) -> Tensor:
     distance = torch.arange(size // 2 + 1, dtype=torch.float64, device=length.device)
     ways = (distance, size - distance, size + distance)
     near, *far = (covariance(h, length.double()[:, None], "gaussian") for h in ways)
-    values = _transform(near + sum(far), size, -1)
+    around = near + sum(far)
+    # One sample at a time: long transforms of several round otherwise.
+    alone = around.device.type == "cpu" and not torch.compiler.is_compiling()
+    values = torch.cat([_transform(one, size, -1) for one in around.split(1 if alone else max(1, len(around)))])
     kept = torch.where(values > _ROUNDING * values.amax(dim=1, keepdim=True), values, 0)
     smooth = _smoothing(distance / size, aperture).reshape(-1, size // 2 + 1)
     variance = (kept * smooth.square() * _multiplicity(size, length.device)).sum(dim=1, keepdim=True)

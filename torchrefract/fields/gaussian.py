@@ -61,10 +61,7 @@ def axis_spectrum(size: int, length: Tensor, aperture: Tensor | None) -> Tensor:
     distance = torch.arange(size // 2 + 1, dtype=torch.float64, device=length.device)
     ways = (distance, size - distance, size + distance)
     near, *far = (covariance(h, length.double()[:, None], "gaussian") for h in ways)
-    around = near + sum(far)
-    # One sample at a time: long transforms of several round otherwise.
-    alone = around.device.type == "cpu" and not torch.compiler.is_compiling()
-    values = torch.cat([_transform(one, size, -1) for one in around.split(1 if alone else max(1, len(around)))])
+    values = _transform(near + sum(far), size, -1)
     kept = torch.where(values > _ROUNDING * values.amax(dim=1, keepdim=True), values, 0)
     smooth = _smoothing(distance / size, aperture).reshape(-1, size // 2 + 1)
     variance = (kept * smooth.square() * _multiplicity(size, length.device)).sum(dim=1, keepdim=True)
@@ -160,7 +157,9 @@ def _transform(values: Tensor, count: int, dim: int) -> Tensor:
 def _even_transform(values: Tensor, count: int, dim: int) -> Tensor:
     if values.shape[0] == 0:  # which PyTorch before 2.15 cannot transform
         return values.clone()
-    return torch.fft.hfft(values, n=count, dim=dim).narrow(dim, 0, count // 2 + 1)
+    # One sample at a time on the CPU: there long transforms of several round otherwise.
+    each = values.split(1) if values.device.type == "cpu" else [values]
+    return torch.cat([torch.fft.hfft(one, n=count, dim=dim).narrow(dim, 0, count // 2 + 1) for one in each])
 
 
 def _fields(noise: Tensor, shape: Tensor, height: int, width: int) -> Tensor:

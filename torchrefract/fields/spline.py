@@ -13,7 +13,7 @@ from torchrefract.warping.grid import pixel_axes
 _NEAREST = 1e-6
 # A set flatter than this ratio of its two extents counts as a line.
 _FLATTEST = 1e-5
-_UNIT = 2
+_UNIT = 2  # of the coordinates, in root mean square distances from the center
 _NOTHING = 1e-300
 _CACHED = 1 << 15  # numbers of eight bytes, a few times over, that stay in a core's cache
 

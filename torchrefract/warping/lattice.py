@@ -173,7 +173,7 @@ def dense(flow: Tensor | SmoothFlow) -> Tensor:
 
 @torch.compiler.assume_constant_result
 def _lagrange(stride: int, count: int) -> list[list[float]]:
-    return _computed_lagrange(stride, count)
+    return _computed_lagrange(stride, count)  # of its own: compilers look through a cache, and warn of it
 
 
 @lru_cache(maxsize=64)

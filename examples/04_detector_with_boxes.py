@@ -27,7 +27,7 @@ class RobustDetector(nn.Module):
         super().__init__()
         self.effect = tr.Compose([tr.Turbulence(), tr.LensDistortion(padding="border")])
         self.detector = fasterrcnn_mobilenet_v3_large_320_fpn(
-            weights=None, weights_backbone=None, num_classes=2, min_size=SIZE[0]
+            weights=None, weights_backbone=None, num_classes=2, min_size=SIZE[0], rpn_post_nms_top_n_train=30
         )
 
     def forward(self, images: Tensor, targets: list[dict] | None = None) -> dict[str, Tensor] | list[dict]:

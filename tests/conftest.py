@@ -18,9 +18,10 @@ def pytest_addoption(parser) -> None:
 
 
 def pytest_configure() -> None:
-    """Of several processes each keeps to one thread, so that they do not wait for one another."""
+    """Of several processes each keeps to one thread, as do those that it starts: none waits for another's threads."""
     if "PYTEST_XDIST_WORKER" in os.environ:
         torch.set_num_threads(1)
+        os.environ["OMP_NUM_THREADS"] = "1"
 
 
 @pytest.fixture(scope="session")

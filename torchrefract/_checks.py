@@ -93,7 +93,7 @@ def is_true(predicate: Callable[[], Tensor]) -> bool | None:
 
 def or_else(value: Tensor, otherwise: float) -> Tensor:
     """The value, and another one where it is not finite: what may not be read cannot be refused."""
-    return torch.where(value.isfinite(), value, otherwise)
+    return value.nan_to_num(nan=otherwise, posinf=otherwise, neginf=otherwise)
 
 
 def read(tensor: Callable[[], Tensor]) -> Any:

@@ -50,10 +50,11 @@ class RadianceEffect(Effect):
 
     def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """The rows in other light, where the gate is open."""
-        if not self.stirs(params):
-            return self._unchanged(image, params)
         active = params.gate & self.acts(params)
-        if depth is not None and is_true(active.any) is False:
+        acted = is_true(active.any)
+        if acted is False and not learns(params):
+            return self._unchanged(image, params)
+        if depth is not None and acted is False:
             depth = None  # and nobody looks at its values
         index, batch = some(active, params), len(active)
         if index is None:

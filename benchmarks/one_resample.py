@@ -1,4 +1,4 @@
-"""What one resample saves over four: four warps composed, against the same four applied one after the other.
+"""What one resample saves: four warps composed, and a frame rectified for another lens, against one look-up for each.
 
 python benchmarks/one_resample.py PATH [--frames 4] [--threads 1] [--out benchmarks/results/one_resample.json]
 
@@ -7,8 +7,9 @@ PATH is a frame, or a folder of frames such as ../shared/data/fullres.
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import combinations, permutations
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,10 +22,12 @@ from timing import Bar, Conditions
 from torch import Tensor
 
 from torchrefract import (
+    Camera,
     Compose,
     ComposeParams,
     DivergenceFree,
     LensDistortion,
+    Rectification,
     ThinPlateSpline,
     Turbulence,
     compose_flows,
@@ -35,13 +38,14 @@ from torchrefract.effects.refraction import WarpEffect
 from torchrefract.warping.grid import inside, length
 
 WHAT = (
-    "LensDistortion, Turbulence, ThinPlateSpline and DivergenceFree at their defaults, one draw a frame. The reference "
-    "takes the four flows in float64, reads each where the later ones look by quintic splines, and looks the frame up "
-    "along the composite by a quintic spline too, cut to [0, 1]. 'one' is Compose, 'four' the same draws applied one "
-    "after the other; both are float32. PSNR in dB, on pixels that all stages see, 12 px and more from where they do "
-    "not. A pixel grid does not hold what lies between its pixels: the reference is what the best reading of a real "
-    "frame makes of its noise and its aliasing, and what differs from it is the blur that each look-up adds. Errors of "
-    "a flow are lengths in px; what misses most is the bilinear reading of rough turbulence. In closed form, a lens, a "
+    "LensDistortion, Turbulence, ThinPlateSpline and DivergenceFree at their defaults, one draw a frame. The "
+    "reference takes the four flows in float64, reads each where the later ones look by quintic splines, and looks "
+    "the frame up along the composite by a quintic spline too, cut to [0, 1]. 'one' is Compose, 'each' the same draws "
+    "applied one after the other; both are float32. 'rectified' is a wide car camera's lens taken out of the frame, "
+    "and a drawn one put on. PSNR in dB, on pixels that all stages see, 12 px and more from where they do not. A "
+    "pixel grid does not hold what lies between its pixels: the reference is what the best reading of a real frame "
+    "makes of its noise and its aliasing, and what differs from it is the blur that each look-up adds. Errors of a "
+    "flow are lengths in px; what misses most is the bilinear reading of rough turbulence. In closed form, a lens, a "
     "thin plate and a sine of 4 px and a wavelength of 200 px are known everywhere, so the truth is no spline."
 )
 MODES = ("bilinear", "bicubic")
@@ -49,6 +53,11 @@ SEED = 7
 MARGIN_PX = 12  # a quintic spline has forgotten the border there, and so have four bicubic look-ups
 COMPOSED = "all four, as composed"
 CLOSED = "in closed form"
+# The wide camera of PJLab-ADG/SensorsCalibration, `pj_wide_cv5` in the table of lenses: focal length in widths.
+WIDE_FOCAL = 0.5513
+WIDE = (-0.14873913, 0.09693338, -0.00015430, -0.00043046, -0.02374642)
+
+Chain = Callable[[str], list[WarpEffect]]  # by the interpolation, in the order in which they are applied
 
 
 @dataclass(frozen=True)
@@ -58,17 +67,17 @@ class Row:
     frame: str
     interpolation: str
     one_db: float
-    four_db: float
+    each_db: float
     share: float  # of the frame, that was compared
 
     @property
     def gain_db(self) -> float:
         """What composing saves."""
-        return self.one_db - self.four_db
+        return self.one_db - self.each_db
 
     def __str__(self) -> str:
         return (
-            f"{self.frame[:28]:28}  {self.interpolation:8}  {self.one_db:6.2f}  {self.four_db:6.2f}"
+            f"{self.frame[:28]:28}  {self.interpolation:8}  {self.one_db:6.2f}  {self.each_db:6.2f}"
             f"  {self.gain_db:6.2f}  {self.share:6.3f}"
         )
 
@@ -87,21 +96,27 @@ def main() -> None:
     args, paths = _arguments()
     torch.set_num_threads(args.threads)
     print(WHAT, end="\n\n", flush=True)
-    print(f"{'frame':28}  look-up   one     four    gain    share", flush=True)
-    rows, errors = [], []
+    print(f"{'frame':28}  look-up   one     each    gain    share", flush=True)
+    rows, relensed, errors = [], [], []
     for key, path in enumerate(paths):
         frame = read_image(path)[None].contiguous()
         made = scene(frame, key)
+        chain = partial(rectified, height=frame.shape[2], width=frame.shape[3])
+        other = scene(frame, key, chain)
         for mode in MODES:
             rows.append(compare(frame, made, interpolation=mode, name=path.name))
-            print(rows[-1], flush=True)
+            relensed.append(compare(frame, other, chain, interpolation=mode, name=f"{path.name[:16]}, rectified"))
+            print(rows[-1], relensed[-1], sep="\n", flush=True)
         errors.append(drawn_errors(frame, made) | closed_errors(made))
     conditions = Conditions.now(read_image(paths[0])[None], threads=args.threads, repeats=1)
-    means, worst = _means(rows), {name: max(found[name] for found in errors) for name in errors[0]}
+    means, worst = (
+        [*_means(rows), *_means(relensed, " rectified")],
+        {name: max(found[name] for found in errors) for name in errors[0]},
+    )
     held = bars(rows, worst)
     print(*means, "", "composite flow: largest error in px", sep="\n")
     print(*(f"  {name:48} {error:.1e}" for name, error in worst.items()), "", "bars:", *held, sep="\n")
-    _save(args.out, rows=rows, means=means, errors=worst, held=held, conditions=conditions)
+    _save(args.out, rows=[*rows, *relensed], means=means, errors=worst, held=held, conditions=conditions)
     print(f"written to {args.out}")
 
 
@@ -115,12 +130,30 @@ def warps(interpolation: str = "bilinear") -> list[WarpEffect]:
     ]
 
 
-def scene(frame: Tensor, key: int) -> Scene:
+def rectified(interpolation: str, *, height: int, width: int) -> list[WarpEffect]:
+    """The wide camera's lens taken out of a frame, and another one put on."""
+    camera = Camera(
+        width=width,
+        height=height,
+        fx=WIDE_FOCAL * width,
+        fy=WIDE_FOCAL * width,
+        cx=(width - 1) / 2,
+        cy=(height - 1) / 2,
+        coefficients=WIDE,
+        model="opencv",
+    )
+    return [
+        Rectification(camera, interpolation=interpolation, tolerance_px=None),
+        LensDistortion(interpolation=interpolation, tolerance_px=None),
+    ]
+
+
+def scene(frame: Tensor, key: int, chain: Chain = warps) -> Scene:
     """The draw of one frame (1, C, H, W), and the reference for it."""
-    height, width = frame.shape[2:]
-    params = Compose(warps()).sample(frame, seed=SEED, keys=[key])
+    (height, width), effects = frame.shape[2:], chain("bilinear")
+    params = Compose(effects).sample(frame, seed=SEED, keys=[key])
     exact = params.to(torch.float64).children
-    flows = tuple(effect.flow(own, height=height, width=width)[0] for effect, own in zip(warps(), exact, strict=True))
+    flows = tuple(effect.flow(own, height=height, width=width)[0] for effect, own in zip(effects, exact, strict=True))
     flow = composite(flows)
     return Scene(params, flows, flow, spline_read(frame, flow).clamp(0, 1))
 
@@ -136,15 +169,15 @@ def sound(valid: Tensor, flow: Tensor) -> Tensor:
     return ~near & (room >= MARGIN_PX).all(dim=1, keepdim=True)
 
 
-def compare(frame: Tensor, made: Scene, *, interpolation: str, name: str) -> Row:
-    """One resample and four of a frame (1, C, H, W), against the reference."""
-    effects = warps(interpolation)
+def compare(frame: Tensor, made: Scene, chain: Chain = warps, *, interpolation: str, name: str) -> Row:
+    """One resample, and one for each warp, of a frame (1, C, H, W), against the reference."""
+    effects = chain(interpolation)
     one = Compose(effects, tolerance_px=None).apply(frame, made.params)
-    four = frame
+    each = frame
     for effect, own in zip(effects, made.params.children, strict=True):
-        four = effect.apply(four, own).image
+        each = effect.apply(each, own).image
     good = sound(one.valid, made.flow)
-    found = (psnr(image, made.image, good).item() for image in (one.image, four))
+    found = (psnr(image, made.image, good).item() for image in (one.image, each))
     return Row(name, interpolation, *found, share=good.double().mean().item())
 
 
@@ -192,12 +225,12 @@ def bars(rows: Sequence[Row], errors: Mapping[str, float]) -> list[Bar]:
     return held
 
 
-def _means(rows: Sequence[Row]) -> list[Row]:
+def _means(rows: Sequence[Row], what: str = "") -> list[Row]:
     means = []
     for mode in MODES:
-        values = [(row.one_db, row.four_db, row.share) for row in rows if row.interpolation == mode]
-        one, four, share = (_mean(column) for column in zip(*values, strict=True))
-        means.append(Row(f"mean of {len(values)}", mode, one, four, share))
+        values = [(row.one_db, row.each_db, row.share) for row in rows if row.interpolation == mode]
+        one, each, share = (_mean(column) for column in zip(*values, strict=True))
+        means.append(Row(f"mean of {len(values)}{what}", mode, one, each, share))
     return means
 
 

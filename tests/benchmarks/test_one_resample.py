@@ -1,5 +1,6 @@
 import json
 import sys
+from functools import partial
 
 import composites
 import one_resample
@@ -104,6 +105,15 @@ def test_one_resample_of_a_smooth_frame_beats_four(mode):
     assert 0.2 < row.share < 1
 
 
+@pytest.mark.parametrize("mode", one_resample.MODES)
+def test_a_frame_that_is_rectified_for_another_lens_is_sharper_after_one_resample_than_after_two(mode):
+    frame, chain = smooth_frame(*SIZE), partial(one_resample.rectified, height=SIZE[0], width=SIZE[1])
+    row = one_resample.compare(frame, one_resample.scene(frame, 0, chain), chain, interpolation=mode, name="waves")
+    assert row.gain_db > 2
+    assert row.one_db > 30
+    assert 0.2 < row.share < 1
+
+
 def test_pixels_near_what_is_not_valid_are_not_compared():
     margin = one_resample.MARGIN_PX
     valid = torch.ones(1, 1, 60, 80, dtype=torch.bool)
@@ -141,7 +151,10 @@ def test_the_command_compares_the_frames_of_a_folder(monkeypatch, tmp_path, caps
     printed = capsys.readouterr().out
     assert "mean of 2" in printed
     content = json.loads(out.read_text())
-    assert [row["frame"] for row in content["rows"]] == ["a.png"] * 2 + ["b.png"] * 2 + ["mean of 2"] * 2
-    first, _, second, _, mean, _ = content["rows"]
+    names = ["a.png", "a.png", "b.png", "b.png", *["a.png, rectified"] * 2, *["b.png, rectified"] * 2]
+    means = ["mean of 2", "mean of 2", "mean of 2 rectified", "mean of 2 rectified"]
+    assert [row["frame"] for row in content["rows"]] == [*names, *means]
+    first, _, second, *_ = content["rows"]
+    mean = content["rows"][len(names)]
     assert mean["gain_db"] == pytest.approx((first["gain_db"] + second["gain_db"]) / 2)
     assert len(content["bars"]) == 4

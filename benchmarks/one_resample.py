@@ -109,10 +109,8 @@ def main() -> None:
             print(rows[-1], relensed[-1], sep="\n", flush=True)
         errors.append(drawn_errors(frame, made) | closed_errors(made))
     conditions = Conditions.now(read_image(paths[0])[None], threads=args.threads, repeats=1)
-    means, worst = (
-        [*_means(rows), *_means(relensed, " rectified")],
-        {name: max(found[name] for found in errors) for name in errors[0]},
-    )
+    means = [*_means(rows), *_means(relensed, " rectified")]
+    worst = {name: max(found[name] for found in errors) for name in errors[0]}
     held = bars(rows, worst)
     print(*means, "", "composite flow: largest error in px", sep="\n")
     print(*(f"  {name:48} {error:.1e}" for name, error in worst.items()), "", "bars:", *held, sep="\n")

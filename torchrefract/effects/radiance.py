@@ -28,6 +28,10 @@ class Shaded(NamedTuple):
 _CLEAR = {"transmission": 1.0, "extinction": 0.0, "intensity": 0.0}
 
 
+def _stirs(active: Tensor, params: Any) -> bool:
+    return is_true(active.any) is not False or learns(params)
+
+
 class RadianceEffect(Effect):
     """An effect that changes light and moves nothing.
 
@@ -46,15 +50,14 @@ class RadianceEffect(Effect):
 
     def stirs(self, params: Any) -> bool:
         """Whether a sample may be changed, or a gradient is asked for that could change it."""
-        return is_true((params.gate & self.acts(params)).any) is not False or learns(params)
+        return _stirs(params.gate & self.acts(params), params)
 
     def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """The rows in other light, where the gate is open."""
         active = params.gate & self.acts(params)
-        acted = is_true(active.any)
-        if acted is False and not learns(params):
+        if not _stirs(active, params):
             return self._unchanged(image, params)
-        if depth is not None and acted is False:
+        if depth is not None and is_true(active.any) is False:
             depth = None  # and nobody looks at its values
         index, batch = some(active, params), len(active)
         if index is None:

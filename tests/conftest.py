@@ -58,19 +58,39 @@ class Agreement(NamedTuple):
 _ORACLES = pytest.StashKey[dict[str, Agreement]]()
 
 
+def keep(config: pytest.Config, what: str, found: Agreement) -> None:
+    """Of all that is told of one oracle, the largest error is kept."""
+    kept = config.stash.setdefault(_ORACLES, {})
+    if what not in kept or found.error > kept[what].error:
+        kept[what] = found
+
+
 @pytest.fixture
 def oracle(request) -> Callable[..., None]:
     """Asserts that two tensors agree within a bar, and keeps the largest error for the summary of the run."""
-    kept = request.config.stash.setdefault(_ORACLES, {})
 
     def agree(what: str, found: Tensor, expected: Tensor, bar: float, *, unit: str = "px", scale: float = 1.0) -> None:
         assert found.shape == expected.shape
         assert found.isfinite().all()
         error = ((found.double() - expected.double()).abs() * scale).amax().item()
-        kept[what] = Agreement(max(error, kept[what].error if what in kept else 0.0), bar, unit)
+        keep(request.config, what, Agreement(error, bar, unit))
         assert error <= bar, f"{what}: {error:.2e} {unit}, bar {bar:g}"
 
     return agree
+
+
+def pytest_sessionfinish(session) -> None:
+    """One of several processes hands what its oracles said to the one that sums up."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        told = {what: tuple(found) for what, found in session.config.stash.get(_ORACLES, {}).items()}
+        session.config.workeroutput["oracles"] = told
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node) -> None:
+    """Collects what the oracles of one process said; one that was killed says nothing."""
+    for what, found in getattr(node, "workeroutput", {}).get("oracles", {}).items():
+        keep(node.config, what, Agreement(*found))
 
 
 def pytest_terminal_summary(terminalreporter, config) -> None:

@@ -38,7 +38,7 @@ def to_stored(linear: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("linear_light", [False, True])
 @pytest.mark.parametrize("given_depth", [False, True])
-def test_the_image_is_the_closed_form(dtype, linear_light, given_depth):
+def test_the_image_is_the_closed_form(dtype, linear_light, given_depth, oracle):
     image = picture(2, 3, 20, 30, dtype=dtype)
     depth = 200 * picture(2, 1, 20, 30, dtype=dtype) if given_depth else None
     effect = UniformFog(visibility_range=(50.0, 150.0), linear_light=linear_light)
@@ -55,8 +55,8 @@ def test_the_image_is_the_closed_form(dtype, linear_light, given_depth):
         else clean * t + airlight * (1 - t)
     )
     assert degraded.transmission is not None
-    assert_close(degraded.image.double(), torch.from_numpy(expected), rtol=0, atol=1e-6)
-    assert_close(degraded.transmission.double(), torch.from_numpy(t.copy()), rtol=0, atol=1e-6)
+    oracle(f"uniform fog, image, {dtype}", degraded.image, torch.from_numpy(expected), 1e-6, unit="")
+    oracle(f"uniform fog, transmission, {dtype}", degraded.transmission, torch.from_numpy(t.copy()), 1e-6, unit="")
     assert torch.equal(degraded.valid, degraded.transmission >= 1 / 255)
     assert degraded.valid.any()
     assert degraded.flow is None

@@ -192,12 +192,40 @@ def test_fog_that_comes_nearer_grows_from_the_center():
         assert max(fits) > 0.95
 
 
-def test_fog_in_place_changes_as_a_gaussian_of_time():
+@pytest.mark.parametrize("contrast", [0.6, 1.5])
+def test_the_logarithm_of_fog_in_place_changes_as_a_gaussian_of_time(contrast):
     tau, samples, times = 30.0, 4_000, (0.0, 15.0, 30.0, 45.0, 60.0)
-    parameters = still(samples) | {"decorrelation": torch.full((samples,), tau)}
+    parameters = still(samples, contrast) | {"decorrelation": torch.full((samples,), tau)}
     before, *after = (at_camera(parameters | {"frame": torch.full((samples,), t)}).log() for t in times)
+    pace = -math.log(math.log1p(math.expm1(contrast**2) / math.e) / contrast**2)
     for t, later in zip(times[1:], after, strict=True):
-        assert alike(before, later) == pytest.approx(math.exp(-((t / tau) ** 2)), abs=3 / math.sqrt(samples))
+        expected = math.exp(-pace * (t / tau) ** 2)
+        assert alike(before, later) == pytest.approx(expected, abs=3 / math.sqrt(samples))
+
+
+def test_the_exponential_of_a_gaussian_field_is_correlated_by_1_over_e_after_its_time():
+    variance = torch.tensor([1e-12, 1e-6, 9.99e-5, 1.01e-4, 1e-2, 0.36, 4.0, 100.0], dtype=torch.float64)
+    left = torch.exp(-fog_volume._pace(variance).square())
+    found = torch.expm1(variance * left) / torch.expm1(variance)
+    assert_close(found, torch.full_like(variance, math.exp(-1)), rtol=1e-8, atol=0)
+    ends = torch.tensor([0.0, 900.0], dtype=torch.float64, requires_grad=True)
+    pace = fog_volume._pace(ends)
+    assert_close(pace, torch.tensor([1.0, math.sqrt(math.log(900 / 899))], dtype=torch.float64))
+    assert torch.autograd.grad(pace.sum(), ends)[0].isfinite().all()
+
+
+@pytest.mark.parametrize("contrast", [0.5, 0.8])
+def test_over_60_frames_fog_in_place_forgets_itself_in_its_decorrelation_time(contrast, oracle):
+    samples = 2_000
+    parameters = still(samples, contrast) | {"decorrelation": torch.full((samples,), 12.0)}
+    q = torch.stack([at_camera(parameters | {"frame": torch.full((samples,), 3.0 * i)}) for i in range(20)])
+    q -= q.mean()
+    for lag in range(1, 6):
+        correlation = (q[:-lag] * q[lag:]).mean().item() / q.square().mean().item()
+        time = torch.tensor(3 * lag / math.sqrt(-math.log(correlation)))
+        oracle(
+            f"decorrelation time of fog in space, contrast {contrast}, frames", time, torch.tensor(12.0), 1.2, unit=""
+        )
 
 
 @pytest.mark.parametrize("columns", [1, 12])

@@ -83,7 +83,8 @@ class HeterogeneousFog(PlannedLight):
         wind_x_range, wind_y_range, wind_z_range: of the drift per frame of a clip, to the right, down and ahead, as
             seen from the camera: m in space, where a car that goes v m per frame sees -v ahead; px of the reference in
             the image, which has no z.
-        decorrelation_range: frames, above 0, inf for fog that only drifts; one over it is drawn uniformly.
+        decorrelation_range: frames, above 0, after which the extinction at a place that goes with the wind is
+            correlated with what it was by 1/e; inf for fog that only drifts; one over it is drawn uniformly.
         tolerance: how far the image may be from the exact one, levels of 1/255, so that octaves in the image are left
             out or known on a coarse lattice only, and fog whose drifts nobody sees is uniform; see `plan`. Exact are
             None, normalize="image", and where <q> may come near 0; in space, drifts are so or not computed at all.

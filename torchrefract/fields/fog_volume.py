@@ -1,5 +1,6 @@
 """Fog in space: the mean extinction along each pixel's ray, through banks and holes that drift and change."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -84,7 +85,8 @@ def path_mean(
         contrast: (N,), c, the standard deviation of ln q.
         frame: (N,), t.
         wind: (N, 3), m per frame, to the right, down and ahead, as the camera sees it.
-        decorrelation: (N,), frames, above 0, of the noise in the wind: exp(-(t / decorrelation)^2); may be inf.
+        decorrelation: (N,), frames, above 0, after which q in the wind is correlated with itself by 1 / e, so that g
+            is by exp(-t^2 ln(1 / r) / decorrelation^2), r = ln(1 + (exp(c^2) - 1) / e) / c^2; may be inf.
         reach: m.
         dtype: of the result.
 
@@ -158,10 +160,22 @@ def _excess(rays: Rays, fog: _Fog, *, scales: Sequence[float], reach: float, dty
         planes=[sum(one < _SPARSEST * scale for one in apart) for scale in scales],
         amplitude=amplitude.to(dtype),
         moved=fog.wind.double() * frame[:, None],
-        turns=frame / fog.decorrelation.double(),
+        turns=frame / fog.decorrelation.double() * _pace(contrast.square()),
     )
     half = VARIANCE / 2 * amplitude.square().sum(dim=1)
     return torch.expm1(noise - half.to(dtype)[:, :, None, None])
+
+
+def _pace(variance: Tensor) -> Tensor:
+    """How much slower a Gaussian field of a variance forgets itself than its exponential, up to a correlation of 1/e.
+
+    The exponentials of two Gaussians of variance v and correlation r are correlated by (exp(v r) - 1) / (exp(v) - 1).
+    """
+    share, little = math.exp(-1), variance < 1e-4
+    some = torch.where(little, 1.0, variance)
+    # ln(1 + (exp(v) - 1) / e), which overflows for no v.
+    left = torch.logaddexp(some - 1, torch.full_like(some, math.log1p(-share))) / some
+    return torch.where(little, share + variance * (share - share * share) / 2, left).log().neg().sqrt()
 
 
 def _damping(apart: Tensor, length: Tensor) -> Tensor:

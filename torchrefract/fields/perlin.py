@@ -23,11 +23,11 @@ _AT_ONCE = 4  # bands, whose nodes stay in a core's cache
 
 
 class Octave(NamedTuple):
-    """The part of a lattice that a frame sees, and where its pixels lie in it."""
+    """The nodes of a lattice that a frame takes, and where its pixels lie between them."""
 
     gradient: Tensor  # (N, 2, m, n), g_x and g_y at the nodes
-    x: Tensor  # (N, W), float64, of each column of pixels, in cells from the first node, evenly spaced in [0, n - 1]
-    y: Tensor  # (N, H), float64, of each row, in [0, m - 1]
+    x: Tensor  # (N, W), float64, of each column of pixels, the number of the node before it and the part of the cell
+    y: Tensor  # (N, H), float64, of each row; in [0, m - 1], and evenly spaced but for less than a cell
 
 
 def octave(
@@ -47,11 +47,12 @@ def octave(
     """One octave at one frame of a clip: unit gradients that turn, at nodes that go with the wind.
 
         g = (cos a, sin a),  a = 2 pi u1 + omega t,  omega = 2 erfinv(2 u2 - 1) / decorrelation
-        x = (start + stride column + 1/2 - wind_x t) / period + phase_x - column of the first node,  y likewise
+        x = (start + stride column + 1/2 - wind_x t) / period + phase_x,  y likewise
         phase = frac(key / 2^32 + (index + 1) (sqrt(5) - 1) / 2)
 
     u1 and u2 are uniform, a hash of the node's place in an endless lattice. omega is normal, so what goes with the wind
     is correlated with itself after t frames by E cos(omega t) = exp(-(t / decorrelation)^2), and its magnitude stays.
+    Nodes that no pixel lies beside are left out where pixels are at least two cells apart.
 
     Args:
         key: (N, 4), int64, of `noise_key`.
@@ -71,9 +72,9 @@ def octave(
     first = origin.detach().floor()
     places, nodes = [], [torch.full((len(key), 1), index, device=key.device)]
     for size, place, node in zip((width, height), (origin - first).unbind(1), first.long().unbind(1), strict=True):
-        along = torch.arange(size, dtype=torch.float64, device=key.device)
-        places.append(place[:, None] + along * stride / period)
-        nodes.append(node[:, None] + torch.arange(math.ceil(size * stride / period) + 2, device=key.device))
+        along, taken = _taken(place[:, None], size, stride / period)
+        places.append(along)
+        nodes.append(node[:, None] + taken)
     angle = 2 * math.pi * _turns(key, nodes, frame=frame, decorrelation=decorrelation, dtype=dtype)
     # In memory column by column, as `perlin_noise` looks them up.
     return Octave(torch.stack([angle.cos(), angle.sin()], dim=1).mT, *places)
@@ -118,6 +119,17 @@ class _Blocks(NamedTuple):
     node: Tensor  # (N, blocks, S)
     weight: Tensor  # (N, 2, blocks, S, size), h and h p
     counts: list[int]  # how many of the S nodes are those of each octave
+
+
+def _taken(start: Tensor, size: int, step: float) -> tuple[Tensor, Tensor]:
+    """Where pixels lie among the nodes they take, (N, size), and the numbers of these nodes, (N or 1, n)."""
+    pixel = torch.arange(size, dtype=start.dtype, device=start.device)
+    along = start + step * pixel
+    if step < 2:
+        return along, torch.arange(math.ceil(size * step) + 2, device=start.device)[None]
+    # Pixels so far apart share no node: each takes the two of its own.
+    before = along.detach().floor()
+    return along - before + 2 * pixel, torch.stack([before, before + 1], dim=2).long().flatten(1)
 
 
 def _turns(key: Tensor, nodes: Sequence[Tensor], *, frame: Tensor, decorrelation: Tensor, dtype: torch.dtype) -> Tensor:

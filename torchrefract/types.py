@@ -19,7 +19,6 @@ class Inverse(NamedTuple):
 
     flow: Tensor  # (B, 2, H, W), px
     valid: Tensor  # (B, 1, H, W), bool: where it does
-    residual: Map  # (B, 1, H, W), px: by how much it misses
 
 
 class Folding(NamedTuple):
@@ -79,7 +78,8 @@ class Degraded:
     intensity: (B, 1, H, W), light added; None without such a map.
 
     Of clips, (B, T, ...), the maps have the dimension of time too. Each map is given as a tensor or as a function that
-    computes it. Those that can be None are typed Any: whoever knows the effect knows which maps it has.
+    computes it; what needs other maps is handed the result, so that nothing here holds the result itself and its memory
+    is free once it is let go. Those that can be None are typed Any: whoever knows the effect knows which maps it has.
     """
 
     def __init__(
@@ -89,8 +89,9 @@ class Degraded:
         *,
         valid: Map,
         flow: Map | None = None,
-        restore: Callable[[], Inverse] | None = None,
-        folding: Callable[[], Folding] | None = None,
+        restore: Callable[["Degraded"], Inverse] | None = None,
+        residual: Callable[["Degraded"], Tensor] | None = None,
+        folding: Callable[["Degraded"], Folding] | None = None,
         light: Mapping[str, Map] | None = None,
     ):
         self.image = image
@@ -102,6 +103,7 @@ class Degraded:
             **(light or {}),
         }
         self._restore = restore
+        self._miss = residual
         self._fold = folding
 
     @property
@@ -117,7 +119,7 @@ class Degraded:
     @cached_property
     def folding(self) -> Any:
         """How much of the image is folded."""
-        return None if self._fold is None else self._fold()
+        return None if self._fold is None else self._fold(self)
 
     @property
     def transmission(self) -> Any:
@@ -144,17 +146,14 @@ class Degraded:
         """Where it does."""
         return None if self._restored is None else self._restored.valid
 
-    @property
+    @cached_property
     def restore_residual(self) -> Any:
         """By how much it misses, in px."""
-        if self._restored is None:
-            return None
-        residual = self._restored.residual
-        return residual() if callable(residual) else residual
+        return None if self._miss is None else self._miss(self)
 
     @cached_property
     def _restored(self) -> Inverse | None:
-        return None if self._restore is None else self._restore()
+        return None if self._restore is None else self._restore(self)
 
     def has(self, name: str) -> bool:
         """Whether there is a map of this name, without computing it."""
@@ -166,17 +165,14 @@ class Degraded:
         def later(name: str) -> Map | None:
             return None if self._maps[name] is None else lambda: function(cast(Tensor, self._read(name)))
 
-        def restore() -> Inverse:
-            flow, valid, _ = cast(Inverse, self._restored)
-            return Inverse(function(flow), function(valid), lambda: function(cast(Tensor, self.restore_residual)))
-
         return Degraded(
             self.image,
             self.params,
             valid=lambda: function(self.valid),
             flow=later("flow"),
-            restore=None if self._restore is None else restore,
-            folding=None if self._fold is None else lambda: Folding(*map(function, self.folding)),
+            restore=None if self._restore is None else lambda _: Inverse(*map(function, cast(Inverse, self._restored))),
+            residual=None if self._miss is None else lambda _: function(self.restore_residual),
+            folding=None if self._fold is None else lambda _: Folding(*map(function, self.folding)),
             light={name: value for name in _LIGHT if (value := later(name)) is not None},
         )
 
@@ -188,7 +184,6 @@ class Degraded:
 
     def __getstate__(self) -> dict[str, Any]:
         """All maps computed: what is still to be computed cannot travel to another process."""
-        restored = self._restored
-        kept = None if restored is None else restored._replace(residual=self.restore_residual)
-        computed = {"_maps": {n: self._read(n) for n in self._maps}, "_restored": kept, "folding": self.folding}
-        return self.__dict__ | computed | {"_restore": None, "_fold": None}
+        maps = {name: self._read(name) for name in self._maps}
+        computed = {name: getattr(self, name) for name in ("_restored", "restore_residual", "folding")}
+        return self.__dict__ | computed | {"_maps": maps, "_restore": None, "_miss": None, "_fold": None}

@@ -101,6 +101,28 @@ def test_the_memory_does_not_grow_with_the_number_of_calls(make, full_extremes):
     assert tensors() <= held + 2
 
 
+def test_what_is_let_go_is_free_at_once(make):
+    def use(key: int) -> None:
+        degraded = make().degrade(picture(), seed=7, keys=[key])
+        maps(degraded)
+        assert degraded.restore_residual is None or degraded.folding is not None
+
+    use(0)
+    gc.collect()
+    gc.disable()
+    try:
+        gc.set_debug(gc.DEBUG_SAVEALL)
+        for key in range(3):
+            use(key)
+        gc.collect()
+        kept = [value for value in gc.garbage if issubclass(type(value), Tensor | tr.Degraded)]
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+    assert not kept
+
+
 def test_new_sizes_and_new_effects_do_not_keep_memory(make):
     image = picture(size=(64, 64))
     make().degrade(image[..., : SIZE[0], : SIZE[1]], seed=7)

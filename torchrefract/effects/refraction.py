@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -150,21 +150,20 @@ def moving(
 ) -> Degraded:
     """What an effect with a flow hands over; `restore_valid` is where the flow back exists and sees valid pixels."""
 
-    def restore() -> Inverse:
+    def restore(result: Degraded) -> Inverse:
         back, known = undo()
-        sound = known & inside(back) & sees(result.valid, back)
-        return Inverse(back, sound, lambda: length(compose_flows(cast(Tensor, result.flow), back)))
+        return Inverse(back, known & inside(back) & sees(result.valid, back))
 
-    result = Degraded(
+    return Degraded(
         image,
         params,
         valid=valid,
         flow=flow,
         restore=restore,
-        folding=lambda: folding(cast(Tensor, result.flow), result.valid),
+        residual=lambda result: length(compose_flows(result.flow, result.restore_flow)),
+        folding=lambda result: folding(result.flow, result.valid),
         light=light,
     )
-    return result
 
 
 def sees(good: Tensor, flow: Tensor) -> Tensor:
@@ -183,8 +182,9 @@ def identity(image: Tensor, params: Any) -> Degraded:
         params,
         valid=lambda: everywhere,
         flow=lambda: still,
-        restore=lambda: Inverse(still, everywhere, lambda: still[:, :1]),
-        folding=lambda: folding(still),
+        restore=lambda _: Inverse(still, everywhere),
+        residual=lambda _: still[:, :1],
+        folding=lambda _: folding(still),
     )
 
 

@@ -43,7 +43,8 @@ class Walk:
         self.waiting: list[Step] = []
         self.modes: dict[tuple[str, str, str], Tensor] = {}  # of the look-up: the samples that ask for it, (B,), bool
         self.moved: list[tuple[WarpEffect, Any, Moved]] = []
-        self.valid: Callable[[], Tensor] = self._everywhere
+        # Not a method of its own, through which the walk and all its maps would hold themselves.
+        self.valid: Callable[[], Tensor] = functools.partial(_everywhere, image.shape, image.device)
         self.light: dict[str, Callable[[], Tensor]] = {}  # the maps of light, by their names in `Degraded`
         self.refracts = False
 
@@ -159,7 +160,7 @@ class Walk:
         return cast(Tensor, warped)
 
     def _undo(self) -> tuple[Tensor, Tensor]:
-        total, known = self._still(), self._everywhere()
+        total, known = self._still(), _everywhere(self.image.shape, self.image.device)
         done = torch.zeros(total.shape[0], dtype=torch.bool, device=total.device)
         for effect, params, moved in self.moved:
             back, exists = (spread(value, total.shape[0]) for value in effect.gated_undo(params, moved))
@@ -177,6 +178,8 @@ class Walk:
         batch, _, height, width = self.image.shape
         return torch.zeros(batch, 2, height, width, dtype=field_dtype(self.image.dtype), device=self.image.device)
 
-    def _everywhere(self) -> Tensor:
-        batch, _, height, width = self.image.shape
-        return torch.ones(batch, 1, height, width, dtype=torch.bool, device=self.image.device)
+
+def _everywhere(shape: torch.Size, device: torch.device) -> Tensor:
+    """(B, 1, H, W), bool, of an image (B, C, H, W)."""
+    batch, _, height, width = shape
+    return torch.ones(batch, 1, height, width, dtype=torch.bool, device=device)

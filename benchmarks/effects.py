@@ -39,7 +39,8 @@ from torchrefract import (
     UniformFog,
 )
 from torchrefract.draws import noise_key, stream
-from torchrefract.fields.perlin import octave, perlin_noise
+from torchrefract.fields.perlin import perlin_noise
+from torchrefract.fields.perlin_lattice import octave
 from torchrefract.warping.grid import sampler_grid
 
 WHAT = (

@@ -81,7 +81,7 @@ def oracle(request) -> Callable[..., None]:
 
 def pytest_sessionfinish(session) -> None:
     """One of several processes hands what its oracles said to the one that sums up."""
-    if "PYTEST_XDIST_WORKER" in os.environ:
+    if hasattr(session.config, "workeroutput"):
         told = {what: tuple(found) for what, found in session.config.stash.get(_ORACLES, {}).items()}
         session.config.workeroutput["oracles"] = told
 

@@ -11,7 +11,8 @@ from torch.testing import assert_close
 
 from torchrefract import Camera, GroundPlaneDepth, HeterogeneousFog, LinearDepth, UniformFog, remove_fog
 from torchrefract.data.road_scenes import render_road_scenes
-from torchrefract.fields.perlin import octave, perlin_noise
+from torchrefract.fields.perlin import perlin_noise
+from torchrefract.fields.perlin_lattice import octave
 
 SIZE = (36, 64)
 PAPER = {"scales": (4, 8, 16, 32, 64, 128), "weights": (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)}

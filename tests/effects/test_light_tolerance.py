@@ -13,8 +13,9 @@ from torchrefract import Camera, Compose, GroundPlaneDepth, HeterogeneousFog, Le
 from torchrefract.effects.depth import DepthProvider
 from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.planned_light import PlannedLight
-from torchrefract.fields.perlin import octave, perlin_noise
+from torchrefract.fields.perlin import perlin_noise
 from torchrefract.fields.perlin_bounds import VARIANCE, error_between, mean_variance
+from torchrefract.fields.perlin_lattice import octave
 from torchrefract.warping.lattice import Lattice, between_nodes
 
 SIZE = (96, 144)

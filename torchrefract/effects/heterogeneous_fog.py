@@ -32,8 +32,8 @@ from torchrefract.effects.rows import column, frame_mean, spread
 from torchrefract.effects.scales import check_scales, chosen, periods, shares, stretched
 from torchrefract.fields.fog import drifting_transmission_, transmission
 from torchrefract.fields.fog_volume import path_mean
-from torchrefract.fields.perlin import Nodes, Octave, perlin_noise
-from torchrefract.fields.perlin import octave as perlin_octave
+from torchrefract.fields.perlin import Nodes, perlin_noise
+from torchrefract.fields.perlin_lattice import Octave, octave
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 from torchrefract.warping.lattice import Lattice
@@ -83,8 +83,7 @@ class HeterogeneousFog(PlannedLight):
         wind_x_range, wind_y_range, wind_z_range: of the drift per frame of a clip, to the right, down and ahead, as
             seen from the camera: m in space, where a car that goes v m per frame sees -v ahead; px of the reference in
             the image, which has no z.
-        decorrelation_range: frames, above 0, after which the extinction at a place that goes with the wind is
-            correlated with what it was by 1/e; inf for fog that only drifts; one over it is drawn uniformly.
+        decorrelation_range: frames, above 0 or inf, until k in the wind is correlated by 1/e; one over it is uniform.
         tolerance: how far the image may be from the exact one, levels of 1/255, so that octaves in the image are left
             out or known on a coarse lattice only, and fog whose drifts nobody sees is uniform; see `plan`. Exact are
             None, normalize="image", and where <q> may come near 0; in space, drifts are so or not computed at all.
@@ -271,11 +270,11 @@ class HeterogeneousFog(PlannedLight):
 
         def made(numbers: Sequence[int], height: int, width: int, **lattice: int) -> list[Octave]:
             size: Any = {"height": height, "width": width, "dtype": share.dtype, **lattice}
-            return [perlin_octave(key, i, period=lengths[i], **size, **motion) for i in numbers]
+            return [octave(key, i, period=lengths[i], **size, **motion) for i in numbers]
 
         octaves = made(plan.fine, plan.height, plan.width)
         if self.normalize == "image":
-            parts = [column(w) * stretched(octave) for octave, w in zip(octaves, share.unbind(1), strict=True)]
+            parts = [column(w) * stretched(each) for each, w in zip(octaves, share.unbind(1), strict=True)]
             q = sum(parts[1:], parts[0])
             return q, self._inverse_mean(q, 0.5), q.new_zeros(1, 1, 1, 1)
         nodes = None

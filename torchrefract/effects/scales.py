@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import check_number, check_positive, or_else
-from torchrefract.fields.perlin import Octave, perlin_noise
+from torchrefract.fields.perlin import perlin_noise
+from torchrefract.fields.perlin_lattice import Octave
 
 # The paper's table of scales, with the weights that go with them.
 _PAPER_SCALES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)

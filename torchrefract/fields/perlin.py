@@ -1,4 +1,4 @@
-"""Perlin's gradient noise in the plane, on lattices that drift and turn from frame to frame."""
+"""Perlin's gradient noise in the plane, at every pixel of a frame."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -9,75 +9,14 @@ import torch
 from torch import Tensor
 
 from torchrefract._bands import join
-from torchrefract._checks import is_true
 from torchrefract._constants import constant
+from torchrefract.fields.perlin_lattice import Octave, has_slope
 from torchrefract.warping.lattice import Lattice, along_rows, row_weights
-from torchrefract.white_noise import lattice
 
-# Multiples of the golden ratio stay away from each other, modulo 1: octaves share no lines of nodes.
-_GOLDEN = (5**0.5 - 1) / 2
 # Pixels that are made of the same nodes: as many rows, and up to so many columns.
 BAND = 24
 _STRIPE = 128
 _AT_ONCE = 4  # bands, whose nodes stay in a core's cache
-
-
-class Octave(NamedTuple):
-    """The nodes of a lattice that a frame takes, and where its pixels lie between them."""
-
-    gradient: Tensor  # (N, 2, m, n), g_x and g_y at the nodes
-    x: Tensor  # (N, W), float64, of each column of pixels, the number of the node before it and the part of the cell
-    y: Tensor  # (N, H), float64, of each row; in [0, m - 1], and evenly spaced but for less than a cell
-
-
-def octave(
-    key: Tensor,
-    index: int,
-    *,
-    period: float,
-    height: int,
-    width: int,
-    frame: Tensor,
-    wind: Tensor,
-    decorrelation: Tensor,
-    dtype: torch.dtype,
-    stride: int = 1,
-    start: int = 0,
-) -> Octave:
-    """One octave at one frame of a clip: unit gradients that turn, at nodes that go with the wind.
-
-        g = (cos a, sin a),  a = 2 pi u1 + omega t,  omega = 2 erfinv(2 u2 - 1) / decorrelation
-        x = (start + stride column + 1/2 - wind_x t) / period + phase_x,  y likewise
-        phase = frac(key / 2^32 + (index + 1) (sqrt(5) - 1) / 2)
-
-    u1 and u2 are uniform, a hash of the node's place in an endless lattice. omega is normal, so what goes with the wind
-    is correlated with itself after t frames by E cos(omega t) = exp(-(t / decorrelation)^2), and its magnitude stays.
-    Nodes that no pixel lies beside are left out where pixels are at least two cells apart.
-
-    Args:
-        key: (N, 4), int64, of `noise_key`.
-        index: of the octave; octaves of different indices are independent.
-        period: px, above 0, between two nodes.
-        height, width: rows and columns, px of the frame or nodes of a lattice.
-        frame: (N,), t.
-        wind: (N, 2), px per frame, to the right and down.
-        decorrelation: (N,), frames, above 0; inf for gradients that stay.
-        dtype: of the gradients.
-        stride, start: px, between rows or columns, and of the first of them.
-
-    Source: Perlin and Neyret, "Flow noise", SIGGRAPH 2001, technical sketches, for the turning.
-    """
-    phase = (2.0**-32 * key[:, :2].double() + (index + 1) * _GOLDEN).frac()
-    origin = (start + 0.5 - wind.double() * frame.double()[:, None]) / period + phase
-    first = origin.detach().floor()
-    places, nodes = [], [torch.full((len(key), 1), index, device=key.device)]
-    for size, place, node in zip((width, height), (origin - first).unbind(1), first.long().unbind(1), strict=True):
-        along, taken = _taken(place[:, None], size, stride / period)
-        places.append(along)
-        nodes.append(node[:, None] + taken)
-    angle = 2 * math.pi * _turns(key, nodes, frame=frame, decorrelation=decorrelation, dtype=dtype)
-    # In memory column by column, as `perlin_noise` looks them up.
-    return Octave(torch.stack([angle.cos(), angle.sin()], dim=1).mT, *places)
 
 
 class Nodes(NamedTuple):
@@ -121,27 +60,6 @@ class _Blocks(NamedTuple):
     counts: list[int]  # how many of the S nodes are those of each octave
 
 
-def _taken(start: Tensor, size: int, step: float) -> tuple[Tensor, Tensor]:
-    """Where pixels lie among the nodes they take, (N, size), and the numbers of these nodes, (N or 1, n)."""
-    pixel = torch.arange(size, dtype=start.dtype, device=start.device)
-    along = start + step * pixel
-    if step < 2:
-        return along, torch.arange(math.ceil(size * step) + 2, device=start.device)[None]
-    # Pixels so far apart share no node: each takes the two of its own.
-    before = along.detach().floor()
-    return along - before + 2 * pixel, torch.stack([before, before + 1], dim=2).long().flatten(1)
-
-
-def _turns(key: Tensor, nodes: Sequence[Tensor], *, frame: Tensor, decorrelation: Tensor, dtype: torch.dtype) -> Tensor:
-    """(N, n, m), the angles of the gradients over 2 pi."""
-    if not _has_slope(frame, decorrelation) and is_true((frame / decorrelation == 0).all):
-        return lattice(key, nodes, 1)[:, 0, 0].to(dtype)
-    start, speed = lattice(key, nodes, 2)[:, :, 0].unbind(1)
-    elapsed = (frame.double() / (math.pi * decorrelation.double()))[:, None, None]
-    # Whole turns are dropped before the type gets narrow: after a long time they are many.
-    return start.to(dtype) + ((2 * speed - 1).double().erfinv() * elapsed).frac().to(dtype)
-
-
 def _by_sample(
     function: Callable[..., Tensor], octaves: Sequence[Octave], weights: Tensor, nodes: Nodes | None
 ) -> Tensor:
@@ -182,7 +100,7 @@ def _noise(octaves: Sequence[Octave], weights: Tensor, nodes: Nodes | None) -> T
     for each in found[1:]:
         index, down = torch.cat([index, found[0].total + each.needed], dim=1), torch.cat([down, each.weight], dim=2)
     # A gradient costs one of the whole table each time that bands are looked up in it.
-    few = weights.device.type == "cpu" and not torch.compiler.is_compiling() and not _has_slope(table)
+    few = weights.device.type == "cpu" and not torch.compiler.is_compiling() and not has_slope(table)
     at_once = _AT_ONCE if few else len(down)
     bands = (
         torch.bmm(weight, table.index_select(0, numbers.flatten()).view(len(weight), weight.shape[2], -1))
@@ -303,7 +221,3 @@ def _stripe(width: int) -> int:
     """A width of stripes that divides that of the frame, where there is any."""
     divisors = (size for size in range(_STRIPE, _STRIPE // 2, -1) if width % size == 0)
     return next(divisors, min(_STRIPE, width))
-
-
-def _has_slope(*tensors: Tensor) -> bool:
-    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)

@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -94,6 +94,11 @@ def is_true(predicate: Callable[[], Tensor]) -> bool | None:
 def or_else(value: Tensor, otherwise: float) -> Tensor:
     """The value, and another one where it is not finite: what may not be read cannot be refused."""
     return value.nan_to_num(nan=otherwise, posinf=otherwise, neginf=otherwise)
+
+
+def learns(values: Iterable[Any]) -> bool:
+    """Whether a gradient of one of the values is asked for: tensors, or what has a `requires_grad` as they do."""
+    return torch.is_grad_enabled() and any(value.requires_grad for value in values)
 
 
 def read(tensor: Callable[[], Tensor]) -> Any:

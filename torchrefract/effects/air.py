@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._bands import join
-from torchrefract._checks import check_all, check_flag, check_number
+from torchrefract._checks import check_all, check_flag, check_number, learns
 from torchrefract._constants import constant
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.color import check_color, each_channel
@@ -108,8 +108,8 @@ class Air:
         if len(bands) == 1 and bands[0][0] == "computed":
             return self.blended(image, t, airlight)
         color = spread(airlight, image.shape[0])[:, :, None, None]
-        learns = torch.is_grad_enabled() and any(value.requires_grad for value in (image, t))
-        few = not learns and image.device.type == "cpu" and not torch.compiler.is_compiling()
+        learning = learns((image, t))
+        few = not learning and image.device.type == "cpu" and not torch.compiler.is_compiling()
         step = max(1, _CACHED // max(1, image.numel() // image.shape[2])) if few else image.shape[2]
 
         def parts() -> Iterator[Tensor]:
@@ -122,7 +122,7 @@ class Air:
                     else:
                         yield rows if kind == "left" else color.expand_as(rows).to(image.dtype)
 
-        if learns:  # some parts have a slope, and others none
+        if learning:  # some parts have a slope, and others none
             return torch.cat(list(parts()), dim=2)
         return join(parts(), dim=2, length=image.shape[2])
 

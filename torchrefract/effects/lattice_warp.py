@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true
+from torchrefract._checks import is_true, learns
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, check_tolerance
 from torchrefract.effects.refraction import Moved, WarpEffect
-from torchrefract.effects.rows import learns, only, params_part, put, some, spread
+from torchrefract.effects.rows import only, params_part, put, some, spread
 from torchrefract.warping.lattice import SmoothFlow
 
 

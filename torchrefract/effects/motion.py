@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_all, check_range, is_true, or_else
+from torchrefract._checks import check_all, check_range, is_true, learns, or_else
 from torchrefract.types import Range
 
 _FASTEST = 1e6  # of the wind
@@ -62,6 +62,6 @@ def check_frame(params: Any) -> None:
 def is_still(params: Any) -> bool:
     """Whether only the first frame is asked for, as far as that can be known, and no gradient of time."""
     moving = (params.frame, params.wind, params.decorrelation)
-    if params.frame.shape[1] > 1 or (torch.is_grad_enabled() and any(value.requires_grad for value in moving)):
+    if params.frame.shape[1] > 1 or learns(moving):
         return False
     return is_true((params.frame == 0).all) is True

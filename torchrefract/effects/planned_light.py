@@ -7,11 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true
+from torchrefract._checks import is_true, learns
 from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.plan import check_tolerance
 from torchrefract.effects.radiance import RadianceEffect
-from torchrefract.effects.rows import learns
 from torchrefract.warping.grid import field_dtype
 
 

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true
+from torchrefract._checks import is_true, learns
 from torchrefract.effects.base import Effect
-from torchrefract.effects.rows import column, learns, only, params_part, part, put, some, spread
+from torchrefract.effects.rows import column, only, params_part, part, put, some, spread
 from torchrefract.types import Degraded, Map
 from torchrefract.warping.grid import field_dtype
 

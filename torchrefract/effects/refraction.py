@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_choice, is_true
+from torchrefract._checks import check_choice, is_true, learns
 from torchrefract.effects.base import Effect
 from torchrefract.effects.plan import Ask, Plan
-from torchrefract.effects.rows import alike, column, learns, only, params_part, part, put, some, spread
+from torchrefract.effects.rows import alike, column, only, params_part, part, put, some, spread
 from torchrefract.types import Degraded, Inverse, Map
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import field_dtype, inside, length

@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true, read
+from torchrefract._checks import is_true, learns, read
 
 
 def spread(value: Tensor, rows: int) -> Tensor:
@@ -119,8 +119,3 @@ def put(value: Tensor, index: Tensor, into: Tensor | float, batch: int) -> Tenso
 def _at(index: Tensor, frames: int) -> Tensor:
     """The numbers of the rows of some samples of so many frames each."""
     return (frames * index[:, None] + torch.arange(frames)).flatten()
-
-
-def learns(params: Any) -> bool:
-    """Whether a gradient of the parameters is asked for."""
-    return torch.is_grad_enabled() and any(value.requires_grad for value in params)

@@ -7,8 +7,8 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true, read
-from torchrefract.effects.rows import learns, only
+from torchrefract._checks import is_true, learns, read
+from torchrefract.effects.rows import only
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import Positions
 from torchrefract.warping.lattice import SmoothFlow, dense

@@ -8,13 +8,13 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true
+from torchrefract._checks import is_true, learns
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.plan import Plan
 from torchrefract.effects.radiance import RadianceEffect
 from torchrefract.effects.refraction import Moved, WarpEffect, moving, sees
-from torchrefract.effects.rows import column, learns, only, spread
+from torchrefract.effects.rows import column, only, spread
 from torchrefract.effects.steps import Flow, Step, exact, on_grid
 from torchrefract.types import Degraded
 from torchrefract.warping.compose import compose_flows

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from torchrefract._bands import join
+from torchrefract._checks import learns
 from torchrefract._constants import constant
-from torchrefract.fields.perlin_lattice import Octave, has_slope
+from torchrefract.fields.perlin_lattice import Octave
 from torchrefract.warping.lattice import Lattice, along_rows, row_weights
 
 # Pixels that are made of the same nodes: as many rows, and up to so many columns.
@@ -100,7 +101,7 @@ def _noise(octaves: Sequence[Octave], weights: Tensor, nodes: Nodes | None) -> T
     for each in found[1:]:
         index, down = torch.cat([index, found[0].total + each.needed], dim=1), torch.cat([down, each.weight], dim=2)
     # A gradient costs one of the whole table each time that bands are looked up in it.
-    few = weights.device.type == "cpu" and not torch.compiler.is_compiling() and not has_slope(table)
+    few = weights.device.type == "cpu" and not torch.compiler.is_compiling() and not learns((table,))
     at_once = _AT_ONCE if few else len(down)
     bands = (
         torch.bmm(weight, table.index_select(0, numbers.flatten()).view(len(weight), weight.shape[2], -1))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true
+from torchrefract._checks import is_true, learns
 from torchrefract.white_noise import lattice
 
 # Multiples of the golden ratio stay away from each other, modulo 1: octaves share no lines of nodes.
@@ -72,11 +72,6 @@ def octave(
     return Octave(torch.stack([angle.cos(), angle.sin()], dim=1).mT, *places)
 
 
-def has_slope(*tensors: Tensor) -> bool:
-    """Whether a gradient is asked for."""
-    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-
-
 def _taken(start: Tensor, size: int, step: float) -> tuple[Tensor, Tensor]:
     """Where pixels lie among the nodes they take, (N, size), and the numbers of these nodes, (N or 1, n)."""
     pixel = torch.arange(size, dtype=start.dtype, device=start.device)
@@ -90,7 +85,7 @@ def _taken(start: Tensor, size: int, step: float) -> tuple[Tensor, Tensor]:
 
 def _turns(key: Tensor, nodes: Sequence[Tensor], *, frame: Tensor, decorrelation: Tensor, dtype: torch.dtype) -> Tensor:
     """(N, n, m), the angles of the gradients over 2 pi."""
-    if not has_slope(frame, decorrelation) and is_true((frame / decorrelation == 0).all):
+    if not learns((frame, decorrelation)) and is_true((frame / decorrelation == 0).all):
         return lattice(key, nodes, 1)[:, 0, 0].to(dtype)
     start, speed = lattice(key, nodes, 2)[:, :, 0].unbind(1)
     elapsed = (frame.double() / (math.pi * decorrelation.double()))[:, None, None]

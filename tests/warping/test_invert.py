@@ -163,6 +163,16 @@ def test_nothing_is_valid_that_is_read_from_a_hole(poison):
     assert (valid | ~expected).all()
 
 
+@pytest.mark.parametrize("amplitude_px", [1e3, 1e6, 1e9, 1e11, 9e11])
+def test_flows_of_any_length_have_a_finite_inverse(amplitude_px):
+    source = torch.Generator().manual_seed(0)
+    spikes = torch.rand(40, 1, 23, 31, generator=source) < 0.2  # beside which the map turns over
+    noise = torch.randn(40, 2, 23, 31, generator=source).clamp(-1, 1)
+    inverse, _, residual = invert_flow(amplitude_px * noise * spikes)
+    assert inverse.isfinite().all()
+    assert residual.isfinite().all()
+
+
 def test_gradients_through_an_affine_flow_are_those_of_finite_differences(pixels):
     x, y = pixels(5, 6)
     flow = torch.stack([0.1 * x - 0.05 * y + 0.23, 0.08 * y + 0.04 * x - 0.31])[None].requires_grad_()

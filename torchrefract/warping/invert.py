@@ -9,27 +9,33 @@ from torchrefract._checks import check_count, check_flow, check_positive, is_tru
 from torchrefract.warping.grid import field_dtype, inside, length, pixel_axes
 from torchrefract.warping.resample import look_up
 
-# Px: after so short a step the next one, a square of it, is below rounding.
+# Px: so short a step is the last.
 _NEAR = {torch.float32: 1e-3, torch.float64: 1e-6}
 # Px: flow from here on leads nowhere, and its square is a number still.
 _FARTHEST = 1e12
 # Of so many pixels one may be left on a fold, where no step helps.
 _FEW = 500
+# Where a step is longer than this share of the one before, the slopes of the flow are other ones by now: they are read
+# anew if so few pixels are no longer few.
+_SLOW, _FEW_SLOW = 1 / 3, 2000
+# Of determinants: what is nearer to a fold is begun without slopes.
+_UPRIGHT = 0.5
 
 
-def invert_flow(flow: Tensor, *, steps: int = 6, tolerance_px: float = 0.05) -> tuple[Tensor, Tensor, Tensor]:
+def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> tuple[Tensor, Tensor, Tensor]:
     """The flow that undoes a warp: warp(warp(image, flow), inverse) = image on `valid`.
 
-        inverse(p) + flow(p + inverse(p)) = 0, solved by Newton's method from -flow:
-        inverse <- inverse - (I + grad flow)^-1 (inverse + flow),  flow and its gradient read at p + inverse
+        inverse(p) + flow(p + inverse(p)) = 0, solved by Newton's method from no flow:
+        inverse <- inverse - (I + grad flow)^-1 (inverse + flow),  flow read at p + inverse,
+        its gradient at first at p, and at p + inverse once steps no longer shrink to a third
 
     The flow is read bilinearly, its gradient by central differences. The gradient with respect to `flow` comes from
     one attached Newton step at the solution (implicit function theorem), not from unrolling.
 
     Args:
         flow: (B, 2, H, W), px.
-        steps: Newton steps at most, at least 1; a sample takes no more once all its pixels stay within 1e-3 px (1e-6 px
-            in float64), or the few of them that do not, one in 500, no longer become fewer.
+        steps: Newton steps at most beside the first, at least 1; a sample takes no more once all its pixels stay within
+            1e-3 px (1e-6 px in float64), or the few of them that do not, one in 500, no longer become fewer.
         tolerance_px: the residual up to which a pixel counts as solved, px.
 
     Returns:
@@ -41,10 +47,9 @@ def invert_flow(flow: Tensor, *, steps: int = 6, tolerance_px: float = 0.05) -> 
         ValueError: a flow of another shape, no step, a tolerance that is not positive.
 
     Newton and the fixed point inverse <- -flow(p + inverse) end in the same inverse, equally smooth, valid on the same
-    pixels. To 1e-3 px on 99.9 % of them Newton takes 1 to 2 steps on the effects' defaults and 3 on strong ones (21 to
-    25, and 33 bare grid_samples), the fixed point 3 to 12 and 12 to 30 (17 to 33, and 33 to 64); on a strong lens
-    (k1 = -0.4) it is still 17 px off after 30. Newton's steps hardly depend on the flow, so their number can be fixed;
-    6 leave room. Measured by benchmarks/inverses.py on frames of 1280 x 720.
+    pixels. To 1e-3 px on 99.9 % of them Newton takes 9 to 13 bare grid_samples on the defaults of a lens, turbulence
+    and a thin plate, and 19 on strong turbulence, the fixed point 7 to 19, and 18; on a strong lens (k1 = -0.4) the
+    fixed point is still 17 px off after 30 steps. Measured by benchmarks/inverses.py on frames of 1280 x 720.
 
     Source: Chen, Lu, Chen, Ruchala, Olivera, "A simple fixed-point approach to invert a deformation field", Medical
     Physics 35 (2008), for the equation and the fixed point.
@@ -54,29 +59,49 @@ def invert_flow(flow: Tensor, *, steps: int = 6, tolerance_px: float = 0.05) -> 
     check_positive("tolerance_px", tolerance_px)
     flow = flow.to(field_dtype(flow.dtype))
     known = (flow.abs() <= _FARTHEST).all(dim=1, keepdim=True)
-    flow = torch.where(known, flow, 0)
+    whole = is_true(known.all)
+    flow = flow if whole else torch.where(known, flow, 0)
     with torch.no_grad():
-        table = torch.cat([flow, _gradient(flow)], dim=1)
-        inverse = -flow
-        going, far = known.new_ones(known.shape[0], 1, 1, 1), math.prod(known.shape[2:])
-        for _ in range(steps):
-            error, jacobian = _residual(table, inverse)
-            step = _solve(jacobian, error)
-            inverse = torch.where(going, inverse - step, inverse)
-            going, far = _goes_on(step, going, far)
-            if is_true(going.any) is False:
-                break
-        error, jacobian = _residual(table, inverse)
-        residual = length(error)
-        solution = inverse
-        solved = (residual <= tolerance_px) & (_determinant(jacobian) > 0) & inside(solution)
+        slopes = _gradient(flow)
+        solution = inverse = _solved(flow, slopes, steps)
+        read = _read(torch.cat([flow, _determinant(slopes)], dim=1), solution)
+        residual = length(solution + read[:, :2])
+        solved = (residual <= tolerance_px) & (read[:, 2:] > 0) & inside(solution)
         # Nothing is known where a hole in the flow would have been read.
-        read = look_up(known.to(flow.dtype), solution, padding="border", interpolation="bilinear")
-        valid = solved & known & (read > 0.999)
+        valid = solved if whole else solved & known & (_read(known.to(flow.dtype), solution) > 0.999)
     if flow.requires_grad and torch.is_grad_enabled():
-        moved = look_up(flow, solution, padding="border", interpolation="bilinear")
-        inverse = inverse - _solve(_cell_gradient(flow.detach(), solution), moved - moved.detach())
+        moved = _read(flow, solution)
+        unmoved = _inverted(_cell_gradient(flow.detach(), solution))
+        inverse = solution - _times(unmoved, moved - moved.detach())
     return inverse, valid, residual
+
+
+def _solved(flow: Tensor, slopes: Tensor, steps: int) -> Tensor:
+    """The inverse (B, 2, H, W), after some steps; a sample that is done stays as it is, and depends on no other."""
+    near, pixels = _NEAR[flow.dtype] ** 2, math.prod(flow.shape[2:])
+    # The first step, from no flow at all, has nothing to read.
+    upright = _determinant(slopes) >= _UPRIGHT
+    matrix = _where(upright, _inverted(slopes), _identity(flow))
+    inverse = -_step(matrix, flow)
+    going, many, before = upright.new_ones(upright.shape[0], 1, 1, 1), pixels, _square(inverse)
+    for _ in range(steps):
+        error = inverse + _read(flow, inverse)
+        step = _step(matrix, error)
+        size = _square(step)
+        far = size > near
+        slow = going & (_count(far & (size > _SLOW**2 * before)) * _FEW_SLOW > pixels)
+        if is_true(slow.any) is not False:
+            matrix = _where(slow, _inverted(_read(slopes, inverse)), matrix)
+            step = _step(matrix, error)
+            size = _square(step)
+            far = size > near
+        inverse = _where(going, inverse - step, inverse)
+        left = _count(far)
+        stuck = (left * _FEW <= pixels) & (left >= many)
+        going, many, before = going & (left > 0) & ~stuck, left, size
+        if is_true(going.any) is False:
+            break
+    return inverse
 
 
 def _gradient(flow: Tensor) -> Tensor:
@@ -93,37 +118,58 @@ def _cell_gradient(flow: Tensor, at: Tensor) -> Tensor:
         shift = (axis + at[:, channel : channel + 1]).floor() - axis
         low = torch.cat([shift, at[:, 1:]] if channel == 0 else [at[:, :1], shift], dim=1)
         high = low + torch.eye(2, dtype=flow.dtype, device=flow.device)[channel].view(1, 2, 1, 1)
-        ends = (look_up(flow, end, padding="border", interpolation="bilinear") for end in (high, low))
+        ends = (_read(flow, end) for end in (high, low))
         slopes.append(torch.sub(*ends))
     return torch.cat(slopes, dim=1)
 
 
-def _goes_on(step: Tensor, going: Tensor, before: Tensor | int) -> tuple[Tensor, Tensor]:
-    """(B, 1, 1, 1), bool: the samples that another step changes, and how many of their pixels were far from solved.
-
-    A sample that is done stays as it is, so that it does not depend on the others.
-    """
-    near = _NEAR[step.dtype]
-    far = (step.square().sum(dim=1, keepdim=True) > near**2).sum(dim=(2, 3), keepdim=True)
-    stuck = (far * _FEW <= math.prod(step.shape[2:])) & (far >= before)
-    return going & (far > 0) & ~stuck, far
+def _read(field: Tensor, at: Tensor) -> Tensor:
+    """A field (B, C, H, W) at p + at(p)."""
+    return look_up(field, at, padding="border", interpolation="bilinear")
 
 
-def _residual(table: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
-    read = look_up(table, inverse, padding="border", interpolation="bilinear")
-    return inverse + read[:, :2], read[:, 2:]
+def _where(flags: Tensor, value: Tensor, otherwise: Tensor) -> Tensor:
+    """As `torch.where`, which takes longer than the rest of a step; nothing is chosen where all flags are true."""
+    return value if is_true(flags.all) else torch.where(flags, value, otherwise)
 
 
-def _determinant(jacobian: Tensor) -> Tensor:
-    u_x, v_x, u_y, v_y = jacobian.split(1, dim=1)
+def _count(flags: Tensor) -> Tensor:
+    """(B, 1, 1, 1): how many pixels of a sample, (B, 1, H, W), are true."""
+    return flags.sum(dim=(2, 3), keepdim=True)
+
+
+def _square(step: Tensor) -> Tensor:
+    """(B, 1, H, W), px^2, of (B, 2, H, W)."""
+    u, v = step.split(1, dim=1)
+    return torch.addcmul(u * u, v, v)
+
+
+def _determinant(slopes: Tensor) -> Tensor:
+    """(B, 1, H, W): of I + the slopes (B, 4, H, W), as of `_gradient`."""
+    u_x, v_x, u_y, v_y = slopes.split(1, dim=1)
     return (1 + u_x) * (1 + v_y) - u_y * v_x
 
 
-def _solve(jacobian: Tensor, error: Tensor) -> Tensor:
-    """(I + jacobian)^-1 error, in closed form."""
-    u_x, v_x, u_y, v_y = jacobian.split(1, dim=1)
-    a, b = error.split(1, dim=1)
-    determinant = _determinant(jacobian)
+def _inverted(slopes: Tensor) -> Tensor:
+    """(B, 4, H, W): the matrix (I + slopes)^-1, column by column."""
+    determinant = _determinant(slopes)
     # Near a fold the step has no good length; a bounded determinant keeps it finite, the residual tells the rest.
-    determinant = torch.where(determinant >= 0, determinant.clamp(min=0.1), determinant.clamp(max=-0.1))
-    return torch.cat([(1 + v_y) * a - u_y * b, (1 + u_x) * b - v_x * a], dim=1) / determinant
+    determinant = determinant.abs().clamp(min=0.1).copysign(determinant)
+    u_x, v_x, u_y, v_y = slopes.split(1, dim=1)
+    return torch.cat([1 + v_y, -v_x, -u_y, 1 + u_x], dim=1) / determinant
+
+
+def _identity(flow: Tensor) -> Tensor:
+    """(1, 4, 1, 1), as of `_inverted`."""
+    return torch.eye(2, dtype=flow.dtype, device=flow.device).view(1, 4, 1, 1)
+
+
+def _step(matrix: Tensor, error: Tensor) -> Tensor:
+    """Newton's, no longer than any flow, so that all that comes of it is a number."""
+    return _times(matrix, error).clamp(-_FARTHEST, _FARTHEST)
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    """(B, 2, H, W) of matrices (B, 4, H, W), column by column, and vectors (B, 2, H, W)."""
+    x, y = vector.split(1, dim=1)
+    return torch.addcmul(matrix[:, :2] * x, matrix[:, 2:], y)

@@ -21,7 +21,9 @@ def pytest_configure(config) -> None:
 
 
 @pytest.fixture
-def small_tori(request, monkeypatch) -> None:
-    """The longest correlations would take seconds each: a smaller cap asks the same questions."""
-    if request.config.getoption("extremes") != "full":
-        monkeypatch.setattr(torus, "_MOST_POINTS", 1 << 12)
+def small_tori(full_extremes, monkeypatch) -> None:
+    """The longest correlations would take seconds each: a smaller cap asks the same questions.
+
+    The cap that users have is tried by `test_the_longest_correlations_take_the_largest_torus`.
+    """
+    monkeypatch.setattr(torus, "_MOST_POINTS", 1 << (18 if full_extremes else 12))

@@ -5,7 +5,21 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from promises import EFFECTS, FLOWS, HERE, LEARNED, MASKED, NOTHING, REFUSED, RESAMPLE, TOLD, ZERO, Row, frame
+from promises import (
+    EFFECTS,
+    FLOWS,
+    HERE,
+    LEARNED,
+    MASKED,
+    NOTHING,
+    PROPERTIES,
+    REFUSED,
+    RESAMPLE,
+    TOLD,
+    ZERO,
+    Row,
+    frame,
+)
 
 import torchrefract as tr
 
@@ -211,6 +225,13 @@ ROWS = (
         "W",
         "clipped, and by how much is told",
         EFFECTS + "turbulence.py::test_a_length_that_no_torus_has_room_for_is_told",
+    ),
+    Row(
+        "turbulence",
+        "length 1e6 px, swirls too",
+        "M",
+        "the largest torus, 2^24 px; finite, and a batch is each sample alone, bit for bit on the CPU",
+        PROPERTIES + "the_longest_correlations_take_the_largest_torus",
     ),
     Row(
         "turbulence",

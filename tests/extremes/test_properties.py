@@ -9,12 +9,15 @@ from torch import Tensor
 
 import torchrefract as tr
 from torchrefract.effects.base import Effect
+from torchrefract.fields import torus
+from torchrefract.fields.covariance import COVARIANCES
 
 MAPS = ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission", "extinction", "intensity")
 FLOATS = (torch.float32, torch.float64)
+small = pytest.mark.usefixtures("small_tori")
 # Whoever asks for folds is told of them; here they are asked for.
 # Strong draws warn that they fold; `valid` leaves the folds out, and other tests hold the warning.
-pytestmark = [pytest.mark.filterwarnings("ignore::UserWarning"), pytest.mark.usefixtures("small_tori")]
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
 
 @pytest.fixture(params=DOMAINS)
@@ -36,6 +39,7 @@ def unbounded(effect: Effect) -> bool:
     return isinstance(effect, tr.LensFlare) and not effect.clip and effect.blend == "add"
 
 
+@small
 @given(data=st.data())
 def test_what_comes_out_is_finite_in_range_and_of_the_same_kind(name, data):
     effect, image = data.draw(cases(name))
@@ -55,6 +59,7 @@ def test_what_comes_out_is_finite_in_range_and_of_the_same_kind(name, data):
         assert ((degraded.transmission >= 0) & (degraded.transmission <= 1)).all()
 
 
+@small
 @given(data=st.data())
 def test_gradients_are_finite(name, data):
     effect, image = data.draw(cases(name, dtypes=FLOATS))
@@ -68,6 +73,7 @@ def test_gradients_are_finite(name, data):
         assert gradient is None or gradient.isfinite().all(), key
 
 
+@small
 @given(data=st.data())
 def test_what_is_off_is_the_image_bit_for_bit(name, data):
     never = data.draw(st.booleans())
@@ -80,6 +86,7 @@ def test_what_is_off_is_the_image_bit_for_bit(name, data):
         assert found.flow is None or not found.flow.any()
 
 
+@small
 @given(data=st.data())
 def test_a_batch_is_each_sample_alone(name, data):
     effect, image = data.draw(cases(name, batch=3))
@@ -89,3 +96,22 @@ def test_a_batch_is_each_sample_alone(name, data):
         alone = maps(effect.degrade(image[i : i + 1], seed=7, keys=[key]))
         for field, value in alone.items():
             assert torch.equal(value, together[field][i : i + 1]), field
+
+
+@pytest.mark.parametrize("covariance", COVARIANCES)
+@pytest.mark.parametrize("kind", [tr.Turbulence, tr.DivergenceFree])
+def test_the_longest_correlations_take_the_largest_torus(kind, covariance, full_extremes, monkeypatch):
+    if not full_extremes:
+        monkeypatch.setattr(torus, "_MOST_POINTS", 1 << 16)
+    rows, columns = torus.torus(24, 31, length=1e6, kind=covariance)
+    assert torus._MOST_POINTS / 2 < rows * columns <= torus._MOST_POINTS
+    effect = kind(length_range=(1e6, 1e6), covariance=covariance, tolerance_px=None)
+    image = torch.rand(2, 3, 24, 31, generator=torch.Generator().manual_seed(0))
+    together = maps(effect.degrade(image, seed=7, keys=[1, 2]))
+    for i, key in enumerate([1, 2]):
+        for field, value in maps(effect.degrade(image[i : i + 1], seed=7, keys=[key])).items():
+            assert value.isfinite().all(), field
+            assert torch.equal(value, together[field][i : i + 1]), field
+    assert together["flow"].any()
+    assert (together["image"] >= 0).all()
+    assert (together["image"] <= 1 + 1e-6).all()

@@ -94,6 +94,10 @@ def test_where_a_lens_is_valid_it_shows_the_ray_that_it_says(data):
     effect, image = data.draw(cases("lens", dtypes=FLOATS, side=40))
     tolerance = effect.tolerance_px or 0.0
     degraded = effect.degrade(image, seed=7)
+    if image.shape[2:] == (1, 1):  # which warps leave alone
+        assert not degraded.flow.any()
+        assert not degraded.restore_flow.any()
+        return
     for i in range(len(image)):
         lens = Lens(degraded.params, i, *image.shape[2:])
         valid, sound = (mask[i, 0].numpy() for mask in (degraded.valid, degraded.restore_valid))

@@ -85,8 +85,9 @@ def mode_field(
 
     if both.device.type != "cpu" or torch.compiler.is_compiling():
         return fields(both)
-    # Two products of one sample at a time: other numbers of them may round by the batch, and one by the threads.
-    return torch.cat([fields(pair) for pair in both.split(1)])
+    # Two products of one sample at a time: other numbers of them may round by the batch, one by the threads, and all by
+    # where in memory they begin.
+    return torch.cat([fields(pair.clone()) for pair in both.split(1)])
 
 
 def _waves(k: Tensor, places: Sequence[int], size: int, **options: Any) -> tuple[Tensor, Tensor]:

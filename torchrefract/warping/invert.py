@@ -15,8 +15,8 @@ _NEAR = {torch.float32: 1e-3, torch.float64: 1e-6}
 _FARTHEST = 1e12
 # Of so many pixels one may be left on a fold, where no step helps.
 _FEW = 500
-# Where a step is longer than this share of the one before, the slopes of the flow are other ones by now: they are read
-# anew if so few pixels are no longer few.
+# Where a step is longer than this share of the one before, the slopes that both took no longer fit. They are read anew
+# for a sample of which more than one pixel in so many is like that.
 _SLOW, _FEW_SLOW = 1 / 3, 2000
 # Of determinants: what is nearer to a fold is begun without slopes.
 _UPRIGHT = 0.5

@@ -170,6 +170,13 @@ def test_what_nobody_sees_is_not_computed(effect, capsys):
     assert not torch.equal(exact.image, frame)
 
 
+def test_a_thickness_of_which_a_part_is_no_number_is_not_computed():
+    effect = UniformFog(visibility_range=(3e302, 3e302), depth=LinearDepth(max_depth=2e-16), tolerance=1.0)
+    frame = torch.rand(2, 3, *SIZE)
+    assert not effect.plan(*SIZE).acts
+    assert effect(frame) is frame
+
+
 def test_thin_fog_before_a_depth_that_is_passed_in_is_computed():
     effect, depth = UniformFog(visibility_range=(1e6, 1e6), tolerance=1.0), torch.full((2, 1, *SIZE), 1e6)
     found = effect.degrade(image(), seed=3, depth=depth).image

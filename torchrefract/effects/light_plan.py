@@ -81,7 +81,8 @@ def thicknesses(most: float) -> np.ndarray:
     """Optical thicknesses up to the largest, close enough to one another to look for the largest of a smooth bound."""
     # Beyond that nothing of any light is left.
     most = min(most, 1e5)
-    return np.geomspace(1e-5 * min(most, 1.0), most, 200) if most > 0 else np.zeros(1)
+    least = 1e-5 * min(most, 1.0)
+    return np.geomspace(least, most, 200) if least > 0 else np.zeros(1)
 
 
 def check_level_reachable(tolerance: float, *, linear: bool, double: bool, scale: float = 1.0) -> float:

@@ -171,9 +171,10 @@ def test_what_nobody_sees_is_not_computed(effect, capsys):
 
 
 def test_a_thickness_of_which_a_part_is_no_number_is_not_computed():
-    effect = UniformFog(visibility_range=(3e302, 3e302), depth=LinearDepth(max_depth=2e-16), tolerance=1.0)
-    frame = torch.rand(2, 3, *SIZE)
-    assert not effect.plan(*SIZE).acts
+    camera = Camera(width=4, height=3, fx=9.0, fy=9.0, cx=2.0, cy=1.0, coefficients=(0.0,) * 4)
+    thin = {"visibility_range": (3.3e302, 3.3e302), "depth": LinearDepth(max_depth=1e-17)}
+    effect, frame = UniformFog(**thin, camera=camera, tolerance=0.5), torch.rand(2, 3, 3, 4)
+    assert not effect.plan(3, 4).acts
     assert effect(frame) is frame
 
 

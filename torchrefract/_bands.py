@@ -1,6 +1,6 @@
-"""Work in bands that stay in a core's cache."""
+"""Work in bands that stay in a core's cache, or sample by sample."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import chain
 
 import torch
@@ -30,3 +30,11 @@ def join(bands: Iterable[Tensor], *, dim: int, length: int) -> Tensor:
         whole.narrow(dim, start, band.shape[dim]).copy_(band)
         start += band.shape[dim]
     return whole
+
+
+def by_samples(values: Tensor, work: Callable[[Tensor], Tensor]) -> Tensor:
+    """(B, ...): what products of matrices make of values (B, ...), to the same bits in any batch on the CPU."""
+    if len(values) <= 1 or values.device.type != "cpu" or torch.compiler.is_compiling():
+        return work(values)
+    # How products of small matrices round depends on how many there are, and on where in memory they begin.
+    return torch.cat([work(own.clone()) for own in values.split(1)])

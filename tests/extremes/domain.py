@@ -183,7 +183,18 @@ def cases(draw: Any, name: str, *, fixed: dict[str, Any] | None = None, **image:
     frames, given = draw(images(**image)), draw(options(name))
     if "airlight" in DOMAINS[name].others:
         given["camera"] = draw(cameras(*frames.shape[2:]))
-    if name == "flare" and given.get("tolerance"):
-        # Of light above 1 028, half a level is below the rounding of float32, and refused.
-        given |= {"strength_range": draw(ranges(0.0, 100.0)), "color": draw(_colors(10.0))}
-    return DOMAINS[name].kind(**(given | (fixed or {}))), frames
+    given |= fixed or {}
+    if name == "flare" and not _reaches(tr.LensFlare(**given), frames):
+        given["tolerance"] = None
+    return DOMAINS[name].kind(**given), frames
+
+
+def _reaches(flare: tr.LensFlare, frames: Tensor) -> bool:
+    """Whether the rounding of float32 leaves room for its tolerance; where not, that is refused."""
+    try:
+        flare.planned(*frames.shape[2:], torch.float32)
+    except ValueError as refused:  # by a promise of its own; anything else is an error here, too
+        if "tolerance must be at least" not in str(refused):
+            raise
+        return False
+    return True

@@ -15,9 +15,9 @@ from torchrefract.fields.covariance import COVARIANCES
 MAPS = ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission", "extinction", "intensity")
 FLOATS = (torch.float32, torch.float64)
 small = pytest.mark.usefixtures("small_tori")
-# Whoever asks for folds is told of them; here they are asked for.
-# Strong draws warn that they fold; `valid` leaves the folds out, and other tests hold the warning.
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::UserWarning"
+)  # of folds and tori cut short, asked for; others hold them
 
 
 @pytest.fixture(params=DOMAINS)
@@ -33,6 +33,15 @@ def test_every_public_effect_has_a_domain():
 
 def maps(degraded: tr.Degraded) -> dict[str, Tensor]:
     return {name: getattr(degraded, name) for name in MAPS if getattr(degraded, name) is not None}
+
+
+def each_alone(effect: Effect, image: Tensor, keys: list[int]) -> dict[str, Tensor]:
+    """The maps of a batch, which are those of each sample alone, bit for bit."""
+    together = maps(effect.degrade(image, seed=7, keys=keys))
+    for i, key in enumerate(keys):
+        for field, value in maps(effect.degrade(image[i : i + 1], seed=7, keys=[key])).items():
+            assert torch.equal(value, together[field][i : i + 1]), field
+    return together
 
 
 def unbounded(effect: Effect) -> bool:
@@ -91,11 +100,7 @@ def test_what_is_off_is_the_image_bit_for_bit(name, data):
 def test_a_batch_is_each_sample_alone(name, data):
     effect, image = data.draw(cases(name, batch=3))
     keys = data.draw(st.lists(st.integers(-(2**63), 2**63 - 1), min_size=len(image), max_size=len(image)))
-    together = maps(effect.degrade(image, seed=7, keys=keys))
-    for i, key in enumerate(keys):
-        alone = maps(effect.degrade(image[i : i + 1], seed=7, keys=[key]))
-        for field, value in alone.items():
-            assert torch.equal(value, together[field][i : i + 1]), field
+    each_alone(effect, image, keys)
 
 
 @pytest.mark.parametrize("covariance", COVARIANCES)
@@ -107,11 +112,8 @@ def test_the_longest_correlations_take_the_largest_torus(kind, covariance, full_
     assert torus._MOST_POINTS / 2 < rows * columns <= torus._MOST_POINTS
     effect = kind(length_range=(1e6, 1e6), covariance=covariance, tolerance_px=None)
     image = torch.rand(2, 3, 24, 31, generator=torch.Generator().manual_seed(0))
-    together = maps(effect.degrade(image, seed=7, keys=[1, 2]))
-    for i, key in enumerate([1, 2]):
-        for field, value in maps(effect.degrade(image[i : i + 1], seed=7, keys=[key])).items():
-            assert value.isfinite().all(), field
-            assert torch.equal(value, together[field][i : i + 1]), field
+    together = each_alone(effect, image, [1, 2])
+    assert all(value.isfinite().all() for value in together.values())
     assert together["flow"].any()
     assert (together["image"] >= 0).all()
     assert (together["image"] <= 1 + 1e-6).all()

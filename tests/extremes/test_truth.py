@@ -12,9 +12,10 @@ import torchrefract as tr
 
 FLOATS = (torch.float32, torch.float64)
 BOUND_PX = 0.05  # that of invert_flow
-# Whoever asks for folds is told of them; here they are asked for.
-# Strong draws warn that they fold; `valid` leaves the folds out, and other tests hold the warning.
-pytestmark = [pytest.mark.filterwarnings("ignore::UserWarning"), pytest.mark.usefixtures("small_tori")]
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::UserWarning"),  # of folds and tori cut short, asked for here; others hold them
+    pytest.mark.usefixtures("small_tori"),
+]
 
 
 def doubles(value: Tensor) -> np.ndarray:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import white_noise
+from torchrefract._bands import by_samples
 from torchrefract._constants import constant
 from torchrefract.fields.evolution import turned
 from torchrefract.fields.gaussian import axis_spectrum
@@ -83,11 +84,8 @@ def mode_field(
         along = torch.bmm(pairs.flatten(0, 1), in_x.expand(2 * pairs.shape[0], -1, -1))
         return in_y @ along.unflatten(0, (-1, 2)).flatten(1, 2).unsqueeze(1)
 
-    if both.device.type != "cpu" or torch.compiler.is_compiling():
-        return fields(both)
-    # Two products of one sample at a time: other numbers of them may round by the batch, one by the threads, and all by
-    # where in memory they begin.
-    return torch.cat([fields(pair.clone()) for pair in both.split(1)])
+    # Two products to a sample: one by itself may round by the threads.
+    return by_samples(both, fields)
 
 
 def _waves(k: Tensor, places: Sequence[int], size: int, **options: Any) -> tuple[Tensor, Tensor]:

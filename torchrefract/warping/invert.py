@@ -63,25 +63,26 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
     flow = flow if whole else torch.where(known, flow, 0)
     with torch.no_grad():
         slopes = _gradient(flow)
-        solution = inverse = _solved(flow, slopes, steps)
-        read = _read(torch.cat([flow, _determinant(slopes)], dim=1), solution)
+        determinant = _determinant(slopes)
+        solution = inverse = _solved(flow, slopes, determinant, steps)
+        read = _read(torch.cat([flow, determinant], dim=1), solution)
         residual = length(solution + read[:, :2])
         solved = (residual <= tolerance_px) & (read[:, 2:] > 0) & inside(solution)
         # Nothing is known where a hole in the flow would have been read.
         valid = solved if whole else solved & known & (_read(known.to(flow.dtype), solution) > 0.999)
     if flow.requires_grad and torch.is_grad_enabled():
         moved = _read(flow, solution)
-        unmoved = _inverted(_cell_gradient(flow.detach(), solution))
-        inverse = solution - _times(unmoved, moved - moved.detach())
+        slopes = _cell_gradient(flow.detach(), solution)
+        inverse = solution - _times(_inverted(slopes, _determinant(slopes)), moved - moved.detach())
     return inverse, valid, residual
 
 
-def _solved(flow: Tensor, slopes: Tensor, steps: int) -> Tensor:
+def _solved(flow: Tensor, slopes: Tensor, determinant: Tensor, steps: int) -> Tensor:
     """The inverse (B, 2, H, W), after some steps; a sample that is done stays as it is, and depends on no other."""
     near, pixels = _NEAR[flow.dtype] ** 2, math.prod(flow.shape[2:])
     # The first step, from no flow at all, has nothing to read.
-    upright = _determinant(slopes) >= _UPRIGHT
-    matrix = _where(upright, _inverted(slopes), _identity(flow))
+    upright = determinant >= _UPRIGHT
+    matrix = _where(upright, _inverted(slopes, determinant), _identity(flow))
     inverse = -_step(matrix, flow)
     going, many, before = upright.new_ones(upright.shape[0], 1, 1, 1), pixels, _square(inverse)
     for _ in range(steps):
@@ -91,7 +92,8 @@ def _solved(flow: Tensor, slopes: Tensor, steps: int) -> Tensor:
         far = size > near
         slow = going & (_count(far & (size > _SLOW**2 * before)) * _FEW_SLOW > pixels)
         if is_true(slow.any) is not False:
-            matrix = _where(slow, _inverted(_read(slopes, inverse)), matrix)
+            there = _read(slopes, inverse)
+            matrix = _where(slow, _inverted(there, _determinant(there)), matrix)
             step = _step(matrix, error)
             size = _square(step)
             far = size > near
@@ -150,9 +152,8 @@ def _determinant(slopes: Tensor) -> Tensor:
     return (1 + u_x) * (1 + v_y) - u_y * v_x
 
 
-def _inverted(slopes: Tensor) -> Tensor:
-    """(B, 4, H, W): the matrix (I + slopes)^-1, column by column."""
-    determinant = _determinant(slopes)
+def _inverted(slopes: Tensor, determinant: Tensor) -> Tensor:
+    """(B, 4, H, W): the matrix (I + slopes)^-1, column by column, from that and its determinant."""
     # Near a fold the step has no good length; a bounded determinant keeps it finite, the residual tells the rest.
     determinant = determinant.abs().clamp(min=0.1).copysign(determinant)
     u_x, v_x, u_y, v_y = slopes.split(1, dim=1)

@@ -1,6 +1,5 @@
 """Smooth flows on a coarse lattice, and what lies between its nodes."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -9,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchrefract._bands import by_samples
 from torchrefract._constants import constant
 from torchrefract.warping.grid import finite, pixel_axes, sampler_positions
 
@@ -61,13 +61,13 @@ def between_nodes(nodes: Tensor, lattice: Lattice) -> Tensor:
     Source: the remainder of Lagrange's interpolation; de Boor, "A practical guide to splines" (1978), chapter 2.
     """
     weight = lagrange_weights(lattice.stride, 4, dtype=nodes.dtype, device=nodes.device)
-    return _by_samples(nodes, lambda own: _down(_across(own, weight, lattice.width), weight, lattice.height))
+    return by_samples(nodes, lambda own: _down(_across(own, weight, lattice.width), weight, lattice.height))
 
 
 def along_rows(nodes: Tensor, lattice: Lattice) -> Tensor:
     """(B, C, n, W), the field of `between_nodes` in the rows of nodes, at every column of pixels."""
     weight = lagrange_weights(lattice.stride, 4, dtype=nodes.dtype, device=nodes.device)
-    return _by_samples(nodes, lambda own: _across(own, weight, lattice.width))
+    return by_samples(nodes, lambda own: _across(own, weight, lattice.width))
 
 
 def row_weights(like: Tensor, lattice: Lattice) -> Tensor:
@@ -169,7 +169,7 @@ class StreamFlow(SmoothFlow):
             lines = torch.cat([scale[0] * along, -scale[1] * across], dim=1)
             return _down(lines, torch.stack([slope, weight]), self.lattice.height)
 
-        return _by_samples(nodes, flow)
+        return by_samples(nodes, flow)
 
 
 def dense(flow: Tensor | SmoothFlow) -> Tensor:
@@ -188,15 +188,6 @@ def _computed_lagrange(stride: int, count: int) -> list[list[float]]:
     t = torch.arange(stride, dtype=torch.float64)[:, None] / stride
     others = torch.stack([nodes[nodes != node] for node in nodes])
     return ((t[..., None] - others) / (nodes[:, None] - others)).prod(dim=2).tolist()
-
-
-def _by_samples(nodes: Tensor, read: Callable[[Tensor], Tensor]) -> Tensor:
-    """What is read from nodes (B, C, n, m), (B, ...), by products of matrices."""
-    if len(nodes) <= 1 or nodes.device.type != "cpu" or torch.compiler.is_compiling():
-        return read(nodes)
-    # How products of small matrices round depends on how many there are, and on where in memory they begin: a sample
-    # must not depend on the others.
-    return torch.cat([read(own.clone()) for own in nodes.split(1)])
 
 
 def _across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:

@@ -15,9 +15,7 @@ from torchrefract.fields.covariance import COVARIANCES
 MAPS = ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission", "extinction", "intensity")
 FLOATS = (torch.float32, torch.float64)
 small = pytest.mark.usefixtures("small_tori")
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::UserWarning"
-)  # of folds and tori cut short, asked for; others hold them
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # of folds and short tori, which others hold
 
 
 @pytest.fixture(params=DOMAINS)

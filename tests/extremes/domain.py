@@ -192,7 +192,7 @@ def cases(draw: Any, name: str, *, fixed: dict[str, Any] | None = None, **image:
 def _reaches(flare: tr.LensFlare, frames: Tensor) -> bool:
     """Whether the rounding of float32 leaves room for its tolerance; where not, that is refused."""
     try:
-        flare.planned(*frames.shape[2:], torch.float32)
+        flare.planned(frames.shape[2], frames.shape[3], torch.float32)
     except ValueError as refused:  # by a promise of its own; anything else is an error here, too
         if "tolerance must be at least" not in str(refused):
             raise

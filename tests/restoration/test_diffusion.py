@@ -94,7 +94,9 @@ def expected_loss(model: Diffusion, pair: Pair, *, size: tuple[int, int]) -> flo
     unit = 0.1 * np.array([size[1], size[0]]).reshape(1, 2, 1, 1)
     flow = pair.flow.double().numpy()
     lens = model.task.name == "undistort"
-    target = np.clip(flow / unit, -1, 1) if lens else 2 * pair.clean.double().numpy() - 1
+    share = np.clip(flow / unit, -1, 1)
+    companded = np.sign(share) * np.log(1 + 100 * np.abs(share)) / np.log(101)
+    target = companded if lens else 2 * pair.clean.double().numpy() - 1
     noise = (noisy - np.sqrt(kept) * target) / np.sqrt(1 - kept)
     predicted = 0.7 * noisy + 0.1 * condition[:, : noisy.shape[1]]
     # The velocity is the derivative by the angle of (signal, spread) = (cos, sin); the inverse of that rotation.
@@ -104,7 +106,8 @@ def expected_loss(model: Diffusion, pair: Pair, *, size: tuple[int, int]) -> flo
             [np.stack([np.sqrt(kept), -np.sqrt(1 - kept)]), np.stack([np.sqrt(1 - kept), np.sqrt(kept)])]
         )
         origin, found = (row[0] * noisy + row[1] * predicted for row in rotation)
-    restored = numpy_warp(pair.degraded, origin * unit) if lens else (origin + 1) / 2
+    expanded = np.sign(origin) * (101 ** np.clip(np.abs(origin), 0, 1) - 1) / 100
+    restored = numpy_warp(pair.degraded, expanded * unit) if lens else (origin + 1) / 2
     losses = []
     for i, valid in enumerate(pair.valid[:, 0].numpy()):
         first = np.abs(found[i] - noise[i])[:, valid].mean()

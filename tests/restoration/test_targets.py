@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -16,17 +18,31 @@ def made(flow: Tensor) -> Pair:
     return Pair(degraded, clean, flow, torch.ones_like(flow[:, :1], dtype=torch.bool), torch.zeros(1).long())
 
 
+def companded(share: float) -> float:
+    """The mu-law of 100, of a share of the limit."""
+    return math.copysign(math.log(1 + 100 * abs(share)) / math.log(101), share)
+
+
 def test_a_flow_of_the_largest_displacement_is_one_and_longer_ones_are_cut_off():
     flow = torch.zeros(1, 2, *SIZE)
     flow[0, :, 0, :4] = torch.tensor([[2.5, -1.25, 40, torch.nan], [1.5, 0.75, -40, torch.inf]])
     target = FlowTarget(0.25).encode(made(flow), SIZE)  # 0.25 x 10 px and 0.25 x 6 px
-    assert_close(target[0, :, 0, :4], torch.tensor([[1, -0.5, 1, 0], [1, 0.5, -1, 1]]))
+    half = companded(0.5)
+    assert_close(target[0, :, 0, :4], torch.tensor([[1, -half, 1, 0], [1, half, -1, 1]]))
     assert not target[0, :, 1:].any()
 
 
 def test_a_flow_of_a_crop_is_in_units_of_the_whole_frame():
     flow = torch.full((1, 2, 3, 5), 1.5)
-    assert_close(FlowTarget(0.5).encode(made(flow), (6, 10))[0, :, 0, 0], torch.tensor([0.3, 0.5]))
+    expected = torch.tensor([companded(0.3), companded(0.5)])
+    assert_close(FlowTarget(0.5).encode(made(flow), (6, 10))[0, :, 0, 0], expected)
+
+
+def test_what_a_denoiser_finds_beyond_the_limit_is_the_longest_flow_and_no_longer_one():
+    found = torch.tensor([1.5, -30.0]).view(1, 2, 1, 1).expand(-1, -1, *SIZE)
+    flow = FlowTarget(0.25).decode(found, torch.rand(1, 3, *SIZE), SIZE).flow
+    assert flow is not None
+    assert_close(flow[0, :, 0, 0], torch.tensor([2.5, -1.5]))
 
 
 def test_an_encoded_flow_decodes_to_the_image_looked_up_along_it():

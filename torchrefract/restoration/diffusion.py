@@ -39,8 +39,8 @@ class Diffusion(Learner):
         loss = 0.8 |found noise - noise|_1 + a |restored(found target) - clean|^2
 
     on the valid pixels, at one of 1000 levels of noise for each sample, a falling by variances that grow linearly from
-    0.0001 to 0.02. The target is the flow that undoes a warp, in units of the largest one that the task allows, or the
-    clean image from -1 to 1. What the network predicts gives both that are found:
+    0.0001 to 0.02. The target is the flow that undoes a warp, companded as by `FlowTarget`, or the clean image from -1
+    to 1. What the network predicts gives both that are found:
 
         epsilon:       found noise = predicted,  found target = (noisy - sqrt(1 - a) predicted) / sqrt(a)
         v_prediction:  found noise = sqrt(1 - a) noisy + sqrt(a) predicted,

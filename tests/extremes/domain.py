@@ -3,6 +3,7 @@
 import math
 from typing import Any, NamedTuple
 
+import pytest
 import torch
 from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
@@ -14,6 +15,12 @@ from torchrefract.fields.covariance import COVARIANCES
 from torchrefract.types import Range
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS
 
+WARNED = pytest.mark.filterwarnings(
+    "ignore:.*folds back inside the frame:UserWarning",  # of a rectification; test_rectification.py holds it
+    "ignore:.*pixels beyond have no preimage:UserWarning",  # of a lens that folds; test_folding.py holds it
+    "ignore:amplitude is above what the covariance bears:UserWarning",  # of air that folds; test_turbulence.py holds it
+    "ignore:length must be short enough for a torus:UserWarning",  # of a torus cut short; test_turbulence.py holds it
+)
 DTYPES = (torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _FIELD = {"wind_x_range": (-1e6, 1e6), "wind_y_range": (-1e6, 1e6), "decorrelation_range": (1e-3, math.inf)}
 _FOG = {"visibility_range": (1e-6, math.inf), "deviation_range": (-0.999, 0.999)}

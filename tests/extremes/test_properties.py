@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from domain import DOMAINS, cases
+from domain import DOMAINS, WARNED, cases
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
@@ -15,7 +15,7 @@ from torchrefract.fields.covariance import COVARIANCES
 MAPS = ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission", "extinction", "intensity")
 FLOATS = (torch.float32, torch.float64)
 small = pytest.mark.usefixtures("small_tori")
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # of folds and short tori, which others hold
+pytestmark = WARNED
 
 
 @pytest.fixture(params=DOMAINS)

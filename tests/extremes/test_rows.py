@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 import pytest
 import torch
 from contract import ROWS
-from domain import DTYPES
+from domain import DTYPES, WARNED
 from promises import KINDS, LEARNED, MASKED, NOTHING, REFUSED, TOLD
 from torch import Tensor
 from torch.testing import assert_close
@@ -105,7 +105,7 @@ def test_nothing_to_do_leaves_every_bit(make, name, device, product):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("size", SIZES[1:])
 @pytest.mark.parametrize(("make", "name"), cases(MASKED))
-@pytest.mark.filterwarnings("ignore::UserWarning")  # of folds, which another row is about
+@WARNED
 def test_what_leaves_its_domain_is_finite_and_masked(make, name, size, device, product):
     for way, dtype in product(ways(make), DTYPES):
         effect, image = make(**way), picture(2, 3, *size, dtype=dtype, device=device)
@@ -123,7 +123,7 @@ def test_what_leaves_its_domain_is_finite_and_masked(make, name, size, device, p
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("make", "name"), cases(LEARNED))
-@pytest.mark.filterwarnings("ignore::UserWarning")  # of folds, which another row is about
+@WARNED
 def test_gradients_are_finite_where_nothing_is_known(make, name, dtype, device):
     for size in SIZES[1:]:
         effect, image = make(), picture(2, 3, *size, dtype=dtype, device=device)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from domain import cases
+from domain import WARNED, cases
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
@@ -12,10 +12,7 @@ import torchrefract as tr
 
 FLOATS = (torch.float32, torch.float64)
 BOUND_PX = 0.05  # that of invert_flow
-pytestmark = [
-    pytest.mark.filterwarnings("ignore::UserWarning"),  # of folds and tori cut short, asked for here; others hold them
-    pytest.mark.usefixtures("small_tori"),
-]
+pytestmark = [WARNED, pytest.mark.usefixtures("small_tori")]
 
 
 def doubles(value: Tensor) -> np.ndarray:

@@ -1,12 +1,15 @@
 import math
+from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import grid_sample
 from torch.testing import assert_close
 
 from torchrefract import Pair
+from torchrefract.restoration.checkpoints import CheckpointError, check_fits
+from torchrefract.restoration.diffusion import Diffusion
 from torchrefract.restoration.targets import FlowTarget, ImageTarget, target_of
 from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
 
@@ -55,6 +58,22 @@ def test_an_encoded_flow_decodes_to_the_image_looked_up_along_it():
     y = torch.arange(SIZE[0])[:, None] + flow[:, 1]
     grid = torch.stack([(2 * x + 1) / SIZE[1] - 1, (2 * y + 1) / SIZE[0] - 1], dim=-1)
     assert_close(found.image, grid_sample(pair.degraded, grid, padding_mode="border", align_corners=False))
+
+
+def test_weights_of_flows_as_they_are_do_not_fit_and_those_of_another_law_bring_it():
+    model = Diffusion(lambda _: nn.Identity(), Undistort(0.25))
+    state = model.state_dict()
+    with pytest.raises(CheckpointError, match=r"got old\.ckpt, where target\.mu differs"):
+        check_fits(
+            {"state_dict": {name: value for name, value in state.items() if name != "target.mu"}},
+            model,
+            Path("old.ckpt"),
+        )
+    model.load_state_dict(state | {"target.mu": torch.tensor(255.0)})
+    assert isinstance(model.target, FlowTarget)
+    encoded = model.target.encode(made(torch.full((1, 2, *SIZE), 0.5)), SIZE)[0, :, 0, 0]
+    expected = [math.log1p(255 * 0.5 / (0.25 * side)) / math.log1p(255) for side in reversed(SIZE)]
+    assert_close(encoded, torch.tensor(expected))
 
 
 def test_an_image_goes_from_minus_one_to_one_and_back():

@@ -1,11 +1,10 @@
 """What a diffusion model makes out of noise: the restoration of each task, in numbers of about [-1, 1]."""
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrefract._constants import constant
 from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
@@ -15,8 +14,8 @@ from torchrefract.warping.resample import warp
 _MU = 100.0
 
 
-class Target(ABC):
-    """A restoration as `channels` maps."""
+class Target(nn.Module, ABC):
+    """A restoration as `channels` maps. What decodes them is in its state, so that weights for another do not fit."""
 
     channels: int
 
@@ -41,20 +40,23 @@ class FlowTarget(Target):
     """
 
     channels = 2
+    mu: Tensor
 
     def __init__(self, limit: float):
+        super().__init__()
         self.limit = limit
+        self.register_buffer("mu", torch.tensor(_MU))
 
     def encode(self, pair: Pair, size: Sequence[int]) -> Tensor:
         """The flow, what is beyond the limit cut off."""
         # What no look-up can give back may be anything, and the network sees it beside what counts.
         share = (pair.flow / self._unit(pair.flow, size)).nan_to_num(0.0).clamp(-1, 1)
-        return torch.log1p(_MU * share.abs()).copysign(share) / math.log1p(_MU)
+        return torch.log1p(self.mu * share.abs()).copysign(share) / self.mu.log1p()
 
     def decode(self, target: Tensor, degraded: Tensor, size: Sequence[int]) -> Restored:
         """The image looked up along the flow."""
         target = target.clamp(-1, 1)  # the law grows a hundredfold from one to two
-        share = torch.expm1(math.log1p(_MU) * target.abs()).copysign(target) / _MU
+        share = torch.expm1(self.mu.log1p() * target.abs()).copysign(target) / self.mu
         flow = share * self._unit(target, size)
         return Restored(warp(degraded, flow, padding="border")[0], flow)
 

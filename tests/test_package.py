@@ -7,9 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 
 import torchrefract
 from torchrefract._config import CONFIG_DIR
+from torchrefract._constants import assume_constant_result
 
 ROOT = Path(__file__).parents[1]
 HEAVY = (
@@ -26,15 +28,31 @@ HEAVY = (
     "scipy",
     "segmentation_models_pytorch",
     "timm",
+    "torch._dynamo",
     "torchvision",
     "yaml",
 )
-IMPORT = "import sys, torchrefract; print([name for name in {names} if name in sys.modules])"
+LEARNING = ("diffusers", "pytorch_lightning", "segmentation_models_pytorch", "timm", "torch._dynamo", "torchvision")
+WITHOUT_MODELS = ("calibrate", "generate", "make_board", "preview", "rectify")
+IMPORT = "import sys, {module}; print([name for name in {names} if name in sys.modules])"
 
 
 def test_the_layer_needs_no_training_stack(spawn, tmp_path):
-    found = spawn("-W", "error", "-c", IMPORT.format(names=HEAVY), cwd=tmp_path)
+    found = spawn("-W", "error", "-c", IMPORT.format(module="torchrefract", names=HEAVY), cwd=tmp_path)
     assert (found.out.strip(), found.err) == ("[]", "")
+
+
+def test_commands_without_a_model_do_not_wait_for_the_training_stack(spawn, tmp_path):
+    modules = ", ".join(
+        f"torchrefract.{name}" for name in ("calibrate", "generate", "make_board", "preview", "rectify")
+    )
+    found = spawn("-c", IMPORT.format(module=modules, names=LEARNING), cwd=tmp_path)
+    assert (found.code, found.out.strip()) == (0, "[]"), found.err
+
+
+def test_compilers_see_the_same_in_a_constant_as_in_one_of_torch():
+    ours, theirs = assume_constant_result(lambda: 1), torch.compiler.assume_constant_result(lambda: 1)
+    assert vars(ours) == vars(theirs) != {}
 
 
 def test_all_is_what_the_package_imports_by_name():

@@ -11,28 +11,20 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, TypeVar, cast
 
-from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, InstantiationException, MissingConfigException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
-from pytorch_lightning import LightningModule, Trainer, seed_everything
-from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from rich.console import Console
 from rich.progress import track
 from yaml import YAMLError
 
 from torchrefract._config import CONFIG_DIR
-from torchrefract._files import replacing
-from torchrefract.data.fingerprint import fingerprint
+from torchrefract._errors import UsageError
 from torchrefract.data.images import UnreadableImageError
-from torchrefract.data.module import PairData
-from torchrefract.restoration.checkpoints import CheckpointError, Origin, check_fits, read_checkpoint
-from torchrefract.restoration.finite import NotFiniteError
-from torchrefract.restoration.models.pretrained import weights_license
 
 _T = TypeVar("_T")
 _INFORMING = ("--help", "-h", "--hydra-help", "--info", "--shell-completion", "-sc")
@@ -53,18 +45,6 @@ _HINTS = (
 # The options of Hydra whose value is the next word.
 _TAKING = ("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--cfg", "-c", "--package", "-p")
 _TAKING += ("--info", "-i", "--experimental-rerun")
-
-
-class Job(NamedTuple):
-    """What a command works with."""
-
-    data: PairData
-    model: LightningModule
-    trainer: Trainer
-
-
-class UsageError(Exception):
-    """Something that the user can mend; the message says how."""
 
 
 def with_task(name: str, words: list[str]) -> list[str]:
@@ -137,53 +117,11 @@ def job(function: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
     return run
 
 
-def make_job(cfg: DictConfig, *, needs_checkpoint: bool = False) -> Job:
-    """Data, model and trainer of a configuration, the checkpoint checked, the resolved configuration written."""
-    OmegaConf.resolve(cfg)
-    seed_everything(check_seed(cfg.seed), workers=True, verbose=False)
-    if needs_checkpoint and cfg.ckpt_path is None:
-        raise UsageError("ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none")
-    path = Path(cfg.ckpt_path or "")
-    checkpoint = None
-    if cfg.ckpt_path is not None:
-        checkpoint = read_checkpoint(path, task=str(HydraConfig.get().runtime.choices["task"]))
-    made = Job(make(cfg, "data"), make(cfg, "model"), make(cfg, "trainer"))
-    with naming("data"):
-        made.data.check_ranks(made.trainer.world_size)
-    if checkpoint is not None:
-        check_fits(checkpoint, made.model, path, config=cfg.model)
-        if not needs_checkpoint:
-            _check_unfinished(checkpoint["epoch"] + 1, made.trainer.max_epochs)
-    if not needs_checkpoint:
-        _add_origin(cfg, made)
-    if made.trainer.is_global_zero:
-        with replacing(Path(cfg.run_dir, "config.yaml")) as path:
-            OmegaConf.save(cfg, path)
-    return made
-
-
-def _add_origin(cfg: DictConfig, made: Job) -> None:
-    """Checkpoints of the run will say where they come from."""
-    data = fingerprint(made.data.train)
-    config = cast(dict[str, Any], OmegaConf.to_container(cfg, enum_to_str=True))
-    network = cfg.model.network
-    weights = weights_license(network.encoder) if "encoder" in network and network.get("pretrained") else None
-    origin = Origin(config, data=data, licenses={"data": data["license"], "pretrained weights": weights})
-    made.trainer.callbacks.insert(0, origin)  # pyright: ignore[reportAttributeAccessIssue]  # a connector sets it
-
-
 def check_seed(seed: Any) -> int:
     """`seed` if a command can take it."""
     if not isinstance(seed, int) or not 0 <= seed < _SEEDS:
         raise UsageError(f"seed must be a whole number from 0 to {_SEEDS - 1}, got {seed}")
     return seed
-
-
-def _check_unfinished(done: int, epochs: int | None) -> None:
-    if epochs is not None and -1 < epochs <= done:
-        raise UsageError(
-            f"trainer.max_epochs must be above the {done} epochs that ckpt_path has behind it, got {epochs}"
-        )
 
 
 def tasks() -> list[str]:
@@ -205,7 +143,7 @@ def naming(part: str) -> Iterator[None]:
     """Errors of values inside the block are the user's, in the part of the configuration that is named."""
     try:
         yield
-    except (ValueError, TypeError, OSError, MisconfigurationException) as error:
+    except (ValueError, TypeError, OSError) as error:
         raise UsageError(f"{part}: {error}") from error
 
 
@@ -240,8 +178,7 @@ def _mendable(error: Exception, name: str) -> str | None:
         return f"{error.full_key} must be given, as in {error.full_key}=…, got nothing"
     if isinstance(error, UnreadableImageError):
         return str(error).strip().splitlines()[-1].split("Error: ", 1)[-1]  # a worker prepends its traceback
-    told = UsageError | CheckpointError | NotFiniteError | HydraException | OmegaConfBaseException | YAMLError
-    if isinstance(error, told):
+    if isinstance(error, UsageError | HydraException | OmegaConfBaseException | YAMLError):
         unknown = _UNKNOWN.match(str(error)) if name else None
         return _no_option(name, unknown[1]) if unknown else " ".join(str(error).split())
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from torchrefract._command import UsageError
+from torchrefract._errors import UsageError
 from torchrefract._files import replacing
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.detection import View, detect, is_enough

@@ -9,8 +9,9 @@ import hydra
 from omegaconf import DictConfig
 
 from torchrefract._checks import check_choice, check_number
-from torchrefract._command import UsageError, as_they_are, command, job, make, naming, progress
+from torchrefract._command import as_they_are, command, job, make, naming, progress
 from torchrefract._config import CONFIG_DIR
+from torchrefract._errors import UsageError
 from torchrefract._files import replacing
 from torchrefract.board_views import Look, look_at, main_size, pictures_of, shown_instead
 from torchrefract.calibration_report import CAMERA_FILE, Calibration, camera_of, set_aside, write_looks, write_report

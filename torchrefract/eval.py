@@ -3,8 +3,9 @@
 import hydra
 from omegaconf import DictConfig
 
-from torchrefract._command import command, job, make_job
+from torchrefract._command import command, job
 from torchrefract._config import CONFIG_DIR
+from torchrefract._learning import make_job
 
 
 @command("eval")

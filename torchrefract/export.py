@@ -9,8 +9,9 @@ import torch
 from omegaconf import DictConfig
 
 from torchrefract._checks import check_choice
-from torchrefract._command import UsageError, as_they_are, command, job, naming
+from torchrefract._command import as_they_are, command, job, naming
 from torchrefract._config import CONFIG_DIR
+from torchrefract._errors import UsageError
 from torchrefract._files import replacing
 from torchrefract.programs import FORMATS, outputs_of, save_program, traced
 from torchrefract.restoration.loading import Loaded, load_model

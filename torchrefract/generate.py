@@ -16,8 +16,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from torchrefract._checks import check_choice, check_count, check_flag, check_number
-from torchrefract._command import UsageError, check_seed, command, job, make, naming, with_text
+from torchrefract._command import check_seed, command, job, make, naming, with_text
 from torchrefract._config import CONFIG_DIR
+from torchrefract._errors import UsageError
 from torchrefract._files import replacing
 from torchrefract.data.images import check_size
 from torchrefract.data.pair_files import FORMATS

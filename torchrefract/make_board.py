@@ -6,8 +6,9 @@ import hydra
 from omegaconf import DictConfig
 
 from torchrefract._checks import check_number
-from torchrefract._command import UsageError, as_they_are, command, job, make, naming
+from torchrefract._command import as_they_are, command, job, make, naming
 from torchrefract._config import CONFIG_DIR
+from torchrefract._errors import UsageError
 from torchrefract._files import replacing
 from torchrefract.board_prints import board_page
 

@@ -16,8 +16,9 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from torchrefract._checks import check_count, check_number, check_positive
-from torchrefract._command import UsageError, check_seed, command, job, make, naming, with_picture
+from torchrefract._command import check_seed, command, job, make, naming, with_picture
 from torchrefract._config import CONFIG_DIR
+from torchrefract._errors import UsageError
 from torchrefract._files import replacing
 from torchrefract.data.images import EXTENSIONS, check_size, fit, image_size, read_image
 from torchrefract.data.road_scenes import render_road_scenes

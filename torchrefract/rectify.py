@@ -10,8 +10,9 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from torchrefract._checks import check_number
-from torchrefract._command import UsageError, as_they_are, command, job, naming, progress
+from torchrefract._command import as_they_are, command, job, naming, progress
 from torchrefract._config import CONFIG_DIR
+from torchrefract._errors import UsageError
 from torchrefract._files import replacing
 from torchrefract.cameras.files.opencv import read_opencv, write_opencv
 from torchrefract.cameras.models import Camera

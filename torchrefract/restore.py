@@ -15,8 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchrefract._checks import check_count, check_flag
-from torchrefract._command import UsageError, as_they_are, command, job, naming, progress
+from torchrefract._command import as_they_are, command, job, naming, progress
 from torchrefract._config import CONFIG_DIR
+from torchrefract._errors import UsageError
 from torchrefract._files import replacing
 from torchrefract.data.images import UnreadableImageError, check_size, read_image
 from torchrefract.footage import (

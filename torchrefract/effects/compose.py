@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchrefract import draws
 from torchrefract._checks import check_choice, check_number, is_true
-from torchrefract._constants import constant
+from torchrefract._constants import assume_constant_result, constant
 from torchrefract.effects.base import Effect, moved
 from torchrefract.effects.compose_plan import ComposePlan, compose_plan
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, check_tolerance
@@ -131,7 +131,7 @@ class Compose(Effect):
         ask = Ask(height, width, self.tolerance_px, dtype is torch.float64).of_default
         return compose_plan(list(self._chances(1.0)), self._together(), ask)
 
-    @torch.compiler.assume_constant_result
+    @assume_constant_result
     def _constant(self, _: int, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
         # As for `PlannedLight`.
         return self.planned(height, width, dtype)

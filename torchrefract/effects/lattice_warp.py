@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import is_true, learns
+from torchrefract._constants import assume_constant_result
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, check_tolerance
 from torchrefract.effects.refraction import Moved, WarpEffect
 from torchrefract.effects.rows import only, params_part, put, some, spread
@@ -41,7 +42,7 @@ class LatticeWarp(WarpEffect):
         dtype = next(value.dtype for value in params if value.is_floating_point())
         return self._constant(id(self), height, width, dtype)
 
-    @torch.compiler.assume_constant_result
+    @assume_constant_result
     def _constant(self, _: int, height: int, width: int, dtype: torch.dtype) -> Plan:
         # As for `PlannedLight`.
         return self.planned(height, width, dtype)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import is_true, learns
+from torchrefract._constants import assume_constant_result
 from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.plan import check_tolerance
 from torchrefract.effects.radiance import RadianceEffect
@@ -46,7 +47,7 @@ class PlannedLight(RadianceEffect):
         size = image.shape[2], image.shape[3]
         return self._constant(id(self), *size, field_dtype(image.dtype), any_depth=depth is not None, exact=exact)
 
-    @torch.compiler.assume_constant_result
+    @assume_constant_result
     def _constant(self, _: int, height: int, width: int, dtype: torch.dtype, *, any_depth: bool, exact: bool) -> Any:
         # Compilers take the plan as it is, and need not follow how it was made; that of PyTorch 2.11 from a method
         # alone. What asks for the identity of this effect is not taken for another one's.

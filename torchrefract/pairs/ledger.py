@@ -9,7 +9,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from torchrefract._command import UsageError
+from torchrefract._errors import UsageError
 from torchrefract._files import replacing
 from torchrefract.data.pair_files import DamagedPairError
 from torchrefract.data.pair_manifest import PairRow, Place, lines_of, manifests, read_stored, scan

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._command import UsageError, naming
+from torchrefract._command import naming
+from torchrefract._errors import UsageError
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.pair_files import FLOWS, LIGHTS, PairArrays, beyond, encode_pair
 from torchrefract.data.pair_manifest import PairRow, Stored

@@ -12,7 +12,7 @@ from multiprocessing.context import BaseContext
 import cv2
 import torch
 
-from torchrefract._command import UsageError
+from torchrefract._errors import UsageError
 from torchrefract.data.pair_manifest import PairRow
 from torchrefract.pairs.making import Job, Maker, Recipe
 from torchrefract.pairs.writing import Store

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from torchrefract._command import UsageError
+from torchrefract._errors import UsageError
 from torchrefract.data.frame_folder import path_key, place_frames, val_drives, walk
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, read_image
 from torchrefract.videos import VIDEOS, read_video, video_facts

@@ -13,6 +13,7 @@ from pytorch_lightning import Callback, LightningModule, Trainer
 from pytorch_lightning.plugins.io import TorchCheckpointIO
 from torch import nn
 
+from torchrefract._errors import UsageError
 from torchrefract._files import replacing
 
 # What a damaged archive, or a file that is none, makes the readers raise.
@@ -20,7 +21,7 @@ _DAMAGE = (zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, EOFError, Loo
 _DAMAGE += (struct.error, ValueError, TypeError, AttributeError, ArithmeticError, AssertionError)
 
 
-class CheckpointError(Exception):
+class CheckpointError(UsageError):
     """A checkpoint that cannot be read, does not fit, or cannot be written; the message says what to do."""
 
 

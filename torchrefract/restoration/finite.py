@@ -4,8 +4,10 @@ import math
 
 from torch import Tensor
 
+from torchrefract._errors import UsageError
 
-class NotFiniteError(Exception):
+
+class NotFiniteError(UsageError):
     """A loss that is NaN or infinite; the message says in which step and for which keys."""
 
 

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._bands import by_samples
-from torchrefract._constants import constant
+from torchrefract._constants import assume_constant_result, constant
 from torchrefract.warping.grid import finite, pixel_axes, sampler_positions
 
 # Slopes of cubics are not smooth enough from cell to cell.
@@ -177,7 +177,7 @@ def dense(flow: Tensor | SmoothFlow) -> Tensor:
     return flow.dense() if isinstance(flow, SmoothFlow) else flow
 
 
-@torch.compiler.assume_constant_result
+@assume_constant_result
 def _lagrange(stride: int, count: int) -> list[list[float]]:
     return _computed_lagrange(stride, count)  # of its own: compilers look through a cache, and warn of it
 

@@ -27,7 +27,7 @@ from torchrefract.effects.base import Effect
 from torchrefract.pairs.card import HISTOGRAMS, contents, histograms, write_card
 from torchrefract.pairs.ledger import Ledger, claim
 from torchrefract.pairs.making import Job, Maker, Recipe
-from torchrefract.pairs.running import run
+from torchrefract.pairs.running import make_ready, run
 from torchrefract.pairs.sources import Sources, find_sources
 from torchrefract.pairs.watching import watched
 from torchrefract.pairs.writing import Folders, Store, Tars
@@ -89,6 +89,8 @@ def main(cfg: DictConfig) -> None:
         _tell(asked, there, damaged)
         units = [unit for unit in asked.shard.units(asked.number, store.unit) if not there.issuperset(unit)]
         if units:
+            if asked.workers:
+                make_ready()
             _check_room(asked, [number for unit in units for number in unit], store)
             jobs = ([asked.job(number) for number in unit] for unit in units)
             made = run(jobs, asked.recipe, store, workers=min(asked.workers, len(units)))

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import forkserver
 from multiprocessing.context import BaseContext
 
 import cv2
@@ -27,7 +28,7 @@ def run(units: Iterable[Sequence[Job]], recipe: Recipe, store: Store, *, workers
         units: of `store`.
         recipe: of the pairs.
         store: where they go.
-        workers: processes; 0 makes them in this one.
+        workers: processes, after `make_ready`; 0 makes them in this one.
 
     Raises:
         UsageError: a worker that died.
@@ -57,17 +58,26 @@ def run(units: Iterable[Sequence[Job]], recipe: Recipe, store: Store, *, workers
         pool.shutdown(cancel_futures=True)
 
 
+def make_ready() -> None:
+    """Let what workers import be imported beside what this process does before it has work for them.
+
+    That takes one core: threads that wait for each other would wait for it.
+    """
+    _use_one_thread()
+    if "forkserver" in multiprocessing.get_all_start_methods():
+        # All that the command imports beside itself, since each worker imports the command again.
+        preloaded = [__name__, "torchrefract._command", "torchrefract.pairs.card", "torchrefract.pairs.ledger"]
+        multiprocessing.set_forkserver_preload(preloaded)
+        forkserver.ensure_running()
+
+
 def _context() -> BaseContext:
     """Workers are forked off a process that has imported what they need, and computed nothing yet.
 
     A fork of this process, which has threads, may hang; spawned ones would each import everything anew.
     """
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return multiprocessing.get_context("spawn")
-    context = multiprocessing.get_context("forkserver")
-    # All that the command imports beside itself, since each worker imports the command again.
-    context.set_forkserver_preload([__name__, "torchrefract.pairs.card", "torchrefract.pairs.ledger"])
-    return context
+    there = "forkserver" in multiprocessing.get_all_start_methods()
+    return multiprocessing.get_context("forkserver" if there else "spawn")
 
 
 class _Worker:
@@ -78,12 +88,15 @@ class _Worker:
 
 
 def _start(recipe: Recipe, store: Store) -> None:
-    # One thread each: as many workers as cores leave nothing for more.
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    _use_one_thread()  # as many workers as cores leave nothing for more
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers itself
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _Worker.maker, _Worker.store = Maker(recipe), store
+
+
+def _use_one_thread() -> None:
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
 
 
 def _end_with_parent() -> None:

@@ -7,7 +7,7 @@ python benchmarks/table1.py --source FRAMES [--form small|gpu|paper] [--rows res
 Rows whose training is in `--out` are loaded, what was stopped goes on, the others are trained. `--frames` of the drives
 held out are scored, 0 for all; of a diffusion model `--sampled`, with each number of steps. The best constant flow
 knows which effect it undoes; the mix is the mean of its effects, told once more for the frames whose names begin with
-each of `--apart`, and for those of none.
+each of `--apart`, and for those of none. A diffusion model is compared with doing nothing to the same frames.
 """
 
 import argparse
@@ -45,6 +45,7 @@ PAPER = {
 _FORMS = {"small": "_small", "gpu": "_gpu", "paper": ""}  # of the experiments, by the ends of their names
 _BATCH = 8
 _ALL = "all"
+_NOTHING = "do nothing"
 _NONE = Scores(*[math.nan] * 6)
 
 
@@ -104,13 +105,18 @@ def scored(task: str, models: dict[str, Loaded], args: argparse.Namespace) -> It
         effects = effects_of(task, size[1])
         pairs = {name: corrupted(frames, effect) for name, (effect, _) in effects.items()}
         groups = _groups(held_out, args.apart)
-        found = dict[str, dict[str, Tensor]]()
+        found, keys = dict[str, dict[str, Tensor]](), _keys(frames)
         for name, (effect, _) in effects.items():
             for rival, scores in references(task, effect, frames, pairs[name]).items():
                 found.setdefault(rival, {})[name] = scores
         for rival, each in found.items():
-            yield from _lines(Line(task, "", "", rival, _NONE, 0, size), each, _keys(frames), groups)
+            yield from _lines(Line(task, "", "", rival, _NONE, 0, size), each, keys, groups)
         for loaded in own.values():
+            if isinstance(loaded.model, Diffusion) and args.sampled < len(keys):
+                few = _evenly(len(keys), args.sampled)
+                nothing = {name: scores[few] for name, scores in found[_NOTHING].items()}
+                line = Line(task, "", "", f"{_NOTHING}, frames of DDPM", _NONE, 0, size)
+                yield from _lines(line, nothing, [keys[i] for i in few], groups)
             yield from _of_model(task, loaded, pairs, groups, args)
 
 
@@ -153,7 +159,8 @@ def page(lines: Sequence[Line]) -> str:
         size = f"{own[0].size[1]}x{own[0].size[0]}"
         head = ["method", "L", "L_rec", "L_k", "PSNR (dB)", "SSIM", f"EPE (px at {METRIC_SIZE[1]}x{METRIC_SIZE[0]})"]
         head += ["x do nothing", "frames", "parameters", f"ms per frame of {size}"]
-        rows = [head, ["---"] * len(head), *(_cells(line, own[0].scores) for line in own)]
+        nothing = {line.frames: line.scores for line in own if line.method.startswith(_NOTHING)}
+        rows = [head, ["---"] * len(head), *(_cells(line, nothing[line.frames]) for line in own)]
         if effect == MIX and which == _ALL:
             rows += [_paper(name, *figures) for name, figures in PAPER[task].items()]
         title = f"### {task}: {effect}" + ("" if which == _ALL else f", frames {which}")

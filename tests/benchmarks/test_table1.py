@@ -8,13 +8,16 @@ import pytest
 import table1
 import torch
 from restoration_scores import MIX, Scores, constant_flow, corrupted, effects_of, mean_of, references, score
+from torch import Tensor, nn
 from torch.testing import assert_close
 
 from torchrefract import LensDistortion, UniformFog
+from torchrefract.data.frame_folder import FrameFolder
 from torchrefract.data.road_scenes import render_road_scenes
-from torchrefract.restoration.loading import load_model
-from torchrefract.restoration.tasks import Restored
-from torchrefract.types import Frame
+from torchrefract.restoration.diffusion import Diffusion
+from torchrefract.restoration.loading import Loaded, load_model
+from torchrefract.restoration.tasks import Restored, Undistort
+from torchrefract.types import Frame, Pair
 
 SIZE = (48, 80)
 PLAIN: dict[str, Any] = {"device": torch.device("cpu"), "apart": ["drive2"]}
@@ -24,6 +27,10 @@ def frames(count: int = 3) -> list[Frame]:
     keys = torch.arange(count)
     image, _ = render_road_scenes(keys, *SIZE, seed=2)
     return [Frame(image, keys, torch.empty(0))]
+
+
+def still(pair: Pair) -> Restored:
+    return Restored(pair.degraded, torch.zeros_like(pair.flow))
 
 
 def test_doing_nothing_is_off_by_the_flow_itself_and_the_true_flow_by_nothing():
@@ -127,6 +134,30 @@ def test_what_is_trained_is_loaded_and_the_page_tells_all(tmp_path, known_model)
     assert text.count("best constant flow") == 8
     assert "### undistort: all of the paper's, frames drive2*" in text
     assert {line.which: line.frames for line in lines} == {"all": 2, "drive2*": 1, "others": 1}
+
+
+def test_a_diffusion_model_is_compared_with_doing_nothing_to_the_same_frames(tmp_path):
+    class Quiet(nn.Module):
+        def forward(self, noisy: Tensor, time: Tensor, condition: Tensor) -> Tensor:
+            return torch.zeros_like(noisy)
+
+    args = argparse.Namespace(source=folder(tmp_path), frames=0, steps=[1], sampled=1, **PLAIN)
+    model = Diffusion(lambda _: Quiet(), Undistort(0.1))
+    loaded = Loaded(model, "Quiet", "undistort", SIZE, {})
+    lines = list(table1.scored("undistort", {"ddpm_undistort": loaded}, args))
+    found = {(line.method, line.effect): line for line in lines if line.which == "all"}
+    every, one, own = (
+        found[name, "wide lens"] for name in ("do nothing", "do nothing, frames of DDPM", "DDPM, 1 steps")
+    )
+    assert (every.frames, one.frames, own.frames) == (2, 1, 1)
+    assert one.scores.epe != pytest.approx(every.scores.epe, rel=1e-3)
+    held_out = FrameFolder(args.source, size=SIZE, split="val")
+    first = [Frame(*(value[None] for value in held_out[0]))]
+    (alone,) = corrupted(first, effects_of("undistort", SIZE[1])["wide lens"][0])
+    assert one.scores.epe == pytest.approx(mean_of(score([still(alone)], [alone])).epe, rel=1e-6)
+    part = table1.page(lines).partition("### undistort: wide lens\n")[2].partition("###")[0]
+    (row,) = (line.split(" | ") for line in part.splitlines() if line.startswith("| DDPM"))
+    assert float(row[7]) == pytest.approx(own.scores.epe / one.scores.epe, abs=0.006)
 
 
 def test_a_stopped_training_goes_on_and_what_is_not_there_is_trained(tmp_path, monkeypatch):

@@ -16,13 +16,14 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import fmean, median
 from typing import NamedTuple
 
 import cv2
-import numpy as np
 import torch
 from arguments import count, size
 from hydra.utils import instantiate
+from looks import seconds
 from omegaconf import OmegaConf
 from timing import Bar
 
@@ -36,11 +37,12 @@ WHAT = (
     "A run of torchrefract.generate: pairs a second, its start among the time; the share of the cores' time that it "
     "used, looked at four times a second, and the memory of all its processes, shared pages counted once, looked at "
     "every two seconds, since a look takes 30 ms of each of them from the run. And one pair on one thread: read, "
-    "degraded and encoded, beside reading the same frame and encoding the same arrays."
+    "degraded and encoded, beside reading the same frame and encoding the same arrays: means over pairs, of the median "
+    "of three calls each."
 )
 LIMIT = 1.5
 BUSY = 0.85
-_TRIED = 24  # pairs that are timed singly
+_TRIED, _CALLS = 24, 3  # pairs that are timed singly, so often each
 _PAUSE = 0.25  # s, between two looks at the processes
 _BETWEEN_MEMORY = 2.0  # s, between two at their memory
 
@@ -56,7 +58,7 @@ class Run(NamedTuple):
 
 
 class Single(NamedTuple):
-    """Medians over pairs on one thread, s."""
+    """Means over pairs on one thread, s, as a rate has them."""
 
     made: float
     bare: float
@@ -153,13 +155,12 @@ def one_by_one(args: argparse.Namespace) -> Single:
         arrays = decode_pair({suffix: lambda data=data: data for suffix, data in files.items()})
         made.append(_seconds(lambda job=job: maker.make(job)))
         bare.append(_seconds(lambda job=job, arrays=arrays: (maker.read(job), encode_pair(arrays, args.maps))))
-    return Single(float(np.median(made)), float(np.median(bare)))
+    return Single(fmean(made), fmean(bare))
 
 
 def _seconds(call: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    call()
-    return time.perf_counter() - start
+    """The median of a few calls."""
+    return median(seconds(call) for _ in range(_CALLS))
 
 
 def _scene(name: str) -> dict[str, object]:

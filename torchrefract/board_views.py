@@ -14,7 +14,7 @@ from torchrefract._files import replacing
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.detection import View, detect, is_enough
 from torchrefract.cameras.calibration.diagnosis import edge_width, explain, what_instead
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, read_image
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, pixels_of, read_image
 
 _VERSION = 2  # of the file; another one is not read
 _MOST_OF = 0.75  # of the pictures that must be of one size
@@ -46,8 +46,7 @@ def pictures_of(folder: Path) -> list[Path]:
 
 def read_gray(path: Path) -> np.ndarray:
     """A picture (H, W), uint8, as OpenCV makes it gray."""
-    pixels = read_image(path).permute(1, 2, 0).contiguous().mul(255).round().byte().numpy()
-    return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(pixels_of(read_image(path)), cv2.COLOR_RGB2GRAY)
 
 
 def look_at(files: Sequence[Path], board: Board, kept: Path) -> Iterator[Look]:

@@ -19,6 +19,7 @@ from PIL.GifImagePlugin import getdata, getheader
 from torch import Tensor
 
 from torchrefract._command import naming, progress
+from torchrefract.data.images import pixels_of
 from torchrefract.effects.base import Effect
 from torchrefract.page import Page, as_drawn
 from torchrefract.sheet import Scale, draw_legend, drawn, map_picture, map_scales
@@ -79,7 +80,7 @@ class Film:
     def _put(self, page: np.ndarray, image: Tensor, i: int, column: int) -> None:
         x, y = self.place(i, column)
         height, width = image.shape[1:]
-        page[y : y + height, x : x + width] = (255 * image).round().byte().movedim(0, -1).numpy()
+        page[y : y + height, x : x + width] = pixels_of(image)
 
     def place(self, i: int, column: int) -> tuple[int, int]:
         """The upper left corner of an effect's image, column 0, or map, column 1."""

@@ -16,7 +16,7 @@ from torchrefract._errors import UsageError
 from torchrefract._files import replacing
 from torchrefract.cameras.files.opencv import read_opencv, write_opencv
 from torchrefract.cameras.models import Camera
-from torchrefract.data.images import UnreadableImageError, read_image
+from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
 from torchrefract.fields.rectifying import camera_flow
 from torchrefract.footage import (
     check_apart,
@@ -79,7 +79,7 @@ class _Lens:
     def __call__(self, frame: Tensor) -> np.ndarray:
         """A frame (1, 3, H, W) in [0, 1] rectified: (H, W, 3), uint8, RGB."""
         image = warp(frame, self.flow(*frame.shape[2:]), interpolation="bicubic")[0]
-        return (255 * image[0].clamp(0, 1)).round().byte().permute(1, 2, 0).contiguous().numpy()
+        return pixels_of(image[0])
 
 
 def _claim(out: Path, lens: _Lens) -> None:

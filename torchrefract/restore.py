@@ -19,7 +19,7 @@ from torchrefract._command import as_they_are, command, job, naming, progress
 from torchrefract._config import CONFIG_DIR
 from torchrefract._errors import UsageError
 from torchrefract._files import replacing
-from torchrefract.data.images import UnreadableImageError, check_size, read_image
+from torchrefract.data.images import UnreadableImageError, check_size, pixels_of, read_image
 from torchrefract.footage import (
     check_apart,
     find_footage,
@@ -61,7 +61,7 @@ class _Asked(NamedTuple):
         there = [image.to(self.device).contiguous() for image in images]
         for before, after in zip(there, self.restorer(there), strict=True):
             shown = torch.cat([before, after], dim=2) if self.side_by_side else after
-            yield (255 * shown).round().byte().permute(1, 2, 0).contiguous().cpu().numpy()
+            yield pixels_of(shown)
 
 
 @command("restore", prepare=as_they_are)

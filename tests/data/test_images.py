@@ -7,7 +7,7 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from torchrefract.data.images import UnreadableImageError, fit, image_size, read_image
+from torchrefract.data.images import UnreadableImageError, fit, image_size, pixels_of, read_image
 
 RNG = np.random.default_rng(0)
 PIXELS = RNG.integers(0, 256, (36, 50, 3), dtype=np.uint8)
@@ -41,6 +41,22 @@ def test_eight_bit_pixels_come_back_exactly(tmp_path, suffix):
     path.write_bytes(encode(PIXELS, **FORMATS[suffix]))
     assert_close(read_image(path), as_tensor(PIXELS), rtol=0, atol=0)
     assert_close(read_image(str(path)), read_image(path), rtol=0, atol=0)
+
+
+def test_what_was_read_from_eight_bits_is_written_as_it_was(tmp_path):
+    every = np.arange(3 * 256, dtype=np.uint8).reshape(3, 256).T.reshape(16, 16, 3).copy()
+    cv2.imwrite(str(tmp_path / "all.png"), every[..., ::-1])
+    image = read_image(tmp_path / "all.png")
+    for same in (image, image.contiguous(), image.contiguous().flip(2).flip(2)):
+        found = pixels_of(same)
+        assert found.flags["C_CONTIGUOUS"]
+        np.testing.assert_array_equal(found, every)
+
+
+def test_values_become_the_nearest_level_and_none_leaves_the_range():
+    values = torch.tensor([-9.0, -0.1, 0.0, 0.49 / 255, 0.51 / 255, 254.4 / 255, 254.6 / 255, 1.0, 1.1, 300.0])
+    image = values.expand(3, 2, -1).contiguous().requires_grad_()
+    assert pixels_of(image)[1, :, 2].tolist() == [0, 0, 0, 0, 1, 254, 255, 255, 255, 255]
 
 
 def test_sixteen_bit_pixels_come_back_exactly(tmp_path):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrefract._command import naming
 from torchrefract._errors import UsageError
-from torchrefract.data.images import UnreadableImageError
+from torchrefract.data.images import UnreadableImageError, pixels_of
 from torchrefract.data.pair_files import FLOWS, LIGHTS, PairArrays, beyond, encode_pair
 from torchrefract.data.pair_manifest import PairRow, Stored
 from torchrefract.effects.base import Effect
@@ -74,7 +74,7 @@ class Maker:
         with naming("scene"), warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore", UserWarning)  # of folds, which the masks leave out
             degraded = self.recipe.effect.degrade(image, seed=seed, keys=[key])
-            pair = PairArrays(_pixels(image), _pixels(degraded.image), _maps(degraded))
+            pair = PairArrays(pixels_of(image[0]), pixels_of(degraded.image[0]), _maps(degraded))
         with naming("maps"):
             data = encode_pair(pair, self.recipe.maps)
         rest = {
@@ -128,8 +128,3 @@ def _beyond(pair: PairArrays) -> dict[str, int]:
     """How many valid pixels a PNG cannot hold, of the flows that have some."""
     counts = {name: beyond(pair.maps[name], pair.maps[mask]) for name, mask in FLOWS.items() if name in pair.maps}
     return {name: count for name, count in counts.items() if count}
-
-
-def _pixels(image: Tensor) -> np.ndarray:
-    """(H, W, 3), uint8, of (1, 3, H, W) in [0, 1]."""
-    return (255 * image[0].clamp(0, 1)).round().byte().permute(1, 2, 0).contiguous().numpy()

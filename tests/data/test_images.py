@@ -47,7 +47,7 @@ def test_what_was_read_from_eight_bits_is_written_as_it_was(tmp_path):
     every = np.arange(3 * 256, dtype=np.uint8).reshape(3, 256).T.reshape(16, 16, 3).copy()
     cv2.imwrite(str(tmp_path / "all.png"), every[..., ::-1])
     image = read_image(tmp_path / "all.png")
-    for same in (image, image.contiguous(), image.contiguous().flip(2).flip(2)):
+    for same in (image, image.contiguous(), torch.cat([image, image], dim=2)[..., :16]):
         found = pixels_of(same)
         assert found.flags["C_CONTIGUOUS"]
         np.testing.assert_array_equal(found, every)

@@ -23,7 +23,7 @@ import cv2
 import torch
 from arguments import count, size
 from hydra.utils import instantiate
-from looks import seconds
+from looks import LOOKS, seconds
 from omegaconf import OmegaConf
 from timing import Bar
 
@@ -36,13 +36,13 @@ from torchrefract.pairs.sources import find_sources
 WHAT = (
     "A run of torchrefract.generate: pairs a second, its start among the time; the share of the cores' time that it "
     "used, looked at four times a second, and the memory of all its processes, shared pages counted once, looked at "
-    "every two seconds, since a look takes 30 ms of each of them from the run. And one pair on one thread: read, "
+    "every two seconds, since a look takes time from each of them. And one pair on one thread: read, "
     "degraded and encoded, beside reading the same frame and encoding the same arrays: means over pairs, of the median "
     "of three calls each."
 )
 LIMIT = 1.5
 BUSY = 0.85
-_TRIED, _CALLS = 24, 3  # pairs that are timed singly, so often each
+_TRIED = 24  # pairs that are timed singly
 _PAUSE = 0.25  # s, between two looks at the processes
 _BETWEEN_MEMORY = 2.0  # s, between two at their memory
 
@@ -114,13 +114,13 @@ def measured(words: Sequence[str], pairs: int, out: Path, *, cores: int) -> Run:
             if time.perf_counter() - looked > _BETWEEN_MEMORY:
                 peak, looked = max(peak, sum(map(_memory, family))), time.perf_counter()
             # The system adds up what workers have used only for who waits for them, which a server of forks does not.
-            used |= {process: seconds for process in family if (seconds := _used(process))}
+            used |= {process: own for process in family if (own := _used(process))}
             time.sleep(_PAUSE)
-    seconds = time.perf_counter() - start
+    took = time.perf_counter() - start
     if run.returncode:
         raise SystemExit(f"the run ended with {run.returncode}")
     disk = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
-    return Run(pairs, seconds, sum(used.values()) / seconds / cores, peak, disk)
+    return Run(pairs, took, sum(used.values()) / took / cores, peak, disk)
 
 
 def killed(args: argparse.Namespace, room: Path, dice: random.Random) -> list[str]:
@@ -153,14 +153,13 @@ def one_by_one(args: argparse.Namespace) -> Single:
     for job in (Job(i, source, 0) for i, source in enumerate(sources.frames)):
         files = maker.make(job).data
         arrays = decode_pair({suffix: lambda data=data: data for suffix, data in files.items()})
-        made.append(_seconds(lambda job=job: maker.make(job)))
-        bare.append(_seconds(lambda job=job, arrays=arrays: (maker.read(job), encode_pair(arrays, args.maps))))
+        made.append(_typical(lambda job=job: maker.make(job)))
+        bare.append(_typical(lambda job=job, arrays=arrays: (maker.read(job), encode_pair(arrays, args.maps))))
     return Single(fmean(made), fmean(bare))
 
 
-def _seconds(call: Callable[[], object]) -> float:
-    """The median of a few calls."""
-    return median(seconds(call) for _ in range(_CALLS))
+def _typical(call: Callable[[], object]) -> float:
+    return median(seconds(call) for _ in range(LOOKS))
 
 
 def _scene(name: str) -> dict[str, object]:

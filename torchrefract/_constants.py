@@ -17,7 +17,7 @@ def constant(values: Any, *, dtype: torch.dtype | None = None, device: torch.dev
 def assume_constant_result(function: _F) -> _F:
     """What `torch.compiler.assume_constant_result` does, without importing the compiler.
 
-    That takes nearly as long as torch itself, in each process that imports this package, and most never compile.
+    By `python -X importtime` that takes nearly as long as torch itself, and most processes never compile.
     """
-    setattr(function, "_dynamo_marked_constant", True)  # noqa: B010  # no attribute that functions have
+    setattr(function, "_dynamo_marked_constant", True)  # noqa: B010  # type checkers know of no such attribute
     return function

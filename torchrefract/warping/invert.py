@@ -1,41 +1,41 @@
 """The flow that undoes a flow, with a certificate."""
 
-import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_count, check_flow, check_positive, is_true
-from torchrefract.warping.grid import field_dtype, inside, length, pixel_axes
-from torchrefract.warping.resample import look_up
+from torchrefract._checks import check_count, check_flow, check_positive, is_true, read
+from torchrefract._constants import constant
+from torchrefract.warping.grid import field_dtype, inside, length, pixel_axes, sampler_positions, squared_length
+from torchrefract.warping.resample import look_up, sampled, sampler_dtype
 
-# Px: so short a step is the last.
-_NEAR = {torch.float32: 1e-3, torch.float64: 1e-6}
+# Px: a residual that calls for no further step.
+_NEAR = {torch.float32: 1e-3, torch.float64: 1e-9}
 # Px: flow from here on leads nowhere, and its square is a number still.
 _FARTHEST = 1e12
-# Of so many pixels one may be left on a fold, where no step helps.
-_FEW = 500
-# Where a step is longer than this share of the one before, the slopes that both took no longer fit. They are read anew
-# for a sample of which more than one pixel in so many is like that.
-_SLOW, _FEW_SLOW = 1 / 3, 2000
 # Of determinants: what is nearer to a fold is begun without slopes.
 _UPRIGHT = 0.5
+# Steps of all pixels of a sample by the slopes they began with, while more than this share of them is left. Slopes read
+# anew, and pixels picked one by one, cost more for each, and pay where few are left.
+_AT_ONCE, _MANY = 3, 1 / 8
+_ROW = 1024  # pixels that are picked out lie in rows of so many
 
 
 def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> tuple[Tensor, Tensor, Tensor]:
     """The flow that undoes a warp: warp(warp(image, flow), inverse) = image on `valid`.
 
-        inverse(p) + flow(p + inverse(p)) = 0, solved by Newton's method from no flow:
+        inverse(p) + flow(p + inverse(p)) = 0, solved by Newton's method from no flow, each pixel by itself:
         inverse <- inverse - (I + grad flow)^-1 (inverse + flow),  flow read at p + inverse,
-        its gradient at first at p, and at p + inverse once steps no longer shrink to a third
+        its gradient at first at p, for up to 3 steps while many pixels need them, and at p + inverse then
 
     The flow is read bilinearly, its gradient by central differences. The gradient with respect to `flow` comes from
     one attached Newton step at the solution (implicit function theorem), not from unrolling.
 
     Args:
         flow: (B, 2, H, W), px.
-        steps: Newton steps at most beside the first, at least 1; a sample takes no more once all its pixels stay within
-            1e-3 px (1e-6 px in float64), or the few of them that do not, one in 500, no longer become fewer.
+        steps: Newton steps at most beside the first, at least 1; a pixel takes no more once its residual is within
+            1e-3 px (1e-9 px in float64).
         tolerance_px: the residual up to which a pixel counts as solved, px.
 
     Returns:
@@ -58,52 +58,130 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
     check_count("steps", steps)
     check_positive("tolerance_px", tolerance_px)
     flow = flow.to(field_dtype(flow.dtype))
-    known = (flow.abs() <= _FARTHEST).all(dim=1, keepdim=True)
-    whole = is_true(known.all)
-    flow = flow if whole else torch.where(known, flow, 0)
+    if flow.numel() == 0:
+        return flow.clone(), flow[:, :1] == 0, flow[:, :1].clone()
+    whole = is_true(lambda: flow.abs().amax() <= _FARTHEST)
+    known = None if whole else (flow.abs() <= _FARTHEST).all(dim=1, keepdim=True)
+    flow = flow if known is None else torch.where(known, flow, 0)
     with torch.no_grad():
-        slopes = _gradient(flow)
-        determinant = _determinant(slopes)
-        solution = inverse = _solved(flow, slopes, determinant, steps)
-        read = _read(torch.cat([flow, determinant], dim=1), solution)
-        residual = length(solution + read[:, :2])
-        solved = (residual <= tolerance_px) & (read[:, 2:] > 0) & inside(solution)
-        # Nothing is known where a hole in the flow would have been read.
-        valid = solved if whole else solved & known & (_read(known.to(flow.dtype), solution) > 0.999)
+        # In large frames the positions are of another type.
+        found = _solved(flow.to(sampler_dtype(flow, flow.dtype)), steps)
+        solution = inverse = found.inverse.to(flow.dtype)
+        residual = length(found.error).to(flow.dtype)
+        valid = (residual <= tolerance_px) & (found.determinant > 0) & inside(solution)
+        if known is not None:
+            # Nothing is known where a hole in the flow would have been read.
+            valid = valid & known & (_read(known.to(flow.dtype), solution) > 0.999)
     if flow.requires_grad and torch.is_grad_enabled():
         moved = _read(flow, solution)
         slopes = _cell_gradient(flow.detach(), solution)
-        inverse = solution - _times(_inverted(slopes, _determinant(slopes)), moved - moved.detach())
+        inverse = solution - _step(slopes, _determinant(slopes), moved - moved.detach())
     return inverse, valid, residual
 
 
-def _solved(flow: Tensor, slopes: Tensor, determinant: Tensor, steps: int) -> Tensor:
-    """The inverse (B, 2, H, W), after some steps; a sample that is done stays as it is, and depends on no other."""
-    near, pixels = _NEAR[flow.dtype] ** 2, math.prod(flow.shape[2:])
+class _Pixels(NamedTuple):
+    """Pixels of each sample, in rows, and what is known of them."""
+
+    home: Tensor  # (1, 2, n, m), where they are, in the sampler's coordinates
+    inverse: Tensor  # (B, 2, n, m), px
+    error: Tensor  # (B, 2, n, m), px, what is to vanish: inverse + flow, read at p + inverse
+    determinant: Tensor  # (B, 1, n, m), read there too
+
+    def left(self) -> Tensor:
+        """(B, 1, n, m), bool: those that take another step."""
+        return squared_length(self.error) > _NEAR[self.error.dtype] ** 2
+
+    def picked(self, index: Tensor) -> "_Pixels":
+        """Some of those of one sample, by their numbers, (N,), a multiple of the length of a row."""
+        return _Pixels(*(value.flatten(2).index_select(2, index).unflatten(2, (-1, _ROW)) for value in self))
+
+
+class _Fields(NamedTuple):
+    """What Newton's method reads."""
+
+    flow: Tensor  # (B, 3, H, W): the flow, px, and the determinant of I + its slopes
+    slopes: Tensor  # (B, 4, H, W), as of `_gradient`
+
+    def at(self, home: Tensor, inverse: Tensor) -> _Pixels:
+        """Pixels with their inverse."""
+        read = self._read(self.flow, home, inverse)
+        return _Pixels(home, inverse, inverse + read[:, :2], read[:, 2:])
+
+    def stepped(self, pixels: _Pixels) -> _Pixels:
+        """After a step with the slopes at p + inverse."""
+        slopes = self._read(self.slopes, pixels.home, pixels.inverse)
+        return self.at(pixels.home, pixels.inverse - _step(slopes, _determinant(slopes), pixels.error))
+
+    def _read(self, field: Tensor, home: Tensor, inverse: Tensor) -> Tensor:
+        height, width = field.shape[2:]
+        scale = constant((2 / width, 2 / height), dtype=home.dtype, device=home.device).view(2, 1, 1)
+        grid = torch.addcmul(home, inverse, scale).movedim(1, -1)
+        return sampled(field, grid, padding="border", interpolation="bilinear")
+
+
+def _solved(flow: Tensor, steps: int) -> _Pixels:
+    """All pixels after some steps. What becomes of one depends on no other, and on no other sample."""
+    slopes = _gradient(flow)
+    determinant = _determinant(slopes)
+    fields = _Fields(torch.cat([flow, determinant], dim=1), slopes)
     # The first step, from no flow at all, has nothing to read.
+    begun = _begun(slopes, determinant)
+    pixels = fields.at(_home(flow), -_step(*begun, flow))
+    if read(lambda: pixels.error[0, 0, 0, 0]) is None:
+        for _ in range(steps):
+            inverse = torch.where(pixels.left(), fields.stepped(pixels).inverse, pixels.inverse)
+            pixels = fields.at(pixels.home, inverse)
+        return pixels
+    ends = [
+        _finished(_Fields(*own[:2]), _Pixels(pixels.home, *own[2:5]), own[5:], steps)
+        for own in zip(*(value.split(1) for value in (*fields, *pixels[1:], *begun)), strict=True)
+    ]
+    if len(ends) == 1:
+        return ends[0]
+    return _Pixels(pixels.home, *map(torch.cat, zip(*(end[1:] for end in ends), strict=True)))
+
+
+def _home(flow: Tensor) -> Tensor:
+    """(1, 2, H, W): where the pixels of a flow are, in the sampler's coordinates."""
+    height, width = flow.shape[2:]
+    x, y = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
+    still = flow.new_zeros(()).expand(1, 2, height, width)
+    return sampler_positions(still, x, y, height=height, width=width)
+
+
+def _begun(slopes: Tensor, determinant: Tensor) -> tuple[Tensor, Tensor]:
+    """Slopes and determinant for the first steps."""
     upright = determinant >= _UPRIGHT
-    matrix = _where(upright, _inverted(slopes, determinant), _identity(flow))
-    inverse = -_step(matrix, flow)
-    going, many, before = upright.new_ones(upright.shape[0], 1, 1, 1), pixels, _square(inverse)
-    for _ in range(steps):
-        error = inverse + _read(flow, inverse)
-        step = _step(matrix, error)
-        size = _square(step)
-        far = size > near
-        slow = going & (_count(far & (size > _SLOW**2 * before)) * _FEW_SLOW > pixels)
-        if is_true(slow.any) is not False:
-            there = _read(slopes, inverse)
-            matrix = _where(slow, _inverted(there, _determinant(there)), matrix)
-            step = _step(matrix, error)
-            size = _square(step)
-            far = size > near
-        inverse = _where(going, inverse - step, inverse)
-        left = _count(far)
-        stuck = (left * _FEW <= pixels) & (left >= many)
-        going, many, before = going & (left > 0) & ~stuck, left, size
-        if is_true(going.any) is False:
-            break
-    return inverse
+    if is_true(upright.all):
+        return slopes, determinant
+    return torch.where(upright, slopes, 0), torch.where(upright, determinant, 1)
+
+
+def _finished(fields: _Fields, pixels: _Pixels, begun: tuple[Tensor, Tensor], steps: int) -> _Pixels:
+    """The pixels of one sample after the steps that they need."""
+    left = pixels.left()
+    count, at_once = int(left.sum()), min(steps, _AT_ONCE)
+    while at_once > 0 and count > _MANY * left.numel():
+        pixels = fields.at(pixels.home, pixels.inverse - _step(*begun, pixels.error))
+        left = pixels.left()
+        count, at_once, steps = int(left.sum()), at_once - 1, steps - 1
+    if steps == 0 or count == 0:
+        return pixels
+    index = _filled(left)
+    some, ends = pixels.picked(index), [value.contiguous().flatten(2) for value in pixels[1:]]
+    while steps > 0 and len(index):
+        some, steps = fields.stepped(some), steps - 1
+        for end, value in zip(ends, some[1:], strict=True):
+            end.index_copy_(2, index, value.flatten(2))
+        places = _filled(some.left())
+        index, some = index[places], some.picked(places)
+    return _Pixels(pixels.home, *(end.unflatten(2, left.shape[2:]) for end in ends))
+
+
+def _filled(flags: Tensor) -> Tensor:
+    """(N,): the numbers of those that are true, the last one again until they fill their rows."""
+    index = flags.flatten().nonzero()[:, 0]
+    return torch.cat([index, index[-1:].expand(-len(index) % _ROW)])
 
 
 def _gradient(flow: Tensor) -> Tensor:
@@ -130,47 +208,18 @@ def _read(field: Tensor, at: Tensor) -> Tensor:
     return look_up(field, at, padding="border", interpolation="bilinear")
 
 
-def _where(flags: Tensor, value: Tensor, otherwise: Tensor) -> Tensor:
-    """As `torch.where`, which takes longer than the rest of a step; nothing is chosen where all flags are true."""
-    return value if is_true(flags.all) else torch.where(flags, value, otherwise)
-
-
-def _count(flags: Tensor) -> Tensor:
-    """(B, 1, 1, 1): how many pixels of a sample, (B, 1, H, W), are true."""
-    return flags.sum(dim=(2, 3), keepdim=True)
-
-
-def _square(step: Tensor) -> Tensor:
-    """(B, 1, H, W), px^2, of (B, 2, H, W)."""
-    u, v = step.split(1, dim=1)
-    return torch.addcmul(u * u, v, v)
-
-
 def _determinant(slopes: Tensor) -> Tensor:
     """(B, 1, H, W): of I + the slopes (B, 4, H, W), as of `_gradient`."""
     u_x, v_x, u_y, v_y = slopes.split(1, dim=1)
     return (1 + u_x) * (1 + v_y) - u_y * v_x
 
 
-def _inverted(slopes: Tensor, determinant: Tensor) -> Tensor:
-    """(B, 4, H, W): the matrix (I + slopes)^-1, column by column, from that and its determinant."""
+def _step(slopes: Tensor, determinant: Tensor, error: Tensor) -> Tensor:
+    """(B, 2, H, W): (I + slopes)^-1 error, no longer than any flow, so that all that comes of it is a number."""
     # Near a fold the step has no good length; a bounded determinant keeps it finite, the residual tells the rest.
     determinant = determinant.abs().clamp(min=0.1).copysign(determinant)
     u_x, v_x, u_y, v_y = slopes.split(1, dim=1)
-    return torch.cat([1 + v_y, -v_x, -u_y, 1 + u_x], dim=1) / determinant
-
-
-def _identity(flow: Tensor) -> Tensor:
-    """(1, 4, 1, 1), as of `_inverted`."""
-    return torch.eye(2, dtype=flow.dtype, device=flow.device).view(1, 4, 1, 1)
-
-
-def _step(matrix: Tensor, error: Tensor) -> Tensor:
-    """Newton's, no longer than any flow, so that all that comes of it is a number."""
-    return _times(matrix, error).clamp(-_FARTHEST, _FARTHEST)
-
-
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    """(B, 2, H, W) of matrices (B, 4, H, W), column by column, and vectors (B, 2, H, W)."""
-    x, y = vector.split(1, dim=1)
-    return torch.addcmul(matrix[:, :2] * x, matrix[:, 2:], y)
+    x, y = error.split(1, dim=1)
+    right = torch.addcmul(torch.addcmul(x, v_y, x), u_y, y, value=-1)
+    down = torch.addcmul(torch.addcmul(y, u_x, y), v_x, x, value=-1)
+    return (torch.cat([right, down], dim=1) / determinant).clamp(-_FARTHEST, _FARTHEST)

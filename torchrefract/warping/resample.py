@@ -93,7 +93,7 @@ def look_up(
             raise ValueError(f"resampler must be auto or grid_sample {why}, got 'opencv'")
     source = image.to(dtype)
     bands = (
-        _sample(source, grid, padding=padding, interpolation=interpolation)
+        sampled(source, grid, padding=padding, interpolation=interpolation)
         for grid in _grids(source, flow, dtype, whole=(interpolation, padding) == _WHOLE)
     )
     warped = join(bands, dim=2, length=image.shape[2])
@@ -118,9 +118,27 @@ def follow(first: Tensor | SmoothFlow, grid: Tensor) -> Tensor:
     """(B, H, W, 2): the grid of two warps in a row, from that of the second; as by `compose_flows`."""
     flow = dense(first).to(grid.dtype)
     height, width = flow.shape[2:]
-    read = _sample(flow, grid, padding="border", interpolation="bilinear").movedim(1, -1)
+    read = sampled(flow, grid, padding="border", interpolation="bilinear").movedim(1, -1)
     both = torch.addcmul(grid, read, constant((2 / width, 2 / height), dtype=read.dtype, device=read.device))
     return both if isinstance(first, SmoothFlow) else finite(both, FAR)
+
+
+def sampled(source: Tensor, grid: Tensor, *, padding: str, interpolation: str) -> Tensor:
+    """What F.grid_sample reads of a source (B, C, H, W) along its grid (B, n, m, 2), with all threads."""
+    parts = 1 if (interpolation, padding) == _WHOLE else _parts(source, grid)
+    if parts == 1:
+        return F.grid_sample(source, grid, mode=interpolation, padding_mode=padding, align_corners=False)
+    # The CPU sampler threads over the batch alone: bands of rows as a batch give the same bits on all threads.
+    batch, channels = source.shape[:2]
+    height, width = grid.shape[1:3]
+    rows = -(-height // parts)
+    if rows * parts > height:
+        grid = F.pad(grid, (0, 0, 0, 0, 0, rows * parts - height))
+    bands = grid.reshape(batch * parts, rows, width, 2)
+    repeated = source[:, None].expand(-1, parts, -1, -1, -1).reshape(batch * parts, *source.shape[1:])
+    out = F.grid_sample(repeated, bands, mode=interpolation, padding_mode=padding, align_corners=False)
+    out = out.view(batch, parts, channels, rows, width).movedim(1, 2)
+    return out.reshape(batch, channels, parts * rows, width)[:, :, :height]
 
 
 def is_channels_last(image: Tensor) -> bool:
@@ -210,23 +228,6 @@ def _rows_at_once(source: Tensor, flow: Tensor) -> int:
     ):
         return height
     return max(1, _CACHED // max(1, batch * width))
-
-
-def _sample(source: Tensor, grid: Tensor, *, padding: str, interpolation: str) -> Tensor:
-    parts = 1 if (interpolation, padding) == _WHOLE else _parts(source, grid)
-    if parts == 1:
-        return F.grid_sample(source, grid, mode=interpolation, padding_mode=padding, align_corners=False)
-    # The CPU sampler threads over the batch alone: bands of rows as a batch give the same bits on all threads.
-    batch, channels = source.shape[:2]
-    height, width = grid.shape[1:3]
-    rows = -(-height // parts)
-    if rows * parts > height:
-        grid = F.pad(grid, (0, 0, 0, 0, 0, rows * parts - height))
-    bands = grid.reshape(batch * parts, rows, width, 2)
-    repeated = source[:, None].expand(-1, parts, -1, -1, -1).reshape(batch * parts, *source.shape[1:])
-    out = F.grid_sample(repeated, bands, mode=interpolation, padding_mode=padding, align_corners=False)
-    out = out.view(batch, parts, channels, rows, width).movedim(1, 2)
-    return out.reshape(batch, channels, parts * rows, width)[:, :, :height]
 
 
 def _parts(source: Tensor, grid: Tensor) -> int:

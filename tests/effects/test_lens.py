@@ -9,7 +9,7 @@ from scipy import stats
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import Degraded, LensDistortion, LensParams, warp
+from torchrefract import Compose, Degraded, LensDistortion, LensParams, OneOf, warp
 from torchrefract.cameras.distortion import POLYNOMIAL12
 
 FOLDING: dict[str, Any] = {"k1_range": (-0.6, -0.6), "k2_range": (0.0, 0.0), "focal_range": (0.7, 0.7)}
@@ -162,6 +162,15 @@ def test_pixels_beyond_a_fold_are_warned_of_once_padded_and_marked():
 def test_strict_refuses_a_lens_that_folds():
     with pytest.raises(ValueError, match="must not fold back inside the frame"):
         LensDistortion(**FOLDING, strict=True).degrade(torch.ones(1, 1, 36, 64), seed=7)
+
+
+@pytest.mark.parametrize("around", [lambda lens: Compose([lens]), lambda lens: OneOf([lens, lens])])
+def test_a_fold_is_told_inside_a_composition_too(around):
+    image = torch.ones(2, 1, 36, 64)
+    with pytest.raises(ValueError, match="must not fold back inside the frame"):
+        around(LensDistortion(**FOLDING, strict=True)).degrade(image, seed=7)
+    with pytest.warns(UserWarning, match="must not fold back inside the frame"):
+        around(LensDistortion(**FOLDING)).degrade(image, seed=7)
 
 
 def test_a_fold_behind_a_closed_gate_or_outside_the_frame_is_nobodys_business():

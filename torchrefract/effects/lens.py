@@ -17,9 +17,10 @@ from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.lens_plan import covers, kept_terms, lens_plan
 from torchrefract.effects.lens_source import LensSource, correlated, jittered, listed
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan
+from torchrefract.effects.refraction import Moved
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, smooth_lens_flow
 from torchrefract.fields.lens_bounds import LensRanges
-from torchrefract.types import Degraded, Range
+from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice, SmoothFlow
 
 _LARGEST = 100.0  # coefficient
@@ -212,12 +213,12 @@ class LensDistortion(LatticeWarp):
         camera = in_px(params, lattice.height, lattice.width)
         return SmoothFlow(smooth_lens_flow(*camera, x, y, steps=cast(int, plan.steps), terms=terms), lattice)
 
-    def compute(self, image: Tensor, params: LensParams, depth: Tensor | None) -> Degraded:
-        """The batch looked up along the flow; a lens that folds is told."""
-        height, width = image.shape[2:]
-        if self.plan_for(params, height, width).stride == 1:  # no other plan has lenses that fold
+    def gated(self, params: LensParams, *, height: int, width: int, plan: Plan | None = None) -> Moved:
+        """The flow, by its own plan or by one that is given; a lens that folds is told."""
+        moved = super().gated(params, height=height, width=width, plan=plan)
+        if is_true(moved.exists.all) is False:
             self._check_fold(params, height, width)
-        return super().compute(image, params, depth)
+        return moved
 
     def flow(self, params: LensParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
         """The flow of `lens_flow`, and where it exists."""

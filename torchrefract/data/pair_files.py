@@ -96,6 +96,8 @@ def decode_pair(files: Mapping[str, Callable[[], bytes]], names: tuple[str, ...]
 
 def beyond(flow: np.ndarray, valid: np.ndarray) -> int:
     """How many valid pixels of a flow (2, H, W) a PNG cannot hold, of more than 512 px; it has them as not valid."""
+    if _fits(np.array([[flow.min(), flow.max()]])).all():
+        return 0
     return int((valid & ~_fits(flow)).sum())
 
 

@@ -85,7 +85,7 @@ class WarpEffect(Effect):
         return params.gate & self.moves(params) & (height * width > 1)
 
     def gated_undo(self, params: Any, moved: "Moved") -> tuple[Tensor, Tensor]:
-        """The flow that undoes `gated`, and where it exists."""
+        """The flow that undoes `gated`, zero for the samples that the effect leaves alone, and where it exists."""
         active, batch = moved.active.view(len(params.gate), -1)[:, 0], len(params.gate)
         index = some(active, params)
         if index is not None:
@@ -152,7 +152,7 @@ def moving(
 
     def restore(result: Degraded) -> Inverse:
         back, known = undo()
-        return Inverse(back, known & inside(back) & sees(result.valid, back))
+        return Inverse(back, known & sees(result.valid, back))
 
     return Degraded(
         image,

@@ -43,8 +43,7 @@ class Walk:
         self.waiting: list[Step] = []
         self.modes: dict[tuple[str, str, str], Tensor] = {}  # of the look-up: the samples that ask for it, (B,), bool
         self.moved: list[tuple[WarpEffect, Any, Moved]] = []
-        # Not a method of its own, through which the walk and all its maps would hold themselves.
-        self.valid: Callable[[], Tensor] = functools.partial(_everywhere, image.shape, image.device)
+        self.valid: Callable[[], Tensor] | None = None  # everywhere
         self.light: dict[str, Callable[[], Tensor]] = {}  # the maps of light, by their names in `Degraded`
         self.refracts = False
 
@@ -58,7 +57,11 @@ class Walk:
         own = effect.gated(params, height=height, width=width, **planned)
         moved, valid = own.spread(rows), self.valid
         self.waiting.append(Step(spread(params.gate, rows), moved.active, moved.path))
-        self.valid = lambda: moved.exists & inside(moved.flow) & sees(valid(), moved.flow)
+
+        def own_valid() -> Tensor:
+            return moved.exists & inside(moved.flow)
+
+        self.valid = own_valid if valid is None else lambda: own_valid() & sees(valid(), moved.flow)
         self._choose(effect, moved.active)
         self.moved.append((effect, params, own))
 
@@ -70,7 +73,7 @@ class Walk:
         shaded = effect.compute(self.image, params, self.depth)
         rows, before, valid = self.image.shape[0], dict(self.light), self.valid
         self.image = shaded.image
-        self.valid = lambda: valid() & spread(shaded.valid, rows)
+        self.valid = lambda: spread(shaded.valid, rows) if valid is None else valid() & spread(shaded.valid, rows)
 
         def now(name: str) -> Callable[[], Tensor] | None:
             return (lambda: spread(getattr(shaded, name), rows)) if shaded.has(name) else None
@@ -86,13 +89,15 @@ class Walk:
     def arrive(self, params: Any) -> Degraded:
         """What has become of the image, with all maps."""
         self._look_up()
+        # Not a method of its own, through which the walk and all its maps would hold themselves.
+        valid = self.valid or functools.partial(_everywhere, self.image.shape, self.image.device)
         if not self.refracts:
-            return Degraded(self.image, params, valid=self.valid, light=self.light)
+            return Degraded(self.image, params, valid=valid, light=self.light)
         return moving(
             self.image,
             params,
             flow=self._flow,
-            valid=self.valid,
+            valid=valid,
             undo=self._undo,
             light=self.light,
         )
@@ -101,6 +106,8 @@ class Walk:
         """(B, 2, H, W), px: of all that is done."""
         if not self.done:
             return self._still()
+        if len(self.moved) == 1:
+            return self.moved[0][2].spread(self.image.shape[0]).flow
         first, *others = self.done
         return cast(Tensor, exact([exact(first), *itertools.chain.from_iterable(others)]).path)
 
@@ -160,19 +167,21 @@ class Walk:
         return cast(Tensor, warped)
 
     def _undo(self) -> tuple[Tensor, Tensor]:
-        total, known = self._still(), _everywhere(self.image.shape, self.image.device)
-        done = torch.zeros(total.shape[0], dtype=torch.bool, device=total.device)
+        rows, found = self.image.shape[0], None
         for effect, params, moved in self.moved:
-            back, exists = (spread(value, total.shape[0]) for value in effect.gated_undo(params, moved))
+            back, exists = (spread(value, rows) for value in effect.gated_undo(params, moved))
             # A flow that is zero is left out, not looked up: a sample must not depend on what moves the others.
-            moves = spread(params.gate if learns(params) else moved.active, total.shape[0])
+            moves = spread(params.gate if learns(params) else moved.active, rows)
+            if found is None:
+                found = back, exists, moves
+                continue
+            total, known, done = found
             both, last = column(done & moves), column(moves)
             if is_true(both.any) is not False:
                 exists = torch.where(both, known & sees(exists, total), exists)
                 back = torch.where(both, compose_flows(back, total), back)
-            known, total = torch.where(last, exists, known), torch.where(last, back, total)
-            done = done | moves
-        return total, known
+            found = torch.where(last, back, total), torch.where(last, exists, known), done | moves
+        return found[:2] if found else (self._still(), _everywhere(self.image.shape, self.image.device))
 
     def _still(self) -> Tensor:
         batch, _, height, width = self.image.shape

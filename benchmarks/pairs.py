@@ -19,8 +19,6 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import NamedTuple
 
-import cv2
-import torch
 from arguments import count, size
 from hydra.utils import instantiate
 from looks import LOOKS, seconds
@@ -31,6 +29,7 @@ from torchrefract._config import CONFIG_DIR
 from torchrefract._files import replacing
 from torchrefract.data.pair_files import FORMATS, decode_pair, encode_pair
 from torchrefract.pairs.making import Job, Maker, Recipe
+from torchrefract.pairs.running import work_alone
 from torchrefract.pairs.sources import find_sources
 
 WHAT = (
@@ -141,8 +140,7 @@ def killed(args: argparse.Namespace, room: Path, dice: random.Random) -> list[st
 
 def one_by_one(args: argparse.Namespace) -> Single:
     """Pairs made by this process, on one thread."""
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    work_alone()
     cfg = _scene(args.scene)
     if "width" in cfg:
         cfg["width"] = args.size[1]

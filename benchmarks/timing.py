@@ -10,7 +10,6 @@ anew once enough is free at the top of its heap, which depends on what ran befor
 against any candidate that is unlucky.
 """
 
-import ctypes
 import json
 import os
 import platform
@@ -29,6 +28,7 @@ from torch import Tensor
 from torch.utils import benchmark
 
 from torchrefract._files import replacing
+from torchrefract._memory import keep_freed_memory
 from torchrefract.warping.grid import pixel_axes, sampler_grid
 
 Candidate = Callable[[], object]
@@ -39,7 +39,6 @@ COPY = "copy of the frame"
 FEWEST_REPEATS = 15
 _STRETCH_S = 0.02  # a timed stretch lasts this long at least: far above the clock's grain and a thread's start
 _MOST_CALLS = 1000
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
 _REFERENCE_FLOW_PX = 4.0
 _OPENCV = ("opencv-contrib-python-headless", "opencv-contrib-python", "opencv-python-headless", "opencv-python")
 
@@ -168,14 +167,6 @@ def measure(
         )
         for name in candidates
     ]
-
-
-def keep_freed_memory() -> bool:
-    """Have the C library keep the memory that is freed; whether it will."""
-    if platform.libc_ver()[0] != "glibc":
-        return False
-    mallopt = ctypes.CDLL(None).mallopt
-    return bool(mallopt(_TRIM_THRESHOLD, 2**31 - 1) and mallopt(_MMAP_THRESHOLD, 2**25))
 
 
 def references(frame: Tensor) -> dict[str, Candidate]:

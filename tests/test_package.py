@@ -50,6 +50,11 @@ def test_commands_without_a_model_do_not_wait_for_the_training_stack(spawn, tmp_
     assert (found.code, found.out.strip()) == (0, "[]"), found.err
 
 
+def test_workers_that_make_pairs_do_not_wait_for_what_draws(spawn, tmp_path):
+    found = spawn("-c", IMPORT.format(module="torchrefract.generate", names=("matplotlib",)), cwd=tmp_path)
+    assert (found.code, found.out.strip()) == (0, "[]"), found.err
+
+
 def test_compilers_see_the_same_in_a_constant_as_in_one_of_torch():
     ours, theirs = assume_constant_result(lambda: 1), torch.compiler.assume_constant_result(lambda: 1)
     assert vars(ours) == vars(theirs) != {}

@@ -24,7 +24,7 @@ from torchrefract.data.images import check_size
 from torchrefract.data.pair_files import FORMATS
 from torchrefract.data.pair_manifest import manifests, scan
 from torchrefract.effects.base import Effect
-from torchrefract.pairs.card import HISTOGRAMS, contents, histograms, write_card
+from torchrefract.pairs.card import HISTOGRAMS, contents, write_card
 from torchrefract.pairs.ledger import Ledger, claim
 from torchrefract.pairs.making import Job, Maker, Recipe
 from torchrefract.pairs.running import make_ready, run
@@ -217,6 +217,9 @@ def _finish(asked: _Asked, out: Path, *, made: int) -> None:
     if there == 0 and not missing:
         raise UsageError(f"source must hold frames that can be read, got {found.skipped[0]}")
     if not missing:
+        # Workers import this file too, and draw nothing.
+        from torchrefract.pairs.histograms import histograms  # noqa: PLC0415  # what it imports takes half a second
+
         picture = histograms(found)
         if picture is not None:
             _write(out / HISTOGRAMS, picture)

@@ -59,6 +59,11 @@ def family(process: int | str) -> list[str]:
     return [*children, *(later for child in children for later in family(child))]
 
 
+def workers_of(process: int) -> set[str]:
+    """Those that the process has let a server of it fork."""
+    return set(family(process)) - set(children_of(process))
+
+
 def wait_for(condition: Callable[[], bool]) -> None:
     end = time.monotonic() + 120
     while not condition():
@@ -76,16 +81,18 @@ def lines(out: Path) -> list[str]:
     return sorted(line for path in out.glob("manifest*.jsonl") for line in path.read_text().splitlines())
 
 
-@pytest.mark.parametrize(("workers", "kills"), [(0, 2), (2, 1)])
+@pytest.mark.parametrize(("workers", "kills"), [(0, 2), (2, 2)])
 def test_a_run_that_is_killed_ends_as_if_it_never_was(tmp_path, words, sums, whole, workers, kills):
     out, dice = tmp_path / "out", random.Random(workers)
     arguments = words(out, f"count={COUNT}", f"workers={workers}")
-    for _ in range(kills):
+    for kill in range(kills):
         before = len(list(out.rglob("*.png")))
         run = started(*arguments)
         # After a pair or more, at any moment of another one.
         while run.poll() is None and len(list(out.rglob("*.png"))) < before + 8:
             time.sleep(0.01)
+        if workers and kill % 2 == 0:  # the run itself makes the first pairs
+            wait_for(lambda run=run: run.poll() is not None or bool(workers_of(run.pid)))
         time.sleep(dice.uniform(0, 0.1))
         children = family(run.pid)
         run.send_signal(signal.SIGKILL)
@@ -99,9 +106,8 @@ def test_a_run_that_is_killed_ends_as_if_it_never_was(tmp_path, words, sums, who
 def test_a_worker_that_is_killed_ends_the_run_with_a_reason(tmp_path, words):
     out = tmp_path / "out"
     run = started(*words(out, "count=4000", "workers=1"))
-    wait_for(lambda: run.poll() is not None or any(out.rglob("*.png")))
-    workers = set(family(run.pid)) - set(children_of(run.pid)) or set(children_of(run.pid))
-    for worker in workers:
+    wait_for(lambda: run.poll() is not None or bool(workers_of(run.pid)))
+    for worker in workers_of(run.pid):
         os.kill(int(worker), signal.SIGKILL)
     _, err = run.communicate(timeout=100)
     assert run.returncode == 1

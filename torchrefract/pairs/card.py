@@ -1,35 +1,18 @@
 """The card of a set of pairs: what is in it, how its files are read, and whose the frames are."""
 
-import io
-import math
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
-from torchrefract.cameras.distortion import POLYNOMIAL12
 from torchrefract.data.pair_manifest import PairRow
 
 HISTOGRAMS = "parameters.png"
 
-_Values = Mapping[tuple[str, str], list["array[float]"]]
+Values = Mapping[tuple[str, str], list["array[float]"]]
 
-_COLUMNS, _MOST_BINS = 4, 30
-_AXES = ("x", "y", "z")
-_UNITS = {
-    "amplitude": "px",
-    "length": "px",
-    "aperture": "px",
-    "displacement": "px",
-    "visibility": "m",
-    "focal": "widths of the frame",
-    "radius": "diagonals of the frame",
-}
 _UNSEEN = ("effect", "key", "frame", "wind", "drift", "decorrelation")  # no numbers, or none that a single frame shows
 _READ = {
     "clean.png": "8 bits, RGB: the frame",
@@ -59,7 +42,7 @@ class Contents(NamedTuple):
     beyond: Counter[str]  # pairs with pixels of a flow that a PNG cannot hold
     files: tuple[str, ...]  # of a pair
     bytes: int
-    values: _Values  # of each effect's parameters, by component
+    values: Values  # of each effect's parameters, by component
 
 
 def contents(rows: Iterable[PairRow]) -> Contents:
@@ -118,28 +101,6 @@ def write_card(found: Contents, *, settings: Mapping[str, Any], license_of: str,
     return "\n".join(lines) + "\n"
 
 
-def histograms(found: Contents) -> bytes | None:
-    """A PNG with a histogram of each parameter that is not the same in all pairs, or None without one."""
-    panels = list(_panels(found.values))
-    if not panels:
-        return None
-    rows = -(-len(panels) // _COLUMNS)
-    figure = Figure(figsize=(3.2 * _COLUMNS, 2.3 * rows), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
-    for i, (title, label, values) in enumerate(panels):
-        axes = figure.add_subplot(rows, _COLUMNS, i + 1)
-        axes.hist(values, bins=min(_MOST_BINS, math.isqrt(len(values)) + 1), color="tab:blue", edgecolor="white")
-        axes.set_title(title, fontsize=9)
-        axes.set_xlabel(label, fontsize=8)
-        axes.set_ylabel("count" if i % _COLUMNS == 0 else "", fontsize=8)
-        axes.tick_params(labelsize=7)
-        axes.xaxis.set_major_locator(MaxNLocator(4))
-        axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png")
-    return stream.getvalue()
-
-
 def _collect(effects: Sequence[Mapping[str, Any]], values: dict[tuple[str, str], list["array[float]"]]) -> None:
     for effect in effects:
         for name, value in effect.items():
@@ -149,21 +110,6 @@ def _collect(effects: Sequence[Mapping[str, Any]], values: dict[tuple[str, str],
                 columns.extend(array("d") for _ in range(len(numbers) - len(columns)))
                 for column, number in zip(columns, numbers, strict=False):
                     column.append(number)
-
-
-def _panels(values: _Values) -> Iterable[tuple[str, str, np.ndarray]]:
-    """Of each parameter that varies a title, a label and its values; those of many components are put together."""
-    for (effect, name), columns in sorted(values.items()):
-        arrays = [np.frombuffer(column) for column in columns]
-        varied = {i: column for i, column in enumerate(arrays) if np.isfinite(column).all() and np.ptp(column) > 0}
-        unit = f", {_UNITS[name]}" if name in _UNITS else ""
-        if name == "coefficients" and len(arrays) == len(POLYNOMIAL12):
-            yield from ((effect, POLYNOMIAL12[i], column) for i, column in varied.items())
-        elif len(arrays) > len(_AXES) and varied:
-            yield effect, f"{name}{unit}, all components", np.concatenate(list(varied.values()))
-        else:
-            for i, column in varied.items():
-                yield effect, f"{name}{f' {_AXES[i]}' if len(arrays) > 1 else ''}{unit}", column
 
 
 def _remarks(found: Contents) -> list[str]:

@@ -14,6 +14,7 @@ import cv2
 import torch
 
 from torchrefract._errors import UsageError
+from torchrefract._memory import keep_freed_memory
 from torchrefract.data.pair_manifest import PairRow
 from torchrefract.pairs.making import Job, Maker, Recipe
 from torchrefract.pairs.writing import Store
@@ -28,7 +29,7 @@ def run(units: Iterable[Sequence[Job]], recipe: Recipe, store: Store, *, workers
         units: of `store`.
         recipe: of the pairs.
         store: where they go.
-        workers: processes, after `make_ready`; 0 makes them in this one.
+        workers: processes, after `make_ready`; 0 makes them in this one, which also makes some until they have started.
 
     Raises:
         UsageError: a worker that died.
@@ -40,6 +41,13 @@ def run(units: Iterable[Sequence[Job]], recipe: Recipe, store: Store, *, workers
         return
     pool = ProcessPoolExecutor(workers, mp_context=_context(), initializer=_start, initargs=(recipe, store))
     try:
+        # The first one waits for what workers are forked off to have imported all.
+        start = threading.Thread(target=pool.submit, args=(os.getpid,), daemon=True)
+        start.start()
+        units, maker = iter(units), Maker(recipe)
+        while start.is_alive() and (unit := next(units, None)) is not None:
+            yield store.write(unit, maker)
+        start.join()
         waiting = set[Future[list[PairRow]]]()
         for unit in units:
             waiting.add(pool.submit(_write, unit))
@@ -63,7 +71,7 @@ def make_ready() -> None:
 
     That takes one core: threads that wait for each other would wait for it.
     """
-    _use_one_thread()
+    work_alone()
     if "forkserver" in multiprocessing.get_all_start_methods():
         # All that the command imports beside itself, since each worker imports the command again.
         preloaded = [__name__, "torchrefract._command", "torchrefract.pairs.card", "torchrefract.pairs.ledger"]
@@ -88,15 +96,17 @@ class _Worker:
 
 
 def _start(recipe: Recipe, store: Store) -> None:
-    _use_one_thread()  # as many workers as cores leave nothing for more
+    work_alone()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers itself
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _Worker.maker, _Worker.store = Maker(recipe), store
 
 
-def _use_one_thread() -> None:
+def work_alone() -> None:
+    """Make pairs as fast as one thread can: as many workers as cores leave nothing for more."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+    keep_freed_memory()
 
 
 def _end_with_parent() -> None:

@@ -11,6 +11,7 @@ from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from torchrefract._command import check_seed, make, naming
 from torchrefract._errors import UsageError
 from torchrefract._files import replacing
+from torchrefract._memory import keep_freed_memory
 from torchrefract.data.fingerprint import fingerprint
 from torchrefract.data.module import PairData
 from torchrefract.restoration.checkpoints import Origin, check_fits, read_checkpoint
@@ -28,6 +29,7 @@ class Job(NamedTuple):
 def make_job(cfg: DictConfig, *, needs_checkpoint: bool = False) -> Job:
     """Data, model and trainer of a configuration, the checkpoint checked, the resolved configuration written."""
     OmegaConf.resolve(cfg)
+    keep_freed_memory()  # before the loader forks its workers, which degrade frames
     seed_everything(check_seed(cfg.seed), workers=True, verbose=False)
     if needs_checkpoint and cfg.ckpt_path is None:
         raise UsageError("ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none")

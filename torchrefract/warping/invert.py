@@ -47,9 +47,9 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
         ValueError: a flow of another shape, no step, a tolerance that is not positive.
 
     Newton and the fixed point inverse <- -flow(p + inverse) end in the same inverse, equally smooth, valid on the same
-    pixels. To 1e-3 px on 99.9 % of them Newton takes 9 to 13 bare grid_samples on the defaults of a lens, turbulence
-    and a thin plate, and 19 on strong turbulence, the fixed point 7 to 19, and 18; on a strong lens (k1 = -0.4) the
-    fixed point is still 17 px off after 30 steps. Measured by benchmarks/inverses.py on frames of 1280 x 720.
+    pixels. To 1e-3 px on 99.9 % of them Newton takes 6 to 9 bare grid_samples on the defaults of the four warps and 13
+    to 17 on strong ones, the fixed point 7 to 20, and 20 to 44; on a strong lens (k1 = -0.4) the fixed point is still
+    17 px off after 30 steps. Measured by benchmarks/inverses.py on frames of 1280 x 720.
 
     Source: Chen, Lu, Chen, Ruchala, Olivera, "A simple fixed-point approach to invert a deformation field", Medical
     Physics 35 (2008), for the equation and the fixed point.

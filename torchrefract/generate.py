@@ -5,7 +5,9 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
+from threading import Thread
 from typing import Any, NamedTuple
 
 import cv2
@@ -35,6 +37,7 @@ from torchrefract.pairs.writing import Folders, Store, Tars
 _TRIED = 4  # pairs that tell how much room the others will take
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LARGEST_SEED = 2**31  # so that seeds of the draws fit 64 bits with a sign
+_DRAWING = "torchrefract.pairs.histograms"  # which workers, who import this file too, do without
 _MADE_WITH = {"torch": torch.__version__, "numpy": np.__version__, "opencv": cv2.__version__}
 
 
@@ -91,6 +94,8 @@ def main(cfg: DictConfig) -> None:
         if units:
             if asked.workers:
                 make_ready()
+                # Beside the pairs, not when all else is done.
+                Thread(target=import_module, args=(_DRAWING,), daemon=True).start()
             _check_room(asked, [number for unit in units for number in unit], store)
             jobs = ([asked.job(number) for number in unit] for unit in units)
             made = run(jobs, asked.recipe, store, workers=min(asked.workers, len(units)))
@@ -217,10 +222,7 @@ def _finish(asked: _Asked, out: Path, *, made: int) -> None:
     if there == 0 and not missing:
         raise UsageError(f"source must hold frames that can be read, got {found.skipped[0]}")
     if not missing:
-        # Workers import this file too, and draw nothing.
-        from torchrefract.pairs.histograms import histograms  # noqa: PLC0415  # what it imports takes half a second
-
-        picture = histograms(found)
+        picture: bytes | None = import_module(_DRAWING).histograms(found)
         if picture is not None:
             _write(out / HISTOGRAMS, picture)
         pictured = picture is not None

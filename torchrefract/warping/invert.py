@@ -104,8 +104,8 @@ class _Fields(NamedTuple):
 
     def at(self, home: Tensor, inverse: Tensor) -> _Pixels:
         """Pixels with their inverse."""
-        read = self._read(self.flow, home, inverse)
-        return _Pixels(home, inverse, inverse + read[:, :2], read[:, 2:])
+        there = self._read(self.flow, home, inverse)
+        return _Pixels(home, inverse, inverse + there[:, :2], there[:, 2:])
 
     def stepped(self, pixels: _Pixels) -> _Pixels:
         """After a step with the slopes at p + inverse."""

@@ -19,5 +19,5 @@ def assume_constant_result(function: _F) -> _F:
 
     By `python -X importtime` that takes nearly as long as torch itself, and most processes never compile.
     """
-    setattr(function, "_dynamo_marked_constant", True)  # noqa: B010  # type checkers know of no such attribute
+    vars(function)["_dynamo_marked_constant"] = True
     return function

@@ -33,7 +33,7 @@ def histograms(found: Contents) -> bytes | None:
     rows = -(-len(panels) // _COLUMNS)
     width, height = 3.2 * _COLUMNS, 2.3 * rows
     figure = Figure(figsize=(width, height), dpi=100)
-    # In inches, which panels of this size need; to have them found would take as long as to draw.
+    # In inches, what panels of this size need.
     figure.subplots_adjust(0.6 / width, 0.5 / height, 1 - 0.15 / width, 1 - 0.3 / height, wspace=0.25, hspace=0.55)
     FigureCanvasAgg(figure)
     for i, (title, label, values) in enumerate(panels):

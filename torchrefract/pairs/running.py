@@ -29,7 +29,7 @@ def run(units: Iterable[Sequence[Job]], recipe: Recipe, store: Store, *, workers
         units: of `store`.
         recipe: of the pairs.
         store: where they go.
-        workers: processes, after `make_ready`; 0 makes them in this one, which also makes some until they have started.
+        workers: processes, after `make_ready`; until they have started this one makes pairs, and all where they are 0.
 
     Raises:
         UsageError: a worker that died.

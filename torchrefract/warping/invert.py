@@ -27,7 +27,8 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
 
         inverse(p) + flow(p + inverse(p)) = 0, solved by Newton's method from no flow, each pixel by itself:
         inverse <- inverse - (I + grad flow)^-1 (inverse + flow),  flow read at p + inverse,
-        its gradient at first at p, for up to 3 steps while many pixels need them, and at p + inverse then
+        its gradient at first at p, for up to 3 steps while many pixels need them, and at p + inverse then; where no
+        value can be read (accelerators, compilers) at p + inverse from the second step on
 
     The flow is read bilinearly, its gradient by central differences. The gradient with respect to `flow` comes from
     one attached Newton step at the solution (implicit function theorem), not from unrolling.

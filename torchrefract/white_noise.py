@@ -11,7 +11,7 @@ from torchrefract._bands import join
 _WORD = 0xFFFFFFFF
 # Odd constants of the hash, as int32: 2^32 over the golden ratio, and the two of lowbias32.
 _HASH = (0x9E3779B1 - 2**32, 0x7FEB352D, 0x846CA68B - 2**32)
-_CACHED = 1 << 18  # numbers that stay in a core's cache
+_CACHED = 1 << 17  # numbers that stay in a core's cache
 
 
 def noise(key: Tensor, count: int) -> Tensor:
@@ -89,18 +89,18 @@ def _noise_at(key: Tensor, places: Tensor) -> Tensor:
 def _pairs(words: tuple[Tensor, ...], places: Tensor) -> Tensor:
     a, b, c, d = words
     index = places * _HASH[0]
-    uniform = ((_hash(index, a, b) >> 9) & 0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
+    uniform = (_hash(index, a, b) >> 9).bitwise_and_(0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
     radius, angle = uniform.log_().mul_(-2).sqrt_(), _hash(index, c, d).float().mul_(math.pi * 2.0**-31)
-    return torch.stack([radius * angle.cos(), radius * angle.sin()], dim=1)
+    return torch.stack([angle.cos().mul_(radius), angle.sin_().mul_(radius)], dim=1)
 
 
 def _hash(index: Tensor, a: Tensor, b: Tensor) -> Tensor:
     x = index + a
-    x ^= (x >> 16) & 0xFFFF
+    x ^= (x >> 16).bitwise_and_(0xFFFF)
     x = x.mul_(_HASH[1]).add_(b)
-    x ^= (x >> 15) & 0x1FFFF
+    x ^= (x >> 15).bitwise_and_(0x1FFFF)
     x.mul_(_HASH[2])
-    x ^= (x >> 16) & 0xFFFF
+    x ^= (x >> 16).bitwise_and_(0xFFFF)
     return x
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._checks import read
+from torchrefract._checks import is_true, read
 from torchrefract.cameras.radial import RadialLimit, radial, radial_slope
 
 POLYNOMIAL12 = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
@@ -45,12 +45,14 @@ class Jacobian(NamedTuple):
     @property
     def determinant(self) -> Tensor:
         """Of the 2x2 matrix."""
-        return self.xx * self.yy - self.xy * self.yx
+        return torch.addcmul(self.xx * self.yy, self.xy, self.yx, value=-1)
 
     def solve(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         """J^-1 (a, b), with the determinant held above zero."""
         scale = 1 / self.determinant.clamp(min=1e-6)
-        return (self.yy * a - self.xy * b) * scale, (self.xx * b - self.yx * a) * scale
+        x = torch.addcmul(self.yy * a, self.xy, b, value=-1)
+        y = torch.addcmul(self.xx * b, self.yx, a, value=-1)
+        return x * scale, y * scale
 
     def after(self, first: "Jacobian") -> "Jacobian":
         """The product J first: the derivatives of one map after another."""
@@ -103,8 +105,9 @@ def undistort_polynomial(
     """The points that `distort_polynomial` maps to (x_d, y_d), without gradient, and which of them exist.
 
     A table gives the inverse of the radial part to 1e-6. From there go Newton steps: along the radius for a lens with
-    radial terms only (2, in float64 3), in the plane for others (3, in float64 5). A point exists if the radial part
-    still grows there, the map keeps its orientation and the residual vanishes.
+    radial terms only (2, in float64 3), in the plane for others (2, in float64 3; up to 3 and 5 for points that the
+    last of these still moves by 1e-4, in float64 1e-8). A point exists if the radial part still grows there, the map
+    keeps its orientation and the residual vanishes.
 
     Args:
         x_d, y_d: (B, ...), on the plane z = 1.
@@ -119,6 +122,8 @@ def undistort_polynomial(
     with torch.no_grad():
         c = coefficients.unbind(1)
         r_d = (x_d * x_d + y_d * y_d).sqrt()
+        if r_d.numel() == 0:
+            return r_d, r_d, r_d == 0
         r = _radial_start(r_d, c, limit, terms)
         scale = r / r_d.clamp(min=torch.finfo(r_d.dtype).tiny)
         x, y = scale * x_d, scale * y_d
@@ -128,9 +133,11 @@ def undistort_polynomial(
         # What must not be negative, in one number: comparisons are slow.
         room = (1e-12 if r_d.dtype is torch.float64 else 2e-6) * (1 + r_d)
         room = torch.minimum(room - (reached_x - x_d).abs(), room - (reached_y - y_d).abs())
-        room = torch.minimum(room, limit.radius.square() - (x * x + y * y))
+        room = torch.minimum(room, limit.radius.square() - r2)
         if terms.bent:
             room = torch.minimum(room, _slopes(x, y, r2, g, c, terms).determinant)
+        if is_true(lambda: room.amin() >= 0):
+            return x, y, torch.ones_like(room, dtype=torch.bool)
         return x.nan_to_num(0, 0, 0), y.nan_to_num(0, 0, 0), room >= 0
 
 
@@ -200,10 +207,19 @@ def _bend(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, coefficients: Tensor, 
     """(x, y) brought from the inverse of the radial part to that of the whole model."""
     c = coefficients.unbind(1)
     straight = x, y
-    for _ in range(5 if x.dtype is torch.float64 else 3):
+    least, most, still = (3, 5, 1e-8) if x.dtype is torch.float64 else (2, 3, 1e-4)
+    moves: Tensor | None = None  # points that the last step has moved
+    for count in range(1, most + 1):
         (reached_x, reached_y), r2, g = _distorted(x, y, c, terms)
         step_x, step_y = _slopes(x, y, r2, g, c, terms).solve(reached_x - x_d, reached_y - y_d)
+        if moves is not None:  # each point by itself
+            step_x, step_y = torch.where(moves, step_x, 0), torch.where(moves, step_y, 0)
         x, y = x - step_x, y - step_y
+        if count >= least:
+            size = torch.maximum(step_x.abs(), step_y.abs())
+            if is_true(lambda size=size: size.amax() <= still):
+                break
+            moves = size > still
     if not terms.round:
         return x, y
     # A lens without such terms keeps its bits, whatever its neighbors in the batch have.
@@ -235,9 +251,9 @@ def bent(
     if not terms.bent:
         return (x * g, y * g), g
     if terms.tangential:
-        g = g + 2 * p1 * y + 2 * p2 * x
+        g = torch.addcmul(torch.addcmul(g, 2 * p1, y), 2 * p2, x)
     a, b = (p2 + s1 + s2 * r2, p1 + s3 + s4 * r2) if terms.prism else (p2, p1)
-    return (x * g + r2 * a, y * g + r2 * b), g
+    return (torch.addcmul(r2 * a, x, g), torch.addcmul(r2 * b, y, g)), g
 
 
 def _slopes(x: Tensor, y: Tensor, r2: Tensor, g: Tensor, c: tuple[Tensor, ...], terms: Terms) -> Jacobian:
@@ -251,18 +267,19 @@ def bent_slopes(
     """The derivatives of the point of `bent`: g as it returns it, slope that of the radial part by r^2."""
     p1, p2, s1, s2, s3, s4 = others
     along_x, along_y = slope * x, slope * y
-    cross = along_x * y
     if not terms.bent:
-        return Jacobian(g + 2 * x * along_x, 2 * cross, 2 * cross, g + 2 * y * along_y)
+        cross = 2 * along_x * y
+        return Jacobian(torch.addcmul(g, x, along_x, value=2), cross, cross, torch.addcmul(g, y, along_y, value=2))
+    cross = torch.addcmul(2 * p1 * x, along_x + p2, y, value=2)
     if not terms.prism:
-        cross = 2 * (cross + p1 * x + p2 * y)
-        return Jacobian(g + 2 * x * (along_x + 2 * p2), cross, cross, g + 2 * y * (along_y + 2 * p1))
-    a, b = p2 + s1 + 2 * s2 * r2, p1 + s3 + 2 * s4 * r2
+        xx, yy = torch.addcmul(g, x, along_x + 2 * p2, value=2), torch.addcmul(g, y, along_y + 2 * p1, value=2)
+        return Jacobian(xx, cross, cross, yy)
+    a, b = s1 + 2 * s2 * r2, s3 + 2 * s4 * r2
     return Jacobian(
-        g + 2 * x * (along_x + (p2 + a)),
-        2 * (cross + p1 * x + a * y),
-        2 * (cross + b * x + p2 * y),
-        g + 2 * y * (along_y + (p1 + b)),
+        torch.addcmul(g, x, along_x + (2 * p2 + a), value=2),
+        torch.addcmul(cross, a, y, value=2),
+        torch.addcmul(cross, b, x, value=2),
+        torch.addcmul(g, y, along_y + (2 * p1 + b), value=2),
     )
 
 

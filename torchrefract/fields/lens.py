@@ -156,6 +156,7 @@ def _flow_of_rows(
 def _restore_flow_of_rows(
     x: Tensor, y: Tensor, c: Tensor, focal: Tensor, limit: RadialLimit, terms: Terms
 ) -> tuple[Tensor, Tensor]:
+    x, y = (axis.contiguous() for axis in torch.broadcast_tensors(x, y))
     exists = _unfolded(x, y, c, limit, terms)
     known = _known(x, y, exists) if torch.is_grad_enabled() and (c.requires_grad or x.requires_grad) else (x, y)
     x_d, y_d = distort_polynomial(*known, c, terms)
@@ -171,7 +172,8 @@ def _unfolded(x: Tensor, y: Tensor, c: Tensor, limit: RadialLimit, terms: Terms)
     with torch.no_grad():
         exists = x * x + y * y <= limit.radius.square()
         if terms.bent:
-            exists &= jacobian_polynomial(x, y, c, terms).determinant > 0
+            determinant = jacobian_polynomial(x, y, c, terms).determinant
+            exists &= (determinant > 0) & (determinant < torch.inf)  # beyond the largest number nothing is shown
         return exists
 
 

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrefract._checks import is_true
+
 # F.grid_sample spans [-1, 1]; four of these lie well outside whatever the padding, and keep every product finite.
 FAR = 4.0
 # Positions this near to the border pixels count as inside: rounding of fp32 coordinates, 1/1000 px.
@@ -48,9 +50,11 @@ def inside(flow: Tensor) -> Tensor:
     """(B, 1, H, W), bool: where p + flow(p) lies on the frame; NaN does not."""
     height, width = flow.shape[2:]
     x, y = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
-    u, v = flow.split(1, dim=1)
-    on_x = (u >= -_TOLERANCE - x) & (u <= width - 1 + _TOLERANCE - x)
-    return on_x & (v >= -_TOLERANCE - y) & (v <= height - 1 + _TOLERANCE - y)
+    u, v = flow.detach().split(1, dim=1)
+    # Distances from the middle, since comparisons are slow.
+    half_x, half_y = (width - 1) / 2, (height - 1) / 2
+    on_x = ((x - half_x) + u).abs() <= half_x + _TOLERANCE
+    return on_x & (((y - half_y) + v).abs() <= half_y + _TOLERANCE)
 
 
 def length(flow: Tensor) -> Tensor:
@@ -90,10 +94,15 @@ def sampler_positions(flow: Tensor, x: Tensor, y: Tensor, *, height: int, width:
         x, y: (1, 1, 1, m) and (1, 1, n, 1), px, where the flow is.
         height, width: px, of the frame.
     """
-    # A pixel center sits at (i + 1/2) / n of the width, so an image of one pixel is no special case.
-    x, y = (2 * x + 1) / width - 1, (2 * y + 1) / height - 1
+    x, y = sampler_axes(x, y, height=height, width=width)
     u, v = flow.split(1, dim=1)
     return torch.cat([x + u * (2 / width), y + v * (2 / height)], dim=1)
+
+
+def sampler_axes(x: Tensor, y: Tensor, *, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Positions in px in the coordinates of F.grid_sample; arguments as for `sampler_positions`."""
+    # A pixel center sits at (i + 1/2) / n of the width, so an image of one pixel is no special case.
+    return (2 * x + 1) / width - 1, (2 * y + 1) / height - 1
 
 
 def pixel_positions(grid: Tensor, *, height: int, width: int, out: Tensor) -> Tensor:
@@ -115,4 +124,6 @@ def pixel_positions(grid: Tensor, *, height: int, width: int, out: Tensor) -> Te
 def finite(positions: Tensor, limit: float) -> Tensor:
     """The positions within a limit; what is no number lies there."""
     # One NaN in a grid with border padding ends the process in the sampler's backward.
+    if positions.numel() == 0 or is_true(lambda: torch.stack(positions.aminmax()).abs().amax() <= limit):
+        return positions
     return positions.nan_to_num(nan=limit, posinf=limit, neginf=-limit).clamp(-limit, limit)

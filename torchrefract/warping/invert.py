@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import check_count, check_flow, check_positive, is_true, read
-from torchrefract._constants import constant
-from torchrefract.warping.grid import field_dtype, inside, length, pixel_axes, sampler_positions, squared_length
+from torchrefract.warping.grid import field_dtype, inside, pixel_axes, sampler_axes
 from torchrefract.warping.resample import look_up, sampled, sampler_dtype
 
 # Px: a residual that calls for no further step.
@@ -48,8 +47,8 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
         ValueError: a flow of another shape, no step, a tolerance that is not positive.
 
     Newton and the fixed point inverse <- -flow(p + inverse) end in the same inverse, equally smooth, valid on the same
-    pixels. To 1e-3 px on 99.9 % of them Newton takes 6 to 9 bare grid_samples on the defaults of the four warps and 13
-    to 17 on strong ones, the fixed point 7 to 20, and 20 to 44; on a strong lens (k1 = -0.4) the fixed point is still
+    pixels. To 1e-3 px on 99.9 % of them Newton takes 7 to 10 bare grid_samples on the defaults of the four warps and 14
+    to 19 on strong ones, the fixed point 10 to 23, and 23 to 48; on a strong lens (k1 = -0.4) the fixed point is still
     17 px off after 30 steps. Measured by benchmarks/inverses.py on frames of 1280 x 720.
 
     Source: Chen, Lu, Chen, Ruchala, Olivera, "A simple fixed-point approach to invert a deformation field", Medical
@@ -61,122 +60,187 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
     flow = flow.to(field_dtype(flow.dtype))
     if flow.numel() == 0:
         return flow.clone(), flow[:, :1] == 0, flow[:, :1].clone()
-    whole = is_true(lambda: flow.abs().amax() <= _FARTHEST)
+    whole = is_true(lambda: torch.stack(flow.detach().aminmax()).abs().amax() <= _FARTHEST)
     known = None if whole else (flow.abs() <= _FARTHEST).all(dim=1, keepdim=True)
     flow = flow if known is None else torch.where(known, flow, 0)
     with torch.no_grad():
         # In large frames the positions are of another type.
-        found = _solved(flow.to(sampler_dtype(flow, flow.dtype)), steps)
-        solution = inverse = found.inverse.to(flow.dtype)
-        residual = length(found.error).to(flow.dtype)
-        valid = (residual <= tolerance_px) & (found.determinant > 0) & inside(solution)
+        solution, residual, upright = _solved(flow.to(sampler_dtype(flow, flow.dtype)), steps)
+        solution, residual = solution.to(flow.dtype), residual.to(flow.dtype)
+        valid = (residual <= tolerance_px) & inside(solution)
+        valid = valid if upright is None else valid & upright
         if known is not None:
             # Nothing is known where a hole in the flow would have been read.
             valid = valid & known & (_read(known.to(flow.dtype), solution) > 0.999)
-    if flow.requires_grad and torch.is_grad_enabled():
-        moved = _read(flow, solution)
-        slopes = _cell_gradient(flow.detach(), solution)
-        inverse = solution - _step(slopes, _determinant(slopes), moved - moved.detach())
-    return inverse, valid, residual
+    if not (flow.requires_grad and torch.is_grad_enabled()):
+        return solution, valid, residual
+    moved = _read(flow, solution)
+    sheet = _sheet(*_cell_slopes(flow.detach(), solution))
+    inverse = sheet.newton().step(*solution.split(1, dim=1), *(moved - moved.detach()).split(1, dim=1))
+    return torch.cat(inverse, dim=1), valid, residual
+
+
+class _Sheet(NamedTuple):
+    """I + the slopes of a flow, [[xx, xy], [yx, yy]], each (B, 1, n, m)."""
+
+    xx: Tensor
+    xy: Tensor
+    yx: Tensor
+    yy: Tensor
+
+    @property
+    def determinant(self) -> Tensor:
+        """(B, 1, n, m), above zero where the sheet is upright."""
+        return torch.addcmul(self.xx * self.yy, self.xy, self.yx, value=-1)
+
+    def newton(self) -> "_Newton":
+        """Also for that of a fold, near which a step has no good length; the residual tells the rest."""
+        determinant = self.determinant
+        return self.over(determinant.abs().clamp(min=0.1).copysign(determinant))
+
+    def over(self, determinant: Tensor) -> "_Newton":
+        """With a determinant that is known."""
+        scale = 1 / determinant
+        return _Newton(self.yy * scale, self.xy * scale, self.yx * scale, self.xx * scale)
+
+
+class _Newton(NamedTuple):
+    """The inverse of a sheet, [[xx, -xy], [-yx, yy]], each (B, 1, n, m)."""
+
+    xx: Tensor
+    xy: Tensor
+    yx: Tensor
+    yy: Tensor
+
+    def step(self, u: Tensor, v: Tensor, error_u: Tensor, error_v: Tensor) -> tuple[Tensor, Tensor]:
+        """The inverse (u, v) after a step that undoes its error, no longer than any flow, so that it is a number."""
+        u = torch.addcmul(torch.addcmul(u, self.xx, error_u, value=-1), self.xy, error_v)
+        v = torch.addcmul(torch.addcmul(v, self.yy, error_v, value=-1), self.yx, error_u)
+        return u.clamp(-_FARTHEST, _FARTHEST), v.clamp(-_FARTHEST, _FARTHEST)
 
 
 class _Pixels(NamedTuple):
-    """Pixels of each sample, in rows, and what is known of them."""
+    """Pixels of each sample, in rows, and what is known of them; each (B, 1, n, m), or what broadcasts to it."""
 
-    home: Tensor  # (1, 2, n, m), where they are, in the sampler's coordinates
-    inverse: Tensor  # (B, 2, n, m), px
-    error: Tensor  # (B, 2, n, m), px, what is to vanish: inverse + flow, read at p + inverse
-    determinant: Tensor  # (B, 1, n, m), read there too
+    x: Tensor  # where they are, in the sampler's coordinates
+    y: Tensor
+    u: Tensor  # px, their inverse
+    v: Tensor
+    error_u: Tensor  # px, what is to vanish: inverse + flow, read at p + inverse
+    error_v: Tensor
+    determinant: Tensor | None  # read there too; None for a sheet that is upright everywhere
+
+    @property
+    def squared_error(self) -> Tensor:
+        """(B, 1, n, m), px^2."""
+        return torch.addcmul(self.error_u * self.error_u, self.error_v, self.error_v)
 
     def left(self) -> Tensor:
         """(B, 1, n, m), bool: those that take another step."""
-        return squared_length(self.error) > _NEAR[self.error.dtype] ** 2
+        return self.squared_error > _NEAR[self.error_u.dtype] ** 2
+
+    def stepped(self, newton: _Newton) -> tuple[Tensor, Tensor]:
+        """Their inverse after a step."""
+        return newton.step(self.u, self.v, self.error_u, self.error_v)
 
     def picked(self, index: Tensor) -> "_Pixels":
         """Some of those of one sample, by their numbers, (N,), a multiple of the length of a row."""
-        return _Pixels(*(value.flatten(2).index_select(2, index).unflatten(2, (-1, _ROW)) for value in self))
+        return _Pixels(*(None if plane is None else plane.flatten()[index].view(1, 1, -1, _ROW) for plane in self))
 
 
 class _Fields(NamedTuple):
     """What Newton's method reads."""
 
-    flow: Tensor  # (B, 3, H, W): the flow, px, and the determinant of I + its slopes
-    slopes: Tensor  # (B, 4, H, W), as of `_gradient`
+    flow: Tensor  # (B, 3, H, W): the flow, px, and the determinant of I + its slopes; without that if upright, (B, 2)
+    along: Tensor  # (B, 2, H, W), the slopes of u and v along x
+    across: Tensor  # (B, 2, H, W), those along y
 
-    def at(self, home: Tensor, inverse: Tensor) -> _Pixels:
+    def at(self, x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> _Pixels:
         """Pixels with their inverse."""
-        there = self._read(self.flow, home, inverse)
-        return _Pixels(home, inverse, inverse + there[:, :2], there[:, 2:])
+        moved_u, moved_v, *determinant = self._read(self.flow, x, y, u, v).split(1, dim=1)
+        return _Pixels(x, y, u, v, moved_u.add_(u), moved_v.add_(v), determinant[0] if determinant else None)
 
-    def stepped(self, pixels: _Pixels) -> _Pixels:
-        """After a step with the slopes at p + inverse."""
-        slopes = self._read(self.slopes, pixels.home, pixels.inverse)
-        return self.at(pixels.home, pixels.inverse - _step(slopes, _determinant(slopes), pixels.error))
+    def newton(self, pixels: _Pixels) -> _Newton:
+        """With the slopes at p + inverse."""
+        return _sheet(*(self._read(slopes, *pixels[:4]) for slopes in (self.along, self.across))).newton()
 
-    def _read(self, field: Tensor, home: Tensor, inverse: Tensor) -> Tensor:
+    def _read(self, field: Tensor, x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> Tensor:
         height, width = field.shape[2:]
-        scale = constant((2 / width, 2 / height), dtype=home.dtype, device=home.device).view(2, 1, 1)
-        grid = torch.addcmul(home, inverse, scale).movedim(1, -1)
-        return sampled(field, grid, padding="border", interpolation="bilinear")
+        grid = torch.cat([torch.add(x, u, alpha=2 / width), torch.add(y, v, alpha=2 / height)], dim=1)
+        return sampled(field, grid.movedim(1, -1), padding="border", interpolation="bilinear")
 
 
-def _solved(flow: Tensor, steps: int) -> _Pixels:
-    """All pixels after some steps. What becomes of one depends on no other, and on no other sample."""
-    slopes = _gradient(flow)
-    determinant = _determinant(slopes)
-    fields = _Fields(torch.cat([flow, determinant], dim=1), slopes)
-    # The first step, from no flow at all, has nothing to read.
-    begun = _begun(slopes, determinant)
-    pixels = fields.at(_home(flow), -_step(*begun, flow))
-    if read(lambda: pixels.error[0, 0, 0, 0]) is None:
-        for _ in range(steps):
-            inverse = torch.where(pixels.left(), fields.stepped(pixels).inverse, pixels.inverse)
-            pixels = fields.at(pixels.home, inverse)
-        return pixels
-    ends = [
-        _finished(_Fields(*own[:2]), _Pixels(pixels.home, *own[2:5]), own[5:], steps)
-        for own in zip(*(value.split(1) for value in (*fields, *pixels[1:], *begun)), strict=True)
-    ]
+def _solved(flow: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor | None]:
+    """The inverse (B, 2, H, W) after some steps and its error (B, 1, H, W), px, and where the sheet is upright.
+
+    That is (B, 1, H, W), bool, or None for everywhere.
+    """
+    if read(lambda: flow[0, 0, 0, 0]) is None:
+        return _ended(_masked(flow, steps))
+    # What becomes of a sample depends on no other.
+    ends = [_ended(_alone(one, steps)) for one in flow.split(1)]
     if len(ends) == 1:
         return ends[0]
-    return _Pixels(pixels.home, *map(torch.cat, zip(*(end[1:] for end in ends), strict=True)))
+    inverse, error, upright = zip(*ends, strict=True)
+    everywhere = torch.ones_like(error[0], dtype=torch.bool)
+    flags = [everywhere if flag is None else flag for flag in upright]
+    return torch.cat(inverse), torch.cat(error), None if upright.count(None) == len(upright) else torch.cat(flags)
 
 
-def _home(flow: Tensor) -> Tensor:
-    """(1, 2, H, W): where the pixels of a flow are, in the sampler's coordinates."""
-    height, width = flow.shape[2:]
-    x, y = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
-    still = flow.new_zeros(()).expand(1, 2, height, width)
-    return sampler_positions(still, x, y, height=height, width=width)
+def _ended(pixels: _Pixels) -> tuple[Tensor, Tensor, Tensor | None]:
+    upright = None if pixels.determinant is None else pixels.determinant > 0
+    return torch.cat([pixels.u, pixels.v], dim=1), pixels.squared_error.sqrt(), upright
 
 
-def _begun(slopes: Tensor, determinant: Tensor) -> tuple[Tensor, Tensor]:
-    """Slopes and determinant for the first steps."""
-    upright = determinant >= _UPRIGHT
-    if is_true(upright.all):
-        return slopes, determinant
-    return torch.where(upright, slopes, 0), torch.where(upright, determinant, 1)
-
-
-def _finished(fields: _Fields, pixels: _Pixels, begun: tuple[Tensor, Tensor], steps: int) -> _Pixels:
-    """The pixels of one sample after the steps that they need."""
-    left = pixels.left()
-    count, at_once = int(left.sum()), min(steps, _AT_ONCE)
-    while at_once > 0 and count > _MANY * left.numel():
-        pixels = fields.at(pixels.home, pixels.inverse - _step(*begun, pixels.error))
+def _masked(flow: Tensor, steps: int) -> _Pixels:
+    """All pixels after all steps, those that need none masked: where no value can be read."""
+    pixels, fields, _ = _begun(flow)
+    for _ in range(steps):
         left = pixels.left()
-        count, at_once, steps = int(left.sum()), at_once - 1, steps - 1
+        u, v = pixels.stepped(fields.newton(pixels))
+        pixels = fields.at(*pixels[:2], torch.where(left, u, pixels.u), torch.where(left, v, pixels.v))
+    return pixels
+
+
+def _alone(flow: Tensor, steps: int) -> _Pixels:
+    """The pixels of one sample after the steps that they need."""
+    pixels, fields, newton = _begun(flow)
+    left = pixels.left()
+    count, at_once = int(left.count_nonzero()), min(steps, _AT_ONCE)
+    while at_once > 0 and count > _MANY * left.numel():
+        pixels = fields.at(*pixels[:2], *pixels.stepped(newton))
+        left = pixels.left()
+        count, at_once, steps = int(left.count_nonzero()), at_once - 1, steps - 1
     if steps == 0 or count == 0:
         return pixels
-    index = _filled(left)
-    some, ends = pixels.picked(index), [value.contiguous().flatten(2) for value in pixels[1:]]
+    index, ends = _filled(left), pixels[2:]
+    x, y = (plane.expand_as(left) for plane in pixels[:2])
+    some = _Pixels(x, y, *ends).picked(index)
     while steps > 0 and len(index):
-        some, steps = fields.stepped(some), steps - 1
-        for end, value in zip(ends, some[1:], strict=True):
-            end.index_copy_(2, index, value.flatten(2))
+        some, steps = fields.at(some.x, some.y, *some.stepped(fields.newton(some))), steps - 1
+        for end, plane in zip(ends, some[2:], strict=True):
+            if end is not None:
+                end.view(-1).index_copy_(0, index, plane.flatten())
         places = _filled(some.left())
         index, some = index[places], some.picked(places)
-    return _Pixels(pixels.home, *(end.unflatten(2, left.shape[2:]) for end in ends))
+    return pixels
+
+
+def _begun(flow: Tensor) -> tuple[_Pixels, _Fields, _Newton]:
+    """The pixels after the first step, which has nothing to read, and what the next ones take."""
+    fields = _Fields(flow, _slopes(flow, 3), _slopes(flow, 2))
+    sheet = _sheet(fields.along, fields.across)
+    determinant = sheet.determinant
+    # Where it is at every pixel, what is read between them is above zero, too.
+    if not is_true(lambda: determinant.amin() >= _UPRIGHT):
+        fields = fields._replace(flow=torch.cat([flow, determinant], dim=1))
+        upright = determinant >= _UPRIGHT
+        flat = _Sheet(*(torch.where(upright, own, still) for own, still in zip(sheet, (1, 0, 0, 1), strict=True)))
+        sheet, determinant = flat, torch.where(upright, determinant, 1)
+    newton, size = sheet.over(determinant), {"height": flow.shape[2], "width": flow.shape[3]}
+    x, y = sampler_axes(*pixel_axes(**size, dtype=flow.dtype, device=flow.device), **size)
+    none = flow.new_zeros(())
+    return fields.at(x, y, *newton.step(none, none, *flow.split(1, dim=1))), fields, newton
 
 
 def _filled(flags: Tensor) -> Tensor:
@@ -185,23 +249,27 @@ def _filled(flags: Tensor) -> Tensor:
     return torch.cat([index, index[-1:].expand(-len(index) % _ROW)])
 
 
-def _gradient(flow: Tensor) -> Tensor:
-    """(B, 4, H, W): u_x, v_x, u_y, v_y by central differences, one-sided at the border."""
-    sides = [torch.gradient(flow, dim=dim)[0] if flow.shape[dim] > 1 else torch.zeros_like(flow) for dim in (-1, -2)]
-    return torch.cat(sides, dim=1)
+def _slopes(flow: Tensor, dim: int) -> Tensor:
+    """(B, 2, H, W): the slopes of u and v along a dimension, by central differences, one-sided at the border."""
+    count = flow.shape[dim]
+    if count == 1:
+        return torch.zeros_like(flow)
+    first, second = flow.narrow(dim, 0, 2).split(1, dim)
+    before, last = flow.narrow(dim, count - 2, 2).split(1, dim)
+    longer = torch.cat([2 * first - second, flow, 2 * last - before], dim)
+    return (longer.narrow(dim, 2, count) - longer.narrow(dim, 0, count)).mul_(0.5)
 
 
-def _cell_gradient(flow: Tensor, at: Tensor) -> Tensor:
-    """(B, 4, H, W): u_x, v_x, u_y, v_y of the bilinear reading itself at p + at(p), each the slope of a cell."""
+def _cell_slopes(flow: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """Twice (B, 2, H, W): the slopes, along x and y, of the bilinear reading itself at p + at(p), each of a cell."""
     axes = pixel_axes(flow.shape[2], flow.shape[3], dtype=flow.dtype, device=flow.device)
     slopes = []
     for channel, axis in enumerate(axes):
         shift = (axis + at[:, channel : channel + 1]).floor() - axis
         low = torch.cat([shift, at[:, 1:]] if channel == 0 else [at[:, :1], shift], dim=1)
         high = low + torch.eye(2, dtype=flow.dtype, device=flow.device)[channel].view(1, 2, 1, 1)
-        ends = (_read(flow, end) for end in (high, low))
-        slopes.append(torch.sub(*ends))
-    return torch.cat(slopes, dim=1)
+        slopes.append(_read(flow, high) - _read(flow, low))
+    return slopes[0], slopes[1]
 
 
 def _read(field: Tensor, at: Tensor) -> Tensor:
@@ -209,18 +277,7 @@ def _read(field: Tensor, at: Tensor) -> Tensor:
     return look_up(field, at, padding="border", interpolation="bilinear")
 
 
-def _determinant(slopes: Tensor) -> Tensor:
-    """(B, 1, H, W): of I + the slopes (B, 4, H, W), as of `_gradient`."""
-    u_x, v_x, u_y, v_y = slopes.split(1, dim=1)
-    return (1 + u_x) * (1 + v_y) - u_y * v_x
-
-
-def _step(slopes: Tensor, determinant: Tensor, error: Tensor) -> Tensor:
-    """(B, 2, H, W): (I + slopes)^-1 error, no longer than any flow, so that all that comes of it is a number."""
-    # Near a fold the step has no good length; a bounded determinant keeps it finite, the residual tells the rest.
-    determinant = determinant.abs().clamp(min=0.1).copysign(determinant)
-    u_x, v_x, u_y, v_y = slopes.split(1, dim=1)
-    x, y = error.split(1, dim=1)
-    right = torch.addcmul(torch.addcmul(x, v_y, x), u_y, y, value=-1)
-    down = torch.addcmul(torch.addcmul(y, u_x, y), v_x, x, value=-1)
-    return (torch.cat([right, down], dim=1) / determinant).clamp(-_FARTHEST, _FARTHEST)
+def _sheet(along: Tensor, across: Tensor) -> _Sheet:
+    """Of slopes (B, 2, n, m) of u and v along x, and along y."""
+    (u_x, v_x), (u_y, v_y) = along.split(1, dim=1), across.split(1, dim=1)
+    return _Sheet(1 + u_x, u_y, v_x, 1 + v_y)

@@ -102,17 +102,16 @@ def acting(effect: Effect, params: Any) -> list[dict[str, Any]]:
     found = []
     for leaf, own in leaves:
         if own.gate[0]:
-            values = {name: _plain(value[0]) for name, value in own._asdict().items() if name != "gate"}
+            values = {name: _plain(value[0].tolist()) for name, value in own._asdict().items() if name != "gate"}
             found.append({"effect": type(leaf).__name__} | values)
     return found
 
 
-def _plain(value: Tensor) -> Any:
-    """Numbers, or nested lists of them; JSON has no infinity, so that it becomes a word."""
-    if value.ndim > 0:
+def _plain(value: Any) -> Any:
+    """A number, or nested lists of them; JSON has no infinity, so that it becomes a word."""
+    if isinstance(value, list):
         return [_plain(row) for row in value]
-    number = value.item()
-    return str(number) if isinstance(number, float) and not math.isfinite(number) else number
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _maps(degraded: Degraded) -> dict[str, np.ndarray]:

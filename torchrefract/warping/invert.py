@@ -157,17 +157,19 @@ class _Fields(NamedTuple):
 
     def at(self, x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> _Pixels:
         """Pixels with their inverse."""
-        moved_u, moved_v, *determinant = self._read(self.flow, x, y, u, v).split(1, dim=1)
+        moved_u, moved_v, *determinant = _sampled(self.flow, self._grid(x, y, u, v)).split(1, dim=1)
         return _Pixels(x, y, u, v, moved_u.add_(u), moved_v.add_(v), determinant[0] if determinant else None)
 
     def newton(self, pixels: _Pixels) -> _Newton:
         """With the slopes at p + inverse."""
-        return _sheet(*(self._read(slopes, *pixels[:4]) for slopes in (self.along, self.across))).newton()
+        grid = self._grid(*pixels[:4])
+        return _sheet(_sampled(self.along, grid), _sampled(self.across, grid)).newton()
 
-    def _read(self, field: Tensor, x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> Tensor:
-        height, width = field.shape[2:]
-        grid = torch.cat([torch.add(x, u, alpha=2 / width), torch.add(y, v, alpha=2 / height)], dim=1)
-        return sampled(field, grid.movedim(1, -1), padding="border", interpolation="bilinear")
+    def _grid(self, x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> Tensor:
+        """(B, n, m, 2), in the sampler's coordinates."""
+        height, width = self.flow.shape[2:]
+        there = torch.add(x, u, alpha=2 / width), torch.add(y, v, alpha=2 / height)
+        return torch.cat(there, dim=1).movedim(1, -1)
 
 
 def _solved(flow: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -270,6 +272,10 @@ def _cell_slopes(flow: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
         high = low + torch.eye(2, dtype=flow.dtype, device=flow.device)[channel].view(1, 2, 1, 1)
         slopes.append(_read(flow, high) - _read(flow, low))
     return slopes[0], slopes[1]
+
+
+def _sampled(field: Tensor, grid: Tensor) -> Tensor:
+    return sampled(field, grid, padding="border", interpolation="bilinear")
 
 
 def _read(field: Tensor, at: Tensor) -> Tensor:

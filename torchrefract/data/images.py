@@ -32,6 +32,7 @@ _BARE_MARKERS = (0x01, *range(0xD0, 0xD8))  # TEM and RST0 to RST7 carry no leng
 _ORIENTATION = 0x0112
 _TURNED = (5, 6, 7, 8)  # EXIF orientations that swap height and width
 _QUIETING = Lock()
+_AT_ONCE = 1 << 16  # pixels of a picture that stay in a core's cache
 _levels: list[int] = []  # OpenCV's log level before, once for each thread that has it off
 
 
@@ -62,10 +63,17 @@ def pixels_of(image: Tensor) -> np.ndarray:
 
     What `read_image` has read from 8 bits comes back as it was.
     """
-    levels = image.detach().mul(255).clamp_(0, 255).round_().byte().cpu()
-    last = levels.permute(1, 2, 0)
-    # OpenCV interleaves planes sooner than a copy in another order of strides does.
-    return last.numpy() if last.is_contiguous() else cv2.merge([*levels.numpy()])
+    image = image.detach().cpu()
+    pixels, rows = np.empty((*image.shape[1:], 3), np.uint8), max(1, _AT_ONCE // max(1, image.shape[2]))
+    for start in range(0, len(pixels), rows):
+        band, levels = pixels[start : start + rows], image[:, start : start + rows].mul(255)
+        levels = levels.clamp_(0, 255).round_().byte()
+        # OpenCV interleaves planes sooner than a copy in another order of strides does.
+        if (last := levels.permute(1, 2, 0)).is_contiguous():
+            band[:] = last.numpy()
+        else:
+            cv2.merge([*levels.numpy()], dst=band)
+    return pixels
 
 
 def image_size(path: str | Path) -> tuple[int, int]:

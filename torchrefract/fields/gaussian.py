@@ -11,6 +11,7 @@ from torchrefract._bands import join
 from torchrefract.fields.covariance import REACH, covariance
 
 _ROUNDING = 5e-13  # of the transform, relative to the largest eigenvalue
+_NOTHING = 1e-16  # of an amplitude: what adds nothing to the sum of all
 _CACHED = 1 << 18  # complex numbers that stay in a core's cache
 
 
@@ -137,7 +138,9 @@ def _smoothing(frequency: Tensor, aperture: Tensor | None) -> Tensor:
     """What a Gaussian aperture leaves of the amplitude at frequencies in cycles per px."""
     if aperture is None:
         return torch.ones_like(frequency)
-    return torch.exp(-0.5 * (2 * math.pi * aperture.double()[:, None, None] * frequency).square())
+    kept = torch.exp(-0.5 * (2 * math.pi * aperture.double()[:, None, None] * frequency).square())
+    # Below, products are no normal numbers of float32 any more, with which all arithmetic is many times slower.
+    return torch.where(kept > _NOTHING, kept, 0)
 
 
 def _root(values: Tensor) -> Tensor:

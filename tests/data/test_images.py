@@ -53,6 +53,13 @@ def test_what_was_read_from_eight_bits_is_written_as_it_was(tmp_path):
         np.testing.assert_array_equal(found, every)
 
 
+def test_large_pictures_are_written_as_they_were_too():
+    every = np.random.default_rng(0).integers(0, 256, (301, 500, 3), dtype=np.uint8)
+    image = torch.from_numpy(every).permute(2, 0, 1) / 255
+    for same in (image, image.contiguous()):
+        np.testing.assert_array_equal(pixels_of(same), every)
+
+
 def test_values_become_the_nearest_level_and_none_leaves_the_range():
     values = torch.tensor([-9.0, -0.1, 0.0, 0.49 / 255, 0.51 / 255, 254.4 / 255, 254.6 / 255, 1.0, 1.1, 300.0])
     image = values.expand(3, 2, -1).contiguous().requires_grad_()

@@ -319,6 +319,15 @@ def test_an_aperture_makes_a_gaussian_covariance_wider_by_the_closed_form(length
 
 
 @pytest.mark.parametrize("kind", COVARIANCES)
+def test_an_amplitude_is_a_normal_number_or_zero(kind):
+    amplitude = spectrum(
+        (200, 300), torch.tensor([20.0]), kind=kind, aperture=torch.tensor([5.0]), dtype=torch.float32
+    ).amplitude
+    assert (amplitude == 0).any()
+    assert amplitude[amplitude > 0].min() >= torch.finfo(torch.float32).tiny
+
+
+@pytest.mark.parametrize("kind", COVARIANCES)
 def test_an_aperture_smooths_the_field_by_a_gaussian(kind):
     size, length, aperture = (64, 80), 4.0, 1.7
     sharp, smooth = (exact_spectrum(size, length, kind, a).amplitude for a in (None, aperture))

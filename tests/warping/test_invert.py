@@ -199,6 +199,16 @@ def test_a_sample_depends_on_no_other(pixels, waves):
             assert torch.equal(value[i : i + 1], alone)
 
 
+@pytest.mark.parametrize("amplitude_px", [0.5, 3.0, 8.0])  # the last one folds
+def test_it_does_not_matter_how_a_flow_lies_in_memory(pixels, waves, amplitude_px):
+    flow = waves(*pixels(200, 300), amplitude_px, 12.0).float()
+    expected = invert_flow(flow)
+    wider = torch.cat([flow, flow], dim=3)[..., :300]
+    for same in (flow.contiguous(memory_format=torch.channels_last), wider):
+        for value, other in zip(invert_flow(same), expected, strict=True):
+            assert torch.equal(value, other)
+
+
 def test_a_fold_in_one_place_does_not_cost_steps_everywhere(pixels, waves, monkeypatch):
     positions = list[int]()
 

@@ -65,7 +65,7 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
     flow = flow if known is None else torch.where(known, flow, 0)
     with torch.no_grad():
         # In large frames the positions are of another type.
-        solution, residual, upright = _solved(flow.to(sampler_dtype(flow, flow.dtype)), steps)
+        solution, residual, upright = _solved(flow.to(sampler_dtype(flow, flow.dtype)).contiguous(), steps)
         solution, residual = solution.to(flow.dtype), residual.to(flow.dtype)
         valid = (residual <= tolerance_px) & inside(solution)
         valid = valid if upright is None else valid & upright
@@ -215,7 +215,7 @@ def _alone(flow: Tensor, steps: int) -> _Pixels:
         count, at_once, steps = int(left.count_nonzero()), at_once - 1, steps - 1
     if steps == 0 or count == 0:
         return pixels
-    index, ends = _filled(left), pixels[2:]
+    index, ends = _filled(left), [None if plane is None else plane.contiguous() for plane in pixels[2:]]
     x, y = (plane.expand_as(left) for plane in pixels[:2])
     some = _Pixels(x, y, *ends).picked(index)
     while steps > 0 and len(index):
@@ -225,7 +225,7 @@ def _alone(flow: Tensor, steps: int) -> _Pixels:
                 end.view(-1).index_copy_(0, index, plane.flatten())
         places = _filled(some.left())
         index, some = index[places], some.picked(places)
-    return pixels
+    return _Pixels(*pixels[:2], *ends)
 
 
 def _begun(flow: Tensor) -> tuple[_Pixels, _Fields, _Newton]:
@@ -256,10 +256,14 @@ def _slopes(flow: Tensor, dim: int) -> Tensor:
     count = flow.shape[dim]
     if count == 1:
         return torch.zeros_like(flow)
-    first, second = flow.narrow(dim, 0, 2).split(1, dim)
-    before, last = flow.narrow(dim, count - 2, 2).split(1, dim)
-    longer = torch.cat([2 * first - second, flow, 2 * last - before], dim)
-    return (longer.narrow(dim, 2, count) - longer.narrow(dim, 0, count)).mul_(0.5)
+    if read(lambda: flow[0, 0, 0, 0]) is None:
+        return torch.gradient(flow, dim=dim)[0]
+    # The same, without the copies on its way.
+    slopes, inner = torch.empty_like(flow), count - 2
+    torch.sub(flow.narrow(dim, 2, inner), flow.narrow(dim, 0, inner), out=slopes.narrow(dim, 1, inner)).mul_(0.5)
+    for border, low in ((0, 0), (count - 1, inner)):
+        torch.sub(flow.narrow(dim, low + 1, 1), flow.narrow(dim, low, 1), out=slopes.narrow(dim, border, 1))
+    return slopes
 
 
 def _cell_slopes(flow: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:

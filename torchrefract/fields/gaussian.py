@@ -62,7 +62,7 @@ def axis_spectrum(size: int, length: Tensor, aperture: Tensor | None) -> Tensor:
     distance = torch.arange(size // 2 + 1, dtype=torch.float64, device=length.device)
     ways = (distance, size - distance, size + distance)
     near, *far = (covariance(h, length.double()[:, None], "gaussian") for h in ways)
-    values = _transform(near + sum(far), size, -1)
+    values = _transform(near + sum(far), -1)
     kept = torch.where(values > _ROUNDING * values.amax(dim=1, keepdim=True), values, 0)
     smooth = _smoothing(distance / size, aperture).reshape(-1, size // 2 + 1)
     variance = (kept * smooth.square() * _multiplicity(size, length.device)).sum(dim=1, keepdim=True)
@@ -109,7 +109,7 @@ def _eigenvalues(size: tuple[int, int], length: Tensor, kind: str) -> Tensor:
     # eigenvalues span sixteen powers of ten.
     y, x = _half_axes(size, length.device)
     if kind == "exponential":
-        return _transform(_transform(covariance((x * x + y * y).sqrt(), length, kind), size[1], -1), size[0], -2)
+        return _transform(_transform(covariance((x * x + y * y).sqrt(), length, kind), -1), -2)
     # A smooth covariance of the shortest way round the torus has a kink half-way, and so negative eigenvalues. Summed
     # over the ways round it has none; on a torus too short for it, the sum would be off by more.
     others = (REACH[kind] * length <= min(size)).double()
@@ -118,13 +118,13 @@ def _eigenvalues(size: tuple[int, int], length: Tensor, kind: str) -> Tensor:
             covariance(t, length, kind) + others * (covariance(n - t, length, kind) + covariance(n + t, length, kind))
             for t, n in ((y, size[0]), (x, size[1]))
         )
-        values = _transform(rows, size[0], -2) * _transform(columns, size[1], -1)
+        values = _transform(rows, -2) * _transform(columns, -1)
     else:
         x2, y2, far_x2, far_y2 = x * x, y * y, (size[1] - x).square(), (size[0] - y).square()
         near, *far = (
             covariance(square.sqrt(), length, kind) for square in (x2 + y2, far_x2 + y2, x2 + far_y2, far_x2 + far_y2)
         )
-        values = _transform(_transform(near + others * sum(far), size[1], -1), size[0], -2)
+        values = _transform(_transform(near + others * sum(far), -1), -2)
     # What rounding leaves is no eigenvalue: the slope of its root would be anything.
     return torch.where(values.abs() > _ROUNDING * values.amax(dim=(1, 2), keepdim=True), values, 0)
 
@@ -150,19 +150,19 @@ def _root(values: Tensor) -> Tensor:
     return torch.where(values > 0, values, 1).sqrt() * (values > 0)
 
 
-def _transform(values: Tensor, count: int, dim: int) -> Tensor:
-    """The real Fourier transform of an even, periodic sequence of `count`, half of which is given and returned."""
+def _transform(values: Tensor, dim: int) -> Tensor:
+    """The real Fourier transform of an even, periodic sequence, half of which is given and returned."""
     if torch.compiler.is_compiling():
-        return torch.ops.torchrefract.even_transform(values, count, dim)
-    return _even_transform(values, count, dim)
+        return torch.ops.torchrefract.even_transform(values, dim)
+    return _even_transform(values, dim)
 
 
-def _even_transform(values: Tensor, count: int, dim: int) -> Tensor:
+def _even_transform(values: Tensor, dim: int) -> Tensor:
     if values.shape[0] == 0:  # which PyTorch before 2.15 cannot transform
         return values.clone()
     # One sample at a time on the CPU: there long transforms of several round otherwise.
     each = values.split(1) if values.device.type == "cpu" else [values]
-    return torch.cat([torch.fft.hfft(one, n=count, dim=dim).narrow(dim, 0, count // 2 + 1) for one in each])
+    return torch.cat([torch.fft.rfft(_whole(one, dim), dim=dim).real for one in each])
 
 
 def _fields(noise: Tensor, shape: Tensor, height: int, width: int) -> Tensor:
@@ -212,23 +212,23 @@ def _multiplicity(count: int, device: torch.device) -> Tensor:
 
 
 @torch.library.custom_op("torchrefract::even_transform", mutates_args=())
-def _even_transform_op(values: Tensor, count: int, dim: int) -> Tensor:
-    return _even_transform(values, count, dim).contiguous()
+def _even_transform_op(values: Tensor, dim: int) -> Tensor:
+    return _even_transform(values, dim).contiguous()
 
 
 @_even_transform_op.register_fake
-def _(values: Tensor, count: int, dim: int) -> Tensor:
+def _(values: Tensor, dim: int) -> Tensor:
     return torch.empty_like(values, memory_format=torch.contiguous_format)
 
 
 def _keep_even_transform(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    ctx.count, ctx.dim = inputs[1:]
+    ctx.dim = inputs[1]
 
 
-def _even_transform_gradient(ctx: Any, slope: Tensor) -> tuple[Tensor, None, None]:
-    times = _multiplicity(ctx.count, slope.device)
+def _even_transform_gradient(ctx: Any, slope: Tensor) -> tuple[Tensor, None]:
+    times = _multiplicity(2 * (slope.shape[ctx.dim] - 1), slope.device)
     times = times if ctx.dim == -1 else times[:, None]
-    return times * torch.ops.torchrefract.even_transform(slope / times, ctx.count, ctx.dim), None, None
+    return times * torch.ops.torchrefract.even_transform(slope / times, ctx.dim), None
 
 
 _even_transform_op.register_autograd(_even_transform_gradient, setup_context=_keep_even_transform)

@@ -128,7 +128,13 @@ class _Pixels(NamedTuple):
     v: Tensor
     error_u: Tensor  # px, what is to vanish: inverse + flow, read at p + inverse
     error_v: Tensor
-    determinant: Tensor | None  # read there too; None for a sheet that is upright everywhere
+    determinant: Tensor | None = None  # read there too; None for a sheet that is upright everywhere
+
+    @property
+    def known(self) -> list[Tensor]:
+        """What steps change."""
+        ends = [self.u, self.v, self.error_u, self.error_v]
+        return ends if self.determinant is None else [*ends, self.determinant]
 
     @property
     def squared_error(self) -> Tensor:
@@ -145,7 +151,8 @@ class _Pixels(NamedTuple):
 
     def picked(self, index: Tensor) -> "_Pixels":
         """Some of those of one sample, by their numbers, (N,), a multiple of the length of a row."""
-        return _Pixels(*(None if plane is None else plane.flatten()[index].view(1, 1, -1, _ROW) for plane in self))
+        planes = (self.x, self.y, *self.known)
+        return _Pixels(*(plane.flatten()[index].view(1, 1, -1, _ROW) for plane in planes))
 
 
 class _Fields(NamedTuple):
@@ -158,7 +165,7 @@ class _Fields(NamedTuple):
     def at(self, x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> _Pixels:
         """Pixels with their inverse."""
         moved_u, moved_v, *determinant = _sampled(self.flow, self._grid(x, y, u, v)).split(1, dim=1)
-        return _Pixels(x, y, u, v, moved_u.add_(u), moved_v.add_(v), determinant[0] if determinant else None)
+        return _Pixels(x, y, u, v, moved_u.add_(u), moved_v.add_(v), *determinant)
 
     def newton(self, pixels: _Pixels) -> _Newton:
         """With the slopes at p + inverse."""
@@ -215,14 +222,13 @@ def _alone(flow: Tensor, steps: int) -> _Pixels:
         count, at_once, steps = int(left.count_nonzero()), at_once - 1, steps - 1
     if steps == 0 or count == 0:
         return pixels
-    index, ends = _filled(left), [None if plane is None else plane.contiguous() for plane in pixels[2:]]
+    index, ends = _filled(left), [plane.contiguous() for plane in pixels.known]
     x, y = (plane.expand_as(left) for plane in pixels[:2])
     some = _Pixels(x, y, *ends).picked(index)
     while steps > 0 and len(index):
         some, steps = fields.at(some.x, some.y, *some.stepped(fields.newton(some))), steps - 1
-        for end, plane in zip(ends, some[2:], strict=True):
-            if end is not None:
-                end.view(-1).index_copy_(0, index, plane.flatten())
+        for end, plane in zip(ends, some.known, strict=True):
+            end.view(-1).index_copy_(0, index, plane.flatten())
         places = _filled(some.left())
         index, some = index[places], some.picked(places)
     return _Pixels(*pixels[:2], *ends)

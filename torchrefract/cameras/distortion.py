@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchrefract._checks import is_true, read
 from torchrefract.cameras.radial import RadialLimit, radial, radial_slope
+from torchrefract.warping.jacobian import Jacobian
 
 POLYNOMIAL12 = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
 _SMALLEST_RADIAL = 0.1  # of a first guess
@@ -32,36 +33,6 @@ class Terms(NamedTuple):
 
 
 ALL_TERMS = Terms()
-
-
-class Jacobian(NamedTuple):
-    """Derivatives of the distorted point: xy is d x_d / d y."""
-
-    xx: Tensor
-    xy: Tensor
-    yx: Tensor
-    yy: Tensor
-
-    @property
-    def determinant(self) -> Tensor:
-        """Of the 2x2 matrix."""
-        return torch.addcmul(self.xx * self.yy, self.xy, self.yx, value=-1)
-
-    def solve(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """J^-1 (a, b), with the determinant held above zero."""
-        scale = 1 / self.determinant.clamp(min=1e-6)
-        x = torch.addcmul(self.yy * a, self.xy, b, value=-1)
-        y = torch.addcmul(self.xx * b, self.yx, a, value=-1)
-        return x * scale, y * scale
-
-    def after(self, first: "Jacobian") -> "Jacobian":
-        """The product J first: the derivatives of one map after another."""
-        return Jacobian(
-            self.xx * first.xx + self.xy * first.yx,
-            self.xx * first.xy + self.xy * first.yy,
-            self.yx * first.xx + self.yy * first.yx,
-            self.yx * first.xy + self.yy * first.yy,
-        )
 
 
 def used_terms(coefficients: Tensor) -> Terms:

@@ -59,12 +59,11 @@ def inside(flow: Tensor) -> Tensor:
 
 def length(flow: Tensor) -> Tensor:
     """(B, 1, H, W), px: sqrt(u^2 + v^2), without gradient, and to the same bits in any batch, as `norm` is not."""
-    return squared_length(flow.detach()).sqrt()
+    return squared_length(*flow.detach().split(1, dim=1)).sqrt()
 
 
-def squared_length(flow: Tensor) -> Tensor:
+def squared_length(u: Tensor, v: Tensor) -> Tensor:
     """(B, 1, H, W), px^2: u^2 + v^2."""
-    u, v = flow.split(1, dim=1)
     return torch.addcmul(u * u, v, v)
 
 

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import check_count, check_flow, check_positive, is_true, read
-from torchrefract.warping.grid import field_dtype, inside, pixel_axes, sampler_axes
+from torchrefract.warping.grid import field_dtype, inside, pixel_axes, sampler_axes, squared_length
+from torchrefract.warping.jacobian import Jacobian
 from torchrefract.warping.resample import look_up, sampled, sampler_dtype
 
 # Px: a residual that calls for no further step.
@@ -75,37 +76,13 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
     if not (flow.requires_grad and torch.is_grad_enabled()):
         return solution, valid, residual
     moved = _read(flow, solution)
-    sheet = _sheet(*_cell_slopes(flow.detach(), solution))
-    inverse = sheet.newton().step(*solution.split(1, dim=1), *(moved - moved.detach()).split(1, dim=1))
+    newton = _newton(_jacobian(*_cell_slopes(flow.detach(), solution)))
+    inverse = newton.step(*solution.split(1, dim=1), *(moved - moved.detach()).split(1, dim=1))
     return torch.cat(inverse, dim=1), valid, residual
 
 
-class _Sheet(NamedTuple):
-    """I + the slopes of a flow, [[xx, xy], [yx, yy]], each (B, 1, n, m)."""
-
-    xx: Tensor
-    xy: Tensor
-    yx: Tensor
-    yy: Tensor
-
-    @property
-    def determinant(self) -> Tensor:
-        """(B, 1, n, m), above zero where the sheet is upright."""
-        return torch.addcmul(self.xx * self.yy, self.xy, self.yx, value=-1)
-
-    def newton(self) -> "_Newton":
-        """Also for that of a fold, near which a step has no good length; the residual tells the rest."""
-        determinant = self.determinant
-        return self.over(determinant.abs().clamp(min=0.1).copysign(determinant))
-
-    def over(self, determinant: Tensor) -> "_Newton":
-        """With a determinant that is known."""
-        scale = 1 / determinant
-        return _Newton(self.yy * scale, self.xy * scale, self.yx * scale, self.xx * scale)
-
-
 class _Newton(NamedTuple):
-    """The inverse of a sheet, [[xx, -xy], [-yx, yy]], each (B, 1, n, m)."""
+    """The inverse of a Jacobian, [[xx, -xy], [-yx, yy]], each (B, 1, n, m)."""
 
     xx: Tensor
     xy: Tensor
@@ -139,7 +116,7 @@ class _Pixels(NamedTuple):
     @property
     def squared_error(self) -> Tensor:
         """(B, 1, n, m), px^2."""
-        return torch.addcmul(self.error_u * self.error_u, self.error_v, self.error_v)
+        return squared_length(self.error_u, self.error_v)
 
     def left(self) -> Tensor:
         """(B, 1, n, m), bool: those that take another step."""
@@ -170,7 +147,7 @@ class _Fields(NamedTuple):
     def newton(self, pixels: _Pixels) -> _Newton:
         """With the slopes at p + inverse."""
         grid = self._grid(*pixels[:4])
-        return _sheet(_sampled(self.along, grid), _sampled(self.across, grid)).newton()
+        return _newton(_jacobian(_sampled(self.along, grid), _sampled(self.across, grid)))
 
     def _grid(self, x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> Tensor:
         """(B, n, m, 2), in the sampler's coordinates."""
@@ -237,15 +214,15 @@ def _alone(flow: Tensor, steps: int) -> _Pixels:
 def _begun(flow: Tensor) -> tuple[_Pixels, _Fields, _Newton]:
     """The pixels after the first step, which has nothing to read, and what the next ones take."""
     fields = _Fields(flow, _slopes(flow, 3), _slopes(flow, 2))
-    sheet = _sheet(fields.along, fields.across)
+    sheet = _jacobian(fields.along, fields.across)
     determinant = sheet.determinant
     # Where it is at every pixel, what is read between them is above zero, too.
     if not is_true(lambda: determinant.amin() >= _UPRIGHT):
         fields = fields._replace(flow=torch.cat([flow, determinant], dim=1))
         upright = determinant >= _UPRIGHT
-        flat = _Sheet(*(torch.where(upright, own, still) for own, still in zip(sheet, (1, 0, 0, 1), strict=True)))
+        flat = Jacobian(*(torch.where(upright, own, still) for own, still in zip(sheet, (1, 0, 0, 1), strict=True)))
         sheet, determinant = flat, torch.where(upright, determinant, 1)
-    newton, size = sheet.over(determinant), {"height": flow.shape[2], "width": flow.shape[3]}
+    newton, size = _over(sheet, determinant), {"height": flow.shape[2], "width": flow.shape[3]}
     x, y = sampler_axes(*pixel_axes(**size, dtype=flow.dtype, device=flow.device), **size)
     none = flow.new_zeros(())
     return fields.at(x, y, *newton.step(none, none, *flow.split(1, dim=1))), fields, newton
@@ -293,7 +270,19 @@ def _read(field: Tensor, at: Tensor) -> Tensor:
     return look_up(field, at, padding="border", interpolation="bilinear")
 
 
-def _sheet(along: Tensor, across: Tensor) -> _Sheet:
-    """Of slopes (B, 2, n, m) of u and v along x, and along y."""
+def _jacobian(along: Tensor, across: Tensor) -> Jacobian:
+    """I + the slopes (B, 2, n, m) of u and v along x, and along y."""
     (u_x, v_x), (u_y, v_y) = along.split(1, dim=1), across.split(1, dim=1)
-    return _Sheet(1 + u_x, u_y, v_x, 1 + v_y)
+    return Jacobian(1 + u_x, u_y, v_x, 1 + v_y)
+
+
+def _newton(jacobian: Jacobian) -> _Newton:
+    """Also for that of a fold, near which a step has no good length; the residual tells the rest."""
+    determinant = jacobian.determinant
+    return _over(jacobian, determinant.abs().clamp(min=0.1).copysign(determinant))
+
+
+def _over(jacobian: Jacobian, determinant: Tensor) -> _Newton:
+    """With a determinant that is known."""
+    scale = 1 / determinant
+    return _Newton(jacobian.yy * scale, jacobian.xy * scale, jacobian.yx * scale, jacobian.xx * scale)

@@ -1,11 +1,43 @@
 """How a flow stretches the image, and where it folds it."""
 
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._checks import check_flow
 from torchrefract.types import Folding
+
+
+class Jacobian(NamedTuple):
+    """Derivatives of a map of the plane: xy is that of the new x with respect to y."""
+
+    xx: Tensor
+    xy: Tensor
+    yx: Tensor
+    yy: Tensor
+
+    @property
+    def determinant(self) -> Tensor:
+        """Of the 2x2 matrix."""
+        return torch.addcmul(self.xx * self.yy, self.xy, self.yx, value=-1)
+
+    def solve(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        """J^-1 (a, b), with the determinant held above zero."""
+        scale = 1 / self.determinant.clamp(min=1e-6)
+        x = torch.addcmul(self.yy * a, self.xy, b, value=-1)
+        y = torch.addcmul(self.xx * b, self.yx, a, value=-1)
+        return x * scale, y * scale
+
+    def after(self, first: "Jacobian") -> "Jacobian":
+        """The product J first: the derivatives of one map after another."""
+        return Jacobian(
+            self.xx * first.xx + self.xy * first.yx,
+            self.xx * first.xy + self.xy * first.yy,
+            self.yx * first.xx + self.yy * first.yx,
+            self.yx * first.xy + self.yy * first.yy,
+        )
 
 
 def jacobian_determinant(flow: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from torchrefract.warping.grid import field_dtype, inside, length
 from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.jacobian import folding
 from torchrefract.warping.lattice import SmoothFlow, dense
+from torchrefract.warping.masks import mixes_only
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, RESAMPLERS, look_up
 
 
@@ -168,8 +169,7 @@ def moving(
 
 def sees(good: Tensor, flow: Tensor) -> Tensor:
     """(B, 1, H, W), bool: all pixels that a look-up along the flow mixes are good, but for weights below 1/1000."""
-    good, flow = alike(good, flow)
-    return look_up(good.to(flow.dtype), flow, padding="zeros", interpolation="bilinear") > 0.999
+    return mixes_only(*alike(good, flow))
 
 
 def identity(image: Tensor, params: Any) -> Degraded:

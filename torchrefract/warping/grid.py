@@ -1,12 +1,13 @@
 """Pixels and the sampler's coordinates: the one place that knows both."""
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true
+from torchrefract._checks import is_true, read
 
 # F.grid_sample spans [-1, 1]; four of these lie well outside whatever the padding, and keep every product finite.
 FAR = 4.0
@@ -53,8 +54,37 @@ def inside(flow: Tensor) -> Tensor:
     u, v = flow.detach().split(1, dim=1)
     # Distances from the middle, since comparisons are slow.
     half_x, half_y = (width - 1) / 2, (height - 1) / 2
-    on_x = ((x - half_x) + u).abs() <= half_x + _TOLERANCE
-    return on_x & (((y - half_y) + v).abs() <= half_y + _TOLERANCE)
+    x, y = x - half_x, y - half_y
+
+    def at(rows: slice, columns: slice) -> Tensor:
+        on_x = (x[..., columns] + u[..., rows, columns]).abs() <= half_x + _TOLERANCE
+        return on_x & ((y[..., rows, :] + v[..., rows, columns]).abs() <= half_y + _TOLERANCE)
+
+    return near_border(flow, 1, at)
+
+
+def near_border(flow: Tensor, depth: int, at: Callable[[slice, slice], Tensor]) -> Tensor:
+    """(B, 1, H, W), bool: `at` where flow leads to the border, and true where it does not.
+
+    Args:
+        flow: (B, 2, H, W), px.
+        depth: px, how far from the border p + flow(p) is for `at` to be true.
+        at: from rows and columns of the frame to (B, 1, n, m), bool.
+    """
+    (height, width), everywhere = flow.shape[2:], slice(None)
+    farthest = read(lambda: torch.stack(flow.detach().aminmax()).abs().amax()) if flow.numel() else None
+    if farthest is None or not farthest < min(height, width):  # nor is NaN
+        return at(everywhere, everywhere)
+    depth += math.ceil(farthest)
+    # Narrow strips take longer than they are large.
+    if 6 * depth >= min(height, width):
+        return at(everywhere, everywhere)
+    found = torch.ones_like(flow[:, :1], dtype=torch.bool)
+    top, middle, bottom = slice(0, depth), slice(depth, height - depth), slice(height - depth, height)
+    sides = slice(0, depth), slice(width - depth, width)
+    for rows, columns in ((top, everywhere), (bottom, everywhere), (middle, sides[0]), (middle, sides[1])):
+        found[..., rows, columns] = at(rows, columns)
+    return found
 
 
 def length(flow: Tensor) -> Tensor:
@@ -80,7 +110,12 @@ def sampler_grids(flow: Tensor, *, rows: int) -> Iterator[Tensor]:
     height, width = flow.shape[2:]
     x, y = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
     for band, middle in zip(flow.split(max(1, rows), dim=2), y.split(max(1, rows), dim=2), strict=True):
-        yield finite(sampler_positions(band, x, middle, height=height, width=width), FAR).movedim(1, -1)
+        yield sampler_grid_at(band, x, middle, height=height, width=width)
+
+
+def sampler_grid_at(flow: Tensor, x: Tensor, y: Tensor, *, height: int, width: int) -> Tensor:
+    """(B, n, m, 2): the grid of `sampler_grid` for part of a frame; arguments as for `sampler_positions`."""
+    return finite(sampler_positions(flow, x, y, height=height, width=width), FAR).movedim(1, -1)
 
 
 def sampler_positions(flow: Tensor, x: Tensor, y: Tensor, *, height: int, width: int) -> Tensor:

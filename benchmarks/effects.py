@@ -49,14 +49,15 @@ WHAT = (
     "drawn number (of a lens all 12 coefficients, so that none is skipped as zero), forward alone or forward and "
     "backward. 'radial' is a lens without decentring, which needs no Newton steps in the plane. On the CPU the bare "
     "grid_sample threads over the batch alone; the effects use all threads on one frame too. Within 0.05 px the flow "
-    "is computed on a lattice: one mild lens, and fields of 40 px and longer; the image asks for its gradient, forward"
-    " alone. How long the sampler takes depends on the flow, so it stands beside them with the flow of that lens, "
-    "ready made."
+    "is computed on lattices: one mild lens, the lenses of the default ranges, each by its part of them, and fields of "
+    "40 px and longer; the image asks for its gradient, forward alone. How long the sampler takes depends on the flow, "
+    "so it stands beside them with the flow of the mild lens, ready made."
 )
 LENS, RADIAL, FOG, FLARE = "LensDistortion", "LensDistortion radial", "UniformFog", "LensFlare"
 PERLIN, DRIFTS, SPACE = "Perlin noise, 6 octaves", "HeterogeneousFog", "HeterogeneousFog in space"
 TURBULENCE, SPLINE, SWIRL = "Turbulence, length 20 px", "ThinPlateSpline, 16 points", "DivergenceFree, length 20 px"
 SAME_FLOW = "bare grid_sample, the mild lens"
+FLEET = f"LensDistortion within {TOLERANCE_PX} px"
 MILD, PLATE, AIR, STREAM, ALL_FOUR = (f"{name} within {TOLERANCE_PX} px" for name in (*SMOOTH, "all four warps"))
 # Multiples of the bare grid_sample.
 LIMITS = {LENS: 20.0, TURBULENCE: 10.0, SPLINE: 20.0, SWIRL: 10.0, FOG: 0.15, FLARE: 0.25, DRIFTS: 1.8, PERLIN: 1.5}
@@ -117,6 +118,7 @@ def _tolerant(frame: Tensor) -> dict[str, Candidate]:
         SAME_FLOW: lambda: F.grid_sample(frame, grid, mode="bilinear", align_corners=False),
     }
     learning = frame.clone().requires_grad_()
+    warps[FLEET] = LensDistortion(tolerance_px=TOLERANCE_PX)
     for name, effect in {**warps, ALL_FOUR: all_warps(tolerance_px=TOLERANCE_PX)}.items():
         found[name] = lambda effect=effect: effect(learning)
     return found

@@ -1,6 +1,6 @@
 """Work in bands that stay in a core's cache, or sample by sample."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
 
 import torch
@@ -30,6 +30,12 @@ def join(bands: Iterable[Tensor], *, dim: int, length: int) -> Tensor:
         whole.narrow(dim, start, band.shape[dim]).copy_(band)
         start += band.shape[dim]
     return whole
+
+
+def in_place(parts: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+    """(B, ...): rows (n, ...) in their places, (n,), which are all of 0 ... B - 1."""
+    index, rows = (torch.cat(both) for both in zip(*parts, strict=True))
+    return torch.empty_like(rows).index_copy(0, index, rows)
 
 
 def by_samples(values: Tensor, work: Callable[[Tensor], Tensor]) -> Tensor:

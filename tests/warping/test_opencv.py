@@ -72,6 +72,7 @@ def test_bytes_are_those_of_grid_sample_but_for_halves(size, padding, interpolat
 
 @pytest.mark.parametrize("padding", PADDINGS)
 def test_bytes_of_real_frames_differ_in_few_values_in_a_million(padding, shared_data):
+    differing = 0.0
     for path in sorted((shared_data / "fullres").glob("*.jpg"))[:6]:
         pixels = cv2.imread(str(path))
         assert pixels is not None
@@ -82,7 +83,11 @@ def test_bytes_of_real_frames_differ_in_few_values_in_a_million(padding, shared_
         found, expected = (warp(image, flow, padding=padding, resampler=name)[0] for name in ("auto", "grid_sample"))
         unrounded = warp(image.float(), flow, padding=padding, resampler="grid_sample")[0]
         same_but_for_halves(found, expected, unrounded)
-        assert 0 < (found != expected).double().mean() < 5e-5  # above 0, or OpenCV was not asked
+        share = (found != expected).double().mean().item()
+        assert share < 5e-5
+        differing += share
+    # A handful in each frame, but chance may leave none in one of them; none in all, and OpenCV was not asked.
+    assert differing > 0
 
 
 def test_bytes_are_the_nearest_to_what_opencv_finds_in_floats():

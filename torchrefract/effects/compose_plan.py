@@ -2,8 +2,9 @@
 
 The composite d_1 of n flows, d_i = d_(i+1) + f_i(p + d_(i+1)), is off by e_1 at most, e_i = e_(i+1) (1 + L_i) + the
 error of f_i, L_i being the largest slope of f_i. So the error of each flow counts times the product of 1 + L of those
-before it, and what follows a flow whose slope is not known is computed exactly. Errors that are of a chance add as
-deviations do. Of several effects that never act on one sample together, each has the whole tolerance.
+before it, and what follows a flow whose slope is not known is computed exactly; that flow itself shares in the
+tolerance if parts of its ranges may have lattices. Errors that are of a chance add as deviations do. Of several effects
+that never act on one sample together, each has the whole tolerance.
 """
 
 import math
@@ -160,15 +161,17 @@ def _in_row(warps: Sequence[_Warp], ask: Ask) -> list[_Share]:
 
 def _shared_once(warps: Sequence[_Warp], shares: Sequence[_Share], ask: Ask) -> list[_Share]:
     """The plans for shares of the tolerance that go by the slopes of earlier ones."""
-    smooth = list(takewhile(lambda both: both[1].plan.stride != 1, zip(warps, shares, strict=True)))
-    whole = (ask.tolerance_px or 0.0) / max(1.0, _total([(1.0, share.plan.random) for _, share in smooth]))
+    smooth = sum(1 for _ in takewhile(lambda share: share.plan.stride != 1, shares))
+    # The one that comes next has an error, too, where what is drawn may have a lattice of its own.
+    sharing = smooth + any(share.plan.parts for share in shares[smooth : smooth + 1])
+    whole = (ask.tolerance_px or 0.0) / max(1.0, _total([(1.0, share.plan.random) for share in shares[:sharing]]))
     found, before = list[_Share](), 1.0
-    for warp, last in smooth:
+    for warp, last in zip(warps[:sharing], shares[:sharing], strict=True):
         found.append(_Share(whole / before, warp.plan(ask, whole / before), before))
         # A flow that is not computed is too small to count.
         before *= 1 + last.plan.slope if last.plan.stride > 0 else 1.0
     follows = _Share(0.0, ask.plan(1, 0.0, "it follows a warp whose slope is not known"))
-    return found + [share if i == 0 else follows for i, share in enumerate(shares[len(smooth) :])]
+    return found + [share if i == smooth else follows for i, share in enumerate(shares[sharing:], start=sharing)]
 
 
 def _total(errors: Iterable[tuple[float, bool]]) -> float:

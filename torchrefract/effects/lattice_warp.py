@@ -1,6 +1,7 @@
 """Warps whose flow can be computed on a lattice, under a tolerance."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from copy import copy
 from typing import Any
 
@@ -10,7 +11,7 @@ from torch import Tensor
 from torchrefract._checks import is_true, learns
 from torchrefract._constants import assume_constant_result
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, check_tolerance
-from torchrefract.effects.refraction import Moved, WarpEffect
+from torchrefract.effects.refraction import Moved, WarpEffect, mixed
 from torchrefract.effects.rows import only, params_part, put, some, spread
 from torchrefract.warping.lattice import SmoothFlow
 
@@ -71,6 +72,10 @@ class LatticeWarp(WarpEffect):
     def on_lattice(self, params: Any, plan: Plan) -> SmoothFlow:
         """The flow on the plan's lattice, where it exists everywhere."""
 
+    def plans_of(self, params: Any, plan: Plan) -> Sequence[Plan] | None:
+        """Of a plan that has parts the one for each sample, None where it cannot be told."""
+        return None
+
     def stirs(self, params: Any, height: int, width: int, plan: Plan | None = None) -> bool:
         """Whether a sample may be moved by more than the tolerance, or a gradient is asked for."""
         if learns(params):
@@ -81,8 +86,21 @@ class LatticeWarp(WarpEffect):
     def gated(self, params: Any, *, height: int, width: int, plan: Plan | None = None) -> Moved:
         """The flow, zero for the samples that the effect leaves alone, by its own plan or by one that is given."""
         plan = plan or self.plan_for(params, height, width)
+        plans = self.plans_of(params, plan) if plan.parts and not learns(params) else None
+        if not plans:
+            return self._gated(params, plan)
+        places: dict[Plan, list[int]] = {}
+        for i, own in enumerate(plans):
+            places.setdefault(own, []).append(i)
+        # In one form whatever the plans: how a sample is looked up must not depend on the others.
+        alike = [(own, torch.tensor(rows)) for own, rows in places.items()]
+        return mixed([(index, self._gated(params_part(params, index), own)) for own, index in alike])
+
+    def _gated(self, params: Any, plan: Plan) -> Moved:
+        """The same, by one plan."""
         if plan.lattice is None:
-            return super().gated(params, height=height, width=width)
+            return super().gated(params, height=plan.height, width=plan.width)
+        height, width = plan.height, plan.width
         active = self.active(params, height, width)
         if (index := some(active, params)) is not None:
             path = self.on_lattice(params_part(params, index), plan)

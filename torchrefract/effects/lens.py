@@ -8,18 +8,19 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_flag, check_range, is_true
+from torchrefract._checks import check_all, check_flag, check_range, is_true, read
 from torchrefract._constants import constant
 from torchrefract.cameras.distortion import ALL_TERMS, POLYNOMIAL12
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
-from torchrefract.effects.lens_plan import covers, kept_terms, lens_plan
+from torchrefract.effects.lens_parts import plan_in_parts, plan_of_lens
+from torchrefract.effects.lens_plan import covers, kept_terms
 from torchrefract.effects.lens_source import LensSource, correlated, jittered, listed
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan
 from torchrefract.effects.refraction import Moved
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, smooth_lens_flow
-from torchrefract.fields.lens_bounds import LensRanges
+from torchrefract.fields.lens_bounds import LensRanges, lens_numbers
 from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice, SmoothFlow
 
@@ -46,7 +47,9 @@ class LensDistortion(LatticeWarp):
 
     `flow` undistorts (the exact inverse), `restore_flow` distorts (closed form). Pixels that the lens shows nothing
     at, beyond the radius where the model folds back, are padded and not valid. OpenCV's k4, k5, k6 belong to another
-    model. The defaults are those of one fleet of cheap dashcams: a barrel that folds nowhere.
+    model. The defaults are those of one fleet of cheap dashcams: a barrel that folds nowhere. Under a tolerance, where
+    the strongest lens of the ranges asks for a fine lattice or none, those that are drawn go by their parts of the
+    ranges, if values can be read (on the CPU, uncompiled, without gradients of the lens) and frames have 2^16 px.
 
     Args:
         k1_range ... k6_range: radial coefficients, each within [-100, 100].
@@ -183,8 +186,7 @@ class LensDistortion(LatticeWarp):
     def draw(self, source: draws.Stream, image: Tensor) -> LensParams:
         """One lens a sample: every number uniform in its range, or one of those of a table or a camera."""
         if self._source is None:
-            box = self._ranges()
-            gate, values = self._uniform(source, [*box.coefficients, *box[1:]], image)
+            gate, values = self._uniform(source, self._ranges().numbers, image)
         else:
             gate, values = self._uniform(source, self._source.inputs, image)
             values = self._source.lenses(values)
@@ -196,8 +198,14 @@ class LensDistortion(LatticeWarp):
         check_lens(params, image.shape[0])
 
     def plan_within(self, ask: Ask) -> Plan:
-        """The plan of `lens_plan`, for all lenses of a table."""
-        return lens_plan((self._ranges(),) if self._source is None else self._source.boxes, ask)
+        """The plan for all lenses of the ranges, or of a table."""
+        return plan_in_parts(self._boxes(), ask)
+
+    def plans_of(self, params: LensParams, plan: Plan) -> list[Plan] | None:
+        """For each lens the plan of `plan_of_lens`."""
+        numbers = read(lambda: lens_numbers(*(value.detach() for value in params[1:])))
+        ask = Ask(plan.height, plan.width, plan.tolerance_px, params.focal.dtype is torch.float64)
+        return None if numbers is None else [plan_of_lens(self._boxes(), lens, ask) for lens in numbers]
 
     def covers(self, params: LensParams) -> Tensor:
         """Whether the lenses lie in the ranges, or near one of a table's."""
@@ -232,6 +240,9 @@ class LensDistortion(LatticeWarp):
     def moves(self, params: LensParams) -> Tensor:
         """The samples with a coefficient that is not zero."""
         return (params.coefficients != 0).any(dim=1)
+
+    def _boxes(self) -> tuple[LensRanges, ...]:
+        return (self._ranges(),) if self._source is None else self._source.boxes
 
     def _ranges(self) -> LensRanges:
         others = (self.focal_range, self.aspect_range, self.center_x_range, self.center_y_range)

@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 from functools import lru_cache
 
-import torch
 from torch import Tensor
 
 from torchrefract.cameras.distortion import POLYNOMIAL12, Terms
 from torchrefract.effects.plan import STRIDES, Ask, Plan, coarsest, lies_in
-from torchrefract.fields.lens_bounds import LensRanges, lens_errors, moved_by_terms
+from torchrefract.fields.lens_bounds import LensRanges, lens_errors, lens_numbers, moved_by_terms
 from torchrefract.warping.lattice import Lattice
 
 # Of the tolerance: for the terms that are left out and for Newton's method; the rest is for the cubics.
@@ -21,11 +20,10 @@ _GROUPS = (range(8, 12), range(6, 8), (5,), (4,), (3,), (2,), (1,), (0,))
 
 def covers(ranges: LensRanges, coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
     """(), bool: lenses (B, 12), (B, 2), (B, 2) all lie in the ranges, but for rounding."""
-    values = torch.cat([coefficients, focal[:, :1], focal[:, 1:] / focal[:, :1], center], dim=1)
-    return lies_in(values, [*ranges.coefficients, *ranges[1:]])
+    return lies_in(lens_numbers(coefficients, focal, center), ranges.numbers)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=2048)
 def lens_plan(boxes: tuple[LensRanges, ...], ask: Ask) -> Plan:
     """The plan for lenses that are drawn from any of the boxes."""
     if ask.tolerance_px is None:

@@ -15,7 +15,7 @@ from torchrefract.cameras.distortion import POLYNOMIAL12
 from torchrefract.cameras.lens_table import read_lenses
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.plan import lies_in_one
-from torchrefract.fields.lens_bounds import LensRanges
+from torchrefract.fields.lens_bounds import LensRanges, lens_numbers
 from torchrefract.types import Range
 
 _NAMES = (*POLYNOMIAL12, "focal", "aspect", "center_x", "center_y")
@@ -54,21 +54,18 @@ class LensSource(NamedTuple):
     def boxes(self) -> tuple[LensRanges, ...]:
         """For each row what its numbers lie in."""
         reach = [sum(map(abs, row)) for row in self.spread] or [0.0] * 16
-        return tuple(_box([(n - r, n + r) for n, r in zip(row, reach, strict=True)]) for row in self.rows)
+        return tuple(LensRanges.of([(n - r, n + r) for n, r in zip(row, reach, strict=True)]) for row in self.rows)
 
     @property
     def ranges(self) -> dict[str, Range]:
         """What all lenses lie in, by the arguments of `LensDistortion`."""
-        flat = [(*box.coefficients, *box[1:]) for box in self.boxes]
-        limits = [
-            (min(low for low, _ in column), max(high for _, high in column)) for column in zip(*flat, strict=True)
-        ]
+        columns = zip(*(box.numbers for box in self.boxes), strict=True)
+        limits = [(min(low for low, _ in column), max(high for _, high in column)) for column in columns]
         return {f"{name}_range": limit for name, limit in zip(_NAMES, limits, strict=True)}
 
     def covers(self, coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
         """(), bool: each of B lenses lies in one of the boxes, but for rounding."""
-        values = torch.cat([coefficients, focal[:, :1], focal[:, 1:] / focal[:, :1], center], dim=1)
-        return lies_in_one(values, [[*box.coefficients, *box[1:]] for box in self.boxes])
+        return lies_in_one(lens_numbers(coefficients, focal, center), [box.numbers for box in self.boxes])
 
 
 def listed(table: Sequence[Camera] | None, *, residual_px: float) -> LensSource:
@@ -179,7 +176,3 @@ def _slopes(camera: Camera, size: int) -> np.ndarray:
         if place is not None:
             slopes[place, 4 + i] = 1.0
     return slopes
-
-
-def _box(limits: Sequence[Range]) -> LensRanges:
-    return LensRanges(tuple(limits[:12]), *limits[12:])

@@ -85,6 +85,8 @@ class Plan:
     resamples: how often the image is looked up.
     random: whether the error is that of a chance, independent of those of other effects.
     slope: how much the flow differs from pixel to pixel, px, at most; inf where that is not known.
+    parts: whether what is drawn may have a coarser plan of its own, where it can be read which; then `error_px` is the
+        tolerance, which all of them keep.
     before, after: nodes that the lattice has before the frame and behind its last cell.
     lattice: where the flow is computed; None for every pixel, or for none.
     why: what decided.
@@ -102,6 +104,7 @@ class Plan:
     resamples: int = 1
     random: bool = False
     slope: float = math.inf
+    parts: bool = False
     before: int = 1
     after: int = 1
     lattice: Lattice | None = field(init=False)
@@ -118,7 +121,8 @@ class Plan:
     def summary(self) -> str:
         """Where the flow is computed, and why there."""
         flow = {0: "not computed", 1: "at every pixel"}.get(self.stride, f"every {self.stride} px")
-        return f"{flow} ({self.why})"
+        own = "; on the CPU coarser where what is drawn allows it" if self.parts else ""
+        return f"{flow} ({self.why}{own})"
 
     def __str__(self) -> str:
         lines = [

@@ -1,12 +1,13 @@
 """What every effect that moves pixels is: a flow, the flow back, and one look-up."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
+from torchrefract._bands import in_place
 from torchrefract._checks import check_choice, is_true, learns
 from torchrefract.effects.base import Effect
 from torchrefract.effects.plan import Ask, Plan
@@ -16,8 +17,9 @@ from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import field_dtype, inside, length
 from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.jacobian import folding
-from torchrefract.warping.lattice import SmoothFlow, dense
+from torchrefract.warping.lattice import SmoothFlow
 from torchrefract.warping.masks import mixes_only
+from torchrefract.warping.mixed import Flow, MixedFlow, PartFlow, dense, flow_rows
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, RESAMPLERS, look_up
 
 
@@ -116,12 +118,12 @@ class WarpEffect(Effect):
 class Moved:
     """What an effect moves, in one row for each clip or for each frame.
 
-    path: (B, 2, H, W), px, the flow, or the flow on a lattice.
+    path: (B, 2, H, W), px, the flow, or the flow in another form.
     exists: bool, of (B, 1, H, W) or what broadcasts to it.
     active: (B,), bool: the samples that are moved at all.
     """
 
-    def __init__(self, path: Tensor | SmoothFlow, exists: Tensor, active: Tensor):
+    def __init__(self, path: Flow, exists: Tensor, active: Tensor):
         self.path, self.exists, self.active = path, exists, active
         self._flow: Tensor | None = None
 
@@ -137,7 +139,9 @@ class Moved:
         """The same in so many rows."""
         if rows == len(self.active):
             return self
-        return Moved(_spread_path(self.path, rows), spread(self.exists, rows), spread(self.active, rows))
+        return Moved(
+            _spread_path(self.path, rows, len(self.active)), spread(self.exists, rows), spread(self.active, rows)
+        )
 
 
 def moving(
@@ -188,7 +192,17 @@ def identity(image: Tensor, params: Any) -> Degraded:
     )
 
 
-def _spread_path(path: Tensor | SmoothFlow, rows: int) -> Tensor | SmoothFlow:
+def mixed(parts: Sequence[tuple[Tensor, Moved]]) -> Moved:
+    """What is moved in several ways, each for some rows of a batch, (n,), all of which are there."""
+    path = MixedFlow(tuple((index, cast(PartFlow, moved.path)) for index, moved in parts))
+    height, width = max(moved.exists.shape[2:] for _, moved in parts)
+    exists = in_place([(index, moved.exists.expand(len(index), 1, height, width)) for index, moved in parts])
+    return Moved(path, exists, in_place([(index, moved.active) for index, moved in parts]))
+
+
+def _spread_path(path: Flow, rows: int, before: int) -> Flow:
     if isinstance(path, SmoothFlow):
         return path.with_nodes(spread(path.nodes, rows))
+    if isinstance(path, MixedFlow):
+        return flow_rows(path, spread(torch.arange(before), rows))
     return spread(path, rows)

@@ -7,14 +7,13 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
+from torchrefract._bands import in_place
 from torchrefract._checks import is_true, learns, read
 from torchrefract.effects.rows import only
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import Positions
-from torchrefract.warping.lattice import SmoothFlow, dense
-from torchrefract.warping.resample import follow, grid_of
-
-Flow = Tensor | SmoothFlow
+from torchrefract.warping.mixed import Flow, dense, flow_rows, grid_of
+from torchrefract.warping.resample import follow
 
 
 class Step(NamedTuple):
@@ -26,9 +25,7 @@ class Step(NamedTuple):
 
     def of(self, index: Tensor) -> "Step":
         """The same for some of the rows."""
-        path = cast(Flow, self.path)
-        some = path.with_nodes(path.nodes[index]) if isinstance(path, SmoothFlow) else path[index]
-        return Step(self.gate[index], self.active[index], some)
+        return Step(self.gate[index], self.active[index], flow_rows(cast(Flow, self.path), index))
 
 
 def exact(steps: Sequence[Step]) -> Step:
@@ -59,14 +56,12 @@ def _each_by_itself(steps: Sequence[Step], one: Callable[[Sequence[Step]], Tenso
     apart = _apart(steps)
     if apart is None:
         return one(steps)
-    order, found = list[int](), list[Tensor]()
+    found = list[tuple[Tensor, Tensor]]()
     for acting, rows in sorted(apart.items(), reverse=True):  # what moves nothing comes last
         index = torch.tensor(rows)
         own = [step.of(index) for step, acts in zip(steps, acting, strict=True) if acts]
-        found.append(one(own) if own else found[0].new_zeros(len(rows), *found[0].shape[1:]))
-        order += rows
-    together = torch.cat(found)
-    return torch.empty_like(together).index_copy(0, torch.tensor(order), together)
+        found.append((index, one(own) if own else found[0][1].new_zeros(len(rows), *found[0][1].shape[1:])))
+    return in_place(found)
 
 
 def _apart(steps: Sequence[Step]) -> dict[tuple[bool, ...], list[int]] | None:

@@ -15,10 +15,11 @@ from torchrefract.effects.plan import Plan
 from torchrefract.effects.radiance import RadianceEffect
 from torchrefract.effects.refraction import Moved, WarpEffect, moving, sees
 from torchrefract.effects.rows import column, only, spread
-from torchrefract.effects.steps import Flow, Step, exact, on_grid
+from torchrefract.effects.steps import Step, exact, on_grid
 from torchrefract.types import Degraded
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import Positions, field_dtype, inside
+from torchrefract.warping.mixed import Flow
 from torchrefract.warping.resample import look_up, sampler_dtype
 
 _Combine = Callable[[Tensor, Tensor], Tensor]

@@ -44,6 +44,21 @@ class LensRanges(NamedTuple):
     center_x: Range
     center_y: Range
 
+    @classmethod
+    def of(cls, numbers: Sequence[Range]) -> "LensRanges":
+        """Of the ranges of all 16 numbers."""
+        return cls(tuple(numbers[:12]), *numbers[12:])
+
+    @property
+    def numbers(self) -> tuple[Range, ...]:
+        """The ranges of all 16 numbers."""
+        return (*self.coefficients, self.focal, self.aspect, self.center_x, self.center_y)
+
+
+def lens_numbers(coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
+    """(B, 16): the numbers of lenses that `LensRanges` has ranges of; (B, 12), (B, 2), fx and fy, and (B, 2)."""
+    return torch.cat([coefficients, focal[:, :1], focal[:, 1:] / focal[:, :1], center], dim=1)
+
 
 class LensErrors(NamedTuple):
     """Of the flow of any lens in the ranges."""
@@ -200,7 +215,7 @@ def _radius(ranges: LensRanges, lattice: Lattice) -> float:
 def _tried(ranges: LensRanges) -> np.ndarray:
     """(N, 16): corners of the ranges, and lenses inside."""
     # All displacements fall faster than 1 / focal.
-    limits = np.array([*ranges.coefficients, (ranges.focal[0], ranges.focal[0]), *ranges[2:]])
+    limits = np.array(ranges._replace(focal=(ranges.focal[0], ranges.focal[0])).numbers)
     wide = np.flatnonzero(limits[:, 0] != limits[:, 1])
     if not len(wide):
         return limits[None, :, 0]

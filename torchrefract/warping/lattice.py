@@ -119,6 +119,10 @@ class SmoothFlow:
         """The same flow with other nodes."""
         return replace(self, nodes=nodes)
 
+    def rows(self, index: Tensor) -> "SmoothFlow":
+        """Some rows of the batch."""
+        return self.with_nodes(self.nodes[index])
+
     def dense(self) -> Tensor:
         """(B, 2, H, W), px."""
         return between_nodes(self.nodes, self.lattice)
@@ -170,11 +174,6 @@ class StreamFlow(SmoothFlow):
             return _down(lines, torch.stack([slope, weight]), self.lattice.height)
 
         return by_samples(nodes, flow)
-
-
-def dense(flow: Tensor | SmoothFlow) -> Tensor:
-    """(B, 2, H, W), px, of a flow in either form."""
-    return flow.dense() if isinstance(flow, SmoothFlow) else flow
 
 
 @assume_constant_result

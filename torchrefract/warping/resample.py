@@ -9,8 +9,9 @@ from torch import Tensor
 from torchrefract._bands import join
 from torchrefract._checks import check_choice, check_flow, check_tensor
 from torchrefract._constants import constant
-from torchrefract.warping.grid import FAR, Positions, field_dtype, finite, inside, sampler_grid, sampler_grids
-from torchrefract.warping.lattice import SmoothFlow, dense
+from torchrefract.warping.grid import FAR, Positions, field_dtype, finite, inside, sampler_grids
+from torchrefract.warping.lattice import SmoothFlow
+from torchrefract.warping.mixed import Flow, dense, grid_of, known
 from torchrefract.warping.opencv import obstacle, remapped
 
 PADDINGS = ("zeros", "border", "reflection")
@@ -74,7 +75,7 @@ def warp(
 
 def look_up(
     image: Tensor,
-    flow: Tensor | SmoothFlow | Positions,
+    flow: Flow | Positions,
     *,
     padding: str,
     interpolation: str,
@@ -85,7 +86,13 @@ def look_up(
         return image.clone()
     dtype = sampler_dtype(image, flow.dtype)
     if resampler == "opencv" or (resampler == "auto" and _suits_opencv(image)):
-        why = obstacle(image, _known(flow), padding=padding, interpolation=interpolation, positions=dtype)
+        why = obstacle(
+            image,
+            flow.grid if isinstance(flow, Positions) else known(flow),
+            padding=padding,
+            interpolation=interpolation,
+            positions=dtype,
+        )
         if why is None:
             grids = _grids(image, flow, dtype, whole=False)
             return _laid_out(remapped(image, grids, padding=padding, interpolation=interpolation), image)
@@ -109,12 +116,7 @@ def sampler_dtype(image: Tensor, dtype: torch.dtype) -> torch.dtype:
     return torch.float64 if large else torch.promote_types(field_dtype(image.dtype), dtype)
 
 
-def grid_of(flow: Tensor | SmoothFlow, dtype: torch.dtype) -> Tensor:
-    """(B, H, W, 2): where F.grid_sample(align_corners=False) looks along a flow in either form, finite."""
-    return flow.sampler_grid(dtype) if isinstance(flow, SmoothFlow) else sampler_grid(flow.to(dtype))
-
-
-def follow(first: Tensor | SmoothFlow, grid: Tensor) -> Tensor:
+def follow(first: Flow, grid: Tensor) -> Tensor:
     """(B, H, W, 2): the grid of two warps in a row, from that of the second; as by `compose_flows`."""
     flow = dense(first).to(grid.dtype)
     height, width = flow.shape[2:]
@@ -168,13 +170,6 @@ def _check_fit(image: Tensor, flow: Tensor) -> None:
         )
 
 
-def _known(flow: Tensor | SmoothFlow | Positions) -> Tensor:
-    """What a flow is computed from."""
-    if isinstance(flow, SmoothFlow):
-        return flow.nodes
-    return flow.grid if isinstance(flow, Positions) else flow
-
-
 def _suits_opencv(image: Tensor) -> bool:
     """Whether OpenCV is faster: for bytes that lie in memory as it has them."""
     # Of floats PyTorch is. One sample is asked, so that the batch around it changes nothing.
@@ -207,13 +202,11 @@ def _clamped(warped: Tensor, source: Tensor, padding: str) -> Tensor:
     return torch.where(warped.isfinite(), warped.clamp(low, high), warped)
 
 
-def _grids(
-    source: Tensor, flow: Tensor | SmoothFlow | Positions, dtype: torch.dtype, *, whole: bool
-) -> Iterable[Tensor]:
+def _grids(source: Tensor, flow: Flow | Positions, dtype: torch.dtype, *, whole: bool) -> Iterable[Tensor]:
     if isinstance(flow, Positions):
         return [flow.grid]
-    if isinstance(flow, SmoothFlow):
-        return [flow.sampler_grid(dtype)]
+    if not isinstance(flow, Tensor):
+        return [grid_of(flow, dtype)]
     return sampler_grids(flow.to(dtype), rows=flow.shape[2] if whole else _rows_at_once(source, flow))
 
 

@@ -1,0 +1,67 @@
+import pytest
+import torch
+
+from torchrefract import warp
+from torchrefract.warping.grid import sampler_grid
+from torchrefract.warping.lattice import Lattice, SmoothFlow
+from torchrefract.warping.mixed import Flow, MixedFlow, dense, flow_rows, grid_of, known
+from torchrefract.warping.resample import follow, look_up
+
+HEIGHT, WIDTH = 33, 47
+
+
+def smooth(seed: int, rows: int, stride: int) -> SmoothFlow:
+    lattice = Lattice(HEIGHT, WIDTH, stride)
+    size = [len(axis) for axis in lattice.axes()]
+    return SmoothFlow(torch.randn(rows, 2, *size, generator=torch.Generator().manual_seed(seed)), lattice)
+
+
+@pytest.fixture
+def forms() -> tuple[SmoothFlow, SmoothFlow, torch.Tensor]:
+    return smooth(0, 2, 8), smooth(1, 1, 5), dense(smooth(2, 2, 6))
+
+
+@pytest.fixture
+def flow(forms) -> MixedFlow:
+    return MixedFlow(tuple(zip((torch.tensor([4, 1]), torch.tensor([2]), torch.tensor([0, 3])), forms, strict=True)))
+
+
+@pytest.fixture
+def rows(forms) -> list[Flow]:
+    """Each row by itself."""
+    first, second, third = forms
+    order = ((third, 0), (first, 1), (second, 0), (third, 1), (first, 0))
+    return [flow_rows(form, torch.tensor([i])) for form, i in order]
+
+
+def test_each_row_is_what_it_is_alone(flow, rows):
+    assert torch.equal(dense(flow), torch.cat([dense(row) for row in rows]))
+    assert torch.equal(grid_of(flow, torch.float32), torch.cat([grid_of(row, torch.float32) for row in rows]))
+    image = torch.rand(5, 3, HEIGHT, WIDTH)
+    options = {"padding": "border", "interpolation": "bilinear"}
+    found = look_up(image, flow, **options)
+    assert torch.equal(found, torch.cat([look_up(image[i : i + 1], row, **options) for i, row in enumerate(rows)]))
+    assert torch.allclose(found, warp(image, dense(flow), padding="border")[0], rtol=0, atol=1e-5)
+
+
+def test_some_rows_are_those_in_their_order(flow, rows):
+    for index in ([3], [4, 0, 2], [1, 1, 3, 3], [0, 1, 2, 3, 4]):
+        expected = torch.cat([dense(rows[i]) for i in index])
+        assert torch.equal(dense(flow_rows(flow, torch.tensor(index))), expected)
+
+
+def test_it_is_followed_as_its_dense_form(flow):
+    grid = sampler_grid(dense(smooth(5, 5, 7)))
+    assert torch.equal(follow(flow, grid), follow(dense(flow), grid))
+
+
+def test_it_knows_its_type_and_its_gradient(flow):
+    assert flow.dtype is torch.float32
+    assert known(flow) is flow.parts[0][1].nodes
+    assert not flow.requires_grad
+    leaf = flow.parts[2][1].clone().requires_grad_()
+    learning = MixedFlow((*flow.parts[:2], (flow.parts[2][0], leaf)))
+    assert learning.requires_grad
+    assert not learning.detach().requires_grad
+    dense(learning).sum().backward()
+    assert torch.equal(leaf.grad, torch.ones_like(leaf))

@@ -1,0 +1,87 @@
+"""Flows of one batch in several forms."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from torchrefract._bands import in_place
+from torchrefract.warping.grid import sampler_grid
+from torchrefract.warping.lattice import SmoothFlow
+
+PartFlow = Tensor | SmoothFlow
+Part = tuple[Tensor, PartFlow]
+
+
+@dataclass(frozen=True)
+class MixedFlow:
+    """Flows of a batch, of which some rows are known at every pixel and others on lattices, each as it is alone.
+
+    parts: for each form, (n,), the rows of the batch, and their flow, (n, 2, H, W), px, or on a lattice.
+    """
+
+    parts: tuple[Part, ...]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of all parts."""
+        return self.parts[0][1].dtype
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether a part has a gradient."""
+        return any(flow.requires_grad for _, flow in self.parts)
+
+    def detach(self) -> "MixedFlow":
+        """The same flows without their gradient."""
+        return MixedFlow(tuple((index, flow.detach()) for index, flow in self.parts))
+
+    def rows(self, index: Tensor) -> "MixedFlow":
+        """Some rows of the batch."""
+        parts = list[Part]()
+        for own, flow in self.parts:
+            here, places = (index[:, None] == own).nonzero().unbind(1)
+            if len(here):
+                parts.append((here, cast(PartFlow, flow_rows(flow, places))))
+        return MixedFlow(tuple(parts))
+
+    def dense(self) -> Tensor:
+        """(B, 2, H, W), px."""
+        return self._each(dense)
+
+    def sampler_grid(self, dtype: torch.dtype) -> Tensor:
+        """(B, H, W, 2): where F.grid_sample(align_corners=False) looks."""
+        return self._each(lambda flow: grid_of(flow, dtype))
+
+    def _each(self, work: Callable[[PartFlow], Tensor]) -> Tensor:
+        if len(self.parts) == 1:  # of all rows, in their order
+            return work(self.parts[0][1])
+        return in_place([(index, work(flow)) for index, flow in self.parts])
+
+
+# A flow (B, 2, H, W), px, or in another form.
+Flow = Tensor | SmoothFlow | MixedFlow
+
+
+def dense(flow: Flow) -> Tensor:
+    """(B, 2, H, W), px, of a flow in any form."""
+    return flow if isinstance(flow, Tensor) else flow.dense()
+
+
+def grid_of(flow: Flow, dtype: torch.dtype) -> Tensor:
+    """(B, H, W, 2): where F.grid_sample(align_corners=False) looks along a flow in any form, finite."""
+    return sampler_grid(flow.to(dtype)) if isinstance(flow, Tensor) else flow.sampler_grid(dtype)
+
+
+def flow_rows(flow: Flow, index: Tensor) -> Flow:
+    """Some rows of a flow."""
+    return flow.rows(index) if isinstance(flow, SmoothFlow | MixedFlow) else flow[index]
+
+
+def known(flow: Flow) -> Tensor:
+    """What a flow is computed from, or part of that."""
+    if isinstance(flow, MixedFlow):
+        return known(flow.parts[0][1])
+    return flow.nodes if isinstance(flow, SmoothFlow) else flow

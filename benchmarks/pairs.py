@@ -30,7 +30,7 @@ from torchrefract._files import replacing
 from torchrefract.data.pair_files import FORMATS, decode_pair, encode_pair
 from torchrefract.pairs.making import Job, Maker, Recipe
 from torchrefract.pairs.running import work_alone
-from torchrefract.pairs.sources import find_sources
+from torchrefract.pairs.sources import Reader, find_sources
 
 WHAT = (
     "A run of torchrefract.generate: pairs a second, its start among the time; the share of the cores' time that it "
@@ -146,13 +146,14 @@ def one_by_one(args: argparse.Namespace) -> Single:
         cfg["width"] = args.size[1]
     options = {"every": 1, "drive_by": "auto", "val_share": 0.2, "seed": 0}
     sources = find_sources(args.source, size=args.size, **options).thinned(_TRIED)
+    reader = Reader(sources.root, args.size)
     maker = Maker(Recipe(instantiate(cfg), args.scene, sources.root, args.size, 0, args.maps))
     made, bare = [], []
     for job in (Job(i, source, 0) for i, source in enumerate(sources.frames)):
         files = maker.make(job).data
         arrays = decode_pair({suffix: lambda data=data: data for suffix, data in files.items()})
         made.append(_typical(lambda job=job: maker.make(job)))
-        bare.append(_typical(lambda job=job, arrays=arrays: (maker.read(job), encode_pair(arrays, args.maps))))
+        bare.append(_typical(lambda job=job, arrays=arrays: (reader.read(job.source), encode_pair(arrays, args.maps))))
     return Single(fmean(made), fmean(bare))
 
 

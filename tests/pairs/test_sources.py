@@ -2,11 +2,12 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
-from torchrefract.data.images import UnreadableImageError
+from torchrefract.data.images import UnreadableImageError, fit, pixels_of, read_image
 from torchrefract.data.paired_folder import PairedFolder
 from torchrefract.pairs.sources import Reader, Source, draw_of, find_sources
 from torchrefract.videos import read_video, write_video
@@ -29,14 +30,30 @@ def test_frames_are_those_of_the_video_forward_backward_and_across(videos):
     plain = {name: [frame for _, frame in read_video(videos / name, range(FRAMES))] for name in ("a.mp4", "b.mp4")}
     reader = Reader(videos, None)
     for name, t in [("a.mp4", 0), ("a.mp4", 4), ("b.mp4", 4), ("b.mp4", 8), ("b.mp4", 2), ("a.mp4", 5), ("a.mp4", 5)]:
-        assert torch.equal(reader.read(Source(name, name, "train", t)), plain[name][t][0])
+        image, pixels = reader.read(Source(name, name, "train", t))
+        assert torch.equal(image, plain[name][t][0])
+        assert np.array_equal(pixels, pixels_of(image))
 
 
 def test_a_video_that_ends_early_is_named(videos):
     reader = Reader(videos, None)
     with pytest.raises(UnreadableImageError, match=r"a\.mp4 ends before its frame 9"):
         reader.read(Source("a.mp4", "a", "train", FRAMES))
-    assert reader.read(Source("a.mp4", "a", "train", 1)).shape == (3, 32, 48)
+    assert reader.read(Source("a.mp4", "a", "train", 1))[0].shape == (3, 32, 48)
+
+
+@pytest.mark.parametrize("size", [None, (40, 60), (20, 30)])
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_a_picture_comes_with_its_bytes(size, kind, tmp_path):
+    levels = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (40, 60, 3), endpoint=True).astype(kind)
+    assert cv2.imwrite(str(tmp_path / "a.png"), levels[..., ::-1])
+    image, pixels = Reader(tmp_path, size).read(Source("a.png", ".", "train"))
+    expected = fit(read_image(tmp_path / "a.png"), size or (40, 60))
+    assert torch.equal(image, expected)
+    assert image.is_contiguous()
+    assert np.array_equal(pixels, pixels_of(expected))
+    if kind is np.uint8 and size != (20, 30):
+        assert np.array_equal(pixels, levels)
 
 
 def test_each_video_is_a_drive_and_lies_in_one_split(videos):

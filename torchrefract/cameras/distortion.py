@@ -63,11 +63,18 @@ def distort_polynomial(x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms 
     return _distorted(x, y, coefficients.unbind(1), terms)[0]
 
 
+def distort_with_jacobian(
+    x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms = ALL_TERMS
+) -> tuple[tuple[Tensor, Tensor], Jacobian]:
+    """The point of `distort_polynomial` and the derivatives of `jacobian_polynomial`; arguments as there."""
+    c = coefficients.unbind(1)
+    point, r2, g = _distorted(x, y, c, terms)
+    return point, _slopes(x, y, r2, g, c, terms)
+
+
 def jacobian_polynomial(x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms = ALL_TERMS) -> Jacobian:
     """The derivatives of `distort_polynomial` with respect to x and y."""
-    c = coefficients.unbind(1)
-    _, r2, g = _distorted(x, y, c, terms)
-    return _slopes(x, y, r2, g, c, terms)
+    return distort_with_jacobian(x, y, coefficients, terms)[1]
 
 
 def undistort_polynomial(

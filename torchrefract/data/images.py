@@ -47,13 +47,22 @@ def read_image(path: str | Path) -> Tensor:
         (3, H, W), float32 in [0, 1], RGB, 8-bit values / 255 and 16-bit values / 65535; strides as decoded, so
         channels last.
     """
+    return as_image(read_pixels(path))
+
+
+def read_pixels(path: str | Path) -> np.ndarray:
+    """The picture of `read_image` as the file has it: (H, W, 3), RGB, uint8 or uint16."""
     data = _bytes(path)
     _check_whole(path, io.BytesIO(data), len(data))
     if data.startswith(_PNG) and not png_fits(data):
         raise UnreadableImageError(f"{path} is damaged: its parts are not as long as they say")
     # Where a header claims 30000 x 30000 pixels OpenCV would make them, though the file holds a hundred bytes.
     _header_size(path, io.BytesIO(data))
-    pixels = _decode(path, data)
+    return _decode(path, data)
+
+
+def as_image(pixels: np.ndarray) -> Tensor:
+    """(3, H, W), float32 in [0, 1], of a picture (H, W, 3), uint8 or uint16."""
     scale = np.iinfo(pixels.dtype).max
     return torch.from_numpy(pixels).to(torch.float32).div_(scale).permute(2, 0, 1)
 
@@ -119,6 +128,8 @@ def fit(image: Tensor, size: Sequence[int]) -> Tensor:
     H, W = image.shape[1:]
     if height > H or width > W:
         raise ValueError(f"image must be at least size = {height}x{width} (height x width), got {H}x{W}")
+    if (height, width) == (H, W):
+        return image.detach().clone(memory_format=torch.contiguous_format)
     crop_height, crop_width = min(H, round(W * height / width)), min(W, round(H * width / height))
     top, left = (H - crop_height) // 2, (W - crop_width) // 2
     crop = image.detach()[:, top : top + crop_height, left : left + crop_width].permute(1, 2, 0).contiguous().numpy()

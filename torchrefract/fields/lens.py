@@ -8,6 +8,7 @@ from torchrefract._constants import constant
 from torchrefract.cameras.distortion import (
     Terms,
     distort_polynomial,
+    distort_with_jacobian,
     implicit,
     jacobian_polynomial,
     newton_undistort,
@@ -16,6 +17,7 @@ from torchrefract.cameras.distortion import (
 )
 from torchrefract.cameras.radial import RadialLimit, radial_limit
 from torchrefract.warping.grid import pixel_axes
+from torchrefract.warping.jacobian import Jacobian
 
 # The preimage of a pixel is looked for up to so many half-diagonals of the frame; beyond, nothing of it is seen.
 REACH = 4.0
@@ -157,9 +159,11 @@ def _restore_flow_of_rows(
     x: Tensor, y: Tensor, c: Tensor, focal: Tensor, limit: RadialLimit, terms: Terms
 ) -> tuple[Tensor, Tensor]:
     x, y = (axis.contiguous() for axis in torch.broadcast_tensors(x, y))
-    exists = _unfolded(x, y, c, limit, terms)
-    known = _known(x, y, exists) if torch.is_grad_enabled() and (c.requires_grad or x.requires_grad) else (x, y)
-    x_d, y_d = distort_polynomial(*known, c, terms)
+    with torch.no_grad():
+        (x_d, y_d), jacobian = distort_with_jacobian(x, y, c, terms)
+        exists = _unfolded(x, y, jacobian, limit, terms)
+    if torch.is_grad_enabled() and (c.requires_grad or x.requires_grad):
+        x_d, y_d = distort_polynomial(*_known(x, y, exists), c, terms)
     return _as_flow(x_d - x, y_d - y, exists, x, y, focal), exists
 
 
@@ -168,13 +172,16 @@ def _known(x: Tensor, y: Tensor, exists: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(exists, x, 0), torch.where(exists, y, 0)
 
 
-def _unfolded(x: Tensor, y: Tensor, c: Tensor, limit: RadialLimit, terms: Terms) -> Tensor:
-    with torch.no_grad():
-        exists = x * x + y * y <= limit.radius.square()
-        if terms.bent:
-            determinant = jacobian_polynomial(x, y, c, terms).determinant
-            exists &= (determinant > 0) & (determinant < torch.inf)  # beyond the largest number nothing is shown
-        return exists
+def _unfolded(x: Tensor, y: Tensor, jacobian: Jacobian, limit: RadialLimit, terms: Terms) -> Tensor:
+    """(B, 1, H, W), bool: the points that are shown, and not folded over."""
+    squared, most = x * x + y * y, limit.radius.square()
+    if not terms.bent:
+        return squared <= most
+    determinant = jacobian.determinant
+    # Comparisons of every point are slow.
+    if is_true(lambda: ((squared - most).amax() <= 0) & (determinant.amin() > 0) & (determinant.amax() < torch.inf)):
+        return torch.ones_like(squared, dtype=torch.bool)
+    return (squared <= most) & (determinant > 0) & (determinant < torch.inf)  # no number: nothing is shown there
 
 
 def _attach(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, c: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:

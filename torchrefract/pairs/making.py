@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torchrefract._command import naming
 from torchrefract._errors import UsageError
@@ -65,7 +64,7 @@ class Maker:
     def make(self, job: Job) -> Made:
         """The pair of a job; a frame that cannot be read gives none, and a row that says so."""
         try:
-            image = self.read(job)
+            image, pixels = self._reader.read(job.source)
         except UnreadableImageError as error:
             return Made(self._row(job, (0, 0), skipped=str(error).replace(f"{self.recipe.root}/", "")), {})
         except ValueError as error:
@@ -73,8 +72,8 @@ class Maker:
         seed, key = draw_of(job.source, seed=self.recipe.seed, lap=job.lap)
         with naming("scene"), warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore", UserWarning)  # of folds, which the masks leave out
-            degraded = self.recipe.effect.degrade(image, seed=seed, keys=[key])
-            pair = PairArrays(pixels_of(image[0]), pixels_of(degraded.image[0]), _maps(degraded))
+            degraded = self.recipe.effect.degrade(image[None], seed=seed, keys=[key])
+            pair = PairArrays(pixels, pixels_of(degraded.image[0]), _maps(degraded))
         with naming("maps"):
             data = encode_pair(pair, self.recipe.maps)
         rest = {
@@ -82,11 +81,7 @@ class Maker:
             "beyond": _beyond(pair) if self.recipe.maps == "png" else {},
             "files": {name: Stored("", len(value), hashlib.sha256(value).hexdigest()) for name, value in data.items()},
         }
-        return Made(self._row(job, tuple(image.shape[2:]), **rest), data)
-
-    def read(self, job: Job) -> Tensor:
-        """The frame of a job, (1, 3, H, W), float32 in [0, 1]."""
-        return self._reader.read(job.source)[None]
+        return Made(self._row(job, tuple(image.shape[1:]), **rest), data)
 
     def _row(self, job: Job, size: tuple[int, ...], **rest: Any) -> PairRow:
         seed, key = draw_of(job.source, seed=self.recipe.seed, lap=job.lap)

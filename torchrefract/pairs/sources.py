@@ -5,11 +5,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from torch import Tensor
 
 from torchrefract._errors import UsageError
 from torchrefract.data.frame_folder import path_key, place_frames, val_drives, walk
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, read_image
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, as_image, fit, pixels_of, read_pixels
 from torchrefract.videos import VIDEOS, read_video, video_facts
 
 
@@ -59,14 +60,22 @@ class Reader:
         self._wanted = 0
         self._open: tuple[str, int, Iterator[tuple[int, Tensor]]] | None = None  # a video, its last frame, the others
 
-    def read(self, source: Source) -> Tensor:
-        """The frame (3, H, W), float32 in [0, 1], cut and reduced to the size if there is one.
+    def read(self, source: Source) -> tuple[Tensor, np.ndarray]:
+        """The frame, cut and reduced to the size if there is one.
+
+        Returns:
+            image: (3, H, W), float32 in [0, 1].
+            pixels: (H, W, 3), uint8, the same.
 
         Raises:
             UnreadableImageError: a damaged file, or a video that ends before the frame.
         """
-        image = read_image(self.root / source.path) if source.frame is None else self._video(source.path, source.frame)
-        return image.contiguous() if self.size is None else fit(image, self.size)
+        pixels = None if source.frame is not None else read_pixels(self.root / source.path)
+        image = as_image(pixels) if pixels is not None else self._video(source.path, source.frame)
+        image = image.contiguous() if self.size is None else fit(image, self.size)
+        if pixels is not None and pixels.dtype == np.uint8 and pixels.shape[:2] == image.shape[1:]:
+            return image, pixels
+        return image, pixels_of(image)
 
     def _video(self, path: str, frame: int) -> Tensor:
         if self._open is None or self._open[0] != path or self._open[1] >= frame:

@@ -34,8 +34,11 @@ def join(bands: Iterable[Tensor], *, dim: int, length: int) -> Tensor:
 
 def in_place(parts: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
     """(B, ...): rows (n, ...) in their places, (n,), which are all of 0 ... B - 1."""
-    index, rows = (torch.cat(both) for both in zip(*parts, strict=True))
-    return torch.empty_like(rows).index_copy(0, index, rows)
+    some = parts[0][1]
+    whole = some.new_empty(sum(len(index) for index, _ in parts), *some.shape[1:])
+    for index, rows in parts:
+        whole.index_copy_(0, index, rows)
+    return whole
 
 
 def by_samples(values: Tensor, work: Callable[[Tensor], Tensor]) -> Tensor:

@@ -53,7 +53,8 @@ class MixedFlow:
 
     def sampler_grid(self, dtype: torch.dtype) -> Tensor:
         """(B, H, W, 2): where F.grid_sample(align_corners=False) looks."""
-        return self._each(lambda flow: grid_of(flow, dtype))
+        # Planes of x and of y, as the parts have them.
+        return self._each(lambda flow: grid_of(flow, dtype).movedim(-1, 1)).movedim(1, -1)
 
     def _each(self, work: Callable[[PartFlow], Tensor]) -> Tensor:
         if len(self.parts) == 1:  # of all rows, in their order

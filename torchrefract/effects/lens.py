@@ -204,8 +204,11 @@ class LensDistortion(LatticeWarp):
     def plans_of(self, params: LensParams, plan: Plan) -> list[Plan] | None:
         """For each lens the plan of `plan_of_lens`."""
         numbers = read(lambda: lens_numbers(*(value.detach() for value in params[1:])))
+        if numbers is None:
+            return None
+        boxes = self._boxes()
         ask = Ask(plan.height, plan.width, plan.tolerance_px, params.focal.dtype is torch.float64)
-        return None if numbers is None else [plan_of_lens(self._boxes(), lens, ask) for lens in numbers]
+        return [plan_of_lens(boxes, lens, ask) for lens in numbers]
 
     def covers(self, params: LensParams) -> Tensor:
         """Whether the lenses lie in the ranges, or near one of a table's."""

@@ -17,7 +17,6 @@ from torchrefract.cameras.distortion import (
 )
 from torchrefract.cameras.radial import RadialLimit, radial_limit
 from torchrefract.warping.grid import pixel_axes
-from torchrefract.warping.jacobian import Jacobian
 
 # The preimage of a pixel is looked for up to so many half-diagonals of the frame; beyond, nothing of it is seen.
 REACH = 4.0
@@ -160,8 +159,12 @@ def _restore_flow_of_rows(
 ) -> tuple[Tensor, Tensor]:
     x, y = (axis.contiguous() for axis in torch.broadcast_tensors(x, y))
     with torch.no_grad():
-        (x_d, y_d), jacobian = distort_with_jacobian(x, y, c, terms)
-        exists = _unfolded(x, y, jacobian, limit, terms)
+        if terms.bent:
+            (x_d, y_d), jacobian = distort_with_jacobian(x, y, c, terms)
+            exists = _unfolded(x, y, jacobian.determinant, limit)
+        else:
+            x_d, y_d = distort_polynomial(x, y, c, terms)
+            exists = x * x + y * y <= limit.radius.square()
     if torch.is_grad_enabled() and (c.requires_grad or x.requires_grad):
         x_d, y_d = distort_polynomial(*_known(x, y, exists), c, terms)
     return _as_flow(x_d - x, y_d - y, exists, x, y, focal), exists
@@ -172,12 +175,9 @@ def _known(x: Tensor, y: Tensor, exists: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(exists, x, 0), torch.where(exists, y, 0)
 
 
-def _unfolded(x: Tensor, y: Tensor, jacobian: Jacobian, limit: RadialLimit, terms: Terms) -> Tensor:
+def _unfolded(x: Tensor, y: Tensor, determinant: Tensor, limit: RadialLimit) -> Tensor:
     """(B, 1, H, W), bool: the points that are shown, and not folded over."""
     squared, most = x * x + y * y, limit.radius.square()
-    if not terms.bent:
-        return squared <= most
-    determinant = jacobian.determinant
     # Comparisons of every point are slow.
     if is_true(lambda: ((squared - most).amax() <= 0) & (determinant.amin() > 0) & (determinant.amax() < torch.inf)):
         return torch.ones_like(squared, dtype=torch.bool)

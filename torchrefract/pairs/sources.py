@@ -70,12 +70,16 @@ class Reader:
         Raises:
             UnreadableImageError: a damaged file, or a video that ends before the frame.
         """
-        pixels = None if source.frame is not None else read_pixels(self.root / source.path)
-        image = as_image(pixels) if pixels is not None else self._video(source.path, source.frame)
-        image = image.contiguous() if self.size is None else fit(image, self.size)
-        if pixels is not None and pixels.dtype == np.uint8 and pixels.shape[:2] == image.shape[1:]:
-            return image, pixels
-        return image, pixels_of(image)
+        if source.frame is not None:
+            image = self._fitting(self._video(source.path, source.frame))
+            return image, pixels_of(image)
+        pixels = read_pixels(self.root / source.path)
+        image = self._fitting(as_image(pixels))
+        as_it_was = pixels.dtype == np.uint8 and pixels.shape[:2] == image.shape[1:]
+        return image, pixels if as_it_was else pixels_of(image)
+
+    def _fitting(self, image: Tensor) -> Tensor:
+        return image.contiguous() if self.size is None else fit(image, self.size)
 
     def _video(self, path: str, frame: int) -> Tensor:
         if self._open is None or self._open[0] != path or self._open[1] >= frame:

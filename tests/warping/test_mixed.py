@@ -3,7 +3,7 @@ import torch
 
 from torchrefract import warp
 from torchrefract.warping.grid import sampler_grid
-from torchrefract.warping.lattice import Lattice, SmoothFlow
+from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
 from torchrefract.warping.mixed import Flow, MixedFlow, dense, flow_rows, grid_of, known
 from torchrefract.warping.resample import follow, look_up
 
@@ -65,3 +65,24 @@ def test_it_knows_its_type_and_its_gradient(flow):
     assert not learning.detach().requires_grad
     dense(learning).sum().backward()
     assert torch.equal(leaf.grad, torch.ones_like(leaf))
+
+
+@pytest.mark.parametrize("form", ["lattice", "stream", "dense"])
+def test_rows_that_are_one_are_computed_once(form):
+    lattice = Lattice(HEIGHT, WIDTH, 5, before=3, after=2)
+    size = [len(axis) for axis in lattice.axes()]
+    noise = torch.randn(1, 2, *size, generator=torch.Generator().manual_seed(8))
+    nodes = noise[:, :1] if form == "stream" else noise
+    forms: dict[str, tuple[Flow, Flow]] = {
+        "lattice": (SmoothFlow(nodes, lattice), SmoothFlow(nodes.expand(6, -1, -1, -1), lattice)),
+        "stream": (StreamFlow(nodes, lattice), StreamFlow(nodes.expand(6, -1, -1, -1), lattice)),
+        "dense": (dense(smooth(0, 1, 8)), dense(smooth(0, 1, 8)).expand(6, -1, -1, -1)),
+    }
+    one, many = forms[form]
+    found, grid = dense(many), grid_of(many, torch.float32)
+    assert torch.equal(found, dense(one).expand_as(found))
+    assert torch.equal(grid, grid_of(one, torch.float32).expand_as(grid))
+    assert grid.stride(0) == found.stride(0) == 0
+    image = torch.rand(6, 3, HEIGHT, WIDTH)
+    options = {"padding": "zeros", "interpolation": "bilinear"}
+    assert torch.equal(look_up(image, many, **options)[3:4], look_up(image[3:4], one, **options))

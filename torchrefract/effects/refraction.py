@@ -11,7 +11,7 @@ from torchrefract._bands import in_place
 from torchrefract._checks import check_choice, is_true, learns
 from torchrefract.effects.base import Effect
 from torchrefract.effects.plan import Ask, Plan
-from torchrefract.effects.rows import alike, column, only, params_part, part, put, some, spread
+from torchrefract.effects.rows import alike, column, frames_of, only, params_part, part, put, some, spread
 from torchrefract.types import Degraded, Inverse, Map
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import field_dtype, inside, length
@@ -19,7 +19,7 @@ from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.jacobian import folding
 from torchrefract.warping.lattice import SmoothFlow
 from torchrefract.warping.masks import mixes_only
-from torchrefract.warping.mixed import Flow, MixedFlow, PartFlow, dense, flow_rows
+from torchrefract.warping.mixed import Flow, MixedFlow, PartFlow, dense
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, RESAMPLERS, look_up
 
 
@@ -204,5 +204,7 @@ def _spread_path(path: Flow, rows: int, before: int) -> Flow:
     if isinstance(path, SmoothFlow):
         return path.with_nodes(spread(path.nodes, rows))
     if isinstance(path, MixedFlow):
-        return flow_rows(path, spread(torch.arange(before), rows))
+        frames = rows // before
+        parts = ((frames_of(own, frames), _spread_path(flow, frames * len(own), len(own))) for own, flow in path.parts)
+        return MixedFlow(tuple((index, cast(PartFlow, flow)) for index, flow in parts))
     return spread(path, rows)

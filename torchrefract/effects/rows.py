@@ -99,7 +99,7 @@ def some(active: Tensor, params: Any) -> Tensor | None:
 def part(value: Tensor, index: Tensor, batch: int) -> Tensor:
     """The rows of some samples of a batch; one row for all of them stays."""
     frames, odd = divmod(value.shape[0], batch)
-    return value if odd else value[_at(index, frames)]
+    return value if odd else value[frames_of(index, frames)]
 
 
 def params_part(params: Any, index: Tensor) -> Any:
@@ -113,9 +113,9 @@ def put(value: Tensor, index: Tensor, into: Tensor | float, batch: int) -> Tenso
     frames = value.shape[0] // len(index)
     if not isinstance(into, Tensor):
         into = value.new_full((batch * frames, *value.shape[1:]), into)
-    return into.index_copy(0, _at(index, frames), value)
+    return into.index_copy(0, frames_of(index, frames), value)
 
 
-def _at(index: Tensor, frames: int) -> Tensor:
-    """The numbers of the rows of some samples of so many frames each."""
+def frames_of(index: Tensor, frames: int) -> Tensor:
+    """(n frames,): the numbers of the rows of some samples, (n,), of so many frames each."""
     return (frames * index[:, None] + torch.arange(frames)).flatten()

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import cast
+from typing import TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from torchrefract.warping.grid import sampler_grid
 from torchrefract.warping.lattice import SmoothFlow
 
 PartFlow = Tensor | SmoothFlow
+_Form = TypeVar("_Form", bound="Tensor | SmoothFlow | MixedFlow")
 Part = tuple[Tensor, PartFlow]
 
 
@@ -68,17 +69,28 @@ Flow = Tensor | SmoothFlow | MixedFlow
 
 def dense(flow: Flow) -> Tensor:
     """(B, 2, H, W), px, of a flow in any form."""
-    return flow if isinstance(flow, Tensor) else flow.dense()
+    return flow if isinstance(flow, Tensor) else _once(flow, lambda own: own.dense())
 
 
 def grid_of(flow: Flow, dtype: torch.dtype) -> Tensor:
     """(B, H, W, 2): where F.grid_sample(align_corners=False) looks along a flow in any form, finite."""
-    return sampler_grid(flow.to(dtype)) if isinstance(flow, Tensor) else flow.sampler_grid(dtype)
+    if isinstance(flow, Tensor):
+        return _once(flow, lambda own: sampler_grid(own.to(dtype)))
+    return _once(flow, lambda own: own.sampler_grid(dtype))
 
 
 def flow_rows(flow: Flow, index: Tensor) -> Flow:
     """Some rows of a flow."""
     return flow.rows(index) if isinstance(flow, SmoothFlow | MixedFlow) else flow[index]
+
+
+def _once(flow: _Form, work: Callable[[_Form], Tensor]) -> Tensor:
+    """What is made of a flow, once where all its rows are one, as for the frames of a clip."""
+    nodes = known(flow)
+    if isinstance(flow, MixedFlow) or len(nodes) < 2 or nodes.stride(0) != 0:
+        return work(flow)
+    first = cast(_Form, flow.with_nodes(nodes[:1]) if isinstance(flow, SmoothFlow) else nodes[:1])
+    return work(first).expand(len(nodes), -1, -1, -1)
 
 
 def known(flow: Flow) -> Tensor:

@@ -12,6 +12,7 @@ from torchrefract._checks import (
     check_range,
     check_tensor,
     is_true,
+    read,
 )
 
 
@@ -123,6 +124,21 @@ def test_nothing_is_read_from_a_device_that_would_make_us_wait():
     elsewhere = torch.empty(3, device="meta")
     check_all("depth", "be above 0, in m", elsewhere, positive)
     assert is_true((elsewhere > 0).all) is None
+
+
+def test_what_cannot_be_read_is_not_even_computed():
+    elsewhere, computed = torch.empty(3, device="meta"), list[torch.Tensor]()
+
+    def kept(value: torch.Tensor) -> torch.Tensor:
+        computed.append(value)
+        return value
+
+    assert is_true(lambda: kept(elsewhere).all(), of=elsewhere) is None
+    assert read(lambda: kept(elsewhere), of=elsewhere) is None
+    check_all("depth", "be above 0, in m", elsewhere, lambda value: kept(value) > 0)
+    assert computed == []
+    assert read(lambda: kept(torch.arange(2)), of=torch.empty(0)) == [0, 1]
+    assert len(computed) == 1
 
 
 def test_nothing_is_read_while_compiling():

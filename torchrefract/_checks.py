@@ -80,14 +80,17 @@ def check_all(name: str, condition: str, value: Tensor, test: Callable[[Tensor],
 
     On an accelerator, under torch.compile and inside torch.vmap nothing is read: there the result is masked instead.
     """
-    if value.device.type == "cpu" and is_true(lambda: test(value).all()) is False:
+    if is_true(lambda: test(value).all(), of=value) is False:
         wrong = value.detach()[~test(value.detach())].flatten()
         raise ValueError(f"{name} must {condition}, got {wrong[0].item():g}")
 
 
-def is_true(predicate: Callable[[], Tensor]) -> bool | None:
-    """The truth of a one-element tensor, or None where reading it would wait for a device or break a graph."""
-    values = read(predicate)
+def is_true(predicate: Callable[[], Tensor], *, of: Tensor | None = None) -> bool | None:
+    """The truth of a one-element tensor, or None where reading it would wait for a device or break a graph.
+
+    `of`: as for `read`.
+    """
+    values = read(predicate, of=of)
     return None if values is None else bool(values)
 
 
@@ -101,9 +104,12 @@ def learns(values: Iterable[Any]) -> bool:
     return torch.is_grad_enabled() and any(value.requires_grad for value in values)
 
 
-def read(tensor: Callable[[], Tensor]) -> Any:
-    """The values of a tensor as a number or nested lists, or None where reading them would wait for a device."""
-    if torch.compiler.is_compiling():
+def read(tensor: Callable[[], Tensor], *, of: Tensor | None = None) -> Any:
+    """The values of a tensor as a number or nested lists, or None where reading them would wait for a device.
+
+    `of`: what it is computed from, so that on a device it is not even computed.
+    """
+    if torch.compiler.is_compiling() or (of is not None and of.device.type != "cpu"):
         return None
     value = tensor()
     if value.device.type != "cpu":

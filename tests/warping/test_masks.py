@@ -3,8 +3,10 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchrefract.warping.grid import inside, pixel_axes, sampler_grid
+from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.masks import mixes_only
 
 SIZES = [(1, 1), (3, 40), (37, 53), (96, 128)]
@@ -75,3 +77,25 @@ def test_a_map_over_samples_and_a_compiled_graph_say_the_same():
     compiled = torch.compile(mixes_only, backend="aot_eager", fullgraph=True)
     assert torch.equal(compiled(good, flow), expected)
     assert torch.equal(torch.compile(inside, backend="aot_eager", fullgraph=True)(flow), inside(flow))
+
+
+class _Named(TorchDispatchMode):
+    """The names of the operations that run."""
+
+    def __init__(self):
+        super().__init__()
+        self.names: list[str] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.names.append(func.overloadpacket.__name__)
+        return func(*args, **(kwargs or {}))
+
+
+def test_on_a_device_nothing_is_computed_that_could_not_be_read():
+    flow = torch.empty(2, 2, 96, 128, device="meta")
+    with _Named() as ran:
+        good = inside(flow)
+        mixes_only(good, flow)
+        invert_flow(flow)
+    assert "grid_sampler_2d" in ran.names
+    assert not {"amin", "amax", "aminmax", "_local_scalar_dense"} & set(ran.names)

@@ -114,7 +114,7 @@ def undistort_polynomial(
         room = torch.minimum(room, limit.radius.square() - r2)
         if terms.bent:
             room = torch.minimum(room, _slopes(x, y, r2, g, c, terms).determinant)
-        if is_true(lambda: room.amin() >= 0):
+        if is_true(lambda: room.amin() >= 0, of=room):
             return x, y, torch.ones_like(room, dtype=torch.bool)
         return x.nan_to_num(0, 0, 0), y.nan_to_num(0, 0, 0), room >= 0
 
@@ -195,7 +195,7 @@ def _bend(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, coefficients: Tensor, 
         x, y = x - step_x, y - step_y
         if count >= least:
             size = torch.maximum(step_x.abs(), step_y.abs())
-            if is_true(lambda size=size: size.amax() <= still):
+            if is_true(lambda size=size: size.amax() <= still, of=size):
                 break
             moves = size > still
     if not terms.round:

@@ -51,7 +51,7 @@ class Effect(nn.Module, ABC):
             return result
         flow = degraded.flow
         # Labels of what stays where it is are not clipped or filtered either.
-        if flow is None or is_true((flow == 0).all):
+        if flow is None or is_true((flow == 0).all, of=flow):
             return result, target[0]
         if flow.ndim == 5:
             raise TypeError("target must be None beside several clips: warp_labels moves that of each, got one for all")

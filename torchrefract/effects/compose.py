@@ -229,7 +229,7 @@ class OneOf(Compose):
         """As for `Compose`; exact, too, for parameters by which several effects act on a sample."""
         acting = torch.stack([child.gate for child in params.children]).sum(dim=0)
         fitted = super().fitted(params)
-        if self.tolerance_px is None or is_true((acting <= 1).all) is not False:
+        if self.tolerance_px is None or is_true((acting <= 1).all, of=acting) is not False:
             return fitted
         exact = copy(fitted)
         exact.tolerance_px = None

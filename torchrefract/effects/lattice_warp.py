@@ -58,7 +58,7 @@ class LatticeWarp(WarpEffect):
 
     def fitted(self, params: Any) -> "LatticeWarp":
         """The effect itself; an exact one for parameters outside the ranges that its plan is for."""
-        if self.tolerance_px is None or is_true(lambda: self.covers(params)) is not False:
+        if self.tolerance_px is None or is_true(lambda: self.covers(params), of=params.gate) is not False:
             return self
         exact = copy(self)
         exact.tolerance_px = None

@@ -203,7 +203,7 @@ class LensDistortion(LatticeWarp):
 
     def plans_of(self, params: LensParams, plan: Plan) -> list[Plan] | None:
         """For each lens the plan of `plan_of_lens`."""
-        numbers = read(lambda: lens_numbers(*(value.detach() for value in params[1:])))
+        numbers = read(lambda: lens_numbers(*(value.detach() for value in params[1:])), of=params.focal)
         if numbers is None:
             return None
         boxes = self._boxes()
@@ -227,7 +227,7 @@ class LensDistortion(LatticeWarp):
     def gated(self, params: LensParams, *, height: int, width: int, plan: Plan | None = None) -> Moved:
         """The flow, by its own plan or by one that is given; a lens that folds is told."""
         moved = super().gated(params, height=height, width=width, plan=plan)
-        if is_true(moved.exists.all) is False:
+        if is_true(moved.exists.all, of=moved.exists) is False:
             self._check_fold(params, height, width)
         return moved
 
@@ -257,7 +257,7 @@ class LensDistortion(LatticeWarp):
         def folds() -> Tensor:
             return (params.gate & folds_inside(*camera, height=height, width=width)).any()
 
-        if not is_true(folds):
+        if not is_true(folds, of=params.gate):
             return
         rule = "the lens must not fold back inside the frame (k1, k2 ... and focal_range decide)"
         if self.strict:

@@ -64,4 +64,4 @@ def is_still(params: Any) -> bool:
     moving = (params.frame, params.wind, params.decorrelation)
     if params.frame.shape[1] > 1 or learns(moving):
         return False
-    return is_true((params.frame == 0).all) is True
+    return is_true((params.frame == 0).all, of=params.frame) is True

@@ -31,7 +31,7 @@ class PlannedLight(RadianceEffect):
 
     def fitted(self, params: Any) -> "PlannedLight":
         """The effect itself; an exact one for parameters outside the ranges that its plan is for."""
-        if self.tolerance is None or is_true(lambda: self.covers(params)) is not False:
+        if self.tolerance is None or is_true(lambda: self.covers(params), of=params.gate) is not False:
             return self
         return self.exact()
 

@@ -29,7 +29,7 @@ _CLEAR = {"transmission": 1.0, "extinction": 0.0, "intensity": 0.0}
 
 
 def _stirs(active: Tensor, params: Any) -> bool:
-    return is_true(active.any) is not False or learns(params)
+    return is_true(active.any, of=active) is not False or learns(params)
 
 
 class RadianceEffect(Effect):
@@ -57,7 +57,7 @@ class RadianceEffect(Effect):
         active = params.gate & self.acts(params)
         if not _stirs(active, params):
             return self._unchanged(image, params)
-        if depth is not None and is_true(active.any) is False:
+        if depth is not None and is_true(active.any, of=active) is False:
             depth = None  # and nobody looks at its values
         index, batch = some(active, params), len(active)
         if index is None:
@@ -70,7 +70,7 @@ class RadianceEffect(Effect):
         def where_active(value: Tensor, off: float | bool) -> Tensor:
             if index is not None:
                 value = put(value, index, off, batch)
-            elif is_true(active.all) is not True:
+            elif is_true(active.all, of=active) is not True:
                 value = _choose(value, off, active)
             return value.expand(-1, 1, height, width)
 

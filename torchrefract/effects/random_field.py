@@ -41,7 +41,7 @@ def random_field(
     size = torus(height, width, length=longest, kind=kind, aperture=widest or 0.0)
     aperture = None if widest is None else params.aperture
     shape, clipped = spectrum(size, params.length, kind=kind, aperture=aperture, dtype=dtype)
-    share = max(read(lambda: torch.where(params.gate, clipped, 0)) or [0.0])
+    share = max(read(lambda: torch.where(params.gate, clipped, 0), of=clipped) or [0.0])
     if share > _CLIPPED:
         warnings.warn(
             f"length must be short enough for a torus of {size[0]} x {size[1]} px, the largest for this frame: "

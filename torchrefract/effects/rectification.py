@@ -167,7 +167,7 @@ class Rectification(LatticeWarp):
             camera = in_px(params, height, width)
             return (params.gate & shows_folded(*camera, model=self.model, height=height, width=width)).any()
 
-        if is_true(folds):
+        if is_true(folds, of=params.gate):
             warnings.warn(
                 "camera: the model folds back inside the frame: pixels beyond are padded, not valid", stacklevel=3
             )

@@ -69,7 +69,7 @@ class WarpEffect(Effect):
 
     def stirs(self, params: Any, height: int, width: int) -> bool:
         """Whether a sample may be moved, or a gradient is asked for that could move it."""
-        return is_true((params.gate & self.moves(params)).any) is not False or learns(params)
+        return is_true((params.gate & self.moves(params)).any, of=params.gate) is not False or learns(params)
 
     def gated(self, params: Any, *, height: int, width: int) -> "Moved":
         """The flow, zero for the samples that the effect leaves alone."""

@@ -74,7 +74,7 @@ def only(changed: Tensor, same: Tensor | float, active: Tensor, params: Any) -> 
         active: (N,) or (B,), bool: the samples that the effect changes at all.
         params: (B,) of everything; those of open gates keep their gradient.
     """
-    if is_true(active.all):
+    if is_true(active.all, of=active):
         return changed
     rows = changed.shape[0]
     value = torch.where(column(spread(active, rows)), changed, same)

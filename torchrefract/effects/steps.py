@@ -66,7 +66,11 @@ def _each_by_itself(steps: Sequence[Step], one: Callable[[Sequence[Step]], Tenso
 
 def _apart(steps: Sequence[Step]) -> dict[tuple[bool, ...], list[int]] | None:
     """The rows that each combination of the steps moves, by which of them do; None where that would save nothing."""
-    flags = None if any(map(learns, steps)) else read(lambda: torch.stack([step.active for step in steps], dim=1))
+    flags = (
+        None
+        if any(map(learns, steps))
+        else read(lambda: torch.stack([step.active for step in steps], dim=1), of=steps[0].active)
+    )
     if flags is None or all(map(all, flags)) or not any(map(any, flags)):
         return None
     rows: dict[tuple[bool, ...], list[int]] = {}
@@ -92,6 +96,6 @@ def _in_a_row_on_grid(steps: Sequence[Step], dtype: torch.dtype) -> Tensor:
     for step in reversed(earlier):
         own = cast(Flow, step.path)
         both = follow(own, grid)
-        grid = both if is_true(last.active.all) else only(both, grid_of(own, dtype), last.active, last)
+        grid = both if is_true(last.active.all, of=last.active) else only(both, grid_of(own, dtype), last.active, last)
         last = Step(step.gate | last.gate, step.active | last.active, Positions(grid))
     return grid

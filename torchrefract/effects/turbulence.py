@@ -155,7 +155,7 @@ class Turbulence(LatticeWarp):
             slope = slope_rms(params.length, kind=self.covariance, aperture=params.aperture)
             return (params.gate & (params.amplitude * slope > _FOLD)).any()
 
-        if is_true(folds):
+        if is_true(folds, of=params.gate):
             warnings.warn(
                 "amplitude is above what the covariance bears without folding the image (0.2 px over the slope of the "
                 "field): restore_valid leaves folded pixels out; a larger length_range or aperture_range folds less",

@@ -160,7 +160,7 @@ class Walk:
     def _looked_up(self, flow: Flow | Positions) -> Tensor:
         warped = None
         for (padding, interpolation, resampler), samples in reversed(self.modes.items()):
-            if warped is not None and is_true(samples.any) is False:
+            if warped is not None and is_true(samples.any, of=samples) is False:
                 continue
             options = {"padding": padding, "interpolation": interpolation, "resampler": resampler}
             found = look_up(self.image, flow, **options)
@@ -178,7 +178,7 @@ class Walk:
                 continue
             total, known, done = found
             both, last = column(done & moves), column(moves)
-            if is_true(both.any) is not False:
+            if is_true(both.any, of=both) is not False:
                 exists = torch.where(both, known & sees(exists, total), exists)
                 back = torch.where(both, compose_flows(back, total), back)
             found = torch.where(last, back, total), torch.where(last, exists, known), done | moves

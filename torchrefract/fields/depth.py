@@ -188,7 +188,7 @@ def check_depth(depth: Tensor, *, name: str = "depth") -> None:
     Raises:
         ValueError: a depth that is none.
     """
-    lowest = read(lambda: depth.detach().amin()) if depth.numel() else None
+    lowest = read(lambda: depth.detach().amin(), of=depth) if depth.numel() else None
     if lowest is None:
         return
     if not lowest >= 0:  # NaN is not either

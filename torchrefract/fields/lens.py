@@ -179,7 +179,11 @@ def _unfolded(x: Tensor, y: Tensor, determinant: Tensor, limit: RadialLimit) -> 
     """(B, 1, H, W), bool: the points that are shown, and not folded over."""
     squared, most = x * x + y * y, limit.radius.square()
     # Comparisons of every point are slow.
-    if is_true(lambda: ((squared - most).amax() <= 0) & (determinant.amin() > 0) & (determinant.amax() < torch.inf)):
+
+    def everywhere() -> Tensor:
+        return ((squared - most).amax() <= 0) & (determinant.amin() > 0) & (determinant.amax() < torch.inf)
+
+    if is_true(everywhere, of=squared):
         return torch.ones_like(squared, dtype=torch.bool)
     return (squared <= most) & (determinant > 0) & (determinant < torch.inf)  # no number: nothing is shown there
 
@@ -193,7 +197,7 @@ def _attach(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, c: Tensor, terms: Te
 
 
 def _as_flow(u: Tensor, v: Tensor, exists: Tensor, x: Tensor, y: Tensor, focal: Tensor) -> Tensor:
-    if not is_true(exists.all):
+    if not is_true(exists.all, of=exists):
         # Where there is no answer, look outward past every frame: padded, never extrapolated.
         u, v = torch.where(exists, u, 2 * REACH * x.detach()), torch.where(exists, v, 2 * REACH * y.detach())
     return torch.cat([u, v], dim=1) * focal[:, :, None, None]

@@ -85,7 +85,7 @@ def _taken(start: Tensor, size: int, step: float) -> tuple[Tensor, Tensor]:
 
 def _turns(key: Tensor, nodes: Sequence[Tensor], *, frame: Tensor, decorrelation: Tensor, dtype: torch.dtype) -> Tensor:
     """(N, n, m), the angles of the gradients over 2 pi."""
-    if not learns((frame, decorrelation)) and is_true((frame / decorrelation == 0).all):
+    if not learns((frame, decorrelation)) and is_true((frame / decorrelation == 0).all, of=frame):
         return lattice(key, nodes, 1)[:, 0, 0].to(dtype)
     start, speed = lattice(key, nodes, 2)[:, :, 0].unbind(1)
     elapsed = (frame.double() / (math.pi * decorrelation.double()))[:, None, None]

@@ -107,9 +107,9 @@ def check_points(points: Tensor) -> None:
     def spread() -> Tensor:
         return (torch.linalg.svdvals(centered.nan_to_num(0.0, 0.0, 0.0))[:, 1] > _FLATTEST * extent).all()
 
-    if is_true(apart) is False:
+    if is_true(apart, of=centered) is False:
         raise ValueError("points must differ from one another, got two that are the same")
-    if is_true(spread) is False:
+    if is_true(spread, of=centered) is False:
         raise ValueError("points must not lie on a line, got a sample whose points do")
 
 

@@ -72,7 +72,7 @@ def near_border(flow: Tensor, depth: int, at: Callable[[slice, slice], Tensor]) 
         at: from rows and columns of the frame to (B, 1, n, m), bool.
     """
     (height, width), everywhere = flow.shape[2:], slice(None)
-    farthest = read(lambda: torch.stack(flow.detach().aminmax()).abs().amax()) if flow.numel() else None
+    farthest = read(lambda: torch.stack(flow.detach().aminmax()).abs().amax(), of=flow) if flow.numel() else None
     if farthest is None or not farthest < min(height, width):  # nor is NaN
         return at(everywhere, everywhere)
     depth += math.ceil(farthest)
@@ -158,6 +158,6 @@ def pixel_positions(grid: Tensor, *, height: int, width: int, out: Tensor) -> Te
 def finite(positions: Tensor, limit: float) -> Tensor:
     """The positions within a limit; what is no number lies there."""
     # One NaN in a grid with border padding ends the process in the sampler's backward.
-    if positions.numel() == 0 or is_true(lambda: torch.stack(positions.aminmax()).abs().amax() <= limit):
+    if positions.numel() == 0 or is_true(lambda: torch.stack(positions.aminmax()).abs().amax() <= limit, of=positions):
         return positions
     return positions.nan_to_num(nan=limit, posinf=limit, neginf=-limit).clamp(-limit, limit)

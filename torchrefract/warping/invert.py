@@ -61,7 +61,7 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
     flow = flow.to(field_dtype(flow.dtype))
     if flow.numel() == 0:
         return flow.clone(), flow[:, :1] == 0, flow[:, :1].clone()
-    whole = is_true(lambda: torch.stack(flow.detach().aminmax()).abs().amax() <= _FARTHEST)
+    whole = is_true(lambda: torch.stack(flow.detach().aminmax()).abs().amax() <= _FARTHEST, of=flow)
     known = None if whole else (flow.abs() <= _FARTHEST).all(dim=1, keepdim=True)
     flow = flow if known is None else torch.where(known, flow, 0)
     with torch.no_grad():
@@ -217,7 +217,7 @@ def _begun(flow: Tensor) -> tuple[_Pixels, _Fields, _Newton]:
     sheet = _jacobian(fields.along, fields.across)
     determinant = sheet.determinant
     # Where it is at every pixel, what is read between them is above zero, too.
-    if not is_true(lambda: determinant.amin() >= _UPRIGHT):
+    if not is_true(lambda: determinant.amin() >= _UPRIGHT, of=determinant):
         fields = fields._replace(flow=torch.cat([flow, determinant], dim=1))
         upright = determinant >= _UPRIGHT
         flat = Jacobian(*(torch.where(upright, own, still) for own, still in zip(sheet, (1, 0, 0, 1), strict=True)))

@@ -23,6 +23,7 @@ _MOST_HALVINGS = 5
 _SMALLEST_FRAME = 1 << 16
 
 
+@lru_cache(maxsize=2048)
 def plan_in_parts(boxes: tuple[LensRanges, ...], ask: Ask) -> Plan:
     """The plan of `lens_plan`, said to have parts if lenses may get coarser ones of their own."""
     plan = lens_plan(boxes, ask)

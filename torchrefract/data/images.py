@@ -20,6 +20,7 @@ from PIL import Image
 from torch import Tensor
 
 from torchrefract._checks import check_count, check_tensor
+from torchrefract._levels import levels_of, numbers_of
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 
@@ -32,7 +33,6 @@ _BARE_MARKERS = (0x01, *range(0xD0, 0xD8))  # TEM and RST0 to RST7 carry no leng
 _ORIENTATION = 0x0112
 _TURNED = (5, 6, 7, 8)  # EXIF orientations that swap height and width
 _QUIETING = Lock()
-_AT_ONCE = 1 << 16  # pixels of a picture that stay in a core's cache
 _levels: list[int] = []  # OpenCV's log level before, once for each thread that has it off
 
 
@@ -63,8 +63,7 @@ def read_pixels(path: str | Path) -> np.ndarray:
 
 def as_image(pixels: np.ndarray) -> Tensor:
     """(3, H, W), float32 in [0, 1], of a picture (H, W, 3), uint8 or uint16."""
-    scale = np.iinfo(pixels.dtype).max
-    return torch.from_numpy(pixels).to(torch.float32).div_(scale).permute(2, 0, 1)
+    return numbers_of(torch.from_numpy(pixels)).permute(2, 0, 1)
 
 
 def pixels_of(image: Tensor) -> np.ndarray:
@@ -72,17 +71,9 @@ def pixels_of(image: Tensor) -> np.ndarray:
 
     What `read_image` has read from 8 bits comes back as it was.
     """
-    image = image.detach().cpu()
-    pixels, rows = np.empty((*image.shape[1:], 3), np.uint8), max(1, _AT_ONCE // max(1, image.shape[2]))
-    for start in range(0, len(pixels), rows):
-        band, levels = pixels[start : start + rows], image[:, start : start + rows].mul(255)
-        levels = levels.clamp_(0, 255).round_().byte()
-        # OpenCV interleaves planes sooner than a copy in another order of strides does.
-        if (last := levels.permute(1, 2, 0)).is_contiguous():
-            band[:] = last.numpy()
-        else:
-            cv2.merge([*levels.numpy()], dst=band)
-    return pixels
+    levels = levels_of(image.detach().cpu()[None])[0]
+    # OpenCV interleaves planes sooner than a copy in another order of strides does.
+    return last.numpy() if (last := levels.permute(1, 2, 0)).is_contiguous() else cv2.merge([*levels.numpy()])
 
 
 def image_size(path: str | Path) -> tuple[int, int]:

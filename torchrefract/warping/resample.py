@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrefract._bands import join
 from torchrefract._checks import check_choice, check_flow, check_tensor
 from torchrefract._constants import constant
+from torchrefract._levels import rounded
 from torchrefract.warping.grid import FAR, Positions, field_dtype, finite, inside, sampler_grids
 from torchrefract.warping.lattice import SmoothFlow
 from torchrefract.warping.mixed import Flow, dense, grid_of, known
@@ -99,14 +100,17 @@ def look_up(
         if resampler == "opencv":
             raise ValueError(f"resampler must be auto or grid_sample {why}, got 'opencv'")
     source = image.to(dtype)
-    bands = (
-        sampled(source, grid, padding=padding, interpolation=interpolation)
-        for grid in _grids(source, flow, dtype, whole=(interpolation, padding) == _WHOLE)
-    )
+
+    def looked_up(grid: Tensor) -> Tensor:
+        found = sampled(source, grid, padding=padding, interpolation=interpolation)
+        # What bicubics overshoot is cut first.
+        return found if interpolation == "bicubic" else _in_type(found, image)
+
+    bands = map(looked_up, _grids(image, flow, dtype, whole=(interpolation, padding) == _WHOLE))
     warped = join(bands, dim=2, length=image.shape[2])
     if interpolation == "bicubic":
-        warped = _clamped(warped, source, padding)
-    return _as_image(warped, image)
+        warped = _in_type(_clamped(warped, source, padding), image)
+    return _laid_out(warped, image)
 
 
 def sampler_dtype(image: Tensor, dtype: torch.dtype) -> torch.dtype:
@@ -176,11 +180,9 @@ def _suits_opencv(image: Tensor) -> bool:
     return image.dtype is torch.uint8 and is_channels_last(image[:1])
 
 
-def _as_image(warped: Tensor, image: Tensor) -> Tensor:
-    if not image.is_floating_point():
-        limits = (0, 1) if image.dtype is torch.bool else (torch.iinfo(image.dtype).min, torch.iinfo(image.dtype).max)
-        warped = warped.round().clamp(*limits)
-    return _laid_out(warped, image)
+def _in_type(warped: Tensor, image: Tensor) -> Tensor:
+    """Values in the type of the image; those of whole numbers are rounded."""
+    return warped if image.is_floating_point() else rounded(warped, image.dtype).to(image.dtype)
 
 
 def _laid_out(warped: Tensor, image: Tensor) -> Tensor:
@@ -202,23 +204,20 @@ def _clamped(warped: Tensor, source: Tensor, padding: str) -> Tensor:
     return torch.where(warped.isfinite(), warped.clamp(low, high), warped)
 
 
-def _grids(source: Tensor, flow: Flow | Positions, dtype: torch.dtype, *, whole: bool) -> Iterable[Tensor]:
-    if isinstance(flow, Positions):
-        return [flow.grid]
-    if not isinstance(flow, Tensor):
-        return [grid_of(flow, dtype)]
-    return sampler_grids(flow.to(dtype), rows=flow.shape[2] if whole else _rows_at_once(source, flow))
+def _grids(image: Tensor, flow: Flow | Positions, dtype: torch.dtype, *, whole: bool) -> Iterable[Tensor]:
+    rows = image.shape[2] if whole else _rows_at_once(image)
+    if isinstance(flow, Tensor):
+        return sampler_grids(flow.to(dtype), rows=rows)
+    grid = flow.grid if isinstance(flow, Positions) else grid_of(flow, dtype)
+    # What is looked up in bands is still in the cache when it is rounded; of numbers nothing would be faster.
+    return [grid] if image.is_floating_point() else grid.split(rows, dim=1)
 
 
-def _rows_at_once(source: Tensor, flow: Tensor) -> int:
+def _rows_at_once(image: Tensor) -> int:
     """Rows whose grid stays in a core's cache, where nothing speaks for all at once."""
-    batch, _, height, width = flow.shape
+    batch, _, height, width = image.shape
     # The backward pass keeps one gradient image a band.
-    if (
-        source.device.type != "cpu"
-        or torch.compiler.is_compiling()
-        or (source.requires_grad and torch.is_grad_enabled())
-    ):
+    if image.device.type != "cpu" or torch.compiler.is_compiling() or (image.requires_grad and torch.is_grad_enabled()):
         return height
     return max(1, _CACHED // max(1, batch * width))
 

@@ -122,13 +122,22 @@ def test_flow_that_is_not_finite_leads_outside(poison, padding):
     assert not valid[0, 0, 4, 5]
 
 
+@pytest.fixture
+def on_opencv_threads():
+    """Sets the number of OpenCV's threads, for the length of a test."""
+    before = cv2.getNumThreads()
+    yield cv2.setNumThreads
+    cv2.setNumThreads(before)
+
+
 @pytest.mark.parametrize("size", [(131, 127), (301, 263)])
 @pytest.mark.parametrize("channels", [3, 4])
-def test_threads_and_batch_change_no_bit(size, channels, on_threads):
+def test_threads_and_batch_change_no_bit(size, channels, on_threads, on_opencv_threads):
     image, flow = levels(3, channels, *size), flows(3, *size)["short"]
     results = []
     for threads in (1, 2, 3):
         on_threads(threads)
+        on_opencv_threads(threads)
         results.append(warp(image, flow, padding="border")[0])
     alone = torch.cat([warp(image[i : i + 1], flow[i : i + 1], padding="border")[0] for i in range(3)])
     for result in (*results[1:], alone, warp(image[::2], flow[::2], padding="border")[0]):

@@ -5,7 +5,6 @@ From version 5 on remap takes the positions of images of 1, 3 or 4 channels as t
 
 import importlib
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from itertools import product
 from typing import Any
@@ -21,7 +20,8 @@ _PADDINGS = {"zeros": "BORDER_CONSTANT", "border": "BORDER_REPLICATE"}
 _INTERPOLATIONS = {"nearest": "INTER_NEAREST", "bilinear": "INTER_LINEAR"}
 _CHANNELS = (1, 3, 4)
 _OLDEST = 5
-# So few positions stay in a core's cache, and neither PyTorch nor OpenCV shares them among threads of its own.
+# So few positions stay in a core's cache, and PyTorch does not share them among its threads, which would stand in the
+# way of OpenCV's.
 _AT_ONCE = 1 << 15
 
 
@@ -48,7 +48,7 @@ def obstacle(image: Tensor, flow: Tensor, *, padding: str, interpolation: str, p
 def remapped(image: Tensor, grids: Iterable[Tensor], *, padding: str, interpolation: str) -> Tensor:
     """The image (B, C, H, W) of float32 or uint8, in channels_last format, looked up along the sampler's grid.
 
-    Bytes are rounded to the nearest. Each look-up takes as many threads as torch has, and leaves OpenCV's own alone.
+    Bytes are rounded to the nearest. The threads are OpenCV's own.
 
     Args:
         image: of which `obstacle` has nothing to say.
@@ -75,22 +75,12 @@ def remapped(image: Tensor, grids: Iterable[Tensor], *, padding: str, interpolat
 def _remap_rows(remap: Any, source: np.ndarray, out: np.ndarray, grid: Tensor) -> None:
     batch, height, width = grid.shape[:3]
     rows = max(1, _AT_ONCE // width)
-    bands = list(product(range(batch), range(0, height, rows)))
-
-    def work(part: int) -> None:
-        room = grid.new_empty(2, min(rows, height), width)
-        for i, start in bands[part::threads]:
-            band = slice(start, min(height, start + rows))
-            size = {"height": source.shape[1], "width": source.shape[2]}
-            x, y = pixel_positions(grid[i, band], **size, out=room[:, : band.stop - start]).numpy()
-            remap(source[i], x, y, dst=out[i, band])
-
-    threads = min(torch.get_num_threads(), len(bands))
-    if threads == 1:
-        work(0)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(work, range(threads)))
+    room = grid.new_empty(2, min(rows, height), width)
+    for i, start in product(range(batch), range(0, height, rows)):
+        band = slice(start, min(height, start + rows))
+        size = {"height": source.shape[1], "width": source.shape[2]}
+        x, y = pixel_positions(grid[i, band], **size, out=room[:, : band.stop - start]).numpy()
+        remap(source[i], x, y, dst=out[i, band])
 
 
 def _pictures(image: Tensor) -> np.ndarray:

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 
 from torchrefract._files import replacing
+from torchrefract._levels import levels_of, numbers_of
 from torchrefract.board_views import pictures_of, read_gray
 from torchrefract.calibration_report import camera_of
 from torchrefract.cameras.calibration.boards import Board, Charuco, Chessboard
@@ -160,9 +161,9 @@ def _straight(views: list[View], pictures: dict[str, np.ndarray], board: Board, 
     """How straight corners are before and after, of those found in both."""
     flow, pairs = camera_flow(camera)[0], []
     for view in views:
-        image = torch.from_numpy(pictures[view.name])[None, None].float() / 255
-        rectified = warp(image, flow, interpolation="bicubic")[0][0, 0]
-        again = detect((255 * rectified.clamp(0, 1)).round().byte().numpy(), board, name=view.name)
+        image = numbers_of(torch.from_numpy(pictures[view.name])[None, None])
+        rectified = levels_of(warp(image, flow, interpolation="bicubic")[0])
+        again = detect(rectified[0, 0].numpy(), board, name=view.name)
         both, before, after = np.intersect1d(view.ids, again.ids, return_indices=True)
         pairs.append((View(view.name, both, view.corners[before]), View(view.name, both, again.corners[after])))
     first, then = zip(*pairs, strict=True)

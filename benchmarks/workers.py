@@ -21,6 +21,7 @@ from torch.utils import benchmark
 from torch.utils.data import DataLoader, Dataset
 
 from torchrefract._files import replacing
+from torchrefract._levels import levels_of
 from torchrefract.effects.base import Effect
 
 WHAT = (
@@ -89,7 +90,7 @@ def main() -> None:
     ((timings, notes, conditions),) = loader(Measured(chosen, frame, args.repeats))
     held = bars(timings, list(within))
     print(table(timings, conditions), *notes, "", *held, "", sep="\n", flush=True)
-    pixels = (frame[0] * 255).round().byte()
+    pixels = levels_of(frame)[0]
     rates = {}
     for name, frames in datasets(chosen, albumentations(peers, args.size[1]), pixels).items():
         rates[name] = rate(frames, seconds=args.seconds)

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchrefract._bands import join
+from torchrefract._bands import join, rows_at_once
 
 
 @pytest.mark.parametrize("dim", [1, 2])
@@ -9,6 +9,15 @@ from torchrefract._bands import join
 def test_bands_are_joined_in_order(dim, sizes):
     whole = torch.randn(2, 5, 5)
     assert torch.equal(join(whole.split(sizes, dim=dim), dim=dim, length=5), whole)
+
+
+@pytest.mark.parametrize(("each", "expected"), [(0, 64), (1, 64), (9, 7), (64, 1), (65, 1)])
+def test_rows_of_a_band_stay_in_the_cache(each, expected):
+    assert rows_at_once(torch.device("cpu"), 100, each=each, cached=64) == expected
+
+
+def test_other_devices_take_all_rows_at_once():
+    assert rows_at_once(torch.device("meta"), 100, each=9, cached=64) == 100
 
 
 def test_each_band_is_placed_before_the_next_is_made():

@@ -7,6 +7,20 @@ import torch
 from torch import Tensor
 
 
+def rows_at_once(device: torch.device, rows: int, *, each: int, cached: int) -> int:
+    """How many rows at a time stay in a core's cache; all, on an accelerator and in a compiled graph.
+
+    Args:
+        device: they are computed on.
+        rows: all of them.
+        each: values in a row.
+        cached: values that stay in the cache.
+    """
+    if device.type != "cpu" or torch.compiler.is_compiling():
+        return max(1, rows)
+    return max(1, cached // max(1, each))
+
+
 def join(bands: Iterable[Tensor], *, dim: int, length: int) -> Tensor:
     """The bands one after the other along a dimension, of which they fill `length`.
 

@@ -3,7 +3,9 @@
 import torch
 from torch import Tensor
 
-_AT_ONCE = 1 << 17  # values that stay in a core's cache
+from torchrefract._bands import rows_at_once
+
+_CACHED = 1 << 17  # values that stay in a core's cache
 
 
 def numbers_of(levels: Tensor) -> Tensor:
@@ -15,7 +17,9 @@ def levels_of(numbers: Tensor) -> Tensor:
     """round(255 v) of each number v of images (N, C, H, W), which is cut to [0, 1] first; uint8, as they lie there."""
     numbers = numbers.detach()
     levels = torch.empty_like(numbers, dtype=torch.uint8)
-    rows = rows_at_once(numbers)
+    batch, channels, height, width = numbers.shape
+    cached = torch.get_num_threads() * _CACHED  # all threads share a band
+    rows = rows_at_once(numbers.device, height, each=batch * channels * width, cached=cached)
     for place, band in zip(levels.split(rows, dim=2), numbers.split(rows, dim=2), strict=True):
         place.copy_(rounded(band * 255, torch.uint8))
     return levels
@@ -25,11 +29,3 @@ def rounded(values: Tensor, dtype: torch.dtype) -> Tensor:
     """The nearest of the whole numbers of a type, in the type of the values."""
     low, high = (0, 1) if dtype is torch.bool else (torch.iinfo(dtype).min, torch.iinfo(dtype).max)
     return values.clamp(low, high).round_()
-
-
-def rows_at_once(images: Tensor) -> int:
-    """Rows of images (N, C, H, W) that stay in the caches of all cores; all of them where that is of no matter."""
-    batch, channels, height, width = images.shape
-    if images.device.type != "cpu" or torch.compiler.is_compiling():
-        return height
-    return max(1, torch.get_num_threads() * _AT_ONCE // max(1, batch * channels * width))

@@ -9,6 +9,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from torchrefract._levels import levels_of, numbers_of
 from torchrefract.cameras.distortion import POLYNOMIAL12
 from torchrefract.effects.air import Air
 from torchrefract.effects.base import Effect
@@ -219,7 +220,7 @@ def _restored(effect: Effect, degraded: Degraded) -> _Restored | None:
     if not isinstance(air, Air):
         return None
     # Of the float image it would be exact, which no file is.
-    stored = (255 * degraded.image.clamp(0, 1)).round() / 255
+    stored = numbers_of(levels_of(degraded.image))
     t, airlight = degraded.transmission, degraded.params.airlight
     return _Restored(*remove_fog(stored, t, airlight, linear_light=air.linear_light), "restored from 8 bits")
 

@@ -8,7 +8,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrefract._bands import join
+from torchrefract._bands import join, rows_at_once
 from torchrefract._checks import check_all, check_flag, check_number, learns
 from torchrefract._constants import constant
 from torchrefract.cameras.models import Camera
@@ -108,9 +108,9 @@ class Air:
         if len(bands) == 1 and bands[0][0] == "computed":
             return self.blended(image, t, airlight)
         color = spread(airlight, image.shape[0])[:, :, None, None]
-        learning = learns((image, t))
-        few = not learning and image.device.type == "cpu" and not torch.compiler.is_compiling()
-        step = max(1, _CACHED // max(1, image.numel() // image.shape[2])) if few else image.shape[2]
+        learning, step = learns((image, t)), image.shape[2]
+        if not learning:
+            step = rows_at_once(image.device, step, each=image.numel() // step, cached=_CACHED)
 
         def parts() -> Iterator[Tensor]:
             for kind, start, stop in bands:

@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._bands import join
-from torchrefract._checks import or_else
+from torchrefract._bands import join, rows_at_once
+from torchrefract._checks import learns, or_else
 from torchrefract._constants import constant
 from torchrefract.fields.perlin3d import VARIANCE, Rays, deviation_of_mean, noise_on_planes
 
@@ -249,12 +249,9 @@ def _by_pixel(view: _View, volume: Tensor, distance: Tensor, reach: float) -> Te
         for n, size in ((view.width, columns), (view.height, rows * _SLICES))
     )
     x, y = (x - 1).to(volume.dtype), (y - 1).to(volume.dtype)[:, None]
-    learns = pairs.requires_grad and torch.is_grad_enabled()
-    at_once = (
-        view.height
-        if learns or torch.compiler.is_compiling() or pairs.device.type != "cpu"
-        else max(1, _CACHED // view.width)
-    )
+    at_once = view.height
+    if not learns((pairs,)):
+        at_once = rows_at_once(pairs.device, at_once, each=view.width, cached=_CACHED)
     bands = (
         _looked_up(pairs, band, x, middle, reach)
         for band, middle in zip(distance.split(at_once, dim=2), y.split(at_once), strict=True)

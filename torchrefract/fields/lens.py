@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torchrefract._bands import rows_at_once
 from torchrefract._checks import is_true
 from torchrefract._constants import constant
 from torchrefract.cameras.distortion import (
@@ -22,6 +23,7 @@ from torchrefract.warping.grid import pixel_axes
 REACH = 4.0
 # Points of each side of the frame at which a fold is looked for; folds begin at the border.
 _BORDER = 17
+_CACHED = 1 << 16  # places whose numbers stay in a core's cache
 
 
 def lens_flow(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -44,7 +46,7 @@ def lens_flow(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: in
     """
     c, terms, x_d, y_d = _normalized(coefficients, focal, center, height, width)
     limit = frame_limit(coefficients, focal, center, height=height, width=width)
-    bands = y_d.split(rows_at_once(x_d, height), dim=2)
+    bands = y_d.split(lens_rows(x_d, height), dim=2)
     return stacked([_flow_of_rows(x_d, rows, c, focal, limit, terms) for rows in bands])
 
 
@@ -59,7 +61,7 @@ def lens_restore_flow(
     """
     c, terms, x, y = _normalized(coefficients, focal, center, height, width)
     limit = frame_limit(coefficients, focal, center, height=height, width=width)
-    bands = y.split(rows_at_once(x, height), dim=2)
+    bands = y.split(lens_rows(x, height), dim=2)
     return stacked([_restore_flow_of_rows(x, rows, c, focal, limit, terms) for rows in bands])
 
 
@@ -130,11 +132,9 @@ def axes_on_plane(axes: tuple[Tensor, Tensor], focal: Tensor, center: Tensor) ->
     return x, y
 
 
-def rows_at_once(x: Tensor, height: int) -> int:
-    """Rows whose temporaries stay in a core's cache; an accelerator, or a compiled graph, takes all at once."""
-    if x.device.type != "cpu" or torch.compiler.is_compiling():
-        return max(1, height)
-    return max(1, (1 << 16) // max(1, x.shape[0] * x.shape[3]))
+def lens_rows(x: Tensor, height: int) -> int:
+    """How many rows of places x, (B, 1, 1, W), of so many are computed at once."""
+    return rows_at_once(x.device, height, each=x.shape[0] * x.shape[3], cached=_CACHED)
 
 
 def stacked(bands: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:

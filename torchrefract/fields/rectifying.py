@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrefract._checks import check_positive
 from torchrefract.cameras.models import Camera
 from torchrefract.cameras.sheet import columns, image_of, on_plane, radius_within, ray_of
-from torchrefract.fields.lens import REACH, axes_on_plane, border, corner_radius, rows_at_once, stacked
+from torchrefract.fields.lens import REACH, axes_on_plane, border, corner_radius, lens_rows, stacked
 from torchrefract.fields.lens_bounds import LensErrors, cubic_errors, lines_of_cells
 from torchrefract.warping.grid import pixel_axes
 from torchrefract.warping.lattice import Lattice
@@ -163,4 +163,4 @@ def _flow(
         )
         return torch.stack([u, v], dim=1).view(shape[0], 2, *shape[2:]), exists.view(shape)
 
-    return stacked([band(part) for part in y.split(rows or rows_at_once(x, y.shape[2]), dim=2)])
+    return stacked([band(part) for part in y.split(rows or lens_rows(x, y.shape[2]), dim=2)])

@@ -6,8 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._bands import join
-from torchrefract._checks import check_choice, check_flow, check_tensor
+from torchrefract._bands import join, rows_at_once
+from torchrefract._checks import check_choice, check_flow, check_tensor, learns
 from torchrefract._constants import constant
 from torchrefract._levels import rounded
 from torchrefract.warping.grid import FAR, Positions, field_dtype, finite, inside, sampler_grids
@@ -49,8 +49,9 @@ def warp(
         interpolation: "nearest", "bilinear" or "bicubic" (a = -3/4, clamped to the range of the image's values).
         resampler: "grid_sample", of PyTorch; "opencv", for float32 or uint8 of 1, 3 or 4 channels on the CPU, without
             gradients, neither reflection nor bicubic; or "auto", OpenCV from version 5 on, where it is installed, for
-            such uint8 in channels_last format. The two agree to 1e-6 of the range of the values before these are
-            rounded: bytes differ, by one level, where they lie so near to a half.
+            such uint8 in channels_last format, on as many threads as cv2.setNumThreads says. The two agree to 1e-6 of
+            the range of the values before these are rounded: bytes differ, by one level, where they lie so near to a
+            half.
 
     Returns:
         image of the same shape, type and memory format, and valid, (B, 1, H, W) or (1, H, W), bool.
@@ -205,21 +206,15 @@ def _clamped(warped: Tensor, source: Tensor, padding: str) -> Tensor:
 
 
 def _grids(image: Tensor, flow: Flow | Positions, dtype: torch.dtype, *, whole: bool) -> Iterable[Tensor]:
-    rows = image.shape[2] if whole else _rows_at_once(image)
+    batch, _, rows, width = image.shape
+    # The backward pass keeps one gradient image a band.
+    if not (whole or learns((image,))):
+        rows = rows_at_once(image.device, rows, each=batch * width, cached=_CACHED)
     if isinstance(flow, Tensor):
         return sampler_grids(flow.to(dtype), rows=rows)
     grid = flow.grid if isinstance(flow, Positions) else grid_of(flow, dtype)
     # What is looked up in bands is still in the cache when it is rounded; of numbers nothing would be faster.
     return [grid] if image.is_floating_point() else grid.split(rows, dim=1)
-
-
-def _rows_at_once(image: Tensor) -> int:
-    """Rows whose grid stays in a core's cache, where nothing speaks for all at once."""
-    batch, _, height, width = image.shape
-    # The backward pass keeps one gradient image a band.
-    if image.device.type != "cpu" or torch.compiler.is_compiling() or (image.requires_grad and torch.is_grad_enabled()):
-        return height
-    return max(1, _CACHED // max(1, batch * width))
 
 
 def _parts(source: Tensor, grid: Tensor) -> int:

@@ -63,7 +63,7 @@ class Degraded:
     """What an effect makes of an image, with the maps that tell how; maps are computed when they are first read.
 
     image: as the input, (B, C, H, W), (C, H, W) or (B, T, C, H, W); the maps have the same dimensions before C.
-    params: what was drawn, a NamedTuple of tensors with a leading batch dimension.
+    params: what was drawn, a NamedTuple of tensors with a leading batch dimension; may be given as a function, too.
     flow: (B, 2, H, W), px, makes the image from the clean one; None for an effect that moves nothing.
     valid: (B, 1, H, W), bool, the pixels that show what the clean image holds.
     restore_flow: (B, 2, H, W), px, warp(image, restore_flow) = clean on restore_valid; None without a flow.
@@ -95,7 +95,7 @@ class Degraded:
         light: Mapping[str, Map] | None = None,
     ):
         self.image = image
-        self.params = params
+        self._params = params
         self._maps: dict[str, Map | None] = {
             "valid": valid,
             "flow": flow,
@@ -105,6 +105,13 @@ class Degraded:
         self._restore = restore
         self._miss = residual
         self._fold = folding
+
+    @property
+    def params(self) -> Any:
+        """What was drawn."""
+        if callable(self._params):
+            self._params = self._params()
+        return self._params
 
     @property
     def valid(self) -> Tensor:
@@ -167,7 +174,7 @@ class Degraded:
 
         return Degraded(
             self.image,
-            self.params,
+            lambda: self.params,
             valid=lambda: function(self.valid),
             flow=later("flow"),
             restore=None if self._restore is None else lambda _: Inverse(*map(function, cast(Inverse, self._restored))),
@@ -186,4 +193,5 @@ class Degraded:
         """All maps computed: what is still to be computed cannot travel to another process."""
         maps = {name: self._read(name) for name in self._maps}
         computed = {name: getattr(self, name) for name in ("_restored", "restore_residual", "folding")}
-        return self.__dict__ | computed | {"_maps": maps, "_restore": None, "_miss": None, "_fold": None}
+        given = {"_params": self.params, "_maps": maps, "_restore": None, "_miss": None, "_fold": None}
+        return self.__dict__ | computed | given

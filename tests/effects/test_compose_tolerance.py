@@ -138,7 +138,7 @@ def test_the_plan_is_printed_and_names_what_is_dropped(capsys):
     assert plan.resamples == 1
     lines = told.splitlines()
     assert lines[-3].split(maxsplit=1) == ["UniformFog", "at every pixel (no tolerance)"]
-    assert lines[-2].split(maxsplit=1) == ["DivergenceFree", "not computed (it moves too little)"]
+    assert lines[-2].split(maxsplit=1) == ["DivergenceFree", "not computed (its strength is 0)"]
     assert lines[-1].split(maxsplit=1) == ["Turbulence", "not computed (its p is 0)"]
 
 

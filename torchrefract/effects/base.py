@@ -11,7 +11,7 @@ from torchrefract import draws
 from torchrefract._checks import check_all, check_number, is_true
 from torchrefract.effects.door import Layout, check_depth_fits, check_image, enter, leave
 from torchrefract.effects.plan import check_size
-from torchrefract.effects.rows import at_frames
+from torchrefract.effects.rows import Undrawn, at_frames
 from torchrefract.labels.rows import is_tv, wrapped
 from torchrefract.labels.targets import warp_labels
 from torchrefract.types import Degraded, Range
@@ -80,7 +80,8 @@ class Effect(nn.Module, ABC):
             ValueError, TypeError: arguments that do not fit.
         """
         layout = check_image(image)
-        return self._run(image, layout, self._sample(image, layout, seed, keys, 0, frame), depth)
+        params = self._sample(self.draw_sparingly, image, layout, seed, keys, 0, frame)
+        return self._run(image, layout, params, depth)
 
     def sample(
         self,
@@ -92,10 +93,11 @@ class Effect(nn.Module, ABC):
         frame: float | Tensor = 0,
     ) -> Any:
         """The parameters of one draw for this image, a NamedTuple of tensors; `place` is that in a pipeline."""
-        return self._sample(image, check_image(image), seed, keys, place, frame)
+        return self._sample(self.draw, image, check_image(image), seed, keys, place, frame)
 
     def _sample(
         self,
+        draw: Callable[[draws.Stream, Tensor], Any],
         image: Tensor,
         layout: Layout,
         seed: int | Tensor | None,
@@ -105,7 +107,7 @@ class Effect(nn.Module, ABC):
     ) -> Any:
         seed = draws.call_seed() if seed is None else _seed(seed)
         source = draws.stream(seed, _keys(keys, layout.batch), device=image.device)
-        params = self.draw(source.at(place), _samples(image, layout))
+        params = draw(source.at(place), _samples(image, layout))
         return at_frames(params, lambda: _frames(frame, image, layout))
 
     def apply(  # pyright: ignore[reportIncompatibleMethodOverride]  # nn.Module has taken the name; both uses work
@@ -153,6 +155,15 @@ class Effect(nn.Module, ABC):
         """The plan for fields of a type, from the ranges alone."""
 
     @property
+    def idle(self) -> bool:
+        """Whether no draw changes anything, by its chance or by the ranges."""
+        return self.p == 0 or self.at_rest()
+
+    def at_rest(self) -> bool:
+        """Whether the ranges leave no draw that changes anything."""
+        return False
+
+    @property
     def takes_levels(self) -> bool:
         """Whether `compute` takes the levels of uint8 as they are, not as numbers in [0, 1]."""
         return False
@@ -160,6 +171,10 @@ class Effect(nn.Module, ABC):
     @abstractmethod
     def draw(self, source: draws.Stream, image: Tensor) -> Any:
         """The parameters of a batch (B, C, H, W), drawn from the streams of its samples; a `frame` among them is 0."""
+
+    def draw_sparingly(self, source: draws.Stream, image: Tensor) -> Any:
+        """The same; what a composition has that is idle may still be `Undrawn`."""
+        return self.draw(source, image)
 
     @abstractmethod
     def check(self, params: Any, image: Tensor) -> None:
@@ -254,6 +269,8 @@ def _frames(first: float | Tensor, image: Tensor, layout: Layout) -> Tensor:
 
 def _check_frames(params: Any, layout: Layout) -> None:
     """Raise unless the parameters are for as many frames as there are."""
+    if isinstance(params, Undrawn):
+        return
     for child in getattr(params, "children", ()):
         _check_frames(child, layout)
     if "frame" in params._fields and params.frame.shape != (layout.batch, layout.frames):

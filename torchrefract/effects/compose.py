@@ -17,6 +17,7 @@ from torchrefract.effects.compose_plan import ComposePlan, compose_plan
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, check_tolerance
 from torchrefract.effects.radiance import RadianceEffect
 from torchrefract.effects.refraction import WarpEffect
+from torchrefract.effects.rows import Undrawn, drawn
 from torchrefract.effects.walk import Walk
 from torchrefract.types import Degraded
 from torchrefract.warping.grid import field_dtype
@@ -90,10 +91,34 @@ class Compose(Effect):
         """Whether all its effects do."""
         return all(effect.takes_levels for effect in self._effects())
 
+    def at_rest(self) -> bool:
+        """Whether none of its effects acts."""
+        return all(effect.idle for effect in self._effects())
+
     def draw(self, source: draws.Stream, image: Tensor) -> ComposeParams:
         """Each effect's draw, from streams of their own."""
-        gate = draws.uniform(source, 1)[:, 0] < self.p
-        return self._draw_children(source, image, [gate] * len(self.effects), gate)
+        gate, gates = self._gates(source)
+        inner = draws.fold(source)
+        children = (effect.draw(inner.at(i), image) for i, effect in enumerate(self._effects()))
+        return ComposeParams(gate, tuple(map(_closed, children, gates)))
+
+    def draw_sparingly(self, source: draws.Stream, image: Tensor) -> ComposeParams:
+        """The same, but what is idle is drawn when somebody reads it."""
+        like = image.new_empty(()).expand(image.shape)  # what is still to be drawn holds no picture
+        return self._draw_sparingly(source, image, like, idle=False)
+
+    def _draw_sparingly(self, source: draws.Stream, image: Tensor, like: Tensor, *, idle: bool) -> ComposeParams:
+        gate, gates = self._gates(source)
+        inner, idle = draws.fold(source), idle or self.p == 0
+        children: list[Any] = []
+        for i, effect in enumerate(self._effects()):
+            if isinstance(effect, Compose):
+                children.append(effect._draw_sparingly(inner.at(i), image, like, idle=idle))
+            elif idle or effect.idle:
+                children.append(_later(effect, inner.at(i), like))
+            else:
+                children.append(effect.draw(inner.at(i), image))
+        return ComposeParams(gate, tuple(map(_closed, children, gates)))
 
     def check(self, params: ComposeParams, image: Tensor) -> None:
         """Raise for parameters that one of the effects refuses."""
@@ -118,23 +143,32 @@ class Compose(Effect):
         """The batch through all effects."""
         walk = Walk(image, depth, self.padding, self.interpolation, self.resampler)
         height, width = image.shape[2:]
-        plans = self._constant(id(self), height, width, field_dtype(image.dtype)).plans
-        for (effect, own), plan in zip(self.leaves(params), plans, strict=True):
-            if isinstance(effect, WarpEffect):
+        leaves = list(self.leaves(params))
+        idle = tuple(isinstance(own, Undrawn) for _, own in leaves)
+        plans = self._constant(id(self), height, width, field_dtype(image.dtype), idle).plans
+        for (effect, own), plan in zip(leaves, plans, strict=True):
+            if isinstance(own, Undrawn):
+                walk.rest(effect)
+            elif isinstance(effect, WarpEffect):
                 walk.move(effect, own, cast(Plan, plan))
             else:
                 walk.shade(cast(RadianceEffect, effect), own, plan)
-        return walk.arrive(params)
+        return walk.arrive((lambda: drawn(params)) if any(idle) else params)
 
     def planned(self, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
         """The plan for fields of a type."""
+        return self._planned(height, width, dtype, [idle for _, idle in self._leaves()])
+
+    def _planned(self, height: int, width: int, dtype: torch.dtype, idle: Sequence[bool]) -> ComposePlan:
+        """That without some effects."""
         ask = Ask(height, width, self.tolerance_px, dtype is torch.float64).of_default
-        return compose_plan(list(self._chances(1.0)), self._together(), ask)
+        effects = [(effect, rests) for (effect, _), rests in zip(self._leaves(), idle, strict=True)]
+        return compose_plan(effects, self._together(), ask)
 
     @assume_constant_result
-    def _constant(self, _: int, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
+    def _constant(self, _: int, height: int, width: int, dtype: torch.dtype, idle: Sequence[bool]) -> ComposePlan:
         # As for `PlannedLight`.
-        return self.planned(height, width, dtype)
+        return self._planned(height, width, dtype, idle)
 
     def fitted(self, params: ComposeParams) -> "Compose":
         """The composition, with each effect that relies on ranges which its parameters lie outside of exact."""
@@ -153,20 +187,19 @@ class Compose(Effect):
             else:
                 yield effect, child
 
-    def _draw_children(
-        self, source: draws.Stream, image: Tensor, gates: Sequence[Tensor], gate: Tensor
-    ) -> ComposeParams:
-        inner = draws.fold(source)
-        drawn = (effect.draw(inner.at(i), image) for i, effect in enumerate(self._effects()))
-        return ComposeParams(gate, tuple(_closed(child, own) for child, own in zip(drawn, gates, strict=True)))
+    def _gates(self, source: draws.Stream) -> tuple[Tensor, list[Tensor]]:
+        """(B,), bool: that of the composition, and those of its effects."""
+        gate = draws.uniform(source, 1)[:, 0] < self.p
+        return gate, [gate] * len(self.effects)
 
-    def _chances(self, p: float) -> Iterator[tuple[Effect, float]]:
-        """The effects that are no compositions, in order, and the chance that each acts."""
+    def _leaves(self, *, idle: bool = False) -> Iterator[tuple[Effect, bool]]:
+        """The effects that are no compositions, in order, and whether each is idle; in an idle composition all are."""
+        idle = idle or self.p == 0
         for effect in self._effects():
             if isinstance(effect, Compose):
-                yield from effect._chances(p * self.p)
+                yield from effect._leaves(idle=idle)
             else:
-                yield effect, p * self.p * effect.p
+                yield effect, idle or effect.idle
 
     def _together(self) -> list[tuple[int, ...]]:
         """The effects that are no compositions, by their places in order, as sets that may act on one sample."""
@@ -217,13 +250,13 @@ class OneOf(Compose):
             raise ValueError(f"weights must be one number for each of {len(effects)} effects, got {len(weights)}")
         self.weights = tuple(check_number("weights", weight, low=1e-9) for weight in weights)
 
-    def draw(self, source: draws.Stream, image: Tensor) -> ComposeParams:
-        """A choice for each sample, and each effect's draw."""
+    def _gates(self, source: draws.Stream) -> tuple[Tensor, list[Tensor]]:
+        """As for `Compose`, those of the effects by a choice for each sample."""
         values = draws.uniform(source, 2)
         gate, choice = values[:, 0] < self.p, values[:, 1] * sum(self.weights)
         ends = constant(self.weights, device=choice.device).cumsum(dim=0)[:-1]
         chosen = torch.bucketize(choice, ends, right=True)
-        return self._draw_children(source, image, [gate & (chosen == i) for i in range(len(self.effects))], gate)
+        return gate, [gate & (chosen == i) for i in range(len(self.effects))]
 
     def fitted(self, params: ComposeParams) -> "Compose":
         """As for `Compose`; exact, too, for parameters by which several effects act on a sample."""
@@ -241,6 +274,14 @@ class OneOf(Compose):
 
 def _closed(params: Any, gate: Tensor) -> Any:
     """Parameters that leave the samples alone for which the gate is closed."""
+    if isinstance(params, Undrawn):
+        return params.then(lambda found: _closed(found, gate))
     if isinstance(params, ComposeParams):
         return ComposeParams(params.gate & gate, tuple(_closed(child, gate) for child in params.children))
     return params._replace(gate=params.gate & gate)
+
+
+def _later(effect: Effect, source: draws.Stream, image: Tensor) -> Undrawn:
+    """The draw of an effect as it is now, whatever becomes of its ranges; compilers follow no copies."""
+    now = effect if torch.compiler.is_compiling() else copy(effect)
+    return Undrawn(lambda: now.draw(source, image))

@@ -10,6 +10,7 @@ that never act on one sample together, each has the whole tolerance.
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import takewhile
 from typing import NamedTuple, cast
 
@@ -72,11 +73,11 @@ class _Warp(NamedTuple):
         return self.effect.plan_within(ask)
 
 
-def compose_plan(effects: Sequence[tuple[Effect, float]], together: Sequence[Sequence[int]], ask: Ask) -> ComposePlan:
+def compose_plan(effects: Sequence[tuple[Effect, bool]], together: Sequence[Sequence[int]], ask: Ask) -> ComposePlan:
     """The plan that is asked for.
 
     Args:
-        effects: those that are no compositions, in order, and the chance that each acts.
+        effects: those that are no compositions, in order, and whether each changes nothing.
         together: their places, as sets that may act on one sample.
         ask: for what.
 
@@ -93,25 +94,30 @@ def compose_plan(effects: Sequence[tuple[Effect, float]], together: Sequence[Seq
     resamples = len({warp.group for warp, plan in zip(warps, plans, strict=True) if plan.stride > 0})
     by_place = {warp.place: plan for warp, plan in zip(warps, plans, strict=True)}
     each = tuple(
-        by_place[place] if place in by_place else _other_plan(effect, p, ask)
-        for place, (effect, p) in enumerate(effects)
+        by_place[place] if place in by_place else _other_plan(effect, idle, ask)
+        for place, (effect, idle) in enumerate(effects)
     )
     names = tuple(type(effect).__name__ for effect, _ in effects)
     return ComposePlan(ask.height, ask.width, ask.tolerance_px, names, each, error, resamples)
 
 
-def _other_plan(effect: Effect, p: float, ask: Ask) -> Plan | LightPlan:
+def _other_plan(effect: Effect, idle: bool, ask: Ask) -> Plan | LightPlan:
     """Of an effect that moves nothing."""
-    if p == 0:
-        return ask.plan(0, 0.0, "its p is 0")
+    if idle:
+        return _idle_plan(ask, "its strength is 0" if effect.at_rest() else "its p is 0")
     return cast(PlannedLight, effect).planned(ask.height, ask.width, torch.float64 if ask.double else torch.float32)
 
 
-def _warps(effects: Sequence[tuple[Effect, float]]) -> Iterator[_Warp]:
+@lru_cache(maxsize=64)
+def _idle_plan(ask: Ask, why: str) -> Plan:
+    return ask.plan(0, 0.0, why)
+
+
+def _warps(effects: Sequence[tuple[Effect, bool]]) -> Iterator[_Warp]:
     """Those that may move something; what changes light in between parts them."""
     group = 0
-    for place, (effect, p) in enumerate(effects):
-        if p == 0:
+    for place, (effect, idle) in enumerate(effects):
+        if idle:
             continue
         if isinstance(effect, WarpEffect):
             yield _Warp(place, group, effect)

@@ -100,6 +100,10 @@ class DivergenceFree(LatticeWarp):
 
     params_type = DivergenceFreeParams
 
+    def at_rest(self) -> bool:
+        """Whether no flow has an amplitude."""
+        return self.amplitude_range[1] == 0
+
     def draw(self, source: draws.Stream, image: Tensor) -> DivergenceFreeParams:
         """One stream function a sample, every number uniform in its range."""
         motion = motion_ranges(self.wind_x_range, self.wind_y_range, decorrelation=self.decorrelation_range)

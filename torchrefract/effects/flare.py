@@ -103,6 +103,10 @@ class LensFlare(PlannedLight):
     params_type = FlareParams
     maps = ("intensity",)
 
+    def at_rest(self) -> bool:
+        """Whether no sun has any strength, or size."""
+        return 0 in (self.strength_range[1], self.radius_range[1])
+
     def draw(self, source: draws.Stream, image: Tensor) -> FlareParams:
         """One sun a sample, every number uniform in its range."""
         places = [getattr(self, f"{name}_range") for name in ("center_x", "center_y", "drift_x", "drift_y")]

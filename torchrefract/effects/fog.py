@@ -90,6 +90,10 @@ class UniformFog(PlannedLight):
     params_type = FogParams
     maps = ("transmission", "extinction")
 
+    def at_rest(self) -> bool:
+        """Whether all air is clear."""
+        return self.visibility_range[0] == math.inf
+
     def draw(self, source: draws.Stream, image: Tensor) -> FogParams:
         """One fog a sample; V and the deviation are uniform in their ranges."""
         gate, values = self._uniform(source, [visibility_span(self.visibility_range), self.deviation_range], image)

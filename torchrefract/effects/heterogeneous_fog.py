@@ -147,6 +147,10 @@ class HeterogeneousFog(PlannedLight):
     params_type = HeterogeneousFogParams
     maps = ("transmission", "extinction")
 
+    def at_rest(self) -> bool:
+        """Whether all air is clear."""
+        return self.visibility_range[0] == math.inf
+
     def draw(self, source: draws.Stream, image: Tensor) -> HeterogeneousFogParams:
         """One fog a sample, every number uniform in its range."""
         winds = (self.wind_x_range, self.wind_y_range, self.wind_z_range)
@@ -245,21 +249,10 @@ class HeterogeneousFog(PlannedLight):
             return self._in_image(key, share, motion | {"decorrelation": decorrelation}, plan)
         focal, center = self.air.pinhole(height, width)
         q = path_mean(
-            key,
-            distance,
-            height=height,
-            width=width,
-            focal=focal,
-            center=center,
-            scales=self.scales,
-            weights=share,
-            contrast=contrast.to(dtype),
-            frame=frame,
-            wind=wind,
-            decorrelation=decorrelation,
-            reach=self.reach,
+            key, distance, height=height, width=width, focal=focal, center=center, scales=self.scales, weights=share,
+            contrast=contrast.to(dtype), frame=frame, wind=wind, decorrelation=decorrelation, reach=self.reach,
             dtype=dtype,
-        )
+        )  # fmt: skip
         return q, self._inverse_mean(q, 1.0), q.new_zeros(1, 1, 1, 1)
 
     def _in_image(

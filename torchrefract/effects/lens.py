@@ -183,6 +183,10 @@ class LensDistortion(LatticeWarp):
 
     params_type = LensParams
 
+    def at_rest(self) -> bool:
+        """Whether all lenses are pinholes."""
+        return self._source is None and all(span == (0.0, 0.0) for span in self._ranges().coefficients)
+
     def draw(self, source: draws.Stream, image: Tensor) -> LensParams:
         """One lens a sample: every number uniform in its range, or one of those of a table or a camera."""
         if self._source is None:

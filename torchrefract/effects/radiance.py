@@ -56,7 +56,8 @@ class RadianceEffect(Effect):
         """The rows in other light, where the gate is open."""
         active = params.gate & self.acts(params)
         if not _stirs(active, params):
-            return self._unchanged(image, params)
+            everywhere = active.new_ones(()).expand(_map_size(image))
+            return Degraded(image, params, valid=everywhere, light=self.clear(image))
         if depth is not None and is_true(active.any, of=active) is False:
             depth = None  # and nobody looks at its values
         index, batch = some(active, params), len(active)
@@ -91,15 +92,18 @@ class RadianceEffect(Effect):
             light={name: value for name in _CLEAR if (value := gated(name)) is not None},
         )
 
-    def _unchanged(self, image: Tensor, params: Any) -> Degraded:
-        """The rows as they are, with maps that say so."""
-        size = (image.shape[0], 1, *image.shape[2:])
+    def clear(self, image: Tensor) -> dict[str, Map]:
+        """The maps that it has, as they are where it changes nothing."""
+        size, dtype, device = _map_size(image), field_dtype(image.dtype), image.device
 
-        def everywhere(value: float | bool, dtype: torch.dtype) -> Map:
-            return lambda: torch.full((), value, dtype=dtype, device=image.device).expand(size)
+        def everywhere(value: float) -> Map:
+            return lambda: torch.full((), value, dtype=dtype, device=device).expand(size)
 
-        light = {name: everywhere(_CLEAR[name], field_dtype(image.dtype)) for name in self.maps}
-        return Degraded(image, params, valid=everywhere(True, torch.bool), light=light)
+        return {name: everywhere(_CLEAR[name]) for name in self.maps}
+
+
+def _map_size(image: Tensor) -> tuple[int, ...]:
+    return (image.shape[0], 1, *image.shape[2:])
 
 
 def _choose(value: Tensor, off: float | bool, active: Tensor) -> Tensor:

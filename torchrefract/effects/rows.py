@@ -27,8 +27,33 @@ def alike(*values: Tensor) -> list[Tensor]:
     return [spread(value, rows) for value in values]
 
 
+class Undrawn:
+    """Parameters that are drawn when somebody reads them.
+
+    Args:
+        draw: what draws them.
+    """
+
+    def __init__(self, draw: Callable[[], Any]):
+        self.draw = draw
+
+    def then(self, change: Callable[[Any], Any]) -> "Undrawn":
+        """The same, changed once they are drawn."""
+        return Undrawn(lambda: change(self.draw()))
+
+
+def drawn(params: Any) -> Any:
+    """The parameters, with all that was left undrawn among them."""
+    if isinstance(params, Undrawn):
+        return params.draw()
+    children = getattr(params, "children", None)
+    return params if children is None else params._replace(children=tuple(map(drawn, children)))
+
+
 def at_frames(params: Any, frames: Callable[[], Tensor]) -> Any:
     """The parameters of the same draw at other frames, (B, T), of the clips; those without a `frame` stay."""
+    if isinstance(params, Undrawn):
+        return params.then(lambda found: at_frames(found, frames))
     if "children" in params._fields:
         return params._replace(children=tuple(at_frames(child, frames) for child in params.children))
     return params._replace(frame=frames()) if "frame" in params._fields else params

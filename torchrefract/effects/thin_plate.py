@@ -70,6 +70,10 @@ class ThinPlateSpline(LatticeWarp):
 
     params_type = ThinPlateParams
 
+    def at_rest(self) -> bool:
+        """Whether no plate has an amplitude."""
+        return self.amplitude_range[1] == 0
+
     def draw(self, source: draws.Stream, image: Tensor) -> ThinPlateParams:
         """One plate a sample, amplitude and smoothing uniform in their ranges."""
         gate, values = self._uniform(source, (self.amplitude_range, self.smoothing_range), image)

@@ -103,6 +103,10 @@ class Turbulence(LatticeWarp):
 
     params_type = TurbulenceParams
 
+    def at_rest(self) -> bool:
+        """Whether no air has an amplitude."""
+        return self.amplitude_range[1] == 0
+
     def draw(self, source: draws.Stream, image: Tensor) -> TurbulenceParams:
         """One air a sample, every number uniform in its range."""
         motion = motion_ranges(self.wind_x_range, self.wind_y_range, decorrelation=self.decorrelation_range)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import is_true, learns
+from torchrefract.effects.base import Effect
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.plan import Plan
@@ -16,7 +17,7 @@ from torchrefract.effects.radiance import RadianceEffect
 from torchrefract.effects.refraction import Moved, WarpEffect, moving, sees
 from torchrefract.effects.rows import column, only, spread
 from torchrefract.effects.steps import Step, exact, on_grid
-from torchrefract.types import Degraded
+from torchrefract.types import Degraded, Map
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import Positions, field_dtype, inside
 from torchrefract.warping.mixed import Flow
@@ -46,7 +47,15 @@ class Walk:
         self.moved: list[tuple[WarpEffect, Any, Moved]] = []
         self.valid: Callable[[], Tensor] | None = None  # everywhere
         self.light: dict[str, Callable[[], Tensor]] = {}  # the maps of light, by their names in `Degraded`
+        self.clear: dict[str, Map] = {}  # those of effects that change nothing, likewise
         self.refracts = False
+
+    def rest(self, effect: Effect) -> None:
+        """One that changes nothing; maps say so."""
+        if isinstance(effect, RadianceEffect):
+            self.clear |= effect.clear(self.image)
+        else:
+            self.refracts = True
 
     def move(self, effect: WarpEffect, params: Any, plan: Plan) -> None:
         """One more warp waits."""
@@ -92,15 +101,16 @@ class Walk:
         self._look_up()
         # Not a method of its own, through which the walk and all its maps would hold themselves.
         valid = self.valid or functools.partial(_everywhere, self.image.shape, self.image.device)
+        light = self.clear | self.light
         if not self.refracts:
-            return Degraded(self.image, params, valid=valid, light=self.light)
+            return Degraded(self.image, params, valid=valid, light=light)
         return moving(
             self.image,
             params,
             flow=self._flow,
             valid=valid,
             undo=self._undo,
-            light=self.light,
+            light=light,
         )
 
     def _flow(self) -> Tensor:

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
-from torchrefract import _levels
+from torchrefract import Compose, LensFlare, UniformFog, _levels
 from torchrefract._levels import levels_of, numbers_of, rounded
 
 
@@ -49,3 +50,11 @@ def test_whole_numbers_end_where_their_type_ends(dtype, low, high):
     values = torch.tensor([-1e9, -0.6, 0.4, 0.6, 1e9])
     expected = [max(low, v) for v in (-1e9, -1)] + [0, 1, high]
     assert rounded(values, dtype).tolist() == expected
+
+
+@pytest.mark.parametrize("kind", [UniformFog, LensFlare, lambda: Compose([LensFlare()])])
+def test_one_graph_takes_levels(kind):
+    effect, frame = kind(), torch.randint(0, 256, (2, 3, 24, 32), dtype=torch.uint8)
+    params = effect.sample(frame, seed=0)
+    compiled = torch.compile(lambda image: effect.apply(image, params).image, fullgraph=True, backend="eager")
+    assert_close(compiled(frame).int(), effect.apply(frame, params).image.int(), rtol=0, atol=1)

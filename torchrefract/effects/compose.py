@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrefract import draws
-from torchrefract._checks import check_choice, check_number, is_true
+from torchrefract._checks import check_choice, check_number, is_true, learns
 from torchrefract._constants import assume_constant_result, constant
 from torchrefract.effects.base import Effect, moved
 from torchrefract.effects.compose_plan import ComposePlan, compose_plan
@@ -144,10 +144,11 @@ class Compose(Effect):
         walk = Walk(image, depth, self.padding, self.interpolation, self.resampler)
         height, width = image.shape[2:]
         leaves = list(self.leaves(params))
-        idle = tuple(isinstance(own, Undrawn) for _, own in leaves)
+        by_ranges = (rests for _, rests in self._leaves())
+        idle = tuple(_rests(*leaf, idle=rests) for leaf, rests in zip(leaves, by_ranges, strict=True))
         plans = self._constant(id(self), height, width, field_dtype(image.dtype), idle).plans
-        for (effect, own), plan in zip(leaves, plans, strict=True):
-            if isinstance(own, Undrawn):
+        for (effect, own), plan, rests in zip(leaves, plans, idle, strict=True):
+            if rests:
                 walk.rest(effect)
             elif isinstance(effect, WarpEffect):
                 walk.move(effect, own, cast(Plan, plan))
@@ -279,6 +280,14 @@ def _closed(params: Any, gate: Tensor) -> Any:
     if isinstance(params, ComposeParams):
         return ComposeParams(params.gate & gate, tuple(_closed(child, gate) for child in params.children))
     return params._replace(gate=params.gate & gate)
+
+
+def _rests(effect: Effect, params: Any, *, idle: bool) -> bool:
+    """Whether an effect that is idle or not changes nothing by these parameters, drawn, given, or not drawn yet."""
+    if isinstance(params, Undrawn) or not idle or learns(params):
+        return isinstance(params, Undrawn)
+    acts = effect.moves(params) if isinstance(effect, WarpEffect) else cast(RadianceEffect, effect).acts(params)
+    return is_true((params.gate & acts).any, of=acts) is False
 
 
 def _later(effect: Effect, source: draws.Stream, image: Tensor) -> Undrawn:

@@ -7,18 +7,19 @@ import torch
 from torch import Tensor
 
 
-def rows_at_once(device: torch.device, rows: int, *, each: int, cached: int) -> int:
-    """How many rows at a time stay in a core's cache; all, on an accelerator and in a compiled graph.
+def rows_at_once(device: torch.device, rows: int, *, each: int, cached: int, shared: bool = False) -> int:
+    """How many rows at a time stay in the cache; all, on an accelerator and in a compiled graph.
 
     Args:
         device: they are computed on.
         rows: all of them.
         each: values in a row.
-        cached: values that stay in the cache.
+        cached: values that stay in that of one core.
+        shared: all threads work on the rows together, each with a core's cache of its own.
     """
     if device.type != "cpu" or torch.compiler.is_compiling():
         return max(1, rows)
-    return max(1, cached // max(1, each))
+    return max(1, (torch.get_num_threads() if shared else 1) * cached // max(1, each))
 
 
 def join(bands: Iterable[Tensor], *, dim: int, length: int) -> Tensor:

@@ -18,9 +18,7 @@ def levels_of(numbers: Tensor) -> Tensor:
     numbers = numbers.detach()
     levels = torch.empty_like(numbers, dtype=torch.uint8)
     batch, channels, height, width = numbers.shape
-    # All threads share a band; compilers cannot ask for them, and need none.
-    cached = _CACHED if torch.compiler.is_compiling() else torch.get_num_threads() * _CACHED
-    rows = rows_at_once(numbers.device, height, each=batch * channels * width, cached=cached)
+    rows = rows_at_once(numbers.device, height, each=batch * channels * width, cached=_CACHED, shared=True)
     for place, band in zip(levels.split(rows, dim=2), numbers.split(rows, dim=2), strict=True):
         place.copy_(rounded(band * 255, torch.uint8))
     return levels

@@ -21,7 +21,6 @@ from torchrefract import (
     Turbulence,
     UniformFog,
 )
-from torchrefract.cameras.distortion import POLYNOMIAL12
 from torchrefract.effects.base import Effect
 
 STILL, CLEAR = (0.0, 0.0), (math.inf, math.inf)
@@ -29,7 +28,7 @@ IDLE: dict[str, Callable[[], Effect]] = {
     "turbulence": lambda: Turbulence(amplitude_range=STILL),
     "plate": lambda: ThinPlateSpline(amplitude_range=STILL),
     "swirls": lambda: DivergenceFree(amplitude_range=STILL),
-    "pinhole": lambda: LensDistortion(**{f"{name}_range": STILL for name in POLYNOMIAL12}),  # pyright: ignore[reportArgumentType]  # ranges alone
+    "pinhole": lambda: LensDistortion(k1_range=STILL, k2_range=STILL, p1_range=STILL, p2_range=STILL),
     "fog": lambda: UniformFog(visibility_range=CLEAR),
     "drifts": lambda: HeterogeneousFog(visibility_range=CLEAR),
     "weak flare": lambda: LensFlare(strength_range=STILL),

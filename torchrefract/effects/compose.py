@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrefract import draws
-from torchrefract._checks import check_choice, check_number, is_true, learns
+from torchrefract._checks import check_choice, check_number, is_true
 from torchrefract._constants import assume_constant_result, constant
 from torchrefract.effects.base import Effect, moved
 from torchrefract.effects.compose_plan import ComposePlan, compose_plan
@@ -97,23 +97,20 @@ class Compose(Effect):
 
     def draw(self, source: draws.Stream, image: Tensor) -> ComposeParams:
         """Each effect's draw, from streams of their own."""
-        gate, gates = self._gates(source)
-        inner = draws.fold(source)
-        children = (effect.draw(inner.at(i), image) for i, effect in enumerate(self._effects()))
-        return ComposeParams(gate, tuple(map(_closed, children, gates)))
+        return drawn(self.draw_sparingly(source, image))
 
     def draw_sparingly(self, source: draws.Stream, image: Tensor) -> ComposeParams:
         """The same, but what is idle is drawn when somebody reads it."""
-        like = image.new_empty(()).expand(image.shape)  # what is still to be drawn holds no picture
-        return self._draw_sparingly(source, image, like, idle=False)
+        return self._draw_sparingly(source, image, idle=False)
 
-    def _draw_sparingly(self, source: draws.Stream, image: Tensor, like: Tensor, *, idle: bool) -> ComposeParams:
+    def _draw_sparingly(self, source: draws.Stream, image: Tensor, *, idle: bool) -> ComposeParams:
         gate, gates = self._gates(source)
         inner, idle = draws.fold(source), idle or self.p == 0
+        like = image.new_empty(()).expand(image.shape)  # what is still to be drawn holds no picture
         children: list[Any] = []
         for i, effect in enumerate(self._effects()):
             if isinstance(effect, Compose):
-                children.append(effect._draw_sparingly(inner.at(i), image, like, idle=idle))
+                children.append(effect._draw_sparingly(inner.at(i), image, idle=idle))
             elif idle or effect.idle:
                 children.append(_later(effect, inner.at(i), like))
             else:
@@ -144,8 +141,10 @@ class Compose(Effect):
         walk = Walk(image, depth, self.padding, self.interpolation, self.resampler)
         height, width = image.shape[2:]
         leaves = list(self.leaves(params))
-        by_ranges = (rests for _, rests in self._leaves())
-        idle = tuple(_rests(*leaf, idle=rests) for leaf, rests in zip(leaves, by_ranges, strict=True))
+        idle = tuple(
+            isinstance(own, Undrawn) or (rests and not _stirs(effect, own, height, width))
+            for (effect, own), rests in zip(leaves, self._idle(), strict=True)
+        )
         plans = self._constant(id(self), height, width, field_dtype(image.dtype), idle).plans
         for (effect, own), plan, rests in zip(leaves, plans, idle, strict=True):
             if rests:
@@ -154,17 +153,16 @@ class Compose(Effect):
                 walk.move(effect, own, cast(Plan, plan))
             else:
                 walk.shade(cast(RadianceEffect, effect), own, plan)
-        return walk.arrive((lambda: drawn(params)) if any(idle) else params)
+        return walk.arrive(lambda: drawn(params))
 
     def planned(self, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
         """The plan for fields of a type."""
-        return self._planned(height, width, dtype, [idle for _, idle in self._leaves()])
+        return self._planned(height, width, dtype, list(self._idle()))
 
     def _planned(self, height: int, width: int, dtype: torch.dtype, idle: Sequence[bool]) -> ComposePlan:
         """That without some effects."""
         ask = Ask(height, width, self.tolerance_px, dtype is torch.float64).of_default
-        effects = [(effect, rests) for (effect, _), rests in zip(self._leaves(), idle, strict=True)]
-        return compose_plan(effects, self._together(), ask)
+        return compose_plan(list(zip(self._leaves(), idle, strict=True)), self._together(), ask)
 
     @assume_constant_result
     def _constant(self, _: int, height: int, width: int, dtype: torch.dtype, idle: Sequence[bool]) -> ComposePlan:
@@ -193,14 +191,19 @@ class Compose(Effect):
         gate = draws.uniform(source, 1)[:, 0] < self.p
         return gate, [gate] * len(self.effects)
 
-    def _leaves(self, *, idle: bool = False) -> Iterator[tuple[Effect, bool]]:
-        """The effects that are no compositions, in order, and whether each is idle; in an idle composition all are."""
+    def _leaves(self) -> Iterator[Effect]:
+        """The effects that are no compositions, in order."""
+        for effect in self._effects():
+            yield from effect._leaves() if isinstance(effect, Compose) else [effect]
+
+    def _idle(self, *, idle: bool = False) -> Iterator[bool]:
+        """Whether each of them is idle; in an idle composition all are."""
         idle = idle or self.p == 0
         for effect in self._effects():
             if isinstance(effect, Compose):
-                yield from effect._leaves(idle=idle)
+                yield from effect._idle(idle=idle)
             else:
-                yield effect, idle or effect.idle
+                yield idle or effect.idle
 
     def _together(self) -> list[tuple[int, ...]]:
         """The effects that are no compositions, by their places in order, as sets that may act on one sample."""
@@ -282,12 +285,11 @@ def _closed(params: Any, gate: Tensor) -> Any:
     return params._replace(gate=params.gate & gate)
 
 
-def _rests(effect: Effect, params: Any, *, idle: bool) -> bool:
-    """Whether an effect that is idle or not changes nothing by these parameters, drawn, given, or not drawn yet."""
-    if isinstance(params, Undrawn) or not idle or learns(params):
-        return isinstance(params, Undrawn)
-    acts = effect.moves(params) if isinstance(effect, WarpEffect) else cast(RadianceEffect, effect).acts(params)
-    return is_true((params.gate & acts).any, of=acts) is False
+def _stirs(effect: Effect, params: Any, height: int, width: int) -> bool:
+    """Whether an effect that is no composition may change a sample, or a gradient is asked for that could."""
+    if isinstance(effect, WarpEffect):
+        return effect.stirs(params, height, width)
+    return cast(RadianceEffect, effect).stirs(params)
 
 
 def _later(effect: Effect, source: draws.Stream, image: Tensor) -> Undrawn:

@@ -248,11 +248,10 @@ class HeterogeneousFog(PlannedLight):
             motion: dict[str, Any] = {"frame": frame, "wind": wind[:, :2] * (width / self.reference_width)}
             return self._in_image(key, share, motion | {"decorrelation": decorrelation}, plan)
         focal, center = self.air.pinhole(height, width)
-        q = path_mean(
-            key, distance, height=height, width=width, focal=focal, center=center, scales=self.scales, weights=share,
-            contrast=contrast.to(dtype), frame=frame, wind=wind, decorrelation=decorrelation, reach=self.reach,
-            dtype=dtype,
-        )  # fmt: skip
+        view: Any = {"height": height, "width": width, "focal": focal, "center": center, "reach": self.reach}
+        fog: Any = {"scales": self.scales, "weights": share, "contrast": contrast.to(dtype)}
+        motion = {"frame": frame, "wind": wind, "decorrelation": decorrelation}
+        q = path_mean(key, distance, **view, **fog, **motion, dtype=dtype)
         return q, self._inverse_mean(q, 1.0), q.new_zeros(1, 1, 1, 1)
 
     def _in_image(

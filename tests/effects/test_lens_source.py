@@ -147,9 +147,9 @@ def test_lenses_outside_the_table_are_taken_exactly():
     effect = LensDistortion.from_lenses(OTHERS, tolerance_px=0.05)
     image = torch.zeros(2, 1, 36, 64)
     params = effect.sample(image, seed=0)
-    assert effect.fitted(params) is effect
+    assert effect.fitted(params, 36, 64) is effect
     other = params._replace(coefficients=0.5 * params.coefficients)
-    assert effect.fitted(other) is not effect
+    assert effect.fitted(other, 36, 64) is not effect
     assert torch.equal(effect.apply(image, other).flow, LensDistortion().apply(image, other).flow)
 
 

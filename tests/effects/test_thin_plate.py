@@ -5,7 +5,7 @@ import torch
 from scipy.interpolate import RBFInterpolator
 from torch.testing import assert_close
 
-from torchrefract import ThinPlateParams, ThinPlateSpline
+from torchrefract import Compose, ComposeParams, ThinPlateParams, ThinPlateSpline
 
 
 def plate(points: torch.Tensor, displacement: torch.Tensor, smoothing: float = 0.0) -> ThinPlateParams:
@@ -70,6 +70,24 @@ def test_smoothing_leads_to_the_plane_of_least_squares():
     assert_close(flow[0].movedim(0, -1), expected, rtol=0, atol=1e-6)
     exact = effect.apply(image, plate(points, displacement)).flow
     assert (exact - flow).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("points", ["of another frame", "one of its own", "all of its own"])
+def test_plates_that_could_not_be_drawn_for_a_frame_are_exact(points):
+    effect, image = ThinPlateSpline(), torch.rand(1, 1, 180, 320)
+    params = effect.sample(image, seed=3)
+    assert effect.fitted(params, 180, 320) is effect
+    assert effect.fitted(params.to(torch.float64), 180, 320) is effect
+    if points == "of another frame":
+        params = effect.sample(image[..., :60, :80], seed=3)
+    elif points == "one of its own":
+        params = params._replace(points=params.points + torch.eye(16)[:, 5:6])
+    else:
+        params = params._replace(points=100 + 40 * torch.rand(1, 16, 2, generator=torch.Generator().manual_seed(1)))
+    exact = ThinPlateSpline(tolerance_px=None).apply(image, params)
+    for made in (effect.apply(image, params), Compose([effect]).apply(image, ComposeParams(params.gate, (params,)))):
+        assert torch.equal(made.flow, exact.flow)
+        assert torch.equal(made.image, exact.image)
 
 
 @pytest.mark.parametrize(

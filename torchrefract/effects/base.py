@@ -124,10 +124,10 @@ class Effect(nn.Module, ABC):
         self.check_params(params, _samples(image, layout))
         if frame is not None:
             params = at_frames(params, lambda: _frames(frame, image, layout))
-        return self.fitted(params)._run(image, layout, params, depth)
+        return self.fitted(params, *image.shape[-2:])._run(image, layout, params, depth)
 
-    def fitted(self, params: Any) -> "Effect":
-        """The effect that takes parameters which are given: itself, unless it relies on its own ranges."""
+    def fitted(self, params: Any, height: int, width: int) -> "Effect":
+        """The effect that takes parameters which are given: itself, unless it relies on what it draws itself."""
         return self
 
     params_type: type[Any]

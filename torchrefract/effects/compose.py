@@ -169,9 +169,10 @@ class Compose(Effect):
         # As for `PlannedLight`.
         return self._planned(height, width, dtype, idle)
 
-    def fitted(self, params: ComposeParams) -> "Compose":
+    def fitted(self, params: ComposeParams, height: int, width: int) -> "Compose":
         """The composition, with each effect that relies on ranges which its parameters lie outside of exact."""
-        effects = [effect.fitted(child) for effect, child in zip(self._effects(), params.children, strict=True)]
+        pairs = zip(self._effects(), params.children, strict=True)
+        effects = [effect.fitted(child, height, width) for effect, child in pairs]
         if all(new is old for new, old in zip(effects, self._effects(), strict=True)):
             return self
         fitted = copy(self)
@@ -262,10 +263,10 @@ class OneOf(Compose):
         chosen = torch.bucketize(choice, ends, right=True)
         return gate, [gate & (chosen == i) for i in range(len(self.effects))]
 
-    def fitted(self, params: ComposeParams) -> "Compose":
+    def fitted(self, params: ComposeParams, height: int, width: int) -> "Compose":
         """As for `Compose`; exact, too, for parameters by which several effects act on a sample."""
         acting = torch.stack([child.gate for child in params.children]).sum(dim=0)
-        fitted = super().fitted(params)
+        fitted = super().fitted(params, height, width)
         if self.tolerance_px is None or is_true((acting <= 1).all, of=acting) is not False:
             return fitted
         exact = copy(fitted)

@@ -142,7 +142,7 @@ class DivergenceFree(LatticeWarp):
         ranges = FieldRanges(self.amplitude_range, self.length_range, (0.0, 0.0), stream=True)
         return field_plan(ranges, ask)
 
-    def covers(self, params: DivergenceFreeParams) -> Tensor:
+    def covers(self, params: DivergenceFreeParams, height: int, width: int) -> Tensor:
         """Whether the swirls lie in the ranges."""
         values = torch.stack([params.amplitude, params.length], dim=1)
         return lies_in(values, [self.amplitude_range, self.length_range])

@@ -1,5 +1,6 @@
 """Warps whose flow can be computed on a lattice, under a tolerance."""
 
+import functools
 from abc import abstractmethod
 from collections.abc import Sequence
 from copy import copy
@@ -56,17 +57,22 @@ class LatticeWarp(WarpEffect):
         """The plan that is asked for, from the ranges alone."""
         return ask.plan(1, 0.0, "no tolerance" if ask.tolerance_px is None else "no bound is known for these arguments")
 
-    def fitted(self, params: Any) -> "LatticeWarp":
+    def fitted(self, params: Any, height: int, width: int) -> "LatticeWarp":
         """The effect itself; an exact one for parameters outside the ranges that its plan is for."""
-        if self.tolerance_px is None or is_true(lambda: self.covers(params), of=params.gate) is not False:
+        covers = functools.partial(self.covers, params, height, width)
+        if self.tolerance_px is None or is_true(covers, of=params.gate) is not False:
             return self
+        return self.exact()
+
+    def exact(self) -> "LatticeWarp":
+        """The effect without a tolerance."""
         exact = copy(self)
         exact.tolerance_px = None
         return exact
 
     @abstractmethod
-    def covers(self, params: Any) -> Tensor:
-        """(), bool: all parameters lie in the ranges that the plan is for."""
+    def covers(self, params: Any, height: int, width: int) -> Tensor:
+        """(), bool: all parameters lie in the ranges that the plan for such a frame is for."""
 
     @abstractmethod
     def on_lattice(self, params: Any, plan: Plan) -> SmoothFlow:

@@ -214,7 +214,7 @@ class LensDistortion(LatticeWarp):
         ask = Ask(plan.height, plan.width, plan.tolerance_px, params.focal.dtype is torch.float64)
         return [plan_of_lens(boxes, lens, ask) for lens in numbers]
 
-    def covers(self, params: LensParams) -> Tensor:
+    def covers(self, params: LensParams, height: int, width: int) -> Tensor:
         """Whether the lenses lie in the ranges, or near one of a table's."""
         if self._source is not None:
             return self._source.covers(params.coefficients, params.focal, params.center)

@@ -29,7 +29,7 @@ class PlannedLight(RadianceEffect):
         super().__init__(p=p)
         self.tolerance = check_tolerance(tolerance, name="tolerance")
 
-    def fitted(self, params: Any) -> "PlannedLight":
+    def fitted(self, params: Any, height: int, width: int) -> "PlannedLight":
         """The effect itself; an exact one for parameters outside the ranges that its plan is for."""
         if self.tolerance is None or is_true(lambda: self.covers(params), of=params.gate) is not False:
             return self

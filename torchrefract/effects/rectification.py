@@ -108,7 +108,7 @@ class Rectification(LatticeWarp):
         """The plan of `rectification_plan`."""
         return rectification_plan(self.camera, ask)
 
-    def covers(self, params: RectificationParams) -> Tensor:
+    def covers(self, params: RectificationParams, height: int, width: int) -> Tensor:
         """Whether the cameras are the one that is known, but for rounding."""
         found = torch.cat(params[1:], dim=1)
         known = constant([n for row in self._numbers() for n in row], dtype=found.dtype, device=found.device)

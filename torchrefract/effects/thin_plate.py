@@ -16,6 +16,8 @@ from torchrefract.fields.spline import check_points, fit_spline, spline_at, spli
 from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice, SmoothFlow
 
+_CLOSE = 1e-3  # px
+
 
 class ThinPlateParams(NamedTuple):
     """The plates of a batch."""
@@ -40,7 +42,8 @@ class ThinPlateSpline(LatticeWarp):
         amplitude_range: px, standard deviation of the displacements, 0 or above.
         lattice: (rows, columns) of control points, each at least 2.
         smoothing_range: 0 goes through the points exactly; larger bends less, in units of the points' rms radius.
-        padding, interpolation, resampler, tolerance_px, p: as for every warp; plates with own points are exact.
+        padding, interpolation, resampler, tolerance_px, p: as for every warp; plates with own points are exact,
+            on an accelerator those with as many as drawn ones only without a tolerance.
 
     Raises:
         ValueError: an argument outside its range; points that are fewer than three, the same, or on one line.
@@ -80,12 +83,8 @@ class ThinPlateSpline(LatticeWarp):
         amplitude, smoothing = values.unbind(1)
         rows, columns = self.lattice
         normal = draws.normal(draws.fold(source), 2 * rows * columns).to(values.dtype).view(-1, rows * columns, 2)
-        # A frame of one pixel has no extent, and a plate needs one.
-        y = torch.linspace(0, max(image.shape[2] - 1, 1), rows, dtype=values.dtype, device=values.device)
-        x = torch.linspace(0, max(image.shape[3] - 1, 1), columns, dtype=values.dtype, device=values.device)
-        points = torch.stack([x.expand(rows, -1), y[:, None].expand(-1, columns)], dim=-1).view(1, -1, 2)
-        displacement = amplitude[:, None, None] * normal
-        return ThinPlateParams(gate, points.repeat(image.shape[0], 1, 1), displacement, smoothing)
+        points = self._points(image.shape[2], image.shape[3], values).repeat(image.shape[0], 1, 1)
+        return ThinPlateParams(gate, points, amplitude[:, None, None] * normal, smoothing)
 
     def check(self, params: ThinPlateParams, image: Tensor) -> None:
         """Raise for plates that are none."""
@@ -113,13 +112,18 @@ class ThinPlateSpline(LatticeWarp):
         """The plan of `plate_plan`."""
         return plate_plan(self.amplitude_range[1], self.lattice, self.smoothing_range, ask)
 
-    def covers(self, params: ThinPlateParams) -> Tensor:
-        """Whether the points are as many as drawn ones, displaced and smoothed as those can be."""
-        if params.points.shape[1] != math.prod(self.lattice):
-            return params.gate.new_zeros(())
+    def fitted(self, params: ThinPlateParams, height: int, width: int) -> "LatticeWarp":
+        """As for every warp; that there are more or fewer points than drawn ones is known where none can be read."""
+        drawn = params.points.shape[1] == math.prod(self.lattice)
+        return super().fitted(params, height, width) if drawn else self.exact()
+
+    def covers(self, params: ThinPlateParams, height: int, width: int) -> Tensor:
+        """Whether the points are drawn ones of such a frame, displaced and smoothed as those can be."""
+        # Positions in whatever type they were kept in: so little changes nothing that a plan relies on.
+        near = (params.points - self._points(height, width, params.points)).abs() <= _CLOSE
         most = draws.LARGEST_NORMAL * self.amplitude_range[1]
         displaced = lies_in(params.displacement.reshape(-1, 1), [(-most, most)])
-        return displaced & lies_in(params.smoothing[:, None], [self.smoothing_range])
+        return near.all() & displaced & lies_in(params.smoothing[:, None], [self.smoothing_range])
 
     def on_lattice(self, params: ThinPlateParams, plan: Plan) -> SmoothFlow:
         """The flow of `spline_at`."""
@@ -131,3 +135,11 @@ class ThinPlateSpline(LatticeWarp):
     def moves(self, params: ThinPlateParams) -> Tensor:
         """The samples with a displaced point."""
         return (params.displacement != 0).flatten(1).any(dim=1)
+
+    def _points(self, height: int, width: int, like: Tensor) -> Tensor:
+        """(1, N, 2), px: the control points of drawn plates."""
+        rows, columns = self.lattice
+        # A frame of one pixel has no extent, and a plate needs one.
+        y = torch.linspace(0, max(height - 1, 1), rows, dtype=like.dtype, device=like.device)
+        x = torch.linspace(0, max(width - 1, 1), columns, dtype=like.dtype, device=like.device)
+        return torch.stack([x.expand(rows, -1), y[:, None].expand(-1, columns)], dim=-1).view(1, -1, 2)

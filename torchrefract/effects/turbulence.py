@@ -138,7 +138,7 @@ class Turbulence(LatticeWarp):
         ranges = FieldRanges(self.amplitude_range, self.length_range, self.aperture_range)
         return field_plan(ranges, ask)
 
-    def covers(self, params: TurbulenceParams) -> Tensor:
+    def covers(self, params: TurbulenceParams, height: int, width: int) -> Tensor:
         """Whether the air lies in the ranges."""
         values = torch.stack([params.amplitude, params.length, params.aperture], dim=1)
         return lies_in(values, [self.amplitude_range, self.length_range, self.aperture_range])

@@ -1,7 +1,6 @@
 """Plain values that cross layers."""
 
 from collections.abc import Callable, Mapping
-from functools import cached_property
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -77,6 +76,8 @@ class Degraded:
         such a map.
     intensity: (B, 1, H, W), light added; None without such a map.
 
+    restore, restore_valid: what gives restore_flow and where it is one, and of the result and that restore_valid.
+
     Of clips, (B, T, ...), the maps have the dimension of time too. Each map is given as a tensor or as a function that
     computes it; what needs other maps is handed the result, so that nothing here holds the result itself and its memory
     is free once it is let go. Those that can be None are typed Any: whoever knows the effect knows which maps it has.
@@ -90,6 +91,7 @@ class Degraded:
         valid: Map,
         flow: Map | None = None,
         restore: Callable[["Degraded"], Inverse] | None = None,
+        restore_valid: Callable[["Degraded", Tensor], Tensor] | None = None,
         residual: Callable[["Degraded"], Tensor] | None = None,
         folding: Callable[["Degraded"], Folding] | None = None,
         light: Mapping[str, Map] | None = None,
@@ -102,9 +104,14 @@ class Degraded:
             **dict.fromkeys(_LIGHT),
             **(light or {}),
         }
-        self._restore = restore
-        self._miss = residual
-        self._fold = folding
+        # Compilers cannot enter the lock of a cached property.
+        self._later: dict[str, Callable[[Degraded], Any] | None] = {
+            "restored": restore,
+            "restore_valid": restore_valid and (lambda result: restore_valid(result, result._restored.valid)),
+            "restore_residual": residual,
+            "folding": folding,
+        }
+        self._known: dict[str, Any] = {}
 
     @property
     def params(self) -> Any:
@@ -123,10 +130,10 @@ class Degraded:
         """The flow that makes the image from the clean one."""
         return self._read("flow")
 
-    @cached_property
+    @property
     def folding(self) -> Any:
         """How much of the image is folded."""
-        return None if self._fold is None else self._fold(self)
+        return self._once("folding")
 
     @property
     def transmission(self) -> Any:
@@ -151,16 +158,16 @@ class Degraded:
     @property
     def restore_valid(self) -> Any:
         """Where it does."""
-        return None if self._restored is None else self._restored.valid
+        return self._once("restore_valid")
 
-    @cached_property
+    @property
     def restore_residual(self) -> Any:
         """By how much it misses, in px."""
-        return None if self._miss is None else self._miss(self)
+        return self._once("restore_residual")
 
-    @cached_property
-    def _restored(self) -> Inverse | None:
-        return None if self._restore is None else self._restore(self)
+    @property
+    def _restored(self) -> Any:
+        return self._once("restored")
 
     def has(self, name: str) -> bool:
         """Whether there is a map of this name, without computing it."""
@@ -177,9 +184,10 @@ class Degraded:
             lambda: self.params,
             valid=lambda: function(self.valid),
             flow=later("flow"),
-            restore=None if self._restore is None else lambda _: Inverse(*map(function, cast(Inverse, self._restored))),
-            residual=None if self._miss is None else lambda _: function(self.restore_residual),
-            folding=None if self._fold is None else lambda _: Folding(*map(function, self.folding)),
+            restore=self._has("restored", lambda _: Inverse(*map(function, self._restored))),
+            restore_valid=self._has("restore_valid", lambda *_: function(self.restore_valid)),
+            residual=self._has("restore_residual", lambda _: function(self.restore_residual)),
+            folding=self._has("folding", lambda _: Folding(*map(function, self.folding))),
             light={name: value for name in _LIGHT if (value := later(name)) is not None},
         )
 
@@ -189,9 +197,20 @@ class Degraded:
             value = self._maps[name] = value()
         return value
 
+    def _once(self, name: str) -> Any:
+        """What is computed of the result itself."""
+        if name not in self._known:
+            compute = self._later[name]
+            self._known[name] = None if compute is None else compute(self)
+        return self._known[name]
+
+    def _has(self, name: str, function: Any) -> Any:
+        """The function, if there is something of this name."""
+        present = self._known.get(name) is not None or self._later.get(name) is not None
+        return function if present else None
+
     def __getstate__(self) -> dict[str, Any]:
         """All maps computed: what is still to be computed cannot travel to another process."""
         maps = {name: self._read(name) for name in self._maps}
-        computed = {name: getattr(self, name) for name in ("_restored", "restore_residual", "folding")}
-        given = {"_params": self.params, "_maps": maps, "_restore": None, "_miss": None, "_fold": None}
-        return self.__dict__ | computed | given
+        known = {name: self._once(name) for name in self._later}
+        return self.__dict__ | {"_params": self.params, "_maps": maps, "_later": {}, "_known": known}

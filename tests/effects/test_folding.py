@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from torchrefract import Compose, LensDistortion, Turbulence, UniformFog, folding, jacobian_determinant
+from torchrefract import Compose, DivergenceFree, LensDistortion, Turbulence, UniformFog, folding, jacobian_determinant
 
 
 def air(amplitude: float) -> Turbulence:
@@ -39,6 +39,16 @@ def test_folded_pixels_are_not_valid_in_the_flow_back():
     assert calm.restore_valid.double().mean() > 0.9
     assert made.restore_valid.double().mean() < 0.6
     assert made.restore_residual[made.restore_valid].max() <= 0.05
+
+
+def test_compositions_do_not_mix_the_sheets_of_a_fold():
+    image = torch.zeros(4, 1, 180, 320)
+    effect = Compose([LensDistortion(), DivergenceFree(amplitude_range=(10.0, 30.0))])
+    for seed in (2, 3, 5):
+        degraded = effect.degrade(image, seed=seed)
+        assert degraded.folding.fraction.amax() > 0.02
+        assert degraded.restore_valid.float().mean() > 0.6
+        assert degraded.restore_residual[degraded.restore_valid].max() <= 0.5
 
 
 def test_what_a_lens_shows_nothing_at_is_not_folded():

@@ -22,6 +22,8 @@ from torchrefract.warping.masks import mixes_only
 from torchrefract.warping.mixed import Flow, MixedFlow, PartFlow, dense
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, RESAMPLERS, look_up
 
+_MISSED = 0.5  # px; rough flows back, read between pixels, miss by less
+
 
 class WarpEffect(Effect):
     """An effect that moves pixels.
@@ -151,20 +153,28 @@ def moving(
     flow: Callable[[], Tensor],
     valid: Callable[[], Tensor],
     undo: Callable[[], tuple[Tensor, Tensor]],
+    several: Callable[[], Tensor] | None = None,
     light: Mapping[str, Map] | None = None,
 ) -> Degraded:
-    """What an effect with a flow hands over; `restore_valid` is where the flow back exists and sees valid pixels."""
+    """What an effect with a flow hands over; `restore_valid` is where the flow back exists and sees valid pixels.
 
-    def restore(result: Degraded) -> Inverse:
-        back, known = undo()
-        return Inverse(back, known & sees(result.valid, back))
+    several: gives the samples, (B,), bool, that several warps move. Their flow back is read between pixels that may lie
+        on two sheets of a fold, where it leads to neither: it counts where it leads to its place.
+    """
+
+    def restore_valid(result: Degraded, known: Tensor) -> Tensor:
+        good, many = known & sees(result.valid, result.restore_flow), None if several is None else several()
+        if many is None or is_true(many.any, of=many) is False:
+            return good
+        return good & (~column(many) | (result.restore_residual <= _MISSED))
 
     return Degraded(
         image,
         params,
         valid=valid,
         flow=flow,
-        restore=restore,
+        restore=lambda _: Inverse(*undo()),
+        restore_valid=restore_valid,
         residual=lambda result: length(compose_flows(result.flow, result.restore_flow)),
         folding=lambda result: folding(result.flow, result.valid),
         light=light,
@@ -187,6 +197,7 @@ def identity(image: Tensor, params: Any) -> Degraded:
         valid=lambda: everywhere,
         flow=lambda: still,
         restore=lambda _: Inverse(still, everywhere),
+        restore_valid=lambda _, known: known,
         residual=lambda _: still[:, :1],
         folding=lambda _: folding(still),
     )

@@ -110,6 +110,7 @@ class Walk:
             flow=self._flow,
             valid=valid,
             undo=self._undo,
+            several=self._several if len(self.moved) > 1 else None,
             light=light,
         )
 
@@ -177,12 +178,20 @@ class Walk:
             warped = found if warped is None else torch.where(column(samples), found, warped)
         return cast(Tensor, warped)
 
+    def _moves(self) -> list[Tensor]:
+        """(B,), bool, of each warp: the samples that it may move."""
+        # A flow that is zero is left out, not looked up: a sample must not depend on what moves the others.
+        rows = self.image.shape[0]
+        return [spread(own.gate if learns(own) else moved.active, rows) for _, own, moved in self.moved]
+
+    def _several(self) -> Tensor:
+        """(B,), bool: the samples that several warps may move."""
+        return torch.stack(self._moves()).sum(dim=0) > 1
+
     def _undo(self) -> tuple[Tensor, Tensor]:
         rows, found = self.image.shape[0], None
-        for effect, params, moved in self.moved:
+        for (effect, params, moved), moves in zip(self.moved, self._moves(), strict=True):
             back, exists = (spread(value, rows) for value in effect.gated_undo(params, moved))
-            # A flow that is zero is left out, not looked up: a sample must not depend on what moves the others.
-            moves = spread(params.gate if learns(params) else moved.active, rows)
             if found is None:
                 found = back, exists, moves
                 continue

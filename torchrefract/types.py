@@ -1,7 +1,7 @@
 """Plain values that cross layers."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -76,11 +76,10 @@ class Degraded:
         such a map.
     intensity: (B, 1, H, W), light added; None without such a map.
 
-    restore, restore_valid: what gives restore_flow and where it is one, and of the result and that restore_valid.
-
     Of clips, (B, T, ...), the maps have the dimension of time too. Each map is given as a tensor or as a function that
     computes it; what needs other maps is handed the result, so that nothing here holds the result itself and its memory
-    is free once it is let go. Those that can be None are typed Any: whoever knows the effect knows which maps it has.
+    is free once it is let go; `restore_valid` is handed what `restore` says of where the flow back exists, too. Those
+    that can be None are typed Any: whoever knows the effect knows which maps it has.
     """
 
     def __init__(
@@ -98,20 +97,17 @@ class Degraded:
     ):
         self.image = image
         self._params = params
-        self._maps: dict[str, Map | None] = {
-            "valid": valid,
-            "flow": flow,
-            **dict.fromkeys(_LIGHT),
-            **(light or {}),
-        }
-        # Compilers cannot enter the lock of a cached property.
-        self._later: dict[str, Callable[[Degraded], Any] | None] = {
+        # Each a value, or a function of the result that computes it. Compilers cannot enter the lock of a cached
+        # property.
+        self._maps: dict[str, Any] = {
+            "valid": _of_result(valid),
+            "flow": _of_result(flow),
+            **{name: _of_result((light or {}).get(name)) for name in _LIGHT},
             "restored": restore,
-            "restore_valid": restore_valid and (lambda result: restore_valid(result, result._restored.valid)),
+            "restore_valid": restore_valid and (lambda result: restore_valid(result, result._read("restored").valid)),
             "restore_residual": residual,
             "folding": folding,
         }
-        self._known: dict[str, Any] = {}
 
     @property
     def params(self) -> Any:
@@ -123,7 +119,7 @@ class Degraded:
     @property
     def valid(self) -> Tensor:
         """Where the image shows what the clean one holds."""
-        return cast(Tensor, self._read("valid"))
+        return self._read("valid")
 
     @property
     def flow(self) -> Any:
@@ -133,7 +129,7 @@ class Degraded:
     @property
     def folding(self) -> Any:
         """How much of the image is folded."""
-        return self._once("folding")
+        return self._read("folding")
 
     @property
     def transmission(self) -> Any:
@@ -153,21 +149,18 @@ class Degraded:
     @property
     def restore_flow(self) -> Any:
         """The flow that undoes the damage."""
-        return None if self._restored is None else self._restored.flow
+        restored = self._read("restored")
+        return None if restored is None else restored.flow
 
     @property
     def restore_valid(self) -> Any:
         """Where it does."""
-        return self._once("restore_valid")
+        return self._read("restore_valid")
 
     @property
     def restore_residual(self) -> Any:
         """By how much it misses, in px."""
-        return self._once("restore_residual")
-
-    @property
-    def _restored(self) -> Any:
-        return self._once("restored")
+        return self._read("restore_residual")
 
     def has(self, name: str) -> bool:
         """Whether there is a map of this name, without computing it."""
@@ -176,41 +169,32 @@ class Degraded:
     def map(self, function: Callable[[Tensor], Tensor]) -> "Degraded":
         """A copy with `function` applied to each map, not to image and params; what is lazy stays so."""
 
-        def later(name: str) -> Map | None:
-            return None if self._maps[name] is None else lambda: function(cast(Tensor, self._read(name)))
+        def later(name: str, mapped: Callable[[Any], Any] = function) -> Any:
+            return None if self._maps[name] is None else lambda *_: mapped(self._read(name))
 
         return Degraded(
             self.image,
             lambda: self.params,
             valid=lambda: function(self.valid),
             flow=later("flow"),
-            restore=self._has("restored", lambda _: Inverse(*map(function, self._restored))),
-            restore_valid=self._has("restore_valid", lambda *_: function(self.restore_valid)),
-            residual=self._has("restore_residual", lambda _: function(self.restore_residual)),
-            folding=self._has("folding", lambda _: Folding(*map(function, self.folding))),
+            restore=later("restored", lambda restored: Inverse(*map(function, restored))),
+            restore_valid=later("restore_valid"),
+            residual=later("restore_residual"),
+            folding=later("folding", lambda folding: Folding(*map(function, folding))),
             light={name: value for name in _LIGHT if (value := later(name)) is not None},
         )
 
-    def _read(self, name: str) -> Tensor | None:
+    def _read(self, name: str) -> Any:
         value = self._maps[name]
-        if value is not None and not isinstance(value, Tensor):
-            value = self._maps[name] = value()
+        if callable(value):
+            value = self._maps[name] = value(self)
         return value
-
-    def _once(self, name: str) -> Any:
-        """What is computed of the result itself."""
-        if name not in self._known:
-            compute = self._later[name]
-            self._known[name] = None if compute is None else compute(self)
-        return self._known[name]
-
-    def _has(self, name: str, function: Any) -> Any:
-        """The function, if there is something of this name."""
-        present = self._known.get(name) is not None or self._later.get(name) is not None
-        return function if present else None
 
     def __getstate__(self) -> dict[str, Any]:
         """All maps computed: what is still to be computed cannot travel to another process."""
-        maps = {name: self._read(name) for name in self._maps}
-        known = {name: self._once(name) for name in self._later}
-        return self.__dict__ | {"_params": self.params, "_maps": maps, "_later": {}, "_known": known}
+        return self.__dict__ | {"_params": self.params, "_maps": {name: self._read(name) for name in self._maps}}
+
+
+def _of_result(value: Map | None) -> Any:
+    """A map's function as one of the result."""
+    return (lambda _: value()) if callable(value) else value

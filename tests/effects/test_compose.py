@@ -369,7 +369,7 @@ def test_compositions_params_and_results_are_copied_whole(copied):
     effect = Compose([*warps(), UniformFog()])
     drawn = effect.degrade(image, seed=7)
     again = copied(effect).apply(image, copied(drawn.params))
-    duplicate = maps(copied(drawn))
+    duplicate = maps(copied(copied(drawn)))
     for name, value in maps(drawn).items():
         assert torch.equal(getattr(again, name), value), name
         assert torch.equal(duplicate[name], value), name

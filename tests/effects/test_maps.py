@@ -41,6 +41,7 @@ def test_nobody_pays_for_maps_that_nobody_reads(effect, work):
     warps = len(WARPS) if isinstance(effect, Compose) else 1
     assert work.count("undo") == warps
     assert "length" not in work
+    assert warps > 1 or work == ["undo"]
     work.clear()
     assert made.restore_valid.any()
     # Of several warps the residual tells where the flow back may not be taken.

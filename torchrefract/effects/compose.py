@@ -46,7 +46,8 @@ class Compose(Effect):
 
     Warps that follow one another look the image up once, along the composite of their flows, so that the image is
     blurred once. Effects of light between them keep their place: the image is looked up before, and their maps move
-    with the warps after. `restore_flow` is the composite of the flows back, in closed form where the effects have one.
+    with the warps after. `restore_flow` is the composite of the flows back, in closed form where the effects have one;
+    it is not valid where it misses by more than 0.5 px, as between the sheets of a fold.
 
     Args:
         effects: at least one; compositions may be nested.

@@ -22,7 +22,7 @@ from torchrefract.warping.masks import mixes_only
 from torchrefract.warping.mixed import Flow, MixedFlow, PartFlow, dense
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, RESAMPLERS, look_up
 
-_MISSED = 0.5  # px; rough flows back, read between pixels, miss by less
+_MISSED = 0.5  # px; smooth flows back, read between pixels, miss by far less, rough ones seldom by more
 
 
 class WarpEffect(Effect):

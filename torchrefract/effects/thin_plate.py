@@ -43,7 +43,7 @@ class ThinPlateSpline(LatticeWarp):
         lattice: (rows, columns) of control points, each at least 2.
         smoothing_range: 0 goes through the points exactly; larger bends less, in units of the points' rms radius.
         padding, interpolation, resampler, tolerance_px, p: as for every warp; plates with own points are exact,
-            on an accelerator those with as many as drawn ones only without a tolerance.
+            on accelerators and in compiled graphs those with as many as drawn ones only without a tolerance.
 
     Raises:
         ValueError: an argument outside its range; points that are fewer than three, the same, or on one line.

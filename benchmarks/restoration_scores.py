@@ -9,10 +9,10 @@ from torch import Tensor
 from torchrefract._levels import levels_of, numbers_of
 from torchrefract.data.module import make_pair
 from torchrefract.effects.base import Effect
-from torchrefract.effects.compose import OneOf
 from torchrefract.effects.defog import remove_fog
 from torchrefract.effects.flare import LensFlare
 from torchrefract.effects.lens import LensDistortion
+from torchrefract.effects.one_of import OneOf
 from torchrefract.presets import paper_refractive, paper_weather
 from torchrefract.restoration.metrics import endpoint_error, masked_mean, psnr, ssim
 from torchrefract.restoration.tasks import Restored

@@ -430,3 +430,42 @@ def test_params_that_do_not_fit_raise():
 def test_weights_that_do_not_fit_raise(weights, message):
     with pytest.raises(ValueError, match=message):
         OneOf([LensDistortion(), UniformFog()], weights=weights)
+
+
+def test_nested_compositions_say_how_their_own_effects_are_looked_up():
+    image = picture(2, 3, 24, 32)
+    shift = ThinPlateSpline(amplitude_range=(4.0, 6.0), padding="zeros", interpolation="bicubic")
+    idle = LensDistortion(p=0)
+
+    def shown(effect: Effect) -> Tensor:
+        return effect.degrade(image, seed=4).image
+
+    def with_options(effect: WarpEffect, **options: Any) -> WarpEffect:
+        other = copy.copy(effect)
+        vars(other).update(options)
+        return other
+
+    own: dict[str, Any] = {"padding": "border", "interpolation": "nearest", "resampler": "grid_sample"}
+    expected = shown(Compose([idle, Compose([with_options(shift, **own)])]))
+    assert not torch.equal(expected, shown(Compose([idle, Compose([shift])])))
+    assert torch.equal(shown(Compose([idle, Compose([shift], **own)])), expected)
+    # The outermost that says how has the word; what it leaves open the next one says.
+    half = {name: own[name] for name in ("padding", "resampler")}
+    inner = Compose([shift], interpolation="nearest", padding="reflection")
+    expected = shown(Compose([idle, Compose([Compose([with_options(shift, **own)])])]))
+    assert torch.equal(shown(Compose([idle, Compose([inner], **half)])), expected)
+    assert torch.equal(shown(Compose([idle, Compose([inner])], **half)), expected)
+
+
+def test_one_of_looks_its_own_effects_up_as_it_says_inside_of_a_composition():
+    image = picture(8, 3, 24, 32)
+    a, b = LensDistortion(**LENS), ThinPlateSpline(amplitude_range=(4.0, 6.0))
+    choice = OneOf([a, b], padding="border")
+    nested = Compose([choice])
+    params = nested.sample(image, seed=2)
+    assert params.children[0].children[0].gate.any()
+    assert params.children[0].children[1].gate.any()
+    expected = choice.apply(image, params.children[0])
+    assert torch.equal(nested.apply(image, params).image, expected.image)
+    unlike = OneOf([a, b]).apply(image, params.children[0]).image
+    assert not torch.equal(expected.image, unlike)

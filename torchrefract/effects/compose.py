@@ -1,4 +1,4 @@
-"""Several effects in a row, with one look-up for all warps that follow one another; or one out of several."""
+"""Several effects in a row, with one look-up for all warps that follow one another."""
 
 import itertools
 import math
@@ -10,19 +10,20 @@ import torch
 from torch import Tensor, nn
 
 from torchrefract import draws
-from torchrefract._checks import check_choice, check_number, is_true
-from torchrefract._constants import assume_constant_result, constant
+from torchrefract._checks import check_choice
+from torchrefract._constants import assume_constant_result
 from torchrefract.effects.base import Effect, moved
 from torchrefract.effects.compose_plan import ComposePlan, compose_plan
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, check_tolerance
 from torchrefract.effects.radiance import RadianceEffect
 from torchrefract.effects.refraction import WarpEffect
 from torchrefract.effects.rows import Undrawn, drawn
-from torchrefract.effects.walk import Walk
+from torchrefract.effects.walk import Look, Walk
 from torchrefract.types import Degraded
 from torchrefract.warping.grid import field_dtype
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, RESAMPLERS
 
+_OPEN = Look()
 _MOST_SETS = 64  # of effects that act together, for each of which there is a plan
 
 
@@ -51,7 +52,8 @@ class Compose(Effect):
 
     Args:
         effects: at least one; compositions may be nested.
-        padding, interpolation, resampler: of the look-ups; None takes those of the last warp that moves the sample.
+        padding, interpolation, resampler: of the look-ups, whatever the effects and compositions inside have; None
+            takes those of the last warp that moves the sample, or of the outermost composition inside that has it.
         tolerance_px: how far the composite of all flows may be from the exact one, px, see `plan`; None is exact. It
             takes the place of what the effects and compositions inside have, but an effect that has None stays exact.
             As for warps, the default is exact in frames too large for it.
@@ -139,7 +141,7 @@ class Compose(Effect):
 
     def compute(self, image: Tensor, params: ComposeParams, depth: Tensor | None) -> Degraded:
         """The batch through all effects."""
-        walk = Walk(image, depth, self.padding, self.interpolation, self.resampler)
+        walk = Walk(image, depth)
         height, width = image.shape[2:]
         leaves = list(self.leaves(params))
         idle = tuple(
@@ -147,11 +149,11 @@ class Compose(Effect):
             for (effect, own), rests in zip(leaves, self._idle(), strict=True)
         )
         plans = self._constant(id(self), height, width, field_dtype(image.dtype), idle).plans
-        for (effect, own), plan, rests in zip(leaves, plans, idle, strict=True):
+        for (effect, own), plan, look, rests in zip(leaves, plans, self._looks(), idle, strict=True):
             if rests:
                 walk.rest(effect)
             elif isinstance(effect, WarpEffect):
-                walk.move(effect, own, cast(Plan, plan))
+                walk.move(effect, own, cast(Plan, plan), look)
             else:
                 walk.shade(cast(RadianceEffect, effect), own, plan)
         return walk.arrive(lambda: drawn(params))
@@ -198,6 +200,15 @@ class Compose(Effect):
         for effect in self._effects():
             yield from effect._leaves() if isinstance(effect, Compose) else [effect]
 
+    def _looks(self, outer: Look = _OPEN) -> Iterator[Look]:
+        """How each of them is looked up, as far as the compositions say."""
+        own = outer.before(Look(self.padding, self.interpolation, self.resampler))
+        for effect in self._effects():
+            if isinstance(effect, Compose):
+                yield from effect._looks(own)
+            else:
+                yield own
+
     def _idle(self, *, idle: bool = False) -> Iterator[bool]:
         """Whether each of them is idle; in an idle composition all are."""
         idle = idle or self.p == 0
@@ -224,58 +235,6 @@ class Compose(Effect):
 
     def _effects(self) -> Iterator[Effect]:
         return cast(Iterator[Effect], iter(self.effects))
-
-
-class OneOf(Compose):
-    """One of several effects for each sample.
-
-    Args:
-        effects: to choose from.
-        weights: how often each is chosen, relative to one another, above 0; None chooses all alike.
-        padding, interpolation, resampler, tolerance_px, p: as for `Compose`; each effect has the whole tolerance.
-
-    Raises:
-        ValueError, TypeError: as for `Compose`; weights that are not one positive number for each effect.
-    """
-
-    def __init__(
-        self,
-        effects: Sequence[Effect],
-        *,
-        weights: Sequence[float] | None = None,
-        padding: str | None = None,
-        interpolation: str | None = None,
-        resampler: str | None = None,
-        tolerance_px: float | None = TOLERANCE_PX,
-        p: float = 1.0,
-    ):
-        options = {"padding": padding, "interpolation": interpolation, "resampler": resampler}
-        super().__init__(effects, **options, tolerance_px=tolerance_px, p=p)
-        weights = [1.0] * len(effects) if weights is None else weights
-        if len(weights) != len(effects):
-            raise ValueError(f"weights must be one number for each of {len(effects)} effects, got {len(weights)}")
-        self.weights = tuple(check_number("weights", weight, low=1e-9) for weight in weights)
-
-    def _gates(self, source: draws.Stream) -> tuple[Tensor, list[Tensor]]:
-        """As for `Compose`, those of the effects by a choice for each sample."""
-        values = draws.uniform(source, 2)
-        gate, choice = values[:, 0] < self.p, values[:, 1] * sum(self.weights)
-        ends = constant(self.weights, device=choice.device).cumsum(dim=0)[:-1]
-        chosen = torch.bucketize(choice, ends, right=True)
-        return gate, [gate & (chosen == i) for i in range(len(self.effects))]
-
-    def fitted(self, params: ComposeParams, height: int, width: int) -> "Compose":
-        """As for `Compose`; exact, too, for parameters by which several effects act on a sample."""
-        acting = torch.stack([child.gate for child in params.children]).sum(dim=0)
-        fitted = super().fitted(params, height, width)
-        if self.tolerance_px is None or is_true((acting <= 1).all, of=acting) is not False:
-            return fitted
-        exact = copy(fitted)
-        exact.tolerance_px = None
-        return exact
-
-    def _joined(self, sets: Sequence[Sequence[tuple[int, ...]]]) -> list[tuple[int, ...]]:
-        return list(itertools.chain.from_iterable(sets))
 
 
 def _closed(params: Any, gate: Tensor) -> Any:

@@ -3,7 +3,7 @@
 import functools
 import itertools
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -28,22 +28,26 @@ _Combine = Callable[[Tensor, Tensor], Tensor]
 _COMBINED: dict[str, _Combine] = {"transmission": torch.mul, "intensity": torch.add, "extinction": torch.add}
 
 
+class Look(NamedTuple):
+    """How an image is looked up, as for `warp`; None leaves it open."""
+
+    padding: str | None = None
+    interpolation: str | None = None
+    resampler: str | None = None
+
+    def before(self, other: "Look") -> "Look":
+        """This, and the other where it is left open."""
+        return Look(*(own or others for own, others in zip(self, other, strict=True)))
+
+
 class Walk:
     """An image on its way through effects; warps wait until something needs the image."""
 
-    def __init__(
-        self,
-        image: Tensor,
-        depth: Tensor | None,
-        padding: str | None,
-        interpolation: str | None,
-        resampler: str | None,
-    ):
+    def __init__(self, image: Tensor, depth: Tensor | None):
         self.image, self.depth = image, depth
-        self.padding, self.interpolation, self.resampler = padding, interpolation, resampler
         self.done: list[list[Step]] = []  # those that were looked up together
         self.waiting: list[Step] = []
-        self.modes: dict[tuple[str, str, str], Tensor] = {}  # of the look-up: the samples that ask for it, (B,), bool
+        self.modes: dict[Look, Tensor] = {}  # of the look-up: the samples that ask for it, (B,), bool
         self.moved: list[tuple[WarpEffect, Any, Moved]] = []
         self.valid: Callable[[], Tensor] | None = None  # everywhere
         self.light: dict[str, Callable[[], Tensor]] = {}  # the maps of light, by their names in `Degraded`
@@ -57,8 +61,8 @@ class Walk:
         else:
             self.refracts = True
 
-    def move(self, effect: WarpEffect, params: Any, plan: Plan) -> None:
-        """One more warp waits."""
+    def move(self, effect: WarpEffect, params: Any, plan: Plan, look: Look) -> None:
+        """One more warp waits; what `look` leaves open is looked up as the warp asks."""
         self.refracts = True
         rows, _, height, width = self.image.shape
         planned = {"plan": plan} if isinstance(effect, LatticeWarp) else {}
@@ -72,7 +76,7 @@ class Walk:
             return moved.exists & inside(moved.flow)
 
         self.valid = own_valid if valid is None else lambda: own_valid() & sees(valid(), moved.flow)
-        self._choose(effect, moved.active)
+        self._choose(look.before(Look(effect.padding, effect.interpolation, effect.resampler)), moved.active)
         self.moved.append((effect, params, own))
 
     def shade(self, effect: RadianceEffect, params: Any, plan: Plan | LightPlan) -> None:
@@ -158,23 +162,17 @@ class Walk:
         flows = functools.reduce(torch.promote_types, [step.path.dtype for step in self.waiting])
         return on_grid(self.waiting, sampler_dtype(self.image, flows))
 
-    def _choose(self, effect: WarpEffect, active: Tensor) -> None:
-        """The samples that an effect moves are looked up as it asks, unless the whole composition says how."""
-        mode = (
-            self.padding or effect.padding,
-            self.interpolation or effect.interpolation,
-            self.resampler or effect.resampler,
-        )
+    def _choose(self, mode: Look, active: Tensor) -> None:
+        """The samples that an effect moves are looked up as is asked for it."""
         asked = self.modes.pop(mode, torch.zeros_like(active))
         self.modes = {other: samples & ~active for other, samples in self.modes.items()} | {mode: asked | active}
 
     def _looked_up(self, flow: Flow | Positions) -> Tensor:
         warped = None
-        for (padding, interpolation, resampler), samples in reversed(self.modes.items()):
+        for mode, samples in reversed(self.modes.items()):
             if warped is not None and is_true(samples.any, of=samples) is False:
                 continue
-            options = {"padding": padding, "interpolation": interpolation, "resampler": resampler}
-            found = look_up(self.image, flow, **options)
+            found = look_up(self.image, flow, **mode._asdict())
             warped = found if warped is None else torch.where(column(samples), found, warped)
         return cast(Tensor, warped)
 

@@ -1,0 +1,67 @@
+"""One effect out of several."""
+
+import itertools
+from collections.abc import Sequence
+from copy import copy
+
+import torch
+from torch import Tensor
+
+from torchrefract import draws
+from torchrefract._checks import check_number, is_true
+from torchrefract._constants import constant
+from torchrefract.effects.base import Effect
+from torchrefract.effects.compose import Compose, ComposeParams
+from torchrefract.effects.plan import TOLERANCE_PX
+
+
+class OneOf(Compose):
+    """One of several effects for each sample.
+
+    Args:
+        effects: to choose from.
+        weights: how often each is chosen, relative to one another, above 0; None chooses all alike.
+        padding, interpolation, resampler, tolerance_px, p: as for `Compose`; each effect has the whole tolerance.
+
+    Raises:
+        ValueError, TypeError: as for `Compose`; weights that are not one positive number for each effect.
+    """
+
+    def __init__(
+        self,
+        effects: Sequence[Effect],
+        *,
+        weights: Sequence[float] | None = None,
+        padding: str | None = None,
+        interpolation: str | None = None,
+        resampler: str | None = None,
+        tolerance_px: float | None = TOLERANCE_PX,
+        p: float = 1.0,
+    ):
+        options = {"padding": padding, "interpolation": interpolation, "resampler": resampler}
+        super().__init__(effects, **options, tolerance_px=tolerance_px, p=p)
+        weights = [1.0] * len(effects) if weights is None else weights
+        if len(weights) != len(effects):
+            raise ValueError(f"weights must be one number for each of {len(effects)} effects, got {len(weights)}")
+        self.weights = tuple(check_number("weights", weight, low=1e-9) for weight in weights)
+
+    def _gates(self, source: draws.Stream) -> tuple[Tensor, list[Tensor]]:
+        """As for `Compose`, those of the effects by a choice for each sample."""
+        values = draws.uniform(source, 2)
+        gate, choice = values[:, 0] < self.p, values[:, 1] * sum(self.weights)
+        ends = constant(self.weights, device=choice.device).cumsum(dim=0)[:-1]
+        chosen = torch.bucketize(choice, ends, right=True)
+        return gate, [gate & (chosen == i) for i in range(len(self.effects))]
+
+    def fitted(self, params: ComposeParams, height: int, width: int) -> "Compose":
+        """As for `Compose`; exact, too, for parameters by which several effects act on a sample."""
+        acting = torch.stack([child.gate for child in params.children]).sum(dim=0)
+        fitted = super().fitted(params, height, width)
+        if self.tolerance_px is None or is_true((acting <= 1).all, of=acting) is not False:
+            return fitted
+        exact = copy(fitted)
+        exact.tolerance_px = None
+        return exact
+
+    def _joined(self, sets: Sequence[Sequence[tuple[int, ...]]]) -> list[tuple[int, ...]]:
+        return list(itertools.chain.from_iterable(sets))

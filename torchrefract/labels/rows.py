@@ -19,8 +19,11 @@ def siblings_of(paths: list[Any], i: int) -> dict[str, int]:
     return {str(path[-1].key).lower(): k for k, path in enumerate(paths) if path[:-1] == place[:-1]}
 
 
-def companions(sample: Any, leaves: list[Any], siblings: dict[str, int], i: int, labels_getter: Any) -> list[int]:
+def companions(
+    sample: Any, paths: list[Any], leaves: list[Any], siblings: dict[str, int], i: int, labels_getter: Any
+) -> list[int]:
     """The places of the boxes at i and of all that has a row for each of them."""
+    place = paths[i]
     count = leaves[i].shape[0]
     masks = [k for k in siblings.values() if is_tv(leaves[k], "Mask") and leaves[k].ndim > 2]
     rows = [i, *(k for k in masks if leaves[k].shape[0] == count)]
@@ -33,18 +36,19 @@ def companions(sample: Any, leaves: list[Any], siblings: dict[str, int], i: int,
     elif not siblings:
         raise ValueError("target must hold boxes in a dict with their labels to drop some, got them outside of one")
     else:
-        rows += _labels(leaves, siblings)
+        beside = pytree.key_get(sample, place[:-1])
+        rows += _labels({str(key).lower(): value for key, value in beside.items()}, siblings)
     for k in rows:
         if leaves[k].shape[:1] != (count,):
             raise ValueError(f"labels must have one row for each of the {count} boxes, got {tuple(leaves[k].shape)}")
     return sorted(set(rows))
 
 
-def _labels(leaves: list[Any], siblings: Mapping[str, int]) -> list[int]:
-    keys = ["labels"] if "labels" in siblings else [key for key in siblings if "label" in key][:1]
+def _labels(beside: Mapping[str, Any], siblings: Mapping[str, int]) -> list[int]:
+    keys = ["labels"] if "labels" in beside else [key for key in beside if "label" in key][:1]
     for key in keys:
-        if not isinstance(leaves[siblings[key]], Tensor):
-            kind = type(leaves[siblings[key]]).__name__
+        if not isinstance(beside[key], Tensor):
+            kind = type(beside[key]).__name__
             raise TypeError(f"{key} must be a tensor for boxes to be dropped, got {kind}")
     return [siblings[key] for key in keys]
 

@@ -121,7 +121,7 @@ def _warp_sample(sample: Any, flow: Tensor, options: _Options, labels_getter: An
         if not is_tv(leaves[i], "BoundingBoxes"):
             hide(values, leaves, siblings, one.flags)
         elif options.drop:
-            for k in companions(sample, leaves, siblings, i, labels_getter):
+            for k in companions(sample, paths, leaves, siblings, i, labels_getter):
                 values[k] = kept(values[k], one.flags)
     return pytree.tree_unflatten(values, spec)
 

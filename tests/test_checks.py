@@ -1,5 +1,7 @@
 import math
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -41,7 +43,18 @@ def test_a_number_outside_its_bounds_raises(value, rule):
         check_number("p", value, low=0.0, high=1.0)
 
 
-@pytest.mark.parametrize("value", ["1", None, True, [1.0], 1j, torch.tensor(1.0)])
+def test_numbers_of_numpy_are_numbers():
+    numbers: list[Any] = [np.float32(0.5), np.int64(1), np.int8(0), np.uint8(3), np.float64(3)]
+    half, one, zero, three, broken = numbers
+    found = [check_number("p", half), check_number("p", one), *check_range("r", (zero, one))]
+    assert [(value, type(value)) for value in found] == [(0.5, float), (1.0, float), (0.0, float), (1.0, float)]
+    count = check_count("steps", three)
+    assert (count, type(count)) == (3, int)
+    with pytest.raises(TypeError, match="steps must be a whole number, got"):
+        check_count("steps", broken)
+
+
+@pytest.mark.parametrize("value", ["1", None, True, np.True_, [1.0], 1j, torch.tensor(1.0), np.array([1.0])])
 def test_what_is_no_real_number_raises(value):
     with pytest.raises(TypeError, match="p must be a real number, got"):
         check_number("p", value)

@@ -1,6 +1,7 @@
 """Argument checks, in one form: `<argument> must <condition>, got <value>`."""
 
 import math
+import numbers
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -15,7 +16,7 @@ _LARGEST = sys.float_info.max
 
 def check_number(name: str, value: float, *, low: float = -_LARGEST, high: float = _LARGEST) -> float:
     """`value` as a float in [low, high]; NaN never is, and infinity only where a bound is."""
-    _check_real(name, value)
+    value = _check_real(name, value)
     if not low <= value <= high:
         raise ValueError(f"{name} must be a number {_bounds(low, high)}, got {value}")
     return float(value)
@@ -32,11 +33,10 @@ def check_range(name: str, value: Sequence[float], *, low: float = -_LARGEST, hi
     """`value` as (low, high), both ends inside the bounds."""
     if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 2:
         raise ValueError(f"{name} must be (low, high), got {value!r}")
-    for end in value:
-        _check_real(name, end)
-    if not low <= value[0] <= value[1] <= high:
+    first, last = (_check_real(name, end) for end in value)  # Hydra hands over its own list type
+    if not low <= first <= last <= high:
         raise ValueError(f"{name} must be (low, high), low <= high, each {_bounds(low, high)}, got {tuple(value)}")
-    return float(value[0]), float(value[1])  # Hydra hands over its own list type
+    return float(first), float(last)
 
 
 def check_flag(name: str, value: bool) -> bool:
@@ -52,11 +52,18 @@ def check_choice(name: str, value: str, choices: Sequence[str]) -> str:
 
 
 def check_count(name: str, value: int, *, low: int = 1) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise TypeError(f"{name} must be a whole number, got {value!r}")
+    value = check_whole(name, value)
     if value < low:
         raise ValueError(f"{name} must be at least {low}, got {value}")
     return value
+
+
+def check_whole(name: str, value: int) -> int:
+    """`value` as an int; numbers of numpy are numbers, flags are none."""
+    # Compilers know int, and ask no further.
+    if isinstance(value, bool) or not isinstance(value, int | numbers.Integral):
+        raise TypeError(f"{name} must be a whole number, got {value!r}")
+    return value if isinstance(value, int) else int(value)
 
 
 def check_tensor(name: str, value: Tensor) -> Tensor:
@@ -120,11 +127,13 @@ def read(tensor: Callable[[], Tensor], *, of: Tensor | None = None) -> Any:
         return None
 
 
-def _check_real(name: str, value: float) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
+def _check_real(name: str, value: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float | numbers.Real):
         raise TypeError(f"{name} must be a real number, got {value!r}")
     if math.isnan(value):
         raise ValueError(f"{name} must not be NaN, got {value}")
+    # Small types of numpy cannot be compared with large bounds.
+    return value if isinstance(value, int | float) else float(value)
 
 
 def _bounds(low: float, high: float) -> str:

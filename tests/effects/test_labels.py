@@ -1,5 +1,7 @@
 """What an effect does to the labels beside its image."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor, nn
@@ -27,6 +29,12 @@ def sample(size: tuple[int, int] = (64, 96)) -> tuple[Tensor, dict]:
         "name": "frame 1",
     }
     return torch.rand(3, height, width), target
+
+
+def acts(effect: Effect, images: Tensor, seed: int) -> list[bool]:
+    """Of each sample, whether it is moved by the draw that torch's seed gives."""
+    torch.manual_seed(seed)
+    return (effect.degrade(images).flow != 0).flatten(1).any(dim=1).tolist()
 
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: type(effect).__name__)
@@ -84,6 +92,37 @@ def test_labels_of_what_stays_where_it_is_are_not_clipped():
     _, moved = LensDistortion()(image, target)
     assert moved["labels"].tolist() == [0]
     assert not torch.equal(moved["second"], second)
+
+
+def test_labels_of_a_sample_that_stays_are_not_clipped_beside_one_that_moves():
+    effect, images = ThinPlateSpline(amplitude_range=(6.0, 9.0), p=0.5), torch.rand(2, 3, 40, 56)
+    seed = next(seed for seed in range(99) if acts(effect, images, seed) == [True, False])
+    size: dict[str, Any] = {"canvas_size": (40, 56)}
+    points = torch.tensor([[-3.0, -2.0], [20.0, 10.0]])
+    sample = {
+        "boxes": tv_tensors.BoundingBoxes(torch.tensor([[-5.0, -5, 20, 20], [80, 5, 90, 9]]), format="XYXY", **size),
+        "labels": torch.arange(2),
+        "points": tv_tensors.KeyPoints(points, **size),
+        "visible": torch.ones(2),
+    }
+    torch.manual_seed(seed)
+    _, (moved, stayed) = effect(images, [sample, sample])
+    assert moved["labels"].tolist() == [0]
+    assert moved["visible"].tolist() == [0, 1]
+    for name, value in sample.items():
+        assert torch.equal(stayed[name], value), name
+    batch = {
+        "points": tv_tensors.KeyPoints(torch.stack([points, points]), **size),
+        "visible": torch.ones(2, 2),
+        "second": tv_tensors.Image(torch.rand(2, 3, 40, 56)),
+    }
+    torch.manual_seed(seed)
+    _, both = effect(images, batch)
+    assert both["visible"].tolist() == [[0, 1], [1, 1]]
+    for name in ("points", "second"):
+        assert torch.equal(both[name][1], batch[name][1]), name
+        assert not torch.equal(both[name][0], batch[name][0]), name
+        assert type(both[name]) is type(batch[name])
 
 
 def test_light_moves_no_label():

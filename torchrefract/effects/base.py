@@ -8,12 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_number, is_true
+from torchrefract._checks import check_all, check_number, check_whole
 from torchrefract.effects.door import Layout, check_depth_fits, check_image, enter, leave
 from torchrefract.effects.plan import check_size
 from torchrefract.effects.rows import Undrawn, at_frames
 from torchrefract.labels.rows import is_tv, wrapped
-from torchrefract.labels.targets import warp_labels
+from torchrefract.labels.targets import follow
 from torchrefract.types import Degraded, Range
 from torchrefract.warping.grid import field_dtype
 
@@ -40,7 +40,8 @@ class Effect(nn.Module, ABC):
         """The image degraded, by a draw that torch's global generator seeds; beside a target, both of them.
 
         The target is any nesting of torchvision's tv_tensors and plain values. What has a place in the image moves as
-        by `warp_labels`, which says what raises; light moves nothing.
+        by `warp_labels`, which says what raises; light moves nothing, and labels of a sample that stays where it is are
+        neither clipped nor filtered.
         """
         if len(target) > 1:
             raise TypeError(f"target must be one, of any nesting, got {len(target)}")
@@ -50,12 +51,11 @@ class Effect(nn.Module, ABC):
         if not target:
             return result
         flow = degraded.flow
-        # Labels of what stays where it is are not clipped or filtered either.
-        if flow is None or is_true((flow == 0).all, of=flow):
+        if flow is None:
             return result, target[0]
         if flow.ndim == 5:
             raise TypeError("target must be None beside several clips: warp_labels moves that of each, got one for all")
-        return result, warp_labels(target[0], flow)
+        return result, follow(target[0], flow)
 
     def degrade(
         self,
@@ -228,9 +228,13 @@ class Effect(nn.Module, ABC):
 
 
 def _seed(seed: int | Tensor) -> int | Tensor:
-    if isinstance(seed, bool) or not isinstance(seed, int | Tensor):
-        raise TypeError(f"seed must be a whole number, got {seed!r}")
-    return seed
+    if not isinstance(seed, Tensor):
+        return check_whole("seed", seed)
+    if seed.is_floating_point() or seed.is_complex() or seed.dtype is torch.bool:
+        raise TypeError(f"seed must be a whole number, got {seed.dtype}")
+    if seed.numel() != 1:
+        raise ValueError(f"seed must be one number, got shape {tuple(seed.shape)}")
+    return seed.reshape(())
 
 
 def _keys(keys: Tensor | Sequence[int] | None, batch: int) -> Tensor | range:

@@ -1,5 +1,7 @@
 """How masks and depth follow a flow."""
 
+import numbers
+
 import torch
 from torch import Tensor
 
@@ -98,5 +100,5 @@ def _check_fill(fill: float, dtype: torch.dtype) -> None:
         check_number("fill", fill)
         return
     low, high = (0, 1) if dtype is torch.bool else (torch.iinfo(dtype).min, torch.iinfo(dtype).max)
-    if not isinstance(fill, int) or not low <= fill <= high:
+    if not isinstance(fill, int | numbers.Integral) or not low <= fill <= high:
         raise ValueError(f"fill must be a whole number in [{low}, {high}] for {dtype}, got {fill}")

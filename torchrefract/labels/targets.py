@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from torchrefract._checks import check_choice, check_flag, check_tensor
+from torchrefract._checks import check_choice, check_flag, check_tensor, is_true
 from torchrefract.labels.boxes import check_policy, warp_boxes, warp_outlines
 from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.points import STEPS, TOLERANCE_PX, check_rows, land, on_frame
@@ -38,6 +38,7 @@ class _Options(NamedTuple):
     mask_fill: float
     padding: str
     interpolation: str
+    leave: bool = False  # samples as they are that the flow leaves where they are
 
 
 class _Moved(NamedTuple):
@@ -86,7 +87,8 @@ def warp_labels(
         padding, interpolation: of images and videos, as for `warp`.
 
     Raises:
-        TypeError: something in the target that could not be moved and is not plain.
+        TypeError: something in the target that could not be moved and is not plain; labels of boxes to drop that are
+            no tensor.
         ValueError: shapes that do not fit, options out of their range, boxes to drop outside of a dict, where
             what belongs to them cannot be known (boxes alone may be dropped).
     """
@@ -101,6 +103,16 @@ def warp_labels(
     if labels_getter is not None and labels_getter != "default" and not callable(labels_getter):
         raise ValueError(f"labels_getter must be 'default', a function or None, got {labels_getter!r}")
     options = _Options(min_area, min_visibility, clip, drop, soft_masks, mask_fill, padding, interpolation)
+    return _warp_target(target, flow, options, labels_getter)
+
+
+def follow(target: Any, flow: Tensor) -> Any:
+    """As by `warp_labels`, but labels of a sample that stays where it is are neither clipped nor filtered."""
+    options = _Options(0.0, 0.0, True, True, False, 0, "zeros", "bilinear", leave=True)
+    return _warp_target(target, flow, options, "default")
+
+
+def _warp_target(target: Any, flow: Tensor, options: _Options, labels_getter: Any) -> Any:
     if flow.ndim == 4 and type(target) in (list, tuple):
         if len(target) != flow.shape[0]:
             raise ValueError(f"target must have one sample for each of the {flow.shape[0]} flows, got {len(target)}")
@@ -110,9 +122,14 @@ def warp_labels(
 
 
 def _warp_sample(sample: Any, flow: Tensor, options: _Options, labels_getter: Any) -> Any:
+    still = (flow == 0).flatten(-3).all(dim=-1) if options.leave else None
+    if still is not None and is_true(still.all, of=still):
+        return sample
     pairs, spec = pytree.tree_flatten_with_path(sample)
     paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]
     moved = [_move(leaf, flow, options) for leaf in leaves]
+    if still is not None:
+        moved = [_left(leaf, one, still) for leaf, one in zip(leaves, moved, strict=True)]
     values = [one.value for one in moved]
     for i, one in enumerate(moved):
         if one.flags is None:
@@ -124,6 +141,19 @@ def _warp_sample(sample: Any, flow: Tensor, options: _Options, labels_getter: An
             for k in companions(sample, paths, leaves, siblings, i, labels_getter):
                 values[k] = kept(values[k], one.flags)
     return pytree.tree_unflatten(values, spec)
+
+
+def _left(leaf: Any, moved: _Moved, still: Tensor) -> _Moved:
+    """What is moved of a leaf, but for the samples, () or (B,), that stay where they are."""
+    if moved.value is leaf:
+        return moved
+
+    def rows(value: Tensor) -> Tensor:
+        return still.to(value.device).view(*still.shape, *[1] * (value.ndim - still.ndim))
+
+    before, after = (value.as_subclass(Tensor) for value in (leaf, moved.value))
+    flags = None if moved.flags is None else moved.flags | rows(moved.flags)
+    return _Moved(wrapped(torch.where(rows(after), before, after), leaf), flags)
 
 
 def _move(leaf: Any, flow: Tensor, options: _Options) -> _Moved:

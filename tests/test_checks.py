@@ -1,4 +1,5 @@
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from torchrefract._checks import (
     check_number,
     check_range,
     check_tensor,
+    check_within,
     is_true,
     read,
 )
@@ -41,6 +43,13 @@ def test_a_number_inside_its_bounds_comes_back_as_a_float():
 def test_a_number_outside_its_bounds_raises(value, rule):
     with pytest.raises(ValueError, match=rule):
         check_number("p", value, low=0.0, high=1.0)
+
+
+def test_what_lies_within_but_for_rounding_passes_and_what_does_not_is_told():
+    check_within("v", torch.tensor([1e-3, 5.0, 1e6 * (1 + 5e-6), 1e-3 * (1 - 5e-6)], dtype=torch.float64), 1e-3, 1e6)
+    for value in (9e-4, 1.1e6, math.inf, -1.0):
+        with pytest.raises(ValueError, match=re.escape(f"v must lie in [0.001, 1e+06], got {value:g}")):
+            check_within("v", torch.tensor([1.0, value]), 1e-3, 1e6)
 
 
 def test_numbers_of_numpy_are_numbers():

@@ -92,6 +92,13 @@ def check_all(name: str, condition: str, value: Tensor, test: Callable[[Tensor],
         raise ValueError(f"{name} must {condition}, got {wrong[0].item():g}")
 
 
+def check_within(name: str, value: Tensor, low: float, high: float) -> None:
+    """Raise unless all of `value` lies in [low, high], but for rounding, where looking costs no wait for a device."""
+    room = 1e-5
+    ends = low - room * abs(low), high + room * abs(high)
+    check_all(name, f"lie in [{low:g}, {high:g}]", value, lambda v: (v >= ends[0]) & (v <= ends[1]))
+
+
 def is_true(predicate: Callable[[], Tensor], *, of: Tensor | None = None) -> bool | None:
     """The truth of a one-element tensor, or None where reading it would wait for a device or break a graph.
 

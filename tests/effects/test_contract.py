@@ -459,6 +459,38 @@ def test_params_change_type_together_but_for_their_flags(case):
     assert {value.device.type for value in params.to("meta")} == {"meta"}
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
+def test_params_of_a_smaller_type_than_fields_are_widened(case, dtype):
+    image = picture(3, 3, 20, 30, dtype=torch.float64 if dtype is torch.float32 else torch.float32)
+    effect = Compose([case.strong(p=0.7)])
+    rounded = effect.sample(image, seed=7).to(dtype)
+    found, expected = effect.apply(image, rounded), effect.apply(image, rounded.to(image.dtype))
+    assert_same(maps(found), maps(expected))
+    assert {value.dtype for value in maps(found).values() if value.is_floating_point()} == {image.dtype}
+
+
+def attempt(effect: Effect, image: Tensor, params: Any) -> Degraded | ValueError:
+    try:
+        return effect.apply(image, params)
+    except ValueError as error:
+        return error
+
+
+@pytest.mark.parametrize("value", [1e5, -1e5, 1e10, -1e10, 1e20, 3e38, -3e38, 1e-10, 1e-38])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_numbers_far_outside_are_refused_or_give_numbers(case, value):
+    effect, image = case.strong(), picture(2, 3, 24, 32)
+    params = effect.sample(image, seed=1)
+    for name in case.fields:
+        far = params._replace(**{name: torch.full_like(getattr(params, name), value)})
+        found = attempt(effect, image, far)
+        if isinstance(found, ValueError):
+            assert name in str(found)
+            continue
+        for which, shown in maps(found).items():
+            assert shown.isfinite().all(), (name, which)
+
+
 def test_params_of_a_smaller_type_are_still_those_of_the_draw(case):
     image = picture(3, 3, 8, 9, dtype=torch.float64)
     params = case.strong(p=0.5).sample(image, seed=7)

@@ -217,7 +217,8 @@ def test_arguments_out_of_range_raise(options: dict[str, Any]):
         ("visibility", -5.0, "be above 0"),
         ("deviation", -1.0, "be above -1"),
         ("deviation", math.inf, "be above -1"),
-        ("airlight", math.inf, "be finite"),
+        ("airlight", math.inf, r"lie in \[0, 1\]"),
+        ("airlight", 1.01, r"lie in \[0, 1\]"),
     ],
 )
 def test_params_out_of_range_raise(field, value, rule):

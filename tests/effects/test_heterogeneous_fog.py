@@ -338,7 +338,7 @@ def test_arguments_of_another_kind_raise(wrong: dict[str, Any]):
     ("field", "value", "rule"),
     [
         ("weights", -0.1, "be at least 0 and finite"),
-        ("contrast", -0.1, "be at least 0 and finite"),
+        ("contrast", -0.1, r"lie in \[0, 2\]"),
         ("decorrelation", 0.0, "be above 0"),
         ("visibility", 0.0, "be above 0"),
     ],

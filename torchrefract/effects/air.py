@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._bands import join, rows_at_once
-from torchrefract._checks import check_all, check_flag, check_number, learns
+from torchrefract._checks import check_all, check_flag, check_number, check_within, learns
 from torchrefract._constants import constant
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.color import check_color, each_channel
@@ -183,4 +183,4 @@ def check_fog_params(params: Any, image: Tensor) -> None:
             raise ValueError(f"params.{name} must have shape (B,), got {tuple(getattr(params, name).shape)}")
     check_all("params.visibility", "be above 0", params.visibility, lambda v: v > 0)
     check_all("params.deviation", "be above -1", params.deviation, lambda v: (v > -1) & v.isfinite())
-    check_all("params.airlight", "be finite", params.airlight, torch.isfinite)
+    check_within("params.airlight", params.airlight, 0.0, 1.0)

@@ -11,7 +11,7 @@ from torchrefract import draws
 from torchrefract._checks import check_all, check_number, check_whole
 from torchrefract.effects.door import Layout, check_depth_fits, check_image, enter, leave
 from torchrefract.effects.plan import check_size
-from torchrefract.effects.rows import Undrawn, at_frames
+from torchrefract.effects.rows import Undrawn, at_frames, widened
 from torchrefract.labels.rows import is_tv, wrapped
 from torchrefract.labels.targets import follow
 from torchrefract.types import Degraded, Range
@@ -115,13 +115,15 @@ class Effect(nn.Module, ABC):
     ) -> Any:
         """The image degraded by parameters that are given, as by those of an earlier draw -> Degraded.
 
-        With `frame` they are those of the same draw at another frame of its clip. With a function as its one argument
+        With `frame` they are those of the same draw at another frame of its clip. Parameters of a smaller type than
+        fields have are taken in that of fields. With a function as its one argument
         this is `nn.Module.apply`, so that an effect can sit inside a model.
         """
         if params is None and callable(image) and not isinstance(image, Tensor):
             return super().apply(cast(Callable[[nn.Module], None], image))
         layout = check_image(image)
         self.check_params(params, _samples(image, layout))
+        params = widened(params, field_dtype(image.dtype))
         if frame is not None:
             params = at_frames(params, lambda: _frames(frame, image, layout))
         return self.fitted(params, *image.shape[-2:])._run(image, layout, params, depth)

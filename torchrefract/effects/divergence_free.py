@@ -6,13 +6,13 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_choice, check_count, check_range
+from torchrefract._checks import check_choice, check_count
 from torchrefract.effects.base import params_to
 from torchrefract.effects.field_plan import FieldPlan, FieldRanges, field_plan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, lies_in
-from torchrefract.effects.random_field import check_field_params, field_on_lattice, random_field
+from torchrefract.effects.random_field import check_field_params, check_field_range, field_on_lattice, random_field
 from torchrefract.effects.rows import column, spread
 from torchrefract.fields.covariance import COVARIANCES
 from torchrefract.fields.modes import Modes
@@ -89,8 +89,8 @@ class DivergenceFree(LatticeWarp):
         super().__init__(
             padding=padding, interpolation=interpolation, resampler=resampler, tolerance_px=tolerance_px, p=p
         )
-        self.amplitude_range = check_range("amplitude_range", amplitude_range, low=0.0, high=1e4)
-        self.length_range = check_range("length_range", length_range, low=1e-3, high=1e6)
+        self.amplitude_range = check_field_range("amplitude", amplitude_range)
+        self.length_range = check_field_range("length", length_range)
         self.wind_x_range = check_wind("wind_x_range", wind_x_range)
         self.wind_y_range = check_wind("wind_y_range", wind_y_range)
         self.decorrelation_range = check_decorrelation(decorrelation_range)
@@ -113,7 +113,7 @@ class DivergenceFree(LatticeWarp):
 
     def check(self, params: DivergenceFreeParams, image: Tensor) -> None:
         """Raise for swirls that are none."""
-        check_field_params(params, at_least_zero=("amplitude",))
+        check_field_params(params)
 
     def flow(self, params: DivergenceFreeParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
         """The flow, frame by frame, and where it exists: everywhere."""

@@ -8,7 +8,15 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_choice, check_number, check_positive, check_range, or_else
+from torchrefract._checks import (
+    check_all,
+    check_choice,
+    check_number,
+    check_positive,
+    check_range,
+    check_within,
+    or_else,
+)
 from torchrefract._constants import constant
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.air import check_fog_params, distances, make_air
@@ -37,6 +45,8 @@ from torchrefract.fields.perlin_lattice import Octave, octave
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 from torchrefract.warping.lattice import Lattice
+
+_FLATTEST, _STARKEST = 0.0, 2.0  # of the contrast
 
 
 class HeterogeneousFogParams(NamedTuple):
@@ -135,7 +145,7 @@ class HeterogeneousFog(PlannedLight):
         self.reference_width = check_positive("reference_width", reference_width)
         self.normalize = check_choice("normalize", normalize, ("theory", "image"))
         self.mean = check_choice("mean", mean, ("image", "ensemble"))
-        self.contrast_range = check_range("contrast_range", contrast_range, low=0.0, high=2.0)
+        self.contrast_range = check_range("contrast_range", contrast_range, low=_FLATTEST, high=_STARKEST)
         self.reach = check_number("reach", reach, low=1.0, high=1e5)
         self.wind_x_range = check_wind("wind_x_range", wind_x_range)
         self.wind_y_range = check_wind("wind_y_range", wind_y_range)
@@ -179,10 +189,11 @@ class HeterogeneousFog(PlannedLight):
             raise ValueError(f"params.weights must be (B, {len(self.scales)}), got {tuple(params.weights.shape)}")
         if params.contrast.ndim != 1:
             raise ValueError(f"params.contrast must have shape (B,), got {tuple(params.contrast.shape)}")
-        for name in ("weights", "contrast"):
-            value = getattr(params, name)
-            check_all(f"params.{name}", "be at least 0 and finite", value, lambda v: v.isfinite() & (v >= 0))
-        check_all("params.weights", "have a sum above 0", params.weights.sum(dim=1), lambda v: v > 0)
+        check_within("params.contrast", params.contrast, _FLATTEST, _STARKEST)
+        weights, sums = params.weights, params.weights.sum(dim=1)
+        check_all("params.weights", "be at least 0 and finite", weights, lambda v: v.isfinite() & (v >= 0))
+        check_all("params.weights", "have a sum above 0", sums, lambda v: v > 0)
+        check_all("params.weights", "have a finite sum", sums, torch.isfinite)
 
     def acts(self, params: HeterogeneousFogParams) -> Tensor:
         """The samples whose air is not clear."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_flag, check_range, is_true, read
+from torchrefract._checks import check_all, check_flag, check_range, check_within, is_true, read
 from torchrefract._constants import constant
 from torchrefract.cameras.distortion import ALL_TERMS, POLYNOMIAL12
 from torchrefract.cameras.models import Camera
@@ -25,6 +25,7 @@ from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice, SmoothFlow
 
 _LARGEST = 100.0  # coefficient
+_FARTHEST = 1e10  # widths
 _MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors are another model in another order)"
 
 
@@ -276,8 +277,8 @@ def check_lens(params: Any, batch: int, *, count: int = 12, what: str = _MODEL, 
         if value.shape != (batch, width):
             raise ValueError(f"params.{name} must have shape (B, {width}), {meaning}, got {tuple(value.shape)}")
     check_all("params.coefficients", f"lie in [-{bound:g}, {bound:g}]", params.coefficients, lambda v: v.abs() <= bound)
-    check_all("params.focal", "be positive and finite", params.focal, lambda v: (v > 0) & v.isfinite())
-    check_all("params.center", "be finite", params.center, torch.isfinite)
+    check_within("params.focal", params.focal, 1 / _FARTHEST, _FARTHEST)
+    check_within("params.center", params.center, -_FARTHEST, _FARTHEST)
 
 
 def in_px(params: Any, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,24 +1,27 @@
 """What the effects of random fields share."""
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrefract import white_noise
-from torchrefract._checks import check_all, read
+from torchrefract._checks import check_range, check_within, read
 from torchrefract.effects.motion import check_motion, is_still
 from torchrefract.effects.rows import spread
 from torchrefract.fields.evolution import evolved, turn_rates
 from torchrefract.fields.gaussian import gaussian_random_field, spectrum
 from torchrefract.fields.modes import Modes, evolved_modes, mode_amplitude, mode_field, mode_noise, mode_turn_rates
 from torchrefract.fields.torus import torus
+from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice
 
 # A covariance that is off by twice this is told.
 _CLIPPED = 1e-3
+# px
+FIELD_BOUNDS: dict[str, Range] = {"amplitude": (0.0, 1e4), "length": (1e-3, 1e6), "aperture": (0.0, 1e4)}
 
 
 def random_field(
@@ -99,17 +102,22 @@ def field_on_lattice(params: Any, modes: Modes, lattice: Lattice, *, aperture: b
     return mode_field(noise, (down, across), modes, *places)
 
 
-def check_field_params(params: Any, *, at_least_zero: Sequence[str]) -> None:
-    """Raise for parameters of a random field with a `length`, a `key` and what moves them that are none."""
-    for name in (*at_least_zero, "length"):
+def check_field_range(name: str, value: Range) -> Range:
+    """The range of one of `FIELD_BOUNDS`."""
+    low, high = FIELD_BOUNDS[name]
+    return check_range(f"{name}_range", value, low=low, high=high)
+
+
+def check_field_params(params: Any) -> None:
+    """Raise for parameters of a random field, some of `FIELD_BOUNDS`, a `key` and what moves them, that are none."""
+    bounds = {name: ends for name, ends in FIELD_BOUNDS.items() if name in params._fields}
+    for name in bounds:
         if getattr(params, name).ndim != 1:
             raise ValueError(f"params.{name} must have shape (B,), got {tuple(getattr(params, name).shape)}")
     check_key(params)
     check_motion(params, axes=2)
-    for name in at_least_zero:
-        value = getattr(params, name)
-        check_all(f"params.{name}", "be at least 0 and finite", value, lambda v: v.isfinite() & (v >= 0))
-    check_all("params.length", "be above 0 and finite", params.length, lambda v: v.isfinite() & (v > 0))
+    for name, ends in bounds.items():
+        check_within(f"params.{name}", getattr(params, name), *ends)
 
 
 def check_key(params: Any) -> None:

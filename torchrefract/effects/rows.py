@@ -59,6 +59,17 @@ def at_frames(params: Any, frames: Callable[[], Tensor]) -> Any:
     return params._replace(frame=frames()) if "frame" in params._fields else params
 
 
+def widened(params: Any, dtype: torch.dtype) -> Any:
+    """The parameters, those that are floating in the given type or a wider one: fields are never half."""
+    if isinstance(params, Undrawn):
+        return params.then(lambda found: widened(found, dtype))
+    if isinstance(params, Tensor):
+        return params.to(torch.promote_types(params.dtype, dtype)) if params.is_floating_point() else params
+    if "children" in params._fields:
+        return params._replace(children=tuple(widened(child, dtype) for child in params.children))
+    return type(params)(*(widened(value, dtype) for value in params))
+
+
 def frame_mean(value: Tensor) -> Tensor:
     """(N, C, 1, 1), the mean over the frame of (N, C, H, W), to the same bits in any batch and on any thread."""
     # By rows, which no threads share.

@@ -278,8 +278,10 @@ def test_a_depth_of_one_frame_for_a_clip_is_static_by_its_shape_or_raises():
     ("frame", "rule"),
     [
         (math.nan, "not be NaN, got nan"),
-        (math.inf, "be a number that is finite, got inf"),
-        (torch.tensor([1.0, math.nan]), "be finite, got nan"),
+        (math.inf, r"be a number in \[-1e\+09, 1e\+09\], got inf"),
+        (torch.tensor([1.0, math.nan]), r"lie in \[-1e\+09, 1e\+09\], got nan"),
+        (torch.tensor([1.0, 3e38]), r"lie in \[-1e\+09, 1e\+09\], got 3e\+38"),
+        (-3e38, r"be a number in \[-1e\+09, 1e\+09\], got -3e\+38"),
     ],
 )
 def test_a_frame_that_is_no_number_raises(frame, rule):

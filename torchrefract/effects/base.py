@@ -8,8 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_number, check_whole
+from torchrefract._checks import check_all, check_number, check_whole, check_within
 from torchrefract.effects.door import Layout, check_depth_fits, check_image, enter, leave
+from torchrefract.effects.motion import LATEST_FRAME
 from torchrefract.effects.plan import check_size
 from torchrefract.effects.rows import Undrawn, at_frames, widened
 from torchrefract.labels.rows import is_tv, wrapped
@@ -74,7 +75,7 @@ class Effect(nn.Module, ABC):
             keys: (B,), whole numbers: sample i depends on (seed, keys[i]) alone; None counts from 0.
             depth: (B, 1, H, W) or (1, H, W), m, for the effects that ask for it; of clips (B, T, 1, H, W), or
                 (B, 1, 1, H, W) if it is the same in all frames.
-            frame: the number of the image in its clip, or of a clip's first frame; a number, or (B,).
+            frame: the number of the image in its clip, or of a clip's first frame, in [-1e9, 1e9]; a number, or (B,).
 
         Raises:
             ValueError, TypeError: arguments that do not fit.
@@ -116,8 +117,8 @@ class Effect(nn.Module, ABC):
         """The image degraded by parameters that are given, as by those of an earlier draw -> Degraded.
 
         With `frame` they are those of the same draw at another frame of its clip. Parameters of a smaller type than
-        fields have are taken in that of fields. With a function as its one argument
-        this is `nn.Module.apply`, so that an effect can sit inside a model.
+        fields have are taken in that of fields. With a function as its one argument this is `nn.Module.apply`, so that
+        an effect can sit inside a model.
         """
         if params is None and callable(image) and not isinstance(image, Tensor):
             return super().apply(cast(Callable[[nn.Module], None], image))
@@ -263,13 +264,13 @@ def _frames(first: float | Tensor, image: Tensor, layout: Layout) -> Tensor:
     """(B, T), the numbers of the frames."""
     options: Any = {"dtype": field_dtype(image.dtype), "device": image.device}
     if not isinstance(first, Tensor):
-        first = check_number("frame", first)
+        first = check_number("frame", first, low=-LATEST_FRAME, high=LATEST_FRAME)
         if layout.frames == 1:
             return torch.full((layout.batch, 1), first, **options)
     start = torch.as_tensor(first, **options)
     if start.ndim > 1 or (start.ndim == 1 and start.shape[0] not in (1, layout.batch)):
         raise ValueError(f"frame must be a number, or one for each of {layout.batch} samples, got {tuple(start.shape)}")
-    check_all("frame", "be finite", start, torch.isfinite)
+    check_within("frame", start, -LATEST_FRAME, LATEST_FRAME)
     return start.view(-1, 1).expand(layout.batch, 1) + torch.arange(layout.frames, **options)
 
 

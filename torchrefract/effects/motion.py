@@ -10,7 +10,7 @@ from torchrefract.types import Range
 
 _FASTEST = 1e6  # of the wind
 _SHORTEST = 1e-3  # frames
-_LONGEST = 1e9  # frames: with the fastest wind, places that float64 still tells apart
+LATEST_FRAME = 1e9  # either way: with the fastest wind, places that float64 still tells apart
 
 
 def check_wind(name: str, value: Range) -> Range:
@@ -48,7 +48,7 @@ def check_motion(params: Any, *, axes: int) -> None:
 
 def tame(frame: Tensor, wind: Tensor, decorrelation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The three as they are; still, where they are no numbers and nothing may be read, or lead beyond float64."""
-    frame, wind = or_else(frame, 0.0).clamp(-_LONGEST, _LONGEST), or_else(wind, 0.0).clamp(-_FASTEST, _FASTEST)
+    frame, wind = or_else(frame, 0.0).clamp(-LATEST_FRAME, LATEST_FRAME), or_else(wind, 0.0).clamp(-_FASTEST, _FASTEST)
     return frame, wind, torch.where(decorrelation > 0, decorrelation.clamp(min=_SHORTEST), torch.inf)
 
 
@@ -56,7 +56,7 @@ def check_frame(params: Any) -> None:
     """Raise unless `frame`, (B, T), numbers frames that clips may have."""
     if params.frame.ndim != 2:
         raise ValueError(f"params.frame must have shape (B, T), got {tuple(params.frame.shape)}")
-    check_within("params.frame", params.frame, -_LONGEST, _LONGEST)
+    check_within("params.frame", params.frame, -LATEST_FRAME, LATEST_FRAME)
 
 
 def is_still(params: Any) -> bool:

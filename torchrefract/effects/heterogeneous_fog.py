@@ -8,15 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import (
-    check_all,
-    check_choice,
-    check_number,
-    check_positive,
-    check_range,
-    check_within,
-    or_else,
-)
+from torchrefract._checks import check_choice, check_number, check_positive, check_range, check_within, or_else
 from torchrefract._constants import constant
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.air import check_fog_params, distances, make_air
@@ -37,7 +29,7 @@ from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.radiance import Shaded
 from torchrefract.effects.random_field import check_key
 from torchrefract.effects.rows import column, frame_mean, spread
-from torchrefract.effects.scales import check_scales, chosen, periods, shares, stretched
+from torchrefract.effects.scales import check_scales, check_weights, chosen, periods, shares, stretched
 from torchrefract.fields.fog import drifting_transmission_, transmission
 from torchrefract.fields.fog_volume import path_mean
 from torchrefract.fields.perlin import Nodes, perlin_noise
@@ -185,15 +177,10 @@ class HeterogeneousFog(PlannedLight):
         check_fog_params(params, image)
         check_key(params)
         check_motion(params, axes=3)
-        if params.weights.shape[1:] != (len(self.scales),):
-            raise ValueError(f"params.weights must be (B, {len(self.scales)}), got {tuple(params.weights.shape)}")
+        check_weights(params.weights, len(self.scales))
         if params.contrast.ndim != 1:
             raise ValueError(f"params.contrast must have shape (B,), got {tuple(params.contrast.shape)}")
         check_within("params.contrast", params.contrast, _FLATTEST, _STARKEST)
-        weights, sums = params.weights, params.weights.sum(dim=1)
-        check_all("params.weights", "be at least 0 and finite", weights, lambda v: v.isfinite() & (v >= 0))
-        check_all("params.weights", "have a sum above 0", sums, lambda v: v > 0)
-        check_all("params.weights", "have a finite sum", sums, torch.isfinite)
 
     def acts(self, params: HeterogeneousFogParams) -> Tensor:
         """The samples whose air is not clear."""

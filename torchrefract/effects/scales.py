@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_number, check_positive, or_else
+from torchrefract._checks import check_all, check_number, check_positive, or_else
 from torchrefract.fields.perlin import perlin_noise
 from torchrefract.fields.perlin_lattice import Octave
 
@@ -71,6 +71,16 @@ def stretched(octave: Octave) -> Tensor:
     noise = perlin_noise([octave], octave.x.new_ones(octave.x.shape[0], 1))
     low, high = noise.detach().amin(dim=(2, 3), keepdim=True), noise.detach().amax(dim=(2, 3), keepdim=True)
     return torch.where(high > low, (noise - low) / torch.where(high > low, high - low, 1), 0.5)
+
+
+def check_weights(weights: Tensor, count: int) -> None:
+    """Raise unless these are `params.weights`, (B, count), of noises."""
+    if weights.shape[1:] != (count,):
+        raise ValueError(f"params.weights must be (B, {count}), got {tuple(weights.shape)}")
+    check_all("params.weights", "be at least 0 and finite", weights, lambda v: v.isfinite() & (v >= 0))
+    sums = weights.sum(dim=1)
+    check_all("params.weights", "have a sum above 0", sums, lambda v: v > 0)
+    check_all("params.weights", "have a finite sum", sums, torch.isfinite)
 
 
 def shares(weights: Tensor) -> Tensor:

@@ -99,6 +99,11 @@ def check_within(name: str, value: Tensor, low: float, high: float) -> None:
     check_all(name, f"lie in [{low:g}, {high:g}]", value, lambda v: (v >= ends[0]) & (v <= ends[1]))
 
 
+def is_whole(value: Tensor) -> bool:
+    """Whether a tensor is of a type of whole numbers; flags are none."""
+    return not (value.is_floating_point() or value.is_complex() or value.dtype is torch.bool)
+
+
 def is_true(predicate: Callable[[], Tensor], *, of: Tensor | None = None) -> bool | None:
     """The truth of a one-element tensor, or None where reading it would wait for a device or break a graph.
 

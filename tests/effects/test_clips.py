@@ -121,9 +121,10 @@ def test_masks_of_a_video_move_frame_by_frame():
     assert not torch.equal(target["masks"].as_subclass(Tensor), mask)
 
 
-def test_a_target_beside_several_clips_raises():
-    with pytest.raises(TypeError, match="target must be None beside several clips"):
-        EFFECTS["turbulence"](clips(2, 3, 3, 20, 30), {"id": 1})
+def test_a_target_beside_several_clips_raises_whether_they_move_or_not():
+    for effect in (EFFECTS["turbulence"], tr.Turbulence(p=0)):
+        with pytest.raises(TypeError, match="target must be None beside several clips"):
+            effect(clips(2, 3, 3, 20, 30), {"id": 1})
     _, target = EFFECTS["fog"](clips(2, 3, 3, 20, 30), {"id": 1})
     assert target == {"id": 1}
 

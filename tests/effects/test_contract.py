@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
+from domain import WARNED
 from torch import Tensor, nn
 from torch.testing import assert_close
 from torch.utils.data import DataLoader, Dataset
@@ -477,7 +478,7 @@ def attempt(effect: Effect, image: Tensor, params: Any) -> Degraded | ValueError
 
 
 @pytest.mark.parametrize("value", [1e5, -1e5, 1e10, -1e10, 1e20, 3e38, -3e38, 1e-10, 1e-38])
-@pytest.mark.filterwarnings("ignore::UserWarning")
+@WARNED
 def test_numbers_far_outside_are_refused_or_give_numbers(case, value):
     effect, image = case.strong(), picture(2, 3, 24, 32)
     params = effect.sample(image, seed=1)

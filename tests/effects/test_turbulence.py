@@ -104,6 +104,7 @@ def test_wrong_arguments_raise(options, rule):
     ("field", "value", "rule"),
     [
         ("length", 0.0, r"params.length must lie in \[0.001, 1e\+06\]"),
+        ("length", -1.0, r"params.length must lie in \[0.001, 1e\+06\]"),
         ("length", 1e10, r"params.length must lie in \[0.001, 1e\+06\]"),
         ("length", math.nan, "params.length must not be NaN"),
         ("amplitude", -1.0, r"params.amplitude must lie in \[0, 10000\]"),

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_number, check_whole, check_within
+from torchrefract._checks import check_all, check_number, check_whole, check_within, is_whole
 from torchrefract.effects.door import Layout, check_depth_fits, check_image, enter, leave
 from torchrefract.effects.motion import LATEST_FRAME
 from torchrefract.effects.plan import check_size
@@ -233,7 +233,7 @@ class Effect(nn.Module, ABC):
 def _seed(seed: int | Tensor) -> int | Tensor:
     if not isinstance(seed, Tensor):
         return check_whole("seed", seed)
-    if seed.is_floating_point() or seed.is_complex() or seed.dtype is torch.bool:
+    if not is_whole(seed):
         raise TypeError(f"seed must be a whole number, got {seed.dtype}")
     if seed.numel() != 1:
         raise ValueError(f"seed must be one number, got shape {tuple(seed.shape)}")
@@ -246,7 +246,7 @@ def _keys(keys: Tensor | Sequence[int] | None, batch: int) -> Tensor | range:
     # An empty list has no type of its own.
     dtype = None if isinstance(keys, Tensor) or len(keys) else torch.int64
     keys = torch.as_tensor(keys, dtype=dtype)
-    if keys.is_floating_point() or keys.is_complex() or keys.dtype is torch.bool:
+    if not is_whole(keys):
         raise TypeError(f"keys must be whole numbers, got {keys.dtype}")
     if keys.reshape(-1).shape[0] != batch or keys.ndim > 1:
         raise ValueError(f"keys must have one key for each of the {batch} images, got shape {tuple(keys.shape)}")

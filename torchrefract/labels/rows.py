@@ -23,7 +23,6 @@ def companions(
     sample: Any, paths: list[Any], leaves: list[Any], siblings: dict[str, int], i: int, labels_getter: Any
 ) -> list[int]:
     """The places of the boxes at i and of all that has a row for each of them."""
-    place = paths[i]
     count = leaves[i].shape[0]
     masks = [k for k in siblings.values() if is_tv(leaves[k], "Mask") and leaves[k].ndim > 2]
     rows = [i, *(k for k in masks if leaves[k].shape[0] == count)]
@@ -36,7 +35,7 @@ def companions(
     elif not siblings:
         raise ValueError("target must hold boxes in a dict with their labels to drop some, got them outside of one")
     else:
-        beside = pytree.key_get(sample, place[:-1])
+        beside = pytree.key_get(sample, paths[i][:-1])
         rows += _labels({str(key).lower(): value for key, value in beside.items()}, siblings)
     for k in rows:
         if leaves[k].shape[:1] != (count,):

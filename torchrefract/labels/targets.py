@@ -30,14 +30,14 @@ _SAMPLES = 64
 
 
 class _Options(NamedTuple):
-    min_area: float
-    min_visibility: float
-    clip: bool
-    drop: bool
-    soft_masks: bool
-    mask_fill: float
-    padding: str
-    interpolation: str
+    min_area: float = 0.0
+    min_visibility: float = 0.0
+    clip: bool = True
+    drop: bool = True
+    soft_masks: bool = False
+    mask_fill: float = 0
+    padding: str = "zeros"
+    interpolation: str = "bilinear"
     leave: bool = False  # samples as they are that the flow leaves where they are
 
 
@@ -108,8 +108,7 @@ def warp_labels(
 
 def follow(target: Any, flow: Tensor) -> Any:
     """As by `warp_labels`, but labels of a sample that stays where it is are neither clipped nor filtered."""
-    options = _Options(0.0, 0.0, True, True, False, 0, "zeros", "bilinear", leave=True)
-    return _warp_target(target, flow, options, "default")
+    return _warp_target(target, flow, _Options(leave=True), "default")
 
 
 def _warp_target(target: Any, flow: Tensor, options: _Options, labels_getter: Any) -> Any:
@@ -128,7 +127,7 @@ def _warp_sample(sample: Any, flow: Tensor, options: _Options, labels_getter: An
     pairs, spec = pytree.tree_flatten_with_path(sample)
     paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]
     moved = [_move(leaf, flow, options) for leaf in leaves]
-    if still is not None:
+    if still is not None and is_true(still.any, of=still) is not False:
         moved = [_left(leaf, one, still) for leaf, one in zip(leaves, moved, strict=True)]
     values = [one.value for one in moved]
     for i, one in enumerate(moved):

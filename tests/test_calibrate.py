@@ -97,12 +97,14 @@ def test_pictures_that_show_no_board_are_named_with_a_reason(call, pictures, tmp
     cv2.imwrite(str(pictures / "mirrored.png"), gray[:, ::-1])
     cv2.imwrite(str(pictures / "odd.png"), cv2.resize(gray, (320, 200)))
     (pictures / "empty.png").touch()
+    (pictures / "dead.png").symlink_to("gone.png")
     assert call("calibrate", *WORDS).code == 0
     report = (tmp_path / "calibration" / "report.md").read_text()
     assert "| blurred.png | no board found; it is blurred, its sharpest edges are " in report
     assert "| mirrored.png | mirrored: flipped from left to right it shows " in report
     assert "| odd.png | 320 x 200 px, others are of 640 x 400 |" in report
     assert "| empty.png | no picture: pictures/empty.png is empty (0 bytes) |" in report
+    assert "| dead.png | no picture: pictures/dead.png cannot be opened (No such file or directory) |" in report
 
 
 def test_a_wrong_definition_says_what_was_found_and_keeps_it(call, pictures, tmp_path):

@@ -414,7 +414,8 @@ def frames(tmp_path) -> list[torch.Tensor]:
     squares = np.random.default_rng(0).integers(0, 256, (12, 24, 32, 3), dtype=np.uint8)
     for t, values in enumerate(squares):
         Image.fromarray(values).save(tmp_path / "drive" / f"frame{t}.png")
-    (tmp_path / "drive" / "notes.txt").touch()
+    for name in ("notes.txt", "._frame3.png"):
+        (tmp_path / "drive" / name).touch()
     return [torch.from_numpy(values).movedim(-1, 0)[None] / 255 for values in squares]
 
 

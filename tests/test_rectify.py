@@ -155,6 +155,13 @@ def test_a_damaged_picture_is_named_and_skipped(call, folder):
     assert outcome.out.startswith("out: 2 rectified, 0 were there already, 1 skipped")
 
 
+def test_a_picture_of_another_shape_is_named_and_skipped(call, folder):
+    cv2.imwrite(str(folder / "raw" / "wide.png"), np.zeros((10, 90, 3), np.uint8))
+    outcome = call("rectify", "input=raw", "camera=cam.yaml", "out=out")
+    assert outcome.err.startswith("skipped: raw/wide.png: image must have the shape of the camera's frames, ")
+    assert outcome.out.startswith("out: 3 rectified, 0 were there already, 1 skipped")
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -178,7 +185,10 @@ def test_a_damaged_picture_is_named_and_skipped(call, folder):
         ),
         (("input=raw", "camera=cam.yaml", "zoom=0"), "zoom: zoom must be a number in [0.05, 20], got 0"),
         (("input=raw", "camera=cam.yaml", "out=raw"), "out must be another folder than that of input, got raw"),
-        (("input=wide.png", "camera=cam.yaml"), "input must hold what can be rectified, got image must have the shape"),
+        (
+            ("input=wide.png", "camera=cam.yaml"),
+            "input must hold what can be rectified, got wide.png: image must have the shape",
+        ),
     ],
 )
 def test_a_wrong_word_is_one_line_of_error(call, folder, words, message):

@@ -3,11 +3,13 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
 from PIL import Image
 
+from torchrefract.data.paired_folder import PairedFolder
 from torchrefract.restoration.checkpoints import read_checkpoint
 
 # A run that goes on leaves best.ckpt of the one before where it is; Lightning says so.
@@ -129,6 +131,52 @@ def test_a_stopped_run_goes_on_at_its_epoch_and_ends_as_if_never_stopped(call, s
 def test_a_finished_run_says_that_nothing_is_left_to_do(call, trained):
     outcome = call("train", *trained.words, f"ckpt_path={trained.folder / 'last.ckpt'}", "hydra.run.dir=run")
     assert "trainer.max_epochs" in outcome.message
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ("+task=undistort", "scene=cape_town_fog"),
+            "data: effect must have a flow, as a lens has, got HeterogeneousFog",
+        ),
+        (
+            ("+task=deweather", "task.transmission_head=true", "scene=cheap_dashcam"),
+            "data: effect must have a transmission, as fog has, got LensDistortion",
+        ),
+        (("+task=undistort", "run_dir=/dev/null/run"), "run_dir: "),
+        (("+task=undistort", "model.lr=nan"), "model: lr must not be NaN, got nan"),
+        (("+task=undistort", "model.weight_decay=-1"), "model: weight_decay must be a number of at least 0, got -1"),
+        (("+task=undistort", "model.warmup_steps=-1"), "model: warmup_steps must be at least 0, got -1"),
+        (("+task=undistort", "model.metric_size=[1080]"), "model: metric_size must be (height, width), got [1080]"),
+    ],
+)
+def test_what_cannot_be_trained_is_one_line_of_error(call, small, words, message):
+    assert call("train", *small, *words).message.startswith(message)
+
+
+def test_a_run_folder_that_is_not_there_yet_is_made(call, small, tmp_path):
+    assert call("train", "+task=undistort", *small, "trainer.max_epochs=1", "run_dir=new/run").code == 0
+    assert sorted(path.name for path in (tmp_path / "new" / "run").iterdir()) == FILES
+
+
+def test_a_damaged_pair_is_one_line_of_error(call, small, tmp_path):
+    (tmp_path / "frames").mkdir()
+    for drive in "ab":
+        for i in range(4):
+            pixels = np.random.default_rng(i).integers(0, 256, (36, 48, 3), dtype=np.uint8)
+            Image.fromarray(pixels).save(tmp_path / "frames" / f"{drive}_{i}.png")
+    words = ("scene=cheap_dashcam", "source=frames", "out=out", "license=CC0", "workers=0")
+    assert call("generate", *words).code == 0
+    stored = PairedFolder(tmp_path / "out", split="train")
+    last = stored.row(len(stored) - 1)
+    (tmp_path / "out" / last.files["clean.png"].path).write_bytes(b"")
+    model = [word for word in small if not word.startswith("data.")]
+    options = ("data=pairs", "data.root=out", "data.batch_size=2", "data.workers=1")
+    outcome = call("train", "+task=undistort", *model, *options)
+    assert outcome.code == 1
+    message = f"error: pair {last.number} in out must be whole, got out/{last.files['clean.png'].path} is "
+    assert outcome.err.splitlines()[-1].startswith(message), outcome.err
 
 
 def test_deweathering_is_trained_by_the_same_command(call, small, tmp_path):

@@ -66,6 +66,13 @@ def check_whole(name: str, value: int) -> int:
     return value if isinstance(value, int) else int(value)
 
 
+def check_size(name: str, size: Sequence[int]) -> tuple[int, int]:
+    """`size` as (height, width), two whole numbers of at least 1."""
+    if isinstance(size, str) or not isinstance(size, Sequence) or len(size) != 2:
+        raise ValueError(f"{name} must be (height, width), got {size!r}")
+    return check_count(name, size[0]), check_count(name, size[1])
+
+
 def check_tensor(name: str, value: Tensor) -> Tensor:
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")

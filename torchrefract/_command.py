@@ -25,6 +25,7 @@ from yaml import YAMLError
 from torchrefract._config import CONFIG_DIR
 from torchrefract._errors import UsageError
 from torchrefract.data.images import UnreadableImageError
+from torchrefract.data.pair_files import DamagedPairError
 
 _T = TypeVar("_T")
 _INFORMING = ("--help", "-h", "--hydra-help", "--info", "--shell-completion", "-sc")
@@ -176,7 +177,7 @@ def _mendable(error: Exception, name: str) -> str | None:
         return f"{group} must be one of {', '.join(error.options or [])}, got {option}"
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key} must be given, as in {error.full_key}=…, got nothing"
-    if isinstance(error, UnreadableImageError):
+    if isinstance(error, UnreadableImageError | DamagedPairError):
         return str(error).strip().splitlines()[-1].split("Error: ", 1)[-1]  # a worker prepends its traceback
     if isinstance(error, UsageError | HydraException | OmegaConfBaseException | YAMLError):
         unknown = _UNKNOWN.match(str(error)) if name else None

@@ -40,6 +40,7 @@ def make_job(cfg: DictConfig, *, needs_checkpoint: bool = False) -> Job:
     made = Job(make(cfg, "data"), make(cfg, "model"), _trainer(cfg))
     with naming("data"):
         made.data.check_ranks(made.trainer.world_size)
+        made.data.check_pair()
     if checkpoint is not None:
         check_fits(checkpoint, made.model, path, config=cfg.model)
         if not needs_checkpoint:
@@ -47,8 +48,10 @@ def make_job(cfg: DictConfig, *, needs_checkpoint: bool = False) -> Job:
     if not needs_checkpoint:
         _add_origin(cfg, made)
     if made.trainer.is_global_zero:
-        with replacing(Path(cfg.run_dir, "config.yaml")) as path:
-            OmegaConf.save(cfg, path)
+        with naming("run_dir"):
+            Path(cfg.run_dir).mkdir(parents=True, exist_ok=True)
+            with replacing(Path(cfg.run_dir, "config.yaml")) as path:
+                OmegaConf.save(cfg, path)
     return made
 
 

@@ -14,7 +14,7 @@ from torchrefract._files import replacing
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.detection import View, detect, is_enough
 from torchrefract.cameras.calibration.diagnosis import edge_width, explain, what_instead
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, pixels_of, read_image
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, pixels_of, read_image
 
 _VERSION = 2  # of the file; another one is not read
 _MOST_OF = 0.75  # of the pictures that must be of one size
@@ -38,8 +38,7 @@ def pictures_of(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise UsageError(f"images must be a folder of pictures, got {folder}, which is none")
-    files = sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() in EXTENSIONS)
-    if not files:
+    if not (files := files_in(folder)):
         raise UsageError(f"images must be a folder that holds {', '.join(EXTENSIONS)}, got {folder}")
     return files
 
@@ -109,8 +108,11 @@ def _look(file: Path, board: Board) -> Look:
 
 
 def _stamp(file: Path) -> str:
-    """Changes with the file."""
-    stat = file.stat()
+    """Changes with the file; empty where there is none."""
+    try:
+        stat = file.stat()
+    except OSError:
+        return ""
     return f"{stat.st_size} {stat.st_mtime_ns}"
 
 

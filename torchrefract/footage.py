@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrefract._errors import UsageError
 from torchrefract.data.frame_folder import walk
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, image_size
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, image_size
 from torchrefract.videos import VIDEOS, read_video, video_facts, write_video
 
 _FPS = 25.0  # of a video that does not say
@@ -26,9 +26,8 @@ def find_footage(source: Path, *, deep: bool = False) -> Sequence[Path]:
     if not source.exists():
         raise UsageError(f"input must be a folder, a picture or a video, got {source}, which does not exist")
     known = (*EXTENSIONS, *VIDEOS)
-    # What is hidden is no picture of the user's, but a file that a stop has left half written.
-    inside = walk(source) if deep else source.glob("[!.]*")
-    files = sorted(file for file in (inside if source.is_dir() else [source]) if file.suffix.lower() in known)
+    inside = [source] if not source.is_dir() else sorted(walk(source)) if deep else files_in(source, known)
+    files = [file for file in inside if file.suffix.lower() in known]
     if not files:
         raise UsageError(f"input must be, or hold, {', '.join(known)}, got {source}")
     names = [written_as(file) for file in files]

@@ -17,12 +17,12 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from torchrefract._checks import check_choice, check_count, check_flag, check_number
+from torchrefract._checks import check_choice, check_count, check_flag, check_number, check_size
 from torchrefract._command import check_seed, command, job, make, naming, with_text
 from torchrefract._config import CONFIG_DIR
 from torchrefract._errors import UsageError
 from torchrefract._files import replacing
-from torchrefract.data.images import check_size
+from torchrefract.data.frame_folder import some
 from torchrefract.data.pair_files import FORMATS
 from torchrefract.data.pair_manifest import manifests, scan
 from torchrefract.effects.base import Effect
@@ -188,8 +188,8 @@ def _workers(cfg: DictConfig) -> int:
 
 def _tell(asked: _Asked, there: set[int], damaged: int) -> None:
     frames = len(asked.sources.frames)
-    if asked.sources.skipped:
-        print(f"{asked.sources.skipped} files of the source cannot be read")
+    if skipped := asked.sources.skipped:
+        print(f"{len(skipped)} files of the source cannot be read: {some(skipped)}")
     if asked.sources.alone:
         print("the source has a single drive, which cannot be split: all of it is for training")
     if asked.number > frames:

@@ -15,12 +15,12 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchrefract._checks import check_count, check_number, check_positive
+from torchrefract._checks import check_count, check_number, check_positive, check_size
 from torchrefract._command import check_seed, command, job, make, naming, with_picture
 from torchrefract._config import CONFIG_DIR
 from torchrefract._errors import UsageError
 from torchrefract._files import replacing
-from torchrefract.data.images import EXTENSIONS, check_size, fit, image_size, read_image
+from torchrefract.data.images import EXTENSIONS, files_in, fit, image_size, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
 from torchrefract.fields.depth import check_depth
@@ -112,7 +112,7 @@ def _subject(cfg: DictConfig) -> _Subject:
 def _read(path: Path, most: int) -> Footage:
     """The first frames of a video or a folder, or a picture that stands still."""
     if path.is_dir():
-        files = sorted((file for file in path.iterdir() if file.suffix.lower() in EXTENSIONS), key=_natural)[:most]
+        files = sorted(files_in(path), key=_natural)[:most]
         if not files:
             raise UsageError(f"image must be a folder that holds {', '.join(EXTENSIONS)}, got {path}")
         return Footage(len(files), lambda times: _of_one_size((t, files[t].name, read_image(files[t])) for t in times))

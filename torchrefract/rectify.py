@@ -53,9 +53,9 @@ def main(cfg: DictConfig) -> None:
     for file in progress(files, "rectifying", count=len(files)):
         try:
             made += _rectify(file, lens, out)
-        except (UnreadableImageError, ValueError) as error:
-            failed[file] = str(error)
-            print(f"skipped: {error}", file=sys.stderr)
+        except ValueError as error:
+            failed[file] = str(error) if isinstance(error, UnreadableImageError) else f"{file}: {error}"
+            print(f"skipped: {failed[file]}", file=sys.stderr)
     if len(failed) == len(files):
         raise UsageError(f"input must hold what can be rectified, got {next(iter(failed.values()))}")
     there = len(files) - len(failed) - made

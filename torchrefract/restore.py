@@ -14,12 +14,12 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchrefract._checks import check_count, check_flag
+from torchrefract._checks import check_count, check_flag, check_size
 from torchrefract._command import as_they_are, command, job, naming, progress
 from torchrefract._config import CONFIG_DIR
 from torchrefract._errors import UsageError
 from torchrefract._files import replacing
-from torchrefract.data.images import UnreadableImageError, check_size, pixels_of, read_image
+from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
 from torchrefract.footage import (
     check_apart,
     find_footage,

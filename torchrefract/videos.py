@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._levels import numbers_of
-from torchrefract.data.images import UnreadableImageError
+from torchrefract.data.images import opened
 
 # OpenCV and its FFmpeg write to the terminal on their own; what goes wrong is raised as an error.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
@@ -43,7 +43,8 @@ def video_facts(path: Path) -> tuple[int, float]:
     capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
     count, fps = (capture.get(key) for key in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
     capture.release()
-    return round(count), fps
+    # For what it cannot open FFmpeg says -1.
+    return max(0, round(count)), max(0.0, fps)
 
 
 def write_video(pages: Iterable[np.ndarray], path: Path, *, fps: float, size: tuple[int, int]) -> int:
@@ -73,7 +74,5 @@ def write_video(pages: Iterable[np.ndarray], path: Path, *, fps: float, size: tu
 
 
 def _check_opens(path: Path) -> None:
-    try:
-        path.open("rb").close()
-    except OSError as error:
-        raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
+    with opened(path):
+        return

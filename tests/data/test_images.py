@@ -1,4 +1,5 @@
 import io
+import os
 
 import cv2
 import numpy as np
@@ -7,7 +8,7 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from torchrefract.data.images import UnreadableImageError, fit, image_size, pixels_of, read_image
+from torchrefract.data.images import UnreadableImageError, files_in, fit, image_size, pixels_of, read_image
 
 RNG = np.random.default_rng(0)
 PIXELS = RNG.integers(0, 256, (36, 50, 3), dtype=np.uint8)
@@ -194,6 +195,24 @@ def test_what_is_no_picture_is_named_with_the_reason(tmp_path, read, data, reaso
 def test_a_missing_file_is_named_with_the_reason(tmp_path, read):
     with pytest.raises(UnreadableImageError, match=r"gone\.jpg cannot be opened \(No such file"):
         read(tmp_path / "gone.jpg")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+@pytest.mark.parametrize("read", [read_image, image_size])
+def test_a_pipe_is_not_waited_for(tmp_path, read):
+    os.mkfifo(tmp_path / "frame.jpg")
+    with pytest.raises(UnreadableImageError, match=r"frame\.jpg cannot be opened \(a pipe or a device\)"):
+        read(tmp_path / "frame.jpg")
+
+
+def test_the_files_of_a_folder_are_listed_by_name_without_folders_and_what_is_hidden(tmp_path):
+    for name in ("b.png", "a.JPG", "notes.txt", "._b.png", "dead.png"):
+        (tmp_path / name).touch()
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "dead.png").unlink()
+    (tmp_path / "dead.png").symlink_to("gone.png")  # what somebody wanted to be there is to be told
+    assert [file.name for file in files_in(tmp_path)] == ["a.JPG", "b.png", "dead.png"]
+    assert [file.name for file in files_in(tmp_path, (".txt",))] == ["notes.txt"]
 
 
 def test_damage_between_header_and_end_is_found_on_reading(tmp_path, capfd):

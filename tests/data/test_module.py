@@ -111,6 +111,28 @@ def test_an_effect_without_a_transmission_cannot_be_asked_for_it():
         make_pair(frame, LensDistortion(), seed=0, transmission=True)
 
 
+def test_an_effect_without_a_flow_cannot_be_asked_for_it():
+    frame = Frame(torch.rand(2, 3, *SIZE), torch.arange(2), torch.empty(2, 0))
+    with pytest.raises(ValueError, match="effect must have a flow, as a lens has, got UniformFog"):
+        make_pair(frame, UniformFog(), seed=0, flow=True)
+    # One that could move some sample has it, whatever was drawn.
+    assert not make_pair(frame, LensDistortion(p=0.0), seed=0, flow=True).flow.any()
+
+
+@pytest.mark.parametrize(
+    ("effect", "asked", "message"),
+    [
+        (UniformFog(), {"flow": True}, "effect must have a flow, as a lens has, got UniformFog"),
+        (LensDistortion(), {"transmission": True}, "effect must have a transmission, as fog has, got LensDistortion"),
+    ],
+)
+def test_data_says_at_once_that_its_pairs_will_lack_a_map(effect, asked, message):
+    data = road_scenes(effect=effect, size=SIZE, train_count=4, val_count=4, batch_size=2, workers=0, **asked)
+    with pytest.raises(ValueError, match=message):
+        data.check_pair()
+    road_scenes(effect=effect, size=SIZE, train_count=4, val_count=4, batch_size=2, workers=0).check_pair()
+
+
 def test_a_pair_in_fog_moves_nothing_and_is_valid_everywhere():
     pair = make_pair(Frame(torch.rand(2, 3, *SIZE), torch.arange(2), torch.empty(2, 0)), UniformFog(), seed=0)
     assert torch.equal(pair.flow, torch.zeros(2, 2, *SIZE))

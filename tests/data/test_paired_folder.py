@@ -94,6 +94,15 @@ def test_pairs_without_a_transmission_cannot_be_asked_for_it(made):
         folder[0]
 
 
+def test_pairs_without_a_flow_cannot_be_asked_for_it(made):
+    out = made(scene=("scene=paper_weather",))
+    with pytest.raises(ValueError, match="root must hold pairs with a flow, as of a lens, got 0 in "):
+        PairedFolder(out, flow=True)[0]
+    with pytest.raises(ValueError, match="root must hold pairs with a flow, as of a lens, got "):
+        pairs(root=out, batch_size=4, workers=0, flow=True).check_pair()
+    pairs(root=made(out="moved"), batch_size=4, workers=0, flow=True).check_pair()
+
+
 def test_twenty_steps_of_training_from_disk_have_the_losses_of_training_on_the_fly(made, source):
     stored = pairs(root=made("count=16"), batch_size=2, workers=0)
     live = frames(root=source, effect=presets.paper_refractive(width=192), size=SIZE, batch_size=2, workers=0)

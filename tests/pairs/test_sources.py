@@ -1,5 +1,6 @@
 """Frames of videos are those of the video, in whatever order they are asked for."""
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -98,4 +99,15 @@ def test_pictures_beside_videos_are_refused(call, videos, frames, tmp_path):
     (both / "a.mp4").symlink_to(videos / "a.mp4")
     (both / "a.png").symlink_to(frames / "drive0" / "000.png")
     words = ("scene=limpopo_sun_glare", "source=both", "out=out", "license=CC0")
-    assert call("generate", *words).message == "source must hold pictures or videos, got both in both"
+    message = "source must hold pictures or videos, got both in both, such as a.png and a.mp4"
+    assert call("generate", *words).message == message
+
+
+def test_videos_that_cannot_be_read_are_named_and_left_out(call, videos, tmp_path):
+    shutil.copytree(videos, tmp_path / "videos")
+    whole = (videos / "a.mp4").read_bytes()
+    (tmp_path / "videos" / "cut.mp4").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "videos" / "empty.mp4").touch()
+    assert find_sources(tmp_path / "videos", **OPTIONS).skipped == ["cut.mp4", "empty.mp4"]
+    words = ("scene=limpopo_sun_glare", "source=videos", "out=out", "license=CC0", "workers=0", "count=2")
+    assert "2 files of the source cannot be read: cut.mp4, empty.mp4\n" in call("generate", *words).out

@@ -19,8 +19,8 @@ from typing import NamedTuple, NoReturn
 import torch
 from torch.utils.data import Dataset
 
-from torchrefract._checks import check_choice, check_number
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, check_size, fit, image_size, read_image
+from torchrefract._checks import check_choice, check_number, check_size
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, image_size, read_image
 from torchrefract.types import Frame
 
 _SPLITS = {"train": "train", "val": "val", "valid": "val", "validation": "val"}  # names of folders that are a split
@@ -207,9 +207,7 @@ def _select_given(root: Path, found: list[str], *, split: str, given: dict[str, 
     drives = {name: _drives(group, "auto", below=1 if name else 0) for name, group in groups.items()}
     shared = sorted(set(drives["train"].values()) & set(drives["val"].values()) - {_NO_NAME})
     if shared:
-        message = (
-            f"train and val in {root} both hold frames of {_some(shared)}, by name; a drive belongs in one of them"
-        )
+        message = f"train and val in {root} both hold frames of {some(shared)}, by name; a drive belongs in one of them"
         warnings.warn(message, stacklevel=4)
     if split == "all":
         return drives["train"] | drives["val"] | drives[""]
@@ -242,7 +240,7 @@ def val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: float, see
         )
     if 2 * len(frames) > len(drive_of) > _SHOWN:
         message = (
-            f"{len(drive_of)} frames in {root} seem to come from {len(frames)} drives ({_some(sorted(frames))}): if "
+            f"{len(drive_of)} frames in {root} seem to come from {len(frames)} drives ({some(sorted(frames))}): if "
             "that is wrong, train and val share drives; put each drive in a sub-folder of its own"
         )
         warnings.warn(message, stacklevel=4)
@@ -262,7 +260,7 @@ def _check_frames(root: Path, paths: list[str], size: tuple[int, int]) -> tuple[
         results = list(pool.map(_size_or_reason, [root / path for path in paths]))
     skipped = [(root / path, result) for path, result in zip(paths, results, strict=True) if isinstance(result, str)]
     if skipped:
-        examples = _some([f"{path.relative_to(root).as_posix()} {reason}" for path, reason in skipped])
+        examples = some([f"{path.relative_to(root).as_posix()} {reason}" for path, reason in skipped])
         if len(skipped) > _BAD_SHARE * len(paths):
             raise ValueError(
                 f"root must hold readable frames, got {len(skipped)} of {len(paths)} in {root} that are not: "
@@ -274,7 +272,7 @@ def _check_frames(root: Path, paths: list[str], size: tuple[int, int]) -> tuple[
     small = [f"{path} of {H}x{W}" for path, (H, W) in sizes.items() if size[0] > H or size[1] > W]
     if small:
         raise ValueError(
-            f"frames must be at least size = {size[0]}x{size[1]} (height x width), got {_some(small)} in {root}; "
+            f"frames must be at least size = {size[0]}x{size[1]} (height x width), got {some(small)} in {root}; "
             "ask for a smaller size or remove them"
         )
     return list(sizes), skipped
@@ -287,7 +285,8 @@ def _size_or_reason(path: Path) -> tuple[int, int] | str:
         return str(error).removeprefix(f"{path} ")
 
 
-def _some(names: Sequence[str]) -> str:
+def some(names: Sequence[str]) -> str:
+    """The first names, and how many more there are."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + more
 

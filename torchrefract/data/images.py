@@ -7,6 +7,7 @@ length that WebP and BMP state at their start.
 
 import io
 import os
+import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +20,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from torchrefract._checks import check_count, check_tensor
+from torchrefract._checks import check_size, check_tensor
 from torchrefract._levels import levels_of, numbers_of
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
@@ -52,7 +53,8 @@ def read_image(path: str | Path) -> Tensor:
 
 def read_pixels(path: str | Path) -> np.ndarray:
     """The picture of `read_image` as the file has it: (H, W, 3), RGB, uint8 or uint16."""
-    data = _bytes(path)
+    with opened(path) as stream:
+        data = stream.read()
     _check_whole(path, io.BytesIO(data), len(data))
     if data.startswith(_PNG) and not png_fits(data):
         raise UnreadableImageError(f"{path} is damaged: its parts are not as long as they say")
@@ -82,12 +84,34 @@ def image_size(path: str | Path) -> tuple[int, int]:
     A file that lacks its end, is empty, or is no picture raises UnreadableImageError, as `read_image` does; one that
     is damaged in between is found by `read_image` alone.
     """
+    with opened(path) as stream:
+        _check_whole(path, stream, os.fstat(stream.fileno()).st_size)
+        return _header_size(path, stream)
+
+
+@contextmanager
+def opened(path: str | Path) -> Iterator[BinaryIO]:
+    """A file to read from; what the system says against it is an UnreadableImageError.
+
+    A pipe is refused: opening it would wait for somebody who writes.
+    """
     try:
+        mode = os.stat(path).st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise UnreadableImageError(f"{path} cannot be opened (a pipe or a device)")
         with open(path, "rb") as stream:
-            _check_whole(path, stream, os.fstat(stream.fileno()).st_size)
-            return _header_size(path, stream)
+            yield stream
     except OSError as error:
         raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
+
+
+def files_in(folder: Path, suffixes: Sequence[str] = EXTENSIONS) -> list[Path]:
+    """The files of a folder whose names end so, in any case, by name; folders and hidden files aside.
+
+    What is hidden is no picture of the user's, but what a stop has left half written, or another system's notes.
+    """
+    found = (file for file in folder.glob("[!.]*") if file.suffix.lower() in suffixes)
+    return sorted(file for file in found if not file.is_dir())
 
 
 def png_fits(data: bytes) -> bool:
@@ -129,26 +153,12 @@ def fit(image: Tensor, size: Sequence[int]) -> Tensor:
     return torch.from_numpy(small).permute(2, 0, 1).contiguous().clamp_(0, 1)
 
 
-def check_size(name: str, size: Sequence[int]) -> tuple[int, int]:
-    """`size` as (height, width), two whole numbers of at least 1."""
-    if isinstance(size, str) or not isinstance(size, Sequence) or len(size) != 2:
-        raise ValueError(f"{name} must be (height, width), got {size!r}")
-    return check_count(name, size[0]), check_count(name, size[1])
-
-
 def _check_image(image: Tensor) -> None:
     check_tensor("image", image)
     if image.ndim != 3 or image.shape[0] != 3:
         raise ValueError(f"image must have shape (3, H, W), got {tuple(image.shape)}")
     if image.dtype != torch.float32 or image.device.type != "cpu":
         raise TypeError(f"image must be float32 on the CPU, got {image.dtype} on {image.device}")
-
-
-def _bytes(path: str | Path) -> bytes:
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
 
 
 def _header_size(path: str | Path, stream: BinaryIO) -> tuple[int, int]:

@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import torch
 from pytorch_lightning import LightningDataModule
-from torch.utils.data import DataLoader, Dataset, DistributedSampler
+from torch.utils.data import DataLoader, Dataset, DistributedSampler, default_collate
 
 from torchrefract._checks import check_count, check_flag
 from torchrefract.data.frame_folder import FrameFolder
@@ -32,6 +32,7 @@ class PairData(LightningDataModule):
         workers: processes that read or render frames; 0 does it in the training process.
         seed: of the draws and of the order.
         transmission: whether pairs made on the fly have theirs.
+        flow: whether they must have one.
     """
 
     def __init__(
@@ -44,13 +45,14 @@ class PairData(LightningDataModule):
         workers: int = 2,
         seed: int = 0,
         transmission: bool = False,
+        flow: bool = False,
     ):
         super().__init__()
         self.train, self.val, self.effect = train, val, effect
         self.batch_size = check_count("batch_size", batch_size)
         self.workers = check_count("workers", workers, low=0)
         self.seed = check_count("seed", seed, low=0)
-        self.transmission = check_flag("transmission", transmission)
+        self.asked = {"transmission": check_flag("transmission", transmission), "flow": check_flag("flow", flow)}
         self.check_ranks(1)
 
     def check_ranks(self, ranks: int) -> None:
@@ -59,6 +61,12 @@ class PairData(LightningDataModule):
         if count < self.batch_size:
             share = "" if ranks == 1 else f" that each of {ranks} processes has"
             raise ValueError(f"batch_size must be at most the {count} training frames{share}, got {self.batch_size}")
+
+    def check_pair(self) -> None:
+        """Raise ValueError where the first pair cannot be had, or lacks what is asked for."""
+        first = self.train[0]
+        if isinstance(first, Frame) and self.effect is not None:
+            make_pair(default_collate([first]), self.effect, seed=0, **self.asked)
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Batches of frames, or pairs, in an order of the epoch."""
@@ -78,7 +86,7 @@ class PairData(LightningDataModule):
             return cast(Pair, batch)
         training = self.trainer is not None and self.trainer.training
         epoch = _FIRST_EPOCH + self.trainer.current_epoch if training and self.trainer else 0
-        return make_pair(batch, self.effect, seed=(self.seed << 32) + epoch, transmission=self.transmission)
+        return make_pair(batch, self.effect, seed=(self.seed << 32) + epoch, **self.asked)
 
     def _loader(self, frames: Dataset[Any], *, training: bool) -> DataLoader[Any]:
         ranks, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
@@ -97,22 +105,22 @@ class PairData(LightningDataModule):
 
 
 @torch.no_grad()
-def make_pair(frames: Frame, effect: Effect, *, seed: int, transmission: bool = False) -> Pair:
+def make_pair(frames: Frame, effect: Effect, *, seed: int, transmission: bool = False, flow: bool = False) -> Pair:
     """A batch of frames and what an effect makes of it, on the device of the frames; its transmission, if asked for.
 
     Raises:
-        ValueError: a transmission is asked for, and the effect has none.
+        ValueError: a transmission or a flow is asked for, and the effect has none.
     """
     depth = frames.depth if frames.depth.ndim == 4 else None
     degraded = effect.degrade(frames.image, seed=seed, keys=frames.key, depth=depth)
-    flow, valid = degraded.restore_flow, degraded.restore_valid
-    if flow is None or valid is None:
-        like = frames.image[:, :1]
-        flow, valid = torch.zeros_like(like).expand(-1, 2, -1, -1), torch.ones_like(like, dtype=torch.bool)
-    if transmission and not degraded.has("transmission"):
-        raise ValueError(f"effect must have a transmission, as fog has, got {effect}")
+    for wanted, name, example in ((transmission, "transmission", "fog"), (flow, "flow", "a lens")):
+        if wanted and not degraded.has(name):
+            raise ValueError(f"effect must have a {name}, as {example} has, got {type(effect).__name__}")
+    like = frames.image[:, :1]
+    moved = torch.zeros_like(like).expand(-1, 2, -1, -1) if degraded.restore_flow is None else degraded.restore_flow
+    valid = torch.ones_like(like, dtype=torch.bool) if degraded.restore_valid is None else degraded.restore_valid
     passed = degraded.transmission if transmission else frames.image.new_empty(len(frames.image), 0)
-    return Pair(degraded.image, frames.image, flow, valid, frames.key, passed)
+    return Pair(degraded.image, frames.image, moved, valid, frames.key, passed)
 
 
 def road_scenes(
@@ -125,11 +133,12 @@ def road_scenes(
     workers: int = 2,
     seed: int = 0,
     transmission: bool = False,
+    flow: bool = False,
 ) -> PairData:
     """Pairs of rendered road scenes; arguments as for `RoadScenes` and `PairData`."""
     train = RoadScenes(train_count, size=size, seed=seed)
     val = RoadScenes(val_count, size=size, seed=seed, first=train_count)
-    options = {"batch_size": batch_size, "workers": workers, "seed": seed, "transmission": transmission}
+    options = {"batch_size": batch_size, "workers": workers, "seed": seed, "transmission": transmission, "flow": flow}
     return PairData(train, val, effect=effect, **options)
 
 
@@ -144,19 +153,26 @@ def frames(
     workers: int = 2,
     seed: int = 0,
     transmission: bool = False,
+    flow: bool = False,
 ) -> PairData:
     """Pairs of a folder's frames, split by drive; arguments as for `FrameFolder` and `PairData`."""
     train, val = (
         FrameFolder(root, size=size, split=split, drive_by=drive_by, val_share=val_share, seed=seed)
         for split in ("train", "val")
     )
-    options = {"batch_size": batch_size, "workers": workers, "seed": seed, "transmission": transmission}
+    options = {"batch_size": batch_size, "workers": workers, "seed": seed, "transmission": transmission, "flow": flow}
     return PairData(train, val, effect=effect, **options)
 
 
 def pairs(
-    *, root: str | Path, batch_size: int = 16, workers: int = 2, seed: int = 0, transmission: bool = False
+    *,
+    root: str | Path,
+    batch_size: int = 16,
+    workers: int = 2,
+    seed: int = 0,
+    transmission: bool = False,
+    flow: bool = False,
 ) -> PairData:
     """Pairs from disk, split by drive when they were made; arguments as for `PairedFolder` and `PairData`."""
-    train, val = (PairedFolder(root, split=split, transmission=transmission) for split in ("train", "val"))
+    train, val = (PairedFolder(root, split=split, transmission=transmission, flow=flow) for split in ("train", "val"))
     return PairData(train, val, effect=None, batch_size=batch_size, workers=workers, seed=seed)

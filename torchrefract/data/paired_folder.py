@@ -11,13 +11,13 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from torchrefract._checks import check_choice, check_count, check_flag
 from torchrefract._levels import numbers_of
-from torchrefract.data.pair_files import DamagedPairError, PairArrays, decode_pair
+from torchrefract.data.pair_files import DamagedPairError, decode_pair
 from torchrefract.data.pair_manifest import PairRow, Place, lines_of, manifests, read_row, read_stored, scan
 from torchrefract.types import Pair
 
 _SPLITS = ("all", "train", "val")
-_NEEDED = ("restore_flow", "restore_valid")
-_PASSED = "transmission"
+_FLOW, _PASSED = "restore_flow", "transmission"
+_NEEDED = (_FLOW, "restore_valid")
 
 
 class PairedFolder(Dataset[Pair]):
@@ -30,16 +30,18 @@ class PairedFolder(Dataset[Pair]):
         root: the folder, with pairs/ or tars/ in it.
         split: "all", "train" or "val", by drive.
         transmission: whether pairs are read with theirs.
+        flow: whether pairs must have one; of those that need none it is zero.
 
     Raises:
         ValueError: a folder without pairs of the split; a damaged manifest; in `[]`, a damaged file, or a pair without
-            the transmission that is asked for.
+            the transmission or the flow that is asked for.
     """
 
-    def __init__(self, root: str | Path, *, split: str = "all", transmission: bool = False):
+    def __init__(self, root: str | Path, *, split: str = "all", transmission: bool = False, flow: bool = False):
         self.root = Path(root).expanduser()
         self.split = check_choice("split", split, _SPLITS)
         self.transmission = check_flag("transmission", transmission)
+        self.flow = check_flag("flow", flow)
         self._manifests = manifests(self.root)
         if not self._manifests:
             raise ValueError(f"root must be a folder with manifest.jsonl, got {self.root}")
@@ -70,11 +72,15 @@ class PairedFolder(Dataset[Pair]):
                 f"pair {row.number} in {self.root} must be whole, got {error}; torchrefract.generate with verify=true "
                 "makes it again"
             ) from error
+        asked = ((self.transmission, _PASSED, "transmission, as of fog"), (self.flow, _FLOW, "flow, as of a lens"))
+        for wanted, name, words in asked:
+            if wanted and name not in arrays.maps:
+                raise ValueError(f"root must hold pairs with a {words}, got {row.number} in {self.root}")
         size = arrays.clean.shape[:2]
-        flow = arrays.maps.get("restore_flow", np.zeros((2, *size), np.float32))
-        valid = arrays.maps["restore_valid"] if "restore_flow" in arrays.maps else np.ones(size, dtype=bool)
+        flow = arrays.maps.get(_FLOW, np.zeros((2, *size), np.float32))
+        valid = arrays.maps["restore_valid"] if _FLOW in arrays.maps else np.ones(size, dtype=bool)
         degraded, clean = _image(arrays.corrupted), _image(arrays.clean)
-        passed = self._passed(arrays, row)
+        passed = torch.from_numpy(arrays.maps[_PASSED])[None] if self.transmission else torch.empty(0)
         return Pair(
             degraded, clean, torch.from_numpy(flow), torch.from_numpy(valid)[None], torch.tensor(row.key), passed
         )
@@ -88,13 +94,6 @@ class PairedFolder(Dataset[Pair]):
     def rows(self) -> Iterator[PairRow]:
         """What the manifest says of all pairs of the split, in its order."""
         return (row for row, _ in scan(self._manifests, self._has))
-
-    def _passed(self, arrays: PairArrays, row: PairRow) -> Tensor:
-        if not self.transmission:
-            return torch.empty(0)
-        if _PASSED not in arrays.maps:
-            raise ValueError(f"root must hold pairs with a transmission, as of fog, got {row.number} in {self.root}")
-        return torch.from_numpy(arrays.maps[_PASSED])[None]
 
     def _has(self, row: PairRow) -> bool:
         return not row.skipped and self.split in ("all", row.split)

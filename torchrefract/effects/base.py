@@ -11,7 +11,7 @@ from torchrefract import draws
 from torchrefract._checks import check_all, check_number, check_whole, check_within, is_whole
 from torchrefract.effects.door import Layout, check_depth_fits, check_image, enter, leave
 from torchrefract.effects.motion import LATEST_FRAME
-from torchrefract.effects.plan import check_size
+from torchrefract.effects.plan import check_sides
 from torchrefract.effects.rows import Undrawn, at_frames, widened
 from torchrefract.labels.rows import is_tv, wrapped
 from torchrefract.labels.targets import follow
@@ -148,7 +148,7 @@ class Effect(nn.Module, ABC):
         Raises:
             ValueError: a frame without a pixel; a tolerance below the rounding of such a frame.
         """
-        check_size(height, width)
+        check_sides(height, width)
         plan = self.planned(height, width, field_dtype(dtype))
         print(plan)
         return plan

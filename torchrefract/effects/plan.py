@@ -145,7 +145,7 @@ def check_tolerance(value: float | None, *, name: str = "tolerance_px") -> float
     return None if value is None else check_number(name, value, low=_SMALLEST, high=_LARGEST)
 
 
-def check_size(height: int, width: int) -> None:
+def check_sides(height: int, width: int) -> None:
     """Raise for frames without a pixel."""
     check_count("height", height)
     check_count("width", width)

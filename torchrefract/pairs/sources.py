@@ -33,7 +33,7 @@ class Sources(NamedTuple):
 
     root: Path
     frames: Sequence[Source]
-    skipped: int  # files that cannot be read
+    skipped: Sequence[str]  # files that cannot be read, below the root
     alone: bool  # whether there is a single drive, which cannot be split
 
     def thinned(self, count: int) -> "Sources":
@@ -124,9 +124,11 @@ def find_sources(
     if not videos:
         placed, skipped = place_frames(source, size=size, drive_by=drive_by, val_share=val_share, seed=seed)
         alone = len({(frame.drive, frame.split) for frame in placed}) < 2
-        return Sources(source, [Source(*frame) for frame in placed], len(skipped), alone)
-    if any(file.lower().endswith(EXTENSIONS) for file in files):
-        raise UsageError(f"source must hold pictures or videos, got both in {source}")
+        names = [path.relative_to(source).as_posix() for path, _ in skipped]
+        return Sources(source, [Source(*frame) for frame in placed], names, alone)
+    if pictures := [file for file in files if file.lower().endswith(EXTENSIONS)]:
+        both = f"{pictures[0]} and {videos[0]}"
+        raise UsageError(f"source must hold pictures or videos, got both in {source}, such as {both}")
     return _videos(source, videos, every, val_share, seed)
 
 
@@ -141,7 +143,7 @@ def _videos(root: Path, paths: Sequence[str], every: int, val_share: float, seed
     several = len(set(drive_of.values())) > 1
     val = val_drives(root, drive_of, val_share=val_share, seed=seed) if several else set()
     found = [Source(path, drives[path] or ".", "val" if drives[path] in val else "train", t) for path, t in frames]
-    return Sources(root, found, sum(count == 0 for count in counts.values()), not several)
+    return Sources(root, found, [path for path, count in counts.items() if count == 0], not several)
 
 
 def draw_of(source: Source, *, seed: int, lap: int) -> tuple[int, int]:

@@ -9,7 +9,7 @@ from pytorch_lightning import LightningModule
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import ReduceLROnPlateau
 
-from torchrefract._checks import check_choice
+from torchrefract._checks import check_choice, check_count, check_number, check_positive, check_size
 from torchrefract.restoration.finite import check_finite
 from torchrefract.restoration.metrics import endpoint_error, psnr, ssim
 from torchrefract.restoration.schedules import SCHEDULES, schedule
@@ -50,9 +50,10 @@ class Learner(LightningModule, ABC):
     ):
         super().__init__()
         self.task, self.network = task, network
-        self.lr, self.weight_decay, self.warmup_steps = lr, weight_decay, warmup_steps
+        self.lr, self.weight_decay = check_positive("lr", lr), check_number("weight_decay", weight_decay, low=0.0)
+        self.warmup_steps = check_count("warmup_steps", warmup_steps, low=0)
         self.schedule = check_choice("schedule", schedule, SCHEDULES)
-        self.metric_size = (metric_size[0], metric_size[1])
+        self.metric_size = check_size("metric_size", metric_size)
         # For a rival without eyes: flows summed on valid pixels, and how many; of all ranks, and new ones of this one.
         self.flows, self.new_flows = _NOTHING, _NOTHING
 

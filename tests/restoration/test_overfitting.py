@@ -72,7 +72,7 @@ def test_half_precision_trains_without_a_number_that_is_none(network, task):
     fog = isinstance(task, Deweather)
     effect = presets.cape_town_fog() if fog else presets.cheap_dashcam()
     counts = {"train_count": 6, "val_count": 2, "batch_size": 2, "workers": 0}
-    data = road_scenes(effect=effect, size=SIZE, transmission=fog, **counts)
+    data = road_scenes(effect=effect, size=SIZE, transmission=fog, flow=not fog, **counts)
     model = Restoration(SMALL[network], task)
     trainer = Trainer(
         accelerator="cpu",

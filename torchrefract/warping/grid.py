@@ -155,6 +155,17 @@ def pixel_positions(grid: Tensor, *, height: int, width: int, out: Tensor) -> Te
     return out
 
 
+def mirror(place: Tensor, size: int) -> None:
+    """Reflect positions, px, about the borders of `size` pixels, as F.grid_sample does and to its bits, in place."""
+    # Where nothing is reflected the steps round, too.
+    place.add_(0.5)
+    if not torch.stack(place.aminmax()).sub_(size / 2).abs().amax() <= size / 2:
+        place.abs_()
+        place.sub_(place.div(2 * size).trunc_(), alpha=2 * size)
+        torch.minimum(place, 2 * size - place, out=place)
+    place.sub_(0.5)
+
+
 def finite(positions: Tensor, limit: float) -> Tensor:
     """The positions within a limit; what is no number lies there."""
     # One NaN in a grid with border padding ends the process in the sampler's backward.

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from torchrefract.warping.grid import pixel_positions
+from torchrefract.warping.grid import mirror, pixel_positions
 
-_PADDINGS = {"zeros": "BORDER_CONSTANT", "border": "BORDER_REPLICATE"}
+_PADDINGS = {"zeros": "BORDER_CONSTANT", "border": "BORDER_REPLICATE", "reflection": "BORDER_REPLICATE"}
 _INTERPOLATIONS = {"nearest": "INTER_NEAREST", "bilinear": "INTER_LINEAR"}
 _CHANNELS = (1, 3, 4)
 _OLDEST = 5
@@ -25,19 +25,19 @@ _OLDEST = 5
 _AT_ONCE = 1 << 15
 
 
-def obstacle(image: Tensor, flow: Tensor, *, padding: str, interpolation: str, positions: torch.dtype) -> str | None:
+def obstacle(image: Tensor, flow: Tensor, *, interpolation: str, positions: torch.dtype) -> str | None:
     """Why OpenCV cannot look the image up as F.grid_sample does, None where it can.
 
     Args:
         image: (B, C, H, W).
         flow: what decides on the positions.
-        padding, interpolation: of the look-up.
+        interpolation: of the look-up.
         positions: the type that F.grid_sample takes the positions in.
     """
     if torch.compiler.is_compiling():
         return "under torch.compile"
-    if padding not in _PADDINGS or interpolation not in _INTERPOLATIONS:
-        return f"for {padding} padding and {interpolation} interpolation"
+    if interpolation not in _INTERPOLATIONS:
+        return f"for {interpolation} interpolation"
     if image.dtype not in (torch.float32, torch.uint8) or image.shape[1] not in _CHANNELS:
         return f"for an image of {image.shape[1]} channels, {image.dtype}"
     if positions is not torch.float32:
@@ -67,20 +67,24 @@ def remapped(image: Tensor, grids: Iterable[Tensor], *, padding: str, interpolat
     out = source.new_empty(batch, height, width, channels).movedim(-1, 1)
     remap, start = partial(cv2.remap, **options), 0
     for grid in grids:
-        _remap_rows(remap, _pictures(source), _pictures(out)[:, start : start + grid.shape[1]], grid)
+        band = _pictures(out)[:, start : start + grid.shape[1]]
+        _remap_rows(remap, _pictures(source), band, grid, mirrored=padding == "reflection")
         start += grid.shape[1]
     return out
 
 
-def _remap_rows(remap: Any, source: np.ndarray, out: np.ndarray, grid: Tensor) -> None:
+def _remap_rows(remap: Any, source: np.ndarray, out: np.ndarray, grid: Tensor, *, mirrored: bool) -> None:
     batch, height, width = grid.shape[:3]
     rows = max(1, _AT_ONCE // width)
     room = grid.new_empty(2, min(rows, height), width)
     for i, start in product(range(batch), range(0, height, rows)):
         band = slice(start, min(height, start + rows))
         size = {"height": source.shape[1], "width": source.shape[2]}
-        x, y = pixel_positions(grid[i, band], **size, out=room[:, : band.stop - start]).numpy()
-        remap(source[i], x, y, dst=out[i, band])
+        places = pixel_positions(grid[i, band], **size, out=room[:, : band.stop - start])
+        if mirrored:
+            for place, length in zip(places, (size["width"], size["height"]), strict=True):
+                mirror(place, length)
+        remap(source[i], *places.numpy(), dst=out[i, band])
 
 
 def _pictures(image: Tensor) -> np.ndarray:

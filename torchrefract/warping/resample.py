@@ -48,10 +48,9 @@ def warp(
         padding: what lies outside: "zeros", "border" or "reflection" (of positions up to 3/2 frames off the center).
         interpolation: "nearest", "bilinear" or "bicubic" (a = -3/4, clamped to the range of the image's values).
         resampler: "grid_sample", of PyTorch; "opencv", for float32 or uint8 of 1, 3 or 4 channels on the CPU, without
-            gradients, neither reflection nor bicubic; or "auto", OpenCV from version 5 on, where it is installed, for
-            such uint8 in channels_last format, on as many threads as cv2.setNumThreads says. The two agree to 1e-6 of
-            the range of the values before these are rounded: bytes differ, by one level, where they lie so near to a
-            half.
+            gradients, not for bicubic; or "auto", OpenCV from version 5 on, where it is installed, for such uint8 in
+            channels_last format, on as many threads as cv2.setNumThreads says. The two agree to 1e-6 of the range of
+            the values before these are rounded: bytes differ, by one level, where they lie so near to a half.
 
     Returns:
         image of the same shape, type and memory format, and valid, (B, 1, H, W) or (1, H, W), bool.
@@ -91,7 +90,6 @@ def look_up(
         why = obstacle(
             image,
             flow.grid if isinstance(flow, Positions) else known(flow),
-            padding=padding,
             interpolation=interpolation,
             positions=dtype,
         )

@@ -28,7 +28,7 @@ from torchrefract.fields.depth import (
     ray_distance,
 )
 from torchrefract.labels.boxes import warp_boxes
-from torchrefract.labels.maps import warp_depth, warp_mask
+from torchrefract.labels.maps import warp_depth, warp_mask, warp_optical_flow
 from torchrefract.labels.points import warp_points
 from torchrefract.labels.targets import warp_labels
 from torchrefract.types import Degraded, Folding, Frame, Pair
@@ -80,5 +80,6 @@ __all__ = [
     "warp_depth",
     "warp_labels",
     "warp_mask",
+    "warp_optical_flow",
     "warp_points",
 ]

@@ -52,6 +52,33 @@ def test_the_lens_of_a_camera_shows_every_ray_where_the_camera_does():
     assert_close(pixels + degraded.flow[0][:, rows, columns].T, clean, rtol=0, atol=1e-8)
 
 
+def test_the_camera_of_a_degraded_frame_shows_every_ray_where_the_frame_does():
+    height, width = 36, 64
+    wide = LensDistortion(s1_range=(-0.01, 0.01), s4_range=(-0.01, 0.01), aspect_range=(0.95, 1.05), p=0.6)
+    degraded = wide.degrade(torch.zeros(6, 3, height, width, dtype=torch.float64), seed=2)
+    cameras = wide.cameras(degraded.params, height=height, width=width)
+    y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    pixels = torch.stack([x, y], dim=-1).view(-1, 2)
+    assert {camera.is_pinhole for camera in cameras} == {True, False}
+    for camera, acts, flow in zip(cameras, degraded.params.gate.tolist(), degraded.restore_flow, strict=True):
+        assert camera.is_pinhole is not acts
+        # A clean pixel's ray, seen by the camera, is where the flow back looks.
+        rays = replace(camera, coefficients=(0.0,) * 12).unproject(pixels).points
+        shown, valid, _ = camera.project(rays)
+        assert valid.all()
+        assert_close(shown - pixels, flow.flatten(1).mT, rtol=0, atol=1e-9)
+
+
+def test_the_lens_of_a_camera_has_that_camera():
+    lens = LensDistortion.from_camera(replace(OTHERS[2], fx=500.25))
+    params = lens.sample(torch.zeros(2, 3, 180, 320, dtype=torch.float64), seed=0)
+    expected = replace(OTHERS[2], fx=500.25).resized(width=320, height=180)
+    for found in lens.cameras(params, height=180, width=320):
+        assert (found.model, found.width, found.height) == ("polynomial12", 320, 180)
+        for name in ("fx", "fy", "cx", "cy", "coefficients"):
+            assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-9)
+
+
 def test_a_jitter_is_uniform_in_each_number_by_itself():
     values, expected = drawn(LensDistortion.from_camera(CAR, jitter=0.1), 2000), by_hand(CAR)
     aspect = values[:, 13] / values[:, 12]

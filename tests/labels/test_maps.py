@@ -1,7 +1,15 @@
 import pytest
 import torch
 
-from torchrefract import warp, warp_depth, warp_mask
+from torchrefract import (
+    LensDistortion,
+    Turbulence,
+    warp,
+    warp_depth,
+    warp_mask,
+    warp_optical_flow,
+    warp_points,
+)
 
 SIZE = (90, 140)
 
@@ -107,3 +115,107 @@ ONE = torch.zeros(2, 5, 6)
 def test_what_does_not_fit_raises(call, kind, rule):
     with pytest.raises(kind, match=rule):
         call()
+
+
+def motion(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """(1, 2, H, W), px: what drives ahead sees, growing from a point."""
+    return torch.stack([0.06 * (x - 60) + 1.5, 0.06 * (y - 40) - 0.5])[None]
+
+
+@pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
+def test_content_is_found_where_the_optical_flow_of_degraded_frames_leads(pixels, interpolation, oracle):
+    x, y = pixels(*SIZE)
+    first, second = (
+        LensDistortion(tolerance_px=None).degrade(torch.zeros(1, 3, *SIZE).double(), seed=s) for s in (1, 2)
+    )
+    moved, valid = warp_optical_flow(
+        motion(x, y), first.flow, second.restore_flow, restore_valid=second.restore_valid, interpolation=interpolation
+    )
+    # Each pixel by itself: to the clean frame, along the motion, and by the points' own inverse to the other frame.
+    clean = torch.stack([x, y], dim=-1)[None] + first.flow.movedim(1, -1)
+    at = clean if interpolation == "bilinear" else clean.round()
+    there = clean + motion(at[0, ..., 0], at[0, ..., 1]).movedim(1, -1)
+    landed, visible = warp_points(there.flatten(1, 2), second.flow)
+    expected = (landed.view(1, *SIZE, 2) - torch.stack([x, y], dim=-1)).movedim(-1, 1)
+    sure = valid & visible.view(1, 1, *SIZE)
+    # Halfway between two pixels rounding decides, by 0.06 px.
+    halfway = ((clean.frac().abs() - 0.5).abs() < 1e-6).any(dim=-1)[:, None]
+    assert sure.double().mean() > 0.5
+    oracle("optical flow, points", *(torch.where(sure & ~halfway, v, 0) for v in (moved, expected)), 0.01, unit="px")
+
+
+def test_the_optical_flow_of_degraded_frames_leads_from_one_to_the_other(pixels):
+    x, y = pixels(*SIZE)
+    frame = torch.stack([torch.sin(x / 7) * torch.cos(y / 9), torch.cos(x / 11 + y / 8)])[None]
+    # The second clean frame holds what is at q in the first one at q + motion(q); that is affine, so is its inverse.
+    back = torch.stack([(x + 60 * 0.06 - 1.5) / 1.06 - x, (y + 40 * 0.06 + 0.5) / 1.06 - y])[None]
+    then = warp(frame, back, interpolation="bicubic")[0]
+    air = Turbulence(covariance="gaussian", amplitude_range=(2.0, 2.0), length_range=(30.0, 30.0), tolerance_px=None)
+    one, two = (air.degrade(image, seed=seed) for seed, image in ((0, frame), (1, then)))
+    moved, valid = warp_optical_flow(motion(x, y), one.flow, two.restore_flow, restore_valid=two.restore_valid)
+    found, seen = warp(two.image, moved, interpolation="bicubic")
+    near = (found - one.image).abs()[(valid & seen & one.valid).expand_as(frame)]
+    before = (two.image - one.image).abs()[(valid & seen & one.valid).expand_as(frame)]
+    assert valid.double().mean() > 0.7
+    assert before.mean() > 0.1
+    assert near.mean() < 0.006
+
+
+def test_a_motion_that_is_not_known_or_leads_off_the_frame_is_filled():
+    motions = torch.zeros(1, 2, 6, 8)
+    motions[0, 0, 2, 3], motions[0, 1, 4, 4], motions[0, 0, 1, 6] = torch.nan, torch.inf, 3.0
+    still, hidden = torch.zeros(1, 2, 6, 8), torch.ones(1, 1, 6, 8, dtype=torch.bool)
+    hidden[0, 0, 5, 5] = False
+    moved, valid = warp_optical_flow(motions, still, still, restore_valid=hidden, fill=-9.0)
+    unknown = torch.zeros(1, 1, 6, 8, dtype=torch.bool)
+    for row, column in ((2, 3), (4, 4), (1, 6), (5, 5)):
+        unknown[0, 0, row, column] = True
+    assert torch.equal(valid, ~unknown)
+    assert torch.equal(moved, torch.where(unknown, -9.0, torch.zeros(())).expand_as(moved))
+    for hole in (torch.nan, torch.inf):
+        flow, back = still.clone(), still.clone()
+        flow[0, 0, 0, 0] = back[0, 1, 5, 0] = hole
+        moved_on, known = warp_optical_flow(torch.zeros(1, 2, 6, 8), flow, back, fill=-9.0)
+        assert not known[0, 0, 0, 0]
+        assert not known[0, 0, 5, 0]
+        assert torch.equal(moved_on == -9, ~known.expand_as(moved_on))
+        assert known.sum() >= 48 - 1 - 4
+    alone = warp_optical_flow(motions[0], still[0], still[0], restore_valid=hidden[0], fill=-9.0)
+    assert torch.equal(alone[0], moved[0])
+    assert torch.equal(alone[1], valid[0])
+    both = warp_optical_flow(motions.expand(2, -1, -1, -1), still, still, restore_valid=hidden, fill=-9.0)
+    assert torch.equal(both[0], moved.expand(2, -1, -1, -1))
+
+
+def test_gradients_of_optical_flow_are_those_of_finite_differences(pixels, waves):
+    flow, back = ((waves(*pixels(5, 6), 0.3, 2.0, phase) + 0.31).requires_grad_() for phase in (0.3, 0.7))
+    motions = (0.1 * torch.rand(1, 2, 5, 6, generator=generator(), dtype=torch.float64)).requires_grad_()
+
+    def moved(m: torch.Tensor, f: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        return warp_optical_flow(m, f, b, interpolation="bilinear")[0]
+
+    assert torch.autograd.gradcheck(moved, [motions, flow, back])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"optical_flow": None}, TypeError, "optical_flow must be a tensor, got NoneType"),
+        ({"optical_flow": torch.zeros(1, 3, 6, 8)}, ValueError, "optical_flow must have shape"),
+        ({"optical_flow": torch.zeros(1, 2, 6, 8).long()}, TypeError, "optical_flow must be"),
+        ({"flow": torch.zeros(1, 2, 6, 9)}, ValueError, "flow must have the batch and the size of optical_flow"),
+        ({"restore_flow": torch.zeros(3, 2, 6, 8)}, ValueError, "restore_flow must have the batch and the size of"),
+        ({"restore_valid": torch.ones(1, 1, 6, 8)}, TypeError, "restore_valid must be bool, got torch.float32"),
+        ({"restore_valid": torch.ones(6, 8).bool()}, ValueError, r"restore_valid must have shape \(2, 1, 6, 8\)"),
+        ({"interpolation": "bicubic"}, ValueError, "interpolation must be one of nearest, bilinear, got 'bicubic'"),
+        ({"fill": torch.inf}, ValueError, "fill must be"),
+    ],
+)
+def test_optical_flow_names_a_wrong_argument(arguments, error, message):
+    good = {
+        "optical_flow": torch.zeros(2, 2, 6, 8),
+        "flow": torch.zeros(1, 2, 6, 8),
+        "restore_flow": torch.zeros(1, 2, 6, 8),
+    }
+    with pytest.raises(error, match=message):
+        warp_optical_flow(**{**good, **arguments})

@@ -16,7 +16,7 @@ from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.lens_parts import plan_in_parts, plan_of_lens
 from torchrefract.effects.lens_plan import covers, kept_terms
-from torchrefract.effects.lens_source import LensSource, correlated, jittered, listed
+from torchrefract.effects.lens_source import LensSource, cameras_of, correlated, jittered, listed
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan
 from torchrefract.effects.refraction import Moved
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, smooth_lens_flow
@@ -244,6 +244,16 @@ class LensDistortion(LatticeWarp):
         """The flow of `lens_restore_flow`, and where it exists; the closed form needs no flow."""
         height, width = flow.shape[2:]
         return lens_restore_flow(*in_px(params, height, width), height=height, width=width)
+
+    def cameras(self, params: LensParams, *, height: int, width: int) -> list[Camera]:
+        """The camera of each sample's degraded frame, where its focal length and center are those of the clean one's.
+
+        A pinhole where the gate is closed. Values are read, for which an accelerator is waited for.
+
+        Raises:
+            ValueError: a lens that is no `Camera`.
+        """
+        return cameras_of(params.gate, *in_px(params, height, width), height=height, width=width)
 
     def moves(self, params: LensParams) -> Tensor:
         """The samples with a coefficient that is not zero."""

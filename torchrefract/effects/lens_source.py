@@ -134,6 +134,17 @@ def correlated(camera: Camera, covariance: Any) -> LensSource:
     return LensSource((_numbers(polynomial),), tuple(tuple(row) for row in spread.tolist()))
 
 
+def cameras_of(
+    gate: Tensor, coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int
+) -> list[Camera]:
+    """The cameras of lenses (B,), (B, 12), (B, 2) and (B, 2), px; pinholes where the gate is closed."""
+    found = []
+    for acts, own, (fx, fy), (cx, cy) in zip(*(v.tolist() for v in (gate, coefficients, focal, center)), strict=True):
+        numbers = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "coefficients": tuple(own) if acts else (0.0,) * len(own)}
+        found.append(Camera(width=width, height=height, **numbers, model="polynomial12"))
+    return found
+
+
 def polynomial_of(name: str, camera: Camera, residual_px: float) -> Camera:
     """A camera as one of the model "polynomial12" that covers its frame.
 

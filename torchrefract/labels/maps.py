@@ -1,12 +1,14 @@
-"""How masks and depth follow a flow."""
+"""How masks, depth and optical flow follow a flow."""
 
 import numbers
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrefract._checks import check_choice, check_flag, check_flow, check_number, check_tensor
-from torchrefract.warping.grid import field_dtype
+from torchrefract.warping.compose import compose_flows
+from torchrefract.warping.grid import field_dtype, inside
 from torchrefract.warping.resample import look_up
 
 
@@ -75,6 +77,87 @@ def warp_depth(
     return torch.where(valid, moved, torch.full_like(moved, fill)), valid
 
 
+def warp_optical_flow(
+    optical_flow: Tensor,
+    flow: Tensor,
+    restore_flow: Tensor,
+    *,
+    restore_valid: Tensor | None = None,
+    fill: float = 0.0,
+    interpolation: str = "nearest",
+) -> tuple[Tensor, Tensor]:
+    """The optical flow between two degraded frames, from that between the clean ones, and where it is known.
+
+        moved(p) = c(p) + restore_flow(p + c(p)),  c(p) = flow(p) + optical_flow(p + flow(p))
+
+    What is at p in the first degraded frame is at p + flow(p) in the clean one, moves on by the optical flow there, and
+    is then found in the second degraded frame. Frames that one lens has seen take `flow` and `restore_flow` of one
+    `Degraded`; of a clip `flow` is that of each frame and `restore_flow` that of the next.
+
+    Args:
+        optical_flow: (B, 2, H, W) or (2, H, W), px, floating, from the first clean frame to the second; NaN and inf are
+            not known.
+        flow: of the first frame, (B, 2, H, W) or (1, 2, H, W), px; (2, H, W) for an unbatched optical flow.
+        restore_flow: of the second frame, in the shape of `flow`.
+        restore_valid: of the second frame, (B, 1, H, W) or (1, 1, H, W), bool; (1, H, W) for an unbatched optical flow.
+            None is everywhere.
+        fill: what stands where the optical flow is not known, px, finite.
+        interpolation: of the optical flow, "nearest", or "bilinear", which mixes the motions of the two sides of an
+            edge; `restore_flow` is read bilinearly.
+
+    Returns:
+        moved, in the shape and type of the optical flow, without NaN, and valid, (B, 1, H, W) or (1, H, W), bool: the
+        content comes from the clean frame, its motion is known, and leads to where the second degraded frame shows it.
+
+    Raises:
+        ValueError: shapes that do not fit, an unknown interpolation, a fill that is not finite.
+        TypeError: an argument that is no tensor, an optical flow that is not floating, a mask that is not bool.
+    """
+    named = {"optical_flow": optical_flow, "flow": flow, "restore_flow": restore_flow}
+    for name, value in named.items():
+        check_tensor(name, value)
+    if optical_flow.ndim == 3 and flow.ndim == 3 and restore_flow.ndim == 3:
+        known = None if restore_valid is None else restore_valid[None]
+        options: dict[str, Any] = {"restore_valid": known, "fill": fill, "interpolation": interpolation}
+        moved, valid = warp_optical_flow(*(value[None] for value in named.values()), **options)
+        return moved[0], valid[0]
+    check_flow("optical_flow", optical_flow)
+    for name in ("flow", "restore_flow"):
+        _check_map("optical_flow", optical_flow, named[name], name=name)
+    check_choice("interpolation", interpolation, ("nearest", "bilinear"))
+    _check_fill(fill, optical_flow.dtype)
+    flow, restore_flow = (_in_type(value, optical_flow) for value in (flow, restore_flow))
+    motion, valid = _follow(optical_flow, flow, interpolation)
+    valid = valid & motion.isfinite().all(dim=1, keepdim=True)
+    there = flow + torch.where(valid, motion, 0)
+    valid = valid & inside(there)
+    if restore_valid is not None:
+        known = _checked_valid(restore_valid, restore_flow)
+        valid = valid & (look_up(known, there, padding="zeros", interpolation="nearest") > 0.5)
+    moved = compose_flows(restore_flow, there).to(optical_flow.dtype)
+    valid = valid & moved.isfinite().all(dim=1, keepdim=True)
+    return torch.where(valid, moved, fill), valid
+
+
+def _in_type(flow: Tensor, like: Tensor) -> Tensor:
+    """A flow in the type of fields beside a map, for each sample of it."""
+    dtype = field_dtype(torch.promote_types(flow.dtype, like.dtype))
+    return flow.to(dtype).expand(like.shape[0], -1, -1, -1)
+
+
+def _checked_valid(restore_valid: Tensor, restore_flow: Tensor) -> Tensor:
+    """(B, 1, H, W), 1 where the mask is true, in the type of the flow."""
+    check_tensor("restore_valid", restore_valid)
+    if restore_valid.dtype is not torch.bool:
+        raise TypeError(f"restore_valid must be bool, got {restore_valid.dtype}")
+    batch, _, *size = restore_flow.shape
+    if restore_valid.shape not in ((batch, 1, *size), (1, 1, *size)):
+        raise ValueError(
+            f"restore_valid must have shape {(batch, 1, *size)} beside this flow, got {tuple(restore_valid.shape)}"
+        )
+    return restore_valid.to(restore_flow.dtype).expand(batch, -1, -1, -1)
+
+
 def _follow(value: Tensor, flow: Tensor, interpolation: str) -> tuple[Tensor, Tensor]:
     """The map looked up, and where the nearest pixel lies on the frame."""
     flow = flow.to(field_dtype(value.dtype)).expand(value.shape[0], -1, -1, -1)
@@ -83,15 +166,15 @@ def _follow(value: Tensor, flow: Tensor, interpolation: str) -> tuple[Tensor, Te
     return look_up(value, flow, padding="border", interpolation=interpolation), on_frame
 
 
-def _check_map(name: str, value: Tensor, flow: Tensor) -> None:
-    check_flow("flow", flow)
+def _check_map(what: str, value: Tensor, flow: Tensor, *, name: str = "flow") -> None:
+    check_flow(name, flow)
     if value.ndim != 4:
-        raise ValueError(f"{name} must have shape (B, C, H, W) beside a batched flow, got {tuple(value.shape)}")
+        raise ValueError(f"{what} must have shape (B, C, H, W) beside a batched flow, got {tuple(value.shape)}")
     if value.is_complex():
-        raise TypeError(f"{name} must be real, got {value.dtype}")
+        raise TypeError(f"{what} must be real, got {value.dtype}")
     if value.shape[2:] != flow.shape[2:] or flow.shape[0] not in (1, value.shape[0]):
         raise ValueError(
-            f"flow must have the batch and the size of {name} {tuple(value.shape)}, got {tuple(flow.shape)}"
+            f"{name} must have the batch and the size of {what} {tuple(value.shape)}, got {tuple(flow.shape)}"
         )
 
 

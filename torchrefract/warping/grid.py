@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -155,15 +156,17 @@ def pixel_positions(grid: Tensor, *, height: int, width: int, out: Tensor) -> Te
     return out
 
 
-def mirror(place: Tensor, size: int) -> None:
-    """Reflect positions, px, about the borders of `size` pixels, as F.grid_sample does and to its bits, in place."""
-    # Where nothing is reflected the steps round, too.
-    place.add_(0.5)
-    if not torch.stack(place.aminmax()).sub_(size / 2).abs().amax() <= size / 2:
-        place.abs_()
-        place.sub_(place.div(2 * size).trunc_(), alpha=2 * size)
-        torch.minimum(place, 2 * size - place, out=place)
-    place.sub_(0.5)
+def mirror(place: np.ndarray, size: int) -> None:
+    """Reflect positions, px, float32, about the borders of so many pixels, in place, to the bits of F.grid_sample."""
+    # In numpy, whose operations wake no threads that would stand in the way of those of the look-up.
+    half, length, period = np.float32(0.5), np.float32(size), np.float32(2 * size)
+    place += half  # where nothing is reflected this rounds, too
+    np.abs(place, out=place)
+    if not (farthest := place.max(initial=0)) <= length:
+        if not farthest < period:
+            place -= np.trunc(place / period) * period
+        np.minimum(place, period - place, out=place)
+    place -= half
 
 
 def finite(positions: Tensor, limit: float) -> Tensor:

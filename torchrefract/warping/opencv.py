@@ -80,11 +80,11 @@ def _remap_rows(remap: Any, source: np.ndarray, out: np.ndarray, grid: Tensor, *
     for i, start in product(range(batch), range(0, height, rows)):
         band = slice(start, min(height, start + rows))
         size = {"height": source.shape[1], "width": source.shape[2]}
-        places = pixel_positions(grid[i, band], **size, out=room[:, : band.stop - start])
+        x, y = pixel_positions(grid[i, band], **size, out=room[:, : band.stop - start]).numpy()
         if mirrored:
-            for place, length in zip(places, (size["width"], size["height"]), strict=True):
-                mirror(place, length)
-        remap(source[i], *places.numpy(), dst=out[i, band])
+            mirror(x, size["width"])
+            mirror(y, size["height"])
+        remap(source[i], x, y, dst=out[i, band])
 
 
 def _pictures(image: Tensor) -> np.ndarray:

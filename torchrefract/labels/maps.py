@@ -98,7 +98,7 @@ def warp_optical_flow(
         optical_flow: (B, 2, H, W) or (2, H, W), px, floating, from the first clean frame to the second; NaN and inf are
             not known.
         flow: of the first frame, (B, 2, H, W) or (1, 2, H, W), px; (2, H, W) for an unbatched optical flow.
-        restore_flow: of the second frame, in the shape of `flow`.
+        restore_flow: of the second frame, likewise.
         restore_valid: of the second frame, (B, 1, H, W) or (1, 1, H, W), bool; (1, H, W) for an unbatched optical flow.
             None is everywhere.
         fill: what stands where the optical flow is not known, px, finite.

@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from torchrefract import _command
+from torchrefract.data.frame_folder import FrameFolder
 from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint
 
 # Loads the data and the model, and trains for no epoch.
@@ -125,9 +126,13 @@ def test_many_bad_frames_stop_the_command(call, tmp_path):
     assert re.search(r"drive./00.\.png is empty \(0 bytes\)", message)
 
 
+@pytest.mark.parametrize("whole", [0, 1])
 @pytest.mark.parametrize("workers", [0, 2])
-def test_a_frame_that_turns_out_to_be_damaged_is_named(call, tmp_path, workers):
-    for path in pictures(tmp_path / "frames", 8):
+def test_a_frame_that_turns_out_to_be_damaged_is_named(call, tmp_path, workers, whole):
+    paths = pictures(tmp_path / "frames", 8)
+    # One is read before the training, the others by workers.
+    spared = FrameFolder(tmp_path / "frames", size=(8, 8), split="train").paths[:whole]
+    for path in set(paths) - set(spared):
         data = path.read_bytes()
         path.write_bytes(data[:200] + b"\0" * 600 + data[800:])
     outcome = call("train", *LITTLE, "trainer.max_epochs=1", f"data.workers={workers}")

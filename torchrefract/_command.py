@@ -28,6 +28,7 @@ from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.pair_files import DamagedPairError
 
 _T = TypeVar("_T")
+_OF_FILES = (UnreadableImageError, DamagedPairError)
 _INFORMING = ("--help", "-h", "--hydra-help", "--info", "--shell-completion", "-sc")
 _CHOOSING = ("+task=", "++task=", "+experiment=", "++experiment=")
 _UNKNOWN = re.compile(r"Could not override '(\w+)'")
@@ -141,9 +142,14 @@ def make(cfg: DictConfig, part: str) -> Any:
 
 @contextmanager
 def naming(part: str) -> Iterator[None]:
-    """Errors of values inside the block are the user's, in the part of the configuration that is named."""
+    """Errors of values inside the block are the user's, in the part of the configuration that is named.
+
+    Those of a file, which they name, stay as they are.
+    """
     try:
         yield
+    except _OF_FILES:
+        raise
     except (ValueError, TypeError, OSError) as error:
         raise UsageError(f"{part}: {error}") from error
 
@@ -177,7 +183,7 @@ def _mendable(error: Exception, name: str) -> str | None:
         return f"{group} must be one of {', '.join(error.options or [])}, got {option}"
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key} must be given, as in {error.full_key}=…, got nothing"
-    if isinstance(error, UnreadableImageError | DamagedPairError):
+    if isinstance(error, _OF_FILES):
         return str(error).strip().splitlines()[-1].split("Error: ", 1)[-1]  # a worker prepends its traceback
     if isinstance(error, UsageError | HydraException | OmegaConfBaseException | YAMLError):
         unknown = _UNKNOWN.match(str(error)) if name else None

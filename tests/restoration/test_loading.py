@@ -130,9 +130,9 @@ def test_no_pretrained_weights_are_looked_for(written, saved):
     # ResUNet would not take the word, so a None that is handed on is told apart from one that is not.
     network = {"_target_": f"{TASKS}.Undistort", "pretrained": "imagenet"}
     assert "pretrained" in refused(written(config={"model": config(task=network)}))
-    nested = config(lr={"pretrained": "imagenet"})
+    nested = config(task={"_target_": f"{TASKS}.Undistort", "limit": {"pretrained": "imagenet"}})
     loaded = load_model(written(config={"model": nested}))
-    assert loaded.model.lr == {"pretrained": None}
+    assert vars(loaded.model.task)["limit"] == {"pretrained": None}
 
 
 @pytest.mark.parametrize(

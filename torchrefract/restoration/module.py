@@ -9,7 +9,7 @@ from pytorch_lightning import LightningModule
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import ReduceLROnPlateau
 
-from torchrefract._checks import check_choice, check_count, check_number, check_positive, check_size
+from torchrefract._checks import check_choice, check_count, check_number, check_size
 from torchrefract.restoration.finite import check_finite
 from torchrefract.restoration.metrics import endpoint_error, psnr, ssim
 from torchrefract.restoration.schedules import SCHEDULES, schedule
@@ -50,7 +50,8 @@ class Learner(LightningModule, ABC):
     ):
         super().__init__()
         self.task, self.network = task, network
-        self.lr, self.weight_decay = check_positive("lr", lr), check_number("weight_decay", weight_decay, low=0.0)
+        self.lr = check_number("lr", lr, low=0.0)
+        self.weight_decay = check_number("weight_decay", weight_decay, low=0.0)
         self.warmup_steps = check_count("warmup_steps", warmup_steps, low=0)
         self.schedule = check_choice("schedule", schedule, SCHEDULES)
         self.metric_size = check_size("metric_size", metric_size)

@@ -47,6 +47,15 @@ def fresh_compiler(request) -> Iterator[None]:
         torch.compiler.reset()
 
 
+@pytest.fixture(autouse=True)
+def threads_of_its_own() -> Iterator[None]:
+    """What a test sets, as the benchmarks do, the next one does not find: sums differ with the number of threads."""
+    before = torch.get_num_threads()
+    yield
+    if torch.get_num_threads() != before:
+        torch.set_num_threads(before)
+
+
 class Agreement(NamedTuple):
     """How far something is from an independent oracle at most, and how far it may be."""
 

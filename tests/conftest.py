@@ -52,8 +52,7 @@ def threads_of_its_own() -> Iterator[None]:
     """What a test sets, as the benchmarks do, the next one does not find: sums differ with the number of threads."""
     before = torch.get_num_threads()
     yield
-    if torch.get_num_threads() != before:
-        torch.set_num_threads(before)
+    torch.set_num_threads(before)
 
 
 class Agreement(NamedTuple):
@@ -112,11 +111,9 @@ def pytest_terminal_summary(terminalreporter, config) -> None:
 
 
 @pytest.fixture
-def on_threads() -> Iterator[Callable[[int], None]]:
-    """Sets the number of torch's threads, for the length of a test."""
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
+def on_threads() -> Callable[[int], None]:
+    """Sets the number of torch's threads, which `threads_of_its_own` sets back."""
+    return torch.set_num_threads
 
 
 @pytest.fixture

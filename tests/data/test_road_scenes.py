@@ -68,14 +68,11 @@ def test_a_frame_has_the_same_bits_in_every_batch_and_order(frames):
         assert torch.equal(depth[0], frames[1][key])
 
 
-def test_a_frame_has_the_same_bits_with_any_thread_count():
-    threads, results = torch.get_num_threads(), []
-    try:
-        for count in (1, 2, 3):
-            torch.set_num_threads(count)
-            results.append(render_road_scenes(torch.arange(3), 90, 161))
-    finally:
-        torch.set_num_threads(threads)
+def test_a_frame_has_the_same_bits_with_any_thread_count(on_threads):
+    results = []
+    for count in (1, 2, 3):
+        on_threads(count)
+        results.append(render_road_scenes(torch.arange(3), 90, 161))
     for image, depth in results[1:]:
         assert torch.equal(image, results[0][0])
         assert torch.equal(depth, results[0][1])

@@ -126,7 +126,7 @@ def warp_optical_flow(
         _check_map("optical_flow", optical_flow, named[name], name=name)
     check_choice("interpolation", interpolation, ("nearest", "bilinear"))
     _check_fill(fill, optical_flow.dtype)
-    flow, restore_flow = (_in_type(value, optical_flow) for value in (flow, restore_flow))
+    flow, restore_flow = (_beside(optical_flow, value) for value in (flow, restore_flow))
     motion, valid = _follow(optical_flow, flow, interpolation)
     valid = valid & motion.isfinite().all(dim=1, keepdim=True)
     there = flow + torch.where(valid, motion, 0)
@@ -139,10 +139,9 @@ def warp_optical_flow(
     return torch.where(valid, moved, fill), valid
 
 
-def _in_type(flow: Tensor, like: Tensor) -> Tensor:
-    """A flow in the type of fields beside a map, for each sample of it."""
-    dtype = field_dtype(torch.promote_types(flow.dtype, like.dtype))
-    return flow.to(dtype).expand(like.shape[0], -1, -1, -1)
+def _beside(value: Tensor, flow: Tensor) -> Tensor:
+    """A flow in the type of fields beside a map, one for each sample of it."""
+    return flow.to(field_dtype(value.dtype)).expand(value.shape[0], -1, -1, -1)
 
 
 def _checked_valid(restore_valid: Tensor, restore_flow: Tensor) -> Tensor:
@@ -160,7 +159,7 @@ def _checked_valid(restore_valid: Tensor, restore_flow: Tensor) -> Tensor:
 
 def _follow(value: Tensor, flow: Tensor, interpolation: str) -> tuple[Tensor, Tensor]:
     """The map looked up, and where the nearest pixel lies on the frame."""
-    flow = flow.to(field_dtype(value.dtype)).expand(value.shape[0], -1, -1, -1)
+    flow = _beside(value, flow)
     everywhere = torch.ones_like(flow[:, :1])
     on_frame = look_up(everywhere, flow, padding="zeros", interpolation="nearest") > 0.5
     return look_up(value, flow, padding="border", interpolation=interpolation), on_frame

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchrefract.types import Range
 
@@ -144,6 +145,23 @@ def read(tensor: Callable[[], Tensor], *, of: Tensor | None = None) -> Any:
         return value.tolist()
     except RuntimeError:  # inside torch.vmap no sample has values of its own
         return None
+
+
+def withheld(value: Tensor) -> str | None:
+    """Why the numbers of a tensor are not there for what is not of PyTorch, None where they are."""
+    if torch.compiler.is_compiling():
+        return "under torch.compile"
+    if torch.jit.is_tracing():
+        return "under torch.jit.trace"
+    if value.device.type != "cpu":
+        return f"on {value.device.type}"
+    if forward_ad.unpack_dual(value).tangent is not None:
+        return "where a forward gradient is asked for"
+    try:
+        value.detach().numpy()
+    except RuntimeError:
+        return "inside torch.func"
+    return None
 
 
 def _check_real(name: str, value: float) -> float:

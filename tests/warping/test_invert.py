@@ -217,6 +217,7 @@ def test_a_fold_in_one_place_does_not_cost_steps_everywhere(pixels, waves, monke
         return sampled(source, grid, **options)
 
     monkeypatch.setattr(invert, "sampled", counted)
+    monkeypatch.setattr(invert, "obstacle", lambda *_: "where reads are counted")
     x, y = pixels(200, 300)
     tame = waves(x, y, 0.5, 20.0)
     folded = tame.clone()

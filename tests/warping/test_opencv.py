@@ -269,7 +269,7 @@ def test_without_opencv_5_auto_goes_without_it_and_opencv_raises(found, monkeypa
 
 
 def test_an_unknown_resampler_raises():
-    rule = "resampler must be one of auto, grid_sample, opencv, got 'pil'"
+    rule = "resampler must be one of auto, grid_sample, numba, opencv, got 'pil'"
     with pytest.raises(ValueError, match=rule):
         warp(torch.zeros(1, 1, 2, 2), torch.zeros(1, 2, 2, 2), resampler="pil")
     with pytest.raises(ValueError, match=rule):

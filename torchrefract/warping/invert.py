@@ -1,11 +1,15 @@
 """The flow that undoes a flow, with a certificate."""
 
+from functools import partial
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchrefract._checks import check_count, check_flow, check_positive, is_true, read
+from torchrefract._threads import share
+from torchrefract.warping.compiled import SMALLEST, kernels, obstacle
 from torchrefract.warping.grid import field_dtype, inside, pixel_axes, sampler_axes, squared_length
 from torchrefract.warping.jacobian import Jacobian
 from torchrefract.warping.resample import look_up, sampled, sampler_dtype
@@ -27,8 +31,8 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
 
         inverse(p) + flow(p + inverse(p)) = 0, solved by Newton's method from no flow, each pixel by itself:
         inverse <- inverse - (I + grad flow)^-1 (inverse + flow),  flow read at p + inverse,
-        its gradient at first at p, for up to 3 steps while many pixels need them, and at p + inverse then; where no
-        value can be read (accelerators, compilers) at p + inverse from the second step on
+        its gradient at first at p, for up to 3 steps (of smaller frames, and in float64, while many pixels need them),
+        and at p + inverse then; where no value can be read (accelerators, compilers) there from the second step on
 
     The flow is read bilinearly, its gradient by central differences. The gradient with respect to `flow` comes from
     one attached Newton step at the solution (implicit function theorem), not from unrolling.
@@ -163,6 +167,8 @@ def _solved(flow: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor | None]:
     """
     if read(lambda: flow[0, 0, 0, 0]) is None:
         return _ended(_masked(flow, steps))
+    if flow.shape[2] * flow.shape[3] >= SMALLEST and obstacle(flow) is None:
+        return _by_kernel(flow, steps)
     # What becomes of a sample depends on no other.
     ends = [_ended(_alone(one, steps)) for one in flow.split(1)]
     if len(ends) == 1:
@@ -171,6 +177,25 @@ def _solved(flow: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor | None]:
     everywhere = torch.ones_like(error[0], dtype=torch.bool)
     flags = [everywhere if flag is None else flag for flag in upright]
     return torch.cat(inverse), torch.cat(error), None if upright.count(None) == len(upright) else torch.cat(flags)
+
+
+def _by_kernel(flow: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor | None]:
+    """The same, all steps of a pixel at once."""
+    newton, (batch, _, height, width) = kernels("newton"), flow.shape
+    share_rows = partial(share, count=batch * height, least=SMALLEST // width + 1)
+    values, inverse, error = flow.numpy(), torch.empty_like(flow), torch.empty_like(flow[:, :1])
+    bounds = np.float32(_UPRIGHT), steps, _AT_ONCE, np.float32(_NEAR[flow.dtype]), np.float32(_FARTHEST)
+    solve, ends = partial(newton.solve, values, *bounds), (inverse.numpy(), error[:, 0].numpy())
+    share_rows(lambda start, stop: solve(start, stop, *ends))
+    least = np.empty(batch * height, np.float32)
+    share_rows(lambda start, stop: newton.least_determinants(values, start, stop, least))
+    # Where it is at every pixel, what is read between them is above zero, too.
+    if least.min() >= _UPRIGHT:
+        return inverse, error, None
+    sheet, there = np.empty_like(ends[1]), np.empty_like(ends[1])
+    share_rows(lambda start, stop: newton.determinants(values, start, stop, sheet))
+    share_rows(lambda start, stop: newton.read_at(sheet, ends[0], start, stop, there))
+    return inverse, error, torch.from_numpy(there > 0)[:, None]
 
 
 def _ended(pixels: _Pixels) -> tuple[Tensor, Tensor, Tensor | None]:

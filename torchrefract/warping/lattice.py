@@ -1,7 +1,7 @@
 """Smooth flows on a coarse lattice, and what lies between its nodes."""
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import torch
@@ -10,7 +10,9 @@ from torch import Tensor
 
 from torchrefract._bands import by_samples
 from torchrefract._constants import assume_constant_result, constant
-from torchrefract.warping.grid import finite, pixel_axes, sampler_positions
+from torchrefract._threads import share
+from torchrefract.warping.compiled import SMALLEST, kernels, obstacle, with_gradients
+from torchrefract.warping.grid import finite, pixel_axes, sampler_axes, sampler_positions
 
 # Slopes of cubics are not smooth enough from cell to cell.
 STREAM_NODES = 6
@@ -60,20 +62,17 @@ def between_nodes(nodes: Tensor, lattice: Lattice) -> Tensor:
 
     Source: the remainder of Lagrange's interpolation; de Boor, "A practical guide to splines" (1978), chapter 2.
     """
-    weight = lagrange_weights(lattice.stride, 4, dtype=nodes.dtype, device=nodes.device)
-    return by_samples(nodes, lambda own: _down(_across(own, weight, lattice.width), weight, lattice.height))
+    return _down(along_rows(nodes, lattice), _cubics(nodes, lattice), lattice.height)
 
 
 def along_rows(nodes: Tensor, lattice: Lattice) -> Tensor:
     """(B, C, n, W), the field of `between_nodes` in the rows of nodes, at every column of pixels."""
-    weight = lagrange_weights(lattice.stride, 4, dtype=nodes.dtype, device=nodes.device)
-    return by_samples(nodes, lambda own: _across(own, weight, lattice.width))
+    return _across(nodes, _cubics(nodes, lattice), lattice.width)
 
 
 def row_weights(like: Tensor, lattice: Lattice) -> Tensor:
     """(H, n), of the rows of nodes for each row of pixels, in the type of a tensor."""
-    weight = lagrange_weights(lattice.stride, 4, dtype=like.dtype, device=like.device)
-    return _matrix(weight, len(lattice.axes()[0]), lattice.height)
+    return _matrix(_cubics(like, lattice), len(lattice.axes()[0]), lattice.height)
 
 
 def lagrange_weights(stride: int, count: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -92,6 +91,24 @@ def slope_weights(stride: int, count: int, *, dtype: torch.dtype, device: torch.
     # The pixel before belongs to the cell before, whose nodes are one farther to the left; the one behind to the next.
     last, first = F.pad(weight[-1:], (0, 1)), F.pad(weight[:1], (2, 0))[:, :-1]
     return ((torch.cat([own[1:], first]) - torch.cat([last, own[:-1]])) / 2).to(dtype)
+
+
+class Lines(NamedTuple):
+    """Where F.grid_sample(align_corners=False) looks, at every pixel of the rows of a lattice's nodes."""
+
+    values: Tensor  # (B, 2, n, W)
+    weight: Tensor  # (2, stride, taps), of x and of y: of the rows around a row of pixels, by its place in its cell
+    height: int  # of the frame
+    x: Tensor | None = None  # (W,), to be added to the x between the rows
+    y: Tensor | None = None  # (H,), to be added to the y
+
+    def grid(self) -> Tensor:
+        """(B, H, W, 2): the same at every pixel."""
+        found = _down(self.values, self.weight, self.height)
+        if self.x is not None and self.y is not None:
+            found[:, :1] += self.x
+            found[:, 1:] += self.y[:, None]
+        return found.movedim(1, -1)
 
 
 @dataclass(frozen=True)
@@ -129,11 +146,16 @@ class SmoothFlow:
 
     def sampler_grid(self, dtype: torch.dtype) -> Tensor:
         """(B, H, W, 2): where F.grid_sample(align_corners=False) looks; no flow of that size is written."""
+        return self.lines(dtype).grid()
+
+    def lines(self, dtype: torch.dtype) -> Lines:
+        """Where it looks, at every pixel of the rows of nodes."""
         x, y = self.lattice.places(dtype=dtype, device=self.nodes.device)
-        size = {"height": self.lattice.height, "width": self.lattice.width}
+        height, width = self.lattice.height, self.lattice.width
         # The identity is linear, so it may go through the cubics with the flow.
-        positions = finite(sampler_positions(self.nodes.to(dtype), x, y, **size), _FARTHEST)
-        return between_nodes(positions, self.lattice).movedim(1, -1)
+        positions = finite(sampler_positions(self.nodes.to(dtype), x, y, height=height, width=width), _FARTHEST)
+        values, weight = along_rows(positions, self.lattice), _cubics(positions, self.lattice)
+        return Lines(values, weight.expand(2, -1, -1), height)
 
 
 class StreamFlow(SmoothFlow):
@@ -149,31 +171,23 @@ class StreamFlow(SmoothFlow):
 
     def dense(self) -> Tensor:
         """(B, 2, H, W), px."""
-        return self._flow(self.nodes, (1.0, 1.0))
+        return _down(*self._lines(self.nodes, (1.0, 1.0)), self.lattice.height)
 
-    def sampler_grid(self, dtype: torch.dtype) -> Tensor:
-        """(B, H, W, 2): where F.grid_sample(align_corners=False) looks."""
+    def lines(self, dtype: torch.dtype) -> Lines:
+        """Where F.grid_sample(align_corners=False) looks, at every pixel of the rows of nodes."""
         height, width = self.lattice.height, self.lattice.width
         x, y = pixel_axes(height, width, dtype=dtype, device=self.nodes.device)
-        still = torch.zeros((), dtype=dtype, device=self.nodes.device).expand(1, 2, 1, 1)
-        identity = sampler_positions(still, x[..., :1], y[..., :1, :], height=height, width=width)
-        grid = self._flow(finite(self.nodes.to(dtype), _FARTHEST), (2 / width, 2 / height))
-        grid[:, :1] += identity[:, :1] + x * (2 / width)
-        grid[:, 1:] += identity[:, 1:] + y * (2 / height)
-        return grid.movedim(1, -1)
+        x, y = sampler_axes(x, y, height=height, width=width)
+        nodes = finite(self.nodes.to(dtype), _FARTHEST)
+        return Lines(*self._lines(nodes, (2 / width, 2 / height)), height, x.flatten(), y.flatten())
 
-    def _flow(self, nodes: Tensor, scale: tuple[float, float]) -> Tensor:
-        """(D_y psi, -D_x psi), each times its scale."""
+    def _lines(self, nodes: Tensor, scale: tuple[float, float]) -> tuple[Tensor, Tensor]:
+        """(B, 2, n, W) and (2, stride, taps): (D_y psi, -D_x psi), each times its scale, as in `Lines`."""
         options = {"dtype": nodes.dtype, "device": nodes.device}
         slope = slope_weights(self.lattice.stride, STREAM_NODES, **options)
         weight = F.pad(lagrange_weights(self.lattice.stride, STREAM_NODES, **options), (1, 0))
-
-        def flow(own: Tensor) -> Tensor:
-            along, across = (_across(own, values, self.lattice.width) for values in (weight, slope))
-            lines = torch.cat([scale[0] * along, -scale[1] * across], dim=1)
-            return _down(lines, torch.stack([slope, weight]), self.lattice.height)
-
-        return by_samples(nodes, flow)
+        along, across = (_across(nodes, values, self.lattice.width) for values in (weight, slope))
+        return torch.cat([scale[0] * along, -scale[1] * across], dim=1), torch.stack([slope, weight])
 
 
 @assume_constant_result
@@ -189,16 +203,63 @@ def _computed_lagrange(stride: int, count: int) -> list[list[float]]:
     return ((t[..., None] - others) / (nodes[:, None] - others)).prod(dim=2).tolist()
 
 
+def _cubics(like: Tensor, lattice: Lattice) -> Tensor:
+    """(stride, 4), in the type of a tensor."""
+    return lagrange_weights(lattice.stride, 4, dtype=like.dtype, device=like.device)
+
+
 def _across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:
     """(B, C, n, W) of (B, C, n, m), by weights (stride, taps)."""
+
+    def plain(nodes: Tensor) -> Tensor:
+        return by_samples(nodes, lambda own: _multiplied_across(own, weight, width))
+
+    if nodes.shape[2] * width < SMALLEST or obstacle(nodes, weight):
+        return plain(nodes)
+    return with_gradients(lambda nodes: _filled_across(nodes, weight, width), plain, nodes)
+
+
+def _down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
+    """(B, C, H, W) of (B, C, n, W), by weights (stride, taps), or (C, stride, taps)."""
+
+    def plain(lines: Tensor) -> Tensor:
+        return by_samples(lines, lambda own: _multiplied_down(own, weight, height))
+
+    if height * lines.shape[3] < SMALLEST or obstacle(lines, weight):
+        return plain(lines)
+    return with_gradients(lambda lines: _filled_down(lines, weight, height), plain, lines)
+
+
+def _filled_across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:
+    """`_across` by a kernel."""
+    rows = nodes.shape[:3].numel()
+    out = nodes.new_empty(*nodes.shape[:3], width)
+    values = nodes.contiguous().view(rows, -1).numpy(), weight.mT.contiguous().numpy()
+    across, into = partial(kernels("look_up").across, *values), out.view(rows, width).numpy()
+    share(lambda start, stop: across(start, stop, into), rows, least=SMALLEST // width + 1)
+    return out
+
+
+def _filled_down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
+    """`_down` by a kernel."""
+    batch, channels, _, width = lines.shape
+    out = lines.new_empty(batch, channels, height, width)
+    values = lines.contiguous().numpy(), weight.expand(channels, -1, -1).contiguous().numpy()
+    down = partial(kernels("look_up").down, *values)
+    share(lambda start, stop: down(start, stop, out.numpy()), batch * channels * height, least=SMALLEST // width + 1)
+    return out
+
+
+def _multiplied_across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:
+    """`_across` by products of matrices."""
     if nodes.shape[3] <= _FEW_COLUMNS:
         return nodes @ _matrix(weight, nodes.shape[3], width).mT
     cells = nodes.unfold(3, weight.shape[-1], 1) @ weight.mT
     return cells.flatten(3)[..., :width]
 
 
-def _down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
-    """(B, C, H, W) of (B, C, n, W), by weights (stride, taps), or (C, stride, taps)."""
+def _multiplied_down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
+    """`_down` by products of matrices."""
     if lines.shape[2] <= _FEW_ROWS:
         return _matrix(weight, lines.shape[2], height) @ lines
     bands = weight.unsqueeze(-3) @ lines.unfold(2, weight.shape[-1], 1).mT

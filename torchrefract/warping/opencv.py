@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
+from torchrefract._checks import learns, withheld
 from torchrefract.warping.grid import mirror, pixel_positions
 
 _PADDINGS = {"zeros": "BORDER_CONSTANT", "border": "BORDER_REPLICATE", "reflection": "BORDER_REPLICATE"}
@@ -34,7 +34,7 @@ def obstacle(image: Tensor, flow: Tensor, *, interpolation: str, positions: torc
         interpolation: of the look-up.
         positions: the type that F.grid_sample takes the positions in.
     """
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_compiling():  # where no other question may be asked
         return "under torch.compile"
     if interpolation not in _INTERPOLATIONS:
         return f"for {interpolation} interpolation"
@@ -42,7 +42,9 @@ def obstacle(image: Tensor, flow: Tensor, *, interpolation: str, positions: torc
         return f"for an image of {image.shape[1]} channels, {image.dtype}"
     if positions is not torch.float32:
         return f"for positions that are {positions}"
-    return _withheld(image) or _withheld(flow) or _missing()
+    if learns((image, flow)):
+        return "where a gradient is asked for"
+    return withheld(image) or withheld(flow) or _missing()
 
 
 def remapped(image: Tensor, grids: Iterable[Tensor], *, padding: str, interpolation: str) -> Tensor:
@@ -91,19 +93,6 @@ def _pictures(image: Tensor) -> np.ndarray:
     """(B, H, W, C), or (B, H, W) of one channel, as OpenCV has it: the same memory."""
     pixels = image.movedim(1, -1).numpy()
     return pixels[..., 0] if image.shape[1] == 1 else pixels
-
-
-def _withheld(value: Tensor) -> str | None:
-    """Why the numbers of a tensor are not there to be read, None where they are."""
-    if value.device.type != "cpu":
-        return f"on {value.device.type}"
-    if (value.requires_grad and torch.is_grad_enabled()) or forward_ad.unpack_dual(value).tangent is not None:
-        return "where a gradient is asked for"
-    try:
-        value.detach().numpy()
-    except RuntimeError:
-        return "inside torch.func"
-    return None
 
 
 def _missing() -> str | None:

@@ -3,28 +3,24 @@
 from collections.abc import Iterable
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._bands import join, rows_at_once
 from torchrefract._checks import check_choice, check_flow, check_tensor, learns
 from torchrefract._constants import constant
 from torchrefract._levels import rounded
+from torchrefract.warping import fused
+from torchrefract.warping.compiled import SMALLEST
 from torchrefract.warping.grid import FAR, Positions, field_dtype, finite, inside, sampler_grids
+from torchrefract.warping.grid_sample import INTERPOLATIONS, PADDINGS, WHOLE, by_grid_sample
 from torchrefract.warping.lattice import SmoothFlow
 from torchrefract.warping.mixed import Flow, dense, grid_of, known
 from torchrefract.warping.opencv import obstacle, remapped
 
-PADDINGS = ("zeros", "border", "reflection")
-INTERPOLATIONS = ("nearest", "bilinear", "bicubic")
-RESAMPLERS = ("auto", "grid_sample", "opencv")
+RESAMPLERS = ("auto", "grid_sample", "numba", "opencv")
 # Above this, float32 coordinates of the sampler are off by more than 1/1000 px.
 _LARGEST_FLOAT32_SIDE = 8192
-# The kernel of this pair alone rounds by the layout of its grid, which bands of rows change.
-_WHOLE = ("bicubic", "reflection")
 _CACHED = 1 << 18  # positions of a grid that stay in a core's cache
-# Below this many output pixels a second thread costs more than it brings.
-_SMALLEST_SPLIT = 1 << 14
 
 
 def warp(
@@ -99,13 +95,19 @@ def look_up(
         if resampler == "opencv":
             raise ValueError(f"resampler must be auto or grid_sample {why}, got 'opencv'")
     source = image.to(dtype)
+    if resampler == "numba" or (resampler == "auto" and _suits_numba(image)):
+        why = fused.obstacle(source, flow, interpolation=interpolation)
+        if why is None:
+            return _laid_out(_in_type(fused.looked_up(source, flow, padding=padding), image), image)
+        if resampler == "numba":
+            raise ValueError(f"resampler must be auto or grid_sample {why}, got 'numba'")
 
     def looked_up(grid: Tensor) -> Tensor:
-        found = sampled(source, grid, padding=padding, interpolation=interpolation)
+        found = by_grid_sample(source, grid, padding=padding, interpolation=interpolation)
         # What bicubics overshoot is cut first.
         return found if interpolation == "bicubic" else _in_type(found, image)
 
-    bands = map(looked_up, _grids(image, flow, dtype, whole=(interpolation, padding) == _WHOLE))
+    bands = map(looked_up, _grids(image, flow, dtype, whole=(interpolation, padding) == WHOLE))
     warped = join(bands, dim=2, length=image.shape[2])
     if interpolation == "bicubic":
         warped = _in_type(_clamped(warped, source, padding), image)
@@ -129,21 +131,14 @@ def follow(first: Flow, grid: Tensor) -> Tensor:
 
 
 def sampled(source: Tensor, grid: Tensor, *, padding: str, interpolation: str) -> Tensor:
-    """What F.grid_sample reads of a source (B, C, H, W) along its grid (B, n, m, 2), with all threads."""
-    parts = 1 if (interpolation, padding) == _WHOLE else _parts(source, grid)
-    if parts == 1:
-        return F.grid_sample(source, grid, mode=interpolation, padding_mode=padding, align_corners=False)
-    # The CPU sampler threads over the batch alone: bands of rows as a batch give the same bits on all threads.
-    batch, channels = source.shape[:2]
-    height, width = grid.shape[1:3]
-    rows = -(-height // parts)
-    if rows * parts > height:
-        grid = F.pad(grid, (0, 0, 0, 0, 0, rows * parts - height))
-    bands = grid.reshape(batch * parts, rows, width, 2)
-    repeated = source[:, None].expand(-1, parts, -1, -1, -1).reshape(batch * parts, *source.shape[1:])
-    out = F.grid_sample(repeated, bands, mode=interpolation, padding_mode=padding, align_corners=False)
-    out = out.view(batch, parts, channels, rows, width).movedim(1, 2)
-    return out.reshape(batch, channels, parts * rows, width)[:, :, :height]
+    """What F.grid_sample reads of a source (B, C, H, W) along its grid (B, n, m, 2), finite, by what is fastest."""
+    positions = Positions(grid)
+    if (
+        grid.shape[1] * grid.shape[2] >= SMALLEST
+        and fused.obstacle(source, positions, interpolation=interpolation) is None
+    ):
+        return fused.looked_up(source, positions, padding=padding)
+    return by_grid_sample(source, grid, padding=padding, interpolation=interpolation)
 
 
 def is_channels_last(image: Tensor) -> bool:
@@ -177,6 +172,11 @@ def _suits_opencv(image: Tensor) -> bool:
     """Whether OpenCV is faster: for bytes that lie in memory as it has them."""
     # Of floats PyTorch is. One sample is asked, so that the batch around it changes nothing.
     return image.dtype is torch.uint8 and is_channels_last(image[:1])
+
+
+def _suits_numba(image: Tensor) -> bool:
+    """Whether a kernel is faster: for planes."""
+    return image.shape[2] * image.shape[3] >= SMALLEST and not is_channels_last(image[:1])
 
 
 def _in_type(warped: Tensor, image: Tensor) -> Tensor:
@@ -213,11 +213,3 @@ def _grids(image: Tensor, flow: Flow | Positions, dtype: torch.dtype, *, whole: 
     grid = flow.grid if isinstance(flow, Positions) else grid_of(flow, dtype)
     # What is looked up in bands is still in the cache when it is rounded; of numbers nothing would be faster.
     return [grid] if image.is_floating_point() else grid.split(rows, dim=1)
-
-
-def _parts(source: Tensor, grid: Tensor) -> int:
-    if source.device.type != "cpu" or torch.compiler.is_compiling() or grid.shape[1] * grid.shape[2] < _SMALLEST_SPLIT:
-        return 1
-    threads = torch.get_num_threads() // source.shape[0]
-    # The backward pass keeps one gradient image a band, so a long gradient caps the bands.
-    return max(1, min(threads, 4 if source.requires_grad else grid.shape[1]))

@@ -1,0 +1,116 @@
+"""Looking an image up by numba's kernels: positions and look-up in one pass, to the bits of F.grid_sample."""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrefract._checks import learns
+from torchrefract._threads import share
+from torchrefract.warping import compiled
+from torchrefract.warping.grid import FAR, Positions, pixel_axes, sampler_axes
+from torchrefract.warping.grid_sample import PADDINGS, by_grid_sample, gradients_by_grid_sample
+from torchrefract.warping.lattice import Lines, SmoothFlow
+from torchrefract.warping.mixed import Flow, MixedFlow, PartFlow, grid_of, known
+
+_Kernel = Callable[[int, int], None]
+
+
+def obstacle(source: Tensor, flow: Flow | Positions, *, interpolation: str) -> str | None:
+    """Why no kernel can look a source up along a flow, None where one can."""
+    if interpolation != "bilinear":
+        return f"for {interpolation} interpolation"
+    return compiled.obstacle(source, flow.grid if isinstance(flow, Positions) else known(flow))
+
+
+def looked_up(source: Tensor, flow: Flow | Positions, *, padding: str) -> Tensor:
+    """What F.grid_sample reads of a source (B, C, H, W), bilinear, of which `obstacle` has nothing to say.
+
+    A grid of positions may have another size than the source.
+    """
+    if not learns((source, flow)):
+        return _filled(source, flow, padding)
+    grid = None
+    if flow.requires_grad:
+        grid = flow.grid if isinstance(flow, Positions) else grid_of(flow, source.dtype)
+    return _LookedUp.apply(source, grid, flow.detach(), padding)
+
+
+class _LookedUp(torch.autograd.Function):
+    """The look-up with the gradients of F.grid_sample; the grid has those of a flow that learns, else it is None."""
+
+    @staticmethod
+    def forward(ctx: Any, source: Tensor, grid: Tensor | None, flow: Flow | Positions, padding: str) -> Tensor:
+        ctx.save_for_backward(source, grid)
+        ctx.flow, ctx.padding = flow, padding
+        return _filled(source.detach(), flow if grid is None else Positions(grid.detach()), padding)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:
+        source, grid = ctx.saved_tensors
+        if grid is None:
+            grid = ctx.flow.grid if isinstance(ctx.flow, Positions) else grid_of(ctx.flow, source.dtype)
+        needed, options = ctx.needs_input_grad[:2], {"padding": ctx.padding, "interpolation": "bilinear"}
+        if torch.is_grad_enabled():  # for gradients of these
+            plain = partial(by_grid_sample, **options)
+            found = compiled.gradients_of(plain, (source, grid), needed, gradients[0])
+        else:
+            found = gradients_by_grid_sample(source, grid, gradients[0], needed=needed, padding=ctx.padding)
+        return *found, None, None
+
+
+def _filled(source: Tensor, flow: Flow | Positions, padding: str) -> Tensor:
+    height, width = flow.grid.shape[1:3] if isinstance(flow, Positions) else source.shape[2:]
+    out = source.new_empty(*source.shape[:2], height, width)
+    for images, own in _parts(flow, len(source)):
+        kernel = _kernel(source.detach().contiguous(), images, own, PADDINGS.index(padding), out)
+        share(kernel, len(images) * height, least=compiled.SMALLEST // width + 1)
+    return out
+
+
+def _parts(flow: Flow | Positions, batch: int) -> Iterator[tuple[Tensor, PartFlow | Positions]]:
+    """The rows of a batch that have their flow in one form."""
+    if isinstance(flow, MixedFlow):
+        yield from flow.parts
+    else:
+        yield torch.arange(batch), flow
+
+
+def _kernel(source: Tensor, images: Tensor, flow: PartFlow | Positions, padding: int, out: Tensor) -> _Kernel:
+    """What looks rows up, of the source and of out, along a flow."""
+    values = flow.grid.movedim(-1, 1) if isinstance(flow, Positions) else known(flow)
+    rows = images.numpy()
+    flows = np.arange(len(values))
+    if len(values) > 1 and values.stride(0) == 0:  # one for all, as that of the frames of a clip
+        flows, values = np.zeros_like(flows), values[:1]
+    image, into = source.numpy(), out.numpy()
+    if isinstance(flow, SmoothFlow):
+        lines = flow.with_nodes(values).lines(source.dtype)
+        work = partial(compiled.kernels("look_up").look_up_lattice, image, rows, *_of_lines(lines, flows))
+    else:
+        work = partial(
+            compiled.kernels("look_up").look_up_dense, image, rows, *_of_pixels(values, flows, flow, source.dtype)
+        )
+    return lambda start, stop: work(padding, start, stop, into)
+
+
+def _of_lines(lines: Lines, flows: np.ndarray) -> tuple[Any, ...]:
+    values, weight = lines.values.contiguous(), lines.weight.contiguous()
+    x = values.new_zeros(values.shape[3]) if lines.x is None else lines.x
+    y = values.new_zeros(lines.height) if lines.y is None else lines.y
+    return values.numpy(), flows, weight.numpy(), x.numpy(), y.numpy()
+
+
+def _of_pixels(values: Tensor, flows: np.ndarray, flow: PartFlow | Positions, dtype: torch.dtype) -> tuple[Any, ...]:
+    height, width = values.shape[2:]
+    x, y = values.new_zeros(width), values.new_zeros(height)
+    scale = 1.0, 1.0
+    if not isinstance(flow, Positions):
+        size = {"height": height, "width": width}
+        x, y = sampler_axes(*pixel_axes(**size, dtype=dtype, device=values.device), **size)
+        scale = 2 / width, 2 / height
+    ends = map(np.float32, (*scale, FAR))
+    return values.contiguous().numpy(), flows, x.flatten().numpy(), y.flatten().numpy(), *ends

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrefract._checks import check_tensor
 from torchrefract._levels import levels_of, numbers_of
 from torchrefract.labels.rows import is_tv
-from torchrefract.warping.resample import is_channels_last
+from torchrefract.warping.layout import is_channels_last
 
 
 class Layout(NamedTuple):

@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrefract import white_noise
 from torchrefract._bands import by_samples
-from torchrefract._constants import constant
+from torchrefract._constants import constant, kept
 from torchrefract.fields.evolution import turned
 from torchrefract.fields.gaussian import axis_spectrum
 
@@ -70,15 +70,10 @@ def mode_field(
         modes: their frequencies.
         rows, columns: px, whole numbers.
     """
-    options = {"dtype": noise.dtype, "device": noise.device}
     weighted = noise * (amplitude[0][:, None, :, None] * amplitude[1][:, None, None, :])
     real, imaginary = weighted.unbind(1)
-    ky, kx = _numbers(modes, noise.device)
-    cos_x, sin_x = _waves(kx, columns, modes.size[1], **options)
-    cos_y, sin_y = _waves(ky, rows, modes.size[0], **options)
+    in_y, in_x = _waves(modes, tuple(rows), tuple(columns), noise.dtype, noise.device)
     both = torch.stack([torch.cat([real, imaginary], dim=2), torch.cat([imaginary, -real], dim=2)], dim=1)
-    in_x = torch.cat([cos_x, sin_x]).unsqueeze(0)
-    in_y = torch.stack([torch.cat([cos_y, sin_y]).mT, torch.cat([-sin_y, cos_y]).mT])
 
     def fields(pairs: Tensor) -> Tensor:
         along = torch.bmm(pairs.flatten(0, 1), in_x.expand(2 * pairs.shape[0], -1, -1))
@@ -88,12 +83,21 @@ def mode_field(
     return by_samples(both, fields)
 
 
-def _waves(k: Tensor, places: Sequence[int], size: int, **options: Any) -> tuple[Tensor, Tensor]:
-    """cos and sin of 2 pi k p / size, (M, n)."""
-    where = constant(list(places), device=k.device)
-    # Whole turns are taken out of whole numbers, exactly.
-    angle = (k[:, None] * where).remainder(size).to(**options) * (2 * math.pi / size)
-    return angle.cos(), angle.sin()
+@kept
+def _waves(
+    modes: Modes, rows: tuple[int, ...], columns: tuple[int, ...], dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """(2, n, 2 My) and (1, 2 Mx, m): cos and sin of 2 pi k p / size, as the two products take them."""
+
+    def waves(k: Tensor, places: Sequence[int], size: int) -> tuple[Tensor, Tensor]:
+        # Whole turns are taken out of whole numbers, exactly.
+        angle = (k[:, None] * constant(places, device=device)).remainder(size).to(dtype) * (2 * math.pi / size)
+        return angle.cos(), angle.sin()
+
+    ky, kx = _numbers(modes, device)
+    (cos_y, sin_y), (cos_x, sin_x) = waves(ky, rows, modes.size[0]), waves(kx, columns, modes.size[1])
+    in_y = torch.stack([torch.cat([cos_y, sin_y]).mT, torch.cat([-sin_y, cos_y]).mT])
+    return in_y, torch.cat([cos_x, sin_x]).unsqueeze(0)
 
 
 def _numbers(modes: Modes, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -101,6 +105,7 @@ def _numbers(modes: Modes, device: torch.device) -> tuple[Tensor, Tensor]:
     return rows, columns
 
 
+@kept
 def _places(modes: Modes, device: torch.device) -> Tensor:
     """(My, Mx): where each frequency stands among those of the torus."""
     ky, kx = _numbers(modes, device)

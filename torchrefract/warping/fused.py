@@ -8,28 +8,35 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._checks import learns
+from torchrefract._checks import learns, withheld
 from torchrefract._threads import share
 from torchrefract.warping import compiled
 from torchrefract.warping.grid import FAR, Positions, pixel_axes, sampler_axes
 from torchrefract.warping.grid_sample import PADDINGS, by_grid_sample, gradients_by_grid_sample
 from torchrefract.warping.lattice import Lines, SmoothFlow
+from torchrefract.warping.layout import is_channels_last
 from torchrefract.warping.mixed import Flow, MixedFlow, PartFlow, grid_of, known
 
 _Kernel = Callable[[int, int], None]
+# Channels, height and width; how far pixels are apart; source and out, as the kernels have them.
+_Images = tuple[torch.Size, int, np.ndarray, np.ndarray]
 
 
 def obstacle(source: Tensor, flow: Flow | Positions, *, interpolation: str) -> str | None:
     """Why no kernel can look a source up along a flow, None where one can."""
     if interpolation != "bilinear":
         return f"for {interpolation} interpolation"
-    return compiled.obstacle(source, flow.grid if isinstance(flow, Positions) else known(flow))
+    positions = flow.grid if isinstance(flow, Positions) else known(flow)
+    if source.dtype is torch.uint8:
+        return withheld(source) or compiled.obstacle(positions)
+    return compiled.obstacle(source, positions)
 
 
 def looked_up(source: Tensor, flow: Flow | Positions, *, padding: str) -> Tensor:
     """What F.grid_sample reads of a source (B, C, H, W), bilinear, of which `obstacle` has nothing to say.
 
-    A grid of positions may have another size than the source.
+    A grid of positions may have another size than the source. Bytes are rounded to the nearest; nothing may learn from
+    them.
     """
     if not learns((source, flow)):
         return _filled(source, flow, padding)
@@ -64,11 +71,17 @@ class _LookedUp(torch.autograd.Function):
 
 def _filled(source: Tensor, flow: Flow | Positions, padding: str) -> Tensor:
     height, width = flow.grid.shape[1:3] if isinstance(flow, Positions) else source.shape[2:]
-    out = source.new_empty(*source.shape[:2], height, width)
-    for images, own in _parts(flow, len(source)):
-        kernel = _kernel(source.detach().contiguous(), images, own, PADDINGS.index(padding), out)
-        share(kernel, len(images) * height, least=compiled.SMALLEST // width + 1)
-    return out
+    batch, channels = source.shape[:2]
+    last = is_channels_last(source)
+    pixels = source.movedim(1, -1) if last else source.contiguous()
+    # Not `empty_like`, which gives a frame of one pixel other strides.
+    shape = (height, width, channels) if last else (channels, height, width)
+    out = source.new_empty(batch, *shape)
+    images = (source.shape[1:], channels if last else 1, pixels.reshape(batch, -1).numpy(), out.view(batch, -1).numpy())
+    for rows, own in _parts(flow, batch):
+        kernel = _kernel(images, rows, own, PADDINGS.index(padding))
+        share(kernel, len(rows) * height, least=compiled.SMALLEST // width + 1)
+    return out.movedim(-1, 1) if last else out
 
 
 def _parts(flow: Flow | Positions, batch: int) -> Iterator[tuple[Tensor, PartFlow | Positions]]:
@@ -79,22 +92,20 @@ def _parts(flow: Flow | Positions, batch: int) -> Iterator[tuple[Tensor, PartFlo
         yield torch.arange(batch), flow
 
 
-def _kernel(source: Tensor, images: Tensor, flow: PartFlow | Positions, padding: int, out: Tensor) -> _Kernel:
-    """What looks rows up, of the source and of out, along a flow."""
+def _kernel(images: _Images, rows: Tensor, flow: PartFlow | Positions, padding: int) -> _Kernel:
+    """What looks rows up, of the pictures that are told, along a flow."""
+    (channels, height, width), step, source, out = images
     values = flow.grid.movedim(-1, 1) if isinstance(flow, Positions) else known(flow)
-    rows = images.numpy()
     flows = np.arange(len(values))
     if len(values) > 1 and values.stride(0) == 0:  # one for all, as that of the frames of a clip
         flows, values = np.zeros_like(flows), values[:1]
-    image, into = source.numpy(), out.numpy()
+    size = channels, height, width, step
     if isinstance(flow, SmoothFlow):
-        lines = flow.with_nodes(values).lines(source.dtype)
-        work = partial(compiled.kernels("look_up").look_up_lattice, image, rows, *_of_lines(lines, flows))
+        look_up, along = "look_up_lattice", _of_lines(flow.with_nodes(values).lines(values.dtype), flows)
     else:
-        work = partial(
-            compiled.kernels("look_up").look_up_dense, image, rows, *_of_pixels(values, flows, flow, source.dtype)
-        )
-    return lambda start, stop: work(padding, start, stop, into)
+        look_up, along = "look_up_dense", _of_pixels(values, flows, whole=isinstance(flow, Positions))
+    work = partial(getattr(compiled.kernels("look_up"), look_up), source, size, rows.numpy(), *along, padding)
+    return lambda start, stop: work(start, stop, out)
 
 
 def _of_lines(lines: Lines, flows: np.ndarray) -> tuple[Any, ...]:
@@ -104,13 +115,13 @@ def _of_lines(lines: Lines, flows: np.ndarray) -> tuple[Any, ...]:
     return values.numpy(), flows, weight.numpy(), x.numpy(), y.numpy()
 
 
-def _of_pixels(values: Tensor, flows: np.ndarray, flow: PartFlow | Positions, dtype: torch.dtype) -> tuple[Any, ...]:
+def _of_pixels(values: Tensor, flows: np.ndarray, *, whole: bool) -> tuple[Any, ...]:
+    """Of positions as a whole, or of the flows that make them."""
     height, width = values.shape[2:]
-    x, y = values.new_zeros(width), values.new_zeros(height)
-    scale = 1.0, 1.0
-    if not isinstance(flow, Positions):
+    x, y, scale = values.new_zeros(width), values.new_zeros(height), (1.0, 1.0)
+    if not whole:
         size = {"height": height, "width": width}
-        x, y = sampler_axes(*pixel_axes(**size, dtype=dtype, device=values.device), **size)
+        x, y = sampler_axes(*pixel_axes(**size, dtype=values.dtype, device=values.device), **size)
         scale = 2 / width, 2 / height
     ends = map(np.float32, (*scale, FAR))
     return values.contiguous().numpy(), flows, x.flatten().numpy(), y.flatten().numpy(), *ends

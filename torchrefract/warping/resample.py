@@ -14,6 +14,7 @@ from torchrefract.warping.compiled import SMALLEST
 from torchrefract.warping.grid import FAR, Positions, field_dtype, finite, inside, sampler_grids
 from torchrefract.warping.grid_sample import INTERPOLATIONS, PADDINGS, WHOLE, by_grid_sample
 from torchrefract.warping.lattice import SmoothFlow
+from torchrefract.warping.layout import has_format, is_channels_last
 from torchrefract.warping.mixed import Flow, dense, grid_of, known
 from torchrefract.warping.opencv import obstacle, remapped
 
@@ -82,25 +83,21 @@ def look_up(
     if image.numel() == 0:
         return image.clone()
     dtype = sampler_dtype(image, flow.dtype)
-    if resampler == "opencv" or (resampler == "auto" and _suits_opencv(image)):
-        why = obstacle(
-            image,
-            flow.grid if isinstance(flow, Positions) else known(flow),
-            interpolation=interpolation,
-            positions=dtype,
-        )
-        if why is None:
-            grids = _grids(image, flow, dtype, whole=False)
-            return _laid_out(remapped(image, grids, padding=padding, interpolation=interpolation), image)
-        if resampler == "opencv":
-            raise ValueError(f"resampler must be auto or grid_sample {why}, got 'opencv'")
-    source = image.to(dtype)
-    if resampler == "numba" or (resampler == "auto" and _suits_numba(image)):
+    options = {"padding": padding, "interpolation": interpolation}
+    # Bytes go as they are where nothing is learned from them; the kernels make them numbers as they read them.
+    source = image if image.dtype is torch.uint8 and not learns((flow,)) else image.to(dtype)
+    if resampler == "numba" or (resampler == "auto" and image.shape[2] * image.shape[3] >= SMALLEST):
         why = fused.obstacle(source, flow, interpolation=interpolation)
         if why is None:
             return _laid_out(_in_type(fused.looked_up(source, flow, padding=padding), image), image)
-        if resampler == "numba":
-            raise ValueError(f"resampler must be auto or grid_sample {why}, got 'numba'")
+        _refuse(resampler, "numba", why)
+    if resampler == "opencv" or (resampler == "auto" and _suits_opencv(image)):
+        positions = flow.grid if isinstance(flow, Positions) else known(flow)
+        why = obstacle(image, positions, interpolation=interpolation, positions=dtype)
+        if why is None:
+            return _laid_out(remapped(image, _grids(image, flow, dtype, whole=False), **options), image)
+        _refuse(resampler, "opencv", why)
+    source = source.to(dtype)
 
     def looked_up(grid: Tensor) -> Tensor:
         found = by_grid_sample(source, grid, padding=padding, interpolation=interpolation)
@@ -141,21 +138,6 @@ def sampled(source: Tensor, grid: Tensor, *, padding: str, interpolation: str) -
     return by_grid_sample(source, grid, padding=padding, interpolation=interpolation)
 
 
-def is_channels_last(image: Tensor) -> bool:
-    """Whether the image (B, C, H, W) lies in memory in that format and in no other."""
-    # A batch of one, or one channel, counts as both formats; only a real channels_last image asks for its own.
-    return not image.is_contiguous() and _has_format(image) and image.is_contiguous(memory_format=torch.channels_last)
-
-
-def _has_format(image: Tensor) -> bool:
-    """Whether it can be said how the image lies in memory."""
-    try:
-        image.is_contiguous(memory_format=torch.channels_last)
-    except RuntimeError:  # inside torch.vmap a sample has no format
-        return False
-    return True
-
-
 def _check_fit(image: Tensor, flow: Tensor) -> None:
     check_flow("flow", flow)
     if image.ndim != 4:
@@ -174,19 +156,22 @@ def _suits_opencv(image: Tensor) -> bool:
     return image.dtype is torch.uint8 and is_channels_last(image[:1])
 
 
-def _suits_numba(image: Tensor) -> bool:
-    """Whether a kernel is faster: for planes."""
-    return image.shape[2] * image.shape[3] >= SMALLEST and not is_channels_last(image[:1])
+def _refuse(resampler: str, name: str, why: str) -> None:
+    """Raise if it was asked for by its name."""
+    if resampler == name:
+        raise ValueError(f"resampler must be auto or grid_sample {why}, got {name!r}")
 
 
 def _in_type(warped: Tensor, image: Tensor) -> Tensor:
     """Values in the type of the image; those of whole numbers are rounded."""
+    if warped.dtype is image.dtype:
+        return warped
     return warped if image.is_floating_point() else rounded(warped, image.dtype).to(image.dtype)
 
 
 def _laid_out(warped: Tensor, image: Tensor) -> Tensor:
     """The warped image in the type and the memory format of the image."""
-    layout = torch.channels_last if is_channels_last(image) and _has_format(warped) else torch.contiguous_format
+    layout = torch.channels_last if is_channels_last(image) and has_format(warped) else torch.contiguous_format
     # `to` with a format copies what has the type and the format already.
     if warped.dtype is image.dtype:
         return warped.contiguous(memory_format=layout)

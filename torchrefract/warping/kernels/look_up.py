@@ -1,53 +1,39 @@
-"""What numba compiles: fields between nodes, and images looked up row by row, by the steps of F.grid_sample.
+"""What numba compiles: images looked up row by row, bilinearly, by the steps of F.grid_sample.
 
-Rows are those of all pictures, one below the other; each call does those from `start` on and before `stop`. All numbers
-are float32. Arguments: source (B, C, H, W), out (B, C, n, m), images and flows (k,), the pictures of source and out and
-the rows of the batch of flows that belong together, in k pairs.
+Rows are those of all pairs, one below the other; each call does those from `start` on and before `stop`. Numbers are
+float32, but those of a source and of what it is looked up to may both be bytes, which are rounded. Arguments:
+
+source, (B, C H W), and out, (B, C n m): with planes of channels, or the channels of each pixel together.
+size: C, H, W, and how far a pixel is from the next one: 1 of planes, C of channels that lie together.
+images, flows, (k,): the rows of the batches of source and out, and of flows, that belong together, in k pairs.
 """
 
+from typing import Any
+
 import numpy as np
+from numba.extending import overload
 from numpy.typing import NDArray
 
 from torchrefract._jit import fma, jit
+from torchrefract.warping.kernels.lines import between
 
 ZEROS, BORDER, REFLECTION = range(3)
 _CHUNK = 512  # pixels that are looked up together: without a look at borders if all of them are inside
 
 Floats = NDArray[np.float32]
+Values = NDArray[Any]
 Whole = NDArray[np.int64]
 Corners = NDArray[np.int32]
 Number = np.float32
-
-
-@jit
-def down(lines: Floats, weight: Floats, start: int, stop: int, out: Floats) -> None:
-    """Rows of out, (B, C, H, W), of lines, (B, C, n, W), at every `stride` px, by weights (C, stride, taps)."""
-    channels, height, width = out.shape[1:]
-    for row in range(start, stop):
-        plane, line = divmod(row, height)
-        i, c = divmod(plane, channels)
-        _between(lines[i, c], weight[c], line, 0, width, out[i, c, line])
-
-
-@jit
-def across(nodes: Floats, weight: Floats, start: int, stop: int, out: Floats) -> None:
-    """Rows of out, (N, W), of nodes, (N, m), every `stride` px, by weights (taps, stride)."""
-    taps, stride = weight.shape
-    for row in range(start, stop):
-        own, line = nodes[row], out[row]
-        for cell in range(-(-line.size // stride)):
-            here = line[cell * stride : (cell + 1) * stride]
-            a, b, c, d = own[cell], own[cell + 1], own[cell + 2], own[cell + 3]
-            for k in range(here.size):
-                here[k] = fma(weight[3, k], d, fma(weight[2, k], c, fma(weight[1, k], b, weight[0, k] * a)))
-            for tap in range(4, taps):
-                for k in range(here.size):
-                    here[k] = fma(weight[tap, k], own[cell + tap], here[k])
+Index = np.uintp  # what has a sign could count from the end, and would be asked
+Size = tuple[int, int, int, int]
+Cells = tuple[Corners, Floats, Floats]
 
 
 @jit
 def look_up_lattice(
-    source: Floats,
+    source: Values,
+    size: Size,
     images: Whole,
     lines: Floats,
     flows: Whole,
@@ -57,33 +43,30 @@ def look_up_lattice(
     padding: int,
     start: int,
     stop: int,
-    out: Floats,
+    out: Values,
 ) -> None:
     """Look up along positions between the nodes of a lattice.
 
-    lines (F, 2, n, W), weight (2, stride, taps): as for `down`; base_x (W,) and base_y (H,) are added.
+    lines (F, 2, n, W), weight (2, stride, taps): as for `between`; base_x (W,) and base_y (H,) are added.
     """
-    height, width = out.shape[2:]
+    height, width = base_y.size, base_x.size
     x, y = np.empty(width, np.float32), np.empty(width, np.float32)
-    right, below, corner = np.empty(_CHUNK, np.float32), np.empty(_CHUNK, np.float32), np.empty(_CHUNK, np.int32)
+    cells = np.empty(_CHUNK, np.int32), np.empty(_CHUNK, np.float32), np.empty(_CHUNK, np.float32)
     for row in range(start, stop):
         pair, line = divmod(row, height)
-        i, flow = images[pair], flows[pair]
-        _between(lines[flow, 0], weight[0], line, 0, width, x)
-        _between(lines[flow, 1], weight[1], line, 0, width, y)
+        image, flow = images[pair], flows[pair]
+        between(lines[flow, 0], weight[0], line, x)
+        between(lines[flow, 1], weight[1], line, y)
         for k in range(width):
             x[k] += base_x[k]
             y[k] += base_y[line]
-        _to_pixels(x, source.shape[3], padding)
-        _to_pixels(y, source.shape[2], padding)
-        for first in range(0, width, _CHUNK):
-            last = min(first + _CHUNK, width)
-            _look_up(source[i], x[first:last], y[first:last], padding, corner, right, below, out[i], line, first)
+        _look_up(source[image], size, x, y, padding, cells, out[image], line, height)
 
 
 @jit
 def look_up_dense(
-    source: Floats,
+    source: Values,
+    size: Size,
     images: Whole,
     flow: Floats,
     flows: Whole,
@@ -95,27 +78,23 @@ def look_up_dense(
     padding: int,
     start: int,
     stop: int,
-    out: Floats,
+    out: Values,
 ) -> None:
     """Look up along positions that are known at every pixel.
 
     flow (F, 2, n, m): times the scales, with base_x (m,) and base_y (n,) added, within [-far, far], where also lies
     what is no number.
     """
-    height, width = out.shape[2:]
+    height, width = base_y.size, base_x.size
     x, y = np.empty(width, np.float32), np.empty(width, np.float32)
-    right, below, corner = np.empty(_CHUNK, np.float32), np.empty(_CHUNK, np.float32), np.empty(_CHUNK, np.int32)
+    cells = np.empty(_CHUNK, np.int32), np.empty(_CHUNK, np.float32), np.empty(_CHUNK, np.float32)
     for row in range(start, stop):
         pair, line = divmod(row, height)
-        i, u, v = images[pair], flow[flows[pair], 0, line], flow[flows[pair], 1, line]
+        image, u, v = images[pair], flow[flows[pair], 0, line], flow[flows[pair], 1, line]
         for k in range(width):
             x[k] = _within(base_x[k] + u[k] * scale_x, far)
             y[k] = _within(base_y[line] + v[k] * scale_y, far)
-        _to_pixels(x, source.shape[3], padding)
-        _to_pixels(y, source.shape[2], padding)
-        for first in range(0, width, _CHUNK):
-            last = min(first + _CHUNK, width)
-            _look_up(source[i], x[first:last], y[first:last], padding, corner, right, below, out[i], line, first)
+        _look_up(source[image], size, x, y, padding, cells, out[image], line, height)
 
 
 @jit
@@ -125,59 +104,43 @@ def _within(place: Number, far: Number) -> Number:
 
 
 @jit
-def _between(lines: Floats, weight: Floats, line: int, first: int, last: int, out: Floats) -> None:
-    """Pixels first ... last of a row, of lines (n, W), by the weights (stride, taps) of its place in its cell."""
-    cell, place = divmod(line, weight.shape[0])
-    taps = weight[place]
-    a, b, c, d = (
-        lines[cell, first:last],
-        lines[cell + 1, first:last],
-        lines[cell + 2, first:last],
-        lines[cell + 3, first:last],
-    )
-    for i in range(out.size):
-        out[i] = fma(taps[3], d[i], fma(taps[2], c[i], fma(taps[1], b[i], taps[0] * a[i])))
-    for tap in range(4, taps.size):
-        more = lines[cell + tap, first:last]
-        for i in range(out.size):
-            out[i] = fma(taps[tap], more[i], out[i])
-
-
-@jit
 def _look_up(
-    source: Floats,
+    source: Values,
+    size: Size,
     x: Floats,
     y: Floats,
     padding: int,
-    corner: Corners,
-    right: Floats,
-    below: Floats,
-    out: Floats,
+    cells: Cells,
+    out: Values,
     line: int,
-    first: int,
+    lines: int,
 ) -> None:
-    """Pixels of a row of out (C, n, m), from `first` on, of a source (C, H, W) at the sampler's coordinates (N,).
+    """A row of out, which has so many, of a source, (C H W,), at the sampler's coordinates, (m,).
 
-    The coordinates are overwritten; corner, right and below (_CHUNK,) are room to work in.
+    These are overwritten; cells: room for what `_cells` finds.
     """
-    channels, height, width = source.shape
-    last = first + x.size
-    inside, beside = _cells(x, y, height, width, corner, right, below)
-    if inside:
-        _in_frame(source, corner, right, below, out, line, first, last)
-        return
-    if beside:
-        for c in range(channels):
-            out[c, line, first:last] = 0
-        return
-    start, stop = _middle(x, y, height, width)
-    _at_border(source, x[:start], y[:start], out, line, first)
-    _at_border(source, x[stop:], y[stop:], out, line, first + stop)
-    x, y = x[start:stop], y[start:stop]
-    if _cells(x, y, height, width, corner, right, below)[0]:
-        _in_frame(source, corner, right, below, out, line, first + start, first + stop)
-    else:
-        _at_border(source, x, y, out, line, first + start)
+    channels, height, width, step = size
+    _to_pixels(x, width, padding)
+    _to_pixels(y, height, padding)
+    # From one channel to the next, of the source and of out, and where the row begins.
+    apart = (height * width, lines * x.size, line * x.size) if step == 1 else (1, 1, line * x.size * step)
+    for chunk in range(0, x.size, _CHUNK):
+        first, last = chunk, min(chunk + _CHUNK, x.size)
+        inside, beside = _cells(x[first:last], y[first:last], height, width, cells)
+        if beside:
+            for c in range(channels):
+                for k in range(first, last):
+                    out[c * apart[1] + apart[2] + k * step] = 0
+            continue
+        if not inside:
+            start, stop = _middle(x, y, first, last, height, width)
+            _at_border(source, size, x, y, first, start, apart, out)
+            _at_border(source, size, x, y, stop, last, apart, out)
+            first, last = start, stop
+            if not _cells(x[first:last], y[first:last], height, width, cells)[0]:
+                _at_border(source, size, x, y, first, last, apart, out)
+                continue
+        _in_frame(source, size, cells, last - first, apart, out[apart[2] + first * step :])
 
 
 @jit
@@ -205,13 +168,12 @@ def _to_pixels(place: Floats, size: int, padding: int) -> None:
 
 
 @jit
-def _cells(
-    x: Floats, y: Floats, height: int, width: int, corner: Corners, right: Floats, below: Floats
-) -> tuple[bool, bool]:
+def _cells(x: Floats, y: Floats, height: int, width: int, cells: Cells) -> tuple[bool, bool]:
     """Whether all four pixels around each position are in the frame, and whether none of them is.
 
-    If all are: the first of the four, and how far it is.
+    If all are: the first of the four, and how far behind it the position is along both axes.
     """
+    corner, right, below = cells
     inside, beside = True, True
     for i in range(x.size):
         left, top = np.floor(x[i]), np.floor(y[i])
@@ -223,9 +185,8 @@ def _cells(
 
 
 @jit
-def _middle(x: Floats, y: Floats, height: int, width: int) -> tuple[int, int]:
+def _middle(x: Floats, y: Floats, start: int, stop: int, height: int, width: int) -> tuple[int, int]:
     """Where those begin and end that are left without the ones at both ends which are not inside."""
-    start, stop = 0, x.size
     while start < stop and not (0 <= x[start] < width - 1 and 0 <= y[start] < height - 1):
         start += 1
     while start < stop and not (0 <= x[stop - 1] < width - 1 and 0 <= y[stop - 1] < height - 1):
@@ -234,54 +195,58 @@ def _middle(x: Floats, y: Floats, height: int, width: int) -> tuple[int, int]:
 
 
 @jit
-def _in_frame(
-    source: Floats, corner: Corners, right: Floats, below: Floats, out: Floats, line: int, start: int, stop: int
-) -> None:
-    """Pixels start ... stop of a row of out (C, n, m), whose four pixels of a source (C, H, W) are all there."""
-    channels, height, width = source.shape
-    planes, c, cells = source.reshape(channels, height * width), 0, (width, corner, right, below)
+def _in_frame(source: Values, size: Size, cells: Cells, count: int, apart: tuple[int, int, int], out: Values) -> None:
+    """So many pixels of out, whose four pixels are all there; three channels at once, which share the weights."""
+    channels, _, width, step = size
+    c = 0
     while c + 3 <= channels:
-        into = out[c, line, start:stop], out[c + 1, line, start:stop], out[c + 2, line, start:stop]
-        _of_three(planes[c], planes[c + 1], planes[c + 2], *cells, *into)
+        first, second, third = (
+            source[c * apart[0] :],
+            source[(c + 1) * apart[0] :],
+            source[(c + 2) * apart[0] :],
+        )
+        into = out[c * apart[1] :], out[(c + 1) * apart[1] :], out[(c + 2) * apart[1] :]
+        _of_three(first, second, third, width, step, cells, count, into[0], into[1], into[2])
         c += 3
     while c < channels:
-        _of_one(planes[c], *cells, out[c, line, start:stop])
+        _of_one(source[c * apart[0] :], width, step, cells, count, out[c * apart[1] :])
         c += 1
 
 
 @jit
 def _of_three(
-    first: Floats,
-    second: Floats,
-    third: Floats,
+    first: Values,
+    second: Values,
+    third: Values,
     width: int,
-    corner: Corners,
-    right: Floats,
-    below: Floats,
-    first_out: Floats,
-    second_out: Floats,
-    third_out: Floats,
+    step: int,
+    cells: Cells,
+    count: int,
+    first_out: Values,
+    second_out: Values,
+    third_out: Values,
 ) -> None:
-    """Of three channels (H W,) at once, which share the weights."""
-    # What has a sign could count from the end, and would be asked.
-    one, wide = np.uintp(1), np.uintp(width)
-    for i in range(first_out.size):
-        here = np.uintp(corner[i])
-        under = here + wide
+    corner, right, below = cells
+    each, wide = np.uintp(step), np.uintp(width * step)
+    for i in range(count):
+        here, into = np.uintp(corner[i]) * each, np.uintp(i) * each
+        beside, under = here + each, here + wide
+        last = under + each
         a, b, c, d = _weights(right[i], below[i])
-        first_out[i] = _sum(a, first[here], b, first[here + one], c, first[under], d, first[under + one])
-        second_out[i] = _sum(a, second[here], b, second[here + one], c, second[under], d, second[under + one])
-        third_out[i] = _sum(a, third[here], b, third[here + one], c, third[under], d, third[under + one])
+        _put(first_out, into, _sum(first, here, beside, under, last, a, b, c, d))
+        _put(second_out, into, _sum(second, here, beside, under, last, a, b, c, d))
+        _put(third_out, into, _sum(third, here, beside, under, last, a, b, c, d))
 
 
 @jit
-def _of_one(plane: Floats, width: int, corner: Corners, right: Floats, below: Floats, out: Floats) -> None:
-    one, wide = np.uintp(1), np.uintp(width)
-    for i in range(out.size):
-        here = np.uintp(corner[i])
-        under = here + wide
+def _of_one(plane: Values, width: int, step: int, cells: Cells, count: int, out: Values) -> None:
+    corner, right, below = cells
+    each, wide = np.uintp(step), np.uintp(width * step)
+    for i in range(count):
+        here = np.uintp(corner[i]) * each
+        beside, under = here + each, here + wide
         a, b, c, d = _weights(right[i], below[i])
-        out[i] = _sum(a, plane[here], b, plane[here + one], c, plane[under], d, plane[under + one])
+        _put(out, np.uintp(i) * each, _sum(plane, here, beside, under, under + each, a, b, c, d))
 
 
 @jit
@@ -291,31 +256,71 @@ def _weights(right: Number, below: Number) -> tuple[Number, Number, Number, Numb
 
 
 @jit
-def _sum(a: Number, p: Number, b: Number, q: Number, c: Number, r: Number, d: Number, s: Number) -> Number:
-    return fma(d, s, fma(c, r, fma(b, q, a * p)))
+def _sum(
+    plane: Values, here: Index, beside: Index, under: Index, last: Index, a: Number, b: Number, c: Number, d: Number
+) -> Number:
+    upper = fma(b, _number(plane[beside]), a * _number(plane[here]))
+    return fma(d, _number(plane[last]), fma(c, _number(plane[under]), upper))
 
 
 @jit
-def _at_border(source: Floats, x: Floats, y: Floats, out: Floats, line: int, first: int) -> None:
-    """Pixels of a row of out (C, n, m), from `first` on.
+def _at_border(
+    source: Values,
+    size: Size,
+    x: Floats,
+    y: Floats,
+    start: int,
+    stop: int,
+    apart: tuple[int, int, int],
+    out: Values,
+) -> None:
+    """Pixels start ... stop of a row.
 
     Those that are not in the frame count nothing, whatever there is instead: a product with 0 need not be 0.
     """
-    channels, height, width = source.shape
-    for i in range(x.size):
+    channels, height, width, step = size
+    for i in range(start, stop):
         left, top = np.floor(x[i]), np.floor(y[i])
         column, row = np.int64(left), np.int64(top)
         a, b, c, d = _weights(x[i] - left, y[i] - top)
         above, under = 0 <= row < height, -1 <= row < height - 1
         before, behind = 0 <= column < width, -1 <= column < width - 1
-        for channel in range(channels):
+        here, into = (row * width + column) * step, apart[2] + i * step
+        for _ in range(channels):
             total = np.float32(0)
             if above and before:
-                total = a * source[channel, row, column]
+                total = a * _number(source[here])
             if above and behind:
-                total = fma(b, source[channel, row, column + 1], total)
+                total = fma(b, _number(source[here + step]), total)
             if under and before:
-                total = fma(c, source[channel, row + 1, column], total)
+                total = fma(c, _number(source[here + width * step]), total)
             if under and behind:
-                total = fma(d, source[channel, row + 1, column + 1], total)
-            out[channel, line, first + i] = total
+                total = fma(d, _number(source[here + width * step + step]), total)
+            _put(out, np.uintp(into), total)
+            here += apart[0]
+            into += apart[1]
+
+
+@jit
+def _number(value: Any) -> Number:
+    return np.float32(value)
+
+
+def _put(out: Any, place: Any, value: Any) -> Any:
+    """A number to its place, rounded if that is for bytes."""
+    raise NotImplementedError("only in what is compiled")
+
+
+@overload(_put)
+def _put_into(out: Any, place: Any, value: Any) -> Any:
+    if str(out.dtype) == "uint8":
+
+        def put(out: Any, place: Any, value: Any) -> None:
+            out[place] = np.uint8(np.int32(np.rint(min(value, np.float32(255)))))
+
+    else:
+
+        def put(out: Any, place: Any, value: Any) -> None:
+            out[place] = value
+
+    return put

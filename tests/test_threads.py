@@ -34,10 +34,14 @@ def test_every_part_is_done_once(threads, count, least, on_threads):
 @pytest.mark.usefixtures("of_threads")
 def test_several_threads_are_at_work(on_threads):
     on_threads(2)
-    both = threading.Barrier(2, timeout=20)
-    # No part ends before another thread has begun one.
-    share(lambda *_: both.wait(), 8, least=1)
-    assert both.n_waiting == 0
+    both, names = threading.Barrier(2, timeout=20), set[int]()
+
+    def work(*_: int) -> None:
+        names.add(threading.get_ident())
+        both.wait()  # no part ends before another thread has begun one
+
+    share(work, 8, least=1)
+    assert len(names) == 2
 
 
 @pytest.mark.usefixtures("of_threads")

@@ -151,7 +151,7 @@ def learned(image: Tensor, flow: Tensor, padding: str, resampler: str) -> list[T
     found = warp(image, flow, padding=padding, resampler=resampler)[0]
     upstream = image_of(*found.shape, seed=3)
     first = torch.autograd.grad(found, (image, flow), upstream, create_graph=True)
-    second = torch.autograd.grad(sum(value.square().sum() for value in first), (image, flow))
+    second = torch.autograd.grad(torch.stack([value.square().sum() for value in first]).sum(), (image, flow))
     alone = torch.autograd.grad(warp(image, flow.detach(), padding=padding, resampler=resampler)[0], image, upstream)
     return [*first, *second, *alone]
 

@@ -46,6 +46,25 @@ def looked_up(source: Tensor, flow: Flow | Positions, *, padding: str) -> Tensor
     return _LookedUp.apply(source, grid, flow.detach(), padding)
 
 
+def followed(flow: Tensor, grid: Tensor, *, far: float) -> Tensor:
+    """(B, n, m, 2): the grid, and the flow (B, 2, H, W), px, that is read there, as at its border outside of the frame.
+
+    Neither learns; the sums lie within `far`, where also lies what is no number.
+    """
+    values, flows = _of_batch(flow)
+    height, width = flow.shape[2:]
+    before = grid.movedim(-1, 1).contiguous()
+    out = torch.empty_like(before)
+    scales = map(np.float32, (2 / width, 2 / height, far))
+    work, into = (
+        partial(compiled.kernels("look_up").follow, before.numpy(), values.numpy(), flows, *scales),
+        out.numpy(),
+    )
+    lines, columns = grid.shape[1:3]
+    share(lambda start, stop: work(start, stop, into), len(grid) * lines, least=compiled.SMALLEST // columns + 1)
+    return out.movedim(1, -1)
+
+
 class _LookedUp(torch.autograd.Function):
     """The look-up with the gradients of F.grid_sample; the grid has those of a flow that learns, else it is None."""
 
@@ -95,10 +114,7 @@ def _parts(flow: Flow | Positions, batch: int) -> Iterator[tuple[Tensor, PartFlo
 def _kernel(images: _Images, rows: Tensor, flow: PartFlow | Positions, padding: int) -> _Kernel:
     """What looks rows up, of the pictures that are told, along a flow."""
     (channels, height, width), step, source, out = images
-    values = flow.grid.movedim(-1, 1) if isinstance(flow, Positions) else known(flow)
-    flows = np.arange(len(values))
-    if len(values) > 1 and values.stride(0) == 0:  # one for all, as that of the frames of a clip
-        flows, values = np.zeros_like(flows), values[:1]
+    values, flows = _of_batch(flow.grid.movedim(-1, 1) if isinstance(flow, Positions) else known(flow))
     size = channels, height, width, step
     if isinstance(flow, SmoothFlow):
         look_up, along = "look_up_lattice", _of_lines(flow.with_nodes(values).lines(values.dtype), flows)
@@ -106,6 +122,14 @@ def _kernel(images: _Images, rows: Tensor, flow: PartFlow | Positions, padding: 
         look_up, along = "look_up_dense", _of_pixels(values, flows, whole=isinstance(flow, Positions))
     work = partial(getattr(compiled.kernels("look_up"), look_up), source, size, rows.numpy(), *along, padding)
     return lambda start, stop: work(start, stop, out)
+
+
+def _of_batch(values: Tensor) -> tuple[Tensor, np.ndarray]:
+    """The values that differ, and which of them each row of the batch has."""
+    flows = np.arange(len(values))
+    if len(values) > 1 and values.stride(0) == 0:  # one for all, as that of the frames of a clip
+        return values[:1].contiguous(), np.zeros_like(flows)
+    return values.contiguous(), flows
 
 
 def _of_lines(lines: Lines, flows: np.ndarray) -> tuple[Any, ...]:
@@ -124,4 +148,4 @@ def _of_pixels(values: Tensor, flows: np.ndarray, *, whole: bool) -> tuple[Any, 
         x, y = sampler_axes(*pixel_axes(**size, dtype=values.dtype, device=values.device), **size)
         scale = 2 / width, 2 / height
     ends = map(np.float32, (*scale, FAR))
-    return values.contiguous().numpy(), flows, x.flatten().numpy(), y.flatten().numpy(), *ends
+    return values.numpy(), flows, x.flatten().numpy(), y.flatten().numpy(), *ends

@@ -1,15 +1,13 @@
 """The flow that undoes a flow, with a certificate."""
 
-from functools import partial
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchrefract._checks import check_count, check_flow, check_positive, is_true, read
-from torchrefract._threads import share
-from torchrefract.warping.compiled import SMALLEST, kernels, obstacle
+from torchrefract.warping.compiled import SMALLEST, obstacle
+from torchrefract.warping.fused_newton import solved
 from torchrefract.warping.grid import field_dtype, inside, pixel_axes, sampler_axes, squared_length
 from torchrefract.warping.jacobian import Jacobian
 from torchrefract.warping.resample import look_up, sampled, sampler_dtype
@@ -168,7 +166,7 @@ def _solved(flow: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor | None]:
     if read(lambda: flow[0, 0, 0, 0]) is None:
         return _ended(_masked(flow, steps))
     if flow.shape[2] * flow.shape[3] >= SMALLEST and obstacle(flow) is None:
-        return _by_kernel(flow, steps)
+        return solved(flow, steps, at_once=_AT_ONCE, near=_NEAR[flow.dtype], farthest=_FARTHEST, upright=_UPRIGHT)
     # What becomes of a sample depends on no other.
     ends = [_ended(_alone(one, steps)) for one in flow.split(1)]
     if len(ends) == 1:
@@ -177,25 +175,6 @@ def _solved(flow: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor | None]:
     everywhere = torch.ones_like(error[0], dtype=torch.bool)
     flags = [everywhere if flag is None else flag for flag in upright]
     return torch.cat(inverse), torch.cat(error), None if upright.count(None) == len(upright) else torch.cat(flags)
-
-
-def _by_kernel(flow: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor | None]:
-    """The same, all steps of a pixel at once."""
-    newton, (batch, _, height, width) = kernels("newton"), flow.shape
-    share_rows = partial(share, count=batch * height, least=SMALLEST // width + 1)
-    values, inverse, error = flow.numpy(), torch.empty_like(flow), torch.empty_like(flow[:, :1])
-    bounds = np.float32(_UPRIGHT), steps, _AT_ONCE, np.float32(_NEAR[flow.dtype]), np.float32(_FARTHEST)
-    solve, ends = partial(newton.solve, values, *bounds), (inverse.numpy(), error[:, 0].numpy())
-    share_rows(lambda start, stop: solve(start, stop, *ends))
-    least = np.empty(batch * height, np.float32)
-    share_rows(lambda start, stop: newton.least_determinants(values, start, stop, least))
-    # Where it is at every pixel, what is read between them is above zero, too.
-    if least.min() >= _UPRIGHT:
-        return inverse, error, None
-    sheet, there = np.empty_like(ends[1]), np.empty_like(ends[1])
-    share_rows(lambda start, stop: newton.determinants(values, start, stop, sheet))
-    share_rows(lambda start, stop: newton.read_at(sheet, ends[0], start, stop, there))
-    return inverse, error, torch.from_numpy(there > 0)[:, None]
 
 
 def _ended(pixels: _Pixels) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -17,7 +17,7 @@ from torchrefract.warping.grid import finite, pixel_axes, sampler_axes, sampler_
 # Slopes of cubics are not smooth enough from cell to cell.
 STREAM_NODES = 6
 # In the sampler's coordinates: farther than a flow leads that is computed on a lattice, and finite in all products.
-_FARTHEST = 1e4
+FARTHEST = 1e4
 # Up to so many nodes along an axis one product with all of them is faster than one for each cell.
 _FEW_ROWS, _FEW_COLUMNS = 24, 64
 
@@ -153,7 +153,7 @@ class SmoothFlow:
         x, y = self.lattice.places(dtype=dtype, device=self.nodes.device)
         height, width = self.lattice.height, self.lattice.width
         # The identity is linear, so it may go through the cubics with the flow.
-        positions = finite(sampler_positions(self.nodes.to(dtype), x, y, height=height, width=width), _FARTHEST)
+        positions = finite(sampler_positions(self.nodes.to(dtype), x, y, height=height, width=width), FARTHEST)
         values, weight = along_rows(positions, self.lattice), _cubics(positions, self.lattice)
         return Lines(values, weight.expand(2, -1, -1), height)
 
@@ -178,7 +178,7 @@ class StreamFlow(SmoothFlow):
         height, width = self.lattice.height, self.lattice.width
         x, y = pixel_axes(height, width, dtype=dtype, device=self.nodes.device)
         x, y = sampler_axes(x, y, height=height, width=width)
-        nodes = finite(self.nodes.to(dtype), _FARTHEST)
+        nodes = finite(self.nodes.to(dtype), FARTHEST)
         return Lines(*self._lines(nodes, (2 / width, 2 / height)), height, x.flatten(), y.flatten())
 
     def _lines(self, nodes: Tensor, scale: tuple[float, float]) -> tuple[Tensor, Tensor]:

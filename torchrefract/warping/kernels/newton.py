@@ -140,7 +140,7 @@ def _step(
     for k in range(count):
         column = np.uintp(pixels[k])
         own_u, own_v = u[column], v[column]
-        cell = _cell(own_u, own_v, line, np.int64(pixels[k]), height, width)
+        cell = _cell(own_u, own_v, line, int(pixels[k]), height, width)
         error_u, error_v = _read(plane_u, cell) + own_u, _read(plane_v, cell) + own_v
         square = fma(error_u, error_u, error_v * error_v)
         error[column] = square

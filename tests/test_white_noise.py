@@ -185,3 +185,12 @@ def test_one_graph_gives_the_same_lattice():
     key = keys(samples=3)
     compiled = torch.compile(lambda key: 2 * white_noise.lattice(key, axes, 2), fullgraph=True)
     assert torch.equal(compiled(key), 2 * white_noise.lattice(key, axes, 2))
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_what_numba_compiles_gives_the_same_bits(samples, monkeypatch, on_threads):
+    on_threads(2)
+    key, places = keys(samples=samples), torch.arange(40_000).flip(0) * 107_374
+    found = white_noise.noise_at(key, places)
+    monkeypatch.setattr(white_noise, "kernels", lambda _: None)
+    assert torch.equal(found, white_noise.noise_at(key, places))

@@ -2,11 +2,16 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchrefract._bands import join
+from torchrefract._checks import withheld
+from torchrefract._compiled import SMALLEST, kernels
+from torchrefract._threads import share
 
 _WORD = 0xFFFFFFFF
 # Odd constants of the hash, as int32: 2^32 over the golden ratio, and the two of lowbias32.
@@ -87,11 +92,23 @@ def _noise_at(key: Tensor, places: Tensor) -> Tensor:
 
 
 def _pairs(words: tuple[Tensor, ...], places: Tensor) -> Tensor:
-    a, b, c, d = words
-    index = places * _HASH[0]
-    uniform = (_hash(index, a, b) >> 9).bitwise_and_(0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
-    radius, angle = uniform.log_().mul_(-2).sqrt_(), _hash(index, c, d).float().mul_(math.pi * 2.0**-31)
+    uniform, angle = _hashed(words, places)
+    radius = uniform.log_().mul_(-2).sqrt_()
     return torch.stack([angle.cos().mul_(radius), angle.sin_().mul_(radius)], dim=1)
+
+
+def _hashed(words: tuple[Tensor, ...], places: Tensor) -> tuple[Tensor, Tensor]:
+    """(B, n), uniform in (0, 1), and (B, n), angles, of keys of four words, (B, 1), at places, (n,), int32."""
+    a, b, c, d = words
+    if len(places) < SMALLEST or withheld(places) or withheld(a) or kernels("_jit") is None:
+        index = places * _HASH[0]
+        uniform = (_hash(index, a, b) >> 9).bitwise_and_(0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
+        return uniform, _hash(index, c, d).float().mul_(math.pi * 2.0**-31)
+    uniform, angle = (torch.empty(len(a), len(places)) for _ in range(2))
+    keys, numbers = torch.cat(words, dim=1).numpy().view(np.uint32), places.contiguous().numpy().view(np.uint32)
+    work = partial(kernels("noise_kernel").hashed, keys, numbers, tuple(word % 2**32 for word in _HASH))
+    share(lambda start, stop: work(start, stop, uniform.numpy(), angle.numpy()), len(places), least=SMALLEST)
+    return uniform, angle
 
 
 def _hash(index: Tensor, a: Tensor, b: Tensor) -> Tensor:

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrefract import _compiled as compiled
 from torchrefract._checks import learns, withheld
 from torchrefract._threads import share
-from torchrefract.warping import compiled
 from torchrefract.warping.grid import FAR, Positions, pixel_axes, sampler_axes
 from torchrefract.warping.grid_sample import PADDINGS, by_grid_sample, gradients_by_grid_sample
 from torchrefract.warping.lattice import Lines, SmoothFlow
@@ -57,7 +57,7 @@ def followed(flow: Tensor, grid: Tensor, *, far: float) -> Tensor:
     out = torch.empty_like(before)
     scales = map(np.float32, (2 / width, 2 / height, far))
     work, into = (
-        partial(compiled.kernels("look_up").follow, before.numpy(), values.numpy(), flows, *scales),
+        partial(compiled.kernels("warping.kernels.look_up").follow, before.numpy(), values.numpy(), flows, *scales),
         out.numpy(),
     )
     lines, columns = grid.shape[1:3]
@@ -120,7 +120,9 @@ def _kernel(images: _Images, rows: Tensor, flow: PartFlow | Positions, padding: 
         look_up, along = "look_up_lattice", _of_lines(flow.with_nodes(values).lines(values.dtype), flows)
     else:
         look_up, along = "look_up_dense", _of_pixels(values, flows, whole=isinstance(flow, Positions))
-    work = partial(getattr(compiled.kernels("look_up"), look_up), source, size, rows.numpy(), *along, padding)
+    work = partial(
+        getattr(compiled.kernels("warping.kernels.look_up"), look_up), source, size, rows.numpy(), *along, padding
+    )
     return lambda start, stop: work(start, stop, out)
 
 

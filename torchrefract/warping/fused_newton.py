@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrefract._compiled import SMALLEST, kernels
 from torchrefract._threads import share
-from torchrefract.warping.compiled import SMALLEST, kernels
 
 
 def solved(
@@ -25,7 +25,7 @@ def solved(
         farthest: px, how long the inverse may be.
         upright: of determinants of I + slopes; pixels of a smaller one begin without slopes.
     """
-    newton, (batch, _, height, width) = kernels("newton"), flow.shape
+    newton, (batch, _, height, width) = kernels("warping.kernels.newton"), flow.shape
     share_rows = partial(share, count=batch * height, least=SMALLEST // width + 1)
     values, inverse, error = flow.numpy(), torch.empty_like(flow), torch.empty_like(flow[:, :1])
     solve = partial(newton.solve, values, np.float32(upright), steps, at_once, np.float32(near), np.float32(farthest))

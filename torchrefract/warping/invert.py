@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import check_count, check_flow, check_positive, is_true, read
-from torchrefract.warping.compiled import SMALLEST, obstacle
+from torchrefract._compiled import SMALLEST, obstacle
 from torchrefract.warping.fused_newton import solved
 from torchrefract.warping.grid import field_dtype, inside, pixel_axes, sampler_axes, squared_length
 from torchrefract.warping.jacobian import Jacobian

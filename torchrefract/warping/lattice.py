@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._bands import by_samples
+from torchrefract._compiled import SMALLEST, kernels, obstacle, with_gradients
 from torchrefract._constants import assume_constant_result, constant
 from torchrefract._threads import share
-from torchrefract.warping.compiled import SMALLEST, kernels, obstacle, with_gradients
 from torchrefract.warping.grid import finite, pixel_axes, sampler_axes, sampler_positions
 
 # Slopes of cubics are not smooth enough from cell to cell.
@@ -235,7 +235,7 @@ def _filled_across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:
     rows = nodes.shape[:3].numel()
     out = nodes.new_empty(*nodes.shape[:3], width)
     values = nodes.contiguous().view(rows, -1).numpy(), weight.mT.contiguous().numpy()
-    across, into = partial(kernels("lines").across, *values), out.view(rows, width).numpy()
+    across, into = partial(kernels("warping.kernels.lines").across, *values), out.view(rows, width).numpy()
     share(lambda start, stop: across(start, stop, into), rows, least=SMALLEST // width + 1)
     return out
 
@@ -245,7 +245,7 @@ def _filled_down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
     batch, channels, _, width = lines.shape
     out = lines.new_empty(batch, channels, height, width)
     values = lines.contiguous().numpy(), weight.expand(channels, -1, -1).contiguous().numpy()
-    down = partial(kernels("lines").down, *values)
+    down = partial(kernels("warping.kernels.lines").down, *values)
     share(lambda start, stop: down(start, stop, out.numpy()), batch * channels * height, least=SMALLEST // width + 1)
     return out
 

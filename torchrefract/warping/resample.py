@@ -5,12 +5,13 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from torchrefract import _compiled as compiled
 from torchrefract._bands import join, rows_at_once
 from torchrefract._checks import check_choice, check_flow, check_tensor, learns
+from torchrefract._compiled import SMALLEST
 from torchrefract._constants import constant
 from torchrefract._levels import rounded
-from torchrefract.warping import compiled, fused
-from torchrefract.warping.compiled import SMALLEST
+from torchrefract.warping import fused
 from torchrefract.warping.grid import FAR, Positions, field_dtype, finite, inside, sampler_grids
 from torchrefract.warping.grid_sample import INTERPOLATIONS, PADDINGS, WHOLE, by_grid_sample
 from torchrefract.warping.lattice import FARTHEST, SmoothFlow

@@ -1,1 +1,1 @@
-"""What numba compiles; imported by `compiled.kernels` alone, since numba may be missing and takes its time."""
+"""What numba compiles; imported by `_compiled.kernels` alone."""

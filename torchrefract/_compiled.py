@@ -21,14 +21,15 @@ def obstacle(*values: Tensor) -> str | None:
             return f"for numbers that are {value.dtype}"
         if why := withheld(value):
             return why
-    return None if kernels("look_up") else "without numba (pip install 'torchrefract[fast]')"
+    return None if kernels("_jit") else "without numba (pip install 'torchrefract[fast]')"
 
 
 @cache
 def kernels(name: str) -> Any:
-    """One of the modules of `kernels`, None where numba is missing or does not fit what else is installed."""
+    """One of the modules that numba compiles, None where it is missing or does not fit what else is installed."""
+    # By name: numba may be missing, and takes its time.
     try:
-        return importlib.import_module(f"torchrefract.warping.kernels.{name}")
+        return importlib.import_module(f"torchrefract.{name}")
     except ImportError:
         return None
 

@@ -15,7 +15,7 @@ from torchrefract.warping import lattice
 from torchrefract.warping.grid import Positions
 from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
 from torchrefract.warping.mixed import Flow, MixedFlow
-from torchrefract.warping.resample import look_up
+from torchrefract.warping.resample import follow, look_up
 
 SIZES = [(1, 1), (1, 7), (9, 1), (3, 4), (37, 53), (131, 127), (270, 481)]
 PADDINGS = ["zeros", "border", "reflection"]
@@ -121,6 +121,23 @@ def test_flows_in_all_forms_are_followed_to_the_bit(padding, form):
     assert torch.equal(found, look_up(image, mixes()[form], **options, resampler="grid_sample"))
     assert torch.equal(found, look_up(image, mixes()[form], **options))
     assert not torch.equal(found, image)
+
+
+def test_rows_that_are_not_there_are_not_read():
+    image, flow = image_of(3, 3, *LARGE), flows(2, *LARGE)["short"]
+    with pytest.raises(ValueError, match="flow must have a row for each of 3 images, got 2"):
+        look_up(image, flow, padding="zeros", interpolation="bilinear", resampler="numba")
+    with pytest.raises(ValueError, match="flow must have a row for each of 3 grids, got 2"):
+        follow(flow, image[:, :2].movedim(1, -1))
+
+
+def test_flows_in_a_row_are_those_of_grid_sample(monkeypatch, oracle):
+    first, grid = smooth(SmoothFlow, 2, 9, *LARGE), smooth(SmoothFlow, 2, 12, *LARGE).sampler_grid(torch.float32)
+    found = [follow(first, grid), follow(first.dense(), grid)]
+    monkeypatch.setattr(compiled, "kernels", lambda _: None)
+    # Grids span 2; a rounding of a position is up to 1.2e-7.
+    for one, plain in zip(found, (first.dense(), first.dense()), strict=True):
+        oracle("grid of two flows, grid_sample", one, follow(plain, grid), 1e-6, unit="")
 
 
 @pytest.mark.parametrize("stride", [2, 7, 8, 33])

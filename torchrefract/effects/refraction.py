@@ -31,7 +31,7 @@ class WarpEffect(Effect):
     Args:
         padding: what lies outside the frame: "zeros", "border" or "reflection".
         interpolation: "nearest", "bilinear" or "bicubic".
-        resampler: "auto", "grid_sample" or "opencv", as for `warp`.
+        resampler: "auto", "grid_sample", "numba" or "opencv", as for `warp`.
         p: chance that a sample is degraded at all.
     """
 

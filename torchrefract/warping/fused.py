@@ -52,14 +52,14 @@ def followed(flow: Tensor, grid: Tensor, *, far: float) -> Tensor:
     Neither learns; the sums lie within `far`, where also lies what is no number.
     """
     values, flows = _of_batch(flow)
+    if len(flows) != len(grid):
+        raise ValueError(f"flow must have a row for each of {len(grid)} grids, got {len(flows)}")
     height, width = flow.shape[2:]
     before = grid.movedim(-1, 1).contiguous()
     out = torch.empty_like(before)
     scales = map(np.float32, (2 / width, 2 / height, far))
-    work, into = (
-        partial(compiled.kernels("warping.kernels.look_up").follow, before.numpy(), values.numpy(), flows, *scales),
-        out.numpy(),
-    )
+    kernel, into = compiled.kernels("warping.kernels.look_up").follow, out.numpy()
+    work = partial(kernel, before.numpy(), values.numpy(), flows, *scales)
     lines, columns = grid.shape[1:3]
     share(lambda start, stop: work(start, stop, into), len(grid) * lines, least=compiled.SMALLEST // columns + 1)
     return out.movedim(1, -1)
@@ -115,14 +115,15 @@ def _kernel(images: _Images, rows: Tensor, flow: PartFlow | Positions, padding: 
     """What looks rows up, of the pictures that are told, along a flow."""
     (channels, height, width), step, source, out = images
     values, flows = _of_batch(flow.grid.movedim(-1, 1) if isinstance(flow, Positions) else known(flow))
+    if len(flows) != len(rows):  # F.grid_sample raises, too; a kernel would read what is not there
+        raise ValueError(f"flow must have a row for each of {len(rows)} images, got {len(flows)}")
     size = channels, height, width, step
     if isinstance(flow, SmoothFlow):
         look_up, along = "look_up_lattice", _of_lines(flow.with_nodes(values).lines(values.dtype), flows)
     else:
         look_up, along = "look_up_dense", _of_pixels(values, flows, whole=isinstance(flow, Positions))
-    work = partial(
-        getattr(compiled.kernels("warping.kernels.look_up"), look_up), source, size, rows.numpy(), *along, padding
-    )
+    kernel = getattr(compiled.kernels("warping.kernels.look_up"), look_up)
+    work = partial(kernel, source, size, rows.numpy(), *along, padding)
     return lambda start, stop: work(start, stop, out)
 
 

@@ -1,4 +1,4 @@
-"""Looking an image up along a flow: the one call of F.grid_sample, and what goes to OpenCV instead."""
+"""Looking an image up along a flow, by what is fastest and gives what F.grid_sample gives."""
 
 from collections.abc import Iterable
 
@@ -45,16 +45,18 @@ def warp(
         flow: (B, 2, H, W) or (1, 2, H, W), px, u (right) and v (down); (2, H, W) for an unbatched image.
         padding: what lies outside: "zeros", "border" or "reflection" (of positions up to 3/2 frames off the center).
         interpolation: "nearest", "bilinear" or "bicubic" (a = -3/4, clamped to the range of the image's values).
-        resampler: "grid_sample", of PyTorch; "opencv", for float32 or uint8 of 1, 3 or 4 channels on the CPU, without
-            gradients, not for bicubic; or "auto", OpenCV from version 5 on, where it is installed, for such uint8 in
-            channels_last format, on as many threads as cv2.setNumThreads says. The two agree to 1e-6 of the range of
-            the values before these are rounded: bytes differ, by one level, where they lie so near to a half.
+        resampler: "grid_sample", of PyTorch; "numba", for float32 or uint8 on the CPU, bilinear, to the bits of
+            "grid_sample" and with its gradients; "opencv", for float32 or uint8 of 1, 3 or 4 channels on the CPU,
+            without gradients, not for bicubic; or "auto": numba for frames from 2^14 pixels on, where it is installed,
+            else OpenCV from version 5 on, where that is, for uint8 in channels_last format, on as many threads as
+            cv2.setNumThreads says. OpenCV agrees to 1e-6 of the range of the values before these are rounded: bytes
+            differ, by one level, where they lie so near to a half.
 
     Returns:
         image of the same shape, type and memory format, and valid, (B, 1, H, W) or (1, H, W), bool.
 
     Raises:
-        ValueError: shapes that do not fit, an unknown padding, interpolation or resampler, what "opencv" cannot do.
+        ValueError: shapes that do not fit, an unknown padding, interpolation or resampler, what "numba" or "opencv" cannot do.
         TypeError: an argument that is no tensor, a flow of integers.
     """
     check_tensor("image", image)

@@ -56,7 +56,7 @@ def warp(
         image of the same shape, type and memory format, and valid, (B, 1, H, W) or (1, H, W), bool.
 
     Raises:
-        ValueError: shapes that do not fit, an unknown padding, interpolation or resampler, what "numba" or "opencv" cannot do.
+        ValueError: shapes that do not fit, an unknown padding, interpolation or resampler, what a resampler cannot do.
         TypeError: an argument that is no tensor, a flow of integers.
     """
     check_tensor("image", image)

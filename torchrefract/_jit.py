@@ -1,6 +1,10 @@
 """How functions are compiled by numba, once for each machine."""
 
+import hashlib
+import os
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
@@ -15,13 +19,42 @@ if numba.config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]  # s
 def jit(function: _F) -> _F:
     """The function, compiled at its first call for the types of its arguments, and free of Python's lock.
 
-    What was compiled is kept beside the source or, if nothing can be written there, in the user's cache.
+    What was compiled is kept in numba's own folder for that if there is one, beside the source, or in the user's cache.
     """
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    return _compiled(function)
+
+
+def inlined(function: _F) -> _F:
+    """The same, made part of each function that calls it: for what passes registers on."""
+    return _compiled(function, forceinline=True)
+
+
+def _compiled(function: _F, **more: bool) -> _F:
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", **more}
+    config: Any = numba.config
+    before, config.CACHE_DIR = config.CACHE_DIR, _folder()
     try:
         return cast(_F, numba.njit(cache=True, **options)(function))
-    except RuntimeError:  # nor can that be written
+    except RuntimeError:  # nothing can be written anywhere
         return cast(_F, numba.njit(**options)(function))
+    finally:
+        config.CACHE_DIR = before
+
+
+@cache
+def _folder() -> str:
+    """Where what is compiled of these sources is kept: of other ones elsewhere.
+
+    By itself numba looks at the file of a function alone, not at those of the functions that it calls.
+    """
+    package = Path(__file__).parent
+    alone = ("_jit.py", "_lanes.py", "noise_kernel.py")
+    sources = [*(package / name for name in alone), *sorted((package / "warping" / "kernels").glob("*.py"))]
+    digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
+    given = str(numba.config.CACHE_DIR)  # pyright: ignore[reportAttributeAccessIssue]  # as above
+    places = [Path(given)] if given else [package / "__pycache__", Path.home() / ".cache"]
+    writable = (place for place in places if os.access(place if place.exists() else place.parent, os.W_OK))
+    return str(next(writable, places[-1]) / f"torchrefract-{digest}")
 
 
 def _fma(_: Any, a: Any, b: Any, c: Any) -> Any:

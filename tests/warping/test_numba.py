@@ -1,7 +1,11 @@
 import math
+import os
+import platform
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,7 +16,7 @@ from torch.utils.data import DataLoader, Dataset
 from torchrefract import DivergenceFree, LensDistortion, OneOf, ThinPlateSpline, warp
 from torchrefract import _compiled as compiled
 from torchrefract.warping import lattice
-from torchrefract.warping.grid import Positions
+from torchrefract.warping.grid import Positions, sampler_grid
 from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
 from torchrefract.warping.mixed import Flow, MixedFlow
 from torchrefract.warping.resample import follow, look_up
@@ -185,6 +189,28 @@ def test_gradients_are_those_of_grid_sample(padding, threads, batch, on_threads)
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5 * other.abs().max().item())
 
 
+@pytest.mark.parametrize("padding", PADDINGS)
+@pytest.mark.parametrize("threads", [1, 2, 8])
+@pytest.mark.parametrize("kind", ["short", "far", "half", "nowhere", "lattice", "positions"])
+def test_images_learn_along_flows_of_all_kinds(padding, threads, kind, on_threads):
+    on_threads(threads)
+    made = flows(2, *LARGE)
+    flow = made.get(kind, made["far"])
+    path = Positions(sampler_grid(flow)) if kind == "positions" else smooth(SmoothFlow, 2, 9, *LARGE)
+    upstream, found = image_of(2, 4, *LARGE, seed=3), list[Tensor]()
+    for name in ("numba", "grid_sample"):
+        image = image_of(2, 4, *LARGE).requires_grad_()
+        looked = look_up(
+            image,
+            path if kind in ("lattice", "positions") else flow,
+            padding=padding,
+            interpolation="bilinear",
+            resampler=name,
+        )
+        found.append(torch.autograd.grad(looked, image, upstream)[0])
+    torch.testing.assert_close(*found, rtol=1e-5, atol=1e-5 * found[1].abs().max().item())
+
+
 def test_parameters_learn_through_the_kernels():
     image = image_of(1, 3, *LARGE)
     for effect in (LensDistortion(), ThinPlateSpline(amplitude_range=(3, 3)), DivergenceFree(amplitude_range=(3, 3))):
@@ -316,6 +342,45 @@ def test_numba_that_does_not_work_is_numba_that_is_missing(fault):
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+SAME_ON_ALL = """
+import torch
+from torchrefract import warp
+from torchrefract._lanes import LANES
+assert LANES == {lanes}, LANES
+noise = torch.rand(2, 2, 140, 181, generator=torch.Generator().manual_seed(1)) * 2 - 1
+image = torch.rand(2, 3, 140, 181, generator=torch.Generator().manual_seed(2))
+across = image.movedim(1, -1).contiguous().movedim(-1, 1)
+for flow in (noise, noise * 30, torch.nn.functional.avg_pool2d(noise, 9, 1, 4) * 60):
+    for source in (image, across, (image * 256).to(torch.uint8), (across * 256).to(torch.uint8)):
+        for padding in ("zeros", "border", "reflection"):
+            a, b = (warp(source, flow, padding=padding, resampler=name)[0] for name in ("numba", "grid_sample"))
+            assert torch.equal(a, b), (source.dtype, padding)
+"""
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the names are those of x86 processors")
+@pytest.mark.parametrize(
+    ("name", "features", "lanes"), [("haswell", "+avx,+avx2,+fma", 8), ("generic", "", 0), ("x86-64-v3", "+avx2", 0)]
+)
+def test_every_processor_finds_the_same(name, features, lanes, tmp_path):
+    told = {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": features, "NUMBA_CACHE_DIR": str(tmp_path)}
+    words = [sys.executable, "-c", SAME_ON_ALL.format(lanes=lanes)]
+    done = subprocess.run(words, env=os.environ | told, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_what_is_kept_is_of_the_very_sources(tmp_path, monkeypatch):
+    jit = pytest.importorskip("torchrefract._jit", reason="needs numba")
+    shutil.copytree(Path(jit.__file__).parent, tmp_path / "torchrefract", ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(jit, "__file__", str(tmp_path / "torchrefract" / "_jit.py"))
+    monkeypatch.setattr(jit.numba.config, "CACHE_DIR", "")
+    before = jit._folder.__wrapped__()
+    assert Path(before).parent == tmp_path / "torchrefract" / "__pycache__"
+    with (tmp_path / "torchrefract" / "warping" / "kernels" / "groups.py").open("a") as source:
+        source.write("# another version\n")
+    assert jit._folder.__wrapped__() != before
 
 
 class Warped(Dataset[Tensor]):

@@ -17,6 +17,7 @@ from torchrefract.warping.lattice import Lines, SmoothFlow
 from torchrefract.warping.layout import is_channels_last
 from torchrefract.warping.mixed import Flow, MixedFlow, PartFlow, grid_of, known
 
+_MOST_BANDS = 4  # of a frame whose gradient is scattered: each of them has a frame of its own
 _Kernel = Callable[[int, int], None]
 # Channels, height and width; how far pixels are apart; source and out, as the kernels have them.
 _Images = tuple[torch.Size, int, np.ndarray, np.ndarray]
@@ -77,6 +78,8 @@ class _LookedUp(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:
         source, grid = ctx.saved_tensors
+        if grid is None and not torch.is_grad_enabled():
+            return _scattered(gradients[0], source.shape, ctx.flow, ctx.padding), None, None, None
         if grid is None:
             grid = ctx.flow.grid if isinstance(ctx.flow, Positions) else grid_of(ctx.flow, source.dtype)
         needed, options = ctx.needs_input_grad[:2], {"padding": ctx.padding, "interpolation": "bilinear"}
@@ -86,6 +89,20 @@ class _LookedUp(torch.autograd.Function):
         else:
             found = gradients_by_grid_sample(source, grid, gradients[0], needed=needed, padding=ctx.padding)
         return *found, None, None
+
+
+def _scattered(upstream: Tensor, shape: torch.Size, flow: Flow | Positions, padding: str) -> Tensor:
+    """The gradient of a source (B, C, H, W) that was looked up, from that of what was found."""
+    batch, threads = shape[0], torch.get_num_threads()
+    bands = max(1, min(threads // batch, _MOST_BANDS))
+    found = upstream.new_zeros(batch, bands, shape[1:].numel())
+    values, into = upstream.contiguous().view(batch, -1).numpy(), found.numpy()
+    for rows, own in _parts(flow, batch):
+        form, along = _along(own, len(rows))
+        kernel = getattr(compiled.kernels("warping.kernels.scatter"), f"scatter_{form}")
+        work = partial(kernel, values, tuple(shape[1:]), rows.numpy(), *along, PADDINGS.index(padding))
+        share(lambda start, stop, work=work: work(start, stop, into), len(rows) * bands, least=1)
+    return (found[:, 0] if bands == 1 else found.sum(dim=1)).view(shape)
 
 
 def _filled(source: Tensor, flow: Flow | Positions, padding: str) -> Tensor:
@@ -114,17 +131,20 @@ def _parts(flow: Flow | Positions, batch: int) -> Iterator[tuple[Tensor, PartFlo
 def _kernel(images: _Images, rows: Tensor, flow: PartFlow | Positions, padding: int) -> _Kernel:
     """What looks rows up, of the pictures that are told, along a flow."""
     (channels, height, width), step, source, out = images
-    values, flows = _of_batch(flow.grid.movedim(-1, 1) if isinstance(flow, Positions) else known(flow))
-    if len(flows) != len(rows):  # F.grid_sample raises, too; a kernel would read what is not there
-        raise ValueError(f"flow must have a row for each of {len(rows)} images, got {len(flows)}")
-    size = channels, height, width, step
-    if isinstance(flow, SmoothFlow):
-        look_up, along = "look_up_lattice", _of_lines(flow.with_nodes(values).lines(values.dtype), flows)
-    else:
-        look_up, along = "look_up_dense", _of_pixels(values, flows, whole=isinstance(flow, Positions))
-    kernel = getattr(compiled.kernels("warping.kernels.look_up"), look_up)
-    work = partial(kernel, source, size, rows.numpy(), *along, padding)
+    form, along = _along(flow, len(rows))
+    kernel = getattr(compiled.kernels("warping.kernels.look_up"), f"look_up_{form}")
+    work = partial(kernel, source, (channels, height, width, step), rows.numpy(), *along, padding)
     return lambda start, stop: work(start, stop, out)
+
+
+def _along(flow: PartFlow | Positions, rows: int) -> tuple[str, tuple[Any, ...]]:
+    """How kernels are called that look along a flow of so many rows, and with what."""
+    values, flows = _of_batch(flow.grid.movedim(-1, 1) if isinstance(flow, Positions) else known(flow))
+    if len(flows) != rows:  # F.grid_sample raises, too; a kernel would read what is not there
+        raise ValueError(f"flow must have a row for each of {rows} images, got {len(flows)}")
+    if isinstance(flow, SmoothFlow):
+        return "lattice", _of_lines(flow.with_nodes(values).lines(values.dtype), flows)
+    return "dense", _of_pixels(values, flows, whole=isinstance(flow, Positions))
 
 
 def _of_batch(values: Tensor) -> tuple[Tensor, np.ndarray]:

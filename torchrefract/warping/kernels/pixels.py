@@ -21,7 +21,9 @@ Corners = NDArray[np.int32]
 Number = np.float32
 Index = np.uintp  # what has a sign could count from the end, and would be asked
 Size = tuple[int, int, int, int]
+Apart = tuple[int, int, int]  # from one channel to the next, of the source and of out, and where the row begins
 Cells = tuple[Corners, Floats, Floats]
+CHUNK = 512  # pixels that are read together: without a look at borders if all of them are inside
 
 
 @jit
@@ -49,6 +51,47 @@ def to_pixels(place: Floats, size: int, padding: int) -> None:
 
 
 @jit
+def read_row(source: Values, size: Size, x: Floats, y: Floats, cells: Cells, apart: Apart, out: Values) -> None:
+    """A row of out, of a source, (C H W,), at positions (m,), px.
+
+    cells: room for those of CHUNK pixels.
+    """
+    for chunk in range(0, x.size, CHUNK):
+        read_part(source, size, x, y, chunk, min(chunk + CHUNK, x.size), cells, apart, out)
+
+
+@jit
+def read_part(
+    source: Values,
+    size: Size,
+    x: Floats,
+    y: Floats,
+    first: int,
+    last: int,
+    cells: Cells,
+    apart: Apart,
+    out: Values,
+) -> None:
+    """Pixels first ... last of the row, CHUNK of them at most."""
+    channels, height, width, step = size
+    inside, beside = find_cells(x[first:last], y[first:last], height, width, cells)
+    if beside:
+        for c in range(channels):
+            for k in range(first, last):
+                out[c * apart[1] + apart[2] + k * step] = 0
+        return
+    if not inside:
+        start, stop = _middle(x, y, first, last, height, width)
+        _at_border(source, size, x, y, first, start, apart, out)
+        _at_border(source, size, x, y, stop, last, apart, out)
+        first, last = start, stop
+        if not find_cells(x[first:last], y[first:last], height, width, cells)[0]:
+            _at_border(source, size, x, y, first, last, apart, out)
+            return
+    _in_frame(source, size, cells, last - first, apart, out[apart[2] + first * step :])
+
+
+@jit
 def find_cells(x: Floats, y: Floats, height: int, width: int, cells: Cells) -> tuple[bool, bool]:
     """Whether all four pixels around each position are in the frame, and whether none of them is.
 
@@ -66,18 +109,7 @@ def find_cells(x: Floats, y: Floats, height: int, width: int, cells: Cells) -> t
 
 
 @jit
-def find_cells_on_frame(x: Floats, y: Floats, height: int, width: int, cells: Cells) -> None:
-    """What `find_cells` finds, of positions on the frame; the last pixels lie at the end of the cells before them."""
-    corner, right, below = cells
-    most_x, most_y = np.float32(max(width - 2, 0)), np.float32(max(height - 2, 0))
-    for i in range(x.size):
-        left, top = min(np.floor(x[i]), most_x), min(np.floor(y[i]), most_y)
-        right[i], below[i] = x[i] - left, y[i] - top
-        corner[i] = np.int32(top) * np.int32(width) + np.int32(left)
-
-
-@jit
-def middle(x: Floats, y: Floats, start: int, stop: int, height: int, width: int) -> tuple[int, int]:
+def _middle(x: Floats, y: Floats, start: int, stop: int, height: int, width: int) -> tuple[int, int]:
     """Where those begin and end that are left without the ones at both ends which are not inside."""
     while start < stop and not (0 <= x[start] < width - 1 and 0 <= y[start] < height - 1):
         start += 1
@@ -87,7 +119,7 @@ def middle(x: Floats, y: Floats, start: int, stop: int, height: int, width: int)
 
 
 @jit
-def in_frame(source: Values, size: Size, cells: Cells, count: int, apart: tuple[int, int, int], out: Values) -> None:
+def _in_frame(source: Values, size: Size, cells: Cells, count: int, apart: Apart, out: Values) -> None:
     """So many pixels of out, whose four pixels are all there; three channels at once, which share the weights."""
     channels, _, width, step = size
     c = 0
@@ -103,22 +135,6 @@ def in_frame(source: Values, size: Size, cells: Cells, count: int, apart: tuple[
     while c < channels:
         _of_one(source[c * apart[0] :], width, step, cells, count, out[c * apart[1] :])
         c += 1
-
-
-@jit
-def of_two(
-    first: Floats, second: Floats, each: int, wide: int, cells: Cells, first_out: Floats, second_out: Floats
-) -> None:
-    """Of two planes (H W,), where the next pixel and the next row are so far away."""
-    corner, right, below = cells
-    step, row = np.uintp(each), np.uintp(wide)
-    for i in range(first_out.size):
-        here = np.uintp(corner[i])
-        beside, under = here + step, here + row
-        last = under + step
-        a, b, c, d = _weights(right[i], below[i])
-        first_out[i] = _sum(first, here, beside, under, last, a, b, c, d)
-        second_out[i] = _sum(second, here, beside, under, last, a, b, c, d)
 
 
 @jit
@@ -140,7 +156,7 @@ def _of_three(
         here, into = np.uintp(corner[i]) * each, np.uintp(i) * each
         beside, under = here + each, here + wide
         last = under + each
-        a, b, c, d = _weights(right[i], below[i])
+        a, b, c, d = weights_at(right[i], below[i])
         _put(first_out, into, _sum(first, here, beside, under, last, a, b, c, d))
         _put(second_out, into, _sum(second, here, beside, under, last, a, b, c, d))
         _put(third_out, into, _sum(third, here, beside, under, last, a, b, c, d))
@@ -153,12 +169,13 @@ def _of_one(plane: Values, width: int, step: int, cells: Cells, count: int, out:
     for i in range(count):
         here = np.uintp(corner[i]) * each
         beside, under = here + each, here + wide
-        a, b, c, d = _weights(right[i], below[i])
+        a, b, c, d = weights_at(right[i], below[i])
         _put(out, np.uintp(i) * each, _sum(plane, here, beside, under, under + each, a, b, c, d))
 
 
 @jit
-def _weights(right: Number, below: Number) -> tuple[Number, Number, Number, Number]:
+def weights_at(right: Number, below: Number) -> tuple[Number, Number, Number, Number]:
+    """Of the four pixels around a position, from how far it is behind the first of them."""
     one = np.float32(1)
     return (one - right) * (one - below), right * (one - below), (one - right) * below, right * below
 
@@ -172,14 +189,14 @@ def _sum(
 
 
 @jit
-def at_border(
+def _at_border(
     source: Values,
     size: Size,
     x: Floats,
     y: Floats,
     start: int,
     stop: int,
-    apart: tuple[int, int, int],
+    apart: Apart,
     out: Values,
 ) -> None:
     """Pixels start ... stop of a row.
@@ -190,7 +207,7 @@ def at_border(
     for i in range(start, stop):
         left, top = np.floor(x[i]), np.floor(y[i])
         column, row = np.int64(left), np.int64(top)
-        a, b, c, d = _weights(x[i] - left, y[i] - top)
+        a, b, c, d = weights_at(x[i] - left, y[i] - top)
         above, under = 0 <= row < height, -1 <= row < height - 1
         before, behind = 0 <= column < width, -1 <= column < width - 1
         here, into = (row * width + column) * step, apart[2] + i * step

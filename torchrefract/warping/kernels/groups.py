@@ -1,0 +1,167 @@
+"""What numba compiles: the pixels of a row, LANES at once, by the steps of F.grid_sample and to the bits of `pixels`.
+
+Neighbors are looked up near to one another: what a group of pixels takes of a row of the source lies, but for rough
+flows, in the two registers from its first pixel on, out of which each lane picks its own.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from torchrefract import _lanes as lanes
+from torchrefract._jit import inlined
+from torchrefract._lanes import LANES
+from torchrefract.warping.kernels import pixels
+from torchrefract.warping.kernels.pixels import Apart, Cells, Floats, Size, Values
+
+Lanes = Any
+Three = tuple[Lanes, Lanes, Lanes]
+Weights = tuple[Lanes, Lanes, Lanes, Lanes]
+Cell = tuple[Lanes, Lanes, Lanes, Lanes]  # upper and lower row, left and right place among what is read
+Flags = tuple[Lanes, Lanes]  # whether the left and the right pixels are in the frame
+Rows = tuple[int, int]
+_MOST_ROWS = 12  # of the source; for more of them one pixel after the other is faster
+_BEFORE = LANES // 4  # pixels that are read before the first of those at both ends of a group
+_AHEAD = 3  # rows before they are read they are asked for: each is read anew, from farther memory, a row later
+
+
+@inlined
+def read_row(source: Values, size: Size, x: Floats, y: Floats, cells: Cells, apart: Apart, out: Values) -> None:
+    """As `pixels.read_row`."""
+    channels, _, width, step = size
+    if x.size < LANES or width < 2 * LANES or (step > 1 and channels != 3):
+        pixels.read_row(source, size, x, y, cells, apart, out)
+        return
+    for begin in range(0, x.size, LANES):
+        start = min(begin, x.size - LANES)  # the last group may do again what the one before it did
+        if not _read_group(source, size, x, y, start, apart, out):
+            pixels.read_part(source, size, x, y, start, start + LANES, cells, apart, out)
+
+
+@inlined
+def _read_group(source: Values, size: Size, x: Floats, y: Floats, start: int, apart: Apart, out: Values) -> bool:
+    """LANES pixels of a row, or False for those that are too far from one another."""
+    channels, height, width, step = size
+    place_x, place_y = lanes.load(x, np.uintp(start)), lanes.load(y, np.uintp(start))
+    left, top = lanes.floor(place_x), lanes.floor(place_y)
+    column, row = lanes.to_wholes(left), lanes.to_wholes(top)
+    one, wide = lanes.all_wholes(np.int32(1)), lanes.all_wholes(np.int32(width))
+    behind = lanes.plus(column, one)
+    # Pixels that are not in the frame count nothing, whatever is read instead.
+    counts = lanes.below(column, wide), lanes.below(behind, wide)
+    lowest, highest = lanes.all_wholes(np.int32(0)), lanes.all_wholes(np.int32(width - 1))
+    column = lanes.larger(lanes.smaller(column, highest), lowest)
+    behind = lanes.larger(lanes.smaller(behind, highest), lowest)
+    near = min(lanes.first(column), lanes.last(column)) - _BEFORE
+    begin = max(0, min(near, width - 2 * LANES))
+    origin, reach = lanes.all_wholes(np.int32(begin)), lanes.all_wholes(np.int32(2 * LANES))
+    column, behind = lanes.minus(column, origin), lanes.minus(behind, origin)
+    if not lanes.everywhere(lanes.both(lanes.below(column, reach), lanes.below(behind, reach))):
+        return False
+    rows = max(0, lanes.smallest(row)), min(height, lanes.largest(row) + 2)
+    if rows[1] - rows[0] > _MOST_ROWS:
+        return False
+    weights = _weights(lanes.difference(place_x, left), lanes.difference(place_y, top))
+    # What -0 is added to keeps its bits; where nothing is read 0 is left.
+    tall, zero = lanes.all_wholes(np.int32(height)), lanes.all_floats(np.float32(0))
+    begins = lanes.where(lanes.below(row, tall), lanes.all_floats(np.float32(-0.0)), zero)
+    cell = row, lanes.plus(row, one), column, behind
+    if step > 1:
+        a, b, c = _of_pixels(source, 3 * begin, 3 * width, height, rows, begins, cell, counts, weights)
+        lanes.store_three(out, np.uintp(apart[2] + 3 * start), a, b, c)
+        return True
+    for c in range(channels):
+        found = _of_plane(source, c * apart[0] + begin, width, height, rows, begins, cell, counts, weights)
+        lanes.store(out, np.uintp(c * apart[1] + apart[2] + start), found)
+    return True
+
+
+@inlined
+def _weights(right: Lanes, below: Lanes) -> Weights:
+    """Of the four pixels around each position, from how far it is behind the first of them."""
+    one = lanes.all_floats(np.float32(1))
+    before, above = lanes.difference(one, right), lanes.difference(one, below)
+    upper = lanes.product(before, above), lanes.product(right, above)
+    return upper[0], upper[1], lanes.product(before, below), lanes.product(right, below)
+
+
+@inlined
+def _of_pixels(
+    source: Values,
+    begin: int,
+    line: int,
+    height: int,
+    rows: Rows,
+    begins: Lanes,
+    cell: Cell,
+    counts: Flags,
+    weights: Weights,
+) -> Three:
+    """Three channels that lie together, from where a row of the source begins, each so long."""
+    a = b = c = begins
+    ahead = begin + _ahead(rows, height) * line + 3 * LANES
+    lanes.fetch(source, np.uintp(ahead))
+    lanes.fetch(source, np.uintp(ahead + LANES))
+    lanes.fetch(source, np.uintp(ahead + 2 * LANES))
+    for row in range(rows[0], rows[1]):
+        reads, at_left, at_right = _shares(row, cell, weights)
+        at = begin + row * line
+        low, high = lanes.load_three(source, np.uintp(at)), lanes.load_three(source, np.uintp(at + 3 * LANES))
+        a = _added(a, low[0], high[0], reads, cell, counts, at_left, at_right)
+        b = _added(b, low[1], high[1], reads, cell, counts, at_left, at_right)
+        c = _added(c, low[2], high[2], reads, cell, counts, at_left, at_right)
+    return a, b, c
+
+
+@inlined
+def _of_plane(
+    source: Values,
+    begin: int,
+    line: int,
+    height: int,
+    rows: Rows,
+    begins: Lanes,
+    cell: Cell,
+    counts: Flags,
+    weights: Weights,
+) -> Lanes:
+    total = begins
+    lanes.fetch(source, np.uintp(begin + _ahead(rows, height) * line + LANES))
+    for row in range(rows[0], rows[1]):
+        reads, at_left, at_right = _shares(row, cell, weights)
+        at = begin + row * line
+        low, high = lanes.load(source, np.uintp(at)), lanes.load(source, np.uintp(at + LANES))
+        total = _added(total, low, high, reads, cell, counts, at_left, at_right)
+    return total
+
+
+@inlined
+def _ahead(rows: Rows, height: int) -> int:
+    return min(rows[1] + _AHEAD, height - 1)
+
+
+@inlined
+def _shares(row: int, cell: Cell, weights: Weights) -> tuple[Lanes, Lanes, Lanes]:
+    """The lanes that read this row of the source, and the weights of its two pixels."""
+    here = lanes.all_wholes(np.int32(row))
+    upper = lanes.equal(cell[0], here)
+    at_left, at_right = lanes.where(upper, weights[0], weights[2]), lanes.where(upper, weights[1], weights[3])
+    return lanes.either(upper, lanes.equal(cell[1], here)), at_left, at_right
+
+
+@inlined
+def _added(
+    total: Lanes,
+    low: Lanes,
+    high: Lanes,
+    reads: Lanes,
+    cell: Cell,
+    counts: Flags,
+    at_left: Lanes,
+    at_right: Lanes,
+) -> Lanes:
+    """The total and what one row of the source adds to it."""
+    none = lanes.all_floats(np.float32(0))
+    left = lanes.where(counts[0], lanes.pick(low, high, cell[2]), none)
+    right = lanes.where(counts[1], lanes.pick(low, high, cell[3]), none)
+    return lanes.where(reads, lanes.fma(at_right, right, lanes.fma(at_left, left, total)), total)

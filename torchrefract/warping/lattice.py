@@ -20,6 +20,7 @@ STREAM_NODES = 6
 FARTHEST = 1e4
 # Up to so many nodes along an axis one product with all of them is faster than one for each cell.
 _FEW_ROWS, _FEW_COLUMNS = 24, 64
+_SMALLEST_LINES = 1 << 10  # pixels of a sample's rows of nodes, from which on a kernel is faster
 
 
 class Lattice(NamedTuple):
@@ -214,7 +215,7 @@ def _across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:
     def plain(nodes: Tensor) -> Tensor:
         return by_samples(nodes, lambda own: _multiplied_across(own, weight, width))
 
-    if nodes.shape[2] * width < SMALLEST or obstacle(nodes, weight):
+    if nodes.shape[2] * width < _SMALLEST_LINES or obstacle(nodes, weight):
         return plain(nodes)
     return with_gradients(lambda nodes: _filled_across(nodes, weight, width), plain, nodes)
 

@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 import torchrefract as tr
 from torchrefract.effects.base import Effect
+from torchrefract.fields import modes
 
 CAMERA = tr.Camera(width=48, height=32, fx=40, fy=40, cx=23, cy=16, coefficients=(-0.2, 0.05, 0.001, 0.002))
 EFFECTS: dict[str, Callable[[], Effect]] = {
@@ -126,9 +127,14 @@ def test_what_is_let_go_is_free_at_once(make):
 def test_new_sizes_and_new_effects_do_not_keep_memory(make):
     image = picture(size=(64, 64))
     make().degrade(image[..., : SIZE[0], : SIZE[1]], seed=7)
+    # The waves and places of the latest sixteen sizes are kept: they have been others so far, whatever ran before.
+    for i in range(16):
+        few = modes.Modes((100 + i, 100), 1, 1)
+        modes._places(few, image.device)
+        modes._waves(few, (0, 1), (0, 1), image.dtype, image.device)
     held = tensors()
     for i in range(24):
-        # Plans are kept for a few hundred sizes; nothing with pixels is.
+        # Plans are kept for a few hundred sizes; nothing else is for more than those sixteen.
         taller = 0 if make is EFFECTS["rectification"] else i
         make().degrade(image[..., : SIZE[0] + taller, : SIZE[1]], seed=7)
     assert tensors() <= held + 2

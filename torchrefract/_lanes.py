@@ -109,7 +109,6 @@ def _element(place: int) -> Callable[..., Any]:
 
 all_floats = _operation(_spread, Floats, types.float32)  # one number in all lanes
 all_wholes = _operation(_spread, Wholes, types.int32)
-sum_of = _operation(lambda builder, a, b: builder.fadd(a, b), Floats, Floats, Floats)
 difference = _operation(lambda builder, a, b: builder.fsub(a, b), Floats, Floats, Floats)
 product = _operation(lambda builder, a, b: builder.fmul(a, b), Floats, Floats, Floats)
 fma = _operation(_fma, Floats, Floats, Floats, Floats)  # a b + c, rounded once

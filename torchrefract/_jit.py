@@ -51,10 +51,12 @@ def _folder() -> str:
     alone = ("_jit.py", "_lanes.py", "noise_kernel.py")
     sources = [*(package / name for name in alone), *sorted((package / "warping" / "kernels").glob("*.py"))]
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
-    given = str(numba.config.CACHE_DIR)  # pyright: ignore[reportAttributeAccessIssue]  # as above
-    places = [Path(given)] if given else [package / "__pycache__", Path.home() / ".cache"]
+    if given := str(numba.config.CACHE_DIR):  # pyright: ignore[reportAttributeAccessIssue]  # as above
+        return str(Path(given) / f"torchrefract-{digest}")
+    # Who has no home has none of that name either.
+    places = package / "__pycache__", Path(os.path.expanduser("~")) / ".cache"
     writable = (place for place in places if os.access(place if place.exists() else place.parent, os.W_OK))
-    return str(next(writable, places[-1]) / f"torchrefract-{digest}")
+    return next((str(place / f"torchrefract-{digest}") for place in writable), "")  # then as numba has it
 
 
 def _fma(_: Any, a: Any, b: Any, c: Any) -> Any:

@@ -381,6 +381,12 @@ def test_what_is_kept_is_of_the_very_sources(tmp_path, monkeypatch):
     with (tmp_path / "torchrefract" / "warping" / "kernels" / "groups.py").open("a") as source:
         source.write("# another version\n")
     assert jit._folder.__wrapped__() != before
+    monkeypatch.setattr(jit.os, "access", lambda *_: False)
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as where a user has no home
+    assert jit._folder.__wrapped__() == ""
+    monkeypatch.setattr(jit.numba.config, "CACHE_DIR", str(tmp_path / "new" / "one"))
+    assert Path(jit._folder.__wrapped__()).parent == tmp_path / "new" / "one"
 
 
 class Warped(Dataset[Tensor]):

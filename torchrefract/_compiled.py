@@ -5,6 +5,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,6 +23,14 @@ def obstacle(*values: Tensor) -> str | None:
         if why := withheld(value):
             return why
     return None if kernels("_jit") else "without numba (pip install 'torchrefract[fast]')"
+
+
+def of_batch(values: Tensor) -> tuple[Tensor, np.ndarray]:
+    """Those of values (B, ...) that differ, and which of them each row of the batch has."""
+    rows = np.arange(len(values))
+    if len(values) > 1 and values.stride(0) == 0:  # one for all, as that of the frames of a clip
+        return values[:1].contiguous(), np.zeros_like(rows)
+    return values.contiguous(), rows
 
 
 @cache

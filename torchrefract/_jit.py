@@ -8,7 +8,10 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
+from numba import types
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -66,6 +69,22 @@ def _fma(_: Any, a: Any, b: Any, c: Any) -> Any:
         return builder.fma(*arguments)
 
     return a(a, b, c), generate
+
+
+def _pointer(_: Any, address: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+    return types.voidptr(address), generate
+
+
+_to_pointer = cast(Callable[[Any], Any], intrinsic(_pointer))
+
+
+@inlined
+def floats_at(address: np.uint64, count: int) -> NDArray[np.float32]:
+    """An array, (count,), of what lies there, which somebody else has to keep."""
+    return numba.carray(_to_pointer(address), (count,), np.float32)
 
 
 # As it is called: what numba calls hands itself over, too.

@@ -103,15 +103,23 @@ def _chosen(sign: str) -> Callable[..., Any]:
     return lambda builder, a, b: builder.select(builder.icmp_signed(sign, a, b), a, b)
 
 
+def _chosen_float(sign: str) -> Callable[..., Any]:
+    return lambda builder, a, b: builder.select(builder.fcmp_ordered(sign, a, b), a, b)
+
+
 def _element(place: int) -> Callable[..., Any]:
     return lambda builder, value: builder.extract_element(value, ir.Constant(_WHOLE, place))
 
 
 all_floats = _operation(_spread, Floats, types.float32)  # one number in all lanes
 all_wholes = _operation(_spread, Wholes, types.int32)
+total = _operation(lambda builder, a, b: builder.fadd(a, b), Floats, Floats, Floats)
 difference = _operation(lambda builder, a, b: builder.fsub(a, b), Floats, Floats, Floats)
 product = _operation(lambda builder, a, b: builder.fmul(a, b), Floats, Floats, Floats)
 fma = _operation(_fma, Floats, Floats, Floats, Floats)  # a b + c, rounded once
+# The second where the first is no number.
+lower = _operation(_chosen_float("<"), Floats, Floats, Floats)
+higher = _operation(_chosen_float(">"), Floats, Floats, Floats)
 floor = _operation(_floor, Floats, Floats)
 to_wholes = _operation(lambda builder, a: builder.fptosi(a, ir.VectorType(_WHOLE, LANES)), Wholes, Floats)
 plus = _operation(lambda builder, a, b: builder.add(a, b), Wholes, Wholes, Wholes)

@@ -2,10 +2,9 @@ import pytest
 import torch
 
 from torchrefract import warp
-from torchrefract.warping.grid import sampler_grid
 from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
 from torchrefract.warping.mixed import Flow, MixedFlow, dense, flow_rows, grid_of, known
-from torchrefract.warping.resample import follow, look_up
+from torchrefract.warping.resample import look_up
 
 HEIGHT, WIDTH = 33, 47
 
@@ -48,11 +47,6 @@ def test_some_rows_are_those_in_their_order(flow, rows):
     for index in ([3], [4, 0, 2], [1, 1, 3, 3], [0, 1, 2, 3, 4]):
         expected = torch.cat([dense(rows[i]) for i in index])
         assert torch.equal(dense(flow_rows(flow, torch.tensor(index))), expected)
-
-
-def test_it_is_followed_as_its_dense_form(flow):
-    grid = sampler_grid(dense(smooth(5, 5, 7)))
-    assert torch.equal(follow(flow, grid), follow(dense(flow), grid))
 
 
 def test_it_knows_its_type_and_its_gradient(flow):

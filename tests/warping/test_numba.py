@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,10 +17,11 @@ from torch.utils.data import DataLoader, Dataset
 from torchrefract import DivergenceFree, LensDistortion, OneOf, ThinPlateSpline, warp
 from torchrefract import _compiled as compiled
 from torchrefract.warping import lattice
+from torchrefract.warping.followed import FollowedFlow, Reading
 from torchrefract.warping.grid import Positions, sampler_grid
 from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
 from torchrefract.warping.mixed import Flow, MixedFlow
-from torchrefract.warping.resample import follow, look_up
+from torchrefract.warping.resample import look_up
 
 SIZES = [(1, 1), (1, 7), (9, 1), (3, 4), (37, 53), (131, 127), (270, 481)]
 PADDINGS = ["zeros", "border", "reflection"]
@@ -105,20 +107,27 @@ def smooth(kind: type[SmoothFlow], batch: int, stride: int, height: int, width: 
 def mixes() -> dict[str, Flow | Positions]:
     """Flows of three rows in all forms."""
     fine, coarse = smooth(SmoothFlow, 1, 5, *LARGE), smooth(SmoothFlow, 2, 16, *LARGE)
-    far = flows(3, *LARGE)["far"]
+    far, alike = flows(3, *LARGE)["far"], fine.with_nodes(fine.nodes.expand(3, -1, -1, -1))
     found: dict[str, Flow | Positions] = {
         "lattice": smooth(SmoothFlow, 3, 12, *LARGE),
         "stream": smooth(StreamFlow, 3, 9, *LARGE),
-        "one for all": fine.with_nodes(fine.nodes.expand(3, -1, -1, -1)),
+        "one for all": alike,
         "dense, one for all": far[:1].expand(3, -1, -1, -1),
         "mixed": MixedFlow(((torch.tensor([2, 0]), coarse), (torch.tensor([1]), far[:1]))),
     }
+    found["followed"] = FollowedFlow(
+        smooth(StreamFlow, 3, 9, *LARGE),
+        (Reading.of(replace(coarse.rows(torch.tensor([0, 1, 1])), every=4)), Reading.of(far)),
+    )
+    found["one for all, followed"] = FollowedFlow(
+        alike, (Reading.of(replace(alike, every=5)), Reading.of(far[:1].expand(3, -1, -1, -1)))
+    )
     grid = fine.sampler_grid(torch.float32).expand(3, -1, -1, -1)
     return {**found, "positions": Positions(grid)}
 
 
 @pytest.mark.parametrize("padding", PADDINGS)
-@pytest.mark.parametrize("form", ["lattice", "stream", "one for all", "dense, one for all", "mixed", "positions"])
+@pytest.mark.parametrize("form", [*mixes()])
 def test_flows_in_all_forms_are_followed_to_the_bit(padding, form):
     image, options = image_of(3, 3, *LARGE), {"padding": padding, "interpolation": "bilinear"}
     found = look_up(image, mixes()[form], **options, resampler="numba")
@@ -131,17 +140,18 @@ def test_rows_that_are_not_there_are_not_read():
     image, flow = image_of(3, 3, *LARGE), flows(2, *LARGE)["short"]
     with pytest.raises(ValueError, match="flow must have a row for each of 3 images, got 2"):
         look_up(image, flow, padding="zeros", interpolation="bilinear", resampler="numba")
-    with pytest.raises(ValueError, match="flow must have a row for each of 3 grids, got 2"):
-        follow(flow, image[:, :2].movedim(1, -1))
+    with pytest.raises(ValueError, match="grid must have a row for each of 2 flows, got 3"):
+        Reading.of(flow).followed(image[:, :2].movedim(1, -1))
 
 
 def test_flows_in_a_row_are_those_of_grid_sample(monkeypatch, oracle):
     first, grid = smooth(SmoothFlow, 2, 9, *LARGE), smooth(SmoothFlow, 2, 12, *LARGE).sampler_grid(torch.float32)
-    found = [follow(first, grid), follow(first.dense(), grid)]
+    readings = [Reading.of(replace(first, every=every)) for every in (1, 2, 3, 6)] + [Reading.of(first.dense())]
+    found = [reading.followed(grid) for reading in readings]
     monkeypatch.setattr(compiled, "kernels", lambda _: None)
     # Grids span 2; a rounding of a position is up to 1.2e-7.
-    for one, plain in zip(found, (first.dense(), first.dense()), strict=True):
-        oracle("grid of two flows, grid_sample", one, follow(plain, grid), 1e-6, unit="")
+    for one, reading in zip(found, readings, strict=True):
+        oracle("grid of two flows, grid_sample", one, reading.followed(grid), 1e-6, unit="")
 
 
 @pytest.mark.parametrize("stride", [2, 7, 8, 33])

@@ -87,6 +87,8 @@ class Plan:
     slope: how much the flow differs from pixel to pixel, px, at most; inf where that is not known.
     parts: whether what is drawn may have a coarser plan of its own, where it can be read which; then `error_px` is the
         tolerance, which all of them keep.
+    every: px, at which the flow is known where others of a composition read it, with lines between.
+    readings: px that this can be, and how far the flow is off then, px.
     before, after: nodes that the lattice has before the frame and behind its last cell.
     lattice: where the flow is computed; None for every pixel, or for none.
     why: what decided.
@@ -105,6 +107,8 @@ class Plan:
     random: bool = False
     slope: float = math.inf
     parts: bool = False
+    every: int = 1
+    readings: tuple[tuple[int, float], ...] = ()
     before: int = 1
     after: int = 1
     lattice: Lattice | None = field(init=False)

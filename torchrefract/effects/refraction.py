@@ -218,4 +218,4 @@ def _spread_path(path: Flow, rows: int, before: int) -> Flow:
         frames = rows // before
         parts = ((frames_of(own, frames), _spread_path(flow, frames * len(own), len(own))) for own, flow in path.parts)
         return MixedFlow(tuple((index, cast(PartFlow, flow)) for index, flow in parts))
-    return spread(path, rows)
+    return spread(cast(Tensor, path), rows)  # no warp alone follows others

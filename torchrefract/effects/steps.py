@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, cast
+from typing import NamedTuple, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -11,9 +11,12 @@ from torchrefract._bands import in_place
 from torchrefract._checks import is_true, learns, read
 from torchrefract.effects.rows import only
 from torchrefract.warping.compose import compose_flows
+from torchrefract.warping.followed import FollowedFlow, Reading
 from torchrefract.warping.grid import Positions
-from torchrefract.warping.mixed import Flow, dense, flow_rows, grid_of
-from torchrefract.warping.resample import follow
+from torchrefract.warping.lattice import SmoothFlow
+from torchrefract.warping.mixed import Flow, MixedFlow, Part, PartFlow, dense, flow_rows, grid_of
+
+_Found = TypeVar("_Found", bound=Flow | Positions)
 
 
 class Step(NamedTuple):
@@ -25,43 +28,44 @@ class Step(NamedTuple):
 
     def of(self, index: Tensor) -> "Step":
         """The same for some of the rows."""
-        return Step(self.gate[index], self.active[index], flow_rows(cast(Flow, self.path), index))
+        path = flow_rows(cast(Flow, self.path), index)
+        return Step(self.gate[index], self.active[index], path)
+
+    def reading(self) -> Reading:
+        """What later steps read of it."""
+        path = cast(Flow, self.path)
+        return Reading.of(path if isinstance(path, SmoothFlow) else dense(path))
 
 
 def exact(steps: Sequence[Step]) -> Step:
     """Warps in a row as one. Each flow is read once, where the later ones look; what is read twice is blurred twice."""
     steps = [step._replace(path=dense(cast(Flow, step.path))) for step in steps]
-    return Step(*_any(steps), _each_by_itself(steps, _in_a_row))
+    apart = _apart(steps)
+    found = _in_a_row(steps) if apart is None else in_place(_each(steps, apart, _in_a_row))
+    return Step(*_any(steps), found)
 
 
 def on_grid(steps: Sequence[Step], dtype: torch.dtype) -> Step:
     """The same in the sampler's own positions: faster, and off by their rounding."""
 
-    def one(steps: Sequence[Step]) -> Tensor:
+    def one(steps: Sequence[Step]) -> Flow | Positions:
+        if len(steps) == 1:
+            return steps[0].path
         if all(isinstance(step.path, Tensor) for step in steps):
-            return grid_of(_in_a_row(steps), dtype)
-        return _in_a_row_on_grid(steps, dtype)
+            return _in_a_row(steps)
+        last = steps[-1].path
+        if isinstance(last, SmoothFlow) and all(is_true(step.active.all, of=step.active) for step in steps):
+            return FollowedFlow(last, tuple(step.reading() for step in reversed(steps[:-1])))
+        return Positions(_in_a_row_on_grid(steps, dtype))
 
-    return Step(*_any(steps), Positions(_each_by_itself(steps, one)))
+    apart = _apart(steps)
+    return Step(*_any(steps), one(steps) if apart is None else _together(_each(steps, apart, one), dtype))
 
 
 def _any(steps: Sequence[Step]) -> tuple[Tensor, Tensor]:
     """Gate and active of steps as one."""
     gates, active = [step.gate for step in steps], [step.active for step in steps]
     return functools.reduce(torch.logical_or, gates), functools.reduce(torch.logical_or, active)
-
-
-def _each_by_itself(steps: Sequence[Step], one: Callable[[Sequence[Step]], Tensor]) -> Tensor:
-    """What `one` makes of the steps, for the rows that a combination of them moves by those alone; 0 for the others."""
-    apart = _apart(steps)
-    if apart is None:
-        return one(steps)
-    found = list[tuple[Tensor, Tensor]]()
-    for acting, rows in sorted(apart.items(), reverse=True):  # what moves nothing comes last
-        index = torch.tensor(rows)
-        own = [step.of(index) for step, acts in zip(steps, acting, strict=True) if acts]
-        found.append((index, one(own) if own else found[0][1].new_zeros(len(rows), *found[0][1].shape[1:])))
-    return in_place(found)
 
 
 def _apart(steps: Sequence[Step]) -> dict[tuple[bool, ...], list[int]] | None:
@@ -79,6 +83,31 @@ def _apart(steps: Sequence[Step]) -> dict[tuple[bool, ...], list[int]] | None:
     return rows
 
 
+def _each(
+    steps: Sequence[Step], apart: dict[tuple[bool, ...], list[int]], one: Callable[[Sequence[Step]], _Found]
+) -> list[tuple[Tensor, _Found]]:
+    """What `one` makes of the steps, for the rows that a combination of them moves by those alone."""
+    found = list[tuple[Tensor, _Found]]()
+    for acting, rows in apart.items():
+        index = torch.tensor(rows)
+        # What none of them moves has a flow of 0 in any of them.
+        own = [step.of(index) for step, acts in zip(steps, acting, strict=True) if acts] or [steps[-1].of(index)]
+        found.append((index, one(own)))
+    return found
+
+
+def _together(found: Sequence[tuple[Tensor, Flow | Positions]], dtype: torch.dtype) -> Flow | Positions:
+    """The rows of a batch in one form."""
+    if any(isinstance(flow, Positions) for _, flow in found):
+        grids = [(i, flow.grid if isinstance(flow, Positions) else grid_of(flow, dtype)) for i, flow in found]
+        return Positions(in_place(grids))
+    parts = list[Part]()
+    for index, flow in found:
+        own = flow.parts if isinstance(flow, MixedFlow) else ((torch.arange(len(index)), cast(PartFlow, flow)),)
+        parts += [(index[rows], part) for rows, part in own]
+    return MixedFlow(tuple(parts))
+
+
 def _in_a_row(steps: Sequence[Step]) -> Tensor:
     """(B, 2, H, W), px, of steps whose paths are flows."""
     *earlier, last = steps
@@ -94,8 +123,8 @@ def _in_a_row_on_grid(steps: Sequence[Step], dtype: torch.dtype) -> Tensor:
     *earlier, last = steps
     grid = grid_of(cast(Flow, last.path), dtype)
     for step in reversed(earlier):
+        both = step.reading().followed(grid)
         own = cast(Flow, step.path)
-        both = follow(own, grid)
         grid = both if is_true(last.active.all, of=last.active) else only(both, grid_of(own, dtype), last.active, last)
         last = Step(step.gate | last.gate, step.active | last.active, Positions(grid))
     return grid

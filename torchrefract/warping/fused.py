@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrefract import _compiled as compiled
 from torchrefract._checks import learns, withheld
 from torchrefract._threads import share
+from torchrefract.warping.followed import FollowedFlow, of_readings
 from torchrefract.warping.grid import FAR, Positions, pixel_axes, sampler_axes
 from torchrefract.warping.grid_sample import PADDINGS, by_grid_sample, gradients_by_grid_sample
 from torchrefract.warping.lattice import Lines, SmoothFlow
@@ -45,25 +46,6 @@ def looked_up(source: Tensor, flow: Flow | Positions, *, padding: str) -> Tensor
     if flow.requires_grad:
         grid = flow.grid if isinstance(flow, Positions) else grid_of(flow, source.dtype)
     return _LookedUp.apply(source, grid, flow.detach(), padding)
-
-
-def followed(flow: Tensor, grid: Tensor, *, far: float) -> Tensor:
-    """(B, n, m, 2): the grid, and the flow (B, 2, H, W), px, that is read there, as at its border outside of the frame.
-
-    Neither learns; the sums lie within `far`, where also lies what is no number.
-    """
-    values, flows = _of_batch(flow)
-    if len(flows) != len(grid):
-        raise ValueError(f"flow must have a row for each of {len(grid)} grids, got {len(flows)}")
-    height, width = flow.shape[2:]
-    before = grid.movedim(-1, 1).contiguous()
-    out = torch.empty_like(before)
-    scales = map(np.float32, (2 / width, 2 / height, far))
-    kernel, into = compiled.kernels("warping.kernels.look_up").follow, out.numpy()
-    work = partial(kernel, before.numpy(), values.numpy(), flows, *scales)
-    lines, columns = grid.shape[1:3]
-    share(lambda start, stop: work(start, stop, into), len(grid) * lines, least=compiled.SMALLEST // columns + 1)
-    return out.movedim(1, -1)
 
 
 class _LookedUp(torch.autograd.Function):
@@ -139,20 +121,15 @@ def _kernel(images: _Images, rows: Tensor, flow: PartFlow | Positions, padding: 
 
 def _along(flow: PartFlow | Positions, rows: int) -> tuple[str, tuple[Any, ...]]:
     """How kernels are called that look along a flow of so many rows, and with what."""
-    values, flows = _of_batch(flow.grid.movedim(-1, 1) if isinstance(flow, Positions) else known(flow))
+    values, flows = compiled.of_batch(flow.grid.movedim(-1, 1) if isinstance(flow, Positions) else known(flow))
     if len(flows) != rows:  # F.grid_sample raises, too; a kernel would read what is not there
         raise ValueError(f"flow must have a row for each of {rows} images, got {len(flows)}")
     if isinstance(flow, SmoothFlow):
         return "lattice", _of_lines(flow.with_nodes(values).lines(values.dtype), flows)
+    if isinstance(flow, FollowedFlow):
+        lines = _of_lines(flow.last.with_nodes(values).lines(values.dtype), flows)
+        return "followed", (*lines, *of_readings(flow.earlier, flow.last.lattice[:2]))
     return "dense", _of_pixels(values, flows, whole=isinstance(flow, Positions))
-
-
-def _of_batch(values: Tensor) -> tuple[Tensor, np.ndarray]:
-    """The values that differ, and which of them each row of the batch has."""
-    flows = np.arange(len(values))
-    if len(values) > 1 and values.stride(0) == 0:  # one for all, as that of the frames of a clip
-        return values[:1].contiguous(), np.zeros_like(flows)
-    return values.contiguous(), flows
 
 
 def _of_lines(lines: Lines, flows: np.ndarray) -> tuple[Any, ...]:

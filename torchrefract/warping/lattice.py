@@ -1,5 +1,7 @@
 """Smooth flows on a coarse lattice, and what lies between its nodes."""
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import NamedTuple
@@ -118,6 +120,7 @@ class SmoothFlow:
 
     nodes: Tensor  # (B, 2, n, m), px
     lattice: Lattice
+    every: int = 1  # px, at which others that read it know it
 
     @property
     def dtype(self) -> torch.dtype:
@@ -144,6 +147,17 @@ class SmoothFlow:
     def dense(self) -> Tensor:
         """(B, 2, H, W), px."""
         return between_nodes(self.nodes, self.lattice)
+
+    def read(self) -> Tensor:
+        """(B, 2, n, m), px: every so many px, from the first row and column to the last of the frame or behind it."""
+        if self.every == 1:
+            return self.dense()
+        px, step = self.every, math.gcd(self.every, self.lattice.stride)
+        weight = _cubics(self.nodes, self.lattice)[::step]
+        rows, columns = ((-(-(size - 1) // px) * px) // step + 1 for size in self.lattice[:2])
+        # One behind the frame may lie on a node, in a cell of which nothing else counts.
+        found = _down(_across(F.pad(self.nodes, (0, 1, 0, 1), mode="replicate"), weight, columns), weight, rows)
+        return found[:, :, :: px // step, :: px // step].contiguous()
 
     def sampler_grid(self, dtype: torch.dtype) -> Tensor:
         """(B, H, W, 2): where F.grid_sample(align_corners=False) looks; no flow of that size is written."""
@@ -189,6 +203,14 @@ class StreamFlow(SmoothFlow):
         weight = F.pad(lagrange_weights(self.lattice.stride, STREAM_NODES, **options), (1, 0))
         along, across = (_across(nodes, values, self.lattice.width) for values in (weight, slope))
         return torch.cat([scale[0] * along, -scale[1] * across], dim=1), torch.stack([slope, weight])
+
+
+def once(flow: SmoothFlow, work: Callable[[SmoothFlow], Tensor]) -> Tensor:
+    """What is made of a flow, (B, ...), once where all its rows are one, as for the frames of a clip."""
+    nodes = flow.nodes
+    if len(nodes) < 2 or nodes.stride(0) != 0:
+        return work(flow)
+    return work(flow.with_nodes(nodes[:1])).expand(len(nodes), -1, -1, -1)
 
 
 @assume_constant_result

@@ -2,17 +2,17 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar, cast
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from torchrefract._bands import in_place
+from torchrefract.warping.followed import FollowedFlow
 from torchrefract.warping.grid import sampler_grid
-from torchrefract.warping.lattice import SmoothFlow
+from torchrefract.warping.lattice import SmoothFlow, once
 
-PartFlow = Tensor | SmoothFlow
-_Form = TypeVar("_Form", bound="Tensor | SmoothFlow | MixedFlow")
+PartFlow = Tensor | SmoothFlow | FollowedFlow
 Part = tuple[Tensor, PartFlow]
 
 
@@ -64,37 +64,36 @@ class MixedFlow:
 
 
 # A flow (B, 2, H, W), px, or in another form.
-Flow = Tensor | SmoothFlow | MixedFlow
+Flow = Tensor | SmoothFlow | FollowedFlow | MixedFlow
 
 
 def dense(flow: Flow) -> Tensor:
-    """(B, 2, H, W), px, of a flow in any form."""
-    return flow if isinstance(flow, Tensor) else _once(flow, lambda own: own.dense())
+    """(B, 2, H, W), px, of a flow in any form but a followed one, which is known by positions alone."""
+    if isinstance(flow, FollowedFlow):
+        raise TypeError("flow must not be one that others are read along")
+    if isinstance(flow, SmoothFlow):
+        return once(flow, lambda own: own.dense())
+    return flow if isinstance(flow, Tensor) else flow.dense()
 
 
 def grid_of(flow: Flow, dtype: torch.dtype) -> Tensor:
     """(B, H, W, 2): where F.grid_sample(align_corners=False) looks along a flow in any form, finite."""
-    if isinstance(flow, Tensor):
-        return _once(flow, lambda own: sampler_grid(own.to(dtype)))
-    return _once(flow, lambda own: own.sampler_grid(dtype))
+    if isinstance(flow, SmoothFlow):
+        return once(flow, lambda own: own.sampler_grid(dtype))
+    if not isinstance(flow, Tensor):
+        return flow.sampler_grid(dtype)
+    if len(flow) < 2 or flow.stride(0) != 0:
+        return sampler_grid(flow.to(dtype))
+    return sampler_grid(flow[:1].to(dtype)).expand(len(flow), -1, -1, -1)
 
 
 def flow_rows(flow: Flow, index: Tensor) -> Flow:
     """Some rows of a flow."""
-    return flow.rows(index) if isinstance(flow, SmoothFlow | MixedFlow) else flow[index]
-
-
-def _once(flow: _Form, work: Callable[[_Form], Tensor]) -> Tensor:
-    """What is made of a flow, once where all its rows are one, as for the frames of a clip."""
-    nodes = known(flow)
-    if isinstance(flow, MixedFlow) or len(nodes) < 2 or nodes.stride(0) != 0:
-        return work(flow)
-    first = cast(_Form, flow.with_nodes(nodes[:1]) if isinstance(flow, SmoothFlow) else nodes[:1])
-    return work(first).expand(len(nodes), -1, -1, -1)
+    return flow[index] if isinstance(flow, Tensor) else flow.rows(index)
 
 
 def known(flow: Flow) -> Tensor:
     """What a flow is computed from, or part of that."""
     if isinstance(flow, MixedFlow):
         return known(flow.parts[0][1])
-    return flow.nodes if isinstance(flow, SmoothFlow) else flow
+    return flow if isinstance(flow, Tensor) else flow.nodes

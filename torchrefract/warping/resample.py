@@ -5,18 +5,15 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from torchrefract import _compiled as compiled
 from torchrefract._bands import join, rows_at_once
 from torchrefract._checks import check_choice, check_flow, check_tensor, learns
 from torchrefract._compiled import SMALLEST
-from torchrefract._constants import constant
 from torchrefract._levels import rounded
 from torchrefract.warping import fused
-from torchrefract.warping.grid import FAR, Positions, field_dtype, finite, inside, sampler_grids
+from torchrefract.warping.grid import Positions, field_dtype, inside, sampler_grids
 from torchrefract.warping.grid_sample import INTERPOLATIONS, PADDINGS, WHOLE, by_grid_sample
-from torchrefract.warping.lattice import FARTHEST, SmoothFlow
 from torchrefract.warping.layout import has_format, is_channels_last
-from torchrefract.warping.mixed import Flow, dense, grid_of, known
+from torchrefract.warping.mixed import Flow, grid_of, known
 from torchrefract.warping.opencv import obstacle, remapped
 
 RESAMPLERS = ("auto", "grid_sample", "numba", "opencv")
@@ -119,18 +116,6 @@ def sampler_dtype(image: Tensor, dtype: torch.dtype) -> torch.dtype:
     large = max(image.shape[2:]) > _LARGEST_FLOAT32_SIDE
     # The CPU sampler of half types is wrong above 2^15 pixels, and no type of 16 bits holds a coordinate.
     return torch.float64 if large else torch.promote_types(field_dtype(image.dtype), dtype)
-
-
-def follow(first: Flow, grid: Tensor) -> Tensor:
-    """(B, H, W, 2): the grid of two warps in a row, from that of the second; as by `compose_flows`."""
-    flow = dense(first).to(grid.dtype)
-    height, width = flow.shape[2:]
-    far = FARTHEST if isinstance(first, SmoothFlow) else FAR
-    if height * width >= SMALLEST and not learns((flow, grid)) and compiled.obstacle(flow, grid) is None:
-        return fused.followed(flow, grid, far=far)
-    read = sampled(flow, grid, padding="border", interpolation="bilinear").movedim(1, -1)
-    both = torch.addcmul(grid, read, constant((2 / width, 2 / height), dtype=read.dtype, device=read.device))
-    return both if isinstance(first, SmoothFlow) else finite(both, FAR)
 
 
 def sampled(source: Tensor, grid: Tensor, *, padding: str, interpolation: str) -> Tensor:

@@ -20,9 +20,9 @@ Weights = tuple[Lanes, Lanes, Lanes, Lanes]
 Cell = tuple[Lanes, Lanes, Lanes, Lanes]  # upper and lower row, left and right place among what is read
 Flags = tuple[Lanes, Lanes]  # whether the left and the right pixels are in the frame
 Rows = tuple[int, int]
-_MOST_ROWS = 12  # of the source; for more of them one pixel after the other is faster
-_BEFORE = LANES // 4  # pixels that are read before the first of those at both ends of a group
-_AHEAD = 3  # rows before they are read they are asked for: each is read anew, from farther memory, a row later
+MOST_ROWS = 12  # of the source; for more of them one pixel after the other is faster
+BEFORE = LANES // 4  # pixels that are read before the first of those at both ends of a group
+AHEAD = 3  # rows before they are read they are asked for: each is read anew, from farther memory, a row later
 
 
 @inlined
@@ -52,16 +52,16 @@ def _read_group(source: Values, size: Size, x: Floats, y: Floats, start: int, ap
     lowest, highest = lanes.all_wholes(np.int32(0)), lanes.all_wholes(np.int32(width - 1))
     column = lanes.larger(lanes.smaller(column, highest), lowest)
     behind = lanes.larger(lanes.smaller(behind, highest), lowest)
-    near = min(lanes.first(column), lanes.last(column)) - _BEFORE
+    near = min(lanes.first(column), lanes.last(column)) - BEFORE
     begin = max(0, min(near, width - 2 * LANES))
     origin, reach = lanes.all_wholes(np.int32(begin)), lanes.all_wholes(np.int32(2 * LANES))
     column, behind = lanes.minus(column, origin), lanes.minus(behind, origin)
     if not lanes.everywhere(lanes.both(lanes.below(column, reach), lanes.below(behind, reach))):
         return False
     rows = max(0, lanes.smallest(row)), min(height, lanes.largest(row) + 2)
-    if rows[1] - rows[0] > _MOST_ROWS:
+    if rows[1] - rows[0] > MOST_ROWS:
         return False
-    weights = _weights(lanes.difference(place_x, left), lanes.difference(place_y, top))
+    weights = weights_of(lanes.difference(place_x, left), lanes.difference(place_y, top))
     # What -0 is added to keeps its bits; where nothing is read 0 is left.
     tall, zero = lanes.all_wholes(np.int32(height)), lanes.all_floats(np.float32(0))
     begins = lanes.where(lanes.below(row, tall), lanes.all_floats(np.float32(-0.0)), zero)
@@ -77,7 +77,7 @@ def _read_group(source: Values, size: Size, x: Floats, y: Floats, start: int, ap
 
 
 @inlined
-def _weights(right: Lanes, below: Lanes) -> Weights:
+def weights_of(right: Lanes, below: Lanes) -> Weights:
     """Of the four pixels around each position, from how far it is behind the first of them."""
     one = lanes.all_floats(np.float32(1))
     before, above = lanes.difference(one, right), lanes.difference(one, below)
@@ -137,7 +137,7 @@ def _of_plane(
 
 @inlined
 def _ahead(rows: Rows, height: int) -> int:
-    return min(rows[1] + _AHEAD, height - 1)
+    return min(rows[1] + AHEAD, height - 1)
 
 
 @inlined

@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 
 from torchrefract._jit import inlined, jit
 from torchrefract._lanes import LANES
-from torchrefract.warping.kernels.pixels import BORDER, Cells, Floats, Number, Size, Values, to_pixels
-from torchrefract.warping.kernels.places import along_lattice, along_pixels, room, within
+from torchrefract.warping.kernels.following import Addresses, Frame
+from torchrefract.warping.kernels.pixels import Cells, Floats, Number, Size, Values, to_pixels
+from torchrefract.warping.kernels.places import along_lattice, along_pixels, room
 
 if LANES:
+    from torchrefract.warping.kernels.following_groups import follow_row
     from torchrefract.warping.kernels.groups import read_row
 else:
+    from torchrefract.warping.kernels.following import follow_row
     from torchrefract.warping.kernels.pixels import read_row
 
 Whole = NDArray[np.int64]
@@ -79,35 +82,55 @@ def look_up_dense(
 
 
 @jit
+def look_up_followed(
+    source: Values,
+    size: Size,
+    images: Whole,
+    lines: Floats,
+    flows: Whole,
+    weight: Floats,
+    base_x: Floats,
+    base_y: Floats,
+    readings: Addresses,
+    table: Whole,
+    far: Floats,
+    frame: Frame,
+    padding: int,
+    start: int,
+    stop: int,
+    out: Values,
+) -> None:
+    """Look up where flows lead the positions of `look_up_lattice`, as for `follow_row`, with readings (k, flows)."""
+    height, width = base_y.size, base_x.size
+    x, y = np.empty(width, np.float32), np.empty(width, np.float32)
+    cells, more = room(), np.empty((4, width), np.float32)
+    for row in range(start, stop):
+        pair, line = divmod(row, height)
+        image, flow = images[pair], flows[pair]
+        along_lattice(lines[flow], weight, base_x, base_y, line, x, y)
+        follow_row(x, y, readings[pair], table, far, frame, cells, more)
+        _look_up(source[image], size, x, y, padding, cells, out[image], line, height)
+
+
+@jit
 def follow(
     grid: Floats,
-    flow: Floats,
-    flows: Whole,
-    scale_x: Number,
-    scale_y: Number,
-    far: Number,
+    readings: Addresses,
+    table: Whole,
+    far: Floats,
+    frame: Frame,
     start: int,
     stop: int,
     out: Floats,
 ) -> None:
-    """Rows of out, (B, 2, n, m): positions of a grid and, times the scales, the flow (F, 2, H, W) that is read there.
-
-    Outside of the frame it is as at its border. The sums lie in [-far, far], where also lies what is no number.
-    """
+    """Rows of out, (B, 2, n, m): where flows lead a grid's positions, as for `follow_row`, with readings (B, k)."""
     lines, columns = grid.shape[2:]
-    height, width = flow.shape[2:]
-    x, y = np.empty(columns, np.float32), np.empty(columns, np.float32)
-    found, cells = np.empty((2, columns), np.float32), room()
+    cells, more = room(), np.empty((4, columns), np.float32)
     for row in range(start, stop):
         i, line = divmod(row, lines)
+        x, y = out[i, 0, line], out[i, 1, line]
         x[:], y[:] = grid[i, 0, line], grid[i, 1, line]
-        to_pixels(x, width, BORDER)
-        to_pixels(y, height, BORDER)
-        source, apart = flow[flows[i]].reshape(2 * height * width), (height * width, columns, 0)
-        read_row(source, (2, height, width, 1), x, y, cells, apart, found.reshape(2 * columns))
-        for k in range(columns):
-            out[i, 0, line, k] = within(grid[i, 0, line, k] + found[0, k] * scale_x, far)
-            out[i, 1, line, k] = within(grid[i, 1, line, k] + found[1, k] * scale_y, far)
+        follow_row(x, y, readings[i], table, far, frame, cells, more)
 
 
 @inlined

@@ -1,0 +1,133 @@
+"""What numba compiles: the same as `following`, LANES pixels at once and to its bits."""
+
+from typing import Any
+
+import numpy as np
+
+from torchrefract import _lanes as lanes
+from torchrefract._jit import floats_at, inlined
+from torchrefract._lanes import LANES
+from torchrefract.warping.kernels import following, pixels
+from torchrefract.warping.kernels.following import Addresses, Frame, Whole
+from torchrefract.warping.kernels.groups import AHEAD, BEFORE, MOST_ROWS, weights_of
+from torchrefract.warping.kernels.pixels import Cells, Floats, Number
+
+Lanes = Any
+Read = tuple[bool, Lanes, Lanes]
+
+
+@inlined
+def follow_row(
+    x: Floats,
+    y: Floats,
+    flows: Addresses,
+    table: Whole,
+    far: Floats,
+    frame: Frame,
+    cells: Cells,
+    more: Floats,
+) -> None:
+    """As `following.follow_row`."""
+    for k in range(table.shape[0]):
+        flow = floats_at(flows[k], 2 * table[k, 0] * table[k, 1])
+        if x.size < LANES or table[k, 1] < 2 * LANES:
+            following.follow_one(x, y, flow, table[k], far[k], frame, cells, more)
+        else:
+            _follow_one(x, y, flow, table[k], far[k], frame, cells, more)
+
+
+@inlined
+def _follow_one(
+    x: Floats,
+    y: Floats,
+    flow: Floats,
+    place: Whole,
+    far: Number,
+    frame: Frame,
+    cells: Cells,
+    more: Floats,
+) -> None:
+    rows, columns, every = place
+    more[2], more[3] = x, y
+    for first in range(0, x.size, LANES):
+        start = min(first, x.size - LANES)  # the last group does again what the one before it did
+        at_x, at_y = lanes.load(more[2], np.uintp(start)), lanes.load(more[3], np.uintp(start))
+        place_x, place_y = _to_pixels(at_x, frame[1], every), _to_pixels(at_y, frame[0], every)
+        known, u, v = _read(flow, rows, columns, place_x, place_y)
+        if not known:
+            lanes.store(more[0], np.uintp(start), place_x)
+            lanes.store(more[1], np.uintp(start), place_y)
+            _read_apart(flow, rows, columns, start, cells, more, x, y)
+            u, v = lanes.load(x, np.uintp(start)), lanes.load(y, np.uintp(start))
+        lanes.store(x, np.uintp(start), _moved(at_x, u, frame[1], far))
+        lanes.store(y, np.uintp(start), _moved(at_y, v, frame[0], far))
+
+
+@inlined
+def _to_pixels(place: Lanes, size: int, every: int) -> Lanes:
+    """From the sampler's coordinates to those of what is known every few px, on a frame of so many pixels."""
+    one, scale = lanes.all_floats(np.float32(1)), lanes.all_floats(np.float32(size / 2))
+    at = lanes.fma(lanes.total(place, one), scale, lanes.all_floats(np.float32(-0.5)))
+    at = lanes.lower(lanes.higher(at, lanes.all_floats(np.float32(0))), lanes.all_floats(np.float32(size - 1)))
+    return lanes.product(at, lanes.all_floats(np.float32(1 / every)))
+
+
+@inlined
+def _moved(place: Lanes, by: Lanes, size: int, far: Number) -> Lanes:
+    """The place in the sampler's coordinates, moved by so many px."""
+    at = lanes.total(place, lanes.product(by, lanes.all_floats(np.float32(2 / size))))
+    return lanes.higher(lanes.lower(at, lanes.all_floats(far)), lanes.all_floats(-far))
+
+
+@inlined
+def _read(flow: Floats, rows: int, columns: int, x: Lanes, y: Lanes) -> Read:
+    """Both planes of a flow at positions in it, or False for those that are too far from one another."""
+    left, top = lanes.floor(x), lanes.floor(y)
+    column, row = lanes.to_wholes(left), lanes.to_wholes(top)
+    one = lanes.all_wholes(np.int32(1))
+    behind = lanes.smaller(lanes.plus(column, one), lanes.all_wholes(np.int32(columns - 1)))
+    near = min(lanes.first(column), lanes.last(column)) - BEFORE
+    at = max(0, min(near, columns - 2 * LANES))
+    origin, reach = lanes.all_wholes(np.int32(at)), lanes.all_wholes(np.int32(2 * LANES))
+    column, behind = lanes.minus(column, origin), lanes.minus(behind, origin)
+    u = v = lanes.all_floats(np.float32(-0.0))  # what is added to it keeps its bits
+    if not lanes.everywhere(lanes.both(lanes.below(column, reach), lanes.below(behind, reach))):
+        return False, u, v
+    first, last = lanes.smallest(row), min(rows, lanes.largest(row) + 2)
+    if last - first > MOST_ROWS:
+        return False, u, v
+    weights, under = weights_of(lanes.difference(x, left), lanes.difference(y, top)), lanes.plus(row, one)
+    at += first * columns
+    _fetch(flow, at + min(last - first + AHEAD, rows - 1 - first) * columns, rows * columns)
+    for line in range(first, last):
+        here = lanes.all_wholes(np.int32(line))
+        upper = lanes.equal(row, here)
+        reads = lanes.either(upper, lanes.equal(under, here))
+        at_left, at_right = lanes.where(upper, weights[0], weights[2]), lanes.where(upper, weights[1], weights[3])
+        u = lanes.where(reads, _added(u, flow, at, column, behind, at_left, at_right), u)
+        v = lanes.where(reads, _added(v, flow, at + rows * columns, column, behind, at_left, at_right), v)
+        at += columns
+    return True, u, v
+
+
+@inlined
+def _fetch(flow: Floats, at: int, plane: int) -> None:
+    lanes.fetch(flow, np.uintp(at + LANES))
+    lanes.fetch(flow, np.uintp(at + LANES + plane))
+
+
+@inlined
+def _added(total: Lanes, flow: Floats, at: int, column: Lanes, behind: Lanes, at_left: Lanes, at_right: Lanes) -> Lanes:
+    low, high = lanes.load(flow, np.uintp(at)), lanes.load(flow, np.uintp(at + LANES))
+    left, right = lanes.pick(low, high, column), lanes.pick(low, high, behind)
+    return lanes.fma(at_right, right, lanes.fma(at_left, left, total))
+
+
+@inlined
+def _read_apart(
+    flow: Floats, rows: int, columns: int, start: int, cells: Cells, more: Floats, u: Floats, v: Floats
+) -> None:
+    """The same one pixel after the other, at positions more[:2] from `start` on."""
+    size, plane = (1, rows, columns, 1), rows * columns
+    pixels.read_part(flow[:plane], size, more[0], more[1], start, start + LANES, cells, (0, 0, 0), u)
+    pixels.read_part(flow[plane:], size, more[0], more[1], start, start + LANES, cells, (0, 0, 0), v)

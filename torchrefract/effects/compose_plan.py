@@ -5,6 +5,9 @@ error of f_i, L_i being the largest slope of f_i. So the error of each flow coun
 before it, and what follows a flow whose slope is not known is computed exactly; that flow itself shares in the
 tolerance if parts of its ranges may have lattices. Errors that are of a chance add as deviations do. Of several effects
 that never act on one sample together, each has the whole tolerance.
+
+Where a later flow leads, f_i is read linearly between pixels, or every h px: that adds no more than its largest error
+between these, as lines through every h-th pixel are themselves lines from pixel to pixel.
 """
 
 import math
@@ -22,6 +25,9 @@ from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.plan import Ask, Plan
 from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.refraction import WarpEffect
+
+# Of a flow's tolerance, for others to read it every few px; and of that of one whose error is of a chance.
+_READING, _CERTAIN = 0.7, 0.5
 
 
 @dataclass(frozen=True)
@@ -132,6 +138,11 @@ class _Share(NamedTuple):
     plan: Plan  # for it
     stretched: float = 1.0  # how often its error counts in the composite
 
+    @property
+    def error(self) -> float:
+        """How far the composite is off by it, px."""
+        return (self.plan.error_px + dict(self.plan.readings).get(self.plan.every, 0.0)) * self.stretched
+
 
 def _shared(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask) -> tuple[list[_Share], float]:
     """What each warp gets, and how far the composite is off at most.
@@ -143,7 +154,7 @@ def _shared(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask)
     tried = [_in_row([warps[i] for i in own], ask) for own in sets]
     found, error = list[_Share | None]([None] * len(warps)), 0.0
     for own, shares in zip(sets, tried, strict=True):
-        error = max(error, _total((share.plan.error_px * share.stretched, share.plan.random) for share in shares))
+        error = max(error, _total((share.error, share.plan.random) for share in shares))
         for i, share in zip(own, shares, strict=True):
             before = found[i]
             if before is not None and (before.plan.stride == 0) != (share.plan.stride == 0):
@@ -170,14 +181,31 @@ def _shared_once(warps: Sequence[_Warp], shares: Sequence[_Share], ask: Ask) -> 
     smooth = sum(1 for _ in takewhile(lambda share: share.plan.stride != 1, shares))
     # The one that comes next has an error, too, where what is drawn may have a lattice of its own.
     sharing = smooth + any(share.plan.parts for share in shares[smooth : smooth + 1])
-    whole = (ask.tolerance_px or 0.0) / max(1.0, _total([(1.0, share.plan.random) for share in shares[:sharing]]))
+    # What is not of a chance adds up, and gets along with less.
+    parts = [1.0 if share.plan.random or sharing == 1 else _CERTAIN for share in shares[:sharing]]
+    sizes = zip(parts, shares, strict=False)
+    whole = (ask.tolerance_px or 0.0) / max(1.0, _total((part, share.plan.random) for part, share in sizes))
     found, before = list[_Share](), 1.0
-    for warp, last in zip(warps[:sharing], shares[:sharing], strict=True):
-        found.append(_Share(whole / before, warp.plan(ask, whole / before), before))
+    for i, (part, warp, last) in enumerate(zip(parts, warps, shares, strict=False)):
+        is_read = any(
+            later.group == warp.group and share.plan.stride > 0
+            for later, share in zip(warps[i + 1 :], shares[i + 1 :], strict=True)
+        )
+        found.append(_share_of(warp, last.plan, min(1.0, part) * whole / before, before, ask, is_read=is_read))
         # A flow that is not computed is too small to count.
         before *= 1 + last.plan.slope if last.plan.stride > 0 else 1.0
     follows = _Share(0.0, ask.plan(1, 0.0, "it follows a warp whose slope is not known"))
     return found + [share if i == smooth else follows for i, share in enumerate(shares[sharing:], start=sharing)]
+
+
+def _share_of(warp: _Warp, last: Plan, tolerance: float, before: float, ask: Ask, *, is_read: bool) -> _Share:
+    """A warp's plan for its part of the tolerance, of which reading its flow may take some; with its last plan."""
+    allowed = [own for own in last.readings if own[1] <= _READING * tolerance] if is_read else []
+    for px, error in reversed(allowed):
+        plan = warp.plan(ask, tolerance - error)
+        if plan.stride > 1 and not plan.parts:
+            return _Share(tolerance, replace(plan, every=px), before)
+    return _Share(tolerance, warp.plan(ask, tolerance), before)
 
 
 def _total(errors: Iterable[tuple[float, bool]]) -> float:

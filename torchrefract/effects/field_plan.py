@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchrefract.effects.plan import Ask, Plan, coarsest
+from torchrefract.effects.plan import READINGS, Ask, Plan, coarsest
 from torchrefract.fields.covariance import REACH
 from torchrefract.fields.modes import Modes
 from torchrefract.fields.torus import torus
@@ -66,13 +66,16 @@ def field_plan(ranges: FieldRanges, ask: Ask) -> Plan:
         return ask.plan(1, 0.0, "the field has too many frequencies for a lattice")
     # Errors and slopes are not at their largest in one place.
     slope = _SLOPE_SIGMAS * ranges.amplitude[1] * spectrum.slope()
-    more = {"modes": modes, "slope": slope, "random": True}
+    more: dict[str, Any] = {"modes": modes, "slope": slope, "random": True}
+    nodes = STREAM_NODES if ranges.stream else 4
     if ranges.stream:
-        more |= {"before": STREAM_NODES // 2, "after": STREAM_NODES // 2 - 1}
+        more |= {"before": nodes // 2, "after": nodes // 2 - 1}
+    else:
+        more["readings"] = tuple((px, most * spectrum.error_between(px, 2)) for px in READINGS)
     counts = "{} x {} of {} x {} frequencies".format(*modes.counts, *modes.size)
 
     def attempt(stride: int) -> Plan | None:
-        off = most * math.hypot(_DROPPED * room / most, spectrum.error_between(stride))
+        off = most * math.hypot(_DROPPED * room / most, spectrum.error_between(stride, nodes))
         if off > room:
             return None
         return FieldPlan(ask.height, ask.width, tolerance, stride, off + tolerance - room, counts, **more)
@@ -122,10 +125,9 @@ class _Spectrum:
         left_out = np.sqrt(np.clip(1 - one * other / self.variance, 0, None))
         return float(np.abs(self.k)[left_out <= max(error, left_out.min())].min())
 
-    def error_between(self, stride: int) -> float:
-        """The deviation of the largest error between nodes of a field of variance 1."""
+    def error_between(self, stride: int, nodes: int) -> float:
+        """The deviation of the largest error of polynomials through so many nodes, of a field of variance 1."""
         options = {"dtype": torch.float64, "device": torch.device("cpu")}
-        nodes = STREAM_NODES if self.stream else 4
         own = along = self._transfer(lagrange_weights(stride, nodes, **options).numpy(), stride)
         if self.stream:
             along = self._transfer(slope_weights(stride, nodes, **options).numpy(), stride)

@@ -6,7 +6,7 @@ from functools import lru_cache
 from torch import Tensor
 
 from torchrefract.cameras.distortion import POLYNOMIAL12, Terms
-from torchrefract.effects.plan import STRIDES, Ask, Plan, coarsest, lies_in
+from torchrefract.effects.plan import READINGS, STRIDES, Ask, Plan, coarsest, lies_in
 from torchrefract.fields.lens_bounds import LensRanges, lens_errors, lens_numbers, moved_by_terms
 from torchrefract.warping.lattice import Lattice
 
@@ -49,7 +49,9 @@ def lens_plan(boxes: tuple[LensRanges, ...], ask: Ask) -> Plan:
         if steps is None:
             return None
         error = left_out + errors.cubic + errors.newton[steps] + tolerance - room
-        more = {"slope": errors.slope, "steps": steps, "kept": kept, "dropped": dropped}
+        # Lines between miss h^2 / 8 of a second derivative along each axis.
+        readings = tuple((px, px**2 / 8 * errors.bend) for px in READINGS)
+        more = {"slope": errors.slope, "steps": steps, "kept": kept, "dropped": dropped, "readings": readings}
         return ask.plan(stride, error, "cubics between", **more)
 
     return coarsest(attempt) or ask.plan(1, 0.0, "the lenses of the ranges bend too much for cubics")

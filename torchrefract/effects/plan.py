@@ -18,6 +18,8 @@ TOLERANCE_PX = 0.02
 _SMALLEST, _LARGEST = 1e-6, 64.0  # px, or levels
 # Positions in float32 are off by so many units of the last place of the longer side.
 _ROUNDING = {False: 16 * 2.0**-24, True: 16 * 2.0**-53}
+# Px at which flows may be known where others read them.
+READINGS = (2, 4)
 # Px between nodes, from fine to coarse.
 STRIDES = (*range(2, 8), *(share << octave for octave in range(1, 7) for share in (4, 5, 6, 7)), 512)
 
@@ -126,7 +128,8 @@ class Plan:
         """Where the flow is computed, and why there."""
         flow = {0: "not computed", 1: "at every pixel"}.get(self.stride, f"every {self.stride} px")
         own = "; on the CPU coarser where what is drawn allows it" if self.parts else ""
-        return f"{flow} ({self.why}{own})"
+        read = f"; others read it every {self.every} px" if self.every > 1 else ""
+        return f"{flow} ({self.why}{own}{read})"
 
     def __str__(self) -> str:
         lines = [

@@ -13,7 +13,7 @@ from typing import NamedTuple, cast
 import numpy as np
 import torch
 
-from torchrefract.effects.plan import Ask, Plan, coarsest
+from torchrefract.effects.plan import READINGS, Ask, Plan, coarsest
 from torchrefract.types import Range
 from torchrefract.warping.lattice import lagrange_weights
 
@@ -45,12 +45,17 @@ def plate_plan(amplitude: float, points: tuple[int, int], smoothing: Range, ask:
     # Errors and slopes are not at their largest in one place.
     slope = _SLOPE_SIGMAS * amplitude * max(_slope(_plate(*plate)) for plate in plates)
 
+    def error_between(stride: int, taps: int) -> float:
+        return _MARGIN * _SIGMAS * amplitude * max(_deviation(plate, stride, taps) for plate in plates)
+
+    readings = tuple((px, error_between(px, 2)) for px in READINGS)
+
     def attempt(stride: int) -> Plan | None:
-        off = _MARGIN * _SIGMAS * amplitude * max(_deviation(plate, stride) for plate in plates)
+        off = error_between(stride, 4)
         if off > room:
             return None
         error = off + cast(float, ask.tolerance_px) - room
-        return ask.plan(stride, error, "kinks of the second derivative", random=True, slope=slope)
+        return ask.plan(stride, error, "kinks of the second derivative", random=True, slope=slope, readings=readings)
 
     return coarsest(attempt) or ask.plan(1, 0.0, "the plate bends too much for cubics")
 
@@ -81,19 +86,23 @@ def _plate(points: tuple[int, int], smoothing: float, height: int, width: int) -
 
 
 @lru_cache(maxsize=1024)
-def _deviation(plate: tuple[tuple[int, int], float, int, int], stride: int) -> float:
-    """Of the largest error between nodes, for displacements of deviation 1; arguments as for `_plate`."""
+def _deviation(plate: tuple[tuple[int, int], float, int, int], stride: int, taps: int) -> float:
+    """Of the largest error of polynomials through so many nodes along each axis, for displacements of deviation 1.
+
+    plate: arguments as for `_plate`.
+    """
     unit, center, scale, weights, looked_at = _plate(*plate)
     step = stride / scale
     around = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
     cells = np.unique((np.floor(looked_at / stride)[:, None] + around).reshape(-1, 2), axis=0)
     corners = (cells * stride - center) / scale
-    nodes = np.stack(np.meshgrid(np.arange(-1, 3), np.arange(-1, 3)), axis=-1).reshape(-1, 2)
-    known = _kernel(corners[:, None, None] + step * nodes[:, None] - unit)  # (cells, 16, N)
+    own = np.arange(1 - taps // 2, taps // 2 + 1)
+    nodes = np.stack(np.meshgrid(own, own), axis=-1).reshape(-1, 2)
+    known = _kernel(corners[:, None, None] + step * nodes[:, None] - unit)  # (cells, nodes, N)
     largest = 0.0
-    cubic = lagrange_weights(6, 4, dtype=torch.float64, device=torch.device("cpu")).numpy()
+    through = lagrange_weights(6, taps, dtype=torch.float64, device=torch.device("cpu")).numpy()
     for x, y in itertools.product(_INSIDE, repeat=2):
-        between = np.einsum("j,cjn->cn", np.outer(cubic[y], cubic[x]).ravel(), known)
+        between = np.einsum("j,cjn->cn", np.outer(through[y], through[x]).ravel(), known)
         error = (_kernel(corners[:, None] + step * np.array([x, y]) / 6 - unit) - between) @ weights[: len(unit)]
         largest = max(largest, float(np.sqrt((error**2).sum(axis=1)).max()))
     return largest

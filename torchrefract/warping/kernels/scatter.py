@@ -65,7 +65,7 @@ def scatter_followed(
     stop: int,
     out: Floats,
 ) -> None:
-    """Of a look-up where flows lead the positions of `scatter_lattice`, as for `follow_row`, with readings (k, flows)."""
+    """Of a look-up where flows lead those of `scatter_lattice`, as for `follow_row`, with readings (k, flows)."""
     height, width, bands = base_y.size, base_x.size, out.shape[1]
     x, y = np.empty(width, np.float32), np.empty(width, np.float32)
     cells, more = room(), np.empty((4, width), np.float32)

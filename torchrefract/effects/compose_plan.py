@@ -6,12 +6,14 @@ before it, and what follows a flow whose slope is not known is computed exactly;
 tolerance if parts of its ranges may have lattices. Errors that are of a chance add as deviations do. Of several effects
 that never act on one sample together, each has the whole tolerance.
 
-Where a later flow leads, f_i is read linearly between pixels, or every h px: that adds no more than its largest error
-between these, as lines through every h-th pixel are themselves lines from pixel to pixel.
+Where a later flow leads, f_i is read linearly between pixels. With what is left of the tolerance it is read between
+every second or fourth: that adds no more than its largest error between these, as lines from every h-th pixel to the
+next are themselves lines from pixel to pixel.
 """
 
+import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import takewhile
@@ -22,12 +24,12 @@ import torch
 from torchrefract.effects.base import Effect
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.light_plan import LightPlan
-from torchrefract.effects.plan import Ask, Plan
+from torchrefract.effects.plan import READINGS, Ask, Plan
 from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.refraction import WarpEffect
 
-# Of a flow's tolerance, for others to read it every few px; and of that of one whose error is of a chance.
-_READING, _CERTAIN = 0.7, 0.5
+# Of the tolerance, left for flows that later ones read between pixels.
+_READING = 0.2
 
 
 @dataclass(frozen=True)
@@ -138,11 +140,6 @@ class _Share(NamedTuple):
     plan: Plan  # for it
     stretched: float = 1.0  # how often its error counts in the composite
 
-    @property
-    def error(self) -> float:
-        """How far the composite is off by it, px."""
-        return (self.plan.error_px + dict(self.plan.readings).get(self.plan.every, 0.0)) * self.stretched
-
 
 def _shared(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask) -> tuple[list[_Share], float]:
     """What each warp gets, and how far the composite is off at most.
@@ -152,15 +149,46 @@ def _shared(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask)
     """
     sets = [[i for i, warp in enumerate(warps) if warp.place in places] for places in together]
     tried = [_in_row([warps[i] for i in own], ask) for own in sets]
-    found, error = list[_Share | None]([None] * len(warps)), 0.0
+    found = list[_Share | None]([None] * len(warps))
     for own, shares in zip(sets, tried, strict=True):
-        error = max(error, _total((share.error, share.plan.random) for share in shares))
         for i, share in zip(own, shares, strict=True):
             before = found[i]
             if before is not None and (before.plan.stride == 0) != (share.plan.stride == 0):
                 return _shared(warps, [[warp.place for warp in warps]], ask)
             found[i] = share if before is None else min(before, share, key=lambda share: share.tolerance)
-    return [cast(_Share, share) for share in found], error
+    shares = cast(list[_Share], found)
+    acting = [dict(zip(own, shares, strict=True)) for own, shares in zip(sets, tried, strict=True)]
+    plans, error = _read_apart([share.plan for share in shares], warps, acting, ask)
+    return [share._replace(plan=plan) for share, plan in zip(shares, plans, strict=True)], error
+
+
+def _read_apart(
+    plans: Sequence[Plan], warps: Sequence[_Warp], acting: Sequence[Mapping[int, _Share]], ask: Ask
+) -> tuple[list[Plan], float]:
+    """The plans with the px at which later warps read their flows, as coarse as is allowed, and the largest error.
+
+    acting: of each set of warps that act together, by their places among all.
+    """
+
+    def error(plans: Sequence[Plan]) -> float:
+        sets = (((_read_error(plans[i], share), share.plan.random) for i, share in own.items()) for own in acting)
+        return max(map(_total, sets), default=0.0)
+
+    def is_read(i: int) -> bool:
+        later = (j for own in acting if i in own for j in own if j > i and warps[j].group == warps[i].group)
+        return plans[i].stride > 1 and not plans[i].parts and any(plans[j].stride > 0 for j in later)
+
+    found = list(plans)
+    for px, i in itertools.product(READINGS, filter(is_read, range(len(plans)))):
+        coarser = [replace(plan, every=px) if i == j else plan for j, plan in enumerate(found)]
+        if px in dict(found[i].readings) and error(coarser) <= (ask.tolerance_px or 0.0):
+            found = coarser
+    return found, error(found)
+
+
+def _read_error(plan: Plan, share: _Share) -> float:
+    """How far the composite is off by a flow, in all."""
+    return (share.plan.error_px + dict(plan.readings).get(plan.every, 0.0)) * share.stretched
 
 
 def _in_row(warps: Sequence[_Warp], ask: Ask) -> list[_Share]:
@@ -181,31 +209,14 @@ def _shared_once(warps: Sequence[_Warp], shares: Sequence[_Share], ask: Ask) -> 
     smooth = sum(1 for _ in takewhile(lambda share: share.plan.stride != 1, shares))
     # The one that comes next has an error, too, where what is drawn may have a lattice of its own.
     sharing = smooth + any(share.plan.parts for share in shares[smooth : smooth + 1])
-    # What is not of a chance adds up, and gets along with less.
-    parts = [1.0 if share.plan.random or sharing == 1 else _CERTAIN for share in shares[:sharing]]
-    sizes = zip(parts, shares, strict=False)
-    whole = (ask.tolerance_px or 0.0) / max(1.0, _total((part, share.plan.random) for part, share in sizes))
+    whole = (ask.tolerance_px or 0.0) / max(1.0, _total([(1.0, share.plan.random) for share in shares[:sharing]]))
     found, before = list[_Share](), 1.0
-    for i, (part, warp, last) in enumerate(zip(parts, warps, shares, strict=False)):
-        is_read = any(
-            later.group == warp.group and share.plan.stride > 0
-            for later, share in zip(warps[i + 1 :], shares[i + 1 :], strict=True)
-        )
-        found.append(_share_of(warp, last.plan, min(1.0, part) * whole / before, before, ask, is_read=is_read))
+    for warp, last in zip(warps[:sharing], shares[:sharing], strict=True):
+        found.append(_Share(whole / before, warp.plan(ask, whole / before), before))
         # A flow that is not computed is too small to count.
         before *= 1 + last.plan.slope if last.plan.stride > 0 else 1.0
     follows = _Share(0.0, ask.plan(1, 0.0, "it follows a warp whose slope is not known"))
     return found + [share if i == smooth else follows for i, share in enumerate(shares[sharing:], start=sharing)]
-
-
-def _share_of(warp: _Warp, last: Plan, tolerance: float, before: float, ask: Ask, *, is_read: bool) -> _Share:
-    """A warp's plan for its part of the tolerance, of which reading its flow may take some; with its last plan."""
-    allowed = [own for own in last.readings if own[1] <= _READING * tolerance] if is_read else []
-    for px, error in reversed(allowed):
-        plan = warp.plan(ask, tolerance - error)
-        if plan.stride > 1 and not plan.parts:
-            return _Share(tolerance, replace(plan, every=px), before)
-    return _Share(tolerance, warp.plan(ask, tolerance), before)
 
 
 def _total(errors: Iterable[tuple[float, bool]]) -> float:

@@ -45,6 +45,13 @@ def exact(steps: Sequence[Step]) -> Step:
     return Step(*_any(steps), found)
 
 
+def composite(whole: Step, steps: Sequence[Step]) -> Step:
+    """Warps that were looked up together, as one with a flow (B, 2, H, W), px."""
+    if isinstance(whole.path, Positions):
+        return exact(steps)
+    return whole._replace(path=dense(whole.path))
+
+
 def on_grid(steps: Sequence[Step], dtype: torch.dtype) -> Step:
     """The same in the sampler's own positions: faster, and off by their rounding."""
 
@@ -54,7 +61,7 @@ def on_grid(steps: Sequence[Step], dtype: torch.dtype) -> Step:
         if all(isinstance(step.path, Tensor) for step in steps):
             return _in_a_row(steps)
         last = steps[-1].path
-        if isinstance(last, SmoothFlow) and all(is_true(step.active.all, of=step.active) for step in steps):
+        if isinstance(last, SmoothFlow) and not any(map(learns, steps)):
             return FollowedFlow(last, tuple(step.reading() for step in reversed(steps[:-1])))
         return Positions(_in_a_row_on_grid(steps, dtype))
 

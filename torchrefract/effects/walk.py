@@ -1,7 +1,6 @@
 """An image on its way through several effects: warps that follow one another are looked up together."""
 
 import functools
-import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -16,7 +15,7 @@ from torchrefract.effects.plan import Plan
 from torchrefract.effects.radiance import RadianceEffect
 from torchrefract.effects.refraction import Moved, WarpEffect, moving, sees
 from torchrefract.effects.rows import column, only, spread
-from torchrefract.effects.steps import Step, exact, on_grid
+from torchrefract.effects.steps import Step, composite, exact, on_grid
 from torchrefract.types import Degraded, Map
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import Positions, field_dtype, inside
@@ -45,7 +44,7 @@ class Walk:
 
     def __init__(self, image: Tensor, depth: Tensor | None):
         self.image, self.depth = image, depth
-        self.done: list[list[Step]] = []  # those that were looked up together
+        self.done: list[tuple[Step, list[Step]]] = []  # those that were looked up together, as one and one by one
         self.waiting: list[Step] = []
         self.modes: dict[Look, Tensor] = {}  # of the look-up: the samples that ask for it, (B,), bool
         self.moved: list[tuple[WarpEffect, Any, Moved]] = []
@@ -124,8 +123,10 @@ class Walk:
             return self._still()
         if len(self.moved) == 1:
             return self.moved[0][2].spread(self.image.shape[0]).flow
+        # The first is read where the others look, and the last leads there: neither is read twice, and blurred.
         first, *others = self.done
-        return cast(Tensor, exact([exact(first), *itertools.chain.from_iterable(others)]).path)
+        ends = [composite(*first), *(step for _, steps in others[:-1] for step in steps)]
+        return cast(Tensor, exact([*ends, *(composite(*last) for last in others[-1:])]).path)
 
     def _add(self, name: str, value: Callable[[], Tensor] | None, combine: _Combine) -> None:
         """One more effect's share in a map of light."""
@@ -150,7 +151,7 @@ class Walk:
             )
 
         self.light = {name: moved_along(value) for name, value in self.light.items()}
-        self.done.append([group] if isinstance(group.path, Tensor) and not self.done else self.waiting)
+        self.done.append((group, self.waiting))
         self.waiting, self.modes = [], {}
 
     def _composite(self) -> Step:

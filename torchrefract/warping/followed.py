@@ -53,7 +53,11 @@ class Reading:
         if len(own.values) != len(grid):  # F.grid_sample raises, too; a kernel would read what is not there
             raise ValueError(f"grid must have a row for each of {len(own.values)} flows, got {len(grid)}")
         large = grid.shape[1] * grid.shape[2] >= compiled.SMALLEST and not learns((own.values, grid))
-        return own._filled(grid) if large and compiled.obstacle(own.values, grid) is None else own._followed(grid)
+        return (
+            own._filled(grid)
+            if large and compiled.obstacle(own.values, grid) is None
+            else own.moved(grid, own.at(grid))
+        )
 
     def _filled(self, grid: Tensor) -> Tensor:
         """The same by a kernel."""
@@ -65,11 +69,15 @@ class Reading:
         share(lambda start, stop: work(start, stop, into), len(grid) * lines, least=compiled.SMALLEST // columns + 1)
         return out.movedim(1, -1)
 
-    def _followed(self, grid: Tensor) -> Tensor:
+    def at(self, grid: Tensor) -> Tensor:
+        """(B, 2, n, m), px: what is read along a grid."""
+        return by_grid_sample(self.values, self._places(grid), padding="border", interpolation="bilinear")
+
+    def moved(self, grid: Tensor, by: Tensor) -> Tensor:
+        """The grid, moved by so many px, (B, 2, n, m)."""
         height, width = self.size
         scale = constant((2 / width, 2 / height), dtype=grid.dtype, device=grid.device)
-        read = by_grid_sample(self.values, self._places(grid), padding="border", interpolation="bilinear")
-        both = torch.addcmul(grid, read.movedim(1, -1), scale)
+        both = torch.addcmul(grid, by.movedim(1, -1), scale)
         return both if self.far == FARTHEST else finite(both, self.far)
 
     def _places(self, grid: Tensor) -> Tensor:
@@ -115,6 +123,14 @@ class FollowedFlow:
         """Some rows of the batch."""
         earlier = (replace(own, values=own.values[index]) for own in self.earlier)
         return FollowedFlow(self.last.rows(index), tuple(earlier))
+
+    def dense(self) -> Tensor:
+        """(B, 2, H, W), px: the last flow, and what is read of the others where they are read for a look-up."""
+        grid, total = self.last.sampler_grid(self.dtype), self.last.dense()
+        for own in self.earlier:
+            read = own.at(grid)
+            grid, total = own.moved(grid, read), total + read
+        return total
 
     def sampler_grid(self, dtype: torch.dtype) -> Tensor:
         """(B, H, W, 2): where F.grid_sample(align_corners=False) looks."""

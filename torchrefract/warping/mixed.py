@@ -68,9 +68,7 @@ Flow = Tensor | SmoothFlow | FollowedFlow | MixedFlow
 
 
 def dense(flow: Flow) -> Tensor:
-    """(B, 2, H, W), px, of a flow in any form but a followed one, which is known by positions alone."""
-    if isinstance(flow, FollowedFlow):
-        raise TypeError("flow must not be one that others are read along")
+    """(B, 2, H, W), px, of a flow in any form."""
     if isinstance(flow, SmoothFlow):
         return once(flow, lambda own: own.dense())
     return flow if isinstance(flow, Tensor) else flow.dense()

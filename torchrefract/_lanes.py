@@ -109,6 +109,7 @@ def _element(place: int) -> Callable[..., Any]:
 
 all_floats = _operation(_spread, Floats, types.float32)  # one number in all lanes
 all_wholes = _operation(_spread, Wholes, types.int32)
+total = _operation(lambda builder, a, b: builder.fadd(a, b), Floats, Floats, Floats)
 difference = _operation(lambda builder, a, b: builder.fsub(a, b), Floats, Floats, Floats)
 product = _operation(lambda builder, a, b: builder.fmul(a, b), Floats, Floats, Floats)
 fma = _operation(_fma, Floats, Floats, Floats, Floats)  # a b + c, rounded once
@@ -142,6 +143,16 @@ def load(_: Any, values: Any, place: Any) -> Any:
         return _as_floats(builder, _loaded(context, builder, signature, given, LANES))
 
     return Floats(values, _INDEX), generate
+
+
+@_intrinsic
+def load_wholes(_: Any, values: Any, place: Any) -> Any:
+    """Wholes: LANES numbers of an array, (n,), of int32, from a place on."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return _loaded(context, builder, signature, given, LANES)
+
+    return Wholes(values, _INDEX), generate
 
 
 @_intrinsic

@@ -15,10 +15,10 @@ from torch.autograd import forward_ad
 from torchrefract import _compiled as compiled
 from torchrefract import draws
 from torchrefract.fields import perlin_drawn
-from torchrefract.fields.perlin import Nodes, perlin_noise
-from torchrefract.fields.perlin_drawn import Drawn, Pixels, drawn_noise
+from torchrefract.fields.perlin import perlin_noise
+from torchrefract.fields.perlin_drawn import Coarse, Drawn, drawn_noise
 from torchrefract.fields.perlin_lattice import octave
-from torchrefract.warping.lattice import Lattice, between_nodes
+from torchrefract.warping.lattice import Lattice
 
 pytest.importorskip("torchrefract._jit", reason="needs numba")
 LONG = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
@@ -43,13 +43,21 @@ def weights_of(count: int, octaves: int, dtype: torch.dtype = torch.float32) -> 
     return (found / found.sum(dim=1, keepdim=True)).to(dtype)
 
 
-def noise_of(drawn: Drawn, periods: tuple[float, ...], pixels: Pixels, dtype=torch.float32, **more: Any) -> Tensor:
+def noise_of(
+    drawn: Drawn, periods: tuple[float, ...], size: tuple[int, int], dtype=torch.float32, coarse: Coarse | None = None
+) -> Tensor:
     weights = weights_of(len(drawn.key), len(periods)).to(dtype)
-    return drawn_noise(drawn, list(enumerate(periods)), weights, pixels=pixels, **more)
+    if coarse is not None:
+        coarse = coarse._replace(weights=coarse.weights.to(dtype))
+    return drawn_noise(drawn, list(enumerate(periods)), weights, height=size[0], width=size[1], coarse=coarse)
 
 
-def in_pytorch(drawn: Drawn, periods: tuple[float, ...], pixels: Pixels, weights: Tensor) -> Tensor:
-    motion: Any = {**drawn._asdict(), **pixels._asdict(), "dtype": weights.dtype}
+def coarse_of(count: int, size: tuple[int, int], stride: int) -> Coarse:
+    return Coarse([(7, 60.0), (8, 4.3 * stride)], weights_of(count, 2).flip(1), Lattice(*size, stride))
+
+
+def in_pytorch(drawn: Drawn, periods: tuple[float, ...], size: tuple[int, int], weights: Tensor) -> Tensor:
+    motion: Any = {**drawn._asdict(), "height": size[0], "width": size[1], "dtype": weights.dtype}
     key = motion.pop("key")
     return perlin_noise([octave(key, i, period=period, **motion) for i, period in enumerate(periods)], weights)
 
@@ -69,22 +77,21 @@ def asked(monkeypatch) -> list[str]:
 
 @pytest.mark.parametrize("still", [True, False])
 @pytest.mark.parametrize(
-    ("periods", "pixels"),
+    ("periods", "size"),
     [
-        (LONG, Pixels(211, 1397)),
-        (SHORT, Pixels(256, 256)),
-        ((7.3, 2.5, 1.1, 1.0), Pixels(41, 29)),
-        ((0.5, 0.013), Pixels(31, 27)),
-        ((0.501, 0.7), Pixels(33, 4100)),
-        ((300.0, 1e9), Pixels(19, 140)),
-        ((300.0, 40.0), Pixels(30, 24, stride=12, start=-12)),
-        ((3.0,), Pixels(1, 1)),
-        ((3.0, 0.2), Pixels(700, 3)),
+        (LONG, (211, 1397)),
+        (SHORT, (256, 256)),
+        ((7.3, 2.5, 1.1, 1.0), (41, 29)),
+        ((0.5, 0.013), (31, 27)),
+        ((0.501, 0.7), (33, 4100)),
+        ((300.0, 1e9), (19, 140)),
+        ((3.0,), (1, 1)),
+        ((3.0, 0.2), (700, 3)),
     ],
 )
-def test_the_noise_is_that_of_float64(periods, pixels, still, asked, oracle):
+def test_the_noise_is_that_of_float64(periods, size, still, asked, oracle):
     drawn = frames(3, still=still)
-    found, exact = (noise_of(drawn, periods, pixels, dtype) for dtype in (torch.float32, torch.float64))
+    found, exact = (noise_of(drawn, periods, size, dtype) for dtype in (torch.float32, torch.float64))
     assert asked == ["fields.kernels.drifts"]
     assert found.dtype == torch.float32
     assert exact.abs().max() > 1e-3
@@ -94,87 +101,91 @@ def test_the_noise_is_that_of_float64(periods, pixels, still, asked, oracle):
 @pytest.mark.parametrize("frame", [1e4, -1e6])
 def test_late_frames_are_those_of_float64(frame, oracle):
     drawn = frames(2)._replace(frame=torch.full((2,), frame).double())
-    found, exact = (noise_of(drawn, LONG, Pixels(97, 130), dtype) for dtype in (torch.float32, torch.float64))
+    found, exact = (noise_of(drawn, LONG, (97, 130), dtype) for dtype in (torch.float32, torch.float64))
     oracle("Perlin noise by a kernel, late in a clip", found, exact, BAR, unit="")
 
 
-def test_what_is_known_at_nodes_is_added(oracle):
-    lattice = Lattice(75, 131, 6)
-    nodes = torch.randn(2, 1, *map(len, lattice.axes()), generator=torch.Generator().manual_seed(3))
-    drawn, pixels = frames(2), Pixels(75, 131)
-    found = noise_of(drawn, (5.0, 9.0), pixels, nodes=Nodes(nodes, lattice))
-    exact = noise_of(drawn, (5.0, 9.0), pixels, torch.float64) + between_nodes(nodes.double(), lattice)
-    oracle("Perlin noise and a lattice by a kernel, float64", found, exact, 2e-6, unit="")
-    nothing = drawn_noise(drawn, [], torch.ones(2, 0), pixels=pixels, nodes=Nodes(nodes, lattice))
-    oracle("a lattice by a kernel, float64", nothing, between_nodes(nodes.double(), lattice), 2e-6, unit="")
+@pytest.mark.parametrize("stride", [2, 3, 7, 16, 20, 100])
+@pytest.mark.parametrize("size", [(75, 131), (9, 5), (1, 1), (40, 700)])
+def test_coarse_octaves_are_those_of_float64(size, stride, asked, oracle):
+    drawn, coarse = frames(2), coarse_of(2, size, stride)
+    found, exact = (noise_of(drawn, (5.0, 9.0), size, dtype, coarse) for dtype in (torch.float32, torch.float64))
+    assert asked == ["fields.kernels.drifts"]
+    oracle("Perlin noise and a lattice by a kernel, float64", found, exact, 2 * BAR, unit="")
+    alone = noise_of(drawn, (), size, torch.float32, coarse)
+    expected = noise_of(drawn, (), size, torch.float64, coarse)
+    oracle("a lattice of Perlin noise by a kernel, float64", alone, expected, BAR, unit="")
+    assert expected.abs().max() > 1e-3
 
 
 @pytest.mark.parametrize(
-    ("periods", "pixels"), [(SHORT, Pixels(150, 256)), (LONG, Pixels(270, 481)), ((2.7, 0.3), Pixels(401, 90))]
+    ("periods", "size", "stride"), [(SHORT, (150, 256), 3), (LONG, (270, 481), 5), ((2.7, 0.3), (401, 90), 8)]
 )
-def test_batch_and_threads_change_no_bit(periods, pixels, on_threads):
-    drawn, weights = frames(4), weights_of(4, len(periods))
-    lattice = Lattice(pixels.height, pixels.width, 5)
-    values = torch.randn(4, 1, *map(len, lattice.axes()), generator=torch.Generator().manual_seed(3))
+def test_batch_and_threads_change_no_bit(periods, size, stride, on_threads):
+    drawn, weights, whole = frames(4), weights_of(4, len(periods)), coarse_of(4, size, stride)
 
-    def made(rows: list[int]) -> Tensor:
-        nodes = Nodes(values[rows], lattice)
-        return drawn_noise(alone(drawn, rows), list(enumerate(periods)), weights[rows], pixels=pixels, nodes=nodes)
+    def made(rows: list[int], coarse: Coarse | None) -> Tensor:
+        place: Any = {"height": size[0], "width": size[1], "coarse": coarse}
+        return drawn_noise(alone(drawn, rows), list(enumerate(periods)), weights[rows], **place)
 
-    together = made([0, 1, 2, 3])
-    for threads in (1, 2, 3, 8):
-        on_threads(threads)
-        for rows in ([0, 1, 2, 3], [1], [3], [3, 1, 0], [2, 2]):
-            assert torch.equal(made(rows), together[rows])
+    for coarse in (None, whole):
+        together = made([0, 1, 2, 3], coarse)
+        for threads in (1, 2, 3, 8):
+            on_threads(threads)
+            for rows in ([0, 1, 2, 3], [1], [3], [3, 1, 0], [2, 2]):
+                own = None if coarse is None else coarse._replace(weights=coarse.weights[rows])
+                assert torch.equal(made(rows, own), together[rows])
 
 
-def test_any_part_of_the_rows_is_made_as_in_the_whole(monkeypatch):
-    drawn, pixels = frames(3), Pixels(61, 100)
-    whole = noise_of(drawn, SHORT, pixels)
-    ends = [0, 1, 2, 17, 61, 62, 130, 183]
+@pytest.mark.parametrize("coarse", [None, coarse_of(3, (61, 100), 4)])
+def test_any_part_of_the_rows_is_made_as_in_the_whole(coarse, monkeypatch):
+    drawn, ends = frames(3), [0, 1, 2, 17, 61, 62, 130, 183]
+    whole = noise_of(drawn, SHORT, (61, 100), coarse=coarse)
 
     def in_pieces(work: Any, count: int, *, least: int) -> None:
         assert count == ends[-1]
+        assert least > 0
         for start, stop in reversed(list(pairwise(ends))):
             work(start, stop)
 
     monkeypatch.setattr(perlin_drawn, "share", in_pieces)
-    assert torch.equal(noise_of(drawn, SHORT, pixels), whole)
+    assert torch.equal(noise_of(drawn, SHORT, (61, 100), coarse=coarse), whole)
 
 
 @pytest.mark.parametrize("shape", [(0, 5, 7), (2, 0, 7), (2, 5, 0)])
 def test_of_nothing_there_is_nothing(shape):
     count, height, width = shape
-    assert noise_of(alone(frames(2), list(range(count))), (3.0,), Pixels(height, width)).shape == (count, 1, *shape[1:])
+    assert noise_of(alone(frames(2), list(range(count))), (3.0,), (height, width)).shape == (count, 1, *shape[1:])
 
 
-@pytest.mark.parametrize("which", ["weights", "frame", "wind", "decorrelation", "nodes"])
+@pytest.mark.parametrize("which", ["weights", "frame", "wind", "decorrelation", "coarse"])
 def test_what_learns_has_the_gradients_of_pytorch(which, asked):
-    pixels, lattice = Pixels(20, 30), Lattice(20, 30, 4)
-    values = torch.randn(2, 1, *map(len, lattice.axes()), generator=torch.Generator().manual_seed(3))
-    inputs = {"weights": weights_of(2, 2), "nodes": values, **frames(2)._asdict()}
+    size: Any = {"height": 20, "width": 30}
+    inputs = {"weights": weights_of(2, 2), "coarse": weights_of(2, 2), **frames(2)._asdict()}
     inputs[which].requires_grad_()
-    drawn, nodes = Drawn(*(inputs[name] for name in Drawn._fields)), Nodes(inputs["nodes"], lattice)
-    found = drawn_noise(drawn, [(0, 3.0), (1, 9.0)], inputs["weights"], pixels=pixels, nodes=nodes)
+    drawn, coarse = Drawn(*(inputs[name] for name in Drawn._fields)), coarse_of(2, (20, 30), 4)
+    coarse = coarse._replace(weights=inputs["coarse"])
+    found = drawn_noise(drawn, [(0, 3.0), (1, 9.0)], inputs["weights"], **size, coarse=coarse)
     slope = torch.autograd.grad(found.square().sum(), inputs[which])[0]
     assert slope.isfinite().all()
     assert slope.abs().max() > 0
     assert not asked
     with torch.no_grad():
-        drawn_noise(drawn, [(0, 3.0), (1, 9.0)], inputs["weights"], pixels=pixels, nodes=nodes)
+        again = drawn_noise(drawn, [(0, 3.0), (1, 9.0)], inputs["weights"], **size, coarse=coarse)
     assert asked
+    torch.testing.assert_close(again, found.detach(), rtol=0, atol=1e-6)
 
 
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:FutureWarning")  # of torch.func.jvp
 def test_maps_graphs_and_forward_gradients_are_pytorchs(asked):
-    drawn, weights, pixels = frames(2), weights_of(2, 2), Pixels(20, 30)
+    drawn, weights, size = frames(2), weights_of(2, 2), (20, 30)
 
     def made(weights: Tensor, *drawn: Tensor) -> Tensor:
-        return drawn_noise(Drawn(*drawn), [(0, 3.0), (1, 9.0)], weights, pixels=pixels)
+        return drawn_noise(Drawn(*drawn), [(0, 3.0), (1, 9.0)], weights, height=size[0], width=size[1])
 
-    expected = in_pytorch(drawn, (3.0, 9.0), pixels, weights)
+    expected = in_pytorch(drawn, (3.0, 9.0), size, weights)
     assert torch.equal(torch.compile(made, fullgraph=True, backend="eager")(weights, *drawn), expected)
-    assert torch.equal(drawn_noise(drawn, [(0, 3.0)], weights[:, :1].double(), pixels=pixels).float() * 0, expected * 0)
+    assert noise_of(drawn, (3.0, 9.0), size, torch.float64).dtype == torch.float64
     mapped = torch.vmap(lambda w, *d: made(w[None], *(value[None] for value in d))[0])(weights, *drawn)
     torch.testing.assert_close(mapped, expected, rtol=0, atol=1e-6)
     with forward_ad.dual_level():
@@ -192,10 +203,10 @@ def test_the_inverse_of_the_error_function_has_no_error_of_its_own():
 
 
 def test_without_numba_the_noise_is_pytorchs(monkeypatch):
-    drawn, pixels = frames(2), Pixels(40, 50)
+    drawn, size = frames(2), (40, 50)
     monkeypatch.setattr(compiled, "kernels", lambda _: None)
-    expected = in_pytorch(drawn, SHORT, pixels, weights_of(2, len(SHORT)))
-    assert torch.equal(noise_of(drawn, SHORT, pixels), expected)
+    expected = in_pytorch(drawn, SHORT, size, weights_of(2, len(SHORT)))
+    assert torch.equal(noise_of(drawn, SHORT, size), expected)
 
 
 SAME_ON_ALL = """

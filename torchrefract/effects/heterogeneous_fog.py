@@ -32,8 +32,7 @@ from torchrefract.effects.rows import column, frame_mean, spread
 from torchrefract.effects.scales import check_scales, check_weights, chosen, periods, shares, stretched
 from torchrefract.fields.fog import drifting_transmission_, transmission
 from torchrefract.fields.fog_volume import path_mean
-from torchrefract.fields.perlin import Nodes
-from torchrefract.fields.perlin_drawn import Drawn, Pixels, drawn_noise
+from torchrefract.fields.perlin_drawn import Coarse, Drawn, drawn_noise
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 from torchrefract.warping.lattice import Lattice
@@ -254,24 +253,21 @@ class HeterogeneousFog(PlannedLight):
 
     def _in_image(self, drawn: Drawn, share: Tensor, plan: DriftPlan) -> tuple[Tensor, Tensor, Tensor]:
         """The paper's noise, for weights (N, K) of sum 1."""
-        lengths, frame = self._periods(plan.height, plan.width), Pixels(plan.height, plan.width)
-
-        def made(numbers: Sequence[int], weights: Tensor, pixels: Pixels, nodes: Nodes | None = None) -> Tensor:
-            return drawn_noise(drawn, [(i, lengths[i]) for i in numbers], weights, pixels=pixels, nodes=nodes)
-
+        size: Any = {"height": plan.height, "width": plan.width}
+        octaves = tuple(enumerate(self._periods(**size)))
         if self.normalize == "image":
             one = share.new_ones(share.shape[0], 1)
-            parts = [column(w) * stretched(made([i], one, frame)) for i, w in enumerate(share.unbind(1))]
+            noises = (stretched(drawn_noise(drawn, [each], one, **size)) for each in octaves)
+            parts = [column(w) * noise for noise, w in zip(noises, share.unbind(1), strict=True)]
             q = sum(parts[1:], parts[0])
             return q, self._inverse_mean(q, 0.5), q.new_zeros(1, 1, 1, 1)
-        nodes = None
+        coarse = None
         if plan.coarse:
             lattice = Lattice(plan.height, plan.width, plan.stride)
-            rows, columns = lattice.axes()
-            places = Pixels(len(rows), len(columns), stride=rows.step, start=rows.start)
-            nodes = Nodes(made(plan.coarse, chosen(share, plan.coarse), places), lattice)
+            coarse = Coarse([octaves[i] for i in plan.coarse], chosen(share, plan.coarse), lattice)
         # q = 1/2 + n / sqrt(2), with the noise n.
-        noise = made(plan.fine, chosen(share, plan.fine), frame, nodes)
+        fine = [octaves[i] for i in plan.fine]
+        noise = drawn_noise(drawn, fine, chosen(share, plan.fine), **size, coarse=coarse)
         mean = 0.5 + frame_mean(noise) / math.sqrt(2) if self.mean == "image" else noise.new_full((1, 1, 1, 1), 0.5)
         return noise, math.sqrt(0.5) / mean, 0.5 / mean
 

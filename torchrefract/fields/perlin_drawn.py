@@ -1,7 +1,7 @@
 """Perlin's noise in the plane as frames of clips have it: drawn and summed by a kernel where one can, or in PyTorch."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,8 +13,8 @@ from torchrefract._checks import learns, withheld
 from torchrefract._compiled import SMALLEST, kernels, obstacle
 from torchrefract._threads import share
 from torchrefract.fields.perlin import Nodes, perlin_noise
-from torchrefract.fields.perlin_lattice import octave, origins
-from torchrefract.warping.lattice import along_rows, lagrange_weights
+from torchrefract.fields.perlin_lattice import Octave, octave, origins
+from torchrefract.warping.lattice import Lattice, lagrange_weights
 from torchrefract.white_noise import HASH
 
 
@@ -27,70 +27,90 @@ class Drawn(NamedTuple):
     decorrelation: Tensor  # (N,), frames
 
 
-class Pixels(NamedTuple):
-    """Rows and columns, every `stride` px from `start` on along each axis."""
+class Coarse(NamedTuple):
+    """Octaves that are known at the nodes of a lattice, and cubics between these."""
 
-    height: int
-    width: int
-    stride: int = 1
-    start: int = 0
+    periods: Sequence[tuple[int, float]]  # each with its index, px
+    weights: Tensor  # (N, octaves)
+    lattice: Lattice
 
 
 def drawn_noise(
-    drawn: Drawn, periods: Sequence[tuple[int, float]], weights: Tensor, *, pixels: Pixels, nodes: Nodes | None = None
+    drawn: Drawn,
+    periods: Sequence[tuple[int, float]],
+    weights: Tensor,
+    *,
+    height: int,
+    width: int,
+    coarse: Coarse | None = None,
 ) -> Tensor:
-    """(N, 1, H, W), what `perlin_noise` makes of octaves, each with its index and its period in px, at pixels.
+    """(N, 1, H, W), what `perlin_noise` makes of octaves, each with its index and its period in px.
 
     By a kernel it is as near to that of real numbers, and not the same in its last digits.
 
     Args:
-        drawn, periods, pixels: of the octaves, as for `octave`.
+        drawn: what the octaves are drawn from.
+        periods: at least one, or none where there are coarse ones.
         weights: (N, octaves), of the type of the noise.
-        nodes: what else is added, as for `perlin_noise`.
+        height, width: px.
+        coarse: what else is added.
     """
-    learning = (*drawn, weights) if nodes is None else (*drawn, weights, nodes.value)
-    learning = learns((*drawn, weights) if nodes is None else (*drawn, weights, nodes.value))
-    if not (learning or obstacle(weights) or any(map(withheld, drawn))):
-        return _by_kernel(drawn, periods, weights, pixels, nodes)
+    values = (*drawn, weights) if coarse is None else (*drawn, weights, coarse.weights)
+    if not (learns(values) or obstacle(weights) or any(map(withheld, values))):
+        return _by_kernel(drawn, periods, weights, height, width, coarse)
     motion: Any = {"frame": drawn.frame, "wind": drawn.wind, "decorrelation": drawn.decorrelation}
-    motion |= pixels._asdict()
-    octaves = [octave(drawn.key, i, period=period, **motion, dtype=weights.dtype) for i, period in periods]
-    return perlin_noise(octaves, weights, nodes=nodes)
+    motion["dtype"] = weights.dtype
+
+    def made(periods: Sequence[tuple[int, float]], height: int, width: int, **lattice: int) -> list[Octave]:
+        place: Any = {"height": height, "width": width, **lattice}
+        return [octave(drawn.key, i, period=period, **place, **motion) for i, period in periods]
+
+    nodes = None
+    if coarse is not None:
+        rows, columns = coarse.lattice.axes()
+        known = made(coarse.periods, len(rows), len(columns), stride=rows.step, start=rows.start)
+        nodes = Nodes(perlin_noise(known, coarse.weights), coarse.lattice)
+    return perlin_noise(made(periods, height, width), weights, nodes=nodes)
 
 
 def _by_kernel(
-    drawn: Drawn, periods: Sequence[tuple[int, float]], weights: Tensor, pixels: Pixels, nodes: Nodes | None
+    drawn: Drawn,
+    periods: Sequence[tuple[int, float]],
+    weights: Tensor,
+    height: int,
+    width: int,
+    coarse: Coarse | None,
 ) -> Tensor:
-    key, height, width = drawn.key, pixels.height, pixels.width
+    key, taps = drawn.key, weights.new_empty(4, 0)
+    if coarse is not None:
+        taps = lagrange_weights(coarse.lattice.stride, 4, dtype=weights.dtype, device=weights.device).mT
     elapsed = drawn.frame.double() / (math.pi * drawn.decorrelation.double())
     words = key.to(torch.int32).contiguous().numpy().view(np.uint32), tuple(word % 2**32 for word in HASH)
-    values = weights, *_lines(weights, nodes)
-    work = partial(
-        kernels("fields.kernels.drifts").drifts,
-        *words,
-        elapsed.detach().contiguous().numpy(),
-        _octaves(drawn, periods, pixels),
-        *(value.detach().contiguous().numpy() for value in values),
-    )
+    levels = _levels(drawn, periods, weights, coarse)
+    drifts = partial(kernels("fields.kernels.drifts").drifts, *words, _numbers(elapsed), *levels, _numbers(taps))
     out = weights.new_empty(len(key), 1, height, width)
     into = out[:, 0].numpy()
-    share(lambda start, stop: work(start, stop, into), len(key) * height, least=SMALLEST // max(1, width) + 1)
+    share(lambda start, stop: drifts(start, stop, into), len(key) * height, least=SMALLEST // max(1, width) + 1)
     return out
 
 
-def _octaves(drawn: Drawn, periods: Sequence[tuple[int, float]], pixels: Pixels) -> tuple[np.ndarray, ...]:
-    """As `drifts` has them."""
-    numbers, lengths = [i for i, _ in periods], [period for _, period in periods]
-    steps = np.array([pixels.stride / period for period in lengths])
-    origin = origins(drawn.key, numbers, lengths, frame=drawn.frame, wind=drawn.wind, start=pixels.start).detach()
-    first = origin.floor()
-    return np.array(numbers, np.uint32), steps, first.long().numpy(), (origin - first).numpy()
+def _levels(
+    drawn: Drawn, periods: Sequence[tuple[int, float]], weights: Tensor, coarse: Coarse | None
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """Octaves at all pixels, and those at the nodes of a lattice, as `drifts` has them."""
+    known = [] if coarse is None else coarse.periods
+    stride, start = (1, 0) if coarse is None else (coarse.lattice.stride, coarse.lattice.axes()[0].start)
+    numbers, lengths, count = [i for i, _ in (*periods, *known)], [each for _, each in (*periods, *known)], len(periods)
+    starts, strides = ([one] * count + [other] * len(known) for one, other in ((0, start), (1, stride)))
+    origin = _numbers(origins(drawn.key, numbers, lengths, frame=drawn.frame, wind=drawn.wind, starts=starts))
+    first = np.floor(origin)
+    steps = np.array(strides, np.float64) / np.array(lengths)
+    parts = np.array(numbers, np.uint32), steps, first.astype(np.int64), origin - first
+    own = weights if coarse is None else coarse.weights
+    for weight, level in ((weights, slice(count)), (own, slice(count, None))):
+        rows = (np.ascontiguousarray(part[:, level] if part.ndim > 1 else part[level]) for part in parts)
+        yield *rows, _numbers(weight)
 
 
-def _lines(like: Tensor, nodes: Nodes | None) -> tuple[Tensor, Tensor]:
-    """Lines through all rows of nodes, (N, n, W), and the weights between these; none."""
-    if nodes is None:
-        return like.new_empty(0, 0, 0), like.new_empty(0, 0)
-    stride = nodes.lattice.stride
-    taps = lagrange_weights(stride, 4, dtype=like.dtype, device=like.device)
-    return along_rows(nodes.value, nodes.lattice)[:, 0], taps
+def _numbers(values: Tensor) -> np.ndarray:
+    return values.detach().contiguous().numpy()

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -60,7 +60,7 @@ def octave(
 
     Source: Perlin and Neyret, "Flow noise", SIGGRAPH 2001, technical sketches, for the turning.
     """
-    origin = origins(key, [index], [period], frame=frame, wind=wind, start=start)[:, 0]
+    origin = origins(key, [index], [period], frame=frame, wind=wind, starts=[start])[:, 0]
     first = origin.detach().floor()
     places, nodes = [], [torch.full((len(key), 1), index, device=key.device)]
     for size, place, node in zip((width, height), (origin - first).unbind(1), first.long().unbind(1), strict=True):
@@ -73,13 +73,19 @@ def octave(
 
 
 def origins(
-    key: Tensor, indices: Sequence[int], periods: Sequence[float], *, frame: Tensor, wind: Tensor, start: int
+    key: Tensor,
+    indices: Sequence[int],
+    periods: Sequence[float],
+    *,
+    frame: Tensor,
+    wind: Tensor,
+    starts: Sequence[int],
 ) -> Tensor:
     """(N, octaves, 2), float64: x and y of the first column and row, in `octave`, of octaves with their periods."""
-    options: Any = {"dtype": torch.float64, "device": key.device}
-    turn, period = constant([_GOLDEN * (i + 1) for i in indices], **options), constant(list(periods), **options)
-    phase = (2.0**-32 * key[:, None, :2].double() + turn[:, None]).frac()
-    return (start + 0.5 - wind.double() * frame.double()[:, None])[:, None] / period[:, None] + phase
+    known = [[_GOLDEN * (i + 1) for i in indices], list(periods), [start + 0.5 for start in starts]]
+    turn, period, start = constant(known, dtype=torch.float64, device=key.device)[..., None]
+    phase = (2.0**-32 * key[:, None, :2].double() + turn).frac()
+    return (start - (wind.double() * frame.double()[:, None])[:, None]) / period + phase
 
 
 def _taken(start: Tensor, size: int, step: float) -> tuple[Tensor, Tensor]:

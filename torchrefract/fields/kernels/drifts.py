@@ -10,19 +10,19 @@ so that what a pixel takes of an octave is four numbers. Numbers are float32, bu
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrefract._jit import jit
+from torchrefract._jit import fma, inlined, jit
 from torchrefract._lanes import LANES
 from torchrefract.fields.kernels.nodes import Constants, Doubles, Key, Words, gradients, hashed_columns
-from torchrefract.fields.kernels.pixels import GROUP, Columns, Floats
-from torchrefract.warping.kernels.lines import between
+from torchrefract.fields.kernels.pixels import GROUP, Columns, Floats, nodes_across
 
 if LANES:
-    from torchrefract.fields.kernels.groups import add_octave
+    from torchrefract.fields.kernels.groups import add_octave, along_nodes
 else:
-    from torchrefract.fields.kernels.pixels import add_octave
+    from torchrefract.fields.kernels.pixels import add_octave, along_nodes
 
 Whole = NDArray[np.int64]
-Octaves = tuple[Words, Doubles, Whole, Doubles]
+Level = tuple[Words, Doubles, Whole, Doubles, Floats]
+Room = tuple[Columns, Words, Floats, Whole, Floats]
 _NONE = -(1 << 62)  # a row of nodes that no frame has
 
 
@@ -31,9 +31,8 @@ def drifts(
     keys: Words,
     constants: Constants,
     elapsed: Doubles,
-    octaves: Octaves,
-    weights: Floats,
-    lines: Floats,
+    fine: Level,
+    coarse: Level,
     taps: Floats,
     start: int,
     stop: int,
@@ -43,53 +42,95 @@ def drifts(
 
     keys: (N, 4), the words of each; constants: of their hash.
     elapsed: (N,), t / (pi decorrelation).
-    octaves: their numbers, (K,); steps, (K,), cells from pixel to pixel; the number of the last column and row of nodes
-        before the frame, (N, K, 2), and how far behind it the first pixel is, (N, K, 2), cells, in [0, 1).
-    weights: (N, K).
-    lines, taps: what else is in the noise, as for `between`, (N, n, W) and (stride, taps); no taps are nothing.
+    fine: octaves, their numbers, (K,); steps, (K,), cells from pixel to pixel; the number of the last column and row of
+        nodes before the first pixel, (N, K, 2), and how far behind it this is, (N, K, 2), cells, in [0, 1); weights,
+        (N, K).
+    coarse, taps: octaves at the nodes of a lattice, and cubics between these, (4, stride); of no stride there are none.
     """
-    numbers, steps, first, place = octaves
     height, width = out.shape[1:]
-    columns, hashes, slopes, line = _room(steps, width)
-    kept, found = np.empty((numbers.size, 2), np.int64), np.empty(columns[1].shape[1], np.float32)
-    frame = -1
+    stride = taps.shape[1]
+    across = nodes_across(taps, width)
+    columns = across[3]
+    rooms = _room(fine[1], width), _room(coarse[1], columns)
+    found, lines = np.empty(_whole(width), np.float32), np.empty((4, _whole(width)), np.float32)
+    nodes, kept, frame = np.zeros(_whole(columns) + 2 * GROUP, np.float32), np.empty(4, np.int64), -1
     for row in range(start, stop):
         i, y = divmod(row, height)
+        key = keys[i], elapsed[i], constants
         if i != frame:
             frame, kept[:] = i, _NONE
-            for k in range(numbers.size):
-                _along(place[i, k, 0], steps[k], width, columns, k)
-                hashed_columns(numbers[k], first[i, k, 0], place[i, k, 0], steps[k], keys[i], constants, hashes[k])
-        if taps.size:
-            between(lines[i], taps, y, found[:width])
+            _enter(fine, rooms[0], i, key, width)
+            _enter(coarse, rooms[1], i, key, columns)
+        if stride:
+            cell, place = divmod(y, stride)
+            for node in range(cell, cell + 4):
+                if kept[node % 4] != node:
+                    kept[node % 4] = node
+                    nodes[:] = 0
+                    _add_row(coarse, rooms[1], i, node, key, columns, nodes[: _whole(columns)])
+                    along_nodes(nodes, across, lines[node % 4])
+            _down(lines, cell, taps[:, place], found)
         else:
             found[:] = 0
-        key = keys[i], elapsed[i], constants
-        for k in range(numbers.size):
-            above, count = place[i, k, 1] + steps[k] * y, _nodes(steps[k], width)
-            _line(above, first[i, k, 1], weights[i, k], hashes[k, :count], key, slopes[k], kept[k], line)
-            add_octave(line, columns, k, found)
+        _add_row(fine, rooms[0], i, y, key, width, found)
         out[i, y] = found[:width]
 
 
 @jit
-def _room(steps: Doubles, width: int) -> tuple[Columns, Words, Floats, Floats]:
-    """For columns, their hashes, gradients, x and y, of two rows of nodes, and what `_line` makes."""
-    count, groups, most = steps.size, -(-width // GROUP), GROUP
-    for step in steps:
-        most = max(most, _nodes(step, width))
-    begins, nodes = np.empty((count, groups), np.int32), np.empty((count, groups * GROUP), np.int32)
-    part, fade = np.empty((count, groups * GROUP), np.float32), np.empty((count, groups * GROUP), np.float32)
-    hashes, slopes = np.empty((count, most), np.uint32), np.empty((count, 2, 2, most), np.float32)
-    # Behind the last nodes as many are read as a group may have.
-    return (begins, nodes, part, fade), hashes, slopes, np.zeros((2, most + 2 * GROUP), np.float32)
+def _enter(level: Level, room: Room, frame: int, key: Key, width: int) -> None:
+    """Where the columns of a frame lie, and hashes of its columns of nodes."""
+    numbers, steps, first, place, _ = level
+    columns, hashes, _, kept, _ = room
+    kept[:] = _NONE
+    for k in range(numbers.size):
+        _along(place[frame, k, 0], steps[k], width, columns, k)
+        hashed_columns(numbers[k], first[frame, k, 0], place[frame, k, 0], steps[k], key, hashes[k])
+
+
+@inlined
+def _add_row(level: Level, room: Room, frame: int, y: int, key: Key, width: int, out: Floats) -> None:
+    """Add all octaves to a row of pixels in whole groups."""
+    numbers, steps, first, place, weights = level
+    columns, hashes, slopes, kept, line = room
+    for k in range(numbers.size):
+        at, count = place[frame, k, 1] + steps[k] * y, _nodes(steps[k], width)
+        _line(at, first[frame, k, 1], weights[frame, k], hashes[k, :count], key, slopes[k], kept[k], line)
+        add_octave(line, columns, k, out)
+
+
+@inlined
+def _down(lines: Floats, cell: int, taps: Floats, out: Floats) -> None:
+    """A row of pixels between four rows of nodes, which lie in turn in lines (4, W)."""
+    a, b, c, d = lines[cell % 4], lines[(cell + 1) % 4], lines[(cell + 2) % 4], lines[(cell + 3) % 4]
+    at_a, at_b, at_c, at_d = taps[0], taps[1], taps[2], taps[3]
+    for k in range(out.size):
+        out[k] = fma(at_d, d[k], fma(at_c, c[k], fma(at_b, b[k], at_a * a[k])))
 
 
 @jit
+def _room(steps: Doubles, width: int) -> Room:
+    """For columns, their hashes, gradients, x and y, of two rows of nodes, their numbers, and what `_line` makes."""
+    count, most = steps.size, GROUP
+    for step in steps:
+        most = max(most, _nodes(step, width))
+    begins, nodes = np.empty((count, _whole(width) // GROUP), np.int32), np.empty((count, _whole(width)), np.int32)
+    part, fade = np.empty((count, _whole(width)), np.float32), np.empty((count, _whole(width)), np.float32)
+    hashes, slopes = np.empty((count, most), np.uint32), np.empty((count, 2, 2, most), np.float32)
+    # Behind the last nodes as many are read as a group may have.
+    line = np.zeros((2, most + 2 * GROUP), np.float32)
+    return (begins, nodes, part, fade), hashes, slopes, np.empty((count, 2), np.int64), line
+
+
+@inlined
+def _whole(width: int) -> int:
+    """So many, in whole groups, which are made faster."""
+    return GROUP * -(-width // GROUP)
+
+
+@inlined
 def _nodes(step: float, width: int) -> int:
-    """In a row, in whole groups, which are made faster."""
-    needed = 2 * width if step >= 2 else int(np.ceil(step * width)) + 2
-    return GROUP * -(-needed // GROUP)
+    """So many are in a row of nodes."""
+    return _whole(2 * width if step >= 2 else int(np.ceil(step * width)) + 2)
 
 
 @jit
@@ -108,7 +149,7 @@ def _along(place: float, step: float, width: int, columns: Columns, octave: int)
         part[octave, k], fade[octave, k] = p, _fade(p)
 
 
-@jit
+@inlined
 def _line(
     at: float, first: int, weight: float, hashes: Words, key: Key, slopes: Floats, kept: Whole, out: Floats
 ) -> None:
@@ -129,6 +170,6 @@ def _line(
         out[1, k] = of_y[0] * upper[1, k] + of_y[1] * lower[1, k]
 
 
-@jit
+@inlined
 def _fade(p: float) -> float:
     return p * p * p * (p * (6 * p - 15) + 10)

@@ -61,14 +61,13 @@ def gradients(columns: Words, row: np.uint32, key: Key, x: Floats, y: Floats) ->
 
 
 @jit
-def hashed_columns(
-    number: np.uint32, first: int, place: float, step: float, key: Words, constants: Constants, out: Words
-) -> None:
+def hashed_columns(number: np.uint32, first: int, place: float, step: float, key: Key, out: Words) -> None:
     """Hashes of the numbers of an octave and of its columns of nodes, out (n,).
 
     first, place, step: as for `drifts`.
     """
-    a, b, c, d = key[0], key[1], key[2], key[3]
+    words, _, constants = key
+    a, b, c, d = words[0], words[1], words[2], words[3]
     octave = hashed_word(np.uint32(number * np.uint32(constants[0])), c, d, constants)
     for k in range(out.size):
         # Pixels two cells apart or more take two nodes each.

@@ -43,7 +43,7 @@ _WORTH = 0.85
 _PASS = 16
 # What kernels take between four rows of nodes, between four columns of them, for a node of Perlin's lattice in a row of
 # pixels, to draw one, and to begin with a lattice at all: measured, in octaves at a pixel.
-_DOWN, _ACROSS, _LINE, _NODE, _START = 0.3, 1.4, 0.5, 2.5, 4e4
+_DOWN, _ACROSS, _LINE, _NODE, _START = 0.3, 1.4, 0.5, 2.5, 3e4
 # Of noise in space, in the middle of a cell: half its diagonal.
 _LARGEST_IN_SPACE = math.sqrt(0.75)
 _HALF = math.sqrt(0.5)  # of q over that of n

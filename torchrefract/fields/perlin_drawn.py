@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -81,17 +81,22 @@ def _by_kernel(
     width: int,
     coarse: Coarse | None,
 ) -> Tensor:
-    key, taps = drawn.key, weights.new_empty(4, 0)
-    if coarse is not None:
-        taps = lagrange_weights(coarse.lattice.stride, 4, dtype=weights.dtype, device=weights.device).mT
+    key, taps = drawn.key, _taps(0 if coarse is None else coarse.lattice.stride)
     elapsed = drawn.frame.double() / (math.pi * drawn.decorrelation.double())
     words = key.to(torch.int32).contiguous().numpy().view(np.uint32), tuple(word % 2**32 for word in HASH)
     levels = _levels(drawn, periods, weights, coarse)
-    drifts = partial(kernels("fields.kernels.drifts").drifts, *words, _numbers(elapsed), *levels, _numbers(taps))
+    drifts = partial(kernels("fields.kernels.drifts").drifts, *words, _numbers(elapsed), *levels, taps)
     out = weights.new_empty(len(key), 1, height, width)
     into = out[:, 0].numpy()
     share(lambda start, stop: drifts(start, stop, into), len(key) * height, least=SMALLEST // max(1, width) + 1)
     return out
+
+
+@lru_cache(maxsize=64)
+def _taps(stride: int) -> np.ndarray:
+    """(4, stride), of cubics between nodes; nobody writes to it."""
+    weights = lagrange_weights(stride, 4, dtype=torch.float32, device=torch.device("cpu"))
+    return np.ascontiguousarray(weights.numpy().reshape(stride, 4).T)
 
 
 def _levels(

@@ -52,7 +52,11 @@ def _folder() -> str:
     """
     package = Path(__file__).parent
     alone = ("_jit.py", "_lanes.py", "noise_kernel.py")
-    sources = [*(package / name for name in alone), *sorted((package / "warping" / "kernels").glob("*.py"))]
+    folders = (package / layer / "kernels" for layer in ("fields", "warping"))
+    sources = [
+        *(package / name for name in alone),
+        *(source for each in folders for source in sorted(each.glob("*.py"))),
+    ]
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
     if given := str(numba.config.CACHE_DIR):  # pyright: ignore[reportAttributeAccessIssue]  # as above
         return str(Path(given) / f"torchrefract-{digest}")
@@ -89,3 +93,18 @@ def floats_at(address: np.uint64, count: int) -> NDArray[np.float32]:
 
 # As it is called: what numba calls hands itself over, too.
 fma = cast(Callable[[Any, Any, Any], Any], intrinsic(_fma))
+
+
+def _horner(_: Any, a: Any, coefficients: Any) -> Any:
+    """The polynomial of a with these coefficients, of the highest power first; a loop would not be unrolled."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        value, *rest = (builder.extract_value(arguments[1], i) for i in range(len(coefficients)))
+        for coefficient in rest:
+            value = builder.fma(value, arguments[0], coefficient)
+        return value
+
+    return a(a, coefficients), generate
+
+
+horner = cast(Callable[[Any, Any], Any], intrinsic(_horner))

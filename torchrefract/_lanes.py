@@ -153,6 +153,16 @@ def load(_: Any, values: Any, place: Any) -> Any:
 
 
 @_intrinsic
+def load_wholes(_: Any, values: Any, place: Any) -> Any:
+    """Wholes: LANES numbers of an array, (n,), of int32, from a place on."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return _loaded(context, builder, signature, given, LANES)
+
+    return Wholes(values, _INDEX), generate
+
+
+@_intrinsic
 def load_three(_: Any, values: Any, place: Any) -> Any:
     """Three Floats: the channels of LANES pixels that lie together in an array, (n,), from a place on."""
 

@@ -26,13 +26,14 @@ def hashed(
         a, b, c, d = words[i]
         for k in range(start, stop):
             index = np.uint32(places[k] * np.uint32(constants[0]))
-            radius, turn = _hash(index, a, b, constants), _hash(index, c, d, constants)
+            radius, turn = hashed_word(index, a, b, constants), hashed_word(index, c, d, constants)
             uniform[i, k] = (np.float32(np.int32(radius >> np.uint32(9))) + np.float32(0.5)) * _STEP
             angle[i, k] = np.float32(np.int32(turn)) * _TURN
 
 
 @jit
-def _hash(index: np.uint32, a: np.uint32, b: np.uint32, constants: tuple[int, int, int]) -> np.uint32:
+def hashed_word(index: np.uint32, a: np.uint32, b: np.uint32, constants: tuple[int, int, int]) -> np.uint32:
+    """Two rounds of the hash, of an index times the first of the constants, under two words of a key."""
     x = np.uint32(index + a)
     x = np.uint32(x ^ (x >> np.uint32(16)))
     x = np.uint32(np.uint32(x * np.uint32(constants[1])) + b)

@@ -15,7 +15,7 @@ from torchrefract._threads import share
 
 _WORD = 0xFFFFFFFF
 # Odd constants of the hash, as int32: 2^32 over the golden ratio, and the two of lowbias32.
-_HASH = (0x9E3779B1 - 2**32, 0x7FEB352D, 0x846CA68B - 2**32)
+HASH = (0x9E3779B1 - 2**32, 0x7FEB352D, 0x846CA68B - 2**32)
 _CACHED = 1 << 17  # numbers that stay in a core's cache
 
 
@@ -68,7 +68,7 @@ def _lattice(key: Tensor, axes: Sequence[Tensor], count: int) -> Tensor:
         shape = [1] * (len(axes) + 2)
         shape[0], shape[i if i < len(shape) else 1] = len(key), axis.shape[1]
         # Each axis in a round of its own, under both halves of the key in turn.
-        node = _hash(node + axis.to(torch.int32).view(shape) * _HASH[0], *((a, b) if i % 2 else (c, d)))
+        node = _hash(node + axis.to(torch.int32).view(shape) * HASH[0], *((a, b) if i % 2 else (c, d)))
     return ((node >> 9) & 0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
 
 
@@ -101,12 +101,12 @@ def _hashed(words: tuple[Tensor, ...], places: Tensor) -> tuple[Tensor, Tensor]:
     """(B, n), uniform in (0, 1), and (B, n), angles, of keys of four words, (B, 1), at places, (n,), int32."""
     a, b, c, d = words
     if len(places) < SMALLEST or withheld(places) or withheld(a) or kernels("_jit") is None:
-        index = places * _HASH[0]
+        index = places * HASH[0]
         uniform = (_hash(index, a, b) >> 9).bitwise_and_(0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
         return uniform, _hash(index, c, d).float().mul_(math.pi * 2.0**-31)
     uniform, angle = (torch.empty(len(a), len(places)) for _ in range(2))
     keys, numbers = torch.cat(words, dim=1).numpy().view(np.uint32), places.contiguous().numpy().view(np.uint32)
-    work = partial(kernels("noise_kernel").hashed, keys, numbers, tuple(word % 2**32 for word in _HASH))
+    work = partial(kernels("noise_kernel").hashed, keys, numbers, tuple(word % 2**32 for word in HASH))
     share(lambda start, stop: work(start, stop, uniform.numpy(), angle.numpy()), len(places), least=SMALLEST)
     return uniform, angle
 
@@ -114,9 +114,9 @@ def _hashed(words: tuple[Tensor, ...], places: Tensor) -> tuple[Tensor, Tensor]:
 def _hash(index: Tensor, a: Tensor, b: Tensor) -> Tensor:
     x = index + a
     x ^= (x >> 16).bitwise_and_(0xFFFF)
-    x = x.mul_(_HASH[1]).add_(b)
+    x = x.mul_(HASH[1]).add_(b)
     x ^= (x >> 15).bitwise_and_(0x1FFFF)
-    x.mul_(_HASH[2])
+    x.mul_(HASH[2])
     x ^= (x >> 16).bitwise_and_(0xFFFF)
     return x
 

@@ -15,6 +15,7 @@ from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.fields.perlin import perlin_noise
 from torchrefract.fields.perlin_bounds import VARIANCE, error_between, mean_variance
+from torchrefract.fields.perlin_drawn import Coarse, Drawn, drawn_noise
 from torchrefract.fields.perlin_lattice import octave
 from torchrefract.warping.lattice import Lattice, between_nodes
 
@@ -267,6 +268,23 @@ def test_the_error_between_nodes_deviates_as_its_bound_says(period, stride):
     assert 0.2 * found.variance <= sampled <= 1.25 * found.variance
     # Of vectors that are known no sum is longer than all of them together.
     assert off.abs().max() <= math.sqrt(2 * found.nodes * found.variance)
+
+
+@pytest.mark.parametrize(("period", "stride"), [(12.0, 4), (50.0, 4), (100.0, 4), (100.0, 2), (110.0, 16)])
+def test_the_error_around_nodes_of_the_noise_keeps_its_bound(period, stride):
+    """There the third derivative jumps: of a long period nearly all of the error is there."""
+    key = torch.randint(1 << 32, (300, 4), generator=torch.Generator().manual_seed(1))
+    still = torch.zeros(300), torch.zeros(300, 2), torch.full((300,), math.inf)
+    weights, lattice = torch.ones(300, 1).double(), Lattice(120, 120, stride)
+    drawn = Drawn(key, *still)
+    size: Any = {"height": 120, "width": 120}
+    coarse = Coarse([(0, period)], weights, lattice)
+    off = drawn_noise(drawn, [], weights[:, :0], **size, coarse=coarse) - drawn_noise(
+        drawn, [(0, period)], weights, **size
+    )
+    found = error_between(period, stride, 120, 120)
+    assert 4 <= found.nodes < 9
+    assert 0.7 <= off.abs().max() / math.sqrt(2 * found.nodes * found.variance) <= 1.02
 
 
 @pytest.mark.parametrize("period", [7.0, 30.0, 200.0])

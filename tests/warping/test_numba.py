@@ -381,14 +381,15 @@ def test_every_processor_finds_the_same(name, features, lanes, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-def test_what_is_kept_is_of_the_very_sources(tmp_path, monkeypatch):
+@pytest.mark.parametrize("layer", ["fields", "warping"])
+def test_what_is_kept_is_of_the_very_sources(layer, tmp_path, monkeypatch):
     jit = pytest.importorskip("torchrefract._jit", reason="needs numba")
     shutil.copytree(Path(jit.__file__).parent, tmp_path / "torchrefract", ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(jit, "__file__", str(tmp_path / "torchrefract" / "_jit.py"))
     monkeypatch.setattr(jit.numba.config, "CACHE_DIR", "")
     before = jit._folder.__wrapped__()
     assert Path(before).parent == tmp_path / "torchrefract" / "__pycache__"
-    with (tmp_path / "torchrefract" / "warping" / "kernels" / "groups.py").open("a") as source:
+    with (tmp_path / "torchrefract" / layer / "kernels" / "groups.py").open("a") as source:
         source.write("# another version\n")
     assert jit._folder.__wrapped__() != before
     monkeypatch.setattr(jit.os, "access", lambda *_: False)

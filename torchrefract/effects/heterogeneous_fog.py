@@ -32,8 +32,7 @@ from torchrefract.effects.rows import column, frame_mean, spread
 from torchrefract.effects.scales import check_scales, check_weights, chosen, periods, shares, stretched
 from torchrefract.fields.fog import drifting_transmission_, transmission
 from torchrefract.fields.fog_volume import path_mean
-from torchrefract.fields.perlin import Nodes, perlin_noise
-from torchrefract.fields.perlin_lattice import Octave, octave
+from torchrefract.fields.perlin_drawn import Coarse, Drawn, drawn_noise
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 from torchrefract.warping.lattice import Lattice
@@ -243,38 +242,32 @@ class HeterogeneousFog(PlannedLight):
         share = shares(weights.to(dtype))
         frame, wind, decorrelation = tame(params.frame.reshape(-1), wind, decorrelation)
         if self.mode == "image":
-            motion: dict[str, Any] = {"frame": frame, "wind": wind[:, :2] * (width / self.reference_width)}
-            return self._in_image(key, share, motion | {"decorrelation": decorrelation}, plan)
+            in_image = Drawn(key, frame, wind[:, :2] * (width / self.reference_width), decorrelation)
+            return self._in_image(in_image, share, plan)
         focal, center = self.air.pinhole(height, width)
         view: Any = {"height": height, "width": width, "focal": focal, "center": center, "reach": self.reach}
         fog: Any = {"scales": self.scales, "weights": share, "contrast": contrast.to(dtype)}
-        motion = {"frame": frame, "wind": wind, "decorrelation": decorrelation}
+        motion: Any = {"frame": frame, "wind": wind, "decorrelation": decorrelation}
         q = path_mean(key, distance, **view, **fog, **motion, dtype=dtype)
         return q, self._inverse_mean(q, 1.0), q.new_zeros(1, 1, 1, 1)
 
-    def _in_image(
-        self, key: Tensor, share: Tensor, motion: dict[str, Any], plan: DriftPlan
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _in_image(self, drawn: Drawn, share: Tensor, plan: DriftPlan) -> tuple[Tensor, Tensor, Tensor]:
         """The paper's noise, for weights (N, K) of sum 1."""
-        lengths = self._periods(plan.height, plan.width)
-
-        def made(numbers: Sequence[int], height: int, width: int, **lattice: int) -> list[Octave]:
-            size: Any = {"height": height, "width": width, "dtype": share.dtype, **lattice}
-            return [octave(key, i, period=lengths[i], **size, **motion) for i in numbers]
-
-        octaves = made(plan.fine, plan.height, plan.width)
+        size: Any = {"height": plan.height, "width": plan.width}
+        octaves = tuple(enumerate(self._periods(**size)))
         if self.normalize == "image":
-            parts = [column(w) * stretched(each) for each, w in zip(octaves, share.unbind(1), strict=True)]
+            one = share.new_ones(share.shape[0], 1)
+            noises = (stretched(drawn_noise(drawn, [each], one, **size)) for each in octaves)
+            parts = [column(w) * noise for noise, w in zip(noises, share.unbind(1), strict=True)]
             q = sum(parts[1:], parts[0])
             return q, self._inverse_mean(q, 0.5), q.new_zeros(1, 1, 1, 1)
-        nodes = None
+        coarse = None
         if plan.coarse:
             lattice = Lattice(plan.height, plan.width, plan.stride)
-            rows, columns = lattice.axes()
-            known = made(plan.coarse, len(rows), len(columns), stride=rows.step, start=rows.start)
-            nodes = Nodes(perlin_noise(known, chosen(share, plan.coarse)), lattice)
+            coarse = Coarse([octaves[i] for i in plan.coarse], chosen(share, plan.coarse), lattice)
         # q = 1/2 + n / sqrt(2), with the noise n.
-        noise = perlin_noise(octaves, chosen(share, plan.fine), nodes=nodes)
+        fine = [octaves[i] for i in plan.fine]
+        noise = drawn_noise(drawn, fine, chosen(share, plan.fine), **size, coarse=coarse)
         mean = 0.5 + frame_mean(noise) / math.sqrt(2) if self.mean == "image" else noise.new_full((1, 1, 1, 1), 0.5)
         return noise, math.sqrt(0.5) / mean, 0.5 / mean
 

@@ -6,8 +6,6 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import check_all, check_number, check_positive, or_else
-from torchrefract.fields.perlin import perlin_noise
-from torchrefract.fields.perlin_lattice import Octave
 
 # The paper's table of scales, with the weights that go with them.
 _PAPER_SCALES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
@@ -66,9 +64,8 @@ def chosen(share: Tensor, octaves: Sequence[int]) -> Tensor:
     return torch.stack([share[:, i] for i in octaves], dim=1) if octaves else share[:, :0]
 
 
-def stretched(octave: Octave) -> Tensor:
-    """(N, 1, H, W), the noise from its smallest value in the frame, at 0, to its largest, at 1."""
-    noise = perlin_noise([octave], octave.x.new_ones(octave.x.shape[0], 1))
+def stretched(noise: Tensor) -> Tensor:
+    """(N, 1, H, W), a noise from its smallest value in the frame, at 0, to its largest, at 1."""
     low, high = noise.detach().amin(dim=(2, 3), keepdim=True), noise.detach().amax(dim=(2, 3), keepdim=True)
     return torch.where(high > low, (noise - low) / torch.where(high > low, high - low, 1), 0.5)
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import is_true, learns
+from torchrefract._constants import constant
 from torchrefract.white_noise import lattice
 
 # Multiples of the golden ratio stay away from each other, modulo 1: octaves share no lines of nodes.
@@ -59,8 +60,7 @@ def octave(
 
     Source: Perlin and Neyret, "Flow noise", SIGGRAPH 2001, technical sketches, for the turning.
     """
-    phase = (2.0**-32 * key[:, :2].double() + (index + 1) * _GOLDEN).frac()
-    origin = (start + 0.5 - wind.double() * frame.double()[:, None]) / period + phase
+    origin = origins(key, [index], [period], frame=frame, wind=wind, starts=[start])[:, 0]
     first = origin.detach().floor()
     places, nodes = [], [torch.full((len(key), 1), index, device=key.device)]
     for size, place, node in zip((width, height), (origin - first).unbind(1), first.long().unbind(1), strict=True):
@@ -70,6 +70,22 @@ def octave(
     angle = 2 * math.pi * _turns(key, nodes, frame=frame, decorrelation=decorrelation, dtype=dtype)
     # In memory column by column, as `perlin_noise` looks them up.
     return Octave(torch.stack([angle.cos(), angle.sin()], dim=1).mT, *places)
+
+
+def origins(
+    key: Tensor,
+    indices: Sequence[int],
+    periods: Sequence[float],
+    *,
+    frame: Tensor,
+    wind: Tensor,
+    starts: Sequence[int],
+) -> Tensor:
+    """(N, octaves, 2), float64: x and y of the first column and row, in `octave`, of octaves with their periods."""
+    known = [[_GOLDEN * (i + 1) for i in indices], list(periods), [start + 0.5 for start in starts]]
+    turn, period, start = constant(known, dtype=torch.float64, device=key.device)[..., None]
+    phase = (2.0**-32 * key[:, None, :2].double() + turn).frac()
+    return (start - (wind.double() * frame.double()[:, None])[:, None]) / period + phase
 
 
 def _taken(start: Tensor, size: int, step: float) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,1 @@
+"""What numba compiles; imported by `_compiled.kernels` alone."""

@@ -80,6 +80,8 @@ class _Asked(NamedTuple):
 @job
 def main(cfg: DictConfig) -> None:
     """Make the pairs that are not there yet, and the card when all are."""
+    if _workers(cfg):  # what they import takes longer than to see what there is to do
+        make_ready()
     asked, out = _asked(cfg), Path(str(cfg.out))
     with _room_on(out):
         about = {"license": asked.license, "made_with": _MADE_WITH}
@@ -93,7 +95,6 @@ def main(cfg: DictConfig) -> None:
         units = [unit for unit in asked.shard.units(asked.number, store.unit) if not there.issuperset(unit)]
         if units:
             if asked.workers:
-                make_ready()
                 # Beside the pairs, not when all else is done.
                 Thread(target=import_module, args=(_DRAWING,), daemon=True).start()
             _check_room(asked, [number for unit in units for number in unit], store)

@@ -1,9 +1,11 @@
 import math
 import random
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch.testing import assert_close
 
 from torchrefract import (
@@ -102,6 +104,37 @@ def test_slopes_are_no_steeper_than_planned(effect):
     steepest = max(flow.diff(dim=dim).square().sum(dim=1).amax().sqrt().item() for dim in (2, 3))
     slope = effect.planned(240, 320, torch.float32).slope
     assert 0.2 * slope < steepest <= slope
+
+
+@pytest.mark.parametrize("effect", parts(0.1)[:3], ids=lambda effect: type(effect).__name__)
+def test_flows_are_no_farther_off_where_they_are_read_than_planned(effect):
+    plan = effect.planned(*SIZE, torch.float64)
+    params = effect.sample(image(64).double(), seed=4)
+    flow = effect.on_lattice(params, plan)
+    shares = []
+    for px, planned in plan.readings:
+        known = replace(flow, every=px).read()
+        # All of the frame lies between what is known.
+        size = [px * (n - 1) + 1 for n in known.shape[2:]]
+        lines = F.interpolate(known, size=size, mode="bilinear", align_corners=True)[..., : SIZE[0], : SIZE[1]]
+        shares.append((lines - flow.dense()).norm(dim=1).amax().item() / planned)
+    assert 0.1 < max(shares) <= 1
+
+
+def test_flows_are_read_as_seldom_as_the_tolerance_allows():
+    coarse, fine = (Compose(parts(64.0), tolerance_px=px).planned(*SIZE, torch.float32) for px in (1.0, 0.03))
+    often = [[part.every for part in of_warps(plan)] for plan in (coarse, fine)]
+    assert max(often[0]) > 1
+    assert all(a >= b for a, b in zip(*often, strict=True))
+    # Nobody reads the last.
+    assert often[0][-1] == often[1][-1] == 1
+    assert fine.error_px <= 0.03
+    assert "others read it every" in str(coarse)
+    light = Compose([*parts(64.0)[:1], UniformFog(), *parts(64.0)[1:2]], tolerance_px=1.0)
+    assert [part.every for part in of_warps(light.planned(*SIZE, torch.float32))] == [1, 1]
+    assert {part.every for part in of_warps(Compose(parts(64.0), tolerance_px=None).planned(*SIZE, torch.float32))} == {
+        1
+    }
 
 
 def test_what_follows_a_rough_warp_is_exact():

@@ -132,9 +132,8 @@ def test_flows_are_read_as_seldom_as_the_tolerance_allows():
     assert "others read it every" in str(coarse)
     light = Compose([*parts(64.0)[:1], UniformFog(), *parts(64.0)[1:2]], tolerance_px=1.0)
     assert [part.every for part in of_warps(light.planned(*SIZE, torch.float32))] == [1, 1]
-    assert {part.every for part in of_warps(Compose(parts(64.0), tolerance_px=None).planned(*SIZE, torch.float32))} == {
-        1
-    }
+    exact = Compose(parts(64.0), tolerance_px=None).planned(*SIZE, torch.float32)
+    assert {part.every for part in of_warps(exact)} == {1}
 
 
 def test_what_follows_a_rough_warp_is_exact():

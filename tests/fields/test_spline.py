@@ -105,6 +105,21 @@ def test_the_dense_flow_is_the_spline_at_each_pixel(size):
     assert_close(flow, evaluate_spline(spline, at).mT.reshape(2, 2, height, width), rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [(33, 40), (120, 200)])
+def test_a_kernel_gives_the_flow_of_pytorchs_operations(size, dtype, monkeypatch, oracle):
+    source = torch.Generator().manual_seed(5)
+    at = 200 * torch.rand(3, 20, 2, generator=source, dtype=torch.float64)
+    at[:, 0] = at[:, 0].round()  # on a pixel, where the kernel is 0
+    spline = fit_spline(at, 10 * torch.randn(3, 20, 2, generator=source), torch.tensor([0.0, 0.1, 10.0]))
+    options = {"height": size[0], "width": size[1], "dtype": dtype}
+    found = spline_flow(spline, **options)
+    monkeypatch.setattr("torchrefract.fields.spline.kernels", lambda _: None)
+    oracle(
+        f"plates by a kernel, {dtype}", found, spline_flow(spline, **options), 1e-5 if dtype is torch.float32 else 1e-11
+    )
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_points_that_stay_move_nothing(dtype):
     points = random_points(16, samples=2).to(dtype)

@@ -1,11 +1,16 @@
 """Thin-plate splines: the smoothest flow that moves given points as told."""
 
+from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_all, is_true
+from torchrefract._checks import check_all, is_true, withheld
+from torchrefract._compiled import kernels
+from torchrefract._threads import share
 from torchrefract.fields.linear import solve
 from torchrefract.warping.grid import pixel_axes
 
@@ -15,6 +20,7 @@ _NEAREST = 1e-6
 _FLATTEST = 1e-5
 _UNIT = 2  # of the coordinates, in root mean square distances from the center
 _NOTHING = 1e-300
+_SMALLEST = 1 << 10  # places, from which on a kernel is faster
 _CACHED = 1 << 15  # numbers of eight bytes, a few times over, that stay in a core's cache
 
 
@@ -120,6 +126,9 @@ class _Lattice(torch.autograd.Function):
 
     @staticmethod
     def forward(points: Tensor, weights: Tensor, affine: Tensor, x: Tensor, y: Tensor, dtype: torch.dtype) -> Tensor:
+        values = points, weights, affine, x, y
+        if x.shape[2] * y.shape[1] >= _SMALLEST and not any(map(withheld, values)) and kernels("_jit"):
+            return _filled(values, dtype)
         rows = y.split(_at_once(x), dim=1)
         return torch.cat([_evaluate(points, weights, affine, x, part).to(dtype) for part in rows], dim=2)
 
@@ -136,6 +145,17 @@ class _Lattice(torch.autograd.Function):
             found = _gradients(slope.double(), points, weights, x, part)
             total = tuple(a + b for a, b in zip(total, found, strict=True))
         return *total, None, None, None
+
+
+def _filled(values: Sequence[Tensor], dtype: torch.dtype) -> Tensor:
+    """The flow by a kernel; the places are the last two."""
+    points, weights, affine, x, y = (value.contiguous() for value in values)
+    batch, rows, columns = len(points), y.shape[1], x.shape[2]
+    out = points.new_empty(batch, 2, rows, columns, dtype=dtype)
+    arrays = (value.numpy() for value in (points, weights, affine, x.expand(batch, -1, -1)[:, 0], y[..., 0]))
+    work = partial(kernels("fields.kernels.plates").plates, *map(np.ascontiguousarray, arrays), _NOTHING)
+    share(lambda start, stop: work(start, stop, out.numpy()), batch * rows, least=_SMALLEST // columns + 1)
+    return out
 
 
 def _evaluate(points: Tensor, weights: Tensor, affine: Tensor, x: Tensor, y: Tensor) -> Tensor:

@@ -82,14 +82,14 @@ def inverse_error(x: float) -> float:
 
     Source: Giles, "Approximating the erfinv function", GPU Computing Gems, Jade edition (2011).
     """
-    w = -_logarithm((1 - x) * (1 + x))
+    w = -logarithm((1 - x) * (1 + x))
     # Both are made and one is taken: so that several numbers are made at once.
     near, far = horner(w - 3.125, _NEAR), horner(np.sqrt(w) - 3.25, _FAR)
     return (near if w < 6.25 else far) * x
 
 
 @jit
-def _logarithm(x: float) -> float:
+def logarithm(x: float) -> float:
     """ln x, of a normal number above 0: not by the C library, which takes one number at a time."""
     bits = np.float64(x).view(np.int64)
     exponent = (bits - _ROOT_BITS) >> 52  # m is in [sqrt(1/2), sqrt(2))

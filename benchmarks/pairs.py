@@ -34,7 +34,7 @@ from torchrefract.pairs.sources import Reader, find_sources
 
 WHAT = (
     "A run of torchrefract.generate: pairs a second, its start among the time; the share of the cores' time that it "
-    "used, looked at four times a second, and the memory of all its processes, shared pages counted once, looked at "
+    "used, looked at twenty times a second, and the memory of all its processes, shared pages counted once, looked at "
     "every two seconds, since a look takes time from each of them. And one pair on one thread: read, "
     "degraded and encoded, beside reading the same frame and encoding the same arrays: means over pairs, of the median "
     "of three calls each."
@@ -42,7 +42,7 @@ WHAT = (
 LIMIT = 1.5
 BUSY = 0.85
 _TRIED = 24  # pairs that are timed singly
-_PAUSE = 0.25  # s, between two looks at the processes
+_PAUSE = 0.05  # s, between two looks at the processes: what one uses after the last of them is not counted
 _BETWEEN_MEMORY = 2.0  # s, between two at their memory
 
 

@@ -18,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from torchrefract._checks import check_choice, check_count, check_flag, check_number, check_size
-from torchrefract._command import check_seed, command, job, make, naming, with_text
+from torchrefract._command import check_seed, command, job, leave, make, naming, with_text
 from torchrefract._config import CONFIG_DIR
 from torchrefract._errors import UsageError
 from torchrefract._files import replacing
@@ -267,3 +267,4 @@ def _size(count: float) -> str:
 
 if __name__ == "__main__":
     main()
+    leave()

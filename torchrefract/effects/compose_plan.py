@@ -28,9 +28,6 @@ from torchrefract.effects.plan import READINGS, Ask, Plan
 from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.refraction import WarpEffect
 
-# Of the tolerance, left for flows that later ones read between pixels.
-_READING = 0.2
-
 
 @dataclass(frozen=True)
 class ComposePlan:
@@ -158,11 +155,11 @@ def _shared(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask)
             found[i] = share if before is None else min(before, share, key=lambda share: share.tolerance)
     shares = cast(list[_Share], found)
     acting = [dict(zip(own, shares, strict=True)) for own, shares in zip(sets, tried, strict=True)]
-    plans, error = _read_apart([share.plan for share in shares], warps, acting, ask)
+    plans, error = _read_seldom([share.plan for share in shares], warps, acting, ask)
     return [share._replace(plan=plan) for share, plan in zip(shares, plans, strict=True)], error
 
 
-def _read_apart(
+def _read_seldom(
     plans: Sequence[Plan], warps: Sequence[_Warp], acting: Sequence[Mapping[int, _Share]], ask: Ask
 ) -> tuple[list[Plan], float]:
     """The plans with the px at which later warps read their flows, as coarse as is allowed, and the largest error.

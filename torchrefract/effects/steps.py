@@ -45,13 +45,6 @@ def exact(steps: Sequence[Step]) -> Step:
     return Step(*_any(steps), found)
 
 
-def composite(whole: Step, steps: Sequence[Step]) -> Step:
-    """Warps that were looked up together, as one with a flow (B, 2, H, W), px."""
-    if isinstance(whole.path, Positions):
-        return exact(steps)
-    return whole._replace(path=dense(whole.path))
-
-
 def on_grid(steps: Sequence[Step], dtype: torch.dtype) -> Step:
     """The same in the sampler's own positions: faster, and off by their rounding."""
 

@@ -1,6 +1,7 @@
 """An image on its way through several effects: warps that follow one another are looked up together."""
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -15,11 +16,11 @@ from torchrefract.effects.plan import Plan
 from torchrefract.effects.radiance import RadianceEffect
 from torchrefract.effects.refraction import Moved, WarpEffect, moving, sees
 from torchrefract.effects.rows import column, only, spread
-from torchrefract.effects.steps import Step, composite, exact, on_grid
+from torchrefract.effects.steps import Step, exact, on_grid
 from torchrefract.types import Degraded, Map
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import Positions, field_dtype, inside
-from torchrefract.warping.mixed import Flow
+from torchrefract.warping.mixed import Flow, dense
 from torchrefract.warping.resample import look_up, sampler_dtype
 
 _Combine = Callable[[Tensor, Tensor], Tensor]
@@ -44,7 +45,7 @@ class Walk:
 
     def __init__(self, image: Tensor, depth: Tensor | None):
         self.image, self.depth = image, depth
-        self.done: list[tuple[Step, list[Step]]] = []  # those that were looked up together, as one and one by one
+        self.done: list[list[Step]] = []  # those that were looked up together
         self.waiting: list[Step] = []
         self.modes: dict[Look, Tensor] = {}  # of the look-up: the samples that ask for it, (B,), bool
         self.moved: list[tuple[WarpEffect, Any, Moved]] = []
@@ -125,8 +126,14 @@ class Walk:
             return self.moved[0][2].spread(self.image.shape[0]).flow
         # The first is read where the others look, and the last leads there: neither is read twice, and blurred.
         first, *others = self.done
-        ends = [composite(*first), *(step for _, steps in others[:-1] for step in steps)]
-        return cast(Tensor, exact([*ends, *(composite(*last) for last in others[-1:])]).path)
+        between = itertools.chain.from_iterable(others[:-1])
+        return cast(Tensor, exact([self._as_one(first), *between, *map(self._as_one, others[-1:])]).path)
+
+    def _as_one(self, steps: list[Step]) -> Step:
+        """Warps that were looked up together, as one with a flow (B, 2, H, W), px."""
+        # Made again for who asks: kept, it would be as large as the image for who does not.
+        whole = self._composite(steps)
+        return exact(steps) if isinstance(whole.path, Positions) else whole._replace(path=dense(whole.path))
 
     def _add(self, name: str, value: Callable[[], Tensor] | None, combine: _Combine) -> None:
         """One more effect's share in a map of light."""
@@ -138,7 +145,7 @@ class Walk:
         """What waits is done."""
         if not self.waiting:
             return
-        group = self._composite()
+        group = self._composite(self.waiting)
         self.image = only(self._looked_up(group.path), self.image, group.active, group)
         if self.depth is not None:
             self.depth = spread(self.depth, self.image.shape[0])
@@ -151,17 +158,17 @@ class Walk:
             )
 
         self.light = {name: moved_along(value) for name, value in self.light.items()}
-        self.done.append((group, self.waiting))
+        self.done.append([group] if isinstance(group.path, Tensor) and not self.done else self.waiting)
         self.waiting, self.modes = [], {}
 
-    def _composite(self) -> Step:
-        """What waits, as one."""
-        if len(self.waiting) == 1:
-            return self.waiting[0]
-        if all(isinstance(step.path, Tensor) for step in self.waiting):
-            return exact(self.waiting)
-        flows = functools.reduce(torch.promote_types, [step.path.dtype for step in self.waiting])
-        return on_grid(self.waiting, sampler_dtype(self.image, flows))
+    def _composite(self, steps: list[Step]) -> Step:
+        """Warps that are looked up together, as one."""
+        if len(steps) == 1:
+            return steps[0]
+        if all(isinstance(step.path, Tensor) for step in steps):
+            return exact(steps)
+        flows = functools.reduce(torch.promote_types, [step.path.dtype for step in steps])
+        return on_grid(steps, sampler_dtype(self.image, flows))
 
     def _choose(self, mode: Look, active: Tensor) -> None:
         """The samples that an effect moves are looked up as is asked for it."""

@@ -31,7 +31,7 @@ class Reading:
     def of(cls, flow: Tensor | SmoothFlow) -> "Reading":
         """That of a flow (B, 2, H, W), px; one that is not on a lattice is known at every pixel."""
         if isinstance(flow, Tensor):
-            flow = flow if flow[0].is_contiguous() else flow.contiguous()
+            flow = flow if flow[:1].is_contiguous() else flow.contiguous()
             return cls(flow, 1, (flow.shape[2], flow.shape[3]), FAR)
         return cls(once(flow, lambda own: own.read()), flow.every, flow.lattice[:2], FARTHEST)
 
@@ -42,7 +42,7 @@ class Reading:
     def addresses(self) -> list[int]:
         """Where the values of each row begin."""
         values = self.values
-        if not values[0].is_contiguous():
+        if not values[:1].is_contiguous():
             raise ValueError(f"values must have the planes of a row one after the other, got strides {values.stride()}")
         apart = values.stride(0) * values.element_size()
         return [values.data_ptr() + i * apart for i in range(len(values))]

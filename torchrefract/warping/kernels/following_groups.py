@@ -1,43 +1,22 @@
-"""What numba compiles: the same as `following`, LANES pixels at once and to its bits."""
+"""What numba compiles: the same as `following_pixels`, LANES pixels at once and to its bits."""
 
 from typing import Any
 
 import numpy as np
 
 from torchrefract import _lanes as lanes
-from torchrefract._jit import floats_at, inlined
+from torchrefract._jit import inlined
 from torchrefract._lanes import LANES
-from torchrefract.warping.kernels import following, pixels
-from torchrefract.warping.kernels.following import Addresses, Frame, Whole
+from torchrefract.warping.kernels import following_pixels, pixels
 from torchrefract.warping.kernels.groups import AHEAD, BEFORE, MOST_ROWS, weights_of
-from torchrefract.warping.kernels.pixels import Cells, Floats, Number
+from torchrefract.warping.kernels.pixels import Cells, Floats, Frame, Number, Whole
 
 Lanes = Any
 Read = tuple[bool, Lanes, Lanes]
 
 
 @inlined
-def follow_row(
-    x: Floats,
-    y: Floats,
-    flows: Addresses,
-    table: Whole,
-    far: Floats,
-    frame: Frame,
-    cells: Cells,
-    more: Floats,
-) -> None:
-    """As `following.follow_row`."""
-    for k in range(table.shape[0]):
-        flow = floats_at(flows[k], 2 * table[k, 0] * table[k, 1])
-        if x.size < LANES or table[k, 1] < 2 * LANES:
-            following.follow_one(x, y, flow, table[k], far[k], frame, cells, more)
-        else:
-            _follow_one(x, y, flow, table[k], far[k], frame, cells, more)
-
-
-@inlined
-def _follow_one(
+def follow_one(
     x: Floats,
     y: Floats,
     flow: Floats,
@@ -47,7 +26,11 @@ def _follow_one(
     cells: Cells,
     more: Floats,
 ) -> None:
+    """As `following_pixels.follow_one`."""
     rows, columns, every = place
+    if x.size < LANES or columns < 2 * LANES:
+        following_pixels.follow_one(x, y, flow, place, far, frame, cells, more)
+        return
     more[2], more[3] = x, y
     for first in range(0, x.size, LANES):
         start = min(first, x.size - LANES)  # the last group does again what the one before it did

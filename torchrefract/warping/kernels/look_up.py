@@ -9,22 +9,17 @@ images, flows, (k,): the rows of the batches of source and out, and of flows, th
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchrefract._jit import inlined, jit
 from torchrefract._lanes import LANES
-from torchrefract.warping.kernels.following import Addresses, Frame
-from torchrefract.warping.kernels.pixels import Cells, Floats, Number, Size, Values, to_pixels
+from torchrefract.warping.kernels.following import Addresses, follow_row
+from torchrefract.warping.kernels.pixels import Cells, Floats, Frame, Number, Size, Values, Whole, to_pixels
 from torchrefract.warping.kernels.places import along_lattice, along_pixels, room
 
 if LANES:
-    from torchrefract.warping.kernels.following_groups import follow_row
     from torchrefract.warping.kernels.groups import read_row
 else:
-    from torchrefract.warping.kernels.following import follow_row
     from torchrefract.warping.kernels.pixels import read_row
-
-Whole = NDArray[np.int64]
 
 
 @jit

@@ -23,6 +23,8 @@ Index = np.uintp  # what has a sign could count from the end, and would be asked
 Size = tuple[int, int, int, int]
 Apart = tuple[int, int, int]  # from one channel to the next, of the source and of out, and where the row begins
 Cells = tuple[Corners, Floats, Floats]
+Frame = tuple[int, int]  # px, height and width
+Whole = NDArray[np.int64]
 CHUNK = 512  # pixels that are read together: without a look at borders if all of them are inside
 
 

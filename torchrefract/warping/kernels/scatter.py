@@ -12,8 +12,8 @@ out, (B, P, C H W): the gradients of the images, zeros at first; what each of P 
 import numpy as np
 
 from torchrefract._jit import inlined, jit
-from torchrefract.warping.kernels.look_up import Addresses, Whole, follow_row
-from torchrefract.warping.kernels.pixels import CHUNK, Cells, Floats, Number, find_cells, to_pixels, weights_at
+from torchrefract.warping.kernels.following import Addresses, follow_row
+from torchrefract.warping.kernels.pixels import CHUNK, Cells, Floats, Number, Whole, find_cells, to_pixels, weights_at
 from torchrefract.warping.kernels.places import along_lattice, along_pixels, room
 
 Frame = tuple[int, int, int]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchrefract import _lanes as lanes
-from torchrefract._jit import inlined
+from torchrefract._jit import inlined, jit
 from torchrefract._lanes import LANES
 from torchrefract.warping.kernels import pixels
 from torchrefract.warping.kernels.pixels import Apart, Cells, Floats, Size, Values
@@ -20,6 +20,7 @@ Weights = tuple[Lanes, Lanes, Lanes, Lanes]
 Cell = tuple[Lanes, Lanes, Lanes, Lanes]  # upper and lower row, left and right place among what is read
 Flags = tuple[Lanes, Lanes]  # whether the left and the right pixels are in the frame
 Rows = tuple[int, int]
+Group = tuple[bool, int, Rows, Lanes, Cell, Flags, Weights]
 MOST_ROWS = 12  # of the source; for more of them one pixel after the other is faster
 BEFORE = LANES // 4  # pixels that are read before the first of those at both ends of a group
 AHEAD = 3  # rows before they are read they are asked for: each is read anew, from farther memory, a row later
@@ -31,17 +32,53 @@ def read_row(source: Values, size: Size, x: Floats, y: Floats, cells: Cells, apa
     channels, _, width, step = size
     if x.size < LANES or width < 2 * LANES or (step > 1 and channels != 3):
         pixels.read_row(source, size, x, y, cells, apart, out)
-        return
-    for begin in range(0, x.size, LANES):
-        start = min(begin, x.size - LANES)  # the last group may do again what the one before it did
-        if not _read_group(source, size, x, y, start, apart, out):
+    elif step > 1:
+        _read_together(source, size, x, y, cells, apart, out)
+    else:
+        _read_planes(source, size, x, y, cells, apart, out)
+
+
+@jit
+def _read_together(source: Values, size: Size, x: Floats, y: Floats, cells: Cells, apart: Apart, out: Values) -> None:
+    """Three channels that lie together."""
+    _, height, width, _ = size
+    for first in range(0, x.size, LANES):
+        start = min(first, x.size - LANES)  # the last group may do again what the one before it did
+        near, begin, rows, begins, cell, counts, weights = _group(size, x, y, start)
+        if near:
+            a, b, c = _of_pixels(source, 3 * begin, 3 * width, height, rows, begins, cell, counts, weights)
+            lanes.store_three(out, np.uintp(apart[2] + 3 * start), a, b, c)
+        else:
             pixels.read_part(source, size, x, y, start, start + LANES, cells, apart, out)
 
 
+@jit
+def _read_planes(source: Values, size: Size, x: Floats, y: Floats, cells: Cells, apart: Apart, out: Values) -> None:
+    """Planes of channels."""
+    channels, height, width, _ = size
+    for first in range(0, x.size, LANES):
+        start = min(first, x.size - LANES)
+        near, begin, rows, begins, cell, counts, weights = _group(size, x, y, start)
+        if not near:
+            pixels.read_part(source, size, x, y, start, start + LANES, cells, apart, out)
+            continue
+        c, at, into = 0, begin, apart[2] + start
+        while c + 3 <= channels:
+            one, two, three = _of_three(source, at, apart[0], width, height, rows, begins, cell, counts, weights)
+            lanes.store(out, np.uintp(into), one)
+            lanes.store(out, np.uintp(into + apart[1]), two)
+            lanes.store(out, np.uintp(into + 2 * apart[1]), three)
+            c, at, into = c + 3, at + 3 * apart[0], into + 3 * apart[1]
+        while c < channels:
+            found = _of_plane(source, at, width, height, rows, begins, cell, counts, weights)
+            lanes.store(out, np.uintp(into), found)
+            c, at, into = c + 1, at + apart[0], into + apart[1]
+
+
 @inlined
-def _read_group(source: Values, size: Size, x: Floats, y: Floats, start: int, apart: Apart, out: Values) -> bool:
-    """LANES pixels of a row, or False for those that are too far from one another."""
-    channels, height, width, step = size
+def _group(size: Size, x: Floats, y: Floats, start: int) -> Group:
+    """What LANES pixels of a row take, and whether they are near enough to one another."""
+    _, height, width, _ = size
     place_x, place_y = lanes.load(x, np.uintp(start)), lanes.load(y, np.uintp(start))
     left, top = lanes.floor(place_x), lanes.floor(place_y)
     column, row = lanes.to_wholes(left), lanes.to_wholes(top)
@@ -52,28 +89,18 @@ def _read_group(source: Values, size: Size, x: Floats, y: Floats, start: int, ap
     lowest, highest = lanes.all_wholes(np.int32(0)), lanes.all_wholes(np.int32(width - 1))
     column = lanes.larger(lanes.smaller(column, highest), lowest)
     behind = lanes.larger(lanes.smaller(behind, highest), lowest)
-    near = min(lanes.first(column), lanes.last(column)) - BEFORE
-    begin = max(0, min(near, width - 2 * LANES))
+    first = min(lanes.first(column), lanes.last(column)) - BEFORE
+    begin = max(0, min(first, width - 2 * LANES))
     origin, reach = lanes.all_wholes(np.int32(begin)), lanes.all_wholes(np.int32(2 * LANES))
     column, behind = lanes.minus(column, origin), lanes.minus(behind, origin)
-    if not lanes.everywhere(lanes.both(lanes.below(column, reach), lanes.below(behind, reach))):
-        return False
+    near = lanes.everywhere(lanes.both(lanes.below(column, reach), lanes.below(behind, reach)))
     rows = max(0, lanes.smallest(row)), min(height, lanes.largest(row) + 2)
-    if rows[1] - rows[0] > MOST_ROWS:
-        return False
     weights = weights_of(lanes.difference(place_x, left), lanes.difference(place_y, top))
     # What -0 is added to keeps its bits; where nothing is read 0 is left.
     tall, zero = lanes.all_wholes(np.int32(height)), lanes.all_floats(np.float32(0))
     begins = lanes.where(lanes.below(row, tall), lanes.all_floats(np.float32(-0.0)), zero)
     cell = row, lanes.plus(row, one), column, behind
-    if step > 1:
-        a, b, c = _of_pixels(source, 3 * begin, 3 * width, height, rows, begins, cell, counts, weights)
-        lanes.store_three(out, np.uintp(apart[2] + 3 * start), a, b, c)
-        return True
-    for c in range(channels):
-        found = _of_plane(source, c * apart[0] + begin, width, height, rows, begins, cell, counts, weights)
-        lanes.store(out, np.uintp(c * apart[1] + apart[2] + start), found)
-    return True
+    return near and rows[1] - rows[0] <= MOST_ROWS, begin, rows, begins, cell, counts, weights
 
 
 @inlined
@@ -114,6 +141,34 @@ def _of_pixels(
 
 
 @inlined
+def _of_three(
+    source: Values,
+    begin: int,
+    plane: int,
+    line: int,
+    height: int,
+    rows: Rows,
+    begins: Lanes,
+    cell: Cell,
+    counts: Flags,
+    weights: Weights,
+) -> Three:
+    """Three planes, one so far behind the other."""
+    a = b = c = begins
+    ahead = begin + _ahead(rows, height) * line + LANES
+    lanes.fetch(source, np.uintp(ahead))
+    lanes.fetch(source, np.uintp(ahead + plane))
+    lanes.fetch(source, np.uintp(ahead + 2 * plane))
+    for row in range(rows[0], rows[1]):
+        reads, at_left, at_right = _shares(row, cell, weights)
+        at = begin + row * line
+        a = _add_plane(a, source, at, reads, cell, counts, at_left, at_right)
+        b = _add_plane(b, source, at + plane, reads, cell, counts, at_left, at_right)
+        c = _add_plane(c, source, at + 2 * plane, reads, cell, counts, at_left, at_right)
+    return a, b, c
+
+
+@inlined
 def _of_plane(
     source: Values,
     begin: int,
@@ -129,10 +184,16 @@ def _of_plane(
     lanes.fetch(source, np.uintp(begin + _ahead(rows, height) * line + LANES))
     for row in range(rows[0], rows[1]):
         reads, at_left, at_right = _shares(row, cell, weights)
-        at = begin + row * line
-        low, high = lanes.load(source, np.uintp(at)), lanes.load(source, np.uintp(at + LANES))
-        total = _added(total, low, high, reads, cell, counts, at_left, at_right)
+        total = _add_plane(total, source, begin + row * line, reads, cell, counts, at_left, at_right)
     return total
+
+
+@inlined
+def _add_plane(
+    total: Lanes, source: Values, at: int, reads: Lanes, cell: Cell, counts: Flags, at_left: Lanes, at_right: Lanes
+) -> Lanes:
+    low, high = lanes.load(source, np.uintp(at)), lanes.load(source, np.uintp(at + LANES))
+    return _added(total, low, high, reads, cell, counts, at_left, at_right)
 
 
 @inlined

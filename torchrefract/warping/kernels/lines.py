@@ -7,24 +7,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrefract._jit import fma, jit
+from torchrefract._lanes import LANES
+from torchrefract.warping.kernels.across import GROUP, nodes_across
+
+if LANES:
+    from torchrefract.warping.kernels.across_groups import along_nodes
+else:
+    from torchrefract.warping.kernels.across import along_nodes
 
 Floats = NDArray[np.float32]
 
 
 @jit
 def across(nodes: Floats, weight: Floats, start: int, stop: int, out: Floats) -> None:
-    """Rows of out, (N, W), of nodes, (N, m), every `stride` px, by weights (taps, stride), four taps or more."""
-    taps, stride = weight.shape
+    """Rows of out, (N, W), of nodes, (N, m), every `stride` px, by weights (taps, stride)."""
+    along = nodes_across(weight, out.shape[1])
+    # Behind the last nodes as many are read as a group may have.
+    own, line = np.zeros(nodes.shape[1] + 2 * GROUP, np.float32), np.empty(along[0].size * GROUP, np.float32)
     for row in range(start, stop):
-        own, line = nodes[row], out[row]
-        for cell in range(-(-line.size // stride)):
-            here = line[cell * stride : (cell + 1) * stride]
-            a, b, c, d = own[cell], own[cell + 1], own[cell + 2], own[cell + 3]
-            for k in range(here.size):
-                here[k] = fma(weight[3, k], d, fma(weight[2, k], c, fma(weight[1, k], b, weight[0, k] * a)))
-            for tap in range(4, taps):
-                for k in range(here.size):
-                    here[k] = fma(weight[tap, k], own[cell + tap], here[k])
+        own[: nodes.shape[1]] = nodes[row]
+        along_nodes(own, along, line)
+        out[row] = line[: out.shape[1]]
 
 
 @jit

@@ -5,10 +5,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchrefract import _compiled as compiled
 from torchrefract import compose_flows
-from torchrefract.warping.followed import FollowedFlow, Reading
+from torchrefract.warping.followed import FollowedFlow, followed, of_readings
 from torchrefract.warping.grid import sampler_grid
-from torchrefract.warping.lattice import FARTHEST, Lattice, SmoothFlow
+from torchrefract.warping.lattice import Lattice, SmoothFlow
 from torchrefract.warping.mixed import dense
 from torchrefract.warping.resample import look_up
 
@@ -22,83 +23,132 @@ def smooth(seed: int, stride: int, *, batch: int = 2, height: int = SIZE[0], wid
     return SmoothFlow(torch.randn(batch, 2, *size, generator=torch.Generator().manual_seed(seed)).double(), lattice)
 
 
-def lines_between(values: Tensor, every: int, *, height: int, width: int) -> Tensor:
-    """At every pixel, from values that are known every few px, by one line along each axis: without a sampler."""
-
-    def along(values: Tensor, size: int) -> Tensor:
-        place = torch.arange(size)
-        first = (place // every).clamp(max=max(values.shape[-1] - 2, 0))
-        return torch.lerp(values[..., first], values[..., first + 1], (place - every * first).double() / every)
-
-    return along(along(values, width).mT, height).mT
+def wave(x: Tensor, y: Tensor, seed: int) -> Tensor:
+    """(2, n, m), px, up to 6 px, anywhere; its waves are 140 px long and more."""
+    a, b, c, d = 0.015 + 0.03 * torch.rand(4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return 3 * torch.stack([(a * x + b * y + seed).sin() + (c * y).cos(), (d * x - a * y).cos() + (b * x).sin()])
 
 
-@pytest.mark.parametrize("every", [2, 3, 4])
-@pytest.mark.parametrize("stride", [2, 3, 5, 8, 12])
-@pytest.mark.parametrize(("height", "width"), [(33, 48), (40, 41), (64, 25)])
-def test_what_is_known_every_few_px_is_the_flow_there(every, stride, height, width):
-    flow = replace(smooth(stride, stride, height=height, width=width), every=every)
-    found, pixels = flow.read(), flow.dense()
-    rows, columns = ((size - 1) // every + 1 for size in (height, width))
-    torch.testing.assert_close(found[:, :, :rows, :columns], pixels[:, :, ::every, ::every], rtol=0, atol=1e-12)
-    # Behind the frame it is what the cubics of the last cell, or a node behind it, say: all of the frame lies between.
-    assert [every * (size - 1) for size in found.shape[2:]] == [
-        -(-(size - 1) // every) * every for size in (height, width)
-    ]
-    more = Lattice(height + every, width + every, stride)
-    around = F.pad(flow.nodes, (0, 9, 0, 9), mode="replicate")[:, :, : len(more.axes()[0]), : len(more.axes()[1])]
-    behind = SmoothFlow(around, more).dense()[:, :, ::every, ::every][:, :, : found.shape[2], : found.shape[3]]
-    inner = [axis[-1] >= every * (size - 1) for axis, size in zip(flow.lattice.axes(), found.shape[2:], strict=True)]
-    assert all(inner)
-    torch.testing.assert_close(found, behind, rtol=0, atol=1e-12)
+def waves(seed: int, stride: int, dtype: torch.dtype = torch.float32) -> SmoothFlow:
+    """The same on a lattice that it hardly loses anything on."""
+    lattice = Lattice(*SIZE, stride)
+    x, y = (place.double() for place in lattice.places(dtype=dtype, device=torch.device("cpu")))
+    return SmoothFlow(wave(*torch.broadcast_tensors(x[0, 0], y[0, 0]), seed)[None].to(dtype), lattice)
 
 
-@pytest.mark.parametrize("every", [1, 2, 4])
-def test_a_flow_is_read_by_lines_between_what_is_known(every, oracle):
-    flow = replace(smooth(1, 12), every=every)
-    between = lines_between(flow.read(), every, height=SIZE[0], width=SIZE[1]) if every > 1 else flow.dense()
-    then = 8 * dense(smooth(2, 16))
+def composite(*seeds: int) -> Tensor:
+    """(1, 2, H, W), px, of waves, the last one first: without lattices or a sampler."""
+    y, x = torch.meshgrid(*(torch.arange(size).double() for size in SIZE), indexing="ij")
+    at_x, at_y = x, y
+    for seed in seeds:
+        # What is read outside of the frame is that of its border.
+        u, v = wave(at_x.clamp(0, SIZE[1] - 1), at_y.clamp(0, SIZE[0] - 1), seed)
+        at_x, at_y = at_x + u, at_y + v
+    return torch.stack([at_x - x, at_y - y])[None]
+
+
+def test_a_flow_is_read_by_lines_between_its_pixels(oracle):
+    flow, then = smooth(1, 12), 8 * dense(smooth(2, 16))
     grid, (height, width) = sampler_grid(then), SIZE
-    found = (Reading.of(flow).followed(grid) - grid).movedim(-1, 1) * grid.new_tensor((width / 2, height / 2))[
-        :, None, None
-    ]
-    expected = look_up(between, then, **LINEAR)
-    oracle("flow read every few px", found, expected, 1e-9)
-    assert (expected - look_up(flow.dense(), then, **LINEAR)).abs().max() > (1e-3 if every > 1 else -1)
+    found = (followed(flow, grid) - grid).movedim(-1, 1) * grid.new_tensor((width / 2, height / 2))[:, None, None]
+    oracle("flow read where another one looks", found, look_up(flow.dense(), then, **LINEAR), 1e-9)
 
 
 def test_flows_in_a_row_are_the_composite(oracle):
     first, middle, last = smooth(1, 20), smooth(2, 12), smooth(3, 16)
-    flow = FollowedFlow(last, (Reading.of(middle), Reading.of(first.dense())))
-    composite = compose_flows(first.dense(), compose_flows(middle.dense(), last.dense()))
-    oracle("composite of three flows", flow.dense(), composite, 1e-9)
-    oracle(
-        "composite of three flows, positions", flow.sampler_grid(torch.float64), sampler_grid(composite), 1e-9, unit=""
-    )
+    flow = FollowedFlow(last, (middle, first.dense()))
+    whole = compose_flows(first.dense(), compose_flows(middle.dense(), last.dense()))
+    oracle("composite of three flows", flow.dense(), whole, 1e-9)
+    oracle("composite of three flows, positions", flow.sampler_grid(torch.float64), sampler_grid(whole), 1e-9, unit="")
     for row in (0, 1):
         alone = flow.rows(torch.tensor([row]))
         assert torch.equal(alone.dense(), flow.dense()[row : row + 1])
 
 
 def test_kernels_read_what_is_read_without_them(monkeypatch, oracle):
-    def single(flow: SmoothFlow, every: int) -> SmoothFlow:
-        return replace(flow.with_nodes(flow.nodes.float()), every=every)
+    pytest.importorskip("torchrefract._jit", reason="needs numba")
 
-    flow = FollowedFlow(
-        single(smooth(3, 16), 1), tuple(Reading.of(single(smooth(i, 12), every)) for i, every in enumerate((2, 4, 1)))
-    )
+    def single(flow: SmoothFlow) -> SmoothFlow:
+        return flow.with_nodes(flow.nodes.float())
+
+    flow = FollowedFlow(single(smooth(3, 16)), (single(smooth(0, 12)), single(smooth(1, 12)).dense()))
     found = flow.sampler_grid(torch.float32)
     monkeypatch.setattr("torchrefract._compiled.kernels", lambda _: None)
     plain = flow.sampler_grid(torch.float32)
     oracle("flows in a row, without numba", found, plain, 1e-6, unit="")
-    double = FollowedFlow(smooth(3, 16), tuple(own.to(torch.float64) for own in flow.earlier))
-    oracle("flows in a row, float64", found.double(), double.sampler_grid(torch.float64), 1e-6, unit="")
+
+
+@pytest.mark.parametrize(("every", "bar"), [(1, 6e-3), (2, 6e-4), (3, 6e-4), (4, 1e-3), (5, 2e-3)])
+def test_the_composite_is_known_every_few_px(every, bar, oracle):
+    pytest.importorskip("torchrefract._jit", reason="needs numba")
+    flow = FollowedFlow(replace(waves(1, 4), every=every), (waves(2, 3), waves(3, 2)))
+    found, exact = flow.dense(), composite(1, 2, 3)
+    # Flows on lattices are read by cubics, and by lines between pixels only where each pixel is followed.
+    oracle(f"composite of waves, every {every} px", found, exact, bar)
+    # At the sides it has kinks, which cubics alone would miss.
+    px = max(every, 2)
+    rows, columns = (px * (n // px - 3) for n in SIZE)
+    alone = SmoothFlow(exact[:, :, ::px, ::px], Lattice(rows, columns, px)).dense()
+    assert (alone - exact[:, :, px : px + rows, px : px + columns]).abs().amax() > 20 * (found - exact).abs().amax()
+
+
+@pytest.mark.parametrize("every", [2, 3, 8])
+@pytest.mark.parametrize("size", [(1, 17000), (17000, 1), (129, 128), (5, 4000)])
+def test_frames_of_any_shape_are_followed(every, size, oracle):
+    pytest.importorskip("torchrefract._jit", reason="needs numba")
+    generator = torch.Generator().manual_seed(every)
+
+    def flow(stride: int) -> SmoothFlow:
+        lattice = Lattice(*size, stride)
+        nodes = torch.rand(2, 2, *map(len, lattice.axes()), generator=generator)
+        return SmoothFlow(F.avg_pool2d(nodes, 3, 1, 1), lattice)
+
+    own = FollowedFlow(replace(flow(40), every=every), (flow(50), flow(30)))
+    double = FollowedFlow(
+        own.last.with_nodes(own.last.nodes.double()),
+        tuple(each.with_nodes(each.nodes.double()) for each in own.earlier),
+    )
+    oracle("flows in a row, frames of any shape", own.dense(), double.dense(), 0.02)
+
+
+def test_batch_and_threads_change_no_bit(on_threads):
+    pytest.importorskip("torchrefract._jit", reason="needs numba")
+
+    def single(flow: SmoothFlow) -> SmoothFlow:
+        return replace(flow.with_nodes(flow.nodes.float()), every=3)
+
+    flow = FollowedFlow(single(smooth(3, 16, batch=4)), (single(smooth(1, 12, batch=4)), single(smooth(2, 9, batch=4))))
+    whole = flow.sampler_grid(torch.float32)
+    for threads in (1, 2, 3, 8):
+        on_threads(threads)
+        for rows in ([0, 1, 2, 3], [2], [3, 1]):
+            assert torch.equal(flow.rows(torch.tensor(rows)).sampler_grid(torch.float32), whole[rows])
+
+
+@pytest.mark.parametrize("every", [1, 2, 5])
+def test_images_have_the_gradients_of_grid_sample(every):
+    pytest.importorskip("torchrefract._jit", reason="needs numba")
+    flow = FollowedFlow(replace(waves(1, 6), every=every), (waves(2, 5), waves(3, 3)))
+    image = torch.rand(1, 3, *SIZE, requires_grad=True)
+    upstream = torch.rand(1, 3, *SIZE)
+    found = look_up(image, flow, padding="zeros", interpolation="bilinear")
+    expected = F.grid_sample(image, flow.sampler_grid(torch.float32), align_corners=False)
+    assert torch.equal(found, expected)
+    both = (torch.autograd.grad(value, image, upstream)[0] for value in (found, expected))
+    torch.testing.assert_close(*both, rtol=1e-5, atol=1e-6)
+
+
+def test_what_is_asked_for_is_made_once(monkeypatch):
+    pytest.importorskip("torchrefract._jit", reason="needs numba")
+    flow, asked = FollowedFlow(replace(waves(1, 6), every=2), (waves(2, 5),)), list[str]()
+    kernels = compiled.kernels
+    monkeypatch.setattr(compiled, "kernels", lambda name: asked.append(name) or kernels(name))
+    image = torch.rand(1, 3, *SIZE, requires_grad=True)
+    look_up(image, flow, padding="zeros", interpolation="bilinear").sum().backward()
+    assert asked.count("warping.kernels.composed") == 1
 
 
 def test_what_lies_anywhere_in_memory_is_not_read():
     flow = smooth(1, 12).dense().float().mT
     with pytest.raises(ValueError, match="values must have the planes of a row one after the other, got strides"):
-        Reading(flow, 1, SIZE, FARTHEST).addresses()
-    # What is made of a flow lies as it has to.
-    assert Reading.of(flow).values[0].is_contiguous()
-    assert torch.equal(Reading.of(flow).values, flow)
+        of_readings([flow], [0], far=[4.0], size=SIZE)

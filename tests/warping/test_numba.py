@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 from torchrefract import DivergenceFree, LensDistortion, OneOf, ThinPlateSpline, warp
 from torchrefract import _compiled as compiled
 from torchrefract.warping import lattice
-from torchrefract.warping.followed import FollowedFlow, Reading
+from torchrefract.warping.followed import FollowedFlow, followed
 from torchrefract.warping.grid import Positions, sampler_grid
 from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
 from torchrefract.warping.mixed import Flow, MixedFlow
@@ -117,11 +117,13 @@ def mixes() -> dict[str, Flow | Positions]:
     }
     found["followed"] = FollowedFlow(
         smooth(StreamFlow, 3, 9, *LARGE),
-        (Reading.of(replace(coarse.rows(torch.tensor([0, 1, 1])), every=4)), Reading.of(far)),
+        (coarse.rows(torch.tensor([0, 1, 1])), far),
     )
-    found["one for all, followed"] = FollowedFlow(
-        alike, (Reading.of(replace(alike, every=5)), Reading.of(far[:1].expand(3, -1, -1, -1)))
-    )
+    found["one for all, followed"] = FollowedFlow(alike, (alike, far[:1].expand(3, -1, -1, -1)))
+    curl = smooth(StreamFlow, 3, 12, *LARGE)
+    for every in (2, 3, 7):
+        seldom = replace(smooth(SmoothFlow, 3, 40, *LARGE), every=every)
+        found[f"followed, known every {every} px"] = FollowedFlow(seldom, (alike, curl))
     grid = fine.sampler_grid(torch.float32).expand(3, -1, -1, -1)
     return {**found, "positions": Positions(grid)}
 
@@ -141,17 +143,17 @@ def test_rows_that_are_not_there_are_not_read():
     with pytest.raises(ValueError, match="flow must have a row for each of 3 images, got 2"):
         look_up(image, flow, padding="zeros", interpolation="bilinear", resampler="numba")
     with pytest.raises(ValueError, match="grid must have a row for each of 2 flows, got 3"):
-        Reading.of(flow).followed(image[:, :2].movedim(1, -1))
+        followed(flow, image[:, :2].movedim(1, -1))
 
 
 def test_flows_in_a_row_are_those_of_grid_sample(monkeypatch, oracle):
     first, grid = smooth(SmoothFlow, 2, 9, *LARGE), smooth(SmoothFlow, 2, 12, *LARGE).sampler_grid(torch.float32)
-    readings = [Reading.of(replace(first, every=every)) for every in (1, 2, 3, 6)] + [Reading.of(first.dense())]
-    found = [reading.followed(grid) for reading in readings]
+    flows = [first, first.dense(), first.with_nodes(first.nodes[:1].expand(2, -1, -1, -1))]
+    found = [followed(flow, grid) for flow in flows]
     monkeypatch.setattr(compiled, "kernels", lambda _: None)
     # Grids span 2; a rounding of a position is up to 1.2e-7.
-    for one, reading in zip(found, readings, strict=True):
-        oracle("grid of two flows, grid_sample", one, reading.followed(grid), 1e-6, unit="")
+    for one, flow in zip(found, flows, strict=True):
+        oracle("grid of two flows, grid_sample", one, followed(flow, grid), 1e-6, unit="")
 
 
 @pytest.mark.parametrize("stride", [2, 7, 8, 33])
@@ -368,6 +370,18 @@ for flow in (noise, noise * 30, torch.nn.functional.avg_pool2d(noise, 9, 1, 4) *
             a, b = (warp(source, flow, padding=padding, resampler=name)[0] for name in ("numba", "grid_sample"))
             assert torch.equal(a, b), (source.dtype, padding)
 """
+FOLLOWED_ON_ALL = """
+from dataclasses import replace
+from torchrefract.warping.followed import FollowedFlow
+from torchrefract.warping.lattice import Lattice, SmoothFlow
+def smooth(stride):
+    lattice = Lattice(140, 181, stride)
+    size = [len(axis) for axis in lattice.axes()]
+    return SmoothFlow(torch.randn(2, 2, *size, generator=torch.Generator().manual_seed(stride)), lattice)
+rough = smooth(2).with_nodes(9 * smooth(2).nodes)
+flow = FollowedFlow(replace(smooth(30), every=3), (smooth(20), rough, smooth(7).dense()))
+torch.save(flow.sampler_grid(torch.float32), {to!r})
+"""
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the names are those of x86 processors")
@@ -375,10 +389,13 @@ for flow in (noise, noise * 30, torch.nn.functional.avg_pool2d(noise, 9, 1, 4) *
     ("name", "features", "lanes"), [("haswell", "+avx,+avx2,+fma", 8), ("generic", "", 0), ("x86-64-v3", "+avx2", 0)]
 )
 def test_every_processor_finds_the_same(name, features, lanes, tmp_path):
+    exec(f"import torch\n{FOLLOWED_ON_ALL.format(to=str(tmp_path / 'here'))}", {})
     told = {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": features, "NUMBA_CACHE_DIR": str(tmp_path)}
-    words = [sys.executable, "-c", SAME_ON_ALL.format(lanes=lanes)]
+    program = SAME_ON_ALL.format(lanes=lanes) + FOLLOWED_ON_ALL.format(to=str(tmp_path / "there"))
+    words = [sys.executable, "-c", program]
     done = subprocess.run(words, env=os.environ | told, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+    assert torch.equal(torch.load(tmp_path / "there"), torch.load(tmp_path / "here"))
 
 
 @pytest.mark.parametrize("layer", ["fields", "warping"])

@@ -6,14 +6,11 @@ before it, and what follows a flow whose slope is not known is computed exactly;
 tolerance if parts of its ranges may have lattices. Errors that are of a chance add as deviations do. Of several effects
 that never act on one sample together, each has the whole tolerance.
 
-Where a later flow leads, f_i is read linearly between pixels. With what is left of the tolerance it is read between
-every second or fourth: that adds no more than its largest error between these, as lines from every h-th pixel to the
-next are themselves lines from pixel to pixel.
+On the CPU what is left of half the tolerance goes to knowing the composite itself every few px; see `composite_errors`.
 """
 
-import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import takewhile
@@ -22,9 +19,10 @@ from typing import NamedTuple, cast
 import torch
 
 from torchrefract.effects.base import Effect
+from torchrefract.effects.composite_errors import SELDOM, Error, Share, errors_of
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.light_plan import LightPlan
-from torchrefract.effects.plan import READINGS, Ask, Plan
+from torchrefract.effects.plan import Ask, Plan
 from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.refraction import WarpEffect
 
@@ -57,6 +55,8 @@ class ComposePlan:
             f"error at most  {self.error_px:.2g} px",
             f"resamples      {self.resamples}",
         ]
+        if (px := max((plan.every for plan in self.plans if isinstance(plan, Plan)), default=1)) > 1:
+            lines.append(f"composite      every {px} px on the CPU (cubics between)")
         widest = max(map(len, self.names))
         for name, plan in zip(self.names, self.plans, strict=True):
             lines.append(f"{name:{widest}}  {plan.summary()}")
@@ -91,11 +91,10 @@ def compose_plan(effects: Sequence[tuple[Effect, bool]], together: Sequence[Sequ
     """
     warps = list(_warps(effects))
     if ask.tolerance_px is None:
-        found, error = [_Share(0.0, warp.plan(ask, None)) for warp in warps], 0.0
+        plans, error = [warp.plan(ask, None) for warp in warps], 0.0
     else:
         ask.room()
-        found, error = _shared(warps, together, ask)
-    plans = [share.plan for share in found]
+        plans, error = _shared(warps, together, ask)
     resamples = len({warp.group for warp, plan in zip(warps, plans, strict=True) if plan.stride > 0})
     by_place = {warp.place: plan for warp, plan in zip(warps, plans, strict=True)}
     each = tuple(
@@ -130,68 +129,56 @@ def _warps(effects: Sequence[tuple[Effect, bool]]) -> Iterator[_Warp]:
             group += 1
 
 
-class _Share(NamedTuple):
-    """A warp's part in a composite."""
+def _shared(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask) -> tuple[list[Plan], float]:
+    """The plan of each warp, and how far the composite is off at most."""
+    tolerance = cast(float, ask.tolerance_px)
+    if ask.halved.reachable and any(_meet([warp for warp in warps if warp.place in own]) for own in together):
+        plans, acting = _in_sets(warps, together, ask.halved)
+        # What is too coarse stays so with larger strides.
+        allowed = takewhile(lambda px: _error(acting, px, ask.rounding) <= tolerance, SELDOM)
+        if (px := max(allowed, default=1)) > 1:
+            return [replace(plan, every=px) for plan in plans], _error(acting, px, ask.rounding)
+    plans, acting = _in_sets(warps, together, ask)
+    return plans, _error(acting, 1, ask.rounding)
 
-    tolerance: float  # px, that its flow may be off by; 0 is exact
-    plan: Plan  # for it
-    stretched: float = 1.0  # how often its error counts in the composite
+
+def _meet(warps: Sequence[_Warp]) -> bool:
+    """Whether some are looked up together."""
+    return len({warp.group for warp in warps}) < len(warps)
 
 
-def _shared(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask) -> tuple[list[_Share], float]:
-    """What each warp gets, and how far the composite is off at most.
+def _error(acting: Sequence[Sequence[Share]], every: int, rounding: float) -> float:
+    """How far the composite of each set is off at most, if it is known every so many px.
+
+    All of a set count as one composite: light between warps may turn out to change nothing.
+    """
+    return max((_total(errors_of(shares, every, rounding)) for shares in acting), default=0.0)
+
+
+def _in_sets(
+    warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask
+) -> tuple[list[Plan], list[list[Share]]]:
+    """What each warp gets, and the shares of each set.
 
     A warp of several sets gets the smallest of its shares, which is within the others. So that no flow counts as too
     small in one set and has a slope in another, all act together where that would be.
     """
     sets = [[i for i, warp in enumerate(warps) if warp.place in places] for places in together]
     tried = [_in_row([warps[i] for i in own], ask) for own in sets]
-    found = list[_Share | None]([None] * len(warps))
+    found = list[Share | None]([None] * len(warps))
     for own, shares in zip(sets, tried, strict=True):
         for i, share in zip(own, shares, strict=True):
             before = found[i]
             if before is not None and (before.plan.stride == 0) != (share.plan.stride == 0):
-                return _shared(warps, [[warp.place for warp in warps]], ask)
+                return _in_sets(warps, [[warp.place for warp in warps]], ask)
             found[i] = share if before is None else min(before, share, key=lambda share: share.tolerance)
-    shares = cast(list[_Share], found)
-    acting = [dict(zip(own, shares, strict=True)) for own, shares in zip(sets, tried, strict=True)]
-    plans, error = _read_seldom([share.plan for share in shares], warps, acting, ask)
-    return [share._replace(plan=plan) for share, plan in zip(shares, plans, strict=True)], error
+    return [share.plan for share in cast(list[Share], found)], tried
 
 
-def _read_seldom(
-    plans: Sequence[Plan], warps: Sequence[_Warp], acting: Sequence[Mapping[int, _Share]], ask: Ask
-) -> tuple[list[Plan], float]:
-    """The plans with the px at which later warps read their flows, as coarse as is allowed, and the largest error.
-
-    acting: of each set of warps that act together, by their places among all.
-    """
-
-    def error(plans: Sequence[Plan]) -> float:
-        sets = (((_read_error(plans[i], share), share.plan.random) for i, share in own.items()) for own in acting)
-        return max(map(_total, sets), default=0.0)
-
-    def is_read(i: int) -> bool:
-        later = (j for own in acting if i in own for j in own if j > i and warps[j].group == warps[i].group)
-        return plans[i].stride > 1 and not plans[i].parts and any(plans[j].stride > 0 for j in later)
-
-    found = list(plans)
-    for px, i in itertools.product(READINGS, filter(is_read, range(len(plans)))):
-        coarser = [replace(plan, every=px) if i == j else plan for j, plan in enumerate(found)]
-        if px in dict(found[i].readings) and error(coarser) <= (ask.tolerance_px or 0.0):
-            found = coarser
-    return found, error(found)
-
-
-def _read_error(plan: Plan, share: _Share) -> float:
-    """How far the composite is off by a flow, in all."""
-    return (share.plan.error_px + dict(plan.readings).get(plan.every, 0.0)) * share.stretched
-
-
-def _in_row(warps: Sequence[_Warp], ask: Ask) -> list[_Share]:
+def _in_row(warps: Sequence[_Warp], ask: Ask) -> list[Share]:
     """What each warp gets of those that act one after the other."""
     tolerance = ask.tolerance_px or 0.0
-    shares = [_Share(tolerance / len(warps), warp.plan(ask, tolerance / len(warps))) for warp in warps]
+    shares = [Share(tolerance / len(warps), warp.plan(ask, tolerance / len(warps))) for warp in warps]
     for _ in warps:
         still = [share.plan.stride == 0 for share in shares]
         shares = _shared_once(warps, shares, ask)
@@ -201,22 +188,22 @@ def _in_row(warps: Sequence[_Warp], ask: Ask) -> list[_Share]:
     return shares
 
 
-def _shared_once(warps: Sequence[_Warp], shares: Sequence[_Share], ask: Ask) -> list[_Share]:
+def _shared_once(warps: Sequence[_Warp], shares: Sequence[Share], ask: Ask) -> list[Share]:
     """The plans for shares of the tolerance that go by the slopes of earlier ones."""
     smooth = sum(1 for _ in takewhile(lambda share: share.plan.stride != 1, shares))
     # The one that comes next has an error, too, where what is drawn may have a lattice of its own.
     sharing = smooth + any(share.plan.parts for share in shares[smooth : smooth + 1])
     whole = (ask.tolerance_px or 0.0) / max(1.0, _total([(1.0, share.plan.random) for share in shares[:sharing]]))
-    found, before = list[_Share](), 1.0
+    found, before = list[Share](), 1.0
     for warp, last in zip(warps[:sharing], shares[:sharing], strict=True):
-        found.append(_Share(whole / before, warp.plan(ask, whole / before), before))
+        found.append(Share(whole / before, warp.plan(ask, whole / before), before))
         # A flow that is not computed is too small to count.
         before *= 1 + last.plan.slope if last.plan.stride > 0 else 1.0
-    follows = _Share(0.0, ask.plan(1, 0.0, "it follows a warp whose slope is not known"))
+    follows = Share(0.0, ask.plan(1, 0.0, "it follows a warp whose slope is not known"))
     return found + [share if i == smooth else follows for i, share in enumerate(shares[sharing:], start=sharing)]
 
 
-def _total(errors: Iterable[tuple[float, bool]]) -> float:
+def _total(errors: Iterable[Error]) -> float:
     """Of errors, and whether each is one of a chance: those add as deviations do."""
     found = list(errors)
     return sum(size for size, random in found if not random) + math.hypot(*(size for size, random in found if random))

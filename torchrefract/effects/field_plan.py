@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchrefract.effects.plan import READINGS, Ask, Plan, coarsest
+from torchrefract.effects.plan import Ask, Plan, Smoothness, coarsest
 from torchrefract.fields.covariance import REACH
 from torchrefract.fields.modes import Modes
 from torchrefract.fields.torus import torus
@@ -24,6 +24,7 @@ from torchrefract.warping.lattice import STREAM_NODES, lagrange_weights, slope_w
 _SIGMAS, _SLOPE_SIGMAS = 7.0, 4.0
 _REACH = 8.0  # deviations of the spectrum beyond which nothing is left of it
 _POINTS = 257
+_PLACES = 8  # between two nodes, at which cubics are looked at
 # Of the tolerance, for frequencies that are left out.
 _DROPPED = 0.3
 # Fields of unit variance in float32 are off by so much.
@@ -65,13 +66,13 @@ def field_plan(ranges: FieldRanges, ask: Ask) -> Plan:
     if spectrum is None or modes is None:
         return ask.plan(1, 0.0, "the field has too many frequencies for a lattice")
     # Errors and slopes are not at their largest in one place.
-    slope = _SLOPE_SIGMAS * ranges.amplitude[1] * spectrum.slope()
-    more: dict[str, Any] = {"modes": modes, "slope": slope, "random": True}
+    steep = _SLOPE_SIGMAS * ranges.amplitude[1]
+    slope, bend, third = (steep * spectrum.derivative(order) for order in (1, 2, 3))
+    smooth = Smoothness(bend, third, most * spectrum.lines(), Cubics(ranges))
+    more: dict[str, Any] = {"modes": modes, "slope": slope, "smooth": smooth, "random": True}
     nodes = STREAM_NODES if ranges.stream else 4
     if ranges.stream:
         more |= {"before": nodes // 2, "after": nodes // 2 - 1}
-    else:
-        more["readings"] = tuple((px, most * spectrum.error_between(px, 2)) for px in READINGS)
     counts = "{} x {} of {} x {} frequencies".format(*modes.counts, *modes.size)
 
     def attempt(stride: int) -> Plan | None:
@@ -81,6 +82,23 @@ def field_plan(ranges: FieldRanges, ask: Ask) -> Plan:
         return FieldPlan(ask.height, ask.width, tolerance, stride, off + tolerance - room, counts, **more)
 
     return coarsest(attempt) or ask.plan(1, 0.0, "the field is too rough for a lattice")
+
+
+@dataclass(frozen=True)
+class Cubics:
+    """As for `Smoothness`."""
+
+    ranges: FieldRanges
+
+    def __call__(self, stride: float) -> float:
+        """Px, the largest error."""
+        return _error_of_cubics(self.ranges, stride)
+
+
+@lru_cache(maxsize=1024)
+def _error_of_cubics(ranges: FieldRanges, stride: float) -> float:
+    spectrum = _Spectrum.of(ranges)
+    return math.inf if spectrum is None else _SIGMAS * ranges.amplitude[1] * spectrum.error_of_cubics(stride)
 
 
 def _modes(ranges: FieldRanges, ask: Ask, cutoff: float) -> Modes | None:
@@ -114,9 +132,17 @@ class _Spectrum:
         share = np.exp(-0.5 * k * k)
         return cls(deviation * k, share / share.sum(), stream=ranges.stream)
 
-    def slope(self) -> float:
-        """The deviation of the steepest derivative of a field of variance 1, in 1/px."""
-        return math.sqrt(self._total(np.abs(self.target * self.k) ** 2) / self.variance)
+    def lines(self) -> float:
+        """The deviation of the largest error of lines between pixels, of a field of variance 1."""
+        return self._missed(2, 2, 1)
+
+    def error_of_cubics(self, stride: float) -> float:
+        """That of cubics through four of its values along each axis, which for a stream function are of its curl."""
+        return self._missed(_PLACES, 4, stride)
+
+    def derivative(self, order: int) -> float:
+        """The deviation of the largest derivative of a field of variance 1, in 1/px^order."""
+        return math.sqrt(self._total(np.abs(self.target * self.k**order) ** 2) / self.variance)
 
     def cutoff(self, error: float) -> float:
         """The lowest frequency from which on all others together deviate by no more than this."""
@@ -131,15 +157,25 @@ class _Spectrum:
         own = along = self._transfer(lagrange_weights(stride, nodes, **options).numpy(), stride)
         if self.stream:
             along = self._transfer(slope_weights(stride, nodes, **options).numpy(), stride)
+        return self._off(own, along)
+
+    def _missed(self, places: int, nodes: int, px: float) -> float:
+        """The deviation of the largest error at so many places between nodes, so many px from one another."""
+        weights = lagrange_weights(places, nodes, dtype=torch.float64, device=torch.device("cpu")).numpy()
+        own = self._transfer(weights, px)
+        return self._off(own, self.target * own)
+
+    def _off(self, own: np.ndarray, along: np.ndarray) -> float:
+        """The deviation of the largest error, from what is made of waves along one axis and along the other."""
         agrees = self._total(self.target.conj() * along)[:, None] * self._total(own)
         power = self._total(np.abs(along) ** 2)[:, None] * self._total(np.abs(own) ** 2)
         return math.sqrt(max(0.0, float((1 + (power - 2 * agrees.real) / self.variance).max())))
 
-    def _transfer(self, weights: np.ndarray, stride: int) -> np.ndarray:
-        """(stride, k): what is made of a wave of height 1 at each pixel of a cell."""
-        count = weights.shape[1]
-        place = np.arange(count) - (count - 1) // 2 - np.arange(stride)[:, None] / stride
-        return np.einsum("tj,tjk->tk", weights, np.exp(1j * stride * place[:, :, None] * self.k))
+    def _transfer(self, weights: np.ndarray, px: float) -> np.ndarray:
+        """(places, k): what weights (places, nodes) make of a wave of height 1, at each place of a cell."""
+        places, count = weights.shape
+        place = np.arange(count) - (count - 1) // 2 - np.arange(places)[:, None] / places
+        return np.einsum("tj,tjk->tk", weights, np.exp(1j * px * place[:, :, None] * self.k))
 
     def _total(self, values: np.ndarray) -> Any:
         return (values * self.share).sum(axis=-1)

@@ -110,13 +110,13 @@ class LatticeWarp(WarpEffect):
         height, width = plan.height, plan.width
         active = self.active(params, height, width)
         if (index := some(active, params)) is not None:
-            path = self._read_every(params_part(params, index), plan)
+            path = self._known_every(params_part(params, index), plan)
             path = path.with_nodes(put(path.nodes, index, 0.0, len(active)))
             return Moved(path, active.new_ones(1, 1, 1, 1), spread(active, path.nodes.shape[0]))
-        path = self._read_every(params, plan)
+        path = self._known_every(params, plan)
         active = spread(active, path.nodes.shape[0])
         path = path.with_nodes(only(path.nodes, 0.0, active, params))
         return Moved(path, active.new_ones(1, 1, 1, 1), active)
 
-    def _read_every(self, params: Any, plan: Plan) -> SmoothFlow:
+    def _known_every(self, params: Any, plan: Plan) -> SmoothFlow:
         return replace(self.on_lattice(params, plan), every=plan.every)

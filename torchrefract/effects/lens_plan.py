@@ -1,12 +1,14 @@
 """What a lens will compute under a tolerance."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 from torch import Tensor
 
 from torchrefract.cameras.distortion import POLYNOMIAL12, Terms
-from torchrefract.effects.plan import READINGS, STRIDES, Ask, Plan, coarsest, lies_in
+from torchrefract.effects.plan import STRIDES, Ask, Plan, Smoothness, coarsest, lies_in
 from torchrefract.fields.lens_bounds import LensRanges, lens_errors, lens_numbers, moved_by_terms
 from torchrefract.warping.lattice import Lattice
 
@@ -50,11 +52,25 @@ def lens_plan(boxes: tuple[LensRanges, ...], ask: Ask) -> Plan:
             return None
         error = left_out + errors.cubic + errors.newton[steps] + tolerance - room
         # Lines between miss h^2 / 8 of a second derivative along each axis.
-        readings = tuple((px, px**2 / 8 * errors.bend) for px in READINGS)
-        more = {"slope": errors.slope, "steps": steps, "kept": kept, "dropped": dropped, "readings": readings}
+        smooth = Smoothness(errors.bend, errors.third, errors.bend / 8, Cubics(boxes, ask.height, ask.width))
+        more = {"slope": errors.slope, "steps": steps, "kept": kept, "dropped": dropped, "smooth": smooth}
         return ask.plan(stride, error, "cubics between", **more)
 
     return coarsest(attempt) or ask.plan(1, 0.0, "the lenses of the ranges bend too much for cubics")
+
+
+@dataclass(frozen=True)
+class Cubics:
+    """As for `Smoothness`."""
+
+    boxes: tuple[LensRanges, ...]
+    height: int  # px, of the frame
+    width: int
+
+    def __call__(self, stride: float) -> float:
+        """Px, the largest error."""
+        errors = lens_errors(self.boxes, Lattice(self.height, self.width, math.ceil(stride)))
+        return math.inf if errors is None else errors.cubic
 
 
 def kept_terms(plan: Plan) -> Terms:

@@ -18,8 +18,6 @@ TOLERANCE_PX = 0.02
 _SMALLEST, _LARGEST = 1e-6, 64.0  # px, or levels
 # Positions in float32 are off by so many units of the last place of the longer side.
 _ROUNDING = {False: 16 * 2.0**-24, True: 16 * 2.0**-53}
-# Px at which flows may be known where others read them.
-READINGS = (2, 4)
 # Px between nodes, from fine to coarse.
 STRIDES = (*range(2, 8), *(share << octave for octave in range(1, 7) for share in (4, 5, 6, 7)), 512)
 
@@ -58,6 +56,11 @@ class Ask:
         default = self.tolerance_px == TOLERANCE_PX and not self.reachable
         return replace(self, tolerance_px=None) if default else self
 
+    @property
+    def halved(self) -> "Ask":
+        """The same with half the tolerance."""
+        return self if self.tolerance_px is None else replace(self, tolerance_px=self.tolerance_px / 2)
+
     def room(self) -> float:
         """What the tolerance leaves beside rounding, px.
 
@@ -71,6 +74,23 @@ class Ask:
                 f"{self.height} x {self.width} px (None is exact), got {self.tolerance_px:g}"
             )
         return cast(float, self.tolerance_px) - self.rounding
+
+
+@dataclass(frozen=True)
+class Smoothness:
+    """How smooth flows are.
+
+    bend: px per px^2, their largest second derivative along any line, as they bend over a px and more.
+    third: px per px^3, likewise; inf where the second has kinks.
+    lines: px, how far lines between pixels are off.
+    cubics: px, how far cubics through four nodes along each axis are off, for so many px between the nodes, wherever
+        these lie.
+    """
+
+    bend: float
+    third: float
+    lines: float
+    cubics: Callable[[float], float]
 
 
 @dataclass(frozen=True)
@@ -89,8 +109,8 @@ class Plan:
     slope: how much the flow differs from pixel to pixel, px, at most; inf where that is not known.
     parts: whether what is drawn may have a coarser plan of its own, where it can be read which; then `error_px` is the
         tolerance, which all of them keep.
-    every: px, at which the flow is known where others of a composition read it, with lines between.
-    readings: px that this can be, and how far the flow is off then, px.
+    smooth: None where that is not known.
+    every: px, between nodes that a composition which this is part of may be known at, on the CPU; 1 is every pixel.
     before, after: nodes that the lattice has before the frame and behind its last cell.
     lattice: where the flow is computed; None for every pixel, or for none.
     why: what decided.
@@ -109,8 +129,8 @@ class Plan:
     random: bool = False
     slope: float = math.inf
     parts: bool = False
+    smooth: Smoothness | None = None
     every: int = 1
-    readings: tuple[tuple[int, float], ...] = ()
     before: int = 1
     after: int = 1
     lattice: Lattice | None = field(init=False)
@@ -128,8 +148,7 @@ class Plan:
         """Where the flow is computed, and why there."""
         flow = {0: "not computed", 1: "at every pixel"}.get(self.stride, f"every {self.stride} px")
         own = "; on the CPU coarser where what is drawn allows it" if self.parts else ""
-        read = f"; others read it every {self.every} px" if self.every > 1 else ""
-        return f"{flow} ({self.why}{own}{read})"
+        return f"{flow} ({self.why}{own})"
 
     def __str__(self) -> str:
         lines = [

@@ -7,13 +7,15 @@ their error falls with the square of the stride alone; so that is where it is lo
 """
 
 import itertools
+import math
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple, cast
 
 import numpy as np
 import torch
 
-from torchrefract.effects.plan import READINGS, Ask, Plan, coarsest
+from torchrefract.effects.plan import Ask, Plan, Smoothness, coarsest
 from torchrefract.types import Range
 from torchrefract.warping.lattice import lagrange_weights
 
@@ -22,6 +24,9 @@ _SLOPE_SIGMAS = 4.0
 _MARGIN = 1.25
 _MOST_POINTS = 64  # that errors are looked at
 _INSIDE = (1, 3, 5)  # sixths of a cell
+_PLACES = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (0.25, 0.25))  # of a kink in its cell
+_NEAREST = math.exp(-1)  # px, from a kink: what ln r is there it is in the mean over the first px
+_Arguments = tuple[tuple[int, int], float, int, int]
 
 
 @lru_cache(maxsize=256)
@@ -43,21 +48,31 @@ def plate_plan(amplitude: float, points: tuple[int, int], smoothing: Range, ask:
         return ask.plan(1, 0.0, "it moves too far for a lattice")
     plates = [(points, value, ask.height, ask.width) for value in set(smoothing)]
     # Errors and slopes are not at their largest in one place.
-    slope = _SLOPE_SIGMAS * amplitude * max(_slope(_plate(*plate)) for plate in plates)
-
-    def error_between(stride: int, taps: int) -> float:
-        return _MARGIN * _SIGMAS * amplitude * max(_deviation(plate, stride, taps) for plate in plates)
-
-    readings = tuple((px, error_between(px, 2)) for px in READINGS)
+    slope, bend = (_SLOPE_SIGMAS * amplitude * max(f(_plate(*plate)) for plate in plates) for f in (_slope, _bend))
+    largest = _MARGIN * _SIGMAS * amplitude
+    lines = largest * max(_deviation(plate, 1, 2) for plate in plates)
+    more = {"slope": slope, "smooth": Smoothness(bend, math.inf, lines, Cubics(largest, tuple(plates)))}
 
     def attempt(stride: int) -> Plan | None:
-        off = error_between(stride, 4)
+        off = largest * max(_deviation(plate, stride, 4) for plate in plates)
         if off > room:
             return None
         error = off + cast(float, ask.tolerance_px) - room
-        return ask.plan(stride, error, "kinks of the second derivative", random=True, slope=slope, readings=readings)
+        return ask.plan(stride, error, "kinks of the second derivative", random=True, **more)
 
     return coarsest(attempt) or ask.plan(1, 0.0, "the plate bends too much for cubics")
+
+
+@dataclass(frozen=True)
+class Cubics:
+    """As for `Smoothness`."""
+
+    largest: float  # px, times a deviation
+    plates: tuple[_Arguments, ...]
+
+    def __call__(self, stride: float) -> float:
+        """Px, the largest error."""
+        return self.largest * max(_deviation(plate, stride, 4, at) for plate in self.plates for at in _PLACES)
 
 
 class _Plate(NamedTuple):
@@ -86,15 +101,17 @@ def _plate(points: tuple[int, int], smoothing: float, height: int, width: int) -
 
 
 @lru_cache(maxsize=1024)
-def _deviation(plate: tuple[tuple[int, int], float, int, int], stride: int, taps: int) -> float:
+def _deviation(plate: _Arguments, stride: float, taps: int, place: tuple[float, float] | None = None) -> float:
     """Of the largest error of polynomials through so many nodes along each axis, for displacements of deviation 1.
 
     plate: arguments as for `_plate`.
+    place: of each kink in its cell, cells; None for a lattice that begins where the frame does.
     """
     unit, center, scale, weights, looked_at = _plate(*plate)
     step = stride / scale
     around = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
-    cells = np.unique((np.floor(looked_at / stride)[:, None] + around).reshape(-1, 2), axis=0)
+    first = np.floor(looked_at / stride) if place is None else looked_at / stride - place
+    cells = np.unique((first[:, None] + around).reshape(-1, 2), axis=0)
     corners = (cells * stride - center) / scale
     own = np.arange(1 - taps // 2, taps // 2 + 1)
     nodes = np.stack(np.meshgrid(own, own), axis=-1).reshape(-1, 2)
@@ -116,6 +133,19 @@ def _slope(plate: _Plate) -> float:
     right, left, down, up = np.concatenate([_kernel(at[:, :, None] - plate.points), plane], axis=-1) @ plate.weights
     slopes = np.stack([right - left, down - up]) / 2
     return float(np.sqrt((slopes**2).sum(axis=-1)).max())
+
+
+def _bend(plate: _Plate) -> float:
+    """The deviation of the largest second derivative along a line, for displacements of deviation 1."""
+    largest = 0.0
+    for line in np.array([[1.0, 0.0], [0.0, 1.0], [0.5**0.5, 0.5**0.5], [0.5**0.5, -(0.5**0.5)]]):
+        at = plate.looked_at[:, None] + _NEAREST * line
+        step = 0.1 * line / plate.scale
+        places = (at - plate.center) / plate.scale + np.array([-step, 0 * step, step])  # (n, 3, 2)
+        before, here, behind = (_kernel(places[:, i, None] - plate.points) for i in range(3))
+        bends = (before - 2 * here + behind) / 0.1**2 @ plate.weights[: len(plate.points)]
+        largest = max(largest, float(np.sqrt((bends**2).sum(axis=-1)).max()))
+    return largest
 
 
 def _kernel(offset: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from torchrefract._bands import in_place
 from torchrefract._checks import is_true, learns, read
 from torchrefract.effects.rows import only
 from torchrefract.warping.compose import compose_flows
-from torchrefract.warping.followed import FollowedFlow, Reading
+from torchrefract.warping.followed import FollowedFlow, Read, followed
 from torchrefract.warping.grid import Positions
 from torchrefract.warping.lattice import SmoothFlow
 from torchrefract.warping.mixed import Flow, MixedFlow, Part, PartFlow, dense, flow_rows, grid_of
@@ -31,10 +31,10 @@ class Step(NamedTuple):
         path = flow_rows(cast(Flow, self.path), index)
         return Step(self.gate[index], self.active[index], path)
 
-    def reading(self) -> Reading:
+    def read(self) -> Read:
         """What later steps read of it."""
         path = cast(Flow, self.path)
-        return Reading.of(path if isinstance(path, SmoothFlow) else dense(path))
+        return path if isinstance(path, SmoothFlow) else dense(path)
 
 
 def exact(steps: Sequence[Step]) -> Step:
@@ -55,7 +55,7 @@ def on_grid(steps: Sequence[Step], dtype: torch.dtype) -> Step:
             return _in_a_row(steps)
         last = steps[-1].path
         if isinstance(last, SmoothFlow) and not any(map(learns, steps)):
-            return FollowedFlow(last, tuple(step.reading() for step in reversed(steps[:-1])))
+            return FollowedFlow(last, tuple(step.read() for step in reversed(steps[:-1])))
         return Positions(_in_a_row_on_grid(steps, dtype))
 
     apart = _apart(steps)
@@ -123,7 +123,7 @@ def _in_a_row_on_grid(steps: Sequence[Step], dtype: torch.dtype) -> Tensor:
     *earlier, last = steps
     grid = grid_of(cast(Flow, last.path), dtype)
     for step in reversed(earlier):
-        both = step.reading().followed(grid)
+        both = followed(step.read(), grid)
         own = cast(Flow, step.path)
         grid = both if is_true(last.active.all, of=last.active) else only(both, grid_of(own, dtype), last.active, last)
         last = Step(step.gate | last.gate, step.active | last.active, Positions(grid))

@@ -27,7 +27,8 @@ _FEW_CELLS, _MANY_CELLS = 5, 17  # along each axis
 _WORST = 8  # lenses that are looked at in many places
 # Strides from the corner of a cell, on a line through its middle; what the cubic of the four nodes misses there.
 _LINE, _MISSED = (-1.0, 0.0, 0.5, 1.0, 2.0), (-1 / 16, 9 / 16, -1.0, 9 / 16, -1 / 16)
-_BENT = (0.0, 4.0, -8.0, 4.0, 0.0)  # what a second derivative makes of them, at strides of 1
+# What second and third derivatives make of them, at strides of 1.
+_BENT, _TWISTED = (0.0, 4.0, -8.0, 4.0, 0.0), (-1.0, 3.0, 0.0, -3.0, 1.0)
 _SOLVED = 1e-12  # the last of Newton's steps, on the plane z = 1
 _MOST_STEPS, _STEPS_TO_SOLVE = 8, 16
 # A map that grows by less than this, compared with no lens, is near to a fold: nothing is smooth there.
@@ -69,6 +70,7 @@ class LensErrors(NamedTuple):
     stretch: float  # how many times as far from the center a node is looked up at most
     slope: float  # of the flow from node to node, px per px
     bend: float  # of the flow: its second derivatives along both axes, together, px per px^2
+    third: float  # likewise, px per px^3
 
 
 def moved_by_terms(boxes: Sequence[LensRanges], lattice: Lattice) -> tuple[float, ...] | None:
@@ -119,13 +121,14 @@ def lens_errors(boxes: tuple[LensRanges, ...], lattice: Lattice) -> LensErrors |
     if found is None:
         return None
     largest = (torch.cat(both, dim=-1).amax(dim=-1) for both in zip(first, found, strict=True))
-    cubic, newton, stretch, slope, bend = largest
+    cubic, newton, stretch, slope, bend, third = largest
     return LensErrors(
         _MARGIN * cubic.item(),
         tuple((_MARGIN * newton).tolist()),
         stretch.item(),
         _MARGIN * slope.item(),
         _MARGIN * bend.item(),
+        _MARGIN * third.item(),
     )
 
 
@@ -164,8 +167,8 @@ def _measured(lenses: _Lenses, lattice: Lattice, cells: int) -> tuple[Tensor, ..
     ]
     flow = torch.stack([(found_x - x) * focal[:, 0], (found_y - y) * focal[:, 1]])
     stretch = torch.hypot(found_x, found_y) / torch.hypot(x, y).clamp(min=1e-9)
-    cubic, slope, bend = cubic_errors(flow, lattice.stride)
-    return cubic, torch.stack(newton), stretch.amax(dim=1), slope, bend
+    cubic, *derivatives = cubic_errors(flow, lattice.stride)
+    return cubic, torch.stack(newton), stretch.amax(dim=1), *derivatives
 
 
 def _solve(x: Tensor, y: Tensor, c: Tensor) -> list[tuple[Tensor, Tensor]] | None:
@@ -194,10 +197,10 @@ def lines_of_cells(lattice: Lattice, most: int) -> Tensor:
     return lattice.stride * at.movedim(2, 0).flatten(1)[None]
 
 
-def cubic_errors(flow: Tensor, stride: int) -> tuple[Tensor, Tensor, Tensor]:
-    """How far flows between nodes are off, and their largest slopes along an axis and bends, of N lenses, (N,).
+def cubic_errors(flow: Tensor, stride: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """How far flows between nodes are off, and their largest slopes, bends and thirds, of N lenses, (N,).
 
-    In px, px per px and px per px^2, as in `LensErrors`.
+    In px, px per px, px per px^2 and px per px^3, as in `LensErrors`.
 
     Args:
         flow: (2, N, cells 2 5), px, at the places of `lines_of_cells`.
@@ -208,8 +211,8 @@ def cubic_errors(flow: Tensor, stride: int) -> tuple[Tensor, Tensor, Tensor]:
     # What is missed along y has gone through cubics along x.
     missed = (along_x + 5 / 4 * along_y).amax(dim=1)
     slopes = torch.hypot(*torch.diff(lines, dim=4)) / (stride * torch.diff(flow.new_tensor(_LINE)))
-    bends = torch.hypot(*(lines @ flow.new_tensor(_BENT))).sum(dim=2).amax(dim=1) / stride**2
-    return missed, slopes.flatten(1).amax(dim=1), bends
+    bends, thirds = (torch.hypot(*(lines @ flow.new_tensor(by))).sum(dim=2).amax(dim=1) for by in (_BENT, _TWISTED))
+    return missed, slopes.flatten(1).amax(dim=1), bends / stride**2, thirds / stride**3
 
 
 def _radius(ranges: LensRanges, lattice: Lattice) -> float:

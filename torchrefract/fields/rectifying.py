@@ -124,9 +124,9 @@ def rectification_errors(camera: Camera, lattice: Lattice) -> LensErrors | None:
     x_d, y_d, exists = image_of(x, y, torch.ones_like(x), columns(c, camera.model), camera.model, radius)
     if not exists.all():
         return None
-    off, slope, bend = cubic_errors(torch.stack([(x_d - x) * focal[:, 0], (y_d - y) * focal[:, 1]]), lattice.stride)
+    off, *derivatives = cubic_errors(torch.stack([(x_d - x) * focal[:, 0], (y_d - y) * focal[:, 1]]), lattice.stride)
     stretch = torch.hypot(x_d, y_d) / torch.hypot(x, y).clamp(min=1e-9)
-    return LensErrors(_MARGIN * off.item(), (), stretch.max().item(), _MARGIN * slope.item(), _MARGIN * bend.item())
+    return LensErrors(_MARGIN * off.item(), (), stretch.max().item(), *(_MARGIN * each.item() for each in derivatives))
 
 
 def _pixels(like: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:

@@ -1,103 +1,69 @@
 """Warps in a row: what the earlier ones add where a later one looks."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract import _compiled as compiled
 from torchrefract._checks import learns
 from torchrefract._constants import constant
 from torchrefract._threads import share
-from torchrefract.warping.grid import FAR, finite
+from torchrefract.warping.grid import FAR, finite, pixel_axes, sampler_axes
 from torchrefract.warping.grid_sample import by_grid_sample
-from torchrefract.warping.lattice import FARTHEST, SmoothFlow, once
+from torchrefract.warping.lattice import FARTHEST, Lines, SmoothFlow, StreamFlow, lagrange_weights, once
+
+# A flow that is read: known at every pixel, (B, 2, H, W), px, lines between, or on a lattice, cubics between.
+Read = Tensor | SmoothFlow
+Size = tuple[int, int]
+Reading = tuple[np.ndarray, np.ndarray, np.ndarray, Size]
+_WIDEST = 32  # nodes in a row that kernels read together
 
 
-@dataclass(frozen=True)
-class Reading:
-    """A flow as others read it: known every few px, bilinear between, outside of the frame as at its border."""
+def followed(flow: Read, grid: Tensor) -> Tensor:
+    """(B, n, m, 2): the grid, where F.grid_sample(align_corners=False) looks, moved by the flow that is there.
 
-    values: Tensor  # (B, 2, n, m), px, at so many px from one another, from the first row and column on
-    every: int  # px
-    size: tuple[int, int]  # px, height and width of the frame
-    far: float  # where sums lie within, in the sampler's coordinates
+    Outside of the frame a flow is as at its border. One on a lattice is read at its pixels, with lines between.
+    """
+    values = _at_pixels(flow).to(grid.dtype)
+    if len(values) != len(grid):  # F.grid_sample raises, too; a kernel would read what is not there
+        raise ValueError(f"grid must have a row for each of {len(values)} flows, got {len(grid)}")
+    size, far = (values.shape[2], values.shape[3]), _far(flow)
+    if learns((values, grid)) or grid.shape[1] * grid.shape[2] < compiled.SMALLEST or compiled.obstacle(values, grid):
+        return _moved(grid, _at(values, grid), size=size, far=far)
+    before = grid.movedim(-1, 1).contiguous()
+    out = torch.empty_like(before)
+    readings = of_readings([values], [0], far=[far], size=size)
+    work, into = partial(compiled.kernels("warping.kernels.following").follow, before.numpy(), *readings), out.numpy()
+    lines, columns = grid.shape[1:3]
+    share(lambda start, stop: work(start, stop, into), len(grid) * lines, least=compiled.SMALLEST // columns + 1)
+    return out.movedim(1, -1)
 
-    @classmethod
-    def of(cls, flow: Tensor | SmoothFlow) -> "Reading":
-        """That of a flow (B, 2, H, W), px; one that is not on a lattice is known at every pixel."""
-        if isinstance(flow, Tensor):
-            flow = flow if flow[:1].is_contiguous() else flow.contiguous()
-            return cls(flow, 1, (flow.shape[2], flow.shape[3]), FAR)
-        return cls(once(flow, lambda own: own.read()), flow.every, flow.lattice[:2], FARTHEST)
 
-    def to(self, dtype: torch.dtype) -> "Reading":
-        """The same in a type."""
-        return replace(self, values=self.values.to(dtype))
+class Trail(NamedTuple):
+    """What kernels are told of flows in a row; `warping.kernels.composed` says what it is."""
 
-    def addresses(self) -> list[int]:
-        """Where the values of each row begin."""
-        values = self.values
-        if not values[:1].is_contiguous():
-            raise ValueError(f"values must have the planes of a row one after the other, got strides {values.stride()}")
-        apart = values.stride(0) * values.element_size()
-        return [values.data_ptr() + i * apart for i in range(len(values))]
-
-    def followed(self, grid: Tensor) -> Tensor:
-        """(B, n, m, 2): the grid, where F.grid_sample(align_corners=False) looks, moved by the flow that is there."""
-        own = self.to(grid.dtype)
-        if len(own.values) != len(grid):  # F.grid_sample raises, too; a kernel would read what is not there
-            raise ValueError(f"grid must have a row for each of {len(own.values)} flows, got {len(grid)}")
-        large = grid.shape[1] * grid.shape[2] >= compiled.SMALLEST and not learns((own.values, grid))
-        return (
-            own._filled(grid)
-            if large and compiled.obstacle(own.values, grid) is None
-            else own.moved(grid, own.at(grid))
-        )
-
-    def _filled(self, grid: Tensor) -> Tensor:
-        """The same by a kernel."""
-        before = grid.movedim(-1, 1).contiguous()
-        out = torch.empty_like(before)
-        kernel, into = compiled.kernels("warping.kernels.look_up").follow, out.numpy()
-        work = partial(kernel, before.numpy(), *of_readings((self,), self.size))
-        lines, columns = grid.shape[1:3]
-        share(lambda start, stop: work(start, stop, into), len(grid) * lines, least=compiled.SMALLEST // columns + 1)
-        return out.movedim(1, -1)
-
-    def at(self, grid: Tensor) -> Tensor:
-        """(B, 2, n, m), px: what is read along a grid."""
-        return by_grid_sample(self.values, self._places(grid), padding="border", interpolation="bilinear")
-
-    def moved(self, grid: Tensor, by: Tensor) -> Tensor:
-        """The grid, moved by so many px, (B, 2, n, m)."""
-        height, width = self.size
-        scale = constant((2 / width, 2 / height), dtype=grid.dtype, device=grid.device)
-        both = torch.addcmul(grid, by.movedim(1, -1), scale)
-        return both if self.far == FARTHEST else finite(both, self.far)
-
-    def _places(self, grid: Tensor) -> Tensor:
-        """The grid in the coordinates of the values."""
-        if self.every == 1:
-            return grid
-        along = zip(grid.unbind(-1), self.size[::-1], self.values.shape[:1:-1], strict=True)
-        places = (
-            (2 / self.every * ((at + 1) * (size / 2) - 0.5).clamp(0, size - 1) + 1) / count - 1
-            for at, size, count in along
-        )
-        return torch.stack(list(places), dim=-1)
+    last: tuple[Any, ...]
+    earlier: Reading
+    known: tuple[Any, ...]
+    held: Sequence[tuple[Tensor, int]]  # what is read, for as long as this is kept
 
 
 @dataclass(frozen=True)
 class FollowedFlow:
-    """A smooth flow, and the flows of warps before it that are read where it looks, one after the other."""
+    """A smooth flow, and the flows of warps before it that are read where it looks, one after the other.
+
+    By kernels their composite is known at nodes every `last.every` px, by cubics between; without these, each pixel is
+    followed.
+    """
 
     last: SmoothFlow
-    earlier: tuple[Reading, ...]  # of the same batch; the later ones first
+    earlier: tuple[Read, ...]  # of the same batch; the later ones first
 
     @property
     def dtype(self) -> torch.dtype:
@@ -107,7 +73,7 @@ class FollowedFlow:
     @property
     def requires_grad(self) -> bool:
         """Whether one of the flows has a gradient."""
-        return self.last.requires_grad or any(own.values.requires_grad for own in self.earlier)
+        return self.last.requires_grad or any(own.requires_grad for own in self.earlier)
 
     @property
     def nodes(self) -> Tensor:
@@ -116,36 +82,127 @@ class FollowedFlow:
 
     def detach(self) -> "FollowedFlow":
         """The same without gradients."""
-        earlier = (replace(own, values=own.values.detach()) for own in self.earlier)
-        return FollowedFlow(self.last.detach(), tuple(earlier))
+        return FollowedFlow(self.last.detach(), tuple(own.detach() for own in self.earlier))
 
     def rows(self, index: Tensor) -> "FollowedFlow":
         """Some rows of the batch."""
-        earlier = (replace(own, values=own.values[index]) for own in self.earlier)
+        earlier = (own[index] if isinstance(own, Tensor) else own.rows(index) for own in self.earlier)
         return FollowedFlow(self.last.rows(index), tuple(earlier))
 
     def dense(self) -> Tensor:
-        """(B, 2, H, W), px: the last flow, and what is read of the others where they are read for a look-up."""
-        grid, total = self.last.sampler_grid(self.dtype), self.last.dense()
-        for own in self.earlier:
-            read = own.at(grid)
-            grid, total = own.moved(grid, read), total + read
-        return total
+        """(B, 2, H, W), px: where it is looked up, less where the pixels are."""
+        height, width = self.last.lattice[:2]
+        grid = self.sampler_grid(self.dtype).movedim(-1, 1)
+        x, y = sampler_axes(
+            *pixel_axes(height, width, dtype=grid.dtype, device=grid.device), height=height, width=width
+        )
+        u, v = grid.split(1, dim=1)
+        return torch.cat([(u - x) * (width / 2), (v - y) * (height / 2)], dim=1)
 
     def sampler_grid(self, dtype: torch.dtype) -> Tensor:
         """(B, H, W, 2): where F.grid_sample(align_corners=False) looks."""
+        height, width = self.last.lattice[:2]
+        values = (self.last.nodes, *(own if isinstance(own, Tensor) else own.nodes for own in self.earlier))
+        if dtype is torch.float32 and height * width >= compiled.SMALLEST and not compiled.obstacle(*values):
+            return self._filled()
         grid = self.last.sampler_grid(dtype)
         for own in self.earlier:
-            grid = own.followed(grid)
+            grid = followed(own, grid)
         return grid
 
+    def _filled(self) -> Tensor:
+        """The same by a kernel."""
+        height, width = self.last.lattice[:2]
+        out = self.last.nodes.new_empty(len(self.last.nodes), 2, height, width)
+        work, into = partial(compiled.kernels("warping.kernels.composed").positions, *self.trail[:3]), out.numpy()
+        share(lambda start, stop: work(start, stop, into), len(out) * height, least=compiled.SMALLEST // width + 1)
+        return out.movedim(1, -1)
 
-def of_readings(readings: Sequence[Reading], size: tuple[int, int]) -> tuple[Any, ...]:
+    @cached_property
+    def trail(self) -> Trail:
+        """What kernels are told."""
+        values, flows = compiled.of_batch(self.last.nodes)
+        lines = self.last.with_nodes(values).lines(values.dtype)
+        size, far = self.last.lattice[:2], [_far(own) for own in self.earlier]
+        held = [_in_memory(own) if self.last.every > 1 else (_at_pixels(own), 0) for own in self.earlier]
+        earlier = of_readings(*zip(*held, strict=True), far=far, size=size)
+        return Trail(of_lines(lines, flows), earlier, self._known(lines, flows, earlier), held)
+
+    def _known(self, lines: Lines, flows: np.ndarray, earlier: Reading) -> tuple[Any, ...]:
+        """Nodes of the composite."""
+        px, (height, width) = self.last.every, self.last.lattice[:2]
+        rows, columns = ((height - 1) // px + 1, (width - 1) // px + 1) if px > 1 else (0, 0)
+        out, spans = np.empty((len(flows), 2, rows, columns), np.float32), np.empty((len(flows), rows, 2), np.int64)
+        if px == 1:
+            return out, spans, np.empty((4, 0), np.float32)
+        x = None if lines.x is None else lines.x[::px]
+        last = of_lines(lines._replace(values=lines.values[..., ::px], x=x), flows)
+        work = partial(compiled.kernels("warping.kernels.composed").compose, last, earlier, px)
+        share(lambda start, stop: work(start, stop, out, spans), len(out) * rows, least=compiled.SMALLEST // width + 1)
+        weight = lagrange_weights(px, 4, dtype=torch.float32, device=torch.device("cpu")).numpy()
+        return out, spans, np.ascontiguousarray(weight.T)
+
+
+def of_lines(lines: Lines, flows: np.ndarray) -> tuple[Any, ...]:
+    """As kernels have them, with the flow of each row."""
+    values, weight = lines.values.contiguous(), lines.weight.contiguous()
+    x = values.new_zeros(values.shape[3]) if lines.x is None else lines.x.contiguous()
+    y = values.new_zeros(lines.height) if lines.y is None else lines.y
+    return values.numpy(), flows, weight.numpy(), x.numpy(), y.numpy()
+
+
+def of_readings(flows: Sequence[Tensor], strides: Sequence[int], *, far: Sequence[float], size: Size) -> Reading:
     """Where the flows of each row lie in memory, (B, k), and what else `follow_row` is told of them.
 
-    Who calls keeps the readings for as long as they are read.
+    Who calls keeps the flows for as long as they are read.
+
+    Args:
+        flows: (B, 2, n, m), px, at every pixel or at nodes.
+        strides: px, of the nodes; 0 for every pixel.
+        far: where sums lie within, in the sampler's coordinates.
+        size: px, height and width of the frame.
     """
-    flows = np.array([own.addresses() for own in readings], np.uint64)
-    table = np.array([(*own.values.shape[2:], own.every) for own in readings])
-    far = np.array([own.far for own in readings], np.float32)
-    return flows.T.copy(), table, far, size
+    addresses = np.array([_addresses(values) for values in flows], np.uint64)
+    table = np.array([(*values.shape[2:], stride) for values, stride in zip(flows, strides, strict=True)])
+    return addresses.T.copy(), table, np.array(far, np.float32), size
+
+
+def _addresses(values: Tensor) -> list[int]:
+    """Where the values of each row begin."""
+    if not values[:1].is_contiguous():
+        raise ValueError(f"values must have the planes of a row one after the other, got strides {values.stride()}")
+    apart = values.stride(0) * values.element_size()
+    return [values.data_ptr() + i * apart for i in range(len(values))]
+
+
+def _at_pixels(flow: Read) -> Tensor:
+    if isinstance(flow, SmoothFlow):
+        return once(flow, lambda own: own.dense())
+    return flow if flow[:1].is_contiguous() else flow.contiguous()
+
+
+def _in_memory(flow: Read) -> tuple[Tensor, int]:
+    """What kernels read of a flow, and the stride of its nodes, 0 for pixels."""
+    if not isinstance(flow, SmoothFlow) or isinstance(flow, StreamFlow):
+        return _at_pixels(flow), 0
+    few = max(0, _WIDEST - flow.nodes.shape[3])
+    return once(flow, lambda own: F.pad(own.nodes, (0, few)).contiguous()), flow.lattice.stride
+
+
+def _far(flow: Read) -> float:
+    """Where a sum with it lies within, in the sampler's coordinates."""
+    return FARTHEST if isinstance(flow, SmoothFlow) else FAR
+
+
+def _at(values: Tensor, grid: Tensor) -> Tensor:
+    """(B, 2, n, m), px: what is read along a grid of a flow at every pixel."""
+    return by_grid_sample(values, grid, padding="border", interpolation="bilinear")
+
+
+def _moved(grid: Tensor, by: Tensor, *, size: Size, far: float) -> Tensor:
+    """The grid, moved by so many px, (B, 2, n, m)."""
+    height, width = size
+    both = torch.addcmul(
+        grid, by.movedim(1, -1), constant((2 / width, 2 / height), dtype=grid.dtype, device=grid.device)
+    )
+    return both if far == FARTHEST else finite(both, far)

@@ -11,10 +11,10 @@ from torch import Tensor
 from torchrefract import _compiled as compiled
 from torchrefract._checks import learns, withheld
 from torchrefract._threads import share
-from torchrefract.warping.followed import FollowedFlow, of_readings
+from torchrefract.warping.followed import FollowedFlow, of_lines
 from torchrefract.warping.grid import FAR, Positions, pixel_axes, sampler_axes
 from torchrefract.warping.grid_sample import PADDINGS, by_grid_sample, gradients_by_grid_sample
-from torchrefract.warping.lattice import Lines, SmoothFlow
+from torchrefract.warping.lattice import SmoothFlow
 from torchrefract.warping.layout import is_channels_last
 from torchrefract.warping.mixed import Flow, MixedFlow, PartFlow, grid_of, known
 
@@ -121,22 +121,14 @@ def _kernel(images: _Images, rows: Tensor, flow: PartFlow | Positions, padding: 
 
 def _along(flow: PartFlow | Positions, rows: int) -> tuple[str, tuple[Any, ...]]:
     """How kernels are called that look along a flow of so many rows, and with what."""
+    if isinstance(flow, FollowedFlow) and len(flow.nodes) == rows:
+        return "followed", flow.trail[:3]
     values, flows = compiled.of_batch(flow.grid.movedim(-1, 1) if isinstance(flow, Positions) else known(flow))
     if len(flows) != rows:  # F.grid_sample raises, too; a kernel would read what is not there
         raise ValueError(f"flow must have a row for each of {rows} images, got {len(flows)}")
     if isinstance(flow, SmoothFlow):
-        return "lattice", _of_lines(flow.with_nodes(values).lines(values.dtype), flows)
-    if isinstance(flow, FollowedFlow):
-        lines = _of_lines(flow.last.with_nodes(values).lines(values.dtype), flows)
-        return "followed", (*lines, *of_readings(flow.earlier, flow.last.lattice[:2]))
+        return "lattice", of_lines(flow.with_nodes(values).lines(values.dtype), flows)
     return "dense", _of_pixels(values, flows, whole=isinstance(flow, Positions))
-
-
-def _of_lines(lines: Lines, flows: np.ndarray) -> tuple[Any, ...]:
-    values, weight = lines.values.contiguous(), lines.weight.contiguous()
-    x = values.new_zeros(values.shape[3]) if lines.x is None else lines.x
-    y = values.new_zeros(lines.height) if lines.y is None else lines.y
-    return values.numpy(), flows, weight.numpy(), x.numpy(), y.numpy()
 
 
 def _of_pixels(values: Tensor, flows: np.ndarray, *, whole: bool) -> tuple[Any, ...]:

@@ -1,6 +1,5 @@
 """Smooth flows on a coarse lattice, and what lies between its nodes."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -120,7 +119,7 @@ class SmoothFlow:
 
     nodes: Tensor  # (B, 2, n, m), px
     lattice: Lattice
-    every: int = 1  # px, at which others that read it know it
+    every: int = 1  # px, between nodes that a composite which ends with it may be known at
 
     @property
     def dtype(self) -> torch.dtype:
@@ -147,17 +146,6 @@ class SmoothFlow:
     def dense(self) -> Tensor:
         """(B, 2, H, W), px."""
         return between_nodes(self.nodes, self.lattice)
-
-    def read(self) -> Tensor:
-        """(B, 2, n, m), px: every so many px, from the first row and column to the last of the frame or behind it."""
-        if self.every == 1:
-            return self.dense()
-        px, step = self.every, math.gcd(self.every, self.lattice.stride)
-        weight = _cubics(self.nodes, self.lattice)[::step]
-        rows, columns = ((-(-(size - 1) // px) * px) // step + 1 for size in self.lattice[:2])
-        # One behind the frame may lie on a node, in a cell of which nothing else counts.
-        found = _down(_across(F.pad(self.nodes, (0, 1, 0, 1), mode="replicate"), weight, columns), weight, rows)
-        return found[:, :, :: px // step, :: px // step].contiguous()
 
     def sampler_grid(self, dtype: torch.dtype) -> Tensor:
         """(B, H, W, 2): where F.grid_sample(align_corners=False) looks; no flow of that size is written."""

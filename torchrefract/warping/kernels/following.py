@@ -1,16 +1,17 @@
 """What numba compiles: where earlier warps lead the pixels of a row that a later one has moved.
 
-Their flows are known every few px, bilinear between, and outside of the frame as at its border. Of each it is told at
-what address its two planes begin, how many rows and columns they have, and how many px these are apart. All numbers are
-float32.
+Their flows are known at the nodes of a lattice, one of them before the frame, by cubics between; or at every pixel, by
+lines between; and outside of the frame as at its border. Of each it is told at what address its two planes begin, how
+many rows and columns they have, and how many px the nodes are apart, 0 for pixels. All numbers are float32.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrefract._jit import floats_at, inlined
+from torchrefract._jit import floats_at, inlined, jit
 from torchrefract._lanes import LANES
 from torchrefract.warping.kernels.pixels import Cells, Floats, Frame, Whole
+from torchrefract.warping.kernels.places import room
 
 if LANES:
     from torchrefract.warping.kernels.following_groups import follow_one
@@ -35,8 +36,29 @@ def follow_row(
 
     flows, (k,), and table, (k, 3): see above; what is read first comes first.
     far: (k,), within which sums lie, and where also lies what is no number.
-    more: (4, W), to work in.
+    more: (4, W or more), to work in.
     """
     for k in range(table.shape[0]):
         flow = floats_at(flows[k], 2 * table[k, 0] * table[k, 1])
         follow_one(x, y, flow, table[k], far[k], frame, cells, more)
+
+
+@jit
+def follow(
+    grid: Floats,
+    addresses: Addresses,
+    table: Whole,
+    far: Floats,
+    frame: Frame,
+    start: int,
+    stop: int,
+    out: Floats,
+) -> None:
+    """Rows of out, (B, 2, n, m): where flows lead a grid's positions, as for `follow_row`, with addresses (B, k)."""
+    lines, columns = grid.shape[2:]
+    cells, more = room(), np.empty((4, columns), np.float32)
+    for row in range(start, stop):
+        i, line = divmod(row, lines)
+        x, y = out[i, 0, line], out[i, 1, line]
+        x[:], y[:] = grid[i, 0, line], grid[i, 1, line]
+        follow_row(x, y, addresses[i], table, far, frame, cells, more)

@@ -13,6 +13,7 @@ from torchrefract.warping.kernels.pixels import Cells, Floats, Frame, Number, Wh
 
 Lanes = Any
 Read = tuple[bool, Lanes, Lanes]
+Four = tuple[Lanes, Lanes, Lanes, Lanes]
 
 
 @inlined
@@ -27,32 +28,35 @@ def follow_one(
     more: Floats,
 ) -> None:
     """As `following_pixels.follow_one`."""
-    rows, columns, every = place
+    rows, columns, stride = place
     if x.size < LANES or columns < 2 * LANES:
         following_pixels.follow_one(x, y, flow, place, far, frame, cells, more)
         return
-    more[2], more[3] = x, y
+    before_x, before_y = more[2, : x.size], more[3, : x.size]
+    before_x[:], before_y[:] = x, y
     for first in range(0, x.size, LANES):
         start = min(first, x.size - LANES)  # the last group does again what the one before it did
-        at_x, at_y = lanes.load(more[2], np.uintp(start)), lanes.load(more[3], np.uintp(start))
-        place_x, place_y = _to_pixels(at_x, frame[1], every), _to_pixels(at_y, frame[0], every)
-        known, u, v = _read(flow, rows, columns, place_x, place_y)
+        at_x, at_y = lanes.load(before_x, np.uintp(start)), lanes.load(before_y, np.uintp(start))
+        place_x, place_y = _to_pixels(at_x, frame[1]), _to_pixels(at_y, frame[0])
+        if stride:
+            known, u, v = _between(flow, rows, columns, stride, place_x, place_y)
+        else:
+            known, u, v = _read(flow, rows, columns, place_x, place_y)
         if not known:
             lanes.store(more[0], np.uintp(start), place_x)
             lanes.store(more[1], np.uintp(start), place_y)
-            _read_apart(flow, rows, columns, start, cells, more, x, y)
+            _read_apart(flow, place, start, cells, more, x, y)
             u, v = lanes.load(x, np.uintp(start)), lanes.load(y, np.uintp(start))
         lanes.store(x, np.uintp(start), _moved(at_x, u, frame[1], far))
         lanes.store(y, np.uintp(start), _moved(at_y, v, frame[0], far))
 
 
 @inlined
-def _to_pixels(place: Lanes, size: int, every: int) -> Lanes:
-    """From the sampler's coordinates to those of what is known every few px, on a frame of so many pixels."""
+def _to_pixels(place: Lanes, size: int) -> Lanes:
+    """From the sampler's coordinates to px, on a frame of so many."""
     one, scale = lanes.all_floats(np.float32(1)), lanes.all_floats(np.float32(size / 2))
     at = lanes.fma(lanes.total(place, one), scale, lanes.all_floats(np.float32(-0.5)))
-    at = lanes.lower(lanes.higher(at, lanes.all_floats(np.float32(0))), lanes.all_floats(np.float32(size - 1)))
-    return lanes.product(at, lanes.all_floats(np.float32(1 / every)))
+    return lanes.lower(lanes.higher(at, lanes.all_floats(np.float32(0))), lanes.all_floats(np.float32(size - 1)))
 
 
 @inlined
@@ -107,10 +111,76 @@ def _added(total: Lanes, flow: Floats, at: int, column: Lanes, behind: Lanes, at
 
 
 @inlined
-def _read_apart(
-    flow: Floats, rows: int, columns: int, start: int, cells: Cells, more: Floats, u: Floats, v: Floats
-) -> None:
+def _between(flow: Floats, rows: int, columns: int, stride: int, x: Lanes, y: Lanes) -> Read:
+    """The same, by cubics between nodes every `stride` px."""
+    share = lanes.all_floats(np.float32(1 / stride))
+    x, y = lanes.product(x, share), lanes.product(y, share)
+    left, top = lanes.floor(x), lanes.floor(y)
+    column, row = lanes.to_wholes(left), lanes.to_wholes(top)
+    near = min(lanes.first(column), lanes.last(column)) - BEFORE
+    at = max(0, min(near, columns - 2 * LANES))
+    column = lanes.minus(column, lanes.all_wholes(np.int32(at)))
+    zero = lanes.all_floats(np.float32(0))
+    u = v = zero
+    if not lanes.everywhere(lanes.below(column, lanes.all_wholes(np.int32(2 * LANES - 3)))):
+        return False, u, v
+    first, last = lanes.smallest(row), min(rows, lanes.largest(row) + 4)
+    if last - first > MOST_ROWS:
+        return False, u, v
+    across, down = _cubic_weights(lanes.difference(x, left)), _cubic_weights(lanes.difference(y, top))
+    one = lanes.all_wholes(np.int32(1))
+    second = lanes.plus(column, one)
+    third = lanes.plus(second, one)
+    places = column, second, third, lanes.plus(third, one)
+    at += first * columns
+    for line in range(first, last):
+        behind = lanes.minus(lanes.all_wholes(np.int32(line)), row)
+        weight = lanes.where(lanes.equal(behind, lanes.all_wholes(np.int32(0))), down[0], zero)
+        weight = lanes.where(lanes.equal(behind, one), down[1], weight)
+        weight = lanes.where(lanes.equal(behind, lanes.all_wholes(np.int32(2))), down[2], weight)
+        weight = lanes.where(lanes.equal(behind, lanes.all_wholes(np.int32(3))), down[3], weight)
+        u = lanes.fma(weight, _along(flow, at, places, across), u)
+        v = lanes.fma(weight, _along(flow, at + rows * columns, places, across), v)
+        at += columns
+    return True, u, v
+
+
+@inlined
+def _along(flow: Floats, at: int, places: Four, weights: Four) -> Lanes:
+    low, high = lanes.load(flow, np.uintp(at)), lanes.load(flow, np.uintp(at + LANES))
+    total = lanes.product(weights[0], lanes.pick(low, high, places[0]))
+    total = lanes.fma(weights[1], lanes.pick(low, high, places[1]), total)
+    total = lanes.fma(weights[2], lanes.pick(low, high, places[2]), total)
+    return lanes.fma(weights[3], lanes.pick(low, high, places[3]), total)
+
+
+@inlined
+def _cubic_weights(t: Lanes) -> Four:
+    """As `following_pixels.cubic_weights`."""
+    one = lanes.all_floats(np.float32(1))
+    before, behind = lanes.total(t, one), lanes.difference(t, one)
+    last = lanes.difference(t, lanes.all_floats(np.float32(2)))
+    inner = lanes.product(lanes.all_floats(np.float32(0.5)), lanes.product(before, last))
+    outer = lanes.product(lanes.all_floats(np.float32(1 / 6)), lanes.product(t, behind))
+    minus = lanes.all_floats(np.float32(-1))
+    negative = lanes.product(minus, outer), lanes.product(minus, inner)
+    return (
+        lanes.product(negative[0], last),
+        lanes.product(inner, behind),
+        lanes.product(negative[1], t),
+        lanes.product(outer, before),
+    )
+
+
+@inlined
+def _read_apart(flow: Floats, place: Whole, start: int, cells: Cells, more: Floats, u: Floats, v: Floats) -> None:
     """The same one pixel after the other, at positions more[:2] from `start` on."""
-    size, plane = (1, rows, columns, 1), rows * columns
+    rows, columns, stride = place
+    plane = rows * columns
+    if stride:
+        for k in range(start, start + LANES):
+            u[k], v[k] = following_pixels.between(flow, rows, columns, stride, more[0, k], more[1, k])
+        return
+    size = (1, rows, columns, 1)
     pixels.read_part(flow[:plane], size, more[0], more[1], start, start + LANES, cells, (0, 0, 0), u)
     pixels.read_part(flow[plane:], size, more[0], more[1], start, start + LANES, cells, (0, 0, 0), v)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchrefract._jit import inlined
+from torchrefract._jit import fma, inlined
 from torchrefract.warping.kernels.pixels import (
     BORDER,
     Cells,
@@ -14,6 +14,9 @@ from torchrefract.warping.kernels.pixels import (
     to_pixels,
 )
 from torchrefract.warping.kernels.places import within
+
+Four = tuple[Number, Number, Number, Number]
+_ONE, _TWO, _HALF, _SIXTH = np.float32(1), np.float32(2), np.float32(0.5), np.float32(1 / 6)
 
 
 @inlined
@@ -28,16 +31,47 @@ def follow_one(
     more: Floats,
 ) -> None:
     """As `following.follow_row` with one flow: its two planes, (2 n m,), and its row of the table."""
-    rows, columns, every = place
-    more[0], more[1] = x, y
-    to_pixels(more[0], frame[1], BORDER)
-    to_pixels(more[1], frame[0], BORDER)
-    share, found = np.float32(1 / every), more[2:].reshape(2 * x.size)
-    for i in range(x.size):
-        more[0, i] *= share
-        more[1, i] *= share
-    read_row(flow, (2, rows, columns, 1), more[0], more[1], cells, (rows * columns, x.size, 0), found)
+    rows, columns, stride = place
+    at_x, at_y, found = more[0, : x.size], more[1, : x.size], more[2:].reshape(-1)
+    at_x[:], at_y[:] = x, y
+    to_pixels(at_x, frame[1], BORDER)
+    to_pixels(at_y, frame[0], BORDER)
+    if stride:
+        for i in range(x.size):
+            found[i], found[x.size + i] = between(flow, rows, columns, stride, at_x[i], at_y[i])
+    else:
+        read_row(flow, (2, rows, columns, 1), at_x, at_y, cells, (rows * columns, x.size, 0), found)
     scale_x, scale_y = np.float32(2 / frame[1]), np.float32(2 / frame[0])
     for i in range(x.size):
         x[i] = within(x[i] + found[i] * scale_x, far)
         y[i] = within(y[i] + found[x.size + i] * scale_y, far)
+
+
+@inlined
+def between(flow: Floats, rows: int, columns: int, stride: int, x: Number, y: Number) -> tuple[Number, Number]:
+    """Both planes at a pixel of the frame, by cubics between nodes every `stride` px."""
+    x, y = x * np.float32(1 / stride), y * np.float32(1 / stride)
+    left, top = np.floor(x), np.floor(y)
+    across, down = cubic_weights(x - left), cubic_weights(y - top)
+    at = min(int(top), rows - 4) * columns + min(int(left), columns - 4)
+    u = v = np.float32(0)
+    for line in range(4):
+        u = fma(down[line], _along(flow, at, across), u)
+        v = fma(down[line], _along(flow, at + rows * columns, across), v)
+        at += columns
+    return u, v
+
+
+@inlined
+def _along(flow: Floats, at: int, weights: Four) -> Number:
+    here = np.uintp(at)
+    total = fma(weights[1], flow[here + np.uintp(1)], weights[0] * flow[here])
+    return fma(weights[3], flow[here + np.uintp(3)], fma(weights[2], flow[here + np.uintp(2)], total))
+
+
+@inlined
+def cubic_weights(t: Number) -> Four:
+    """Of the nodes at -1, 0, 1 and 2 for a place t, of the cubic through them."""
+    before, behind, last = t + _ONE, t - _ONE, t - _TWO
+    inner, outer = _HALF * (before * last), _SIXTH * (t * behind)
+    return -outer * last, inner * behind, -inner * t, outer * before

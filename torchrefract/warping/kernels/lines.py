@@ -41,14 +41,15 @@ def down(lines: Floats, weight: Floats, start: int, stop: int, out: Floats) -> N
 
 
 @jit
-def between(lines: Floats, weight: Floats, line: int, out: Floats) -> None:
-    """One row of pixels, (W,), of lines (n, W), by the weights (stride, taps) of its place in its cell."""
+def between(lines: Floats, weight: Floats, line: int, out: Floats, first: int = 0) -> None:
+    """A row of pixels, (m,), from the `first` on, of lines (n, W), by the weights (stride, taps) of its place."""
     cell, place = divmod(line, weight.shape[0])
-    taps = weight[place]
+    taps, last = weight[place], first + out.size
     a, b, c, d = lines[cell], lines[cell + 1], lines[cell + 2], lines[cell + 3]
+    a, b, c, d = a[first:last], b[first:last], c[first:last], d[first:last]
     for i in range(out.size):
         out[i] = fma(taps[3], d[i], fma(taps[2], c[i], fma(taps[1], b[i], taps[0] * a[i])))
     for tap in range(4, taps.size):
-        more = lines[cell + tap]
+        more = lines[cell + tap, first:last]
         for i in range(out.size):
             out[i] = fma(taps[tap], more[i], out[i])

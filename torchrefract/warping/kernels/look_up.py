@@ -12,8 +12,9 @@ import numpy as np
 
 from torchrefract._jit import inlined, jit
 from torchrefract._lanes import LANES
-from torchrefract.warping.kernels.following import Addresses, follow_row
-from torchrefract.warping.kernels.pixels import Cells, Floats, Frame, Number, Size, Values, Whole, to_pixels
+from torchrefract.warping.kernels.across import GROUP
+from torchrefract.warping.kernels.composed import Earlier, Known, Last, along_followed, room_for
+from torchrefract.warping.kernels.pixels import Cells, Floats, Number, Size, Values, Whole, to_pixels
 from torchrefract.warping.kernels.places import along_lattice, along_pixels, room
 
 if LANES:
@@ -81,51 +82,23 @@ def look_up_followed(
     source: Values,
     size: Size,
     images: Whole,
-    lines: Floats,
-    flows: Whole,
-    weight: Floats,
-    base_x: Floats,
-    base_y: Floats,
-    readings: Addresses,
-    table: Whole,
-    far: Floats,
-    frame: Frame,
+    last: Last,
+    earlier: Earlier,
+    known: Known,
     padding: int,
     start: int,
     stop: int,
     out: Values,
 ) -> None:
-    """Look up where flows lead the positions of `look_up_lattice`, as for `follow_row`, with readings (k, flows)."""
-    height, width = base_y.size, base_x.size
-    x, y = np.empty(width, np.float32), np.empty(width, np.float32)
-    cells, more = room(), np.empty((4, width), np.float32)
+    """Look up along positions as for `along_followed`."""
+    width, height = last[3].size, last[4].size
+    space, whole = room_for(known, width), GROUP * -(-width // GROUP)
+    x, y, cells = np.empty(whole, np.float32), np.empty(whole, np.float32), room()
     for row in range(start, stop):
         pair, line = divmod(row, height)
-        image, flow = images[pair], flows[pair]
-        along_lattice(lines[flow], weight, base_x, base_y, line, x, y)
-        follow_row(x, y, readings[pair], table, far, frame, cells, more)
-        _look_up(source[image], size, x, y, padding, cells, out[image], line, height)
-
-
-@jit
-def follow(
-    grid: Floats,
-    readings: Addresses,
-    table: Whole,
-    far: Floats,
-    frame: Frame,
-    start: int,
-    stop: int,
-    out: Floats,
-) -> None:
-    """Rows of out, (B, 2, n, m): where flows lead a grid's positions, as for `follow_row`, with readings (B, k)."""
-    lines, columns = grid.shape[2:]
-    cells, more = room(), np.empty((4, columns), np.float32)
-    for row in range(start, stop):
-        i, line = divmod(row, lines)
-        x, y = out[i, 0, line], out[i, 1, line]
-        x[:], y[:] = grid[i, 0, line], grid[i, 1, line]
-        follow_row(x, y, readings[i], table, far, frame, cells, more)
+        image = images[pair]
+        along_followed(last, earlier, known, pair, line, space, x, y)
+        _look_up(source[image], size, x[:width], y[:width], padding, cells, out[image], line, height)
 
 
 @inlined

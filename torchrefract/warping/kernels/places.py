@@ -9,16 +9,24 @@ from torchrefract.warping.kernels.pixels import CHUNK, Cells, Floats, Number
 
 @inlined
 def along_lattice(
-    lines: Floats, weight: Floats, base_x: Floats, base_y: Floats, line: int, x: Floats, y: Floats
+    lines: Floats,
+    weight: Floats,
+    base_x: Floats,
+    base_y: Floats,
+    line: int,
+    x: Floats,
+    y: Floats,
+    first: int = 0,
 ) -> None:
-    """x and y, (W,), between the nodes of a lattice.
+    """x and y, (m,), from the `first` column on, between the nodes of a lattice.
 
     lines (2, n, W), weight (2, stride, taps): as for `between`; base_x (W,) and base_y (H,) are added.
     """
-    between(lines[0], weight[0], line, x)
-    between(lines[1], weight[1], line, y)
+    between(lines[0], weight[0], line, x, first)
+    between(lines[1], weight[1], line, y, first)
+    beside = base_x[first : first + x.size]
     for k in range(x.size):
-        x[k] += base_x[k]
+        x[k] += beside[k]
         y[k] += base_y[line]
 
 

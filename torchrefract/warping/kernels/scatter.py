@@ -12,7 +12,8 @@ out, (B, P, C H W): the gradients of the images, zeros at first; what each of P 
 import numpy as np
 
 from torchrefract._jit import inlined, jit
-from torchrefract.warping.kernels.following import Addresses, follow_row
+from torchrefract.warping.kernels.across import GROUP
+from torchrefract.warping.kernels.composed import Earlier, Known, Last, along_followed, room_for
 from torchrefract.warping.kernels.pixels import CHUNK, Cells, Floats, Number, Whole, find_cells, to_pixels, weights_at
 from torchrefract.warping.kernels.places import along_lattice, along_pixels, room
 
@@ -51,31 +52,24 @@ def scatter_followed(
     upstream: Floats,
     size: Frame,
     images: Whole,
-    lines: Floats,
-    flows: Whole,
-    weight: Floats,
-    base_x: Floats,
-    base_y: Floats,
-    readings: Addresses,
-    table: Whole,
-    far: Floats,
-    frame: tuple[int, int],
+    last: Last,
+    earlier: Earlier,
+    known: Known,
     padding: int,
     start: int,
     stop: int,
     out: Floats,
 ) -> None:
-    """Of a look-up where flows lead those of `scatter_lattice`, as for `follow_row`, with readings (k, flows)."""
-    height, width, bands = base_y.size, base_x.size, out.shape[1]
-    x, y = np.empty(width, np.float32), np.empty(width, np.float32)
-    cells, more = room(), np.empty((4, width), np.float32)
+    """Of a look-up along positions as for `along_followed`."""
+    width, height, bands = last[3].size, last[4].size, out.shape[1]
+    space, whole = room_for(known, width), GROUP * -(-width // GROUP)
+    x, y, cells = np.empty(whole, np.float32), np.empty(whole, np.float32), room()
     for task in range(start, stop):
         pair, band = divmod(task, bands)
-        image, flow = images[pair], flows[pair]
+        image = images[pair]
         for line in range(height * band // bands, height * (band + 1) // bands):
-            along_lattice(lines[flow], weight, base_x, base_y, line, x, y)
-            follow_row(x, y, readings[pair], table, far, frame, cells, more)
-            _scatter(upstream[image], size, x, y, padding, cells, line, height, out[image, band])
+            along_followed(last, earlier, known, pair, line, space, x, y)
+            _scatter(upstream[image], size, x[:width], y[:width], padding, cells, line, height, out[image, band])
 
 
 @jit

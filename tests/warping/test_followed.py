@@ -32,8 +32,8 @@ def wave(x: Tensor, y: Tensor, seed: int) -> Tensor:
 def waves(seed: int, stride: int, dtype: torch.dtype = torch.float32) -> SmoothFlow:
     """The same on a lattice that it hardly loses anything on."""
     lattice = Lattice(*SIZE, stride)
-    x, y = (place.double() for place in lattice.places(dtype=dtype, device=torch.device("cpu")))
-    return SmoothFlow(wave(*torch.broadcast_tensors(x[0, 0], y[0, 0]), seed)[None].to(dtype), lattice)
+    x, y = lattice.places(dtype=torch.float64, device=torch.device("cpu"))
+    return SmoothFlow(wave(x[0, 0] + 0 * y[0, 0], y[0, 0] + 0 * x[0, 0], seed)[None].to(dtype), lattice)
 
 
 def composite(*seeds: int) -> Tensor:
@@ -100,14 +100,14 @@ def test_frames_of_any_shape_are_followed(every, size, oracle):
 
     def flow(stride: int) -> SmoothFlow:
         lattice = Lattice(*size, stride)
-        nodes = torch.rand(2, 2, *map(len, lattice.axes()), generator=generator)
+        rows, columns = map(len, lattice.axes())
+        nodes = torch.rand(2, 2, rows, columns, generator=generator)
         return SmoothFlow(F.avg_pool2d(nodes, 3, 1, 1), lattice)
 
-    own = FollowedFlow(replace(flow(40), every=every), (flow(50), flow(30)))
-    double = FollowedFlow(
-        own.last.with_nodes(own.last.nodes.double()),
-        tuple(each.with_nodes(each.nodes.double()) for each in own.earlier),
-    )
+    flows = replace(flow(40), every=every), flow(50), flow(30)
+    own = FollowedFlow(flows[0], flows[1:])
+    last, *earlier = (each.with_nodes(each.nodes.double()) for each in flows)
+    double = FollowedFlow(last, tuple(earlier))
     oracle("flows in a row, frames of any shape", own.dense(), double.dense(), 0.02)
 
 

@@ -5,34 +5,22 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._bands import join, rows_at_once
-from torchrefract._checks import learns, or_else
-from torchrefract._constants import constant
+from torchrefract._bands import join
+from torchrefract._checks import learns, or_else, withheld
+from torchrefract._compiled import obstacle
+from torchrefract._constants import constant, kept
+from torchrefract.fields import fog_drawn
+from torchrefract.fields.fog_view import SLICES, View, by_pixel, by_row, keys, view
 from torchrefract.fields.perlin3d import VARIANCE, Rays, deviation_of_mean, noise_on_planes
 
-_CELLS = 48  # between rays, over the longer side of the frame
-_FINER = 2  # times: the lattice in the image that pixels are interpolated from linearly
 _PLANES = 64  # across the axis, on which the field is evaluated
-_SLICES = 48  # of the distance, in which means are kept
 # An octave fades out where rays come to lie so many of its periods apart, or planes as many times as many.
 _SPARSE, _SPARSEST = 0.4, 0.8
 _LONGER = 5.0
 _MOST_CONTRAST = 30.0  # from there on fog is all holes, and its exponentials leave float32
-_CACHED = 1 << 16  # pixels that stay in a core's cache, a few times over
-
-
-class _View(NamedTuple):
-    """Where the rays of the volume go through the frame; there is one more of them beyond each edge."""
-
-    height: int
-    width: int
-    cell: float  # px, between rays
-    down: int  # cells
-    across: int
-    rays: Rays
+_FEWEST = 1 << 12  # pixels of a frame that kernels are asked for; smaller ones are PyTorch's to the last digit
 
 
 class _Fog(NamedTuple):
@@ -72,7 +60,8 @@ def path_mean(
     cubically between rays, linearly between 48 slices of d. What these cannot resolve is missing in g and in its c^2,
     so that E q = 1: an octave fades out where rays come to lie 0.4 to 0.8 of its periods apart or planes 2 to 4, and on
     a plane it deviates as its mean from there to the next would. Perlin noise is bounded, as a Gaussian is not: for
-    four octaves E q is 0.99 at c = 1, and 0.89 at c = 2.
+    four octaves E q is 0.99 at c = 1, and 0.89 at c = 2. By a kernel m is as near to that of real numbers, and not the
+    same in its last digits.
 
     Args:
         key: (N, 4), int64, of `noise_key`.
@@ -97,30 +86,43 @@ def path_mean(
     """
     if not len(key) * height * width:
         return distance.new_ones((len(key), 1, height, width), dtype=dtype)
-    view, distance = _view(height, width, focal, center), distance.to(dtype)
+    own, distance = view(height, width, focal, center), distance.to(dtype)
     fog = _Fog(key, weights, contrast, frame, wind, decorrelation)
+    if _may_be_drawn(fog, distance, pixels=height * width):
+        return _by_kernel(own, fog, distance, scales=scales, reach=reach)
     # The result has its type whatever autocast would make of a matrix product.
     with torch.autocast(key.device.type, enabled=False):
         if torch.compiler.is_compiling() or key.device.type != "cpu" or len(key) == 1:
-            return _path_mean(view, fog, distance, scales=scales, reach=reach)
+            return _path_mean(own, fog, distance, scales=scales, reach=reach)
         # Matrix products of several samples round in another way than those of one.
         each = zip(distance.expand(len(key), -1, -1, -1).split(1), *(value.split(1) for value in fog), strict=True)
-        found = (_path_mean(view, _Fog(*one), d, scales=scales, reach=reach) for d, *one in each)
+        found = (_path_mean(own, _Fog(*one), d, scales=scales, reach=reach) for d, *one in each)
         return join(found, dim=0, length=len(key))
 
 
-def _view(height: int, width: int, focal: tuple[float, float], center: tuple[float, float]) -> _View:
-    longer = max(height, width)
-    cell, down, across = longer / _CELLS, -(-height * _CELLS // longer), -(-width * _CELLS // longer)
-    left, top = ((-0.5 - cell - c) / f for c, f in zip(center, focal, strict=True))
-    rays = Rays(left, cell / focal[0], across + 3, top, cell / focal[1], down + 3)
-    return _View(height, width, cell, down, across, rays)
+def _may_be_drawn(fog: _Fog, distance: Tensor, *, pixels: int) -> bool:
+    """Whether kernels can make the means."""
+    plain = pixels < _FEWEST or learns((distance, *fog)) or obstacle(distance)
+    return not (plain or any(map(withheld, fog)))
 
 
-def _path_mean(view: _View, fog: _Fog, distance: Tensor, *, scales: Sequence[float], reach: float) -> Tensor:
+def _by_kernel(own: View, fog: _Fog, distance: Tensor, *, scales: Sequence[float], reach: float) -> Tensor:
+    planes = _planes(own.rays, tuple(scales), reach, fog.key.device)
+    octaves = _octaves(fog, planes)
+    drawn = fog_drawn.Drawn(fog.key, octaves.amplitude, octaves.half, octaves.moved, octaves.turns)
+    volume = fog_drawn.Volume(own.rays, reach, tuple(scales), planes.counts, _PLANES)
+    if distance.shape[3] == 1:
+        return fog_drawn.by_row(own, drawn, volume, distance)
+    means = fog_drawn.volume_up_to(drawn, volume, distance)
+    each = zip(distance.expand(len(means), -1, -1, -1).split(1), means.split(1), strict=True)
+    found = (by_pixel(own, keys(own.down, one) @ one, d, reach) for d, one in each)
+    return join(found, dim=0, length=len(means))
+
+
+def _path_mean(view: View, fog: _Fog, distance: Tensor, *, scales: Sequence[float], reach: float) -> Tensor:
     volume = _volume(view.rays, fog, scales=scales, reach=reach, dtype=distance.dtype)
-    volume = _keys(view.down, volume) @ volume
-    look_up = _by_row if distance.shape[3] == 1 else _by_pixel
+    volume = keys(view.down, volume) @ volume
+    look_up = by_row if distance.shape[3] == 1 else by_pixel
     return look_up(view, volume, distance, reach)
 
 
@@ -129,40 +131,63 @@ def _volume(rays: Rays, fog: _Fog, *, scales: Sequence[float], reach: float, dty
     excess = _excess(rays, fog, scales=scales, reach=reach, dtype=dtype)
     mean = _quadrature(excess) @ excess.flatten(2)
     x, y = rays.slopes(mean.device)
-    n = torch.arange(_SLICES + 1, dtype=torch.float64, device=mean.device)
+    n = torch.arange(SLICES + 1, dtype=torch.float64, device=mean.device)
     # A ray is longer than its depth, and planes lie at squares.
-    depth = (n * (n + 1) / (_SLICES * (_SLICES + 1)))[:, None] / (1 + x * x + (y * y)[:, None]).sqrt().flatten()
+    depth = (n * (n + 1) / (SLICES * (SLICES + 1)))[:, None] / (1 + x * x + (y * y)[:, None]).sqrt().flatten()
     place = _PLANES * depth.sqrt()
     first = place.long().clamp(max=_PLANES - 1)
     part, index = (place - first).to(dtype), first.expand(len(mean), -1, -1)
     volume = torch.lerp(mean.gather(1, index), mean.gather(1, index + 1), part)
-    return volume.view(-1, _SLICES + 1, rays.rows, rays.columns)
+    return volume.view(-1, SLICES + 1, rays.rows, rays.columns)
+
+
+class _Planes(NamedTuple):
+    """Where the field is evaluated; tensors that nobody writes to."""
+
+    depths: tuple[float, ...]  # m
+    counts: tuple[int, ...]  # of each octave: only so many, the nearest, have it
+    damping: Tensor  # (octaves, planes + 2)
+
+
+@kept
+def _planes(rays: Rays, scales: tuple[float, ...], reach: float, device: torch.device) -> _Planes:
+    depths = tuple(reach * (k / _PLANES) ** 2 for k in range(_PLANES + 2))
+    lengths = [2 * reach * k / _PLANES**2 for k in range(_PLANES + 2)]  # between planes
+    cell = max(rays.step_x, rays.step_y)
+    apart = [max(cell * depth, length / _LONGER) for depth, length in zip(depths, lengths, strict=True)]
+    counts = tuple(sum(one < _SPARSEST * scale for one in apart) for scale in scales)
+    period, apart_m, length_m = (
+        constant(value, dtype=torch.float64, device=device) for value in (scales, apart, lengths)
+    )
+    return _Planes(depths, counts, _damping(apart_m / period[:, None], length_m / period[:, None]))
+
+
+class _Octaves(NamedTuple):
+    """What ln q, a sum of octaves less its half variance, is made of on the planes, in float64."""
+
+    amplitude: Tensor  # (N, octaves, planes + 2)
+    half: Tensor  # (N, planes + 2)
+    moved: Tensor  # (N, 3), m
+    turns: Tensor  # (N,)
+
+
+def _octaves(fog: _Fog, planes: _Planes) -> _Octaves:
+    weights, frame = fog.weights.double(), fog.frame.double()
+    contrast = or_else(fog.contrast.double(), 0.0).clamp(0, _MOST_CONTRAST)
+    share = weights * (contrast / (VARIANCE * weights.square().sum(dim=1)).sqrt())[:, None]
+    amplitude = share[:, :, None] * planes.damping
+    half = VARIANCE / 2 * amplitude.square().sum(dim=1)
+    turns = frame / fog.decorrelation.double() * _pace(contrast.square())
+    return _Octaves(amplitude, half, fog.wind.double() * frame[:, None], turns)
 
 
 def _excess(rays: Rays, fog: _Fog, *, scales: Sequence[float], reach: float, dtype: torch.dtype) -> Tensor:
     """(N, planes + 2, rows, columns): q - 1 on the planes."""
-    depths = [reach * (k / _PLANES) ** 2 for k in range(_PLANES + 2)]
-    lengths = [2 * reach * k / _PLANES**2 for k in range(_PLANES + 2)]  # between planes
-    cell = max(rays.step_x, rays.step_y)
-    apart = [max(cell * depth, length / _LONGER) for depth, length in zip(depths, lengths, strict=True)]
-    weights, frame = fog.weights.double(), fog.frame.double()
-    contrast = or_else(fog.contrast.double(), 0.0).clamp(0, _MOST_CONTRAST)
-    share = weights * (contrast / (VARIANCE * weights.square().sum(dim=1)).sqrt())[:, None]
-    period, apart_m, length_m = (
-        constant(value, dtype=weights.dtype, device=weights.device) for value in (scales, apart, lengths)
-    )
-    amplitude = share[:, :, None] * _damping(apart_m / period[:, None], length_m / period[:, None])
-    noise = noise_on_planes(
-        fog.key,
-        rays,
-        depths,
-        periods=scales,
-        planes=[sum(one < _SPARSEST * scale for one in apart) for scale in scales],
-        amplitude=amplitude.to(dtype),
-        moved=fog.wind.double() * frame[:, None],
-        turns=frame / fog.decorrelation.double() * _pace(contrast.square()),
-    )
-    half = VARIANCE / 2 * amplitude.square().sum(dim=1)
+    planes = _planes(rays, tuple(scales), reach, fog.key.device)
+    amplitude, half, moved, turns = _octaves(fog, planes)
+    motion, amplitude = {"moved": moved, "turns": turns}, amplitude.to(dtype)
+    own = {"periods": scales, "planes": planes.counts, "amplitude": amplitude}
+    noise = noise_on_planes(fog.key, rays, planes.depths, **own, **motion)
     return torch.expm1(noise - half.to(dtype)[:, :, None, None])
 
 
@@ -195,85 +220,3 @@ def _quadrature(like: Tensor) -> Tensor:
     lag = end - k
     weight = (lag >= 1).double() + (lag == 1) / 24 + (lag == 0) / 2 - (lag == -1) / 24 + (lag >= 0) * (k == 1) / 12
     return torch.where(end == 0, (k == 0).double(), 2 * k / end.clamp(min=1).square() * weight).to(like.dtype)
-
-
-def _keys(cells: int, like: Tensor) -> Tensor:
-    """(finer cells + 1, cells + 3): from rays to a finer lattice, by Keys' cubic of a = -1/2."""
-    fine = torch.arange(cells * _FINER + 1, dtype=torch.float64, device=like.device) / _FINER
-    x = (fine[:, None] + 1 - torch.arange(cells + 3, dtype=torch.float64, device=like.device)).abs()
-    near, far = (1.5 * x - 2.5) * x * x + 1, ((-0.5 * x + 2.5) * x - 4) * x + 2
-    return torch.where(x < 1, near, torch.where(x < 2, far, 0)).to(like.dtype)
-
-
-def _slice(distance: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
-    """The slice below a distance, the part of the way to the next, and reach / d, at most 1."""
-    scale = _SLICES * (_SLICES + 1) / reach
-    # n (n + 1) = scale d has a slope in d at 0 too.
-    place = distance.clamp(max=reach).mul_(scale).add_(0.25).sqrt_()
-    first = place.detach().sub(0.5).floor_().clamp(max=_SLICES - 1)
-    return first, place - (first + 0.5), reach / distance.clamp(min=reach)
-
-
-def _by_row(view: _View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:
-    """m for distances (N or 1, 1, H, 1)."""
-    first, part, share = (value.flatten(1) for value in _slice(distance, reach))
-    y, dy = _places(view.height, view.cell, view.down, volume)
-    batch, slices, rows = volume.shape[:3]
-    start = torch.arange(batch, device=volume.device)[:, None] * slices
-    index, lines = (start + first.long()) * rows + y, volume.flatten(0, 2)
-    near, far = share * (1 - part), share * part
-    corners = ((0, near * (1 - dy)), (1, near * dy), (rows, far * (1 - dy)), (rows + 1, far * dy))
-    first, *others = (lines[index + step] * weight[..., None] for step, weight in corners)
-    x, dx = _places(view.width, view.cell, view.across, volume)
-    keys = _keys(view.across, volume)
-    across = torch.lerp(keys[x], keys[x + 1], dx[:, None])
-    # The product adds 1, too. Cubics overshoot where the contrast is high.
-    mean = F.pad(sum(others, first), (0, 1), value=1.0) @ F.pad(across, (0, 1), value=1.0).T
-    return mean.relu_().unsqueeze(1)
-
-
-def _places(pixels: int, cell: float, cells: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    place = (torch.arange(pixels, dtype=torch.float64, device=like.device) + 0.5) * (_FINER / cell)
-    first = place.floor().clamp(max=cells * _FINER - 1)
-    return first.long(), (place - first).to(like.dtype)
-
-
-def _by_pixel(view: _View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:
-    """m for distances (N or 1, 1, H, W)."""
-    volume = volume @ _keys(view.across, volume).T
-    rows, columns = volume.shape[2:]
-    # One slice below the other as an image, the next slice as its second channel.
-    pairs = torch.stack([volume[:, :-1], volume[:, 1:]], dim=1).flatten(2, 3)
-    x, y = (
-        (2 * (torch.arange(n, dtype=torch.float64, device=volume.device) + 0.5) * (_FINER / view.cell) + 1) / size
-        for n, size in ((view.width, columns), (view.height, rows * _SLICES))
-    )
-    x, y = (x - 1).to(volume.dtype), (y - 1).to(volume.dtype)[:, None]
-    at_once = view.height
-    if not learns((pairs,)):
-        at_once = rows_at_once(pairs.device, at_once, each=view.width, cached=_CACHED)
-    bands = (
-        _looked_up(pairs, band, x, middle, reach)
-        for band, middle in zip(distance.split(at_once, dim=2), y.split(at_once), strict=True)
-    )
-    return join(bands, dim=2, length=view.height)
-
-
-def _looked_up(pairs: Tensor, distance: Tensor, x: Tensor, y: Tensor, reach: float) -> Tensor:
-    first, part, share = _slice(distance, reach)
-    y = first[:, 0].mul_(2 / _SLICES) + y
-    grid = torch.stack([x.expand_as(y), y], dim=1).movedim(1, -1)
-    below, above = _sample(pairs, grid).split(1, dim=1)
-    return torch.addcmul(torch.ones_like(share[:1, :1, :1, :1]), torch.lerp(below, above, part), share).relu_()
-
-
-def _sample(source: Tensor, grid: Tensor) -> Tensor:
-    rows, columns = grid.shape[1:3]
-    eager = source.device.type == "cpu" and not torch.compiler.is_compiling()
-    threads = torch.get_num_threads() if eager else 1
-    if threads == 1 or rows % threads:
-        return F.grid_sample(source, grid.expand(len(source), -1, -1, -1), align_corners=False)
-    # The CPU sampler threads over the batch alone.
-    bands = grid.unflatten(1, (threads, -1)).flatten(0, 1)
-    found = F.grid_sample(source.expand(threads, -1, -1, -1), bands, align_corners=False)
-    return found.movedim(0, 1).reshape(1, 2, rows, columns)

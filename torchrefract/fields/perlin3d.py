@@ -16,7 +16,7 @@ from torchrefract._constants import constant
 VARIANCE = 8 * (181 / 462) ** 2 * (535 / 18018)
 # 1 / r, 1 / r^2 and 1 / r^3, r^4 = r + 1: no two multiples of them come near to each other, modulo 1, before many
 # others have.
-_PHASES = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)
+PHASES = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)
 # Two numbers are made of one of 23 bits: the upper 11, and the others.
 _UPPER = 2048
 # Nodes are numbered modulo 2^32, so many to a line: what returns so far away is out of sight. Octaves are far apart,
@@ -89,7 +89,7 @@ def noise_on_planes(
     nodes = [[math.ceil(high - low) + 2 for low, high in box] for box in boxes]
     low = constant([[end[0] for end in box] for box in boxes], dtype=torch.float64, device=device)
     period = constant(periods, dtype=torch.float64, device=device)[:, None]
-    step = torch.arange(1, len(periods) + 1, device=device)[:, None] * constant(_PHASES, dtype=low.dtype, device=device)
+    step = torch.arange(1, len(periods) + 1, device=device)[:, None] * constant(PHASES, dtype=low.dtype, device=device)
     origin = (key[:, None, :3].double() * 2.0**-32 + step).frac() - moved.double()[:, None] / period
     # The whole coordinates of the first node; float32 suffices for places from there on, wherever the wind has gone.
     first = (origin.detach() + low).floor()

@@ -49,15 +49,15 @@ def gradients(columns: Words, row: np.uint32, key: Key, x: Floats, y: Floats) ->
     if elapsed == 0:
         for k in range(columns.size):
             node = hashed_word(np.uint32(columns[k] + along), c, d, constants)
-            x[k], y[k] = _direction(_uniform(hashed_word(node, a, b, constants)))
+            x[k], y[k] = direction(uniform(hashed_word(node, a, b, constants)))
         return
     for k in range(columns.size):
         node = hashed_word(np.uint32(columns[k] + along), c, d, constants)
         other = hashed_word(np.uint32(node + np.uint32(constants[0])), a, b, constants)
-        turns = elapsed * inverse_error(2 * np.float64(_uniform(other)) - 1)
+        turns = elapsed * inverse_error(2 * np.float64(uniform(other)) - 1)
         # Whole turns are dropped before the type gets narrow: after a long time they are many.
-        turns = turns - np.trunc(turns) + np.float64(_uniform(hashed_word(node, a, b, constants)))
-        x[k], y[k] = _direction(np.float32(turns - np.floor(turns + 0.5)))
+        turns = turns - np.trunc(turns) + np.float64(uniform(hashed_word(node, a, b, constants)))
+        x[k], y[k] = direction(np.float32(turns - np.floor(turns + 0.5)))
 
 
 @jit
@@ -99,12 +99,12 @@ def logarithm(x: float) -> float:
 
 
 @jit
-def _uniform(word: np.uint32) -> Number:
+def uniform(word: np.uint32) -> Number:
     return (np.float32(np.int32(word >> np.uint32(9))) + _HALF) * _STEP
 
 
 @jit
-def _direction(turns: Number) -> tuple[Number, Number]:
+def direction(turns: Number) -> tuple[Number, Number]:
     """Cosine and sine of 2 pi turns, of 1 at most, to 1e-7."""
     quarter = np.int32(np.floor(turns * np.float32(4) + _HALF))
     r = turns - np.float32(quarter) * _QUARTER  # exact

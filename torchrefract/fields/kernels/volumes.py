@@ -1,0 +1,210 @@
+"""What numba compiles: fog in space, one row of rays after the other, plane by plane.
+
+Each octave has its gradients at the four rows of nodes around a row of rays on a plane. There
+
+    noise = sum over the 2 nodes beside x of h(p) (A p + B),
+    A = sum over 4 rows of h(q) h(r) g_x,  B = of h(q) h(r) (q g_y + r g_z)
+
+so that what a ray takes of an octave is four numbers. Numbers are float32, but places float64.
+"""
+
+import numpy as np
+
+from torchrefract._jit import fma, horner, inlined, jit
+from torchrefract._lanes import LANES
+from torchrefract.fields.kernels.nodes import Constants, Doubles, Floats, Key, Number, Words
+from torchrefract.fields.kernels.pixels import GROUP, Columns
+from torchrefract.fields.kernels.sheets import Sheets, Whole, row_of, sheets_before
+
+if LANES:
+    from torchrefract.fields.kernels.groups import add_octave, between_rows
+else:
+    from torchrefract.fields.kernels.pixels import add_octave, between_rows
+
+# Of each frame: turns over pi, (N,); amplitudes, (N, K, planes); what is taken from their sum, (N, planes); the whole
+# coordinates of the first node of each octave, (N, K, 3), and how far from there the camera is, (N, K, 3), periods.
+Fog = tuple[Doubles, Floats, Floats, Whole, Doubles]
+# Periods of each octave to each plane, (K, planes), and how many planes it has, (K,); slopes of the rays, (columns,)
+# and (rows,); the number of the plane where d is the reach, (rows, columns); and of each slice the root of its part of
+# the reach, (slices,).
+Rays = tuple[Doubles, Whole, Doubles, Doubles, Doubles, Doubles]
+# Of octave o and plane k, at o planes + k: its first column of nodes, how many there are, and its first sheet.
+Cells = tuple[Columns, Whole]
+_LOG2_E = np.float32(1.4426950408889634)
+_LN2 = np.float32(0.693359375), np.float32(-2.12194440e-4)  # the first has few digits
+# Of (exp(r) - 1 - r) / r^2, for |r| <= ln(2) / 2, to 2e-8 of r.
+_REST = tuple(np.float32(1 / n) for n in (5040, 720, 120, 24, 6, 2))
+_LEAST, _MOST = np.float32(-80), np.float32(89)
+
+
+@jit
+def volumes(
+    keys: Words, constants: Constants, fog: Fog, rays: Rays, wanted: Whole, start: int, stop: int, out: Floats
+) -> None:
+    """Means along rays, less one, out (N, rows, slices, W), W in whole groups: rows `start` ... `stop` of all frames.
+
+    keys: (N, 4), the words of each; constants: of their hash.
+    wanted: (N or 1, rows, 2), the first and last of the slices that are asked for; others are left as they are.
+    """
+    rows = out.shape[1]
+    for i in range(start // rows, -(-stop // rows)):
+        own = (fog[1][i], fog[2][i], fog[3][i], fog[4][i], rays)
+        key = keys[i], fog[0][i], constants
+        slices = wanted[min(i, wanted.shape[0] - 1)]
+        _rows(own, key, slices, max(0, start - i * rows), min(rows, stop - i * rows), out[i])
+
+
+@jit
+def _rows(own: tuple, key: Key, wanted: Whole, start: int, stop: int, out: Floats) -> None:
+    """Some rows of a frame, out (rows, slices, W)."""
+    amplitude, half, first, place, (ahead, counts, x, y, last, depths) = own
+    wide, planes = out.shape[2], np.zeros(stop, np.int64)
+    for row in range(start, stop):
+        if wanted[row, 0] <= wanted[row, 1]:
+            # The mean up to a plane needs one plane more.
+            planes[row] = _before(depths[wanted[row, 1]] * last[row].max(), ahead.shape[1]) + 3
+    counts = np.minimum(counts, planes.max())
+    if planes.max() == 0:
+        return
+    sheets = sheets_before(place, ahead, counts, x, y)
+    cells, line = _cells(place, ahead, counts, x, wide, sheets[0])
+    excess, means = np.empty((planes.max(), wide), np.float32), np.empty((planes.max(), wide), np.float32)
+    for row in range(start, stop):
+        for plane in range(planes[row]):
+            noise = excess[plane]
+            noise[:] = -half[plane]
+            for k in range(counts.size):
+                if plane < counts[k]:
+                    at = place[k, 1] + ahead[k, plane] * y[row], place[k, 2] + ahead[k, plane]
+                    own_cells = cells[1][k * ahead.shape[1] + plane]
+                    _line(at, amplitude[k, plane], own_cells, k, first[k], key, sheets, line)
+                    add_octave(line, cells[0], k * ahead.shape[1] + plane, noise)
+            for j in range(wide):
+                noise[j] = less_one(noise[j])
+        if planes[row]:
+            _means(excess[: planes[row]], means)
+            _slices(means, last[row], depths, wanted[row], ahead.shape[1], out[row])
+
+
+@inlined
+def _before(place: float, planes: int) -> int:
+    """The plane before a place, of which the next two exist."""
+    return min(int(place), planes - 3)
+
+
+@jit
+def _cells(
+    place: Doubles, ahead: Doubles, counts: Whole, x: Doubles, wide: int, firsts: Whole
+) -> tuple[Cells, Floats]:
+    """Where rays lie between nodes on the planes of a frame, and room for a line of nodes."""
+    octaves, planes = ahead.shape
+    begins, nodes = np.empty((octaves * planes, wide // GROUP), np.int32), np.empty((octaves * planes, wide), np.int32)
+    part, fade = np.empty((octaves * planes, wide), np.float32), np.empty((octaves * planes, wide), np.float32)
+    cells, most = np.empty((octaves * planes, 3), np.int64), 0
+    for k in range(octaves):
+        for plane in range(counts[k]):
+            at, far = k * planes + plane, ahead[k, plane]
+            left = int(np.floor(place[k, 0] + far * x[0]))
+            count = int(np.floor(place[k, 0] + far * x[-1])) + 2 - left
+            cells[at, 0], cells[at, 1] = left, count
+            cells[at, 2] = firsts[k] + int(np.floor(place[k, 2] + far))
+            most = max(most, count)
+            _along(place[k, 0], far, x, left, begins[at], nodes[at], part[at], fade[at])
+    # Behind the last nodes as many are read as a group may have.
+    return ((begins, nodes, part, fade), cells), np.zeros((2, GROUP * (most // GROUP + 3)), np.float32)
+
+
+@inlined
+def _along(
+    place: float, far: float, x: Doubles, left: int, begins: Words, nodes: Words, part: Floats, fade: Floats
+) -> None:
+    """Where the rays, whole groups of them, lie on one plane."""
+    for group in range(begins.size):
+        begin = int(np.floor(place + far * x[group * GROUP]))
+        begins[group] = begin - left
+        for k in range(group * GROUP, (group + 1) * GROUP):
+            at = place + far * x[k]
+            p = at - np.floor(at)
+            nodes[k] = int(np.floor(at)) - begin
+            part[k], fade[k] = p, _fade(p)
+
+
+@inlined
+def _line(
+    at: tuple[float, float], weight: Number, cells: Whole, octave: int, first: Whole, key: Key, sheets: Sheets,
+    line: Floats,
+) -> None:  # fmt: skip
+    """A and B, line (2, n), at the nodes of a row of rays, from the gradients in the rows of nodes around it."""
+    y, sheet = int(np.floor(at[0])), cells[2]
+    q, r = at[0] - np.floor(at[0]), at[1] - np.floor(at[1])
+    below, behind = _fade(q), weight * _fade(r)
+    above, before = 1 - below, weight - behind
+    rows = (
+        _row(sheets, sheet, y, cells[0], octave, first, key, above * before, q, r),
+        _row(sheets, sheet, y + 1, cells[0], octave, first, key, below * before, q - 1, r),
+        _row(sheets, sheet + 1, y, cells[0], octave, first, key, above * behind, q, r - 1),
+        _row(sheets, sheet + 1, y + 1, cells[0], octave, first, key, below * behind, q - 1, r - 1),
+    )
+    between_rows(sheets[2], rows, cells[1], line)
+
+
+@inlined
+def _row(
+    sheets: Sheets, sheet: int, y: int, left: int, octave: int, first: Whole, key: Key, weight: float, q: float,
+    r: float,
+) -> tuple[np.uintp, np.uintp, Number, Number, Number]:  # fmt: skip
+    begin, across = row_of(sheets, sheet, y, octave, first, key)
+    place = np.uintp(begin + left - sheets[1][sheet, 0])
+    return place, np.uintp(across), np.float32(weight), np.float32(weight * q), np.float32(weight * r)
+
+
+@inlined
+def _fade(p: float) -> float:
+    return p * p * p * (p * (6 * p - 15) + 10)
+
+
+@inlined
+def less_one(x: Number) -> Number:
+    """exp(x) - 1."""
+    x = _LEAST if x < _LEAST else x
+    x = _MOST if x > _MOST else x
+    n = np.floor(fma(x, _LOG2_E, np.float32(0.5)))
+    r = fma(n, -_LN2[1], fma(n, -_LN2[0], x))
+    found = fma(r * r, horner(r, _REST), r)
+    # Half of 2^n: the number itself may be too large, where the result is not.
+    half = np.int32((np.int32(n) + np.int32(126)) << np.int32(23)).view(np.float32)
+    return fma(half, found, half - np.float32(0.5)) * np.float32(2)
+
+
+@jit
+def _means(excess: Floats, out: Floats) -> None:
+    """Up to each plane, out (planes, W), from values on the planes and one behind; `_quadrature` has the weights."""
+    twelfth = np.float32(1 / 12)
+    total = excess[1] * (np.float32(2) * twelfth)
+    out[0] = excess[0]
+    for i in range(1, excess.shape[0] - 1):
+        last, here, after, own = excess[i - 1], excess[i], excess[i + 1], out[i]
+        at_last, at, at_after = np.float32(i - 1), np.float32(i), np.float32(i + 1)
+        share = np.float32(1 / (i * i))
+        for k in range(total.size):
+            ends = fma(at, here[k], twelfth * (at_last * last[k] - at_after * after[k]))
+            own[k] = (total[k] + ends) * share
+            total[k] = fma(np.float32(2) * at, here[k], total[k])
+
+
+@jit
+def _slices(means: Floats, last: Doubles, depths: Doubles, wanted: Whole, planes: int, out: Floats) -> None:
+    """Means up to slices of a row of rays, out (slices, W), from those up to planes."""
+    before, part = np.empty(last.size, np.int32), np.empty(last.size, np.float32)
+    for n in range(wanted[0], wanted[1] + 1):
+        low, high, own = planes, 0, out[n]
+        for k in range(last.size):
+            place = depths[n] * last[k]
+            first = min(int(place), planes - 3)
+            before[k], part[k] = first, place - first
+            low, high = min(low, first), max(high, first)
+        for plane in range(low, high + 1):
+            near, far = means[plane], means[plane + 1]
+            for k in range(last.size):
+                found = fma(part[k], far[k] - near[k], near[k])
+                own[k] = found if before[k] == plane else own[k]

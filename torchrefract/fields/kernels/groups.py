@@ -3,14 +3,12 @@
 So many pixels that follow one another lie between 2 LANES nodes that do so, out of which each lane picks its own two.
 """
 
-from typing import Any
-
 import numpy as np
 
 from torchrefract import _lanes as lanes
 from torchrefract._jit import inlined
 from torchrefract._lanes import LANES
-from torchrefract.fields.kernels.pixels import Across, Columns, Floats, Row
+from torchrefract.fields.kernels.pixels import Across, Columns, Floats
 
 
 @inlined
@@ -57,27 +55,3 @@ def along_nodes(nodes: Floats, across: Across, out: Floats) -> None:
         own += np.uintp(LANES)
         if own >= np.uintp(cells.size):
             own = np.uintp(0)
-
-
-@inlined
-def between_rows(gradients: Floats, rows: tuple[Row, Row, Row, Row], count: int, line: Floats) -> None:
-    """As `pixels.between_rows`."""
-    along, across, none = line[0], line[1], lanes.all_floats(np.float32(0))
-    first, second, third, fourth = rows
-    for group in range(-(-count // LANES)):
-        at = np.uintp(group * LANES)
-        a, b = _with_row(gradients, first, at, none, none)
-        a, b = _with_row(gradients, second, at, a, b)
-        a, b = _with_row(gradients, third, at, a, b)
-        a, b = _with_row(gradients, fourth, at, a, b)
-        lanes.store(along, at, a)
-        lanes.store(across, at, b)
-
-
-@inlined
-def _with_row(gradients: Floats, row: Row, at: np.uintp, a: Any, b: Any) -> tuple[Any, Any]:
-    place, behind, of_x, of_y, of_z = row
-    at += place
-    a = lanes.fma(lanes.all_floats(of_x), lanes.load(gradients, at), a)
-    b = lanes.fma(lanes.all_floats(of_y), lanes.load(gradients, at + behind), b)
-    return a, lanes.fma(lanes.all_floats(of_z), lanes.load(gradients, at + behind + behind), b)

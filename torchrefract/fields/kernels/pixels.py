@@ -15,9 +15,6 @@ Columns = tuple[Small, Small, Floats, Floats]
 # Of each group of pixels the first node of a lattice; of each pixel its cell, counted from that one, and its weights of
 # four nodes, (4, n), of so many groups that they repeat themselves; and the number of all nodes.
 Across = tuple[Small, Small, Floats, int]
-# Of a row of nodes in space the place of what is read of its g_x, how far behind that g_y and g_z lie each, and their
-# weights.
-Row = tuple[np.uintp, np.uintp, np.float32, np.float32, np.float32]
 
 
 @jit
@@ -61,16 +58,3 @@ def add_octave(line: Floats, columns: Columns, octave: int, out: Floats) -> None
         left = fma(line[0, node], p, line[1, node])
         right = fma(line[0, node + np.uintp(1)], p - np.float32(1), line[1, node + np.uintp(1)])
         out[k] += fma(fade[octave, k], right - left, left)
-
-
-@jit
-def between_rows(gradients: Floats, rows: tuple[Row, Row, Row, Row], count: int, line: Floats) -> None:
-    """A and B, line (2, n), in whole groups at `count` nodes: the sums of g_x, and of g_y and g_z, of four rows."""
-    for k in range(GROUP * -(-count // GROUP)):
-        a, b = np.float32(0), np.float32(0)
-        for i in range(4):
-            place, behind, of_x, of_y, of_z = rows[i]
-            at = place + np.uintp(k)
-            a = fma(of_x, gradients[at], a)
-            b = fma(of_z, gradients[at + behind + behind], fma(of_y, gradients[at + behind], b))
-        line[0, k], line[1, k] = a, b

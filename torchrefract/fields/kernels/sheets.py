@@ -63,42 +63,37 @@ def _laid_out(firsts: Whole, ends: Whole) -> Sheets:
     return firsts, table, gradients, np.zeros(rows, np.bool_)
 
 
-@inlined
-def row_of(sheets: Sheets, sheet: int, row: int, octave: int, first: Whole, key: Key) -> tuple[int, int]:
-    """Where the gradients of a row of nodes begin, which are drawn if nobody did, and how many nodes it has.
+@jit
+def draw_row(sheets: Sheets, sheet: int, row: int, octave: int, first: Whole, key: Key) -> None:
+    """A row of nodes, which is marked as drawn from then on.
 
-    first: (3,), the whole coordinates of the first node of the octave.
+    first: (K, 3), the whole coordinates of the first node of each octave.
     """
     firsts, table, gradients, drawn = sheets
-    left, top, across, begin = table[sheet, 0], table[sheet, 1], table[sheet, 2], table[sheet, 4]
-    begin += 3 * across * (row - top)
-    if not drawn[table[sheet, 5] + row - top]:
-        drawn[table[sheet, 5] + row - top] = True
-        plane = first[2] + sheet - firsts[octave] + octave * _OCTAVE
-        number = first[0] + left + _LINE * (first[1] + row + _LINE * plane)
-        _directions(np.uint32(number), key, across, gradients[begin : begin + 3 * across])
-    return begin, across
+    down, across = row - table[sheet, 1], table[sheet, 2]
+    begin = table[sheet, 4] + 3 * across * down
+    drawn[table[sheet, 5] + down] = True
+    plane = first[octave, 2] + sheet - firsts[octave] + octave * _OCTAVE
+    number = first[octave, 0] + table[sheet, 0] + _LINE * (first[octave, 1] + row + _LINE * plane)
+    _directions(np.uint32(number), key, gradients[begin : begin + 3 * across])
 
 
 @jit
-def _directions(number: np.uint32, key: Key, count: int, out: Floats) -> None:
-    """x, y and z, out (3 count), at nodes that are numbered one after the other."""
+def _directions(number: np.uint32, key: Key, out: Floats) -> None:
+    """x, y and z, out (3 n), at n nodes that are numbered one after the other."""
     words, elapsed, constants = key
     a, b, c, d = words[0], words[1], words[2], words[3]
-    x, y, z = out[:count], out[count : 2 * count], out[2 * count : 3 * count]
-    if elapsed == 0:
-        for k in range(count):
-            node = hashed_word(_hashed(number, k, constants), c, d, constants)
-            word = hashed_word(np.uint32(node + np.uint32(constants[0])), a, b, constants)
-            x[k], y[k], z[k] = _turned(hashed_word(node, a, b, constants), _upper(word) * _UPPER)
-        return
+    count = out.size // 3
+    x, y, z = out[:count], out[count : 2 * count], out[2 * count :]
     for k in range(count):
         node = hashed_word(_hashed(number, k, constants), c, d, constants)
         word = hashed_word(np.uint32(node + np.uint32(constants[0])), a, b, constants)
-        turns = elapsed * inverse_error(2 * np.float64(_lower(word)) - 1)
-        # Whole turns are dropped before the type gets narrow: after a long time they are many.
-        turns = turns - np.trunc(turns) + np.float64(_upper(word) * _UPPER)
-        own = np.float32(turns - np.floor(turns + 0.5))
+        own = _upper(word) * _UPPER
+        if elapsed != 0:
+            turns = elapsed * inverse_error(2 * np.float64(_lower(word)) - 1)
+            # Whole turns are dropped before the type gets narrow: after a long time they are many.
+            turns = turns - np.trunc(turns) + np.float64(own)
+            own = np.float32(turns - np.floor(turns + 0.5))
         x[k], y[k], z[k] = _turned(hashed_word(node, a, b, constants), own)
 
 

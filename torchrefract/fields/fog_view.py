@@ -95,6 +95,13 @@ def between(pixels: int, cell: float, cells: int) -> Between:
     return Between(near.int().numpy(), weights.T.float().contiguous().numpy())
 
 
+@lru_cache(maxsize=32)
+def finer_places(pixels: int, cell: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """The column of the finer lattice before each pixel, int32, and how far on this is; nobody writes to them."""
+    first, part = _places(pixels, cell, cells, torch.empty(0))
+    return first.int().numpy(), part.numpy()
+
+
 def by_pixel(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:
     """m for distances (N or 1, 1, H, W)."""
     volume = volume @ keys(view.across, volume).T

@@ -111,12 +111,7 @@ def _by_kernel(own: View, fog: _Fog, distance: Tensor, *, scales: Sequence[float
     octaves = _octaves(fog, planes)
     drawn = fog_drawn.Drawn(fog.key, octaves.amplitude, octaves.half, octaves.moved, octaves.turns)
     volume = fog_drawn.Volume(own.rays, reach, tuple(scales), planes.counts, _PLANES)
-    if distance.shape[3] == 1:
-        return fog_drawn.by_row(own, drawn, volume, distance)
-    means = fog_drawn.volume_up_to(drawn, volume, distance)
-    each = zip(distance.expand(len(means), -1, -1, -1).split(1), means.split(1), strict=True)
-    found = (by_pixel(own, keys(own.down, one) @ one, d, reach) for d, one in each)
-    return join(found, dim=0, length=len(means))
+    return fog_drawn.path_means(own, drawn, volume, distance)
 
 
 def _path_mean(view: View, fog: _Fog, distance: Tensor, *, scales: Sequence[float], reach: float) -> Tensor:

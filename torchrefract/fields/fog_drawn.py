@@ -14,6 +14,9 @@ from torchrefract.fields.fog_view import SLICES, Between, View, between, finer_p
 from torchrefract.fields.perlin3d import PHASES, Rays
 from torchrefract.white_noise import HASH
 
+_AT_ONCE = 8  # rows of rays that are worth a thread
+_TOGETHER = 16  # frames, whose volumes are kept at once
+
 
 class Drawn(NamedTuple):
     """What the volumes of N frames are drawn from: ln q is a sum of octaves, less `half`."""
@@ -23,9 +26,6 @@ class Drawn(NamedTuple):
     half: Tensor  # (N, planes + 2)
     moved: Tensor  # (N, 3), m
     turns: Tensor  # (N,)
-
-
-_AT_ONCE = 8  # rows of rays that are worth a thread
 
 
 class Volume(NamedTuple):
@@ -40,26 +40,31 @@ class Volume(NamedTuple):
 
 def path_means(view: View, drawn: Drawn, volume: Volume, distance: Tensor) -> Tensor:
     """(N, 1, H, W), the means for distances (N or 1, 1, H, 1 or W)."""
+    out = torch.empty(len(drawn.key), 1, view.height, view.width)
+    for start in range(0, len(out), _TOGETHER):
+        some = slice(start, start + _TOGETHER)
+        own = distance[some] if len(distance) > 1 else distance
+        _some_means(view, Drawn(*(value[some] for value in drawn)), volume, own, out[some, 0].numpy())
+    return out
+
+
+def _some_means(view: View, drawn: Drawn, volume: Volume, distance: Tensor, out: np.ndarray) -> None:
     views, reach = kernels("fields.kernels.views"), np.float32(volume.reach)
-    down = between(view.height, view.cell, view.down)
+    down = tuple(between(view.height, view.cell, view.down))
     ends = tuple(_numbers(end.flatten(1)) for end in torch.aminmax(distance.detach(), dim=3))
     wanted = np.empty((len(distance), view.rays.rows, 2), np.int64)
-    views.ask_for(ends, reach, SLICES, tuple(down), wanted)
+    views.ask_for(ends, reach, SLICES, down, wanted)
     means = _means(drawn, volume, wanted)
     if distance.shape[3] == 1:
         across = _groups(view.width, view.cell, view.across)
-        work = partial(views.rows_at_distances, means, ends[0], reach, tuple(down), across)
+        work = partial(views.rows_at_distances, means, ends[0], reach, down, across)
     else:
         finer = np.empty((*means.shape[:3], 2 * means.shape[3]), np.float32)
-        share(
-            lambda start, stop: views.refined(means, wanted, start, stop, finer), len(means) * means.shape[1], least=_AT_ONCE
-        )
+        refined = partial(views.refined, means, wanted)
+        share(lambda start, stop: refined(start, stop, finer), means.shape[0] * means.shape[1], least=_AT_ONCE)
         across = finer_places(view.width, view.cell, view.across)
-        work = partial(views.rows_of_pixels, finer, _numbers(distance[:, 0]), ends, reach, tuple(down), across)
-    out = torch.empty(len(drawn.key), 1, view.height, view.width)
-    into, count = out[:, 0].numpy(), len(out) * view.height
-    share(lambda start, stop: work(start, stop, into), count, least=SMALLEST // view.width + 1)
-    return out
+        work = partial(views.rows_of_pixels, finer, _numbers(distance[:, 0]), ends, reach, down, across)
+    share(lambda start, stop: work(start, stop, out), len(out) * view.height, least=SMALLEST // view.width + 1)
 
 
 def _means(drawn: Drawn, volume: Volume, wanted: np.ndarray) -> np.ndarray:

@@ -180,9 +180,16 @@ def _excess(rays: Rays, fog: _Fog, *, scales: Sequence[float], reach: float, dty
     """(N, planes + 2, rows, columns): q - 1 on the planes."""
     planes = _planes(rays, tuple(scales), reach, fog.key.device)
     amplitude, half, moved, turns = _octaves(fog, planes)
-    motion, amplitude = {"moved": moved, "turns": turns}, amplitude.to(dtype)
-    own = {"periods": scales, "planes": planes.counts, "amplitude": amplitude}
-    noise = noise_on_planes(fog.key, rays, planes.depths, **own, **motion)
+    noise = noise_on_planes(
+        fog.key,
+        rays,
+        planes.depths,
+        periods=scales,
+        planes=planes.counts,
+        amplitude=amplitude.to(dtype),
+        moved=moved,
+        turns=turns,
+    )
     return torch.expm1(noise - half.to(dtype)[:, :, None, None])
 
 

@@ -21,8 +21,8 @@ PHASES = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)
 _UPPER = 2048
 # Nodes are numbered modulo 2^32, so many to a line: what returns so far away is out of sight. Octaves are far apart,
 # by the golden section of the planes.
-_LINE = 2048
-_OCTAVE = 633
+LINE = 2048
+OCTAVE = 633
 
 
 class Rays(NamedTuple):
@@ -177,8 +177,8 @@ def _gradients(
     numbered = []
     for i, counts in enumerate(nodes):
         x, y, z = (first[:, i, axis, None] + torch.arange(n, device=key.device) for axis, n in enumerate(counts))
-        plane = z[:, :, None, None] + i * _OCTAVE
-        numbered.append((x[:, None, None] + _LINE * (y[:, None, :, None] + _LINE * plane)).flatten(1))
+        plane = z[:, :, None, None] + i * OCTAVE
+        numbered.append((x[:, None, None] + LINE * (y[:, None, :, None] + LINE * plane)).flatten(1))
     scaled = _UPPER * white_noise.lattice(key, [torch.cat(numbered, dim=1)], 2)
     upper = scaled.floor()
     lower = scaled - upper

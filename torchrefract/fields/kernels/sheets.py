@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrefract._jit import inlined, jit
-from torchrefract.fields.kernels.nodes import Doubles, Floats, Key, Number, Words, direction, inverse_error
+from torchrefract.fields.kernels.nodes import Doubles, Floats, Key, Number, direction, inverse_error
 from torchrefract.fields.kernels.pixels import GROUP
+from torchrefract.fields.perlin3d import LINE, OCTAVE
 from torchrefract.noise_kernel import hashed_word
 
 Whole = NDArray[np.int64]
 # Of each octave the first of its sheets, (K + 1,); of each sheet the first column and row, how many of these there are,
 # where its gradients begin and its rows are marked, (sheets, 6); gradients; and marks of the rows that are drawn.
 Sheets = tuple[Whole, Whole, Floats, NDArray[np.bool_]]
-_LINE, _OCTAVE = 2048, 633  # as in `perlin3d`
 _FAR = 1 << 62
 _STEP = np.float32(2.0**-12)
 _UPPER = np.float32(2.0**-11)
@@ -73,8 +73,8 @@ def draw_row(sheets: Sheets, sheet: int, row: int, octave: int, first: Whole, ke
     down, across = row - table[sheet, 1], table[sheet, 2]
     begin = table[sheet, 4] + 3 * across * down
     drawn[table[sheet, 5] + down] = True
-    plane = first[octave, 2] + sheet - firsts[octave] + octave * _OCTAVE
-    number = first[octave, 0] + table[sheet, 0] + _LINE * (first[octave, 1] + row + _LINE * plane)
+    plane = first[octave, 2] + sheet - firsts[octave] + octave * OCTAVE
+    number = first[octave, 0] + table[sheet, 0] + LINE * (first[octave, 1] + row + LINE * plane)
     _directions(np.uint32(number), key, gradients[begin : begin + 3 * across])
 
 

@@ -1,7 +1,8 @@
 """What numba compiles: rows of pixels, from the means along rays up to slices of the distance."""
 
+from typing import Any
+
 import numpy as np
-from numpy.typing import NDArray
 
 from torchrefract._jit import fma, inlined, jit
 from torchrefract._lanes import LANES
@@ -65,8 +66,9 @@ def rows_at_distances(
             along_nodes(whole, across, found)
         else:
             pixels.along_nodes(whole, across, found)
+        own = out[i, y]
         for k in range(width):
-            out[i, y, k] = _positive(found[k] + _ONE)
+            own[k] = _positive(found[k] + _ONE)
 
 
 @jit
@@ -152,7 +154,7 @@ def _span(nearest: Number, farthest: Number, reach: Number, count: int) -> tuple
 
 
 @inlined
-def _slice(d: Number, reach: Number, count: int) -> tuple[int, Number]:
+def _slice(d: Number, reach: Number, count: int) -> tuple[Any, Number]:
     """The slice below a distance, and the part of the way to the next."""
     near = reach if d > reach else d
     place = np.sqrt(near * (np.float32(count * (count + 1)) / reach) + _QUARTER) - _HALF
@@ -178,8 +180,9 @@ def _mixed(a: Number, b: Number, part: Number) -> Number:
 
 @jit
 def _between_rows(volume: Floats, place: int, step: int, weights: Floats, y: int, factor: Number, line: Floats) -> None:
-    """Add the means at a row of pixels, where columns of rays are: those in `volume` from a place on, `step` to a row."""
-    first, second, third, fourth = np.uintp(place), np.uintp(place + step), np.uintp(place + 2 * step), np.uintp(place + 3 * step)
+    """Add means at a row of pixels: of four rows in `volume`, from a place on, one a step behind the other."""
+    first, second = np.uintp(place), np.uintp(place + step)
+    third, fourth = np.uintp(place + 2 * step), np.uintp(place + 3 * step)
     a, b, c, d = factor * weights[0, y], factor * weights[1, y], factor * weights[2, y], factor * weights[3, y]
     for k in range(line.size):
         at = np.uintp(k)

@@ -13,7 +13,7 @@ import numpy as np
 from torchrefract._jit import fma, horner, inlined, jit
 from torchrefract._lanes import LANES
 from torchrefract.fields.kernels.nodes import Constants, Doubles, Floats, Key, Number, Words
-from torchrefract.fields.kernels.pixels import GROUP, Columns
+from torchrefract.fields.kernels.pixels import GROUP, Columns, Small
 from torchrefract.fields.kernels.sheets import Sheets, Whole, draw_row, sheets_before
 from torchrefract.fields.kernels.single_rays import Rows
 
@@ -59,14 +59,14 @@ def volumes(
 def _rows(own: tuple, key: Key, wanted: Whole, start: int, stop: int, out: Floats) -> None:
     """Some rows of a frame, out (rows, slices, W)."""
     amplitude, half, first, place, (ahead, counts, x, y, last, depths) = own
-    wide, planes = out.shape[2], np.zeros(stop, np.int64)
+    wide, planes = out.shape[2], np.zeros(stop, np.int64)  # those that each row needs
     for row in range(start, stop):
         if wanted[row, 0] <= wanted[row, 1]:
             # The mean up to a plane needs one plane more.
             planes[row] = _before(depths[wanted[row, 1]] * last[row].max(), ahead.shape[1]) + 3
-    counts = np.minimum(counts, planes.max())
     if planes.max() == 0:
         return
+    counts = np.minimum(counts, planes.max())
     sheets = sheets_before(place, ahead, counts, x, y)
     columns, crossings, line = _crossings(place, ahead, counts, x, wide, sheets[0])
     places, behind = np.empty((len(crossings), 4), np.int64), np.empty((len(crossings), 4), np.int64)
@@ -111,7 +111,7 @@ def _crossings(
 
 @inlined
 def _along(
-    place: float, far: float, x: Doubles, left: int, begins: Words, nodes: Words, part: Floats, fade: Floats
+    place: float, far: float, x: Doubles, left: int, begins: Small, nodes: Small, part: Floats, fade: Floats
 ) -> None:
     """Where the rays, whole groups of them, lie on one plane."""
     for group in range(begins.size):
@@ -126,9 +126,17 @@ def _along(
 
 @jit
 def _rows_around(
-    place: Doubles, ahead: Doubles, counts: Whole, y: float, amplitude: Floats, crossings: Crossings, first: Whole,
-    key: Key, sheets: Sheets, rows: Rows,
-) -> None:  # fmt: skip
+    place: Doubles,
+    ahead: Doubles,
+    counts: Whole,
+    y: float,
+    amplitude: Floats,
+    crossings: Crossings,
+    first: Whole,
+    key: Key,
+    sheets: Sheets,
+    rows: Rows,
+) -> None:
     """The rows of nodes around a row of rays on all planes, drawn where nobody did."""
     places, behind, weights = rows
     _, table, _, drawn = sheets
@@ -152,9 +160,15 @@ def _rows_around(
 
 @jit
 def _excess(
-    gradients: Floats, rows: Rows, crossings: Crossings, counts: Whole, columns: Columns, half: Floats, line: Floats,
+    gradients: Floats,
+    rows: Rows,
+    crossings: Crossings,
+    counts: Whole,
+    columns: Columns,
+    half: Floats,
+    line: Floats,
     out: Floats,
-) -> None:  # fmt: skip
+) -> None:
     """Values of q - 1 at a row of rays on the planes, out (planes, W)."""
     planes = len(crossings) // counts.size
     for plane in range(out.shape[0]):
@@ -210,7 +224,7 @@ def _slices(means: Floats, last: Doubles, depths: Doubles, wanted: Whole, planes
         low, high = planes, 0
         for k in range(last.size):
             place = depths[n] * last[k]
-            first = min(int(place), planes - 3)
+            first = _before(place, planes)
             before[k], part[k] = first, place - first
             low, high = min(low, first), max(high, first)
         for plane in range(low, high + 1):

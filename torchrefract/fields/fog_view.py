@@ -85,21 +85,22 @@ class Between(NamedTuple):
     weights: np.ndarray  # (4, n), float32
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=16)
 def between(pixels: int, cell: float, cells: int) -> Between:
     """For pixels of a cell each, as `by_row` has them; nobody writes to it."""
     like = torch.empty(0, dtype=torch.float64)
     (first, part), finer = _places(pixels, cell, cells, like), keys(cells, like)
     near = first // _FINER
     weights = torch.lerp(finer[first], finer[first + 1], part[:, None]).gather(1, near[:, None] + torch.arange(4))
-    return Between(near.int().numpy(), weights.T.float().contiguous().numpy())
+    # Copies: arrays that are a tensor's would keep it.
+    return Between(np.array(near, np.int32), np.array(weights.T, np.float32, order="C"))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=16)
 def finer_places(pixels: int, cell: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
     """The column of the finer lattice before each pixel, int32, and how far on this is; nobody writes to them."""
     first, part = _places(pixels, cell, cells, torch.empty(0))
-    return first.int().numpy(), part.numpy()
+    return np.array(first, np.int32), np.array(part)
 
 
 def by_pixel(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:

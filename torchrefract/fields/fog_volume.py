@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrefract._bands import join
 from torchrefract._checks import learns, or_else, withheld
 from torchrefract._compiled import obstacle
-from torchrefract._constants import constant, kept
+from torchrefract._constants import constant
 from torchrefract.fields import fog_drawn
 from torchrefract.fields.fog_view import SLICES, View, by_pixel, by_row, keys, view
 from torchrefract.fields.perlin3d import VARIANCE, Rays, deviation_of_mean, noise_on_planes
@@ -137,14 +137,13 @@ def _volume(rays: Rays, fog: _Fog, *, scales: Sequence[float], reach: float, dty
 
 
 class _Planes(NamedTuple):
-    """Where the field is evaluated; tensors that nobody writes to."""
+    """Where the field is evaluated."""
 
     depths: tuple[float, ...]  # m
     counts: tuple[int, ...]  # of each octave: only so many, the nearest, have it
     damping: Tensor  # (octaves, planes + 2)
 
 
-@kept
 def _planes(rays: Rays, scales: tuple[float, ...], reach: float, device: torch.device) -> _Planes:
     depths = tuple(reach * (k / _PLANES) ** 2 for k in range(_PLANES + 2))
     lengths = [2 * reach * k / _PLANES**2 for k in range(_PLANES + 2)]  # between planes

@@ -91,7 +91,7 @@ def _fog(drawn: Drawn, volume: Volume) -> tuple[np.ndarray, ...]:
 def _rays(volume: Volume) -> tuple[np.ndarray, ...]:
     """As `volumes` has them; nobody writes to them."""
     depths = volume.reach * (np.arange(volume.planes + 2) / volume.planes) ** 2
-    x, y = (np.array(slopes) for slopes in volume.rays.slopes(torch.device("cpu")))
+    x, y = (np.array(slopes.numpy()) for slopes in volume.rays.slopes(torch.device("cpu")))
     # Whole groups of rays are made, of which the last are alike.
     x = np.pad(x, (0, -len(x) % _group()), mode="edge")
     last = volume.planes * (1 + x * x + (y * y)[:, None]) ** -0.25

@@ -93,14 +93,14 @@ def between(pixels: int, cell: float, cells: int) -> Between:
     near = first // _FINER
     weights = torch.lerp(finer[first], finer[first + 1], part[:, None]).gather(1, near[:, None] + torch.arange(4))
     # Copies: arrays that are a tensor's would keep it.
-    return Between(np.array(near, np.int32), np.array(weights.T, np.float32, order="C"))
+    return Between(np.array(near.numpy(), np.int32), np.array(weights.T.numpy(), np.float32, order="C"))
 
 
 @lru_cache(maxsize=16)
 def finer_places(pixels: int, cell: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
     """The column of the finer lattice before each pixel, int32, and how far on this is; nobody writes to them."""
     first, part = _places(pixels, cell, cells, torch.empty(0))
-    return np.array(first, np.int32), np.array(part)
+    return np.array(first.numpy(), np.int32), np.array(part.numpy())
 
 
 def by_pixel(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:

@@ -99,7 +99,7 @@ def test_frames_of_any_shape_are_followed(every, size, oracle):
     generator = torch.Generator().manual_seed(every)
 
     def flow(stride: int) -> SmoothFlow:
-        lattice = Lattice(*size, stride)
+        lattice = Lattice(size[0], size[1], stride)
         rows, columns = map(len, lattice.axes())
         nodes = torch.rand(2, 2, rows, columns, generator=generator)
         return SmoothFlow(F.avg_pool2d(nodes, 3, 1, 1), lattice)

@@ -108,11 +108,11 @@ def _groups(pixels: int, cell: float, cells: int) -> tuple[Any, ...]:
     cell_of = np.pad(place.cell, (0, more), mode="edge").reshape(-1, _group())
     begins = np.ascontiguousarray(cell_of[:, 0])
     weights = np.pad(place.weights, ((0, 0), (0, more)), mode="edge")
-    return begins, np.ascontiguousarray((cell_of - begins[:, None]).ravel()), weights, cells + 3
+    return begins, np.ascontiguousarray((cell_of - begins[:, None]).ravel()), weights
 
 
 def _group() -> int:
-    return kernels("fields.kernels.pixels").GROUP
+    return kernels("warping.kernels.across").GROUP
 
 
 def _numbers(values: Tensor) -> np.ndarray:

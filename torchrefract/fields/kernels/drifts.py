@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from torchrefract._jit import fma, inlined, jit
 from torchrefract._lanes import LANES
 from torchrefract.fields.kernels.nodes import Constants, Doubles, Key, Words, gradients, hashed_columns
-from torchrefract.fields.kernels.pixels import GROUP, Columns, Floats, nodes_across
+from torchrefract.fields.kernels.pixels import Columns, Floats
+from torchrefract.warping.kernels.across import GROUP, nodes_across
 
 if LANES:
-    from torchrefract.fields.kernels.groups import add_octave, along_nodes
+    from torchrefract.fields.kernels.groups import add_octave
+    from torchrefract.warping.kernels.across_groups import along_nodes
 else:
-    from torchrefract.fields.kernels.pixels import add_octave, along_nodes
+    from torchrefract.fields.kernels.pixels import add_octave
+    from torchrefract.warping.kernels.across import along_nodes
 
 Whole = NDArray[np.int64]
 Level = tuple[Words, Doubles, Whole, Doubles, Floats]
@@ -49,8 +52,7 @@ def drifts(
     """
     height, width = out.shape[1:]
     stride = taps.shape[1]
-    across = nodes_across(taps, width)
-    columns = across[3]
+    across, columns = nodes_across(taps, width), -(-width // stride) + 3 if stride else 0
     rooms = _room(fine[1], width), _room(coarse[1], columns)
     found, lines = np.empty(_whole(width), np.float32), np.empty((4, _whole(width)), np.float32)
     nodes, kept, frame = np.zeros(_whole(columns) + 2 * GROUP, np.float32), np.empty(4, np.int64), -1

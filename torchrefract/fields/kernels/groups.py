@@ -8,7 +8,7 @@ import numpy as np
 from torchrefract import _lanes as lanes
 from torchrefract._jit import inlined
 from torchrefract._lanes import LANES
-from torchrefract.fields.kernels.pixels import Across, Columns, Floats
+from torchrefract.fields.kernels.pixels import Columns, Floats
 
 
 @inlined
@@ -28,30 +28,3 @@ def add_octave(line: Floats, columns: Columns, octave: int, out: Floats) -> None
         right = lanes.fma(lanes.pick(a, a_behind, node), lanes.difference(p, one), lanes.pick(b, b_behind, node))
         found = lanes.fma(lanes.load(fade, at), lanes.difference(right, left), left)
         lanes.store(out, at, lanes.total(lanes.load(out, at), found))
-
-
-@inlined
-def along_nodes(nodes: Floats, across: Across, out: Floats) -> None:
-    """As `pixels.along_nodes`."""
-    begins, cells, weights, _ = across
-    one = lanes.all_wholes(np.int32(1))
-    first, second, third, fourth = weights[0], weights[1], weights[2], weights[3]
-    own = np.uintp(0)
-    for group in range(begins.size):
-        begin = np.uintp(begins[group])
-        low, high, cell = (
-            lanes.load(nodes, begin),
-            lanes.load(nodes, begin + np.uintp(LANES)),
-            lanes.load_wholes(cells, own),
-        )
-        found = lanes.product(lanes.load(first, own), lanes.pick(low, high, cell))
-        cell = lanes.plus(cell, one)
-        found = lanes.fma(lanes.load(second, own), lanes.pick(low, high, cell), found)
-        cell = lanes.plus(cell, one)
-        found = lanes.fma(lanes.load(third, own), lanes.pick(low, high, cell), found)
-        cell = lanes.plus(cell, one)
-        found = lanes.fma(lanes.load(fourth, own), lanes.pick(low, high, cell), found)
-        lanes.store(out, np.uintp(group * LANES), found)
-        own += np.uintp(LANES)
-        if own >= np.uintp(cells.size):
-            own = np.uintp(0)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from torchrefract._jit import inlined, jit
 from torchrefract.fields.kernels.nodes import Doubles, Floats, Key, Number, direction, inverse_error
-from torchrefract.fields.kernels.pixels import GROUP
 from torchrefract.fields.perlin3d import LINE, OCTAVE
 from torchrefract.noise_kernel import hashed_word
+from torchrefract.warping.kernels.across import GROUP
 
 Whole = NDArray[np.int64]
 # Of each octave the first of its sheets, (K + 1,); of each sheet the first column and row, how many of these there are,

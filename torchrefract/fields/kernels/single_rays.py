@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrefract._jit import fma, inlined
-from torchrefract.fields.kernels.pixels import GROUP, Columns, Floats
+from torchrefract.fields.kernels.pixels import Columns, Floats
+from torchrefract.warping.kernels.across import GROUP
 
 # Of four rows of nodes each, where g_x is read from, how far behind it g_y and g_z are, and their three weights.
 Rows = tuple[NDArray[np.int64], NDArray[np.int64], Floats]

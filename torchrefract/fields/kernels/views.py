@@ -6,15 +6,15 @@ import numpy as np
 
 from torchrefract._jit import fma, inlined, jit
 from torchrefract._lanes import LANES
-from torchrefract.fields.kernels import pixels
 from torchrefract.fields.kernels.nodes import Floats, Number
-from torchrefract.fields.kernels.pixels import GROUP, Across, Small
 from torchrefract.fields.kernels.sheets import Whole
+from torchrefract.warping.kernels import across as single
+from torchrefract.warping.kernels.across import GROUP, Across, Small
 
 if LANES:
-    from torchrefract.fields.kernels.groups import along_nodes
+    from torchrefract.warping.kernels.across_groups import along_nodes
 else:
-    from torchrefract.fields.kernels.pixels import along_nodes
+    from torchrefract.warping.kernels.across import along_nodes
 
 # Of each row of pixels the first of four rows of rays, (H,), and their weights, (4, H).
 Down = tuple[Small, Floats]
@@ -65,7 +65,7 @@ def rows_at_distances(
         if together:
             along_nodes(whole, across, found)
         else:
-            pixels.along_nodes(whole, across, found)
+            single.along_nodes(whole, across, found)
         own = out[i, y]
         for k in range(width):
             own[k] = _positive(found[k] + _ONE)

@@ -13,9 +13,10 @@ import numpy as np
 from torchrefract._jit import fma, horner, inlined, jit
 from torchrefract._lanes import LANES
 from torchrefract.fields.kernels.nodes import Constants, Doubles, Floats, Key, Number, Words
-from torchrefract.fields.kernels.pixels import GROUP, Columns, Small
+from torchrefract.fields.kernels.pixels import Columns
 from torchrefract.fields.kernels.sheets import Sheets, Whole, draw_row, sheets_before
 from torchrefract.fields.kernels.single_rays import Rows
+from torchrefract.warping.kernels.across import GROUP, Small
 
 if LANES:
     from torchrefract.fields.kernels.rays_at_once import add_crossing, between_rows

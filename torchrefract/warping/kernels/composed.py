@@ -27,6 +27,7 @@ else:
 Last = tuple[Floats, Whole, Floats, Floats, Floats]
 Earlier = tuple[Addresses, Whole, Floats, Frame]
 Known = tuple[Floats, Whole, Floats]
+_SIDES = 16  # px, so many at a time are followed by themselves, with registers of any size
 Room = tuple[Across, Floats, Cells, Floats]
 
 
@@ -65,8 +66,7 @@ def along_followed(
     across, between, cells, more = space
     width = base_x.size
     low, high = _between(known[0][pair], known[1][pair], known[2], line, across, between, x, y)
-    # The sides in whole groups, too.
-    low, high = min(width, GROUP * -(-low // GROUP)), max(0, width - GROUP * -(-(width - high) // GROUP))
+    low, high = min(width, _SIDES * -(-low // _SIDES)), max(0, width - _SIDES * -(-(width - high) // _SIDES))
     sides = ((0, low), (high, width)) if low < high else ((0, width), (width, width))
     for first, behind in sides:
         if first < behind:

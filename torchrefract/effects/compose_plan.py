@@ -6,11 +6,11 @@ before it, and what follows a flow whose slope is not known is computed exactly;
 tolerance if parts of its ranges may have lattices. Errors that are of a chance add as deviations do. Of several effects
 that never act on one sample together, each has the whole tolerance.
 
-On the CPU what is left of half the tolerance goes to knowing the composite itself every few px; see `composite_errors`.
+On the CPU part of the tolerance goes to knowing the composite itself every few px; see `composite_errors`.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import takewhile
@@ -25,6 +25,11 @@ from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.plan import Ask, Plan
 from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.refraction import WarpEffect
+
+# Of the tolerance, what flows may have of it where their composite is known seldom, as is tried.
+_PARTS = (0.65, 0.5, 0.35)
+_MOST_KNOWN = 64
+_known = dict[Hashable, tuple[Sequence[Plan], float]]()
 
 
 @dataclass(frozen=True)
@@ -129,15 +134,34 @@ def _warps(effects: Sequence[tuple[Effect, bool]]) -> Iterator[_Warp]:
             group += 1
 
 
-def _shared(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask) -> tuple[list[Plan], float]:
+def _shared(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask) -> tuple[Sequence[Plan], float]:
     """The plan of each warp, and how far the composite is off at most."""
-    tolerance = cast(float, ask.tolerance_px)
-    if ask.halved.reachable and any(_meet([warp for warp in warps if warp.place in own]) for own in together):
-        plans, acting = _in_sets(warps, together, ask.halved)
-        # What is too coarse stays so with larger strides.
-        allowed = takewhile(lambda px: _error(acting, px, ask.rounding) <= tolerance, SELDOM)
-        if (px := max(allowed, default=1)) > 1:
-            return [replace(plan, every=px) for plan in plans], _error(acting, px, ask.rounding)
+    alone = tuple(warp.plan(ask, ask.tolerance_px) for warp in warps)
+    if not all(plan.smooth for plan in alone):
+        return _sought(warps, together, ask)
+    # Plans of flows whose smoothness is known tell all that is asked of them.
+    key = ask, alone, tuple(warp.group for warp in warps), tuple(map(tuple, together))
+    if key not in _known:
+        if len(_known) >= _MOST_KNOWN:
+            _known.clear()
+        _known[key] = _sought(warps, together, ask)
+    return _known[key]
+
+
+def _sought(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask) -> tuple[Sequence[Plan], float]:
+    """The same: of the composites that are known most seldom the one with the coarsest flows."""
+    found = list[tuple[int, list[Plan], float]]()
+    parted = any(_meet([warp for warp in warps if warp.place in own]) for own in together)
+    for part in _PARTS if parted else ():
+        own = replace(ask, tolerance_px=part * cast(float, ask.tolerance_px))
+        if own.reachable:
+            plans, acting = _in_sets(warps, together, own)
+            # What is too coarse stays so with larger strides.
+            errors = ((px, _error(acting, px, ask.rounding)) for px in SELDOM)
+            allowed = list(takewhile(lambda tried: tried[1] <= cast(float, ask.tolerance_px), errors))
+            found += [(px, [replace(plan, every=px) for plan in plans], error) for px, error in allowed[-1:]]
+    if found:
+        return max(found, key=lambda one: one[0])[1:]
     plans, acting = _in_sets(warps, together, ask)
     return plans, _error(acting, 1, ask.rounding)
 

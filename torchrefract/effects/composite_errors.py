@@ -35,9 +35,6 @@ from torchrefract.warping.lattice import lagrange_weights
 
 # Px between nodes, from fine to coarse.
 SELDOM = (2, 3, 4, 5, 6, 8, 10, 12, 16)
-# Errors of lattices whose axes are square to one another, of both, are more than sqrt(2) times that of one axis; of any
-# axes they are up to 1 + 5/4 times that.
-_OBLIQUE = 2.25 / math.sqrt(2)
 # Px, which kernels leave to the border: more than what lies between nodes can be from all of them.
 _MARGIN = 1.0
 
@@ -67,7 +64,7 @@ def errors_of(shares: Sequence[Share], every: int, rounding: float) -> list[Erro
         if smooth is None or later.bend * every**2 > 4 * _MARGIN:
             return [(math.inf, False)]
         own = cubics.amplified**2 * max(0.0, plan.error_px - rounding)
-        own += _OBLIQUE * smooth.cubics(every * later.stretch)
+        own += smooth.cubics(every * later.stretch)
         if later.flows:  # it is read, and the exact one by lines; as known at every pixel if it is a curl
             own += ((1 + cubics.amplified**2) if plan.before > 1 else 1.0) * smooth.lines
         found.append((own * share.stretched, plan.random))

@@ -24,6 +24,8 @@ from torchrefract.warping.lattice import STREAM_NODES, lagrange_weights, slope_w
 _SIGMAS, _SLOPE_SIGMAS = 7.0, 4.0
 _REACH = 8.0  # deviations of the spectrum beyond which nothing is left of it
 _POINTS = 257
+# Of axes that are square to one another errors are sqrt(2) times those along one and more, of any up to 1 + 5/4 times.
+_OBLIQUE = 2.25 / math.sqrt(2)
 _PLACES = 8  # between two nodes, at which cubics are looked at
 # Of the tolerance, for frequencies that are left out.
 _DROPPED = 0.3
@@ -98,7 +100,7 @@ class Cubics:
 @lru_cache(maxsize=1024)
 def _error_of_cubics(ranges: FieldRanges, stride: float) -> float:
     spectrum = _Spectrum.of(ranges)
-    return math.inf if spectrum is None else _SIGMAS * ranges.amplitude[1] * spectrum.error_of_cubics(stride)
+    return math.inf if spectrum is None else _OBLIQUE * _SIGMAS * ranges.amplitude[1] * spectrum.error_of_cubics(stride)
 
 
 def _modes(ranges: FieldRanges, ask: Ask, cutoff: float) -> Modes | None:

@@ -56,11 +56,6 @@ class Ask:
         default = self.tolerance_px == TOLERANCE_PX and not self.reachable
         return replace(self, tolerance_px=None) if default else self
 
-    @property
-    def halved(self) -> "Ask":
-        """The same with half the tolerance."""
-        return self if self.tolerance_px is None else replace(self, tolerance_px=self.tolerance_px / 2)
-
     def room(self) -> float:
         """What the tolerance leaves beside rounding, px.
 
@@ -83,8 +78,8 @@ class Smoothness:
     bend: px per px^2, their largest second derivative along any line, as they bend over a px and more.
     third: px per px^3, likewise; inf where the second has kinks.
     lines: px, how far lines between pixels are off.
-    cubics: px, how far cubics through four nodes along each axis are off, for so many px between the nodes, wherever
-        these lie.
+    cubics: px, how far cubics through four nodes along each of two axes are off, whatever the axes and wherever the
+        nodes lie, for so many px between these.
     """
 
     bend: float

@@ -3,7 +3,8 @@
 A plate is linear in the displacements of its control points, so the error of the cubics between nodes is, too: with
 normal displacements it is normal at every pixel, with a deviation that the splines through one displaced point each
 give. Cubics leave nothing of the affine part. The kernel r^2 ln r has no second derivative at its control point, where
-their error falls with the square of the stride alone; so that is where it is looked at, `_MARGIN` times.
+their error falls with the square of the stride alone; so that is where it is looked at, `_MARGIN` times. The kernel is
+the same in all directions: along axes that are not square to one another the error is less.
 """
 
 import itertools

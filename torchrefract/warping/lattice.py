@@ -189,8 +189,8 @@ class StreamFlow(SmoothFlow):
         options = {"dtype": nodes.dtype, "device": nodes.device}
         slope = slope_weights(self.lattice.stride, STREAM_NODES, **options)
         weight = F.pad(lagrange_weights(self.lattice.stride, STREAM_NODES, **options), (1, 0))
-        along, across = (_across(nodes, values, self.lattice.width) for values in (weight, slope))
-        return torch.cat([scale[0] * along, -scale[1] * across], dim=1), torch.stack([slope, weight])
+        lines = [_across(nodes, values, self.lattice.width) for values in (scale[0] * weight, -scale[1] * slope)]
+        return torch.cat(lines, dim=1), torch.stack([slope, weight])
 
 
 def once(flow: SmoothFlow, work: Callable[[SmoothFlow], Tensor]) -> Tensor:

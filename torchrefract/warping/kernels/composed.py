@@ -28,7 +28,7 @@ Last = tuple[Floats, Whole, Floats, Floats, Floats]
 Earlier = tuple[Addresses, Whole, Floats, Frame]
 Known = tuple[Floats, Whole, Floats]
 _SIDES = 16  # px, so many at a time are followed by themselves, with registers of any size
-Room = tuple[Across, Floats, Cells, Floats]
+Room = tuple[Across, Floats, Floats, Cells, Floats]
 
 
 @jit
@@ -63,23 +63,29 @@ def along_followed(
     """
     lines, flows, weight, base_x, base_y = last
     addresses, table, far, frame = earlier
-    across, between, cells, more = space
+    across, between, sides, cells, more = space
     width = base_x.size
     low, high = _between(known[0][pair], known[1][pair], known[2], line, across, between, x, y)
     low, high = min(width, _SIDES * -(-low // _SIDES)), max(0, width - _SIDES * -(-(width - high) // _SIDES))
-    sides = ((0, low), (high, width)) if low < high else ((0, width), (width, width))
-    for first, behind in sides:
-        if first < behind:
-            own_x, own_y = x[first:behind], y[first:behind]
-            along_lattice(lines[flows[pair]], weight, base_x, base_y, line, own_x, own_y, first)
-            follow_row(own_x, own_y, addresses[pair], table, far, frame, cells, more)
+    low, high = (low, high) if low < high else (width, width)
+    count = low + width - high
+    side_x, side_y = sides[0, :count], sides[1, :count]
+    own = lines[flows[pair]]
+    along_lattice(own, weight, base_x, base_y, line, side_x[:low], side_y[:low])
+    along_lattice(own, weight, base_x, base_y, line, side_x[low:], side_y[low:], high)
+    follow_row(side_x, side_y, addresses[pair], table, far, frame, cells, more)
+    for k in range(low):
+        x[k], y[k] = side_x[k], side_y[k]
+    for k in range(low, count):
+        x[high - low + k], y[high - low + k] = side_x[k], side_y[k]
 
 
 @jit
 def room_for(known: Known, width: int) -> Room:
     """To work in, for rows of so many pixels."""
     between = np.zeros((2, known[0].shape[3] + 2 * GROUP + 1), np.float32)
-    return nodes_across(known[2], width), between, room(), np.empty((4, width), np.float32)
+    sides, more = np.empty((2, width), np.float32), np.empty((4, width), np.float32)
+    return nodes_across(known[2], width), between, sides, room(), more
 
 
 @inlined
@@ -99,16 +105,21 @@ def _between(
         low, high = max(low, spans[k, 0]), min(high, spans[k, 1])
     if high - low < 4:
         return 0, 0
-    at_a, at_b, at_c, at_d = taps[0, place], taps[1, place], taps[2, place], taps[3, place]
     for i in range(2):
-        a, b, c, d = nodes[i, cell - 1], nodes[i, cell], nodes[i, cell + 1], nodes[i, cell + 2]
         # Cubics take a node before each cell: before the frame there is none.
-        into = between[i, 1 : columns + 1]
-        for k in range(columns):
-            into[k] = fma(at_d, d[k], fma(at_c, c[k], fma(at_b, b[k], at_a * a[k])))
+        _down(nodes[i, cell - 1 : cell + 3], taps[:, place], between[i, 1 : columns + 1])
     along_nodes(between[0], across, x)
     along_nodes(between[1], across, y)
     return (low + 1) * stride, (high - 2) * stride
+
+
+@jit
+def _down(rows: Floats, taps: Floats, out: Floats) -> None:
+    """A row, out (n,), between four, (4, n)."""
+    a, b, c, d = rows[0], rows[1], rows[2], rows[3]
+    at_a, at_b, at_c, at_d = taps[0], taps[1], taps[2], taps[3]
+    for k in range(out.size):
+        out[k] = fma(at_d, d[k], fma(at_c, c[k], fma(at_b, b[k], at_a * a[k])))
 
 
 @inlined

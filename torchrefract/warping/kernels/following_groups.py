@@ -32,11 +32,13 @@ def follow_one(
     if x.size < LANES or columns < 2 * LANES:
         following_pixels.follow_one(x, y, flow, place, far, frame, cells, more)
         return
-    before_x, before_y = more[2, : x.size], more[3, : x.size]
-    before_x[:], before_y[:] = x, y
+    end = np.uintp(x.size - LANES)
+    last_x, last_y = lanes.load(x, end), lanes.load(y, end)
     for first in range(0, x.size, LANES):
         start = min(first, x.size - LANES)  # the last group does again what the one before it did
-        at_x, at_y = lanes.load(before_x, np.uintp(start)), lanes.load(before_y, np.uintp(start))
+        at_x, at_y = lanes.load(x, np.uintp(start)), lanes.load(y, np.uintp(start))
+        if start < first:
+            at_x, at_y = last_x, last_y
         place_x, place_y = _to_pixels(at_x, frame[1]), _to_pixels(at_y, frame[0])
         if stride:
             known, u, v = _between(flow, rows, columns, stride, place_x, place_y)
@@ -132,7 +134,7 @@ def _between(flow: Floats, rows: int, columns: int, stride: int, x: Lanes, y: La
     second = lanes.plus(column, one)
     third = lanes.plus(second, one)
     places = column, second, third, lanes.plus(third, one)
-    at += first * columns
+    at, plane = at + first * columns, rows * columns
     for line in range(first, last):
         behind = lanes.minus(lanes.all_wholes(np.int32(line)), row)
         weight = lanes.where(lanes.equal(behind, lanes.all_wholes(np.int32(0))), down[0], zero)
@@ -140,7 +142,7 @@ def _between(flow: Floats, rows: int, columns: int, stride: int, x: Lanes, y: La
         weight = lanes.where(lanes.equal(behind, lanes.all_wholes(np.int32(2))), down[2], weight)
         weight = lanes.where(lanes.equal(behind, lanes.all_wholes(np.int32(3))), down[3], weight)
         u = lanes.fma(weight, _along(flow, at, places, across), u)
-        v = lanes.fma(weight, _along(flow, at + rows * columns, places, across), v)
+        v = lanes.fma(weight, _along(flow, at + plane, places, across), v)
         at += columns
     return True, u, v
 

@@ -27,7 +27,7 @@ from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.refraction import WarpEffect
 
 # Of the tolerance, what flows may have of it where their composite is known seldom, as is tried.
-_PARTS = (0.65, 0.5, 0.35)
+_PARTS = (0.7, 0.55, 0.4)
 _MOST_KNOWN = 64
 _known = dict[Hashable, tuple[Sequence[Plan], float]]()
 

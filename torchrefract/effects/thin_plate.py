@@ -128,7 +128,8 @@ class ThinPlateSpline(LatticeWarp):
     def on_lattice(self, params: ThinPlateParams, plan: Plan) -> SmoothFlow:
         """The flow of `spline_at`."""
         lattice, dtype = cast(Lattice, plan.lattice), params.points.dtype
-        spline = fit_spline(params.points, params.displacement, params.smoothing)
+        # Those that such a plan is for are drawn ones.
+        spline = fit_spline(params.points, params.displacement, params.smoothing, checked=True)
         x, y = lattice.places(dtype=torch.float64, device=params.points.device)
         return SmoothFlow(spline_at(spline, x, y, dtype=dtype), lattice)
 

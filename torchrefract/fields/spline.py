@@ -34,7 +34,7 @@ class Spline(NamedTuple):
     scale: Tensor  # (B, 1, 1), px
 
 
-def fit_spline(points: Tensor, displacement: Tensor, smoothing: Tensor) -> Spline:
+def fit_spline(points: Tensor, displacement: Tensor, smoothing: Tensor, *, checked: bool = False) -> Spline:
     """The thin-plate spline with f(p_i) = d_i at the control points, or near them where it is smoothed.
 
         f(p) = a1 + a2 x + a3 y + sum w_i U(|p - p_i|),  U(r) = r^2 ln r,  sum w = sum w x = sum w y = 0
@@ -47,13 +47,15 @@ def fit_spline(points: Tensor, displacement: Tensor, smoothing: Tensor) -> Splin
         points: (B, N, 2), px, x and y, N at least 3, not all on a line, no two the same.
         displacement: (B, N, 2), px, of each point.
         smoothing: (B,), 0 or above; 0 interpolates.
+        checked: the points are known to be such.
 
     Raises:
         ValueError: too few points, points on a line, two that are the same; where reading them costs nothing.
 
     Source: Bookstein, "Principal warps", IEEE TPAMI 11 (1989).
     """
-    check_points(points)
+    if not checked:
+        check_points(points)
     points, displacement = points.double(), displacement.double()
     center = points.mean(dim=1, keepdim=True)
     scale = (points - center).square().sum(dim=2).mean(dim=1)[:, None, None].clamp(min=1e-24).sqrt()

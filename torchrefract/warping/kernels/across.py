@@ -45,3 +45,10 @@ def along_nodes(nodes: Floats, across: Across, out: Floats) -> None:
             at += np.uintp(1)
             found = fma(weights[tap, own], nodes[at], found)
         out[k] = found
+
+
+@jit
+def both_along_nodes(nodes: Floats, across: Across, x: Floats, y: Floats) -> None:
+    """The same of two rows of nodes, (2, n), at once."""
+    along_nodes(nodes[0], across, x)
+    along_nodes(nodes[1], across, y)

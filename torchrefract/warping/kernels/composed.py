@@ -20,9 +20,9 @@ from torchrefract.warping.kernels.pixels import Cells, Floats, Frame, Whole
 from torchrefract.warping.kernels.places import along_lattice, room
 
 if LANES:
-    from torchrefract.warping.kernels.across_groups import along_nodes
+    from torchrefract.warping.kernels.across_groups import both_along_nodes
 else:
-    from torchrefract.warping.kernels.across import along_nodes
+    from torchrefract.warping.kernels.across import both_along_nodes
 
 Last = tuple[Floats, Whole, Floats, Floats, Floats]
 Earlier = tuple[Addresses, Whole, Floats, Frame]
@@ -108,8 +108,7 @@ def _between(
     for i in range(2):
         # Cubics take a node before each cell: before the frame there is none.
         _down(nodes[i, cell - 1 : cell + 3], taps[:, place], between[i, 1 : columns + 1])
-    along_nodes(between[0], across, x)
-    along_nodes(between[1], across, y)
+    both_along_nodes(between, across, x, y)
     return (low + 1) * stride, (high - 2) * stride
 
 

@@ -132,7 +132,9 @@ class FollowedFlow:
         """Nodes of the composite."""
         px, (height, width) = self.last.every, self.last.lattice[:2]
         rows, columns = ((height - 1) // px + 1, (width - 1) // px + 1) if px > 1 else (0, 0)
-        out, spans = np.empty((len(flows), 2, rows, columns), np.float32), np.empty((len(flows), rows, 2), np.int64)
+        # Of torch, which gives the same memory again: what is new has to be cleared first.
+        out = self.last.nodes.new_empty(len(flows), 2, rows, columns).numpy()
+        spans = np.empty((len(flows), rows, 2), np.int64)
         if px == 1:
             return out, spans, np.empty((4, 0), np.float32)
         x = None if lines.x is None else lines.x[::px]

@@ -92,7 +92,7 @@ def test_an_error_counts_as_much_as_the_slopes_before_it_stretch_it():
     both = Compose([lens(64.0), swirls(64.0)], tolerance_px=0.3).planned(540, 960, torch.float32)
     first, behind = of_warps(both)
     assert first.slope > 0
-    # One error of a chance and one that is none share in halves what knowing the composite seldom leaves, 7 of 10 parts.
+    # One error of a chance and one that is none share in halves what knowing the composite seldom leaves: 7 tenths.
     assert both.error_px > 0.15
     assert behind.every > 1
     assert behind.tolerance_px == pytest.approx(0.7 * 0.15 / (1 + first.slope), rel=0.05)

@@ -140,7 +140,7 @@ def _shared(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask)
     if not all(plan.smooth for plan in alone):
         return _sought(warps, together, ask)
     # Plans of flows whose smoothness is known tell all that is asked of them.
-    key = ask, alone, tuple(warp.group for warp in warps), tuple(map(tuple, together))
+    key = ask, alone, tuple((warp.place, warp.group) for warp in warps), tuple(map(tuple, together))
     if key not in _known:
         if len(_known) >= _MOST_KNOWN:
             _known.clear()

@@ -1,3 +1,4 @@
+import itertools
 import math
 import random
 from typing import Any
@@ -21,7 +22,8 @@ from torchrefract.cameras import Camera
 from torchrefract.effects.compose_plan import ComposePlan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.plan import Plan
-from torchrefract.warping.lattice import Lattice, SmoothFlow
+from torchrefract.fields.spline import evaluate_spline, fit_spline
+from torchrefract.warping.lattice import Lattice, SmoothFlow, lagrange_weights
 
 SIZE = (96, 130)
 
@@ -130,6 +132,39 @@ def test_flows_are_as_smooth_as_planned(effect):
             off = max(off, largest(found - own))
         assert 0.02 * smooth.cubics(px) < off <= smooth.cubics(px)
         assert smooth.cubics(px + 0.5) > smooth.cubics(px)
+
+
+def test_plates_are_no_farther_off_along_axes_that_are_not_square():
+    effect, (height, width), px = ThinPlateSpline(), (540, 960), 5.0
+    y, x = torch.meshgrid(torch.linspace(0, height - 1, 4), torch.linspace(0, width - 1, 4), indexing="ij")
+    points = torch.stack([x.flatten(), y.flatten()], dim=1).double()
+    # One plate for each point that is displaced: the sum of squares is the variance for normal displacements.
+    displaced = torch.eye(16, dtype=torch.float64)[:, :, None].expand(-1, -1, 2)
+    spline = fit_spline(points.expand(16, -1, -1), displaced, torch.zeros(16))
+    weight = lagrange_weights(6, 4, dtype=torch.float64, device=torch.device("cpu"))
+
+    def largest(first: float, second: float) -> float:
+        axes = torch.tensor([[math.cos(a), math.sin(a)] for a in (first, second)]).double()
+        nodes = torch.cartesian_prod(*[torch.arange(-1.0, 3.0).double()] * 2) @ axes
+        found = 0.0
+        for place in torch.cartesian_prod(*[torch.arange(0.0, 1.0, 0.25).double()] * 2):  # of a point in its cell
+            corner = points[:, None] - px * (place @ axes)
+            known = evaluate_spline(spline, (corner + px * nodes).flatten(0, 1).expand(16, -1, -1))[..., 0].view(
+                16, 16, 16
+            )
+            for i, j in itertools.product((1, 3, 5), repeat=2):
+                at = corner[:, 0] + px / 6 * (torch.tensor([i, j]).double() @ axes)
+                own = evaluate_spline(spline, at.expand(16, -1, -1))[..., 0]
+                between = known @ torch.outer(weight[i], weight[j]).flatten()
+                found = max(found, (own - between).square().sum(dim=0).amax().sqrt().item())
+        return found
+
+    square = largest(0.0, math.pi / 2)
+    assert largest(math.pi / 4, 3 * math.pi / 4) == pytest.approx(square, rel=0.02)
+    for between in (30, 45, 60, 75, 105, 150):
+        assert 0.5 * square < largest(0.2, 0.2 + math.radians(between)) < square
+    planned = effect.planned(height, width, torch.float64).smooth
+    assert 7 * effect.amplitude_range[1] * square <= planned.cubics(px)
 
 
 def test_composites_are_known_as_seldom_as_the_tolerance_allows():

@@ -164,6 +164,7 @@ def test_plates_are_no_farther_off_along_axes_that_are_not_square():
     for between in (30, 45, 60, 75, 105, 150):
         assert 0.5 * square < largest(0.2, 0.2 + math.radians(between)) < square
     planned = effect.planned(height, width, torch.float64).smooth
+    assert planned is not None
     assert 7 * effect.amplitude_range[1] * square <= planned.cubics(px)
 
 

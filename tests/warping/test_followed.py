@@ -76,6 +76,8 @@ def test_kernels_read_what_is_read_without_them(monkeypatch, oracle):
     monkeypatch.setattr("torchrefract._compiled.kernels", lambda _: None)
     plain = flow.sampler_grid(torch.float32)
     oracle("flows in a row, without numba", found, plain, 1e-6, unit="")
+    double = FollowedFlow(smooth(3, 16), (smooth(0, 12), smooth(1, 12).dense()))
+    oracle("flows in a row, float64", found.double(), double.sampler_grid(torch.float64), 1e-6, unit="")
 
 
 @pytest.mark.parametrize(("every", "bar"), [(1, 6e-3), (2, 6e-4), (3, 6e-4), (4, 1e-3), (5, 2e-3)])
@@ -152,3 +154,8 @@ def test_what_lies_anywhere_in_memory_is_not_read():
     flow = smooth(1, 12).dense().float().mT
     with pytest.raises(ValueError, match="values must have the planes of a row one after the other, got strides"):
         of_readings([flow], [0], far=[4.0], size=SIZE)
+    # What is made of a flow lies as it has to.
+    last = smooth(2, 12, height=SIZE[1], width=SIZE[0])
+    last = last.with_nodes(last.nodes.float())
+    apart, together = (FollowedFlow(last, (own,)).sampler_grid(torch.float32) for own in (flow, flow.contiguous()))
+    assert torch.equal(apart, together)

@@ -212,6 +212,27 @@ def test_what_follows_a_rough_warp_is_exact():
     assert "whose slope is not known" in of_warps(plan)[2].why
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_what_follows_a_warp_that_is_exact_has_a_lattice_if_slopes_are_known(seed):
+    def row(tolerance: float | None) -> list[LatticeWarp]:
+        lens, plate, air, swirls = parts(tolerance)
+        plate.amplitude_range = (3.0, 4.0)
+        return [lens, plate, air, swirls]
+
+    effects = Compose(row(64.0), tolerance_px=0.03)
+    plan = effects.planned(*SIZE, torch.float32)
+    first, bent, *others = strides(plan)
+    assert bent == 1
+    assert min(first, *others) > 1
+    # It leaves its share to the others.
+    shares = [part.error_px for part in of_warps(plan)]
+    assert 0.02 < plan.error_px <= 0.03
+    assert shares[1] == 0
+    found = effects.degrade(image(), seed=seed)
+    exact = Compose(row(None)).apply(image().double(), found.params.to(torch.float64))
+    assert (found.flow - exact.flow).norm(dim=1).amax() <= plan.error_px
+
+
 def test_an_effect_without_a_tolerance_stays_exact():
     effects = parts(0.1)
     effects[2].tolerance_px = None

@@ -3,8 +3,9 @@
 The composite d_1 of n flows, d_i = d_(i+1) + f_i(p + d_(i+1)), is off by e_1 at most, e_i = e_(i+1) (1 + L_i) + the
 error of f_i, L_i being the largest slope of f_i. So the error of each flow counts times the product of 1 + L of those
 before it, and what follows a flow whose slope is not known is computed exactly; that flow itself shares in the
-tolerance if parts of its ranges may have lattices. Errors that are of a chance add as deviations do. Of several effects
-that never act on one sample together, each has the whole tolerance.
+tolerance if parts of its ranges may have lattices. A flow that is exact under its share leaves that to the others.
+Errors that are of a chance add as deviations do. Of several effects that never act on one sample together, each has the
+whole tolerance.
 
 On the CPU part of the tolerance goes to knowing the composite itself every few px; see `composite_errors`.
 """
@@ -137,9 +138,9 @@ def _warps(effects: Sequence[tuple[Effect, bool]]) -> Iterator[_Warp]:
 def _shared(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask) -> tuple[Sequence[Plan], float]:
     """The plan of each warp, and how far the composite is off at most."""
     alone = tuple(warp.plan(ask, ask.tolerance_px) for warp in warps)
-    if not all(plan.smooth for plan in alone):
+    if not all(plan.smooth or _is_exact(plan) for plan in alone):
         return _sought(warps, together, ask)
-    # Plans of flows whose smoothness is known tell all that is asked of them.
+    # Plans of flows whose smoothness is known tell all that is asked of them; what is exact is so under a share, too.
     key = ask, alone, tuple((warp.place, warp.group) for warp in warps), tuple(map(tuple, together))
     if key not in _known:
         if len(_known) >= _MOST_KNOWN:
@@ -203,28 +204,38 @@ def _in_row(warps: Sequence[_Warp], ask: Ask) -> list[Share]:
     """What each warp gets of those that act one after the other."""
     tolerance = ask.tolerance_px or 0.0
     shares = [Share(tolerance / len(warps), warp.plan(ask, tolerance / len(warps))) for warp in warps]
-    for _ in warps:
-        still = [share.plan.stride == 0 for share in shares]
-        shares = _shared_once(warps, shares, ask)
+    exact = [False] * len(warps)
+    for _ in (*warps, *warps):
+        before = [share.plan.stride == 0 for share in shares], exact
+        shares = _shared_once(warps, shares, exact, ask)
+        # What would come to a lattice by a share that another one leaves stays exact: shares come to an end.
+        exact = [own or _is_exact(share.plan) for own, share in zip(exact, shares, strict=True)]
         # A flow that is too small to count under a larger share has given no slope yet.
-        if still == [share.plan.stride == 0 for share in shares]:
+        if before == ([share.plan.stride == 0 for share in shares], exact):
             break
     return shares
 
 
-def _shared_once(warps: Sequence[_Warp], shares: Sequence[Share], ask: Ask) -> list[Share]:
-    """The plans for shares of the tolerance that go by the slopes of earlier ones."""
-    smooth = sum(1 for _ in takewhile(lambda share: share.plan.stride != 1, shares))
+def _is_exact(plan: Plan) -> bool:
+    return plan.stride == 1 and not plan.parts
+
+
+def _shared_once(warps: Sequence[_Warp], shares: Sequence[Share], exact: Sequence[bool], ask: Ask) -> list[Share]:
+    """The plans for shares of the tolerance that go by the slopes of earlier ones; some are known to be exact."""
+    known = sum(1 for _ in takewhile(lambda share: share.plan.stride == 0 or share.plan.slope < math.inf, shares))
     # The one that comes next has an error, too, where what is drawn may have a lattice of its own.
-    sharing = smooth + any(share.plan.parts for share in shares[smooth : smooth + 1])
-    whole = (ask.tolerance_px or 0.0) / max(1.0, _total([(1.0, share.plan.random) for share in shares[:sharing]]))
+    sharing = known + any(share.plan.parts for share in shares[known : known + 1])
+    erring = [share.plan for share, own in zip(shares[:sharing], exact, strict=False) if not own]
+    whole = (ask.tolerance_px or 0.0) / max(1.0, _total([(1.0, plan.random) for plan in erring]))
     found, before = list[Share](), 1.0
-    for warp, last in zip(warps[:sharing], shares[:sharing], strict=True):
-        found.append(Share(whole / before, warp.plan(ask, whole / before), before))
+    for warp, last, own in zip(warps[:sharing], shares, exact, strict=False):
+        found.append(
+            Share(0.0, last.plan, before) if own else Share(whole / before, warp.plan(ask, whole / before), before)
+        )
         # A flow that is not computed is too small to count.
         before *= 1 + last.plan.slope if last.plan.stride > 0 else 1.0
     follows = Share(0.0, ask.plan(1, 0.0, "it follows a warp whose slope is not known"))
-    return found + [share if i == smooth else follows for i, share in enumerate(shares[sharing:], start=sharing)]
+    return found + [share if i == known else follows for i, share in enumerate(shares[sharing:], start=sharing)]
 
 
 def _total(errors: Iterable[Error]) -> float:

@@ -64,14 +64,16 @@ def field_plan(ranges: FieldRanges, ask: Ask) -> Plan:
     if most > min(ask.height, ask.width) or room <= 0:
         return ask.plan(1, 0.0, "it moves too far for a lattice")
     spectrum = _Spectrum.of(ranges)
-    modes = None if spectrum is None else _modes(ranges, ask, spectrum.cutoff(_DROPPED * room / most))
-    if spectrum is None or modes is None:
+    if spectrum is None:
         return ask.plan(1, 0.0, "the field has too many frequencies for a lattice")
     # Errors and slopes are not at their largest in one place.
     steep = _SLOPE_SIGMAS * ranges.amplitude[1]
     slope, bend, third = (steep * spectrum.derivative(order) for order in (1, 2, 3))
-    smooth = Smoothness(bend, third, most * spectrum.lines(), Cubics(ranges))
-    more: dict[str, Any] = {"modes": modes, "slope": slope, "smooth": smooth, "random": True}
+    known = {"slope": slope, "smooth": Smoothness(bend, third, most * spectrum.lines(), Cubics(ranges))}
+    modes = _modes(ranges, ask, spectrum.cutoff(_DROPPED * room / most))
+    if modes is None:
+        return ask.plan(1, 0.0, "the field has too many frequencies for a lattice", **known)
+    more: dict[str, Any] = {"modes": modes, "random": True, **known}
     nodes = STREAM_NODES if ranges.stream else 4
     if ranges.stream:
         more |= {"before": nodes // 2, "after": nodes // 2 - 1}
@@ -83,7 +85,7 @@ def field_plan(ranges: FieldRanges, ask: Ask) -> Plan:
             return None
         return FieldPlan(ask.height, ask.width, tolerance, stride, off + tolerance - room, counts, **more)
 
-    return coarsest(attempt) or ask.plan(1, 0.0, "the field is too rough for a lattice")
+    return coarsest(attempt) or ask.plan(1, 0.0, "the field is too rough for a lattice", **known)
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,11 @@ def lens_plan(boxes: tuple[LensRanges, ...], ask: Ask) -> Plan:
         more = {"slope": errors.slope, "steps": steps, "kept": kept, "dropped": dropped, "smooth": smooth}
         return ask.plan(stride, error, "cubics between", **more)
 
-    return coarsest(attempt) or ask.plan(1, 0.0, "the lenses of the ranges bend too much for cubics")
+    if (plan := coarsest(attempt)) is not None:
+        return plan
+    errors = lens_errors(boxes, Lattice(ask.height, ask.width, STRIDES[0]))
+    slope = math.inf if errors is None or errors.stretch > MOST_STRETCH else errors.slope
+    return ask.plan(1, 0.0, "the lenses of the ranges bend too much for cubics", slope=slope)
 
 
 @dataclass(frozen=True)

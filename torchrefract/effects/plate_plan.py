@@ -11,7 +11,7 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -52,7 +52,7 @@ def plate_plan(amplitude: float, points: tuple[int, int], smoothing: Range, ask:
     slope, bend = (_SLOPE_SIGMAS * amplitude * max(f(_plate(*plate)) for plate in plates) for f in (_slope, _bend))
     largest = _MARGIN * _SIGMAS * amplitude
     lines = largest * max(_deviation(plate, 1, 2) for plate in plates)
-    more = {"slope": slope, "smooth": Smoothness(bend, math.inf, lines, Cubics(largest, tuple(plates)))}
+    more: dict[str, Any] = {"slope": slope, "smooth": Smoothness(bend, math.inf, lines, Cubics(largest, tuple(plates)))}
 
     def attempt(stride: int) -> Plan | None:
         off = largest * max(_deviation(plate, stride, 4) for plate in plates)
@@ -61,7 +61,7 @@ def plate_plan(amplitude: float, points: tuple[int, int], smoothing: Range, ask:
         error = off + cast(float, ask.tolerance_px) - room
         return ask.plan(stride, error, "kinks of the second derivative", random=True, **more)
 
-    return coarsest(attempt) or ask.plan(1, 0.0, "the plate bends too much for cubics")
+    return coarsest(attempt) or ask.plan(1, 0.0, "the plate bends too much for cubics", **more)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from arguments import count, frame_of, size
-from subjects import SMOOTH, TOLERANCE_PX, all_warps
+from subjects import ROUGH, SMOOTH, TOLERANCE_PX, all_warps
 from timing import (
     COPY,
     FEWEST_REPEATS,
@@ -49,9 +49,9 @@ WHAT = (
     "drawn number (of a lens all 12 coefficients, so that none is skipped as zero), forward alone or forward and "
     "backward. 'radial' is a lens without decentring, which needs no Newton steps in the plane. On the CPU the bare "
     "grid_sample threads over the batch alone; the effects use all threads on one frame too. Within 0.05 px the flow "
-    "is computed on lattices: one mild lens, the lenses of the default ranges, each by its part of them, and fields of "
-    "40 px and longer; the image asks for its gradient, forward alone. How long the sampler takes depends on the flow, "
-    "so bare grid_samples along flows of theirs, ready made, stand beside them, and they are told as multiples of "
+    "is computed on lattices: one mild lens, the lenses of the default ranges, each by its part of them, fields of 40 "
+    "px and longer, and rough air that an aperture smooths; the image asks for its gradient, forward alone. How long "
+    "the sampler takes depends on the flow, so bare grid_samples along flows of theirs, ready made, stand beside them, and they are told as multiples of "
     "these, too."
 )
 LENS, RADIAL, FOG, FLARE = "LensDistortion", "LensDistortion radial", "UniformFog", "LensFlare"
@@ -90,7 +90,7 @@ def candidates(frame: Tensor) -> dict[str, Candidate]:
     radial = LensDistortion(p1_range=(0.0, 0.0), p2_range=(0.0, 0.0), tolerance_px=None)
     found = references(frame)
     others = {
-        TURBULENCE: Turbulence(length_range=(20.0, 20.0)),
+        TURBULENCE: Turbulence(length_range=(20.0, 20.0), tolerance_px=None),
         SPLINE: ThinPlateSpline(tolerance_px=None),
         SWIRL: DivergenceFree(length_range=(20.0, 20.0), tolerance_px=None),
         FLARE: LensFlare(),
@@ -113,7 +113,8 @@ def candidates(frame: Tensor) -> dict[str, Candidate]:
 
 def _tolerant(frame: Tensor) -> dict[str, Candidate]:
     """The warps under a tolerance."""
-    warps = {f"{name} within {TOLERANCE_PX} px": make(tolerance_px=TOLERANCE_PX) for name, make in SMOOTH.items()}
+    makers = {**SMOOTH, **ROUGH}
+    warps = {f"{name} within {TOLERANCE_PX} px": make(tolerance_px=TOLERANCE_PX) for name, make in makers.items()}
     found, learning = dict[str, Candidate](), frame.clone().requires_grad_()
     warps[FLEET] = LensDistortion(tolerance_px=TOLERANCE_PX)
     for name, effect in {**warps, ALL_FOUR: all_warps(tolerance_px=TOLERANCE_PX)}.items():

@@ -40,7 +40,8 @@ def _ours(frame: Tensor) -> dict[str, Candidate]:
     ranges: dict[str, Any] = {"amplitude_range": (FIELD_PX, FIELD_PX), "length_range": (LENGTH_PX, LENGTH_PX)}
     within = f"within {TOLERANCE_PX} px"
     effects = {
-        "field: ours Turbulence": Turbulence(**ranges),
+        "field: ours Turbulence, exact": Turbulence(**ranges, tolerance_px=None),
+        f"field: ours Turbulence {within}": Turbulence(**ranges, tolerance_px=TOLERANCE_PX),
         f"field: ours Turbulence, Gaussian {within}": Turbulence(
             **ranges, covariance="gaussian", tolerance_px=TOLERANCE_PX
         ),

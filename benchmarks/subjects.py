@@ -18,7 +18,7 @@ from torchrefract.effects.base import Effect
 from torchrefract.effects.lattice_warp import LatticeWarp
 
 TOLERANCE_PX = 0.05
-LENS, PLATE, AIR, SWIRLS = "mild lens", "thin plate", "Gaussian air", "swirls"
+LENS, PLATE, AIR, SWIRLS, HOT_AIR = "mild lens", "thin plate", "Gaussian air", "swirls", "hot air"
 _exact = partial(partial, tolerance_px=None)
 FOG, DRIFTS, SPACE, FLARE = "fog", "drifts of fog", "fog in space", "flare"
 # Flows that are smooth enough for a lattice, exact; to be called with `tolerance_px` and other arguments of a warp.
@@ -27,6 +27,10 @@ SMOOTH: Mapping[str, Callable[..., LatticeWarp]] = {
     PLATE: _exact(ThinPlateSpline),
     AIR: _exact(Turbulence, covariance="gaussian", length_range=(40.0, 60.0)),
     SWIRLS: _exact(DivergenceFree, length_range=(40.0, 60.0)),
+}
+# Of exponential covariance, as `presets.highveld_heat_haze` has it, likewise.
+ROUGH: Mapping[str, Callable[..., LatticeWarp]] = {
+    HOT_AIR: _exact(Turbulence, amplitude_range=(1.2, 1.8), length_range=(40.0, 80.0), aperture_range=(4.0, 6.0)),
 }
 WEATHER: Mapping[str, Callable[..., Effect]] = {
     FOG: UniformFog,

@@ -7,7 +7,22 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple
 
-from subjects import AIR, DRIFTS, FLARE, FOG, LENS, PLATE, SMOOTH, SPACE, SWIRLS, TOLERANCE_PX, WEATHER, all_warps
+from subjects import (
+    AIR,
+    DRIFTS,
+    FLARE,
+    FOG,
+    HOT_AIR,
+    LENS,
+    PLATE,
+    ROUGH,
+    SMOOTH,
+    SPACE,
+    SWIRLS,
+    TOLERANCE_PX,
+    WEATHER,
+    all_warps,
+)
 
 from torchrefract.effects.base import Effect
 
@@ -97,6 +112,7 @@ SWEEPS: Mapping[str, list[Variant]] = {
     LENS: _warp(LENS),
     PLATE: _warp(PLATE),
     AIR: _warp(AIR) + _kinds(SMOOTH[AIR], "covariance", "matern52", "matern32", "exponential"),
+    HOT_AIR: _tolerances(ROUGH[HOT_AIR]),
     SWIRLS: _warp(SWIRLS) + _steps(SMOOTH[SWIRLS]),
     "all four warps": _tolerances(all_warps),
     FOG: [*_levels(WEATHER[FOG]), *_lights(WEATHER[FOG])],

@@ -158,6 +158,13 @@ def _turbulence(dice: random.Random) -> tuple[type[LatticeWarp], dict[str, Any]]
     }
 
 
+def _rough_air(dice: random.Random) -> tuple[type[LatticeWarp], dict[str, Any]]:
+    """Of covariances that are rough but for an aperture; with one below 1.8 px all are exact."""
+    kind, ranges = _turbulence(dice)
+    rough = {"covariance": dice.choice(("exponential", "matern32", "matern52")), "aperture_range": span(dice, 1.5, 15)}
+    return kind, ranges | rough
+
+
 def _swirl(dice: random.Random) -> tuple[type[LatticeWarp], dict[str, Any]]:
     return DivergenceFree, {
         "amplitude_range": span(dice, 0.01, 30.0),
@@ -179,6 +186,7 @@ CONFIGURATIONS: dict[str, Callable[[random.Random], tuple[Callable[..., LatticeW
     "LensDistortion": _lens,
     "ThinPlateSpline": _plate,
     "Turbulence": _turbulence,
+    "Turbulence, not Gaussian": _rough_air,
     "DivergenceFree": _swirl,
     "Compose": _composition,
 }

@@ -180,7 +180,8 @@ def test_composites_are_known_as_seldom_as_the_tolerance_allows():
     # Nothing is composed of what is looked up by itself, or has no bound.
     alone = Compose(parts(64.0)[:1], tolerance_px=1.0).planned(*SIZE, torch.float32)
     light = Compose([*parts(64.0)[:1], UniformFog(), *parts(64.0)[1:2]], tolerance_px=1.0).planned(*SIZE, torch.float32)
-    rough = Compose([*parts(64.0)[:2], Turbulence()], tolerance_px=1.0).planned(*SIZE, torch.float32)
+    sharp = Turbulence(aperture_range=(0.0, 0.0))
+    rough = Compose([*parts(64.0)[:2], sharp], tolerance_px=1.0).planned(*SIZE, torch.float32)
     exact = Compose(parts(64.0), tolerance_px=None).planned(*SIZE, torch.float32)
     assert {part.every for plan in (alone, light, rough, exact) for part in of_warps(plan)} == {1}
 
@@ -203,13 +204,36 @@ def test_flows_that_leave_the_frame_are_within_the_tolerance(tolerance):
     assert (found.flow - exact.flow).norm(dim=1).amax() <= plan.error_px <= tolerance
 
 
-def test_what_follows_a_rough_warp_is_exact():
-    rough = Turbulence(tolerance_px=0.1)
+def test_what_follows_a_warp_of_unknown_slope_is_exact():
+    unknown = Turbulence(normalize="image", tolerance_px=0.1)
     before, after = parts(0.1)[1:3]
-    plan = Compose([before, rough, after], tolerance_px=0.3).planned(*SIZE, torch.float32)
+    plan = Compose([before, unknown, after], tolerance_px=0.3).planned(*SIZE, torch.float32)
     assert strides(plan)[0] > 1
     assert strides(plan)[1:] == [1, 1]
     assert "whose slope is not known" in of_warps(plan)[2].why
+
+
+@pytest.mark.parametrize("aperture", [0.0, 0.3, 3.0])
+@pytest.mark.parametrize("covariance", ["exponential", "matern32", "matern52"])
+def test_what_follows_rough_air_is_within_the_tolerance(covariance, aperture):
+    def row(tolerance: float | None) -> list[LatticeWarp]:
+        ranges: dict[str, Any] = {"amplitude_range": (0.2, 0.4), "length_range": (10.0, 20.0)}
+        apertures = (aperture, aperture)
+        air = Turbulence(**ranges, aperture_range=apertures, covariance=covariance, tolerance_px=tolerance)
+        return [lens(tolerance), air, *parts(tolerance)[2:]]
+
+    effects = Compose(row(64.0), tolerance_px=0.2)
+    plan = effects.planned(*SIZE, torch.float32)
+    found = effects.degrade(image(), seed=4)
+    exact = Compose(row(None)).apply(image().double(), found.params.to(torch.float64))
+    assert (strides(plan)[1] > 1) == (aperture == 3)
+    assert min(strides(plan)[2:]) > 1
+    assert (found.flow - exact.flow).norm(dim=1).amax() <= plan.error_px
+    alone = row(0.2)[1]
+    flow = alone.degrade(torch.zeros(8, 1, 240, 320), seed=1).flow
+    steepest = max(flow.diff(dim=dim).square().sum(dim=1).amax().sqrt().item() for dim in (2, 3))
+    slope = alone.planned(240, 320, torch.float32).slope
+    assert 0.2 * slope < steepest <= 7 / 4 * slope  # which counts four deviations
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -315,8 +339,8 @@ def test_one_of_several_has_the_whole_tolerance():
 
 def test_one_of_several_beside_others_shares_with_them_alone():
     air, plate = parts(64.0)[2], parts(64.0)[1]
-    both = Compose([OneOf([swirls(64.0), Turbulence(p=0.5)]), plate], tolerance_px=0.1)
-    # A turbulence of exponential covariance has no slope, so what follows it is exact.
+    both = Compose([OneOf([swirls(64.0), Turbulence(normalize="image", p=0.5)]), plate], tolerance_px=0.1)
+    # A turbulence that is normalized by itself has no slope that is known, so what follows it is exact.
     first, *others = strides(both.planned(*SIZE, torch.float32))
     assert first > 1
     assert others == [1, 1]

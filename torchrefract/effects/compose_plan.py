@@ -217,7 +217,7 @@ def _in_row(warps: Sequence[_Warp], ask: Ask) -> list[Share]:
 
 
 def _is_exact(plan: Plan) -> bool:
-    return plan.stride == 1 and not plan.parts
+    return plan.stride == 1 and plan.error_px == 0
 
 
 def _shared_once(warps: Sequence[_Warp], shares: Sequence[Share], exact: Sequence[bool], ask: Ask) -> list[Share]:

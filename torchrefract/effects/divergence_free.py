@@ -1,6 +1,6 @@
 """A warp that swirls: its displacement has no divergence."""
 
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -8,13 +8,14 @@ from torch import Tensor
 from torchrefract import draws
 from torchrefract._checks import check_choice, check_count
 from torchrefract.effects.base import params_to
-from torchrefract.effects.field_plan import FieldPlan, FieldRanges, field_plan
+from torchrefract.effects.field_plan import FieldPlan, field_plan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, lies_in
-from torchrefract.effects.random_field import check_field_params, check_field_range, field_on_lattice, random_field
+from torchrefract.effects.random_field import check_field_params, check_field_range, field_of_modes, random_field
 from torchrefract.effects.rows import column, spread
 from torchrefract.fields.covariance import COVARIANCES
+from torchrefract.fields.field_bounds import FieldRanges
 from torchrefract.fields.modes import Modes
 from torchrefract.fields.stream import curl, curl_rms
 from torchrefract.types import Range
@@ -149,9 +150,11 @@ class DivergenceFree(LatticeWarp):
 
     def on_lattice(self, params: DivergenceFreeParams, plan: Plan) -> SmoothFlow:
         """The curl of psi between nodes, of the frequencies that the plan keeps."""
-        modes, lattice = cast(FieldPlan, plan).modes, cast(Lattice, plan.lattice)
+        modes, lattice = cast(Modes, cast(FieldPlan, plan).modes), cast(Lattice, plan.lattice)
         # The psi of the exact flow has a row and a column of its own around the frame.
-        psi = field_on_lattice(params, cast(Modes, modes), lattice, aperture=False, offset=1)[:, :1]
+        rows, columns = ([place + 1 for place in axis] for axis in lattice.axes())
+        drawn: Any = {"kind": self.covariance, "lengths": self.length_range, "nodes": None, "aperture": False}
+        psi = field_of_modes(params, modes, (rows, columns), **drawn)[:, :1]
         scale = params.amplitude / curl_rms(params.length, self.covariance)
         return StreamFlow(column(spread(scale, psi.shape[0])) * psi, lattice)
 

@@ -79,6 +79,10 @@ class LatticeWarp(WarpEffect):
     def on_lattice(self, params: Any, plan: Plan) -> SmoothFlow:
         """The flow on the plan's lattice, where it exists everywhere."""
 
+    def at_pixels(self, params: Any, plan: Plan) -> tuple[Tensor, Tensor]:
+        """The flow of a plan that has no lattice, and where it exists, as for `flow`."""
+        return self.flow(params, height=plan.height, width=plan.width)
+
     def plans_of(self, params: Any, plan: Plan) -> Sequence[Plan] | None:
         """Of a plan that has parts the one for each sample, None where it cannot be told."""
         return None
@@ -105,9 +109,9 @@ class LatticeWarp(WarpEffect):
 
     def _gated(self, params: Any, plan: Plan) -> Moved:
         """The same, by one plan."""
-        if plan.lattice is None:
-            return super().gated(params, height=plan.height, width=plan.width)
         height, width = plan.height, plan.width
+        if plan.lattice is None:
+            return self._moved(params, lambda own: self.at_pixels(own, plan), height, width)
         active = self.active(params, height, width)
         if (index := some(active, params)) is not None:
             path = self._known_every(params_part(params, index), plan)

@@ -94,7 +94,7 @@ class Plan:
 
     height, width: px, of the frame.
     tolerance_px: how far the flow may be from the exact one anywhere; None is exact.
-    stride: px between the nodes at which the flow is computed; 1 is every pixel, and exact; 0 is no flow at all.
+    stride: px between the nodes at which the flow is computed; 1 is every pixel; 0 is no flow at all.
     error_px: how far the flow is from the exact one at most.
     steps: of Newton's method, where there is one.
     kept: the terms that are computed.

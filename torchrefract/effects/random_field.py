@@ -1,7 +1,7 @@
 """What the effects of random fields share."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -13,10 +13,10 @@ from torchrefract.effects.motion import check_motion, is_still
 from torchrefract.effects.rows import spread
 from torchrefract.fields.evolution import evolved, turn_rates
 from torchrefract.fields.gaussian import gaussian_random_field, spectrum
+from torchrefract.fields.low_modes import low_amplitude, low_field
 from torchrefract.fields.modes import Modes, evolved_modes, mode_amplitude, mode_field, mode_noise, mode_turn_rates
 from torchrefract.fields.torus import torus
 from torchrefract.types import Range
-from torchrefract.warping.lattice import Lattice
 
 # A covariance that is off by twice this is told.
 _CLIPPED = 1e-3
@@ -79,15 +79,26 @@ def _noises(params: Any, shape: Tensor, size: tuple[int, int]) -> Iterator[tuple
             yield evolved(noise[i : i + 1], rates[i : i + 1], frame=frame, **own), shape[i : i + 1]
 
 
-def field_on_lattice(params: Any, modes: Modes, lattice: Lattice, *, aperture: bool, offset: int = 0) -> Tensor:
-    """The fields of `random_field` with a Gaussian covariance, (B T, 2, n, m), at the nodes of a lattice.
+def field_of_modes(
+    params: Any,
+    modes: Modes,
+    at: tuple[Sequence[int], Sequence[int]],
+    *,
+    kind: str,
+    lengths: Range,
+    nodes: int | None,
+    aperture: bool,
+) -> Tensor:
+    """The fields of `random_field`, (B T, 2, n, m), of a few frequencies.
 
     Args:
         params: as for `random_field`.
         modes: the frequencies to keep.
-        lattice: where.
+        at: px, rows and columns.
+        kind: of the covariance.
+        lengths: px, the range of correlation lengths.
+        nodes: as for `low_eigenvalues`.
         aperture: whether the parameters have one.
-        offset: px, of the frame within that of `random_field`, along both axes.
     """
     dtype, rows = params.amplitude.dtype, params.frame.numel()
     noise = mode_noise(params.key, modes, dtype=dtype)
@@ -95,11 +106,12 @@ def field_on_lattice(params: Any, modes: Modes, lattice: Lattice, *, aperture: b
         rates = spread(mode_turn_rates(params.key, modes, dtype=dtype), rows)
         options = {name: spread(getattr(params, name), rows) for name in ("wind", "decorrelation")}
         noise = evolved_modes(spread(noise, rows), rates, modes, frame=params.frame.reshape(-1), **options)
-    width = params.aperture if aperture else None
-    amplitude = mode_amplitude(modes, params.length, aperture=width, dtype=dtype)
-    down, across = (spread(values, noise.shape[0]) for values in amplitude)
-    places = ([place + offset for place in axis] for axis in lattice.axes())
-    return mode_field(noise, (down, across), modes, *places)
+    shape: Any = {"aperture": params.aperture if aperture else None, "dtype": dtype}
+    if kind == "gaussian":
+        down, across = (spread(values, noise.shape[0]) for values in mode_amplitude(modes, params.length, **shape))
+        return mode_field(noise, (down, across), modes, *at)
+    amplitude = low_amplitude(modes, params.length, kind=kind, lengths=lengths, nodes=nodes, **shape)
+    return low_field(noise, spread(amplitude, noise.shape[0]), modes, *at)
 
 
 def check_field_range(name: str, value: Range) -> Range:

@@ -75,12 +75,16 @@ class WarpEffect(Effect):
 
     def gated(self, params: Any, *, height: int, width: int) -> "Moved":
         """The flow, zero for the samples that the effect leaves alone."""
+        return self._moved(params, lambda own: self.flow(own, height=height, width=width), height, width)
+
+    def _moved(self, params: Any, flow_of: Callable[[Any], tuple[Tensor, Tensor]], height: int, width: int) -> "Moved":
+        """The same, of a flow at every pixel that is made as told."""
         active = self.active(params, height, width)
         index, batch = some(active, params), len(active)
         if index is None:
-            flow, exists = self.flow(params, height=height, width=width)
+            flow, exists = flow_of(params)
         else:
-            flow, exists = self.flow(params_part(params, index), height=height, width=width)
+            flow, exists = flow_of(params_part(params, index))
             flow, exists = put(flow, index, 0.0, batch), put(exists, index, True, batch)
         active = spread(active, flow.shape[0])
         return Moved(only(flow, 0.0, active, params), exists | ~column(active), active)

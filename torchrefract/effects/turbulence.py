@@ -1,7 +1,8 @@
 """Hot air over a road."""
 
 import warnings
-from typing import NamedTuple, cast
+from collections.abc import Sequence
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -9,13 +10,14 @@ from torch import Tensor
 from torchrefract import draws
 from torchrefract._checks import check_choice, is_true
 from torchrefract.effects.base import params_to
-from torchrefract.effects.field_plan import FieldPlan, FieldRanges, field_plan
+from torchrefract.effects.field_plan import FieldPlan, field_plan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
 from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, lies_in
-from torchrefract.effects.random_field import check_field_params, check_field_range, field_on_lattice, random_field
+from torchrefract.effects.random_field import check_field_params, check_field_range, field_of_modes, random_field
 from torchrefract.effects.rows import column, frame_mean, spread
 from torchrefract.fields.covariance import COVARIANCES, slope_rms
+from torchrefract.fields.field_bounds import FieldRanges
 from torchrefract.fields.modes import Modes
 from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice, SmoothFlow
@@ -58,8 +60,8 @@ class Turbulence(LatticeWarp):
         covariance: "exponential", "gaussian", "matern32" or "matern52".
         normalize: "theory" gives the amplitude to all fields together, "image" to each: its mean is subtracted and its
             standard deviation divided by, which inflates fields that are longer than the frame.
-        padding, interpolation, resampler, tolerance_px, p: as for every warp; only Gaussian fields have a coarser
-            lattice.
+        padding, interpolation, resampler, tolerance_px, p: as for every warp; other fields than Gaussian ones have few
+            enough frequencies for a tolerance if the aperture is 1.8 px or more, and are exact otherwise.
 
     Raises:
         ValueError: an argument outside its range.
@@ -132,10 +134,10 @@ class Turbulence(LatticeWarp):
         return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
 
     def plan_within(self, ask: Ask) -> Plan:
-        """The plan of `field_plan` for a Gaussian covariance; all others are exact."""
-        if self.covariance != "gaussian" or self.normalize != "theory":
+        """The plan of `field_plan` for air that is normalized by theory; other is exact."""
+        if self.normalize != "theory":
             return super().plan_within(ask)
-        ranges = FieldRanges(self.amplitude_range, self.length_range, self.aperture_range)
+        ranges = FieldRanges(self.amplitude_range, self.length_range, self.aperture_range, kind=self.covariance)
         return field_plan(ranges, ask)
 
     def covers(self, params: TurbulenceParams, height: int, width: int) -> Tensor:
@@ -145,10 +147,22 @@ class Turbulence(LatticeWarp):
 
     def on_lattice(self, params: TurbulenceParams, plan: Plan) -> SmoothFlow:
         """The flow of the frequencies that the plan keeps."""
+        lattice = cast(Lattice, plan.lattice)
+        return SmoothFlow(self._of_modes(params, plan, *lattice.axes()), lattice)
+
+    def at_pixels(self, params: TurbulenceParams, plan: Plan) -> tuple[Tensor, Tensor]:
+        """The same at every pixel, where a plan keeps some of the frequencies."""
+        if not isinstance(plan, FieldPlan):
+            return super().at_pixels(params, plan)
+        flow = self._of_modes(params, plan, range(plan.height), range(plan.width))
+        return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
+
+    def _of_modes(self, params: TurbulenceParams, plan: Plan, rows: Sequence[int], columns: Sequence[int]) -> Tensor:
         self._check_folds(params)
-        modes, lattice = cast(FieldPlan, plan).modes, cast(Lattice, plan.lattice)
-        field = field_on_lattice(params, cast(Modes, modes), lattice, aperture=True)
-        return SmoothFlow(column(spread(params.amplitude, field.shape[0])) * field, lattice)
+        kept = cast(FieldPlan, plan)
+        drawn: Any = {"kind": self.covariance, "lengths": self.length_range, "nodes": kept.nodes}
+        field = field_of_modes(params, cast(Modes, kept.modes), (rows, columns), **drawn, aperture=True)
+        return column(spread(params.amplitude, field.shape[0])) * field
 
     def moves(self, params: TurbulenceParams) -> Tensor:
         """The samples with an amplitude."""

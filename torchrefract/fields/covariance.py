@@ -37,8 +37,7 @@ def slope_rms(length: Tensor, *, kind: str, aperture: Tensor | None = None) -> T
     """(B,), 1/px: the root mean square of the difference between neighboring pixels of a field of variance 1.
 
         sqrt(2 (1 - C(1) / C(0))),  C smoothed by the aperture a twice, for which it is a sum of Gaussians:
-        C(h) = sum w s / (s + 2 a^2) exp(-h^2 / (2 (s + 2 a^2))),  s = l^2 t / nu,
-        w = t^nu exp(-t) over equal steps of ln t
+        C(h) = sum w s / (s + 2 a^2) exp(-h^2 / (2 (s + 2 a^2))),  w and s / l^2 as by `as_gaussians`
 
     An aperture below half a pixel smooths pixels by less than this, up to a tenth.
 
@@ -47,11 +46,24 @@ def slope_rms(length: Tensor, *, kind: str, aperture: Tensor | None = None) -> T
         kind: one of COVARIANCES.
         aperture: (B,), px.
     """
-    variance = length.double()[:, None].square()
-    weight = torch.ones_like(variance)
-    if kind != "gaussian":
-        t = torch.arange(-60.0, 5.0, 0.5, dtype=torch.float64, device=length.device).exp()
-        weight, variance = t ** _SMOOTHNESS[kind] * torch.exp(-t), variance * t / _SMOOTHNESS[kind]
+    weight, scale = as_gaussians(kind, length.device)
+    variance = length.double()[:, None].square() * scale
     spread = variance if aperture is None else variance + 2 * aperture.double()[:, None].square()
     weight = weight * variance / spread
     return (-2 * (weight * torch.expm1(-0.5 / spread)).sum(dim=1) / weight.sum(dim=1)).sqrt()
+
+
+def as_gaussians(kind: str, device: torch.device) -> tuple[Tensor, Tensor]:
+    """(n,) and (n,), float64: weights and squared lengths, of l^2, of the Gaussian covariances that a kind is a sum of.
+
+        C(h) = sum w exp(-h^2 / (2 s l^2)),  s = t / nu,  w = t^nu exp(-t) over equal steps of ln t, of sum 1
+
+    Source: a Matern covariance is a mixture of Gaussian ones; Rasmussen and Williams, "Gaussian processes for machine
+    learning" (2006), section 4.2.
+    """
+    t = torch.ones(1, dtype=torch.float64, device=device)
+    if kind == "gaussian":
+        return t, t
+    t = torch.arange(-60.0, 5.0, 0.5, dtype=torch.float64, device=device).exp()
+    weight = t ** _SMOOTHNESS[kind] * torch.exp(-t)
+    return weight / weight.sum(), t / _SMOOTHNESS[kind]

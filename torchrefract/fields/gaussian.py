@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._bands import join
+from torchrefract._bands import join, rows_at_once
 from torchrefract.fields.covariance import REACH, covariance
 
 _ROUNDING = 5e-13  # of the transform, relative to the largest eigenvalue
@@ -64,9 +64,9 @@ def axis_spectrum(size: int, length: Tensor, aperture: Tensor | None) -> Tensor:
     near, *far = (covariance(h, length.double()[:, None], "gaussian") for h in ways)
     values = _transform(near + sum(far), -1)
     kept = torch.where(values > _ROUNDING * values.amax(dim=1, keepdim=True), values, 0)
-    smooth = _smoothing(distance / size, aperture).reshape(-1, size // 2 + 1)
+    smooth = smoothing(distance / size, aperture).reshape(-1, size // 2 + 1)
     variance = (kept * smooth.square() * _multiplicity(size, length.device)).sum(dim=1, keepdim=True)
-    return _root(kept) * smooth / variance.sqrt()
+    return root(kept) * smooth / variance.sqrt()
 
 
 def gaussian_random_field(noise: Tensor, shape: Tensor, *, height: int, width: int) -> Tensor:
@@ -87,10 +87,12 @@ def gaussian_random_field(noise: Tensor, shape: Tensor, *, height: int, width: i
 def _spectrum(
     size: tuple[int, int], length: Tensor, *, kind: str, aperture: Tensor | None, dtype: torch.dtype
 ) -> Spectrum:
-    values = _eigenvalues(size, length.double()[:, None, None], kind)
+    values = eigenvalues(size, length.double()[:, None, None], kind)
+    if kind != "exponential":  # what rounding leaves is no eigenvalue: the slope of its root would be anything
+        values = torch.where(values.abs() > _ROUNDING * values.amax(dim=(1, 2), keepdim=True), values, 0)
     kept = values.clamp(min=0)
     y, x = _half_axes(size, length.device)
-    smooth_y, smooth_x = _smoothing(y / size[0], aperture), _smoothing(x / size[1], aperture)
+    smooth_y, smooth_x = smoothing(y / size[0], aperture), smoothing(x / size[1], aperture)
     weight_y = _multiplicity(size[0], length.device)[:, None] * smooth_y.square()
     weight_x = _multiplicity(size[1], length.device) * smooth_x.square()
 
@@ -99,34 +101,49 @@ def _spectrum(
 
     variance = total(kept)
     clipped = 1 - variance / (2 * variance - total(values))
-    amplitude = _root(kept).to(dtype) * (smooth_y / variance.sqrt()).to(dtype) * smooth_x.to(dtype)
+    amplitude = root(kept).to(dtype) * (smooth_y / variance.sqrt()).to(dtype) * smooth_x.to(dtype)
     return Spectrum(amplitude, clipped[:, 0, 0].to(dtype))
 
 
-def _eigenvalues(size: tuple[int, int], length: Tensor, kind: str) -> Tensor:
-    """(B, Ht / 2 + 1, Wt / 2 + 1), for a length of (B, 1, 1)."""
+def eigenvalues(
+    size: tuple[int, int], length: Tensor, kind: str, *, most: tuple[int | None, int | None] = (None, None)
+) -> Tensor:
+    """(B, Ht / 2 + 1, Wt / 2 + 1), float64, up to rounding; fewer rows and columns, from frequency 0 on, up to `most`.
+
+    The lengths are (B, 1, 1), px, float64.
+    """
     # The covariance is even along both axes, so a quarter of it holds everything. Smooth ones need float64: their
     # eigenvalues span sixteen powers of ten.
     y, x = _half_axes(size, length.device)
-    if kind == "exponential":
-        return _transform(_transform(covariance((x * x + y * y).sqrt(), length, kind), -1), -2)
-    # A smooth covariance of the shortest way round the torus has a kink half-way, and so negative eigenvalues. Summed
-    # over the ways round it has none; on a torus too short for it, the sum would be off by more.
-    others = (REACH[kind] * length <= min(size)).double()
     if kind == "gaussian":  # a product of two functions of one axis
+        others = _others(size, length, kind)
         rows, columns = (
             covariance(t, length, kind) + others * (covariance(n - t, length, kind) + covariance(n + t, length, kind))
             for t, n in ((y, size[0]), (x, size[1]))
         )
-        values = _transform(rows, -2) * _transform(columns, -1)
-    else:
-        x2, y2, far_x2, far_y2 = x * x, y * y, (size[1] - x).square(), (size[0] - y).square()
-        near, *far = (
-            covariance(square.sqrt(), length, kind) for square in (x2 + y2, far_x2 + y2, x2 + far_y2, far_x2 + far_y2)
-        )
-        values = _transform(_transform(near + others * sum(far), -1), -2)
-    # What rounding leaves is no eigenvalue: the slope of its root would be anything.
-    return torch.where(values.abs() > _ROUNDING * values.amax(dim=(1, 2), keepdim=True), values, 0)
+        return _transform(rows, -2)[:, : most[0]] * _transform(columns, -1)[:, :, : most[1]]
+    at_once = rows_at_once(length.device, len(y), each=len(length) * size[1], cached=_CACHED // 2)
+    parts = (_on_torus(part, x, size, length, kind) for part in y.split(at_once))
+    bands = (_transform(part, -1)[:, :, : most[1]] for part in parts)
+    return _transform(join(bands, dim=1, length=len(y)), -2)[:, : most[0]]
+
+
+def _on_torus(y: Tensor, x: Tensor, size: tuple[int, int], length: Tensor, kind: str) -> Tensor:
+    """(B, n, m): a Matern covariance at rows (n, 1) and columns (m,) of the torus."""
+    x2, y2, far_x2, far_y2 = x * x, y * y, (size[1] - x).square(), (size[0] - y).square()
+    if kind == "exponential":
+        return covariance((x2 + y2).sqrt(), length, kind)
+    near, *far = (
+        covariance(square.sqrt(), length, kind) for square in (x2 + y2, far_x2 + y2, x2 + far_y2, far_x2 + far_y2)
+    )
+    return near + _others(size, length, kind) * sum(far)
+
+
+def _others(size: tuple[int, int], length: Tensor, kind: str) -> Tensor:
+    """(B, 1, 1): whether the covariance is summed over the ways round the torus."""
+    # That of the shortest way has a kink half-way where the covariance is smooth, and so negative eigenvalues. The sum
+    # has none; on a torus too short for it, it would be off by more.
+    return (REACH[kind] * length <= min(size)).double()
 
 
 def _half_axes(size: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
@@ -134,7 +151,7 @@ def _half_axes(size: tuple[int, int], device: torch.device) -> tuple[Tensor, Ten
     return y[:, None], x
 
 
-def _smoothing(frequency: Tensor, aperture: Tensor | None) -> Tensor:
+def smoothing(frequency: Tensor, aperture: Tensor | None) -> Tensor:
     """What a Gaussian aperture leaves of the amplitude at frequencies in cycles per px."""
     if aperture is None:
         return torch.ones_like(frequency)
@@ -143,7 +160,8 @@ def _smoothing(frequency: Tensor, aperture: Tensor | None) -> Tensor:
     return torch.where(kept > _NOTHING, kept, 0)
 
 
-def _root(values: Tensor) -> Tensor:
+def root(values: Tensor) -> Tensor:
+    """The square root, without a slope where there is nothing."""
     if not (values.requires_grad and torch.is_grad_enabled()):
         return values.sqrt()
     # The root of zero has no slope, and a frequency that is not there needs none.

@@ -70,9 +70,13 @@ def mode_field(
         modes: their frequencies.
         rows, columns: px, whole numbers.
     """
-    weighted = noise * (amplitude[0][:, None, :, None] * amplitude[1][:, None, None, :])
+    return sum_of_modes(noise * (amplitude[0][:, None, :, None] * amplitude[1][:, None, None, :]), modes, rows, columns)
+
+
+def sum_of_modes(weighted: Tensor, modes: Modes, rows: Sequence[int], columns: Sequence[int]) -> Tensor:
+    """The fields of `mode_field`, from the noise times its amplitude, (B, 2, My, Mx)."""
     real, imaginary = weighted.unbind(1)
-    in_y, in_x = _waves(modes, tuple(rows), tuple(columns), noise.dtype, noise.device)
+    in_y, in_x = _waves(modes, tuple(rows), tuple(columns), weighted.dtype, weighted.device)
     both = torch.stack([torch.cat([real, imaginary], dim=2), torch.cat([imaginary, -real], dim=2)], dim=1)
 
     def fields(pairs: Tensor) -> Tensor:

@@ -51,8 +51,8 @@ WHAT = (
     "grid_sample threads over the batch alone; the effects use all threads on one frame too. Within 0.05 px the flow "
     "is computed on lattices: one mild lens, the lenses of the default ranges, each by its part of them, fields of 40 "
     "px and longer, and rough air that an aperture smooths; the image asks for its gradient, forward alone. How long "
-    "the sampler takes depends on the flow, so bare grid_samples along flows of theirs, ready made, stand beside them, and they are told as multiples of "
-    "these, too."
+    "the sampler takes depends on the flow, so bare grid_samples along flows of theirs, ready made, stand beside them, "
+    "and they are told as multiples of these, too."
 )
 LENS, RADIAL, FOG, FLARE = "LensDistortion", "LensDistortion radial", "UniformFog", "LensFlare"
 PERLIN, DRIFTS, SPACE = "Perlin noise, 6 octaves", "HeterogeneousFog", "HeterogeneousFog in space"

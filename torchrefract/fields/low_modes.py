@@ -14,7 +14,7 @@ from torchrefract.fields.modes import Modes, sum_of_modes
 from torchrefract.types import Range
 
 _CACHED = 1 << 17  # complex numbers that stay in a core's cache
-_MOST_KEPT = 1 << 25  # numbers of tables
+_MOST_TABLES, _MOST_KEPT = 64, 1 << 25  # and numbers in all of them
 _tables: dict[tuple[Modes, str, Range, int], Tensor] = {}  # those asked for last come last
 
 
@@ -37,9 +37,9 @@ def low_eigenvalues(modes: Modes, length: Tensor, *, kind: str, lengths: Range, 
 
     Small ones are kept that `spectrum` takes for rounding, up to 5e-13 of the largest.
 
-    On the CPU they are polynomials in ln(length), through Chebyshev points between the ends of its range: their tables
-    are kept, of 8 nodes (rows + 1) (columns + 1) bytes each and 256 MB in all. Elsewhere, and in a compiled graph, all
-    eigenvalues of the torus are transformed for each length.
+    On the CPU they are polynomials in ln(length), through Chebyshev points between the ends of its range. Tables of them
+    are kept, of 8 nodes (rows + 1) (columns + 1) bytes each: the latest 64, up to 256 MB. Elsewhere, and in a compiled
+    graph, all eigenvalues of the torus are transformed for each length.
 
     Args:
         modes: the frequencies, below half of all along both axes.
@@ -172,7 +172,9 @@ def _coefficients(modes: Modes, kind: str, lengths: Range, nodes: int) -> Tensor
     if found is None:
         found = _made(modes, kind, lengths, nodes)
     _tables[key] = found
-    while len(_tables) > 1 and sum(table.numel() for table in _tables.values()) > _MOST_KEPT:
+    while len(_tables) > 1 and (
+        len(_tables) > _MOST_TABLES or sum(table.numel() for table in _tables.values()) > _MOST_KEPT
+    ):
         _tables.pop(next(iter(_tables)), None)  # that nobody has asked for longest
     return found
 

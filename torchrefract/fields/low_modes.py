@@ -37,9 +37,9 @@ def low_eigenvalues(modes: Modes, length: Tensor, *, kind: str, lengths: Range, 
 
     Small ones are kept that `spectrum` takes for rounding, up to 5e-13 of the largest.
 
-    On the CPU they are polynomials in ln(length), through Chebyshev points between the ends of its range. Tables of them
-    are kept, of 8 nodes (rows + 1) (columns + 1) bytes each: the latest 64, up to 256 MB. Elsewhere, and in a compiled
-    graph, all eigenvalues of the torus are transformed for each length.
+    On the CPU they are polynomials in ln(length), through Chebyshev points between the ends of its range. Tables are
+    kept of them, of 8 nodes (rows + 1) (columns + 1) bytes each: the latest 64, up to 256 MB. Elsewhere, and in a
+    compiled graph, all eigenvalues of the torus are transformed for each length.
 
     Args:
         modes: the frequencies, below half of all along both axes.

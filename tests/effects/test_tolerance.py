@@ -12,6 +12,7 @@ from torch.testing import assert_close
 
 from torchrefract import Compose, DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, UniformFog
 from torchrefract.effects.lattice_warp import LatticeWarp
+from torchrefract.effects.plan import MOST_ULPS
 from torchrefract.fields.stream import curl
 from torchrefract.warping.grid import sampler_grid
 from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow, between_nodes
@@ -229,9 +230,12 @@ def test_the_default_is_a_fiftieth_of_a_pixel_and_exact_where_rounding_is_more(k
     assert effect.tolerance_px == 0.02
     exact, found = (copy(effect) for _ in range(2))
     exact.tolerance_px = None
-    large = found.planned(2, 40_000, torch.float32)
+    ulps = getattr(effect, "ulps", MOST_ULPS)
+    width = math.ceil(0.01 / (ulps * 2.0**-24)) + 1  # where rounding is half of the tolerance
+    large = found.planned(2, width, torch.float32)
     assert large.error_px == 0
-    assert str(large).splitlines()[1:] == str(exact.planned(2, 40_000, torch.float32)).splitlines()[1:]
+    assert str(large).splitlines()[1:] == str(exact.planned(2, width, torch.float32)).splitlines()[1:]
+    assert found.planned(2, width - 3, torch.float32).tolerance_px == 0.02
     assert found.planned(1080, 1920, torch.float32).tolerance_px == 0.02
 
 

@@ -78,7 +78,7 @@ class _Warp(NamedTuple):
         """Its plan under a tolerance, None for exact; if it has none of its own it stays exact."""
         if not isinstance(self.effect, LatticeWarp):
             return self.effect.planned(ask.height, ask.width, torch.float64 if ask.double else torch.float32)
-        ask = replace(ask, tolerance_px=None if self.effect.tolerance_px is None else tolerance)
+        ask = replace(ask, tolerance_px=None if self.effect.tolerance_px is None else tolerance, ulps=self.effect.ulps)
         if not ask.reachable:
             return ask.plan(1, 0.0, "its share of the tolerance is below rounding")
         return self.effect.plan_within(ask)
@@ -158,13 +158,13 @@ def _sought(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask)
         if own.reachable:
             plans, acting = _in_sets(warps, together, own)
             # What is too coarse stays so with larger strides.
-            errors = ((px, _error(acting, px, ask.rounding)) for px in SELDOM)
+            errors = ((px, _error(acting, px)) for px in SELDOM)
             allowed = list(takewhile(lambda tried: tried[1] <= cast(float, ask.tolerance_px), errors))
             found += [(px, [replace(plan, every=px) for plan in plans], error) for px, error in allowed[-1:]]
     if found:
         return max(found, key=lambda one: one[0])[1:]
     plans, acting = _in_sets(warps, together, ask)
-    return plans, _error(acting, 1, ask.rounding)
+    return plans, _error(acting, 1)
 
 
 def _meet(warps: Sequence[_Warp]) -> bool:
@@ -172,12 +172,12 @@ def _meet(warps: Sequence[_Warp]) -> bool:
     return len({warp.group for warp in warps}) < len(warps)
 
 
-def _error(acting: Sequence[Sequence[Share]], every: int, rounding: float) -> float:
+def _error(acting: Sequence[Sequence[Share]], every: int) -> float:
     """How far the composite of each set is off at most, if it is known every so many px.
 
     All of a set count as one composite: light between warps may turn out to change nothing.
     """
-    return max((_total(errors_of(shares, every, rounding)) for shares in acting), default=0.0)
+    return max((_total(errors_of(shares, every)) for shares in acting), default=0.0)
 
 
 def _in_sets(

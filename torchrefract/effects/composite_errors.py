@@ -49,11 +49,8 @@ class Share(NamedTuple):
     stretched: float = 1.0  # how often its error counts in the composite
 
 
-def errors_of(shares: Sequence[Share], every: int, rounding: float) -> list[Error]:
-    """Of flows that are read where later ones look, in their order; inf where there is no bound.
-
-    rounding: px, that each plan counts with, and all flows together have once.
-    """
+def errors_of(shares: Sequence[Share], every: int) -> list[Error]:
+    """Of flows that are read where later ones look, in their order; inf where there is no bound."""
     if every == 1:
         return [(share.plan.error_px * share.stretched, share.plan.random) for share in shares]
     still = [share for share in shares if share.plan.stride == 0]
@@ -63,7 +60,7 @@ def errors_of(shares: Sequence[Share], every: int, rounding: float) -> list[Erro
         plan, smooth = share.plan, share.plan.smooth
         if smooth is None or later.bend * every**2 > 4 * _MARGIN:
             return [(math.inf, False)]
-        own = cubics.amplified**2 * max(0.0, plan.error_px - rounding)
+        own = cubics.amplified**2 * plan.error_px
         own += smooth.cubics(every * later.stretch)
         if later.flows:  # it is read, and the exact one by lines; as known at every pixel if it is a curl
             own += ((1 + cubics.amplified**2) if plan.before > 1 else 1.0) * smooth.lines
@@ -71,7 +68,7 @@ def errors_of(shares: Sequence[Share], every: int, rounding: float) -> list[Erro
         cross = (1 + cubics.amplified) * cubics.across(smooth, later, every)
         found.append((cross * share.stretched, False))
         later = later.after(plan.slope, smooth, every)
-    return [*found, (cubics.amplified**2 * rounding, False)]
+    return found
 
 
 class _Later(NamedTuple):

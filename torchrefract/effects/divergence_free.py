@@ -11,7 +11,7 @@ from torchrefract.effects.base import params_to
 from torchrefract.effects.field_plan import FieldPlan, field_plan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
-from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, lies_in
+from torchrefract.effects.plan import FEW_ULPS, TOLERANCE_PX, Ask, Plan, lies_in
 from torchrefract.effects.random_field import check_field_params, check_field_range, field_of_modes, random_field
 from torchrefract.effects.rows import column, spread
 from torchrefract.fields.covariance import COVARIANCES
@@ -100,6 +100,7 @@ class DivergenceFree(LatticeWarp):
         self.steps = check_count("steps", steps)
 
     params_type = DivergenceFreeParams
+    ulps = FEW_ULPS
 
     def at_rest(self) -> bool:
         """Whether no flow has an amplitude."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrefract._checks import is_true, learns
 from torchrefract._constants import assume_constant_result
-from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, check_tolerance
+from torchrefract.effects.plan import MOST_ULPS, TOLERANCE_PX, Ask, Plan, check_tolerance
 from torchrefract.effects.refraction import Moved, WarpEffect, mixed
 from torchrefract.effects.rows import only, params_part, put, some, spread
 from torchrefract.warping.lattice import SmoothFlow
@@ -25,8 +25,13 @@ class LatticeWarp(WarpEffect):
         padding, interpolation, resampler, p: as for every warp.
         tolerance_px: how far the flow may be from the exact one, px, anywhere and for all parameters in the ranges of
             the effect, so that it can be computed on a coarser lattice, see `plan`; None is exact, and so is the
-            default in frames so large that float32 does not reach it, from about 10 000 px on.
+            default in frames so large that float32 does not reach it, from about 10 000 px on for lenses and 40 000
+            for others.
+
+    ulps: as for `Ask`.
     """
+
+    ulps = MOST_ULPS
 
     def __init__(
         self,
@@ -52,7 +57,8 @@ class LatticeWarp(WarpEffect):
 
     def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
         """The plan for fields of a type."""
-        return self.plan_within(Ask(height, width, self.tolerance_px, dtype is torch.float64).of_default)
+        ask = Ask(height, width, self.tolerance_px, dtype is torch.float64, self.ulps)
+        return self.plan_within(ask.of_default)
 
     def plan_within(self, ask: Ask) -> Plan:
         """The plan that is asked for, from the ranges alone."""

@@ -16,8 +16,10 @@ from torchrefract.warping.lattice import Lattice
 # Of warps, px: nobody sees so little.
 TOLERANCE_PX = 0.02
 _SMALLEST, _LARGEST = 1e-6, 64.0  # px, or levels
-# Positions in float32 are off by so many units of the last place of the longer side.
-_ROUNDING = {False: 16 * 2.0**-24, True: 16 * 2.0**-53}
+# Units of the last place, of the longer side, that flows and positions along them are off by.
+MOST_ULPS = 16  # of lenses, which Newton's method magnifies the rounding of
+FEW_ULPS = 4  # of what is added to positions as it is
+_LAST_PLACE = {False: 2.0**-24, True: 2.0**-53}
 # Px between nodes, from fine to coarse.
 STRIDES = (*range(2, 8), *(share << octave for octave in range(1, 7) for share in (4, 5, 6, 7)), 512)
 
@@ -29,12 +31,14 @@ class Ask:
     height, width: px, of the frame.
     tolerance_px: as for `Plan`.
     double: of fields in float64, not float32.
+    ulps: units of the last place, of the longer side, that the flow is off by besides.
     """
 
     height: int
     width: int
     tolerance_px: float | None
     double: bool
+    ulps: int = MOST_ULPS
 
     def plan(self, stride: int, error_px: float, why: str, **more: Any) -> "Plan":
         """A plan with what was asked for."""
@@ -42,8 +46,8 @@ class Ask:
 
     @property
     def rounding(self) -> float:
-        """Of positions in such a frame, px."""
-        return _ROUNDING[self.double] * max(self.height, self.width)
+        """Of the flow in such a frame, px."""
+        return self.ulps * _LAST_PLACE[self.double] * max(self.height, self.width)
 
     @property
     def reachable(self) -> bool:

@@ -10,7 +10,7 @@ from torchrefract import draws
 from torchrefract._checks import check_all, check_count, check_range
 from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
-from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, lies_in
+from torchrefract.effects.plan import FEW_ULPS, TOLERANCE_PX, Ask, Plan, lies_in
 from torchrefract.effects.plate_plan import plate_plan
 from torchrefract.fields.spline import check_points, fit_spline, spline_at, spline_flow
 from torchrefract.types import Range
@@ -72,6 +72,7 @@ class ThinPlateSpline(LatticeWarp):
         self.smoothing_range = check_range("smoothing_range", smoothing_range, low=0.0, high=1e12)
 
     params_type = ThinPlateParams
+    ulps = FEW_ULPS
 
     def at_rest(self) -> bool:
         """Whether no plate has an amplitude."""

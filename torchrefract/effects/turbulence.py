@@ -13,7 +13,7 @@ from torchrefract.effects.base import params_to
 from torchrefract.effects.field_plan import FieldPlan, field_plan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
-from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, lies_in
+from torchrefract.effects.plan import FEW_ULPS, TOLERANCE_PX, Ask, Plan, lies_in
 from torchrefract.effects.random_field import check_field_params, check_field_range, field_of_modes, random_field
 from torchrefract.effects.rows import column, frame_mean, spread
 from torchrefract.fields.covariance import COVARIANCES, slope_rms
@@ -104,6 +104,7 @@ class Turbulence(LatticeWarp):
         self.normalize = check_choice("normalize", normalize, ("theory", "image"))
 
     params_type = TurbulenceParams
+    ulps = FEW_ULPS
 
     def at_rest(self) -> bool:
         """Whether no air has an amplitude."""

@@ -108,7 +108,8 @@ def field_of_modes(
         noise = evolved_modes(spread(noise, rows), rates, modes, frame=params.frame.reshape(-1), **options)
     shape: Any = {"aperture": params.aperture if aperture else None, "dtype": dtype}
     if kind == "gaussian":
-        down, across = (spread(values, noise.shape[0]) for values in mode_amplitude(modes, params.length, **shape))
+        amplitude = mode_amplitude(modes, params.length, **shape, shortest=lengths[0])
+        down, across = (spread(values, noise.shape[0]) for values in amplitude)
         return mode_field(noise, (down, across), modes, *at)
     amplitude = low_amplitude(modes, params.length, kind=kind, lengths=lengths, nodes=nodes, **shape)
     return low_field(noise, spread(amplitude, noise.shape[0]), modes, *at)

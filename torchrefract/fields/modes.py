@@ -13,6 +13,8 @@ from torchrefract._constants import constant, kept
 from torchrefract.fields.evolution import turned
 from torchrefract.fields.gaussian import axis_spectrum
 
+_SMOOTH = 2.0  # px, from which length on a Gaussian covariance has no frequencies beyond those of pixels
+
 
 class Modes(NamedTuple):
     """The lowest frequencies of a torus: -rows ... rows and -columns ... columns periods."""
@@ -49,11 +51,36 @@ def evolved_modes(
 
 
 def mode_amplitude(
-    modes: Modes, length: Tensor, *, aperture: Tensor | None, dtype: torch.dtype
+    modes: Modes, length: Tensor, *, aperture: Tensor | None, dtype: torch.dtype, shortest: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """(B, My) and (B, Mx), whose product is the amplitude of a Gaussian covariance's `spectrum` at each frequency."""
+    """(B, My) and (B, Mx), whose product is the amplitude of a Gaussian covariance's `spectrum` at each frequency.
+
+    Along an axis of N px the eigenvalues of lengths l of 2 px or more are those of the real line, and so, with k in
+    radians per px and L^2 = l^2 + 2 a^2 for an aperture a,
+
+        amplitude^2 = sqrt(2 pi) L / N exp(-(k L)^2 / 2) / (1 + 2 exp(-(N / L)^2 / 2))
+
+    but for shares of exp(-2 (pi l - k l)^2) and exp(-2 (N / L)^2). For shorter ones they are transformed.
+
+    Args:
+        modes: the frequencies, of a torus with room for the length.
+        length: (B,), px.
+        aperture: (B,), px.
+        dtype: of the amplitude.
+        shortest: px, no length is shorter.
+    """
     sides = zip(modes.size, _numbers(modes, length.device), strict=True)
-    rows, columns = (axis_spectrum(n, length, aperture)[:, k.abs()].to(dtype) for n, k in sides)
+    if shortest < _SMOOTH:
+        rows, columns = (axis_spectrum(n, length, aperture)[:, k.abs()].to(dtype) for n, k in sides)
+        return rows, columns
+    square = length.double().square()[:, None]
+    square = square if aperture is None else square + 2 * aperture.double().square()[:, None]
+
+    def along(n: int, k: Tensor) -> Tensor:
+        largest = math.sqrt(2 * math.pi) / n * square.sqrt() / (1 + 2 * torch.exp(-0.5 * n * n / square))
+        return (largest.sqrt() * torch.exp((-0.25 * (2 * math.pi / n) ** 2) * square * (k * k))).to(dtype)
+
+    rows, columns = (along(n, k) for n, k in sides)
     return rows, columns
 
 

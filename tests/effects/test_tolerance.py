@@ -11,6 +11,7 @@ from scipy.interpolate import lagrange
 from torch.testing import assert_close
 
 from torchrefract import Compose, DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, UniformFog
+from torchrefract.effects.field_plan import FieldPlan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.plan import MOST_ULPS
 from torchrefract.fields.stream import curl
@@ -293,3 +294,23 @@ def test_a_smooth_flow_leads_where_its_dense_form_does():
     x, y = lattice.places(dtype=torch.float64, device=torch.device("cpu"))
     flow = SmoothFlow(torch.randn(2, 2, y.numel(), x.numel(), dtype=torch.float64), lattice)
     assert_close(flow.sampler_grid(torch.float64), sampler_grid(flow.dense()), rtol=0, atol=1e-13)
+
+
+def test_rough_air_has_a_lattice_that_transforms_are_short_for():
+    air: dict[str, Any] = {"amplitude_range": (1.2, 1.8), "length_range": (40.0, 80.0), "aperture_range": (4.0, 6.0)}
+    strides = []
+    for px in (0.02, 0.1, 0.3, 1.0):
+        plan = Turbulence(**air, tolerance_px=px).planned(1080, 1920, torch.float32)
+        assert isinstance(plan, FieldPlan)
+        assert plan.modes is not None
+        assert all(side % plan.stride == 0 for side in plan.modes.size)
+        assert plan.error_px <= px
+        strides.append(plan.stride)
+    assert strides == sorted(strides)
+    assert strides[-1] > strides[0] > 1
+    few = Turbulence(tolerance_px=0.02).planned(256, 256, torch.float32)
+    assert few.stride == 1
+    assert 0 < few.error_px <= 0.02
+    narrow = Turbulence(aperture_range=(0.0, 3.0)).planned(256, 256, torch.float32)
+    assert narrow.stride == 1
+    assert narrow.error_px == 0

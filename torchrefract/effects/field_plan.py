@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from torchrefract.effects.plan import Ask, Plan, Smoothness, coarsest
+from torchrefract.effects.plan import STRIDES, Ask, Plan, Smoothness, coarsest
 from torchrefract.fields.covariance import REACH, slope_rms
 from torchrefract.fields.field_bounds import FieldRanges, FieldSpectrum, error_of_cubics, field_spectrum
 from torchrefract.fields.length_bounds import nodes_needed
@@ -83,11 +83,17 @@ def _planned(ranges: FieldRanges, spectrum: FieldSpectrum, ask: Ask, room: float
             return plan(stride, modes, off, **beside) if off <= room else None
 
         if (found := coarsest(attempt)) is not None:
-            return found
+            return found if ranges.kind == "gaussian" else attempt(_quickest(found.stride, modes.size))
     if ranges.kind == "gaussian":
         return None
     fewest = _modes(ranges, ask, spectrum.cutoff(room / most))
     return None if fewest is None else plan(1, fewest, room)
+
+
+def _quickest(most: int, size: tuple[int, int]) -> int:
+    """Of strides up to one that with the fewest points to transform: those that `low_field` has of the torus."""
+    strides = [stride for stride in STRIDES if stride <= most]
+    return min(strides, key=lambda stride: (math.prod(n // math.gcd(stride, n) for n in size), -stride))
 
 
 @dataclass(frozen=True)

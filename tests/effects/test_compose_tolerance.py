@@ -256,6 +256,24 @@ def test_what_follows_a_warp_that_is_exact_has_a_lattice_if_slopes_are_known(see
     assert (found.flow - exact.flow).norm(dim=1).amax() <= plan.error_px
 
 
+def test_a_warp_whose_share_is_below_rounding_is_exact_and_others_are_not():
+    def row(tolerance: float | None) -> list[LatticeWarp]:
+        lens, _, *fields = parts(tolerance)
+        return [lens, *fields]
+
+    height, width = 64, 1920
+    effects = Compose(row(64.0), tolerance_px=0.008)
+    plan = effects.planned(height, width, torch.float32)
+    first, *others = of_warps(plan)
+    assert (first.stride, first.error_px) == (1, 0.0)
+    assert "below rounding" in first.why
+    assert min(other.stride for other in others) > 1
+    found = effects.degrade(torch.zeros(1, 1, height, width), seed=2)
+    frame = torch.zeros(1, 1, height, width, dtype=torch.float64)
+    exact = Compose(row(None)).apply(frame, found.params.to(torch.float64))
+    assert (found.flow - exact.flow).norm(dim=1).amax() <= plan.error_px <= 0.008
+
+
 def test_an_effect_without_a_tolerance_stays_exact():
     effects = parts(0.1)
     effects[2].tolerance_px = None

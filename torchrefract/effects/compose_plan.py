@@ -80,7 +80,10 @@ class _Warp(NamedTuple):
             return self.effect.planned(ask.height, ask.width, torch.float64 if ask.double else torch.float32)
         ask = replace(ask, tolerance_px=None if self.effect.tolerance_px is None else tolerance, ulps=self.effect.ulps)
         if not ask.reachable:
-            return ask.plan(1, 0.0, "its share of the tolerance is below rounding")
+            least = self.effect.plan_within(replace(ask, tolerance_px=2 * ask.rounding))
+            # Neighbors that move by less than that each are apart by less than twice as much.
+            slope = 4 * ask.rounding if least.stride == 0 else least.slope
+            return ask.plan(1, 0.0, "its share of the tolerance is below rounding", slope=slope, smooth=least.smooth)
         return self.effect.plan_within(ask)
 
 

@@ -86,3 +86,12 @@ def test_pixels_may_be_too_coarse_for_a_field():
     assert field_spectrum(FieldRanges((1.0, 1.0), (50.0, 50.0), (0.0, 5.0), kind="exponential")) is None
     assert field_spectrum(FieldRanges((1.0, 1.0), (2.0, 50.0), (0.0, 0.0))) is None
     assert field_spectrum(FieldRanges((1.0, 1.0), (2.0, 50.0), (3.0, 3.0))) is not None
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, math.pi / 4])
+@pytest.mark.parametrize("k", [0.5, 1.0, 1.5, 2.0, 2.2])
+def test_what_pixels_fold_back_is_no_more_than_the_margin_takes_it_for(k, angle):
+    x, y = k * math.cos(angle), k * math.sin(angle)
+    places = [(i, j) for i in range(-80, 81) for j in range(-80, 81) if (i, j) != (0, 0)]
+    folded = sum((k / math.hypot(x + 2 * math.pi * i, y + 2 * math.pi * j)) ** 3 for i, j in places)
+    assert 0.03 * k**3 < folded <= 0.045 * k**3

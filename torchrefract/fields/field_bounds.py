@@ -22,9 +22,10 @@ _POINTS = 257
 # Of axes that are square to one another errors are sqrt(2) times those along one and more, of any up to 1 + 5/4 times.
 _OBLIQUE = 2.25 / math.sqrt(2)
 _PLACES = 8  # between two nodes, at which cubics are looked at
-# Pixels fold what a covariance has beyond their own frequencies back, before the aperture: below 2/3 of pi no more than
-# a fifth of its power; a Gaussian one has nothing there.
-_FOLDED = math.sqrt(1.2)
+# Pixels fold what a covariance has beyond their own frequencies back, before the aperture: of the power at k, radians
+# per px, where it falls as k^-3 or faster, 0.045 k^3 or less up to k = 2.2, about where half of all frequencies are.
+# Beyond 5 / a an aperture a leaves exp(-25). A Gaussian covariance has nothing there.
+_FOLDED, _HALF_OF_ALL, _SEEN = 0.045, 2.2, 5.0
 # Of a variance that an aperture adds 2 a^2 to: as if it were 0.
 _LITTLE = 0.02
 
@@ -66,8 +67,10 @@ class FieldSpectrum:
         weight, deviation = weight * own / spread, 1 / np.sqrt(np.where(own < _LITTLE * blur, blur, spread))
         if _REACH * deviation.max() > math.pi:
             return None
-        margin = 1.0 if ranges.kind == "gaussian" else _FOLDED
-        return cls(weight / weight.sum(), deviation, stream=ranges.stream, margin=margin)
+        folded = 0.0
+        if ranges.kind != "gaussian":
+            folded = _FOLDED * min(_HALF_OF_ALL, _SEEN / ranges.aperture[0]) ** 3
+        return cls(weight / weight.sum(), deviation, stream=ranges.stream, margin=math.sqrt(1 + folded))
 
     def lines(self) -> float:
         """The deviation of the largest error of lines between pixels."""

@@ -108,6 +108,25 @@ def test_means_at_distances_by_pixel_are_those_of_float64(size, asked, oracle):
     assert "fields.kernels.volumes" in asked
 
 
+@pytest.mark.parametrize("columns", [13, 29, 45])
+@pytest.mark.parametrize("by_pixel", [False, True])
+def test_rays_that_fill_whole_groups_reach_the_last_pixel(columns, by_pixel, monkeypatch, oracle):
+    height, width = 192, 4 * columns  # and with the three that lie beyond them rays are 16, 32 or 48
+    empty = np.empty
+
+    def garbage(shape: Any, dtype: Any = np.float64, **options: Any) -> np.ndarray:
+        made = empty(shape, dtype, **options)
+        if np.issubdtype(dtype, np.floating):
+            made.fill(np.nan)
+        return made
+
+    fog, distance = fogs(2), far(2, height, width if by_pixel else 1)
+    expected = field(fog, distance, torch.float64, **view(height, width))
+    monkeypatch.setattr(np, "empty", garbage)
+    found = field(fog, distance, **view(height, width))
+    oracle("means along rays in whole groups, float64", found, expected, BAR, unit="")
+
+
 @pytest.mark.parametrize(
     ("scales", "reach"),
     [

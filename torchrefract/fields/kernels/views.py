@@ -87,6 +87,8 @@ def refined(volume: Floats, wanted: Whole, start: int, stop: int, out: Floats) -
                 to = np.uintp(2) * (place + np.uintp(k))
                 into[to] = here
                 into[to + np.uintp(1)] = fma(_FAR, outer, _NEAR * (here + after))
+            # The last column that has one of the rays beside it, which rays in whole groups have none behind.
+            into[np.uintp(2) * (place + np.uintp(most - 3))] = flat[place + np.uintp(most - 2)]
 
 
 @jit

@@ -1,4 +1,5 @@
 import math
+from copy import copy
 from typing import Any
 
 import light_tolerance
@@ -215,7 +216,7 @@ def test_octaves_of_no_weight_are_dropped_and_named():
     )
     plan = effect.planned(*SIZE, torch.float32)
     assert plan.kept == ("octave of 20 px", "octave of 40 px")
-    assert [name for name, _ in plan.dropped] == ["octave of 80 px"]
+    assert [name for name, _ in plan.dropped] == ["octave of 80 px", "the fog where 1 - t < 0.0011"]
     assert 0 < plan.dropped[0][1] < 0.3
     assert "term dropped   octave of 80 px, which moves up to" in str(plan)
 
@@ -225,9 +226,46 @@ def test_drifts_that_nobody_sees_are_uniform_fog():
     plan = effect.planned(*SIZE, torch.float32)
     assert plan.acts
     assert plan.is_uniform
-    assert len(plan.dropped) == 6
-    uniform = UniformFog(visibility_range=(3e5, 3e5), deviation_range=(0.0, 0.0)).degrade(image(), seed=1)
-    assert torch.equal(effect.degrade(image(), seed=1).image, uniform.image)
+    names = [name for name, _ in plan.dropped]
+    assert len(names) == 7
+    assert names[-1].startswith("the fog where 1 - t < ")
+    exact = UniformFog(visibility_range=(3e5, 3e5), deviation_range=(0.0, 0.0)).degrade(image(), seed=1)
+    found, left = effect.degrade(image(), seed=1).image, exact.transmission > plan.ends.clear
+    assert 0.1 < left.float().mean() < 0.9
+    assert torch.equal(found, torch.where(left, image(), exact.image))
+
+
+@pytest.mark.parametrize("linear", [False, True])
+@pytest.mark.parametrize(
+    "effect",
+    [UniformFog(), HeterogeneousFog(), HeterogeneousFog(mode="ray"), HeterogeneousFog(normalize="image")],
+    ids=["fog", "drifts", "space", "stretched"],
+)
+def test_where_no_scene_is_seen_is_the_airlight_and_where_no_fog_is_the_image(effect, linear):
+    exact = type(effect)(
+        visibility_range=(30.0, 40.0),
+        linear_light=linear,
+        **({} if isinstance(effect, UniformFog) else {"mode": effect.mode, "normalize": effect.normalize}),
+    )
+    within = copy(exact)
+    within.tolerance = 1.0
+    plan = within.planned(*SIZE, torch.float32, any_depth=True)
+    depth = torch.logspace(-4, 4, SIZE[0])[:, None].expand(2, 1, *SIZE)
+    expected, found = (one.degrade(image(), seed=1, depth=depth) for one in (exact, within))
+    # Octaves that are left out move t a little.
+    room = 0.02 if isinstance(effect, HeterogeneousFog) else 1e-5
+    opaque = expected.transmission < (1 - room) * plan.ends.opaque
+    clear = 1 - expected.transmission < (1 - room) * (1 - plan.ends.clear)
+    assert opaque.float().mean() > 0.2
+    assert clear.float().mean() > 0.2
+    for where, what in ((opaque, expected.params.airlight[:, :, None, None]), (clear, image())):
+        chosen = where.expand_as(found.image)
+        assert torch.equal(found.image[chosen], what.expand_as(found.image)[chosen])
+    assert levels_apart(found.image, expected.image) <= 1
+    assert levels_apart(found.image, expected.image) > 0.1
+    words = str(plan)
+    assert f"term dropped   the scene where t < {plan.ends.opaque:.2g}, which moves up to" in words
+    assert f"term dropped   the fog where 1 - t < {1 - plan.ends.clear:.2g}, which moves up to" in words
 
 
 def test_long_octaves_are_on_a_lattice_that_a_tolerance_makes_coarse():

@@ -247,9 +247,10 @@ def depths() -> Iterator[Case]:
 
 def _depth(effect: Effect, value: float) -> None:
     image = picture().requires_grad_()
-    depth = 5 + 100 * picture()[:, :1].detach()
+    # A depth that learns goes through PyTorch's operations, whose last digits are not those of kernels.
+    depth = (5 + 100 * picture()[:, :1]).detach().requires_grad_()
     tame = effect.degrade(image, seed=7, depth=depth)
-    dirty = depth.clone()
+    dirty = depth.detach().clone()
     dirty[0, 0, ROW, COLUMN] = value
     dirty.requires_grad_()
     try:

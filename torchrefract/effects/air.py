@@ -1,6 +1,6 @@
 """What all fogs share: the light of the air, the distance through it, and the blend of both."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, cast
@@ -8,8 +8,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrefract._bands import join, rows_at_once
-from torchrefract._checks import check_all, check_flag, check_number, check_within, learns
+from torchrefract._checks import check_all, check_flag, check_number, check_within
 from torchrefract._constants import constant
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.color import check_color, each_channel
@@ -18,14 +17,13 @@ from torchrefract.effects.light_plan import Blend
 from torchrefract.effects.plan import lies_in
 from torchrefract.effects.rows import spread
 from torchrefract.fields.depth import check_depth, ray_distance
-from torchrefract.fields.fog import linear_to_srgb, srgb_to_linear, veil
+from torchrefract.fields.veils import Drifting, Ends, veiled, veiled_by_drifts_
 from torchrefract.warping.grid import field_dtype
 
 _PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)
 _REC_709 = (0.2126, 0.7152, 0.0722)
 _GRAY = sum(weight * value for weight, value in zip(_REC_709, _PAPER_AIRLIGHT, strict=True))
 _FOCAL = 0.9  # widths, where no camera is known
-_CACHED = 1 << 18  # values of an image that stay in a core's cache, a few times over
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,37 +101,16 @@ class Air:
         stretch = ((1 + y * y)[:, None] + constant(squares, dtype=y.dtype, device=y.device)).sqrt()
         return self.depth(height, width, dtype=dtype, device=image.device) * stretch
 
-    def in_bands(self, image: Tensor, t: Tensor, airlight: Tensor, bands: Sequence[tuple[str, int, int]]) -> Tensor:
-        """As `blended`, of the bands of a plan."""
-        if len(bands) == 1 and bands[0][0] == "computed":
-            return self.blended(image, t, airlight)
-        color = spread(airlight, image.shape[0])[:, :, None, None]
-        learning, step = learns((image, t)), image.shape[2]
-        if not learning:
-            step = rows_at_once(image.device, step, each=image.numel() // step, cached=_CACHED)
-
-        def parts() -> Iterator[Tensor]:
-            for kind, start, stop in bands:
-                for i in range(start, stop, step) if kind == "computed" else (start,):
-                    end = min(i + step, stop) if kind == "computed" else stop
-                    rows = image[:, :, i:end]
-                    if kind == "computed":
-                        yield self.blended(rows, t[:, :, i:end], airlight)
-                    else:
-                        yield rows if kind == "left" else color.expand_as(rows).to(image.dtype)
-
-        if learning:  # some parts have a slope, and others none
-            return torch.cat(list(parts()), dim=2)
-        return join(parts(), dim=2, length=image.shape[2])
-
-    def blended(self, image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
-        """I t + A (1 - t), of rows (N, C, H, W), with t and the airlight (B, C) in as many rows or fewer."""
+    def blended(self, image: Tensor, t: Tensor, airlight: Tensor, ends: Ends) -> Tensor:
+        """As `veiled`, of rows (N, C, H, W), with t and the airlight (B, C) in as many rows or fewer."""
         rows = image.shape[0]
-        t, airlight = spread(t, rows), spread(airlight, rows)[:, :, None, None]
-        if not self.linear_light:
-            return veil(image, t, airlight)
-        blended = linear_to_srgb(veil(srgb_to_linear(image), t, srgb_to_linear(airlight)))
-        return torch.where(t == 1, image, blended)
+        t = t if t.shape[0] == 1 else spread(t, rows)
+        return veiled(image, t, spread(airlight, rows), ends=ends, linear=self.linear_light)
+
+    def behind_drifts(self, image: Tensor, drifting: Drifting, airlight: Tensor, ends: Ends) -> tuple[Tensor, Tensor]:
+        """As `veiled_by_drifts_`, with the airlight (B, C) in as many rows or fewer."""
+        airlight = spread(airlight, image.shape[0])
+        return veiled_by_drifts_(image, drifting, airlight, ends=ends, linear=self.linear_light)
 
 
 @lru_cache(maxsize=64)

@@ -1,4 +1,8 @@
-"""What fog in drifts will compute under a tolerance: fewer octaves, and the long ones of them on a lattice.
+"""What fog in drifts will compute under a tolerance: where it is seen, of fewer octaves, the long ones on a lattice.
+
+Pixels whose t is so small that nothing is seen of the scene count as t = 0, those whose t is so near to 1 that nothing
+is seen of the fog as t = 1, by the t that is computed. Octaves have a share of the tolerance, and these ends what is
+left of it.
 
 With q = 1/2 + n / sqrt(2) and m = <q> fog is t = exp(-x r), x = k0 (1 + deviation) d, r = q / m. Another noise n + e
 has another mean, m + f, and r changes by
@@ -7,23 +11,23 @@ has another mean, m + f, and r changes by
     |t' - t| <= exp(-x r_low) (1 - exp(-x |e'| / m_low)) + |f'| / m_low max over y of y exp(-y)
 
 where r_low is the smaller of q / m and (q + e') / m, at least 0. e and n are sub-Gaussian, see `perlin_bounds`: at a
-pixel they lie in the ellipse of their variances and their covariance, `_SIGMAS` deviations wide, and neither is beyond
+pixel they lie in the ellipse of their variances and their covariance, `SIGMAS` deviations wide, and neither is beyond
 its own `largest_sum`; means likewise. Over that and over all x up to that of the farthest pixel the bound is looked
 for.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchrefract.effects.light_plan import Blend, LightPlan, check_level_reachable, thicknesses, whole
+from torchrefract.effects.fog_plan import FogPlan
+from torchrefract.effects.light_plan import Blend, check_level_reachable, named, thicknesses, whole
 from torchrefract.effects.plan import STRIDES
 from torchrefract.fields.perlin import BAND
-from torchrefract.fields.perlin3d import VARIANCE as VARIANCE_IN_SPACE
 from torchrefract.fields.perlin_bounds import (
     VARIANCE,
     Error,
@@ -32,11 +36,14 @@ from torchrefract.fields.perlin_bounds import (
     largest_sum,
     mean_variance,
 )
+from torchrefract.fields.veils import Ends
 
-_SIGMAS = 7.0
-_MARGIN = 1.05  # for what lies between the x and the places that are looked at
+SIGMAS = 7.0
+MARGIN = 1.05  # for what lies between the x and the places that are looked at
 # A mean nearer to zero than this has no bound of its own.
 _LEAST_MEAN = 0.1
+# Of the room, which octaves may take.
+_OF_OCTAVES = 0.75
 # Less work than this of all is worth a step more.
 _WORTH = 0.85
 # What one more pass over the frame takes in float64, in products for each pixel.
@@ -44,8 +51,6 @@ _PASS = 16
 # What kernels take between four rows of nodes, between four columns of them, for a node of Perlin's lattice in a row of
 # pixels, to draw one, and to begin with a lattice at all: measured, in octaves at a pixel.
 _DOWN, _ACROSS, _LINE, _NODE, _START = 0.3, 1.4, 0.5, 2.5, 3e4
-# Of noise in space, in the middle of a cell: half its diagonal.
-_LARGEST_IN_SPACE = math.sqrt(0.75)
 _HALF = math.sqrt(0.5)  # of q over that of n
 
 
@@ -67,8 +72,8 @@ class Drifts:
 
 
 @dataclass(frozen=True)
-class DriftPlan(LightPlan):
-    """A plan with the octaves that are computed at every pixel, and those on a lattice.
+class DriftPlan(FogPlan):
+    """A plan with the octaves that are computed at every pixel, and those on a lattice; without any, that of a fog.
 
     fine, coarse: their numbers.
     stride: px, between the nodes of the lattice; 1 is none.
@@ -84,6 +89,11 @@ class DriftPlan(LightPlan):
         super().__post_init__()
         object.__setattr__(self, "is_uniform", not (self.fine or self.coarse))
 
+    def of_uniform(self, fog: FogPlan) -> "DriftPlan":
+        """The same, where no drifts are left, with what a plan that knows its error says of the fog that is."""
+        own: Any = {name: getattr(fog, name) for name in ("error", "bands", "details", "nodes", "ends")}
+        return replace(self, dropped=self.dropped + fog.dropped, **own)
+
 
 class _Choice(NamedTuple):
     fine: tuple[int, ...]
@@ -96,80 +106,54 @@ class _Choice(NamedTuple):
 def drift_plan(drifts: Drifts, height: int, width: int, tolerance: float | None, double: bool) -> DriftPlan:
     """The plan for frames of a size, in float64 or in float32."""
     octaves = tuple(range(len(drifts.periods)))
-
-    def plan(error: float, why: str, choice: _Choice | None = None) -> DriftPlan:
-        fine, coarse, stride = (octaves, (), 1) if choice is None else choice[:3]
-        kept = tuple(_name(drifts, i) for i in octaves if i in (*fine, *coarse))
-        dropped = tuple(
-            (_name(drifts, i), _error(drifts, {i: None}, height, width)) for i in octaves if i not in (*fine, *coarse)
-        )
-        details = [("on a lattice", ", ".join(_name(drifts, i) for i in coarse) + f", every {stride} px")]
-        return DriftPlan(
-            height, width, tolerance, error, why, whole("computed", height), kept, dropped,
-            details=tuple(details) if coarse else (), fine=fine, coarse=coarse, stride=stride,
-        )  # fmt: skip
-
-    if tolerance is None:
-        return plan(0.0, "no tolerance")
-    room = check_level_reachable(tolerance, linear=drifts.blend.linear, double=double)
-    least = _lowest_mean(drifts, height, width)
-    if least >= _LEAST_MEAN and (seen := _whole(drifts, 1 / least)) <= room:
-        dropped = (("fog", seen),)
-        left = whole("left", height)
-        return DriftPlan(height, width, tolerance, seen, "it is too thin", left, dropped=dropped, fine=octaves)
-    if least < _LEAST_MEAN:
-        return plan(0.0, "the mean over the frame may come near 0")
-    work = partial(_products, drifts, height=height) if double else partial(_work, drifts, area=height * width)
-    best = min(_choices(drifts, height, width, room), key=work, default=None)
-    if best is None or work(best) > _WORTH * work(_Choice(octaves, (), 1, 0.0)):
-        return plan(0.0, "no octave can be left out or made coarser")
-    return plan(best.error + tolerance - room, "what octaves can move", best)
-
-
-@lru_cache(maxsize=256)
-def space_plan(
-    drifts: Drifts, contrast: float | None, height: int, width: int, tolerance: float | None, double: bool
-) -> DriftPlan:
-    """That of fog whose drifts are computed exactly or not at all.
-
-    In space q = exp(c g - c^2 / 2) with |g| <= G, so that q / <q> is between exp(-2 c G) and exp(2 c G), or, of the
-    ensemble, between exp(-c G - c^2 / 2) and exp(c G), at every point and so along every ray.
-
-    Args:
-        drifts: their periods are of no matter here.
-        contrast: the largest; None is not known.
-        height, width, tolerance, double: of the frame.
-    """
-    octaves = tuple(range(len(drifts.shares)))
+    every = _Choice(octaves, (), 1, 0.0)
     plan = partial(DriftPlan, height, width, tolerance)
     computed = whole("computed", height)
+    names = tuple(_name(drifts, i) for i in octaves)
     if tolerance is None:
-        return plan(0.0, "no tolerance", computed, fine=octaves)
+        return plan(0.0, "no tolerance", computed, names, fine=octaves)
     room = check_level_reachable(tolerance, linear=drifts.blend.linear, double=double)
-    if contrast is None:
-        return plan(0.0, "each noise is stretched to its extremes", computed, fine=octaves)
-    root = math.sqrt(VARIANCE_IN_SPACE * sum(share**2 for share in drifts.shares))
-    most = contrast * min(_SIGMAS, _LARGEST_IN_SPACE * sum(drifts.shares) / root)
-    low, high = (-2 * most, 2 * most) if drifts.of_image else (-most - contrast**2 / 2, most)
-    if (seen := _whole(drifts, math.exp(high))) <= room:
-        left = whole("left", height)
-        return plan(seen, "it is too thin", left, dropped=(("fog", seen),), fine=octaves)
-    x = thicknesses(drifts.thickness)
-    uniform = np.exp(-x)
-    ends = [np.exp(-x * math.exp(end)) for end in (low, high)]
-    moved = _MARGIN * max(float((abs(t - uniform) * drifts.blend.slope(np.maximum(t, uniform))).max()) for t in ends)
-    if moved > room:
-        return plan(0.0, "drifts in space have no coarser form with a bound", computed, fine=octaves)
-    return plan(moved + tolerance - room, "its drifts are too faint", computed, dropped=(("drifts", moved),))
+    least = _lowest_mean(drifts, height, width)
+    if least < _LEAST_MEAN:
+        ends, seldom = ends_of(drifts, room, math.inf)
+        return plan(
+            tolerance, "the mean over the frame may come near 0", computed, names, seldom, fine=octaves, ends=ends
+        )
+    if (seen := seen_of_all(drifts, 1 / least)) <= room:
+        return plan(seen, "it is too thin", whole("left", height), dropped=(("fog", seen),), fine=octaves)
+    work = partial(_products, drifts, height=height) if double else partial(_work, drifts, area=height * width)
+    best, why = min(_choices(drifts, height, width, room), key=work, default=every), "what octaves can move"
+    if work(best) > _WORTH * work(every):
+        best, why = every, "no octave can be left out or made coarser"
+    fine, coarse, stride, error = best
+    kept = tuple(name for i, name in enumerate(names) if i in (*fine, *coarse))
+    dropped = tuple(
+        (name, _error(drifts, {i: None}, height, width)) for i, name in enumerate(names) if name not in kept
+    )
+    if not kept:
+        return plan(error, why, computed, dropped=dropped)
+    ends, seldom = ends_of(drifts, room - error, 1 / least)
+    on_lattice = (("on a lattice", ", ".join(names[i] for i in coarse) + f", every {stride} px"),) if coarse else ()
+    return plan(
+        tolerance, why, computed, kept, dropped + seldom,
+        details=on_lattice, fine=fine, coarse=coarse, stride=stride, ends=ends,
+    )  # fmt: skip
 
 
-def _whole(drifts: Drifts, ratio: float) -> float:
+def ends_of(drifts: Drifts, room: float, most: float) -> tuple[Ends, tuple[tuple[str, float], ...]]:
+    """Those of t that move nothing farther, and what they leave out, where q / <q> is at most so large."""
+    ends = drifts.blend.ends(room).within(math.exp(-drifts.thickness * most), 1.0)
+    return ends, named(ends, room)
+
+
+def seen_of_all(drifts: Drifts, ratio: float) -> float:
     """Levels, by which the whole fog can move the image, where q / <q> is at most so large."""
     return float(drifts.blend.left(np.exp(-np.array([drifts.thickness * ratio])))[0])
 
 
 def _choices(drifts: Drifts, height: int, width: int, room: float) -> list[_Choice]:
-    """What keeps the room: some octaves of the least weight dropped, some of the longest on the widest lattice."""
+    """What keeps a share of the room: octaves of the least weight dropped, the longest on the widest lattice."""
+    room *= _OF_OCTAVES
     by_share = sorted(range(len(drifts.shares)), key=lambda i: drifts.shares[i])
     found = []
     for dropped in range(len(by_share) + 1):
@@ -232,15 +216,15 @@ def _error(drifts: Drifts, changed: dict[int, int | None], height: int, width: i
     if variance == 0:
         return 0.0
     deviation = math.sqrt(variance)
-    most = largest_sum([share**2 * part.variance for share, part in parts], [part.nodes for _, part in parts], _SIGMAS)
-    most = min(_SIGMAS, most / deviation)
+    most = largest_sum([share**2 * part.variance for share, part in parts], [part.nodes for _, part in parts], SIGMAS)
+    most = min(SIGMAS, most / deviation)
     own = sum(share**2 for share in drifts.shares) * VARIANCE
     z = np.linspace(0, most, 25)
-    beside = np.sqrt(max(own - covariance**2 / variance, 0.0) * (_SIGMAS**2 - z**2))
-    deepest = largest_sum([VARIANCE * share**2 for share in drifts.shares], [4] * len(drifts.shares), _SIGMAS)
+    beside = np.sqrt(max(own - covariance**2 / variance, 0.0) * (SIGMAS**2 - z**2))
+    deepest = largest_sum([VARIANCE * share**2 for share in drifts.shares], [4] * len(drifts.shares), SIGMAS)
     lowest = 0.5 - _HALF * np.minimum(covariance / deviation * z + beside, deepest)
     off = _HALF * deviation * z
-    mean = _HALF * _SIGMAS * math.sqrt(sum(share**2 * part.mean for share, part in parts)) if drifts.of_image else 0.0
+    mean = _HALF * SIGMAS * math.sqrt(sum(share**2 * part.mean for share, part in parts)) if drifts.of_image else 0.0
     least, greatest = _mean_bounds(drifts, height, width)
     least = least - mean
     if least <= 0:
@@ -251,7 +235,7 @@ def _error(drifts: Drifts, changed: dict[int, int | None], height: int, width: i
     moved = (at * -np.expm1(-x * r_off[:, None]) * drifts.blend.slope(at)).max()
     y = np.linspace(0, 1, 60)[1:] * min(1.0, drifts.thickness * greatest / least)
     moved += mean / least * (y * np.exp(-y) * drifts.blend.slope(np.exp(-y))).max()
-    return _MARGIN * float(moved)
+    return MARGIN * float(moved)
 
 
 def _part(period: float, stride: int | None, height: int, width: int) -> Error:
@@ -268,7 +252,7 @@ def _mean_bounds(drifts: Drifts, height: int, width: int) -> tuple[float, float]
         return 0.5, 0.5
     pairs = zip(drifts.shares, drifts.periods, strict=True)
     variance = sum(share**2 * mean_variance(period, height, width) for share, period in pairs)
-    off = _HALF * min(_SIGMAS * math.sqrt(variance), _HALF)
+    off = _HALF * min(SIGMAS * math.sqrt(variance), _HALF)
     return 0.5 - off, 0.5 + off
 
 

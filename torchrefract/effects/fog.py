@@ -114,34 +114,44 @@ class UniformFog(PlannedLight):
 
     def planned(self, height: int, width: int, dtype: torch.dtype, *, any_depth: bool = False) -> FogPlan:
         """The plan for images of a type, from the ranges alone; for the depth of the effect, or for any."""
-        fogs = None
-        if self.tolerance is not None and not any_depth:
-            near, far = distances(self.air, height, width)
-            fogs = Fogs(extinctions(self), near, far, squares(self.air, height, width), self.air.blend)
-        return fog_plan(fogs, height, width, self.tolerance, self.air.linear_light, dtype is torch.float64)
+        fogs = fogs_of(self, height, width, any_depth=any_depth)
+        return fog_plan(fogs, height, width, self.tolerance, dtype is torch.float64)
 
     def shade(self, image: Tensor, params: FogParams, depth: Tensor | None) -> Shaded:
         """The rows behind the fog."""
-        dtype = field_dtype(image.dtype)
-        k = column(mean_extinction(params, self.air, dtype))
-        plan: FogPlan = self.plan_for(params, image, depth)
+        return behind_fog(self.air, image, params, depth, self.plan_for(params, image, depth))
 
-        def through(distance: Tensor) -> Tensor:
-            return transmission(distance, k) if distance.shape[0] == 1 else transmission(*alike(distance, k))
 
-        def exact() -> Tensor:
-            return through(self.air.distance(image, depth))
+def behind_fog(air: Air, image: Tensor, params: Any, depth: Tensor | None, plan: FogPlan) -> Shaded:
+    """Rows behind fog of one density, with a `visibility`, a `deviation` and an `airlight`, as planned."""
+    dtype = field_dtype(image.dtype)
+    k = column(mean_extinction(params, air, dtype))
 
-        if not plan.acts:
-            return Shaded(image, valid=lambda: exact() >= 1 / 255, transmission=exact, extinction=k)
-        if plan.nodes is None:
-            t = exact()
-            blended = self.air.in_bands(image, t, or_else(params.airlight.to(dtype), 0.0), plan.bands)
-            return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
-        places, weights = along_columns(self.air, image, plan.nodes)
-        t = through(self.air.distance_at(places, image)) @ weights
-        blended = self.air.in_bands(image, t, or_else(params.airlight.to(dtype), 0.0), plan.bands)
-        return Shaded(blended, valid=lambda: exact() >= 1 / 255, transmission=exact, extinction=k)
+    def through(distance: Tensor) -> Tensor:
+        return transmission(distance, k) if distance.shape[0] == 1 else transmission(*alike(distance, k))
+
+    def exact() -> Tensor:
+        return through(air.distance(image, depth))
+
+    if not plan.acts:
+        return Shaded(image, valid=lambda: exact() >= 1 / 255, transmission=exact, extinction=k)
+    airlight = or_else(params.airlight.to(dtype), 0.0)
+    if plan.nodes is None:
+        t = exact()
+        blended = air.blended(image, t, airlight, plan.ends)
+        return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
+    places, weights = along_columns(air, image, plan.nodes)
+    t = through(air.distance_at(places, image)) @ weights
+    blended = air.blended(image, t, airlight, plan.ends)
+    return Shaded(blended, valid=lambda: exact() >= 1 / 255, transmission=exact, extinction=k)
+
+
+def fogs_of(fog: Any, height: int, width: int, *, any_depth: bool) -> Fogs:
+    """Those of an effect with a `visibility_range`, a `deviation_range` and an `air`, before its own depth or any."""
+    if fog.tolerance is None or any_depth:
+        return Fogs(extinctions(fog), (0.0,) * height, (math.inf,) * height, None, fog.air.blend)
+    near, far = distances(fog.air, height, width)
+    return Fogs(extinctions(fog), near, far, squares(fog.air, height, width), fog.air.blend)
 
 
 def extinctions(fog: Any) -> Range:

@@ -1,10 +1,11 @@
 """What fog of one density will compute under a tolerance.
 
-Rows so near that no draw dims them visibly may be left as they are, where that saves more than it costs; rows so far
-that nothing comes through may be filled with the airlight. Along a row, in front of a camera, t is exp(-x sqrt(c + u))
-with u = ((column - cx) / fx)^2, c = 1 + ((row - cy) / fy)^2 and x = k z, a completely monotone function of u: the
-derivatives alternate in sign and are largest where u is smallest. So the polynomial through its values at the n zeros
-of a Chebyshev polynomial over u_low ... u_high is off by
+Pixels through whose fog nothing is seen of the scene count as t = 0, those where nothing is seen of the fog as t = 1;
+for rows of which that holds whatever is drawn the plan says it.
+
+Along a row, in front of a camera, t is exp(-x sqrt(c + u)) with u = ((column - cx) / fx)^2, c = 1 + ((row - cy) / fy)^2
+and x = k z, a completely monotone function of u: the derivatives alternate in sign and are largest where u is smallest.
+So the polynomial through its values at the n zeros of a Chebyshev polynomial over u_low ... u_high is off by
 
     |error| <= 2 ((u_high - u_low) / 4)^n a_n,  exp(-x sqrt(c + u_low - v)) = sum over n of a_n v^n
     a_0 = exp(-x s),  a_1 = a_0 x / (2 s),  a_(n+2) = (x^2 a_n + (4 n + 2) (n + 1) a_(n+1)) / (4 s^2 (n + 1) (n + 2))
@@ -21,11 +22,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from torchrefract.effects.light_plan import Blend, LightPlan, bands_of, check_level_reachable, thicknesses, whole
+from torchrefract.effects.light_plan import Blend, LightPlan, bands_of, check_level_reachable, named, thicknesses, whole
+from torchrefract.fields.veils import NO_ENDS, Ends
 
 _MOST_NODES = 8
 _MARGIN = 1.02  # for what lies between the x that are looked at
-_WORTH = 0.05  # of the rows
+_OF_COLUMNS = 0.75  # of the room, which the polynomial along rows may take
 
 
 @dataclass(frozen=True)
@@ -33,9 +35,11 @@ class FogPlan(LightPlan):
     """A plan with the columns at which t is computed in each row.
 
     nodes: how many; None is each.
+    ends: of t.
     """
 
     nodes: int | None = None
+    ends: Ends = NO_ENDS
 
 
 @dataclass(frozen=True)
@@ -56,38 +60,36 @@ class Fogs:
 
 
 @lru_cache(maxsize=64)
-def fog_plan(
-    fogs: Fogs | None, height: int, width: int, tolerance: float | None, linear: bool, double: bool
-) -> FogPlan:
-    """The plan for frames of a size, in float64 or in float32; None are fogs of any depth."""
+def fog_plan(fogs: Fogs, height: int, width: int, tolerance: float | None, double: bool, moved: float = 0.0) -> FogPlan:
+    """The plan for frames of a size, in float64 or in float32.
+
+    moved: levels, of the tolerance, that somebody else takes.
+    """
     if tolerance is None:
         return FogPlan(height, width, None, 0.0, "no tolerance", whole("computed", height))
-    room = check_level_reachable(tolerance, linear=linear, double=double)
-    if fogs is None:
-        return FogPlan(height, width, tolerance, 0.0, "the depth is not known before", whole("computed", height))
+    rounding = tolerance - check_level_reachable(tolerance, linear=fogs.blend.linear, double=double)
+    room, blend = tolerance - rounding - moved, fogs.blend
+    nodes, error = _nodes(fogs, _OF_COLUMNS * room)
+    rest = room - error
     with np.errstate(invalid="ignore"):  # an infinite depth in clear air
         near, far = (np.nan_to_num(np.exp(-k * np.minimum(d, 1e12))) for k, d in (
             (fogs.extinction[0], np.array(fogs.near)), (fogs.extinction[1], np.array(fogs.far)),
         ))  # fmt: skip
-    left, filled = fogs.blend.left(far), fogs.blend.filled(near)
-    nodes, error = _nodes(fogs, room)
-    # What is neither left nor filled is read and written once: leaving it saves nothing by itself.
-    cheap = not linear and nodes is None and fogs.squares is None and (left > room).any()
-    bands = bands_of((left <= room) & (not cheap), filled <= room)
-    if sum(stop - start for kind, start, stop in bands if kind != "computed") < _WORTH * height:
-        bands = whole("computed", height)
-    moved = {"left": left, "filled": filled, "computed": np.full(height, error)}
-    found = max(float(moved[kind][start:stop].max()) for kind, start, stop in bands)
-    dropped = tuple(
-        (f"fog in rows {start} to {stop - 1}" if kind == "left" else f"the scene in rows {start} to {stop - 1}",
-         float(moved[kind][start:stop].max()))
-        for kind, start, stop in bands if kind != "computed"
-    )  # fmt: skip
+    ends = blend.ends(rest).within(float(far.min()), float(near.max()))
+    bands = bands_of(blend.left(far) <= rest, blend.filled(near) <= rest)
+    if bands == whole("left", height):
+        seen = float(blend.left(far).max())
+        return FogPlan(height, width, tolerance, moved + seen, "it is too thin", bands, dropped=(("fog", seen),))
+    dropped = named(ends, rest)
+    error = tolerance if dropped else moved + error + rounding
+    if nodes is None and not dropped:
+        error = moved + rounding if moved else 0.0
+        return FogPlan(height, width, tolerance, error, "every row is seen through fog", bands)
     details = (("columns", f"t at {nodes} of {width} in each row"),) if nodes else ()
-    exact = nodes is None and len(bands) == 1 and bands[0][0] == "computed"
-    why = "every row is seen through fog" if exact else "what fog can move"
-    error = 0.0 if exact else found + tolerance - room
-    return FogPlan(height, width, tolerance, error, why, bands, dropped=dropped, details=details, nodes=nodes)
+    return FogPlan(
+        height, width, tolerance, error, "what fog can move", bands,
+        dropped=dropped, details=details, nodes=nodes, ends=ends,
+    )  # fmt: skip
 
 
 def _nodes(fogs: Fogs, room: float) -> tuple[int | None, float]:

@@ -14,15 +14,18 @@ from torchrefract.cameras.models import Camera
 from torchrefract.effects.air import check_fog_params, distances, make_air
 from torchrefract.effects.base import params_to
 from torchrefract.effects.depth import DepthProvider
-from torchrefract.effects.drift_plan import DriftPlan, Drifts, drift_plan, space_plan
+from torchrefract.effects.drift_plan import DriftPlan, Drifts, drift_plan
 from torchrefract.effects.fog import (
+    behind_fog,
     check_visibility,
     drawn_visibility,
     extinctions,
     fogs_lie_in,
+    fogs_of,
     mean_extinction,
     visibility_span,
 )
+from torchrefract.effects.fog_plan import fog_plan
 from torchrefract.effects.motion import check_decorrelation, check_motion, check_wind, drawn_motion, motion_ranges, tame
 from torchrefract.effects.plan import lies_in
 from torchrefract.effects.planned_light import PlannedLight
@@ -30,9 +33,11 @@ from torchrefract.effects.radiance import Shaded
 from torchrefract.effects.random_field import check_key
 from torchrefract.effects.rows import column, frame_mean, spread
 from torchrefract.effects.scales import check_scales, check_weights, chosen, periods, shares, stretched
-from torchrefract.fields.fog import drifting_transmission_, transmission
+from torchrefract.effects.space_plan import space_plan
+from torchrefract.fields.fog import drifting_transmission_
 from torchrefract.fields.fog_volume import path_mean
 from torchrefract.fields.perlin_drawn import Coarse, Drawn, drawn_noise
+from torchrefract.fields.veils import Drifting
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 from torchrefract.warping.lattice import Lattice
@@ -85,9 +90,10 @@ class HeterogeneousFog(PlannedLight):
             seen from the camera: m in space, where a car that goes v m per frame sees -v ahead; px of the reference in
             the image, which has no z.
         decorrelation_range: frames, above 0 or inf, until k in the wind is correlated by 1/e; one over it is uniform.
-        tolerance: how far the image may be from the exact one, levels of 1/255, so that octaves in the image are left
-            out or known on a coarse lattice only, and fog whose drifts nobody sees is uniform; see `plan`. Exact are
-            None, normalize="image", and where <q> may come near 0; in space, drifts are so or not computed at all.
+        tolerance: how far the image may be from the exact one, levels of 1/255, so that pixels behind so much fog that
+            nothing is seen of them are filled with the airlight, those behind too little of it left as they are,
+            octaves in the image left out or known on a coarse lattice only, and fog whose drifts nobody sees is
+            uniform; see `plan`; None is exact. Octaves are all computed where normalize="image" or <q> may come near 0.
         visibility_range, deviation_range, airlight, threshold, depth, camera, linear_light, p: as for `UniformFog`; the
             rays of space are those of the camera, or of a pinhole of 0.9 widths.
 
@@ -198,37 +204,41 @@ class HeterogeneousFog(PlannedLight):
         thickness = extinctions(self)[1] * min(farthest, 1e12)
         lengths = self._periods(height, width) if self.mode == "image" else self.scales
         drifts = Drifts(thickness, lengths, self._shares(), self.mean == "image", self.air.blend)
+        size, double = (height, width, self.tolerance), dtype is torch.float64
         if self.mode == "ray" or self.normalize == "image":
-            contrast = self.contrast_range[1] if self.mode == "ray" else None
-            return space_plan(drifts, contrast, height, width, self.tolerance, dtype is torch.float64)
-        return drift_plan(drifts, height, width, self.tolerance, dtype is torch.float64)
+            plan = space_plan(drifts, self.contrast_range[1] if self.mode == "ray" else None, *size, double)
+        else:
+            plan = drift_plan(drifts, *size, double)
+        if not plan.is_uniform:
+            return plan
+        return plan.of_uniform(fog_plan(fogs_of(self, height, width, any_depth=any_depth), *size, double, plan.error))
 
     def shade(self, image: Tensor, params: HeterogeneousFogParams, depth: Tensor | None) -> Shaded:
         """The rows behind the fog."""
-        rows, dtype = image.shape[0], field_dtype(image.dtype)
         plan: DriftPlan = self.plan_for(params, image, depth)
+        if plan.is_uniform:
+            return behind_fog(self.air, image, params, depth, plan)
+        rows, dtype = image.shape[0], field_dtype(image.dtype)
         distance = self.air.distance(image, depth)
         mean_k = column(spread(mean_extinction(params, self.air, dtype), rows))
         distance = spread(distance, rows) if distance.shape[0] > 1 else distance
 
-        def field() -> tuple[Tensor, Tensor, Tensor]:
+        def drifting() -> Drifting:
             noise, share, offset = self._field(params, distance, image, plan)
-            return noise, share * mean_k, offset * mean_k
+            return Drifting(noise, share * mean_k, offset * mean_k, distance)
 
         def k() -> Tensor:
             # Made again for who asks: kept, it would be a third of the image for who does not.
-            if plan.is_uniform:
-                return mean_k
-            noise, scale, offset = field()
+            noise, scale, offset, _ = drifting()
             return noise * scale + offset
 
         def through() -> Tensor:
-            return transmission(distance, mean_k) if plan.is_uniform else drifting_transmission_(distance, *field())
+            return drifting_transmission_(*drifting())
 
         if not plan.acts:
             return Shaded(image, valid=lambda: through() >= 1 / 255, transmission=through, extinction=k)
-        t = through()
-        blended = self.air.blended(image, t, or_else(params.airlight.to(dtype), 0.0))
+        airlight = or_else(params.airlight.to(dtype), 0.0)
+        blended, t = self.air.behind_drifts(image, drifting(), airlight, plan.ends)
         return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
 
     def _field(

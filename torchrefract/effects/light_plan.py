@@ -5,10 +5,13 @@ moves it by |A - I| e <= max(A, 1 - A) e; in linear light by at most S' of the d
 curve of sRGB, is steepest in the dark and concave: two values that are apart by x come out apart by S(x) at most.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
+
+from torchrefract.fields.veils import Ends
 
 LEVELS = 255.0
 # Images in float32 are off by so many units of the last place; the curve of sRGB stretches that in the dark.
@@ -107,6 +110,16 @@ def check_level_reachable(tolerance: float, *, linear: bool, double: bool, scale
     return tolerance - rounding
 
 
+def named(ends: Ends, room: float) -> tuple[tuple[str, float], ...]:
+    """What ends of t leave out, each with how far that moves the image, levels."""
+    names = []
+    if ends.clear < 1:
+        names.append((f"the fog where 1 - t < {1 - ends.clear:.2g}", room))
+    if ends.opaque > 0:
+        names.append((f"the scene where t < {ends.opaque:.2g}", room))
+    return tuple(names)
+
+
 def bands_of(left: np.ndarray, filled: np.ndarray) -> tuple[tuple[str, int, int], ...]:
     """Rows of one kind after another, from (H,) flags of what may be left and what may be filled."""
     kinds = np.where(left, "left", np.where(filled, "filled", "computed"))
@@ -142,6 +155,12 @@ class Blend:
         darker, brighter = color - _stored((1 - t) * light), _stored(light + t * (1 - light)) - color
         return LEVELS * np.maximum(darker, brighter).max(axis=0)
 
+    def ends(self, room: float) -> Ends:
+        """Where t may end, so that neither the image nor t itself moves by more than `room` levels."""
+        # Both ends move an image the more, the nearer to the middle they are.
+        fill = _bisected(lambda t: max(self.filled(t)[0], LEVELS * t[0]) <= room)
+        return Ends(fill, 1 - _bisected(lambda loss: max(self.left(1 - loss)[0], LEVELS * loss[0]) <= room))
+
     def slope(self, t: np.ndarray) -> np.ndarray:
         """Levels by which a small error of t moves the image, over that error, for this t or a smaller one."""
         color = np.array(self.colors).reshape(-1, *[1] * t.ndim)
@@ -150,6 +169,15 @@ class Blend:
         light = _linear(color)
         steepest = _slope((1 - t) * light) * np.maximum(light, 1 - light)
         return LEVELS * np.maximum(steepest, 1).max(axis=0)
+
+
+def _bisected(holds: Callable[[np.ndarray], bool]) -> float:
+    """The largest number in [0, 1/2] for which something holds that holds below it."""
+    low, high = 0.0, 0.5
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if holds(np.array([middle])) else (low, middle)
+    return low
 
 
 def _linear(value: np.ndarray) -> np.ndarray:

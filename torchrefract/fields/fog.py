@@ -22,13 +22,13 @@ def transmission(depth: Tensor, k: Tensor) -> Tensor:
     return torch.exp(k * -_finite(depth))
 
 
-def drifting_transmission_(depth: Tensor, noise: Tensor, scale: Tensor, offset: Tensor) -> Tensor:
+def drifting_transmission_(noise: Tensor, scale: Tensor, offset: Tensor, depth: Tensor) -> Tensor:
     """t = exp(-(scale n + offset) d), through an extinction that is a noise n; in its memory if it has no gradient.
 
     Args:
-        depth: (N or 1, 1, H, W or 1), m.
         noise: (N, 1, H, W).
         scale, offset: (N, 1, 1, 1), 1/m.
+        depth: (N or 1, 1, H, W or 1), m.
     """
     distance = -_finite(depth)
     scale, offset = scale * distance, offset * distance

@@ -10,9 +10,10 @@ so that what a ray takes of an octave is four numbers. Numbers are float32, but 
 
 import numpy as np
 
-from torchrefract._jit import fma, horner, inlined, jit
+from torchrefract._jit import fma, inlined, jit
 from torchrefract._lanes import LANES
-from torchrefract.fields.kernels.nodes import Constants, Doubles, Floats, Key, Number, Words
+from torchrefract.fields.kernels.exponentials import less_one
+from torchrefract.fields.kernels.nodes import Constants, Doubles, Floats, Key, Words
 from torchrefract.fields.kernels.pixels import Columns
 from torchrefract.fields.kernels.sheets import Sheets, Whole, draw_row, sheets_before
 from torchrefract.fields.kernels.single_rays import Rows
@@ -32,11 +33,6 @@ Fog = tuple[Doubles, Floats, Floats, Whole, Doubles]
 Rays = tuple[Doubles, Whole, Doubles, Doubles, Doubles, Doubles]
 # Where planes cross octaves, at k planes + plane: the first column of nodes, how many there are, and the first sheet.
 Crossings = Whole
-_LOG2_E = np.float32(1.4426950408889634)
-_LN2 = np.float32(0.693359375), np.float32(-2.12194440e-4)  # the first has few digits
-# Of (exp(r) - 1 - r) / r^2, for |r| <= ln(2) / 2, to 2e-8 of r.
-_REST = tuple(np.float32(1 / n) for n in (5040, 720, 120, 24, 6, 2))
-_LEAST, _MOST = np.float32(-80), np.float32(89)
 
 
 @jit
@@ -187,19 +183,6 @@ def _excess(
 @inlined
 def _fade(p: float) -> float:
     return p * p * p * (p * (6 * p - 15) + 10)
-
-
-@inlined
-def less_one(x: Number) -> Number:
-    """exp(x) - 1."""
-    x = _LEAST if x < _LEAST else x
-    x = _MOST if x > _MOST else x
-    n = np.floor(fma(x, _LOG2_E, np.float32(0.5)))
-    r = fma(n, -_LN2[1], fma(n, -_LN2[0], x))
-    found = fma(r * r, horner(r, _REST), r)
-    # Half of 2^n: the number itself may be too large, where the result is not.
-    half = np.int32((np.int32(n) + np.int32(126)) << np.int32(23)).view(np.float32)
-    return fma(half, found, half - np.float32(0.5)) * np.float32(2)
 
 
 @jit

@@ -1,0 +1,125 @@
+"""Frames behind fog: by a kernel where one can, or in PyTorch."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrefract._checks import learns
+from torchrefract._compiled import SMALLEST, gradients_of, kernels, obstacle
+from torchrefract._threads import share
+from torchrefract.fields.fog import drifting_transmission_, linear_to_srgb, srgb_to_linear, veil
+
+_LEAST = 87.0  # -ln of the smallest t that kernels tell from 0
+
+
+class Ends(NamedTuple):
+    """Of t: below `opaque` it counts as 0, so that the scene is not looked at, above `clear` as 1, nor is the fog."""
+
+    opaque: float = 0.0
+    clear: float = 1.0
+
+    def within(self, least: float, most: float) -> "Ends":
+        """Those that a t between two others meets."""
+        return Ends(self.opaque if least < self.opaque else 0.0, self.clear if most > self.clear else 1.0)
+
+
+NO_ENDS = Ends()
+
+
+class Drifting(NamedTuple):
+    """Fog with an extinction a n + b, n a noise, before something at a distance."""
+
+    noise: Tensor  # (N, 1, H, W)
+    scale: Tensor  # (N, 1, 1, 1), a, 1/m
+    offset: Tensor  # (N, 1, 1, 1), b, 1/m
+    distance: Tensor  # (N or 1, 1, H, W or 1), m
+
+
+def veiled(image: Tensor, t: Tensor, airlight: Tensor, *, ends: Ends, linear: bool) -> Tensor:
+    """I t + A (1 - t), exactly I where t = 1.
+
+    Args:
+        image: (N, C, H, W).
+        t: (N or 1, 1, H, W or 1), in [0, 1].
+        airlight: (N, C).
+        ends: of t.
+        linear: of linear light, not of stored values (sRGB).
+    """
+    if learns((t, airlight)) or obstacle(image, t, airlight):
+        return _in_pytorch(image, _between(t, ends), airlight, linear=linear)
+    work = kernels("fields.kernels.veils").behind
+    work = partial(work, t.detach()[:, 0].contiguous().numpy(), (np.float32(ends.clear), np.float32(ends.opaque)))
+    return _Veiled.apply(partial(_filled, work, linear=linear), linear, image, _between(t, ends), airlight)
+
+
+def veiled_by_drifts_(
+    image: Tensor, drifting: Drifting, airlight: Tensor, *, ends: Ends, linear: bool
+) -> tuple[Tensor, Tensor]:
+    """`veiled` with t = exp(-(a n + b) d) between the ends, and t, (N, 1, H, W), in memory of n if it has no gradient.
+
+    Args:
+        image, airlight, linear: as for `veiled`.
+        drifting: n, a, b and d.
+        ends: of t.
+    """
+    if learns((*drifting, airlight)) or obstacle(image, airlight, *drifting):
+        t = _between(drifting_transmission_(*drifting), ends)
+        return _in_pytorch(image, t, airlight, linear=linear), t
+    noise = drifting.noise.detach().contiguous()
+    rows = (value.detach().expand(len(image), 1, 1, 1).flatten().numpy() for value in (drifting.scale, drifting.offset))
+    distance = drifting.distance.detach()[:, 0].contiguous().numpy()
+    low, high = np.float32(-math.log(ends.clear)), np.float32(-math.log(ends.opaque) if ends.opaque else _LEAST)
+    work = kernels("fields.kernels.veils").behind_drifts
+    work = partial(work, (noise.view(-1).numpy(), distance, *rows), (low, min(high, np.float32(_LEAST))))
+    return _Veiled.apply(partial(_filled, work, linear=linear), linear, image, noise, airlight), noise
+
+
+def _between(t: Tensor, ends: Ends) -> Tensor:
+    if ends.clear < 1:
+        t = torch.where(t > ends.clear, 1.0, t)
+    return torch.where(t < ends.opaque, 0.0, t) if ends.opaque > 0 else t
+
+
+def _in_pytorch(image: Tensor, t: Tensor, airlight: Tensor, *, linear: bool) -> Tensor:
+    airlight = airlight[:, :, None, None]
+    if not linear:
+        return veil(image, t, airlight)
+    blended = linear_to_srgb(veil(srgb_to_linear(image), t, srgb_to_linear(airlight)))
+    return torch.where(t == 1, image, blended)
+
+
+def _filled(work: Callable[..., None], image: Tensor, airlight: Tensor, *, linear: bool) -> Tensor:
+    """What a kernel makes of frames."""
+    image, out = image.contiguous(), torch.empty(image.shape)
+    light = torch.stack([airlight, srgb_to_linear(airlight) if linear else airlight]).numpy()
+    size, source, into = tuple(image.shape[1:]), image.view(-1).numpy(), out.view(-1).numpy()
+    rows, least = len(image) * image.shape[2], SMALLEST // image.shape[3] + 1
+    share(lambda start, stop: work(source, size, light, linear, start, stop, into), rows, least=least)
+    return out
+
+
+class _Veiled(torch.autograd.Function):
+    """What `fill` makes of an image and an airlight, with a gradient of the image, differentiable in turn."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, fill: Callable[..., Tensor], linear: bool, image: Tensor, t: Tensor, airlight: Tensor
+    ) -> Tensor:
+        ctx.linear = linear
+        found = fill(image.detach(), airlight.detach())
+        ctx.save_for_backward(*((image, t, airlight) if linear else (t,)))
+        return found
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:
+        if not ctx.linear:
+            (t,) = ctx.saved_tensors
+            return None, None, gradients[0] * t, None, None
+        plain, needed = partial(_in_pytorch, linear=True), (True, False, False)
+        found = gradients_of(plain, ctx.saved_tensors, needed, gradients[0])
+        return None, None, *found

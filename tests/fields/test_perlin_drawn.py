@@ -215,8 +215,13 @@ import torch
 from torchrefract import HeterogeneousFog
 from torchrefract._lanes import LANES
 assert {lanes} in (None, LANES), LANES
-made = [HeterogeneousFog().degrade(torch.zeros(2, 2, 1, 61, width), seed=3).extinction for width in (7, 256, 300)]
-torch.save(made, sys.argv[1])
+found = []
+for width in (7, 256, 300):
+    for linear in (False, True):
+        leaf = torch.linspace(0, 1, 244 * width).view(2, 2, 1, 61, width).requires_grad_()
+        degraded = HeterogeneousFog(linear_light=linear, tolerance=0.3).degrade(leaf, seed=3)
+        found += [degraded.extinction, degraded.image.detach(), *torch.autograd.grad(degraded.image.sum(), leaf)]
+torch.save(found, sys.argv[1])
 """
 
 

@@ -55,9 +55,9 @@ class UniformFog(PlannedLight):
         depth: what gives d where no depth is passed in; None is `LinearDepth()`, the paper's ramp over the rows.
         camera: of the frames; with it depth is taken along its axis and turned into the distance along each ray.
         linear_light: blend radiance, not stored values (sRGB).
-        tolerance: how far the image may be from the exact one, levels of 1/255, so that rows that are all clear or all
-            fog are left out, and t is a polynomial along the rows of a camera; see `plan`; None is exact. Maps stay
-            exact, and so does fog before a depth that is passed in.
+        tolerance: how far the image may be from the exact one, levels of 1/255, so that pixels behind so much fog that
+            nothing is seen of them are filled with the airlight, those behind too little of it left as they are, and t
+            is a polynomial along the rows of a camera; see `plan`; None is exact. Maps stay exact.
         p: chance that a sample is degraded at all.
 
     Raises:

@@ -50,10 +50,13 @@ def veiled(image: Tensor, t: Tensor, airlight: Tensor, *, ends: Ends, linear: bo
         ends: of t.
         linear: of linear light, not of stored values (sRGB).
     """
-    if learns((t, airlight)) or obstacle(image, t, airlight):
+    # Stored values behind one t in each row, all of them read, are PyTorch's at no more than a copy.
+    plain = not linear and t.shape[3] == 1 and ends.opaque == 0 and ends.clear == 1
+    if plain or learns((t, airlight)) or obstacle(image, t, airlight):
         return _in_pytorch(image, _between(t, ends), airlight, linear=linear)
     work = kernels("fields.kernels.veils").behind
-    work = partial(work, t.detach()[:, 0].contiguous().numpy(), (np.float32(ends.clear), np.float32(ends.opaque)))
+    limits = np.float32(ends.clear), np.float32(ends.opaque)
+    work = partial(work, linear, t.detach()[:, 0].contiguous().numpy(), limits)
     return _Veiled.apply(partial(_filled, work, linear=linear), linear, image, _between(t, ends), airlight)
 
 
@@ -75,14 +78,14 @@ def veiled_by_drifts_(
     distance = drifting.distance.detach()[:, 0].contiguous().numpy()
     low, high = np.float32(-math.log(ends.clear)), np.float32(-math.log(ends.opaque) if ends.opaque else _LEAST)
     work = kernels("fields.kernels.veils").behind_drifts
-    work = partial(work, (noise.view(-1).numpy(), distance, *rows), (low, min(high, np.float32(_LEAST))))
+    work = partial(work, linear, (noise.view(-1).numpy(), distance, *rows), (low, min(high, np.float32(_LEAST))))
     return _Veiled.apply(partial(_filled, work, linear=linear), linear, image, noise, airlight), noise
 
 
 def _between(t: Tensor, ends: Ends) -> Tensor:
     if ends.clear < 1:
-        t = torch.where(t > ends.clear, 1.0, t)
-    return torch.where(t < ends.opaque, 0.0, t) if ends.opaque > 0 else t
+        t = torch.where(t >= ends.clear, 1.0, t)
+    return torch.where(t <= ends.opaque, 0.0, t) if ends.opaque > 0 else t
 
 
 def _in_pytorch(image: Tensor, t: Tensor, airlight: Tensor, *, linear: bool) -> Tensor:
@@ -97,9 +100,9 @@ def _filled(work: Callable[..., None], image: Tensor, airlight: Tensor, *, linea
     """What a kernel makes of frames."""
     image, out = image.contiguous(), torch.empty(image.shape)
     light = torch.stack([airlight, srgb_to_linear(airlight) if linear else airlight]).numpy()
-    size, source, into = tuple(image.shape[1:]), image.view(-1).numpy(), out.view(-1).numpy()
-    rows, least = len(image) * image.shape[2], SMALLEST // image.shape[3] + 1
-    share(lambda start, stop: work(source, size, light, linear, start, stop, into), rows, least=least)
+    known = image.view(-1).numpy(), tuple(image.shape[1:]), light
+    rows, least, into = len(image) * image.shape[2], SMALLEST // image.shape[3] + 1, out.view(-1).numpy()
+    share(lambda start, stop: work(*known, start, stop, into), rows, least=least)
     return out
 
 
@@ -120,6 +123,11 @@ class _Veiled(torch.autograd.Function):
         if not ctx.linear:
             (t,) = ctx.saved_tensors
             return None, None, gradients[0] * t, None, None
-        plain, needed = partial(_in_pytorch, linear=True), (True, False, False)
-        found = gradients_of(plain, ctx.saved_tensors, needed, gradients[0])
-        return None, None, *found
+        image, t, airlight = ctx.saved_tensors
+        if torch.is_grad_enabled():  # for gradients of these
+            plain = partial(_in_pytorch, linear=True)
+            found = gradients_of(plain, ctx.saved_tensors, (True, False, False), gradients[0])
+            return None, None, *found
+        work = partial(kernels("fields.kernels.veils").slopes, t.detach()[:, 0].contiguous().numpy())
+        slopes = _filled(work, image.detach(), airlight, linear=True)
+        return None, None, gradients[0] * slopes, None, None

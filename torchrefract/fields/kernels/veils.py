@@ -30,12 +30,12 @@ _OFFSET, _SCALE, _EXPONENT = np.float32(0.055), np.float32(1.055), np.float32(2.
 
 @jit
 def behind_drifts(
+    linear: bool,
     drifting: Drifting,
     ends: tuple[Number, Number],
     source: Floats,
     size: Size,
     light: Floats,
-    linear: bool,
     start: int,
     stop: int,
     out: Floats,
@@ -70,49 +70,80 @@ def behind_drifts(
 
 @jit
 def behind(
+    linear: bool,
     t: Floats,
     ends: tuple[Number, Number],
     source: Floats,
     size: Size,
     light: Floats,
-    linear: bool,
     start: int,
     stop: int,
     out: Floats,
 ) -> None:
     """Behind fog that lets t through, (N or 1, H, W or 1).
 
-    ends: of t: above the first one it counts as 1, below the second as 0.
+    ends: of t: from the first one on it counts as 1, up to the second as 0.
     """
     channels, height, width = size
-    own, none = np.empty(AT_ONCE, np.float32), np.uintp(0)
+    own, none, kind = np.empty(AT_ONCE, np.float32), np.uintp(0), 0
     for at in range(start, stop):
         i, y = divmod(at, height)
         row = t[min(i, t.shape[0] - 1), y]
         for begin in range(0, width, AT_ONCE):
             count = min(AT_ONCE, width - begin)
-            clear, opaque = 0, 0
-            for k in range(count):
-                found = row[0] if row.size == 1 else row[np.uintp(begin + k)]
-                found = _ONE if found > ends[0] else found
-                own[k] = _NONE if found < ends[1] else found
-                clear += own[k] == _ONE
-                opaque += own[k] == _NONE
-            kind = _kind(clear, opaque, count)
+            if row.size == 1 and begin == 0:
+                for k in range(count):
+                    own[k] = row[0]
+                kind = _ended(own, ends, count)
+            elif row.size > 1:
+                for k in range(count):
+                    own[k] = row[np.uintp(begin + k)]
+                kind = _ended(own, ends, count)
             for c in range(channels):
                 pixel = np.uintp(((i * channels + c) * height + y) * width + begin)
                 _blend(own, none, kind, (light[0, i, c], light[1, i, c]), linear, source, pixel, count, out)
 
 
+@jit
+def slopes(t: Floats, source: Floats, size: Size, light: Floats, start: int, stop: int, out: Floats) -> None:
+    """Of what linear light behind fog becomes, as it is stored, in what it was: out (N C H W,), behind t."""
+    channels, height, width = size
+    own = np.empty(width, np.float32)
+    for at in range(start, stop):
+        i, y = divmod(at, height)
+        row = t[min(i, t.shape[0] - 1), y]
+        for k in range(width):
+            own[k] = row[0] if row.size == 1 else row[k]
+        for c in range(channels):
+            pixel = np.uintp(((i * channels + c) * height + y) * width)
+            for k in range(width):
+                value = source[pixel + np.uintp(k)]
+                mixed = _mixed(_decoded(value), own[k], light[1, i, c])
+                found = own[k] * _decoding(value) * _encoding(mixed)
+                out[pixel + np.uintp(k)] = _ONE if own[k] == _ONE else found
+
+
+@inlined
+def _ended(t: Floats, ends: tuple[Number, Number], count: int) -> int:
+    """The kind of pixels, see `_transmission`, whose t has its ends from here on."""
+    high, low = ends
+    least, most = _bits(t[0]), _bits(t[0])
+    for k in range(count):
+        bits = _bits(t[k])
+        least, most = min(least, bits), max(most, bits)
+        t[k] = _ONE if t[k] >= high else _NONE if t[k] <= low else t[k]
+    return 1 if least >= _bits(high) else -1 if most <= _bits(low) else 0
+
+
 @inlined
 def _transmission(x: Floats, ends: tuple[Number, Number], count: int, out: Floats, place: np.uintp) -> int:
-    """The kind of these pixels, see `_kind`."""
+    """The kind of these pixels: -1 where nothing comes through, 1 where all does, else 0."""
     low, high = ends
-    clear, opaque = 0, 0
+    least, most = _bits(x[0]), _bits(x[0])
     for k in range(count):
-        clear += x[k] < low
-        opaque += x[k] > high
-    kind = _kind(clear, opaque, count)
+        bits = _bits(x[k])
+        least, most = min(least, bits), max(most, bits)
+    kind = 1 if most < _bits(low) else -1 if least > _bits(high) else 0
     if kind:
         for k in range(count):
             out[place + np.uintp(k)] = _ONE if kind > 0 else _NONE
@@ -125,9 +156,9 @@ def _transmission(x: Floats, ends: tuple[Number, Number], count: int, out: Float
 
 
 @inlined
-def _kind(clear: int, opaque: int, count: int) -> int:
-    """-1 where nothing comes through, 1 where all does, else 0."""
-    return (clear == count) - (opaque == count)
+def _bits(value: Number) -> np.int32:
+    """In the order of numbers that are not negative, and below them where they are: extremes are found at once."""
+    return np.float32(value).view(np.int32)
 
 
 @inlined
@@ -164,8 +195,7 @@ def _blend(
 @inlined
 def _mixed(value: Number, t: Number, light: Number) -> Number:
     """The value itself where t = 1, and the light where t = 0."""
-    apart = value - light
-    return fma(t, apart, light) if t < _HALF else fma(t - _ONE, apart, value)
+    return value if t == _ONE else fma(t, value - light, light)
 
 
 @inlined
@@ -182,3 +212,17 @@ def _encoded(light: Number) -> Number:
     line = light * _SLOPE
     high = fma(_SCALE, power(max(light, _END), _ONE / _EXPONENT), -_OFFSET)
     return line if light <= _END else high if light < _LARGEST else light
+
+
+@inlined
+def _decoding(stored: Number) -> Number:
+    """The slope of `_decoded`."""
+    high = _EXPONENT / _SCALE * power((max(stored, _END_STORED) + _OFFSET) * (_ONE / _SCALE), _EXPONENT - _ONE)
+    return _ONE / _SLOPE if stored <= _END_STORED else high if stored < _LARGEST else _ONE
+
+
+@inlined
+def _encoding(light: Number) -> Number:
+    """The slope of `_encoded`."""
+    high = _SCALE / _EXPONENT * power(max(light, _END), _ONE / _EXPONENT - _ONE)
+    return _SLOPE if light <= _END else high if light < _LARGEST else _ONE

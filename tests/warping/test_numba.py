@@ -446,3 +446,16 @@ def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(monkeypat
 
     monkeypatch.setattr(jit.numba, "njit", refuse)
     assert jit.jit(lambda a: a + 1)(2) == 3
+
+
+@pytest.mark.parametrize("width", [16, 240, 1920])
+def test_between_nodes_every_second_pixel_has_the_bits_of_any_stride(width):
+    across = compiled.kernels("warping.kernels.across")
+    taps = lattice.lagrange_weights(2, 4, dtype=torch.float32, device=torch.device("cpu"))
+    weights = taps.reshape(2, 4).T.contiguous().numpy()
+    nodes = image_of(width // 2 + 3 + 2 * across.GROUP).sub(0.5).numpy()
+    found, expected = (torch.empty(width) for _ in range(2))
+    across.along_every_second(nodes, weights, found.numpy())
+    across.along_nodes(nodes, across.nodes_across(weights, width), expected.numpy())
+    assert torch.equal(found, expected)
+    assert torch.equal(found[::2], torch.from_numpy(nodes)[1 : width // 2 + 1])

@@ -14,7 +14,7 @@ import numpy as np
 
 from torchrefract._jit import floats_at, fma, inlined, jit
 from torchrefract._lanes import LANES
-from torchrefract.warping.kernels.across import GROUP, Across, nodes_across
+from torchrefract.warping.kernels.across import GROUP, Across, along_every_second, nodes_across
 from torchrefract.warping.kernels.following import Addresses, follow_one, follow_row
 from torchrefract.warping.kernels.pixels import Cells, Floats, Frame, Whole
 from torchrefract.warping.kernels.places import along_lattice, room
@@ -108,7 +108,11 @@ def _between(
     for i in range(2):
         # Cubics take a node before each cell: before the frame there is none.
         _down(nodes[i, cell - 1 : cell + 3], taps[:, place], between[i, 1 : columns + 1])
-    both_along_nodes(between, across, x, y)
+    if stride == 2:
+        along_every_second(between[0], taps, x)
+        along_every_second(between[1], taps, y)
+    else:
+        both_along_nodes(between, across, x, y)
     return (low + 1) * stride, (high - 2) * stride
 
 

@@ -127,9 +127,7 @@ def drift_plan(drifts: Drifts, height: int, width: int, tolerance: float | None,
         best, why = every, "no octave can be left out or made coarser"
     fine, coarse, stride, error = best
     kept = tuple(name for i, name in enumerate(names) if i in (*fine, *coarse))
-    dropped = tuple(
-        (name, _error(drifts, {i: None}, height, width)) for i, name in enumerate(names) if name not in kept
-    )
+    dropped = tuple((names[i], _error(drifts, {i: None}, height, width)) for i in octaves if i not in (*fine, *coarse))
     if not kept:
         return plan(error, why, computed, dropped=dropped)
     ends, seldom = ends_of(drifts, room - error, 1 / least)

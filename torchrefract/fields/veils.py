@@ -57,7 +57,8 @@ def veiled(image: Tensor, t: Tensor, airlight: Tensor, *, ends: Ends, linear: bo
     work = kernels("fields.kernels.veils").behind
     limits = np.float32(ends.clear), np.float32(ends.opaque)
     work = partial(work, linear, t.detach()[:, 0].contiguous().numpy(), limits)
-    return _Veiled.apply(partial(_filled, work, linear=linear), linear, image, _between(t, ends), airlight)
+    through = _between(t, ends) if learns((image,)) else t  # for the gradient alone
+    return _Veiled.apply(partial(_filled, work, linear=linear), linear, image, through, airlight)
 
 
 def veiled_by_drifts_(

@@ -64,6 +64,8 @@ def gradients_of(plain: Callable[..., Tensor], inputs: Any, needed: Any, gradien
     """Those of the inputs of plain(*inputs) that are needed, differentiable where a backward pass is to be."""
     again = torch.is_grad_enabled()
     with torch.enable_grad():
+        # One input may come of another: each counts by itself, and what comes before them is not gone through.
+        inputs = [value.view_as(value) if asked else value for value, asked in zip(inputs, needed, strict=True)]
         wanted = [value for value, asked in zip(inputs, needed, strict=True) if asked]
         found = iter(torch.autograd.grad(plain(*inputs), wanted, gradient, create_graph=again))
     return [next(found) if asked else None for asked in needed]

@@ -247,10 +247,9 @@ def depths() -> Iterator[Case]:
 
 def _depth(effect: Effect, value: float) -> None:
     image = picture().requires_grad_()
-    # A depth that learns goes through PyTorch's operations, whose last digits are not those of kernels.
-    depth = (5 + 100 * picture()[:, :1]).detach().requires_grad_()
+    depth = 5 + 100 * picture()[:, :1].detach()
     tame = effect.degrade(image, seed=7, depth=depth)
-    dirty = depth.detach().clone()
+    dirty = depth.clone()
     dirty[0, 0, ROW, COLUMN] = value
     dirty.requires_grad_()
     try:

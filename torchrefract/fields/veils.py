@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._checks import learns
-from torchrefract._compiled import SMALLEST, gradients_of, kernels, obstacle
+from torchrefract._compiled import SMALLEST, gradients_of, kernels, obstacle, with_gradients
 from torchrefract._threads import share
 from torchrefract.fields.fog import drifting_transmission_, linear_to_srgb, srgb_to_linear, veil
 
@@ -52,13 +52,13 @@ def veiled(image: Tensor, t: Tensor, airlight: Tensor, *, ends: Ends, linear: bo
     """
     # Stored values behind one t in each row, all of them read, are PyTorch's at no more than a copy.
     plain = not linear and t.shape[3] == 1 and ends.opaque == 0 and ends.clear == 1
-    if plain or learns((t, airlight)) or obstacle(image, t, airlight):
+    if plain or obstacle(image, t, airlight):
         return _in_pytorch(image, _between(t, ends), airlight, linear=linear)
-    work = kernels("fields.kernels.veils").behind
-    limits = np.float32(ends.clear), np.float32(ends.opaque)
-    work = partial(work, linear, t.detach()[:, 0].contiguous().numpy(), limits)
+    if learns((t, airlight)):
+        return _learning(image, _between(t, ends), airlight, linear=linear)
     through = _between(t, ends) if learns((image,)) else t  # for the gradient alone
-    return _Veiled.apply(partial(_filled, work, linear=linear), linear, image, through, airlight)
+    fill = partial(_filled, _behind(t, ends, linear=linear), linear=linear)
+    return _Veiled.apply(fill, linear, image, through, airlight)
 
 
 def veiled_by_drifts_(
@@ -71,16 +71,52 @@ def veiled_by_drifts_(
         drifting: n, a, b and d.
         ends: of t.
     """
-    if learns((*drifting, airlight)) or obstacle(image, airlight, *drifting):
-        t = _between(drifting_transmission_(*drifting), ends)
+    if obstacle(image, airlight, *drifting):
+        t = _transmission_in_pytorch(*drifting, ends=ends)
         return _in_pytorch(image, t, airlight, linear=linear), t
+    if learns((*drifting, airlight)):
+        t = with_gradients(partial(_transmission, ends=ends), partial(_transmission_in_pytorch, ends=ends), *drifting)
+        return _learning(image, t, airlight, linear=linear), t
     noise = drifting.noise.detach().contiguous()
-    rows = (value.detach().expand(len(image), 1, 1, 1).flatten().numpy() for value in (drifting.scale, drifting.offset))
-    distance = drifting.distance.detach()[:, 0].contiguous().numpy()
-    low, high = np.float32(-math.log(ends.clear)), np.float32(-math.log(ends.opaque) if ends.opaque else _LEAST)
-    work = kernels("fields.kernels.veils").behind_drifts
-    work = partial(work, linear, (noise.view(-1).numpy(), distance, *rows), (low, min(high, np.float32(_LEAST))))
-    return _Veiled.apply(partial(_filled, work, linear=linear), linear, image, noise, airlight), noise
+    fill = partial(_filled, _behind_drifts(drifting._replace(noise=noise), ends, linear=linear), linear=linear)
+    return _Veiled.apply(fill, linear, image, noise, airlight), noise
+
+
+def _learning(image: Tensor, t: Tensor, airlight: Tensor, *, linear: bool) -> Tensor:
+    """The same numbers where t or the airlight has a gradient."""
+
+    def kernel(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
+        return _filled(_behind(t, NO_ENDS, linear=linear), image, airlight, linear=linear)
+
+    return with_gradients(kernel, partial(_in_pytorch, linear=linear), image, t, airlight)
+
+
+def _transmission(*drifting: Tensor, ends: Ends) -> Tensor:
+    """That of drifts by the kernel, before an image without channels."""
+    own = Drifting(*drifting)
+    t = own.noise.clone(memory_format=torch.contiguous_format)
+    none = t[:, :0]
+    _filled(_behind_drifts(own._replace(noise=t), ends, linear=False), none, none[:, :, 0, 0], linear=False)
+    return t
+
+
+def _transmission_in_pytorch(*drifting: Tensor, ends: Ends) -> Tensor:
+    return _between(drifting_transmission_(*drifting), ends)
+
+
+def _behind(t: Tensor, ends: Ends, *, linear: bool) -> Callable[..., None]:
+    limits = np.float32(ends.clear), np.float32(ends.opaque)
+    return partial(kernels("fields.kernels.veils").behind, linear, t.detach()[:, 0].contiguous().numpy(), limits)
+
+
+def _behind_drifts(drifting: Drifting, ends: Ends, *, linear: bool) -> Callable[..., None]:
+    """What writes t over the noise."""
+    noise, *numbers, distance = (value.detach() for value in drifting)
+    rows = (value.expand(len(noise), 1, 1, 1).flatten().numpy() for value in numbers)
+    known = noise.view(-1).numpy(), distance[:, 0].contiguous().numpy(), *rows
+    low, high = -math.log(ends.clear), -math.log(ends.opaque) if ends.opaque else _LEAST
+    limits = np.float32(low), np.float32(min(high, _LEAST))
+    return partial(kernels("fields.kernels.veils").behind_drifts, linear, known, limits)
 
 
 def _between(t: Tensor, ends: Ends) -> Tensor:

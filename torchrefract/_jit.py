@@ -24,7 +24,7 @@ def jit(function: _F) -> _F:
 
     What was compiled is kept in numba's own folder for that if there is one, beside the source, or in the user's cache.
     """
-    return _compiled(function)
+    return _compiled(function, forceinline=False)
 
 
 def inlined(function: _F) -> _F:
@@ -93,6 +93,19 @@ def floats_at(address: np.uint64, count: int) -> NDArray[np.float32]:
 
 # As it is called: what numba calls hands itself over, too.
 fma = cast(Callable[[Any, Any, Any], Any], intrinsic(_fma))
+
+
+def _alone(_: Any) -> Any:
+    """Has the function that calls it stay one of its own: for what is long and seldom called."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        builder.function.attributes.add("noinline")
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+alone = cast(Callable[[], None], intrinsic(_alone))
 
 
 def _horner(_: Any, a: Any, coefficients: Any) -> Any:

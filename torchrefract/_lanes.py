@@ -123,6 +123,7 @@ higher = _operation(_chosen_float(">"), Floats, Floats, Floats)
 floor = _operation(_floor, Floats, Floats)
 to_wholes = _operation(lambda builder, a: builder.fptosi(a, ir.VectorType(_WHOLE, LANES)), Wholes, Floats)
 plus = _operation(lambda builder, a, b: builder.add(a, b), Wholes, Wholes, Wholes)
+times = _operation(lambda builder, a, b: builder.mul(a, b), Wholes, Wholes, Wholes)
 minus = _operation(lambda builder, a, b: builder.sub(a, b), Wholes, Wholes, Wholes)
 smaller = _operation(_chosen("<"), Wholes, Wholes, Wholes)
 larger = _operation(_chosen(">"), Wholes, Wholes, Wholes)
@@ -176,6 +177,34 @@ def load_three(_: Any, values: Any, place: Any) -> Any:
 
 
 @_intrinsic
+def load_pairs(_: Any, values: Any, place: Any, apart: Any) -> Any:
+    """Two Floats: for each lane a number of an array, (n,), and the next one, so far from a place on, Wholes."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        one, two = (_concatenated(builder, own) for own in _loaded_apart(context, builder, signature, given, 2))
+        found = [_each_four(builder, one, two, (k, k + 2, k + 4, k + 6)) for k in range(2)]
+        return context.make_tuple(builder, signature.return_type, [_as_floats(builder, own) for own in found])
+
+    return types.UniTuple(Floats, 2)(values, _INDEX, Wholes), generate
+
+
+@_intrinsic
+def load_fours(_: Any, values: Any, place: Any, apart: Any) -> Any:
+    """Four Floats: the same with the three next ones."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        a, b, c, d = (_concatenated(builder, own) for own in _loaded_apart(context, builder, signature, given, 4))
+        found = list[Any]()
+        for low in (0, 2):
+            order = low, low + 4, low + 1, low + 5
+            first, second = _each_four(builder, a, b, order), _each_four(builder, c, d, order)
+            found += [_each_four(builder, first, second, own) for own in ((0, 1, 4, 5), (2, 3, 6, 7))]
+        return context.make_tuple(builder, signature.return_type, [_as_floats(builder, own) for own in found])
+
+    return types.UniTuple(Floats, 4)(values, _INDEX, Wholes), generate
+
+
+@_intrinsic
 def store(_: Any, values: Any, place: Any, lanes: Any) -> Any:
     """Write Floats to an array, (n,), of float32, or rounded to one of bytes, from a place on."""
 
@@ -224,6 +253,35 @@ def _loaded(context: Any, builder: Any, signature: Any, given: Any, count: int) 
     found = builder.load(builder.bitcast(at, ir.VectorType(at.type.pointee, count).as_pointer()))
     found.align = 1  # arrays may begin anywhere
     return found
+
+
+def _loaded_apart(context: Any, builder: Any, signature: Any, given: Any, count: int) -> list[list[Any]]:
+    """So many numbers for each lane, as they make registers that have four numbers of each lane or pair in a row.
+
+    Of four lanes in a row the first are in the first of these registers.
+    """
+    at = _address(context, builder, signature, given)
+    kind, found = ir.VectorType(at.type.pointee, count).as_pointer(), list[Any]()
+    for i in range(LANES):
+        place = builder.sext(builder.extract_element(given[2], ir.Constant(_WHOLE, i)), ir.IntType(64))
+        found.append(builder.load(builder.bitcast(builder.gep(at, [place]), kind)))
+        found[-1].align = 1
+    fours, own = range(0, LANES, 4), 4 // count
+    return [[found[four + i + k] for four in fours for k in range(own)] for i in range(0, 4, own)]
+
+
+def _concatenated(builder: Any, parts: list[Any]) -> Any:
+    """One register of several."""
+    while len(parts) > 1:
+        order = _order(range(2 * parts[0].type.count))
+        parts = [builder.shuffle_vector(*two, order) for two in zip(parts[::2], parts[1::2], strict=True)]
+    return parts[0]
+
+
+def _each_four(builder: Any, a: Any, b: Any, order: tuple[int, ...]) -> Any:
+    """Of each four numbers of two registers some, by their places among these eight."""
+    places = [4 * four + i + (LANES - 4) * (i > 3) for four in range(LANES // 4) for i in order]
+    return builder.shuffle_vector(a, b, _order(places))
 
 
 def _stored(context: Any, builder: Any, signature: Any, given: Any, lanes: Any) -> Any:

@@ -53,7 +53,7 @@ def compose(last: Last, earlier: Earlier, every: int, start: int, stop: int, out
         spans[i, line, 0], spans[i, line, 1] = low, high
 
 
-@inlined
+@jit
 def along_followed(
     last: Last, earlier: Earlier, known: Known, pair: int, line: int, space: Room, x: Floats, y: Floats
 ) -> None:

@@ -8,7 +8,7 @@ many rows and columns they have, and how many px the nodes are apart, 0 for pixe
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrefract._jit import floats_at, inlined, jit
+from torchrefract._jit import floats_at, jit
 from torchrefract._lanes import LANES
 from torchrefract.warping.kernels.pixels import Cells, Floats, Frame, Whole
 from torchrefract.warping.kernels.places import room
@@ -21,7 +21,7 @@ else:
 Addresses = NDArray[np.uint64]
 
 
-@inlined
+@jit
 def follow_row(
     x: Floats,
     y: Floats,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchrefract._jit import fma, inlined
+from torchrefract._jit import fma, inlined, jit
 from torchrefract.warping.kernels.pixels import (
     BORDER,
     Cells,
@@ -19,7 +19,7 @@ Four = tuple[Number, Number, Number, Number]
 _ONE, _TWO, _HALF, _SIXTH = np.float32(1), np.float32(2), np.float32(0.5), np.float32(1 / 6)
 
 
-@inlined
+@jit
 def follow_one(
     x: Floats,
     y: Floats,

@@ -10,7 +10,7 @@ images, flows, (k,): the rows of the batches of source and out, and of flows, th
 
 import numpy as np
 
-from torchrefract._jit import inlined, jit
+from torchrefract._jit import jit
 from torchrefract._lanes import LANES
 from torchrefract.warping.kernels.across import GROUP
 from torchrefract.warping.kernels.composed import Earlier, Known, Last, along_followed, room_for
@@ -101,7 +101,7 @@ def look_up_followed(
         _look_up(source[image], size, x[:width], y[:width], padding, cells, out[image], line, height)
 
 
-@inlined
+@jit
 def _look_up(
     source: Values,
     size: Size,

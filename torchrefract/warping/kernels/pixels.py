@@ -11,7 +11,7 @@ import numpy as np
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from torchrefract._jit import fma, jit
+from torchrefract._jit import alone, fma, jit
 
 ZEROS, BORDER, REFLECTION = range(3)
 
@@ -75,6 +75,7 @@ def read_part(
     out: Values,
 ) -> None:
     """Pixels first ... last of the row, CHUNK of them at most."""
+    alone()
     channels, height, width, step = size
     inside, beside = find_cells(x[first:last], y[first:last], height, width, cells)
     if beside:

@@ -24,6 +24,7 @@ def jit(function: _F) -> _F:
 
     What was compiled is kept in numba's own folder for that if there is one, beside the source, or in the user's cache.
     """
+    # Said, since numba would else hand on to it that it is called in one that is inlined.
     return _compiled(function, forceinline=False)
 
 

@@ -21,11 +21,11 @@ Weights = tuple[Lanes, Lanes, Lanes, Lanes]
 Cell = tuple[Lanes, Lanes, Lanes, Lanes]  # upper and lower row, left and right place among what is read
 Flags = tuple[Lanes, Lanes]  # whether the left and the right pixels are in the frame
 Rows = tuple[int, int]
-ROWS_AHEAD = 6  # the same, where each lane loads its own
 Group = tuple[bool, int, Rows, Lanes, Cell, Flags, Weights]
 MOST_ROWS = 12  # of the source; for more of them one pixel after the other is faster
 BEFORE = LANES // 4  # pixels that are read before the first of those at both ends of a group
 AHEAD = 3  # rows before they are read they are asked for: each is read anew, from farther memory, a row later
+ROWS_AHEAD = 6  # the same, where each lane loads its own
 
 
 @inlined

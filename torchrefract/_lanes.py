@@ -99,12 +99,8 @@ def _extreme(kind: str) -> Callable[..., Any]:
     return lambda builder, value: _call(builder, f"llvm.vector.reduce.{kind}.v{LANES}i32", _WHOLE, value)
 
 
-def _chosen(sign: str) -> Callable[..., Any]:
-    return lambda builder, a, b: builder.select(builder.icmp_signed(sign, a, b), a, b)
-
-
-def _chosen_float(sign: str) -> Callable[..., Any]:
-    return lambda builder, a, b: builder.select(builder.fcmp_ordered(sign, a, b), a, b)
+def _chosen(compared: str, sign: str) -> Callable[..., Any]:
+    return lambda builder, a, b: builder.select(getattr(builder, compared)(sign, a, b), a, b)
 
 
 def _element(place: int) -> Callable[..., Any]:
@@ -118,15 +114,15 @@ difference = _operation(lambda builder, a, b: builder.fsub(a, b), Floats, Floats
 product = _operation(lambda builder, a, b: builder.fmul(a, b), Floats, Floats, Floats)
 fma = _operation(_fma, Floats, Floats, Floats, Floats)  # a b + c, rounded once
 # The second where the first is no number.
-lower = _operation(_chosen_float("<"), Floats, Floats, Floats)
-higher = _operation(_chosen_float(">"), Floats, Floats, Floats)
+lower = _operation(_chosen("fcmp_ordered", "<"), Floats, Floats, Floats)
+higher = _operation(_chosen("fcmp_ordered", ">"), Floats, Floats, Floats)
 floor = _operation(_floor, Floats, Floats)
 to_wholes = _operation(lambda builder, a: builder.fptosi(a, ir.VectorType(_WHOLE, LANES)), Wholes, Floats)
 plus = _operation(lambda builder, a, b: builder.add(a, b), Wholes, Wholes, Wholes)
 times = _operation(lambda builder, a, b: builder.mul(a, b), Wholes, Wholes, Wholes)
 minus = _operation(lambda builder, a, b: builder.sub(a, b), Wholes, Wholes, Wholes)
-smaller = _operation(_chosen("<"), Wholes, Wholes, Wholes)
-larger = _operation(_chosen(">"), Wholes, Wholes, Wholes)
+smaller = _operation(_chosen("icmp_signed", "<"), Wholes, Wholes, Wholes)
+larger = _operation(_chosen("icmp_signed", ">"), Wholes, Wholes, Wholes)
 # Of all lanes.
 smallest = _operation(_extreme("smin"), types.int32, Wholes)
 largest = _operation(_extreme("smax"), types.int32, Wholes)

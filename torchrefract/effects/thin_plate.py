@@ -132,7 +132,7 @@ class ThinPlateSpline(LatticeWarp):
         # Those that such a plan is for are drawn ones.
         spline = fit_spline(params.points, params.displacement, params.smoothing, checked=True)
         x, y = lattice.places(dtype=torch.float64, device=params.points.device)
-        return SmoothFlow(spline_at(spline, x, y, dtype=dtype), lattice)
+        return SmoothFlow(spline_at(spline, x, y, dtype=dtype, again=True), lattice)
 
     def moves(self, params: ThinPlateParams) -> Tensor:
         """The samples with a displaced point."""

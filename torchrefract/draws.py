@@ -1,26 +1,24 @@
 """Keyed random numbers: what a sample draws depends on (seed, key, place) and on nothing else.
 
-The generator is Threefry-2x32 with 20 rounds, written in integer tensor operations that never overflow. So the same
-words come out for every batch size, order, worker, thread count and device, inside torch.compile too.
-
-Source: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
+So they are the same for every batch size, order, worker, thread count and device, inside torch.compile too.
 """
 
 import math
-from collections.abc import Sequence
-from typing import Any, cast
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchrefract.threefry import WORD, rounds, threefry
 from torchrefract.types import Range
 
-_WORD = 0xFFFFFFFF
-_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
-_PARITY = 0x1BD11BDA
 LARGEST_NORMAL = 5.8  # in magnitude
-_FEW = 8  # up to so many, Python computes faster than numpy
+_FEW = 32  # up to so many, Python computes faster than numpy
+_F = TypeVar("_F", bound=Callable[..., Any])
+_Words = tuple[Tensor, Tensor]
 
 
 class Stream:
@@ -91,26 +89,28 @@ def stream(seed: int | Tensor, keys: Tensor | range, *, device: torch.device | N
         seed = (seed + 2**63) % 2**64 - 2**63
     if (few := _few(seed, keys)) is not None:
         start, numbers = few
-        return Stream([_rounds(*_words(start), *_words(number)) for number in numbers], device=device)
+        return Stream([rounds(*_halves(start), *_halves(number)) for number in numbers], device=device)
+    if not isinstance(seed, Tensor):
+        seed = torch.full((), seed, dtype=torch.int64, device=None if isinstance(keys, range) else keys.device)
     if isinstance(keys, range):
-        keys = torch.arange(keys.start, keys.stop)
-    if isinstance(seed, Tensor) and seed.device.type != "cpu":
+        return Stream(_of_range(seed, keys.start, keys.stop), device=device)
+    if seed.device.type != "cpu":
         keys = keys.to(seed.device, non_blocking=True)
-    start = seed.long() if isinstance(seed, Tensor) else torch.full((), seed, dtype=torch.int64, device=keys.device)
-    return Stream(threefry(_words(start), _words(keys.long())), device=device)
+    return Stream(_of_keys(seed.long(), keys.long()), device=device)
 
 
 def fold(parent: Stream) -> Stream:
     """Streams of their own for what is nested in a lane."""
     if parent.few is not None:
-        return Stream([_rounds(high, low, _WORD, parent.lane) for high, low in parent.few], device=parent.device)
-    zero = torch.zeros_like(parent.low)
-    return Stream(threefry((parent.high, parent.low), (zero + _WORD, zero + parent.lane)), device=parent.device)
+        return Stream([rounds(high, low, WORD, parent.lane) for high, low in parent.few], device=parent.device)
+    return Stream(_folded(parent.high, parent.low, parent.lane), device=parent.device)
 
 
 def uniform(source: Stream, count: int) -> Tensor:
     """(B, count), float32, uniform in the open interval (0, 1), on a lattice of 2^23 values."""
-    return _brought(_uniform(source, count), source)
+    if _is_few(source, count):
+        return _brought(torch.from_numpy(_uniform_few(source, count)), source)
+    return _brought(_uniform(source.high, source.low, source.lane, count), source)
 
 
 def between(source: Stream, ranges: Sequence[Range], *, dtype: torch.dtype) -> Tensor:
@@ -121,31 +121,30 @@ def between(source: Stream, ranges: Sequence[Range], *, dtype: torch.dtype) -> T
         ranges: n of them.
         dtype: float32 or float64.
     """
-    if (few := source.few) is not None and _blocks(len(ranges)) * len(few) <= _FEW:
+    if _is_few(source, len(ranges)):
         # A handful of numbers: numpy's operations start several times as fast, and round alike.
         kind = np.float64 if dtype is torch.float64 else np.float32
         low, high = np.array(ranges, dtype=kind).T
-        values = torch.from_numpy(low + (high - low) * _uniform_few(few, len(ranges), source.lane).astype(kind))
+        values = torch.from_numpy(low + (high - low) * _uniform_few(source, len(ranges)).astype(kind))
         return _brought(values, source)
-    low, high = torch.tensor(ranges, dtype=dtype, device=source.low.device).unbind(1)
-    return _brought(low + (high - low) * _uniform(source, len(ranges)).to(dtype), source)
+    ends = [float(end) for span in ranges for end in span]
+    return _brought(_between(source.high, source.low, source.lane, ends, dtype is torch.float64), source)
 
 
 def normal(source: Stream, count: int) -> Tensor:
     """(B, count), float32, standard normal (Box and Muller 1958), below `LARGEST_NORMAL` in magnitude."""
-    radius, angle = _uniform(source, 2 * _blocks(count)).chunk(2, dim=1)
-    radius, angle = (-2 * radius.log()).sqrt(), 2 * math.pi * angle
-    return _brought(torch.cat([radius * angle.cos(), radius * angle.sin()], dim=1)[:, :count], source)
+    if _is_few(source, 2 * _blocks(count)):
+        return _brought(_normal_of(torch.from_numpy(_uniform_few(source, 2 * _blocks(count))), count), source)
+    return _brought(_normal(source.high, source.low, source.lane, count), source)
 
 
 def noise_key(source: Stream) -> Tensor:
     """(B, 4), int64, in [0, 2^32): what the white noise of each sample comes from."""
     child = fold(source)
     if child.few is not None:
-        key = torch.tensor([(*words, *_rounds(*words, 0, 0)) for words in child.few], dtype=torch.int64)
+        key = torch.tensor([(*words, *rounds(*words, 0, 0)) for words in child.few], dtype=torch.int64)
     else:
-        zero = torch.zeros_like(child.low)
-        key = torch.stack([child.high, child.low, *threefry((child.high, child.low), (zero, zero))], dim=1)
+        key = _noise_key(child.high, child.low)
     return _brought(key, source)
 
 
@@ -153,39 +152,6 @@ def call_seed() -> Tensor:
     """(), int64: a fresh seed from torch's global generator, in eager mode and under torch.compile alike."""
     # Calling the operator loads what compilers need, a second of work that eager mode does without.
     return torch.ops.torchrefract.call_seed.default() if torch.compiler.is_compiling() else _new_seed()
-
-
-def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Two words for each counter under each key, all of them int64 tensors in [0, 2^32) that broadcast."""
-    # For a compiler this is one operator: its hundreds of steps would take it a minute.
-    if torch.compiler.is_compiling():
-        return torch.ops.torchrefract.threefry(*key, *counter)
-    try:
-        arrays = [value.numpy() for value in (*key, *counter)]
-    except (TypeError, RuntimeError):  # on an accelerator, or inside torch.vmap
-        return _rounds(*key, *counter)
-    # Hundreds of operations on not so many numbers: those of numpy start several times as fast.
-    x, y = _rounds(*arrays)
-    return torch.from_numpy(np.asarray(x)), torch.from_numpy(np.asarray(y))
-
-
-def _threefry(key0: Tensor, key1: Tensor, counter0: Tensor, counter1: Tensor) -> tuple[Tensor, Tensor]:
-    return _rounds(key0, key1, counter0, counter1)
-
-
-def _rounds(key0: Any, key1: Any, counter0: Any, counter1: Any) -> tuple[Any, Any]:
-    """The generator, on tensors, arrays or whole numbers alike."""
-    keys = (key0, key1, key0 ^ key1 ^ _PARITY)
-    x, y = counter0 + key0, counter1 + key1
-    for group in range(5):
-        for rotation in _ROTATIONS[group % 2]:
-            # Only what is shifted right must be free of carries; they never reach bit 63.
-            y = y & _WORD
-            x = x + y
-            y = (y << rotation | y >> (32 - rotation)) ^ x
-        x = (x + keys[(group + 1) % 3]) & _WORD
-        y = y + keys[(group + 2) % 3] + group + 1
-    return x, y & _WORD
 
 
 def _few(seed: int | Tensor, keys: Tensor | range) -> tuple[int, Sequence[int]] | None:
@@ -200,19 +166,23 @@ def _few(seed: int | Tensor, keys: Tensor | range) -> tuple[int, Sequence[int]] 
         return None
 
 
+def _is_few(source: Stream, count: int) -> bool:
+    """Whether so many numbers of each sample are faster in Python."""
+    return source.few is not None and _blocks(count) * len(source.few) <= _FEW
+
+
+def _uniform_few(source: Stream, count: int) -> np.ndarray:
+    rows = []
+    for high, low in cast(Sequence[tuple[int, int]], source.few):
+        blocks = (rounds(high, low, i, source.lane) for i in range(_blocks(count)))
+        first, second = zip(*blocks, strict=True)
+        rows.append([((word >> 9) + 0.5) * 2.0**-23 for word in (*first, *second)[:count]])
+    return np.array(rows, dtype=np.float32)
+
+
 def _blocks(count: int) -> int:
     """Each gives two numbers."""
     return (count + 1) // 2
-
-
-def _uniform(source: Stream, count: int) -> Tensor:
-    """`uniform`, where the words are."""
-    if (few := source.few) is not None and _blocks(count) * len(few) <= _FEW:
-        return torch.from_numpy(_uniform_few(few, count, source.lane))
-    counter = torch.arange(_blocks(count), dtype=torch.int64, device=source.low.device)
-    lane = torch.full_like(counter, source.lane)
-    words = threefry((source.high[:, None], source.low[:, None]), (counter, lane))
-    return (torch.cat(words, dim=1)[:, :count] >> 9).float().add(0.5).mul(2.0**-23)
 
 
 def _brought(value: Tensor, source: Stream) -> Tensor:
@@ -222,21 +192,101 @@ def _brought(value: Tensor, source: Stream) -> Tensor:
     return value.to(source.device, non_blocking=value.device.type == "cpu")
 
 
-def _uniform_few(words: Sequence[tuple[int, int]], count: int, lane: int) -> np.ndarray:
-    rows = []
-    for high, low in words:
-        blocks = (_rounds(high, low, i, lane) for i in range(_blocks(count)))
-        first, second = zip(*blocks, strict=True)
-        rows.append([((word >> 9) + 0.5) * 2.0**-23 for word in (*first, *second)[:count]])
-    return np.array(rows, dtype=np.float32)
-
-
 def _new_seed() -> Tensor:
     return torch.randint(-(2**63), 2**63 - 1, (), dtype=torch.int64)
 
 
-def _words(value: Any) -> tuple[Any, Any]:
-    return (value >> 32) & _WORD, value & _WORD
+def _halves(value: Any) -> tuple[Any, Any]:
+    return (value >> 32) & WORD, value & WORD
+
+
+def _operator(schema: str, result: Callable[..., Any]) -> Callable[[_F], _F]:
+    """Makes a function one operator for compilers: its hundreds of steps would take them a minute.
+
+    Args:
+        schema: its arguments and results, as PyTorch writes them.
+        result: gives what has the results' shapes, types and devices, of the same arguments.
+    """
+
+    def made(function: _F) -> _F:
+        name = function.__name__.removeprefix("_")
+        operator = torch.library.custom_op(f"torchrefract::{name}", function, mutates_args=(), schema=schema)
+        operator.register_fake(result)
+
+        @wraps(function)
+        def chosen(*args: Any) -> Any:
+            if torch.compiler.is_compiling():
+                return getattr(torch.ops.torchrefract, name)(*args)
+            return function(*args)
+
+        return cast(_F, chosen)
+
+    return made
+
+
+@_operator(
+    "(Tensor seed, int start, int stop) -> (Tensor, Tensor)", lambda seed, start, stop: _pair(seed, stop - start)
+)
+def _of_range(seed: Tensor, start: int, stop: int) -> _Words:
+    """The words of each key."""
+    return threefry(_halves(seed.long()), _halves(torch.arange(start, stop, device=seed.device)))
+
+
+@_operator("(Tensor seed, Tensor keys) -> (Tensor, Tensor)", lambda seed, keys: _pair(keys, len(keys)))
+def _of_keys(seed: Tensor, keys: Tensor) -> _Words:
+    return threefry(_halves(seed), _halves(keys))
+
+
+@_operator("(Tensor high, Tensor low, int lane) -> (Tensor, Tensor)", lambda high, low, lane: _pair(low, len(low)))
+def _folded(high: Tensor, low: Tensor, lane: int) -> _Words:
+    zero = torch.zeros_like(low)
+    return threefry((high, low), (zero + WORD, zero + lane))
+
+
+@_operator(
+    "(Tensor high, Tensor low, int lane, int count) -> Tensor",
+    lambda high, low, lane, count: high.new_empty((len(high), count), dtype=torch.float32),
+)
+def _uniform(high: Tensor, low: Tensor, lane: int, count: int) -> Tensor:
+    counter = torch.arange(_blocks(count), dtype=torch.int64, device=low.device)
+    words = threefry((high[:, None], low[:, None]), (counter, torch.full_like(counter, lane)))
+    return (torch.cat(words, dim=1)[:, :count] >> 9).float().add(0.5).mul(2.0**-23)
+
+
+@_operator(
+    "(Tensor high, Tensor low, int lane, float[] ends, bool double) -> Tensor",
+    lambda high, low, lane, ends, double: high.new_empty(
+        (len(high), len(ends) // 2), dtype=torch.float64 if double else torch.float32
+    ),
+)
+def _between(high: Tensor, low: Tensor, lane: int, ends: Sequence[float], double: bool) -> Tensor:
+    dtype = torch.float64 if double else torch.float32
+    least, most = torch.tensor(ends, dtype=dtype, device=low.device).view(-1, 2).unbind(1)
+    return least + (most - least) * _uniform(high, low, lane, len(ends) // 2).to(dtype)
+
+
+@_operator(
+    "(Tensor high, Tensor low, int lane, int count) -> Tensor",
+    lambda high, low, lane, count: high.new_empty((len(high), count), dtype=torch.float32),
+)
+def _normal(high: Tensor, low: Tensor, lane: int, count: int) -> Tensor:
+    return _normal_of(_uniform(high, low, lane, 2 * _blocks(count)), count)
+
+
+def _normal_of(values: Tensor, count: int) -> Tensor:
+    radius, angle = values.chunk(2, dim=1)
+    radius, angle = (-2 * radius.log()).sqrt(), 2 * math.pi * angle
+    return torch.cat([radius * angle.cos(), radius * angle.sin()], dim=1)[:, :count].contiguous()
+
+
+@_operator("(Tensor high, Tensor low) -> Tensor", lambda high, low: high.new_empty((len(high), 4)))
+def _noise_key(high: Tensor, low: Tensor) -> Tensor:
+    zero = torch.zeros_like(low)
+    return torch.stack([high, low, *threefry((high, low), (zero, zero))], dim=1)
+
+
+def _pair(like: Tensor, count: int) -> _Words:
+    return like.new_empty(count, dtype=torch.int64), like.new_empty(count, dtype=torch.int64)
 
 
 @torch.library.custom_op("torchrefract::call_seed", mutates_args=(), tags=(torch.Tag.nondeterministic_seeded,))
@@ -248,12 +298,3 @@ def _call_seed() -> Tensor:
 @_call_seed.register_fake
 def _() -> Tensor:
     return torch.empty((), dtype=torch.int64)
-
-
-_threefry_op = torch.library.custom_op("torchrefract::threefry", _threefry, mutates_args=())
-
-
-@_threefry_op.register_fake
-def _(key0: Tensor, key1: Tensor, counter0: Tensor, counter1: Tensor) -> tuple[Tensor, Tensor]:
-    shape = torch.broadcast_shapes(key0.shape, key1.shape, counter0.shape, counter1.shape)
-    return counter0.new_empty(shape), counter0.new_empty(shape)

@@ -10,10 +10,10 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from arguments import count, shape
@@ -96,17 +96,29 @@ def working(found: Mapping[str, Candidate]) -> tuple[dict[str, Candidate], list[
 
 
 def agreement(chosen: Mapping[str, Effect], frame: Tensor) -> list[Bar]:
-    """How far each effect on the device of a frame (1, C, H, W) is from itself on the CPU."""
-    return [_agreement(name, effect, frame) for name, effect in chosen.items()]
+    """How far each effect on the device of a frame (1, C, H, W) is from itself on the CPU.
+
+    And how far where a training has told PyTorch to round the factors of products.
+    """
+    return [bar for name, effect in chosen.items() for bar in _agreement(name, effect, frame)]
 
 
-def _agreement(name: str, effect: Effect, frame: Tensor) -> Bar:
+def _agreement(name: str, effect: Effect, frame: Tensor) -> Iterator[Bar]:
     params = effect.sample(frame.cpu(), seed=SEED)
-    there, here = effect.apply(frame, params.to(frame.device)), effect.apply(frame.cpu(), params)
-    if here.flow is not None:
-        return Bar(f"{name} as on the CPU", length(there.flow.cpu() - here.flow).max().item(), "<=", AGREE_PX, "px")
-    off = 255 * (there.image.cpu() - here.image).abs().max().item()
-    return Bar(f"{name} as on the CPU", off, "<=", AGREE_LEVELS, "levels")
+    here, before = effect.apply(frame.cpu(), params), torch.get_float32_matmul_precision()
+    flow = here.flow
+    for precision in ("highest", "high"):
+        torch.set_float32_matmul_precision(precision)
+        try:
+            there = effect.apply(frame, params.to(frame.device))
+            what = f"{name} as on the CPU" + (", TF32 allowed" if precision == "high" else "")
+            if flow is not None:
+                yield Bar(what, length(cast(Tensor, there.flow).cpu() - flow).max().item(), "<=", AGREE_PX, "px")
+            else:
+                off = 255 * (there.image.cpu() - here.image).abs().max().item()
+                yield Bar(what, off, "<=", AGREE_LEVELS, "levels")
+        finally:
+            torch.set_float32_matmul_precision(before)
 
 
 def bytes_per_second(timings: Sequence[Timing], frames: Tensor) -> dict[str, float]:

@@ -3,22 +3,33 @@
 So they are the same for every batch size, order, worker, thread count and device, inside torch.compile too.
 """
 
-import math
-from collections.abc import Callable, Sequence
-from functools import wraps
-from typing import Any, TypeVar, cast
+from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract.threefry import WORD, rounds, threefry
+from torchrefract.draw_operators import (
+    Words,
+    between_of,
+    blocks,
+    folded,
+    halves,
+    noise_key_of,
+    normal_from,
+    normal_of,
+    uniform_few,
+    uniform_of,
+    within,
+    words_of_keys,
+    words_of_range,
+)
+from torchrefract.threefry import WORD, rounds
 from torchrefract.types import Range
 
 LARGEST_NORMAL = 5.8  # in magnitude
 _FEW = 32  # up to so many, Python computes faster than numpy
-_F = TypeVar("_F", bound=Callable[..., Any])
-_Words = tuple[Tensor, Tensor]
 
 
 class Stream:
@@ -32,7 +43,7 @@ class Stream:
 
     def __init__(
         self,
-        words: Sequence[tuple[int, int]] | tuple[Tensor, Tensor],
+        words: Sequence[tuple[int, int]] | Words,
         lane: int = 0,
         device: torch.device | None = None,
     ):
@@ -69,7 +80,7 @@ class Stream:
 
     def _word(self, which: int) -> Tensor:
         if self._tensors:
-            return cast(tuple[Tensor, Tensor], self._words)[which]
+            return cast(Words, self._words)[which]
         return torch.tensor([pair[which] for pair in cast(Sequence[tuple[int, int]], self._words)], dtype=torch.int64)
 
 
@@ -89,28 +100,28 @@ def stream(seed: int | Tensor, keys: Tensor | range, *, device: torch.device | N
         seed = (seed + 2**63) % 2**64 - 2**63
     if (few := _few(seed, keys)) is not None:
         start, numbers = few
-        return Stream([rounds(*_halves(start), *_halves(number)) for number in numbers], device=device)
+        return Stream([rounds(*halves(start), *halves(number)) for number in numbers], device=device)
     if not isinstance(seed, Tensor):
         seed = torch.full((), seed, dtype=torch.int64, device=None if isinstance(keys, range) else keys.device)
     if isinstance(keys, range):
-        return Stream(_of_range(seed, keys.start, keys.stop), device=device)
+        return Stream(words_of_range(seed, keys.start, keys.stop), device=device)
     if seed.device.type != "cpu":
         keys = keys.to(seed.device, non_blocking=True)
-    return Stream(_of_keys(seed.long(), keys.long()), device=device)
+    return Stream(words_of_keys(seed.long(), keys.long()), device=device)
 
 
 def fold(parent: Stream) -> Stream:
     """Streams of their own for what is nested in a lane."""
     if parent.few is not None:
         return Stream([rounds(high, low, WORD, parent.lane) for high, low in parent.few], device=parent.device)
-    return Stream(_folded(parent.high, parent.low, parent.lane), device=parent.device)
+    return Stream(folded(parent.high, parent.low, parent.lane), device=parent.device)
 
 
 def uniform(source: Stream, count: int) -> Tensor:
     """(B, count), float32, uniform in the open interval (0, 1), on a lattice of 2^23 values."""
-    if _is_few(source, count):
-        return _brought(torch.from_numpy(_uniform_few(source, count)), source)
-    return _brought(_uniform(source.high, source.low, source.lane, count), source)
+    if (few := _few_uniform(source, count)) is not None:
+        return _brought(torch.from_numpy(few), source)
+    return _brought(uniform_of(source.high, source.low, source.lane, count), source)
 
 
 def between(source: Stream, ranges: Sequence[Range], *, dtype: torch.dtype) -> Tensor:
@@ -121,21 +132,17 @@ def between(source: Stream, ranges: Sequence[Range], *, dtype: torch.dtype) -> T
         ranges: n of them.
         dtype: float32 or float64.
     """
-    if _is_few(source, len(ranges)):
-        # A handful of numbers: numpy's operations start several times as fast, and round alike.
-        kind = np.float64 if dtype is torch.float64 else np.float32
-        low, high = np.array(ranges, dtype=kind).T
-        values = torch.from_numpy(low + (high - low) * _uniform_few(source, len(ranges)).astype(kind))
-        return _brought(values, source)
-    ends = [float(end) for span in ranges for end in span]
-    return _brought(_between(source.high, source.low, source.lane, ends, dtype is torch.float64), source)
+    ends, double = [float(end) for span in ranges for end in span], dtype is torch.float64
+    if (few := _few_uniform(source, len(ranges))) is not None:
+        return _brought(torch.from_numpy(within(ends, few, double=double)), source)
+    return _brought(between_of(source.high, source.low, source.lane, ends, double), source)
 
 
 def normal(source: Stream, count: int) -> Tensor:
     """(B, count), float32, standard normal (Box and Muller 1958), below `LARGEST_NORMAL` in magnitude."""
-    if _is_few(source, 2 * _blocks(count)):
-        return _brought(_normal_of(torch.from_numpy(_uniform_few(source, 2 * _blocks(count))), count), source)
-    return _brought(_normal(source.high, source.low, source.lane, count), source)
+    if (few := _few_uniform(source, 2 * blocks(count))) is not None:
+        return _brought(normal_from(torch.from_numpy(few), count), source)
+    return _brought(normal_of(source.high, source.low, source.lane, count), source)
 
 
 def noise_key(source: Stream) -> Tensor:
@@ -144,7 +151,7 @@ def noise_key(source: Stream) -> Tensor:
     if child.few is not None:
         key = torch.tensor([(*words, *rounds(*words, 0, 0)) for words in child.few], dtype=torch.int64)
     else:
-        key = _noise_key(child.high, child.low)
+        key = noise_key_of(child.high, child.low)
     return _brought(key, source)
 
 
@@ -166,23 +173,11 @@ def _few(seed: int | Tensor, keys: Tensor | range) -> tuple[int, Sequence[int]] 
         return None
 
 
-def _is_few(source: Stream, count: int) -> bool:
-    """Whether so many numbers of each sample are faster in Python."""
-    return source.few is not None and _blocks(count) * len(source.few) <= _FEW
-
-
-def _uniform_few(source: Stream, count: int) -> np.ndarray:
-    rows = []
-    for high, low in cast(Sequence[tuple[int, int]], source.few):
-        blocks = (rounds(high, low, i, source.lane) for i in range(_blocks(count)))
-        first, second = zip(*blocks, strict=True)
-        rows.append([((word >> 9) + 0.5) * 2.0**-23 for word in (*first, *second)[:count]])
-    return np.array(rows, dtype=np.float32)
-
-
-def _blocks(count: int) -> int:
-    """Each gives two numbers."""
-    return (count + 1) // 2
+def _few_uniform(source: Stream, count: int) -> np.ndarray | None:
+    """The numbers of `uniform`, None where they are so many that tensors are faster."""
+    if source.few is None or blocks(count) * len(source.few) > _FEW:
+        return None
+    return uniform_few(source.few, source.lane, count)
 
 
 def _brought(value: Tensor, source: Stream) -> Tensor:
@@ -194,99 +189,6 @@ def _brought(value: Tensor, source: Stream) -> Tensor:
 
 def _new_seed() -> Tensor:
     return torch.randint(-(2**63), 2**63 - 1, (), dtype=torch.int64)
-
-
-def _halves(value: Any) -> tuple[Any, Any]:
-    return (value >> 32) & WORD, value & WORD
-
-
-def _operator(schema: str, result: Callable[..., Any]) -> Callable[[_F], _F]:
-    """Makes a function one operator for compilers: its hundreds of steps would take them a minute.
-
-    Args:
-        schema: its arguments and results, as PyTorch writes them.
-        result: gives what has the results' shapes, types and devices, of the same arguments.
-    """
-
-    def made(function: _F) -> _F:
-        name = function.__name__.removeprefix("_")
-        operator = torch.library.custom_op(f"torchrefract::{name}", function, mutates_args=(), schema=schema)
-        operator.register_fake(result)
-
-        @wraps(function)
-        def chosen(*args: Any) -> Any:
-            if torch.compiler.is_compiling():
-                return getattr(torch.ops.torchrefract, name)(*args)
-            return function(*args)
-
-        return cast(_F, chosen)
-
-    return made
-
-
-@_operator(
-    "(Tensor seed, int start, int stop) -> (Tensor, Tensor)", lambda seed, start, stop: _pair(seed, stop - start)
-)
-def _of_range(seed: Tensor, start: int, stop: int) -> _Words:
-    """The words of each key."""
-    return threefry(_halves(seed.long()), _halves(torch.arange(start, stop, device=seed.device)))
-
-
-@_operator("(Tensor seed, Tensor keys) -> (Tensor, Tensor)", lambda seed, keys: _pair(keys, len(keys)))
-def _of_keys(seed: Tensor, keys: Tensor) -> _Words:
-    return threefry(_halves(seed), _halves(keys))
-
-
-@_operator("(Tensor high, Tensor low, int lane) -> (Tensor, Tensor)", lambda high, low, lane: _pair(low, len(low)))
-def _folded(high: Tensor, low: Tensor, lane: int) -> _Words:
-    zero = torch.zeros_like(low)
-    return threefry((high, low), (zero + WORD, zero + lane))
-
-
-@_operator(
-    "(Tensor high, Tensor low, int lane, int count) -> Tensor",
-    lambda high, low, lane, count: high.new_empty((len(high), count), dtype=torch.float32),
-)
-def _uniform(high: Tensor, low: Tensor, lane: int, count: int) -> Tensor:
-    counter = torch.arange(_blocks(count), dtype=torch.int64, device=low.device)
-    words = threefry((high[:, None], low[:, None]), (counter, torch.full_like(counter, lane)))
-    return (torch.cat(words, dim=1)[:, :count] >> 9).float().add(0.5).mul(2.0**-23)
-
-
-@_operator(
-    "(Tensor high, Tensor low, int lane, float[] ends, bool double) -> Tensor",
-    lambda high, low, lane, ends, double: high.new_empty(
-        (len(high), len(ends) // 2), dtype=torch.float64 if double else torch.float32
-    ),
-)
-def _between(high: Tensor, low: Tensor, lane: int, ends: Sequence[float], double: bool) -> Tensor:
-    dtype = torch.float64 if double else torch.float32
-    least, most = torch.tensor(ends, dtype=dtype, device=low.device).view(-1, 2).unbind(1)
-    return least + (most - least) * _uniform(high, low, lane, len(ends) // 2).to(dtype)
-
-
-@_operator(
-    "(Tensor high, Tensor low, int lane, int count) -> Tensor",
-    lambda high, low, lane, count: high.new_empty((len(high), count), dtype=torch.float32),
-)
-def _normal(high: Tensor, low: Tensor, lane: int, count: int) -> Tensor:
-    return _normal_of(_uniform(high, low, lane, 2 * _blocks(count)), count)
-
-
-def _normal_of(values: Tensor, count: int) -> Tensor:
-    radius, angle = values.chunk(2, dim=1)
-    radius, angle = (-2 * radius.log()).sqrt(), 2 * math.pi * angle
-    return torch.cat([radius * angle.cos(), radius * angle.sin()], dim=1)[:, :count].contiguous()
-
-
-@_operator("(Tensor high, Tensor low) -> Tensor", lambda high, low: high.new_empty((len(high), 4)))
-def _noise_key(high: Tensor, low: Tensor) -> Tensor:
-    zero = torch.zeros_like(low)
-    return torch.stack([high, low, *threefry((high, low), (zero, zero))], dim=1)
-
-
-def _pair(like: Tensor, count: int) -> _Words:
-    return like.new_empty(count, dtype=torch.int64), like.new_empty(count, dtype=torch.int64)
 
 
 @torch.library.custom_op("torchrefract::call_seed", mutates_args=(), tags=(torch.Tag.nondeterministic_seeded,))

@@ -49,7 +49,9 @@ class Off(ThinPlateSpline):
 def test_what_differs_from_the_cpu_is_told():
     frame = torch.rand(1, 3, 24, 32)
     chosen: dict[str, Effect] = {"plate": ThinPlateSpline(), "flare": LensFlare(), "off": Off()}
-    plate, flare, off = gpu.agreement(chosen, frame)
+    plate, plate_rounded, flare, _, off, _ = gpu.agreement(chosen, frame)
+    assert plate_rounded.name == "plate as on the CPU, TF32 allowed"
+    assert plate_rounded.holds
     assert (plate.value, plate.unit, plate.holds) == (0, "px", True)
     assert (flare.value, flare.unit, flare.holds) == (0, "levels", True)
     assert off.value == pytest.approx(0.2 * 2**0.5, rel=1e-4)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrefract import draws
 from torchrefract._checks import check_range, or_else
+from torchrefract._products import product
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.air import Air, check_fog_params, distances, make_air, squares
 from torchrefract.effects.base import params_to
@@ -141,7 +142,7 @@ def behind_fog(air: Air, image: Tensor, params: Any, depth: Tensor | None, plan:
         blended = air.blended(image, t, airlight, plan.ends)
         return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
     places, weights = along_columns(air, image, plan.nodes)
-    t = through(air.distance_at(places, image)) @ weights
+    t = product(through(air.distance_at(places, image)), weights)
     blended = air.blended(image, t, airlight, plan.ends)
     return Shaded(blended, valid=lambda: exact() >= 1 / 255, transmission=exact, extinction=k)
 

@@ -14,7 +14,7 @@ from torchrefract.effects.plan import Ask, Plan
 from torchrefract.effects.rows import alike, column, frames_of, only, params_part, part, put, some, spread
 from torchrefract.types import Degraded, Inverse, Map
 from torchrefract.warping.compose import compose_flows
-from torchrefract.warping.grid import field_dtype, inside, length
+from torchrefract.warping.grid import Positions, field_dtype, inside, length
 from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.jacobian import folding
 from torchrefract.warping.lattice import SmoothFlow
@@ -109,11 +109,10 @@ class WarpEffect(Effect):
         if not self.stirs(params, height, width):
             return identity(image, params)
         moved = self.gated(params, height=height, width=width)
-        path = moved.spread(image.shape[0]).path
+        own = moved.spread(image.shape[0])
         options = {"padding": self.padding, "interpolation": self.interpolation, "resampler": self.resampler}
-        warped = look_up(image, path, **options)
         return moving(
-            only(warped, image, moved.active, params),
+            looked_up(image, own.path, own.active, params, **options),
             params,
             flow=lambda: moved.flow,
             valid=lambda: (moved.exists & inside(moved.flow)) | ~column(moved.active),
@@ -183,6 +182,13 @@ def moving(
         folding=lambda result: folding(result.flow, result.valid),
         light=light,
     )
+
+
+def looked_up(image: Tensor, path: Flow | Positions, active: Tensor, params: Any, **options: Any) -> Tensor:
+    """The image (N, C, H, W) along a path; samples that are not active, (N,), bool, bit for bit as they are."""
+    if learns(params) or is_true(active.all, of=active) is not None:
+        return only(look_up(image, path, **options), image, active, params)
+    return look_up(image, path, active=active, **options)
 
 
 def sees(good: Tensor, flow: Tensor) -> Tensor:

@@ -14,13 +14,13 @@ from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.plan import Plan
 from torchrefract.effects.radiance import RadianceEffect
-from torchrefract.effects.refraction import Moved, WarpEffect, moving, sees
+from torchrefract.effects.refraction import Moved, WarpEffect, looked_up, moving, sees
 from torchrefract.effects.rows import column, only, spread
 from torchrefract.effects.steps import Step, exact, on_grid
 from torchrefract.types import Degraded, Map
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import Positions, field_dtype, inside
-from torchrefract.warping.mixed import Flow, dense
+from torchrefract.warping.mixed import dense
 from torchrefract.warping.resample import look_up, sampler_dtype
 
 _Combine = Callable[[Tensor, Tensor], Tensor]
@@ -146,7 +146,7 @@ class Walk:
         if not self.waiting:
             return
         group = self._composite(self.waiting)
-        self.image = only(self._looked_up(group.path), self.image, group.active, group)
+        self.image = self._looked_up(group)
         if self.depth is not None:
             self.depth = spread(self.depth, self.image.shape[0])
             near = look_up(self.depth, group.path.detach(), padding="border", interpolation="nearest")
@@ -175,14 +175,16 @@ class Walk:
         asked = self.modes.pop(mode, torch.zeros_like(active))
         self.modes = {other: samples & ~active for other, samples in self.modes.items()} | {mode: asked | active}
 
-    def _looked_up(self, flow: Flow | Positions) -> Tensor:
-        warped = None
-        for mode, samples in reversed(self.modes.items()):
-            if warped is not None and is_true(samples.any, of=samples) is False:
-                continue
-            found = look_up(self.image, flow, **mode._asdict())
-            warped = found if warped is None else torch.where(column(samples), found, warped)
-        return cast(Tensor, warped)
+    def _looked_up(self, group: Step) -> Tensor:
+        """The image where a group of warps leads."""
+        (latest, _), *before = reversed(self.modes.items())
+        others = [(mode, samples) for mode, samples in before if is_true(samples.any, of=samples) is not False]
+        if not others:
+            return looked_up(self.image, group.path, group.active, group, **latest._asdict())
+        warped = look_up(self.image, group.path, **latest._asdict())
+        for mode, samples in others:
+            warped = torch.where(column(samples), look_up(self.image, group.path, **mode._asdict()), warped)
+        return only(warped, self.image, group.active, group)
 
     def _moves(self) -> list[Tensor]:
         """(B,), bool, of each warp: the samples that it may move."""

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrefract._bands import join, rows_at_once
 from torchrefract._checks import learns
+from torchrefract._products import product
 from torchrefract.fields.perlin3d import Rays
 
 SLICES = 48  # of the distance, in which means are kept
@@ -68,7 +69,7 @@ def by_row(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor
     finer = keys(view.across, volume)
     across = torch.lerp(finer[x], finer[x + 1], dx[:, None])
     # The product adds 1, too. Cubics overshoot where the contrast is high.
-    mean = F.pad(sum(others, first), (0, 1), value=1.0) @ F.pad(across, (0, 1), value=1.0).T
+    mean = product(F.pad(sum(others, first), (0, 1), value=1.0), F.pad(across, (0, 1), value=1.0).T)
     return mean.relu_().unsqueeze(1)
 
 
@@ -105,7 +106,7 @@ def finer_places(pixels: int, cell: float, cells: int) -> tuple[np.ndarray, np.n
 
 def by_pixel(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:
     """m for distances (N or 1, 1, H, W)."""
-    volume = volume @ keys(view.across, volume).T
+    volume = product(volume, keys(view.across, volume).T)
     rows, columns = volume.shape[2:]
     # One slice below the other as an image, the next slice as its second channel.
     pairs = torch.stack([volume[:, :-1], volume[:, 1:]], dim=1).flatten(2, 3)

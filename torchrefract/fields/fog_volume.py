@@ -11,6 +11,7 @@ from torchrefract._bands import join
 from torchrefract._checks import learns, or_else, withheld
 from torchrefract._compiled import obstacle
 from torchrefract._constants import constant
+from torchrefract._products import product
 from torchrefract.fields import fog_drawn
 from torchrefract.fields.fog_view import SLICES, View, by_pixel, by_row, keys, view
 from torchrefract.fields.perlin3d import VARIANCE, Rays, deviation_of_mean, noise_on_planes
@@ -116,7 +117,7 @@ def _by_kernel(own: View, fog: _Fog, distance: Tensor, *, scales: Sequence[float
 
 def _path_mean(view: View, fog: _Fog, distance: Tensor, *, scales: Sequence[float], reach: float) -> Tensor:
     volume = _volume(view.rays, fog, scales=scales, reach=reach, dtype=distance.dtype)
-    volume = keys(view.down, volume) @ volume
+    volume = product(keys(view.down, volume), volume)
     look_up = by_row if distance.shape[3] == 1 else by_pixel
     return look_up(view, volume, distance, reach)
 
@@ -124,7 +125,7 @@ def _path_mean(view: View, fog: _Fog, distance: Tensor, *, scales: Sequence[floa
 def _volume(rays: Rays, fog: _Fog, *, scales: Sequence[float], reach: float, dtype: torch.dtype) -> Tensor:
     """(N, slices + 1, rows, columns): m - 1 along each ray up to the slices d = reach n (n + 1) / (S (S + 1))."""
     excess = _excess(rays, fog, scales=scales, reach=reach, dtype=dtype)
-    mean = _quadrature(excess) @ excess.flatten(2)
+    mean = product(_quadrature(excess), excess.flatten(2))
     x, y = rays.slopes(mean.device)
     n = torch.arange(SLICES + 1, dtype=torch.float64, device=mean.device)
     # A ray is longer than its depth, and planes lie at squares.

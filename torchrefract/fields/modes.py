@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrefract import white_noise
 from torchrefract._bands import by_samples
 from torchrefract._constants import constant, kept
+from torchrefract._products import product
 from torchrefract.fields.evolution import turned
 from torchrefract.fields.gaussian import axis_spectrum
 
@@ -107,8 +108,8 @@ def sum_of_modes(weighted: Tensor, modes: Modes, rows: Sequence[int], columns: S
     both = torch.stack([torch.cat([real, imaginary], dim=2), torch.cat([imaginary, -real], dim=2)], dim=1)
 
     def fields(pairs: Tensor) -> Tensor:
-        along = torch.bmm(pairs.flatten(0, 1), in_x.expand(2 * pairs.shape[0], -1, -1))
-        return in_y @ along.unflatten(0, (-1, 2)).flatten(1, 2).unsqueeze(1)
+        along = product(pairs.flatten(0, 1), in_x.expand(2 * pairs.shape[0], -1, -1))
+        return product(in_y, along.unflatten(0, (-1, 2)).flatten(1, 2).unsqueeze(1))
 
     # Two products to a sample: one by itself may round by the threads.
     return by_samples(both, fields)

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrefract._bands import join
 from torchrefract._checks import learns
 from torchrefract._constants import constant
+from torchrefract._products import product
 from torchrefract.fields.perlin_lattice import Octave
 from torchrefract.warping.lattice import Lattice, along_rows, row_weights
 
@@ -104,7 +105,7 @@ def _noise(octaves: Sequence[Octave], weights: Tensor, nodes: Nodes | None) -> T
     few = weights.device.type == "cpu" and not torch.compiler.is_compiling() and not learns((table,))
     at_once = _AT_ONCE if few else len(down)
     bands = (
-        torch.bmm(weight, table.index_select(0, numbers.flatten()).view(len(weight), weight.shape[2], -1))
+        product(weight, table.index_select(0, numbers.flatten()).view(len(weight), weight.shape[2], -1))
         for weight, numbers in zip(down.split(at_once), index.split(at_once), strict=True)
     )
     image = join(bands, dim=0, length=len(down))
@@ -144,7 +145,7 @@ def _lines(gradient: Tensor, nodes: Tensor, across: Tensor) -> Tensor:
     batch, _, m, n = gradient.shape
     lane = n * torch.arange(2 * batch, device=nodes.device).view(batch, 2, 1, 1)
     chosen = gradient.mT.reshape(-1, m).index_select(0, (nodes[:, None] + lane).flatten())
-    return torch.bmm(chosen.unflatten(0, (-1, nodes.shape[2])).mT, across.flatten(0, 2)).flatten(0, 1)
+    return product(chosen.unflatten(0, (-1, nodes.shape[2])).mT, across.flatten(0, 2)).flatten(0, 1)
 
 
 def _line_numbers(y: _Blocks, *, lines: Sequence[int], stripes: int) -> Tensor:

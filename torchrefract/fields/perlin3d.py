@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrefract import white_noise
 from torchrefract._constants import constant
+from torchrefract._products import product
 
 # Of the noise below, over all gradients and all places in a cell: each of the 8 nodes adds a third of the mean of
 # (h(p) h(q) h(r))^2 (p^2 + q^2 + r^2); the mean of h^2 is 181 / 462, that of (h p)^2 is 535 / 18018.
@@ -161,8 +162,9 @@ def _octave(axes: Sequence[tuple[Tensor, Tensor]], gradients: Sequence[Tensor], 
     (hat_x, ramp_x), (hat_y, ramp_y), z = axes
     hat_z, ramp_z = (matrix[:, 0, :, :planes].mT for matrix in z)
     size = (-1, planes, *gradients[0].shape[2:])
-    gx, gy, gz = ((z @ g.flatten(2)).view(size) for z, g in zip((hat_z, hat_z, ramp_z), gradients, strict=True))
-    return hat_y.mT @ (gx @ ramp_x + gz @ hat_x) + ramp_y.mT @ (gy @ hat_x)
+    gx, gy, gz = (product(z, g.flatten(2)).view(size) for z, g in zip((hat_z, hat_z, ramp_z), gradients, strict=True))
+    along = product(gx, ramp_x) + product(gz, hat_x)
+    return product(hat_y.mT, along) + product(ramp_y.mT, product(gy, hat_x))
 
 
 def _grown(field: Tensor, planes: int) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrefract._bands import by_samples
 from torchrefract._compiled import SMALLEST, kernels, obstacle, with_gradients
 from torchrefract._constants import assume_constant_result, constant
+from torchrefract._products import product
 from torchrefract._threads import share
 from torchrefract.warping.grid import finite, pixel_axes, sampler_axes, sampler_positions
 
@@ -75,6 +76,11 @@ def along_rows(nodes: Tensor, lattice: Lattice) -> Tensor:
 def row_weights(like: Tensor, lattice: Lattice) -> Tensor:
     """(H, n), of the rows of nodes for each row of pixels, in the type of a tensor."""
     return _matrix(_cubics(like, lattice), len(lattice.axes()[0]), lattice.height)
+
+
+def gradient_of_lines(of_positions: Tensor, weight: Tensor, nodes: int) -> Tensor:
+    """(B, 2, nodes, W): that of lines, of the gradient (B, 2, H, W) of the positions between them; as in `Lines`."""
+    return product(_matrix(weight, nodes, of_positions.shape[2]).mT, of_positions)
 
 
 def lagrange_weights(stride: int, count: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -264,16 +270,16 @@ def _filled_down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
 def _multiplied_across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:
     """`_across` by products of matrices."""
     if nodes.shape[3] <= _FEW_COLUMNS:
-        return nodes @ _matrix(weight, nodes.shape[3], width).mT
-    cells = nodes.unfold(3, weight.shape[-1], 1) @ weight.mT
+        return product(nodes, _matrix(weight, nodes.shape[3], width).mT)
+    cells = product(nodes.unfold(3, weight.shape[-1], 1), weight.mT)
     return cells.flatten(3)[..., :width]
 
 
 def _multiplied_down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
     """`_down` by products of matrices."""
     if lines.shape[2] <= _FEW_ROWS:
-        return _matrix(weight, lines.shape[2], height) @ lines
-    bands = weight.unsqueeze(-3) @ lines.unfold(2, weight.shape[-1], 1).mT
+        return product(_matrix(weight, lines.shape[2], height), lines)
+    bands = product(weight.unsqueeze(-3), lines.unfold(2, weight.shape[-1], 1).mT)
     return bands.flatten(2, 3)[:, :, :height]
 
 

@@ -1,6 +1,7 @@
 """Looking an image up along a flow, by what is fastest and gives what F.grid_sample gives."""
 
 from collections.abc import Iterable
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -9,9 +10,10 @@ from torchrefract._bands import join, rows_at_once
 from torchrefract._checks import check_choice, check_flow, check_tensor, learns
 from torchrefract._compiled import SMALLEST
 from torchrefract._levels import rounded
-from torchrefract.warping import fused
+from torchrefract.warping import fused, on_gpu
 from torchrefract.warping.grid import Positions, field_dtype, inside, sampler_grids
 from torchrefract.warping.grid_sample import INTERPOLATIONS, PADDINGS, WHOLE, by_grid_sample
+from torchrefract.warping.lattice import SmoothFlow
 from torchrefract.warping.layout import has_format, is_channels_last
 from torchrefract.warping.mixed import Flow, grid_of, known
 from torchrefract.warping.opencv import obstacle, remapped
@@ -47,7 +49,8 @@ def warp(
             without gradients, not for bicubic; or "auto": numba for frames from 2^14 pixels on, where it is installed,
             else OpenCV from version 5 on, where that is, for uint8 in channels_last format, on as many threads as
             cv2.setNumThreads says. OpenCV agrees to 1e-6 of the range of the values before these are rounded: bytes
-            differ, by one level, where they lie so near to a half.
+            differ, by one level, where they lie so near to a half. On a GPU "auto" has effects that know their flow on
+            a lattice read float32, bilinear, by a kernel of Triton, where that is.
 
     Returns:
         image of the same shape, type and memory format, and valid, (B, 1, H, W) or (1, H, W), bool.
@@ -67,8 +70,8 @@ def warp(
     check_choice("interpolation", interpolation, INTERPOLATIONS)
     check_choice("resampler", resampler, RESAMPLERS)
     flow = flow.to(field_dtype(image.dtype)).expand(image.shape[0], -1, -1, -1)
-    options = {"padding": padding, "interpolation": interpolation, "resampler": resampler}
-    return look_up(image, flow, **options), inside(flow)
+    found = look_up(image, flow, padding=padding, interpolation=interpolation, resampler=resampler)
+    return found, inside(flow)
 
 
 def look_up(
@@ -78,11 +81,26 @@ def look_up(
     padding: str,
     interpolation: str,
     resampler: str = "auto",
+    active: Tensor | None = None,
 ) -> Tensor:
-    """The image (B, C, H, W) at p + flow(p), flow being (B, 2, H, W) in px; the arguments are taken as checked."""
+    """The image (B, C, H, W) at p + flow(p), flow being (B, 2, H, W) in px; the arguments are taken as checked.
+
+    active: (B,), bool: the other samples come back as they are; None is all.
+    """
     if image.numel() == 0:
         return image.clone()
     dtype = sampler_dtype(image, flow.dtype)
+    if resampler == "auto" and interpolation == "bilinear" and on_gpu.serves(image, flow, dtype):
+        found = on_gpu.looked_up(image.to(dtype), cast(SmoothFlow, flow), padding=padding, active=active)
+        return _laid_out(_in_type(found, image), image)
+    found = _looked_up(image, flow, dtype, padding=padding, interpolation=interpolation, resampler=resampler)
+    return found if active is None else torch.where(active.view(-1, 1, 1, 1), found, image)
+
+
+def _looked_up(
+    image: Tensor, flow: Flow | Positions, dtype: torch.dtype, *, padding: str, interpolation: str, resampler: str
+) -> Tensor:
+    """`look_up` of all samples, at positions of a type, by what serves a CPU or by F.grid_sample."""
     options = {"padding": padding, "interpolation": interpolation}
     # Bytes go as they are where nothing is learned from them; the kernels make them numbers as they read them.
     source = image if image.dtype is torch.uint8 and not learns((flow,)) else image.to(dtype)

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchrefract._checks import check_count, check_flow, check_tensor
 from torchrefract._constants import constant
+from torchrefract._products import product
 
 _GHOSTS = 2  # nodes beyond each border that a cubic may take
 
@@ -32,7 +33,7 @@ def resize_image(image: Tensor, size: Sequence[int]) -> Tensor:
         _cover(old, side, like=image) if side <= old else _weights(old, side, like=image)
         for old, side in zip(image.shape[2:], new, strict=True)
     )
-    resized = down @ (image @ across.mT)
+    resized = product(down, product(image, across.mT))
     return resized.clamp(image.amin(dim=(2, 3), keepdim=True), image.amax(dim=(2, 3), keepdim=True))
 
 
@@ -58,7 +59,7 @@ def resize_flow(flow: Tensor, size: Sequence[int]) -> Tensor:
     H, W = flow.shape[2:]
     down, across = (_weights(old, new, like=flow) for old, new in ((H, height), (W, width)))
     scale = constant([width / W, height / H], dtype=flow.dtype, device=flow.device).view(1, 2, 1, 1)
-    return down @ (flow @ across.mT) * scale
+    return product(down, product(flow, across.mT)) * scale
 
 
 def _cover(old: int, new: int, *, like: Tensor) -> Tensor:

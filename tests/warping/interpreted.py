@@ -1,0 +1,71 @@
+"""The kernel for GPUs on the CPU, by Triton's interpreter, beside F.grid_sample: errors as JSON.
+
+For a process of its own, whose environment says TRITON_INTERPRET=1.
+"""
+
+import itertools
+import json
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchrefract.warping import on_gpu
+from torchrefract.warping.grid_sample import PADDINGS
+from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
+
+# What is interpreted is no kernel that compilers could see into.
+torch.library.wrap_triton = lambda kernel: kernel
+
+KINDS = {"cubics": (SmoothFlow, 2, Lattice(37, 70, 8)), "stream": (StreamFlow, 1, Lattice(37, 70, 8, 3, 2))}
+LAYOUTS = {"rows": torch.contiguous_format, "last": torch.channels_last}
+
+
+def main() -> None:
+    """Print the errors of all cases."""
+    cases = itertools.product(KINDS, (2, 1), LAYOUTS, PADDINGS, (False, True))
+    print(json.dumps({"-".join(map(str, case)): errors(*case) for case in cases}))
+
+
+def errors(kind: str, rows: int, layout: str, padding: str, gated: bool) -> dict[str, float]:
+    """How far image and gradients are from those of F.grid_sample in float64, and how far float32 is by itself."""
+    torch.manual_seed(0)
+    form, channels, lattice = KINDS[kind]
+    sides = [len(axis) for axis in lattice.axes()]
+    nodes = (30 * torch.rand(rows, channels, *sides) - 15).requires_grad_()
+    source = (
+        torch.rand(2, 3 if padding != "border" else 5, lattice.height, lattice.width)
+        .to(memory_format=LAYOUTS[layout])
+        .requires_grad_()
+    )
+    active = torch.tensor([True, False]) if gated else None
+    towards = torch.rand(source.shape)
+    spread = nodes if rows == 2 else nodes.expand(2, -1, -1, -1)
+    found = on_gpu.looked_up(source, form(spread, lattice), padding=padding, active=active)
+    assert found.is_contiguous(memory_format=LAYOUTS[layout])
+    assert active is None or torch.equal(found[~active], source[~active])
+    exact, alike = (
+        by_grid_sample(source.to(dtype), form(nodes.to(dtype), lattice), padding, active)
+        for dtype in (torch.double, torch.float)
+    )
+    results = {"image": (found, exact, alike)}
+    gradients = [
+        torch.autograd.grad(image, (source, nodes), towards.to(image.dtype)) for image in (found, exact, alike)
+    ]
+    results |= dict(zip(("source", "nodes"), zip(*gradients, strict=True), strict=True))
+    return {
+        f"{name}{which}": ((value - true).abs().max() / true.abs().max()).item()
+        for name, (own, true, plain) in results.items()
+        for which, value in (("", own), (" by PyTorch", plain))
+    }
+
+
+def by_grid_sample(source: Tensor, flow: SmoothFlow, padding: str, active: Tensor | None) -> Tensor:
+    """The same by PyTorch's operations."""
+    grid = flow.lines(source.dtype).grid().expand(len(source), -1, -1, -1)
+    found = F.grid_sample(source, grid, padding_mode=padding, align_corners=False)
+    return found if active is None else torch.where(active.view(-1, 1, 1, 1), found, source)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,169 @@
+"""Random numbers of two words a sample, high and low, (B,), int64: each function is one operator for compilers.
+
+Its hundreds of steps would take these a minute. On the CPU it is computed by a kernel of numba, where that is.
+"""
+
+import math
+import sys
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any, TypeVar, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrefract._checks import withheld
+from torchrefract._compiled import kernels
+from torchrefract.threefry import WORD, rounds, threefry
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+Words = tuple[Tensor, Tensor]
+
+
+def blocks(count: int) -> int:
+    """How many counters so many numbers take: each gives two."""
+    return (count + 1) // 2
+
+
+def halves(value: Any) -> tuple[Any, Any]:
+    """The two words of a whole number, or of each in a tensor."""
+    return (value >> 32) & WORD, value & WORD
+
+
+def _operator(schema: str, result: Callable[..., Any]) -> Callable[[_F], _F]:
+    """Makes a function one operator for compilers.
+
+    Args:
+        schema: its arguments and results, as PyTorch writes them.
+        result: gives what has the results' shapes, types and devices, of the same arguments.
+    """
+
+    def made(function: _F) -> _F:
+        name = function.__name__
+        operator = torch.library.custom_op(f"torchrefract::{name}", function, mutates_args=(), schema=schema)
+        operator.register_fake(result)
+
+        @wraps(function)
+        def chosen(*args: Any) -> Any:
+            # Calling the operator loads what compilers need, a second of work that eager mode does without.
+            return getattr(torch.ops.torchrefract, name)(*args) if torch.compiler.is_compiling() else function(*args)
+
+        return cast(_F, chosen)
+
+    return made
+
+
+@_operator(
+    "(Tensor seed, int start, int stop) -> (Tensor, Tensor)", lambda seed, start, stop: _pair(seed, stop - start)
+)
+def words_of_range(seed: Tensor, start: int, stop: int) -> Words:
+    """The words of the keys from start to stop."""
+    return words_of_keys(seed.long(), torch.arange(start, stop, device=seed.device))
+
+
+@_operator("(Tensor seed, Tensor keys) -> (Tensor, Tensor)", lambda seed, keys: _pair(keys, len(keys)))
+def words_of_keys(seed: Tensor, keys: Tensor) -> Words:
+    """The words of keys, (B,), int64."""
+    if (kernel := _kernels(keys)) is None or _kernels(seed) is None:
+        return threefry(halves(seed), halves(keys))
+    out = np.empty((2, len(keys)), np.int64)
+    kernel.words_of(int(seed), np.ascontiguousarray(keys.numpy()), out)
+    return torch.from_numpy(out[0]), torch.from_numpy(out[1])
+
+
+@_operator("(Tensor high, Tensor low, int lane) -> (Tensor, Tensor)", lambda high, low, lane: _pair(low, len(low)))
+def folded(high: Tensor, low: Tensor, lane: int) -> Words:
+    """The words of what is nested in a lane."""
+    return _under((high, low), (torch.full_like(low, WORD), torch.full_like(low, lane)))
+
+
+@_operator(
+    "(Tensor high, Tensor low, int lane, int count) -> Tensor",
+    lambda high, low, lane, count: high.new_empty((len(high), count), dtype=torch.float32),
+)
+def uniform_of(high: Tensor, low: Tensor, lane: int, count: int) -> Tensor:
+    """(B, count), float32, as by `draws.uniform`."""
+    if (kernel := _kernels(low)) is not None:
+        out = torch.empty(len(high), count)
+        kernel.uniforms(np.stack([high.numpy(), low.numpy()]), lane, out.numpy())
+        return out
+    counter = torch.arange(blocks(count), dtype=torch.int64, device=low.device)
+    words = threefry((high[:, None], low[:, None]), (counter, torch.full_like(counter, lane)))
+    return (torch.cat(words, dim=1)[:, :count] >> 9).float().add(0.5).mul(2.0**-23)
+
+
+@_operator(
+    "(Tensor high, Tensor low, int lane, float[] ends, bool double) -> Tensor",
+    lambda high, low, lane, ends, double: high.new_empty(
+        (len(high), len(ends) // 2), dtype=torch.float64 if double else torch.float32
+    ),
+)
+def between_of(high: Tensor, low: Tensor, lane: int, ends: Sequence[float], double: bool) -> Tensor:
+    """(B, n), as by `draws.between`, of the ends of n ranges, one after the other."""
+    if _kernels(low) is not None:
+        return torch.from_numpy(within(ends, uniform_of(high, low, lane, len(ends) // 2).numpy(), double=double))
+    dtype = torch.float64 if double else torch.float32
+    least, most = torch.tensor(ends, dtype=dtype, device=low.device).unflatten(0, (-1, 2)).unbind(1)
+    return least + (most - least) * uniform_of(high, low, lane, len(ends) // 2).to(dtype)
+
+
+@_operator(
+    "(Tensor high, Tensor low, int lane, int count) -> Tensor",
+    lambda high, low, lane, count: high.new_empty((len(high), count), dtype=torch.float32),
+)
+def normal_of(high: Tensor, low: Tensor, lane: int, count: int) -> Tensor:
+    """(B, count), float32, as by `draws.normal`."""
+    return normal_from(uniform_of(high, low, lane, 2 * blocks(count)), count)
+
+
+@_operator("(Tensor high, Tensor low) -> Tensor", lambda high, low: high.new_empty((len(high), 4)))
+def noise_key_of(high: Tensor, low: Tensor) -> Tensor:
+    """(B, 4), int64: the words, and those of the counter 0 under them."""
+    zero = torch.zeros_like(low)
+    return torch.stack([high, low, *_under((high, low), (zero, zero))], dim=1)
+
+
+def within(ends: Sequence[float], uniform: np.ndarray, *, double: bool) -> np.ndarray:
+    """(B, n): low + (high - low) u of each range; numpy's operations start several times as fast, and round alike."""
+    kind = np.float64 if double else np.float32
+    low, high = np.array(ends, kind).reshape(-1, 2).T
+    return low + (high - low) * uniform.astype(kind, copy=False)
+
+
+def normal_from(uniform: Tensor, count: int) -> Tensor:
+    """(B, count), standard normal, from uniform numbers: the radii of pairs, and then their angles."""
+    radius, angle = uniform.chunk(2, dim=1)
+    radius, angle = (-2 * radius.log()).sqrt(), 2 * math.pi * angle
+    return torch.cat([radius * angle.cos(), radius * angle.sin()], dim=1)[:, :count].contiguous()
+
+
+def uniform_few(words: Sequence[tuple[int, int]], lane: int, count: int) -> np.ndarray:
+    """`uniform_of` of words as whole numbers; for so few numba is not loaded, but asked where it is at work already."""
+    if "torchrefract._jit" in sys.modules and (kernel := kernels("draw_kernels")):
+        out = np.empty((len(words), count), np.float32)
+        kernel.uniforms(np.array(words, np.int64).T.copy(), lane, out)
+        return out
+    rows = []
+    for high, low in words:
+        first, second = zip(*(rounds(high, low, i, lane) for i in range(blocks(count))), strict=True)
+        rows.append([((word >> 9) + 0.5) * 2.0**-23 for word in (*first, *second)[:count]])
+    return np.array(rows, dtype=np.float32)
+
+
+def _under(key: Words, counter: Words) -> Words:
+    """Two words of each counter, (B,), under its key, (B,)."""
+    if (kernel := _kernels(key[1])) is None or _kernels(counter[1]) is None:
+        return threefry(key, counter)
+    out = np.empty((2, len(key[0])), np.int64)
+    kernel.words_under(*(np.stack([own.numpy() for own in pair]) for pair in (key, counter)), out)
+    return torch.from_numpy(out[0]), torch.from_numpy(out[1])
+
+
+def _kernels(value: Tensor) -> Any:
+    """Those of numba, where they can read a tensor, else None."""
+    return None if withheld(value) or kernels("_jit") is None else kernels("draw_kernels")
+
+
+def _pair(like: Tensor, count: int) -> Words:
+    return like.new_empty(count, dtype=torch.int64), like.new_empty(count, dtype=torch.int64)

@@ -18,14 +18,11 @@ def words_of(seed: int, keys: NDArray[np.int64], out: _Words) -> None:
 
 
 @jit
-def words_under(keys: _Words, counters: _Words, out: _Words) -> None:
-    """Two words, (2, n), for each of n counters under its key."""
+def words_under(keys: _Words, counter: tuple[int, int], out: _Words) -> None:
+    """The two words, (2, n), of one counter under each key, (2, n)."""
+    first, second = np.uint32(counter[0]), np.uint32(counter[1])
     for i in range(keys.shape[1]):
-        key, counter = (
-            (np.uint32(keys[0, i]), np.uint32(keys[1, i])),
-            (np.uint32(counters[0, i]), np.uint32(counters[1, i])),
-        )
-        out[0, i], out[1, i] = _rounds(*key, *counter)
+        out[0, i], out[1, i] = _rounds(np.uint32(keys[0, i]), np.uint32(keys[1, i]), first, second)
 
 
 @jit

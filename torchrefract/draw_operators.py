@@ -1,6 +1,7 @@
 """Random numbers of two words a sample, high and low, (B,), int64: each function is one operator for compilers.
 
-Its hundreds of steps would take these a minute. On the CPU it is computed by a kernel of numba, where that is.
+Its hundreds of steps would take these a minute. On the CPU it is computed by a kernel of numba, where that is, and on a
+GPU by one of Triton, that compilers see into.
 """
 
 import math
@@ -15,10 +16,13 @@ from torch import Tensor
 
 from torchrefract._checks import withheld
 from torchrefract._compiled import kernels
+from torchrefract._constants import constant
+from torchrefract._triton import launched, reads
 from torchrefract.threefry import WORD, rounds, threefry
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 Words = tuple[Tensor, Tensor]
+_BLOCK = 128  # numbers that one program of a GPU makes
 
 
 def blocks(count: int) -> int:
@@ -46,8 +50,10 @@ def _operator(schema: str, result: Callable[..., Any]) -> Callable[[_F], _F]:
 
         @wraps(function)
         def chosen(*args: Any) -> Any:
-            # Calling the operator loads what compilers need, a second of work that eager mode does without.
-            return getattr(torch.ops.torchrefract, name)(*args) if torch.compiler.is_compiling() else function(*args)
+            if torch.compiler.is_compiling() and not reads(args[0]):
+                # Calling it loads what compilers need, a second of work that eager mode does without.
+                return getattr(torch.ops.torchrefract, name)(*args)
+            return function(*args)
 
         return cast(_F, chosen)
 
@@ -59,12 +65,16 @@ def _operator(schema: str, result: Callable[..., Any]) -> Callable[[_F], _F]:
 )
 def words_of_range(seed: Tensor, start: int, stop: int) -> Words:
     """The words of the keys from start to stop."""
+    if reads(seed):
+        return torch.ops.torchrefract.gpu_words_of_range(seed.long(), start, stop)
     return words_of_keys(seed.long(), torch.arange(start, stop, device=seed.device))
 
 
 @_operator("(Tensor seed, Tensor keys) -> (Tensor, Tensor)", lambda seed, keys: _pair(keys, len(keys)))
 def words_of_keys(seed: Tensor, keys: Tensor) -> Words:
     """The words of keys, (B,), int64."""
+    if reads(seed, keys):
+        return torch.ops.torchrefract.gpu_words_of_keys(seed, keys.contiguous())
     if (kernel := _kernels(keys)) is None or _kernels(seed) is None:
         return threefry(halves(seed), halves(keys))
     out = np.empty((2, len(keys)), np.int64)
@@ -75,7 +85,7 @@ def words_of_keys(seed: Tensor, keys: Tensor) -> Words:
 @_operator("(Tensor high, Tensor low, int lane) -> (Tensor, Tensor)", lambda high, low, lane: _pair(low, len(low)))
 def folded(high: Tensor, low: Tensor, lane: int) -> Words:
     """The words of what is nested in a lane."""
-    return _under((high, low), (torch.full_like(low, WORD), torch.full_like(low, lane)))
+    return _under(high, low, (WORD, lane))
 
 
 @_operator(
@@ -84,6 +94,8 @@ def folded(high: Tensor, low: Tensor, lane: int) -> Words:
 )
 def uniform_of(high: Tensor, low: Tensor, lane: int, count: int) -> Tensor:
     """(B, count), float32, as by `draws.uniform`."""
+    if reads(high, low):
+        return torch.ops.torchrefract.gpu_uniforms(high, low, lane, count)
     if (kernel := _kernels(low)) is not None:
         out = torch.empty(len(high), count)
         kernel.uniforms(np.stack([high.numpy(), low.numpy()]), lane, out.numpy())
@@ -104,7 +116,7 @@ def between_of(high: Tensor, low: Tensor, lane: int, ends: Sequence[float], doub
     if _kernels(low) is not None:
         return torch.from_numpy(within(ends, uniform_of(high, low, lane, len(ends) // 2).numpy(), double=double))
     dtype = torch.float64 if double else torch.float32
-    least, most = torch.tensor(ends, dtype=dtype, device=low.device).unflatten(0, (-1, 2)).unbind(1)
+    least, most = constant(ends, dtype=dtype, device=low.device).unflatten(0, (-1, 2)).unbind(1)
     return least + (most - least) * uniform_of(high, low, lane, len(ends) // 2).to(dtype)
 
 
@@ -120,8 +132,7 @@ def normal_of(high: Tensor, low: Tensor, lane: int, count: int) -> Tensor:
 @_operator("(Tensor high, Tensor low) -> Tensor", lambda high, low: high.new_empty((len(high), 4)))
 def noise_key_of(high: Tensor, low: Tensor) -> Tensor:
     """(B, 4), int64: the words, and those of the counter 0 under them."""
-    zero = torch.zeros_like(low)
-    return torch.stack([high, low, *_under((high, low), (zero, zero))], dim=1)
+    return torch.stack([high, low, *_under(high, low, (0, 0))], dim=1)
 
 
 def within(ends: Sequence[float], uniform: np.ndarray, *, double: bool) -> np.ndarray:
@@ -151,12 +162,14 @@ def uniform_few(words: Sequence[tuple[int, int]], lane: int, count: int) -> np.n
     return np.array(rows, dtype=np.float32)
 
 
-def _under(key: Words, counter: Words) -> Words:
-    """Two words of each counter, (B,), under its key, (B,)."""
-    if (kernel := _kernels(key[1])) is None or _kernels(counter[1]) is None:
-        return threefry(key, counter)
-    out = np.empty((2, len(key[0])), np.int64)
-    kernel.words_under(*(np.stack([own.numpy() for own in pair]) for pair in (key, counter)), out)
+def _under(high: Tensor, low: Tensor, counter: tuple[int, int]) -> Words:
+    """Two words of one counter under each key, (B,)."""
+    if reads(high, low):
+        return torch.ops.torchrefract.gpu_words_under(high, low, *counter)
+    if (kernel := _kernels(low)) is None:
+        return threefry((high, low), (torch.full_like(low, counter[0]), torch.full_like(low, counter[1])))
+    out = np.empty((2, len(low)), np.int64)
+    kernel.words_under(np.stack([high.numpy(), low.numpy()]), counter, out)
     return torch.from_numpy(out[0]), torch.from_numpy(out[1])
 
 
@@ -167,3 +180,36 @@ def _kernels(value: Tensor) -> Any:
 
 def _pair(like: Tensor, count: int) -> Words:
     return like.new_empty(count, dtype=torch.int64), like.new_empty(count, dtype=torch.int64)
+
+
+@torch.library.triton_op("torchrefract::gpu_words_of_range", mutates_args={})
+def _gpu_words_of_range(seed: Tensor, start: int, stop: int) -> Words:
+    return _gpu_words(seed, seed, start, stop - start, given=False)
+
+
+@torch.library.triton_op("torchrefract::gpu_words_of_keys", mutates_args={})
+def _gpu_words_of_keys(seed: Tensor, keys: Tensor) -> Words:
+    return _gpu_words(seed, keys, 0, len(keys), given=True)
+
+
+@torch.library.triton_op("torchrefract::gpu_words_under", mutates_args={})
+def _gpu_words_under(high: Tensor, low: Tensor, first: int, second: int) -> Words:
+    found = _pair(high, len(high))
+    kernel = launched("gpu_draws", "words_under")
+    kernel[(-(-len(high) // _BLOCK),)](high, low, first, second, *found, len(high), block=_BLOCK)
+    return found
+
+
+@torch.library.triton_op("torchrefract::gpu_uniforms", mutates_args={})
+def _gpu_uniforms(high: Tensor, low: Tensor, lane: int, count: int) -> Tensor:
+    out = high.new_empty((len(high), count), dtype=torch.float32)
+    total = len(high) * count
+    launched("gpu_draws", "uniforms")[(-(-total // _BLOCK),)](high, low, lane, out, total, count, block=_BLOCK)
+    return out
+
+
+def _gpu_words(seed: Tensor, keys: Tensor, start: int, count: int, *, given: bool) -> Words:
+    found = _pair(seed, count)
+    kernel = launched("gpu_draws", "words_of")
+    kernel[(-(-count // _BLOCK),)](seed, keys, start, *found, count, given=given, block=_BLOCK)
+    return found

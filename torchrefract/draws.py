@@ -103,6 +103,9 @@ def stream(seed: int | Tensor, keys: Tensor | range, *, device: torch.device | N
         return Stream([rounds(*halves(start), *halves(number)) for number in numbers], device=device)
     if not isinstance(seed, Tensor):
         seed = torch.full((), seed, dtype=torch.int64, device=None if isinstance(keys, range) else keys.device)
+    if torch.compiler.is_compiling() and device is not None and device.type == "cuda":
+        # A graph that works on the CPU in between waits for it, and could not be replayed as a whole.
+        seed = seed.to(device, non_blocking=True)
     if isinstance(keys, range):
         return Stream(words_of_range(seed, keys.start, keys.stop), device=device)
     if seed.device.type != "cpu":

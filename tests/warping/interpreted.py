@@ -3,7 +3,6 @@
 For a process of its own, whose environment says TRITON_INTERPRET=1.
 """
 
-import itertools
 import json
 
 import torch
@@ -11,20 +10,28 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract.warping import on_gpu
-from torchrefract.warping.grid_sample import PADDINGS
 from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
 
 # What is interpreted is no kernel that compilers could see into.
 torch.library.wrap_triton = lambda kernel: kernel
 
-KINDS = {"cubics": (SmoothFlow, 2, Lattice(37, 70, 8)), "stream": (StreamFlow, 1, Lattice(37, 70, 8, 3, 2))}
+SIDES = 9, 40
+KINDS = {"cubics": (SmoothFlow, 2, Lattice(*SIDES, 8)), "stream": (StreamFlow, 1, Lattice(*SIDES, 8, 3, 2))}
 LAYOUTS = {"rows": torch.contiguous_format, "last": torch.channels_last}
+# A kind of flow; samples that have one; how the image lies in memory; padding; whether one sample is left alone.
+CASES = [
+    ("cubics", 2, "rows", "zeros", True),
+    ("cubics", 1, "last", "border", False),
+    ("cubics", 2, "last", "reflection", False),
+    ("stream", 2, "last", "zeros", False),
+    ("stream", 1, "rows", "border", True),
+    ("stream", 2, "rows", "reflection", True),
+]
 
 
 def main() -> None:
     """Print the errors of all cases."""
-    cases = itertools.product(KINDS, (2, 1), LAYOUTS, PADDINGS, (False, True))
-    print(json.dumps({"-".join(map(str, case)): errors(*case) for case in cases}))
+    print(json.dumps({"-".join(map(str, case)): errors(*case) for case in CASES}))
 
 
 def errors(kind: str, rows: int, layout: str, padding: str, gated: bool) -> dict[str, float]:

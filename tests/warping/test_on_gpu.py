@@ -13,6 +13,7 @@ from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.warping import on_gpu
 from torchrefract.warping.lattice import Lattice, SmoothFlow
 
+SEED = 4  # has some of six samples moved and some not
 on_a_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 MAKERS = {
     "lens": lambda **more: LensDistortion(
@@ -32,7 +33,7 @@ def test_the_kernel_reads_what_grid_sample_does_and_has_its_gradients():
     )
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    assert len(found) == 2 * 2 * 2 * 3 * 2
+    assert len(found) == 6
     for case, errors in found.items():
         for name in ("image", "source", "nodes"):
             assert errors[name] <= 2 * errors[f"{name} by PyTorch"] < 1e-4, (case, name)
@@ -55,10 +56,10 @@ def drawn(name: str, **more) -> tuple[LatticeWarp, LatticeWarp]:
 @pytest.mark.parametrize("padding", ["zeros", "border", "reflection"])
 @pytest.mark.parametrize("kind", [torch.float32, torch.float16, torch.uint8])
 def test_an_effect_on_a_gpu_is_that_by_grid_sample(name, padding, kind):
-    image = torch.rand(4, 3, 270, 480, device="cuda")
+    image = torch.rand(6, 3, 270, 480, device="cuda")
     image = image.mul(255).to(kind) if kind is torch.uint8 else image.to(kind)
     ours, plain = drawn(name, padding=padding, p=0.5)
-    params = ours.sample(image, seed=1)
+    params = ours.sample(image, seed=SEED)
     assert params.gate.any()
     assert not params.gate.all()
     found, expected = ours.apply(image, params).image, plain.apply(image, params).image

@@ -1,53 +1,57 @@
 """What Triton compiles: a look-up along a flow on a lattice, for which no grid of the frame's size is written."""
 
+# pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportOptionalMemberAccess=false
+# Triton has a language of its own, which only looks like Python.
+
 import triton
 import triton.language as tl
 
 
 @triton.jit
-def look_up_lines(
+def look_up_lattice(
     source,
     out,
-    lines,
-    weight,
-    axis_x,
-    axis_y,
+    nodes,
+    across,
+    down,
     active,
     height,
     width,
-    nodes,
     stride,
+    node_rows,
+    node_columns,
     batch_step,
     channel_step,
     row_step,
     column_step,
-    lines_step,
+    nodes_step,
+    other_step,
     channels: tl.constexpr,
     taps: tl.constexpr,
-    whole: tl.constexpr,
+    shared: tl.constexpr,
     gated: tl.constexpr,
     padding: tl.constexpr,
     rows: tl.constexpr,
     columns: tl.constexpr,
 ):
-    """The source (B, C, H, W) where lines of nodes lead, with what lies outside by its padding.
+    """The source (B, C, H, W) where a flow leads that is known at nodes, with what lies outside by its padding.
 
-        x' = sum_j w_x(t, j) X(i + j) [+ axis_x],  y' likewise,  t and i the place of a row in its cell and that cell
+        u = sum_i down_u(t_y, i) sum_j across_u(t_x, j) nodes_u(cell_y + i, cell_x + j),  v likewise
 
-    A program looks up some rows of a cell, each thread a pixel of each: neighbors read neighbors, and what nodes there
-    are of a column is read once.
+    A program looks up some rows of a cell, each thread a pixel of each: neighbors read neighbors, and the nodes of a
+    column are read once.
 
     Args:
         source, out: of these steps, in elements.
-        lines: (B or 1, 2, nodes, W), where F.grid_sample(align_corners=False) looks, in the rows of nodes.
-        weight: (2, stride, taps), of x and of y.
-        axis_x, axis_y: (W,) and (H,), what is to be added between the rows, unless the lines are `whole`.
+        nodes: (B or 1, 2, node_rows, node_columns), of u and v, or (B or 1, 1, ...) if one is `shared` by both.
+        across, down: (2, stride, taps), by the place in a cell.
         active: (B,), zero or not, if `gated`: the other samples come back as they are.
         height, width: of the source.
-        nodes: rows of them.
-        stride: px, between them.
+        stride: px, between nodes.
+        node_rows, node_columns: how many there are.
         batch_step, channel_step, row_step, column_step: from one to the next in source and out.
-        lines_step: from a sample's lines to the next one's, 0 where all have the same.
+        nodes_step: from a sample's nodes to the next one's, 0 where all have the same.
+        other_step: from the nodes of u to those of v.
         channels: of the source.
         padding: 0 for zeros, 1 for border, 2 for reflection.
         rows, columns: of pixels that one program looks up.
@@ -60,28 +64,35 @@ def look_up_lines(
         moved = inside & (tl.zeros((columns,), tl.int32) + tl.load(active + sample) != 0)
     parts = tl.cdiv(stride, rows)
     cell, place = tl.program_id(1) // parts, tl.program_id(1) % parts * rows
-    at = lines + sample * lines_step + cell * width + x
     last = tl.minimum(tl.minimum(place + rows, stride), height - cell * stride)
-    known_x, known_y = (), ()
+    at = nodes + sample * nodes_step + cell * node_columns + x // stride
+    by = across + x % stride * taps
+    # Loads are never shared by the compiler: each is written once.
+    over_u, over_v = (), ()
     for tap in tl.static_range(taps):
-        known_x = known_x + (tl.load(at + tap * width, inside, 0.0),)
-        known_y = known_y + (tl.load(at + (nodes + tap) * width, inside, 0.0),)
-    if not whole:
-        add_x = tl.load(axis_x + x, inside, 0.0)
-
-    for place in range(place, last):
-        y = cell * stride + place
-        by = weight + place * taps
-        to_x = tl.zeros((columns,), tl.float32)
-        to_y = tl.zeros((columns,), tl.float32)
+        over_u = over_u + (tl.load(by + tap, inside, 0.0),)  # noqa: RUF005 - Triton knows no unpacking
+        over_v = over_v + (tl.load(by + stride * taps + tap, inside, 0.0),)  # noqa: RUF005
+    known_u, known_v = (), ()
+    for line in tl.static_range(taps):
+        u = tl.zeros((columns,), tl.float32)
+        v = tl.zeros((columns,), tl.float32)
         for tap in tl.static_range(taps):
-            to_x += tl.load(by + tap) * known_x[tap]
-            to_y += tl.load(by + stride * taps + tap) * known_y[tap]
-        if not whole:
-            to_x += add_x
-            to_y += tl.load(axis_y + y)
-        to_x = _padded(((to_x + 1.0) * width - 1.0) * 0.5, width, padding)
-        to_y = _padded(((to_y + 1.0) * height - 1.0) * 0.5, height, padding)
+            node = at + line * node_columns + tap
+            first_node = tl.load(node, inside, 0.0)
+            u += over_u[tap] * first_node
+            v += over_v[tap] * (first_node if shared else tl.load(node + other_step, inside, 0.0))
+        known_u = known_u + (u,)  # noqa: RUF005
+        known_v = known_v + (v,)  # noqa: RUF005
+
+    for own_row in range(place, last):
+        y = cell * stride + own_row
+        weight = down + own_row * taps
+        u = tl.zeros((columns,), tl.float32)
+        v = tl.zeros((columns,), tl.float32)
+        for tap in tl.static_range(taps):
+            u += tl.load(weight + tap) * known_u[tap]
+            v += tl.load(weight + stride * taps + tap) * known_v[tap]
+        to_x, to_y = _padded(x + u, width, padding), _padded(y + v, height, padding)
         if gated:
             to_x = tl.where(moved, to_x, x.to(tl.float32))
             to_y = tl.where(moved, to_y, y.to(tl.float32))
@@ -120,13 +131,13 @@ def _mixed(plane, first, row_step, column_step, hits, shares, moved, gated: tl.c
 
 @triton.jit
 def _padded(place, size, padding: tl.constexpr):
-    """Where a place, px, is read along an axis of so many pixels."""
+    """Where a place, px, is read along an axis of so many pixels, finite."""
+    place = tl.minimum(tl.maximum(place, -1e7), 1e7)
     if padding == 2:
         place = tl.abs(place + 0.5)
         turns = tl.floor(place / size)
         rest = place - turns * size
-        odd = (turns.to(tl.int32) % 2) == 1
-        place = tl.where(odd, size - rest, rest) - 0.5
+        place = tl.where((turns.to(tl.int32) % 2) == 1, size - rest, rest) - 0.5
     if padding != 0:
         place = tl.minimum(tl.maximum(place, 0.0), size - 1.0)
     return place

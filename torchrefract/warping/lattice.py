@@ -75,12 +75,7 @@ def along_rows(nodes: Tensor, lattice: Lattice) -> Tensor:
 
 def row_weights(like: Tensor, lattice: Lattice) -> Tensor:
     """(H, n), of the rows of nodes for each row of pixels, in the type of a tensor."""
-    return _matrix(_cubics(like, lattice), len(lattice.axes()[0]), lattice.height)
-
-
-def gradient_of_lines(of_positions: Tensor, weight: Tensor, nodes: int) -> Tensor:
-    """(B, 2, nodes, W): that of lines, of the gradient (B, 2, H, W) of the positions between them; as in `Lines`."""
-    return product(_matrix(weight, nodes, of_positions.shape[2]).mT, of_positions)
+    return matrix_of(_cubics(like, lattice), len(lattice.axes()[0]), lattice.height)
 
 
 def lagrange_weights(stride: int, count: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -149,6 +144,11 @@ class SmoothFlow:
         """Some rows of the batch."""
         return self.with_nodes(self.nodes[index])
 
+    def weights(self) -> tuple[Tensor, Tensor]:
+        """Of the nodes around, along a row and along a column, (2, stride, taps): for u and v, by place in a cell."""
+        weight = _cubics(self.nodes, self.lattice).expand(2, -1, -1)
+        return weight, weight
+
     def dense(self) -> Tensor:
         """(B, 2, H, W), px."""
         return between_nodes(self.nodes, self.lattice)
@@ -190,13 +190,18 @@ class StreamFlow(SmoothFlow):
         nodes = finite(self.nodes.to(dtype), FARTHEST)
         return Lines(*self._lines(nodes, (2 / width, 2 / height)), height, x.flatten(), y.flatten())
 
-    def _lines(self, nodes: Tensor, scale: tuple[float, float]) -> tuple[Tensor, Tensor]:
-        """(B, 2, n, W) and (2, stride, taps): (D_y psi, -D_x psi), each times its scale, as in `Lines`."""
-        options = {"dtype": nodes.dtype, "device": nodes.device}
+    def weights(self) -> tuple[Tensor, Tensor]:
+        """Of the nodes around, along a row and along a column, (2, stride, taps): for u and v, by place in a cell."""
+        options = {"dtype": self.nodes.dtype, "device": self.nodes.device}
         slope = slope_weights(self.lattice.stride, STREAM_NODES, **options)
         weight = F.pad(lagrange_weights(self.lattice.stride, STREAM_NODES, **options), (1, 0))
-        lines = [_across(nodes, values, self.lattice.width) for values in (scale[0] * weight, -scale[1] * slope)]
-        return torch.cat(lines, dim=1), torch.stack([slope, weight])
+        return torch.stack([weight, -slope]), torch.stack([slope, weight])
+
+    def _lines(self, nodes: Tensor, scale: tuple[float, float]) -> tuple[Tensor, Tensor]:
+        """(B, 2, n, W) and (2, stride, taps): (D_y psi, -D_x psi), each times its scale, as in `Lines`."""
+        across, down = self.with_nodes(nodes).weights()
+        lines = [_across(nodes, by * own, self.lattice.width) for by, own in zip(scale, across, strict=True)]
+        return torch.cat(lines, dim=1), down
 
 
 def once(flow: SmoothFlow, work: Callable[[SmoothFlow], Tensor]) -> Tensor:
@@ -270,7 +275,7 @@ def _filled_down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
 def _multiplied_across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:
     """`_across` by products of matrices."""
     if nodes.shape[3] <= _FEW_COLUMNS:
-        return product(nodes, _matrix(weight, nodes.shape[3], width).mT)
+        return product(nodes, matrix_of(weight, nodes.shape[3], width).mT)
     cells = product(nodes.unfold(3, weight.shape[-1], 1), weight.mT)
     return cells.flatten(3)[..., :width]
 
@@ -278,12 +283,12 @@ def _multiplied_across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:
 def _multiplied_down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
     """`_down` by products of matrices."""
     if lines.shape[2] <= _FEW_ROWS:
-        return product(_matrix(weight, lines.shape[2], height), lines)
+        return product(matrix_of(weight, lines.shape[2], height), lines)
     bands = product(weight.unsqueeze(-3), lines.unfold(2, weight.shape[-1], 1).mT)
     return bands.flatten(2, 3)[:, :, :height]
 
 
-def _matrix(weight: Tensor, nodes: int, length: int) -> Tensor:
+def matrix_of(weight: Tensor, nodes: int, length: int) -> Tensor:
     """(..., length, nodes): the weights (..., stride, taps) of each pixel's own nodes, among all of them."""
     *lead, stride, taps = weight.shape
     cells = nodes - taps + 1

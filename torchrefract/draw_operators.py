@@ -195,8 +195,10 @@ def _gpu_words_of_keys(seed: Tensor, keys: Tensor) -> Words:
 @torch.library.triton_op("torchrefract::gpu_words_under", mutates_args={})
 def _gpu_words_under(high: Tensor, low: Tensor, first: int, second: int) -> Words:
     found = _pair(high, len(high))
+    # As signed words: PyTorch 2.11 compiles no larger numbers.
+    signed = ((word + 2**31) % 2**32 - 2**31 for word in (first, second))
     kernel = launched("gpu_draws", "words_under")
-    kernel[(-(-len(high) // _BLOCK),)](high, low, first, second, *found, len(high), block=_BLOCK)
+    kernel[(-(-len(high) // _BLOCK),)](high, low, *signed, *found, len(high), block=_BLOCK)
     return found
 
 

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from torchrefract import DivergenceFree, LensDistortion, OneOf, ThinPlateSpline, warp
 from torchrefract import _compiled as compiled
-from torchrefract.warping import lattice
+from torchrefract.warping import lattice, sums
 from torchrefract.warping.followed import FollowedFlow, followed
 from torchrefract.warping.grid import Positions, sampler_grid
 from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
@@ -161,7 +161,7 @@ def test_flows_in_a_row_are_those_of_grid_sample(monkeypatch, oracle):
 def test_lines_between_nodes_are_those_of_products_of_matrices(stride, kind, monkeypatch, oracle):
     flow = smooth(kind, 2, stride, *LARGE)
     by_kernel = flow.dense()
-    monkeypatch.setattr(lattice, "obstacle", lambda *_: "for this test")
+    monkeypatch.setattr(sums, "obstacle", lambda *_: "for this test")
     oracle("field between nodes, products of matrices", by_kernel, flow.dense(), 2e-5)
     double = flow.with_nodes(flow.nodes.double())
     oracle("field between nodes, float64", by_kernel.double(), double.dense(), 2e-5)
@@ -173,7 +173,7 @@ def test_nodes_have_the_gradients_of_products_of_matrices(kind, monkeypatch):
     upstream, found = torch.randn(2, 2, *LARGE), list[Tensor]()
     for why in (None, "for this test"):
         if why:
-            monkeypatch.setattr(lattice, "obstacle", lambda *_: "for this test")
+            monkeypatch.setattr(sums, "obstacle", lambda *_: "for this test")
         nodes = flow.nodes.clone().requires_grad_()
         found.append(torch.autograd.grad(flow.with_nodes(nodes).dense(), nodes, upstream)[0])
     torch.testing.assert_close(*found, rtol=1e-5, atol=1e-4 * found[0].abs().max().item())

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -159,7 +160,9 @@ class Turbulence(LatticeWarp):
         return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
 
     def _of_modes(self, params: TurbulenceParams, plan: Plan, rows: Sequence[int], columns: Sequence[int]) -> Tensor:
-        self._check_folds(params)
+        strongest = self.amplitude_range[1], self.length_range[0], self.aperture_range[0]
+        if torch.compiler.is_compiling() or _may_fold(*strongest, self.covariance):
+            self._check_folds(params)
         kept = cast(FieldPlan, plan)
         drawn: Any = {"kind": self.covariance, "lengths": self.length_range, "nodes": kept.nodes}
         field = field_of_modes(params, cast(Modes, kept.modes), (rows, columns), **drawn, aperture=True)
@@ -180,3 +183,10 @@ class Turbulence(LatticeWarp):
                 "field): restore_valid leaves folded pixels out; a larger length_range or aperture_range folds less",
                 stacklevel=2,
             )
+
+
+@lru_cache(maxsize=64)
+def _may_fold(amplitude: float, length: float, aperture: float, kind: str) -> bool:
+    """Whether air folds the image that is no stronger, and has no shorter length and no narrower aperture."""
+    slope = slope_rms(torch.tensor([length]), kind=kind, aperture=torch.tensor([aperture]))
+    return amplitude * slope.item() > _FOLD

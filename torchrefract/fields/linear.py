@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrefract._checks import learns, withheld
+
 
 def solve(system: Tensor, right: Tensor) -> Tensor:
     """x with A x = b, (B, n, m), of A (B, n, n) and b (B, n, m); NaN where A is singular.
@@ -18,6 +20,8 @@ def solve(system: Tensor, right: Tensor) -> Tensor:
     if system.device.type != "cpu" or torch.compiler.is_compiling():
         # solve_ex raises nothing, and so waits for no device.
         return torch.linalg.solve_ex(system, right)[0]
+    if not (learns((system, right)) or withheld(system) or withheld(right)):
+        return torch.from_numpy(_solved(system.numpy(), right.numpy()))
     return _Solve.apply(system, right)
 
 

@@ -103,33 +103,51 @@ def mode_field(
 
 def sum_of_modes(weighted: Tensor, modes: Modes, rows: Sequence[int], columns: Sequence[int]) -> Tensor:
     """The fields of `mode_field`, from the noise times its amplitude, (B, 2, My, Mx)."""
-    real, imaginary = weighted.unbind(1)
     in_y, in_x = _waves(modes, tuple(rows), tuple(columns), weighted.dtype, weighted.device)
-    both = torch.stack([torch.cat([real, imaginary], dim=2), torch.cat([imaginary, -real], dim=2)], dim=1)
 
     def fields(pairs: Tensor) -> Tensor:
-        along = product(pairs.flatten(0, 1), in_x.expand(2 * pairs.shape[0], -1, -1))
-        return product(in_y, along.unflatten(0, (-1, 2)).flatten(1, 2).unsqueeze(1))
+        # Two products to a sample: one by itself may round by the threads.
+        both = pairs.flatten(0, 1)
+        along = product(both, in_x.expand(len(both), -1, -1))
+        return product(in_y.expand(len(both), -1, -1), along).unflatten(0, (-1, 2))
 
-    # Two products to a sample: one by itself may round by the threads.
-    return by_samples(both, fields)
+    return by_samples(_folded(_folded(weighted, 2), 3), fields)
+
+
+def _folded(values: Tensor, dim: int) -> Tensor:
+    """Sums and differences of opposite frequencies along an axis, of (real, imaginary) parts: half as many factors.
+
+    With even and odd parts e and o of a sum over k = -n ... n, of which e_0 counts twice,
+
+        sum_k (r_k + i m_k) exp(-i k t) = sum_k>=0 (e(r) cos k t + o(m) sin k t) + i (e(m) cos k t - o(r) sin k t)
+
+    Args:
+        values: (B, 2, ...), 2 n + 1 long along the axis.
+        dim: the axis.
+
+    Returns:
+        (B, 2, ...), of the same shape: e_0 ... e_n and o_1 ... o_n of the real and of the imaginary sum.
+    """
+    n, other = values.shape[dim] // 2, values.flip(dim)
+    even, odd = (values + other).narrow(dim, n, n + 1), (values - other).narrow(dim, n + 1, n)
+    real = torch.cat([even[:, 0], odd[:, 1]], dim=dim - 1)
+    return torch.stack([real, torch.cat([even[:, 1], -odd[:, 0]], dim=dim - 1)], dim=1)
 
 
 @kept
 def _waves(
     modes: Modes, rows: tuple[int, ...], columns: tuple[int, ...], dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """(2, n, 2 My) and (1, 2 Mx, m): cos and sin of 2 pi k p / size, as the two products take them."""
+    """(n, My) and (Mx, m): cos and sin of 2 pi k p / size, as `_folded` pairs them."""
 
-    def waves(k: Tensor, places: Sequence[int], size: int) -> tuple[Tensor, Tensor]:
+    def waves(most: int, places: Sequence[int], size: int) -> Tensor:
         # Whole turns are taken out of whole numbers, exactly.
+        k = torch.arange(most + 1, device=device)
         angle = (k[:, None] * constant(places, device=device)).remainder(size).to(dtype) * (2 * math.pi / size)
-        return angle.cos(), angle.sin()
+        cosines = torch.cat([torch.full_like(angle[:1], 0.5), angle[1:].cos()])
+        return torch.cat([cosines, angle[1:].sin()])
 
-    ky, kx = _numbers(modes, device)
-    (cos_y, sin_y), (cos_x, sin_x) = waves(ky, rows, modes.size[0]), waves(kx, columns, modes.size[1])
-    in_y = torch.stack([torch.cat([cos_y, sin_y]).mT, torch.cat([-sin_y, cos_y]).mT])
-    return in_y, torch.cat([cos_x, sin_x]).unsqueeze(0)
+    return waves(modes.rows, rows, modes.size[0]).mT.contiguous(), waves(modes.columns, columns, modes.size[1])
 
 
 def _numbers(modes: Modes, device: torch.device) -> tuple[Tensor, Tensor]:

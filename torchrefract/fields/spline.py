@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_all, is_true, withheld
+from torchrefract._checks import check_all, is_true, learns, withheld
 from torchrefract._compiled import kernels
 from torchrefract._threads import share
 from torchrefract.fields.linear import solve
@@ -20,6 +20,7 @@ _NEAREST = 1e-6
 _FLATTEST = 1e-5
 _UNIT = 2  # of the coordinates, in root mean square distances from the center
 _NOTHING = 1e-300
+_FEW_POINTS = 1 << 12  # numbers of all samples, whose system is kept
 _SMALLEST = 1 << 10  # places, from which on a kernel is faster
 _CACHED = 1 << 15  # numbers of eight bytes, a few times over, that stay in a core's cache
 _MOST_KEPT = 1 << 21  # numbers of eight bytes, of each of the latest lattices
@@ -57,23 +58,48 @@ def fit_spline(points: Tensor, displacement: Tensor, smoothing: Tensor, *, check
     """
     if not checked:
         check_points(points)
-    points, displacement = points.double(), displacement.double()
-    center = points.mean(dim=1, keepdim=True)
-    scale = (points - center).square().sum(dim=2).mean(dim=1)[:, None, None].clamp(min=1e-24).sqrt()
-    # The choice of coordinates moves nothing but the smoothing, which is measured in them.
-    smoothing = smoothing.double()[:, None, None] * (scale / scale.detach()).square() / _UNIT**2
-    center, scale = center.detach(), _UNIT * scale.detach()
-    unit = (points - center) / scale
+    points, displacement, smoothing = points.double(), displacement.double(), smoothing.double()
+    unit, center, scale, system = _system_of(points, smoothing)
     count = unit.shape[1]
-    x, y = unit.unbind(2)
-    kernel = _kernel(_square(x[:, None] - x[:, :, None], y[:, None] - y[:, :, None])) / 2
-    kernel = kernel + smoothing * torch.eye(count, dtype=unit.dtype, device=unit.device)
-    plane = torch.cat([torch.ones_like(unit[..., :1]), unit], dim=2)
-    corner = unit.new_zeros(unit.shape[0], 3, 3)
-    system = torch.cat([torch.cat([kernel, plane], dim=2), torch.cat([plane.mT, corner], dim=2)], dim=1)
     right = torch.cat([displacement, displacement.new_zeros(unit.shape[0], 3, 2)], dim=1)
     solution = solve(system, right)
     return Spline(unit, solution[:, :count], solution[:, count:], center, scale)
+
+
+_System = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+def _system_of(points: Tensor, smoothing: Tensor) -> _System:
+    """The points in their own units, center and scale, and the system of all that go there, (B, N + 3, N + 3)."""
+    values = points, smoothing
+    if points.numel() > _FEW_POINTS or learns(values) or any(map(withheld, values)):
+        return _made_system(points, smoothing)
+    # Drawn plates have the same points in every frame.
+    return _kept_system(tuple(points.shape), *(value.numpy().tobytes() for value in values))
+
+
+@lru_cache(maxsize=16)
+def _kept_system(shape: tuple[int, ...], points: bytes, smoothing: bytes) -> _System:
+    # Tensors made in inference mode could not be used outside of it.
+    with torch.inference_mode(False), torch.no_grad():
+        at, weight = (torch.from_numpy(np.frombuffer(own).copy()) for own in (points, smoothing))
+        return _made_system(at.view(shape), weight)
+
+
+def _made_system(points: Tensor, smoothing: Tensor) -> _System:
+    center = points.mean(dim=1, keepdim=True)
+    scale = (points - center).square().sum(dim=2).mean(dim=1)[:, None, None].clamp(min=1e-24).sqrt()
+    # The choice of coordinates moves nothing but the smoothing, which is measured in them.
+    smoothing = smoothing[:, None, None] * (scale / scale.detach()).square() / _UNIT**2
+    center, scale = center.detach(), _UNIT * scale.detach()
+    unit = (points - center) / scale
+    x, y = unit.unbind(2)
+    kernel = _kernel(_square(x[:, None] - x[:, :, None], y[:, None] - y[:, :, None])) / 2
+    kernel = kernel + smoothing * torch.eye(unit.shape[1], dtype=unit.dtype, device=unit.device)
+    plane = torch.cat([torch.ones_like(unit[..., :1]), unit], dim=2)
+    corner = unit.new_zeros(unit.shape[0], 3, 3)
+    system = torch.cat([torch.cat([kernel, plane], dim=2), torch.cat([plane.mT, corner], dim=2)], dim=1)
+    return unit, center, scale, system
 
 
 def spline_flow(spline: Spline, *, height: int, width: int, dtype: torch.dtype) -> Tensor:
@@ -99,7 +125,10 @@ def spline_at(spline: Spline, x: Tensor, y: Tensor, *, dtype: torch.dtype, again
         kernel = _kernel(_square(x[:, None] - px, y[:, None] - py))
         bent = torch.stack([(weight * kernel).sum(dim=1) for weight in (wu, wv)], dim=1)
         return (torch.stack(_plane(spline.affine, x, y), dim=1) + bent).to(dtype)
-    return _Lattice.apply(spline.points, spline.weights, spline.affine, x, y, dtype, again)
+    values = spline.points, spline.weights, spline.affine, x, y
+    if not learns(values) and _by_kernel(values):
+        return _filled(values, dtype, again=again)
+    return _Lattice.apply(*values, dtype, again)
 
 
 def evaluate_spline(spline: Spline, points: Tensor) -> Tensor:
@@ -141,7 +170,7 @@ class _Lattice(torch.autograd.Function):
         points: Tensor, weights: Tensor, affine: Tensor, x: Tensor, y: Tensor, dtype: torch.dtype, again: bool
     ) -> Tensor:
         values = points, weights, affine, x, y
-        if x.shape[2] * y.shape[1] >= _SMALLEST and not any(map(withheld, values)) and kernels("_jit"):
+        if _by_kernel(values):
             return _filled(values, dtype, again=again)
         rows = y.split(_at_once(x), dim=1)
         return torch.cat([_evaluate(points, weights, affine, x, part).to(dtype) for part in rows], dim=2)
@@ -159,6 +188,12 @@ class _Lattice(torch.autograd.Function):
             found = _gradients(slope.double(), points, weights, x, part)
             total = tuple(a + b for a, b in zip(total, found, strict=True))
         return *total, None, None, None, None
+
+
+def _by_kernel(values: Sequence[Tensor]) -> bool:
+    """Whether a kernel can make the flow, and is faster; the places are the last two."""
+    large = values[3].shape[2] * values[4].shape[1] >= _SMALLEST
+    return large and not any(map(withheld, values)) and kernels("_jit") is not None
 
 
 def _filled(values: Sequence[Tensor], dtype: torch.dtype, *, again: bool) -> Tensor:

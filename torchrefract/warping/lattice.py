@@ -2,27 +2,21 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._bands import by_samples
-from torchrefract._compiled import SMALLEST, kernels, obstacle, with_gradients
 from torchrefract._constants import assume_constant_result, constant
-from torchrefract._products import product
-from torchrefract._threads import share
 from torchrefract.warping.grid import finite, pixel_axes, sampler_axes, sampler_positions
+from torchrefract.warping.sums import across, across_twice, down, matrix_of
 
 # Slopes of cubics are not smooth enough from cell to cell.
 STREAM_NODES = 6
 # In the sampler's coordinates: farther than a flow leads that is computed on a lattice, and finite in all products.
 FARTHEST = 1e4
-# Up to so many nodes along an axis one product with all of them is faster than one for each cell.
-_FEW_ROWS, _FEW_COLUMNS = 24, 64
-_SMALLEST_LINES = 1 << 10  # pixels of a sample's rows of nodes, from which on a kernel is faster
 
 
 class Lattice(NamedTuple):
@@ -65,12 +59,12 @@ def between_nodes(nodes: Tensor, lattice: Lattice) -> Tensor:
 
     Source: the remainder of Lagrange's interpolation; de Boor, "A practical guide to splines" (1978), chapter 2.
     """
-    return _down(along_rows(nodes, lattice), _cubics(nodes, lattice), lattice.height)
+    return down(along_rows(nodes, lattice), _cubics(nodes, lattice), lattice.height)
 
 
 def along_rows(nodes: Tensor, lattice: Lattice) -> Tensor:
     """(B, C, n, W), the field of `between_nodes` in the rows of nodes, at every column of pixels."""
-    return _across(nodes, _cubics(nodes, lattice), lattice.width)
+    return across(nodes, _cubics(nodes, lattice), lattice.width)
 
 
 def row_weights(like: Tensor, lattice: Lattice) -> Tensor:
@@ -107,7 +101,7 @@ class Lines(NamedTuple):
 
     def grid(self) -> Tensor:
         """(B, H, W, 2): the same at every pixel."""
-        found = _down(self.values, self.weight, self.height)
+        found = down(self.values, self.weight, self.height)
         if self.x is not None and self.y is not None:
             found[:, :1] += self.x
             found[:, 1:] += self.y[:, None]
@@ -180,7 +174,7 @@ class StreamFlow(SmoothFlow):
 
     def dense(self) -> Tensor:
         """(B, 2, H, W), px."""
-        return _down(*self._lines(self.nodes, (1.0, 1.0)), self.lattice.height)
+        return down(*self._lines(self.nodes, (1.0, 1.0)), self.lattice.height)
 
     def lines(self, dtype: torch.dtype) -> Lines:
         """Where F.grid_sample(align_corners=False) looks, at every pixel of the rows of nodes."""
@@ -199,9 +193,8 @@ class StreamFlow(SmoothFlow):
 
     def _lines(self, nodes: Tensor, scale: tuple[float, float]) -> tuple[Tensor, Tensor]:
         """(B, 2, n, W) and (2, stride, taps): (D_y psi, -D_x psi), each times its scale, as in `Lines`."""
-        across, down = self.with_nodes(nodes).weights()
-        lines = [_across(nodes, by * own, self.lattice.width) for by, own in zip(scale, across, strict=True)]
-        return torch.cat(lines, dim=1), down
+        along, between = self.with_nodes(nodes).weights()
+        return across_twice(nodes, (scale[0] * along[0], scale[1] * along[1]), self.lattice.width), between
 
 
 def once(flow: SmoothFlow, work: Callable[[SmoothFlow], Tensor]) -> Tensor:
@@ -228,71 +221,3 @@ def _computed_lagrange(stride: int, count: int) -> list[list[float]]:
 def _cubics(like: Tensor, lattice: Lattice) -> Tensor:
     """(stride, 4), in the type of a tensor."""
     return lagrange_weights(lattice.stride, 4, dtype=like.dtype, device=like.device)
-
-
-def _across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:
-    """(B, C, n, W) of (B, C, n, m), by weights (stride, taps)."""
-
-    def plain(nodes: Tensor) -> Tensor:
-        return by_samples(nodes, lambda own: _multiplied_across(own, weight, width))
-
-    if nodes.shape[2] * width < _SMALLEST_LINES or obstacle(nodes, weight):
-        return plain(nodes)
-    return with_gradients(lambda nodes: _filled_across(nodes, weight, width), plain, nodes)
-
-
-def _down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
-    """(B, C, H, W) of (B, C, n, W), by weights (stride, taps), or (C, stride, taps)."""
-
-    def plain(lines: Tensor) -> Tensor:
-        return by_samples(lines, lambda own: _multiplied_down(own, weight, height))
-
-    if height * lines.shape[3] < SMALLEST or obstacle(lines, weight):
-        return plain(lines)
-    return with_gradients(lambda lines: _filled_down(lines, weight, height), plain, lines)
-
-
-def _filled_across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:
-    """`_across` by a kernel."""
-    rows = nodes.shape[:3].numel()
-    out = nodes.new_empty(*nodes.shape[:3], width)
-    values = nodes.contiguous().view(rows, -1).numpy(), weight.mT.contiguous().numpy()
-    across, into = partial(kernels("warping.kernels.lines").across, *values), out.view(rows, width).numpy()
-    share(lambda start, stop: across(start, stop, into), rows, least=SMALLEST // width + 1)
-    return out
-
-
-def _filled_down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
-    """`_down` by a kernel."""
-    batch, channels, _, width = lines.shape
-    out = lines.new_empty(batch, channels, height, width)
-    values = lines.contiguous().numpy(), weight.expand(channels, -1, -1).contiguous().numpy()
-    down = partial(kernels("warping.kernels.lines").down, *values)
-    share(lambda start, stop: down(start, stop, out.numpy()), batch * channels * height, least=SMALLEST // width + 1)
-    return out
-
-
-def _multiplied_across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:
-    """`_across` by products of matrices."""
-    if nodes.shape[3] <= _FEW_COLUMNS:
-        return product(nodes, matrix_of(weight, nodes.shape[3], width).mT)
-    cells = product(nodes.unfold(3, weight.shape[-1], 1), weight.mT)
-    return cells.flatten(3)[..., :width]
-
-
-def _multiplied_down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
-    """`_down` by products of matrices."""
-    if lines.shape[2] <= _FEW_ROWS:
-        return product(matrix_of(weight, lines.shape[2], height), lines)
-    bands = product(weight.unsqueeze(-3), lines.unfold(2, weight.shape[-1], 1).mT)
-    return bands.flatten(2, 3)[:, :, :height]
-
-
-def matrix_of(weight: Tensor, nodes: int, length: int) -> Tensor:
-    """(..., length, nodes): the weights (..., stride, taps) of each pixel's own nodes, among all of them."""
-    *lead, stride, taps = weight.shape
-    cells = nodes - taps + 1
-    # One cell's rows again and again, each time one longer than there are nodes: so they move on by one.
-    rows = F.pad(weight, (0, cells)).repeat(*[1] * len(lead), 1, cells)
-    own = rows[..., : cells * nodes].reshape(*lead, stride, cells, nodes)
-    return own.transpose(-3, -2).reshape(*lead, cells * stride, nodes)[..., :length, :]

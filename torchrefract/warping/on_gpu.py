@@ -10,7 +10,8 @@ from torchrefract._products import product
 from torchrefract._triton import launched, reads
 from torchrefract.warping.grid import finite, pixel_axes, sampler_positions
 from torchrefract.warping.grid_sample import PADDINGS, gradients_by_grid_sample
-from torchrefract.warping.lattice import FARTHEST, SmoothFlow, matrix_of
+from torchrefract.warping.lattice import FARTHEST, SmoothFlow
+from torchrefract.warping.sums import matrix_of
 
 ROWS, COLUMNS = 16, 128  # of pixels that one program looks up
 _LARGEST_PLANE = 2**31 - 1  # elements that the kernel counts within a channel

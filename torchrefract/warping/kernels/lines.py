@@ -31,6 +31,21 @@ def across(nodes: Floats, weight: Floats, start: int, stop: int, out: Floats) ->
 
 
 @jit
+def across_twice(nodes: Floats, first: Floats, second: Floats, start: int, stop: int, out: Floats) -> None:
+    """The same by two weights: rows of both planes of out, (B, 2, n, W), of nodes, (B n, m)."""
+    along_first, along_second = nodes_across(first, out.shape[3]), nodes_across(second, out.shape[3])
+    own = np.zeros(nodes.shape[1] + 2 * GROUP, np.float32)
+    line = np.empty(along_first[0].size * GROUP, np.float32)
+    for row in range(start, stop):
+        i, own_row = divmod(row, out.shape[2])
+        own[: nodes.shape[1]] = nodes[row]
+        along_nodes(own, along_first, line)
+        out[i, 0, own_row] = line[: out.shape[3]]
+        along_nodes(own, along_second, line)
+        out[i, 1, own_row] = line[: out.shape[3]]
+
+
+@jit
 def down(lines: Floats, weight: Floats, start: int, stop: int, out: Floats) -> None:
     """Rows of all planes of out, (B, C, H, W), of lines, (B, C, n, W), by weights (C, stride, taps)."""
     channels, height = out.shape[1:3]

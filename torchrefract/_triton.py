@@ -1,8 +1,6 @@
 """Where kernels of Triton can stand in for PyTorch's operations: on a GPU, in eager mode and in compiled graphs."""
 
 from importlib import import_module
-from importlib.util import find_spec
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,9 +10,9 @@ from torch.autograd import forward_ad
 from torchrefract._constants import assume_constant_result
 
 
-def reads(*values: Tensor) -> bool:
-    """Whether kernels can read the tensors."""
-    if not all(value.device.type == "cuda" for value in values) or not _is_there():
+def reads(module: str, *values: Tensor) -> bool:
+    """Whether the operators of a module, each of them a kernel, can read the tensors."""
+    if not all(value.device.type == "cuda" for value in values) or not _is_there(module):
         return False
     if torch.compiler.is_compiling():
         # What this flag says `is_exporting` says of every graph while it is traced.
@@ -26,12 +24,11 @@ def reads(*values: Tensor) -> bool:
     )
 
 
-def launched(module: str, kernel: str) -> Any:
-    """A kernel of one of the modules that Triton compiles, as operators of `torch.library.triton_op` launch it."""
-    # By name: Triton may be missing, and takes its time.
-    return torch.library.wrap_triton(getattr(import_module(f"torchrefract.{module}"), kernel))
-
-
 @assume_constant_result
-def _is_there() -> bool:
-    return find_spec("triton") is not None
+def _is_there(module: str) -> bool:
+    # By name: Triton may be missing, and to define operators takes its time.
+    try:
+        import_module(f"torchrefract.{module}")
+    except ImportError:
+        return False
+    return True

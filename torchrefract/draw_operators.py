@@ -17,12 +17,11 @@ from torch import Tensor
 from torchrefract._checks import withheld
 from torchrefract._compiled import kernels
 from torchrefract._constants import constant
-from torchrefract._triton import launched, reads
+from torchrefract._triton import reads
 from torchrefract.threefry import WORD, rounds, threefry
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 Words = tuple[Tensor, Tensor]
-_BLOCK = 128  # numbers that one program of a GPU makes
 
 
 def blocks(count: int) -> int:
@@ -50,7 +49,7 @@ def _operator(schema: str, result: Callable[..., Any]) -> Callable[[_F], _F]:
 
         @wraps(function)
         def chosen(*args: Any) -> Any:
-            if torch.compiler.is_compiling() and not reads(args[0]):
+            if torch.compiler.is_compiling() and not reads("gpu_draws", args[0]):
                 # Calling it loads what compilers need, a second of work that eager mode does without.
                 return getattr(torch.ops.torchrefract, name)(*args)
             return function(*args)
@@ -65,7 +64,7 @@ def _operator(schema: str, result: Callable[..., Any]) -> Callable[[_F], _F]:
 )
 def words_of_range(seed: Tensor, start: int, stop: int) -> Words:
     """The words of the keys from start to stop."""
-    if reads(seed):
+    if reads("gpu_draws", seed):
         return torch.ops.torchrefract.gpu_words_of_range(seed.long(), start, stop)
     return words_of_keys(seed.long(), torch.arange(start, stop, device=seed.device))
 
@@ -73,7 +72,7 @@ def words_of_range(seed: Tensor, start: int, stop: int) -> Words:
 @_operator("(Tensor seed, Tensor keys) -> (Tensor, Tensor)", lambda seed, keys: _pair(keys, len(keys)))
 def words_of_keys(seed: Tensor, keys: Tensor) -> Words:
     """The words of keys, (B,), int64."""
-    if reads(seed, keys):
+    if reads("gpu_draws", seed, keys):
         return torch.ops.torchrefract.gpu_words_of_keys(seed, keys.contiguous())
     if (kernel := _kernels(keys)) is None or _kernels(seed) is None:
         return threefry(halves(seed), halves(keys))
@@ -94,7 +93,7 @@ def folded(high: Tensor, low: Tensor, lane: int) -> Words:
 )
 def uniform_of(high: Tensor, low: Tensor, lane: int, count: int) -> Tensor:
     """(B, count), float32, as by `draws.uniform`."""
-    if reads(high, low):
+    if reads("gpu_draws", high, low):
         return torch.ops.torchrefract.gpu_uniforms(high, low, lane, count)
     if (kernel := _kernels(low)) is not None:
         out = torch.empty(len(high), count)
@@ -164,7 +163,7 @@ def uniform_few(words: Sequence[tuple[int, int]], lane: int, count: int) -> np.n
 
 def _under(high: Tensor, low: Tensor, counter: tuple[int, int]) -> Words:
     """Two words of one counter under each key, (B,)."""
-    if reads(high, low):
+    if reads("gpu_draws", high, low):
         return torch.ops.torchrefract.gpu_words_under(high, low, *counter)
     if (kernel := _kernels(low)) is None:
         return threefry((high, low), (torch.full_like(low, counter[0]), torch.full_like(low, counter[1])))
@@ -180,38 +179,3 @@ def _kernels(value: Tensor) -> Any:
 
 def _pair(like: Tensor, count: int) -> Words:
     return like.new_empty(count, dtype=torch.int64), like.new_empty(count, dtype=torch.int64)
-
-
-@torch.library.triton_op("torchrefract::gpu_words_of_range", mutates_args={})
-def _gpu_words_of_range(seed: Tensor, start: int, stop: int) -> Words:
-    return _gpu_words(seed, seed, start, stop - start, given=False)
-
-
-@torch.library.triton_op("torchrefract::gpu_words_of_keys", mutates_args={})
-def _gpu_words_of_keys(seed: Tensor, keys: Tensor) -> Words:
-    return _gpu_words(seed, keys, 0, len(keys), given=True)
-
-
-@torch.library.triton_op("torchrefract::gpu_words_under", mutates_args={})
-def _gpu_words_under(high: Tensor, low: Tensor, first: int, second: int) -> Words:
-    found = _pair(high, len(high))
-    # As signed words: PyTorch 2.11 compiles no larger numbers.
-    signed = ((word + 2**31) % 2**32 - 2**31 for word in (first, second))
-    kernel = launched("gpu_draws", "words_under")
-    kernel[(-(-len(high) // _BLOCK),)](high, low, *signed, *found, len(high), block=_BLOCK)
-    return found
-
-
-@torch.library.triton_op("torchrefract::gpu_uniforms", mutates_args={})
-def _gpu_uniforms(high: Tensor, low: Tensor, lane: int, count: int) -> Tensor:
-    out = high.new_empty((len(high), count), dtype=torch.float32)
-    total = len(high) * count
-    launched("gpu_draws", "uniforms")[(-(-total // _BLOCK),)](high, low, lane, out, total, count, block=_BLOCK)
-    return out
-
-
-def _gpu_words(seed: Tensor, keys: Tensor, start: int, count: int, *, given: bool) -> Words:
-    found = _pair(seed, count)
-    kernel = launched("gpu_draws", "words_of")
-    kernel[(-(-count // _BLOCK),)](seed, keys, start, *found, count, given=given, block=_BLOCK)
-    return found

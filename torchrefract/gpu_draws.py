@@ -1,10 +1,16 @@
-"""What Triton compiles of the keyed random numbers: the generator, for each sample and each number of it."""
+"""The keyed random numbers on a GPU: operators that compilers see into, each of them a kernel of Triton."""
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportOptionalMemberAccess=false
 # Triton has a language of its own, which only looks like Python.
 
+import torch
 import triton
 import triton.language as tl
+from torch import Tensor
+from torch.library import triton_op, wrap_triton
+
+_Words = tuple[Tensor, Tensor]
+_BLOCK = 128  # numbers that one program makes
 
 
 @triton.jit
@@ -77,3 +83,42 @@ def _mixed(x, y, a: tl.constexpr, b: tl.constexpr, c: tl.constexpr, d: tl.conste
 def _round(x, y, rotation: tl.constexpr):
     x = x + y
     return x, ((y << rotation) | (y >> (32 - rotation))) ^ x
+
+
+@triton_op("torchrefract::gpu_words_of_range", mutates_args={})
+def _gpu_words_of_range(seed: Tensor, start: int, stop: int) -> _Words:
+    return _gpu_words(seed, seed, start, stop - start, given=False)
+
+
+@triton_op("torchrefract::gpu_words_of_keys", mutates_args={})
+def _gpu_words_of_keys(seed: Tensor, keys: Tensor) -> _Words:
+    return _gpu_words(seed, keys, 0, len(keys), given=True)
+
+
+@triton_op("torchrefract::gpu_words_under", mutates_args={})
+def _gpu_words_under(high: Tensor, low: Tensor, first: int, second: int) -> _Words:
+    found = _pair(high, len(high))
+    # As signed words: PyTorch 2.11 compiles no larger numbers.
+    signed = ((word + 2**31) % 2**32 - 2**31 for word in (first, second))
+    kernel = wrap_triton(words_under)
+    kernel[(-(-len(high) // _BLOCK),)](high, low, *signed, *found, len(high), block=_BLOCK)
+    return found
+
+
+@triton_op("torchrefract::gpu_uniforms", mutates_args={})
+def _gpu_uniforms(high: Tensor, low: Tensor, lane: int, count: int) -> Tensor:
+    out = high.new_empty((len(high), count), dtype=torch.float32)
+    total = len(high) * count
+    wrap_triton(uniforms)[(-(-total // _BLOCK),)](high, low, lane, out, total, count, block=_BLOCK)
+    return out
+
+
+def _gpu_words(seed: Tensor, keys: Tensor, start: int, count: int, *, given: bool) -> _Words:
+    found = _pair(seed, count)
+    kernel = wrap_triton(words_of)
+    kernel[(-(-count // _BLOCK),)](seed, keys, start, *found, count, given=given, block=_BLOCK)
+    return found
+
+
+def _pair(like: Tensor, count: int) -> _Words:
+    return like.new_empty(count, dtype=torch.int64), like.new_empty(count, dtype=torch.int64)

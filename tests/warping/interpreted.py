@@ -1,19 +1,23 @@
-"""The kernel for GPUs on the CPU, by Triton's interpreter, beside F.grid_sample: errors as JSON.
+"""The kernels for GPUs on the CPU, by Triton's interpreter, beside F.grid_sample and numpy: what they find, as JSON.
 
 For a process of its own, whose environment says TRITON_INTERPRET=1.
 """
 
+import importlib
 import json
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract.warping import on_gpu
+from torchrefract import draw_operators
 from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
 
 # What is interpreted is no kernel that compilers could see into.
 torch.library.wrap_triton = lambda kernel: kernel
+on_gpu = importlib.import_module("torchrefract.warping.on_gpu")
+importlib.import_module("torchrefract.warping.gpu_look_up")
+importlib.import_module("torchrefract.gpu_draws")
 
 SIDES = 9, 40
 KINDS = {"cubics": (SmoothFlow, 2, Lattice(*SIDES, 8)), "stream": (StreamFlow, 1, Lattice(*SIDES, 8, 3, 2))}
@@ -30,8 +34,24 @@ CASES = [
 
 
 def main() -> None:
-    """Print the errors of all cases."""
-    print(json.dumps({"-".join(map(str, case)): errors(*case) for case in CASES}))
+    """Print the errors of all cases of the look-up, and whether draws are the same."""
+    print(json.dumps({"look_up": {"-".join(map(str, case)): errors(*case) for case in CASES}, "draws": same_draws()}))
+
+
+def same_draws() -> list[bool]:
+    """Whether words and numbers are to the bit those of the CPU."""
+    ours, found = torch.ops.torchrefract, list[bool]()
+    for seed in map(torch.tensor, (12345678912345, -5)):
+        keys = torch.randint(-(2**62), 2**62, (37,), generator=torch.Generator().manual_seed(1))
+        words, counted = draw_operators.words_of_keys(seed, keys), draw_operators.words_of_range(seed, 7, 44)
+        pairs = [
+            (ours.gpu_words_of_keys(seed, keys), words),
+            (ours.gpu_words_of_range(seed, 7, 44), counted),
+            (ours.gpu_words_under(*words, 0xFFFFFFFF, 5), draw_operators.folded(*words, 5)),
+            ([ours.gpu_uniforms(*words, 3, 17)], [draw_operators.uniform_of(*words, 3, 17)]),
+        ]
+        found += [all(map(torch.equal, own, other)) for own, other in pairs]
+    return found
 
 
 def errors(kind: str, rows: int, layout: str, padding: str, gated: bool) -> dict[str, float]:
@@ -40,11 +60,8 @@ def errors(kind: str, rows: int, layout: str, padding: str, gated: bool) -> dict
     form, channels, lattice = KINDS[kind]
     sides = [len(axis) for axis in lattice.axes()]
     nodes = (30 * torch.rand(rows, channels, *sides) - 15).requires_grad_()
-    source = (
-        torch.rand(2, 3 if padding != "border" else 5, lattice.height, lattice.width)
-        .to(memory_format=LAYOUTS[layout])
-        .requires_grad_()
-    )
+    size = (2, 5 if padding == "border" else 3, *SIDES)  # a few planes are unrolled, more are not
+    source = torch.rand(size).to(memory_format=LAYOUTS[layout]).requires_grad_()
     active = torch.tensor([True, False]) if gated else None
     towards = torch.rand(source.shape)
     spread = nodes if rows == 2 else nodes.expand(2, -1, -1, -1)

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from torchrefract.warping.mixed import dense
 from torchrefract.warping.resample import look_up
 
 SIZE = (131, 190)
-LINEAR = {"padding": "border", "interpolation": "bilinear"}
+LINEAR: dict[str, Any] = {"padding": "border", "interpolation": "bilinear"}
 
 
 def smooth(seed: int, stride: int, *, batch: int = 2, height: int = SIZE[0], width: int = SIZE[1]) -> SmoothFlow:

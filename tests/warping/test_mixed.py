@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 import torch
 
@@ -37,7 +39,7 @@ def test_each_row_is_what_it_is_alone(flow, rows):
     assert torch.equal(dense(flow), torch.cat([dense(row) for row in rows]))
     assert torch.equal(grid_of(flow, torch.float32), torch.cat([grid_of(row, torch.float32) for row in rows]))
     image = torch.rand(5, 3, HEIGHT, WIDTH)
-    options = {"padding": "border", "interpolation": "bilinear"}
+    options: dict[str, Any] = {"padding": "border", "interpolation": "bilinear"}
     found = look_up(image, flow, **options)
     assert torch.equal(found, torch.cat([look_up(image[i : i + 1], row, **options) for i, row in enumerate(rows)]))
     assert torch.allclose(found, warp(image, dense(flow), padding="border")[0], rtol=0, atol=1e-5)
@@ -78,5 +80,5 @@ def test_rows_that_are_one_are_computed_once(form):
     assert torch.equal(grid, grid_of(one, torch.float32).expand_as(grid))
     assert grid.stride(0) == found.stride(0) == 0
     image = torch.rand(6, 3, HEIGHT, WIDTH)
-    options = {"padding": "zeros", "interpolation": "bilinear"}
+    options: dict[str, Any] = {"padding": "zeros", "interpolation": "bilinear"}
     assert torch.equal(look_up(image, many, **options)[3:4], look_up(image[3:4], one, **options))

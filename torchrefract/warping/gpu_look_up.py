@@ -1,10 +1,24 @@
-"""What Triton compiles: a look-up along a flow on a lattice, for which no grid of the frame's size is written."""
+"""A look-up along a flow on a lattice as one kernel of Triton: no grid of the frame's size is written."""
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportOptionalMemberAccess=false
 # Triton has a language of its own, which only looks like Python.
 
+from typing import Any, cast
+
+import torch
 import triton
 import triton.language as tl
+from torch import Tensor
+from torch.library import triton_op, wrap_triton
+
+from torchrefract._constants import constant
+from torchrefract._products import product
+from torchrefract.warping.grid import finite, pixel_axes, sampler_positions
+from torchrefract.warping.grid_sample import PADDINGS, gradients_by_grid_sample
+from torchrefract.warping.lattice import FARTHEST
+from torchrefract.warping.sums import matrix_of
+
+ROWS, COLUMNS = 16, 128  # of pixels that one program looks up
 
 
 @triton.jit
@@ -141,3 +155,76 @@ def _padded(place, size, padding: tl.constexpr):
     if padding != 0:
         place = tl.minimum(tl.maximum(place, 0.0), size - 1.0)
     return place
+
+
+# Compilers see into this operator: theirs writes a grid, or finds each position once for each channel.
+@triton_op("torchrefract::look_up_lattice", mutates_args={})
+def _look_up_lattice(
+    source: Tensor, nodes: Tensor, across: Tensor, down: Tensor, active: Tensor | None, padding: int
+) -> Tensor:
+    return _filled(wrap_triton(look_up_lattice), source, nodes, across, down, active, padding)
+
+
+def _filled(
+    kernel: Any, source: Tensor, nodes: Tensor, across: Tensor, down: Tensor, active: Tensor | None, padding: int
+) -> Tensor:
+    out = torch.empty_like(source)
+    batch, channels, height, width = source.shape
+    _, stride, taps = across.shape
+    cells, parts = -(-height // stride), -(-stride // ROWS)
+    kernel[(-(-width // COLUMNS), cells * parts, batch)](
+        source,
+        out,
+        nodes,
+        across,
+        down,
+        down if active is None else active,
+        height,
+        width,
+        stride,
+        *nodes.shape[2:],
+        *source.stride(),
+        nodes.stride(0) if len(nodes) > 1 else 0,
+        nodes.stride(1),
+        channels=channels,
+        taps=taps,
+        shared=nodes.shape[1] == 1,
+        gated=active is not None,
+        padding=padding,
+        rows=ROWS,
+        columns=COLUMNS,
+        num_warps=COLUMNS // 32,
+    )
+    return out
+
+
+def _keep(ctx: Any, inputs: Any, output: Tensor) -> None:
+    ctx.save_for_backward(*inputs[:-1])
+    ctx.padding = PADDINGS[inputs[-1]]
+
+
+def _gradients(ctx: Any, gradient: Tensor) -> Any:
+    source, nodes, across, down, active = ctx.saved_tensors
+    height, width = source.shape[2:]
+    over, under = matrix_of(across, nodes.shape[3], width), matrix_of(down, nodes.shape[2], height)
+    flow = product(product(under, nodes), over.mT)
+    axes = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
+    positions = finite(sampler_positions(flow, *axes, height=height, width=width), FARTHEST)
+    grid = positions.movedim(1, -1).expand(len(source), -1, -1, -1)
+    acts = None if active is None else active.bool().view(-1, 1, 1, 1)
+    upstream = gradient if acts is None else torch.where(acts, gradient, 0.0)
+    needed = ctx.needs_input_grad[:2]
+    of_source, of_grid = gradients_by_grid_sample(source, grid, upstream, needed=needed, padding=ctx.padding)
+    if of_source is not None and acts is not None:
+        of_source = torch.where(acts, of_source, gradient)
+    of_nodes = None
+    if of_grid is not None:
+        scale = constant([2 / width, 2 / height], dtype=of_grid.dtype, device=of_grid.device).view(2, 1, 1)
+        of_flow = of_grid.movedim(-1, 1) * scale
+        of_nodes = product(product(under.mT, of_flow), over)
+        of_nodes = of_nodes.sum(dim=0, keepdim=True) if len(nodes) < len(of_nodes) else of_nodes
+        of_nodes = of_nodes.sum(dim=1, keepdim=True) if nodes.shape[1] < 2 else of_nodes
+    return of_source, of_nodes, None, None, None, None
+
+
+cast(Any, _look_up_lattice).register_autograd(_gradients, setup_context=_keep)

@@ -128,3 +128,14 @@ def test_params_of_a_wrong_shape_raise():
 def test_wrong_arguments_raise(options, error, rule):
     with pytest.raises(error, match=rule):
         ThinPlateSpline(**options)
+
+
+def test_parameters_that_learn_serve_where_no_gradient_is_asked_for():
+    effect, image = ThinPlateSpline(), torch.rand(2, 3, 120, 200, dtype=torch.float64)
+    params = effect.sample(image, seed=1)
+    learning = type(params)(*(value.clone().requires_grad_(value.is_floating_point()) for value in params))
+    with torch.no_grad():
+        found = effect.apply(image, learning)
+    assert torch.equal(found.image, effect.apply(image, params).image)
+    effect.apply(image, learning).image.sum().backward()
+    assert learning.displacement.grad.abs().max() > 0

@@ -505,7 +505,7 @@ def test_params_of_a_smaller_type_are_still_those_of_the_draw(case):
 
 def test_gradients_of_params_and_image_are_those_of_finite_differences(case):
     effect = case.strong()
-    image = picture(2, 3, 4, 6, dtype=torch.float64)
+    image = picture(2, 3, 3, 4, dtype=torch.float64)
     params = effect.sample(image, seed=5)
     assert {name for name, value in params._asdict().items() if value.is_floating_point()} == set(case.fields)
 

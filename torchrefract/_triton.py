@@ -4,7 +4,7 @@ from importlib import import_module
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor  # pyright: ignore[reportMissingImports]  # of C++
+from torch._C._functorch import is_functorch_wrapped_tensor  # pyright: ignore[reportMissingImports]  # it is of C++, without stubs
 from torch.autograd import forward_ad
 
 from torchrefract._constants import assume_constant_result

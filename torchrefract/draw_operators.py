@@ -18,10 +18,9 @@ from torchrefract._checks import withheld
 from torchrefract._compiled import kernels
 from torchrefract._constants import constant
 from torchrefract._triton import reads
-from torchrefract.threefry import WORD, rounds, threefry
+from torchrefract.threefry import WORD, Words, empty_words, rounds, threefry
 
 _F = TypeVar("_F", bound=Callable[..., Any])
-Words = tuple[Tensor, Tensor]
 
 
 def blocks(count: int) -> int:
@@ -60,7 +59,7 @@ def _operator(schema: str, result: Callable[..., Any]) -> Callable[[_F], _F]:
 
 
 @_operator(
-    "(Tensor seed, int start, int stop) -> (Tensor, Tensor)", lambda seed, start, stop: _pair(seed, stop - start)
+    "(Tensor seed, int start, int stop) -> (Tensor, Tensor)", lambda seed, start, stop: empty_words(seed, stop - start)
 )
 def words_of_range(seed: Tensor, start: int, stop: int) -> Words:
     """The words of the keys from start to stop."""
@@ -69,7 +68,7 @@ def words_of_range(seed: Tensor, start: int, stop: int) -> Words:
     return words_of_keys(seed.long(), torch.arange(start, stop, device=seed.device))
 
 
-@_operator("(Tensor seed, Tensor keys) -> (Tensor, Tensor)", lambda seed, keys: _pair(keys, len(keys)))
+@_operator("(Tensor seed, Tensor keys) -> (Tensor, Tensor)", lambda seed, keys: empty_words(keys, len(keys)))
 def words_of_keys(seed: Tensor, keys: Tensor) -> Words:
     """The words of keys, (B,), int64."""
     if reads("gpu_draws", seed, keys):
@@ -81,7 +80,9 @@ def words_of_keys(seed: Tensor, keys: Tensor) -> Words:
     return torch.from_numpy(out[0]), torch.from_numpy(out[1])
 
 
-@_operator("(Tensor high, Tensor low, int lane) -> (Tensor, Tensor)", lambda high, low, lane: _pair(low, len(low)))
+@_operator(
+    "(Tensor high, Tensor low, int lane) -> (Tensor, Tensor)", lambda high, low, lane: empty_words(low, len(low))
+)
 def folded(high: Tensor, low: Tensor, lane: int) -> Words:
     """The words of what is nested in a lane."""
     return _under(high, low, (WORD, lane))
@@ -175,7 +176,3 @@ def _under(high: Tensor, low: Tensor, counter: tuple[int, int]) -> Words:
 def _kernels(value: Tensor) -> Any:
     """Those of numba, where they can read a tensor, else None."""
     return None if withheld(value) or kernels("_jit") is None else kernels("draw_kernels")
-
-
-def _pair(like: Tensor, count: int) -> Words:
-    return like.new_empty(count, dtype=torch.int64), like.new_empty(count, dtype=torch.int64)

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from torchrefract.draw_operators import (
-    Words,
     between_of,
     blocks,
     folded,
@@ -25,7 +24,7 @@ from torchrefract.draw_operators import (
     words_of_keys,
     words_of_range,
 )
-from torchrefract.threefry import WORD, rounds
+from torchrefract.threefry import WORD, Words, rounds
 from torchrefract.types import Range
 
 LARGEST_NORMAL = 5.8  # in magnitude

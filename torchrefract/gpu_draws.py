@@ -1,7 +1,7 @@
 """The keyed random numbers on a GPU: operators that compilers see into, each of them a kernel of Triton."""
 
-# pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportOptionalMemberAccess=false
-# Triton has a language of its own, which only looks like Python.
+# Triton has a language of its own, which only looks like Python, so types are checked but for these two rules:
+# pyright: reportGeneralTypeIssues=false, reportArgumentType=false
 
 import torch
 import triton
@@ -9,7 +9,8 @@ import triton.language as tl
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
-_Words = tuple[Tensor, Tensor]
+from torchrefract.threefry import Words, empty_words
+
 _BLOCK = 128  # numbers that one program makes
 
 
@@ -86,18 +87,18 @@ def _round(x, y, rotation: tl.constexpr):
 
 
 @triton_op("torchrefract::gpu_words_of_range", mutates_args={})
-def _gpu_words_of_range(seed: Tensor, start: int, stop: int) -> _Words:
+def _gpu_words_of_range(seed: Tensor, start: int, stop: int) -> Words:
     return _gpu_words(seed, seed, start, stop - start, given=False)
 
 
 @triton_op("torchrefract::gpu_words_of_keys", mutates_args={})
-def _gpu_words_of_keys(seed: Tensor, keys: Tensor) -> _Words:
+def _gpu_words_of_keys(seed: Tensor, keys: Tensor) -> Words:
     return _gpu_words(seed, keys, 0, len(keys), given=True)
 
 
 @triton_op("torchrefract::gpu_words_under", mutates_args={})
-def _gpu_words_under(high: Tensor, low: Tensor, first: int, second: int) -> _Words:
-    found = _pair(high, len(high))
+def _gpu_words_under(high: Tensor, low: Tensor, first: int, second: int) -> Words:
+    found = empty_words(high, len(high))
     # As signed words: PyTorch 2.11 compiles no larger numbers.
     signed = ((word + 2**31) % 2**32 - 2**31 for word in (first, second))
     kernel = wrap_triton(words_under)
@@ -113,12 +114,8 @@ def _gpu_uniforms(high: Tensor, low: Tensor, lane: int, count: int) -> Tensor:
     return out
 
 
-def _gpu_words(seed: Tensor, keys: Tensor, start: int, count: int, *, given: bool) -> _Words:
-    found = _pair(seed, count)
+def _gpu_words(seed: Tensor, keys: Tensor, start: int, count: int, *, given: bool) -> Words:
+    found = empty_words(seed, count)
     kernel = wrap_triton(words_of)
     kernel[(-(-count // _BLOCK),)](seed, keys, start, *found, count, given=given, block=_BLOCK)
     return found
-
-
-def _pair(like: Tensor, count: int) -> _Words:
-    return like.new_empty(count, dtype=torch.int64), like.new_empty(count, dtype=torch.int64)

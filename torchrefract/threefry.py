@@ -11,12 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+Words = tuple[Tensor, Tensor]
 WORD = 0xFFFFFFFF
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
 
 
-def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def threefry(key: Words, counter: Words) -> Words:
     """Two words for each counter under each key, all of them int64 tensors in [0, 2^32) that broadcast."""
     try:
         arrays = [value.numpy() for value in (*key, *counter)]
@@ -40,3 +41,8 @@ def rounds(key0: Any, key1: Any, counter0: Any, counter1: Any) -> tuple[Any, Any
         x = (x + keys[(group + 1) % 3]) & WORD
         y = y + keys[(group + 2) % 3] + group + 1
     return x, y & WORD
+
+
+def empty_words(like: Tensor, count: int) -> Words:
+    """Room for the two words of each sample, (count,), int64, where a tensor is."""
+    return like.new_empty(count, dtype=torch.int64), like.new_empty(count, dtype=torch.int64)

@@ -99,7 +99,8 @@ def test_flows_on_a_gpu_keep_all_digits_whatever_products_a_training_asks_for(na
 
 
 @on_a_gpu
-@pytest.mark.filterwarnings("default")  # compilers warn, of their own code too
+@pytest.mark.filterwarnings("ignore:TensorFloat32 tensor cores:UserWarning")  # inductor's advice, not taken on purpose
+@pytest.mark.filterwarnings("ignore:.torch.jit.script_method. is deprecated:DeprecationWarning")  # PyTorch's own code
 def test_a_compiled_effect_on_a_gpu_is_the_eager_one():
     effect, image = drawn("lens")[0], torch.rand(4, 3, 270, 480, device="cuda")
     compiled = torch.compile(effect, fullgraph=True)

@@ -186,9 +186,9 @@ def moving(
 
 def looked_up(image: Tensor, path: Flow | Positions, active: Tensor, params: Any, **options: Any) -> Tensor:
     """The image (N, C, H, W) along a path; samples that are not active, (N,), bool, bit for bit as they are."""
-    if learns(params) or is_true(active.all, of=active) is not None:
+    if learns(params):
         return only(look_up(image, path, **options), image, active, params)
-    return look_up(image, path, active=active, **options)
+    return look_up(image, path, active=None if is_true(active.all, of=active) else active, **options)
 
 
 def sees(good: Tensor, flow: Tensor) -> Tensor:

@@ -75,7 +75,7 @@ def _system_of(points: Tensor, smoothing: Tensor) -> _System:
     if points.numel() > _FEW_POINTS or learns(values) or any(map(withheld, values)):
         return _made_system(points, smoothing)
     # Drawn plates have the same points in every frame.
-    return _kept_system(tuple(points.shape), *(value.detach().numpy().tobytes() for value in values))
+    return _kept_system(tuple(points.shape), *(value.numpy().tobytes() for value in values))
 
 
 @lru_cache(maxsize=16)
@@ -200,7 +200,7 @@ def _filled(values: Sequence[Tensor], dtype: torch.dtype, *, again: bool) -> Ten
     """The flow by a kernel; the places are the last two."""
     batch, (rows, columns) = len(values[0]), (values[4].shape[1], values[3].shape[2])
     out = values[0].new_empty(batch, 2, rows, columns, dtype=dtype)
-    points, weights, affine, x, y = (np.ascontiguousarray(value.detach().numpy()) for value in values)
+    points, weights, affine, x, y = (np.ascontiguousarray(value.numpy()) for value in values)
     x, y = x.reshape(-1, columns), y.reshape(-1, rows)
     kept = again and points.shape[1] * rows * columns <= _MOST_KEPT
     if kept and batch > 0 and all((own == own[0]).all() for own in (points, x, y)):

@@ -1,7 +1,7 @@
 """A look-up along a flow on a lattice as one kernel of Triton: no grid of the frame's size is written."""
 
-# pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportOptionalMemberAccess=false
-# Triton has a language of its own, which only looks like Python.
+# Triton has a language of its own, which only looks like Python, so types are checked but for these two rules:
+# pyright: reportGeneralTypeIssues=false, reportArgumentType=false
 
 from typing import Any, cast
 
@@ -18,7 +18,7 @@ from torchrefract.warping.grid_sample import PADDINGS, gradients_by_grid_sample
 from torchrefract.warping.lattice import FARTHEST
 from torchrefract.warping.sums import matrix_of
 
-ROWS, COLUMNS = 16, 128  # of pixels that one program looks up
+_ROWS, _COLUMNS = 16, 128  # of pixels that one program looks up
 
 
 @triton.jit
@@ -85,7 +85,7 @@ def look_up_lattice(
     over_u, over_v = (), ()
     for tap in tl.static_range(taps):
         over_u = over_u + (tl.load(by + tap, inside, 0.0),)  # noqa: RUF005 - Triton knows no unpacking
-        over_v = over_v + (tl.load(by + stride * taps + tap, inside, 0.0),)  # noqa: RUF005
+        over_v = over_v + (tl.load(by + stride * taps + tap, inside, 0.0),)  # noqa: RUF005 - as above
     known_u, known_v = (), ()
     for line in tl.static_range(taps):
         u = tl.zeros((columns,), tl.float32)
@@ -95,8 +95,8 @@ def look_up_lattice(
             first_node = tl.load(node, inside, 0.0)
             u += over_u[tap] * first_node
             v += over_v[tap] * (first_node if shared else tl.load(node + other_step, inside, 0.0))
-        known_u = known_u + (u,)  # noqa: RUF005
-        known_v = known_v + (v,)  # noqa: RUF005
+        known_u = known_u + (u,)  # noqa: RUF005 - as above
+        known_v = known_v + (v,)  # noqa: RUF005 - as above
 
     for own_row in range(place, last):
         y = cell * stride + own_row
@@ -162,17 +162,11 @@ def _padded(place, size, padding: tl.constexpr):
 def _look_up_lattice(
     source: Tensor, nodes: Tensor, across: Tensor, down: Tensor, active: Tensor | None, padding: int
 ) -> Tensor:
-    return _filled(wrap_triton(look_up_lattice), source, nodes, across, down, active, padding)
-
-
-def _filled(
-    kernel: Any, source: Tensor, nodes: Tensor, across: Tensor, down: Tensor, active: Tensor | None, padding: int
-) -> Tensor:
     out = torch.empty_like(source)
     batch, channels, height, width = source.shape
     _, stride, taps = across.shape
-    cells, parts = -(-height // stride), -(-stride // ROWS)
-    kernel[(-(-width // COLUMNS), cells * parts, batch)](
+    cells, parts = -(-height // stride), -(-stride // _ROWS)
+    wrap_triton(look_up_lattice)[(-(-width // _COLUMNS), cells * parts, batch)](
         source,
         out,
         nodes,
@@ -191,9 +185,9 @@ def _filled(
         shared=nodes.shape[1] == 1,
         gated=active is not None,
         padding=padding,
-        rows=ROWS,
-        columns=COLUMNS,
-        num_warps=COLUMNS // 32,
+        rows=_ROWS,
+        columns=_COLUMNS,
+        num_warps=_COLUMNS // 32,
     )
     return out
 

@@ -87,6 +87,11 @@ def _all(builder: Any, flags: Any) -> Any:
     return builder.icmp_unsigned("==", builder.bitcast(flags, bits), ir.Constant(bits, -1))
 
 
+def _any(builder: Any, flags: Any) -> Any:
+    bits = ir.IntType(LANES)
+    return builder.icmp_unsigned("!=", builder.bitcast(flags, bits), ir.Constant(bits, 0))
+
+
 def _floor(builder: Any, value: Any) -> Any:
     return _call(builder, f"llvm.floor.v{LANES}f32", value.type, value)
 
@@ -134,6 +139,7 @@ equal = _operation(lambda builder, a, b: builder.icmp_signed("==", a, b), Flags,
 either = _operation(lambda builder, a, b: builder.or_(a, b), Flags, Flags, Flags)
 both = _operation(lambda builder, a, b: builder.and_(a, b), Flags, Flags, Flags)
 everywhere = _operation(_all, types.boolean, Flags)
+anywhere = _operation(_any, types.boolean, Flags)
 where = _operation(lambda builder, flag, a, b: builder.select(flag, a, b), Floats, Flags, Floats, Floats)
 # The numbers at places of two registers that follow one another; places are in [0, 2 LANES).
 pick = _operation(_picked, Floats, Floats, Floats, Wholes)
@@ -177,7 +183,7 @@ def load_pairs(_: Any, values: Any, place: Any, apart: Any) -> Any:
     """Two Floats: for each lane a number of an array, (n,), and the next one, so far from a place on, Wholes."""
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        one, two = (_concatenated(builder, own) for own in _loaded_apart(context, builder, signature, given, 2))
+        one, two = (_concatenated(builder, own) for own in _loaded_apart(context, builder, signature, given))
         found = [_each_four(builder, one, two, (k, k + 2, k + 4, k + 6)) for k in range(2)]
         return context.make_tuple(builder, signature.return_type, [_as_floats(builder, own) for own in found])
 
@@ -185,19 +191,29 @@ def load_pairs(_: Any, values: Any, place: Any, apart: Any) -> Any:
 
 
 @_intrinsic
-def load_fours(_: Any, values: Any, place: Any, apart: Any) -> Any:
-    """Four Floats: the same with the three next ones."""
+def sums_of_eights(_: Any, values: Any, places: Any, weights: Any, own: Any, line: Any, apart: Any) -> Any:
+    """Eight Floats, with 8 lanes: of each lane the sum of four lines of eight numbers in a row, as often as it weighs.
+
+    values: (n,), float32, of which each line begins `line` behind the one before.
+    places: (m,), int32, where the first of them begin, of the first lane at `own`.
+    weights: (k,), float32, likewise of the first line, those of each more `apart` behind.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        a, b, c, d = (_concatenated(builder, own) for own in _loaded_apart(context, builder, signature, given, 4))
+        data, starts, factors = (_address(context, builder, signature.args[i], given[i]) for i in range(3))
         found = list[Any]()
-        for low in (0, 2):
-            order = low, low + 4, low + 1, low + 5
-            first, second = _each_four(builder, a, b, order), _each_four(builder, c, d, order)
-            found += [_each_four(builder, first, second, own) for own in ((0, 1, 4, 5), (2, 3, 6, 7))]
-        return context.make_tuple(builder, signature.return_type, [_as_floats(builder, own) for own in found])
+        for i in range(LANES):
+            at = builder.add(given[3], ir.Constant(given[3].type, i))
+            begin, total = builder.gep(data, [builder.load(builder.gep(starts, [at]))]), None
+            for _line in range(4):
+                weight = _spread(builder, builder.load(builder.gep(factors, [at])))
+                eight = _unaligned(builder, begin, LANES)
+                total = builder.fmul(weight, eight) if total is None else _fma(builder, weight, eight, total)
+                begin, at = builder.gep(begin, [given[4]]), builder.add(at, given[5])
+            found.append(total)
+        return context.make_tuple(builder, signature.return_type, _transposed(builder, found))
 
-    return types.UniTuple(Floats, 4)(values, _INDEX, Wholes), generate
+    return types.UniTuple(Floats, 8)(values, places, weights, _INDEX, _INDEX, _INDEX), generate
 
 
 @_intrinsic
@@ -223,11 +239,21 @@ def store_three(_: Any, values: Any, place: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 @_intrinsic
+def store_wholes(_: Any, values: Any, place: Any, lanes: Any) -> Any:
+    """Write Wholes to an array, (n,), of int32, from a place on."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return _written(context, builder, _address(context, builder, signature.args[0], *given[:2]), given[2])
+
+    return types.void(values, _INDEX, Wholes), generate
+
+
+@_intrinsic
 def fetch(_: Any, values: Any, place: Any) -> Any:
     """Have the processor bring a place of an array, (n,), near, which is soon to be read."""
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        at = builder.bitcast(_address(context, builder, signature, given), _BYTE.as_pointer())
+        at = builder.bitcast(_address(context, builder, signature.args[0], *given), _BYTE.as_pointer())
         read, often, data = (ir.Constant(_WHOLE, number) for number in (0, 3, 1))
         _call(builder, "llvm.prefetch.p0", ir.VoidType(), at, read, often, data)
         return context.get_dummy_value()
@@ -239,31 +265,31 @@ def _order(places: Any) -> ir.Constant:
     return ir.Constant(ir.VectorType(_WHOLE, len(places)), list(places))
 
 
-def _address(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-    array = context.make_array(signature.args[0])(context, builder, given[0])
-    return builder.gep(array.data, [given[1]])
+def _address(context: Any, builder: Any, kind: Any, array: Any, place: Any = None) -> Any:
+    data = context.make_array(kind)(context, builder, array).data
+    return data if place is None else builder.gep(data, [place])
 
 
 def _loaded(context: Any, builder: Any, signature: Any, given: Any, count: int) -> Any:
-    at = _address(context, builder, signature, given)
+    return _unaligned(builder, _address(context, builder, signature.args[0], *given[:2]), count)
+
+
+def _unaligned(builder: Any, at: Any, count: int) -> Any:
+    """So many numbers; arrays may begin anywhere."""
     found = builder.load(builder.bitcast(at, ir.VectorType(at.type.pointee, count).as_pointer()))
-    found.align = 1  # arrays may begin anywhere
+    found.align = 1
     return found
 
 
-def _loaded_apart(context: Any, builder: Any, signature: Any, given: Any, count: int) -> list[list[Any]]:
-    """So many numbers for each lane, as they make registers that have four numbers of each lane or pair in a row.
-
-    Of four lanes in a row the first are in the first of these registers.
-    """
-    at = _address(context, builder, signature, given)
-    kind, found = ir.VectorType(at.type.pointee, count).as_pointer(), list[Any]()
+def _loaded_apart(context: Any, builder: Any, signature: Any, given: Any) -> list[list[Any]]:
+    """Two numbers for each lane: those of the first two of each four lanes, and those of the last two."""
+    at = _address(context, builder, signature.args[0], *given[:2])
+    found = list[Any]()
     for i in range(LANES):
         place = builder.sext(builder.extract_element(given[2], ir.Constant(_WHOLE, i)), ir.IntType(64))
-        found.append(builder.load(builder.bitcast(builder.gep(at, [place]), kind)))
-        found[-1].align = 1
-    fours, own = range(0, LANES, 4), 4 // count
-    return [[found[four + i + k] for four in fours for k in range(own)] for i in range(0, 4, own)]
+        found.append(_unaligned(builder, builder.gep(at, [place]), 2))
+    fours = range(0, LANES, 4)
+    return [[found[four + i + k] for four in fours for k in range(2)] for i in (0, 2)]
 
 
 def _concatenated(builder: Any, parts: list[Any]) -> Any:
@@ -280,9 +306,26 @@ def _each_four(builder: Any, a: Any, b: Any, order: tuple[int, ...]) -> Any:
     return builder.shuffle_vector(a, b, _order(places))
 
 
+def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
+    """Eight registers of 8 numbers: the first of all, the second of all, ..."""
+    halves = list[list[Any]]()
+    for four in (rows[:4], rows[4:]):
+        low, high = (
+            [_each_four(builder, *four[i : i + 2], order) for i in (0, 2)] for order in ((0, 4, 1, 5), (2, 6, 3, 7))
+        )
+        halves.append(
+            [_each_four(builder, *own, order) for own in (low, high) for order in ((0, 1, 4, 5), (2, 3, 6, 7))]
+        )
+    orders = (0, 1, 2, 3, 8, 9, 10, 11), (4, 5, 6, 7, 12, 13, 14, 15)
+    return [builder.shuffle_vector(a, b, _order(order)) for order in orders for a, b in zip(*halves, strict=True)]
+
+
 def _stored(context: Any, builder: Any, signature: Any, given: Any, lanes: Any) -> Any:
-    at = _address(context, builder, signature, given)
-    values = lanes if at.type.pointee == _FLOAT else _as_bytes(builder, lanes)
+    at = _address(context, builder, signature.args[0], *given)
+    return _written(context, builder, at, lanes if at.type.pointee == _FLOAT else _as_bytes(builder, lanes))
+
+
+def _written(context: Any, builder: Any, at: Any, values: Any) -> Any:
     written = builder.store(values, builder.bitcast(at, values.type.as_pointer()))
     written.align = 1
     return context.get_dummy_value()

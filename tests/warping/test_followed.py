@@ -153,7 +153,7 @@ def test_what_is_asked_for_is_made_once(monkeypatch):
 
 def test_what_lies_anywhere_in_memory_is_not_read():
     flow = smooth(1, 12).dense().float().mT
-    with pytest.raises(ValueError, match="values must have the planes of a row one after the other, got strides"):
+    with pytest.raises(ValueError, match="values must have the planes of a row in one piece, got strides"):
         of_readings([flow], [0], far=[4.0], size=SIZE)
     # What is made of a flow lies as it has to.
     last = smooth(2, 12, height=SIZE[1], width=SIZE[0])

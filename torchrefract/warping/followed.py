@@ -164,15 +164,17 @@ def of_readings(flows: Sequence[Tensor], strides: Sequence[int], *, far: Sequenc
         far: where sums lie within, in the sampler's coordinates.
         size: px, height and width of the frame.
     """
-    addresses = np.array([_addresses(values) for values in flows], np.uint64)
+    addresses = np.array([_addresses(*own) for own in zip(flows, strides, strict=True)], np.uint64)
     table = np.array([(*values.shape[2:], stride) for values, stride in zip(flows, strides, strict=True)])
     return addresses.T.copy(), table, np.array(far, np.float32), size
 
 
-def _addresses(values: Tensor) -> list[int]:
+def _addresses(values: Tensor, px: int) -> list[int]:
     """Where the values of each row begin."""
-    if not values[:1].is_contiguous():
-        raise ValueError(f"values must have the planes of a row one after the other, got strides {values.stride()}")
+    form = _form() if px else torch.contiguous_format
+    if not values[:1].is_contiguous(memory_format=form):
+        own = "both numbers of a node together" if form is torch.channels_last else "the planes of a row in one piece"
+        raise ValueError(f"values must have {own}, got strides {values.stride()}")
     apart = values.stride(0) * values.element_size()
     return [values.data_ptr() + i * apart for i in range(len(values))]
 
@@ -188,7 +190,13 @@ def _in_memory(flow: Read) -> tuple[Tensor, int]:
     if not isinstance(flow, SmoothFlow) or isinstance(flow, StreamFlow):
         return _at_pixels(flow), 0
     few = max(0, _WIDEST - flow.nodes.shape[3])
-    return once(flow, lambda own: F.pad(own.nodes, (0, few)).contiguous()), flow.lattice.stride
+    return once(flow, lambda own: F.pad(own.nodes, (0, few)).contiguous(memory_format=_form())), flow.lattice.stride
+
+
+def _form() -> torch.memory_format:
+    """How kernels have nodes."""
+    together = compiled.kernels("warping.kernels.following_pixels").TOGETHER
+    return torch.channels_last if together else torch.contiguous_format
 
 
 def _far(flow: Read) -> float:

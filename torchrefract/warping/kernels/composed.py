@@ -15,7 +15,7 @@ import numpy as np
 from torchrefract._jit import floats_at, fma, inlined, jit
 from torchrefract._lanes import LANES
 from torchrefract.warping.kernels.across import GROUP, Across, along_every_second, nodes_across
-from torchrefract.warping.kernels.following import Addresses, follow_one, follow_row
+from torchrefract.warping.kernels.following import Addresses, follow_one, follow_row, room_beside
 from torchrefract.warping.kernels.pixels import Cells, Floats, Frame, Whole
 from torchrefract.warping.kernels.places import along_lattice, room
 
@@ -40,7 +40,7 @@ def compose(last: Last, earlier: Earlier, every: int, start: int, stop: int, out
     lines, flows, weight, base_x, base_y = last
     addresses, table, far, frame = earlier
     rows, columns = out.shape[2:]
-    cells, more = room(), np.empty((4, columns), np.float32)
+    cells, more = room(), room_beside(columns)
     for row in range(start, stop):
         i, line = divmod(row, rows)
         x, y = out[i, 0, line], out[i, 1, line]
@@ -69,6 +69,8 @@ def along_followed(
     low, high = min(width, _SIDES * -(-low // _SIDES)), max(0, width - _SIDES * -(-(width - high) // _SIDES))
     low, high = (low, high) if low < high else (width, width)
     count = low + width - high
+    if count == 0:
+        return
     side_x, side_y = sides[0, :count], sides[1, :count]
     own = lines[flows[pair]]
     along_lattice(own, weight, base_x, base_y, line, side_x[:low], side_y[:low])
@@ -84,8 +86,7 @@ def along_followed(
 def room_for(known: Known, width: int) -> Room:
     """To work in, for rows of so many pixels."""
     between = np.zeros((2, known[0].shape[3] + 2 * GROUP + 1), np.float32)
-    sides, more = np.empty((2, width), np.float32), np.empty((4, width), np.float32)
-    return nodes_across(known[2], width), between, sides, room(), more
+    return nodes_across(known[2], width), between, np.empty((2, width), np.float32), room(), room_beside(width)
 
 
 @inlined

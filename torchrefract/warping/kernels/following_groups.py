@@ -1,7 +1,5 @@
 """What numba compiles: the same as `following_pixels`, LANES pixels at once and to its bits."""
 
-from typing import Any
-
 import numpy as np
 
 from torchrefract import _lanes as lanes
@@ -9,11 +7,15 @@ from torchrefract._jit import inlined, jit
 from torchrefract._lanes import LANES
 from torchrefract.warping.kernels import following_pixels, pixels
 from torchrefract.warping.kernels.groups import AHEAD, BEFORE, MOST_ROWS, weights_of
+from torchrefract.warping.kernels.lane_weights import Four, Lanes, cubic_weights, moved, to_pixels
 from torchrefract.warping.kernels.pixels import Cells, Floats, Frame, Number, Whole
 
-Lanes = Any
+if following_pixels.TOGETHER:
+    from torchrefract.warping.kernels.following_nodes import follow_nodes
+else:
+    follow_nodes = following_pixels.follow_one
+
 Read = tuple[bool, Lanes, Lanes]
-Four = tuple[Lanes, Lanes, Lanes, Lanes]
 
 
 @jit
@@ -29,6 +31,9 @@ def follow_one(
 ) -> None:
     """As `following_pixels.follow_one`."""
     rows, columns, stride = place
+    if stride and following_pixels.TOGETHER:
+        follow_nodes(x, y, flow, place, far, frame, cells, more)
+        return
     if x.size < LANES or columns < 2 * LANES:
         following_pixels.follow_one(x, y, flow, place, far, frame, cells, more)
         return
@@ -39,10 +44,8 @@ def follow_one(
         at_x, at_y = lanes.load(x, np.uintp(start)), lanes.load(y, np.uintp(start))
         if start < first:
             at_x, at_y = last_x, last_y
-        place_x, place_y = _to_pixels(at_x, frame[1]), _to_pixels(at_y, frame[0])
-        if stride and LANES == 8:
-            known, u, v = _between_own(flow, rows, columns, stride, place_x, place_y)
-        elif stride:
+        place_x, place_y = to_pixels(at_x, frame[1]), to_pixels(at_y, frame[0])
+        if stride:
             known, u, v = _between(flow, rows, columns, stride, place_x, place_y)
         else:
             known, u, v = _read(flow, rows, columns, place_x, place_y)
@@ -51,23 +54,8 @@ def follow_one(
             lanes.store(more[1], np.uintp(start), place_y)
             _read_apart(flow, place, start, cells, more, x, y)
             u, v = lanes.load(x, np.uintp(start)), lanes.load(y, np.uintp(start))
-        lanes.store(x, np.uintp(start), _moved(at_x, u, frame[1], far))
-        lanes.store(y, np.uintp(start), _moved(at_y, v, frame[0], far))
-
-
-@inlined
-def _to_pixels(place: Lanes, size: int) -> Lanes:
-    """From the sampler's coordinates to px, on a frame of so many."""
-    one, scale = lanes.all_floats(np.float32(1)), lanes.all_floats(np.float32(size / 2))
-    at = lanes.fma(lanes.total(place, one), scale, lanes.all_floats(np.float32(-0.5)))
-    return lanes.lower(lanes.higher(at, lanes.all_floats(np.float32(0))), lanes.all_floats(np.float32(size - 1)))
-
-
-@inlined
-def _moved(place: Lanes, by: Lanes, size: int, far: Number) -> Lanes:
-    """The place in the sampler's coordinates, moved by so many px."""
-    at = lanes.total(place, lanes.product(by, lanes.all_floats(np.float32(2 / size))))
-    return lanes.higher(lanes.lower(at, lanes.all_floats(far)), lanes.all_floats(-far))
+        lanes.store(x, np.uintp(start), moved(at_x, u, frame[1], far))
+        lanes.store(y, np.uintp(start), moved(at_y, v, frame[0], far))
 
 
 @inlined
@@ -131,73 +119,39 @@ def _between(flow: Floats, rows: int, columns: int, stride: int, x: Lanes, y: La
     first, last = lanes.smallest(row), min(rows, lanes.largest(row) + 4)
     if last - first > MOST_ROWS:
         return False, u, v
-    across, down = _cubic_weights(lanes.difference(x, left)), _cubic_weights(lanes.difference(y, top))
+    across, down = cubic_weights(lanes.difference(x, left)), cubic_weights(lanes.difference(y, top))
     one = lanes.all_wholes(np.int32(1))
     second = lanes.plus(column, one)
     third = lanes.plus(second, one)
     places = column, second, third, lanes.plus(third, one)
     at, plane = at + first * columns, rows * columns
+    of_u = of_v = zero, zero, zero, zero
     for line in range(first, last):
         behind = lanes.minus(lanes.all_wholes(np.int32(line)), row)
         weight = lanes.where(lanes.equal(behind, lanes.all_wholes(np.int32(0))), down[0], zero)
         weight = lanes.where(lanes.equal(behind, one), down[1], weight)
         weight = lanes.where(lanes.equal(behind, lanes.all_wholes(np.int32(2))), down[2], weight)
         weight = lanes.where(lanes.equal(behind, lanes.all_wholes(np.int32(3))), down[3], weight)
-        u = lanes.fma(weight, _along(flow, at, places, across), u)
-        v = lanes.fma(weight, _along(flow, at + plane, places, across), v)
+        of_u, of_v = _added_four(of_u, flow, at, places, weight), _added_four(of_v, flow, at + plane, places, weight)
         at += columns
-    return True, u, v
+    return True, _across(of_u, across), _across(of_v, across)
 
 
 @inlined
-def _between_own(flow: Floats, rows: int, columns: int, stride: int, x: Lanes, y: Lanes) -> Read:
-    """The same, each lane by loads of its own."""
-    share = lanes.all_floats(np.float32(1 / stride))
-    x, y = lanes.product(x, share), lanes.product(y, share)
-    left, top = lanes.floor(x), lanes.floor(y)
-    column = lanes.smaller(lanes.to_wholes(left), lanes.all_wholes(np.int32(columns - 4)))
-    row = lanes.smaller(lanes.to_wholes(top), lanes.all_wholes(np.int32(rows - 4)))
-    across, down = _cubic_weights(lanes.difference(x, left)), _cubic_weights(lanes.difference(y, top))
-    places = lanes.plus(lanes.times(row, lanes.all_wholes(np.int32(columns))), column)
-    u = v = lanes.all_floats(np.float32(0))
-    for line in range(4):
-        u = lanes.fma(down[line], _along_own(flow, line * columns, places, across), u)
-        v = lanes.fma(down[line], _along_own(flow, (rows + line) * columns, places, across), v)
-    return True, u, v
-
-
-@inlined
-def _along_own(flow: Floats, at: int, places: Lanes, weights: Four) -> Lanes:
-    a, b, c, d = lanes.load_fours(flow, np.uintp(at), places)
-    total = lanes.fma(weights[1], b, lanes.product(weights[0], a))
-    return lanes.fma(weights[3], d, lanes.fma(weights[2], c, total))
-
-
-@inlined
-def _along(flow: Floats, at: int, places: Four, weights: Four) -> Lanes:
+def _added_four(totals: Four, flow: Floats, at: int, places: Four, weight: Lanes) -> Four:
     low, high = lanes.load(flow, np.uintp(at)), lanes.load(flow, np.uintp(at + LANES))
-    total = lanes.product(weights[0], lanes.pick(low, high, places[0]))
-    total = lanes.fma(weights[1], lanes.pick(low, high, places[1]), total)
-    total = lanes.fma(weights[2], lanes.pick(low, high, places[2]), total)
-    return lanes.fma(weights[3], lanes.pick(low, high, places[3]), total)
+    return (
+        lanes.fma(weight, lanes.pick(low, high, places[0]), totals[0]),
+        lanes.fma(weight, lanes.pick(low, high, places[1]), totals[1]),
+        lanes.fma(weight, lanes.pick(low, high, places[2]), totals[2]),
+        lanes.fma(weight, lanes.pick(low, high, places[3]), totals[3]),
+    )
 
 
 @inlined
-def _cubic_weights(t: Lanes) -> Four:
-    """As `following_pixels.cubic_weights`."""
-    one = lanes.all_floats(np.float32(1))
-    before, behind = lanes.total(t, one), lanes.difference(t, one)
-    last = lanes.difference(t, lanes.all_floats(np.float32(2)))
-    inner = lanes.product(lanes.all_floats(np.float32(0.5)), lanes.product(before, last))
-    outer = lanes.product(lanes.all_floats(np.float32(1 / 6)), lanes.product(t, behind))
-    minus = lanes.all_floats(np.float32(-1))
-    negative = lanes.product(minus, outer), lanes.product(minus, inner)
-    return (
-        lanes.product(negative[0], last),
-        lanes.product(inner, behind),
-        lanes.product(negative[1], t),
-        lanes.product(outer, before),
-    )
+def _across(found: Four, weights: Four) -> Lanes:
+    total = lanes.fma(weights[1], found[1], lanes.product(weights[0], found[0]))
+    return lanes.fma(weights[3], found[3], lanes.fma(weights[2], found[2], total))
 
 
 @inlined

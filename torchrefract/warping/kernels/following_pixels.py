@@ -3,6 +3,7 @@
 import numpy as np
 
 from torchrefract._jit import fma, inlined, jit
+from torchrefract._lanes import LANES
 from torchrefract.warping.kernels.pixels import (
     BORDER,
     Cells,
@@ -16,6 +17,8 @@ from torchrefract.warping.kernels.pixels import (
 from torchrefract.warping.kernels.places import within
 
 Four = tuple[Number, Number, Number, Number]
+TOGETHER = LANES == 8  # lie both numbers of a node, of flows on a lattice: one load takes those of four nodes
+FEWEST = 256  # columns of `more`
 _ONE, _TWO, _HALF, _SIXTH = np.float32(1), np.float32(2), np.float32(0.5), np.float32(1 / 6)
 
 
@@ -54,19 +57,28 @@ def between(flow: Floats, rows: int, columns: int, stride: int, x: Number, y: Nu
     left, top = np.floor(x), np.floor(y)
     across, down = cubic_weights(x - left), cubic_weights(y - top)
     at = min(int(top), rows - 4) * columns + min(int(left), columns - 4)
-    u = v = np.float32(0)
-    for line in range(4):
-        u = fma(down[line], _along(flow, at, across), u)
-        v = fma(down[line], _along(flow, at + rows * columns, across), v)
-        at += columns
-    return u, v
+    step, plane = (2, 1) if TOGETHER else (1, rows * columns)
+    u = _between_four(flow, step * at, step, columns * step, across, down)
+    return u, _between_four(flow, step * at + plane, step, columns * step, across, down)
 
 
 @inlined
-def _along(flow: Floats, at: int, weights: Four) -> Number:
-    here = np.uintp(at)
-    total = fma(weights[1], flow[here + np.uintp(1)], weights[0] * flow[here])
-    return fma(weights[3], flow[here + np.uintp(3)], fma(weights[2], flow[here + np.uintp(2)], total))
+def _between_four(flow: Floats, at: int, step: int, line: int, across: Four, down: Four) -> Number:
+    """One plane, of which nodes and their rows lie so far apart."""
+    total = across[0] * _down(flow, at, line, down)
+    for tap in range(1, 4):
+        total = fma(across[tap], _down(flow, at + tap * step, line, down), total)
+    return total
+
+
+@inlined
+def _down(flow: Floats, at: int, line: int, weights: Four) -> Number:
+    here, apart = np.uintp(at), np.uintp(line)
+    total = weights[0] * flow[here]
+    for row in range(1, 4):
+        here += apart
+        total = fma(weights[row], flow[here], total)
+    return total
 
 
 @inlined

@@ -85,7 +85,7 @@ def _read_planes(source: Values, size: Size, x: Floats, y: Floats, cells: Cells,
 
 @inlined
 def _read_in_frame(source: Values, size: Size, x: Floats, y: Floats, apart: Apart, out: Values, first: int) -> int:
-    """Whole groups from a place on, up to the next one that takes pixels outside of the frame, or to the last."""
+    """Whole groups from a place on, up to the next one that the border of the frame goes through, or to the last."""
     channels, height, width, _ = size
     right, bottom = lanes.all_wholes(np.int32(width - 1)), lanes.all_wholes(np.int32(height - 1))
     wide = lanes.all_wholes(np.int32(width))
@@ -94,7 +94,12 @@ def _read_in_frame(source: Values, size: Size, x: Floats, y: Floats, apart: Apar
         left, top = lanes.floor(place_x), lanes.floor(place_y)
         column, row = lanes.to_wholes(left), lanes.to_wholes(top)
         if not lanes.everywhere(lanes.both(lanes.below(column, right), lanes.below(row, bottom))):
-            break
+            if not _is_outside(column, row, size):
+                break
+            for c in range(channels):
+                lanes.store(out, np.uintp(apart[2] + first + c * apart[1]), lanes.all_floats(np.float32(0)))
+            first += LANES
+            continue
         weights = weights_of(lanes.difference(place_x, left), lanes.difference(place_y, top))
         places = lanes.plus(lanes.times(row, wide), column)
         into, ahead = apart[2] + first, min(int(lanes.first(places)) + ROWS_AHEAD * width, height * width - 1)
@@ -114,6 +119,15 @@ def _read_in_frame(source: Values, size: Size, x: Floats, y: Floats, apart: Apar
                 lanes.store(out, np.uintp(into + c * apart[1]), found)
         first += LANES
     return first
+
+
+@inlined
+def _is_outside(column: Lanes, row: Lanes, size: Size) -> bool:
+    """Whether a group takes nothing from the frame."""
+    one = lanes.all_wholes(np.int32(1))
+    wide, tall = lanes.all_wholes(np.int32(size[2] + 1)), lanes.all_wholes(np.int32(size[1] + 1))
+    beside = lanes.both(lanes.below(lanes.plus(column, one), wide), lanes.below(lanes.plus(row, one), tall))
+    return not lanes.anywhere(beside)
 
 
 @inlined

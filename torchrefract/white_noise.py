@@ -16,6 +16,8 @@ from torchrefract._threads import share
 _WORD = 0xFFFFFFFF
 # Odd constants of the hash, as int32: 2^32 over the golden ratio, and the two of lowbias32.
 HASH = (0x9E3779B1 - 2**32, 0x7FEB352D, 0x846CA68B - 2**32)
+_CONSTANTS = tuple(word % 2**32 for word in HASH)
+_FEW = 1 << 11  # below so many a kernel's call costs more than it brings
 _CACHED = 1 << 17  # numbers that stay in a core's cache
 
 
@@ -77,36 +79,35 @@ def _lattice_list(key: Tensor, axes: list[Tensor], count: int) -> Tensor:
 
 
 def _noise(key: Tensor, count: int) -> Tensor:
-    words = key.to(torch.int32)[:, :, None].unbind(1)
+    words = key.to(torch.int32)
     at_once = max(1, _CACHED // max(1, len(key)) if key.device.type == "cpu" else count)
     bands = (_noise_between(words, start, min(start + at_once, count)) for start in range(0, max(1, count), at_once))
     return join(bands, dim=2, length=count)
 
 
-def _noise_between(words: tuple[Tensor, ...], start: int, end: int) -> Tensor:
-    return _pairs(words, torch.arange(start, end, dtype=torch.int32, device=words[0].device))
+def _noise_between(words: Tensor, start: int, end: int) -> Tensor:
+    return _pairs(words, torch.arange(start, end, dtype=torch.int32, device=words.device))
 
 
 def _noise_at(key: Tensor, places: Tensor) -> Tensor:
-    return _pairs(key.to(torch.int32)[:, :, None].unbind(1), places.to(torch.int32))
+    return _pairs(key.to(torch.int32), places.to(torch.int32))
 
 
-def _pairs(words: tuple[Tensor, ...], places: Tensor) -> Tensor:
+def _pairs(words: Tensor, places: Tensor) -> Tensor:
     uniform, angle = _hashed(words, places)
     radius = uniform.log_().mul_(-2).sqrt_()
     return torch.stack([angle.cos().mul_(radius), angle.sin_().mul_(radius)], dim=1)
 
 
-def _hashed(words: tuple[Tensor, ...], places: Tensor) -> tuple[Tensor, Tensor]:
-    """(B, n), uniform in (0, 1), and (B, n), angles, of keys of four words, (B, 1), at places, (n,), int32."""
-    a, b, c, d = words
-    if len(places) < SMALLEST or withheld(places) or withheld(a) or kernels("_jit") is None:
-        index = places * HASH[0]
+def _hashed(words: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+    """(B, n), uniform in (0, 1), and (B, n), angles, of keys of four words, (B, 4), at places, (n,), all int32."""
+    if len(places) < _FEW or withheld(places) or withheld(words) or kernels("_jit") is None:
+        (a, b, c, d), index = words[:, :, None].unbind(1), places * HASH[0]
         uniform = (_hash(index, a, b) >> 9).bitwise_and_(0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
         return uniform, _hash(index, c, d).float().mul_(math.pi * 2.0**-31)
-    uniform, angle = (torch.empty(len(a), len(places)) for _ in range(2))
-    keys, numbers = torch.cat(words, dim=1).numpy().view(np.uint32), places.contiguous().numpy().view(np.uint32)
-    work = partial(kernels("noise_kernel").hashed, keys, numbers, tuple(word % 2**32 for word in HASH))
+    uniform, angle = (torch.empty(len(words), len(places)) for _ in range(2))
+    keys, numbers = (own.contiguous().numpy().view(np.uint32) for own in (words, places))
+    work = partial(kernels("noise_kernel").hashed, keys, numbers, _CONSTANTS)
     share(lambda start, stop: work(start, stop, uniform.numpy(), angle.numpy()), len(places), least=SMALLEST)
     return uniform, angle
 

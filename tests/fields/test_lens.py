@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import warp
-from torchrefract.cameras.distortion import POLYNOMIAL12
-from torchrefract.fields.lens import folds_inside, frame_limit, lens_flow, lens_restore_flow
+from torchrefract.cameras.distortion import ALL_TERMS, POLYNOMIAL12, Terms
+from torchrefract.fields.lens import folds_inside, frame_limit, lens_flow, lens_restore_flow, smooth_lens_flow
 from torchrefract.warping.grid import inside
 
 BARREL = {"k1": -0.25, "k2": 0.09, "p1": 1e-3, "p2": -2e-3, "s1": 1e-3, "s2": -1e-3, "s3": 2e-3, "s4": 1e-3}
@@ -197,3 +197,28 @@ def test_image_gradients_are_those_of_finite_differences(field):
         return warp(image, field(c, f, p, height=4, width=6)[0], padding="border")[0]
 
     assert torch.autograd.gradcheck(warped, [image, *inputs])
+
+
+@pytest.mark.parametrize(
+    "terms",
+    [ALL_TERMS, Terms(6, False, False, False), Terms(2, False, False), Terms(3, True, False), Terms(0, False, True)],
+    ids=str,
+)
+@pytest.mark.parametrize("steps", [0, 1, 4])
+def test_nodes_by_a_kernel_are_those_of_newtons_steps(terms, steps, oracle):
+    random = torch.Generator().manual_seed(0)
+    sizes = 0.1 * torch.tensor([0.4, 0.1, 0.03, 0.01, 0.003, 0.001, 0.03, 0.03, 0.03, 0.01, 0.03, 0.01])
+    if not terms.tangential:
+        sizes[6:8] = 0  # such a plan has none
+    coefficients = sizes * torch.randn(5, 12, generator=random)
+    focal, center = 700 + 500 * torch.rand(5, 2, generator=random), 300 + 100 * torch.rand(5, 2, generator=random)
+    x, y = torch.arange(-64.0, 1216, 64).view(1, 1, 1, -1), torch.arange(-64.0, 832, 64).view(1, 1, -1, 1)
+    numbers = coefficients, focal, center, x, y
+    found = smooth_lens_flow(*numbers, steps=steps, terms=terms, large=True)
+    exact = smooth_lens_flow(*(own.double() for own in numbers), steps=steps, terms=terms, large=False)
+    oracle("nodes of lenses by a kernel", found, exact, 1e-3)
+    alone = smooth_lens_flow(coefficients[2:3], focal[2:3], center[2:3], x, y, steps=steps, terms=terms, large=True)
+    assert torch.equal(alone[0], found[2])
+    learning = coefficients.clone().requires_grad_()
+    by_steps = smooth_lens_flow(learning, *numbers[1:], steps=steps, terms=terms, large=True)
+    oracle("nodes of lenses by a kernel, Newton's steps", found, by_steps.detach(), 5e-4)

@@ -4,8 +4,7 @@ from scipy.interpolate import RBFInterpolator
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract.fields import spline as splines
-from torchrefract.fields.spline import check_points, evaluate_spline, fit_spline, spline_at, spline_flow
+from torchrefract.fields.spline import check_points, evaluate_spline, fit_spline, spline_flow
 
 HEIGHT, WIDTH = 1080, 1920
 
@@ -119,38 +118,6 @@ def test_a_kernel_gives_the_flow_of_pytorchs_operations(size, dtype, monkeypatch
     oracle(
         f"plates by a kernel, {dtype}", found, spline_flow(spline, **options), 1e-5 if dtype is torch.float32 else 1e-11
     )
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_what_is_kept_for_the_next_plates_changes_no_bit(dtype, monkeypatch):
-    points = random_points(16).expand(3, -1, -1)
-    moved = 10 * torch.randn(3, 16, 2, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
-    x, y = torch.arange(-5.0, 240, 5).view(1, 1, 1, -1), torch.arange(-3.0, 160, 3).view(1, 1, -1, 1)
-
-    def at(samples: slice, *, again: bool, others: bool = False) -> Tensor:
-        own = points.clone()
-        own[-1] += 7 * others  # one sample has other points
-        spline = fit_spline(own[samples], moved[samples], torch.zeros(3, dtype=torch.float64)[samples])
-        return spline_at(spline, x, y, dtype=dtype, again=again)
-
-    kept = what_is_asked(monkeypatch)
-    exact = at(slice(3), again=False)
-    assert not kept
-    for _ in range(2):
-        assert torch.equal(at(slice(3), again=True), exact)
-    assert torch.equal(at(slice(1, 2), again=True), exact[1:2])
-    assert len(kept) == 3
-    assert torch.equal(at(slice(3), again=True, others=True), at(slice(3), again=False, others=True))
-    monkeypatch.setattr("torchrefract.fields.spline._MOST_KEPT", 16 * x.numel() * y.numel() - 1)
-    assert torch.equal(at(slice(3), again=True), exact)
-    assert len(kept) == 3
-
-
-def what_is_asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bytes, ...]]:
-    """What is asked of what is kept."""
-    asked, kept = list[tuple[bytes, ...]](), splines._kept
-    monkeypatch.setattr(splines, "_kept", lambda *own: asked.append(own) or kept(*own))
-    return asked
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])

@@ -155,7 +155,7 @@ class DivergenceFree(LatticeWarp):
         # The psi of the exact flow has a row and a column of its own around the frame.
         rows, columns = ([place + 1 for place in axis] for axis in lattice.axes())
         drawn: Any = {"kind": self.covariance, "lengths": self.length_range, "nodes": None, "aperture": False}
-        psi = field_of_modes(params, modes, (rows, columns), **drawn)[:, :1]
+        psi = field_of_modes(params, modes, (rows, columns), **drawn, fields=1)
         scale = params.amplitude / curl_rms(params.length, self.covariance)
         return StreamFlow(column(spread(scale, psi.shape[0])) * psi, lattice)
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrefract import draws
 from torchrefract._checks import check_all, check_flag, check_range, check_within, is_true, read
+from torchrefract._compiled import SMALLEST
 from torchrefract._constants import constant
 from torchrefract.cameras.distortion import ALL_TERMS, POLYNOMIAL12
 from torchrefract.cameras.models import Camera
@@ -226,8 +227,9 @@ class LensDistortion(LatticeWarp):
         lattice = cast(Lattice, plan.lattice)
         x, y = lattice.places(dtype=params.focal.dtype, device=params.focal.device)
         terms = ALL_TERMS if params.coefficients.requires_grad else kept_terms(plan)
-        camera = in_px(params, lattice.height, lattice.width)
-        return SmoothFlow(smooth_lens_flow(*camera, x, y, steps=cast(int, plan.steps), terms=terms), lattice)
+        camera, large = in_px(params, lattice.height, lattice.width), lattice.height * lattice.width >= SMALLEST
+        flow = smooth_lens_flow(*camera, x, y, steps=cast(int, plan.steps), terms=terms, large=large)
+        return SmoothFlow(flow, lattice)
 
     def gated(self, params: LensParams, *, height: int, width: int, plan: Plan | None = None) -> Moved:
         """The flow, by its own plan or by one that is given; a lens that folds is told."""

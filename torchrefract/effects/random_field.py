@@ -88,6 +88,7 @@ def field_of_modes(
     lengths: Range,
     nodes: int | None,
     aperture: bool,
+    fields: int = 2,
 ) -> Tensor:
     """The fields of `random_field`, (B T, 2, n, m), of a few frequencies.
 
@@ -99,6 +100,7 @@ def field_of_modes(
         lengths: px, the range of correlation lengths.
         nodes: as for `low_eigenvalues`.
         aperture: whether the parameters have one.
+        fields: 2, or 1 for the first of them alone, (B T, 1, n, m).
     """
     dtype, rows = params.amplitude.dtype, params.frame.numel()
     noise = mode_noise(params.key, modes, dtype=dtype)
@@ -110,9 +112,9 @@ def field_of_modes(
     if kind == "gaussian":
         amplitude = mode_amplitude(modes, params.length, **shape, shortest=lengths[0])
         down, across = (spread(values, noise.shape[0]) for values in amplitude)
-        return mode_field(noise, (down, across), modes, *at)
+        return mode_field(noise, (down, across), modes, *at, fields=fields)
     amplitude = low_amplitude(modes, params.length, kind=kind, lengths=lengths, nodes=nodes, **shape)
-    return low_field(noise, spread(amplitude, noise.shape[0]), modes, *at)
+    return low_field(noise, spread(amplitude, noise.shape[0]), modes, *at)[:, :fields]
 
 
 def check_field_range(name: str, value: Range) -> Range:

@@ -12,6 +12,7 @@ from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.plan import FEW_ULPS, TOLERANCE_PX, Ask, Plan, lies_in
 from torchrefract.effects.plate_plan import plate_plan
+from torchrefract.fields.drawn_plates import drawn_plates
 from torchrefract.fields.spline import check_points, fit_spline, spline_at, spline_flow
 from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice, SmoothFlow
@@ -127,12 +128,14 @@ class ThinPlateSpline(LatticeWarp):
         return near.all() & displaced & lies_in(params.smoothing[:, None], [self.smoothing_range])
 
     def on_lattice(self, params: ThinPlateParams, plan: Plan) -> SmoothFlow:
-        """The flow of `spline_at`."""
+        """The flow of `drawn_plates`, or of `spline_at`."""
         lattice, dtype = cast(Lattice, plan.lattice), params.points.dtype
         # Those that such a plan is for are drawn ones.
-        spline = fit_spline(params.points, params.displacement, params.smoothing, checked=True)
+        numbers = params.points, params.displacement, params.smoothing
         x, y = lattice.places(dtype=torch.float64, device=params.points.device)
-        return SmoothFlow(spline_at(spline, x, y, dtype=dtype, again=True), lattice)
+        if (flow := drawn_plates(*numbers, x, y)) is None:
+            flow = spline_at(fit_spline(*numbers, checked=True), x, y, dtype=dtype)
+        return SmoothFlow(flow, lattice)
 
     def moves(self, params: ThinPlateParams) -> Tensor:
         """The samples with a displaced point."""

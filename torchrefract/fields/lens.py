@@ -3,8 +3,9 @@
 import torch
 from torch import Tensor
 
+from torchrefract import _compiled as compiled
 from torchrefract._bands import rows_at_once
-from torchrefract._checks import is_true
+from torchrefract._checks import is_true, learns
 from torchrefract._constants import constant
 from torchrefract.cameras.distortion import (
     Terms,
@@ -66,7 +67,7 @@ def lens_restore_flow(
 
 
 def smooth_lens_flow(
-    coefficients: Tensor, focal: Tensor, center: Tensor, x: Tensor, y: Tensor, *, steps: int, terms: Terms
+    coefficients: Tensor, focal: Tensor, center: Tensor, x: Tensor, y: Tensor, *, steps: int, terms: Terms, large: bool
 ) -> Tensor:
     """The flow of `lens_flow` at any places, for lenses that fold nowhere near, by so many Newton steps.
 
@@ -75,16 +76,30 @@ def smooth_lens_flow(
         x, y: (1, 1, 1, m) and (1, 1, n, 1), px.
         steps: of `newton_undistort`.
         terms: those to compute.
+        large: the frame is worth a kernel.
 
     Returns:
         (B, 2, n, m), px.
     """
+    values = coefficients, focal, center, x, y
+    if large and not learns(values) and not compiled.obstacle(*values):
+        out = coefficients.new_empty(len(coefficients), 2, y.shape[2], x.shape[3])
+        arrays = (own.contiguous().numpy() for own in (_kept(coefficients, terms), focal, center))
+        places = x.flatten().numpy(), y.flatten().numpy()
+        compiled.kernels("fields.kernels.lenses").smooth_flows(*arrays, *places, steps, out.numpy())
+        return out
     c = coefficients[:, :, None, None, None]
     x_d, y_d = axes_on_plane((x, y), focal, center)
     found_x, found_y = newton_undistort(x_d.detach(), y_d.detach(), c.detach(), steps=steps, terms=terms)
     if torch.is_grad_enabled() and (c.requires_grad or x_d.requires_grad):
         found_x, found_y = _attach(found_x, found_y, x_d, y_d, c, terms)
     return torch.cat([found_x - x_d, found_y - y_d], dim=1) * focal[:, :, None, None]
+
+
+def _kept(coefficients: Tensor, terms: Terms) -> Tensor:
+    """(B, 12): those of the terms, and 0 for the others."""
+    flags = [i < terms.radial for i in range(6)] + [terms.tangential] * 2 + [terms.prism] * 4
+    return torch.where(constant(flags, device=coefficients.device), coefficients, 0)
 
 
 def frame_limit(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> RadialLimit:

@@ -5,16 +5,20 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract import white_noise
 from torchrefract._bands import by_samples
+from torchrefract._checks import learns
+from torchrefract._compiled import kernels, obstacle
 from torchrefract._constants import constant, kept
 from torchrefract._products import product
 from torchrefract.fields.evolution import turned
 from torchrefract.fields.gaussian import axis_spectrum
 
 _SMOOTH = 2.0  # px, from which length on a Gaussian covariance has no frequencies beyond those of pixels
+_LARGE = 1 << 12  # numbers, of which a kernel is faster
 
 
 class Modes(NamedTuple):
@@ -70,23 +74,35 @@ def mode_amplitude(
         dtype: of the amplitude.
         shortest: px, no length is shorter.
     """
-    sides = zip(modes.size, _numbers(modes, length.device), strict=True)
     if shortest < _SMOOTH:
+        sides = zip(modes.size, _numbers(modes, length.device), strict=True)
         rows, columns = (axis_spectrum(n, length, aperture)[:, k.abs()].to(dtype) for n, k in sides)
         return rows, columns
+    values = (length,) if aperture is None else (length, aperture)
+    if dtype is torch.float32 and math.prod(modes.counts) >= _LARGE and not learns(values) and not obstacle(*values):
+        down, across = (length.new_empty(len(length), count) for count in modes.counts)
+        sides, exponent = (own.numpy() for own in _sides(modes, length.device))
+        lengths, apertures = (own.contiguous().numpy() for own in (length, values[-1]))
+        work = kernels("fields.kernels.modes").amplitudes
+        work(lengths, apertures, aperture is not None, sides, exponent, down.numpy(), across.numpy())
+        return down, across
     square = length.double().square()[:, None]
     square = square if aperture is None else square + 2 * aperture.double().square()[:, None]
-
-    def along(n: int, k: Tensor) -> Tensor:
-        largest = math.sqrt(2 * math.pi) / n * square.sqrt() / (1 + 2 * torch.exp(-0.5 * n * n / square))
-        return (largest.sqrt() * torch.exp((-0.25 * (2 * math.pi / n) ** 2) * square * (k * k))).to(dtype)
-
-    rows, columns = (along(n, k) for n, k in sides)
+    sides, exponent = _sides(modes, length.device)
+    largest = math.sqrt(2 * math.pi) / sides * square.sqrt() / (1 + 2 * torch.exp(-0.5 * sides.square() / square))
+    below = torch.exp(exponent * square).split(modes.counts, dim=1)
+    rows, columns = ((end * own).to(dtype) for end, own in zip(largest.sqrt().split(1, dim=1), below, strict=True))
     return rows, columns
 
 
 def mode_field(
-    noise: Tensor, amplitude: tuple[Tensor, Tensor], modes: Modes, rows: Sequence[int], columns: Sequence[int]
+    noise: Tensor,
+    amplitude: tuple[Tensor, Tensor],
+    modes: Modes,
+    rows: Sequence[int],
+    columns: Sequence[int],
+    *,
+    fields: int = 2,
 ) -> Tensor:
     """Two independent fields (B, 2, n, m) at rows and columns of pixels, by two products of matrices.
 
@@ -97,21 +113,39 @@ def mode_field(
         amplitude: (B, My) and (B, Mx).
         modes: their frequencies.
         rows, columns: px, whole numbers.
+        fields: 2, or 1 for the first alone, (B, 1, n, m).
     """
-    return sum_of_modes(noise * (amplitude[0][:, None, :, None] * amplitude[1][:, None, None, :]), modes, rows, columns)
+    values = noise, *amplitude
+    if noise.numel() >= _LARGE and not learns(values) and not obstacle(*values):
+        both = noise.new_empty(len(noise), fields, *modes.counts)
+        kernels("fields.kernels.modes").folded(*(own.contiguous().numpy() for own in values), both.numpy())
+    else:
+        both = _folded_twice(noise * (amplitude[0][:, None, :, None] * amplitude[1][:, None, None, :]))[:, :fields]
+    return _sum_of(both, modes, rows, columns)
 
 
 def sum_of_modes(weighted: Tensor, modes: Modes, rows: Sequence[int], columns: Sequence[int]) -> Tensor:
     """The fields of `mode_field`, from the noise times its amplitude, (B, 2, My, Mx)."""
-    in_y, in_x = _waves(modes, tuple(rows), tuple(columns), weighted.dtype, weighted.device)
+    return _sum_of(_folded_twice(weighted), modes, rows, columns)
+
+
+def _sum_of(folded: Tensor, modes: Modes, rows: Sequence[int], columns: Sequence[int]) -> Tensor:
+    """(B, n, n, m): the same of what is folded along both axes, (B, 2, My, Mx), or of the first field alone."""
+    single, count = folded.shape[1] == 1, len(columns)
+    in_y, in_x = _waves(modes, tuple(rows), tuple(columns), 1 + single, folded.dtype, folded.device)
 
     def fields(pairs: Tensor) -> Tensor:
-        # Two products to a sample: one by itself may round by the threads.
-        both = pairs.flatten(0, 1)
-        along = product(both, in_x.expand(len(both), -1, -1))
-        return product(in_y.expand(len(both), -1, -1), along).unflatten(0, (-1, 2))
+        # Two products to a sample, of two fields or of two halves: one by itself may round by the threads.
+        both = pairs.expand(-1, 2, -1, -1).flatten(0, 1)
+        along = product(both, in_x.expand(len(pairs), 2, -1, -1).flatten(0, 1))
+        found = product(in_y.expand(len(both), -1, -1), along).unflatten(0, (-1, 2))
+        return found.transpose(1, 2).flatten(2)[:, None, :, :count] if single else found
 
-    return by_samples(_folded(_folded(weighted, 2), 3), fields)
+    return by_samples(folded, fields)
+
+
+def _folded_twice(weighted: Tensor) -> Tensor:
+    return _folded(_folded(weighted, 2), 3)
 
 
 def _folded(values: Tensor, dim: int) -> Tensor:
@@ -136,9 +170,12 @@ def _folded(values: Tensor, dim: int) -> Tensor:
 
 @kept
 def _waves(
-    modes: Modes, rows: tuple[int, ...], columns: tuple[int, ...], dtype: torch.dtype, device: torch.device
+    modes: Modes, rows: tuple[int, ...], columns: tuple[int, ...], parts: int, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """(n, My) and (Mx, m): cos and sin of 2 pi k p / size, as `_folded` pairs them."""
+    """(n, My) and (parts, Mx, m): cos and sin of 2 pi k p / size, as `_folded` pairs them.
+
+    The columns are in so many parts, with zeros behind where they are not as many as others.
+    """
 
     def waves(most: int, places: Sequence[int], size: int) -> Tensor:
         # Whole turns are taken out of whole numbers, exactly.
@@ -147,12 +184,20 @@ def _waves(
         cosines = torch.cat([torch.full_like(angle[:1], 0.5), angle[1:].cos()])
         return torch.cat([cosines, angle[1:].sin()])
 
-    return waves(modes.rows, rows, modes.size[0]).mT.contiguous(), waves(modes.columns, columns, modes.size[1])
+    in_x = F.pad(waves(modes.columns, columns, modes.size[1]), (0, -len(columns) % parts))
+    return waves(modes.rows, rows, modes.size[0]).mT.contiguous(), torch.stack(in_x.chunk(parts, dim=1))
 
 
 def _numbers(modes: Modes, device: torch.device) -> tuple[Tensor, Tensor]:
     rows, columns = (torch.arange(-most, most + 1, device=device) for most in (modes.rows, modes.columns))
     return rows, columns
+
+
+@kept
+def _sides(modes: Modes, device: torch.device) -> tuple[Tensor, Tensor]:
+    """(2,), px, and (My + Mx,), what the square of a length counts times in the exponent of each root."""
+    turns = [-((math.pi / n * k.double()) ** 2) for k, n in zip(_numbers(modes, device), modes.size, strict=True)]
+    return constant(modes.size, dtype=torch.float64, device=device), torch.cat(turns)
 
 
 @kept

@@ -23,7 +23,6 @@ _NOTHING = 1e-300
 _FEW_POINTS = 1 << 12  # numbers of all samples, whose system is kept
 _SMALLEST = 1 << 10  # places, from which on a kernel is faster
 _CACHED = 1 << 15  # numbers of eight bytes, a few times over, that stay in a core's cache
-_MOST_KEPT = 1 << 21  # numbers of eight bytes, of each of the latest lattices
 
 
 class Spline(NamedTuple):
@@ -107,17 +106,8 @@ def spline_flow(spline: Spline, *, height: int, width: int, dtype: torch.dtype) 
     return spline_at(spline, *pixel_axes(height, width, dtype=torch.float64, device=spline.points.device), dtype=dtype)
 
 
-def spline_at(spline: Spline, x: Tensor, y: Tensor, *, dtype: torch.dtype, again: bool = False) -> Tensor:
-    """The flow (B, 2, n, m) in px at places x, (1, 1, 1, m), and y, (1, 1, n, 1), px, computed in float64.
-
-    Args:
-        spline: one for each sample.
-        x: of the columns.
-        y: of the rows.
-        dtype: of the flow.
-        again: whether splines through these very points will be asked for at these places again: what does not depend
-            on their weights is kept, up to 16 MB for each of the latest four lattices.
-    """
+def spline_at(spline: Spline, x: Tensor, y: Tensor, *, dtype: torch.dtype) -> Tensor:
+    """The flow (B, 2, n, m) in px at places x, (1, 1, 1, m), and y, (1, 1, n, 1), px, computed in float64."""
     x = ((x.double().flatten() - spline.center[:, :, 0]) / spline.scale[:, :, 0])[:, None]
     y = ((y.double().flatten() - spline.center[:, :, 1]) / spline.scale[:, :, 0])[:, :, None]
     if torch.compiler.is_compiling():  # one loop over the pixels, whose sums need no memory
@@ -127,8 +117,8 @@ def spline_at(spline: Spline, x: Tensor, y: Tensor, *, dtype: torch.dtype, again
         return (torch.stack(_plane(spline.affine, x, y), dim=1) + bent).to(dtype)
     values = spline.points, spline.weights, spline.affine, x, y
     if not learns(values) and _by_kernel(values):
-        return _filled(values, dtype, again=again)
-    return _Lattice.apply(*values, dtype, again)
+        return _filled(values, dtype)
+    return _Lattice.apply(*values, dtype)
 
 
 def evaluate_spline(spline: Spline, points: Tensor) -> Tensor:
@@ -166,12 +156,10 @@ class _Lattice(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(
-        points: Tensor, weights: Tensor, affine: Tensor, x: Tensor, y: Tensor, dtype: torch.dtype, again: bool
-    ) -> Tensor:
+    def forward(points: Tensor, weights: Tensor, affine: Tensor, x: Tensor, y: Tensor, dtype: torch.dtype) -> Tensor:
         values = points, weights, affine, x, y
         if _by_kernel(values):
-            return _filled(values, dtype, again=again)
+            return _filled(values, dtype)
         rows = y.split(_at_once(x), dim=1)
         return torch.cat([_evaluate(points, weights, affine, x, part).to(dtype) for part in rows], dim=2)
 
@@ -187,7 +175,7 @@ class _Lattice(torch.autograd.Function):
         for slope, part in zip(slopes[0].split(at_once, dim=2), y.split(at_once, dim=1), strict=True):
             found = _gradients(slope.double(), points, weights, x, part)
             total = tuple(a + b for a, b in zip(total, found, strict=True))
-        return *total, None, None, None, None
+        return *total, None, None, None
 
 
 def _by_kernel(values: Sequence[Tensor]) -> bool:
@@ -196,30 +184,17 @@ def _by_kernel(values: Sequence[Tensor]) -> bool:
     return large and not any(map(withheld, values)) and kernels("_jit") is not None
 
 
-def _filled(values: Sequence[Tensor], dtype: torch.dtype, *, again: bool) -> Tensor:
+def _filled(values: Sequence[Tensor], dtype: torch.dtype) -> Tensor:
     """The flow by a kernel; the places are the last two."""
     batch, (rows, columns) = len(values[0]), (values[4].shape[1], values[3].shape[2])
     out = values[0].new_empty(batch, 2, rows, columns, dtype=dtype)
     points, weights, affine, x, y = (np.ascontiguousarray(value.numpy()) for value in values)
-    x, y = x.reshape(-1, columns), y.reshape(-1, rows)
-    kept = again and points.shape[1] * rows * columns <= _MOST_KEPT
-    if kept and batch > 0 and all((own == own[0]).all() for own in (points, x, y)):
-        known = _kept(points[0].tobytes(), x[0].tobytes(), y[0].tobytes())
-        work = partial(kernels("fields.kernels.plates").plates_of, known, weights, affine, x[0], y[0])
-    else:
-        x, y = (np.ascontiguousarray(np.broadcast_to(own, (batch, own.shape[1]))) for own in (x, y))
-        work = partial(kernels("fields.kernels.plates").plates, points, weights, affine, x, y, _NOTHING)
+    x, y = (
+        np.ascontiguousarray(np.broadcast_to(own.reshape(-1, count), (batch, count)))
+        for own, count in ((x, columns), (y, rows))
+    )
+    work = partial(kernels("fields.kernels.plates").plates, points, weights, affine, x, y, _NOTHING)
     share(lambda start, stop: work(start, stop, out.numpy()), batch * rows, least=_SMALLEST // columns + 1)
-    return out
-
-
-@lru_cache(maxsize=4)
-def _kept(points: bytes, x: bytes, y: bytes) -> np.ndarray:
-    """(n, N, m): the kernels of points (N, 2) at places, (m,) and (n,), float64."""
-    at, own_x, own_y = np.frombuffer(points).reshape(-1, 2), np.frombuffer(x), np.frombuffer(y)
-    out = np.empty((len(own_y), len(at), len(own_x)))
-    work = partial(kernels("fields.kernels.plates").bends, at, own_x, own_y, _NOTHING)
-    share(lambda start, stop: work(start, stop, out), len(own_y), least=_SMALLEST // len(own_x) + 1)
     return out
 
 

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._constants import assume_constant_result, constant
+from torchrefract._constants import assume_constant_result, constant, kept
 from torchrefract.warping.grid import finite, pixel_axes, sampler_axes, sampler_positions
 from torchrefract.warping.sums import across, across_twice, down, matrix_of
 
@@ -186,15 +186,12 @@ class StreamFlow(SmoothFlow):
 
     def weights(self) -> tuple[Tensor, Tensor]:
         """Of the nodes around, along a row and along a column, (2, stride, taps): for u and v, by place in a cell."""
-        options = {"dtype": self.nodes.dtype, "device": self.nodes.device}
-        slope = slope_weights(self.lattice.stride, STREAM_NODES, **options)
-        weight = F.pad(lagrange_weights(self.lattice.stride, STREAM_NODES, **options), (1, 0))
-        return torch.stack([weight, -slope]), torch.stack([slope, weight])
+        return _curl_weights(self.lattice.stride, (1.0, 1.0), self.nodes.dtype, self.nodes.device)
 
     def _lines(self, nodes: Tensor, scale: tuple[float, float]) -> tuple[Tensor, Tensor]:
         """(B, 2, n, W) and (2, stride, taps): (D_y psi, -D_x psi), each times its scale, as in `Lines`."""
-        along, between = self.with_nodes(nodes).weights()
-        return across_twice(nodes, (scale[0] * along[0], scale[1] * along[1]), self.lattice.width), between
+        (first, second), between = _curl_weights(self.lattice.stride, scale, nodes.dtype, nodes.device)
+        return across_twice(nodes, (first, second), self.lattice.width), between
 
 
 def once(flow: SmoothFlow, work: Callable[[SmoothFlow], Tensor]) -> Tensor:
@@ -203,6 +200,16 @@ def once(flow: SmoothFlow, work: Callable[[SmoothFlow], Tensor]) -> Tensor:
     if len(nodes) < 2 or nodes.stride(0) != 0:
         return work(flow)
     return work(flow.with_nodes(nodes[:1])).expand(len(nodes), -1, -1, -1)
+
+
+@kept
+def _curl_weights(
+    stride: int, scale: tuple[float, float], dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Those of a `StreamFlow`, along a row times a scale of u and one of v."""
+    slope = slope_weights(stride, STREAM_NODES, dtype=dtype, device=device)
+    weight = F.pad(lagrange_weights(stride, STREAM_NODES, dtype=dtype, device=device), (1, 0))
+    return torch.stack([scale[0] * weight, -scale[1] * slope]), torch.stack([slope, weight])
 
 
 @assume_constant_result

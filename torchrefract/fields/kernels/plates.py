@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrefract._jit import inlined, jit
+from torchrefract._jit import fma, inlined, jit
 from torchrefract.fields.kernels.nodes import Doubles, logarithm
 
 
@@ -25,44 +25,34 @@ def plates(
     nothing: what is added to squared distances, so that they have a logarithm.
     """
     count, columns = y.shape[1], x.shape[1]
-    found, kernel = np.empty((2, columns), np.float64), np.empty(columns, np.float64)
+    found = np.empty((2, columns), np.float64)
     for row in range(start, stop):
         i, line = divmod(row, count)
         _plane(affine[i], x[i], y[i, line], found)
         for j in range(points.shape[1]):
-            _kernel(points[i, j], x[i], y[i, line], nothing, kernel)
-            _add(weights[i, j], kernel, found)
+            _add(weights[i, j], points[i, j], x[i], y[i, line], nothing, found)
         out[i, 0, line], out[i, 1, line] = found[0], found[1]
 
 
 @jit
-def bends(points: Doubles, x: Doubles, y: Doubles, nothing: float, start: int, stop: int, out: Doubles) -> None:
-    """Rows of out, (n, N, m): what `plates_of` takes of points (N, 2) at places x, (m,), and y, (n,)."""
-    for line in range(start, stop):
-        for j in range(points.shape[0]):
-            _kernel(points[j], x, y[line], nothing, out[line, j])
-
-
-@jit
-def plates_of(
-    known: Doubles,
-    weights: Doubles,
-    affine: Doubles,
-    x: Doubles,
-    y: Doubles,
+def sums(
+    known: NDArray[np.float32],
+    displacement: NDArray[np.float32],
     start: int,
     stop: int,
-    out: NDArray[np.floating],
+    out: NDArray[np.float32],
 ) -> None:
-    """As `plates`, to the bit, of plates whose points and places are the same: with what `bends` found."""
-    count, columns = y.size, x.size
-    found = np.empty((2, columns), np.float64)
+    """Rows `start` ... `stop` of out, (B, 2, n, m): known, (n, N, m), as often as the N points are moved, (B, N, 2)."""
+    rows = out.shape[2]
     for row in range(start, stop):
-        i, line = divmod(row, count)
-        _plane(affine[i], x, y[line], found)
-        for j in range(known.shape[1]):
-            _add(weights[i, j], known[line, j], found)
-        out[i, 0, line], out[i, 1, line] = found[0], found[1]
+        i, line = divmod(row, rows)
+        u, v, first = out[i, 0, line], out[i, 1, line], known[line, 0]
+        for k in range(u.size):
+            u[k], v[k] = displacement[i, 0, 0] * first[k], displacement[i, 0, 1] * first[k]
+        for j in range(1, known.shape[1]):
+            own, by_u, by_v = known[line, j], displacement[i, j, 0], displacement[i, j, 1]
+            for k in range(u.size):
+                u[k], v[k] = fma(by_u, own[k], u[k]), fma(by_v, own[k], v[k])
 
 
 @inlined
@@ -74,17 +64,11 @@ def _plane(affine: Doubles, x: Doubles, y: float, out: Doubles) -> None:
 
 
 @inlined
-def _kernel(point: Doubles, x: Doubles, y: float, nothing: float, out: Doubles) -> None:
-    """2 r^2 ln r of the distance from a point."""
+def _add(weight: Doubles, point: Doubles, x: Doubles, y: float, nothing: float, out: Doubles) -> None:
+    u, v, at_u, at_v = out[0], out[1], weight[0] / 2, weight[1] / 2
     px, below = point[0], (y - point[1]) ** 2 + nothing
     for k in range(x.size):
         square = (x[k] - px) ** 2 + below
-        out[k] = square * logarithm(square)
-
-
-@inlined
-def _add(weight: Doubles, kernel: Doubles, out: Doubles) -> None:
-    u, v, at_u, at_v = out[0], out[1], weight[0] / 2, weight[1] / 2
-    for k in range(kernel.size):
-        u[k] += at_u * kernel[k]
-        v[k] += at_v * kernel[k]
+        bend = square * logarithm(square)
+        u[k] += at_u * bend
+        v[k] += at_v * bend

@@ -1,6 +1,6 @@
 """What numba compiles: the same as `following_pixels` between nodes both numbers of which lie together, to its bits.
 
-8 pixels at once: of each pixel four lines of four nodes are loaded and added up, and then put side by side. What weighs them
+8 pixels at once: of each, four lines of four nodes are loaded and added up, and then put side by side. What weighs them
 is made for some groups before any of them reads: from memory one load has a number in all lanes.
 """
 
@@ -12,6 +12,7 @@ from torchrefract import _lanes as lanes
 from torchrefract._jit import inlined, jit
 from torchrefract._lanes import LANES
 from torchrefract.warping.kernels import following_pixels
+from torchrefract.warping.kernels.across import Small
 from torchrefract.warping.kernels.lane_weights import cubic_weights, moved, to_pixels
 from torchrefract.warping.kernels.pixels import Cells, Floats, Frame, Number, Whole
 
@@ -51,13 +52,13 @@ def follow_nodes(
             at_x, at_y = lanes.load(x, np.uintp(start)), lanes.load(y, np.uintp(start))
             if start < begin + first:
                 at_x, at_y = last_x, last_y
-            u, v = _between(flow, columns, places, weights, np.uintp(first))
+            u, v = _between(flow, columns, places, weights, first)
             lanes.store(x, np.uintp(start), moved(at_x, u, frame[1], far))
             lanes.store(y, np.uintp(start), moved(at_y, v, frame[0], far))
 
 
 @inlined
-def _weigh(x: Lanes, y: Lanes, rows: int, columns: int, stride: int, own: int, places: Whole, weights: Floats) -> None:
+def _weigh(x: Lanes, y: Lanes, rows: int, columns: int, stride: int, own: int, places: Small, weights: Floats) -> None:
     """Where a group reads, and the weights of lines and of nodes in them."""
     share = lanes.all_floats(np.float32(1 / stride))
     x, y = lanes.product(x, share), lanes.product(y, share)
@@ -73,11 +74,11 @@ def _weigh(x: Lanes, y: Lanes, rows: int, columns: int, stride: int, own: int, p
 
 
 @inlined
-def _between(flow: Floats, columns: int, places: Whole, weights: Floats, own: int) -> tuple[Lanes, Lanes]:
+def _between(flow: Floats, columns: int, places: Small, weights: Floats, own: int) -> tuple[Lanes, Lanes]:
     """Both planes at a group of pixels."""
-    apart = np.uintp(_PIXELS)
-    u0, v0, u1, v1, u2, v2, u3, v3 = lanes.sums_of_eights(flow, places, weights, own, np.uintp(2 * columns), apart)
-    at = own + np.uintp(4) * apart
+    at, apart = np.uintp(own), np.uintp(_PIXELS)
+    u0, v0, u1, v1, u2, v2, u3, v3 = lanes.sums_of_eights(flow, places, weights, at, np.uintp(2 * columns), apart)
+    at += np.uintp(4) * apart
     weight = lanes.load(weights, at)
     u, v = lanes.product(weight, u0), lanes.product(weight, v0)
     weight = lanes.load(weights, at + apart)

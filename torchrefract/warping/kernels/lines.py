@@ -6,9 +6,9 @@ Each call does the rows from `start` on and before `stop`. All numbers are float
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrefract._jit import fma, jit
+from torchrefract._jit import fma, inlined, jit
 from torchrefract._lanes import LANES
-from torchrefract.warping.kernels.across import GROUP, nodes_across
+from torchrefract.warping.kernels.across import GROUP, Across, nodes_across
 
 if LANES:
     from torchrefract.warping.kernels.across_groups import along_nodes
@@ -26,8 +26,7 @@ def across(nodes: Floats, weight: Floats, start: int, stop: int, out: Floats) ->
     own, line = np.zeros(nodes.shape[1] + 2 * GROUP, np.float32), np.empty(along[0].size * GROUP, np.float32)
     for row in range(start, stop):
         own[: nodes.shape[1]] = nodes[row]
-        along_nodes(own, along, line)
-        out[row] = line[: out.shape[1]]
+        _along(own, along, line, out[row])
 
 
 @jit
@@ -39,10 +38,18 @@ def across_twice(nodes: Floats, first: Floats, second: Floats, start: int, stop:
     for row in range(start, stop):
         i, own_row = divmod(row, out.shape[2])
         own[: nodes.shape[1]] = nodes[row]
-        along_nodes(own, along_first, line)
-        out[i, 0, own_row] = line[: out.shape[3]]
-        along_nodes(own, along_second, line)
-        out[i, 1, own_row] = line[: out.shape[3]]
+        _along(own, along_first, line, out[i, 0, own_row])
+        _along(own, along_second, line, out[i, 1, own_row])
+
+
+@inlined
+def _along(nodes: Floats, across: Across, line: Floats, out: Floats) -> None:
+    """A row of pixels, out (W,), by way of a line in whole groups where these do not fill it."""
+    if line.size == out.size:
+        along_nodes(nodes, across, out)
+        return
+    along_nodes(nodes, across, line)
+    out[:] = line[: out.size]
 
 
 @jit

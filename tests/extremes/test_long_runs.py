@@ -132,7 +132,8 @@ def test_new_sizes_and_new_effects_do_not_keep_memory(make):
     for i in range(16):
         few = modes.Modes((100 + i, 100), 1, 1)
         modes._places(few, image.device)
-        modes._waves(few, (0, 1), (0, 1), image.dtype, image.device)
+        modes._waves(few, (0, 1), (0, 1), 1, image.dtype, image.device)
+        modes._sides(few, image.device)
         low_modes._turns(few, 0, 0, image.dtype, image.device)
     for i in range(low_modes._MOST_TABLES):
         few = modes.Modes((100 + 2 * i, 100), 1, 1)

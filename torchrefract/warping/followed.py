@@ -190,7 +190,11 @@ def _in_memory(flow: Read) -> tuple[Tensor, int]:
     if not isinstance(flow, SmoothFlow) or isinstance(flow, StreamFlow):
         return _at_pixels(flow), 0
     few = max(0, _WIDEST - flow.nodes.shape[3])
-    return once(flow, lambda own: F.pad(own.nodes, (0, few)).contiguous(memory_format=_form())), flow.lattice.stride
+
+    def wide(own: SmoothFlow) -> Tensor:
+        return (F.pad(own.nodes, (0, few)) if few else own.nodes).contiguous(memory_format=_form())
+
+    return once(flow, wide), flow.lattice.stride
 
 
 def _form() -> torch.memory_format:

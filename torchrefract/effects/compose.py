@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from copy import copy
+from functools import partial
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -255,5 +256,11 @@ def _stirs(effect: Effect, params: Any, height: int, width: int) -> bool:
 
 def _later(effect: Effect, source: draws.Stream, image: Tensor) -> Undrawn:
     """The draw of an effect as it is now, whatever becomes of its ranges; compilers follow no copies."""
-    now = effect if torch.compiler.is_compiling() else copy(effect)
-    return Undrawn(lambda: now.draw(source, image))
+    return Undrawn(partial((effect if torch.compiler.is_compiling() else _as_now(effect)).draw, source, image))
+
+
+def _as_now(effect: Effect) -> Effect:
+    """What `copy` makes of an effect, in a tenth of its time: most compositions with idle effects never read it."""
+    now = object.__new__(type(effect))
+    now.__dict__.update(effect.__dict__)
+    return now

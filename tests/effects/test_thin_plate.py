@@ -139,3 +139,17 @@ def test_parameters_that_learn_serve_where_no_gradient_is_asked_for():
     assert torch.equal(found.image, effect.apply(image, params).image)
     effect.apply(image, learning).image.sum().backward()
     assert learning.displacement.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("smoothing", [(0.0, 0.0), (0.2, 0.2), (0.0, 0.4)], ids=str)
+def test_plates_between_nodes_are_the_same_in_any_batch_and_near_the_exact_ones(smoothing):
+    frames = torch.rand(3, 3, 160, 200, generator=torch.Generator().manual_seed(0))
+    effect = ThinPlateSpline(smoothing_range=smoothing, tolerance_px=0.1)
+    assert effect.plan(160, 200).stride > 1
+    whole = effect.degrade(frames, seed=4, keys=range(3))
+    for i in range(3):
+        alone = effect.degrade(frames[i : i + 1], seed=4, keys=[i])
+        assert torch.equal(alone.image[0], whole.image[i])
+    exact = ThinPlateSpline(smoothing_range=smoothing, tolerance_px=None).degrade(frames, seed=4, keys=range(3))
+    error = (whole.flow - exact.flow).norm(dim=1).max()
+    assert 1e-4 < error <= 0.1

@@ -262,5 +262,5 @@ def _later(effect: Effect, source: draws.Stream, image: Tensor) -> Undrawn:
 def _as_now(effect: Effect) -> Effect:
     """What `copy` makes of an effect, in a tenth of its time: most compositions with idle effects never read it."""
     now = object.__new__(type(effect))
-    now.__dict__.update(effect.__dict__)
+    vars(now).update(vars(effect))
     return now

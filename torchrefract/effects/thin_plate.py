@@ -133,7 +133,9 @@ class ThinPlateSpline(LatticeWarp):
         # Those that such a plan is for are drawn ones.
         numbers = params.points, params.displacement, params.smoothing
         x, y = lattice.places(dtype=torch.float64, device=params.points.device)
-        if (flow := drawn_plates(*numbers, x, y)) is None:
+        # Of plates that are smoothed each by itself nothing is there to be kept.
+        alike = self.smoothing_range[0] == self.smoothing_range[1]
+        if (flow := drawn_plates(*numbers, x, y) if alike else None) is None:
             flow = spline_at(fit_spline(*numbers, checked=True), x, y, dtype=dtype)
         return SmoothFlow(flow, lattice)
 

@@ -39,10 +39,10 @@ def amplitudes(
 
 @jit
 def folded(noise: Floats, down: Floats, across: Floats, out: Floats) -> None:
-    """As `weighted_noise` of `fields.modes`, folded along both axes, of all samples or of the first field alone.
+    """The noise times its amplitude, with opposite frequencies along both axes added up as by `fields.modes`.
 
-    noise: (B, 2, My, Mx), of which all are a sample's own; down, (B, My), and across, (B, Mx): its amplitude.
-    out: (B, 2 or 1, My, Mx).
+    noise: (B, 2, My, Mx); down, (B, My), and across, (B, Mx): its amplitude.
+    out: (B, 2, My, Mx), of both fields, or (B, 1, My, Mx), of the first alone.
     """
     batch, _, count, wide = noise.shape
     middle = count // 2

@@ -85,7 +85,7 @@ def look_up_lattice(
     over_u, over_v = (), ()
     for tap in tl.static_range(taps):
         over_u = over_u + (tl.load(by + tap, inside, 0.0),)  # noqa: RUF005 - Triton knows no unpacking
-        over_v = over_v + (tl.load(by + stride * taps + tap, inside, 0.0),)  # noqa: RUF005 - as above
+        over_v = over_v + (tl.load(by + stride * taps + tap, inside, 0.0),)  # noqa: RUF005 - Triton knows no unpacking
     known_u, known_v = (), ()
     for line in tl.static_range(taps):
         u = tl.zeros((columns,), tl.float32)
@@ -95,8 +95,8 @@ def look_up_lattice(
             first_node = tl.load(node, inside, 0.0)
             u += over_u[tap] * first_node
             v += over_v[tap] * (first_node if shared else tl.load(node + other_step, inside, 0.0))
-        known_u = known_u + (u,)  # noqa: RUF005 - as above
-        known_v = known_v + (v,)  # noqa: RUF005 - as above
+        known_u = known_u + (u,)  # noqa: RUF005 - Triton knows no unpacking
+        known_v = known_v + (v,)  # noqa: RUF005 - Triton knows no unpacking
 
     for own_row in range(place, last):
         y = cell * stride + own_row

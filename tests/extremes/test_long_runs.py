@@ -16,7 +16,8 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 import torchrefract as tr
 from torchrefract.effects.base import Effect
-from torchrefract.fields import low_modes, modes
+from torchrefract.fields import low_modes, modes, spline
+from torchrefract.warping import lattice
 
 CAMERA = tr.Camera(width=48, height=32, fx=40, fy=40, cx=23, cy=16, coefficients=(-0.2, 0.05, 0.001, 0.002))
 EFFECTS: dict[str, Callable[[], Effect]] = {
@@ -127,14 +128,17 @@ def test_what_is_let_go_is_free_at_once(make):
 def test_new_sizes_and_new_effects_do_not_keep_memory(make):
     image = picture(size=(64, 64))
     make().degrade(image[..., : SIZE[0], : SIZE[1]], seed=7)
-    # The waves and places of the latest sixteen sizes are kept, and eigenvalues of the latest 64: they have been others
-    # so far, whatever ran before.
+    # What waves, lattices and splines are made of is kept for the latest sixteen, eigenvalues for the latest 64: they
+    # have been others so far, whatever ran before.
     for i in range(16):
         few = modes.Modes((100 + i, 100), 1, 1)
         modes._places(few, image.device)
         modes._waves(few, (0, 1), (0, 1), 1, image.dtype, image.device)
         modes._sides(few, image.device)
         low_modes._turns(few, 0, 0, image.dtype, image.device)
+        lattice._curl_weights(2 + i, (1.0, 1.0), image.dtype, image.device)
+        points = picture(i, size=(4, 2))[:, 0].double()
+        spline.fit_spline(points, points, points.new_zeros(1))
     for i in range(low_modes._MOST_TABLES):
         few = modes.Modes((100 + 2 * i, 100), 1, 1)
         low_modes.low_eigenvalues(few, image.new_ones(1), kind="exponential", lengths=(1.0, 2.0), nodes=2)

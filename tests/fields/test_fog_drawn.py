@@ -1,8 +1,4 @@
 import math
-import os
-import platform
-import subprocess
-import sys
 from itertools import pairwise
 from typing import Any
 
@@ -301,31 +297,3 @@ def test_the_exponential_has_no_error_of_its_own():
     finite = np.isfinite(expected)
     np.testing.assert_allclose(found[finite], exact[finite], rtol=2e-7, atol=0)
     assert kernels.less_one(np.float32(0)) == 0
-
-
-SAME_ON_ALL = """
-import sys
-import torch
-from torchrefract import HeterogeneousFog
-from torchrefract._lanes import LANES
-assert {lanes} in (None, LANES), LANES
-fog = HeterogeneousFog(mode="ray", decorrelation_range=(5.0, 9.0))
-made = [fog.degrade(torch.zeros(2, 2, 1, 131, width), seed=3).extinction for width in (70, 256)]
-depth = 300 * torch.rand(2, 1, 131, 70, generator=torch.Generator().manual_seed(1))
-made.append(fog.degrade(torch.zeros(2, 1, 131, 70), depth=depth, seed=3).extinction)
-torch.save(made, sys.argv[1])
-"""
-
-
-@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the names are those of x86 processors")
-def test_every_processor_finds_the_same(tmp_path):
-    found = []
-    for name, features, lanes in (("haswell", "+avx,+avx2,+fma", 8), ("generic", "", 0), ("own", "", None)):
-        told = {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": features, "NUMBA_CACHE_DIR": str(tmp_path / name)}
-        told = {} if lanes is None else told  # of this processor what other tests had compiled serves
-        words = [sys.executable, "-c", SAME_ON_ALL.format(lanes=lanes), str(tmp_path / f"{name}.pt")]
-        done = subprocess.run(words, env=os.environ | told, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        found.append(torch.load(tmp_path / f"{name}.pt"))
-    for others in found[1:]:
-        assert all(torch.equal(one, other) for one, other in zip(found[0], others, strict=True))

@@ -1,7 +1,3 @@
-import os
-import platform
-import subprocess
-import sys
 from itertools import pairwise
 from typing import Any
 
@@ -207,33 +203,3 @@ def test_without_numba_the_noise_is_pytorchs(monkeypatch):
     monkeypatch.setattr(compiled, "kernels", lambda _: None)
     expected = in_pytorch(drawn, SHORT, size, weights_of(2, len(SHORT)))
     assert torch.equal(noise_of(drawn, SHORT, size), expected)
-
-
-SAME_ON_ALL = """
-import sys
-import torch
-from torchrefract import HeterogeneousFog
-from torchrefract._lanes import LANES
-assert {lanes} in (None, LANES), LANES
-found = []
-for width in (7, 256, 300):
-    for linear in (False, True):
-        leaf = torch.linspace(0, 1, 244 * width).view(2, 2, 1, 61, width).requires_grad_()
-        degraded = HeterogeneousFog(linear_light=linear, tolerance=0.3).degrade(leaf, seed=3)
-        found += [degraded.extinction, degraded.image.detach(), *torch.autograd.grad(degraded.image.sum(), leaf)]
-torch.save(found, sys.argv[1])
-"""
-
-
-@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the names are those of x86 processors")
-def test_every_processor_finds_the_same(tmp_path):
-    found = []
-    for name, features, lanes in (("haswell", "+avx,+avx2,+fma", 8), ("generic", "", 0), ("own", "", None)):
-        told = {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": features, "NUMBA_CACHE_DIR": str(tmp_path / name)}
-        told = {} if lanes is None else told  # of this processor what other tests had compiled serves
-        words = [sys.executable, "-c", SAME_ON_ALL.format(lanes=lanes), str(tmp_path / f"{name}.pt")]
-        done = subprocess.run(words, env=os.environ | told, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        found.append(torch.load(tmp_path / f"{name}.pt"))
-    for others in found[1:]:
-        assert all(torch.equal(one, other) for one, other in zip(found[0], others, strict=True))

@@ -1,6 +1,4 @@
 import math
-import os
-import platform
 import shutil
 import subprocess
 import sys
@@ -354,48 +352,6 @@ def test_numba_that_does_not_work_is_numba_that_is_missing(fault):
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-
-
-SAME_ON_ALL = """
-import torch
-from torchrefract import warp
-from torchrefract._lanes import LANES
-assert LANES == {lanes}, LANES
-noise = torch.rand(2, 2, 140, 181, generator=torch.Generator().manual_seed(1)) * 2 - 1
-image = torch.rand(2, 3, 140, 181, generator=torch.Generator().manual_seed(2))
-across = image.movedim(1, -1).contiguous().movedim(-1, 1)
-for flow in (noise, noise * 30, torch.nn.functional.avg_pool2d(noise, 9, 1, 4) * 60):
-    for source in (image, across, (image * 256).to(torch.uint8), (across * 256).to(torch.uint8)):
-        for padding in ("zeros", "border", "reflection"):
-            a, b = (warp(source, flow, padding=padding, resampler=name)[0] for name in ("numba", "grid_sample"))
-            assert torch.equal(a, b), (source.dtype, padding)
-"""
-FOLLOWED_ON_ALL = """
-from dataclasses import replace
-from torchrefract.warping.followed import FollowedFlow
-from torchrefract.warping.lattice import Lattice, SmoothFlow
-def smooth(stride):
-    lattice = Lattice(140, 181, stride)
-    size = [len(axis) for axis in lattice.axes()]
-    return SmoothFlow(torch.randn(2, 2, *size, generator=torch.Generator().manual_seed(stride)), lattice)
-rough = smooth(2).with_nodes(9 * smooth(2).nodes)
-flow = FollowedFlow(replace(smooth(30), every=3), (smooth(20), rough, smooth(7).dense()))
-torch.save(flow.sampler_grid(torch.float32), {to!r})
-"""
-
-
-@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the names are those of x86 processors")
-@pytest.mark.parametrize(
-    ("name", "features", "lanes"), [("haswell", "+avx,+avx2,+fma", 8), ("generic", "", 0), ("x86-64-v3", "+avx2", 0)]
-)
-def test_every_processor_finds_the_same(name, features, lanes, tmp_path):
-    exec(f"import torch\n{FOLLOWED_ON_ALL.format(to=str(tmp_path / 'here'))}", {})
-    told = {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": features, "NUMBA_CACHE_DIR": str(tmp_path)}
-    program = SAME_ON_ALL.format(lanes=lanes) + FOLLOWED_ON_ALL.format(to=str(tmp_path / "there"))
-    words = [sys.executable, "-c", program]
-    done = subprocess.run(words, env=os.environ | told, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert torch.equal(torch.load(tmp_path / "there"), torch.load(tmp_path / "here"))
 
 
 @pytest.mark.parametrize("layer", ["fields", "warping"])

@@ -110,13 +110,12 @@ class Compose(Effect):
     def _draw_sparingly(self, source: draws.Stream, image: Tensor, *, idle: bool) -> ComposeParams:
         gate, gates = self._gates(source)
         inner, idle = draws.fold(source), idle or self.p == 0
-        like = image.new_empty(()).expand(image.shape)  # what is still to be drawn holds no picture
         children: list[Any] = []
         for i, effect in enumerate(self._effects()):
             if isinstance(effect, Compose):
                 children.append(effect._draw_sparingly(inner.at(i), image, idle=idle))
             elif idle or effect.idle:
-                children.append(_later(effect, inner.at(i), like))
+                children.append(_later(effect, inner.at(i), image))
             else:
                 children.append(effect.draw(inner.at(i), image))
         return ComposeParams(gate, tuple(map(_closed, children, gates)))
@@ -256,7 +255,12 @@ def _stirs(effect: Effect, params: Any, height: int, width: int) -> bool:
 
 def _later(effect: Effect, source: draws.Stream, image: Tensor) -> Undrawn:
     """The draw of an effect as it is now, whatever becomes of its ranges; compilers follow no copies."""
-    return Undrawn(partial((effect if torch.compiler.is_compiling() else _as_now(effect)).draw, source, image))
+    now = effect if torch.compiler.is_compiling() else _as_now(effect)
+    return Undrawn(partial(_draw_for, now, source, image.shape, image.dtype, image.device))  # and holds no picture
+
+
+def _draw_for(effect: Effect, source: draws.Stream, size: torch.Size, dtype: torch.dtype, device: torch.device) -> Any:
+    return effect.draw(source, torch.empty((), dtype=dtype, device=device).expand(size))
 
 
 def _as_now(effect: Effect) -> Effect:

@@ -1,7 +1,7 @@
 """What every effect that changes light is: it moves nothing, and tells what arrives and what is added."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -57,7 +57,7 @@ class RadianceEffect(Effect):
         active = params.gate & self.acts(params)
         if not _stirs(active, params):
             everywhere = active.new_ones(()).expand(_map_size(image))
-            return Degraded(image, params, valid=everywhere, light=self.clear(image))
+            return Degraded(image, params, valid=everywhere, light=clear_maps(self.maps, image))
         if depth is not None and is_true(active.any, of=active) is False:
             depth = None  # and nobody looks at its values
         index, batch = some(active, params), len(active)
@@ -92,14 +92,15 @@ class RadianceEffect(Effect):
             light={name: value for name in _CLEAR if (value := gated(name)) is not None},
         )
 
-    def clear(self, image: Tensor) -> dict[str, Map]:
-        """The maps that it has, as they are where it changes nothing."""
-        size, dtype, device = _map_size(image), field_dtype(image.dtype), image.device
 
-        def everywhere(value: float) -> Map:
-            return lambda: torch.full((), value, dtype=dtype, device=device).expand(size)
+def clear_maps(names: Iterable[str], image: Tensor) -> dict[str, Map]:
+    """The maps of these names, as they are where nothing is changed."""
+    size, dtype, device = _map_size(image), field_dtype(image.dtype), image.device
 
-        return {name: everywhere(_CLEAR[name]) for name in self.maps}
+    def everywhere(value: float) -> Map:
+        return lambda: torch.full((), value, dtype=dtype, device=device).expand(size)
+
+    return {name: everywhere(_CLEAR[name]) for name in names}
 
 
 def _map_size(image: Tensor) -> tuple[int, ...]:

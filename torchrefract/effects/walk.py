@@ -13,11 +13,11 @@ from torchrefract.effects.base import Effect
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.plan import Plan
-from torchrefract.effects.radiance import RadianceEffect
+from torchrefract.effects.radiance import RadianceEffect, clear_maps
 from torchrefract.effects.refraction import Moved, WarpEffect, looked_up, moving, sees
 from torchrefract.effects.rows import column, only, spread
 from torchrefract.effects.steps import Step, exact, on_grid
-from torchrefract.types import Degraded, Map
+from torchrefract.types import Degraded
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import Positions, field_dtype, inside
 from torchrefract.warping.mixed import dense
@@ -51,13 +51,13 @@ class Walk:
         self.moved: list[tuple[WarpEffect, Any, Moved]] = []
         self.valid: Callable[[], Tensor] | None = None  # everywhere
         self.light: dict[str, Callable[[], Tensor]] = {}  # the maps of light, by their names in `Degraded`
-        self.clear: dict[str, Map] = {}  # those of effects that change nothing, likewise
+        self.clear: set[str] = set()  # the names of those of effects that change nothing
         self.refracts = False
 
     def rest(self, effect: Effect) -> None:
         """One that changes nothing; maps say so."""
         if isinstance(effect, RadianceEffect):
-            self.clear |= effect.clear(self.image)
+            self.clear.update(effect.maps)
         else:
             self.refracts = True
 
@@ -105,7 +105,7 @@ class Walk:
         self._look_up()
         # Not a method of its own, through which the walk and all its maps would hold themselves.
         valid = self.valid or functools.partial(_everywhere, self.image.shape, self.image.device)
-        light = self.clear | self.light
+        light = clear_maps(self.clear, self.image) | self.light
         if not self.refracts:
             return Degraded(self.image, params, valid=valid, light=light)
         return moving(

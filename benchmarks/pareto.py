@@ -1,13 +1,19 @@
 """What no other choice beats in both time and error, and the picture of it."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+from matplotlib.text import Annotation
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.transforms import Bbox
+from numpy.typing import NDArray
 
 from torchrefract._files import replacing
 
@@ -15,6 +21,9 @@ from torchrefract._files import replacing
 FLOOR = 1e-5
 _COLORS = ("#1f77b4", "#d1495b", "#2e8b57", "#8a5fbf", "#c77f1a")
 _COLUMNS = 2
+_MARKER, _STEP, _MOST_STEPS = 5, 5, 8  # points: of markers, and steps from those to labels
+# Where labels are tried in each step, from their points.
+_AROUND = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
 
 
 class Point(NamedTuple):
@@ -42,33 +51,78 @@ def draw(path: Path, panels: Mapping[str, Sequence[Point]], *, x: str, y: str) -
     rows = -(-len(panels) // _COLUMNS)
     figure = Figure(figsize=(5.2 * _COLUMNS, 3.1 * rows), dpi=110, layout="constrained")
     places = list(figure.subplots(rows, _COLUMNS, squeeze=False, sharey=True).flat)
-    for axes, (title, points) in zip(places, panels.items(), strict=False):
+    drawn = list(zip(places, panels.items(), strict=False))
+    for axes, (title, points) in drawn:
         _draw_panel(axes, title, points)
     for axes in places[len(panels) :]:
         axes.set_axis_off()
     figure.supxlabel(x, fontsize=11)
     figure.supylabel(y, fontsize=11)
+    figure.draw_without_rendering()  # from here on everything has its place
+    figure.set_layout_engine("none")
+    for axes, (_, points) in drawn:
+        _label(axes, points)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         figure.savefig(temporary)
 
 
 def _draw_panel(axes: Axes, title: str, points: Sequence[Point]) -> None:
+    for color, (series, own) in _colored(points):
+        best = sorted(_place(point) for point in own if point.joined)
+        axes.plot(*zip(*best, strict=True) if best else ([], []), color=color, linewidth=1.2)
+        axes.plot(*zip(*map(_place, own), strict=True), "o", color=color, markersize=_MARKER, label=series)
+    _dress(axes, title, [point.time for point in points])
+
+
+def _colored(points: Sequence[Point]) -> Iterator[tuple[str, tuple[str, list[Point]]]]:
+    """The series, each with its color."""
     by_series: dict[str, list[Point]] = defaultdict(list)
     for point in points:
         by_series[point.series].append(point)
-    for color, (series, own) in zip(_COLORS, by_series.items(), strict=False):
-        best = sorted((point.time, max(point.error, FLOOR)) for point in own if point.joined)
-        axes.plot(*zip(*best, strict=True) if best else ([], []), color=color, linewidth=1.2)
-        shown = [(point.time, max(point.error, FLOOR)) for point in own]
-        axes.plot(*zip(*shown, strict=True), "o", color=color, markersize=5, label=series)
-        for i, (point, place) in enumerate(zip(own, shown, strict=True)):
-            # Neighbors on a front lie close to one another: every other label goes to the left. All others lean.
-            left = point.joined and i % 2 == 1
-            offset, turned = ((-5, -3) if left else (5, -3), 0) if point.joined else ((2, 4), 40)
-            style = {"fontsize": 8, "color": color, "ha": "right" if left else "left", "rotation": turned}
-            axes.annotate(point.label, place, offset, textcoords="offset points", rotation_mode="anchor", **style)
-    _dress(axes, title, [point.time for point in points])
+    return zip(_COLORS, by_series.items(), strict=False)
+
+
+def _place(point: Point) -> tuple[float, float]:
+    return point.time, max(point.error, FLOOR)
+
+
+def _label(axes: Axes, points: Sequence[Point]) -> None:
+    """Each label beside its point, clear of markers, lines, the legend and one another, where there is such a place.
+
+    Those that have to go farther away have a line to their point.
+    """
+    half = cast(Figure, axes.get_figure(root=True)).dpi / 72 * _MARKER / 2
+    taken = [_around(axes.transData.transform(_place(point)), half) for point in points]
+    for line in axes.get_lines():
+        corners = axes.transData.transform(np.stack(line.get_data(), axis=1))
+        if line.get_linestyle() != "None":
+            taken += [_around(at, 1.0) for ends in pairwise(corners) for at in np.linspace(*ends, num=100)]
+    taken.append(cast(Legend, axes.get_legend()).get_window_extent())
+    for color, (_, own) in _colored(points):
+        for point in sorted((point for point in own if point.label), key=lambda point: not point.joined):
+            options = {"textcoords": "offset points", "fontsize": 8, "color": color}
+            text = axes.annotate(point.label, _place(point), (0, 0), **options)
+            taken.append(_put(text, taken, axes.get_window_extent()))
+            if max(map(abs, text.get_position())) > _STEP:
+                leader = {"arrowstyle": "-", "color": color, "linewidth": 0.5, "shrinkA": 0, "shrinkB": 0}
+                axes.annotate("", _place(point), text.get_position(), textcoords="offset points", arrowprops=leader)
+
+
+def _around(at: NDArray[np.float64], half: float) -> Bbox:
+    return Bbox.from_extents(at[0] - half, at[1] - half, at[0] + half, at[1] + half)
+
+
+def _put(text: Annotation, taken: Sequence[Bbox], inside: Bbox) -> Bbox:
+    """The label where it is clear of others, as near as can be, or at its first place; the box it has there."""
+    places = [(steps, side) for steps in range(1, _MOST_STEPS + 1) for side in _AROUND]
+    for steps, (right, up) in (*places, places[0]):
+        text.set_position((_STEP * steps * right, _STEP * steps * up))
+        text.set(ha=("right", "center", "left")[right + 1], va=("top", "center", "bottom")[up + 1])
+        box = text.get_window_extent()
+        if inside.x0 <= box.x0 and box.x1 <= inside.x1 and inside.y0 <= box.y0 and not box.count_overlaps(taken):
+            return box
+    return text.get_window_extent()
 
 
 def _dress(axes: Axes, title: str, times: Sequence[float]) -> None:

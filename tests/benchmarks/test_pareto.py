@@ -1,8 +1,11 @@
+import itertools
 import random
 
 import numpy as np
+import pareto
 import pytest
 import torch
+from matplotlib.figure import Figure
 from pareto import Point, draw, front
 from PIL import Image
 
@@ -36,3 +39,21 @@ def test_a_picture_has_a_panel_for_each_effect(tmp_path):
         lens = torch.from_numpy(np.array(three.convert("RGB")))[100:300, : three.width // 2]
     dots = (lens == torch.tensor([31, 119, 180])).all(dim=2).nonzero()[:, 0]
     assert dots.max() - dots.min() > 100
+
+
+def test_labels_of_points_that_lie_together_are_apart_and_off_the_line(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path: (figures.append(figure), path.write_bytes(b"")))
+    points = [Point(f"{0.01 * (i + 1):.2f}", "tolerance", 1 + 0.02 * (i % 3), 0.1**i, i != 2) for i in range(5)]
+    points += [Point("None", "tolerance", 9.0, 1e-6, True), Point("", "itself", 1.0, 1.0, False)]
+    draw(tmp_path / "one.png", {"lens": points}, x="time", y="error")
+    axes = figures[0].axes[0]
+    texts = [text for text in axes.texts if text.get_text()]
+    assert {text.get_text() for text in texts} == {point.label for point in points} - {""}
+    boxes = [text.get_window_extent() for text in texts]
+    assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
+    (line,) = (line for line in axes.get_lines() if line.get_linestyle() != "None" and len(line.get_xdata()) > 1)
+    path = line.get_transform().transform_path(line.get_path())
+    assert not any(path.intersects_bbox(box, filled=False) for box in boxes)
+    near = [abs(np.array(text.get_position())).max() for text in texts]
+    assert max(near) <= pareto._STEP * pareto._MOST_STEPS

@@ -153,7 +153,7 @@ def measure(
         timer = benchmark.Timer("call()", globals={"call": candidates[name]}, timer=clock, num_threads=threads)
         try:
             return timer.timeit(calls).median
-        except Exception as error:
+        except Exception as error:  # raised again, with the candidate's name
             raise RuntimeError(f"candidate {name!r} failed: {type(error).__name__}: {error}") from error
 
     calls = {name: _calls(seconds(name, 1)) for name in candidates}

@@ -205,7 +205,7 @@ def known_model(tmp_path_factory) -> Callable[..., Path]:
 
     def write(task: str, answer: tuple[float, ...], *, size: tuple[int, int] = (32, 64)) -> Path:
         checkpoints = importlib.import_module("torchrefract.restoration.checkpoints")
-        network = {"_target_": "torchrefract.restoration.models.resunet.ResUNet", "encoder": "tu-test_resnet"}
+        network = {"_target_": "torchrefract.restoration.models.resunet.ResUNet", "encoder": "tu-mobilenetv3_small_050"}
         model = {
             "_target_": "torchrefract.restoration.module.Restoration",
             "task": {"_target_": f"torchrefract.restoration.tasks.{task.capitalize()}"},

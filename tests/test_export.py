@@ -57,7 +57,7 @@ def test_a_program_computes_what_the_model_does(
     outcome = call("export", f"ckpt_path={path}", f"out=out/model{suffix}", *words)
     (line,) = outcome.out.splitlines()
     assert line.startswith(
-        f"out/model{suffix}: ResUNet (tu-test_resnet) for {task}, frames of {height}x{width}, any batch"
+        f"out/model{suffix}: ResUNet (tu-mobilenetv3_small_050) for {task}, frames of {height}x{width}, any batch"
     )
     assert [file.name for file in (tmp_path / "out").iterdir()] == [f"model{suffix}"]
     for batch in (1, 3):

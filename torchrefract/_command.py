@@ -232,7 +232,7 @@ def _options(name: str) -> list[str]:
 def _one_line_errors(name: str = "") -> Iterator[None]:
     try:
         yield
-    except Exception as error:
+    except Exception as error:  # what a user cannot mend is raised again
         if (message := _mendable(error, name)) is None:
             raise
         print(f"error: {message}", file=sys.stderr)

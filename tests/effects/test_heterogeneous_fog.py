@@ -256,7 +256,7 @@ def test_the_transmission_through_measured_depth_is_that_of_the_formula(shared_d
 
 @pytest.mark.parametrize("mode", ["image", "ray"])
 def test_gradients_of_everything_and_of_depth_are_those_of_finite_differences(mode):
-    image, depth = picture(2, 1, 3, 4), 10 + 80 * picture(2, 1, 3, 4)
+    image, depth = picture(2, 3, 3, 4), 10 + 80 * picture(2, 1, 3, 4)
     effect = HeterogeneousFog(mode=mode)
     params = effect.sample(image, seed=3, frame=2.5)
     names = ("visibility", "deviation", "airlight", "weights", "contrast", "wind", "decorrelation", "frame")

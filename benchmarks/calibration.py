@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 import torch
 
-from torchrefract._files import replacing
-from torchrefract._levels import levels_of, numbers_of
+from torchrefract._io import replace_file
+from torchrefract._tensor import to_float, to_uint8
 from torchrefract.board_views import pictures_of, read_gray
 from torchrefract.calibration_report import camera_of
 from torchrefract.cameras.calibration.boards import Board, Charuco, Chessboard
@@ -161,8 +161,8 @@ def _straight(views: list[View], pictures: dict[str, np.ndarray], board: Board, 
     """How straight corners are before and after, of those found in both."""
     flow, pairs = camera_flow(camera)[0], []
     for view in views:
-        image = numbers_of(torch.from_numpy(pictures[view.name])[None, None])
-        rectified = levels_of(warp(image, flow, interpolation="bicubic")[0])
+        image = to_float(torch.from_numpy(pictures[view.name])[None, None])
+        rectified = to_uint8(warp(image, flow, interpolation="bicubic")[0])
         again = detect(rectified[0, 0].numpy(), board, name=view.name)
         both, before, after = np.intersect1d(view.ids, again.ids, return_indices=True)
         pairs.append((View(view.name, both, view.corners[before]), View(view.name, both, again.corners[after])))
@@ -198,7 +198,7 @@ def main() -> None:
                 rows.append(measure(name, entry, args.folder / kind / name))
                 print(_show(rows[-1]), flush=True)
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(args.out) as temporary:
+    with replace_file(args.out) as temporary:
         temporary.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n", encoding="utf-8")
     print(f"written to {args.out}")
 

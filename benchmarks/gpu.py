@@ -21,7 +21,7 @@ from subjects import SMOOTH, TOLERANCE_PX, effects
 from timing import COPY, FEWEST_REPEATS, GRID_SAMPLE, Bar, Candidate, Conditions, Timing, measure, references, table
 from torch import Tensor
 
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.effects.base import Effect
 from torchrefract.warping.grid import length
 
@@ -148,7 +148,7 @@ def save(
         "bars": [asdict(bar) | {"holds": bar.holds} for bar in bars],
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 

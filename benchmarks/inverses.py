@@ -19,11 +19,11 @@ from timing import FEWEST_REPEATS, GRID_SAMPLE, Candidate, Conditions, Timing, m
 from torch import Tensor
 
 from torchrefract import ThinPlateParams, invert_flow
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.data.images import EXTENSIONS, image_size
 from torchrefract.fields.spline import evaluate_spline, fit_spline
 from torchrefract.warping.grid import inside, length, pixel_axes
-from torchrefract.warping.resample import look_up
+from torchrefract.warping.resample import sample_image
 
 WHAT = (
     "Flows of every warp, at its defaults and strong, inverted by the fixed point v <- -flow(p + v) from -flow and by "
@@ -138,7 +138,7 @@ def fixed_point(flow: Tensor, *, steps: int) -> tuple[Tensor, Tensor, Tensor]:
 
 def read(field: Tensor, flow: Tensor) -> Tensor:
     """A field (B, C, H, W) at p + flow(p), bilinearly, outside the frame as at its border."""
-    return look_up(field, flow, padding="border", interpolation="bilinear")
+    return sample_image(field, flow, padding="border", interpolation="bilinear")
 
 
 def certify(flow: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
@@ -248,7 +248,7 @@ def _save(
         "effects": {name: [asdict(row) for row in table] for name, table in tables.items()},
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 

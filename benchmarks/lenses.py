@@ -25,7 +25,7 @@ from timing import Conditions
 from torch import Tensor
 
 from torchrefract import Camera
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.cameras.conversion import Conversion, convert
 from torchrefract.cameras.lens_table import COLUMNS
 
@@ -80,7 +80,7 @@ def main() -> None:
         "inverses": [asdict(row) for row in inverses],
         "conversions": {name: {to: _told(one) for to, one in to_all.items()} for name, to_all in made.items()},
     }
-    with replacing(args.out) as temporary:
+    with replace_file(args.out) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     print(f"\nwritten to {args.out}")
     if args.table is not None:
@@ -206,7 +206,7 @@ def conversion_table(made: Mapping[str, Mapping[str, Conversion]]) -> str:
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]], made: Mapping[str, Mapping[str, Conversion]]) -> None:
     """The CSV of `read_lenses`, without the rows that are share-alike."""
-    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    with replace_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
         for row in rows:

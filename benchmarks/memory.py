@@ -27,7 +27,7 @@ from torchrefract import (
     Turbulence,
     UniformFog,
 )
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 
 WHAT = (
     "The most memory that torch holds at any moment of effect(image), the result included, the image not, without "
@@ -54,7 +54,7 @@ def main() -> None:
     print(WHAT, "", *(f"{name:46} {value:6.3g} x" for name, value in measured.items()), "", *bars, sep="\n")
     content = {"what": WHAT, "conditions": asdict(conditions), "peak": measured}
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(args.out) as path:
+    with replace_file(args.out) as path:
         kept = content | {"bars": [asdict(bar) | {"holds": bar.holds} for bar in bars]}
         path.write_text(json.dumps(kept, indent=2) + "\n", encoding="utf-8")
     print(f"written to {args.out}")

@@ -32,7 +32,7 @@ from torchrefract import (
     Turbulence,
     compose_flows,
 )
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.data.images import EXTENSIONS, read_image
 from torchrefract.effects.refraction import WarpEffect
 from torchrefract.warping.grid import inside, length
@@ -253,7 +253,7 @@ def _save(
         "bars": [asdict(bar) | {"holds": bar.holds} for bar in held],
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 

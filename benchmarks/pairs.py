@@ -25,8 +25,7 @@ from looks import LOOKS, seconds
 from omegaconf import OmegaConf
 from timing import Bar
 
-from torchrefract._config import CONFIG_DIR
-from torchrefract._files import replacing
+from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract.data.pair_files import FORMATS, decode_pair, encode_pair
 from torchrefract.pairs.making import Job, Maker, Recipe
 from torchrefract.pairs.running import work_alone
@@ -90,7 +89,7 @@ def main() -> None:
         "single": single._asdict(),
     }
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(args.out) as path:
+    with replace_file(args.out) as path:
         path.write_text(json.dumps(content | {"differ_after_kills": broken}, indent=2) + "\n", encoding="utf-8")
     print(f"written to {args.out}")
 

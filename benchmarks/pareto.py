@@ -15,7 +15,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 
 # What is drawn at the foot of a panel: errors that small are rounding, or none at all.
 FLOOR = 1e-5
@@ -63,7 +63,7 @@ def draw(path: Path, panels: Mapping[str, Sequence[Point]], *, x: str, y: str) -
     for axes, (_, points) in drawn:
         _label(axes, points)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         figure.savefig(temporary)
 
 

@@ -23,7 +23,7 @@ from looks import timed
 from timing import FEWEST_REPEATS, GRID_SAMPLE, Candidate, Conditions, Timing, references, save, table
 from torch import Tensor
 
-from torchrefract._levels import levels_of
+from torchrefract._tensor import to_uint8
 
 WHAT = (
     "One frame 1x3xHxW float32 through our effects, kornia and torchvision, and the same frame as uint8 HxWx3, which "
@@ -108,7 +108,7 @@ def versions(peers: Mapping[str, ModuleType]) -> str:
 
 def candidates(frame: Tensor, peers: Mapping[str, ModuleType]) -> dict[str, Candidate]:
     """What is compared on a frame (1, 3, H, W), by job and name; the references come first."""
-    pixels = levels_of(frame)[0].movedim(0, -1).contiguous().numpy()
+    pixels = to_uint8(frame)[0].movedim(0, -1).contiguous().numpy()
     found = peer_warps.candidates(frame, pixels, peers) | peer_fields.candidates(frame, pixels, peers)
     found |= peer_weather.candidates(frame, peers)
     for name, chosen in albumentations(peers, frame.shape[3]).items():

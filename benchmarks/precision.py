@@ -22,7 +22,7 @@ from timing import Conditions
 from torch import Tensor
 
 from torchrefract import Turbulence
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.effects.base import Effect
 from torchrefract.fields.gaussian import gaussian_random_field, spectrum
 from torchrefract.fields.spline import fit_spline, spline_flow
@@ -85,7 +85,7 @@ def main() -> None:
     )
     content = {"what": WHAT, "conditions": asdict(conditions), "errors": [asdict(error) for error in found]}
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(args.out) as path:
+    with replace_file(args.out) as path:
         path.write_text(json.dumps(content | {"second_derivatives": seconds}, indent=2) + "\n", encoding="utf-8")
     print(f"written to {args.out}")
 

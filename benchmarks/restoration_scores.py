@@ -6,7 +6,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
-from torchrefract._levels import levels_of, numbers_of
+from torchrefract._tensor import to_float, to_uint8
 from torchrefract.data.module import make_pair
 from torchrefract.effects.base import Effect
 from torchrefract.effects.defog import remove_fog
@@ -106,7 +106,7 @@ def constant_flow(effect: Effect, like: Tensor) -> Tensor:
 def undone(frame: Frame, effect: Effect) -> Tensor:
     """(B, 3, H, W): the clean image from the degraded one in 8 bits and the true map, where that leaves any of it."""
     degraded = effect.degrade(frame.image, seed=_SEED, keys=frame.key)
-    image = numbers_of(levels_of(degraded.image))
+    image = to_float(to_uint8(degraded.image))
     if isinstance(effect, LensFlare):
         return torch.where(degraded.valid, image - degraded.intensity, image)
     return remove_fog(image, degraded.transmission, degraded.params.airlight)[0].clamp(0, 1)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, compose_flows, warp
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.data.images import EXTENSIONS, read_image
 from torchrefract.effects.refraction import WarpEffect
 from torchrefract.warping.grid import length
@@ -105,7 +105,7 @@ def main() -> None:
             flush=True,
         )
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(args.out) as temporary:
+    with replace_file(args.out) as temporary:
         temporary.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n", encoding="utf-8")
     print(f"written to {args.out}")
 

@@ -19,7 +19,7 @@ from memory import peak_bytes
 from subjects import SMOOTH, TOLERANCE_PX, all_warps, effects
 from timing import FEWEST_REPEATS, GRID_SAMPLE, Conditions, references
 
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.effects.base import Effect
 
 WHAT = (
@@ -78,7 +78,7 @@ def main() -> None:
         found += grow(along, steps(), limit=limit, repeats=args.repeats, threads=args.threads)
         print(*table([growth for growth in found if growth.along == along]), "", sep="\n", flush=True)
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(args.out) as path:
+    with replace_file(args.out) as path:
         rows = [asdict(growth) | {"slope": growth.slope} for growth in found]
         content = {"what": WHAT, "conditions": asdict(conditions), "growth": rows}
         path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

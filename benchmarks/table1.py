@@ -28,7 +28,7 @@ from restoration_scores import METRIC_SIZE, MIX, Restore, Scores, corrupted, eff
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.data.frame_folder import FrameFolder
 from torchrefract.restoration.diffusion import Diffusion
 from torchrefract.restoration.loading import Loaded, load_model
@@ -78,7 +78,7 @@ def main() -> None:
     print(text)
     args.out.mkdir(parents=True, exist_ok=True)
     for name, content in (("table.md", text), ("table.json", json.dumps([asdict(line) for line in lines], indent=2))):
-        with replacing(args.out / name) as path:
+        with replace_file(args.out / name) as path:
             path.write_text(content + "\n", encoding="utf-8")
     print(f"written to {args.out}; each row has its curves.png and panel.png")
 

@@ -27,7 +27,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils import benchmark
 
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract._memory import keep_freed_memory
 from torchrefract.warping.grid import pixel_axes, sampler_grid
 
@@ -209,7 +209,7 @@ def save(path: Path, timings: Sequence[Timing], conditions: Conditions, *, what:
         "bars": [asdict(bar) | {"holds": bar.holds} for bar in bars],
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 

@@ -21,7 +21,7 @@ import torch
 from arguments import count
 
 from torchrefract import Compose, DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.cameras.distortion import POLYNOMIAL12
 from torchrefract.effects.compose_plan import ComposePlan
 from torchrefract.effects.lattice_warp import LatticeWarp
@@ -84,7 +84,7 @@ def try_all(
         trials[name] = [attempt(name, args.seed + i) for i in range(args.count)]
         print(summary(name, trials[name]), flush=True)
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(args.out) as path:
+    with replace_file(args.out) as path:
         rows = {name: [asdict(trial) for trial in found] for name, found in trials.items()}
         path.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
     print(f"written to {args.out}")

@@ -24,7 +24,7 @@ from sweeps import DENSE, ITSELF, SWEEPS, Variant
 from timing import FEWEST_REPEATS, GRID_SAMPLE, Candidate, Conditions, Spread, references
 from torch import Tensor
 
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.data.images import EXTENSIONS, fit, image_size, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 
@@ -157,11 +157,11 @@ def point(row: Row) -> Point:
 def save(folder: Path, rows: Sequence[Row], conditions: Conditions, *, frames: int) -> None:
     """The rows as CSV and JSON, and their picture; `frames` is how many the errors are over."""
     folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / "tradeoff.csv") as path, path.open("w", newline="", encoding="utf-8") as stream:
+    with replace_file(folder / "tradeoff.csv") as path, path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, [field.name for field in fields(Row)])
         writer.writeheader()
         writer.writerows(asdict(row) for row in rows)
-    with replacing(folder / "tradeoff.json") as path:
+    with replace_file(folder / "tradeoff.json") as path:
         kept = [asdict(row) | {"psnr_db": None if math.isinf(row.psnr_db) else row.psnr_db} for row in rows]
         content = {"what": WHAT, "conditions": asdict(conditions), "frames": frames, "rows": kept}
         path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")

@@ -19,7 +19,7 @@ from timing import FEWEST_REPEATS, GRID_SAMPLE, Bar, Candidate, Conditions, Timi
 from torch import Tensor
 
 from torchrefract import presets
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.data.module import make_pair
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
@@ -114,7 +114,7 @@ def _save(
         "bars": [asdict(bar) | {"holds": bar.holds} for bar in bars],
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 

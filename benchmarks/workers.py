@@ -20,8 +20,8 @@ from torch import Tensor
 from torch.utils import benchmark
 from torch.utils.data import DataLoader, Dataset
 
-from torchrefract._files import replacing
-from torchrefract._levels import levels_of
+from torchrefract._io import replace_file
+from torchrefract._tensor import to_uint8
 from torchrefract.effects.base import Effect
 
 WHAT = (
@@ -90,7 +90,7 @@ def main() -> None:
     ((timings, notes, conditions),) = loader(Measured(chosen, frame, args.repeats))
     held = bars(timings, list(within))
     print(table(timings, conditions), *notes, "", *held, "", sep="\n", flush=True)
-    pixels = levels_of(frame)[0]
+    pixels = to_uint8(frame)[0]
     rates = {}
     for name, frames in datasets(chosen, albumentations(peers, args.size[1]), pixels).items():
         rates[name] = rate(frames, seconds=args.seconds)
@@ -144,7 +144,7 @@ def _save(
         "frames_per_second": rates,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 

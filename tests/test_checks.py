@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from torchrefract._checks import (
-    check_all,
+from torchrefract._validation import (
     check_choice,
     check_count,
     check_flow,
     check_number,
     check_range,
     check_tensor,
+    check_values,
     check_within,
-    is_true,
-    read,
+    eager_bool,
+    eager_values,
 )
 
 
@@ -137,15 +137,15 @@ def test_a_flow_of_no_floats_raises(dtype):
 
 
 def test_a_wrong_value_in_a_tensor_is_named():
-    check_all("depth", "be above 0, in m", torch.tensor([1.0, 2.0]), positive)
+    check_values("depth", "be above 0, in m", torch.tensor([1.0, 2.0]), positive)
     with pytest.raises(ValueError, match=r"depth must be above 0, in m, got -2\.5"):
-        check_all("depth", "be above 0, in m", torch.tensor([1.0, -2.5, -3.0]), positive)
+        check_values("depth", "be above 0, in m", torch.tensor([1.0, -2.5, -3.0]), positive)
 
 
 def test_nothing_is_read_from_a_device_that_would_make_us_wait():
     elsewhere = torch.empty(3, device="meta")
-    check_all("depth", "be above 0, in m", elsewhere, positive)
-    assert is_true((elsewhere > 0).all) is None
+    check_values("depth", "be above 0, in m", elsewhere, positive)
+    assert eager_bool((elsewhere > 0).all) is None
 
 
 def test_what_cannot_be_read_is_not_even_computed():
@@ -155,18 +155,18 @@ def test_what_cannot_be_read_is_not_even_computed():
         computed.append(value)
         return value
 
-    assert is_true(lambda: kept(elsewhere).all(), of=elsewhere) is None
-    assert read(lambda: kept(elsewhere), of=elsewhere) is None
-    check_all("depth", "be above 0, in m", elsewhere, lambda value: kept(value) > 0)
+    assert eager_bool(lambda: kept(elsewhere).all(), of=elsewhere) is None
+    assert eager_values(lambda: kept(elsewhere), of=elsewhere) is None
+    check_values("depth", "be above 0, in m", elsewhere, lambda value: kept(value) > 0)
     assert computed == []
-    assert read(lambda: kept(torch.arange(2)), of=torch.empty(0)) == [0, 1]
+    assert eager_values(lambda: kept(torch.arange(2)), of=torch.empty(0)) == [0, 1]
     assert len(computed) == 1
 
 
 def test_nothing_is_read_while_compiling():
     @torch.compile(fullgraph=True, backend="eager")
     def checked(value):
-        check_all("depth", "be above 0, in m", value, positive)
+        check_values("depth", "be above 0, in m", value, positive)
         return value + 1
 
     assert torch.equal(checked(torch.tensor([-1.0])), torch.tensor([0.0]))
@@ -174,12 +174,12 @@ def test_nothing_is_read_while_compiling():
 
 def test_nothing_is_read_inside_vmap():
     def checked(value):
-        check_all("depth", "be above 0, in m", value, positive)
+        check_values("depth", "be above 0, in m", value, positive)
         return value + 1
 
     assert torch.equal(torch.vmap(checked)(torch.tensor([[-1.0], [1.0]])), torch.tensor([[0.0], [2.0]]))
 
 
 def test_the_truth_of_a_readable_tensor_is_told():
-    assert is_true(lambda: torch.tensor(True)) is True
-    assert is_true(lambda: torch.tensor(False)) is False
+    assert eager_bool(lambda: torch.tensor(True)) is True
+    assert eager_bool(lambda: torch.tensor(False)) is False

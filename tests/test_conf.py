@@ -11,7 +11,7 @@ from pytorch_lightning import Trainer
 
 import torchrefract
 from torchrefract import presets
-from torchrefract._config import CONFIG_DIR
+from torchrefract._io import CONFIG_DIR
 from torchrefract.cameras.calibration.boards import Charuco, Chessboard
 from torchrefract.data.module import PairData
 from torchrefract.effects.base import Effect

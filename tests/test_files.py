@@ -1,12 +1,12 @@
 import pytest
 
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 
 
 def test_the_old_file_is_there_until_the_new_one_is_whole(tmp_path):
     path = tmp_path / "panel.png"
     path.write_text("old")
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_text("new")
         assert path.read_text() == "old"
         assert (temporary.parent, temporary.suffix) == (path.parent, path.suffix)
@@ -20,7 +20,7 @@ def test_a_failure_keeps_the_old_file_and_leaves_no_other(tmp_path, error):
     path.write_text("old")
 
     def fail():
-        with replacing(path) as temporary:
+        with replace_file(path) as temporary:
             temporary.write_text("half")
             raise error
 
@@ -32,11 +32,11 @@ def test_a_failure_keeps_the_old_file_and_leaves_no_other(tmp_path, error):
 
 def test_a_new_file_can_be_read_by_whom_the_umask_lets(tmp_path):
     (tmp_path / "plain").write_text("")
-    with replacing(tmp_path / "replaced") as temporary:
+    with replace_file(tmp_path / "replaced") as temporary:
         temporary.write_text("")
     assert (tmp_path / "replaced").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
 def test_a_block_that_writes_nothing_is_an_error(tmp_path):
-    with pytest.raises(FileNotFoundError), replacing(tmp_path / "panel.png"):
+    with pytest.raises(FileNotFoundError), replace_file(tmp_path / "panel.png"):
         pass

@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 import torchrefract as tr
-from torchrefract._errors import UsageError
+from torchrefract._validation import UsageError
 from torchrefract.effects.base import Effect
 from torchrefract.film import Film, Footage, formats, make_film, save_film
 from torchrefract.viz import flow_to_rgb, transmission_to_rgb

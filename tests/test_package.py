@@ -10,8 +10,8 @@ import pytest
 import torch
 
 import torchrefract
-from torchrefract._config import CONFIG_DIR
-from torchrefract._constants import assume_constant_result
+from torchrefract._io import CONFIG_DIR
+from torchrefract._tensor import assume_constant_result
 
 ROOT = Path(__file__).parents[1]
 HEAVY = (

@@ -150,6 +150,6 @@ def test_one_of_the_paper_s_effects_is_chosen_for_each_frame():
         effect = made(name)
         assert isinstance(effect, OneOf)
         params = effect.sample(torch.zeros(200, 3, *SIZE), seed=1)
-        gates = torch.stack([child.gate for child in params.children])
+        gates = torch.stack([child.applied for child in params.children])
         assert (gates.sum(dim=0) == 1).all()
         assert (gates.sum(dim=1) > 30).all()

@@ -17,8 +17,8 @@ from PIL import Image
 
 import torchrefract as tr
 from torchrefract._command import with_picture
-from torchrefract._config import CONFIG_DIR
-from torchrefract._errors import UsageError
+from torchrefract._io import CONFIG_DIR
+from torchrefract._validation import UsageError
 from torchrefract.data.images import fit, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.film import Film

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchrefract._products import product
+from torchrefract._tensor import exact_matmul
 
 
 @pytest.mark.parametrize("told", ["highest", "high", "medium"])
@@ -10,7 +10,7 @@ def test_products_keep_the_digits_of_their_type_whatever_a_training_asks_for(tol
     exact = left.double() @ right.double()
     torch.set_float32_matmul_precision(told)
     try:
-        found, wide = product(left, right), product(left.double(), right.double())
+        found, wide = exact_matmul(left, right), exact_matmul(left.double(), right.double())
     finally:
         torch.set_float32_matmul_precision("highest")
     assert torch.equal(found, left @ right if told == "highest" else exact.float())

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrefract.cameras.files.opencv import read_opencv, write_opencv
+from torchrefract.cameras.io.opencv import read_opencv, write_opencv
 from torchrefract.cameras.models import Camera
 from torchrefract.fields.rectifying import camera_flow
 from torchrefract.videos import video_facts

@@ -165,7 +165,7 @@ def test_a_flare_has_a_map_of_its_intensity_with_its_own_scale_and_nothing_to_un
 @pytest.mark.parametrize("seed", range(6))
 def test_of_several_lights_the_one_that_was_drawn_is_mapped(frame, seed):
     effect = tr.OneOf([FOG, SUN])
-    fog, sun = (child.gate.item() for child in effect.degrade(frame, seed=seed).params.children)
+    fog, sun = (child.applied.item() for child in effect.degrade(frame, seed=seed).params.children)
     assert fog != sun
     row = make_row("one", effect, frame=frame, seed=seed)
     assert [scale.name for scale in row.scales] == ["transmission" if fog else "intensity"]

@@ -23,8 +23,8 @@ from rich.console import Console
 from rich.progress import track
 from yaml import YAMLError
 
-from torchrefract._config import CONFIG_DIR
-from torchrefract._errors import UsageError
+from torchrefract._io import CONFIG_DIR
+from torchrefract._validation import UsageError
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.pair_files import DamagedPairError
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._checks import withheld
+from torchrefract._validation import why_not_eager
 
 # Below so many pixels a call costs more than it brings.
 SMALLEST = 1 << 14
@@ -20,7 +20,7 @@ def obstacle(*values: Tensor) -> str | None:
     for value in values:
         if value.dtype is not torch.float32:
             return f"for numbers that are {value.dtype}"
-        if why := withheld(value):
+        if why := why_not_eager(value):
             return why
     return None if kernels("_jit") else "without numba (pip install 'torchrefract[fast]')"
 

@@ -9,9 +9,9 @@ from pytorch_lightning import LightningModule, Trainer, seed_everything
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
 from torchrefract._command import check_seed, make, naming
-from torchrefract._errors import UsageError
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract._memory import keep_freed_memory
+from torchrefract._validation import UsageError
 from torchrefract.data.fingerprint import fingerprint
 from torchrefract.data.module import PairData
 from torchrefract.restoration.checkpoints import Origin, check_fits, read_checkpoint
@@ -50,7 +50,7 @@ def make_job(cfg: DictConfig, *, needs_checkpoint: bool = False) -> Job:
     if made.trainer.is_global_zero:
         with naming("run_dir"):
             Path(cfg.run_dir).mkdir(parents=True, exist_ok=True)
-            with replacing(Path(cfg.run_dir, "config.yaml")) as path:
+            with replace_file(Path(cfg.run_dir, "config.yaml")) as path:
                 OmegaConf.save(cfg, path)
     return made
 

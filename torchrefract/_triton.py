@@ -7,7 +7,7 @@ from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor  # pyright: ignore[reportMissingImports]  # it is of C++, without stubs
 from torch.autograd import forward_ad
 
-from torchrefract._constants import assume_constant_result
+from torchrefract._tensor import assume_constant_result
 
 
 def reads(module: str, *values: Tensor) -> bool:

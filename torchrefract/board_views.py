@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from torchrefract._errors import UsageError
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
+from torchrefract._validation import UsageError
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.detection import View, detect, is_enough
 from torchrefract.cameras.calibration.diagnosis import edge_width, explain, what_instead
@@ -58,7 +58,7 @@ def look_at(files: Sequence[Path], board: Board, kept: Path) -> Iterator[Look]:
     """
     key = {"version": _VERSION, "opencv": cv2.__version__, "board": board.describe()}
     before = _read(kept, key)
-    with replacing(kept) as path:
+    with replace_file(kept) as path:
         lines = [key, *(_as_json(look, stamp) for (_, stamp), look in before.items())]
         path.write_text("".join(f"{json.dumps(line)}\n" for line in lines), encoding="utf-8")
     with kept.open("a", encoding="utf-8") as stream:

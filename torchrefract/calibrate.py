@@ -8,11 +8,9 @@ import cv2
 import hydra
 from omegaconf import DictConfig
 
-from torchrefract._checks import check_choice, check_number
 from torchrefract._command import as_they_are, command, job, make, naming, progress
-from torchrefract._config import CONFIG_DIR
-from torchrefract._errors import UsageError
-from torchrefract._files import replacing
+from torchrefract._io import CONFIG_DIR, replace_file
+from torchrefract._validation import UsageError, check_choice, check_number
 from torchrefract.board_views import Look, look_at, main_size, pictures_of, shown_instead
 from torchrefract.calibration_report import CAMERA_FILE, Calibration, camera_of, set_aside, write_looks, write_report
 from torchrefract.cameras.calibration.boards import Board
@@ -20,7 +18,7 @@ from torchrefract.cameras.calibration.coverage import faults
 from torchrefract.cameras.calibration.fit import FEWEST_VIEWS, MODELS, held_out
 from torchrefract.cameras.calibration.outliers import drop_outliers
 from torchrefract.cameras.calibration.synthetic import CAMERA, VIEWS, render_views
-from torchrefract.cameras.files.opencv import write_opencv
+from torchrefract.cameras.io.opencv import write_opencv
 
 _RENDERED = "synthetic"
 _NEEDED = FEWEST_VIEWS + 1  # views, so that each can be left out
@@ -59,9 +57,9 @@ def _rendered(board: Board, folder: Path) -> list[Path]:
     if not mark.is_file() or mark.read_text(encoding="utf-8") != made_by:
         folder.mkdir(exist_ok=True)
         for name, picture, _ in progress(render_views(board), "rendering", count=VIEWS):
-            with replacing(folder / name) as path:
+            with replace_file(folder / name) as path:
                 cv2.imwrite(str(path), picture)
-        with replacing(mark) as path:
+        with replace_file(mark) as path:
             path.write_text(made_by, encoding="utf-8")
     return pictures_of(folder)
 

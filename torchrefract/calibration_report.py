@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.board_views import Look, read_gray
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.coverage import CELLS, coverage, doubts
@@ -62,7 +62,7 @@ def write_report(found: Calibration, files: dict[str, Path], out: Path) -> None:
         out: the folder.
     """
     for name, figure in zip(_PICTURES, (_coverage(found), _residuals(found, files)), strict=True):
-        with replacing(out / name) as path:
+        with replace_file(out / name) as path:
             figure.savefig(path)
     _write(out / "report.md", _report(found))
 
@@ -101,7 +101,7 @@ def _before(path: Path) -> Path:
 
 
 def _write(path: Path, lines: Sequence[str]) -> None:
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -158,7 +158,9 @@ def _straight(found: Calibration) -> list[str]:
 
 
 def _ranked(found: Calibration) -> list[tuple[str, ...]]:
-    own = {view.name: (len(view.ids), rms(e)) for view, e in zip(found.kept.views, found.fitted.errors, strict=True)}
+    own = {
+        view.name: (len(view.ids), rms(e)) for view, e in zip(found.kept.views, found.fitted.errors, strict=True)
+    }
     return [
         (
             left.name,

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._checks import withheld
 from torchrefract._compiled import kernels
-from torchrefract._constants import constant
+from torchrefract._tensor import as_device_tensor
 from torchrefract._triton import reads
+from torchrefract._validation import why_not_eager
 from torchrefract.threefry import WORD, Words, empty_words, rounds, threefry
 
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -116,7 +116,7 @@ def between_of(high: Tensor, low: Tensor, lane: int, ends: Sequence[float], doub
     if _kernels(low) is not None:
         return torch.from_numpy(within(ends, uniform_of(high, low, lane, len(ends) // 2).numpy(), double=double))
     dtype = torch.float64 if double else torch.float32
-    least, most = constant(ends, dtype=dtype, device=low.device).unflatten(0, (-1, 2)).unbind(1)
+    least, most = as_device_tensor(ends, dtype=dtype, device=low.device).unflatten(0, (-1, 2)).unbind(1)
     return least + (most - least) * uniform_of(high, low, lane, len(ends) // 2).to(dtype)
 
 
@@ -175,4 +175,4 @@ def _under(high: Tensor, low: Tensor, counter: tuple[int, int]) -> Words:
 
 def _kernels(value: Tensor) -> Any:
     """Those of numba, where they can read a tensor, else None."""
-    return None if withheld(value) or kernels("_jit") is None else kernels("draw_kernels")
+    return None if why_not_eager(value) or kernels("_jit") is None else kernels("draw_kernels")

@@ -4,7 +4,7 @@ import hydra
 from omegaconf import DictConfig
 
 from torchrefract._command import command, job
-from torchrefract._config import CONFIG_DIR
+from torchrefract._io import CONFIG_DIR
 from torchrefract._learning import make_job
 
 

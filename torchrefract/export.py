@@ -8,11 +8,9 @@ import hydra
 import torch
 from omegaconf import DictConfig
 
-from torchrefract._checks import check_choice
 from torchrefract._command import as_they_are, command, job, naming
-from torchrefract._config import CONFIG_DIR
-from torchrefract._errors import UsageError
-from torchrefract._files import replacing
+from torchrefract._io import CONFIG_DIR, replace_file
+from torchrefract._validation import UsageError, check_choice
 from torchrefract.programs import FORMATS, outputs_of, save_program, traced
 from torchrefract.restoration.loading import Loaded, load_model
 from torchrefract.restoration.module import Restoration
@@ -43,7 +41,7 @@ def main(cfg: DictConfig) -> None:
     with torch.no_grad():
         expected = network(images)
     about = _about(loaded, (height, width), [*_BARS][: len(expected)])
-    with replacing(out) as path:
+    with replace_file(out) as path:
         save_program(program, path, about=about)
         errors = _errors(path, images, expected)
     told = ", ".join(f"{name} off by {error:.1e} at most" for name, error in errors.items())

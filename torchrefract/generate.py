@@ -17,11 +17,9 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from torchrefract._checks import check_choice, check_count, check_flag, check_number, check_size
 from torchrefract._command import check_seed, command, job, leave, make, naming, with_text
-from torchrefract._config import CONFIG_DIR
-from torchrefract._errors import UsageError
-from torchrefract._files import replacing
+from torchrefract._io import CONFIG_DIR, replace_file
+from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_number, check_size
 from torchrefract.data.frame_folder import some
 from torchrefract.data.pair_files import FORMATS
 from torchrefract.data.pair_manifest import manifests, scan
@@ -236,7 +234,7 @@ def _finish(asked: _Asked, out: Path, *, made: int) -> None:
 
 def _write(path: Path, data: bytes) -> None:
     """Write a file that several shards may be writing at once."""
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_bytes(data)
 
 

@@ -5,11 +5,9 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
-from torchrefract._checks import check_number
 from torchrefract._command import as_they_are, command, job, make, naming
-from torchrefract._config import CONFIG_DIR
-from torchrefract._errors import UsageError
-from torchrefract._files import replacing
+from torchrefract._io import CONFIG_DIR, replace_file
+from torchrefract._validation import UsageError, check_number
 from torchrefract.board_prints import board_page
 
 _FORMATS = (".pdf", ".png")
@@ -28,7 +26,7 @@ def main(cfg: DictConfig) -> None:
     if out.suffix.lower() not in _FORMATS:
         raise UsageError(f"out must end in {' or '.join(_FORMATS)}, got {out}")
     try:
-        with replacing(out) as path:
+        with replace_file(out) as path:
             board_page(board, margin_mm=margin).savefig(path, dpi=dpi)
     except OSError as error:
         raise UsageError(f"{out} could not be written: {error.strerror}") from error

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torchrefract._levels import levels_of
+from torchrefract._tensor import to_uint8
 
 _DPI = 100
 _SMALLEST = 320  # px, the longer side of an image as drawn
@@ -86,7 +86,7 @@ class Page(NamedTuple):
         (height, width), size = image.shape[1:], self.size
         axes = figure.add_axes((x / size[0], 1 - (y + height) / size[1], width / size[0], height / size[1]))
         axes.set_axis_off()
-        axes.imshow(levels_of(image[None])[0].movedim(0, -1).numpy(), interpolation="nearest", aspect="auto")
+        axes.imshow(to_uint8(image[None])[0].movedim(0, -1).numpy(), interpolation="nearest", aspect="auto")
 
     def explain(self, figure: Figure, image: Tensor, text: str, *, x: int, y: int) -> None:
         """A patch of an image (3, page.height, page.width), three lines wide and two high, and its text beside."""

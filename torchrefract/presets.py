@@ -9,7 +9,7 @@ Scenes that move pixels count in px of a frame `width` wide; give the width of y
 from collections.abc import Sequence
 from typing import TypeVar
 
-from torchrefract._checks import check_positive
+from torchrefract._validation import check_positive
 from torchrefract.effects.compose import Compose
 from torchrefract.effects.depth import GroundPlaneDepth
 from torchrefract.effects.divergence_free import DivergenceFree

@@ -15,11 +15,9 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchrefract._checks import check_count, check_number, check_positive, check_size
 from torchrefract._command import check_seed, command, job, make, naming, with_picture
-from torchrefract._config import CONFIG_DIR
-from torchrefract._errors import UsageError
-from torchrefract._files import replacing
+from torchrefract._io import CONFIG_DIR, replace_file
+from torchrefract._validation import UsageError, check_count, check_number, check_positive, check_size
 from torchrefract.data.images import EXTENSIONS, files_in, fit, image_size, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
@@ -223,7 +221,7 @@ def _writing(out: str) -> Iterator[Path]:
     if Path(out).is_dir():
         raise UsageError(f"out must be a file, got the folder {out}")
     try:
-        with replacing(Path(out)) as path:
+        with replace_file(Path(out)) as path:
             path.touch()
             yield path
     except OSError as error:

@@ -10,7 +10,7 @@ from types import ModuleType
 import torch
 from torch import Tensor, nn
 
-from torchrefract._errors import UsageError
+from torchrefract._validation import UsageError
 
 FORMATS = (".onnx", ".pt2")
 ABOUT = "about.json"  # of a .pt2, in its extra files

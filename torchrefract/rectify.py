@@ -9,12 +9,10 @@ import numpy as np
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchrefract._checks import check_number
 from torchrefract._command import as_they_are, command, job, naming, progress
-from torchrefract._config import CONFIG_DIR
-from torchrefract._errors import UsageError
-from torchrefract._files import replacing
-from torchrefract.cameras.files.opencv import read_opencv, write_opencv
+from torchrefract._io import CONFIG_DIR, replace_file
+from torchrefract._validation import UsageError, check_number
+from torchrefract.cameras.io.opencv import read_opencv, write_opencv
 from torchrefract.cameras.models import Camera
 from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
 from torchrefract.fields.rectifying import camera_flow
@@ -101,7 +99,7 @@ def _rectify(file: Path, lens: _Lens, out: Path) -> bool:
     target = out / written_as(file).name
     if is_written(file, target):
         return False
-    with replacing(target) as path:
+    with replace_file(target) as path:
         if is_video(file):
             write_frames(file, path, change=partial(map, lens))
         else:

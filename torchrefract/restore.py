@@ -14,11 +14,9 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchrefract._checks import check_count, check_flag, check_size
 from torchrefract._command import as_they_are, command, job, naming, progress
-from torchrefract._config import CONFIG_DIR
-from torchrefract._errors import UsageError
-from torchrefract._files import replacing
+from torchrefract._io import CONFIG_DIR, replace_file
+from torchrefract._validation import UsageError, check_count, check_flag, check_size
 from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
 from torchrefract.footage import (
     check_apart,
@@ -144,7 +142,7 @@ def _pictures(files: Sequence[Path], asked: _Asked, failed: dict[Path, str]) -> 
         for file, pixels in zip(read, asked.restored([*read.values()]) if read else (), strict=True):
             target = asked.target(file)
             target.parent.mkdir(parents=True, exist_ok=True)
-            with replacing(target) as path:
+            with replace_file(target) as path:
                 write_picture(pixels, path)
             made += 1
     return made
@@ -178,7 +176,7 @@ def _video(file: Path, target: Path, asked: _Asked) -> int:
         for some in _batches(progress(frames, f"restoring {file.name}", count=total), asked.batch):
             yield from asked.restored([frame[0] for frame in some])
 
-    with replacing(target) as path:
+    with replace_file(target) as path:
         return write_frames(file, path, change=change)
 
 

@@ -9,7 +9,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torchrefract._levels import levels_of, numbers_of
+from torchrefract._tensor import to_float, to_uint8
 from torchrefract.cameras.distortion import POLYNOMIAL12
 from torchrefract.effects.air import Air
 from torchrefract.effects.base import Effect
@@ -117,9 +117,11 @@ def make_row(name: str, effect: Effect, *, frame: Tensor, seed: int, depth: Tens
 def drawn(effect: Effect, params: Any) -> str:
     """The parameters of the first sample in words, "amplitude 2.3 px, length 31 px", those of zero left out."""
     if isinstance(effect, Compose):
-        leaves = [f"{type(leaf).__name__} ({drawn(leaf, own)})" for leaf, own in effect.leaves(params) if own.gate[0]]
+        leaves = [
+            f"{type(leaf).__name__} ({drawn(leaf, own)})" for leaf, own in effect.leaves(params) if own.applied[0]
+        ]
         return " + ".join(leaves) or _UNTOUCHED
-    if not params.gate[0]:
+    if not params.applied[0]:
         return _UNTOUCHED
     values = _named(effect, {name: value[0] for name, value in zip(params._fields, params, strict=True)})
     return ", ".join(words(values[name]) for name, words in _WORDS.items() if name in values and values[name].any())
@@ -220,7 +222,7 @@ def _restored(effect: Effect, degraded: Degraded) -> _Restored | None:
     if not isinstance(air, Air):
         return None
     # Of the float image it would be exact, which no file is.
-    stored = numbers_of(levels_of(degraded.image))
+    stored = to_float(to_uint8(degraded.image))
     t, airlight = degraded.transmission, degraded.params.airlight
     return _Restored(*remove_fog(stored, t, airlight, linear_light=air.linear_light), "restored from 8 bits")
 

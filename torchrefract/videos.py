@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._levels import numbers_of
+from torchrefract._tensor import to_float
 from torchrefract.data.images import opened
 
 # OpenCV and its FFmpeg write to the terminal on their own; what goes wrong is raised as an error.
@@ -32,7 +32,7 @@ def read_video(path: Path, times: Iterable[int]) -> Iterator[tuple[int, Tensor]]
                     return
                 position += 1
             pixels = torch.from_numpy(capture.retrieve()[1][..., ::-1].copy())
-            yield t, numbers_of(pixels.permute(2, 0, 1)[None].contiguous())
+            yield t, to_float(pixels.permute(2, 0, 1)[None].contiguous())
     finally:
         capture.release()
 

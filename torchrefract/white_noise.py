@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._bands import join
-from torchrefract._checks import withheld
 from torchrefract._compiled import SMALLEST, kernels
+from torchrefract._tensor import cat_bands
 from torchrefract._threads import share
+from torchrefract._validation import why_not_eager
 
 _WORD = 0xFFFFFFFF
 # Odd constants of the hash, as int32: 2^32 over the golden ratio, and the two of lowbias32.
@@ -82,7 +82,7 @@ def _noise(key: Tensor, count: int) -> Tensor:
     words = key.to(torch.int32)
     at_once = max(1, _CACHED // max(1, len(key)) if key.device.type == "cpu" else count)
     bands = (_noise_between(words, start, min(start + at_once, count)) for start in range(0, max(1, count), at_once))
-    return join(bands, dim=2, length=count)
+    return cat_bands(bands, dim=2, length=count)
 
 
 def _noise_between(words: Tensor, start: int, end: int) -> Tensor:
@@ -101,7 +101,7 @@ def _pairs(words: Tensor, places: Tensor) -> Tensor:
 
 def _hashed(words: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
     """(B, n), uniform in (0, 1), and (B, n), angles, of keys of four words, (B, 4), at places, (n,), all int32."""
-    if len(places) < _FEW or withheld(places) or withheld(words) or kernels("_jit") is None:
+    if len(places) < _FEW or why_not_eager(places) or why_not_eager(words) or kernels("_jit") is None:
         (a, b, c, d), index = words[:, :, None].unbind(1), places * HASH[0]
         uniform = (_hash(index, a, b) >> 9).bitwise_and_(0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
         return uniform, _hash(index, c, d).float().mul_(math.pi * 2.0**-31)

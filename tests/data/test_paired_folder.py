@@ -10,7 +10,7 @@ from PIL import Image
 from torch.utils.data import DataLoader
 
 from torchrefract import Pair, presets
-from torchrefract._config import CONFIG_DIR
+from torchrefract._io import CONFIG_DIR
 from torchrefract.data.module import PairData, frames, pairs
 from torchrefract.data.pair_files import beyond, decode_flow, encode_flow
 from torchrefract.data.paired_folder import PairedFolder, PairStream

@@ -136,7 +136,7 @@ def test_what_does_not_change_is_computed_once_a_clip(monkeypatch):
             original = getattr(kind, name)
 
             def counted(self: Any, params: Any, *args: Any, original: Any = original, **options: Any) -> Any:
-                seen.append(len(params.gate))
+                seen.append(len(params.applied))
                 return original(self, params, *args, **options)
 
             monkeypatch.setattr(kind, name, counted)

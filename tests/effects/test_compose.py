@@ -189,8 +189,8 @@ def test_samples_that_are_left_alone_come_back_bit_for_bit(p):
     image = picture(16, 3, 21, 27)
     effect = Compose([LensDistortion(p=0.5), UniformFog(p=0.5), ThinPlateSpline(p=0.5)], p=p)
     params = effect.sample(image, seed=7)
-    drawn = torch.stack([child.gate for child in params.children]).any(dim=0)
-    assert not (drawn & ~params.gate).any()
+    drawn = torch.stack([child.applied for child in params.children]).any(dim=0)
+    assert not (drawn & ~params.applied).any()
     assert drawn.any() == (p > 0)
     found = effect.apply(image, params)
     assert torch.equal(found.image[~drawn], image[~drawn])
@@ -237,7 +237,7 @@ class Counted(ThinPlateSpline):
     rows: list[int]
 
     def flow(self, params, *, height, width):
-        self.rows.append(len(params.gate))
+        self.rows.append(len(params.applied))
         return super().flow(params, height=height, width=width)
 
     def undo(self, params, flow):
@@ -263,7 +263,7 @@ def test_nothing_is_computed_for_samples_that_an_effect_leaves_alone(frames):
     depth = torch.rand(8, frames, 1, 20, 30) * 50
     effect = OneOf([plate, fog, DivergenceFree()])
     found = effect.degrade(image, seed=1, depth=depth)
-    moved, foggy, _ = (int(child.gate.sum()) for child in found.params.children)
+    moved, foggy, _ = (int(child.applied.sum()) for child in found.params.children)
     assert 0 < moved < 8
     assert 0 < foggy < 8
     assert found.restore_flow.shape == (8, frames, 2, 20, 30)
@@ -281,7 +281,7 @@ def test_a_gradient_of_parameters_is_the_same_for_samples_that_are_left_alone():
     found = effect.apply(image, with_gradient).image
     torch.testing.assert_close(found, effect.apply(image, params).image, rtol=0, atol=1e-12)
     (slope,) = torch.autograd.grad(found.square().sum(), learned)
-    assert (slope != 0).flatten(1).any(dim=1).tolist() == params.children[0].gate.tolist()
+    assert (slope != 0).flatten(1).any(dim=1).tolist() == params.children[0].applied.tolist()
 
 
 @pytest.mark.parametrize("which", range(3), ids=SEVERAL)
@@ -301,8 +301,8 @@ def test_one_of_shows_each_sample_as_the_effect_chosen_for_it_does():
     drawn = effect.degrade(image, seed=7)
     for child, params in zip(effect.effects, drawn.params.children, strict=True):
         alone = cast(Effect, child).apply(image, params)
-        assert params.gate.any()
-        assert torch.equal(drawn.image[params.gate], alone.image[params.gate]), type(child).__name__
+        assert params.applied.any()
+        assert torch.equal(drawn.image[params.applied], alone.image[params.applied]), type(child).__name__
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float16, torch.bfloat16, torch.float64])
@@ -339,8 +339,8 @@ def test_frames_of_any_shape_are_no_special_case(shape):
 def test_one_of_chooses_one_by_weight():
     effect = OneOf([LensDistortion(), UniformFog(), ThinPlateSpline()], weights=[1, 2, 5], p=0.8)
     params = effect.sample(torch.zeros(8000, 3, 1, 1), seed=2)
-    gates = torch.stack([child.gate for child in params.children])
-    assert torch.equal(gates.sum(dim=0), params.gate.long())
+    gates = torch.stack([child.applied for child in params.children])
+    assert torch.equal(gates.sum(dim=0), params.applied.long())
     share = gates.double().mean(dim=1)
     assert_close(share, 0.8 * torch.tensor([1, 2, 5]).double() / 8, rtol=0, atol=4 * 0.5 / 8000**0.5)
 
@@ -445,12 +445,12 @@ def test_nested_compositions_say_how_their_own_effects_are_looked_up():
         vars(other).update(options)
         return other
 
-    own: dict[str, Any] = {"padding": "border", "interpolation": "nearest", "resampler": "grid_sample"}
+    own: dict[str, Any] = {"padding": "border", "interpolation": "nearest", "backend": "torch"}
     expected = shown(Compose([idle, Compose([with_options(shift, **own)])]))
     assert not torch.equal(expected, shown(Compose([idle, Compose([shift])])))
     assert torch.equal(shown(Compose([idle, Compose([shift], **own)])), expected)
     # The outermost that says how has the word; what it leaves open the next one says.
-    half = {name: own[name] for name in ("padding", "resampler")}
+    half = {name: own[name] for name in ("padding", "backend")}
     inner = Compose([shift], interpolation="nearest", padding="reflection")
     expected = shown(Compose([idle, Compose([Compose([with_options(shift, **own)])])]))
     assert torch.equal(shown(Compose([idle, Compose([inner], **half)])), expected)
@@ -463,8 +463,8 @@ def test_one_of_looks_its_own_effects_up_as_it_says_inside_of_a_composition():
     choice = OneOf([a, b], padding="border")
     nested = Compose([choice])
     params = nested.sample(image, seed=2)
-    assert params.children[0].children[0].gate.any()
-    assert params.children[0].children[1].gate.any()
+    assert params.children[0].children[0].applied.any()
+    assert params.children[0].children[1].applied.any()
     expected = choice.apply(image, params.children[0])
     assert torch.equal(nested.apply(image, params).image, expected.image)
     unlike = OneOf([a, b]).apply(image, params.children[0]).image

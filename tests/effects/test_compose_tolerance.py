@@ -23,7 +23,7 @@ from torchrefract.effects.compose_plan import ComposePlan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.plan import Plan
 from torchrefract.fields.spline import evaluate_spline, fit_spline
-from torchrefract.warping.lattice import Lattice, SmoothFlow, lagrange_weights
+from torchrefract.warping.lattice import Lattice, LatticeFlow, lagrange_weights
 
 SIZE = (96, 130)
 
@@ -127,7 +127,7 @@ def test_flows_are_as_smooth_as_planned(effect):
         for first in ((0, 0), (1, 2), (2, 1)):  # where nodes lie
             known = flow[:, :, first[0] :: px, first[1] :: px]
             rows, columns = (px * (n - 3) for n in known.shape[2:])
-            found = SmoothFlow(known, Lattice(rows, columns, px)).dense()
+            found = LatticeFlow(known, Lattice(rows, columns, px)).dense()
             own = flow[:, :, first[0] + px :, first[1] + px :][:, :, :rows, :columns]
             off = max(off, largest(found - own))
         assert 0.02 * smooth.cubics(px) < off <= smooth.cubics(px)
@@ -339,7 +339,7 @@ def test_depth_and_maps_of_light_move_along_as_with_exact_flows():
 def test_a_sample_does_not_depend_on_the_others():
     effects = OneOf([Compose(parts(64.0)), *parts(64.0)[:2]], tolerance_px=0.1)
     together = effects.degrade(image(12), seed=5)
-    gates = torch.stack([own.gate for _, own in effects.leaves(together.params)], dim=1)
+    gates = torch.stack([own.applied for _, own in effects.leaves(together.params)], dim=1)
     assert len(gates.unique(dim=0)) == 3
     for i in range(12):
         alone = effects.degrade(image(12)[i : i + 1], seed=5, keys=[i])

@@ -250,7 +250,7 @@ def test_an_effect_that_is_off_hands_the_image_on_bit_for_bit(case, dtype, how):
     image = picture(3, 3, 21, 17, dtype=dtype)
     if how == "gate":
         effect = case.strong()
-        params = effect.sample(image, seed=7)._replace(gate=torch.zeros(3, dtype=torch.bool))
+        params = effect.sample(image, seed=7)._replace(applied=torch.zeros(3, dtype=torch.bool))
         degraded = effect.apply(image, params)
     else:
         effect = case.strong(p=0.0) if how == "never" else case.make(**case.still)
@@ -267,16 +267,16 @@ def test_an_effect_that_is_off_hands_the_image_on_bit_for_bit(case, dtype, how):
 def test_in_a_mixed_batch_only_the_samples_drawn_are_degraded(case, dtype):
     image = picture(16, 3, 21, 17, dtype=dtype)
     degraded = case.strong(p=0.5).degrade(image, seed=7)
-    gate = degraded.params.gate
-    assert 0 < gate.sum() < 16
-    assert torch.equal(degraded.image[~gate], image[~gate])
-    assert (degraded.image != image).flatten(1).any(dim=1).tolist() == gate.tolist()
+    applied = degraded.params.applied
+    assert 0 < applied.sum() < 16
+    assert torch.equal(degraded.image[~applied], image[~applied])
+    assert (degraded.image != image).flatten(1).any(dim=1).tolist() == applied.tolist()
 
 
 def test_the_share_of_degraded_samples_is_p(case):
     count, p = 4000, 0.3
-    gate = case.strong(p=p).sample(torch.zeros(count, 3, 1, 1), seed=7).gate
-    assert abs(gate.double().mean().item() - p) < 4 * math.sqrt(p * (1 - p) / count)
+    applied = case.strong(p=p).sample(torch.zeros(count, 3, 1, 1), seed=7).applied
+    assert abs(applied.double().mean().item() - p) < 4 * math.sqrt(p * (1 - p) / count)
 
 
 def test_at_strength_zero_descent_can_start(case, pixels):
@@ -518,7 +518,7 @@ def test_gradients_of_params_and_image_are_those_of_finite_differences(case):
 
 def test_a_closed_gate_passes_gradients_to_the_image_only(case):
     effect, image = case.strong(), picture(2, 3, 8, 9).requires_grad_()
-    params = effect.sample(image, seed=7)._replace(gate=torch.tensor([False, True]))
+    params = effect.sample(image, seed=7)._replace(applied=torch.tensor([False, True]))
     field = getattr(params, case.fields[0]).clone().requires_grad_()
     degraded = effect.apply(image, params._replace(**{case.fields[0]: field}))
     of_image, of_field = torch.autograd.grad(degraded.image.sum(), [image, field])

@@ -27,9 +27,9 @@ def sun(
     def row(*values: float) -> Tensor:
         return torch.tensor([values] * batch, dtype=image.dtype)
 
-    gate = torch.ones(batch, dtype=torch.bool)
+    applied = torch.ones(batch, dtype=torch.bool)
     one = (row(radius)[:, 0], row(strength)[:, 0])
-    return FlareParams(gate, row(*center), *one, row(*[1.0] * channels), row(0.0, 0.0), row(0.0))
+    return FlareParams(applied, row(*center), *one, row(*[1.0] * channels), row(0.0, 0.0), row(0.0))
 
 
 def expected_mask(center: tuple[float, float], radius: float) -> Tensor:

@@ -20,7 +20,7 @@ def picture(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
 def fogs(image: Tensor, visibility: float, deviation: float = 0.0) -> FogParams:
     batch, dtype = image.shape[0], image.dtype
     return FogParams(
-        gate=torch.ones(batch, dtype=torch.bool),
+        applied=torch.ones(batch, dtype=torch.bool),
         visibility=torch.full((batch,), visibility, dtype=dtype),
         deviation=torch.full((batch,), deviation, dtype=dtype),
         airlight=torch.tensor([PAPER_AIRLIGHT[: image.shape[1]]] * batch, dtype=dtype),
@@ -237,7 +237,7 @@ def test_gradients_are_those_of_finite_differences(linear_light):
     effect = UniformFog(linear_light=linear_light)
 
     def fogged(image, depth, visibility, deviation, airlight):
-        return effect.apply(image, FogParams(params.gate, visibility, deviation, airlight), depth=depth).image
+        return effect.apply(image, FogParams(params.applied, visibility, deviation, airlight), depth=depth).image
 
     inputs = [image, depth, params.visibility, params.deviation, params.airlight]
     assert torch.autograd.gradcheck(fogged, [value.clone().requires_grad_() for value in inputs])

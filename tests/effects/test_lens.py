@@ -18,7 +18,7 @@ FOLDING: dict[str, Any] = {"k1_range": (-0.6, -0.6), "k2_range": (0.0, 0.0), "fo
 def lenses(coefficients: dict[str, float], focal: float = 0.8, batch: int = 1) -> LensParams:
     row = [coefficients.get(name, 0.0) for name in POLYNOMIAL12]
     return LensParams(
-        gate=torch.ones(batch, dtype=torch.bool),
+        applied=torch.ones(batch, dtype=torch.bool),
         coefficients=torch.tensor([row] * batch),
         focal=torch.full((batch, 2), focal),
         center=torch.zeros(batch, 2),

@@ -7,7 +7,7 @@ import torch
 from torchrefract import Compose, DivergenceFree, LensDistortion, OneOf, Turbulence
 from torchrefract.cameras import Camera
 from torchrefract.effects.lens_parts import plan_of_lens
-from torchrefract.effects.plan import Ask, Plan
+from torchrefract.effects.plan import Plan, PlanRequest
 from torchrefract.fields.lens_bounds import lens_numbers
 from torchrefract.presets import cheap_dashcam
 
@@ -146,7 +146,7 @@ def test_a_plan_says_that_it_has_parts(capsys):
 
 def test_the_plan_of_a_lens_is_that_of_its_part_of_the_ranges():
     effect = fleet("its own")
-    ask = Ask(*SIZE, TOLERANCE, double=False)
+    ask = PlanRequest(*SIZE, TOLERANCE, double=False)
     params = effect.sample(image(200), seed=1)
     numbers = lens_numbers(params.coefficients, params.focal, params.center)
     strides = torch.tensor([plan_of_lens((effect._ranges(),), lens, ask).stride for lens in numbers.tolist()])

@@ -60,7 +60,7 @@ def test_the_camera_of_a_degraded_frame_shows_every_ray_where_the_frame_does():
     y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
     pixels = torch.stack([x, y], dim=-1).view(-1, 2)
     assert {camera.is_pinhole for camera in cameras} == {True, False}
-    for camera, acts, flow in zip(cameras, degraded.params.gate.tolist(), degraded.restore_flow, strict=True):
+    for camera, acts, flow in zip(cameras, degraded.params.applied.tolist(), degraded.restore_flow, strict=True):
         assert camera.is_pinhole is not acts
         # A clean pixel's ray, seen by the camera, is where the flow back looks.
         rays = replace(camera, coefficients=(0.0,) * 12).unproject(pixels).points
@@ -174,9 +174,9 @@ def test_lenses_outside_the_table_are_taken_exactly():
     effect = LensDistortion.from_lenses(OTHERS, tolerance_px=0.05)
     image = torch.zeros(2, 1, 36, 64)
     params = effect.sample(image, seed=0)
-    assert effect.fitted(params, 36, 64) is effect
+    assert effect.for_params(params, 36, 64) is effect
     other = params._replace(coefficients=0.5 * params.coefficients)
-    assert effect.fitted(other, 36, 64) is not effect
+    assert effect.for_params(other, 36, 64) is not effect
     assert torch.equal(effect.apply(image, other).flow, LensDistortion().apply(image, other).flow)
 
 
@@ -194,7 +194,7 @@ def test_the_table_of_the_package_is_drawn_from():
     assert len(near) > 30
     values = drawn(effect, 2000)
     assert len(values.unique(dim=0)) == len({tuple(by_hand(lens.polynomial)) for lens in near if lens.polynomial})
-    assert LensDistortion.from_lenses(residual_px=0.0).sample(torch.zeros(1, 1, 4, 4), seed=0).gate.all()
+    assert LensDistortion.from_lenses(residual_px=0.0).sample(torch.zeros(1, 1, 4, 4), seed=0).applied.all()
 
 
 def test_a_fisheye_is_drawn_as_the_nearest_polynomial():
@@ -240,6 +240,6 @@ def test_gradients_reach_the_lens_of_a_table():
     effect, image = LensDistortion.from_lenses(OTHERS), torch.rand(1, 1, 18, 32, dtype=torch.float64)
     params = effect.sample(image, seed=0)
     coefficients = params.coefficients.requires_grad_()
-    effect.apply(image, LensParams(params.gate, coefficients, params.focal, params.center)).image.sum().backward()
+    effect.apply(image, LensParams(params.applied, coefficients, params.focal, params.center)).image.sum().backward()
     assert coefficients.grad is not None
     assert coefficients.grad[0, :3].all()

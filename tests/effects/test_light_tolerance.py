@@ -83,7 +83,7 @@ def test_a_sample_is_bit_equal_in_any_batch_and_on_any_threads(name, on_threads)
 @every_light
 def test_closed_gates_leave_the_image_alone(name):
     degraded = made(name, 1.0, p=0.5).degrade(image(12), seed=2)
-    off = ~degraded.params.gate
+    off = ~degraded.params.applied
     assert 0 < off.sum() < 12
     assert torch.equal(degraded.image[off], image(12)[off])
     assert degraded.valid[off].all()

@@ -237,14 +237,14 @@ def test_every_sample_is_that_of_a_batch_of_one(camera, on_threads):
     image = torch.rand(5, 3, 27, 48)
     effect = Rectification(camera, p=0.5)
     together = effect.degrade(image, seed=5)
-    assert 0 < together.params.gate.sum() < 5
+    assert 0 < together.params.applied.sum() < 5
     maps = ("image", "flow", "valid", "restore_flow", "restore_valid")
     for i in range(5):
         on_threads(1 + i % 3)
         alone = effect.degrade(image[i], seed=5, keys=[i])
         for name in maps:
             assert torch.equal(getattr(alone, name), getattr(together, name)[i]), name
-    assert torch.equal(together.image[~together.params.gate], image[~together.params.gate])
+    assert torch.equal(together.image[~together.params.applied], image[~together.params.applied])
 
 
 @pytest.mark.parametrize("name", ["opencv4", "opencv14", "fisheye"])
@@ -266,7 +266,7 @@ def test_gradients_under_a_tolerance_are_near_to_exact_ones(camera):
         effect = Rectification(camera, tolerance_px=tolerance)
         params = effect.sample(image, seed=0)
         values = [value.requires_grad_() for value in params[1:]]
-        made = effect.apply(image, RectificationParams(params.gate, *values))
+        made = effect.apply(image, RectificationParams(params.applied, *values))
         found.append(torch.autograd.grad((made.image * image.flip(3)).sum(), values))
     assert effect.plan(27, 48).stride > 1
     for exact, near in zip(*found, strict=True):
@@ -280,7 +280,7 @@ def test_gradients_of_the_camera_are_those_of_finite_differences(camera):
     params = effect.sample(image, seed=0)
 
     def rectified(coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
-        return effect.apply(image, RectificationParams(params.gate, coefficients, focal, center)).image
+        return effect.apply(image, RectificationParams(params.applied, coefficients, focal, center)).image
 
     values = [value.clone().requires_grad_() for value in params[1:]]
     assert torch.autograd.gradcheck(rectified, values, fast_mode=True)
@@ -292,7 +292,7 @@ def test_gradients_of_the_flow_back_are_those_of_finite_differences(camera):
     params = effect.sample(image, seed=0)
 
     def back(coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
-        made = RectificationParams(params.gate, coefficients, focal, center)
+        made = RectificationParams(params.applied, coefficients, focal, center)
         return effect.restore_flow(made, height=9, width=16)[0]
 
     values = [value.clone().requires_grad_() for value in params[1:]]

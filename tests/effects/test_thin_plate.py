@@ -9,8 +9,8 @@ from torchrefract import Compose, ComposeParams, ThinPlateParams, ThinPlateSplin
 
 
 def plate(points: torch.Tensor, displacement: torch.Tensor, smoothing: float = 0.0) -> ThinPlateParams:
-    gate = torch.ones(len(points), dtype=torch.bool)
-    return ThinPlateParams(gate, points, displacement, torch.full((len(points),), smoothing, dtype=points.dtype))
+    applied = torch.ones(len(points), dtype=torch.bool)
+    return ThinPlateParams(applied, points, displacement, torch.full((len(points),), smoothing, dtype=points.dtype))
 
 
 def test_control_points_are_displaced_as_told():
@@ -76,8 +76,8 @@ def test_smoothing_leads_to_the_plane_of_least_squares():
 def test_plates_that_could_not_be_drawn_for_a_frame_are_exact(points):
     effect, image = ThinPlateSpline(), torch.rand(1, 1, 180, 320)
     params = effect.sample(image, seed=3)
-    assert effect.fitted(params, 180, 320) is effect
-    assert effect.fitted(params.to(torch.float64), 180, 320) is effect
+    assert effect.for_params(params, 180, 320) is effect
+    assert effect.for_params(params.to(torch.float64), 180, 320) is effect
     if points == "of another frame":
         params = effect.sample(image[..., :60, :80], seed=3)
     elif points == "one of its own":
@@ -85,7 +85,7 @@ def test_plates_that_could_not_be_drawn_for_a_frame_are_exact(points):
     else:
         params = params._replace(points=100 + 40 * torch.rand(1, 16, 2, generator=torch.Generator().manual_seed(1)))
     exact = ThinPlateSpline(tolerance_px=None).apply(image, params)
-    for made in (effect.apply(image, params), Compose([effect]).apply(image, ComposeParams(params.gate, (params,)))):
+    for made in (effect.apply(image, params), Compose([effect]).apply(image, ComposeParams(params.applied, (params,)))):
         assert torch.equal(made.flow, exact.flow)
         assert torch.equal(made.image, exact.image)
 

@@ -16,7 +16,7 @@ from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.plan import MOST_ULPS
 from torchrefract.fields.stream import curl
 from torchrefract.warping.grid import sampler_grid
-from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow, between_nodes
+from torchrefract.warping.lattice import Lattice, LatticeFlow, StreamFlow, between_nodes
 
 SIZE = (96, 144)
 ARGUMENTS: dict[str, tuple[type[LatticeWarp], dict[str, Any]]] = {
@@ -132,7 +132,7 @@ def test_closed_gates_leave_the_image_alone(name):
     effect = made(name, 0.1)
     effect.p = 0.5
     degraded = effect.degrade(image(12), seed=2)
-    off = ~degraded.params.gate
+    off = ~degraded.params.applied
     assert 0 < off.sum() < 12
     assert torch.equal(degraded.image[off], image(12)[off])
     assert not degraded.flow[off].any()
@@ -293,7 +293,7 @@ def test_a_stream_between_nodes_has_the_curl_of_psi_between_nodes(stride):
 def test_a_smooth_flow_leads_where_its_dense_form_does():
     lattice = Lattice(60, 90, 16)
     x, y = lattice.places(dtype=torch.float64, device=torch.device("cpu"))
-    flow = SmoothFlow(torch.randn(2, 2, y.numel(), x.numel(), dtype=torch.float64), lattice)
+    flow = LatticeFlow(torch.randn(2, 2, y.numel(), x.numel(), dtype=torch.float64), lattice)
     assert_close(flow.sampler_grid(torch.float64), sampler_grid(flow.dense()), rtol=0, atol=1e-13)
 
 

@@ -86,7 +86,7 @@ def test_what_is_off_is_the_image_bit_for_bit(name, data):
     never = data.draw(st.booleans())
     effect, image = data.draw(cases(name, fixed={"p": 0.0} if never else {}))
     params = effect.sample(image, seed=7)
-    degraded = effect.apply(image, params._replace(gate=torch.zeros_like(params.gate)))
+    degraded = effect.apply(image, params._replace(applied=torch.zeros_like(params.applied)))
     off = effect.degrade(image, seed=7) if never else degraded
     for found in (degraded, off):
         assert torch.equal(found.image, image)

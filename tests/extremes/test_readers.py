@@ -22,10 +22,10 @@ from hypothesis import strategies as st
 from torch import nn
 
 from torchrefract import Camera
-from torchrefract.cameras.files.colmap import read_colmap, write_colmap
-from torchrefract.cameras.files.kalibr import read_kalibr, write_kalibr
-from torchrefract.cameras.files.opencv import read_opencv, write_opencv
-from torchrefract.cameras.files.ros import read_ros, write_ros
+from torchrefract.cameras.io.colmap import read_colmap, write_colmap
+from torchrefract.cameras.io.kalibr import read_kalibr, write_kalibr
+from torchrefract.cameras.io.opencv import read_opencv, write_opencv
+from torchrefract.cameras.io.ros import read_ros, write_ros
 from torchrefract.cameras.lens_table import COLUMNS, read_lenses
 from torchrefract.data.frame_folder import FrameFolder
 from torchrefract.data.images import UnreadableImageError, image_size, read_image

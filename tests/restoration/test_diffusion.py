@@ -303,16 +303,16 @@ class Saving(Callback):
 def test_a_stopped_training_goes_on_as_if_never_stopped(trainer, tmp_path, task):
     batches, path = pairs(task, 3), tmp_path / "first.ckpt"
 
-    def fitted(resumed: bool) -> dict[str, Tensor]:
+    def for_params(resumed: bool) -> dict[str, Tensor]:
         torch.manual_seed(0)
         model = Diffusion(tiny, TASKS[task], lr=1e-3, val_steps=1)
         run = trainer(max_epochs=2, callbacks=[] if resumed else [Saving(path)])
         run.fit(model, loader(batches), loader(batches[:1]), ckpt_path=path if resumed else None, weights_only=True)
         return model.state_dict()
 
-    whole = fitted(False)
+    whole = for_params(False)
     assert read_checkpoint(path, task=task)["epoch"] == 0
-    assert_close(fitted(True), whole, rtol=0, atol=1e-6)
+    assert_close(for_params(True), whole, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("task", TASKS)

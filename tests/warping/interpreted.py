@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract import draw_operators
-from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
+from torchrefract.warping.lattice import Lattice, LatticeFlow, StreamFlow
 
 # What is interpreted is no kernel that compilers could see into.
 torch.library.wrap_triton = lambda kernel: kernel
@@ -20,7 +20,7 @@ importlib.import_module("torchrefract.warping.gpu_look_up")
 importlib.import_module("torchrefract.gpu_draws")
 
 SIDES = 9, 40
-KINDS = {"cubics": (SmoothFlow, 2, Lattice(*SIDES, 8)), "stream": (StreamFlow, 1, Lattice(*SIDES, 8, 3, 2))}
+KINDS = {"cubics": (LatticeFlow, 2, Lattice(*SIDES, 8)), "stream": (StreamFlow, 1, Lattice(*SIDES, 8, 3, 2))}
 LAYOUTS = {"rows": torch.contiguous_format, "last": torch.channels_last}
 # A kind of flow; samples that have one; how the image lies in memory; padding; whether one sample is left alone.
 CASES = [
@@ -53,7 +53,7 @@ def same_draws() -> list[bool]:
     return found
 
 
-def errors(kind: str, rows: int, layout: str, padding: str, gated: bool) -> dict[str, float]:
+def errors(kind: str, rows: int, layout: str, padding: str, masked_flow: bool) -> dict[str, float]:
     """How far image and gradients are from those of F.grid_sample in float64, and how far float32 is by itself."""
     torch.manual_seed(0)
     form, channels, lattice = KINDS[kind]
@@ -61,7 +61,7 @@ def errors(kind: str, rows: int, layout: str, padding: str, gated: bool) -> dict
     nodes = (30 * torch.rand(rows, channels, *sides) - 15).requires_grad_()
     size = (2, 5 if padding == "border" else 3, *SIDES)  # a few planes are unrolled, more are not
     source = torch.rand(size).to(memory_format=LAYOUTS[layout]).requires_grad_()
-    active = torch.tensor([True, False]) if gated else None
+    active = torch.tensor([True, False]) if masked_flow else None
     towards = torch.rand(source.shape)
     spread = nodes if rows == 2 else nodes.expand(2, -1, -1, -1)
     found = on_gpu.looked_up(source, form(spread, lattice), padding=padding, active=active)
@@ -83,7 +83,7 @@ def errors(kind: str, rows: int, layout: str, padding: str, gated: bool) -> dict
     }
 
 
-def by_grid_sample(source: Tensor, flow: SmoothFlow, padding: str, active: Tensor | None) -> Tensor:
+def by_grid_sample(source: Tensor, flow: LatticeFlow, padding: str, active: Tensor | None) -> Tensor:
     """The same by PyTorch's operations."""
     grid = flow.lines(source.dtype).grid().expand(len(source), -1, -1, -1)
     found = F.grid_sample(source, grid, padding_mode=padding, align_corners=False)

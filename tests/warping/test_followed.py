@@ -10,18 +10,18 @@ from torchrefract import _compiled as compiled
 from torchrefract import compose_flows
 from torchrefract.warping.followed import FollowedFlow, followed, of_readings
 from torchrefract.warping.grid import sampler_grid
-from torchrefract.warping.lattice import Lattice, SmoothFlow
+from torchrefract.warping.lattice import Lattice, LatticeFlow
 from torchrefract.warping.mixed import dense
-from torchrefract.warping.resample import look_up
+from torchrefract.warping.resample import sample_image
 
 SIZE = (131, 190)
 LINEAR: dict[str, Any] = {"padding": "border", "interpolation": "bilinear"}
 
 
-def smooth(seed: int, stride: int, *, batch: int = 2, height: int = SIZE[0], width: int = SIZE[1]) -> SmoothFlow:
+def smooth(seed: int, stride: int, *, batch: int = 2, height: int = SIZE[0], width: int = SIZE[1]) -> LatticeFlow:
     lattice = Lattice(height, width, stride)
     size = [len(axis) for axis in lattice.axes()]
-    return SmoothFlow(torch.randn(batch, 2, *size, generator=torch.Generator().manual_seed(seed)).double(), lattice)
+    return LatticeFlow(torch.randn(batch, 2, *size, generator=torch.Generator().manual_seed(seed)).double(), lattice)
 
 
 def wave(x: Tensor, y: Tensor, seed: int) -> Tensor:
@@ -30,11 +30,11 @@ def wave(x: Tensor, y: Tensor, seed: int) -> Tensor:
     return 3 * torch.stack([(a * x + b * y + seed).sin() + (c * y).cos(), (d * x - a * y).cos() + (b * x).sin()])
 
 
-def waves(seed: int, stride: int, dtype: torch.dtype = torch.float32) -> SmoothFlow:
+def waves(seed: int, stride: int, dtype: torch.dtype = torch.float32) -> LatticeFlow:
     """The same on a lattice that it hardly loses anything on."""
     lattice = Lattice(*SIZE, stride)
     x, y = lattice.places(dtype=torch.float64, device=torch.device("cpu"))
-    return SmoothFlow(wave(x[0, 0] + 0 * y[0, 0], y[0, 0] + 0 * x[0, 0], seed)[None].to(dtype), lattice)
+    return LatticeFlow(wave(x[0, 0] + 0 * y[0, 0], y[0, 0] + 0 * x[0, 0], seed)[None].to(dtype), lattice)
 
 
 def composite(*seeds: int) -> Tensor:
@@ -52,7 +52,7 @@ def test_a_flow_is_read_by_lines_between_its_pixels(oracle):
     flow, then = smooth(1, 12), 8 * dense(smooth(2, 16))
     grid, (height, width) = sampler_grid(then), SIZE
     found = (followed(flow, grid) - grid).movedim(-1, 1) * grid.new_tensor((width / 2, height / 2))[:, None, None]
-    oracle("flow read where another one looks", found, look_up(flow.dense(), then, **LINEAR), 1e-9)
+    oracle("flow read where another one looks", found, sample_image(flow.dense(), then, **LINEAR), 1e-9)
 
 
 def test_flows_in_a_row_are_the_composite(oracle):
@@ -69,7 +69,7 @@ def test_flows_in_a_row_are_the_composite(oracle):
 def test_kernels_read_what_is_read_without_them(monkeypatch, oracle):
     pytest.importorskip("torchrefract._jit", reason="needs numba")
 
-    def single(flow: SmoothFlow) -> SmoothFlow:
+    def single(flow: LatticeFlow) -> LatticeFlow:
         return flow.with_nodes(flow.nodes.float())
 
     flow = FollowedFlow(single(smooth(3, 16)), (single(smooth(0, 12)), single(smooth(1, 12)).dense()))
@@ -91,7 +91,7 @@ def test_the_composite_is_known_every_few_px(every, bar, oracle):
     # At the sides it has kinks, which cubics alone would miss.
     px = max(every, 2)
     rows, columns = (px * (n // px - 3) for n in SIZE)
-    alone = SmoothFlow(exact[:, :, ::px, ::px], Lattice(rows, columns, px)).dense()
+    alone = LatticeFlow(exact[:, :, ::px, ::px], Lattice(rows, columns, px)).dense()
     assert (alone - exact[:, :, px : px + rows, px : px + columns]).abs().amax() > 20 * (found - exact).abs().amax()
 
 
@@ -101,11 +101,11 @@ def test_frames_of_any_shape_are_followed(every, size, oracle):
     pytest.importorskip("torchrefract._jit", reason="needs numba")
     generator = torch.Generator().manual_seed(every)
 
-    def flow(stride: int) -> SmoothFlow:
+    def flow(stride: int) -> LatticeFlow:
         lattice = Lattice(size[0], size[1], stride)
         rows, columns = map(len, lattice.axes())
         nodes = torch.rand(2, 2, rows, columns, generator=generator)
-        return SmoothFlow(F.avg_pool2d(nodes, 3, 1, 1), lattice)
+        return LatticeFlow(F.avg_pool2d(nodes, 3, 1, 1), lattice)
 
     flows = replace(flow(40), every=every), flow(50), flow(30)
     own = FollowedFlow(flows[0], flows[1:])
@@ -117,7 +117,7 @@ def test_frames_of_any_shape_are_followed(every, size, oracle):
 def test_batch_and_threads_change_no_bit(on_threads):
     pytest.importorskip("torchrefract._jit", reason="needs numba")
 
-    def single(flow: SmoothFlow) -> SmoothFlow:
+    def single(flow: LatticeFlow) -> LatticeFlow:
         return replace(flow.with_nodes(flow.nodes.float()), every=3)
 
     flow = FollowedFlow(single(smooth(3, 16, batch=4)), (single(smooth(1, 12, batch=4)), single(smooth(2, 9, batch=4))))
@@ -134,7 +134,7 @@ def test_images_have_the_gradients_of_grid_sample(every):
     flow = FollowedFlow(replace(waves(1, 6), every=every), (waves(2, 5), waves(3, 3)))
     image = torch.rand(1, 3, *SIZE, requires_grad=True)
     upstream = torch.rand(1, 3, *SIZE)
-    found = look_up(image, flow, padding="zeros", interpolation="bilinear")
+    found = sample_image(image, flow, padding="zeros", interpolation="bilinear")
     expected = F.grid_sample(image, flow.sampler_grid(torch.float32), align_corners=False)
     assert torch.equal(found, expected)
     both = (torch.autograd.grad(value, image, upstream)[0] for value in (found, expected))
@@ -147,7 +147,7 @@ def test_what_is_asked_for_is_made_once(monkeypatch):
     kernels = compiled.kernels
     monkeypatch.setattr(compiled, "kernels", lambda name: asked.append(name) or kernels(name))
     image = torch.rand(1, 3, *SIZE, requires_grad=True)
-    look_up(image, flow, padding="zeros", interpolation="bilinear").sum().backward()
+    sample_image(image, flow, padding="zeros", interpolation="bilinear").sum().backward()
     assert asked.count("warping.kernels.composed") == 1
 
 

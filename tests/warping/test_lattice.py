@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow, along_rows
+from torchrefract.warping.lattice import Lattice, LatticeFlow, StreamFlow, along_rows
 
 SIZES = [(1, 2), (3, 4), (4, 4), (5, 6), (12, 6), (16, 12), (24, 8), (33, 31), (40, 11), (64, 31)]
 
@@ -11,7 +11,7 @@ SIZES = [(1, 2), (3, 4), (4, 4), (5, 6), (12, 6), (16, 12), (24, 8), (33, 31), (
 def test_a_sample_is_read_alike_in_any_batch(stride, dtype):
     source = torch.Generator().manual_seed(stride)
     for height, width in SIZES:
-        for kind, channels, around in ((SmoothFlow, 2, (1, 1)), (StreamFlow, 1, (3, 2))):
+        for kind, channels, around in ((LatticeFlow, 2, (1, 1)), (StreamFlow, 1, (3, 2))):
             lattice = Lattice(height, width, stride, *around)
             nodes = torch.randn(3, channels, *map(len, lattice.axes()), generator=source, dtype=dtype)
             together = kind(nodes, lattice)
@@ -20,6 +20,6 @@ def test_a_sample_is_read_alike_in_any_batch(stride, dtype):
                 alone = kind(nodes[i : i + 1].clone(), lattice)
                 assert torch.equal(together.dense()[i : i + 1], alone.dense()), (height, width)
                 assert torch.equal(together.sampler_grid(dtype)[i : i + 1], alone.sampler_grid(dtype)), (height, width)
-                if kind is SmoothFlow:
+                if kind is LatticeFlow:
                     own = along_rows(alone.nodes, lattice)
                     assert torch.equal(along_rows(nodes, lattice)[i : i + 1], own), (height, width)

@@ -4,21 +4,21 @@ import pytest
 import torch
 
 from torchrefract import warp
-from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
+from torchrefract.warping.lattice import Lattice, LatticeFlow, StreamFlow
 from torchrefract.warping.mixed import Flow, MixedFlow, dense, flow_rows, grid_of, known
-from torchrefract.warping.resample import look_up
+from torchrefract.warping.resample import sample_image
 
 HEIGHT, WIDTH = 33, 47
 
 
-def smooth(seed: int, rows: int, stride: int) -> SmoothFlow:
+def smooth(seed: int, rows: int, stride: int) -> LatticeFlow:
     lattice = Lattice(HEIGHT, WIDTH, stride)
     size = [len(axis) for axis in lattice.axes()]
-    return SmoothFlow(torch.randn(rows, 2, *size, generator=torch.Generator().manual_seed(seed)), lattice)
+    return LatticeFlow(torch.randn(rows, 2, *size, generator=torch.Generator().manual_seed(seed)), lattice)
 
 
 @pytest.fixture
-def forms() -> tuple[SmoothFlow, SmoothFlow, torch.Tensor]:
+def forms() -> tuple[LatticeFlow, LatticeFlow, torch.Tensor]:
     return smooth(0, 2, 8), smooth(1, 1, 5), dense(smooth(2, 2, 6))
 
 
@@ -40,8 +40,8 @@ def test_each_row_is_what_it_is_alone(flow, rows):
     assert torch.equal(grid_of(flow, torch.float32), torch.cat([grid_of(row, torch.float32) for row in rows]))
     image = torch.rand(5, 3, HEIGHT, WIDTH)
     options: dict[str, Any] = {"padding": "border", "interpolation": "bilinear"}
-    found = look_up(image, flow, **options)
-    assert torch.equal(found, torch.cat([look_up(image[i : i + 1], row, **options) for i, row in enumerate(rows)]))
+    found = sample_image(image, flow, **options)
+    assert torch.equal(found, torch.cat([sample_image(image[i : i + 1], row, **options) for i, row in enumerate(rows)]))
     assert torch.allclose(found, warp(image, dense(flow), padding="border")[0], rtol=0, atol=1e-5)
 
 
@@ -70,7 +70,7 @@ def test_rows_that_are_one_are_computed_once(form):
     noise = torch.randn(1, 2, *size, generator=torch.Generator().manual_seed(8))
     nodes = noise[:, :1] if form == "stream" else noise
     forms: dict[str, tuple[Flow, Flow]] = {
-        "lattice": (SmoothFlow(nodes, lattice), SmoothFlow(nodes.expand(6, -1, -1, -1), lattice)),
+        "lattice": (LatticeFlow(nodes, lattice), LatticeFlow(nodes.expand(6, -1, -1, -1), lattice)),
         "stream": (StreamFlow(nodes, lattice), StreamFlow(nodes.expand(6, -1, -1, -1), lattice)),
         "dense": (dense(smooth(0, 1, 8)), dense(smooth(0, 1, 8)).expand(6, -1, -1, -1)),
     }
@@ -81,4 +81,4 @@ def test_rows_that_are_one_are_computed_once(form):
     assert grid.stride(0) == found.stride(0) == 0
     image = torch.rand(6, 3, HEIGHT, WIDTH)
     options: dict[str, Any] = {"padding": "zeros", "interpolation": "bilinear"}
-    assert torch.equal(look_up(image, many, **options)[3:4], look_up(image[3:4], one, **options))
+    assert torch.equal(sample_image(image, many, **options)[3:4], sample_image(image[3:4], one, **options))

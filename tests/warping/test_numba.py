@@ -21,9 +21,9 @@ from torchrefract._lanes import LANES
 from torchrefract.warping import lattice, sums
 from torchrefract.warping.followed import FollowedFlow, followed
 from torchrefract.warping.grid import Positions, sampler_grid
-from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
+from torchrefract.warping.lattice import Lattice, LatticeFlow, StreamFlow
 from torchrefract.warping.mixed import Flow, MixedFlow
-from torchrefract.warping.resample import look_up
+from torchrefract.warping.resample import sample_image
 
 SIZES = [(1, 1), (1, 7), (9, 1), (3, 4), (37, 53), (131, 127), (270, 481)]
 PADDINGS = ["zeros", "border", "reflection"]
@@ -45,7 +45,7 @@ def image_of(*shape: int, seed: int = 0) -> Tensor:
 
 
 def both(image: Tensor, flow: Tensor, **options: str) -> tuple[Tensor, Tensor]:
-    found, expected = (warp(image, flow, resampler=name, **options)[0] for name in ("numba", "grid_sample"))
+    found, expected = (warp(image, flow, backend=name, **options)[0] for name in ("numba", "torch"))
     return found, expected
 
 
@@ -98,20 +98,20 @@ def test_pixels_that_are_not_finite_stay_where_they_are(padding, poison):
         assert torch.equal(found.nan_to_num(), expected.nan_to_num())
 
 
-def smooth(kind: type[SmoothFlow], batch: int, stride: int, height: int, width: int) -> SmoothFlow:
-    before, channels = (1, 2) if kind is SmoothFlow else (3, 1)
-    own = Lattice(height, width, stride, before=before, after=1 if kind is SmoothFlow else 3)
+def smooth(kind: type[LatticeFlow], batch: int, stride: int, height: int, width: int) -> LatticeFlow:
+    before, channels = (1, 2) if kind is LatticeFlow else (3, 1)
+    own = Lattice(height, width, stride, before=before, after=1 if kind is LatticeFlow else 3)
     rows, columns = map(len, own.axes())
     nodes = torch.randn(batch, channels, rows, columns, generator=torch.Generator().manual_seed(2))
-    return kind(nodes * (6 if kind is SmoothFlow else 6 * stride), own)
+    return kind(nodes * (6 if kind is LatticeFlow else 6 * stride), own)
 
 
 def mixes() -> dict[str, Flow | Positions]:
     """Flows of three rows in all forms."""
-    fine, coarse = smooth(SmoothFlow, 1, 5, *LARGE), smooth(SmoothFlow, 2, 16, *LARGE)
+    fine, coarse = smooth(LatticeFlow, 1, 5, *LARGE), smooth(LatticeFlow, 2, 16, *LARGE)
     far, alike = flows(3, *LARGE)["far"], fine.with_nodes(fine.nodes.expand(3, -1, -1, -1))
     found: dict[str, Flow | Positions] = {
-        "lattice": smooth(SmoothFlow, 3, 12, *LARGE),
+        "lattice": smooth(LatticeFlow, 3, 12, *LARGE),
         "stream": smooth(StreamFlow, 3, 9, *LARGE),
         "one for all": alike,
         "dense, one for all": far[:1].expand(3, -1, -1, -1),
@@ -124,7 +124,7 @@ def mixes() -> dict[str, Flow | Positions]:
     found["one for all, followed"] = FollowedFlow(alike, (alike, far[:1].expand(3, -1, -1, -1)))
     curl = smooth(StreamFlow, 3, 12, *LARGE)
     for every in (2, 3, 7):
-        seldom = replace(smooth(SmoothFlow, 3, 40, *LARGE), every=every)
+        seldom = replace(smooth(LatticeFlow, 3, 40, *LARGE), every=every)
         found[f"followed, known every {every} px"] = FollowedFlow(seldom, (alike, curl))
     grid = fine.sampler_grid(torch.float32).expand(3, -1, -1, -1)
     return {**found, "positions": Positions(grid)}
@@ -134,22 +134,22 @@ def mixes() -> dict[str, Flow | Positions]:
 @pytest.mark.parametrize("form", [*mixes()])
 def test_flows_in_all_forms_are_followed_to_the_bit(padding, form):
     image, options = image_of(3, 3, *LARGE), {"padding": padding, "interpolation": "bilinear"}
-    found = look_up(image, mixes()[form], **options, resampler="numba")
-    assert torch.equal(found, look_up(image, mixes()[form], **options, resampler="grid_sample"))
-    assert torch.equal(found, look_up(image, mixes()[form], **options))
+    found = sample_image(image, mixes()[form], **options, backend="numba")
+    assert torch.equal(found, sample_image(image, mixes()[form], **options, backend="torch"))
+    assert torch.equal(found, sample_image(image, mixes()[form], **options))
     assert not torch.equal(found, image)
 
 
 def test_rows_that_are_not_there_are_not_read():
     image, flow = image_of(3, 3, *LARGE), flows(2, *LARGE)["short"]
     with pytest.raises(ValueError, match="flow must have a row for each of 3 images, got 2"):
-        look_up(image, flow, padding="zeros", interpolation="bilinear", resampler="numba")
+        sample_image(image, flow, padding="zeros", interpolation="bilinear", backend="numba")
     with pytest.raises(ValueError, match="grid must have a row for each of 2 flows, got 3"):
         followed(flow, image[:, :2].movedim(1, -1))
 
 
 def test_flows_in_a_row_are_those_of_grid_sample(monkeypatch, oracle):
-    first, grid = smooth(SmoothFlow, 2, 9, *LARGE), smooth(SmoothFlow, 2, 12, *LARGE).sampler_grid(torch.float32)
+    first, grid = smooth(LatticeFlow, 2, 9, *LARGE), smooth(LatticeFlow, 2, 12, *LARGE).sampler_grid(torch.float32)
     flows = [first, first.dense(), first.with_nodes(first.nodes[:1].expand(2, -1, -1, -1))]
     found = [followed(flow, grid) for flow in flows]
     monkeypatch.setattr(compiled, "kernels", lambda _: None)
@@ -159,7 +159,7 @@ def test_flows_in_a_row_are_those_of_grid_sample(monkeypatch, oracle):
 
 
 @pytest.mark.parametrize("stride", [2, 7, 8, 33])
-@pytest.mark.parametrize("kind", [SmoothFlow, StreamFlow])
+@pytest.mark.parametrize("kind", [LatticeFlow, StreamFlow])
 def test_lines_between_nodes_are_those_of_products_of_matrices(stride, kind, monkeypatch, oracle):
     flow = smooth(kind, 2, stride, *LARGE)
     by_kernel = flow.dense()
@@ -169,7 +169,7 @@ def test_lines_between_nodes_are_those_of_products_of_matrices(stride, kind, mon
     oracle("field between nodes, float64", by_kernel.double(), double.dense(), 2e-5)
 
 
-@pytest.mark.parametrize("kind", [SmoothFlow, StreamFlow])
+@pytest.mark.parametrize("kind", [LatticeFlow, StreamFlow])
 def test_nodes_have_the_gradients_of_products_of_matrices(kind, monkeypatch):
     flow = smooth(kind, 2, 9, *LARGE)
     upstream, found = torch.randn(2, 2, *LARGE), list[Tensor]()
@@ -181,14 +181,14 @@ def test_nodes_have_the_gradients_of_products_of_matrices(kind, monkeypatch):
     torch.testing.assert_close(*found, rtol=1e-5, atol=1e-4 * found[0].abs().max().item())
 
 
-def learned(image: Tensor, flow: Tensor, padding: str, resampler: str) -> list[Tensor]:
+def learned(image: Tensor, flow: Tensor, padding: str, backend: str) -> list[Tensor]:
     """Gradients of both, and those of the length of these."""
     image, flow = image.clone().requires_grad_(), flow.clone().requires_grad_()
-    found = warp(image, flow, padding=padding, resampler=resampler)[0]
+    found = warp(image, flow, padding=padding, backend=backend)[0]
     upstream = image_of(*found.shape, seed=3)
     first = torch.autograd.grad(found, (image, flow), upstream, create_graph=True)
     second = torch.autograd.grad(torch.stack([value.square().sum() for value in first]).sum(), (image, flow))
-    alone = torch.autograd.grad(warp(image, flow.detach(), padding=padding, resampler=resampler)[0], image, upstream)
+    alone = torch.autograd.grad(warp(image, flow.detach(), padding=padding, backend=backend)[0], image, upstream)
     return [*first, *second, *alone]
 
 
@@ -198,7 +198,7 @@ def learned(image: Tensor, flow: Tensor, padding: str, resampler: str) -> list[T
 def test_gradients_are_those_of_grid_sample(padding, threads, batch, on_threads):
     on_threads(threads)
     image, flow = image_of(batch, 3, *LARGE), flows(batch, *LARGE)["short"]
-    found, expected = (learned(image, flow, padding, name) for name in ("numba", "grid_sample"))
+    found, expected = (learned(image, flow, padding, name) for name in ("numba", "torch"))
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5 * other.abs().max().item())
 
@@ -210,16 +210,16 @@ def test_images_learn_along_flows_of_all_kinds(padding, threads, kind, on_thread
     on_threads(threads)
     made = flows(2, *LARGE)
     flow = made.get(kind, made["far"])
-    path = Positions(sampler_grid(flow)) if kind == "positions" else smooth(SmoothFlow, 2, 9, *LARGE)
+    path = Positions(sampler_grid(flow)) if kind == "positions" else smooth(LatticeFlow, 2, 9, *LARGE)
     upstream, found = image_of(2, 4, *LARGE, seed=3), list[Tensor]()
-    for name in ("numba", "grid_sample"):
+    for name in ("numba", "torch"):
         image = image_of(2, 4, *LARGE).requires_grad_()
-        looked = look_up(
+        looked = sample_image(
             image,
             path if kind in ("lattice", "positions") else flow,
             padding=padding,
             interpolation="bilinear",
-            resampler=name,
+            backend=name,
         )
         found.append(torch.autograd.grad(looked, image, upstream)[0])
     torch.testing.assert_close(*found, rtol=1e-5, atol=1e-5 * found[1].abs().max().item())
@@ -230,8 +230,8 @@ def test_parameters_learn_through_the_kernels():
     for effect in (LensDistortion(), ThinPlateSpline(amplitude_range=(3, 3)), DivergenceFree(amplitude_range=(3, 3))):
         params = effect.sample(image, seed=5)
         found = list[list[Tensor]]()
-        for name in ("numba", "grid_sample"):
-            effect.resampler = name
+        for name in ("numba", "torch"):
+            effect.backend = name
             leaves = [v.clone().requires_grad_() if v.is_floating_point() else v for v in params]
             made = effect.apply(image, type(params)(*leaves)).image
             own = [leaf for leaf in leaves if leaf.requires_grad]
@@ -247,8 +247,8 @@ def test_threads_and_batch_change_no_bit(size, on_threads):
     image, flow, results = image_of(3, 3, *size), flows(3, *size)["far"], list[Tensor]()
     for threads in (1, 2, 3, 8):
         on_threads(threads)
-        results.append(warp(image, flow, resampler="numba")[0])
-    alone = torch.cat([warp(image[i : i + 1], flow[i : i + 1], resampler="numba")[0] for i in range(3)])
+        results.append(warp(image, flow, backend="numba")[0])
+    alone = torch.cat([warp(image[i : i + 1], flow[i : i + 1], backend="numba")[0] for i in range(3)])
     for result in (*results[1:], alone):
         assert torch.equal(result, results[0])
 
@@ -257,8 +257,8 @@ def test_effects_give_the_same_whatever_looks_them_up():
     image = image_of(3, 3, *LARGE)
     for effect in (LensDistortion(), ThinPlateSpline(), DivergenceFree(), OneOf([LensDistortion(), ThinPlateSpline()])):
         made = list[Tensor]()
-        for name in ("auto", "numba", "grid_sample"):
-            effect.resampler = name
+        for name in ("auto", "numba", "torch"):
+            effect.backend = name
             made.append(effect.degrade(image, seed=11).image)
         assert torch.equal(made[0], made[1])
         assert torch.equal(made[0], made[2])
@@ -284,7 +284,7 @@ def test_small_frames_types_and_looks_that_kernels_lack_go_another_way(asked):
     warp(large, still, interpolation="nearest")
     warp(large, still, interpolation="bicubic")
     warp(large.double(), still)
-    warp(large, still, resampler="grid_sample")
+    warp(large, still, backend="torch")
     assert not asked
     warp(large, still)
     assert asked
@@ -302,8 +302,8 @@ def test_small_frames_types_and_looks_that_kernels_lack_go_another_way(asked):
 )
 def test_what_kernels_cannot_do_raises(image, options, why):
     flow = torch.zeros(1, 2, *image.shape[2:], device=image.device)
-    with pytest.raises(ValueError, match=f"resampler must be auto or grid_sample {why}, got 'numba'"):
-        warp(image, flow, resampler="numba", **options)
+    with pytest.raises(ValueError, match=f"backend must be auto or grid_sample {why}, got 'numba'"):
+        warp(image, flow, backend="numba", **options)
 
 
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:FutureWarning")  # of torch.func.jvp
@@ -320,15 +320,15 @@ def test_forward_gradients_maps_and_graphs_are_pytorchs(asked):
 def test_under_a_map_or_in_a_graph_numba_raises():
     image, flow = image_of(2, 3, *LARGE), torch.zeros(2, 2, *LARGE)
     with pytest.raises(ValueError, match=r"inside torch\.func"):
-        torch.vmap(lambda i, f: warp(i, f, resampler="numba"))(image, flow)
+        torch.vmap(lambda i, f: warp(i, f, backend="numba"))(image, flow)
     with pytest.raises(Exception, match=r"under torch\.compile"):  # dynamo wraps it in an error of its own
-        torch.compile(lambda i, f: warp(i, f, resampler="numba"), fullgraph=True, backend="eager")(image, flow)
+        torch.compile(lambda i, f: warp(i, f, backend="numba"), fullgraph=True, backend="eager")(image, flow)
 
 
 def test_in_inference_mode_nothing_changes():
     image, flow = image_of(1, 3, *LARGE), flows(1, *LARGE)["short"]
     with torch.inference_mode():
-        assert torch.equal(warp(image, flow * 1)[0], warp(image, flow, resampler="grid_sample")[0])
+        assert torch.equal(warp(image, flow * 1)[0], warp(image, flow, backend="torch")[0])
 
 
 def test_without_numba_auto_goes_without_it_and_numba_raises(monkeypatch):
@@ -340,7 +340,7 @@ def test_without_numba_auto_goes_without_it_and_numba_raises(monkeypatch):
     # Fields between nodes are then products of matrices, which round in another way.
     torch.testing.assert_close(effect.degrade(image, seed=3).image, before[1], rtol=0, atol=2e-4)
     with pytest.raises(ValueError, match=r"without numba \(pip install 'torchrefract\[fast\]'\), got 'numba'"):
-        warp(image, flow, resampler="numba")
+        warp(image, flow, backend="numba")
 
 
 @pytest.mark.parametrize("fault", ["NUMBA_DISABLE_JIT", "numba"])
@@ -368,7 +368,7 @@ across = image.movedim(1, -1).contiguous().movedim(-1, 1)
 for flow in (noise, noise * 30, torch.nn.functional.avg_pool2d(noise, 9, 1, 4) * 60):
     for source in (image, across, (image * 256).to(torch.uint8), (across * 256).to(torch.uint8)):
         for padding in ("zeros", "border", "reflection"):
-            a, b = (warp(source, flow, padding=padding, resampler=name)[0] for name in ("numba", "grid_sample"))
+            a, b = (warp(source, flow, padding=padding, backend=name)[0] for name in ("numba", "torch"))
             assert torch.equal(a, b), (source.dtype, padding)
 """
 FLOWS = """
@@ -455,7 +455,7 @@ class Warped(Dataset[Tensor]):
         return 4
 
     def __getitem__(self, i: int) -> Tensor:
-        return warp(image_of(3, *LARGE, seed=i), flows(1, *LARGE)["far"][0], resampler="numba")[0]
+        return warp(image_of(3, *LARGE, seed=i), flows(1, *LARGE)["far"][0], backend="numba")[0]
 
 
 @pytest.mark.parametrize("start", ["fork", "spawn"])

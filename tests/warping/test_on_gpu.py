@@ -11,7 +11,7 @@ import torch
 from torchrefract import DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.warping import on_gpu
-from torchrefract.warping.lattice import Lattice, SmoothFlow
+from torchrefract.warping.lattice import Lattice, LatticeFlow
 
 SEED = 4  # has some of six samples moved and some not
 on_a_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -42,14 +42,14 @@ def test_the_kernels_find_what_grid_sample_and_the_cpu_do():
 
 def test_the_cpu_and_other_types_are_not_served():
     lattice = Lattice(64, 64, 16)
-    flow = SmoothFlow(torch.zeros(1, 2, *map(len, lattice.axes())), lattice)
+    flow = LatticeFlow(torch.zeros(1, 2, *map(len, lattice.axes())), lattice)
     far = torch.zeros(1, 3, 64, 64, device="meta")
     assert not on_gpu.serves(torch.zeros(1, 3, 64, 64), flow, torch.float32)
     assert not on_gpu.serves(far, flow, torch.float32)
 
 
 def drawn(name: str, **more) -> tuple[LatticeWarp, LatticeWarp]:
-    return MAKERS[name](tolerance_px=0.05, **more), MAKERS[name](tolerance_px=0.05, resampler="grid_sample", **more)
+    return MAKERS[name](tolerance_px=0.05, **more), MAKERS[name](tolerance_px=0.05, backend="torch", **more)
 
 
 @on_a_gpu
@@ -61,11 +61,11 @@ def test_an_effect_on_a_gpu_is_that_by_grid_sample(name, padding, kind):
     image = image.mul(255).to(kind) if kind is torch.uint8 else image.to(kind)
     ours, plain = drawn(name, padding=padding, p=0.5)
     params = ours.sample(image, seed=SEED)
-    assert params.gate.any()
-    assert not params.gate.all()
+    assert params.applied.any()
+    assert not params.applied.all()
     found, expected = ours.apply(image, params).image, plain.apply(image, params).image
     assert found.dtype is kind
-    assert torch.equal(found[~params.gate], image[~params.gate])
+    assert torch.equal(found[~params.applied], image[~params.applied])
     apart = (found.double() - expected.double()).abs().max().item()
     assert apart <= {torch.float32: 2e-4, torch.float16: 1e-3, torch.uint8: 1}[kind]
 

@@ -50,8 +50,8 @@ def test_floats_are_those_of_grid_sample(size, padding, interpolation, channels,
     image = levels(2, channels, *size).float() / 255
     for flow in flows(2, *size).values():
         options = {"padding": padding, "interpolation": interpolation}
-        found = warp(image, flow, resampler="opencv", **options)[0]
-        expected = warp(image, flow, resampler="grid_sample", **options)[0]
+        found = warp(image, flow, backend="opencv", **options)[0]
+        expected = warp(image, flow, backend="torch", **options)[0]
         if interpolation == "nearest":
             assert torch.equal(found, expected)
         oracle("remap in float32, grid_sample", found, expected, CLOSE, unit="")
@@ -65,9 +65,9 @@ def test_bytes_are_those_of_grid_sample_but_for_halves(size, padding, interpolat
     image = levels(2, channels, *size)
     for flow in flows(2, *size).values():
         options = {"padding": padding, "interpolation": interpolation}
-        found = warp(image, flow, resampler="opencv", **options)[0]
-        unrounded = warp(image.float(), flow, resampler="grid_sample", **options)[0]
-        same_but_for_halves(found, warp(image, flow, resampler="grid_sample", **options)[0], unrounded)
+        found = warp(image, flow, backend="opencv", **options)[0]
+        unrounded = warp(image.float(), flow, backend="torch", **options)[0]
+        same_but_for_halves(found, warp(image, flow, backend="torch", **options)[0], unrounded)
 
 
 @pytest.mark.parametrize("padding", PADDINGS)
@@ -80,8 +80,8 @@ def test_bytes_of_real_frames_differ_in_few_values_in_a_million(padding, shared_
         lens = LensDistortion(padding=padding, tolerance_px=0.05)
         flow = lens.degrade(image, seed=0).flow
         assert flow is not None
-        found, expected = (warp(image, flow, padding=padding, resampler=name)[0] for name in ("opencv", "grid_sample"))
-        unrounded = warp(image.float(), flow, padding=padding, resampler="grid_sample")[0]
+        found, expected = (warp(image, flow, padding=padding, backend=name)[0] for name in ("opencv", "torch"))
+        unrounded = warp(image.float(), flow, padding=padding, backend="torch")[0]
         same_but_for_halves(found, expected, unrounded)
         share = (found != expected).double().mean().item()
         assert share < 5e-5
@@ -92,7 +92,7 @@ def test_bytes_of_real_frames_differ_in_few_values_in_a_million(padding, shared_
 
 def test_bytes_are_the_nearest_to_what_opencv_finds_in_floats():
     image, flow = levels(1, 3, 270, 481), flows(1, 270, 481)["short"]
-    found, floats = (warp(value, flow, resampler="opencv")[0] for value in (image, image.float()))
+    found, floats = (warp(value, flow, backend="opencv")[0] for value in (image, image.float()))
     assert torch.equal(found, floats.round().to(torch.uint8))
 
 
@@ -116,7 +116,7 @@ def test_flow_that_is_not_finite_leads_outside(poison, padding):
     image, flow = levels(1, 3, 9, 11), torch.zeros(1, 2, 9, 11)
     flow[0, 0, 4, 5] = flow[0, 1, 2, 3] = poison
     found, valid = warp(image, flow, padding=padding)
-    expected, seen = warp(image, flow, padding=padding, resampler="grid_sample")
+    expected, seen = warp(image, flow, padding=padding, backend="torch")
     assert torch.equal(found, expected)
     assert torch.equal(valid, seen)
     assert not valid[0, 0, 4, 5]
@@ -138,8 +138,8 @@ def test_threads_and_batch_change_no_bit(size, channels, on_threads, on_opencv_t
     for threads in (1, 2, 3):
         on_threads(threads)
         on_opencv_threads(threads)
-        results.append(warp(image, flow, padding="border", resampler="opencv")[0])
-    options = {"padding": "border", "resampler": "opencv"}
+        results.append(warp(image, flow, padding="border", backend="opencv")[0])
+    options = {"padding": "border", "backend": "opencv"}
     alone = torch.cat([warp(image[i : i + 1], flow[i : i + 1], **options)[0] for i in range(3)])
     for result in (*results[1:], alone, warp(image[::2], flow[::2], **options)[0]):
         assert torch.equal(result, results[0][:: 2 if len(result) == 2 else 1])
@@ -148,7 +148,7 @@ def test_threads_and_batch_change_no_bit(size, channels, on_threads, on_opencv_t
 def test_opencvs_own_threads_stay_as_they_were(on_threads):
     on_threads(1)
     before = cv2.getNumThreads()
-    warp(levels(1, 3, 301, 263), flows(1, 301, 263)["short"], resampler="opencv")
+    warp(levels(1, 3, 301, 263), flows(1, 301, 263)["short"], backend="opencv")
     assert cv2.getNumThreads() == before
 
 
@@ -190,7 +190,7 @@ def test_auto_asks_opencv_for_bytes_in_its_own_layout_alone(image, asked, calls)
 @pytest.mark.parametrize("options", [{"padding": padding, "interpolation": "bicubic"} for padding in PADDINGS])
 def test_auto_leaves_to_pytorch_what_opencv_does_otherwise(options, calls):
     image, flow = levels(1, *FRAME), flows(1, *FRAME[1:])["short"]
-    assert torch.equal(warp(image, flow, **options)[0], warp(image, flow, resampler="grid_sample", **options)[0])
+    assert torch.equal(warp(image, flow, **options)[0], warp(image, flow, backend="torch", **options)[0])
     assert not calls
 
 
@@ -217,9 +217,9 @@ def test_forward_gradients_maps_and_graphs_are_pytorchs(calls):
 def test_in_inference_mode_nothing_changes(on_threads):
     on_threads(2)
     image, flow = levels(1, 3, 301, 263), flows(1, 301, 263)["short"]
-    expected = warp(image, flow, resampler="opencv")[0]
+    expected = warp(image, flow, backend="opencv")[0]
     with torch.inference_mode():
-        assert torch.equal(warp(image, flow * 1, resampler="opencv")[0], expected)
+        assert torch.equal(warp(image, flow * 1, backend="opencv")[0], expected)
 
 
 @pytest.mark.parametrize(
@@ -236,16 +236,16 @@ def test_in_inference_mode_nothing_changes(on_threads):
 )
 def test_what_opencv_cannot_do_raises(image, options, why):
     flow = torch.zeros(1, 2, *image.shape[2:], device=image.device)
-    with pytest.raises(ValueError, match=f"resampler must be auto or grid_sample {why}, got 'opencv'"):
-        warp(image, flow, resampler="opencv", **options)
+    with pytest.raises(ValueError, match=f"backend must be auto or grid_sample {why}, got 'opencv'"):
+        warp(image, flow, backend="opencv", **options)
 
 
 def test_under_a_map_or_in_a_graph_opencv_raises():
     image, flow = levels(2, *FRAME), torch.zeros(2, 2, *FRAME[1:])
     with pytest.raises(ValueError, match=r"inside torch\.func"):
-        torch.vmap(lambda i, f: warp(i, f, resampler="opencv"))(image, flow)
+        torch.vmap(lambda i, f: warp(i, f, backend="opencv"))(image, flow)
     with pytest.raises(Exception, match=r"under torch\.compile"):  # dynamo wraps it in an error of its own
-        torch.compile(lambda i, f: warp(i, f, resampler="opencv"), fullgraph=True, backend="eager")(image, flow)
+        torch.compile(lambda i, f: warp(i, f, backend="opencv"), fullgraph=True, backend="eager")(image, flow)
 
 
 @pytest.mark.parametrize("found", [None, "4.12.0"])
@@ -257,26 +257,26 @@ def test_without_opencv_5_auto_goes_without_it_and_opencv_raises(found, monkeypa
         return types.SimpleNamespace(__version__=found)
 
     image, flow = levels(1, *FRAME), flows(1, *FRAME[1:])["short"]
-    expected = warp(image, flow, resampler="grid_sample")[0]
+    expected = warp(image, flow, backend="torch")[0]
     opencv._opencv.cache_clear()
     monkeypatch.setattr(importlib, "import_module", load)
     try:
         assert torch.equal(warp(image, flow)[0], expected)
         assert not calls
         with pytest.raises(ValueError, match=r"without OpenCV 5 or later \(pip install"):
-            warp(image, flow, resampler="opencv")
+            warp(image, flow, backend="opencv")
     finally:
         opencv._opencv.cache_clear()
 
 
 def test_an_unknown_resampler_raises():
-    rule = "resampler must be one of auto, grid_sample, numba, opencv, got 'pil'"
+    rule = "backend must be one of auto, grid_sample, numba, opencv, got 'pil'"
     with pytest.raises(ValueError, match=rule):
-        warp(torch.zeros(1, 1, 2, 2), torch.zeros(1, 2, 2, 2), resampler="pil")
+        warp(torch.zeros(1, 1, 2, 2), torch.zeros(1, 2, 2, 2), backend="pil")
     with pytest.raises(ValueError, match=rule):
-        LensDistortion(resampler="pil")
+        LensDistortion(backend="pil")
     with pytest.raises(ValueError, match=rule):
-        OneOf([LensDistortion()], resampler="pil")
+        OneOf([LensDistortion()], backend="pil")
 
 
 @pytest.mark.parametrize("tolerance", [None, 0.05])
@@ -288,21 +288,21 @@ def test_an_effect_on_a_frame_of_opencv_makes_no_detour(tolerance, calls):
     assert calls
     assert result.image.permute(1, 2, 0).is_contiguous()
     assert result.flow is not None
-    expected = warp(frame.float(), result.flow, resampler="grid_sample")[0]
+    expected = warp(frame.float(), result.flow, backend="torch")[0]
     # A flow on a lattice leads to positions that are rounded otherwise: to 1/1000 px, a quarter of a level here.
     assert (result.image.float() - expected).abs().max() <= 0.5 + (0.0 if tolerance is None else 0.26) + 255 * CLOSE
 
 
 def test_a_composition_takes_the_resampler_of_its_last_warp_or_its_own(calls):
     frame = levels(1, *FRAME)
-    opencv_lens = LensDistortion(k1_range=(-0.3, -0.3), resampler="opencv")
-    plate = ThinPlateSpline(padding="border", resampler="grid_sample")
+    opencv_lens = LensDistortion(k1_range=(-0.3, -0.3), backend="opencv")
+    plate = ThinPlateSpline(padding="border", backend="torch")
     by_sampler = Compose([opencv_lens, plate])(frame)
     assert by_sampler.dtype is torch.uint8
     assert not calls
     Compose([plate, opencv_lens])(frame)
     assert len(calls) == 1
-    Compose([opencv_lens, plate], resampler="opencv")(frame)
+    Compose([opencv_lens, plate], backend="opencv")(frame)
     assert len(calls) == 2
     Compose([opencv_lens, UniformFog()])(frame)  # light has floats, and OpenCV them too
     assert len(calls) == 3
@@ -315,7 +315,7 @@ class Frames(Dataset):
         return 3
 
     def __getitem__(self, i: int) -> Tensor:
-        lens = LensDistortion(k1_range=(-0.3, -0.3), tolerance_px=0.05, resampler="opencv")
+        lens = LensDistortion(k1_range=(-0.3, -0.3), tolerance_px=0.05, backend="opencv")
         return lens.degrade(levels(3, 151, 263, seed=i), seed=7, keys=[i]).image
 
 
@@ -329,6 +329,6 @@ def test_workers_of_a_loader_find_the_same(context):
 
 def test_a_model_with_a_resampler_is_saved_whole():
     buffer = io.BytesIO()
-    torch.save(LensDistortion(resampler="opencv"), buffer)
+    torch.save(LensDistortion(backend="opencv"), buffer)
     buffer.seek(0)
-    assert torch.load(buffer, weights_only=False).resampler == "opencv"
+    assert torch.load(buffer, weights_only=False).backend == "opencv"

@@ -2,19 +2,19 @@
 
 `Camera` is one camera in plain numbers; `distort`, `undistort`, `project` and `unproject` take a batch of them as
 tensors, with gradients. `convert` finds the nearest camera of another model, `read_lenses` reads a table of real
-lenses. Files of other programs are read and written by the modules of `torchrefract.cameras.files`.
+lenses. Files of other programs are read and written by the modules of `torchrefract.cameras.io`.
 """
 
 from torchrefract.cameras.conversion import Conversion, convert
 from torchrefract.cameras.lens_table import Lens, read_lenses
 from torchrefract.cameras.models import Camera
-from torchrefract.cameras.points import Mapped, distort, project, undistort, unproject, valid_radius
+from torchrefract.cameras.points import PointResult, distort, project, undistort, unproject, valid_radius
 
 __all__ = [
     "Camera",
     "Conversion",
     "Lens",
-    "Mapped",
+    "PointResult",
     "convert",
     "distort",
     "project",

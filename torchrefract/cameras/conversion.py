@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_choice, check_number
+from torchrefract._validation import check_choice, check_number
 from torchrefract.cameras.models import Camera
 from torchrefract.cameras.points import image_of_rays
 from torchrefract.cameras.sheet import MODELS

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true, read
+from torchrefract._validation import eager_bool, eager_values
 from torchrefract.cameras.radial import RadialLimit, radial, radial_slope
 from torchrefract.warping.jacobian import Jacobian
 
@@ -37,7 +37,7 @@ ALL_TERMS = Terms()
 
 def used_terms(coefficients: Tensor) -> Terms:
     """The terms that coefficients (B, 12) make use of: not zero, or asked for their gradient, or not to be read."""
-    values = None if coefficients.requires_grad else read(lambda: coefficients)
+    values = None if coefficients.requires_grad else eager_values(lambda: coefficients)
     if values is None:
         return ALL_TERMS
     used = [any(row[i] for row in values) for i in range(12)]
@@ -114,7 +114,7 @@ def undistort_polynomial(
         room = torch.minimum(room, limit.radius.square() - r2)
         if terms.bent:
             room = torch.minimum(room, _slopes(x, y, r2, g, c, terms).determinant)
-        if is_true(lambda: room.amin() >= 0, of=room):
+        if eager_bool(lambda: room.amin() >= 0, of=room):
             return x, y, torch.ones_like(room, dtype=torch.bool)
         return x.nan_to_num(0, 0, 0), y.nan_to_num(0, 0, 0), room >= 0
 
@@ -154,7 +154,7 @@ def _radial_start(r_d: Tensor, c: tuple[Tensor, ...], limit: RadialLimit, terms:
     """The inverse of the radial part: exact for lenses without other terms, to start from for the others."""
     if terms.radial == 0:
         return r_d
-    start = limit.look_up(r_d)
+    start = limit.sample_image(r_d)
     if not terms.round:
         return start
     r = newton_radius(r_d, start, limit, lambda r2: (radial(r2, c, terms.radial), radial_slope(r2, c, terms.radial)))
@@ -195,7 +195,7 @@ def _bend(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, coefficients: Tensor, 
         x, y = x - step_x, y - step_y
         if count >= least:
             size = torch.maximum(step_x.abs(), step_y.abs())
-            if is_true(lambda size=size: size.amax() <= still, of=size):
+            if eager_bool(lambda size=size: size.amax() <= still, of=size):
                 break
             moves = size > still
     if not terms.round:

@@ -96,7 +96,7 @@ def undistort_angle(theta_d: Tensor, k: Sequence[Tensor], most: Tensor) -> Tenso
     with torch.no_grad():
         still = tuple(value.detach() for value in k)
         limit = limit_of_curve(most, reach_of(theta_d), lambda theta: distort_angle(theta, still))
-        start = limit.look_up(theta_d)
+        start = limit.sample_image(theta_d)
         theta = newton_radius(theta_d, start, limit, lambda q: (radial(q, still, 4), radial_slope(q, still, 4)))
         q = theta * theta
         growth = (radial(q, still, 4) + 2 * q * radial_slope(q, still, 4)).clamp(min=torch.finfo(q.dtype).eps)

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_choice, check_count, check_number, check_positive, check_tensor
-from torchrefract._constants import constant
+from torchrefract._tensor import as_device_tensor
+from torchrefract._validation import check_choice, check_count, check_number, check_positive, check_tensor
 from torchrefract.cameras.growth import falls_before, first_root, growth_of_powers, growth_of_ratio
-from torchrefract.cameras.points import Mapped, distort, project, undistort, unproject, valid_radius
+from torchrefract.cameras.points import PointResult, distort, project, undistort, unproject, valid_radius
 from torchrefract.cameras.sheet import MODELS
 
 # Along each side of the frame, where it is asked how much of it a model covers.
@@ -182,22 +182,22 @@ class Camera:
     def tensors(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Coefficients (1, n), focal lengths (1, 2) and principal point (1, 2), px, of a tensor's type and device."""
         numbers = (self.coefficients, (self.fx, self.fy), (self.cx, self.cy))
-        coefficients, focal, center = (constant([row], dtype=like.dtype, device=like.device) for row in numbers)
+        coefficients, focal, center = (as_device_tensor([row], dtype=like.dtype, device=like.device) for row in numbers)
         return coefficients, focal, center
 
-    def distort(self, points: Tensor) -> Mapped:
+    def distort(self, points: Tensor) -> PointResult:
         """Points (N, 2) or (B, N, 2) of the plane z = 1 by `points.distort`."""
         return self._through("points", points, lambda p, c, **_: distort(p, c, model=self.model))
 
-    def undistort(self, points: Tensor) -> Mapped:
+    def undistort(self, points: Tensor) -> PointResult:
         """Points (N, 2) or (B, N, 2), in focal lengths, by `points.undistort`."""
         return self._through("points", points, lambda p, c, **_: undistort(p, c, model=self.model))
 
-    def project(self, points: Tensor) -> Mapped:
+    def project(self, points: Tensor) -> PointResult:
         """Points in space (N, 3) or (B, N, 3) by `points.project`: the pixels that show them, in the frame or not."""
         return self._through("points", points, lambda p, c, **pinhole: project(p, c, model=self.model, **pinhole))
 
-    def unproject(self, pixels: Tensor) -> Mapped:
+    def unproject(self, pixels: Tensor) -> PointResult:
         """Pixels (N, 2) or (B, N, 2) by `points.unproject`: the rays of unit length that they show."""
         return self._through("pixels", pixels, lambda p, c, **pinhole: unproject(p, c, model=self.model, **pinhole))
 
@@ -235,13 +235,13 @@ class Camera:
         k1, k2, p1, p2, k3, *others = (*self.coefficients, *(0.0,) * (14 - len(self.coefficients)))
         return (k1, k2, k3, 0.0, 0.0, 0.0, p1, p2, *others[3:7])
 
-    def _through(self, name: str, points: Tensor, function: Callable[..., Mapped]) -> Mapped:
+    def _through(self, name: str, points: Tensor, function: Callable[..., PointResult]) -> PointResult:
         if check_tensor(name, points).ndim not in (2, 3):
             raise ValueError(f"{name} must have shape (N, n) or (B, N, n), got {tuple(points.shape)}")
         batch = points if points.ndim == 3 else points[None]
         coefficients, focal, center = (value.expand(len(batch), -1) for value in self.tensors(points))
         found = function(batch, coefficients, focal=focal, center=center)
-        return found if points.ndim == 3 else Mapped(*(value[0] for value in found))
+        return found if points.ndim == 3 else PointResult(*(value[0] for value in found))
 
     def _check_growth(self) -> None:
         """Raise for a lens that shows less than a pixel; by plain numbers, so that compilers can follow."""

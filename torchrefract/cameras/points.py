@@ -9,13 +9,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_all, check_choice, check_tensor
+from torchrefract._validation import check_choice, check_tensor, check_values
 from torchrefract.cameras.division import distort_division
 from torchrefract.cameras.fisheye import fisheye_image
 from torchrefract.cameras.sheet import MODELS, columns, exact_radius, formula, image_of, on_plane, ray_of
 
 
-class Mapped(NamedTuple):
+class PointResult(NamedTuple):
     """Where points or rays go.
 
     points: (B, N, 2), or of rays (B, N, 3); where `valid` is false the center, or the axis, and without gradient.
@@ -29,7 +29,7 @@ class Mapped(NamedTuple):
     residual: Tensor
 
 
-def distort(points: Tensor, coefficients: Tensor, *, model: str) -> Mapped:
+def distort(points: Tensor, coefficients: Tensor, *, model: str) -> PointResult:
     """The points of the plane z = 1 where a lens shows them.
 
     Args:
@@ -45,10 +45,10 @@ def distort(points: Tensor, coefficients: Tensor, *, model: str) -> Mapped:
     x, y = points[..., 0], points[..., 1]
     c, radius = columns(coefficients, model), _radius(coefficients, model)
     x_d, y_d, valid = image_of(x, y, torch.ones_like(x), c, model, radius)
-    return Mapped(torch.stack([x_d, y_d], dim=-1), valid & finite, torch.zeros_like(x_d))
+    return PointResult(torch.stack([x_d, y_d], dim=-1), valid & finite, torch.zeros_like(x_d))
 
 
-def undistort(points: Tensor, coefficients: Tensor, *, model: str) -> Mapped:
+def undistort(points: Tensor, coefficients: Tensor, *, model: str) -> PointResult:
     """The points of the plane z = 1 that a lens shows at other points: the inverse of `distort`.
 
     Gradients are those of the exact inverse, by the implicit function theorem. A ray at 90 degrees or more to the axis
@@ -66,10 +66,12 @@ def undistort(points: Tensor, coefficients: Tensor, *, model: str) -> Mapped:
     c, radius = columns(coefficients, model), _radius(coefficients, model)
     ray, valid = ray_of(points[..., 0], points[..., 1], c, model, radius)
     x, y, valid = on_plane(ray, valid & finite)
-    return Mapped(torch.stack([x, y], dim=-1), valid, _missed((x, y, torch.ones_like(x)), points, c, model, radius))
+    return PointResult(
+        torch.stack([x, y], dim=-1), valid, _missed((x, y, torch.ones_like(x)), points, c, model, radius)
+    )
 
 
-def project(points: Tensor, coefficients: Tensor, *, focal: Tensor, center: Tensor, model: str) -> Mapped:
+def project(points: Tensor, coefficients: Tensor, *, focal: Tensor, center: Tensor, model: str) -> PointResult:
     """The pixels where cameras show points in space; they may lie outside the frame.
 
         (u, v) = focal distort(x / z, y / z) + center;  for a fisheye the angle to the axis goes up to pi
@@ -88,10 +90,10 @@ def project(points: Tensor, coefficients: Tensor, *, focal: Tensor, center: Tens
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     x_d, y_d, valid = image_of(x, y, z, columns(coefficients, model), model, _radius(coefficients, model))
     pixels = torch.stack([x_d, y_d], dim=-1) * focal[:, None] + center[:, None]
-    return Mapped(pixels, valid & finite, torch.zeros_like(x_d))
+    return PointResult(pixels, valid & finite, torch.zeros_like(x_d))
 
 
-def unproject(pixels: Tensor, coefficients: Tensor, *, focal: Tensor, center: Tensor, model: str) -> Mapped:
+def unproject(pixels: Tensor, coefficients: Tensor, *, focal: Tensor, center: Tensor, model: str) -> PointResult:
     """The rays of unit length that cameras see at pixels: the inverse of `project`.
 
     Args:
@@ -110,7 +112,7 @@ def unproject(pixels: Tensor, coefficients: Tensor, *, focal: Tensor, center: Te
     valid = valid & finite
     rays = torch.stack([torch.where(valid, a, axis) for a, axis in zip(ray, (0.0, 0.0, 1.0), strict=True)], dim=-1)
     missed = _missed(rays.unbind(-1), points, c, model, radius, scale=focal)
-    return Mapped(rays / rays.square().sum(dim=-1, keepdim=True).sqrt(), valid, missed)
+    return PointResult(rays / rays.square().sum(dim=-1, keepdim=True).sqrt(), valid, missed)
 
 
 def valid_radius(coefficients: Tensor, *, model: str) -> Tensor:
@@ -145,15 +147,15 @@ def check_coefficients(coefficients: Tensor, model: str) -> None:
         raise ValueError(
             f"coefficients must have shape (B, {counts}) for the model {model}, got {tuple(coefficients.shape)}"
         )
-    check_all("coefficients", "be finite", coefficients, torch.isfinite)
+    check_values("coefficients", "be finite", coefficients, torch.isfinite)
 
 
 def _check_pinhole(focal: Tensor, center: Tensor, coefficients: Tensor) -> None:
     for name, value in (("focal", focal), ("center", center)):
         if check_tensor(name, value).shape != (coefficients.shape[0], 2):
             raise ValueError(f"{name} must have shape ({coefficients.shape[0]}, 2), got {tuple(value.shape)}")
-    check_all("focal", "be positive and finite", focal, lambda v: (v > 0) & v.isfinite())
-    check_all("center", "be finite", center, torch.isfinite)
+    check_values("focal", "be positive and finite", focal, lambda v: (v > 0) & v.isfinite())
+    check_values("center", "be finite", center, torch.isfinite)
 
 
 def _clean(name: str, points: Tensor, size: int, coefficients: Tensor) -> tuple[Tensor, Tensor]:

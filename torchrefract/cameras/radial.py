@@ -26,7 +26,7 @@ class RadialLimit(NamedTuple):
     folds: Tensor
     table: Tensor
 
-    def look_up(self, r_d: Tensor) -> Tensor:
+    def sample_image(self, r_d: Tensor) -> Tensor:
         """The radius (B, ...) that the radial part maps to r_d, from the table; `radius` where there is none."""
         place = _NODES * (1 - (1 - r_d / self.image_radius).clamp(min=0).sqrt())
         node = place.long().clamp(0, _NODES - 1)

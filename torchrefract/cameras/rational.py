@@ -53,7 +53,7 @@ def undistort_opencv(x_d: Tensor, y_d: Tensor, c: Sequence[Tensor], radius: Tens
         x_l, y_l = _untilted(x_d, y_d, c[12], c[13])
         r_l = (x_l * x_l + y_l * y_l).sqrt()
         limit = limit_of_curve(radius, reach_of(r_l), lambda r: r * _ratio(r * r, c)[0])
-        r = newton_radius(r_l, limit.look_up(r_l), limit, lambda r2: _ratio(r2, c))
+        r = newton_radius(r_l, limit.sample_image(r_l), limit, lambda r2: _ratio(r2, c))
         scale = r / r_l.clamp(min=torch.finfo(r.dtype).tiny)
         x, y = scale * x_l, scale * y_l
         for _ in range(_STEPS):

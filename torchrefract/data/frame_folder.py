@@ -19,7 +19,7 @@ from typing import NamedTuple, NoReturn
 import torch
 from torch.utils.data import Dataset
 
-from torchrefract._checks import check_choice, check_number, check_size
+from torchrefract._validation import check_choice, check_number, check_size
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, image_size, read_image
 from torchrefract.types import Frame
 

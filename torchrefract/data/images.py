@@ -20,8 +20,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from torchrefract._checks import check_size, check_tensor
-from torchrefract._levels import levels_of, numbers_of
+from torchrefract._tensor import to_float, to_uint8
+from torchrefract._validation import check_size, check_tensor
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 
@@ -65,7 +65,7 @@ def read_pixels(path: str | Path) -> np.ndarray:
 
 def as_image(pixels: np.ndarray) -> Tensor:
     """(3, H, W), float32 in [0, 1], of a picture (H, W, 3), uint8 or uint16."""
-    return numbers_of(torch.from_numpy(pixels)).permute(2, 0, 1)
+    return to_float(torch.from_numpy(pixels)).permute(2, 0, 1)
 
 
 def pixels_of(image: Tensor) -> np.ndarray:
@@ -73,7 +73,7 @@ def pixels_of(image: Tensor) -> np.ndarray:
 
     What `read_image` has read from 8 bits comes back as it was.
     """
-    levels = levels_of(image.detach().cpu()[None])[0]
+    levels = to_uint8(image.detach().cpu()[None])[0]
     # OpenCV interleaves planes sooner than a copy in another order of strides does.
     return last.numpy() if (last := levels.permute(1, 2, 0)).is_contiguous() else cv2.merge([*levels.numpy()])
 

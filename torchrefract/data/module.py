@@ -8,7 +8,7 @@ import torch
 from pytorch_lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, DistributedSampler, default_collate
 
-from torchrefract._checks import check_count, check_flag
+from torchrefract._validation import check_count, check_flag
 from torchrefract.data.frame_folder import FrameFolder
 from torchrefract.data.paired_folder import PairedFolder
 from torchrefract.data.road_scenes import RoadScenes

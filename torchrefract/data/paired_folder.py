@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
-from torchrefract._checks import check_choice, check_count, check_flag
-from torchrefract._levels import numbers_of
+from torchrefract._tensor import to_float
+from torchrefract._validation import check_choice, check_count, check_flag
 from torchrefract.data.pair_files import DamagedPairError, decode_pair
 from torchrefract.data.pair_manifest import PairRow, Place, lines_of, manifests, read_row, read_stored, scan
 from torchrefract.types import Pair
@@ -150,4 +150,4 @@ def _mixed(numbers: range, size: int, seed: tuple[int, int, int]) -> Iterator[in
 
 def _image(pixels: np.ndarray) -> Tensor:
     """(3, H, W), float32 in [0, 1], of (H, W, 3), uint8."""
-    return numbers_of(torch.from_numpy(pixels).permute(2, 0, 1).contiguous())
+    return to_float(torch.from_numpy(pixels).permute(2, 0, 1).contiguous())

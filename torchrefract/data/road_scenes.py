@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from torchrefract._checks import check_count, check_tensor
+from torchrefract._validation import check_count, check_tensor
 from torchrefract.data.road_geometry import View, ground_depth, rays
 from torchrefract.data.road_layout import Dice, Light, Road, draw_light, draw_road, draw_view
 from torchrefract.data.road_objects import draw_groups

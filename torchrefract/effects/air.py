@@ -8,14 +8,20 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_all, check_flag, check_number, check_within
-from torchrefract._constants import constant
+from torchrefract._tensor import as_device_tensor
+from torchrefract._validation import (
+    check_color,
+    check_flag,
+    check_number,
+    check_values,
+    check_within,
+    color_per_channel,
+)
 from torchrefract.cameras.models import Camera
-from torchrefract.effects.color import check_color, each_channel
 from torchrefract.effects.depth import DepthProvider, LinearDepth
 from torchrefract.effects.light_plan import Blend
-from torchrefract.effects.plan import lies_in
-from torchrefract.effects.rows import spread
+from torchrefract.effects.plan import in_ranges
+from torchrefract.effects.rows import expand_batch
 from torchrefract.fields.depth import check_depth, ray_distance
 from torchrefract.fields.veils import Drifting, Ends, veiled, veiled_by_drifts_
 from torchrefract.warping.grid import field_dtype
@@ -58,10 +64,10 @@ class Air:
         """What an error of t does to an image."""
         return Blend(self.colors, self.linear_light)
 
-    def covers(self, airlight: Tensor) -> Tensor:
+    def params_in_range(self, airlight: Tensor) -> Tensor:
         """(), bool: the colors (B, C) lie between those of this air."""
         ends = (min(self.colors), max(self.colors))
-        return lies_in(airlight, [ends] * airlight.shape[1])
+        return in_ranges(airlight, [ends] * airlight.shape[1])
 
     def light(self, image: Tensor, dtype: torch.dtype) -> Tensor:
         """(B, C): the airlight for each image of a batch."""
@@ -69,8 +75,8 @@ class Air:
         if self.airlight is None:
             color = _PAPER_AIRLIGHT if channels == 3 else [_GRAY] * channels
         else:
-            color = each_channel("airlight", self.airlight, channels)
-        return constant([color] * batch, dtype=dtype, device=image.device).view(batch, channels)
+            color = color_per_channel("airlight", self.airlight, channels)
+        return as_device_tensor([color] * batch, dtype=dtype, device=image.device).view(batch, channels)
 
     def distance(self, image: Tensor, depth: Tensor | None) -> Tensor:
         """(1, B or N, 1, H, 1 or W), m: how far the light comes; along the rays where the camera is known."""
@@ -98,18 +104,18 @@ class Air:
         dtype, (height, width) = field_dtype(image.dtype), image.shape[2:]
         camera = cast(Camera, self.camera).resized(width=width, height=height)
         y = (torch.arange(height, dtype=dtype, device=image.device) - camera.cy) / camera.fy
-        stretch = ((1 + y * y)[:, None] + constant(squares, dtype=y.dtype, device=y.device)).sqrt()
+        stretch = ((1 + y * y)[:, None] + as_device_tensor(squares, dtype=y.dtype, device=y.device)).sqrt()
         return self.depth(height, width, dtype=dtype, device=image.device) * stretch
 
     def blended(self, image: Tensor, t: Tensor, airlight: Tensor, ends: Ends) -> Tensor:
         """As `veiled`, of rows (N, C, H, W), with t and the airlight (B, C) in as many rows or fewer."""
         rows = image.shape[0]
-        t = t if t.shape[0] == 1 else spread(t, rows)
-        return veiled(image, t, spread(airlight, rows), ends=ends, linear=self.linear_light)
+        t = t if t.shape[0] == 1 else expand_batch(t, rows)
+        return veiled(image, t, expand_batch(airlight, rows), ends=ends, linear=self.linear_light)
 
     def behind_drifts(self, image: Tensor, drifting: Drifting, airlight: Tensor, ends: Ends) -> tuple[Tensor, Tensor]:
         """As `veiled_by_drifts_`, with the airlight (B, C) in as many rows or fewer."""
-        airlight = spread(airlight, image.shape[0])
+        airlight = expand_batch(airlight, image.shape[0])
         return veiled_by_drifts_(image, drifting, airlight, ends=ends, linear=self.linear_light)
 
 
@@ -158,6 +164,6 @@ def check_fog_params(params: Any, image: Tensor) -> None:
     for name in ("visibility", "deviation"):
         if getattr(params, name).ndim != 1:
             raise ValueError(f"params.{name} must have shape (B,), got {tuple(getattr(params, name).shape)}")
-    check_all("params.visibility", "be above 0", params.visibility, lambda v: v > 0)
-    check_all("params.deviation", "be above -1", params.deviation, lambda v: (v > -1) & v.isfinite())
+    check_values("params.visibility", "be above 0", params.visibility, lambda v: v > 0)
+    check_values("params.deviation", "be above -1", params.deviation, lambda v: (v > -1) & v.isfinite())
     check_within("params.airlight", params.airlight, 0.0, 1.0)

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_number, check_whole, check_within, is_whole
+from torchrefract._validation import check_number, check_values, check_whole, check_within, is_whole
 from torchrefract.effects.door import Layout, check_depth_fits, check_image, enter, leave
 from torchrefract.effects.motion import LATEST_FRAME
 from torchrefract.effects.plan import check_sides
-from torchrefract.effects.rows import Undrawn, at_frames, widened
+from torchrefract.effects.rows import Undrawn, at_frames, promote_params
 from torchrefract.labels.rows import is_tv, wrapped
 from torchrefract.labels.targets import follow
 from torchrefract.types import Degraded, Range
@@ -124,12 +124,12 @@ class Effect(nn.Module, ABC):
             return super().apply(cast(Callable[[nn.Module], None], image))
         layout = check_image(image)
         self.check_params(params, _samples(image, layout))
-        params = widened(params, field_dtype(image.dtype))
+        params = promote_params(params, field_dtype(image.dtype))
         if frame is not None:
             params = at_frames(params, lambda: _frames(frame, image, layout))
-        return self.fitted(params, *image.shape[-2:])._run(image, layout, params, depth)
+        return self.for_params(params, *image.shape[-2:])._run(image, layout, params, depth)
 
-    def fitted(self, params: Any, height: int, width: int) -> "Effect":
+    def for_params(self, params: Any, height: int, width: int) -> "Effect":
         """The effect that takes parameters which are given: itself, unless it relies on what it draws itself."""
         return self
 
@@ -220,7 +220,7 @@ class Effect(nn.Module, ABC):
                 )
             if value.is_floating_point():
                 # A visibility may be infinite; what may not is for the effect to say.
-                check_all(f"params.{name}", "not be NaN", value, lambda v: ~v.isnan())
+                check_values(f"params.{name}", "not be NaN", value, lambda v: ~v.isnan())
         self.check(params, image)
 
     def extra_repr(self) -> str:

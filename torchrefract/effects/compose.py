@@ -11,18 +11,18 @@ import torch
 from torch import Tensor, nn
 
 from torchrefract import draws
-from torchrefract._checks import check_choice
-from torchrefract._constants import assume_constant_result
+from torchrefract._tensor import assume_constant_result
+from torchrefract._validation import check_choice
 from torchrefract.effects.base import Effect, moved
 from torchrefract.effects.compose_plan import ComposePlan, compose_plan
-from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan, check_tolerance
+from torchrefract.effects.plan import TOLERANCE_PX, Plan, PlanRequest, check_tolerance
 from torchrefract.effects.radiance import RadianceEffect
 from torchrefract.effects.refraction import WarpEffect
 from torchrefract.effects.rows import Undrawn, drawn
 from torchrefract.effects.walk import Look, Walk
 from torchrefract.types import Degraded
 from torchrefract.warping.grid import field_dtype
-from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, RESAMPLERS
+from torchrefract.warping.resample import BACKENDS, INTERPOLATIONS, PADDINGS
 
 _OPEN = Look()
 _MOST_SETS = 64  # of effects that act together, for each of which there is a plan
@@ -31,13 +31,13 @@ _MOST_SETS = 64  # of effects that act together, for each of which there is a pl
 class ComposeParams(NamedTuple):
     """The parameters of all effects of a composition."""
 
-    gate: Tensor  # (B,), bool: the sample is degraded; where it is not, no effect's own gate is open
+    applied: Tensor  # (B,), bool: the sample is degraded; where it is not, no effect's own gate is open
     children: tuple[Any, ...]  # of each effect, in order
 
     def to(self, *args: Any, **kwargs: Any) -> "ComposeParams":
         """All tensors moved as by `Tensor.to`; a change of type leaves flags as they are."""
         return ComposeParams(
-            moved(self.gate, *args, **kwargs), tuple(child.to(*args, **kwargs) for child in self.children)
+            moved(self.applied, *args, **kwargs), tuple(child.to(*args, **kwargs) for child in self.children)
         )
 
 
@@ -53,7 +53,7 @@ class Compose(Effect):
 
     Args:
         effects: at least one; compositions may be nested.
-        padding, interpolation, resampler: of the look-ups, whatever the effects and compositions inside have; None
+        padding, interpolation, backend: of the look-ups, whatever the effects and compositions inside have; None
             takes those of the last warp that moves the sample, or of the outermost composition inside that has it.
         tolerance_px: how far the composite of all flows may be from the exact one, px, see `plan`; None is exact. It
             takes the place of what the effects and compositions inside have, but an effect that has None stays exact.
@@ -70,7 +70,7 @@ class Compose(Effect):
         *,
         padding: str | None = None,
         interpolation: str | None = None,
-        resampler: str | None = None,
+        backend: str | None = None,
         tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ):
@@ -85,7 +85,7 @@ class Compose(Effect):
         self.interpolation = (
             None if interpolation is None else check_choice("interpolation", interpolation, INTERPOLATIONS)
         )
-        self.resampler = None if resampler is None else check_choice("resampler", resampler, RESAMPLERS)
+        self.backend = None if backend is None else check_choice("backend", backend, BACKENDS)
         self.tolerance_px = check_tolerance(tolerance_px)
 
     params_type = ComposeParams
@@ -108,7 +108,7 @@ class Compose(Effect):
         return self._draw_sparingly(source, image, idle=False)
 
     def _draw_sparingly(self, source: draws.Stream, image: Tensor, *, idle: bool) -> ComposeParams:
-        gate, gates = self._gates(source)
+        applied, gates = self._gates(source)
         inner, idle = draws.fold(source), idle or self.p == 0
         children: list[Any] = []
         for i, effect in enumerate(self._effects()):
@@ -118,7 +118,7 @@ class Compose(Effect):
                 children.append(_later(effect, inner.at(i), image))
             else:
                 children.append(effect.draw(inner.at(i), image))
-        return ComposeParams(gate, tuple(map(_closed, children, gates)))
+        return ComposeParams(applied, tuple(map(_closed, children, gates)))
 
     def check(self, params: ComposeParams, image: Tensor) -> None:
         """Raise for parameters that one of the effects refuses."""
@@ -133,9 +133,9 @@ class Compose(Effect):
         """Raise for parameters that are not of these effects and this batch."""
         if not isinstance(params, ComposeParams):
             raise TypeError(f"params must be ComposeParams, got {type(params).__name__}")
-        if params.gate.shape != image.shape[:1]:
+        if params.applied.shape != image.shape[:1]:
             raise ValueError(
-                f"params.gate must have one row for each of the {image.shape[0]} images, got {tuple(params.gate.shape)}"
+                f"params.applied must have one row for each of the {image.shape[0]} images, got {tuple(params.applied.shape)}"
             )
         self.check(params, image)
 
@@ -164,7 +164,7 @@ class Compose(Effect):
 
     def _planned(self, height: int, width: int, dtype: torch.dtype, idle: Sequence[bool]) -> ComposePlan:
         """That without some effects."""
-        ask = Ask(height, width, self.tolerance_px, dtype is torch.float64).of_default
+        ask = PlanRequest(height, width, self.tolerance_px, dtype is torch.float64).of_default
         return compose_plan(list(zip(self._leaves(), idle, strict=True)), self._together(), ask)
 
     @assume_constant_result
@@ -172,15 +172,15 @@ class Compose(Effect):
         # As for `PlannedLight`.
         return self._planned(height, width, dtype, idle)
 
-    def fitted(self, params: ComposeParams, height: int, width: int) -> "Compose":
+    def for_params(self, params: ComposeParams, height: int, width: int) -> "Compose":
         """The composition, with each effect that relies on ranges which its parameters lie outside of exact."""
         pairs = zip(self._effects(), params.children, strict=True)
-        effects = [effect.fitted(child, height, width) for effect, child in pairs]
+        effects = [effect.for_params(child, height, width) for effect, child in pairs]
         if all(new is old for new, old in zip(effects, self._effects(), strict=True)):
             return self
-        fitted = copy(self)
-        fitted._modules = {**self._modules, "effects": nn.ModuleList(effects)}
-        return fitted
+        for_params = copy(self)
+        for_params._modules = {**self._modules, "effects": nn.ModuleList(effects)}
+        return for_params
 
     def leaves(self, params: ComposeParams) -> Iterator[tuple[Effect, Any]]:
         """The effects that are no compositions, in order, with their parameters."""
@@ -192,8 +192,8 @@ class Compose(Effect):
 
     def _gates(self, source: draws.Stream) -> tuple[Tensor, list[Tensor]]:
         """(B,), bool: that of the composition, and those of its effects."""
-        gate = draws.uniform(source, 1)[:, 0] < self.p
-        return gate, [gate] * len(self.effects)
+        applied = draws.uniform(source, 1)[:, 0] < self.p
+        return applied, [applied] * len(self.effects)
 
     def _leaves(self) -> Iterator[Effect]:
         """The effects that are no compositions, in order."""
@@ -202,7 +202,7 @@ class Compose(Effect):
 
     def _looks(self, outer: Look = _OPEN) -> Iterator[Look]:
         """How each of them is looked up, as far as the compositions say."""
-        own = outer.before(Look(self.padding, self.interpolation, self.resampler))
+        own = outer.before(Look(self.padding, self.interpolation, self.backend))
         for effect in self._effects():
             if isinstance(effect, Compose):
                 yield from effect._looks(own)
@@ -237,13 +237,13 @@ class Compose(Effect):
         return cast(Iterator[Effect], iter(self.effects))
 
 
-def _closed(params: Any, gate: Tensor) -> Any:
+def _closed(params: Any, applied: Tensor) -> Any:
     """Parameters that leave the samples alone for which the gate is closed."""
     if isinstance(params, Undrawn):
-        return params.then(lambda found: _closed(found, gate))
+        return params.then(lambda found: _closed(found, applied))
     if isinstance(params, ComposeParams):
-        return ComposeParams(params.gate & gate, tuple(_closed(child, gate) for child in params.children))
-    return params._replace(gate=params.gate & gate)
+        return ComposeParams(params.applied & applied, tuple(_closed(child, applied) for child in params.children))
+    return params._replace(applied=params.applied & applied)
 
 
 def _stirs(effect: Effect, params: Any, height: int, width: int) -> bool:

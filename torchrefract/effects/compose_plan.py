@@ -23,7 +23,7 @@ from torchrefract.effects.base import Effect
 from torchrefract.effects.composite_errors import SELDOM, Error, Share, errors_of
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.light_plan import LightPlan
-from torchrefract.effects.plan import Ask, Plan
+from torchrefract.effects.plan import Plan, PlanRequest
 from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.refraction import WarpEffect
 
@@ -74,7 +74,7 @@ class _Warp(NamedTuple):
     group: int  # of those that are looked up together
     effect: WarpEffect
 
-    def plan(self, ask: Ask, tolerance: float | None) -> Plan:
+    def plan(self, ask: PlanRequest, tolerance: float | None) -> Plan:
         """Its plan under a tolerance, None for exact; if it has none of its own it stays exact."""
         if not isinstance(self.effect, LatticeWarp):
             return self.effect.planned(ask.height, ask.width, torch.float64 if ask.double else torch.float32)
@@ -87,7 +87,9 @@ class _Warp(NamedTuple):
         return self.effect.plan_within(ask)
 
 
-def compose_plan(effects: Sequence[tuple[Effect, bool]], together: Sequence[Sequence[int]], ask: Ask) -> ComposePlan:
+def compose_plan(
+    effects: Sequence[tuple[Effect, bool]], together: Sequence[Sequence[int]], ask: PlanRequest
+) -> ComposePlan:
     """The plan that is asked for.
 
     Args:
@@ -114,7 +116,7 @@ def compose_plan(effects: Sequence[tuple[Effect, bool]], together: Sequence[Sequ
     return ComposePlan(ask.height, ask.width, ask.tolerance_px, names, each, error, resamples)
 
 
-def _other_plan(effect: Effect, idle: bool, ask: Ask) -> Plan | LightPlan:
+def _other_plan(effect: Effect, idle: bool, ask: PlanRequest) -> Plan | LightPlan:
     """Of an effect that moves nothing."""
     if idle:
         return _idle_plan(ask, "its strength is 0" if effect.at_rest() else "its p is 0")
@@ -122,7 +124,7 @@ def _other_plan(effect: Effect, idle: bool, ask: Ask) -> Plan | LightPlan:
 
 
 @lru_cache(maxsize=64)
-def _idle_plan(ask: Ask, why: str) -> Plan:
+def _idle_plan(ask: PlanRequest, why: str) -> Plan:
     return ask.plan(0, 0.0, why)
 
 
@@ -138,7 +140,9 @@ def _warps(effects: Sequence[tuple[Effect, bool]]) -> Iterator[_Warp]:
             group += 1
 
 
-def _shared(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask) -> tuple[Sequence[Plan], float]:
+def _shared(
+    warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: PlanRequest
+) -> tuple[Sequence[Plan], float]:
     """The plan of each warp, and how far the composite is off at most."""
     alone = tuple(warp.plan(ask, ask.tolerance_px) for warp in warps)
     if not all(plan.smooth or _is_exact(plan) for plan in alone):
@@ -152,7 +156,9 @@ def _shared(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask)
     return _known[key]
 
 
-def _sought(warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask) -> tuple[Sequence[Plan], float]:
+def _sought(
+    warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: PlanRequest
+) -> tuple[Sequence[Plan], float]:
     """The same: of the composites that are known most seldom the one with the coarsest flows."""
     found = list[tuple[int, list[Plan], float]]()
     parted = any(_meet([warp for warp in warps if warp.place in own]) for own in together)
@@ -184,7 +190,7 @@ def _error(acting: Sequence[Sequence[Share]], every: int) -> float:
 
 
 def _in_sets(
-    warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: Ask
+    warps: Sequence[_Warp], together: Sequence[Sequence[int]], ask: PlanRequest
 ) -> tuple[list[Plan], list[list[Share]]]:
     """What each warp gets, and the shares of each set.
 
@@ -203,7 +209,7 @@ def _in_sets(
     return [share.plan for share in cast(list[Share], found)], tried
 
 
-def _in_row(warps: Sequence[_Warp], ask: Ask) -> list[Share]:
+def _in_row(warps: Sequence[_Warp], ask: PlanRequest) -> list[Share]:
     """What each warp gets of those that act one after the other."""
     tolerance = ask.tolerance_px or 0.0
     shares = [Share(tolerance / len(warps), warp.plan(ask, tolerance / len(warps))) for warp in warps]
@@ -223,7 +229,9 @@ def _is_exact(plan: Plan) -> bool:
     return plan.stride == 1 and plan.error_px == 0
 
 
-def _shared_once(warps: Sequence[_Warp], shares: Sequence[Share], exact: Sequence[bool], ask: Ask) -> list[Share]:
+def _shared_once(
+    warps: Sequence[_Warp], shares: Sequence[Share], exact: Sequence[bool], ask: PlanRequest
+) -> list[Share]:
     """The plans for shares of the tolerance that go by the slopes of earlier ones; some are known to be exact."""
     known = sum(1 for _ in takewhile(lambda share: share.plan.stride == 0 or share.plan.slope < math.inf, shares))
     # The one that comes next has an error, too, where what is drawn may have a lattice of its own.

@@ -5,11 +5,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_all, check_flag
-from torchrefract._constants import constant
-from torchrefract.effects.color import check_color, each_channel
+from torchrefract._tensor import as_device_tensor
+from torchrefract._validation import check_color, check_flag, check_values, color_per_channel
 from torchrefract.effects.door import Layout, check_image, enter, leave
-from torchrefract.effects.rows import spread
+from torchrefract.effects.rows import expand_batch
 from torchrefract.fields.depth import check_floating
 from torchrefract.fields.fog import linear_to_srgb, srgb_to_linear
 
@@ -60,7 +59,7 @@ def _rows(t: Tensor, image: Tensor, layout: Layout) -> Tensor:
     shape = check_floating("transmission", t).shape
     if len(shape) != len(full) or any(side not in (1, most) for side, most in zip(shape, full, strict=True)):
         raise ValueError(f"transmission must broadcast to {full}, as the image has it, got {tuple(shape)}")
-    check_all("transmission", "be in [0, 1]", t, lambda v: (v >= 0) & (v <= 1))
+    check_values("transmission", "be in [0, 1]", t, lambda v: (v >= 0) & (v <= 1))
     return t.expand(*layout.lead, -1, -1, -1).reshape(layout.rows, *shape[-3:])
 
 
@@ -72,7 +71,7 @@ def _airlight(airlight: float | Sequence[float] | Tensor, image: Tensor, layout:
             raise ValueError(
                 f"airlight must have shape ({channels},) or ({batch}, {channels}), got {tuple(airlight.shape)}"
             )
-        check_all("airlight", "be finite", airlight, torch.isfinite)
-        return spread(airlight.to(image.dtype).view(-1, channels), layout.rows)[:, :, None, None]
-    numbers = each_channel("airlight", check_color("airlight", airlight, high=1.0), channels)
-    return constant(numbers, dtype=image.dtype, device=image.device)[:, None, None]
+        check_values("airlight", "be finite", airlight, torch.isfinite)
+        return expand_batch(airlight.to(image.dtype).view(-1, channels), layout.rows)[:, :, None, None]
+    numbers = color_per_channel("airlight", check_color("airlight", airlight, high=1.0), channels)
+    return as_device_tensor(numbers, dtype=image.dtype, device=image.device)[:, None, None]

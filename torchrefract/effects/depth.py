@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_number, check_positive
+from torchrefract._validation import check_number, check_positive
 from torchrefract.fields.depth import ground_plane_depth, linear_depth
 
 

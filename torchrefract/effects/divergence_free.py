@@ -6,27 +6,27 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_choice, check_count
+from torchrefract._validation import check_choice, check_count
 from torchrefract.effects.base import params_to
 from torchrefract.effects.field_plan import FieldPlan, field_plan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
-from torchrefract.effects.plan import FEW_ULPS, TOLERANCE_PX, Ask, Plan, lies_in
+from torchrefract.effects.plan import FEW_ULPS, TOLERANCE_PX, Plan, PlanRequest, in_ranges
 from torchrefract.effects.random_field import check_field_params, check_field_range, field_of_modes, random_field
-from torchrefract.effects.rows import column, spread
+from torchrefract.effects.rows import column, expand_batch
 from torchrefract.fields.covariance import COVARIANCES
 from torchrefract.fields.field_bounds import FieldRanges
 from torchrefract.fields.modes import Modes
 from torchrefract.fields.stream import curl, curl_rms
 from torchrefract.types import Range
 from torchrefract.warping.compose import compose_flows
-from torchrefract.warping.lattice import Lattice, SmoothFlow, StreamFlow
+from torchrefract.warping.lattice import Lattice, LatticeFlow, StreamFlow
 
 
 class DivergenceFreeParams(NamedTuple):
     """The swirls of a batch."""
 
-    gate: Tensor  # (B,), bool: the sample is degraded
+    applied: Tensor  # (B,), bool: the sample is degraded
     amplitude: Tensor  # (B,), px, of the displacement as `normalize` has it
     length: Tensor  # (B,), px, correlation length of the stream function
     wind: Tensor  # (B, 2), px per frame, that psi drifts to the right and down
@@ -57,7 +57,7 @@ class DivergenceFree(LatticeWarp):
         normalize: "theory" divides by the standard deviation that each component has over all fields, "max" by the
             longest displacement in the frame, "none" by nothing: amplitude is then in px per unit of slope.
         steps: parts that the displacement is followed in.
-        padding, interpolation, resampler, tolerance_px, p: as for every warp; Gaussian fields followed in one step,
+        padding, interpolation, backend, tolerance_px, p: as for every warp; Gaussian fields followed in one step,
             normalized by theory, have a coarser lattice: psi's, so that the divergence stays zero.
 
     Raises:
@@ -83,13 +83,11 @@ class DivergenceFree(LatticeWarp):
         steps: int = 1,
         padding: str = "reflection",
         interpolation: str = "bilinear",
-        resampler: str = "auto",
+        backend: str = "auto",
         tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ):
-        super().__init__(
-            padding=padding, interpolation=interpolation, resampler=resampler, tolerance_px=tolerance_px, p=p
-        )
+        super().__init__(padding=padding, interpolation=interpolation, backend=backend, tolerance_px=tolerance_px, p=p)
         self.amplitude_range = check_field_range("amplitude", amplitude_range)
         self.length_range = check_field_range("length", length_range)
         self.wind_x_range = check_wind("wind_x_range", wind_x_range)
@@ -109,9 +107,9 @@ class DivergenceFree(LatticeWarp):
     def draw(self, source: draws.Stream, image: Tensor) -> DivergenceFreeParams:
         """One stream function a sample, every number uniform in its range."""
         motion = motion_ranges(self.wind_x_range, self.wind_y_range, decorrelation=self.decorrelation_range)
-        gate, values = self._uniform(source, (self.amplitude_range, self.length_range, *motion), image)
+        applied, values = self._uniform(source, (self.amplitude_range, self.length_range, *motion), image)
         swirls, motion = values[:, :2].unbind(1), drawn_motion(values[:, 2:])
-        return DivergenceFreeParams(gate, *swirls, **motion, key=draws.noise_key(source))
+        return DivergenceFreeParams(applied, *swirls, **motion, key=draws.noise_key(source))
 
     def check(self, params: DivergenceFreeParams, image: Tensor) -> None:
         """Raise for swirls that are none."""
@@ -131,25 +129,25 @@ class DivergenceFree(LatticeWarp):
         psi = random_field(params, kind=self.covariance, longest=longest, height=height + 2, width=width + 2)[:, :1]
         displacement = curl(psi)
         if self.normalize == "theory":
-            displacement = displacement / column(spread(curl_rms(params.length, self.covariance), psi.shape[0]))
+            displacement = displacement / column(expand_batch(curl_rms(params.length, self.covariance), psi.shape[0]))
         elif self.normalize == "max":
             longest = displacement.square().sum(dim=1, keepdim=True).amax(dim=(2, 3), keepdim=True)
             displacement = displacement / longest.clamp(min=1e-24).sqrt()
-        return column(spread(params.amplitude, displacement.shape[0])) * displacement
+        return column(expand_batch(params.amplitude, displacement.shape[0])) * displacement
 
-    def plan_within(self, ask: Ask) -> Plan:
+    def plan_within(self, ask: PlanRequest) -> Plan:
         """The plan of `field_plan` for Gaussian fields, normalized by theory, in one step; all others are exact."""
         if self.covariance != "gaussian" or self.normalize != "theory" or self.steps > 1:
             return super().plan_within(ask)
         ranges = FieldRanges(self.amplitude_range, self.length_range, (0.0, 0.0), stream=True)
         return field_plan(ranges, ask)
 
-    def covers(self, params: DivergenceFreeParams, height: int, width: int) -> Tensor:
+    def params_in_range(self, params: DivergenceFreeParams, height: int, width: int) -> Tensor:
         """Whether the swirls lie in the ranges."""
         values = torch.stack([params.amplitude, params.length], dim=1)
-        return lies_in(values, [self.amplitude_range, self.length_range])
+        return in_ranges(values, [self.amplitude_range, self.length_range])
 
-    def on_lattice(self, params: DivergenceFreeParams, plan: Plan) -> SmoothFlow:
+    def on_lattice(self, params: DivergenceFreeParams, plan: Plan) -> LatticeFlow:
         """The curl of psi between nodes, of the frequencies that the plan keeps."""
         modes, lattice = cast(Modes, cast(FieldPlan, plan).modes), cast(Lattice, plan.lattice)
         # The psi of the exact flow has a row and a column of its own around the frame.
@@ -157,7 +155,7 @@ class DivergenceFree(LatticeWarp):
         drawn: Any = {"kind": self.covariance, "lengths": self.length_range, "nodes": None, "aperture": False}
         psi = field_of_modes(params, modes, (rows, columns), **drawn, fields=1)
         scale = params.amplitude / curl_rms(params.length, self.covariance)
-        return StreamFlow(column(spread(scale, psi.shape[0])) * psi, lattice)
+        return StreamFlow(column(expand_batch(scale, psi.shape[0])) * psi, lattice)
 
     def moves(self, params: DivergenceFreeParams) -> Tensor:
         """The samples with an amplitude."""

@@ -5,10 +5,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_tensor
-from torchrefract._levels import levels_of, numbers_of
+from torchrefract._tensor import is_channels_last, to_float, to_uint8
+from torchrefract._validation import check_tensor
 from torchrefract.labels.rows import is_tv
-from torchrefract.warping.layout import is_channels_last
 
 
 class Layout(NamedTuple):
@@ -84,7 +83,7 @@ def enter(image: Tensor, *, levels: bool = False) -> Tensor:
     """(N, C, H, W), float32 or float64, in [0, 1]; with `levels` uint8 stays as it is."""
     rows = image if image.ndim == 4 else image.reshape(-1, *image.shape[-3:])
     if image.dtype is torch.uint8:
-        return rows if levels else numbers_of(rows)
+        return rows if levels else to_float(rows)
     return rows if image.dtype is torch.float64 else rows.float()
 
 
@@ -93,7 +92,7 @@ def leave(result: Tensor, image: Tensor, rows: Tensor) -> Tensor:
     if result is rows:
         return image
     if image.dtype is torch.uint8 and result.is_floating_point():
-        result = levels_of(result)
+        result = to_uint8(result)
     last = is_channels_last(rows)
     result = result.to(image.dtype).contiguous(memory_format=torch.channels_last if last else torch.contiguous_format)
     return result if image.ndim == 4 else result.view(image.shape)

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from torchrefract.effects.plan import STRIDES, Ask, Plan, Smoothness, coarsest
+from torchrefract.effects.plan import STRIDES, Plan, PlanRequest, Smoothness, coarsest
 from torchrefract.fields.covariance import REACH, slope_rms
 from torchrefract.fields.field_bounds import FieldRanges, FieldSpectrum, error_of_cubics, field_spectrum
 from torchrefract.fields.length_bounds import nodes_needed
@@ -46,7 +46,7 @@ class FieldPlan(Plan):
 
 
 @lru_cache(maxsize=256)
-def field_plan(ranges: FieldRanges, ask: Ask) -> Plan:
+def field_plan(ranges: FieldRanges, ask: PlanRequest) -> Plan:
     """The plan for fields of some ranges."""
     if ask.tolerance_px is None:
         return ask.plan(1, 0.0, "no tolerance")
@@ -65,7 +65,9 @@ def field_plan(ranges: FieldRanges, ask: Ask) -> Plan:
     )
 
 
-def _planned(ranges: FieldRanges, spectrum: FieldSpectrum, ask: Ask, room: float, known: dict[str, Any]) -> Plan | None:
+def _planned(
+    ranges: FieldRanges, spectrum: FieldSpectrum, ask: PlanRequest, room: float, known: dict[str, Any]
+) -> Plan | None:
     """The plan with the fewest nodes, or else with few frequencies at every pixel."""
     most, taps = _SIGMAS * ranges.amplitude[1], STREAM_NODES if ranges.stream else 4
     beside = {"before": taps // 2, "after": taps // 2 - 1} if ranges.stream else {}
@@ -121,7 +123,7 @@ def _known(ranges: FieldRanges, spectrum: FieldSpectrum | None) -> dict[str, Any
     return {"slope": _NARROW * steep * slope_rms(shortest, kind=ranges.kind, aperture=narrowest).item()}
 
 
-def _modes(ranges: FieldRanges, ask: Ask, cutoff: float) -> Modes | None:
+def _modes(ranges: FieldRanges, ask: PlanRequest, cutoff: float) -> Modes | None:
     """The frequencies up to a cutoff, in radians per px; None where there are too many, or one torus is too small."""
     sides = [side + (2 if ranges.stream else 0) for side in (ask.height, ask.width)]
     reach = REACH[ranges.kind] * ranges.length[1]

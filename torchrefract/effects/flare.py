@@ -9,16 +9,23 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_choice, check_flag, check_range, or_else
-from torchrefract._constants import constant
+from torchrefract._tensor import as_device_tensor
+from torchrefract._validation import (
+    check_choice,
+    check_color,
+    check_flag,
+    check_range,
+    check_values,
+    color_per_channel,
+    finite_or,
+)
 from torchrefract.effects.base import params_to
-from torchrefract.effects.color import check_color, each_channel
 from torchrefract.effects.flare_plan import FlarePlan, Suns, flare_plan, reach
 from torchrefract.effects.motion import check_frame
-from torchrefract.effects.plan import lies_in
+from torchrefract.effects.plan import in_ranges
 from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.radiance import Shaded
-from torchrefract.effects.rows import column, spread
+from torchrefract.effects.rows import column, expand_batch
 from torchrefract.fields.flare import flare_axes
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
@@ -32,7 +39,7 @@ _CLIPPED, _SCREENED = 1 / 3, 0.6
 class FlareParams(NamedTuple):
     """The suns of a batch."""
 
-    gate: Tensor  # (B,), bool: the sample is degraded
+    applied: Tensor  # (B,), bool: the sample is degraded
     center: Tensor  # (B, 2), in widths and heights of the frame, from its upper left corner
     radius: Tensor  # (B,), rho, in diagonals of the frame, 0 or above
     strength: Tensor  # (B,), beta, light added at the center, 0 or above
@@ -110,11 +117,11 @@ class LensFlare(PlannedLight):
     def draw(self, source: draws.Stream, image: Tensor) -> FlareParams:
         """One sun a sample, every number uniform in its range."""
         places = [getattr(self, f"{name}_range") for name in ("center_x", "center_y", "drift_x", "drift_y")]
-        gate, values = self._uniform(source, [*places, self.radius_range, self.strength_range], image)
-        colors = [each_channel("color", self.color, image.shape[1])] * image.shape[0]
-        color = constant(colors, dtype=values.dtype, device=values.device).view(image.shape[:2])
+        applied, values = self._uniform(source, [*places, self.radius_range, self.strength_range], image)
+        colors = [color_per_channel("color", self.color, image.shape[1])] * image.shape[0]
+        color = as_device_tensor(colors, dtype=values.dtype, device=values.device).view(image.shape[:2])
         first = torch.zeros_like(values[:, :1])
-        return FlareParams(gate, values[:, :2], values[:, 4], values[:, 5], color, values[:, 2:4], first)
+        return FlareParams(applied, values[:, :2], values[:, 4], values[:, 5], color, values[:, 2:4], first)
 
     def check(self, params: FlareParams, image: Tensor) -> None:
         """Raise for suns that are none."""
@@ -125,21 +132,21 @@ class LensFlare(PlannedLight):
                 raise ValueError(f"params.{name} must have shape {size}, got {tuple(getattr(params, name).shape)}")
         check_frame(params)
         for name in ("center", "drift"):
-            check_all(f"params.{name}", "be finite", getattr(params, name), torch.isfinite)
+            check_values(f"params.{name}", "be finite", getattr(params, name), torch.isfinite)
         for name in ("radius", "strength", "color"):
             value = getattr(params, name)
-            check_all(f"params.{name}", "be at least 0 and finite", value, lambda v: v.isfinite() & (v >= 0))
+            check_values(f"params.{name}", "be at least 0 and finite", value, lambda v: v.isfinite() & (v >= 0))
 
     def acts(self, params: FlareParams) -> Tensor:
         """The samples with a sun."""
         return (params.radius != 0) & (params.strength != 0)
 
-    def covers(self, params: FlareParams) -> Tensor:
+    def params_in_range(self, params: FlareParams) -> Tensor:
         """(), bool: all suns lie in the ranges."""
         names = ("center_x", "center_y", "radius", "strength", "drift_x", "drift_y")
         values = torch.stack([*params.center.T, params.radius, params.strength, *params.drift.T], dim=1)
         ends = [(min(self.color), max(self.color))] * params.color.shape[1]
-        return lies_in(values, [getattr(self, f"{name}_range") for name in names]) & lies_in(params.color, ends)
+        return in_ranges(values, [getattr(self, f"{name}_range") for name in names]) & in_ranges(params.color, ends)
 
     def planned(self, height: int, width: int, dtype: torch.dtype, *, any_depth: bool = False) -> FlarePlan:
         """The plan for images of a type, from the ranges alone; depth is nothing to a flare."""
@@ -162,14 +169,14 @@ class LensFlare(PlannedLight):
         share = params.center[:, None] + params.frame[:, :, None] * params.drift[:, None]
         # Where nothing may be read, numbers that are none are no sun.
         center = (
-            or_else(share.to(dtype), _FARTHEST).reshape(-1, 2)
-            * constant((width, height), dtype=dtype, device=share.device)
+            finite_or(share.to(dtype), _FARTHEST).reshape(-1, 2)
+            * as_device_tensor((width, height), dtype=dtype, device=share.device)
             - 0.5
         )
-        radius = spread(or_else(params.radius.to(dtype), 0.0), rows) * math.hypot(width, height)
+        radius = expand_batch(finite_or(params.radius.to(dtype), 0.0), rows) * math.hypot(width, height)
         along_x, along_y = flare_axes(center, radius, height=height, width=width)
-        along_y = along_y * column(spread(or_else(params.strength.to(dtype), 0.0), rows))
-        color = spread(or_else(params.color.to(dtype), 0.0), rows)[:, :, None, None]
+        along_y = along_y * column(expand_batch(finite_or(params.strength.to(dtype), 0.0), rows))
+        color = expand_batch(finite_or(params.color.to(dtype), 0.0), rows)[:, :, None, None]
         plan: FlarePlan = self.plan_for(params, image, depth)
         shone = image
         if plan.part is None:

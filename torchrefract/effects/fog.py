@@ -8,17 +8,17 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_range, or_else
-from torchrefract._products import product
+from torchrefract._tensor import exact_matmul
+from torchrefract._validation import check_range, finite_or
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.air import Air, check_fog_params, distances, make_air, squares
 from torchrefract.effects.base import params_to
 from torchrefract.effects.depth import DepthProvider
 from torchrefract.effects.fog_plan import FogPlan, Fogs, fog_plan
-from torchrefract.effects.plan import lies_in
+from torchrefract.effects.plan import in_ranges
 from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.radiance import Shaded
-from torchrefract.effects.rows import alike, column
+from torchrefract.effects.rows import column, expand_alike
 from torchrefract.fields.fog import extinction, transmission
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
@@ -31,7 +31,7 @@ _OPAQUE = 1e20  # 1/m: through so much of it nothing comes, and its products wit
 class FogParams(NamedTuple):
     """The fogs of a batch."""
 
-    gate: Tensor  # (B,), bool: the sample is degraded
+    applied: Tensor  # (B,), bool: the sample is degraded
     visibility: Tensor  # (B,), m, above 0; inf is clear air
     deviation: Tensor  # (B,), relative deviation of the extinction, above -1
     airlight: Tensor  # (B, C), in [0, 1], as stored in the image
@@ -97,9 +97,9 @@ class UniformFog(PlannedLight):
 
     def draw(self, source: draws.Stream, image: Tensor) -> FogParams:
         """One fog a sample; V and the deviation are uniform in their ranges."""
-        gate, values = self._uniform(source, [visibility_span(self.visibility_range), self.deviation_range], image)
+        applied, values = self._uniform(source, [visibility_span(self.visibility_range), self.deviation_range], image)
         visibility = drawn_visibility(values[:, 0], self.visibility_range)
-        return FogParams(gate, visibility, values[:, 1], self.air.light(image, values.dtype))
+        return FogParams(applied, visibility, values[:, 1], self.air.light(image, values.dtype))
 
     def check(self, params: FogParams, image: Tensor) -> None:
         """Raise for fogs that are none."""
@@ -109,7 +109,7 @@ class UniformFog(PlannedLight):
         """The samples whose air is not clear."""
         return params.visibility != torch.inf
 
-    def covers(self, params: FogParams) -> Tensor:
+    def params_in_range(self, params: FogParams) -> Tensor:
         """(), bool: all fogs lie in the ranges."""
         return fogs_lie_in(params, extinctions(self), self.air)
 
@@ -129,20 +129,20 @@ def behind_fog(air: Air, image: Tensor, params: Any, depth: Tensor | None, plan:
     k = column(mean_extinction(params, air, dtype))
 
     def through(distance: Tensor) -> Tensor:
-        return transmission(distance, k) if distance.shape[0] == 1 else transmission(*alike(distance, k))
+        return transmission(distance, k) if distance.shape[0] == 1 else transmission(*expand_alike(distance, k))
 
     def exact() -> Tensor:
         return through(air.distance(image, depth))
 
     if not plan.acts:
         return Shaded(image, valid=lambda: exact() >= 1 / 255, transmission=exact, extinction=k)
-    airlight = or_else(params.airlight.to(dtype), 0.0)
+    airlight = finite_or(params.airlight.to(dtype), 0.0)
     if plan.nodes is None:
         t = exact()
         blended = air.blended(image, t, airlight, plan.ends)
         return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
     places, weights = along_columns(air, image, plan.nodes)
-    t = product(through(air.distance_at(places, image)), weights)
+    t = exact_matmul(through(air.distance_at(places, image)), weights)
     blended = air.blended(image, t, airlight, plan.ends)
     return Shaded(blended, valid=lambda: exact() >= 1 / 255, transmission=exact, extinction=k)
 
@@ -171,7 +171,7 @@ def mean_extinction(params: Any, air: Air, dtype: torch.dtype) -> Tensor:
 def fogs_lie_in(params: Any, span: Range, air: Air) -> Tensor:
     """(), bool: fogs have an extinction in a range, and the light of this air."""
     k = mean_extinction(params, air, params.visibility.dtype)
-    return lies_in(k[:, None], [span]) & air.covers(params.airlight)
+    return in_ranges(k[:, None], [span]) & air.params_in_range(params.airlight)
 
 
 def along_columns(air: Air, image: Tensor, count: int) -> tuple[list[float], Tensor]:

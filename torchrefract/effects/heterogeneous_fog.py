@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_choice, check_number, check_positive, check_range, check_within, or_else
-from torchrefract._constants import constant
+from torchrefract._tensor import as_device_tensor
+from torchrefract._validation import check_choice, check_number, check_positive, check_range, check_within, finite_or
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.air import check_fog_params, distances, make_air
 from torchrefract.effects.base import params_to
@@ -27,11 +27,11 @@ from torchrefract.effects.fog import (
 )
 from torchrefract.effects.fog_plan import fog_plan
 from torchrefract.effects.motion import check_decorrelation, check_motion, check_wind, drawn_motion, motion_ranges, tame
-from torchrefract.effects.plan import lies_in
+from torchrefract.effects.plan import in_ranges
 from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.radiance import Shaded
 from torchrefract.effects.random_field import check_key
-from torchrefract.effects.rows import column, frame_mean, spread
+from torchrefract.effects.rows import column, expand_batch, frame_mean
 from torchrefract.effects.scales import check_scales, check_weights, chosen, periods, shares, stretched
 from torchrefract.effects.space_plan import space_plan
 from torchrefract.fields.fog import drifting_transmission_
@@ -48,7 +48,7 @@ _FLATTEST, _STARKEST = 0.0, 2.0  # of the contrast
 class HeterogeneousFogParams(NamedTuple):
     """The fogs of a batch."""
 
-    gate: Tensor  # (B,), bool: the sample is degraded
+    applied: Tensor  # (B,), bool: the sample is degraded
     visibility: Tensor  # (B,), m, above 0, of the mean extinction; inf is clear air
     deviation: Tensor  # (B,), relative deviation of the mean extinction, above -1
     airlight: Tensor  # (B, C), in [0, 1], as stored in the image
@@ -163,13 +163,13 @@ class HeterogeneousFog(PlannedLight):
         winds = (self.wind_x_range, self.wind_y_range, self.wind_z_range)
         ranges = [visibility_span(self.visibility_range), self.deviation_range, self.contrast_range]
         ranges += motion_ranges(*winds, decorrelation=self.decorrelation_range)
-        gate, values = self._uniform(source, ranges, image)
+        applied, values = self._uniform(source, ranges, image)
         return HeterogeneousFogParams(
-            gate,
+            applied,
             drawn_visibility(values[:, 0], self.visibility_range),
             values[:, 1],
             self.air.light(image, values.dtype),
-            constant([self.weights] * image.shape[0], dtype=values.dtype, device=values.device).view(
+            as_device_tensor([self.weights] * image.shape[0], dtype=values.dtype, device=values.device).view(
                 -1, len(self.scales)
             ),
             values[:, 2],
@@ -191,10 +191,10 @@ class HeterogeneousFog(PlannedLight):
         """The samples whose air is not clear."""
         return params.visibility != torch.inf
 
-    def covers(self, params: HeterogeneousFogParams) -> Tensor:
+    def params_in_range(self, params: HeterogeneousFogParams) -> Tensor:
         """(), bool: all fogs lie in the ranges, and the weights are those of the effect."""
         limits = [(share, share) for share in self._shares()]
-        own = lies_in(shares(params.weights), limits) & lies_in(params.contrast[:, None], [self.contrast_range])
+        own = in_ranges(shares(params.weights), limits) & in_ranges(params.contrast[:, None], [self.contrast_range])
         return fogs_lie_in(params, extinctions(self), self.air) & own
 
     def planned(self, height: int, width: int, dtype: torch.dtype, *, any_depth: bool = False) -> DriftPlan:
@@ -220,8 +220,8 @@ class HeterogeneousFog(PlannedLight):
             return behind_fog(self.air, image, params, depth, plan)
         rows, dtype = image.shape[0], field_dtype(image.dtype)
         distance = self.air.distance(image, depth)
-        mean_k = column(spread(mean_extinction(params, self.air, dtype), rows))
-        distance = spread(distance, rows) if distance.shape[0] > 1 else distance
+        mean_k = column(expand_batch(mean_extinction(params, self.air, dtype), rows))
+        distance = expand_batch(distance, rows) if distance.shape[0] > 1 else distance
 
         def drifting() -> Drifting:
             noise, share, offset = self._field(params, distance, image, plan)
@@ -237,7 +237,7 @@ class HeterogeneousFog(PlannedLight):
 
         if not plan.acts:
             return Shaded(image, valid=lambda: through() >= 1 / 255, transmission=through, extinction=k)
-        airlight = or_else(params.airlight.to(dtype), 0.0)
+        airlight = finite_or(params.airlight.to(dtype), 0.0)
         blended, t = self.air.behind_drifts(image, drifting(), airlight, plan.ends)
         return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
 
@@ -248,7 +248,7 @@ class HeterogeneousFog(PlannedLight):
         rows, _, height, width = image.shape
         dtype = field_dtype(image.dtype)
         names = ("key", "weights", "contrast", "wind", "decorrelation")
-        key, weights, contrast, wind, decorrelation = (spread(getattr(params, name), rows) for name in names)
+        key, weights, contrast, wind, decorrelation = (expand_batch(getattr(params, name), rows) for name in names)
         share = shares(weights.to(dtype))
         frame, wind, decorrelation = tame(params.frame.reshape(-1), wind, decorrelation)
         if self.mode == "image":

@@ -10,19 +10,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true, learns
-from torchrefract._constants import assume_constant_result
-from torchrefract.effects.plan import MOST_ULPS, TOLERANCE_PX, Ask, Plan, check_tolerance
+from torchrefract._tensor import assume_constant_result
+from torchrefract._validation import eager_bool, requires_grad
+from torchrefract.effects.plan import MOST_ULPS, TOLERANCE_PX, Plan, PlanRequest, check_tolerance
 from torchrefract.effects.refraction import Moved, WarpEffect, mixed
-from torchrefract.effects.rows import only, params_part, put, some, spread
-from torchrefract.warping.lattice import SmoothFlow
+from torchrefract.effects.rows import expand_batch, params_part, put, some, where_active
+from torchrefract.warping.lattice import LatticeFlow
 
 
 class LatticeWarp(WarpEffect):
     """A warp with a plan.
 
     Args:
-        padding, interpolation, resampler, p: as for every warp.
+        padding, interpolation, backend, p: as for every warp.
         tolerance_px: how far the flow may be from the exact one, px, anywhere and for all parameters in the ranges of
             the effect, so that it can be computed on a coarser lattice, see `plan`; None is exact, and so is the
             default in frames so large that float32 does not reach it, from about 10 000 px on for lenses and 40 000
@@ -38,11 +38,11 @@ class LatticeWarp(WarpEffect):
         *,
         padding: str = "zeros",
         interpolation: str = "bilinear",
-        resampler: str = "auto",
+        backend: str = "auto",
         tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ):
-        super().__init__(padding=padding, interpolation=interpolation, resampler=resampler, p=p)
+        super().__init__(padding=padding, interpolation=interpolation, backend=backend, p=p)
         self.tolerance_px = check_tolerance(tolerance_px)
 
     def plan_for(self, params: Any, height: int, width: int) -> Plan:
@@ -57,17 +57,17 @@ class LatticeWarp(WarpEffect):
 
     def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
         """The plan for fields of a type."""
-        ask = Ask(height, width, self.tolerance_px, dtype is torch.float64, self.ulps)
+        ask = PlanRequest(height, width, self.tolerance_px, dtype is torch.float64, self.ulps)
         return self.plan_within(ask.of_default)
 
-    def plan_within(self, ask: Ask) -> Plan:
+    def plan_within(self, ask: PlanRequest) -> Plan:
         """The plan that is asked for, from the ranges alone."""
         return ask.plan(1, 0.0, "no tolerance" if ask.tolerance_px is None else "no bound is known for these arguments")
 
-    def fitted(self, params: Any, height: int, width: int) -> "LatticeWarp":
+    def for_params(self, params: Any, height: int, width: int) -> "LatticeWarp":
         """The effect itself; an exact one for parameters outside the ranges that its plan is for."""
-        covers = functools.partial(self.covers, params, height, width)
-        if self.tolerance_px is None or is_true(covers, of=params.gate) is not False:
+        params_in_range = functools.partial(self.params_in_range, params, height, width)
+        if self.tolerance_px is None or eager_bool(params_in_range, of=params.applied) is not False:
             return self
         return self.exact()
 
@@ -78,11 +78,11 @@ class LatticeWarp(WarpEffect):
         return exact
 
     @abstractmethod
-    def covers(self, params: Any, height: int, width: int) -> Tensor:
+    def params_in_range(self, params: Any, height: int, width: int) -> Tensor:
         """(), bool: all parameters lie in the ranges that the plan for such a frame is for."""
 
     @abstractmethod
-    def on_lattice(self, params: Any, plan: Plan) -> SmoothFlow:
+    def on_lattice(self, params: Any, plan: Plan) -> LatticeFlow:
         """The flow on the plan's lattice, where it exists everywhere."""
 
     def at_pixels(self, params: Any, plan: Plan) -> tuple[Tensor, Tensor]:
@@ -95,15 +95,15 @@ class LatticeWarp(WarpEffect):
 
     def stirs(self, params: Any, height: int, width: int, plan: Plan | None = None) -> bool:
         """Whether a sample may be moved by more than the tolerance, or a gradient is asked for."""
-        if learns(params):
+        if requires_grad(params):
             return True
         plan = plan or self.plan_for(params, height, width)
         return plan.stride > 0 and super().stirs(params, height, width)
 
-    def gated(self, params: Any, *, height: int, width: int, plan: Plan | None = None) -> Moved:
+    def masked_flow(self, params: Any, *, height: int, width: int, plan: Plan | None = None) -> Moved:
         """The flow, zero for the samples that the effect leaves alone, by its own plan or by one that is given."""
         plan = plan or self.plan_for(params, height, width)
-        plans = self.plans_of(params, plan) if plan.parts and not learns(params) else None
+        plans = self.plans_of(params, plan) if plan.parts and not requires_grad(params) else None
         if not plans:
             return self._gated(params, plan)
         places: dict[Plan, list[int]] = {}
@@ -122,11 +122,11 @@ class LatticeWarp(WarpEffect):
         if (index := some(active, params)) is not None:
             path = self._known_every(params_part(params, index), plan)
             path = path.with_nodes(put(path.nodes, index, 0.0, len(active)))
-            return Moved(path, active.new_ones(1, 1, 1, 1), spread(active, path.nodes.shape[0]))
+            return Moved(path, active.new_ones(1, 1, 1, 1), expand_batch(active, path.nodes.shape[0]))
         path = self._known_every(params, plan)
-        active = spread(active, path.nodes.shape[0])
-        path = path.with_nodes(only(path.nodes, 0.0, active, params))
+        active = expand_batch(active, path.nodes.shape[0])
+        path = path.with_nodes(where_active(path.nodes, 0.0, active, params))
         return Moved(path, active.new_ones(1, 1, 1, 1), active)
 
-    def _known_every(self, params: Any, plan: Plan) -> SmoothFlow:
+    def _known_every(self, params: Any, plan: Plan) -> LatticeFlow:
         return replace(self.on_lattice(params, plan), every=plan.every)

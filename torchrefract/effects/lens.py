@@ -8,22 +8,22 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_flag, check_range, check_within, is_true, read
 from torchrefract._compiled import SMALLEST
-from torchrefract._constants import constant
+from torchrefract._tensor import as_device_tensor
+from torchrefract._validation import check_flag, check_range, check_values, check_within, eager_bool, eager_values
 from torchrefract.cameras.distortion import ALL_TERMS, POLYNOMIAL12
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.lens_parts import plan_in_parts, plan_of_lens
-from torchrefract.effects.lens_plan import covers, kept_terms
+from torchrefract.effects.lens_plan import kept_terms, params_in_range
 from torchrefract.effects.lens_source import LensSource, cameras_of, correlated, jittered, listed
-from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan
+from torchrefract.effects.plan import TOLERANCE_PX, Plan, PlanRequest
 from torchrefract.effects.refraction import Moved
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, smooth_lens_flow
 from torchrefract.fields.lens_bounds import LensRanges, lens_numbers
 from torchrefract.types import Range
-from torchrefract.warping.lattice import Lattice, SmoothFlow
+from torchrefract.warping.lattice import Lattice, LatticeFlow
 
 _LARGEST = 100.0  # coefficient
 _FARTHEST = 1e10  # widths
@@ -33,7 +33,7 @@ _MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors
 class LensParams(NamedTuple):
     """The lenses of a batch."""
 
-    gate: Tensor  # (B,), bool: the sample is degraded
+    applied: Tensor  # (B,), bool: the sample is degraded
     coefficients: Tensor  # (B, 12): k1 ... k6, p1, p2, s1 ... s4
     focal: Tensor  # (B, 2), in widths of the frame: fx / W and fy / W
     center: Tensor  # (B, 2), in widths: the principal point's offset from the center of the frame
@@ -61,7 +61,7 @@ class LensDistortion(LatticeWarp):
         aspect_range: fy / fx, above 0.
         center_x_range, center_y_range: offset of the principal point from the center of the frame, in widths.
         strict: raise, instead of warning, where the model folds back inside the frame (on the CPU).
-        padding, interpolation, resampler, tolerance_px, p: as for every warp.
+        padding, interpolation, backend, tolerance_px, p: as for every warp.
 
     Raises:
         ValueError: an argument outside its range; a lens that folds inside the frame, if `strict`.
@@ -91,13 +91,11 @@ class LensDistortion(LatticeWarp):
         strict: bool = False,
         padding: str = "zeros",
         interpolation: str = "bilinear",
-        resampler: str = "auto",
+        backend: str = "auto",
         tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ):
-        super().__init__(
-            padding=padding, interpolation=interpolation, resampler=resampler, tolerance_px=tolerance_px, p=p
-        )
+        super().__init__(padding=padding, interpolation=interpolation, backend=backend, tolerance_px=tolerance_px, p=p)
         radial = (k1_range, k2_range, k3_range, k4_range, k5_range, k6_range)
         others = (p1_range, p2_range, s1_range, s2_range, s3_range, s4_range)
         for name, value in zip(POLYNOMIAL12, radial + others, strict=True):
@@ -121,7 +119,7 @@ class LensDistortion(LatticeWarp):
         strict: bool = False,
         padding: str = "zeros",
         interpolation: str = "bilinear",
-        resampler: str = "auto",
+        backend: str = "auto",
         tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ) -> "LensDistortion":
@@ -134,7 +132,7 @@ class LensDistortion(LatticeWarp):
             covariance: (4 + n, 4 + n), of fx, fy, cx, cy in px and n coefficients, in place of `jitter`: numbers are
                 off together, by uniform draws of that covariance. For cameras that are polynomials as they are.
             residual_px: how far the polynomial may show a ray from where the camera does, px.
-            strict, padding, interpolation, resampler, tolerance_px, p: as for `LensDistortion`.
+            strict, padding, interpolation, backend, tolerance_px, p: as for `LensDistortion`.
 
         Raises:
             ValueError: numbers out of range; a camera too far from a polynomial, or that folds inside its frame.
@@ -145,7 +143,7 @@ class LensDistortion(LatticeWarp):
             raise ValueError(f"jitter must be 0 beside a covariance, got {jitter}")
         else:
             lenses = correlated(camera, covariance)
-        warp = {"padding": padding, "interpolation": interpolation, "resampler": resampler, "p": p}
+        warp = {"padding": padding, "interpolation": interpolation, "backend": backend, "p": p}
         return cls._drawn_from(lenses, strict=strict, tolerance_px=tolerance_px, **warp)
 
     @classmethod
@@ -157,7 +155,7 @@ class LensDistortion(LatticeWarp):
         strict: bool = False,
         padding: str = "zeros",
         interpolation: str = "bilinear",
-        resampler: str = "auto",
+        backend: str = "auto",
         tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ) -> "LensDistortion":
@@ -167,12 +165,12 @@ class LensDistortion(LatticeWarp):
             table: their cameras; None is the table of the package (`torchrefract.cameras.lens_table`).
             residual_px: how far a polynomial may show a ray from where a camera of another model does, px; lenses of
                 the package's table that are farther off are left out, others raise.
-            strict, padding, interpolation, resampler, tolerance_px, p: as for `LensDistortion`.
+            strict, padding, interpolation, backend, tolerance_px, p: as for `LensDistortion`.
 
         Raises:
             ValueError: an empty table; a camera too far from a polynomial, or that folds inside its frame.
         """
-        warp = {"padding": padding, "interpolation": interpolation, "resampler": resampler, "p": p}
+        warp = {"padding": padding, "interpolation": interpolation, "backend": backend, "p": p}
         return cls._drawn_from(listed(table, residual_px=residual_px), strict=strict, tolerance_px=tolerance_px, **warp)
 
     @classmethod
@@ -192,49 +190,49 @@ class LensDistortion(LatticeWarp):
     def draw(self, source: draws.Stream, image: Tensor) -> LensParams:
         """One lens a sample: every number uniform in its range, or one of those of a table or a camera."""
         if self._source is None:
-            gate, values = self._uniform(source, self._ranges().numbers, image)
+            applied, values = self._uniform(source, self._ranges().numbers, image)
         else:
-            gate, values = self._uniform(source, self._source.inputs, image)
+            applied, values = self._uniform(source, self._source.inputs, image)
             values = self._source.lenses(values)
         fx, aspect = values[:, 12], values[:, 13]
-        return LensParams(gate, values[:, :12], torch.stack([fx, fx * aspect], dim=1), values[:, 14:])
+        return LensParams(applied, values[:, :12], torch.stack([fx, fx * aspect], dim=1), values[:, 14:])
 
     def check(self, params: LensParams, image: Tensor) -> None:
         """Raise for lenses that are none."""
         check_lens(params, image.shape[0])
 
-    def plan_within(self, ask: Ask) -> Plan:
+    def plan_within(self, ask: PlanRequest) -> Plan:
         """The plan for all lenses of the ranges, or of a table."""
         return plan_in_parts(self._boxes(), ask)
 
     def plans_of(self, params: LensParams, plan: Plan) -> list[Plan] | None:
         """For each lens the plan of `plan_of_lens`."""
-        numbers = read(lambda: lens_numbers(*(value.detach() for value in params[1:])), of=params.focal)
+        numbers = eager_values(lambda: lens_numbers(*(value.detach() for value in params[1:])), of=params.focal)
         if numbers is None:
             return None
         boxes = self._boxes()
-        ask = Ask(plan.height, plan.width, plan.tolerance_px, params.focal.dtype is torch.float64)
+        ask = PlanRequest(plan.height, plan.width, plan.tolerance_px, params.focal.dtype is torch.float64)
         return [plan_of_lens(boxes, lens, ask) for lens in numbers]
 
-    def covers(self, params: LensParams, height: int, width: int) -> Tensor:
+    def params_in_range(self, params: LensParams, height: int, width: int) -> Tensor:
         """Whether the lenses lie in the ranges, or near one of a table's."""
         if self._source is not None:
-            return self._source.covers(params.coefficients, params.focal, params.center)
-        return covers(self._ranges(), params.coefficients, params.focal, params.center)
+            return self._source.params_in_range(params.coefficients, params.focal, params.center)
+        return params_in_range(self._ranges(), params.coefficients, params.focal, params.center)
 
-    def on_lattice(self, params: LensParams, plan: Plan) -> SmoothFlow:
+    def on_lattice(self, params: LensParams, plan: Plan) -> LatticeFlow:
         """The flow of `smooth_lens_flow`."""
         lattice = cast(Lattice, plan.lattice)
         x, y = lattice.places(dtype=params.focal.dtype, device=params.focal.device)
         terms = ALL_TERMS if params.coefficients.requires_grad else kept_terms(plan)
         camera, large = in_px(params, lattice.height, lattice.width), lattice.height * lattice.width >= SMALLEST
         flow = smooth_lens_flow(*camera, x, y, steps=cast(int, plan.steps), terms=terms, large=large)
-        return SmoothFlow(flow, lattice)
+        return LatticeFlow(flow, lattice)
 
-    def gated(self, params: LensParams, *, height: int, width: int, plan: Plan | None = None) -> Moved:
+    def masked_flow(self, params: LensParams, *, height: int, width: int, plan: Plan | None = None) -> Moved:
         """The flow, by its own plan or by one that is given; a lens that folds is told."""
-        moved = super().gated(params, height=height, width=width, plan=plan)
-        if is_true(moved.exists.all, of=moved.exists) is False:
+        moved = super().masked_flow(params, height=height, width=width, plan=plan)
+        if eager_bool(moved.exists.all, of=moved.exists) is False:
             self._check_fold(params, height, width)
         return moved
 
@@ -255,7 +253,7 @@ class LensDistortion(LatticeWarp):
         Raises:
             ValueError: a lens that is no `Camera`.
         """
-        return cameras_of(params.gate, *in_px(params, height, width), height=height, width=width)
+        return cameras_of(params.applied, *in_px(params, height, width), height=height, width=width)
 
     def moves(self, params: LensParams) -> Tensor:
         """The samples with a coefficient that is not zero."""
@@ -272,9 +270,9 @@ class LensDistortion(LatticeWarp):
         camera = in_px(params, height, width)
 
         def folds() -> Tensor:
-            return (params.gate & folds_inside(*camera, height=height, width=width)).any()
+            return (params.applied & folds_inside(*camera, height=height, width=width)).any()
 
-        if not is_true(folds, of=params.gate):
+        if not eager_bool(folds, of=params.applied):
             return
         rule = "the lens must not fold back inside the frame (k1, k2 ... and focal_range decide)"
         if self.strict:
@@ -288,12 +286,14 @@ def check_lens(params: Any, batch: int, *, count: int = 12, what: str = _MODEL, 
         value = getattr(params, name)
         if value.shape != (batch, width):
             raise ValueError(f"params.{name} must have shape (B, {width}), {meaning}, got {tuple(value.shape)}")
-    check_all("params.coefficients", f"lie in [-{bound:g}, {bound:g}]", params.coefficients, lambda v: v.abs() <= bound)
+    check_values(
+        "params.coefficients", f"lie in [-{bound:g}, {bound:g}]", params.coefficients, lambda v: v.abs() <= bound
+    )
     check_within("params.focal", params.focal, 1 / _FARTHEST, _FARTHEST)
     check_within("params.center", params.center, -_FARTHEST, _FARTHEST)
 
 
 def in_px(params: Any, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
     """The coefficients, and in px the focal lengths and the principal point, of such parameters."""
-    middle = constant([width - 1, height - 1], dtype=params.center.dtype, device=params.center.device) / 2
+    middle = as_device_tensor([width - 1, height - 1], dtype=params.center.dtype, device=params.center.device) / 2
     return params.coefficients, params.focal * width, middle + params.center * width

@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 from torchrefract.effects.lens_plan import lens_plan
-from torchrefract.effects.plan import Ask, Plan
+from torchrefract.effects.plan import Plan, PlanRequest
 from torchrefract.fields.lens_bounds import LensRanges, moved_by_terms
 from torchrefract.warping.lattice import Lattice
 
@@ -24,7 +24,7 @@ _SMALLEST_FRAME = 1 << 16
 
 
 @lru_cache(maxsize=2048)
-def plan_in_parts(boxes: tuple[LensRanges, ...], ask: Ask) -> Plan:
+def plan_in_parts(boxes: tuple[LensRanges, ...], ask: PlanRequest) -> Plan:
     """The plan of `lens_plan`, said to have parts if lenses may get coarser ones of their own."""
     plan = lens_plan(boxes, ask)
     wide = len(boxes) > 1 or any(low != high for box in boxes for low, high in box.numbers)
@@ -33,7 +33,7 @@ def plan_in_parts(boxes: tuple[LensRanges, ...], ask: Ask) -> Plan:
     return replace(plan, parts=True, error_px=ask.tolerance_px)
 
 
-def plan_of_lens(boxes: tuple[LensRanges, ...], lens: Sequence[float], ask: Ask) -> Plan:
+def plan_of_lens(boxes: tuple[LensRanges, ...], lens: Sequence[float], ask: PlanRequest) -> Plan:
     """The plan for one lens.
 
     Args:

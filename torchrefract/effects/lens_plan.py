@@ -8,7 +8,7 @@ from functools import lru_cache
 from torch import Tensor
 
 from torchrefract.cameras.distortion import POLYNOMIAL12, Terms
-from torchrefract.effects.plan import STRIDES, Ask, Plan, Smoothness, coarsest, lies_in
+from torchrefract.effects.plan import STRIDES, Plan, PlanRequest, Smoothness, coarsest, in_ranges
 from torchrefract.fields.lens_bounds import LensRanges, lens_errors, lens_numbers, moved_by_terms
 from torchrefract.warping.lattice import Lattice
 
@@ -20,13 +20,13 @@ MOST_STRETCH = 3.0
 _GROUPS = (range(8, 12), range(6, 8), (5,), (4,), (3,), (2,), (1,), (0,))
 
 
-def covers(ranges: LensRanges, coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
+def params_in_range(ranges: LensRanges, coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
     """(), bool: lenses (B, 12), (B, 2), (B, 2) all lie in the ranges, but for rounding."""
-    return lies_in(lens_numbers(coefficients, focal, center), ranges.numbers)
+    return in_ranges(lens_numbers(coefficients, focal, center), ranges.numbers)
 
 
 @lru_cache(maxsize=2048)
-def lens_plan(boxes: tuple[LensRanges, ...], ask: Ask) -> Plan:
+def lens_plan(boxes: tuple[LensRanges, ...], ask: PlanRequest) -> Plan:
     """The plan for lenses that are drawn from any of the boxes."""
     if ask.tolerance_px is None:
         return ask.plan(1, 0.0, "no tolerance")

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_number
+from torchrefract._validation import check_number
 from torchrefract.cameras.conversion import convert
 from torchrefract.cameras.distortion import POLYNOMIAL12
 from torchrefract.cameras.lens_table import read_lenses
@@ -63,7 +63,7 @@ class LensSource(NamedTuple):
         limits = [(min(low for low, _ in column), max(high for _, high in column)) for column in columns]
         return {f"{name}_range": limit for name, limit in zip(_NAMES, limits, strict=True)}
 
-    def covers(self, coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
+    def params_in_range(self, coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
         """(), bool: each of B lenses lies in one of the boxes, but for rounding."""
         return lies_in_one(lens_numbers(coefficients, focal, center), [box.numbers for box in self.boxes])
 
@@ -135,11 +135,13 @@ def correlated(camera: Camera, covariance: Any) -> LensSource:
 
 
 def cameras_of(
-    gate: Tensor, coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int
+    applied: Tensor, coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int
 ) -> list[Camera]:
     """The cameras of lenses (B,), (B, 12), (B, 2) and (B, 2), px; pinholes where the gate is closed."""
     found = []
-    for acts, own, (fx, fy), (cx, cy) in zip(*(v.tolist() for v in (gate, coefficients, focal, center)), strict=True):
+    for acts, own, (fx, fy), (cx, cy) in zip(
+        *(v.tolist() for v in (applied, coefficients, focal, center)), strict=True
+    ):
         numbers = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "coefficients": tuple(own) if acts else (0.0,) * len(own)}
         found.append(Camera(width=width, height=height, **numbers, model="polynomial12"))
     return found

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_all, check_range, check_within, is_true, learns, or_else
+from torchrefract._validation import check_range, check_values, check_within, eager_bool, finite_or, requires_grad
 from torchrefract.types import Range
 
 _FASTEST = 1e6  # of the wind
@@ -43,12 +43,15 @@ def check_motion(params: Any, *, axes: int) -> None:
         raise ValueError(f"params.decorrelation must have shape (B,), got {tuple(params.decorrelation.shape)}")
     check_frame(params)
     check_within("params.wind", params.wind, -_FASTEST, _FASTEST)
-    check_all("params.decorrelation", "be above 0", params.decorrelation, lambda v: v > 0)
+    check_values("params.decorrelation", "be above 0", params.decorrelation, lambda v: v > 0)
 
 
 def tame(frame: Tensor, wind: Tensor, decorrelation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The three as they are; still, where they are no numbers and nothing may be read, or lead beyond float64."""
-    frame, wind = or_else(frame, 0.0).clamp(-LATEST_FRAME, LATEST_FRAME), or_else(wind, 0.0).clamp(-_FASTEST, _FASTEST)
+    frame, wind = (
+        finite_or(frame, 0.0).clamp(-LATEST_FRAME, LATEST_FRAME),
+        finite_or(wind, 0.0).clamp(-_FASTEST, _FASTEST),
+    )
     return frame, wind, torch.where(decorrelation > 0, decorrelation.clamp(min=_SHORTEST), torch.inf)
 
 
@@ -62,6 +65,6 @@ def check_frame(params: Any) -> None:
 def is_still(params: Any) -> bool:
     """Whether only the first frame is asked for, as far as that can be known, and no gradient of time."""
     moving = (params.frame, params.wind, params.decorrelation)
-    if params.frame.shape[1] > 1 or learns(moving):
+    if params.frame.shape[1] > 1 or requires_grad(moving):
         return False
-    return is_true((params.frame == 0).all, of=params.frame) is True
+    return eager_bool((params.frame == 0).all, of=params.frame) is True

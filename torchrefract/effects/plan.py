@@ -8,8 +8,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_count, check_number
-from torchrefract._constants import constant
+from torchrefract._tensor import as_device_tensor
+from torchrefract._validation import check_count, check_number
 from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice
 
@@ -25,7 +25,7 @@ STRIDES = (*range(2, 8), *(share << octave for octave in range(1, 7) for share i
 
 
 @dataclass(frozen=True)
-class Ask:
+class PlanRequest:
     """What a plan is asked for.
 
     height, width: px, of the frame.
@@ -55,7 +55,7 @@ class Ask:
         return self.tolerance_px is None or self.tolerance_px >= 2 * self.rounding
 
     @property
-    def of_default(self) -> "Ask":
+    def of_default(self) -> "PlanRequest":
         """The same; without a tolerance where the default one is below rounding, which nobody has asked for."""
         default = self.tolerance_px == TOLERANCE_PX and not self.reachable
         return replace(self, tolerance_px=None) if default else self
@@ -186,14 +186,14 @@ def coarsest(attempt: Callable[[int], Plan | None]) -> Plan | None:
     return found
 
 
-def lies_in(values: Tensor, ranges: Sequence[Range]) -> Tensor:
+def in_ranges(values: Tensor, ranges: Sequence[Range]) -> Tensor:
     """(), bool: all values (B, n) lie in the n ranges, but for rounding."""
     return lies_in_one(values, [ranges])
 
 
 def lies_in_one(values: Tensor, boxes: Sequence[Sequence[Range]]) -> Tensor:
     """(), bool: each row of values (B, n) lies in one of the boxes of n ranges, but for rounding."""
-    low, high = constant(boxes, dtype=values.dtype, device=values.device).unbind(2)
+    low, high = as_device_tensor(boxes, dtype=values.dtype, device=values.device).unbind(2)
     room = 1e-5 * torch.maximum(low.abs(), high.abs())
     inside = (values[:, None] >= low - room) & (values[:, None] <= high + room)
     return inside.all(dim=2).any(dim=1).all()

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true, learns
-from torchrefract._constants import assume_constant_result
+from torchrefract._tensor import assume_constant_result
+from torchrefract._validation import eager_bool, requires_grad
 from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.plan import check_tolerance
 from torchrefract.effects.radiance import RadianceEffect
@@ -29,9 +29,9 @@ class PlannedLight(RadianceEffect):
         super().__init__(p=p)
         self.tolerance = check_tolerance(tolerance, name="tolerance")
 
-    def fitted(self, params: Any, height: int, width: int) -> "PlannedLight":
+    def for_params(self, params: Any, height: int, width: int) -> "PlannedLight":
         """The effect itself; an exact one for parameters outside the ranges that its plan is for."""
-        if self.tolerance is None or is_true(lambda: self.covers(params), of=params.gate) is not False:
+        if self.tolerance is None or eager_bool(lambda: self.params_in_range(params), of=params.applied) is not False:
             return self
         return self.exact()
 
@@ -43,7 +43,7 @@ class PlannedLight(RadianceEffect):
 
     def plan_for(self, params: Any, image: Tensor, depth: Tensor | None) -> Any:
         """The plan for rows (N, C, H, W); an exact one where a gradient of the parameters is asked for."""
-        exact = self.tolerance is not None and learns(params)
+        exact = self.tolerance is not None and requires_grad(params)
         size = image.shape[2], image.shape[3]
         return self._constant(id(self), *size, field_dtype(image.dtype), any_depth=depth is not None, exact=exact)
 
@@ -58,5 +58,5 @@ class PlannedLight(RadianceEffect):
         """The plan for images of a type, from the ranges alone; for the depth of the effect, or for any."""
 
     @abstractmethod
-    def covers(self, params: Any) -> Tensor:
+    def params_in_range(self, params: Any) -> Tensor:
         """(), bool: all parameters lie in the ranges that the plan is for."""

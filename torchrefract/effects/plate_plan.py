@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import torch
 
-from torchrefract.effects.plan import Ask, Plan, Smoothness, coarsest
+from torchrefract.effects.plan import Plan, PlanRequest, Smoothness, coarsest
 from torchrefract.types import Range
 from torchrefract.warping.lattice import lagrange_weights
 
@@ -31,7 +31,7 @@ _Arguments = tuple[tuple[int, int], float, int, int]
 
 
 @lru_cache(maxsize=256)
-def plate_plan(amplitude: float, points: tuple[int, int], smoothing: Range, ask: Ask) -> Plan:
+def plate_plan(amplitude: float, points: tuple[int, int], smoothing: Range, ask: PlanRequest) -> Plan:
     """The plan for plates.
 
     Args:

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true, learns
+from torchrefract._validation import eager_bool, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.rows import column, only, params_part, part, put, some, spread
+from torchrefract.effects.rows import column, expand_batch, params_part, part, put, some, where_active
 from torchrefract.types import Degraded, Map
 from torchrefract.warping.grid import field_dtype
 
@@ -29,7 +29,7 @@ _CLEAR = {"transmission": 1.0, "extinction": 0.0, "intensity": 0.0}
 
 
 def _stirs(active: Tensor, params: Any) -> bool:
-    return is_true(active.any, of=active) is not False or learns(params)
+    return eager_bool(active.any, of=active) is not False or requires_grad(params)
 
 
 class RadianceEffect(Effect):
@@ -50,15 +50,15 @@ class RadianceEffect(Effect):
 
     def stirs(self, params: Any) -> bool:
         """Whether a sample may be changed, or a gradient is asked for that could change it."""
-        return _stirs(params.gate & self.acts(params), params)
+        return _stirs(params.applied & self.acts(params), params)
 
     def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """The rows in other light, where the gate is open."""
-        active = params.gate & self.acts(params)
+        active = params.applied & self.acts(params)
         if not _stirs(active, params):
             everywhere = active.new_ones(()).expand(_map_size(image))
             return Degraded(image, params, valid=everywhere, light=clear_maps(self.maps, image))
-        if depth is not None and is_true(active.any, of=active) is False:
+        if depth is not None and eager_bool(active.any, of=active) is False:
             depth = None  # and nobody looks at its values
         index, batch = some(active, params), len(active)
         if index is None:
@@ -68,28 +68,28 @@ class RadianceEffect(Effect):
             shaded = self.shade(part(image, index, batch), params_part(params, index), few)
         height, width = image.shape[2:]
 
-        def where_active(value: Tensor, off: float | bool) -> Tensor:
+        def spread_map(value: Tensor, off: float | bool) -> Tensor:
             if index is not None:
                 value = put(value, index, off, batch)
-            elif is_true(active.all, of=active) is not True:
+            elif eager_bool(active.all, of=active) is not True:
                 value = _choose(value, off, active)
             return value.expand(-1, 1, height, width)
 
-        def gated(name: str) -> Map | None:
+        def masked_flow(name: str) -> Map | None:
             value = cast(Map | None, getattr(shaded, name))
             if value is None:
                 return None
-            return lambda: where_active(value() if callable(value) else value, _CLEAR[name])
+            return lambda: spread_map(value() if callable(value) else value, _CLEAR[name])
 
         if index is not None:
             shone = put(shaded.image, index, image, batch)
         else:
-            shone = image if shaded.image is image else only(shaded.image, image, active, params)
+            shone = image if shaded.image is image else where_active(shaded.image, image, active, params)
         return Degraded(
             shone,
             params,
-            valid=lambda: where_active(shaded.valid(), True),
-            light={name: value for name in _CLEAR if (value := gated(name)) is not None},
+            valid=lambda: spread_map(shaded.valid(), True),
+            light={name: value for name in _CLEAR if (value := masked_flow(name)) is not None},
         )
 
 
@@ -109,4 +109,4 @@ def _map_size(image: Tensor) -> tuple[int, ...]:
 
 def _choose(value: Tensor, off: float | bool, active: Tensor) -> Tensor:
     rows = max(value.shape[0], active.shape[0])
-    return torch.where(column(spread(active, rows)), spread(value, rows), off)
+    return torch.where(column(expand_batch(active, rows)), expand_batch(value, rows), off)

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from torchrefract import white_noise
-from torchrefract._checks import check_range, check_within, read
+from torchrefract._validation import check_range, check_within, eager_values
 from torchrefract.effects.motion import check_motion, is_still
-from torchrefract.effects.rows import spread
+from torchrefract.effects.rows import expand_batch
 from torchrefract.fields.evolution import evolved, turn_rates
 from torchrefract.fields.gaussian import gaussian_random_field, spectrum
 from torchrefract.fields.low_modes import low_amplitude, low_field
@@ -44,7 +44,7 @@ def random_field(
     size = torus(height, width, length=longest, kind=kind, aperture=widest or 0.0)
     aperture = None if widest is None else params.aperture
     shape, clipped = spectrum(size, params.length, kind=kind, aperture=aperture, dtype=dtype)
-    share = max(read(lambda: torch.where(params.gate, clipped, 0), of=clipped) or [0.0])
+    share = max(eager_values(lambda: torch.where(params.applied, clipped, 0), of=clipped) or [0.0])
     if share > _CLIPPED:
         warnings.warn(
             f"length must be short enough for a torus of {size[0]} x {size[1]} px, the largest for this frame: "
@@ -69,9 +69,9 @@ def _noises(params: Any, shape: Tensor, size: tuple[int, int]) -> Iterator[tuple
     rates = turn_rates(params.key, size, dtype=dtype)
     if frames == 1 or torch.compiler.is_compiling():
         rows = noise.shape[0] * frames
-        options = {name: spread(getattr(params, name), rows) for name in ("wind", "decorrelation")}
-        moved = evolved(spread(noise, rows), spread(rates, rows), frame=params.frame.reshape(-1), **options)
-        yield moved, spread(shape, rows)
+        options = {name: expand_batch(getattr(params, name), rows) for name in ("wind", "decorrelation")}
+        moved = evolved(expand_batch(noise, rows), expand_batch(rates, rows), frame=params.frame.reshape(-1), **options)
+        yield moved, expand_batch(shape, rows)
         return
     for i in range(noise.shape[0]):
         own = {name: getattr(params, name)[i : i + 1] for name in ("wind", "decorrelation")}
@@ -105,16 +105,16 @@ def field_of_modes(
     dtype, rows = params.amplitude.dtype, params.frame.numel()
     noise = mode_noise(params.key, modes, dtype=dtype)
     if not is_still(params):
-        rates = spread(mode_turn_rates(params.key, modes, dtype=dtype), rows)
-        options = {name: spread(getattr(params, name), rows) for name in ("wind", "decorrelation")}
-        noise = evolved_modes(spread(noise, rows), rates, modes, frame=params.frame.reshape(-1), **options)
+        rates = expand_batch(mode_turn_rates(params.key, modes, dtype=dtype), rows)
+        options = {name: expand_batch(getattr(params, name), rows) for name in ("wind", "decorrelation")}
+        noise = evolved_modes(expand_batch(noise, rows), rates, modes, frame=params.frame.reshape(-1), **options)
     shape: Any = {"aperture": params.aperture if aperture else None, "dtype": dtype}
     if kind == "gaussian":
         amplitude = mode_amplitude(modes, params.length, **shape, shortest=lengths[0])
-        down, across = (spread(values, noise.shape[0]) for values in amplitude)
+        down, across = (expand_batch(values, noise.shape[0]) for values in amplitude)
         return mode_field(noise, (down, across), modes, *at, fields=fields)
     amplitude = low_amplitude(modes, params.length, kind=kind, lengths=lengths, nodes=nodes, **shape)
-    return low_field(noise, spread(amplitude, noise.shape[0]), modes, *at)[:, :fields]
+    return low_field(noise, expand_batch(amplitude, noise.shape[0]), modes, *at)[:, :fields]
 
 
 def check_field_range(name: str, value: Range) -> Range:

@@ -7,19 +7,19 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import is_true
-from torchrefract._constants import constant
+from torchrefract._tensor import as_device_tensor
+from torchrefract._validation import eager_bool
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.lens import check_lens, in_px
-from torchrefract.effects.plan import TOLERANCE_PX, Ask, Plan
+from torchrefract.effects.plan import TOLERANCE_PX, Plan, PlanRequest
 from torchrefract.effects.rectification_plan import rectification_plan
 from torchrefract.fields.lens import lens_flow, lens_restore_flow
 from torchrefract.fields.rectifying import rectification_flow, rectification_restore_flow, shows_folded
 from torchrefract.types import Degraded
 from torchrefract.warping.grid import field_dtype
-from torchrefract.warping.lattice import Lattice, SmoothFlow
+from torchrefract.warping.lattice import Lattice, LatticeFlow
 
 _LARGEST = 1e30  # coefficient; those of a ratio may be large without making a large number
 _CLOSE = 1e-5  # of each number, its rounding
@@ -28,7 +28,7 @@ _CLOSE = 1e-5  # of each number, its rounding
 class RectificationParams(NamedTuple):
     """The camera, for each sample."""
 
-    gate: Tensor  # (B,), bool: the sample is rectified
+    applied: Tensor  # (B,), bool: the sample is rectified
     coefficients: Tensor  # (B, n), of `Rectification.model`
     focal: Tensor  # (B, 2), in widths of the frame: fx / W and fy / W
     center: Tensor  # (B, 2), in widths: the principal point's offset from the center of the frame
@@ -54,7 +54,7 @@ class Rectification(LatticeWarp):
 
     Args:
         camera: of the frames, which may have another size with the same ratio of the sides.
-        padding, interpolation, resampler, tolerance_px, p: as for every warp.
+        padding, interpolation, backend, tolerance_px, p: as for every warp.
 
     Raises:
         ValueError: a camera with a pole inside its frame (`Camera.check_pole`); frames of another shape than the
@@ -70,13 +70,11 @@ class Rectification(LatticeWarp):
         *,
         padding: str = "zeros",
         interpolation: str = "bilinear",
-        resampler: str = "auto",
+        backend: str = "auto",
         tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ):
-        super().__init__(
-            padding=padding, interpolation=interpolation, resampler=resampler, tolerance_px=tolerance_px, p=p
-        )
+        super().__init__(padding=padding, interpolation=interpolation, backend=backend, tolerance_px=tolerance_px, p=p)
         if not isinstance(camera, Camera):
             raise TypeError(f"camera must be a Camera, got {type(camera).__name__}")
         camera.check_pole()
@@ -91,10 +89,10 @@ class Rectification(LatticeWarp):
 
     def draw(self, source: draws.Stream, image: Tensor) -> RectificationParams:
         """The camera for every sample; only the gate is drawn."""
-        gate = draws.uniform(source, 1)[:, 0] < self.p
+        applied = draws.uniform(source, 1)[:, 0] < self.p
         dtype, count = field_dtype(image.dtype), image.shape[0]
-        values = (constant([n], dtype=dtype, device=image.device).repeat(count, 1) for n in self._numbers())
-        return RectificationParams(gate, *values)
+        values = (as_device_tensor([n], dtype=dtype, device=image.device).repeat(count, 1) for n in self._numbers())
+        return RectificationParams(applied, *values)
 
     def check(self, params: RectificationParams, image: Tensor) -> None:
         """Raise for cameras that are none."""
@@ -104,24 +102,24 @@ class Rectification(LatticeWarp):
             what = f"of the model {self.model}"
             check_lens(params, image.shape[0], count=len(self.camera.coefficients), what=what, bound=_LARGEST)
 
-    def plan_within(self, ask: Ask) -> Plan:
+    def plan_within(self, ask: PlanRequest) -> Plan:
         """The plan of `rectification_plan`."""
         return rectification_plan(self.camera, ask)
 
-    def covers(self, params: RectificationParams, height: int, width: int) -> Tensor:
+    def params_in_range(self, params: RectificationParams, height: int, width: int) -> Tensor:
         """Whether the cameras are the one that is known, but for rounding."""
         found = torch.cat(params[1:], dim=1)
-        known = constant([n for row in self._numbers() for n in row], dtype=found.dtype, device=found.device)
+        known = as_device_tensor([n for row in self._numbers() for n in row], dtype=found.dtype, device=found.device)
         return ((found - known).abs() <= _CLOSE * known.abs()).all()
 
-    def on_lattice(self, params: RectificationParams, plan: Plan) -> SmoothFlow:
+    def on_lattice(self, params: RectificationParams, plan: Plan) -> LatticeFlow:
         """The flow of `rectification_flow` at the nodes."""
         lattice = cast(Lattice, plan.lattice)
         height, width = lattice.height, lattice.width
         axes = lattice.places(dtype=params.focal.dtype, device=params.focal.device)
         camera = in_px(params, height, width)
         nodes, _ = rectification_flow(*camera, model=self.model, height=height, width=width, axes=axes)
-        return SmoothFlow(nodes, lattice)
+        return LatticeFlow(nodes, lattice)
 
     def compute(self, image: Tensor, params: RectificationParams, depth: Tensor | None) -> Degraded:
         """The batch looked up along the flow; a camera that folds is told."""
@@ -149,7 +147,7 @@ class Rectification(LatticeWarp):
     def moves(self, params: RectificationParams) -> Tensor:
         """The samples with a coefficient that is not zero, or of a fisheye."""
         if self.model == "fisheye":  # whose radius is an angle
-            return torch.ones_like(params.gate)
+            return torch.ones_like(params.applied)
         return (params.coefficients != 0).any(dim=1)
 
     def _numbers(self) -> tuple[tuple[float, ...], ...]:
@@ -165,9 +163,9 @@ class Rectification(LatticeWarp):
     def _tell_folds(self, params: RectificationParams, height: int, width: int) -> None:
         def folds() -> Tensor:
             camera = in_px(params, height, width)
-            return (params.gate & shows_folded(*camera, model=self.model, height=height, width=width)).any()
+            return (params.applied & shows_folded(*camera, model=self.model, height=height, width=width)).any()
 
-        if is_true(folds, of=params.gate):
+        if eager_bool(folds, of=params.applied):
             warnings.warn(
                 "camera: the model folds back inside the frame: pixels beyond are padded, not valid", stacklevel=3
             )

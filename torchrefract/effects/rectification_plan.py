@@ -4,13 +4,13 @@ from functools import lru_cache
 
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.lens_plan import MOST_STRETCH
-from torchrefract.effects.plan import Ask, Plan, coarsest
+from torchrefract.effects.plan import Plan, PlanRequest, coarsest
 from torchrefract.fields.rectifying import rectification_errors
 from torchrefract.warping.lattice import Lattice
 
 
 @lru_cache(maxsize=64)
-def rectification_plan(camera: Camera, ask: Ask) -> Plan:
+def rectification_plan(camera: Camera, ask: PlanRequest) -> Plan:
     """The plan for frames of a camera.
 
     Raises:

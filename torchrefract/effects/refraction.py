@@ -7,20 +7,30 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrefract._bands import in_place
-from torchrefract._checks import check_choice, is_true, learns
+from torchrefract._tensor import scatter_batch
+from torchrefract._validation import check_choice, eager_bool, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.plan import Ask, Plan
-from torchrefract.effects.rows import alike, column, frames_of, only, params_part, part, put, some, spread
+from torchrefract.effects.plan import Plan, PlanRequest
+from torchrefract.effects.rows import (
+    column,
+    expand_alike,
+    expand_batch,
+    frames_of,
+    params_part,
+    part,
+    put,
+    some,
+    where_active,
+)
 from torchrefract.types import Degraded, Inverse, Map
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import Positions, field_dtype, inside, length
 from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.jacobian import folding
-from torchrefract.warping.lattice import SmoothFlow
+from torchrefract.warping.lattice import LatticeFlow
 from torchrefract.warping.masks import mixes_only
 from torchrefract.warping.mixed import Flow, MixedFlow, PartFlow, dense
-from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, RESAMPLERS, look_up
+from torchrefract.warping.resample import BACKENDS, INTERPOLATIONS, PADDINGS, sample_image
 
 _MISSED = 0.5  # px; smooth flows back, read between pixels, miss by far less, rough ones seldom by more
 
@@ -31,17 +41,17 @@ class WarpEffect(Effect):
     Args:
         padding: what lies outside the frame: "zeros", "border" or "reflection".
         interpolation: "nearest", "bilinear" or "bicubic".
-        resampler: "auto", "grid_sample", "numba" or "opencv", as for `warp`.
+        backend: "auto", "torch", "numba" or "opencv", as for `warp`.
         p: chance that a sample is degraded at all.
     """
 
     def __init__(
-        self, *, padding: str = "zeros", interpolation: str = "bilinear", resampler: str = "auto", p: float = 1.0
+        self, *, padding: str = "zeros", interpolation: str = "bilinear", backend: str = "auto", p: float = 1.0
     ):
         super().__init__(p=p)
         self.padding = check_choice("padding", padding, PADDINGS)
         self.interpolation = check_choice("interpolation", interpolation, INTERPOLATIONS)
-        self.resampler = check_choice("resampler", resampler, RESAMPLERS)
+        self.backend = check_choice("backend", backend, BACKENDS)
 
     @property
     def takes_levels(self) -> bool:
@@ -63,7 +73,7 @@ class WarpEffect(Effect):
 
     def planned(self, height: int, width: int, dtype: torch.dtype) -> Plan:
         """That of an exact flow."""
-        return Ask(height, width, None, dtype is torch.float64).plan(1, 0.0, "it has no lattice")
+        return PlanRequest(height, width, None, dtype is torch.float64).plan(1, 0.0, "it has no lattice")
 
     @abstractmethod
     def moves(self, params: Any) -> Tensor:
@@ -71,9 +81,11 @@ class WarpEffect(Effect):
 
     def stirs(self, params: Any, height: int, width: int) -> bool:
         """Whether a sample may be moved, or a gradient is asked for that could move it."""
-        return is_true((params.gate & self.moves(params)).any, of=params.gate) is not False or learns(params)
+        return eager_bool((params.applied & self.moves(params)).any, of=params.applied) is not False or requires_grad(
+            params
+        )
 
-    def gated(self, params: Any, *, height: int, width: int) -> "Moved":
+    def masked_flow(self, params: Any, *, height: int, width: int) -> "Moved":
         """The flow, zero for the samples that the effect leaves alone."""
         return self._moved(params, lambda own: self.flow(own, height=height, width=width), height, width)
 
@@ -86,37 +98,37 @@ class WarpEffect(Effect):
         else:
             flow, exists = flow_of(params_part(params, index))
             flow, exists = put(flow, index, 0.0, batch), put(exists, index, True, batch)
-        active = spread(active, flow.shape[0])
-        return Moved(only(flow, 0.0, active, params), exists | ~column(active), active)
+        active = expand_batch(active, flow.shape[0])
+        return Moved(where_active(flow, 0.0, active, params), exists | ~column(active), active)
 
     def active(self, params: Any, height: int, width: int) -> Tensor:
         """(B,), bool: the samples that are moved at all."""
-        return params.gate & self.moves(params) & (height * width > 1)
+        return params.applied & self.moves(params) & (height * width > 1)
 
-    def gated_undo(self, params: Any, moved: "Moved") -> tuple[Tensor, Tensor]:
+    def masked_inverse_flow(self, params: Any, moved: "Moved") -> tuple[Tensor, Tensor]:
         """The flow that undoes `gated`, zero for the samples that the effect leaves alone, and where it exists."""
-        active, batch = moved.active.view(len(params.gate), -1)[:, 0], len(params.gate)
+        active, batch = moved.active.view(len(params.applied), -1)[:, 0], len(params.applied)
         index = some(active, params)
         if index is not None:
             back, known = self.undo(params_part(params, index), part(moved.flow, index, batch))
             return put(back, index, 0.0, batch), put(known, index, True, batch)
         back, known = self.undo(params, moved.flow)
-        return only(back, 0.0, moved.active, params), known | ~column(moved.active)
+        return where_active(back, 0.0, moved.active, params), known | ~column(moved.active)
 
     def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """The batch looked up along the flow."""
         height, width = image.shape[2:]
         if not self.stirs(params, height, width):
             return identity(image, params)
-        moved = self.gated(params, height=height, width=width)
-        own = moved.spread(image.shape[0])
-        options = {"padding": self.padding, "interpolation": self.interpolation, "resampler": self.resampler}
+        moved = self.masked_flow(params, height=height, width=width)
+        own = moved.expand_batch(image.shape[0])
+        options = {"padding": self.padding, "interpolation": self.interpolation, "backend": self.backend}
         return moving(
             looked_up(image, own.path, own.active, params, **options),
             params,
             flow=lambda: moved.flow,
             valid=lambda: (moved.exists & inside(moved.flow)) | ~column(moved.active),
-            undo=lambda: self.gated_undo(params, moved),
+            undo=lambda: self.masked_inverse_flow(params, moved),
         )
 
 
@@ -140,12 +152,14 @@ class Moved:
             self._flow = dense(self.path)
         return self._flow
 
-    def spread(self, rows: int) -> "Moved":
+    def expand_batch(self, rows: int) -> "Moved":
         """The same in so many rows."""
         if rows == len(self.active):
             return self
         return Moved(
-            _spread_path(self.path, rows, len(self.active)), spread(self.exists, rows), spread(self.active, rows)
+            _spread_path(self.path, rows, len(self.active)),
+            expand_batch(self.exists, rows),
+            expand_batch(self.active, rows),
         )
 
 
@@ -167,7 +181,7 @@ def moving(
 
     def restore_valid(result: Degraded, known: Tensor) -> Tensor:
         good, many = known & sees(result.valid, result.restore_flow), None if several is None else several()
-        if many is None or is_true(many.any, of=many) is False:
+        if many is None or eager_bool(many.any, of=many) is False:
             return good
         return good & (~column(many) | (result.restore_residual <= _MISSED))
 
@@ -186,14 +200,14 @@ def moving(
 
 def looked_up(image: Tensor, path: Flow | Positions, active: Tensor, params: Any, **options: Any) -> Tensor:
     """The image (N, C, H, W) along a path; samples that are not active, (N,), bool, bit for bit as they are."""
-    if learns(params):
-        return only(look_up(image, path, **options), image, active, params)
-    return look_up(image, path, active=None if is_true(active.all, of=active) else active, **options)
+    if requires_grad(params):
+        return where_active(sample_image(image, path, **options), image, active, params)
+    return sample_image(image, path, active=None if eager_bool(active.all, of=active) else active, **options)
 
 
 def sees(good: Tensor, flow: Tensor) -> Tensor:
     """(B, 1, H, W), bool: all pixels that a look-up along the flow mixes are good, but for weights below 1/1000."""
-    return mixes_only(*alike(good, flow))
+    return mixes_only(*expand_alike(good, flow))
 
 
 def identity(image: Tensor, params: Any) -> Degraded:
@@ -217,15 +231,15 @@ def mixed(parts: Sequence[tuple[Tensor, Moved]]) -> Moved:
     """What is moved in several ways, each for some rows of a batch, (n,), all of which are there."""
     path = MixedFlow(tuple((index, cast(PartFlow, moved.path)) for index, moved in parts))
     height, width = max(moved.exists.shape[2:] for _, moved in parts)
-    exists = in_place([(index, moved.exists.expand(len(index), 1, height, width)) for index, moved in parts])
-    return Moved(path, exists, in_place([(index, moved.active) for index, moved in parts]))
+    exists = scatter_batch([(index, moved.exists.expand(len(index), 1, height, width)) for index, moved in parts])
+    return Moved(path, exists, scatter_batch([(index, moved.active) for index, moved in parts]))
 
 
 def _spread_path(path: Flow, rows: int, before: int) -> Flow:
-    if isinstance(path, SmoothFlow):
-        return path.with_nodes(spread(path.nodes, rows))
+    if isinstance(path, LatticeFlow):
+        return path.with_nodes(expand_batch(path.nodes, rows))
     if isinstance(path, MixedFlow):
         frames = rows // before
         parts = ((frames_of(own, frames), _spread_path(flow, frames * len(own), len(own))) for own, flow in path.parts)
         return MixedFlow(tuple((index, cast(PartFlow, flow)) for index, flow in parts))
-    return spread(cast(Tensor, path), rows)  # no warp alone follows others
+    return expand_batch(cast(Tensor, path), rows)  # no warp alone follows others

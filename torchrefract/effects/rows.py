@@ -9,22 +9,14 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true, learns, read
+from torchrefract._tensor import expand_batch
+from torchrefract._validation import eager_bool, eager_values, requires_grad
 
 
-def spread(value: Tensor, rows: int) -> Tensor:
-    """The value with each row for as many frames as make `rows` of them; one row alone is not copied."""
-    if value.shape[0] == rows or value.shape[0] == 0:
-        return value
-    if value.shape[0] == 1:
-        return value.expand(rows, *value.shape[1:])
-    return value.repeat_interleave(rows // value.shape[0], dim=0)
-
-
-def alike(*values: Tensor) -> list[Tensor]:
+def expand_alike(*values: Tensor) -> list[Tensor]:
     """The values with as many rows as the one of them that has most."""
     rows = max(value.shape[0] for value in values)
-    return [spread(value, rows) for value in values]
+    return [expand_batch(value, rows) for value in values]
 
 
 class Undrawn:
@@ -59,15 +51,15 @@ def at_frames(params: Any, frames: Callable[[], Tensor]) -> Any:
     return params._replace(frame=frames()) if "frame" in params._fields else params
 
 
-def widened(params: Any, dtype: torch.dtype) -> Any:
+def promote_params(params: Any, dtype: torch.dtype) -> Any:
     """The parameters, those that are floating in the given type or a wider one: fields are never half."""
     if isinstance(params, Undrawn):
-        return params.then(lambda found: widened(found, dtype))
+        return params.then(lambda found: promote_params(found, dtype))
     if isinstance(params, Tensor):
         return params.to(torch.promote_types(params.dtype, dtype)) if params.is_floating_point() else params
     if "children" in params._fields:
-        return params._replace(children=tuple(widened(child, dtype) for child in params.children))
-    return type(params)(*(widened(value, dtype) for value in params))
+        return params._replace(children=tuple(promote_params(child, dtype) for child in params.children))
+    return type(params)(*(promote_params(value, dtype) for value in params))
 
 
 def frame_mean(value: Tensor) -> Tensor:
@@ -99,7 +91,7 @@ class _Swap(torch.autograd.Function):
         return None, gradient
 
 
-def only(changed: Tensor, same: Tensor | float, active: Tensor, params: Any) -> Tensor:
+def where_active(changed: Tensor, same: Tensor | float, active: Tensor, params: Any) -> Tensor:
     """`changed` for the active samples and `same`, bit for bit, for the others.
 
     A sample at strength zero keeps the gradient of its parameters: descent must be able to start there.
@@ -110,13 +102,13 @@ def only(changed: Tensor, same: Tensor | float, active: Tensor, params: Any) -> 
         active: (N,) or (B,), bool: the samples that the effect changes at all.
         params: (B,) of everything; those of open gates keep their gradient.
     """
-    if is_true(active.all, of=active):
+    if eager_bool(active.all, of=active):
         return changed
     rows = changed.shape[0]
-    value = torch.where(column(spread(active, rows)), changed, same)
-    if not learns(params):
+    value = torch.where(column(expand_batch(active, rows)), changed, same)
+    if not requires_grad(params):
         return value
-    path = torch.where(column(spread(params.gate, rows)), changed, same)
+    path = torch.where(column(expand_batch(params.applied, rows)), changed, same)
     return cast(Tensor, _Swap.apply(value.detach(), path))
 
 
@@ -126,7 +118,7 @@ def some(active: Tensor, params: Any) -> Tensor | None:
     None where that would save nothing, cannot be told without waiting for a device, or where a gradient of the
     parameters is asked for.
     """
-    flags = None if learns(params) else read(lambda: active)
+    flags = None if requires_grad(params) else eager_values(lambda: active)
     if flags is None or all(flags) or not any(flags):
         return None
     return torch.tensor([i for i, flag in enumerate(flags) if flag])
@@ -145,7 +137,7 @@ def params_part(params: Any, index: Tensor) -> Any:
 
 def put(value: Tensor, index: Tensor, into: Tensor | float, batch: int) -> Tensor:
     """The rows of some samples in their places of a batch, the others as they are in `into`, or of that number."""
-    value = spread(value, max(len(index), value.shape[0]))
+    value = expand_batch(value, max(len(index), value.shape[0]))
     frames = value.shape[0] // len(index)
     if not isinstance(into, Tensor):
         into = value.new_full((batch * frames, *value.shape[1:]), into)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_all, check_number, check_positive, or_else
+from torchrefract._validation import check_number, check_positive, check_values, finite_or
 
 # The paper's table of scales, with the weights that go with them.
 _PAPER_SCALES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
@@ -74,14 +74,14 @@ def check_weights(weights: Tensor, count: int) -> None:
     """Raise unless these are `params.weights`, (B, count), of noises."""
     if weights.shape[1:] != (count,):
         raise ValueError(f"params.weights must be (B, {count}), got {tuple(weights.shape)}")
-    check_all("params.weights", "be at least 0 and finite", weights, lambda v: v.isfinite() & (v >= 0))
+    check_values("params.weights", "be at least 0 and finite", weights, lambda v: v.isfinite() & (v >= 0))
     sums = weights.sum(dim=1)
-    check_all("params.weights", "have a sum above 0", sums, lambda v: v > 0)
-    check_all("params.weights", "have a finite sum", sums, torch.isfinite)
+    check_values("params.weights", "have a sum above 0", sums, lambda v: v > 0)
+    check_values("params.weights", "have a finite sum", sums, torch.isfinite)
 
 
 def shares(weights: Tensor) -> Tensor:
     """(N, K), weights over their sum; what is no weight, and may not be read, counts as none, and none as all alike."""
-    weights = or_else(weights, 0.0).clamp(min=0)
+    weights = finite_or(weights, 0.0).clamp(min=0)
     total = weights.sum(dim=1, keepdim=True)
     return torch.where(total > 0, weights, 1.0) / torch.where(total > 0, total, weights.shape[1])

@@ -7,15 +7,15 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_all, check_count, check_range
+from torchrefract._validation import check_count, check_range, check_values
 from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
-from torchrefract.effects.plan import FEW_ULPS, TOLERANCE_PX, Ask, Plan, lies_in
+from torchrefract.effects.plan import FEW_ULPS, TOLERANCE_PX, Plan, PlanRequest, in_ranges
 from torchrefract.effects.plate_plan import plate_plan
 from torchrefract.fields.drawn_plates import drawn_plates
 from torchrefract.fields.spline import check_points, fit_spline, spline_at, spline_flow
 from torchrefract.types import Range
-from torchrefract.warping.lattice import Lattice, SmoothFlow
+from torchrefract.warping.lattice import Lattice, LatticeFlow
 
 _CLOSE = 1e-3  # px
 
@@ -23,7 +23,7 @@ _CLOSE = 1e-3  # px
 class ThinPlateParams(NamedTuple):
     """The plates of a batch."""
 
-    gate: Tensor  # (B,), bool: the sample is degraded
+    applied: Tensor  # (B,), bool: the sample is degraded
     points: Tensor  # (B, N, 2), px, control points, x and y
     displacement: Tensor  # (B, N, 2), px, of each point
     smoothing: Tensor  # (B,), 0 or above
@@ -43,7 +43,7 @@ class ThinPlateSpline(LatticeWarp):
         amplitude_range: px, standard deviation of the displacements, 0 or above.
         lattice: (rows, columns) of control points, each at least 2.
         smoothing_range: 0 goes through the points exactly; larger bends less, in units of the points' rms radius.
-        padding, interpolation, resampler, tolerance_px, p: as for every warp; plates with own points are exact,
+        padding, interpolation, backend, tolerance_px, p: as for every warp; plates with own points are exact,
             on accelerators and in compiled graphs those with as many as drawn ones only without a tolerance.
 
     Raises:
@@ -60,13 +60,11 @@ class ThinPlateSpline(LatticeWarp):
         smoothing_range: Range = (0.0, 0.0),
         padding: str = "reflection",
         interpolation: str = "bilinear",
-        resampler: str = "auto",
+        backend: str = "auto",
         tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ):
-        super().__init__(
-            padding=padding, interpolation=interpolation, resampler=resampler, tolerance_px=tolerance_px, p=p
-        )
+        super().__init__(padding=padding, interpolation=interpolation, backend=backend, tolerance_px=tolerance_px, p=p)
         self.amplitude_range = check_range("amplitude_range", amplitude_range, low=0.0, high=1e4)
         rows, columns = lattice
         self.lattice = (check_count("lattice", rows, low=2), check_count("lattice", columns, low=2))
@@ -81,12 +79,12 @@ class ThinPlateSpline(LatticeWarp):
 
     def draw(self, source: draws.Stream, image: Tensor) -> ThinPlateParams:
         """One plate a sample, amplitude and smoothing uniform in their ranges."""
-        gate, values = self._uniform(source, (self.amplitude_range, self.smoothing_range), image)
+        applied, values = self._uniform(source, (self.amplitude_range, self.smoothing_range), image)
         amplitude, smoothing = values.unbind(1)
         rows, columns = self.lattice
         normal = draws.normal(draws.fold(source), 2 * rows * columns).to(values.dtype).view(-1, rows * columns, 2)
         points = self._points(image.shape[2], image.shape[3], values).repeat(image.shape[0], 1, 1)
-        return ThinPlateParams(gate, points, amplitude[:, None, None] * normal, smoothing)
+        return ThinPlateParams(applied, points, amplitude[:, None, None] * normal, smoothing)
 
     def check(self, params: ThinPlateParams, image: Tensor) -> None:
         """Raise for plates that are none."""
@@ -101,8 +99,8 @@ class ThinPlateSpline(LatticeWarp):
         if smoothing.ndim != 1:
             raise ValueError(f"params.smoothing must have shape (B,), got {tuple(smoothing.shape)}")
         check_points(points)
-        check_all("params.displacement", "be finite", displacement, torch.isfinite)
-        check_all("params.smoothing", "be at least 0 and finite", smoothing, lambda v: v.isfinite() & (v >= 0))
+        check_values("params.displacement", "be finite", displacement, torch.isfinite)
+        check_values("params.smoothing", "be at least 0 and finite", smoothing, lambda v: v.isfinite() & (v >= 0))
 
     def flow(self, params: ThinPlateParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
         """The flow of `spline_flow`, and where it exists: everywhere."""
@@ -110,24 +108,24 @@ class ThinPlateSpline(LatticeWarp):
         flow = spline_flow(spline, height=height, width=width, dtype=params.points.dtype)
         return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
 
-    def plan_within(self, ask: Ask) -> Plan:
+    def plan_within(self, ask: PlanRequest) -> Plan:
         """The plan of `plate_plan`."""
         return plate_plan(self.amplitude_range[1], self.lattice, self.smoothing_range, ask)
 
-    def fitted(self, params: ThinPlateParams, height: int, width: int) -> "LatticeWarp":
+    def for_params(self, params: ThinPlateParams, height: int, width: int) -> "LatticeWarp":
         """As for every warp; that there are more or fewer points than drawn ones is known where none can be read."""
         drawn = params.points.shape[1] == math.prod(self.lattice)
-        return super().fitted(params, height, width) if drawn else self.exact()
+        return super().for_params(params, height, width) if drawn else self.exact()
 
-    def covers(self, params: ThinPlateParams, height: int, width: int) -> Tensor:
+    def params_in_range(self, params: ThinPlateParams, height: int, width: int) -> Tensor:
         """Whether the points are drawn ones of such a frame, displaced and smoothed as those can be."""
         # Positions in whatever type they were kept in: so little changes nothing that a plan relies on.
         near = (params.points - self._points(height, width, params.points)).abs() <= _CLOSE
         most = draws.LARGEST_NORMAL * self.amplitude_range[1]
-        displaced = lies_in(params.displacement.reshape(-1, 1), [(-most, most)])
-        return near.all() & displaced & lies_in(params.smoothing[:, None], [self.smoothing_range])
+        displaced = in_ranges(params.displacement.reshape(-1, 1), [(-most, most)])
+        return near.all() & displaced & in_ranges(params.smoothing[:, None], [self.smoothing_range])
 
-    def on_lattice(self, params: ThinPlateParams, plan: Plan) -> SmoothFlow:
+    def on_lattice(self, params: ThinPlateParams, plan: Plan) -> LatticeFlow:
         """The flow of `drawn_plates`, or of `spline_at`."""
         lattice, dtype = cast(Lattice, plan.lattice), params.points.dtype
         # Those that such a plan is for are drawn ones.
@@ -137,7 +135,7 @@ class ThinPlateSpline(LatticeWarp):
         alike = self.smoothing_range[0] == self.smoothing_range[1]
         if (flow := drawn_plates(*numbers, x, y) if alike else None) is None:
             flow = spline_at(fit_spline(*numbers, checked=True), x, y, dtype=dtype)
-        return SmoothFlow(flow, lattice)
+        return LatticeFlow(flow, lattice)
 
     def moves(self, params: ThinPlateParams) -> Tensor:
         """The samples with a displaced point."""

@@ -9,19 +9,19 @@ import torch
 from torch import Tensor
 
 from torchrefract import draws
-from torchrefract._checks import check_choice, is_true
+from torchrefract._validation import check_choice, eager_bool
 from torchrefract.effects.base import params_to
 from torchrefract.effects.field_plan import FieldPlan, field_plan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
-from torchrefract.effects.plan import FEW_ULPS, TOLERANCE_PX, Ask, Plan, lies_in
+from torchrefract.effects.plan import FEW_ULPS, TOLERANCE_PX, Plan, PlanRequest, in_ranges
 from torchrefract.effects.random_field import check_field_params, check_field_range, field_of_modes, random_field
-from torchrefract.effects.rows import column, frame_mean, spread
+from torchrefract.effects.rows import column, expand_batch, frame_mean
 from torchrefract.fields.covariance import COVARIANCES, slope_rms
 from torchrefract.fields.field_bounds import FieldRanges
 from torchrefract.fields.modes import Modes
 from torchrefract.types import Range
-from torchrefract.warping.lattice import Lattice, SmoothFlow
+from torchrefract.warping.lattice import Lattice, LatticeFlow
 
 # A field folds first where a slope of five standard deviations reaches 1.
 _FOLD = 0.2
@@ -30,7 +30,7 @@ _FOLD = 0.2
 class TurbulenceParams(NamedTuple):
     """The air of a batch."""
 
-    gate: Tensor  # (B,), bool: the sample is degraded
+    applied: Tensor  # (B,), bool: the sample is degraded
     amplitude: Tensor  # (B,), px, standard deviation of each component of the flow
     length: Tensor  # (B,), px, correlation length
     aperture: Tensor  # (B,), px, standard deviation of the Gaussian that averages the field
@@ -61,7 +61,7 @@ class Turbulence(LatticeWarp):
         covariance: "exponential", "gaussian", "matern32" or "matern52".
         normalize: "theory" gives the amplitude to all fields together, "image" to each: its mean is subtracted and its
             standard deviation divided by, which inflates fields that are longer than the frame.
-        padding, interpolation, resampler, tolerance_px, p: as for every warp; other fields than Gaussian ones have few
+        padding, interpolation, backend, tolerance_px, p: as for every warp; other fields than Gaussian ones have few
             enough frequencies for a tolerance if the aperture is 1.8 px or more, and are exact otherwise.
 
     Raises:
@@ -88,13 +88,11 @@ class Turbulence(LatticeWarp):
         normalize: str = "theory",
         padding: str = "reflection",
         interpolation: str = "bilinear",
-        resampler: str = "auto",
+        backend: str = "auto",
         tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ):
-        super().__init__(
-            padding=padding, interpolation=interpolation, resampler=resampler, tolerance_px=tolerance_px, p=p
-        )
+        super().__init__(padding=padding, interpolation=interpolation, backend=backend, tolerance_px=tolerance_px, p=p)
         self.amplitude_range = check_field_range("amplitude", amplitude_range)
         self.length_range = check_field_range("length", length_range)
         self.aperture_range = check_field_range("aperture", aperture_range)
@@ -115,9 +113,9 @@ class Turbulence(LatticeWarp):
         """One air a sample, every number uniform in its range."""
         motion = motion_ranges(self.wind_x_range, self.wind_y_range, decorrelation=self.decorrelation_range)
         ranges = (self.amplitude_range, self.length_range, self.aperture_range, *motion)
-        gate, values = self._uniform(source, ranges, image)
+        applied, values = self._uniform(source, ranges, image)
         air, motion = values[:, :3].unbind(1), drawn_motion(values[:, 3:])
-        return TurbulenceParams(gate, *air, **motion, key=draws.noise_key(source))
+        return TurbulenceParams(applied, *air, **motion, key=draws.noise_key(source))
 
     def check(self, params: TurbulenceParams, image: Tensor) -> None:
         """Raise for air that is none."""
@@ -132,25 +130,25 @@ class Turbulence(LatticeWarp):
             field = field.contiguous()  # sums over another layout round in another way, and a batch has its own
             field = field - frame_mean(field)
             field = field / frame_mean(field.square()).clamp(min=1e-12).sqrt()
-        flow = column(spread(params.amplitude, field.shape[0])) * field
+        flow = column(expand_batch(params.amplitude, field.shape[0])) * field
         return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
 
-    def plan_within(self, ask: Ask) -> Plan:
+    def plan_within(self, ask: PlanRequest) -> Plan:
         """The plan of `field_plan` for air that is normalized by theory; other is exact."""
         if self.normalize != "theory":
             return super().plan_within(ask)
         ranges = FieldRanges(self.amplitude_range, self.length_range, self.aperture_range, kind=self.covariance)
         return field_plan(ranges, ask)
 
-    def covers(self, params: TurbulenceParams, height: int, width: int) -> Tensor:
+    def params_in_range(self, params: TurbulenceParams, height: int, width: int) -> Tensor:
         """Whether the air lies in the ranges."""
         values = torch.stack([params.amplitude, params.length, params.aperture], dim=1)
-        return lies_in(values, [self.amplitude_range, self.length_range, self.aperture_range])
+        return in_ranges(values, [self.amplitude_range, self.length_range, self.aperture_range])
 
-    def on_lattice(self, params: TurbulenceParams, plan: Plan) -> SmoothFlow:
+    def on_lattice(self, params: TurbulenceParams, plan: Plan) -> LatticeFlow:
         """The flow of the frequencies that the plan keeps."""
         lattice = cast(Lattice, plan.lattice)
-        return SmoothFlow(self._of_modes(params, plan, *lattice.axes()), lattice)
+        return LatticeFlow(self._of_modes(params, plan, *lattice.axes()), lattice)
 
     def at_pixels(self, params: TurbulenceParams, plan: Plan) -> tuple[Tensor, Tensor]:
         """The same at every pixel, where a plan keeps some of the frequencies."""
@@ -166,7 +164,7 @@ class Turbulence(LatticeWarp):
         kept = cast(FieldPlan, plan)
         drawn: Any = {"kind": self.covariance, "lengths": self.length_range, "nodes": kept.nodes}
         field = field_of_modes(params, cast(Modes, kept.modes), (rows, columns), **drawn, aperture=True)
-        return column(spread(params.amplitude, field.shape[0])) * field
+        return column(expand_batch(params.amplitude, field.shape[0])) * field
 
     def moves(self, params: TurbulenceParams) -> Tensor:
         """The samples with an amplitude."""
@@ -175,9 +173,9 @@ class Turbulence(LatticeWarp):
     def _check_folds(self, params: TurbulenceParams) -> None:
         def folds() -> Tensor:
             slope = slope_rms(params.length, kind=self.covariance, aperture=params.aperture)
-            return (params.gate & (params.amplitude * slope > _FOLD)).any()
+            return (params.applied & (params.amplitude * slope > _FOLD)).any()
 
-        if is_true(folds, of=params.gate):
+        if eager_bool(folds, of=params.applied):
             warnings.warn(
                 "amplitude is above what the covariance bears without folding the image (0.2 px over the slope of the "
                 "field): restore_valid leaves folded pixels out; a larger length_range or aperture_range folds less",

@@ -8,20 +8,20 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true, learns
+from torchrefract._validation import eager_bool, requires_grad
 from torchrefract.effects.base import Effect
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.plan import Plan
 from torchrefract.effects.radiance import RadianceEffect, clear_maps
 from torchrefract.effects.refraction import Moved, WarpEffect, looked_up, moving, sees
-from torchrefract.effects.rows import column, only, spread
+from torchrefract.effects.rows import column, expand_batch, where_active
 from torchrefract.effects.steps import Step, exact, on_grid
 from torchrefract.types import Degraded
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import Positions, field_dtype, inside
 from torchrefract.warping.mixed import dense
-from torchrefract.warping.resample import look_up, sampler_dtype
+from torchrefract.warping.resample import sample_image, sampler_dtype
 
 _Combine = Callable[[Tensor, Tensor], Tensor]
 # How the maps of several effects of light make one.
@@ -33,7 +33,7 @@ class Look(NamedTuple):
 
     padding: str | None = None
     interpolation: str | None = None
-    resampler: str | None = None
+    backend: str | None = None
 
     def before(self, other: "Look") -> "Look":
         """This, and the other where it is left open."""
@@ -68,15 +68,15 @@ class Walk:
         planned = {"plan": plan} if isinstance(effect, LatticeWarp) else {}
         if not effect.stirs(params, height, width, **planned):
             return
-        own = effect.gated(params, height=height, width=width, **planned)
-        moved, valid = own.spread(rows), self.valid
-        self.waiting.append(Step(spread(params.gate, rows), moved.active, moved.path))
+        own = effect.masked_flow(params, height=height, width=width, **planned)
+        moved, valid = own.expand_batch(rows), self.valid
+        self.waiting.append(Step(expand_batch(params.applied, rows), moved.active, moved.path))
 
         def own_valid() -> Tensor:
             return moved.exists & inside(moved.flow)
 
         self.valid = own_valid if valid is None else lambda: own_valid() & sees(valid(), moved.flow)
-        self._choose(look.before(Look(effect.padding, effect.interpolation, effect.resampler)), moved.active)
+        self._choose(look.before(Look(effect.padding, effect.interpolation, effect.backend)), moved.active)
         self.moved.append((effect, params, own))
 
     def shade(self, effect: RadianceEffect, params: Any, plan: Plan | LightPlan) -> None:
@@ -87,10 +87,12 @@ class Walk:
         shaded = effect.compute(self.image, params, self.depth)
         rows, before, valid = self.image.shape[0], dict(self.light), self.valid
         self.image = shaded.image
-        self.valid = lambda: spread(shaded.valid, rows) if valid is None else valid() & spread(shaded.valid, rows)
+        self.valid = lambda: (
+            expand_batch(shaded.valid, rows) if valid is None else valid() & expand_batch(shaded.valid, rows)
+        )
 
         def now(name: str) -> Callable[[], Tensor] | None:
-            return (lambda: spread(getattr(shaded, name), rows)) if shaded.has(name) else None
+            return (lambda: expand_batch(getattr(shaded, name), rows)) if shaded.has(name) else None
 
         passed = now("transmission")
         if "intensity" in before and passed is not None:  # of the light added before, so much comes through
@@ -123,7 +125,7 @@ class Walk:
         if not self.done:
             return self._still()
         if len(self.moved) == 1:
-            return self.moved[0][2].spread(self.image.shape[0]).flow
+            return self.moved[0][2].expand_batch(self.image.shape[0]).flow
         # The first is read where the others look, and the last leads there: neither is read twice, and blurred.
         first, *others = self.done
         between = itertools.chain.from_iterable(others[:-1])
@@ -148,13 +150,16 @@ class Walk:
         group = self._composite(self.waiting)
         self.image = self._looked_up(group)
         if self.depth is not None:
-            self.depth = spread(self.depth, self.image.shape[0])
-            near = look_up(self.depth, group.path.detach(), padding="border", interpolation="nearest")
-            self.depth = only(near, self.depth, group.active, group)
+            self.depth = expand_batch(self.depth, self.image.shape[0])
+            near = sample_image(self.depth, group.path.detach(), padding="border", interpolation="nearest")
+            self.depth = where_active(near, self.depth, group.active, group)
 
         def moved_along(value: Callable[[], Tensor]) -> Callable[[], Tensor]:
-            return lambda: only(
-                look_up(value(), group.path, padding="border", interpolation="bilinear"), value(), group.active, group
+            return lambda: where_active(
+                sample_image(value(), group.path, padding="border", interpolation="bilinear"),
+                value(),
+                group.active,
+                group,
             )
 
         self.light = {name: moved_along(value) for name, value in self.light.items()}
@@ -178,19 +183,19 @@ class Walk:
     def _looked_up(self, group: Step) -> Tensor:
         """The image where a group of warps leads."""
         (latest, _), *before = reversed(self.modes.items())
-        others = [(mode, samples) for mode, samples in before if is_true(samples.any, of=samples) is not False]
+        others = [(mode, samples) for mode, samples in before if eager_bool(samples.any, of=samples) is not False]
         if not others:
             return looked_up(self.image, group.path, group.active, group, **latest._asdict())
-        warped = look_up(self.image, group.path, **latest._asdict())
+        warped = sample_image(self.image, group.path, **latest._asdict())
         for mode, samples in others:
-            warped = torch.where(column(samples), look_up(self.image, group.path, **mode._asdict()), warped)
-        return only(warped, self.image, group.active, group)
+            warped = torch.where(column(samples), sample_image(self.image, group.path, **mode._asdict()), warped)
+        return where_active(warped, self.image, group.active, group)
 
     def _moves(self) -> list[Tensor]:
         """(B,), bool, of each warp: the samples that it may move."""
         # A flow that is zero is left out, not looked up: a sample must not depend on what moves the others.
         rows = self.image.shape[0]
-        return [spread(own.gate if learns(own) else moved.active, rows) for _, own, moved in self.moved]
+        return [expand_batch(own.applied if requires_grad(own) else moved.active, rows) for _, own, moved in self.moved]
 
     def _several(self) -> Tensor:
         """(B,), bool: the samples that several warps may move."""
@@ -199,13 +204,13 @@ class Walk:
     def _undo(self) -> tuple[Tensor, Tensor]:
         rows, found = self.image.shape[0], None
         for (effect, params, moved), moves in zip(self.moved, self._moves(), strict=True):
-            back, exists = (spread(value, rows) for value in effect.gated_undo(params, moved))
+            back, exists = (expand_batch(value, rows) for value in effect.masked_inverse_flow(params, moved))
             if found is None:
                 found = back, exists, moves
                 continue
             total, known, done = found
             both, last = column(done & moves), column(moves)
-            if is_true(both.any, of=both) is not False:
+            if eager_bool(both.any, of=both) is not False:
                 exists = torch.where(both, known & sees(exists, total), exists)
                 back = torch.where(both, compose_flows(back, total), back)
             found = torch.where(last, back, total), torch.where(last, exists, known), done | moves

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_all, check_number, check_positive, check_tensor, read
+from torchrefract._validation import check_number, check_positive, check_tensor, check_values, eager_values
 from torchrefract.warping.grid import field_dtype, pixel_axes
 
 # Farther than anything: from here on a depth is infinite, and has no gradient.
@@ -124,7 +124,7 @@ def depth_from_disparity(disparity: Tensor, *, focal_px: float, baseline: float)
         TypeError: a disparity that is no floating tensor.
     """
     product = check_positive("focal_px", focal_px) * check_positive("baseline", baseline)
-    check_all("disparity", "be at least 0, in px", check_floating("disparity", disparity), lambda d: d >= 0)
+    check_values("disparity", "be at least 0, in px", check_floating("disparity", disparity), lambda d: d >= 0)
     return _quotient(product, disparity.to(field_dtype(disparity.dtype)))
 
 
@@ -188,11 +188,11 @@ def check_depth(depth: Tensor, *, name: str = "depth") -> None:
     Raises:
         ValueError: a depth that is none.
     """
-    lowest = read(lambda: depth.detach().amin(), of=depth) if depth.numel() else None
+    lowest = eager_values(lambda: depth.detach().amin(), of=depth) if depth.numel() else None
     if lowest is None:
         return
     if not lowest >= 0:  # NaN is not either
-        check_all(name, "be at least 0, in m", depth, lambda v: v >= 0)
+        check_values(name, "be at least 0, in m", depth, lambda v: v >= 0)
     for sample in depth.detach():
         seen = _sampled(sample)
         if _in_unit_range(seen) and (ends := _in_unit_range(sample)):
@@ -218,7 +218,7 @@ def _check_rows(name: str, depth: Tensor, width: int | None) -> None:
 
 def _focal(name: str, value: float | Tensor, like: Tensor) -> float | Tensor:
     if isinstance(value, Tensor):
-        check_all(name, "be above 0, in px", value, lambda f: f > 0)
+        check_values(name, "be above 0, in px", value, lambda f: f > 0)
         return _intrinsic(name, value, like)
     return check_positive(name, value)
 
@@ -229,7 +229,7 @@ def _intrinsic(name: str, value: float | Tensor, like: Tensor) -> float | Tensor
         return check_number(name, value)
     if value.ndim > 1 or (like.shape[0] != 1 and value.numel() not in (1, like.shape[0])):
         raise ValueError(f"{name} must be a number or have shape ({like.shape[0]},), got {tuple(value.shape)}")
-    check_all(name, "be finite", value, torch.isfinite)
+    check_values(name, "be finite", value, torch.isfinite)
     return value.to(like.dtype).view(-1, 1, 1, 1)
 
 
@@ -242,7 +242,7 @@ def _quotient(numerator: float, denominator: Tensor) -> Tensor:
 def _unit(value: Tensor, near: float, far: float) -> Tensor:
     if not near < far:
         raise ValueError(f"far must be above near = {near:g}, got {far:g}")
-    check_all("value", "be in [0, 1]", check_floating("value", value), lambda v: (v >= 0) & (v <= 1))
+    check_values("value", "be in [0, 1]", check_floating("value", value), lambda v: (v >= 0) & (v <= 1))
     return value.to(field_dtype(value.dtype))
 
 

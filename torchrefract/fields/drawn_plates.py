@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from torchrefract import _compiled as compiled
-from torchrefract._checks import learns
 from torchrefract._threads import share
+from torchrefract._validation import requires_grad
 from torchrefract.fields.spline import fit_spline, spline_at
 
 _SMALLEST = 1 << 10  # places, from which on it is faster
@@ -31,7 +31,7 @@ def drawn_plates(points: Tensor, displacement: Tensor, smoothing: Tensor, x: Ten
     """
     values, rows, columns = (points, displacement, smoothing), y.shape[2], x.shape[3]
     few = points.shape[1] * rows * columns <= _MOST_KEPT
-    if not few or rows * columns < _SMALLEST or len(points) == 0 or learns(values) or compiled.obstacle(*values):
+    if not few or rows * columns < _SMALLEST or len(points) == 0 or requires_grad(values) or compiled.obstacle(*values):
         return None
     at, soft = points.numpy(), smoothing.numpy()
     if not ((at == at[0]).all() and (soft == soft[0]).all()):

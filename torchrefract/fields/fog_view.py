@@ -8,9 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._bands import join, rows_at_once
-from torchrefract._checks import learns
-from torchrefract._products import product
+from torchrefract._tensor import cat_bands, exact_matmul, rows_at_once
+from torchrefract._validation import requires_grad
 from torchrefract.fields.perlin3d import Rays
 
 SLICES = 48  # of the distance, in which means are kept
@@ -69,7 +68,7 @@ def by_row(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor
     finer = keys(view.across, volume)
     across = torch.lerp(finer[x], finer[x + 1], dx[:, None])
     # The product adds 1, too. Cubics overshoot where the contrast is high.
-    mean = product(F.pad(sum(others, first), (0, 1), value=1.0), F.pad(across, (0, 1), value=1.0).T)
+    mean = exact_matmul(F.pad(sum(others, first), (0, 1), value=1.0), F.pad(across, (0, 1), value=1.0).T)
     return mean.relu_().unsqueeze(1)
 
 
@@ -106,7 +105,7 @@ def finer_places(pixels: int, cell: float, cells: int) -> tuple[np.ndarray, np.n
 
 def by_pixel(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:
     """m for distances (N or 1, 1, H, W)."""
-    volume = product(volume, keys(view.across, volume).T)
+    volume = exact_matmul(volume, keys(view.across, volume).T)
     rows, columns = volume.shape[2:]
     # One slice below the other as an image, the next slice as its second channel.
     pairs = torch.stack([volume[:, :-1], volume[:, 1:]], dim=1).flatten(2, 3)
@@ -116,13 +115,13 @@ def by_pixel(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tens
     )
     x, y = (x - 1).to(volume.dtype), (y - 1).to(volume.dtype)[:, None]
     at_once = view.height
-    if not learns((pairs,)):
+    if not requires_grad((pairs,)):
         at_once = rows_at_once(pairs.device, at_once, each=view.width, cached=_CACHED)
     bands = (
         _looked_up(pairs, band, x, middle, reach)
         for band, middle in zip(distance.split(at_once, dim=2), y.split(at_once), strict=True)
     )
-    return join(bands, dim=2, length=view.height)
+    return cat_bands(bands, dim=2, length=view.height)
 
 
 def _looked_up(pairs: Tensor, distance: Tensor, x: Tensor, y: Tensor, reach: float) -> Tensor:

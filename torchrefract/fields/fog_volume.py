@@ -7,11 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._bands import join
-from torchrefract._checks import learns, or_else, withheld
 from torchrefract._compiled import obstacle
-from torchrefract._constants import constant
-from torchrefract._products import product
+from torchrefract._tensor import as_device_tensor, cat_bands, exact_matmul
+from torchrefract._validation import finite_or, requires_grad, why_not_eager
 from torchrefract.fields import fog_drawn
 from torchrefract.fields.fog_view import SLICES, View, by_pixel, by_row, keys, view
 from torchrefract.fields.perlin3d import VARIANCE, Rays, deviation_of_mean, noise_on_planes
@@ -98,13 +96,13 @@ def path_mean(
         # Matrix products of several samples round in another way than those of one.
         each = zip(distance.expand(len(key), -1, -1, -1).split(1), *(value.split(1) for value in fog), strict=True)
         found = (_path_mean(own, _Fog(*one), d, scales=scales, reach=reach) for d, *one in each)
-        return join(found, dim=0, length=len(key))
+        return cat_bands(found, dim=0, length=len(key))
 
 
 def _may_be_drawn(fog: _Fog, distance: Tensor, *, pixels: int) -> bool:
     """Whether kernels can make the means."""
-    plain = pixels < _FEWEST or learns((distance, *fog)) or obstacle(distance)
-    return not (plain or any(map(withheld, fog)))
+    plain = pixels < _FEWEST or requires_grad((distance, *fog)) or obstacle(distance)
+    return not (plain or any(map(why_not_eager, fog)))
 
 
 def _by_kernel(own: View, fog: _Fog, distance: Tensor, *, scales: Sequence[float], reach: float) -> Tensor:
@@ -117,15 +115,15 @@ def _by_kernel(own: View, fog: _Fog, distance: Tensor, *, scales: Sequence[float
 
 def _path_mean(view: View, fog: _Fog, distance: Tensor, *, scales: Sequence[float], reach: float) -> Tensor:
     volume = _volume(view.rays, fog, scales=scales, reach=reach, dtype=distance.dtype)
-    volume = product(keys(view.down, volume), volume)
-    look_up = by_row if distance.shape[3] == 1 else by_pixel
-    return look_up(view, volume, distance, reach)
+    volume = exact_matmul(keys(view.down, volume), volume)
+    sample_image = by_row if distance.shape[3] == 1 else by_pixel
+    return sample_image(view, volume, distance, reach)
 
 
 def _volume(rays: Rays, fog: _Fog, *, scales: Sequence[float], reach: float, dtype: torch.dtype) -> Tensor:
     """(N, slices + 1, rows, columns): m - 1 along each ray up to the slices d = reach n (n + 1) / (S (S + 1))."""
     excess = _excess(rays, fog, scales=scales, reach=reach, dtype=dtype)
-    mean = product(_quadrature(excess), excess.flatten(2))
+    mean = exact_matmul(_quadrature(excess), excess.flatten(2))
     x, y = rays.slopes(mean.device)
     n = torch.arange(SLICES + 1, dtype=torch.float64, device=mean.device)
     # A ray is longer than its depth, and planes lie at squares.
@@ -152,7 +150,7 @@ def _planes(rays: Rays, scales: tuple[float, ...], reach: float, device: torch.d
     apart = [max(cell * depth, length / _LONGER) for depth, length in zip(depths, lengths, strict=True)]
     counts = tuple(sum(one < _SPARSEST * scale for one in apart) for scale in scales)
     period, apart_m, length_m = (
-        constant(value, dtype=torch.float64, device=device) for value in (scales, apart, lengths)
+        as_device_tensor(value, dtype=torch.float64, device=device) for value in (scales, apart, lengths)
     )
     return _Planes(depths, counts, _damping(apart_m / period[:, None], length_m / period[:, None]))
 
@@ -168,7 +166,7 @@ class _Octaves(NamedTuple):
 
 def _octaves(fog: _Fog, planes: _Planes) -> _Octaves:
     weights, frame = fog.weights.double(), fog.frame.double()
-    contrast = or_else(fog.contrast.double(), 0.0).clamp(0, _MOST_CONTRAST)
+    contrast = finite_or(fog.contrast.double(), 0.0).clamp(0, _MOST_CONTRAST)
     share = weights * (contrast / (VARIANCE * weights.square().sum(dim=1)).sqrt())[:, None]
     amplitude = share[:, :, None] * planes.damping
     half = VARIANCE / 2 * amplitude.square().sum(dim=1)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._bands import join, rows_at_once
+from torchrefract._tensor import cat_bands, rows_at_once
 from torchrefract.fields.covariance import REACH, covariance
 
 _ROUNDING = 5e-13  # of the transform, relative to the largest eigenvalue
@@ -125,7 +125,7 @@ def eigenvalues(
     at_once = rows_at_once(length.device, len(y), each=len(length) * size[1], cached=_CACHED // 2)
     parts = (_on_torus(part, x, size, length, kind) for part in y.split(at_once))
     bands = (_transform(part, -1)[:, :, : most[1]] for part in parts)
-    return _transform(join(bands, dim=1, length=len(y)), -2)[:, : most[0]]
+    return _transform(cat_bands(bands, dim=1, length=len(y)), -2)[:, : most[0]]
 
 
 def _on_torus(y: Tensor, x: Tensor, size: tuple[int, int], length: Tensor, kind: str) -> Tensor:
@@ -193,12 +193,12 @@ def _fields(noise: Tensor, shape: Tensor, height: int, width: int) -> Tensor:
 def _field(noise: Tensor, shape: Tensor, height: int, width: int) -> Tensor:
     rows = noise.shape[2]
     # Rows and then columns at a time stay in the cache, and only what the frame needs is kept of them.
-    half = join(_shaped_rows(noise, shape, width), dim=1, length=rows)
+    half = cat_bands(_shaped_rows(noise, shape, width), dim=1, length=rows)
     bands = (
         torch.view_as_real(torch.fft.fft(band, dim=1)[:, :height]).movedim(-1, 1)
         for band in half.split(_at_once(noise, rows), dim=2)
     )
-    return join(bands, dim=3, length=width)
+    return cat_bands(bands, dim=3, length=width)
 
 
 def _shaped_rows(noise: Tensor, shape: Tensor, width: int) -> Iterator[Tensor]:

@@ -4,9 +4,8 @@ import torch
 from torch import Tensor
 
 from torchrefract import _compiled as compiled
-from torchrefract._bands import rows_at_once
-from torchrefract._checks import is_true, learns
-from torchrefract._constants import constant
+from torchrefract._tensor import as_device_tensor, rows_at_once
+from torchrefract._validation import eager_bool, requires_grad
 from torchrefract.cameras.distortion import (
     Terms,
     distort_polynomial,
@@ -82,7 +81,7 @@ def smooth_lens_flow(
         (B, 2, n, m), px.
     """
     values = coefficients, focal, center, x, y
-    if large and not learns(values) and not compiled.obstacle(*values):
+    if large and not requires_grad(values) and not compiled.obstacle(*values):
         out = coefficients.new_empty(len(coefficients), 2, y.shape[2], x.shape[3])
         arrays = (own.contiguous().numpy() for own in (_kept(coefficients, terms), focal, center))
         places = x.flatten().numpy(), y.flatten().numpy()
@@ -99,7 +98,7 @@ def smooth_lens_flow(
 def _kept(coefficients: Tensor, terms: Terms) -> Tensor:
     """(B, 12): those of the terms, and 0 for the others."""
     flags = [i < terms.radial for i in range(6)] + [terms.tangential] * 2 + [terms.prism] * 4
-    return torch.where(constant(flags, device=coefficients.device), coefficients, 0)
+    return torch.where(as_device_tensor(flags, device=coefficients.device), coefficients, 0)
 
 
 def frame_limit(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> RadialLimit:
@@ -119,16 +118,16 @@ def folds_inside(coefficients: Tensor, focal: Tensor, center: Tensor, *, height:
 def border(focal: Tensor, center: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
     """x and y, (B, 1, 1, N), on the plane z = 1, of points on the border of the frame."""
     steps = torch.linspace(0, 1, _BORDER, dtype=focal.dtype, device=focal.device)
-    ends = constant([0, 1], dtype=focal.dtype, device=focal.device)
+    ends = as_device_tensor([0, 1], dtype=focal.dtype, device=focal.device)
     sides = torch.cat([torch.cartesian_prod(steps, ends), torch.cartesian_prod(ends, steps)])
-    size = constant([width - 1, height - 1], dtype=focal.dtype, device=focal.device)
+    size = as_device_tensor([width - 1, height - 1], dtype=focal.dtype, device=focal.device)
     x, y = ((sides * size - center[:, None]) / focal[:, None])[:, None, None].unbind(-1)
     return x, y
 
 
 def corner_radius(focal: Tensor, center: Tensor, height: int, width: int) -> Tensor:
     """(B,), on the plane z = 1: the distance of the farthest corner of the frame."""
-    size = constant([width - 1, height - 1], dtype=focal.dtype, device=focal.device)
+    size = as_device_tensor([width - 1, height - 1], dtype=focal.dtype, device=focal.device)
     # Half a pixel at least, so that a frame of one pixel has a radius too.
     farthest = torch.maximum(center.abs(), (size - center).abs()).clamp(min=0.5) / focal
     return farthest.square().sum(dim=1).sqrt()
@@ -198,7 +197,7 @@ def _unfolded(x: Tensor, y: Tensor, determinant: Tensor, limit: RadialLimit) -> 
     def everywhere() -> Tensor:
         return ((squared - most).amax() <= 0) & (determinant.amin() > 0) & (determinant.amax() < torch.inf)
 
-    if is_true(everywhere, of=squared):
+    if eager_bool(everywhere, of=squared):
         return torch.ones_like(squared, dtype=torch.bool)
     return (squared <= most) & (determinant > 0) & (determinant < torch.inf)  # no number: nothing is shown there
 
@@ -212,7 +211,7 @@ def _attach(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, c: Tensor, terms: Te
 
 
 def _as_flow(u: Tensor, v: Tensor, exists: Tensor, x: Tensor, y: Tensor, focal: Tensor) -> Tensor:
-    if not is_true(exists.all, of=exists):
+    if not eager_bool(exists.all, of=exists):
         # Where there is no answer, look outward past every frame: padded, never extrapolated.
         u, v = torch.where(exists, u, 2 * REACH * x.detach()), torch.where(exists, v, 2 * REACH * y.detach())
     return torch.cat([u, v], dim=1) * focal[:, :, None, None]

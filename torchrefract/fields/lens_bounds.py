@@ -96,10 +96,10 @@ def _moved_by_terms(ranges: LensRanges, lattice: Lattice) -> tuple[float, ...] |
     powers = [k * r ** (2 * i) for i, k in enumerate(low, start=1)]
     across = 1 + sum(powers)
     along = 1 + sum((2 * i + 1) * power for i, power in enumerate(powers, start=1))
-    covers = r * across - (3 * p + s2) * r**2 - s4 * r**4 >= radius
-    if not covers.any():
+    params_in_range = r * across - (3 * p + s2) * r**2 - s4 * r**4 >= radius
+    if not params_in_range.any():
         return None
-    last = int(covers.argmax())
+    last = int(params_in_range.argmax())
     least = (np.minimum(across, along) - (6 * p + 2 * s2) * r - 4 * s4 * r**3)[: last + 1].min()
     if least < _FLATTEST:
         return None

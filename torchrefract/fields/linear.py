@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._checks import learns, withheld
+from torchrefract._validation import requires_grad, why_not_eager
 
 
 def solve(system: Tensor, right: Tensor) -> Tensor:
@@ -20,7 +20,7 @@ def solve(system: Tensor, right: Tensor) -> Tensor:
     if system.device.type != "cpu" or torch.compiler.is_compiling():
         # solve_ex raises nothing, and so waits for no device.
         return torch.linalg.solve_ex(system, right)[0]
-    if not (learns((system, right)) or withheld(system) or withheld(right)):
+    if not (requires_grad((system, right)) or why_not_eager(system) or why_not_eager(right)):
         return torch.from_numpy(_solved(system.numpy(), right.numpy()))
     return _Solve.apply(system, right)
 

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._bands import by_samples, join, rows_at_once
-from torchrefract._constants import kept
+from torchrefract._tensor import by_samples, cached, cat_bands, rows_at_once
 from torchrefract.fields.gaussian import eigenvalues, root, smoothing
 from torchrefract.fields.modes import Modes, sum_of_modes
 from torchrefract.types import Range
@@ -113,10 +112,10 @@ def _transformed(noise: Tensor, amplitude: Tensor, turns: tuple[Tensor, Tensor],
     # Columns and then rows at a time stay in the cache, and only what is asked for is kept of them.
     at_once = rows_at_once(noise.device, noise.shape[3], each=down.length, cached=_CACHED)
     both = zip(noise.split(at_once, dim=3), amplitude.split(at_once, dim=2), strict=True)
-    rows = join((down.of(_turned(*band, turns[0]).mT) for band in both), dim=1, length=noise.shape[3]).mT
+    rows = cat_bands((down.of(_turned(*band, turns[0]).mT) for band in both), dim=1, length=noise.shape[3]).mT
     at_once = rows_at_once(noise.device, down.number, each=across.length, cached=_CACHED)
     bands = (torch.view_as_real(across.of(band * turns[1])).movedim(-1, 1) for band in rows.split(at_once, dim=1))
-    return join(bands, dim=2, length=down.number).contiguous()
+    return cat_bands(bands, dim=2, length=down.number).contiguous()
 
 
 def _turned(noise: Tensor, amplitude: Tensor, turns: Tensor) -> Tensor:
@@ -142,7 +141,7 @@ def _line(places: Sequence[int], size: int, most: int) -> _Line | None:
     return line if (line.number - 1) * line.every < line.length else None
 
 
-@kept
+@cached
 def _turns(modes: Modes, y: int, x: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """(My, 1) and (Mx,), complex: exp(-2 pi i k p / size) of a row and a column."""
 

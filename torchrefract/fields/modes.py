@@ -9,11 +9,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract import white_noise
-from torchrefract._bands import by_samples
-from torchrefract._checks import learns
 from torchrefract._compiled import kernels, obstacle
-from torchrefract._constants import constant, kept
-from torchrefract._products import product
+from torchrefract._tensor import as_device_tensor, by_samples, cached, exact_matmul
+from torchrefract._validation import requires_grad
 from torchrefract.fields.evolution import turned
 from torchrefract.fields.gaussian import axis_spectrum
 
@@ -79,7 +77,12 @@ def mode_amplitude(
         rows, columns = (axis_spectrum(n, length, aperture)[:, k.abs()].to(dtype) for n, k in sides)
         return rows, columns
     values = (length,) if aperture is None else (length, aperture)
-    if dtype is torch.float32 and math.prod(modes.counts) >= _LARGE and not learns(values) and not obstacle(*values):
+    if (
+        dtype is torch.float32
+        and math.prod(modes.counts) >= _LARGE
+        and not requires_grad(values)
+        and not obstacle(*values)
+    ):
         down, across = (length.new_empty(len(length), count) for count in modes.counts)
         sides, exponent = (own.numpy() for own in _sides(modes, length.device))
         lengths, apertures = (own.contiguous().numpy() for own in (length, values[-1]))
@@ -116,7 +119,7 @@ def mode_field(
         fields: 2, or 1 for the first alone, (B, 1, n, m).
     """
     values = noise, *amplitude
-    if noise.numel() >= _LARGE and not learns(values) and not obstacle(*values):
+    if noise.numel() >= _LARGE and not requires_grad(values) and not obstacle(*values):
         both = noise.new_empty(len(noise), fields, *modes.counts)
         kernels("fields.kernels.modes").folded(*(own.contiguous().numpy() for own in values), both.numpy())
     else:
@@ -137,8 +140,8 @@ def _sum_of(folded: Tensor, modes: Modes, rows: Sequence[int], columns: Sequence
     def fields(pairs: Tensor) -> Tensor:
         # Two products to a sample, of two fields or of two halves: one by itself may round by the threads.
         both = pairs.expand(-1, 2, -1, -1).flatten(0, 1)
-        along = product(both, in_x.expand(len(pairs), 2, -1, -1).flatten(0, 1))
-        found = product(in_y.expand(len(both), -1, -1), along).unflatten(0, (-1, 2))
+        along = exact_matmul(both, in_x.expand(len(pairs), 2, -1, -1).flatten(0, 1))
+        found = exact_matmul(in_y.expand(len(both), -1, -1), along).unflatten(0, (-1, 2))
         return found.transpose(1, 2).flatten(2)[:, None, :, :count] if single else found
 
     return by_samples(folded, fields)
@@ -168,7 +171,7 @@ def _folded(values: Tensor, dim: int) -> Tensor:
     return torch.stack([real, torch.cat([even[:, 1], -odd[:, 0]], dim=dim - 1)], dim=1)
 
 
-@kept
+@cached
 def _waves(
     modes: Modes, rows: tuple[int, ...], columns: tuple[int, ...], parts: int, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor]:
@@ -180,7 +183,7 @@ def _waves(
     def waves(most: int, places: Sequence[int], size: int) -> Tensor:
         # Whole turns are taken out of whole numbers, exactly.
         k = torch.arange(most + 1, device=device)
-        angle = (k[:, None] * constant(places, device=device)).remainder(size).to(dtype) * (2 * math.pi / size)
+        angle = (k[:, None] * as_device_tensor(places, device=device)).remainder(size).to(dtype) * (2 * math.pi / size)
         cosines = torch.cat([torch.full_like(angle[:1], 0.5), angle[1:].cos()])
         return torch.cat([cosines, angle[1:].sin()])
 
@@ -193,14 +196,14 @@ def _numbers(modes: Modes, device: torch.device) -> tuple[Tensor, Tensor]:
     return rows, columns
 
 
-@kept
+@cached
 def _sides(modes: Modes, device: torch.device) -> tuple[Tensor, Tensor]:
     """(2,), px, and (My + Mx,), what the square of a length counts times in the exponent of each root."""
     turns = [-((math.pi / n * k.double()) ** 2) for k, n in zip(_numbers(modes, device), modes.size, strict=True)]
-    return constant(modes.size, dtype=torch.float64, device=device), torch.cat(turns)
+    return as_device_tensor(modes.size, dtype=torch.float64, device=device), torch.cat(turns)
 
 
-@kept
+@cached
 def _places(modes: Modes, device: torch.device) -> Tensor:
     """(My, Mx): where each frequency stands among those of the torus."""
     ky, kx = _numbers(modes, device)

@@ -8,10 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._bands import join
-from torchrefract._checks import learns
-from torchrefract._constants import constant
-from torchrefract._products import product
+from torchrefract._tensor import as_device_tensor, cat_bands, exact_matmul
+from torchrefract._validation import requires_grad
 from torchrefract.fields.perlin_lattice import Octave
 from torchrefract.warping.lattice import Lattice, along_rows, row_weights
 
@@ -75,7 +73,7 @@ def _by_sample(
 
     # Sums of several samples at once might round in another way than those of one.
     parts = (alone(i) for i in range(len(weights)))
-    return join(parts, dim=0, length=len(weights))
+    return cat_bands(parts, dim=0, length=len(weights))
 
 
 class _Lines(NamedTuple):
@@ -97,18 +95,18 @@ def _noise(octaves: Sequence[Octave], weights: Tensor, nodes: Nodes | None) -> T
     band, stripe = _short(min(BAND, height), y_counts, height), _short(_stripe(width), x_counts, width)
     found = [_of_octaves(octaves, weights, band=band, stripe=stripe)] if octaves else []
     found += [] if nodes is None else [_of_nodes(nodes, band=band, stripe=stripe)]
-    table = join(chain(*(each.parts for each in found)), dim=0, length=sum(each.total for each in found))
+    table = cat_bands(chain(*(each.parts for each in found)), dim=0, length=sum(each.total for each in found))
     index, down = found[0].needed, found[0].weight
     for each in found[1:]:
         index, down = torch.cat([index, found[0].total + each.needed], dim=1), torch.cat([down, each.weight], dim=2)
     # A gradient costs one of the whole table each time that bands are looked up in it.
-    few = weights.device.type == "cpu" and not torch.compiler.is_compiling() and not learns((table,))
+    few = weights.device.type == "cpu" and not torch.compiler.is_compiling() and not requires_grad((table,))
     at_once = _AT_ONCE if few else len(down)
     bands = (
-        product(weight, table.index_select(0, numbers.flatten()).view(len(weight), weight.shape[2], -1))
+        exact_matmul(weight, table.index_select(0, numbers.flatten()).view(len(weight), weight.shape[2], -1))
         for weight, numbers in zip(down.split(at_once), index.split(at_once), strict=True)
     )
-    image = join(bands, dim=0, length=len(down))
+    image = cat_bands(bands, dim=0, length=len(down))
     return image.view(batch, -1, image.shape[2])[:, :height, :width].contiguous()
 
 
@@ -145,7 +143,7 @@ def _lines(gradient: Tensor, nodes: Tensor, across: Tensor) -> Tensor:
     batch, _, m, n = gradient.shape
     lane = n * torch.arange(2 * batch, device=nodes.device).view(batch, 2, 1, 1)
     chosen = gradient.mT.reshape(-1, m).index_select(0, (nodes[:, None] + lane).flatten())
-    return product(chosen.unflatten(0, (-1, nodes.shape[2])).mT, across.flatten(0, 2)).flatten(0, 1)
+    return exact_matmul(chosen.unflatten(0, (-1, nodes.shape[2])).mT, across.flatten(0, 2)).flatten(0, 1)
 
 
 def _line_numbers(y: _Blocks, *, lines: Sequence[int], stripes: int) -> Tensor:
@@ -153,7 +151,7 @@ def _line_numbers(y: _Blocks, *, lines: Sequence[int], stripes: int) -> Tensor:
     batch = len(y.node)
     lane = torch.arange(2 * batch * stripes, device=y.node.device).view(batch, 1, 2, 1, stripes)
     ends = [[sum(lines[:i]) for i in range(len(lines))], [count // (2 * batch * stripes) for count in lines]]
-    start, length = _spread(constant(ends, device=y.node.device), y.counts)
+    start, length = _spread(as_device_tensor(ends, device=y.node.device), y.counts)
     return ((y.node + start)[:, :, None, :, None] + length[:, None] * lane).flatten(0, 1).flatten(1)
 
 
@@ -173,7 +171,7 @@ def _columns(octaves: Sequence[Octave]) -> _Beside:
 
 def _beside(positions: Sequence[Tensor], counts: Sequence[int]) -> _Beside:
     position = torch.stack(list(positions), dim=1)
-    last = constant([n - 2 for n in counts], device=position.device)[:, None]
+    last = as_device_tensor([n - 2 for n in counts], device=position.device)[:, None]
     node = position.detach().long().clamp(min=0).minimum(last)
     p = position - node
     fade = p * p * p * (p * (6 * p - 15) + 10)
@@ -189,7 +187,7 @@ def _blocks(beside: _Beside, counts: Sequence[int], *, size: int, dtype: torch.d
     # As evenly spaced pixels cannot need more.
     count = [min(n, math.ceil((size - 1) * (n - 1) / max(1, length - 1) + 1e-6) + 2) for n in counts]
     device = node.device
-    last, start = constant(
+    last, start = as_device_tensor(
         [[n - k for n, k in zip(counts, count, strict=True)], [sum(count[:i]) for i in range(len(count))]],
         device=device,
     )
@@ -197,7 +195,7 @@ def _blocks(beside: _Beside, counts: Sequence[int], *, size: int, dtype: torch.d
     place = (node - first[:, :, None, :, None] + start[:, None, None, None]).movedim(3, 1).flatten(2, 3)
     weight = weight.to(dtype).movedim(4, 2).flatten(3, 4)
     none = weight.new_zeros((batch, 2, blocks, sum(count), size))
-    step = constant([j for k in count for j in range(k)], device=device)
+    step = as_device_tensor([j for k in count for j in range(k)], device=device)
     nodes = _spread(first.mT, count) + step
     return _Blocks(nodes, none.scatter(3, place[:, None].expand_as(weight), weight), count)
 
@@ -205,7 +203,7 @@ def _blocks(beside: _Beside, counts: Sequence[int], *, size: int, dtype: torch.d
 def _spread(values: Tensor, count: Sequence[int]) -> Tensor:
     """(..., S), of each node, from values (..., octaves)."""
     owner = [i for i, k in enumerate(count) for _ in range(k)]
-    return values.index_select(-1, constant(owner, device=values.device))
+    return values.index_select(-1, as_device_tensor(owner, device=values.device))
 
 
 def _padded(values: Tensor, length: int) -> Tensor:

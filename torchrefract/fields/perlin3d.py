@@ -9,8 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract import white_noise
-from torchrefract._constants import constant
-from torchrefract._products import product
+from torchrefract._tensor import as_device_tensor, exact_matmul
 
 # Of the noise below, over all gradients and all places in a cell: each of the 8 nodes adds a third of the mean of
 # (h(p) h(q) h(r))^2 (p^2 + q^2 + r^2); the mean of h^2 is 181 / 462, that of (h p)^2 is 535 / 18018.
@@ -88,13 +87,17 @@ def noise_on_planes(
     device = key.device
     boxes = [rays.box(depths[count - 1] / period) for count, period in zip(planes, periods, strict=True)]
     nodes = [[math.ceil(high - low) + 2 for low, high in box] for box in boxes]
-    low = constant([[end[0] for end in box] for box in boxes], dtype=torch.float64, device=device)
-    period = constant(periods, dtype=torch.float64, device=device)[:, None]
-    step = torch.arange(1, len(periods) + 1, device=device)[:, None] * constant(PHASES, dtype=low.dtype, device=device)
+    low = as_device_tensor([[end[0] for end in box] for box in boxes], dtype=torch.float64, device=device)
+    period = as_device_tensor(periods, dtype=torch.float64, device=device)[:, None]
+    step = torch.arange(1, len(periods) + 1, device=device)[:, None] * as_device_tensor(
+        PHASES, dtype=low.dtype, device=device
+    )
     origin = (key[:, None, :3].double() * 2.0**-32 + step).frac() - moved.double()[:, None] / period
     # The whole coordinates of the first node; float32 suffices for places from there on, wherever the wind has gone.
     first = (origin.detach() + low).floor()
-    axes = _axes(rays, constant(depths, dtype=low.dtype, device=device) / period, origin - first, nodes, amplitude)
+    axes = _axes(
+        rays, as_device_tensor(depths, dtype=low.dtype, device=device) / period, origin - first, nodes, amplitude
+    )
     gradients = _gradients(key, first.long(), nodes, turns, dtype=amplitude.dtype)
 
     def octave(i: int) -> Tensor:
@@ -141,7 +144,7 @@ def _axes(
     columns, rows = rays.slopes(depth.device)
     x, y, z = origin[..., None, None].unbind(2)
     places = (x + depth[..., None] * columns, y + depth[..., None] * rows, z + depth[:, None])
-    last = constant(nodes, dtype=depth.dtype, device=depth.device)[..., None, None] - 2
+    last = as_device_tensor(nodes, dtype=depth.dtype, device=depth.device)[..., None, None] - 2
     x, y, z = (_beside(place, last[:, i], amplitude.dtype) for i, place in enumerate(places))
     factor = amplitude[..., None, None]
     return x, y._replace(hat=y.hat * factor, ramp=y.ramp * factor), z
@@ -162,9 +165,11 @@ def _octave(axes: Sequence[tuple[Tensor, Tensor]], gradients: Sequence[Tensor], 
     (hat_x, ramp_x), (hat_y, ramp_y), z = axes
     hat_z, ramp_z = (matrix[:, 0, :, :planes].mT for matrix in z)
     size = (-1, planes, *gradients[0].shape[2:])
-    gx, gy, gz = (product(z, g.flatten(2)).view(size) for z, g in zip((hat_z, hat_z, ramp_z), gradients, strict=True))
-    along = product(gx, ramp_x) + product(gz, hat_x)
-    return product(hat_y.mT, along) + product(ramp_y.mT, product(gy, hat_x))
+    gx, gy, gz = (
+        exact_matmul(z, g.flatten(2)).view(size) for z, g in zip((hat_z, hat_z, ramp_z), gradients, strict=True)
+    )
+    along = exact_matmul(gx, ramp_x) + exact_matmul(gz, hat_x)
+    return exact_matmul(hat_y.mT, along) + exact_matmul(ramp_y.mT, exact_matmul(gy, hat_x))
 
 
 def _grown(field: Tensor, planes: int) -> Tensor:

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._checks import learns, withheld
 from torchrefract._compiled import SMALLEST, kernels, obstacle
 from torchrefract._threads import share
+from torchrefract._validation import requires_grad, why_not_eager
 from torchrefract.fields.perlin import Nodes, perlin_noise
 from torchrefract.fields.perlin_lattice import Octave, octave, origins
 from torchrefract.warping.lattice import Lattice, lagrange_weights
@@ -56,7 +56,7 @@ def drawn_noise(
         coarse: what else is added.
     """
     values = (*drawn, weights) if coarse is None else (*drawn, weights, coarse.weights)
-    if not (learns(values) or obstacle(weights) or any(map(withheld, values))):
+    if not (requires_grad(values) or obstacle(weights) or any(map(why_not_eager, values))):
         return _by_kernel(drawn, periods, weights, height, width, coarse)
     motion: Any = {"frame": drawn.frame, "wind": drawn.wind, "decorrelation": drawn.decorrelation}
     motion["dtype"] = weights.dtype

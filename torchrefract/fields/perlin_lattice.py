@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true, learns
-from torchrefract._constants import constant
+from torchrefract._tensor import as_device_tensor
+from torchrefract._validation import eager_bool, requires_grad
 from torchrefract.white_noise import lattice
 
 # Multiples of the golden ratio stay away from each other, modulo 1: octaves share no lines of nodes.
@@ -83,7 +83,7 @@ def origins(
 ) -> Tensor:
     """(N, octaves, 2), float64: x and y of the first column and row, in `octave`, of octaves with their periods."""
     known = [[_GOLDEN * (i + 1) for i in indices], list(periods), [start + 0.5 for start in starts]]
-    turn, period, start = constant(known, dtype=torch.float64, device=key.device)[..., None]
+    turn, period, start = as_device_tensor(known, dtype=torch.float64, device=key.device)[..., None]
     phase = (2.0**-32 * key[:, None, :2].double() + turn).frac()
     return (start - (wind.double() * frame.double()[:, None])[:, None]) / period + phase
 
@@ -101,7 +101,7 @@ def _taken(start: Tensor, size: int, step: float) -> tuple[Tensor, Tensor]:
 
 def _turns(key: Tensor, nodes: Sequence[Tensor], *, frame: Tensor, decorrelation: Tensor, dtype: torch.dtype) -> Tensor:
     """(N, n, m), the angles of the gradients over 2 pi."""
-    if not learns((frame, decorrelation)) and is_true((frame / decorrelation == 0).all, of=frame):
+    if not requires_grad((frame, decorrelation)) and eager_bool((frame / decorrelation == 0).all, of=frame):
         return lattice(key, nodes, 1)[:, 0, 0].to(dtype)
     start, speed = lattice(key, nodes, 2)[:, :, 0].unbind(1)
     elapsed = (frame.double() / (math.pi * decorrelation.double()))[:, None, None]

@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_positive
+from torchrefract._validation import check_positive
 from torchrefract.cameras.models import Camera
 from torchrefract.cameras.sheet import columns, image_of, on_plane, radius_within, ray_of
 from torchrefract.fields.lens import REACH, axes_on_plane, border, corner_radius, lens_rows, stacked

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_all, is_true, learns, withheld
 from torchrefract._compiled import kernels
 from torchrefract._threads import share
+from torchrefract._validation import check_values, eager_bool, requires_grad, why_not_eager
 from torchrefract.fields.linear import solve
 from torchrefract.warping.grid import pixel_axes
 
@@ -71,7 +71,7 @@ _System = tuple[Tensor, Tensor, Tensor, Tensor]
 def _system_of(points: Tensor, smoothing: Tensor) -> _System:
     """The points in their own units, center and scale, and the system of all that go there, (B, N + 3, N + 3)."""
     values = points, smoothing
-    if points.numel() > _FEW_POINTS or learns(values) or any(map(withheld, values)):
+    if points.numel() > _FEW_POINTS or requires_grad(values) or any(map(why_not_eager, values)):
         return _made_system(points, smoothing)
     # Drawn plates have the same points in every frame.
     return _kept_system(tuple(points.shape), *(value.numpy().tobytes() for value in values))
@@ -116,7 +116,7 @@ def spline_at(spline: Spline, x: Tensor, y: Tensor, *, dtype: torch.dtype) -> Te
         bent = torch.stack([(weight * kernel).sum(dim=1) for weight in (wu, wv)], dim=1)
         return (torch.stack(_plane(spline.affine, x, y), dim=1) + bent).to(dtype)
     values = spline.points, spline.weights, spline.affine, x, y
-    if not learns(values) and _by_kernel(values):
+    if not requires_grad(values) and _by_kernel(values):
         return _filled(values, dtype)
     return _Lattice.apply(*values, dtype)
 
@@ -133,7 +133,7 @@ def check_points(points: Tensor) -> None:
         raise ValueError(f"points must be at least 3 to a sample, got {points.shape[1]}")
     if points.device.type != "cpu":
         return  # what follows would keep an accelerator busy, or waited for, and is not read
-    check_all("points", "be finite", points, torch.isfinite)
+    check_values("points", "be finite", points, torch.isfinite)
     centered = (points - points.mean(dim=1, keepdim=True)).detach().double()
     extent = centered.norm(dim=2).amax(dim=1)
 
@@ -144,9 +144,9 @@ def check_points(points: Tensor) -> None:
     def spread() -> Tensor:
         return (torch.linalg.svdvals(centered.nan_to_num(0.0, 0.0, 0.0))[:, 1] > _FLATTEST * extent).all()
 
-    if is_true(apart, of=centered) is False:
+    if eager_bool(apart, of=centered) is False:
         raise ValueError("points must differ from one another, got two that are the same")
-    if is_true(spread, of=centered) is False:
+    if eager_bool(spread, of=centered) is False:
         raise ValueError("points must not lie on a line, got a sample whose points do")
 
 
@@ -181,7 +181,7 @@ class _Lattice(torch.autograd.Function):
 def _by_kernel(values: Sequence[Tensor]) -> bool:
     """Whether a kernel can make the flow, and is faster; the places are the last two."""
     large = values[3].shape[2] * values[4].shape[1] >= _SMALLEST
-    return large and not any(map(withheld, values)) and kernels("_jit") is not None
+    return large and not any(map(why_not_eager, values)) and kernels("_jit") is not None
 
 
 def _filled(values: Sequence[Tensor], dtype: torch.dtype) -> Tensor:

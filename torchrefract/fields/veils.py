@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._checks import learns
 from torchrefract._compiled import SMALLEST, gradients_of, kernels, obstacle, with_gradients
 from torchrefract._threads import share
+from torchrefract._validation import requires_grad
 from torchrefract.fields.fog import drifting_transmission_, linear_to_srgb, srgb_to_linear, veil
 
 _LEAST = 87.0  # -ln of the smallest t that kernels tell from 0
@@ -54,9 +54,9 @@ def veiled(image: Tensor, t: Tensor, airlight: Tensor, *, ends: Ends, linear: bo
     plain = not linear and t.shape[3] == 1 and ends.opaque == 0 and ends.clear == 1
     if plain or obstacle(image, t, airlight):
         return _in_pytorch(image, _between(t, ends), airlight, linear=linear)
-    if learns((t, airlight)):
+    if requires_grad((t, airlight)):
         return _learning(image, _between(t, ends), airlight, linear=linear)
-    through = _between(t, ends) if learns((image,)) else t  # for the gradient alone
+    through = _between(t, ends) if requires_grad((image,)) else t  # for the gradient alone
     fill = partial(_filled, _behind(t, ends, linear=linear), linear=linear)
     return _Veiled.apply(fill, linear, image, through, airlight)
 
@@ -74,7 +74,7 @@ def veiled_by_drifts_(
     if obstacle(image, airlight, *drifting):
         t = _transmission_in_pytorch(*drifting, ends=ends)
         return _in_pytorch(image, t, airlight, linear=linear), t
-    if learns((*drifting, airlight)):
+    if requires_grad((*drifting, airlight)):
         t = with_gradients(partial(_transmission, ends=ends), partial(_transmission_in_pytorch, ends=ends), *drifting)
         return _learning(image, t, airlight, linear=linear), t
     noise = drifting.noise.detach().contiguous()

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_all, check_count, check_flag, check_number, check_tensor
+from torchrefract._validation import check_count, check_flag, check_number, check_tensor, check_values
 from torchrefract.labels.points import (
     STEPS,
     TOLERANCE_PX,
@@ -63,7 +63,7 @@ def warp_boxes(
     check_rows("boxes", boxes, flow, 4)
     check_policy(min_area, min_visibility, clip)
     check_count("samples", samples, low=2)
-    check_all("boxes", "have x1 <= x2 and y1 <= y2", boxes[..., 2:] - boxes[..., :2], lambda size: size >= 0)
+    check_values("boxes", "have x1 <= x2 and y1 <= y2", boxes[..., 2:] - boxes[..., :2], lambda size: size >= 0)
     x1, y1, x2, y2 = boxes.unbind(-1)
     corners = torch.stack([x1, y1, x2, y1, x2, y2, x1, y2], dim=-1).unflatten(-1, (4, 2))
     extent = warp_outlines(corners, flow, samples=samples).extent()

@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_choice, check_flag, check_flow, check_number, check_tensor
+from torchrefract._validation import check_choice, check_flag, check_flow, check_number, check_tensor
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import field_dtype, inside
-from torchrefract.warping.resample import look_up
+from torchrefract.warping.resample import sample_image
 
 
 def warp_mask(mask: Tensor, flow: Tensor, *, fill: float = 0, soft: bool = False) -> Tensor:
@@ -133,7 +133,7 @@ def warp_optical_flow(
     valid = valid & inside(there)
     if restore_valid is not None:
         known = _checked_valid(restore_valid, restore_flow)
-        valid = valid & (look_up(known, there, padding="zeros", interpolation="nearest") > 0.5)
+        valid = valid & (sample_image(known, there, padding="zeros", interpolation="nearest") > 0.5)
     moved = compose_flows(restore_flow, there).to(optical_flow.dtype)
     valid = valid & moved.isfinite().all(dim=1, keepdim=True)
     return torch.where(valid, moved, fill), valid
@@ -161,8 +161,8 @@ def _follow(value: Tensor, flow: Tensor, interpolation: str) -> tuple[Tensor, Te
     """The map looked up, and where the nearest pixel lies on the frame."""
     flow = _beside(value, flow)
     everywhere = torch.ones_like(flow[:, :1])
-    on_frame = look_up(everywhere, flow, padding="zeros", interpolation="nearest") > 0.5
-    return look_up(value, flow, padding="border", interpolation=interpolation), on_frame
+    on_frame = sample_image(everywhere, flow, padding="zeros", interpolation="nearest") > 0.5
+    return sample_image(value, flow, padding="border", interpolation=interpolation), on_frame
 
 
 def _check_map(what: str, value: Tensor, flow: Tensor, *, name: str = "flow") -> None:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_count, check_flow, check_positive, check_tensor
+from torchrefract._validation import check_count, check_flow, check_positive, check_tensor
 from torchrefract.warping.grid import field_dtype
 
 # Newton steps: smooth flows take 6, and those that nearly fold gain little beyond 16.

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from torchrefract._checks import check_choice, check_flag, check_tensor, is_true
+from torchrefract._validation import check_choice, check_flag, check_tensor, eager_bool
 from torchrefract.labels.boxes import check_policy, warp_boxes, warp_outlines
 from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.points import STEPS, TOLERANCE_PX, check_rows, land, on_frame
@@ -122,12 +122,12 @@ def _warp_target(target: Any, flow: Tensor, options: _Options, labels_getter: An
 
 def _warp_sample(sample: Any, flow: Tensor, options: _Options, labels_getter: Any) -> Any:
     still = (flow == 0).flatten(-3).all(dim=-1) if options.leave else None
-    if still is not None and is_true(still.all, of=still):
+    if still is not None and eager_bool(still.all, of=still):
         return sample
     pairs, spec = pytree.tree_flatten_with_path(sample)
     paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]
     moved = [_move(leaf, flow, options) for leaf in leaves]
-    if still is not None and is_true(still.any, of=still) is not False:
+    if still is not None and eager_bool(still.any, of=still) is not False:
         moved = [_left(leaf, one, still) for leaf, one in zip(leaves, moved, strict=True)]
     values = [one.value for one in moved]
     for i, one in enumerate(moved):

@@ -9,8 +9,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from torchrefract._errors import UsageError
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
+from torchrefract._validation import UsageError
 from torchrefract.data.pair_files import DamagedPairError
 from torchrefract.data.pair_manifest import PairRow, Place, lines_of, manifests, read_stored, scan
 
@@ -59,7 +59,7 @@ class Ledger:
         self._write([(row.number, place) for row, place in scan([self.path], lambda _: True, torn=True)])
 
     def _write(self, places: Sequence[tuple[int, Place]]) -> None:
-        with replacing(self.path, alone=True) as temporary, temporary.open("wb") as stream:
+        with replace_file(self.path, alone=True) as temporary, temporary.open("wb") as stream:
             stream.writelines(lines_of(place for _, place in sorted(places)))
 
     def _there(self, row: PairRow) -> bool:
@@ -113,7 +113,7 @@ def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[
         raise UsageError(f"out must be a new folder or one of this command, got {out}, which holds {others[0]}")
     document = {"settings": wanted, "count": count, **about}
     if document != before:
-        with replacing(path) as temporary:
+        with replace_file(path) as temporary:
             temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     return before
 

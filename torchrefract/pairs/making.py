@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from torchrefract._command import naming
-from torchrefract._errors import UsageError
+from torchrefract._validation import UsageError
 from torchrefract.data.images import UnreadableImageError, pixels_of
 from torchrefract.data.pair_files import FLOWS, LIGHTS, PairArrays, beyond, encode_pair
 from torchrefract.data.pair_manifest import PairRow, Stored
@@ -96,7 +96,7 @@ def acting(effect: Effect, params: Any) -> list[dict[str, Any]]:
     leaves = effect.leaves(params) if isinstance(effect, Compose) else [(effect, params)]
     found = []
     for leaf, own in leaves:
-        if own.gate[0]:
+        if own.applied[0]:
             values = {name: _plain(value[0].tolist()) for name, value in own._asdict().items() if name != "gate"}
             found.append({"effect": type(leaf).__name__} | values)
     return found

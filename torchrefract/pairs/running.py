@@ -13,8 +13,8 @@ from multiprocessing.context import BaseContext
 import cv2
 import torch
 
-from torchrefract._errors import UsageError
 from torchrefract._memory import keep_freed_memory
+from torchrefract._validation import UsageError
 from torchrefract.data.pair_manifest import PairRow
 from torchrefract.pairs.making import Job, Maker, Recipe
 from torchrefract.pairs.writing import Store

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.data.pair_manifest import PairRow, pair_name
 from torchrefract.pairs.making import Job, Made, Maker
 
@@ -56,7 +56,7 @@ class Folders(Store):
         files = {}
         for suffix, data in made.data.items():
             file = made.row.files[suffix]._replace(path=f"{folder}/{made.row.name}.{suffix}")
-            with replacing(self.out / file.path, alone=True) as temporary:
+            with replace_file(self.out / file.path, alone=True) as temporary:
                 temporary.write_bytes(data)
             files[suffix] = file
         return made.row._replace(files=files)
@@ -77,7 +77,7 @@ class Tars(Store):
         target = self.out / path
         target.parent.mkdir(parents=True, exist_ok=True)
         with (
-            replacing(target, alone=True) as temporary,
+            replace_file(target, alone=True) as temporary,
             tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar,
         ):
             return [_add_pair(tar, maker.make(job), path) for job in jobs]

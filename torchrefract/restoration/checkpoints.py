@@ -13,8 +13,8 @@ from pytorch_lightning import Callback, LightningModule, Trainer
 from pytorch_lightning.plugins.io import TorchCheckpointIO
 from torch import nn
 
-from torchrefract._errors import UsageError
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
+from torchrefract._validation import UsageError
 
 # What a damaged archive, or a file that is none, makes the readers raise.
 _DAMAGE = (zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, EOFError, LookupError, OSError, RuntimeError)
@@ -33,7 +33,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         path = Path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with replacing(path) as temporary:
+            with replace_file(path) as temporary:
                 torch.save(checkpoint, temporary)
         # torch reports a disk that is full while it writes as a RuntimeError of its archive writer.
         except (OSError, RuntimeError) as error:

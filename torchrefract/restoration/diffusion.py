@@ -9,7 +9,7 @@ from pytorch_lightning.callbacks import WeightAveraging
 from pytorch_lightning.trainer.states import TrainerFn
 from torch import Tensor, nn
 
-from torchrefract._checks import check_choice, check_count, check_number
+from torchrefract._validation import check_choice, check_count, check_number
 from torchrefract.draws import Stream, stream, uniform
 from torchrefract.restoration.metrics import masked_mean
 from torchrefract.restoration.models.denoiser import conditions

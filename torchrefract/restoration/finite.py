@@ -4,7 +4,7 @@ import math
 
 from torch import Tensor
 
-from torchrefract._errors import UsageError
+from torchrefract._validation import UsageError
 
 
 class NotFiniteError(UsageError):

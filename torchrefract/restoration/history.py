@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 
 METRICS, BEFORE = "metrics.csv", "metrics_before.csv"
 
@@ -24,7 +24,7 @@ def carry_over(stopped: Path, run: Path, *, before_epoch: int) -> None:
     names = list(dict.fromkeys(name for row in kept for name in row))
     if not kept:
         return
-    with replacing(run / BEFORE) as path, path.open("w", newline="") as file:
+    with replace_file(run / BEFORE) as path, path.open("w", newline="") as file:
         writer = csv.DictWriter(file, names, restval="")
         writer.writeheader()
         writer.writerows(kept)

@@ -9,7 +9,7 @@ from pytorch_lightning import LightningModule
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import ReduceLROnPlateau
 
-from torchrefract._checks import check_choice, check_count, check_number, check_size
+from torchrefract._validation import check_choice, check_count, check_number, check_size
 from torchrefract.restoration.finite import check_finite
 from torchrefract.restoration.metrics import endpoint_error, psnr, ssim
 from torchrefract.restoration.schedules import SCHEDULES, schedule

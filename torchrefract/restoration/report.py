@@ -14,7 +14,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.page import Page, as_drawn
 from torchrefract.restoration.history import metrics_rows
 from torchrefract.viz import flow_to_rgb, flow_wheel, full_color_px, hatch_invalid
@@ -49,7 +49,7 @@ def save_curves(run: Path, out: Path, *, epe_unit: str = "px") -> None:
         epe_unit: the unit of the endpoint error, with the image size that it holds for: "px at 1920x1080".
     """
     figure = _curves(run, epe_unit=epe_unit)
-    with replacing(out) as path:
+    with replace_file(out) as path:
         figure.savefig(path)
 
 
@@ -143,7 +143,7 @@ def save_panel(rows: PanelRows, out: Path) -> None:
         out: the picture to write; the suffix is its format.
     """
     figure = _panel(rows)
-    with replacing(out) as path:
+    with replace_file(out) as path:
         figure.savefig(path)
 
 

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torchrefract._checks import check_choice, check_count
+from torchrefract._validation import check_choice, check_count
 from torchrefract.restoration.tasks import Restored
 from torchrefract.restoration.tiles import in_tiles
 from torchrefract.warping.resample import INTERPOLATIONS, warp

@@ -8,7 +8,7 @@ from diffusers import DDPMScheduler, DPMSolverMultistepScheduler
 from torch import Tensor
 
 from torchrefract import white_noise
-from torchrefract._checks import check_choice, check_count
+from torchrefract._validation import check_choice, check_count
 from torchrefract.draws import Stream, noise_key
 
 SAMPLERS = ("ddpm", "ddim", "dpm_solver")

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from torchrefract._constants import constant
+from torchrefract._tensor import as_device_tensor
 from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
 from torchrefract.types import Pair
 from torchrefract.warping.resample import warp
@@ -61,7 +61,7 @@ class FlowTarget(Target):
         return Restored(warp(degraded, flow, padding="border")[0], flow)
 
     def _unit(self, like: Tensor, size: Sequence[int]) -> Tensor:
-        return self.limit * constant([size[1], size[0]], dtype=like.dtype, device=like.device).view(1, 2, 1, 1)
+        return self.limit * as_device_tensor([size[1], size[0]], dtype=like.dtype, device=like.device).view(1, 2, 1, 1)
 
 
 class ImageTarget(Target):

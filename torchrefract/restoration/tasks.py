@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._checks import check_flag
+from torchrefract._validation import check_flag
 from torchrefract.restoration.metrics import masked_mean
 from torchrefract.types import Pair
 from torchrefract.warping.resample import warp

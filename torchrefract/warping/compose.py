@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_flow
+from torchrefract._validation import check_flow
 from torchrefract.warping.grid import field_dtype
-from torchrefract.warping.resample import look_up
+from torchrefract.warping.resample import sample_image
 
 
 def compose_flows(first: Tensor, then: Tensor) -> Tensor:
@@ -31,4 +31,4 @@ def compose_flows(first: Tensor, then: Tensor) -> Tensor:
         raise ValueError(f"then must have the shape of first, {tuple(first.shape)}, got {tuple(then.shape)}")
     dtype = field_dtype(torch.promote_types(first.dtype, then.dtype))
     first, then = first.to(dtype), then.to(dtype)
-    return then + look_up(first, then, padding="border", interpolation="bilinear")
+    return then + sample_image(first, then, padding="border", interpolation="bilinear")

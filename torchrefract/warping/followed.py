@@ -11,15 +11,15 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract import _compiled as compiled
-from torchrefract._checks import learns
-from torchrefract._constants import constant
+from torchrefract._tensor import as_device_tensor
 from torchrefract._threads import share
+from torchrefract._validation import requires_grad
 from torchrefract.warping.grid import FAR, finite, pixel_axes, sampler_axes
 from torchrefract.warping.grid_sample import by_grid_sample
-from torchrefract.warping.lattice import FARTHEST, Lines, SmoothFlow, StreamFlow, lagrange_weights, once
+from torchrefract.warping.lattice import FARTHEST, LatticeFlow, Lines, StreamFlow, lagrange_weights, once
 
 # A flow that is read: known at every pixel, (B, 2, H, W), px, lines between, or on a lattice, cubics between.
-Read = Tensor | SmoothFlow
+Read = Tensor | LatticeFlow
 Size = tuple[int, int]
 Reading = tuple[np.ndarray, np.ndarray, np.ndarray, Size]
 _WIDEST = 32  # nodes in a row that kernels read together
@@ -34,7 +34,11 @@ def followed(flow: Read, grid: Tensor) -> Tensor:
     if len(values) != len(grid):  # F.grid_sample raises, too; a kernel would read what is not there
         raise ValueError(f"grid must have a row for each of {len(values)} flows, got {len(grid)}")
     size, far = (values.shape[2], values.shape[3]), _far(flow)
-    if learns((values, grid)) or grid.shape[1] * grid.shape[2] < compiled.SMALLEST or compiled.obstacle(values, grid):
+    if (
+        requires_grad((values, grid))
+        or grid.shape[1] * grid.shape[2] < compiled.SMALLEST
+        or compiled.obstacle(values, grid)
+    ):
         return _moved(grid, _at(values, grid), size=size, far=far)
     before = grid.movedim(-1, 1).contiguous()
     out = torch.empty_like(before)
@@ -62,7 +66,7 @@ class FollowedFlow:
     followed.
     """
 
-    last: SmoothFlow
+    last: LatticeFlow
     earlier: tuple[Read, ...]  # of the same batch; the later ones first
 
     @property
@@ -180,18 +184,18 @@ def _addresses(values: Tensor, px: int) -> list[int]:
 
 
 def _at_pixels(flow: Read) -> Tensor:
-    if isinstance(flow, SmoothFlow):
+    if isinstance(flow, LatticeFlow):
         return once(flow, lambda own: own.dense())
     return flow if flow[:1].is_contiguous() else flow.contiguous()
 
 
 def _in_memory(flow: Read) -> tuple[Tensor, int]:
     """What kernels read of a flow, and the stride of its nodes, 0 for pixels."""
-    if not isinstance(flow, SmoothFlow) or isinstance(flow, StreamFlow):
+    if not isinstance(flow, LatticeFlow) or isinstance(flow, StreamFlow):
         return _at_pixels(flow), 0
     few = max(0, _WIDEST - flow.nodes.shape[3])
 
-    def wide(own: SmoothFlow) -> Tensor:
+    def wide(own: LatticeFlow) -> Tensor:
         return (F.pad(own.nodes, (0, few)) if few else own.nodes).contiguous(memory_format=_form())
 
     return once(flow, wide), flow.lattice.stride
@@ -205,7 +209,7 @@ def _form() -> torch.memory_format:
 
 def _far(flow: Read) -> float:
     """Where a sum with it lies within, in the sampler's coordinates."""
-    return FARTHEST if isinstance(flow, SmoothFlow) else FAR
+    return FARTHEST if isinstance(flow, LatticeFlow) else FAR
 
 
 def _at(values: Tensor, grid: Tensor) -> Tensor:
@@ -217,6 +221,6 @@ def _moved(grid: Tensor, by: Tensor, *, size: Size, far: float) -> Tensor:
     """The grid, moved by so many px, (B, 2, n, m)."""
     height, width = size
     both = torch.addcmul(
-        grid, by.movedim(1, -1), constant((2 / width, 2 / height), dtype=grid.dtype, device=grid.device)
+        grid, by.movedim(1, -1), as_device_tensor((2 / width, 2 / height), dtype=grid.dtype, device=grid.device)
     )
     return both if far == FARTHEST else finite(both, far)

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from torchrefract import _compiled as compiled
-from torchrefract._checks import learns, withheld
+from torchrefract._tensor import is_channels_last
 from torchrefract._threads import share
+from torchrefract._validation import requires_grad, why_not_eager
 from torchrefract.warping.followed import FollowedFlow, of_lines
 from torchrefract.warping.grid import FAR, Positions, pixel_axes, sampler_axes
 from torchrefract.warping.grid_sample import PADDINGS, by_grid_sample, gradients_by_grid_sample
-from torchrefract.warping.lattice import SmoothFlow
-from torchrefract.warping.layout import is_channels_last
+from torchrefract.warping.lattice import LatticeFlow
 from torchrefract.warping.mixed import Flow, MixedFlow, PartFlow, grid_of, known
 
 _MOST_BANDS = 4  # of a frame whose gradient is scattered: each of them has a frame of its own
@@ -30,7 +30,7 @@ def obstacle(source: Tensor, flow: Flow | Positions, *, interpolation: str) -> s
         return f"for {interpolation} interpolation"
     positions = flow.grid if isinstance(flow, Positions) else known(flow)
     if source.dtype is torch.uint8:
-        return withheld(source) or compiled.obstacle(positions)
+        return why_not_eager(source) or compiled.obstacle(positions)
     return compiled.obstacle(source, positions)
 
 
@@ -40,7 +40,7 @@ def looked_up(source: Tensor, flow: Flow | Positions, *, padding: str) -> Tensor
     A grid of positions may have another size than the source. Bytes are rounded to the nearest; nothing may learn from
     them.
     """
-    if not learns((source, flow)):
+    if not requires_grad((source, flow)):
         return _filled(source, flow, padding)
     grid = None
     if flow.requires_grad:
@@ -126,7 +126,7 @@ def _along(flow: PartFlow | Positions, rows: int) -> tuple[str, tuple[Any, ...]]
     values, flows = compiled.of_batch(flow.grid.movedim(-1, 1) if isinstance(flow, Positions) else known(flow))
     if len(flows) != rows:  # F.grid_sample raises, too; a kernel would read what is not there
         raise ValueError(f"flow must have a row for each of {rows} images, got {len(flows)}")
-    if isinstance(flow, SmoothFlow):
+    if isinstance(flow, LatticeFlow):
         return "lattice", of_lines(flow.with_nodes(values).lines(values.dtype), flows)
     return "dense", _of_pixels(values, flows, whole=isinstance(flow, Positions))
 

@@ -11,8 +11,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
-from torchrefract._constants import constant
-from torchrefract._products import product
+from torchrefract._tensor import as_device_tensor, exact_matmul
 from torchrefract.warping.grid import finite, pixel_axes, sampler_positions
 from torchrefract.warping.grid_sample import PADDINGS, gradients_by_grid_sample
 from torchrefract.warping.lattice import FARTHEST
@@ -43,7 +42,7 @@ def look_up_lattice(
     channels: tl.constexpr,
     taps: tl.constexpr,
     shared: tl.constexpr,
-    gated: tl.constexpr,
+    masked_flow: tl.constexpr,
     padding: tl.constexpr,
     rows: tl.constexpr,
     columns: tl.constexpr,
@@ -74,7 +73,7 @@ def look_up_lattice(
     x = tl.program_id(0) * columns + tl.arange(0, columns)
     inside = x < width
     moved = inside
-    if gated:
+    if masked_flow:
         moved = inside & (tl.zeros((columns,), tl.int32) + tl.load(active + sample) != 0)
     parts = tl.cdiv(stride, rows)
     cell, place = tl.program_id(1) // parts, tl.program_id(1) % parts * rows
@@ -107,7 +106,7 @@ def look_up_lattice(
             u += tl.load(weight + tap) * known_u[tap]
             v += tl.load(weight + stride * taps + tap) * known_v[tap]
         to_x, to_y = _padded(x + u, width, padding), _padded(y + v, height, padding)
-        if gated:
+        if masked_flow:
             to_x = tl.where(moved, to_x, x.to(tl.float32))
             to_y = tl.where(moved, to_y, y.to(tl.float32))
 
@@ -121,18 +120,18 @@ def look_up_lattice(
         base = sample * batch_step
         if channels <= 4:
             for _ in tl.static_range(channels):
-                value = _mixed(source + base, first, row_step, column_step, hits, shares, moved, gated)
+                value = _mixed(source + base, first, row_step, column_step, hits, shares, moved, masked_flow)
                 tl.store(out + base + own, value, inside)
                 base += channel_step
         else:
             for _ in range(channels):
-                value = _mixed(source + base, first, row_step, column_step, hits, shares, moved, gated)
+                value = _mixed(source + base, first, row_step, column_step, hits, shares, moved, masked_flow)
                 tl.store(out + base + own, value, inside)
                 base += channel_step
 
 
 @triton.jit
-def _mixed(plane, first, row_step, column_step, hits, shares, moved, gated: tl.constexpr):
+def _mixed(plane, first, row_step, column_step, hits, shares, moved, masked_flow: tl.constexpr):
     """What four pixels of a plane amount to, of which `first` is the upper left; it alone, if nothing is moved."""
     right, lower = shares
     upper_left = tl.load(plane + first, hits[0], 0.0)
@@ -140,7 +139,7 @@ def _mixed(plane, first, row_step, column_step, hits, shares, moved, gated: tl.c
     value += tl.load(plane + column_step + first, hits[1], 0.0) * (right * (1.0 - lower))
     value += tl.load(plane + row_step + first, hits[2], 0.0) * ((1.0 - right) * lower)
     value += tl.load(plane + (row_step + column_step) + first, hits[3], 0.0) * (right * lower)
-    return tl.where(moved, value, upper_left) if gated else value
+    return tl.where(moved, value, upper_left) if masked_flow else value
 
 
 @triton.jit
@@ -183,7 +182,7 @@ def _look_up_lattice(
         channels=channels,
         taps=taps,
         shared=nodes.shape[1] == 1,
-        gated=active is not None,
+        masked_flow=active is not None,
         padding=padding,
         rows=_ROWS,
         columns=_COLUMNS,
@@ -201,7 +200,7 @@ def _gradients(ctx: Any, gradient: Tensor) -> Any:
     source, nodes, across, down, active = ctx.saved_tensors
     height, width = source.shape[2:]
     over, under = matrix_of(across, nodes.shape[3], width), matrix_of(down, nodes.shape[2], height)
-    flow = product(product(under, nodes), over.mT)
+    flow = exact_matmul(exact_matmul(under, nodes), over.mT)
     axes = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
     positions = finite(sampler_positions(flow, *axes, height=height, width=width), FARTHEST)
     grid = positions.movedim(1, -1).expand(len(source), -1, -1, -1)
@@ -213,9 +212,9 @@ def _gradients(ctx: Any, gradient: Tensor) -> Any:
         of_source = torch.where(acts, of_source, gradient)
     of_nodes = None
     if of_grid is not None:
-        scale = constant([2 / width, 2 / height], dtype=of_grid.dtype, device=of_grid.device).view(2, 1, 1)
+        scale = as_device_tensor([2 / width, 2 / height], dtype=of_grid.dtype, device=of_grid.device).view(2, 1, 1)
         of_flow = of_grid.movedim(-1, 1) * scale
-        of_nodes = product(product(under.mT, of_flow), over)
+        of_nodes = exact_matmul(exact_matmul(under.mT, of_flow), over)
         of_nodes = of_nodes.sum(dim=0, keepdim=True) if len(nodes) < len(of_nodes) else of_nodes
         of_nodes = of_nodes.sum(dim=1, keepdim=True) if nodes.shape[1] < 2 else of_nodes
     return of_source, of_nodes, None, None, None, None

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._checks import is_true, read
+from torchrefract._validation import eager_bool, eager_values
 
 # F.grid_sample spans [-1, 1]; four of these lie well outside whatever the padding, and keep every product finite.
 FAR = 4.0
@@ -73,7 +73,9 @@ def near_border(flow: Tensor, depth: int, at: Callable[[slice, slice], Tensor]) 
         at: from rows and columns of the frame to (B, 1, n, m), bool.
     """
     (height, width), everywhere = flow.shape[2:], slice(None)
-    farthest = read(lambda: torch.stack(flow.detach().aminmax()).abs().amax(), of=flow) if flow.numel() else None
+    farthest = (
+        eager_values(lambda: torch.stack(flow.detach().aminmax()).abs().amax(), of=flow) if flow.numel() else None
+    )
     if farthest is None or not farthest < min(height, width):  # nor is NaN
         return at(everywhere, everywhere)
     depth += math.ceil(farthest)
@@ -172,6 +174,8 @@ def mirror(place: np.ndarray, size: int) -> None:
 def finite(positions: Tensor, limit: float) -> Tensor:
     """The positions within a limit; what is no number lies there."""
     # One NaN in a grid with border padding ends the process in the sampler's backward.
-    if positions.numel() == 0 or is_true(lambda: torch.stack(positions.aminmax()).abs().amax() <= limit, of=positions):
+    if positions.numel() == 0 or eager_bool(
+        lambda: torch.stack(positions.aminmax()).abs().amax() <= limit, of=positions
+    ):
         return positions
     return positions.nan_to_num(nan=limit, posinf=limit, neginf=-limit).clamp(-limit, limit)

@@ -5,12 +5,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._checks import check_count, check_flow, check_positive, is_true, read
 from torchrefract._compiled import SMALLEST, obstacle
+from torchrefract._validation import check_count, check_flow, check_positive, eager_bool, eager_values
 from torchrefract.warping.fused_newton import solved
 from torchrefract.warping.grid import field_dtype, inside, pixel_axes, sampler_axes, squared_length
 from torchrefract.warping.jacobian import Jacobian
-from torchrefract.warping.resample import look_up, sampled, sampler_dtype
+from torchrefract.warping.resample import sample_image, sampled, sampler_dtype
 
 # Px: a residual that calls for no further step.
 _NEAR = {torch.float32: 1e-3, torch.float64: 1e-9}
@@ -63,7 +63,7 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
     flow = flow.to(field_dtype(flow.dtype))
     if flow.numel() == 0:
         return flow.clone(), flow[:, :1] == 0, flow[:, :1].clone()
-    whole = is_true(lambda: torch.stack(flow.detach().aminmax()).abs().amax() <= _FARTHEST, of=flow)
+    whole = eager_bool(lambda: torch.stack(flow.detach().aminmax()).abs().amax() <= _FARTHEST, of=flow)
     known = None if whole else (flow.abs() <= _FARTHEST).all(dim=1, keepdim=True)
     flow = flow if known is None else torch.where(known, flow, 0)
     with torch.no_grad():
@@ -163,7 +163,7 @@ def _solved(flow: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor | None]:
 
     That is (B, 1, H, W), bool, or None for everywhere.
     """
-    if read(lambda: flow[0, 0, 0, 0]) is None:
+    if eager_values(lambda: flow[0, 0, 0, 0]) is None:
         return _ended(_masked(flow, steps))
     if flow.shape[2] * flow.shape[3] >= SMALLEST and obstacle(flow) is None:
         return solved(flow, steps, at_once=_AT_ONCE, near=_NEAR[flow.dtype], farthest=_FARTHEST, upright=_UPRIGHT)
@@ -221,7 +221,7 @@ def _begun(flow: Tensor) -> tuple[_Pixels, _Fields, _Newton]:
     sheet = _jacobian(fields.along, fields.across)
     determinant = sheet.determinant
     # Where it is at every pixel, what is read between them is above zero, too.
-    if not is_true(lambda: determinant.amin() >= _UPRIGHT, of=determinant):
+    if not eager_bool(lambda: determinant.amin() >= _UPRIGHT, of=determinant):
         fields = fields._replace(flow=torch.cat([flow, determinant], dim=1))
         upright = determinant >= _UPRIGHT
         flat = Jacobian(*(torch.where(upright, own, still) for own, still in zip(sheet, (1, 0, 0, 1), strict=True)))
@@ -243,7 +243,7 @@ def _slopes(flow: Tensor, dim: int) -> Tensor:
     count = flow.shape[dim]
     if count == 1:
         return torch.zeros_like(flow)
-    if read(lambda: flow[0, 0, 0, 0]) is None:
+    if eager_values(lambda: flow[0, 0, 0, 0]) is None:
         return torch.gradient(flow, dim=dim)[0]
     # The same, without the copies on its way.
     slopes, inner = torch.empty_like(flow), count - 2
@@ -271,7 +271,7 @@ def _sampled(field: Tensor, grid: Tensor) -> Tensor:
 
 def _read(field: Tensor, at: Tensor) -> Tensor:
     """A field (B, C, H, W) at p + at(p)."""
-    return look_up(field, at, padding="border", interpolation="bilinear")
+    return sample_image(field, at, padding="border", interpolation="bilinear")
 
 
 def _jacobian(along: Tensor, across: Tensor) -> Jacobian:

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._checks import check_flow
+from torchrefract._validation import check_flow
 from torchrefract.types import Folding
 
 

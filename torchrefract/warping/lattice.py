@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._constants import assume_constant_result, constant, kept
+from torchrefract._tensor import as_device_tensor, assume_constant_result, cached
 from torchrefract.warping.grid import finite, pixel_axes, sampler_axes, sampler_positions
 from torchrefract.warping.sums import across, across_twice, down, matrix_of
 
@@ -78,7 +78,7 @@ def lagrange_weights(stride: int, count: int, *, dtype: torch.dtype, device: tor
     Of the polynomial through the nodes at 1 - count / 2 ... count / 2.
     """
     # From numbers, which an accelerator need not be waited for to have.
-    return constant(_lagrange(stride, count), dtype=dtype, device=device)
+    return as_device_tensor(_lagrange(stride, count), dtype=dtype, device=device)
 
 
 def slope_weights(stride: int, count: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -109,7 +109,7 @@ class Lines(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SmoothFlow:
+class LatticeFlow:
     """A flow that is known at the nodes of a lattice, and by `between_nodes` everywhere."""
 
     nodes: Tensor  # (B, 2, n, m), px
@@ -126,15 +126,15 @@ class SmoothFlow:
         """Whether the nodes have a gradient."""
         return self.nodes.requires_grad
 
-    def detach(self) -> "SmoothFlow":
+    def detach(self) -> "LatticeFlow":
         """The same flow without its gradient."""
         return self.with_nodes(self.nodes.detach())
 
-    def with_nodes(self, nodes: Tensor) -> "SmoothFlow":
+    def with_nodes(self, nodes: Tensor) -> "LatticeFlow":
         """The same flow with other nodes."""
         return replace(self, nodes=nodes)
 
-    def rows(self, index: Tensor) -> "SmoothFlow":
+    def rows(self, index: Tensor) -> "LatticeFlow":
         """Some rows of the batch."""
         return self.with_nodes(self.nodes[index])
 
@@ -161,7 +161,7 @@ class SmoothFlow:
         return Lines(values, weight.expand(2, -1, -1), height)
 
 
-class StreamFlow(SmoothFlow):
+class StreamFlow(LatticeFlow):
     """The curl of a stream function that is known at the nodes of a lattice, (B, 1, n, m), px^2.
 
         flow = (D_y psi, -D_x psi) of psi between nodes, by polynomials through six of them along each axis
@@ -194,7 +194,7 @@ class StreamFlow(SmoothFlow):
         return across_twice(nodes, (first, second), self.lattice.width), between
 
 
-def once(flow: SmoothFlow, work: Callable[[SmoothFlow], Tensor]) -> Tensor:
+def once(flow: LatticeFlow, work: Callable[[LatticeFlow], Tensor]) -> Tensor:
     """What is made of a flow, (B, ...), once where all its rows are one, as for the frames of a clip."""
     nodes = flow.nodes
     if len(nodes) < 2 or nodes.stride(0) != 0:
@@ -202,7 +202,7 @@ def once(flow: SmoothFlow, work: Callable[[SmoothFlow], Tensor]) -> Tensor:
     return work(flow.with_nodes(nodes[:1])).expand(len(nodes), -1, -1, -1)
 
 
-@kept
+@cached
 def _curl_weights(
     stride: int, scale: tuple[float, float], dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor]:

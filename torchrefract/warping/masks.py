@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from torchrefract._checks import read
+from torchrefract._validation import eager_values
 from torchrefract.warping.grid import near_border, pixel_axes, sampler_grid_at
 from torchrefract.warping.resample import sampled, sampler_dtype
 
@@ -35,8 +35,8 @@ def _rim(good: Tensor) -> int | None:
     height, width = good.shape[2:]
     if good.numel() == 0:
         return None
-    across = read(lambda: good[:, 0, height // 2].amin(dim=0), of=good)
-    down = read(lambda: good[..., width // 2].amin(dim=0)[0], of=good)
+    across = eager_values(lambda: good[:, 0, height // 2].amin(dim=0), of=good)
+    down = eager_values(lambda: good[..., width // 2].amin(dim=0)[0], of=good)
     if across is None or down is None or not (1 in across and 1 in down):
         return None
     rim = max(max(line.index(1), line[::-1].index(1)) for line in (across, down))

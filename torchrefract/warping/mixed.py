@@ -7,12 +7,12 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from torchrefract._bands import in_place
+from torchrefract._tensor import scatter_batch
 from torchrefract.warping.followed import FollowedFlow
 from torchrefract.warping.grid import sampler_grid
-from torchrefract.warping.lattice import SmoothFlow, once
+from torchrefract.warping.lattice import LatticeFlow, once
 
-PartFlow = Tensor | SmoothFlow | FollowedFlow
+PartFlow = Tensor | LatticeFlow | FollowedFlow
 Part = tuple[Tensor, PartFlow]
 
 
@@ -60,23 +60,23 @@ class MixedFlow:
     def _each(self, work: Callable[[PartFlow], Tensor]) -> Tensor:
         if len(self.parts) == 1:  # of all rows, in their order
             return work(self.parts[0][1])
-        return in_place([(index, work(flow)) for index, flow in self.parts])
+        return scatter_batch([(index, work(flow)) for index, flow in self.parts])
 
 
 # A flow (B, 2, H, W), px, or in another form.
-Flow = Tensor | SmoothFlow | FollowedFlow | MixedFlow
+Flow = Tensor | LatticeFlow | FollowedFlow | MixedFlow
 
 
 def dense(flow: Flow) -> Tensor:
     """(B, 2, H, W), px, of a flow in any form."""
-    if isinstance(flow, SmoothFlow):
+    if isinstance(flow, LatticeFlow):
         return once(flow, lambda own: own.dense())
     return flow if isinstance(flow, Tensor) else flow.dense()
 
 
 def grid_of(flow: Flow, dtype: torch.dtype) -> Tensor:
     """(B, H, W, 2): where F.grid_sample(align_corners=False) looks along a flow in any form, finite."""
-    if isinstance(flow, SmoothFlow):
+    if isinstance(flow, LatticeFlow):
         return once(flow, lambda own: own.sampler_grid(dtype))
     if not isinstance(flow, Tensor):
         return flow.sampler_grid(dtype)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchrefract._triton import reads
 from torchrefract.warping.grid_sample import PADDINGS
-from torchrefract.warping.lattice import SmoothFlow
+from torchrefract.warping.lattice import LatticeFlow
 
 _LARGEST_PLANE = 2**31 - 1  # elements that the kernel counts within a channel
 _MOST_PROGRAMS = 65535  # along the batch, and along the rows
@@ -15,7 +15,7 @@ _MOST_PROGRAMS = 65535  # along the batch, and along the rows
 
 def serves(image: Tensor, flow: Any, dtype: torch.dtype) -> bool:
     """Whether the kernel can look an image (B, C, H, W) up along a flow, bilinear, at positions of a type."""
-    if image.device.type != "cuda" or not isinstance(flow, SmoothFlow) or dtype is not torch.float32:
+    if image.device.type != "cuda" or not isinstance(flow, LatticeFlow) or dtype is not torch.float32:
         return False
     batch, height = image.shape[0], image.shape[2]
     # A channel of any layout lies within so many elements.
@@ -24,7 +24,7 @@ def serves(image: Tensor, flow: Any, dtype: torch.dtype) -> bool:
     return flow.dtype is torch.float32 and reads("warping.gpu_look_up", image, flow.nodes)
 
 
-def looked_up(source: Tensor, flow: SmoothFlow, *, padding: str, active: Tensor | None = None) -> Tensor:
+def looked_up(source: Tensor, flow: LatticeFlow, *, padding: str, active: Tensor | None = None) -> Tensor:
     """What F.grid_sample reads of a source (B, C, H, W), bilinear, where the kernel `serves`.
 
     active: (B,), bool: the other samples come back as they are; None is all.

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._checks import learns, withheld
+from torchrefract._validation import requires_grad, why_not_eager
 from torchrefract.warping.grid import mirror, pixel_positions
 
 _PADDINGS = {"zeros": "BORDER_CONSTANT", "border": "BORDER_REPLICATE", "reflection": "BORDER_REPLICATE"}
@@ -42,9 +42,9 @@ def obstacle(image: Tensor, flow: Tensor, *, interpolation: str, positions: torc
         return f"for an image of {image.shape[1]} channels, {image.dtype}"
     if positions is not torch.float32:
         return f"for positions that are {positions}"
-    if learns((image, flow)):
+    if requires_grad((image, flow)):
         return "where a gradient is asked for"
-    return withheld(image) or withheld(flow) or _missing()
+    return why_not_eager(image) or why_not_eager(flow) or _missing()
 
 
 def remapped(image: Tensor, grids: Iterable[Tensor], *, padding: str, interpolation: str) -> Tensor:

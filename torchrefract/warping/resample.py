@@ -6,19 +6,17 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from torchrefract._bands import join, rows_at_once
-from torchrefract._checks import check_choice, check_flow, check_tensor, learns
 from torchrefract._compiled import SMALLEST
-from torchrefract._levels import rounded
+from torchrefract._tensor import cat_bands, has_memory_format, is_channels_last, round_to_dtype, rows_at_once
+from torchrefract._validation import check_choice, check_flow, check_tensor, requires_grad
 from torchrefract.warping import fused, on_gpu
 from torchrefract.warping.grid import Positions, field_dtype, inside, sampler_grids
 from torchrefract.warping.grid_sample import INTERPOLATIONS, PADDINGS, WHOLE, by_grid_sample
-from torchrefract.warping.lattice import SmoothFlow
-from torchrefract.warping.layout import has_format, is_channels_last
+from torchrefract.warping.lattice import LatticeFlow
 from torchrefract.warping.mixed import Flow, grid_of, known
 from torchrefract.warping.opencv import obstacle, remapped
 
-RESAMPLERS = ("auto", "grid_sample", "numba", "opencv")
+BACKENDS = ("auto", "torch", "numba", "opencv")
 # Above this, float32 coordinates of the sampler are off by more than 1/1000 px.
 _LARGEST_FLOAT32_SIDE = 8192
 _CACHED = 1 << 18  # positions of a grid that stay in a core's cache
@@ -30,7 +28,7 @@ def warp(
     *,
     padding: str = "zeros",
     interpolation: str = "bilinear",
-    resampler: str = "auto",
+    backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
     """The image looked up along a backward flow, and where that look-up stays on the image.
 
@@ -44,8 +42,8 @@ def warp(
         flow: (B, 2, H, W) or (1, 2, H, W), px, u (right) and v (down); (2, H, W) for an unbatched image.
         padding: what lies outside: "zeros", "border" or "reflection" (of positions up to 3/2 frames off the center).
         interpolation: "nearest", "bilinear" or "bicubic" (a = -3/4, clamped to the range of the image's values).
-        resampler: "grid_sample", of PyTorch; "numba", for float32 or uint8 on the CPU, bilinear, to the bits of
-            "grid_sample" and with its gradients; "opencv", for float32 or uint8 of 1, 3 or 4 channels on the CPU,
+        backend: "torch", of PyTorch; "numba", for float32 or uint8 on the CPU, bilinear, to the bits of
+            "torch" and with its gradients; "opencv", for float32 or uint8 of 1, 3 or 4 channels on the CPU,
             without gradients, not for bicubic; or "auto": numba for frames from 2^14 pixels on, where it is installed,
             else OpenCV from version 5 on, where that is, for uint8 in channels_last format, on as many threads as
             cv2.setNumThreads says. OpenCV agrees to 1e-6 of the range of the values before these are rounded: bytes
@@ -56,31 +54,31 @@ def warp(
         image of the same shape, type and memory format, and valid, (B, 1, H, W) or (1, H, W), bool.
 
     Raises:
-        ValueError: shapes that do not fit, an unknown padding, interpolation or resampler, what a resampler cannot do.
+        ValueError: shapes that do not fit, an unknown padding, interpolation or backend, what a backend cannot do.
         TypeError: an argument that is no tensor, a flow of integers.
     """
     check_tensor("image", image)
     check_tensor("flow", flow)
     if image.ndim == 3 and flow.ndim == 3:
-        options = {"padding": padding, "interpolation": interpolation, "resampler": resampler}
+        options = {"padding": padding, "interpolation": interpolation, "backend": backend}
         warped, valid = warp(image[None], flow[None], **options)
         return warped[0], valid[0]
     _check_fit(image, flow)
     check_choice("padding", padding, PADDINGS)
     check_choice("interpolation", interpolation, INTERPOLATIONS)
-    check_choice("resampler", resampler, RESAMPLERS)
+    check_choice("backend", backend, BACKENDS)
     flow = flow.to(field_dtype(image.dtype)).expand(image.shape[0], -1, -1, -1)
-    found = look_up(image, flow, padding=padding, interpolation=interpolation, resampler=resampler)
+    found = sample_image(image, flow, padding=padding, interpolation=interpolation, backend=backend)
     return found, inside(flow)
 
 
-def look_up(
+def sample_image(
     image: Tensor,
     flow: Flow | Positions,
     *,
     padding: str,
     interpolation: str,
-    resampler: str = "auto",
+    backend: str = "auto",
     active: Tensor | None = None,
 ) -> Tensor:
     """The image (B, C, H, W) at p + flow(p), flow being (B, 2, H, W) in px; the arguments are taken as checked.
@@ -90,31 +88,31 @@ def look_up(
     if image.numel() == 0:
         return image.clone()
     dtype = sampler_dtype(image, flow.dtype)
-    if resampler == "auto" and interpolation == "bilinear" and on_gpu.serves(image, flow, dtype):
-        found = on_gpu.looked_up(image.to(dtype), cast(SmoothFlow, flow), padding=padding, active=active)
+    if backend == "auto" and interpolation == "bilinear" and on_gpu.serves(image, flow, dtype):
+        found = on_gpu.looked_up(image.to(dtype), cast(LatticeFlow, flow), padding=padding, active=active)
         return _laid_out(_in_type(found, image), image)
-    found = _looked_up(image, flow, dtype, padding=padding, interpolation=interpolation, resampler=resampler)
+    found = _looked_up(image, flow, dtype, padding=padding, interpolation=interpolation, backend=backend)
     return found if active is None else torch.where(active.view(-1, 1, 1, 1), found, image)
 
 
 def _looked_up(
-    image: Tensor, flow: Flow | Positions, dtype: torch.dtype, *, padding: str, interpolation: str, resampler: str
+    image: Tensor, flow: Flow | Positions, dtype: torch.dtype, *, padding: str, interpolation: str, backend: str
 ) -> Tensor:
     """`look_up` of all samples, at positions of a type, by what serves a CPU or by F.grid_sample."""
     options = {"padding": padding, "interpolation": interpolation}
     # Bytes go as they are where nothing is learned from them; the kernels make them numbers as they read them.
-    source = image if image.dtype is torch.uint8 and not learns((flow,)) else image.to(dtype)
-    if resampler == "numba" or (resampler == "auto" and image.shape[2] * image.shape[3] >= SMALLEST):
+    source = image if image.dtype is torch.uint8 and not requires_grad((flow,)) else image.to(dtype)
+    if backend == "numba" or (backend == "auto" and image.shape[2] * image.shape[3] >= SMALLEST):
         why = fused.obstacle(source, flow, interpolation=interpolation)
         if why is None:
             return _laid_out(_in_type(fused.looked_up(source, flow, padding=padding), image), image)
-        _refuse(resampler, "numba", why)
-    if resampler == "opencv" or (resampler == "auto" and _suits_opencv(image)):
+        _refuse(backend, "numba", why)
+    if backend == "opencv" or (backend == "auto" and _suits_opencv(image)):
         positions = flow.grid if isinstance(flow, Positions) else known(flow)
         why = obstacle(image, positions, interpolation=interpolation, positions=dtype)
         if why is None:
             return _laid_out(remapped(image, _grids(image, flow, dtype, whole=False), **options), image)
-        _refuse(resampler, "opencv", why)
+        _refuse(backend, "opencv", why)
     source = source.to(dtype)
 
     def looked_up(grid: Tensor) -> Tensor:
@@ -123,7 +121,7 @@ def _looked_up(
         return found if interpolation == "bicubic" else _in_type(found, image)
 
     bands = map(looked_up, _grids(image, flow, dtype, whole=(interpolation, padding) == WHOLE))
-    warped = join(bands, dim=2, length=image.shape[2])
+    warped = cat_bands(bands, dim=2, length=image.shape[2])
     if interpolation == "bicubic":
         warped = _in_type(_clamped(warped, source, padding), image)
     return _laid_out(warped, image)
@@ -165,22 +163,22 @@ def _suits_opencv(image: Tensor) -> bool:
     return image.dtype is torch.uint8 and is_channels_last(image[:1])
 
 
-def _refuse(resampler: str, name: str, why: str) -> None:
+def _refuse(backend: str, name: str, why: str) -> None:
     """Raise if it was asked for by its name."""
-    if resampler == name:
-        raise ValueError(f"resampler must be auto or grid_sample {why}, got {name!r}")
+    if backend == name:
+        raise ValueError(f"backend must be auto or grid_sample {why}, got {name!r}")
 
 
 def _in_type(warped: Tensor, image: Tensor) -> Tensor:
     """Values in the type of the image; those of whole numbers are rounded."""
     if warped.dtype is image.dtype:
         return warped
-    return warped if image.is_floating_point() else rounded(warped, image.dtype).to(image.dtype)
+    return warped if image.is_floating_point() else round_to_dtype(warped, image.dtype).to(image.dtype)
 
 
 def _laid_out(warped: Tensor, image: Tensor) -> Tensor:
     """The warped image in the type and the memory format of the image."""
-    layout = torch.channels_last if is_channels_last(image) and has_format(warped) else torch.contiguous_format
+    layout = torch.channels_last if is_channels_last(image) and has_memory_format(warped) else torch.contiguous_format
     # `to` with a format copies what has the type and the format already.
     if warped.dtype is image.dtype:
         return warped.contiguous(memory_format=layout)
@@ -200,7 +198,7 @@ def _clamped(warped: Tensor, source: Tensor, padding: str) -> Tensor:
 def _grids(image: Tensor, flow: Flow | Positions, dtype: torch.dtype, *, whole: bool) -> Iterable[Tensor]:
     batch, _, rows, width = image.shape
     # The backward pass keeps one gradient image a band.
-    if not (whole or learns((image,))):
+    if not (whole or requires_grad((image,))):
         rows = rows_at_once(image.device, rows, each=batch * width, cached=_CACHED)
     if isinstance(flow, Tensor):
         return sampler_grids(flow.to(dtype), rows=rows)

@@ -6,9 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._checks import check_count, check_flow, check_tensor
-from torchrefract._constants import constant
-from torchrefract._products import product
+from torchrefract._tensor import as_device_tensor, exact_matmul
+from torchrefract._validation import check_count, check_flow, check_tensor
 
 _GHOSTS = 2  # nodes beyond each border that a cubic may take
 
@@ -33,7 +32,7 @@ def resize_image(image: Tensor, size: Sequence[int]) -> Tensor:
         _cover(old, side, like=image) if side <= old else _weights(old, side, like=image)
         for old, side in zip(image.shape[2:], new, strict=True)
     )
-    resized = product(down, product(image, across.mT))
+    resized = exact_matmul(down, exact_matmul(image, across.mT))
     return resized.clamp(image.amin(dim=(2, 3), keepdim=True), image.amax(dim=(2, 3), keepdim=True))
 
 
@@ -58,8 +57,8 @@ def resize_flow(flow: Tensor, size: Sequence[int]) -> Tensor:
     height, width = (check_count("size", side) for side in size)
     H, W = flow.shape[2:]
     down, across = (_weights(old, new, like=flow) for old, new in ((H, height), (W, width)))
-    scale = constant([width / W, height / H], dtype=flow.dtype, device=flow.device).view(1, 2, 1, 1)
-    return product(down, product(flow, across.mT)) * scale
+    scale = as_device_tensor([width / W, height / H], dtype=flow.dtype, device=flow.device).view(1, 2, 1, 1)
+    return exact_matmul(down, exact_matmul(flow, across.mT)) * scale
 
 
 def _cover(old: int, new: int, *, like: Tensor) -> Tensor:

@@ -6,9 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._bands import by_samples
 from torchrefract._compiled import SMALLEST, kernels, obstacle, with_gradients
-from torchrefract._products import product
+from torchrefract._tensor import by_samples, exact_matmul
 from torchrefract._threads import share
 
 # Up to so many nodes along an axis one product with all of them is faster than one for each cell.
@@ -82,16 +81,16 @@ def _filled_down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
 def _multiplied_across(nodes: Tensor, weight: Tensor, width: int) -> Tensor:
     """`across` by products of matrices."""
     if nodes.shape[3] <= _FEW_COLUMNS:
-        return product(nodes, matrix_of(weight, nodes.shape[3], width).mT)
-    cells = product(nodes.unfold(3, weight.shape[-1], 1), weight.mT)
+        return exact_matmul(nodes, matrix_of(weight, nodes.shape[3], width).mT)
+    cells = exact_matmul(nodes.unfold(3, weight.shape[-1], 1), weight.mT)
     return cells.flatten(3)[..., :width]
 
 
 def _multiplied_down(lines: Tensor, weight: Tensor, height: int) -> Tensor:
     """`down` by products of matrices."""
     if lines.shape[2] <= _FEW_ROWS:
-        return product(matrix_of(weight, lines.shape[2], height), lines)
-    bands = product(weight.unsqueeze(-3), lines.unfold(2, weight.shape[-1], 1).mT)
+        return exact_matmul(matrix_of(weight, lines.shape[2], height), lines)
+    bands = exact_matmul(weight.unsqueeze(-3), lines.unfold(2, weight.shape[-1], 1).mT)
     return bands.flatten(2, 3)[:, :, :height]
 
 

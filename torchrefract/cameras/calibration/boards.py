@@ -6,7 +6,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from torchrefract._checks import check_choice, check_positive
+from torchrefract._validation import check_choice, check_positive
 
 DICTIONARIES = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
 # Each of these begins with the markers of the smaller ones of its kind.

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from diffusers import UNet2DModel
 from torch import Tensor, nn
 
-from torchrefract._checks import check_count
+from torchrefract._validation import check_count
 from torchrefract.restoration.models.places import places
 
 _CONDITIONS = 5  # the image, and the pixel coordinates

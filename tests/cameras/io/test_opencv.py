@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchrefract.cameras.files.opencv import read_opencv, write_opencv
+from torchrefract.cameras.io.opencv import read_opencv, write_opencv
 
 VECTORS = {
     "4": ((-0.3, 0.1, 0.002, 1e-17), "opencv"),

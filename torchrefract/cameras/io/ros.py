@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from torchrefract.cameras.files.documents import (
+from torchrefract.cameras.io.documents import (
     camera_of,
     entry,
     numbers,
@@ -14,7 +14,7 @@ from torchrefract.cameras.files.documents import (
     whole,
     write_text,
 )
-from torchrefract.cameras.files.yaml_documents import dump_yaml, parse_yaml
+from torchrefract.cameras.io.yaml_documents import dump_yaml, parse_yaml
 from torchrefract.cameras.models import Camera
 
 _MODELS = {"plumb_bob": "opencv", "rational_polynomial": "opencv", "equidistant": "fisheye"}

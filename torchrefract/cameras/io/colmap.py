@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from torchrefract.cameras.files.documents import (
+from torchrefract.cameras.io.documents import (
     camera_of,
     numbers,
     read_text,

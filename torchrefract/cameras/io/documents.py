@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchrefract._files import replacing
+from torchrefract._io import replace_file
 from torchrefract.cameras.models import Camera
 
 # A list that YAML's aliases fold into itself is small in memory, and without end in print.
@@ -36,7 +36,7 @@ def read_text(path: Path) -> str:
 
 def write_text(path: Path, text: str) -> None:
     """A file that is there whole or not at all."""
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 

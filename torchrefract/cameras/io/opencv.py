@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from torchrefract.cameras.files.documents import (
+from torchrefract.cameras.io.documents import (
     camera_of,
     entry,
     numbers,
@@ -14,7 +14,7 @@ from torchrefract.cameras.files.documents import (
     whole,
     write_text,
 )
-from torchrefract.cameras.files.yaml_documents import parse_yaml
+from torchrefract.cameras.io.yaml_documents import parse_yaml
 from torchrefract.cameras.models import Camera
 
 _XML, _YAML = ".xml", (".yml", ".yaml")

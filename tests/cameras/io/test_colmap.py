@@ -1,6 +1,6 @@
 import pytest
 
-from torchrefract.cameras.files.colmap import read_colmap, write_colmap
+from torchrefract.cameras.io.colmap import read_colmap, write_colmap
 
 # The layout of COLMAP's documentation; parameters in the order of its camera models.
 TEXT = """# Camera list with one line of data per camera:

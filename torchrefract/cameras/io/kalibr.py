@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrefract.cameras.files.documents import (
+from torchrefract.cameras.io.documents import (
     camera_of,
     entry,
     numbers,
@@ -15,7 +15,7 @@ from torchrefract.cameras.files.documents import (
     whole,
     write_text,
 )
-from torchrefract.cameras.files.yaml_documents import dump_yaml, parse_yaml
+from torchrefract.cameras.io.yaml_documents import dump_yaml, parse_yaml
 from torchrefract.cameras.models import Camera
 
 _MODELS = {"radtan": "opencv", "equidistant": "fisheye", "none": "opencv"}

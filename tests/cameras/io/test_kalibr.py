@@ -1,7 +1,7 @@
 import pytest
 import yaml
 
-from torchrefract.cameras.files.kalibr import read_kalibr, write_kalibr
+from torchrefract.cameras.io.kalibr import read_kalibr, write_kalibr
 
 # The layout of Kalibr's wiki.
 TEXT = """cam0:

@@ -1,7 +1,7 @@
 import pytest
 import yaml
 
-from torchrefract.cameras.files.ros import read_ros, write_ros
+from torchrefract.cameras.io.ros import read_ros, write_ros
 
 # The layout of ROS's camera_calibration, with the values of its documentation's kind.
 TEXT = """image_width: 640

@@ -1,0 +1,169 @@
+"""Small operations on tensors that several packages share."""
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache, wraps
+from itertools import chain
+from typing import Any, TypeVar, cast
+
+import torch
+from torch import Tensor
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+_CACHED_VALUES = 1 << 17  # float32 values that fit into the cache of one core
+
+
+def as_device_tensor(values: Any, *, dtype: torch.dtype | None = None, device: torch.device) -> Tensor:
+    """Create a tensor from numbers or nested lists without waiting for the device, as `torch.tensor` would."""
+    return torch.tensor(values, dtype=dtype).to(device, non_blocking=True)
+
+
+def assume_constant_result(function: _F) -> _F:
+    """Mark a function as `torch.compiler.assume_constant_result` does, without importing the compiler.
+
+    The import takes nearly as long as that of torch itself, and most processes never compile.
+    """
+    vars(function)["_dynamo_marked_constant"] = True
+    return function
+
+
+def cached(function: _F) -> _F:
+    """Keep the latest 16 results of a function on the CPU.
+
+    The arguments must be hashable and the last one must be the device. The results must not be written to.
+    """
+
+    @lru_cache(maxsize=16)
+    def once(*args: Any) -> Any:
+        # Tensors made in inference mode cannot be used outside of it.
+        with torch.inference_mode(False), torch.no_grad():
+            return function(*args)
+
+    @wraps(function)
+    def result(*args: Any) -> Any:
+        return (function if torch.compiler.is_compiling() or args[-1].type != "cpu" else once)(*args)
+
+    return cast(_F, result)
+
+
+def expand_batch(value: Tensor, batch: int) -> Tensor:
+    """Repeat each row of (B, ...) for the T frames of its clip, so that `batch` = B T rows result.
+
+    A single row is expanded, not copied.
+    """
+    if value.shape[0] in (batch, 0):
+        return value
+    if value.shape[0] == 1:
+        return value.expand(batch, *value.shape[1:])
+    return value.repeat_interleave(batch // value.shape[0], dim=0)
+
+
+def cat_bands(bands: Iterable[Tensor], *, dim: int, length: int) -> Tensor:
+    """Concatenate bands along a dimension of the given total length.
+
+    Without gradients each band is copied before the next one is made, so that all bands use the same memory.
+    """
+    iterator = iter(bands)
+    first = next(iterator)
+    if first.shape[dim] == length:
+        return first
+    if first.requires_grad and torch.is_grad_enabled():
+        return torch.cat([first, *iterator], dim=dim)
+    shape = list(first.shape)
+    shape[dim] = length
+    result, start = first.new_empty(shape), 0
+    for band in chain([first], iterator):
+        result.narrow(dim, start, band.shape[dim]).copy_(band)
+        start += band.shape[dim]
+    return result
+
+
+def rows_at_once(device: torch.device, rows: int, *, each: int, cached: int, shared: bool = False) -> int:
+    """Return how many rows fit into the cache; all of them on an accelerator and in a compiled graph.
+
+    Args:
+        device: where the rows are computed.
+        rows: the total number of rows.
+        each: values in a row.
+        cached: values that fit into the cache of one core.
+        shared: True if all threads work on the rows together.
+    """
+    if device.type != "cpu" or torch.compiler.is_compiling():
+        return max(1, rows)
+    return max(1, (torch.get_num_threads() if shared else 1) * cached // max(1, each))
+
+
+def scatter_batch(parts: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+    """Assemble (B, ...) from pairs of indices (n,) and rows (n, ...) that together cover 0 ... B - 1."""
+    rows = parts[0][1]
+    result = rows.new_empty(sum(len(index) for index, _ in parts), *rows.shape[1:])
+    for index, values in parts:
+        result.index_copy_(0, index, values)
+    return result
+
+
+def by_samples(values: Tensor, work: Callable[[Tensor], Tensor]) -> Tensor:
+    """Apply `work` to each sample of (B, ...) alone on the CPU, where products of matrices round by their batch."""
+    if len(values) <= 1 or values.device.type != "cpu" or torch.compiler.is_compiling():
+        return work(values)
+    return torch.cat([work(row.clone()) for row in values.split(1)])
+
+
+def is_channels_last(image: Tensor) -> bool:
+    """Return True if the image (B, C, H, W) has the channels_last memory format and is not contiguous as well."""
+    return (
+        not image.is_contiguous()
+        and has_memory_format(image)
+        and image.is_contiguous(memory_format=torch.channels_last)
+    )
+
+
+def has_memory_format(image: Tensor) -> bool:
+    """Return False inside `torch.vmap`, where a sample has no memory format."""
+    try:
+        image.is_contiguous(memory_format=torch.channels_last)
+    except RuntimeError:
+        return False
+    return True
+
+
+def to_float(image: Tensor) -> Tensor:
+    """Convert integers, as uint8 or uint16, to float32 in [0, 1] and keep the memory format."""
+    return image.float().div_(torch.iinfo(image.dtype).max)
+
+
+def to_uint8(image: Tensor) -> Tensor:
+    """Convert (N, C, H, W) in [0, 1] to uint8: clamp, multiply by 255 and round; keep the memory format."""
+    image = image.detach()
+    result = torch.empty_like(image, dtype=torch.uint8)
+    batch, channels, height, width = image.shape
+    rows = rows_at_once(image.device, height, each=batch * channels * width, cached=_CACHED_VALUES, shared=True)
+    for target, band in zip(result.split(rows, dim=2), image.split(rows, dim=2), strict=True):
+        target.copy_(round_to_dtype(band * 255, torch.uint8))
+    return result
+
+
+def round_to_dtype(values: Tensor, dtype: torch.dtype) -> Tensor:
+    """Round to the nearest value that an integer type can hold, and keep the type of `values`."""
+    low, high = (0, 1) if dtype is torch.bool else (torch.iinfo(dtype).min, torch.iinfo(dtype).max)
+    return values.clamp(low, high).round_()
+
+
+def exact_matmul(left: Tensor, right: Tensor) -> Tensor:
+    """Multiply (..., n, k) by (..., k, m) at the full precision of the type.
+
+    `torch.set_float32_matmul_precision("high")` rounds factors to 10 bits, which moves a position by up to 1/1000 of
+    a frame. With such a setting, float32 is multiplied in float64.
+    """
+    if left.dtype is torch.float32 and _rounds_factors(left.device.type):
+        return torch.matmul(left.double(), right.double()).float()
+    return torch.matmul(left, right)
+
+
+@assume_constant_result
+def _rounds_factors(device: str) -> bool:
+    backends: Any = torch.backends
+    matmul = getattr(backends.mkldnn if device == "cpu" else backends.cuda, "matmul", None)
+    precision = getattr(matmul, "fp32_precision", None)
+    if precision is None:  # before PyTorch 2.9
+        return torch.get_float32_matmul_precision() != "highest"
+    return (backends.fp32_precision if precision == "none" else precision) not in ("none", "ieee")

@@ -27,9 +27,9 @@ from timing import Bar
 
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract.data.pair_files import FORMATS, decode_pair, encode_pair
-from torchrefract.pairs.making import Job, Maker, Recipe
-from torchrefract.pairs.running import work_alone
-from torchrefract.pairs.sources import Reader, find_sources
+from torchrefract.data.pairs.making import Job, Maker, Recipe
+from torchrefract.data.pairs.running import work_alone
+from torchrefract.data.pairs.sources import Reader, find_sources
 
 WHAT = (
     "A run of torchrefract.generate: pairs a second, its start among the time; the share of the cores' time that it "

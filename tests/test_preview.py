@@ -16,9 +16,9 @@ from hydra import compose, initialize_config_dir
 from PIL import Image
 
 import torchrefract as tr
-from torchrefract._command import with_picture
 from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
+from torchrefract.cli.command import with_picture
 from torchrefract.data.images import fit, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.film import Film

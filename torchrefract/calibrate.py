@@ -8,7 +8,6 @@ import cv2
 import hydra
 from omegaconf import DictConfig
 
-from torchrefract._command import as_they_are, command, job, make, naming, progress
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_choice, check_number
 from torchrefract.board_views import Look, look_at, main_size, pictures_of, shown_instead
@@ -19,6 +18,7 @@ from torchrefract.cameras.calibration.fit import FEWEST_VIEWS, MODELS, held_out
 from torchrefract.cameras.calibration.outliers import drop_outliers
 from torchrefract.cameras.calibration.synthetic import CAMERA, VIEWS, render_views
 from torchrefract.cameras.io.opencv import write_opencv
+from torchrefract.cli.command import as_they_are, command, job, make, naming, progress
 
 _RENDERED = "synthetic"
 _NEEDED = FEWEST_VIEWS + 1  # views, so that each can be left out

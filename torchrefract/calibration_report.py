@@ -158,9 +158,7 @@ def _straight(found: Calibration) -> list[str]:
 
 
 def _ranked(found: Calibration) -> list[tuple[str, ...]]:
-    own = {
-        view.name: (len(view.ids), rms(e)) for view, e in zip(found.kept.views, found.fitted.errors, strict=True)
-    }
+    own = {view.name: (len(view.ids), rms(e)) for view, e in zip(found.kept.views, found.fitted.errors, strict=True)}
     return [
         (
             left.name,

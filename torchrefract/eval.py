@@ -3,9 +3,9 @@
 import hydra
 from omegaconf import DictConfig
 
-from torchrefract._command import command, job
 from torchrefract._io import CONFIG_DIR
-from torchrefract._learning import make_job
+from torchrefract.cli.command import command, job
+from torchrefract.cli.training import make_job
 
 
 @command("eval")

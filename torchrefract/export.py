@@ -8,9 +8,9 @@ import hydra
 import torch
 from omegaconf import DictConfig
 
-from torchrefract._command import as_they_are, command, job, naming
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_choice
+from torchrefract.cli.command import as_they_are, command, job, naming
 from torchrefract.programs import FORMATS, outputs_of, save_program, traced
 from torchrefract.restoration.loading import Loaded, load_model
 from torchrefract.restoration.module import Restoration

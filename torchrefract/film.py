@@ -18,7 +18,7 @@ from PIL import Image, features
 from PIL.GifImagePlugin import getdata, getheader
 from torch import Tensor
 
-from torchrefract._command import naming, progress
+from torchrefract.cli.command import naming, progress
 from torchrefract.data.images import pixels_of
 from torchrefract.effects.base import Effect
 from torchrefract.page import Page, as_drawn

@@ -17,25 +17,25 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from torchrefract._command import check_seed, command, job, leave, make, naming, with_text
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_number, check_size
+from torchrefract.cli.command import check_seed, command, job, leave, make, naming, with_text
 from torchrefract.data.frame_folder import some
 from torchrefract.data.pair_files import FORMATS
 from torchrefract.data.pair_manifest import manifests, scan
+from torchrefract.data.pairs.card import HISTOGRAMS, contents, write_card
+from torchrefract.data.pairs.ledger import Ledger, claim
+from torchrefract.data.pairs.making import Job, Maker, Recipe
+from torchrefract.data.pairs.running import make_ready, run
+from torchrefract.data.pairs.sources import Sources, find_sources
+from torchrefract.data.pairs.watching import watched
+from torchrefract.data.pairs.writing import Folders, Store, Tars
 from torchrefract.effects.base import Effect
-from torchrefract.pairs.card import HISTOGRAMS, contents, write_card
-from torchrefract.pairs.ledger import Ledger, claim
-from torchrefract.pairs.making import Job, Maker, Recipe
-from torchrefract.pairs.running import make_ready, run
-from torchrefract.pairs.sources import Sources, find_sources
-from torchrefract.pairs.watching import watched
-from torchrefract.pairs.writing import Folders, Store, Tars
 
 _TRIED = 4  # pairs that tell how much room the others will take
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LARGEST_SEED = 2**31  # so that seeds of the draws fit 64 bits with a sign
-_DRAWING = "torchrefract.pairs.histograms"  # which workers, who import this file too, do without
+_DRAWING = "torchrefract.data.pairs.histograms"  # which workers, who import this file too, do without
 _MADE_WITH = {"torch": torch.__version__, "numpy": np.__version__, "opencv": cv2.__version__}
 
 

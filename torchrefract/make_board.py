@@ -5,10 +5,10 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
-from torchrefract._command import as_they_are, command, job, make, naming
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_number
 from torchrefract.board_prints import board_page
+from torchrefract.cli.command import as_they_are, command, job, make, naming
 
 _FORMATS = (".pdf", ".png")
 

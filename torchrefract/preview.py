@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchrefract._command import check_seed, command, job, make, naming, with_picture
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_count, check_number, check_positive, check_size
+from torchrefract.cli.command import check_seed, command, job, make, naming, with_picture
 from torchrefract.data.images import EXTENSIONS, files_in, fit, image_size, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect

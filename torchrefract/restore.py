@@ -14,10 +14,11 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchrefract._command import as_they_are, command, job, naming, progress
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_count, check_flag, check_size
+from torchrefract.cli.command import as_they_are, command, job, naming, progress
 from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
+from torchrefract.data.pairs.ledger import claim
 from torchrefract.footage import (
     check_apart,
     find_footage,
@@ -27,7 +28,6 @@ from torchrefract.footage import (
     write_picture,
     written_as,
 )
-from torchrefract.pairs.ledger import claim
 from torchrefract.restoration.loading import load_model
 from torchrefract.restoration.restorer import Restorer
 from torchrefract.restoration.tasks import Undistort

@@ -8,10 +8,10 @@ from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning import LightningModule, Trainer, seed_everything
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
-from torchrefract._command import check_seed, make, naming
 from torchrefract._io import replace_file
 from torchrefract._memory import keep_freed_memory
 from torchrefract._validation import UsageError
+from torchrefract.cli.command import check_seed, make, naming
 from torchrefract.data.fingerprint import fingerprint
 from torchrefract.data.module import PairData
 from torchrefract.restoration.checkpoints import Origin, check_fits, read_checkpoint

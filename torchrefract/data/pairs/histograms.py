@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from torchrefract.cameras.distortion import POLYNOMIAL12
-from torchrefract.pairs.card import Contents, Values
+from torchrefract.data.pairs.card import Contents, Values
 
 _COLUMNS, _MOST_BINS = 4, 30
 _AXES = ("x", "y", "z")

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from torchrefract._io import replace_file
 from torchrefract.data.pair_manifest import PairRow, pair_name
-from torchrefract.pairs.making import Job, Made, Maker
+from torchrefract.data.pairs.making import Job, Made, Maker
 
 _FOLDER = 1000  # pairs in a folder
 _HEAD = 512  # bytes of a tar before each of its files

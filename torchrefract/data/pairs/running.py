@@ -16,8 +16,8 @@ import torch
 from torchrefract._memory import keep_freed_memory
 from torchrefract._validation import UsageError
 from torchrefract.data.pair_manifest import PairRow
-from torchrefract.pairs.making import Job, Maker, Recipe
-from torchrefract.pairs.writing import Store
+from torchrefract.data.pairs.making import Job, Maker, Recipe
+from torchrefract.data.pairs.writing import Store
 
 _AHEAD = 2  # units for each worker, made or waiting
 
@@ -74,7 +74,12 @@ def make_ready() -> None:
     work_alone()
     if "forkserver" in multiprocessing.get_all_start_methods():
         # All that the command imports beside itself, since each worker imports the command again.
-        preloaded = [__name__, "torchrefract._command", "torchrefract.pairs.card", "torchrefract.pairs.ledger"]
+        preloaded = [
+            __name__,
+            "torchrefract.cli.command",
+            "torchrefract.data.pairs.card",
+            "torchrefract.data.pairs.ledger",
+        ]
         multiprocessing.set_forkserver_preload(preloaded)
         forkserver.ensure_running()
 

@@ -9,7 +9,7 @@ import torch
 from omegaconf import OmegaConf
 from PIL import Image
 
-from torchrefract import _command
+from torchrefract.cli import command as _command
 from torchrefract.data.frame_folder import FrameFolder
 from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint
 

@@ -10,7 +10,7 @@ import torch
 
 from torchrefract.data.images import UnreadableImageError, fit, pixels_of, read_image
 from torchrefract.data.paired_folder import PairedFolder
-from torchrefract.pairs.sources import Reader, Source, draw_of, find_sources
+from torchrefract.data.pairs.sources import Reader, Source, draw_of, find_sources
 from torchrefract.videos import read_video, write_video
 
 OPTIONS = {"size": None, "every": 1, "drive_by": "auto", "val_share": 0.3, "seed": 0}

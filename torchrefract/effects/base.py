@@ -13,8 +13,7 @@ from torchrefract.effects.door import Layout, check_depth_fits, check_image, ent
 from torchrefract.effects.motion import LATEST_FRAME
 from torchrefract.effects.plan import check_sides
 from torchrefract.effects.rows import Undrawn, at_frames, promote_params
-from torchrefract.labels.rows import is_tv, wrapped
-from torchrefract.labels.targets import follow
+from torchrefract.labels.targets import is_tv_tensor, warp_moved_labels, wrap_like
 from torchrefract.types import Degraded, Range
 from torchrefract.warping.grid import field_dtype
 
@@ -47,8 +46,8 @@ class Effect(nn.Module, ABC):
         if len(target) > 1:
             raise TypeError(f"target must be one, of any nesting, got {len(target)}")
         degraded = self.degrade(image)
-        tv = is_tv(image, "Image") or is_tv(image, "Video")
-        result = wrapped(degraded.image, image) if tv else degraded.image
+        tv = is_tv_tensor(image, "Image") or is_tv_tensor(image, "Video")
+        result = wrap_like(degraded.image, image) if tv else degraded.image
         if not target:
             return result
         flow = degraded.flow
@@ -56,7 +55,7 @@ class Effect(nn.Module, ABC):
             return result, target[0]
         if flow.ndim == 5:
             raise TypeError("target must be None beside several clips: warp_labels moves that of each, got one for all")
-        return result, follow(target[0], flow)
+        return result, warp_moved_labels(target[0], flow)
 
     def degrade(
         self,

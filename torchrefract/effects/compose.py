@@ -188,7 +188,8 @@ class Compose(Effect):
                 if leaf.effect.may_change(leaf.params) and height * width > 1:
                     places.append(place)
                 continue
-            if places and requests[place] is None:  # the effect changes light, so the warps before it go first
+            changes_light = requests[place] is None or leaf.effect.may_change(leaf.params)
+            if places and changes_light:  # the warps before it come first
                 state.move([leaves[i] for i in places], cast(PlanRequest, requests[places[0]]))
                 places = []
             state.shade(cast(PhotometricEffect, leaf.effect), leaf.params)

@@ -7,7 +7,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from torchrefract import draws
+from torchrefract import random
 from torchrefract._validation import check_number, check_values, check_whole, check_within, is_whole
 from torchrefract.effects.door import Layout, check_depth_fits, check_image, enter, leave
 from torchrefract.effects.motion import LATEST_FRAME
@@ -98,7 +98,7 @@ class Effect(nn.Module, ABC):
 
     def _sample(
         self,
-        draw: Callable[[draws.Stream, Tensor], Any],
+        draw: Callable[[random.Stream, Tensor], Any],
         image: Tensor,
         layout: Layout,
         seed: int | Tensor | None,
@@ -106,8 +106,8 @@ class Effect(nn.Module, ABC):
         place: int,
         frame: float | Tensor,
     ) -> Any:
-        seed = draws.call_seed() if seed is None else _seed(seed)
-        source = draws.stream(seed, _keys(keys, layout.batch), device=image.device)
+        seed = random.call_seed() if seed is None else _seed(seed)
+        source = random.stream(seed, _keys(keys, layout.batch), device=image.device)
         params = draw(source.at(place), _samples(image, layout))
         return at_frames(params, lambda: _frames(frame, image, layout))
 
@@ -172,10 +172,10 @@ class Effect(nn.Module, ABC):
         return False
 
     @abstractmethod
-    def draw(self, source: draws.Stream, image: Tensor) -> Any:
+    def draw(self, source: random.Stream, image: Tensor) -> Any:
         """The parameters of a batch (B, C, H, W), drawn from the streams of its samples; a `frame` among them is 0."""
 
-    def draw_sparingly(self, source: draws.Stream, image: Tensor) -> Any:
+    def draw_sparingly(self, source: random.Stream, image: Tensor) -> Any:
         """The same; what a composition has that is idle may still be `Undrawn`."""
         return self.draw(source, image)
 
@@ -203,9 +203,9 @@ class Effect(nn.Module, ABC):
         result.image = leave(result.image, image, rows)
         return result if image.ndim == 4 and not layout.is_clip else result.map(layout.unrolled)
 
-    def _uniform(self, source: draws.Stream, ranges: Sequence[Range], image: Tensor) -> tuple[Tensor, Tensor]:
+    def _uniform(self, source: random.Stream, ranges: Sequence[Range], image: Tensor) -> tuple[Tensor, Tensor]:
         """The gate, (B,), bool, and a value out of each range, (B, n)."""
-        values = draws.between(source, [(0.0, 1.0), *ranges], dtype=field_dtype(image.dtype))
+        values = random.uniform_in_ranges(source, [(0.0, 1.0), *ranges], dtype=field_dtype(image.dtype))
         return values[:, 0].float() < self.p, values[:, 1:]
 
     def check_params(self, params: Any, image: Tensor) -> None:

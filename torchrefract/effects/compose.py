@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from torchrefract import draws
+from torchrefract import random
 from torchrefract._tensor import assume_constant_result
 from torchrefract._validation import check_choice
 from torchrefract.effects.base import Effect, moved
@@ -99,17 +99,17 @@ class Compose(Effect):
         """Whether none of its effects acts."""
         return all(effect.idle for effect in self._effects())
 
-    def draw(self, source: draws.Stream, image: Tensor) -> ComposeParams:
+    def draw(self, source: random.Stream, image: Tensor) -> ComposeParams:
         """Each effect's draw, from streams of their own."""
         return drawn(self.draw_sparingly(source, image))
 
-    def draw_sparingly(self, source: draws.Stream, image: Tensor) -> ComposeParams:
+    def draw_sparingly(self, source: random.Stream, image: Tensor) -> ComposeParams:
         """The same, but what is idle is drawn when somebody reads it."""
         return self._draw_sparingly(source, image, idle=False)
 
-    def _draw_sparingly(self, source: draws.Stream, image: Tensor, *, idle: bool) -> ComposeParams:
+    def _draw_sparingly(self, source: random.Stream, image: Tensor, *, idle: bool) -> ComposeParams:
         applied, gates = self._gates(source)
-        inner, idle = draws.fold(source), idle or self.p == 0
+        inner, idle = random.fold(source), idle or self.p == 0
         children: list[Any] = []
         for i, effect in enumerate(self._effects()):
             if isinstance(effect, Compose):
@@ -190,9 +190,9 @@ class Compose(Effect):
             else:
                 yield effect, child
 
-    def _gates(self, source: draws.Stream) -> tuple[Tensor, list[Tensor]]:
+    def _gates(self, source: random.Stream) -> tuple[Tensor, list[Tensor]]:
         """(B,), bool: that of the composition, and those of its effects."""
-        applied = draws.uniform(source, 1)[:, 0] < self.p
+        applied = random.uniform(source, 1)[:, 0] < self.p
         return applied, [applied] * len(self.effects)
 
     def _leaves(self) -> Iterator[Effect]:
@@ -253,13 +253,13 @@ def _stirs(effect: Effect, params: Any, height: int, width: int) -> bool:
     return cast(RadianceEffect, effect).stirs(params)
 
 
-def _later(effect: Effect, source: draws.Stream, image: Tensor) -> Undrawn:
+def _later(effect: Effect, source: random.Stream, image: Tensor) -> Undrawn:
     """The draw of an effect as it is now, whatever becomes of its ranges; compilers follow no copies."""
     now = effect if torch.compiler.is_compiling() else _as_now(effect)
     return Undrawn(partial(_draw_for, now, source, image.shape, image.dtype, image.device))  # and holds no picture
 
 
-def _draw_for(effect: Effect, source: draws.Stream, size: torch.Size, dtype: torch.dtype, device: torch.device) -> Any:
+def _draw_for(effect: Effect, source: random.Stream, size: torch.Size, dtype: torch.dtype, device: torch.device) -> Any:
     return effect.draw(source, torch.empty((), dtype=dtype, device=device).expand(size))
 
 

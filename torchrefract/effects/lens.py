@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor
 
-from torchrefract import draws
+from torchrefract import random
 from torchrefract._compiled import SMALLEST
 from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import check_flag, check_range, check_values, check_within, eager_bool, eager_values
@@ -187,7 +187,7 @@ class LensDistortion(LatticeWarp):
         """Whether all lenses are pinholes."""
         return self._source is None and all(span == (0.0, 0.0) for span in self._ranges().coefficients)
 
-    def draw(self, source: draws.Stream, image: Tensor) -> LensParams:
+    def draw(self, source: random.Stream, image: Tensor) -> LensParams:
         """One lens a sample: every number uniform in its range, or one of those of a table or a camera."""
         if self._source is None:
             applied, values = self._uniform(source, self._ranges().numbers, image)

@@ -7,7 +7,7 @@ from copy import copy
 import torch
 from torch import Tensor
 
-from torchrefract import draws
+from torchrefract import random
 from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import check_number, eager_bool
 from torchrefract.effects.base import Effect
@@ -45,9 +45,9 @@ class OneOf(Compose):
             raise ValueError(f"weights must be one number for each of {len(effects)} effects, got {len(weights)}")
         self.weights = tuple(check_number("weights", weight, low=1e-9) for weight in weights)
 
-    def _gates(self, source: draws.Stream) -> tuple[Tensor, list[Tensor]]:
+    def _gates(self, source: random.Stream) -> tuple[Tensor, list[Tensor]]:
         """As for `Compose`, those of the effects by a choice for each sample."""
-        values = draws.uniform(source, 2)
+        values = random.uniform(source, 2)
         applied, choice = values[:, 0] < self.p, values[:, 1] * sum(self.weights)
         ends = as_device_tensor(self.weights, device=choice.device).cumsum(dim=0)[:-1]
         chosen = torch.bucketize(choice, ends, right=True)

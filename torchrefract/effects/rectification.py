@@ -6,7 +6,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
-from torchrefract import draws
+from torchrefract import random
 from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import eager_bool
 from torchrefract.cameras.models import Camera
@@ -87,9 +87,9 @@ class Rectification(LatticeWarp):
         """Of the coefficients among the parameters: that of the camera, or "polynomial12" where that is the same."""
         return "polynomial12" if self.camera.is_polynomial else self.camera.model
 
-    def draw(self, source: draws.Stream, image: Tensor) -> RectificationParams:
+    def draw(self, source: random.Stream, image: Tensor) -> RectificationParams:
         """The camera for every sample; only the gate is drawn."""
-        applied = draws.uniform(source, 1)[:, 0] < self.p
+        applied = random.uniform(source, 1)[:, 0] < self.p
         dtype, count = field_dtype(image.dtype), image.shape[0]
         values = (as_device_tensor([n], dtype=dtype, device=image.device).repeat(count, 1) for n in self._numbers())
         return RectificationParams(applied, *values)

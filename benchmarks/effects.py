@@ -38,9 +38,9 @@ from torchrefract import (
     Turbulence,
     UniformFog,
 )
-from torchrefract.draws import noise_key, stream
 from torchrefract.fields.perlin import perlin_noise
 from torchrefract.fields.perlin_lattice import octave
+from torchrefract.random import noise_key, stream
 from torchrefract.warping.grid import sampler_grid
 
 WHAT = (

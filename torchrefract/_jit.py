@@ -52,7 +52,7 @@ def _folder() -> str:
     By itself numba looks at the file of a function alone, not at those of the functions that it calls.
     """
     package = Path(__file__).parent
-    alone = ("_jit.py", "_lanes.py", "_registers.py", "draw_kernels.py", "noise_kernel.py")
+    alone = ("_jit.py", "_lanes.py", "_registers.py", "noise_kernel.py")
     folders = (package / layer / "kernels" for layer in ("fields", "warping"))
     sources = [
         *(package / name for name in alone),

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from torchrefract import _compiled as compiled
-from torchrefract import draws
+from torchrefract import random
 from torchrefract.fields import fog_drawn, fog_volume
 from torchrefract.fields.fog_volume import path_mean
 
@@ -29,7 +29,7 @@ def fogs(count: int, scales: int = 4) -> dict[str, Tensor]:
     weights = 0.1 + torch.rand(count, scales, generator=torch.Generator().manual_seed(1))
     weights[1:2, : scales // 2] = 0
     return {
-        "key": draws.noise_key(draws.stream(5, torch.arange(count))),
+        "key": random.noise_key(random.stream(5, torch.arange(count))),
         "weights": weights,
         "contrast": 0.6 + 0.1 * each.float(),
         "frame": 3.5 * each,

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import draws, white_noise
+from torchrefract import random
 from torchrefract.fields import fog_volume
 from torchrefract.fields.fog_volume import path_mean
 from torchrefract.fields.perlin3d import VARIANCE, Rays
@@ -20,7 +20,7 @@ SMALL: dict[str, Any] = {"height": 27, "width": 48, "focal": (40.0, 42.0), "cent
 
 
 def keys(samples: int, seed: int = 3) -> Tensor:
-    return draws.noise_key(draws.stream(seed, torch.arange(samples)))
+    return random.noise_key(random.stream(seed, torch.arange(samples)))
 
 
 def still(samples: int, contrast: float = 0.6) -> dict[str, Any]:
@@ -77,7 +77,7 @@ def noise_along(key: Tensor, points: np.ndarray, octave: int, turns: float) -> n
         node, away = (first + corner).astype(np.int64), points - first - corner
         number = torch.from_numpy(node @ [1, 2048, 2048**2] + 2048**2 * 633 * octave)
         (high, high2), (low, low2) = np.divmod(
-            2048 * white_noise.lattice(key, [number[None]], 2)[0].double().numpy(), 1
+            2048 * random.lattice_noise(key, [number[None]], 2)[0].double().numpy(), 1
         )
         cosine, longitude = (high + 0.5) / 1024 - 1, 2 * math.pi * low
         angle = 2 * math.pi * high2 / 2048 + math.sqrt(2) * torch.special.ndtri(torch.from_numpy(low2)).numpy() * turns

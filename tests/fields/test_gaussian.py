@@ -8,7 +8,7 @@ from scipy import special
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import draws, white_noise
+from torchrefract import random
 from torchrefract.fields import torus as torus_module
 from torchrefract.fields.covariance import COVARIANCES, covariance, slope_rms
 from torchrefract.fields.gaussian import (
@@ -49,7 +49,7 @@ def distances(height: int, width: int) -> Tensor:
 
 
 def noise(count: int, size: tuple[int, int], seed: int = 3) -> Tensor:
-    return white_noise.noise(draws.noise_key(draws.stream(seed, torch.arange(count))), size[0] * size[1]).view(
+    return random.white_noise(random.noise_key(random.stream(seed, torch.arange(count))), size[0] * size[1]).view(
         -1, 2, *size
     )
 
@@ -477,11 +477,11 @@ def test_the_operators_of_the_compiler_have_the_gradients_of_finite_differences(
 @pytest.mark.parametrize(("kind", "backend"), [("exponential", "inductor"), ("gaussian", "aot_eager")])
 def test_compiled_code_gives_the_same_field_and_gradient(kind, backend):
     size = torus(9, 14, length=4.0, kind=kind)
-    key = draws.noise_key(draws.stream(3, torch.arange(2)))
+    key = random.noise_key(random.stream(3, torch.arange(2)))
 
     def field(length: Tensor, aperture: Tensor) -> Tensor:
         shape = spectrum(size, length, kind=kind, aperture=aperture, dtype=torch.float32)
-        numbers = white_noise.noise(key, size[0] * size[1]).view(-1, 2, *size)
+        numbers = random.white_noise(key, size[0] * size[1]).view(-1, 2, *size)
         return gaussian_random_field(numbers, shape.amplitude, height=9, width=14)
 
     inputs = [torch.tensor(pair, requires_grad=True) for pair in ((4.0, 2.0), (0.5, 1.0))]

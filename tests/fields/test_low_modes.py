@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import draws, white_noise
+from torchrefract import random
 from torchrefract.fields import low_modes
 from torchrefract.fields.covariance import covariance
 from torchrefract.fields.gaussian import eigenvalues, gaussian_random_field, spectrum
@@ -29,7 +29,7 @@ def drawn(lengths: Range, count: int) -> Tensor:
 
 
 def keys(count: int) -> Tensor:
-    return draws.noise_key(draws.stream(3, torch.arange(count)))
+    return random.noise_key(random.stream(3, torch.arange(count)))
 
 
 def exact(modes: Modes, length: Tensor, kind: str) -> Tensor:
@@ -147,7 +147,7 @@ def test_amplitudes_need_no_aperture_and_no_nodes():
 def test_fields_are_those_of_the_whole_torus(step):
     height, width, size = 64, 96, MODES.size
     length, aperture = torch.tensor([20.0, 40.0]).double(), torch.tensor([4.0, 4.0]).double()
-    noise = white_noise.noise(keys(2), size[0] * size[1]).view(-1, 2, *size).double()
+    noise = random.white_noise(keys(2), size[0] * size[1]).view(-1, 2, *size).double()
     shape = spectrum(size, length, kind="exponential", aperture=aperture, dtype=torch.float64).amplitude
     left = 1 - in_order(shape, MODES).square().sum(dim=(1, 2))
     assert left.max() < 1e-10

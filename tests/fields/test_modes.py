@@ -2,10 +2,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from torchrefract.draws import noise_key, stream
 from torchrefract.fields import modes as few
 from torchrefract.fields.gaussian import spectrum
 from torchrefract.fields.modes import Modes, mode_amplitude, mode_field, mode_noise
+from torchrefract.random import noise_key, stream
 
 
 @pytest.mark.parametrize("shortest", [0.0, 2.0])

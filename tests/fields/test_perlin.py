@@ -10,7 +10,7 @@ from scipy import stats
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import draws, white_noise
+from torchrefract import random
 from torchrefract.fields.perlin import perlin_noise
 from torchrefract.fields.perlin_lattice import Octave, octave
 
@@ -21,7 +21,7 @@ BOUND = math.sqrt(0.5)
 
 
 def keys(*samples: int) -> Tensor:
-    return draws.noise_key(draws.stream(5, torch.tensor(samples, dtype=torch.int64)))
+    return random.noise_key(random.stream(5, torch.tensor(samples, dtype=torch.int64)))
 
 
 def frame_of(
@@ -81,7 +81,11 @@ def by_hand(
     x = [(j + 0.5 - wind[0] * t) / period + phase[0] for j in range(width)]
     y = [(i + 0.5 - wind[1] * t) / period + phase[1] for i in range(height)]
     axes = [torch.arange(math.floor(min(axis)), math.floor(max(axis)) + 2) for axis in (x, y)]
-    u = white_noise.lattice(key, [torch.tensor([[index]]), *(axis[None] for axis in axes)], 2)[0, :, 0].double().numpy()
+    u = (
+        random.lattice_noise(key, [torch.tensor([[index]]), *(axis[None] for axis in axes)], 2)[0, :, 0]
+        .double()
+        .numpy()
+    )
     angle = 2 * np.pi * u[0] + math.sqrt(2) * stats.norm.ppf(u[1]) * t / tau
     drawn = np.stack([np.cos(angle), np.sin(angle)], axis=2)
 

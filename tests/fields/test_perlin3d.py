@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import draws, white_noise
+from torchrefract import random
 from torchrefract.fields.perlin3d import VARIANCE, Rays, deviation_of_mean, noise_on_planes
 
 RAYS = Rays(-0.8, 0.37, 5, 0.1, 0.45, 3)
@@ -16,7 +16,7 @@ ONE = Rays(0.0, 0.0, 1, 0.0, 0.0, 1)
 
 
 def keys(samples: int, seed: int = 5) -> Tensor:
-    return draws.noise_key(draws.stream(seed, torch.arange(samples)))
+    return random.noise_key(random.stream(seed, torch.arange(samples)))
 
 
 def at_rest(samples: int) -> dict[str, Any]:
@@ -36,7 +36,7 @@ def phase_of(key: list[int], octave: int) -> np.ndarray:
 def gradient_of(key: Tensor, node: np.ndarray, octave: int, turns: float) -> np.ndarray:
     """Of one node: an axis at random, and a turn about it."""
     number = int(node[0]) + 2048 * int(node[1]) + 2048**2 * (int(node[2]) + 633 * octave)
-    numbers = white_noise.lattice(key[None], [torch.tensor([[number]])], 2).flatten().double().numpy()
+    numbers = random.lattice_noise(key[None], [torch.tensor([[number]])], 2).flatten().double().numpy()
     high, low = np.divmod(numbers * 2048, 1)
     cosine, longitude = (high[0] + 0.5) / 1024 - 1, 2 * math.pi * low[0]
     rate = math.sqrt(2) * torch.special.ndtri(torch.tensor(low[1])).item()

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from torchrefract import _compiled as compiled
-from torchrefract import draws
+from torchrefract import random
 from torchrefract.fields import perlin_drawn
 from torchrefract.fields.perlin import perlin_noise
 from torchrefract.fields.perlin_drawn import Coarse, Drawn, drawn_noise
@@ -25,7 +25,7 @@ BAR = 3e-7  # of noise in float32, whose weights have the sum 1
 def frames(count: int, *, seed: int = 5, still: bool = False) -> Drawn:
     """Of samples that differ in all, the first at rest."""
     each = torch.arange(count).double()
-    key = draws.noise_key(draws.stream(seed, torch.arange(count)))
+    key = random.noise_key(random.stream(seed, torch.arange(count)))
     wind = torch.stack([1.3 - each, 0.2 * each - 0.1], dim=1)
     return Drawn(key, 0 * each if still else 3.5 * each, wind, 40 + each)
 

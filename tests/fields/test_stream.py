@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import draws, warp, white_noise
+from torchrefract import random, warp
 from torchrefract.fields.covariance import COVARIANCES
 from torchrefract.fields.gaussian import gaussian_random_field, spectrum
 from torchrefract.fields.stream import curl, curl_rms
@@ -20,8 +20,8 @@ def random_field(kind: str, length: float, *, samples: int, height: int, width: 
     size = torus(height, width, length=length, kind=kind)
     lengths = torch.full((samples,), length, dtype=torch.float64)
     shape = spectrum(size, lengths, kind=kind, dtype=torch.float64).amplitude
-    key = draws.noise_key(draws.stream(11, torch.arange(samples)))
-    noise = white_noise.noise(key, size[0] * size[1]).view(-1, 2, *size).double()
+    key = random.noise_key(random.stream(11, torch.arange(samples)))
+    noise = random.white_noise(key, size[0] * size[1]).view(-1, 2, *size).double()
     return gaussian_random_field(noise, shape, height=height, width=width).flatten(0, 1)[:, None]
 
 

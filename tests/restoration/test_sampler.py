@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract.draws import stream
+from torchrefract.random import stream
 from torchrefract.restoration.sampler import SAMPLERS, check_steps, noise_levels, normal, sample
 
 KEPT = np.cumprod(1 - np.linspace(1e-4, 0.02, 1000))

@@ -33,7 +33,6 @@ def test_the_kernels_find_what_grid_sample_and_the_cpu_do():
     )
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    assert found["draws"] == [True] * 8
     assert len(found["look_up"]) == 5
     for case, errors in found["look_up"].items():
         for name in ("image", "source", "nodes"):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract.draws import stream, uniform
+from torchrefract.random import stream, uniform
 
 Point = tuple[Tensor, Tensor, Tensor]  # x, y, z
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrefract.data.road_geometry import Point, View
-from torchrefract.draws import stream, uniform
+from torchrefract.random import stream, uniform
 
 _LANE = 0x5CE4E
 

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor
 
-from torchrefract import draws
+from torchrefract import random
 from torchrefract._validation import check_choice, check_count
 from torchrefract.effects.base import params_to
 from torchrefract.effects.field_plan import FieldPlan, field_plan
@@ -104,12 +104,12 @@ class DivergenceFree(LatticeWarp):
         """Whether no flow has an amplitude."""
         return self.amplitude_range[1] == 0
 
-    def draw(self, source: draws.Stream, image: Tensor) -> DivergenceFreeParams:
+    def draw(self, source: random.Stream, image: Tensor) -> DivergenceFreeParams:
         """One stream function a sample, every number uniform in its range."""
         motion = motion_ranges(self.wind_x_range, self.wind_y_range, decorrelation=self.decorrelation_range)
         applied, values = self._uniform(source, (self.amplitude_range, self.length_range, *motion), image)
         swirls, motion = values[:, :2].unbind(1), drawn_motion(values[:, 2:])
-        return DivergenceFreeParams(applied, *swirls, **motion, key=draws.noise_key(source))
+        return DivergenceFreeParams(applied, *swirls, **motion, key=random.noise_key(source))
 
     def check(self, params: DivergenceFreeParams, image: Tensor) -> None:
         """Raise for swirls that are none."""

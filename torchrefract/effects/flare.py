@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract import draws
+from torchrefract import random
 from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import (
     check_choice,
@@ -114,7 +114,7 @@ class LensFlare(PlannedLight):
         """Whether no sun has any strength, or size."""
         return 0 in (self.strength_range[1], self.radius_range[1])
 
-    def draw(self, source: draws.Stream, image: Tensor) -> FlareParams:
+    def draw(self, source: random.Stream, image: Tensor) -> FlareParams:
         """One sun a sample, every number uniform in its range."""
         places = [getattr(self, f"{name}_range") for name in ("center_x", "center_y", "drift_x", "drift_y")]
         applied, values = self._uniform(source, [*places, self.radius_range, self.strength_range], image)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor
 
-from torchrefract import draws
+from torchrefract import random
 from torchrefract._tensor import exact_matmul
 from torchrefract._validation import check_range, finite_or
 from torchrefract.cameras.models import Camera
@@ -95,7 +95,7 @@ class UniformFog(PlannedLight):
         """Whether all air is clear."""
         return self.visibility_range[0] == math.inf
 
-    def draw(self, source: draws.Stream, image: Tensor) -> FogParams:
+    def draw(self, source: random.Stream, image: Tensor) -> FogParams:
         """One fog a sample; V and the deviation are uniform in their ranges."""
         applied, values = self._uniform(source, [visibility_span(self.visibility_range), self.deviation_range], image)
         visibility = drawn_visibility(values[:, 0], self.visibility_range)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract import draws
+from torchrefract import random
 from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import check_choice, check_number, check_positive, check_range, check_within, finite_or
 from torchrefract.cameras.models import Camera
@@ -158,7 +158,7 @@ class HeterogeneousFog(PlannedLight):
         """Whether all air is clear."""
         return self.visibility_range[0] == math.inf
 
-    def draw(self, source: draws.Stream, image: Tensor) -> HeterogeneousFogParams:
+    def draw(self, source: random.Stream, image: Tensor) -> HeterogeneousFogParams:
         """One fog a sample, every number uniform in its range."""
         winds = (self.wind_x_range, self.wind_y_range, self.wind_z_range)
         ranges = [visibility_span(self.visibility_range), self.deviation_range, self.contrast_range]
@@ -174,7 +174,7 @@ class HeterogeneousFog(PlannedLight):
             ),
             values[:, 2],
             **drawn_motion(values[:, 3:]),
-            key=draws.noise_key(source),
+            key=random.noise_key(source),
         )
 
     def check(self, params: HeterogeneousFogParams, image: Tensor) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract import white_noise
+from torchrefract import random
 from torchrefract._validation import check_range, check_within, eager_values
 from torchrefract.effects.motion import check_motion, is_still
 from torchrefract.effects.rows import expand_batch
@@ -62,7 +62,7 @@ def _noises(params: Any, shape: Tensor, size: tuple[int, int]) -> Iterator[tuple
     All samples at once, if no clip asks for so much memory.
     """
     dtype, frames = params.amplitude.dtype, params.frame.shape[1]
-    noise = white_noise.noise(params.key, size[0] * size[1]).view(-1, 2, *size).to(dtype)
+    noise = random.white_noise(params.key, size[0] * size[1]).view(-1, 2, *size).to(dtype)
     if is_still(params):
         yield noise, shape
         return

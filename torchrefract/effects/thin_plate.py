@@ -6,7 +6,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
-from torchrefract import draws
+from torchrefract import random
 from torchrefract._validation import check_count, check_range, check_values
 from torchrefract.effects.base import params_to
 from torchrefract.effects.lattice_warp import LatticeWarp
@@ -77,12 +77,12 @@ class ThinPlateSpline(LatticeWarp):
         """Whether no plate has an amplitude."""
         return self.amplitude_range[1] == 0
 
-    def draw(self, source: draws.Stream, image: Tensor) -> ThinPlateParams:
+    def draw(self, source: random.Stream, image: Tensor) -> ThinPlateParams:
         """One plate a sample, amplitude and smoothing uniform in their ranges."""
         applied, values = self._uniform(source, (self.amplitude_range, self.smoothing_range), image)
         amplitude, smoothing = values.unbind(1)
         rows, columns = self.lattice
-        normal = draws.normal(draws.fold(source), 2 * rows * columns).to(values.dtype).view(-1, rows * columns, 2)
+        normal = random.normal(random.fold(source), 2 * rows * columns).to(values.dtype).view(-1, rows * columns, 2)
         points = self._points(image.shape[2], image.shape[3], values).repeat(image.shape[0], 1, 1)
         return ThinPlateParams(applied, points, amplitude[:, None, None] * normal, smoothing)
 
@@ -121,7 +121,7 @@ class ThinPlateSpline(LatticeWarp):
         """Whether the points are drawn ones of such a frame, displaced and smoothed as those can be."""
         # Positions in whatever type they were kept in: so little changes nothing that a plan relies on.
         near = (params.points - self._points(height, width, params.points)).abs() <= _CLOSE
-        most = draws.LARGEST_NORMAL * self.amplitude_range[1]
+        most = random.LARGEST_NORMAL * self.amplitude_range[1]
         displaced = in_ranges(params.displacement.reshape(-1, 1), [(-most, most)])
         return near.all() & displaced & in_ranges(params.smoothing[:, None], [self.smoothing_range])
 

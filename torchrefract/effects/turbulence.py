@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor
 
-from torchrefract import draws
+from torchrefract import random
 from torchrefract._validation import check_choice, eager_bool
 from torchrefract.effects.base import params_to
 from torchrefract.effects.field_plan import FieldPlan, field_plan
@@ -109,13 +109,13 @@ class Turbulence(LatticeWarp):
         """Whether no air has an amplitude."""
         return self.amplitude_range[1] == 0
 
-    def draw(self, source: draws.Stream, image: Tensor) -> TurbulenceParams:
+    def draw(self, source: random.Stream, image: Tensor) -> TurbulenceParams:
         """One air a sample, every number uniform in its range."""
         motion = motion_ranges(self.wind_x_range, self.wind_y_range, decorrelation=self.decorrelation_range)
         ranges = (self.amplitude_range, self.length_range, self.aperture_range, *motion)
         applied, values = self._uniform(source, ranges, image)
         air, motion = values[:, :3].unbind(1), drawn_motion(values[:, 3:])
-        return TurbulenceParams(applied, *air, **motion, key=draws.noise_key(source))
+        return TurbulenceParams(applied, *air, **motion, key=random.noise_key(source))
 
     def check(self, params: TurbulenceParams, image: Tensor) -> None:
         """Raise for air that is none."""

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchrefract import white_noise
+from torchrefract import random
 
 
 def turn_rates(key: Tensor, size: tuple[int, int], *, dtype: torch.dtype) -> Tensor:
@@ -17,7 +17,7 @@ def turn_rates(key: Tensor, size: tuple[int, int], *, dtype: torch.dtype) -> Ten
         dtype: of the result.
     """
     # The words of the key in another order are another key.
-    return white_noise.noise(key.flip(1), size[0] * size[1] // 2).view(-1, *size).to(dtype)
+    return random.white_noise(key.flip(1), size[0] * size[1] // 2).view(-1, *size).to(dtype)
 
 
 def evolved(noise: Tensor, rates: Tensor, *, frame: Tensor, wind: Tensor, decorrelation: Tensor) -> Tensor:

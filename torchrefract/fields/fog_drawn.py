@@ -12,7 +12,7 @@ from torchrefract._compiled import SMALLEST, kernels
 from torchrefract._threads import share
 from torchrefract.fields.fog_view import SLICES, Between, View, between, finer_places
 from torchrefract.fields.perlin3d import PHASES, Rays
-from torchrefract.white_noise import HASH
+from torchrefract.random import _HASH as HASH
 
 _AT_ONCE = 8  # rows of rays that are worth a thread
 _TOGETHER = 16  # frames, whose volumes are kept at once

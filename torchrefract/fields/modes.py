@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract import white_noise
+from torchrefract import random
 from torchrefract._compiled import kernels, obstacle
 from torchrefract._tensor import as_device_tensor, by_samples, cached, exact_matmul
 from torchrefract._validation import requires_grad
@@ -33,15 +33,15 @@ class Modes(NamedTuple):
 
 
 def mode_noise(key: Tensor, modes: Modes, *, dtype: torch.dtype) -> Tensor:
-    """(B, 2, My, Mx): the white noise of these frequencies, as in `white_noise.noise` of the whole torus."""
-    return white_noise.noise_at(key, _places(modes, key.device).flatten()).unflatten(2, modes.counts).to(dtype)
+    """(B, 2, My, Mx): the white noise of these frequencies, as in `random.white_noise` of the whole torus."""
+    return random.white_noise_at(key, _places(modes, key.device).flatten()).unflatten(2, modes.counts).to(dtype)
 
 
 def mode_turn_rates(key: Tensor, modes: Modes, *, dtype: torch.dtype) -> Tensor:
     """(B, My, Mx), the rates of these frequencies, as in `turn_rates` of the whole torus."""
     half = modes.size[0] * modes.size[1] // 2
     place = _places(modes, key.device).flatten()
-    pairs = white_noise.noise_at(key.flip(1), place % half)
+    pairs = random.white_noise_at(key.flip(1), place % half)
     return torch.where(place < half, pairs[:, 0], pairs[:, 1]).unflatten(1, modes.counts).to(dtype)
 
 

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract import white_noise
+from torchrefract import random
 from torchrefract._tensor import as_device_tensor, exact_matmul
 
 # Of the noise below, over all gradients and all places in a cell: each of the 8 nodes adds a third of the mean of
@@ -186,7 +186,7 @@ def _gradients(
         x, y, z = (first[:, i, axis, None] + torch.arange(n, device=key.device) for axis, n in enumerate(counts))
         plane = z[:, :, None, None] + i * OCTAVE
         numbered.append((x[:, None, None] + LINE * (y[:, None, :, None] + LINE * plane)).flatten(1))
-    scaled = _UPPER * white_noise.lattice(key, [torch.cat(numbered, dim=1)], 2)
+    scaled = _UPPER * random.lattice_noise(key, [torch.cat(numbered, dim=1)], 2)
     upper = scaled.floor()
     lower = scaled - upper
     # Whole turns are taken out in float64: later frames are as exact as the first.

@@ -14,8 +14,8 @@ from torchrefract._threads import share
 from torchrefract._validation import requires_grad, why_not_eager
 from torchrefract.fields.perlin import Nodes, perlin_noise
 from torchrefract.fields.perlin_lattice import Octave, octave, origins
+from torchrefract.random import _HASH as HASH
 from torchrefract.warping.lattice import Lattice, lagrange_weights
-from torchrefract.white_noise import HASH
 
 
 class Drawn(NamedTuple):

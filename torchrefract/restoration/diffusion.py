@@ -10,7 +10,7 @@ from pytorch_lightning.trainer.states import TrainerFn
 from torch import Tensor, nn
 
 from torchrefract._validation import check_choice, check_count, check_number
-from torchrefract.draws import Stream, stream, uniform
+from torchrefract.random import Stream, stream, uniform
 from torchrefract.restoration.metrics import masked_mean
 from torchrefract.restoration.models.denoiser import conditions
 from torchrefract.restoration.module import Learner

@@ -7,9 +7,9 @@ import torch
 from diffusers import DDPMScheduler, DPMSolverMultistepScheduler
 from torch import Tensor
 
-from torchrefract import white_noise
+from torchrefract import random
 from torchrefract._validation import check_choice, check_count
-from torchrefract.draws import Stream, noise_key
+from torchrefract.random import Stream, noise_key
 
 SAMPLERS = ("ddpm", "ddim", "dpm_solver")
 LEVELS = 1000  # of noise, in training
@@ -30,7 +30,7 @@ def check_steps(name: str, steps: int) -> int:
 def normal(source: Stream, like: Tensor) -> Tensor:
     """Standard normal noise in the shape (B, C, H, W) of `like`, of each sample by its stream alone."""
     count = like[0].numel()
-    pairs = white_noise.noise(noise_key(source).to(like.device), -(-count // 2))
+    pairs = random.white_noise(noise_key(source).to(like.device), -(-count // 2))
     return pairs.flatten(1)[:, :count].view_as(like)
 
 

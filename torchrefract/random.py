@@ -1,0 +1,290 @@
+"""Counter-based random numbers: a draw depends on (seed, key, lane) and on nothing else.
+
+The numbers are the same for every batch size, order, worker, thread count and device, under torch.compile too.
+
+Source: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011, for Threefry-2x32 with 20
+rounds; Wellons, "Prospecting for hash functions" (2018), for the hash of the white noise; Box and Muller (1958).
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrefract._tensor import as_device_tensor, cat_bands
+from torchrefract._validation import why_not_eager
+from torchrefract.types import Range
+
+LARGEST_NORMAL = 5.8  # bound of the magnitude of normal numbers
+_WORD = 0xFFFFFFFF
+_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
+_PARITY = 0x1BD11BDA
+# Odd constants of the hash, as int32: 2^32 over the golden ratio, and the two of lowbias32.
+_HASH = (0x9E3779B1 - 2**32, 0x7FEB352D, 0x846CA68B - 2**32)
+_FEW = 12  # counters, up to which Python's integers are faster than NumPy's arrays
+_BAND = 1 << 17  # numbers whose intermediate results stay in a processor's cache
+
+
+class Stream(NamedTuple):
+    """Source of the random numbers of each sample: a key of two 32-bit words, and a lane.
+
+    words: (2, B), int64, in [0, 2^32): a NumPy array, or a tensor in a compiled graph or on an accelerator.
+    lane: numbers of different lanes are independent.
+    device: device of the drawn numbers; None is that of the words.
+    """
+
+    words: np.ndarray | Tensor
+    lane: int = 0
+    device: torch.device | None = None
+
+    def at(self, lane: int) -> "Stream":
+        """Return the streams of the same samples in another lane."""
+        return self._replace(lane=lane)
+
+    def to(self, device: torch.device | None) -> "Stream":
+        """Return the same streams, whose numbers are moved to a device."""
+        return self._replace(device=device)
+
+
+def stream(seed: int | Tensor, keys: Tensor | range, *, device: torch.device | None = None) -> Stream:
+    """Create the stream of each sample.
+
+    The numbers are computed on the CPU unless the seed or the keys are on another device: an accelerator would start
+    more than a hundred small operations for each draw, which takes longer than a copy.
+
+    Args:
+        seed: integer or a tensor of one, int64; the lowest 64 bits of a larger integer count.
+        keys: (B,), int64, or a range of B integers.
+        device: device of the drawn numbers; None is that of the seed or the keys.
+    """
+    if not isinstance(seed, Tensor):
+        seed = (seed + 2**63) % 2**64 - 2**63  # two's complement, so that every Python integer has its 64 bits
+    if _can_read(seed, keys):
+        array = np.arange(keys.start, keys.stop) if isinstance(keys, range) else keys.numpy().astype(np.int64)
+        return Stream(_threefry(_halves(np.array([int(seed)])), _halves(array))[:, 0], device=device)
+    if not isinstance(seed, Tensor):
+        seed = torch.full((), seed, dtype=torch.int64, device=None if isinstance(keys, range) else keys.device)
+    if torch.compiler.is_compiling() and device is not None and device.type == "cuda":
+        # A graph with operations on the CPU waits for them and cannot be recorded as one CUDA graph.
+        seed = seed.to(device, non_blocking=True)
+    if isinstance(keys, range):
+        keys = torch.arange(keys.start, keys.stop, device=seed.device)
+    elif seed.device.type != "cpu":
+        keys = keys.to(seed.device, non_blocking=True)
+    return Stream(_threefry(_halves(seed.long()[None]), _halves(keys.long()))[:, 0], device=device)
+
+
+def fold(parent: Stream) -> Stream:
+    """Return streams for nested draws, independent of those of the parent in any lane."""
+    counters = _counters(parent.words, _WORD, 1, parent.lane)
+    return Stream(_threefry(parent.words, counters)[:, :, 0], device=parent.device)
+
+
+def uniform(source: Stream, count: int) -> Tensor:
+    """Draw (B, count) numbers, float32, uniform in the open interval (0, 1), on a lattice of 2^23 values."""
+    return _drawn(_uniform(source, count), source)
+
+
+def uniform_in_ranges(source: Stream, ranges: Sequence[Range], *, dtype: torch.dtype) -> Tensor:
+    """Draw (B, n) numbers low + (high - low) u, one for each range, with u from `uniform`.
+
+    Args:
+        source: stream to draw from.
+        ranges: n of them.
+        dtype: float32 or float64.
+    """
+    ends = [float(end) for span in ranges for end in span]
+    u = _uniform(source, len(ranges))
+    if isinstance(u, Tensor):
+        low, high = as_device_tensor(ends, dtype=dtype, device=u.device).unflatten(0, (-1, 2)).unbind(1)
+        return _drawn(low + (high - low) * u.to(dtype), source)
+    kind = np.float64 if dtype is torch.float64 else np.float32
+    low, high = np.array(ends, kind).reshape(-1, 2).T
+    return _drawn(low + (high - low) * u.astype(kind), source)
+
+
+def normal(source: Stream, count: int) -> Tensor:
+    """Draw (B, count) standard normal numbers, float32, below `LARGEST_NORMAL` in magnitude.
+
+    sqrt(-2 ln u1) cos(2 pi u2) for all pairs, then sqrt(-2 ln u1) sin(2 pi u2)
+    """
+    u = _uniform(source, 2 * _num_blocks(count))
+    radius, angle = (u if isinstance(u, Tensor) else torch.from_numpy(u)).chunk(2, dim=1)
+    radius, angle = (-2 * radius.log()).sqrt(), 2 * math.pi * angle
+    return _drawn(torch.cat([radius * angle.cos(), radius * angle.sin()], dim=1)[:, :count].contiguous(), source)
+
+
+def noise_key(source: Stream) -> Tensor:
+    """Draw (B, 4), int64, in [0, 2^32): the key of each sample's white noise."""
+    child = fold(source).words
+    more = _threefry(child, _counters(child, 0, 1, 0))[:, :, 0]
+    if isinstance(child, Tensor):
+        return _drawn(torch.cat([child, more]).T.contiguous(), source)
+    return _drawn(np.concatenate([child, more]).T.copy(), source)
+
+
+def white_noise(key: Tensor, count: int) -> Tensor:
+    """Compute (B, 2, count) standard normal numbers, float32, below `LARGEST_NORMAL` in magnitude.
+
+    Made for millions of numbers: pair i of a sample is the Box-Muller transform of a hash of i under the sample's key,
+    two rounds of multiply and xor-shift on 32 bits.
+
+    Args:
+        key: (B, 4), int64, from `noise_key`.
+        count: number of pairs of a sample.
+    """
+    if torch.compiler.is_compiling() or key.device.type != "cpu":
+        return white_noise_at(key, torch.arange(count, device=key.device))
+    band = max(1, _BAND // max(1, len(key)))
+    bands = (
+        white_noise_at(key, torch.arange(start, min(start + band, count))) for start in range(0, max(1, count), band)
+    )
+    return cat_bands(bands, dim=2, length=count)
+
+
+def white_noise_at(key: Tensor, indices: Tensor) -> Tensor:
+    """Compute the pairs (B, 2, n) of `white_noise` at (n,) indices, int64, counted from 0."""
+    a, b, c, d = key.to(torch.int32)[:, :, None].unbind(1)
+    index = indices.to(torch.int32) * _HASH[0]
+    radius = _to_uniform(_hash(index, a, b)).log_().mul_(-2).sqrt_()
+    angle = _hash(index, c, d).float().mul_(math.pi * 2.0**-31)
+    return torch.stack([angle.cos().mul_(radius), angle.sin_().mul_(radius)], dim=1)
+
+
+def lattice_noise(key: Tensor, axes: Sequence[Tensor], count: int) -> Tensor:
+    """Compute (B, count, n1, ..., nd) numbers, float32, uniform in (0, 1): `count` for each node of a lattice.
+
+    The numbers of a node are a hash of its integer coordinates, so any window of an endless lattice can be computed.
+
+    Args:
+        key: (B, 4), int64, from `noise_key`.
+        axes: d of them, (B, ni), int64, coordinates along each axis; their lowest 32 bits count.
+        count: numbers of a node.
+    """
+    index = torch.arange(count, device=key.device).expand(len(key), -1)
+    a, b, c, d = key.to(torch.int32).view(-1, 4, *[1] * (len(axes) + 1)).unbind(1)
+    node = torch.zeros_like(a)
+    for i, axis in enumerate((*axes, index), start=2):
+        shape = [1] * (len(axes) + 2)
+        shape[0], shape[i if i < len(shape) else 1] = len(key), axis.shape[1]
+        # Each axis has one round of the hash, under the two halves of the key in turn.
+        node = _hash(node + axis.to(torch.int32).view(shape) * _HASH[0], *((a, b) if i % 2 else (c, d)))
+    return _to_uniform(node)
+
+
+def call_seed() -> Tensor:
+    """Draw a seed, (), int64, from torch's global generator, in eager mode and under torch.compile alike."""
+    # Calling the operator in eager mode would import the compiler, which takes a second.
+    return torch.ops.torchrefract.call_seed.default() if torch.compiler.is_compiling() else _new_seed()
+
+
+def _can_read(seed: int | Tensor, keys: Tensor | range) -> bool:
+    tensors = [value for value in (seed, keys) if isinstance(value, Tensor)]
+    return not torch.compiler.is_compiling() and not any(map(why_not_eager, tensors))
+
+
+def _threefry(keys: Any, counters: Any) -> Any:
+    """Compute the two words (2, B, n) of n counters (2, n) under each of B keys (2, B), all int64 in [0, 2^32)."""
+    if isinstance(keys, Tensor):
+        if torch.compiler.is_compiling():
+            return torch.ops.torchrefract.threefry(keys, counters)
+        return torch.stack(_rounds(*keys[:, :, None], *counters))
+    # NumPy starts each of the hundred operations several times as fast as PyTorch, and Python those on a few integers.
+    if keys.shape[1] * counters.shape[1] > _FEW:
+        return np.stack(_rounds(*keys[:, :, None], *counters))
+    pairs = [[_rounds(*key, *counter) for counter in counters.T.tolist()] for key in keys.T.tolist()]
+    return np.array(pairs, np.int64).reshape(keys.shape[1], counters.shape[1], 2).transpose(2, 0, 1)
+
+
+@torch.library.custom_op("torchrefract::threefry", mutates_args=())
+def _threefry_operator(keys: Tensor, counters: Tensor) -> Tensor:
+    # A custom operator, since the compiler takes a minute for the hundreds of operations of a few draws.
+    return torch.stack(_rounds(*keys[:, :, None], *counters))
+
+
+@_threefry_operator.register_fake
+def _(keys: Tensor, counters: Tensor) -> Tensor:
+    return keys.new_empty(2, keys.shape[1], counters.shape[1])
+
+
+def _rounds(key0: Any, key1: Any, counter0: Any, counter1: Any) -> tuple[Any, Any]:
+    """Compute Threefry-2x32 with 20 rounds, on integers, arrays or tensors of 64 bits, which never overflow."""
+    keys = (key0, key1, key0 ^ key1 ^ _PARITY)
+    x, y = counter0 + key0, counter1 + key1
+    for group in range(5):
+        for rotation in _ROTATIONS[group % 2]:
+            # Only what is shifted right must be free of carries; they never reach bit 63.
+            y = y & _WORD
+            x = x + y
+            y = (y << rotation | y >> (32 - rotation)) ^ x
+        x = (x + keys[(group + 1) % 3]) & _WORD
+        y = y + keys[(group + 2) % 3] + group + 1
+    return x, y & _WORD
+
+
+def _halves(values: Any) -> Any:
+    """Split (B,) integers of 64 bits into words (2, B), the high ones first."""
+    parts = [(values >> 32) & _WORD, values & _WORD]
+    return torch.stack(parts) if isinstance(values, Tensor) else np.stack(parts)
+
+
+def _counters(like: Any, first: int, count: int, lane: int) -> Any:
+    """Create (2, count) counters: consecutive numbers, and the lane."""
+    if isinstance(like, Tensor):
+        index = torch.arange(first, first + count, device=like.device)
+        return torch.stack([index, torch.full_like(index, lane)])
+    return np.array([range(first, first + count), [lane] * count], np.int64)
+
+
+def _num_blocks(count: int) -> int:
+    """Return how many counters are needed: each gives two words."""
+    return (count + 1) // 2
+
+
+def _uniform(source: Stream, count: int) -> Any:
+    """Compute `uniform` numbers from the first words of all counters, and then their second words."""
+    first, second = _threefry(source.words, _counters(source.words, 0, _num_blocks(count), source.lane))
+    if isinstance(first, Tensor):
+        return (torch.cat([first, second], dim=1)[:, :count] >> 9).float().add(0.5).mul(2.0**-23)
+    # Exact in float64, and then in float32: the numbers have 24 bits.
+    return (((np.concatenate([first, second], axis=1)[:, :count] >> 9) + 0.5) * 2.0**-23).astype(np.float32)
+
+
+def _drawn(values: Any, source: Stream) -> Tensor:
+    """Return the values as a tensor on the device of a stream; a copy from the CPU waits for nothing."""
+    tensor = values if isinstance(values, Tensor) else torch.from_numpy(values)
+    if source.device is None or source.device == tensor.device:
+        return tensor
+    return tensor.to(source.device, non_blocking=tensor.device.type == "cpu")
+
+
+def _hash(index: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    x = index + a
+    x ^= (x >> 16).bitwise_and_(0xFFFF)
+    x = x.mul_(_HASH[1]).add_(b)
+    x ^= (x >> 15).bitwise_and_(0x1FFFF)
+    x.mul_(_HASH[2])
+    x ^= (x >> 16).bitwise_and_(0xFFFF)
+    return x
+
+
+def _to_uniform(word: Tensor) -> Tensor:
+    return ((word >> 9) & 0x7FFFFF).float().add_(0.5).mul_(2.0**-23)
+
+
+def _new_seed() -> Tensor:
+    return torch.randint(-(2**63), 2**63 - 1, (), dtype=torch.int64)
+
+
+@torch.library.custom_op("torchrefract::call_seed", mutates_args=(), tags=(torch.Tag.nondeterministic_seeded,))
+def _call_seed() -> Tensor:
+    # A custom operator, since the compiler would replace torch.randint by its own random numbers.
+    return _new_seed()
+
+
+@_call_seed.register_fake
+def _() -> Tensor:
+    return torch.empty((), dtype=torch.int64)

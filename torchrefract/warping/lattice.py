@@ -1,0 +1,257 @@
+"""Flows at the nodes of a coarse lattice, with cubics between the nodes."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchrefract._tensor import exact_matmul
+from torchrefract.ops.cubic import interpolate_nodes, lagrange_basis
+from torchrefract.ops.sampling import grid_sample
+from torchrefract.warping.grid import Points, finite, pixel_axes, sampler_axes, sampler_positions
+from torchrefract.warping.old_lattice import (
+    FARTHEST,
+    STREAM_NODES,
+    Lines,
+    _cubics,
+    _curl_weights,
+    along_rows,
+    between_nodes,
+    lagrange_weights,
+    once,
+    row_weights,
+    slope_weights,
+)
+from torchrefract.warping.sums import across_twice, down
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Describe nodes every `stride` px over a frame, with `margin` more of them before it and beyond it.
+
+    Node (i, j) lies at x = (j - margin) stride, y = (i - margin) stride. There are as many nodes as a cubic through
+    four of them needs at the last pixel, and margin - 1 more. Stride 1 and margin 0 is the grid of the pixels.
+
+    height, width: px, of the frame.
+    stride: px, between nodes.
+    margin: nodes before the first pixel, at least 1, or 0 with stride 1.
+    """
+
+    height: int
+    width: int
+    stride: int = 1
+    margin: int = 1
+    after: int = 1  # old
+
+    @property
+    def num_nodes(self) -> tuple[int, int]:
+        """Return the numbers of rows and of columns of nodes."""
+        if self.margin == 0:
+            return self.height, self.width
+        rows, columns = (-(-size // self.stride) + 1 + 2 * self.margin for size in (self.height, self.width))
+        return rows, columns
+
+    def points(self, *, dtype: torch.dtype, device: torch.device) -> Points:
+        """Return the positions of the nodes, px."""
+        y, x = (
+            (torch.arange(count, dtype=dtype, device=device) - self.margin) * self.stride for count in self.num_nodes
+        )
+        return Points(x.view(1, 1, 1, -1), y.view(1, 1, -1, 1), self)
+
+    # old: leaves with the old effects
+    before = property(lambda self: self.margin)
+
+    def __getitem__(self, index):
+        return (self.height, self.width, self.stride, self.margin, self.after)[index]
+
+    def cells(self) -> tuple[int, int]:
+        return -(-self.height // self.stride), -(-self.width // self.stride)
+
+    def axes(self) -> tuple[range, range]:
+        start, s = -self.margin * self.stride, self.stride
+        rows, columns = (range(start, (count + self.after) * s + 1, s) for count in self.cells())
+        return rows, columns
+
+    def places(self, *, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+        y, x = (torch.arange(axis.start, axis.stop, axis.step, dtype=dtype, device=device) for axis in self.axes())
+        return x.view(1, 1, 1, -1), y.view(1, 1, -1, 1)
+
+
+def pixel_lattice(height: int, width: int) -> Lattice:
+    """Return the lattice whose nodes are the pixels of a frame."""
+    return Lattice(height, width, stride=1, margin=0)
+
+
+@dataclass(frozen=True)
+class LatticeFlow:
+    """Hold a flow at the nodes of a lattice; cubic polynomials through four nodes along each axis interpolate it.
+
+    nodes: (N, 2, h, w), px.
+    """
+
+    nodes: Tensor
+    lattice: Lattice
+    every: int = 1  # old
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Return the type of the nodes."""
+        return self.nodes.dtype
+
+    @property
+    def requires_grad(self) -> bool:
+        """Return True if the nodes require a gradient."""
+        return self.nodes.requires_grad
+
+    def detach(self) -> "LatticeFlow":
+        """Return the flow without its gradient."""
+        return self.with_nodes(self.nodes.detach())
+
+    def with_nodes(self, nodes: Tensor) -> "LatticeFlow":
+        """Return a flow with other nodes on the same lattice."""
+        return replace(self, nodes=nodes)
+
+    def dense(self) -> Tensor:
+        """Return the flow at every pixel, (N, 2, H, W), px."""
+        lattice, nodes = self.lattice, self.nodes
+        is_shared = len(nodes) > 1 and nodes.stride(0) == 0  # one flow for the frames of a clip
+        flow = interpolate_nodes(
+            nodes[:1] if is_shared else nodes,
+            stride=lattice.stride,
+            margin=lattice.margin,
+            height=lattice.height,
+            width=lattice.width,
+        )
+        return flow.contiguous().expand(len(nodes), -1, -1, -1)
+
+    def at(self, points: Points) -> Tensor:
+        """Interpolate the flow at points, which may lie anywhere; positions beyond the nodes are clamped.
+
+        Interpolation is cubic, or bilinear if the stride of the lattice is 1. The result is differentiable with
+        respect to the nodes and the points.
+
+        Args:
+            points: of shape (N or 1, 1, h, w), px.
+
+        Returns:
+            (N, 2, h, w), px.
+        """
+        if not points.is_displaced:
+            if points.lattice == self.lattice:
+                return self.nodes
+            if points.lattice == pixel_lattice(self.lattice.height, self.lattice.width):
+                return self.dense()
+        stride, margin = self.lattice.stride, self.lattice.margin
+        rows, columns = self.nodes.shape[2:]
+        x, y = _in_strides(points.x, stride, margin, columns), _in_strides(points.y, stride, margin, rows)
+        if stride == 1:
+            return _bilinear(self.nodes, x, y)
+        if points.is_displaced:
+            return _cubic(self.nodes, x, y)
+        with torch.autocast(self.nodes.device.type, enabled=False):
+            along = exact_matmul(self.nodes, _weight_matrix(x.flatten(), columns).to(self.dtype).mT)
+            return exact_matmul(_weight_matrix(y.flatten(), rows).to(self.dtype), along)
+
+
+    # old: leaves with the old effects
+    def rows(self, index: Tensor) -> "LatticeFlow":
+        return self.with_nodes(self.nodes[index])
+
+    def weights(self) -> tuple[Tensor, Tensor]:
+        weight = _cubics(self.nodes, self.lattice).expand(2, -1, -1)
+        return weight, weight
+
+    def sampler_grid(self, dtype: torch.dtype) -> Tensor:
+        return self.lines(dtype).grid()
+
+    def lines(self, dtype: torch.dtype) -> Lines:
+        x, y = self.lattice.places(dtype=dtype, device=self.nodes.device)
+        height, width = self.lattice.height, self.lattice.width
+        positions = finite(sampler_positions(self.nodes.to(dtype), x, y, height=height, width=width), FARTHEST)
+        values, weight = along_rows(positions, self.lattice), _cubics(positions, self.lattice)
+        return Lines(values, weight.expand(2, -1, -1), height)
+
+
+def _in_strides(position: Tensor, stride: int, margin: int, count: int) -> Tensor:
+    """Convert positions from px to indices of nodes, within [0, count - 1]."""
+    return (position / stride + margin).nan_to_num(nan=0.0).clamp(0, count - 1)
+
+
+def _cell(index: Tensor, count: int) -> Tensor:
+    """Return the second of the four nodes around each fractional index, int64."""
+    return index.detach().floor().clamp(1, count - 3).long()
+
+
+def _weight_matrix(index: Tensor, count: int) -> Tensor:
+    """Return the cubic weights of `count` nodes at fractional indices (n,), as (n, count)."""
+    cell = _cell(index, count)
+    weights = lagrange_basis(index - cell)
+    neighbors = cell[:, None] + torch.arange(-1, 3, device=index.device)
+    return weights.new_zeros(len(index), count).scatter(1, neighbors, weights)
+
+
+def _cubic(nodes: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Interpolate nodes (N, 2, h, w) at fractional indices, each (N or 1, 1, n, m)."""
+    batch = torch.broadcast_shapes(nodes.shape[:1], x.shape[:1], y.shape[:1])[0]
+    size = torch.broadcast_shapes(x.shape[2:], y.shape[2:])
+    columns = nodes.shape[3]
+    column, row = _cell(x, columns), _cell(y, nodes.shape[2])
+    along, across = lagrange_basis(x - column), lagrange_basis(y - row)
+    flat = nodes.flatten(2).expand(batch, -1, -1)
+    result: Tensor | None = None
+    for i in range(4):
+        line: Tensor | None = None
+        for j in range(4):
+            index = (row + (i - 1)) * columns + column + (j - 1)
+            index = index.expand(batch, 1, *size).flatten(2).expand(-1, flat.shape[1], -1)
+            values = flat.gather(2, index).unflatten(2, size) * along[..., j]
+            line = values if line is None else line + values
+        assert line is not None
+        result = line * across[..., i] if result is None else result + line * across[..., i]
+    assert result is not None
+    return result
+
+
+def _bilinear(nodes: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Interpolate nodes (N, 2, h, w) at fractional indices, each (N or 1, 1, n, m)."""
+    rows, columns = nodes.shape[2:]
+    x, y = torch.broadcast_tensors((2 * x + 1) / columns - 1, (2 * y + 1) / rows - 1)
+    grid = torch.cat([x, y], dim=1).movedim(1, -1)
+    batch = max(len(nodes), len(grid))
+    return grid_sample(nodes.expand(batch, -1, -1, -1), grid, padding="border", interpolation="bilinear")
+
+
+# old: leaves with the old effects
+class StreamFlow(LatticeFlow):
+    """The curl of a stream function that is known at the nodes of a lattice, (B, 1, n, m), px^2.
+
+        flow = (D_y psi, -D_x psi) of psi between nodes, by polynomials through six of them along each axis
+
+    The lattice has three nodes before the frame and two behind its last cell.
+
+    D is the central difference, as in `curl`: the divergence taken with it vanishes, which that of a flow between nodes
+    of its own does not.
+    """
+
+    def dense(self) -> Tensor:
+        """(B, 2, H, W), px."""
+        return down(*self._lines(self.nodes, (1.0, 1.0)), self.lattice.height)
+
+    def lines(self, dtype: torch.dtype) -> Lines:
+        """Where F.grid_sample(align_corners=False) looks, at every pixel of the rows of nodes."""
+        height, width = self.lattice.height, self.lattice.width
+        x, y = pixel_axes(height, width, dtype=dtype, device=self.nodes.device)
+        x, y = sampler_axes(x, y, height=height, width=width)
+        nodes = finite(self.nodes.to(dtype), FARTHEST)
+        return Lines(*self._lines(nodes, (2 / width, 2 / height)), height, x.flatten(), y.flatten())
+
+    def weights(self) -> tuple[Tensor, Tensor]:
+        """Of the nodes around, along a row and along a column, (2, stride, taps): for u and v, by place in a cell."""
+        return _curl_weights(self.lattice.stride, (1.0, 1.0), self.nodes.dtype, self.nodes.device)
+
+    def _lines(self, nodes: Tensor, scale: tuple[float, float]) -> tuple[Tensor, Tensor]:
+        """(B, 2, n, W) and (2, stride, taps): (D_y psi, -D_x psi), each times its scale, as in `Lines`."""
+        (first, second), between = _curl_weights(self.lattice.stride, scale, nodes.dtype, nodes.device)
+        return across_twice(nodes, (first, second), self.lattice.width), between
+
+

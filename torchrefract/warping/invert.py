@@ -52,7 +52,7 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
     if flow.numel() == 0:
         return flow.clone(), flow[:, :1] == 0, flow[:, :1].clone()
     is_finite = (flow.detach().abs() <= _LARGEST_FLOW).all(dim=1, keepdim=True)
-    has_holes = not eager_bool(lambda: is_finite.all(), of=flow)
+    has_holes = not eager_bool(is_finite.all, of=flow)
     flow = torch.where(is_finite, flow, 0) if has_holes else flow
     with torch.no_grad():
         values = flow.detach().to(sampling_dtype(flow, flow.dtype))

@@ -9,7 +9,7 @@ from torchrefract._tensor import exact_matmul
 from torchrefract.ops.cubic import interpolate_nodes, lagrange_basis
 from torchrefract.ops.sampling import grid_sample
 from torchrefract.warping.grid import Points, finite, pixel_axes, sampler_axes, sampler_positions
-from torchrefract.warping.old_lattice import (
+from torchrefract.warping.old_lattice import (  # noqa: F401 - the old effects import them here
     FARTHEST,
     STREAM_NODES,
     Lines,
@@ -152,7 +152,6 @@ class LatticeFlow:
             along = exact_matmul(self.nodes, _weight_matrix(x.flatten(), columns).to(self.dtype).mT)
             return exact_matmul(_weight_matrix(y.flatten(), rows).to(self.dtype), along)
 
-
     # old: leaves with the old effects
     def rows(self, index: Tensor) -> "LatticeFlow":
         return self.with_nodes(self.nodes[index])
@@ -253,5 +252,3 @@ class StreamFlow(LatticeFlow):
         """(B, 2, n, W) and (2, stride, taps): (D_y psi, -D_x psi), each times its scale, as in `Lines`."""
         (first, second), between = _curl_weights(self.lattice.stride, scale, nodes.dtype, nodes.device)
         return across_twice(nodes, (first, second), self.lattice.width), between
-
-

@@ -1,6 +1,5 @@
 """Warp images along backward flows."""
 
-import torch
 from torch import Tensor
 
 from torchrefract._validation import check_choice, check_flow, check_tensor

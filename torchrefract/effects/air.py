@@ -19,11 +19,11 @@ from torchrefract._validation import (
 )
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.depth import DepthProvider, LinearDepth
-from torchrefract.effects.light_plan import Blend
 from torchrefract.effects.plan import in_ranges
 from torchrefract.effects.rows import expand_batch
 from torchrefract.fields.depth import check_depth, ray_distance
 from torchrefract.fields.veils import Drifting, Ends, veiled, veiled_by_drifts_
+from torchrefract.planning.photometric import Blend
 from torchrefract.warping.grid import field_dtype
 
 _PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)

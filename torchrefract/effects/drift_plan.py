@@ -25,7 +25,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torchrefract.effects.fog_plan import FogPlan
-from torchrefract.effects.light_plan import Blend, check_level_reachable, named, thicknesses, whole
 from torchrefract.effects.plan import STRIDES
 from torchrefract.fields.perlin import BAND
 from torchrefract.fields.perlin_bounds import (
@@ -37,6 +36,7 @@ from torchrefract.fields.perlin_bounds import (
     mean_variance,
 )
 from torchrefract.fields.veils import Ends
+from torchrefract.planning.photometric import Blend, check_level_reachable, named, thicknesses, whole
 
 SIGMAS = 7.0
 MARGIN = 1.05  # for what lies between the x and the places that are looked at

@@ -22,9 +22,9 @@ from torchrefract._validation import (
 from torchrefract.effects.base import params_to
 from torchrefract.effects.flare_plan import FlarePlan, Suns, flare_plan, reach
 from torchrefract.effects.motion import check_frame
+from torchrefract.effects.photometric_effect import Shaded
 from torchrefract.effects.plan import in_ranges
 from torchrefract.effects.planned_light import PlannedLight
-from torchrefract.effects.radiance import Shaded
 from torchrefract.effects.rows import column, expand_batch
 from torchrefract.fields.flare import flare_axes
 from torchrefract.types import Range

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from torchrefract.effects.light_plan import LEVELS, LightPlan, check_level_reachable, whole
+from torchrefract.planning.photometric import LEVELS, LightPlan, check_level_reachable, whole
 from torchrefract.types import Range
 
 _NOTHING = (0, 0, 0, 0)

@@ -15,9 +15,9 @@ from torchrefract.effects.air import Air, check_fog_params, distances, make_air,
 from torchrefract.effects.base import params_to
 from torchrefract.effects.depth import DepthProvider
 from torchrefract.effects.fog_plan import FogPlan, Fogs, fog_plan
+from torchrefract.effects.photometric_effect import Shaded
 from torchrefract.effects.plan import in_ranges
 from torchrefract.effects.planned_light import PlannedLight
-from torchrefract.effects.radiance import Shaded
 from torchrefract.effects.rows import column, expand_alike
 from torchrefract.fields.fog import extinction, transmission
 from torchrefract.types import Range

@@ -22,8 +22,16 @@ from functools import lru_cache
 
 import numpy as np
 
-from torchrefract.effects.light_plan import Blend, LightPlan, bands_of, check_level_reachable, named, thicknesses, whole
 from torchrefract.fields.veils import NO_ENDS, Ends
+from torchrefract.planning.photometric import (
+    Blend,
+    LightPlan,
+    bands_of,
+    check_level_reachable,
+    named,
+    thicknesses,
+    whole,
+)
 
 _MOST_NODES = 8
 _MARGIN = 1.02  # for what lies between the x that are looked at

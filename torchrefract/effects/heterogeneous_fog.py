@@ -27,9 +27,9 @@ from torchrefract.effects.fog import (
 )
 from torchrefract.effects.fog_plan import fog_plan
 from torchrefract.effects.motion import check_decorrelation, check_motion, check_wind, drawn_motion, motion_ranges, tame
+from torchrefract.effects.photometric_effect import Shaded
 from torchrefract.effects.plan import in_ranges
 from torchrefract.effects.planned_light import PlannedLight
-from torchrefract.effects.radiance import Shaded
 from torchrefract.effects.random_field import check_key
 from torchrefract.effects.rows import column, expand_batch, frame_mean
 from torchrefract.effects.scales import check_scales, check_weights, chosen, periods, shares, stretched

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchrefract._tensor import assume_constant_result
 from torchrefract._validation import eager_bool, requires_grad
-from torchrefract.effects.light_plan import LightPlan
+from torchrefract.effects.photometric_effect import RadianceEffect
 from torchrefract.effects.plan import check_tolerance
-from torchrefract.effects.radiance import RadianceEffect
+from torchrefract.planning.photometric import LightPlan
 from torchrefract.warping.grid import field_dtype
 
 

@@ -6,8 +6,8 @@ from functools import lru_cache, partial
 import numpy as np
 
 from torchrefract.effects.drift_plan import MARGIN, SIGMAS, DriftPlan, Drifts, ends_of, seen_of_all
-from torchrefract.effects.light_plan import check_level_reachable, thicknesses, whole
 from torchrefract.fields.perlin3d import VARIANCE
+from torchrefract.planning.photometric import check_level_reachable, thicknesses, whole
 
 # Of noise, in the middle of a cell: half its diagonal.
 _LARGEST = math.sqrt(0.75)

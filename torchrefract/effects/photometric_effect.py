@@ -1,21 +1,33 @@
-"""What every effect that changes light is: it moves nothing, and tells what arrives and what is added."""
+"""The base class of effects that change light and move nothing."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
+from copy import copy
 from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
 
-from torchrefract._validation import eager_bool, requires_grad
+from torchrefract._tensor import assume_constant_result, expand_batch
+from torchrefract._validation import eager_bool, eager_values, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.rows import column, expand_batch, params_part, part, put, some, where_active
+from torchrefract.effects.batch import per_sample, select_params, where_active
+from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest
+from torchrefract.planning.plan import check_tolerance
 from torchrefract.types import Degraded, Map
 from torchrefract.warping.grid import field_dtype
 
+# Values of the maps where nothing changes.
+_UNCHANGED = {"transmission": 1.0, "extinction": 0.0, "intensity": 0.0}
 
-class Shaded(NamedTuple):
-    """What a radiance effect makes of a batch, in rows for each frame; maps also in one row for each clip."""
+
+class Rendered(NamedTuple):
+    """A degraded batch.
+
+    image: (N, C, H, W).
+    valid: computes (N or B, 1, H, W), bool, the pixels from which the clean image can be recovered.
+    transmission, extinction, intensity: (N or B, 1, H or 1, W or 1), or functions that compute them; see `Degraded`.
+    """
 
     image: Tensor
     valid: Callable[[], Tensor]
@@ -24,89 +36,151 @@ class Shaded(NamedTuple):
     intensity: Map | None = None
 
 
-# What the maps say where nothing is changed.
-_CLEAR = {"transmission": 1.0, "extinction": 0.0, "intensity": 0.0}
-
-
-def _stirs(active: Tensor, params: Any) -> bool:
-    return eager_bool(active.any, of=active) is not False or requires_grad(params)
-
-
-class RadianceEffect(Effect):
+class PhotometricEffect(Effect):
     """An effect that changes light and moves nothing.
 
-    maps: the names of those of `Degraded` that it has.
+    Subclasses implement `sample_params`, `validate`, `render`, `make_plan` and `params_in_range`. Their parameters are
+    a NamedTuple with `applied` and a property `is_identity`, both (B,), bool.
+
+    Args:
+        tolerance: largest error of the image in levels of 1/255, for images in [0, 1] and all parameters in the ranges
+            of the effect; terms that cannot change a pixel by more are left out, see `plan`. None is exact. The error
+            counts before the image is rounded to its type.
+        p: probability that a sample is degraded.
     """
 
-    maps: tuple[str, ...]
+    maps: tuple[str, ...]  # of `Degraded` that the effect computes
+
+    def __init__(self, *, tolerance: float | None = None, p: float = 1.0):
+        super().__init__(p=p)
+        self.tolerance = check_tolerance(tolerance, name="tolerance")
 
     @abstractmethod
-    def shade(self, image: Tensor, params: Any, depth: Tensor | None) -> Shaded:
-        """The rows (N, C, H, W) in other light."""
+    def render(self, image: Tensor, params: Any, depth: Tensor | None) -> Rendered:
+        """Degrade images (N, C, H, W), floating, with valid parameters of B samples, all of them."""
 
     @abstractmethod
-    def acts(self, params: Any) -> Tensor:
-        """(B,), bool: the samples whose parameters change anything at all."""
+    def make_plan(self, request: PhotometricRequest, *, has_depth: bool) -> PhotometricPlan:
+        """Plan frames from the ranges, for the depth of the effect or, with `has_depth`, for any depth."""
 
-    def stirs(self, params: Any) -> bool:
-        """Whether a sample may be changed, or a gradient is asked for that could change it."""
-        return _stirs(params.applied & self.acts(params), params)
+    @abstractmethod
+    def params_in_range(self, params: Any) -> Tensor:
+        """Return (), bool: all parameters lie in the ranges of the effect, up to rounding."""
 
-    def compute(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
-        """The rows in other light, where the gate is open."""
-        active = params.applied & self.acts(params)
-        if not _stirs(active, params):
-            everywhere = active.new_ones(()).expand(_map_size(image))
-            return Degraded(image, params, valid=everywhere, light=clear_maps(self.maps, image))
-        if depth is not None and eager_bool(active.any, of=active) is False:
-            depth = None  # and nobody looks at its values
-        index, batch = some(active, params), len(active)
+    def plan_for_dtype(self, height: int, width: int, dtype: torch.dtype, *, has_depth: bool = False) -> PhotometricPlan:
+        """Return the plan for images of a type, for the depth of the effect or, with `has_depth`, for any depth."""
+        request = PhotometricRequest(height, width, self.tolerance, dtype is torch.float64)
+        return self.make_plan(request, has_depth=has_depth)
+
+    def plan_for(self, image: Tensor, params: Any, depth: Tensor | None) -> PhotometricPlan:
+        """Return the plan for a batch; an exact one if parameters require gradients."""
+        is_exact = requires_grad(params)
+        height, width = image.shape[2:]
+        return self._constant_plan(id(self), height, width, field_dtype(image.dtype), depth is not None, is_exact)
+
+    def for_params(self, params: Any, height: int, width: int) -> "PhotometricEffect":
+        """Return this effect, or an exact one if parameters lie outside the ranges that its plan holds for."""
+        if self.tolerance is None or eager_bool(lambda: self.params_in_range(params), of=params.applied) is not False:
+            return self
+        return self.exact()
+
+    def exact(self) -> "PhotometricEffect":
+        """Return the effect without a tolerance."""
+        effect = copy(self)
+        effect.tolerance = None
+        return effect
+
+    def degrade_batch(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
+        """Degrade images (N, C, H, W), floating, with valid parameters of B samples."""
+        active = params.applied & ~params.is_identity
+        if not self.may_change(params):
+            valid = active.new_ones(()).expand(_map_shape(image))
+            return Degraded(image, params, valid=valid, light=unchanged_maps(self.maps, image))
+        index, batch = _active_samples(active, params), len(active)
+        if eager_bool(active.any, of=active) is False:
+            depth = None  # its values do not matter, so they are not checked either
         if index is None:
-            shaded = self.shade(image, params, depth)
+            rendered = self.render(image, params, depth)
         else:
-            few = None if depth is None else part(depth, index, batch)
-            shaded = self.shade(part(image, index, batch), params_part(params, index), few)
+            part = None if depth is None else _select(depth, index, batch)
+            rendered = self.render(_select(image, index, batch), select_params(params, index), part)
         height, width = image.shape[2:]
 
-        def spread_map(value: Tensor, off: float | bool) -> Tensor:
+        def map_of_all(value: Tensor, unchanged: float | bool) -> Tensor:
             if index is not None:
-                value = put(value, index, off, batch)
+                value = _insert(value, index, unchanged, batch)
             elif eager_bool(active.all, of=active) is not True:
-                value = _choose(value, off, active)
+                rows = max(value.shape[0], batch)
+                value = torch.where(per_sample(expand_batch(active, rows)), expand_batch(value, rows), unchanged)
             return value.expand(-1, 1, height, width)
 
-        def masked_flow(name: str) -> Map | None:
-            value = cast(Map | None, getattr(shaded, name))
+        def lazy_map(name: str) -> Map | None:
+            value = cast(Map | None, getattr(rendered, name))
             if value is None:
                 return None
-            return lambda: spread_map(value() if callable(value) else value, _CLEAR[name])
+            return lambda: map_of_all(value() if callable(value) else value, _UNCHANGED[name])
 
-        if index is not None:
-            shone = put(shaded.image, index, image, batch)
+        if rendered.image is image:
+            result = image
+        elif index is not None:
+            result = _insert(rendered.image, index, image, batch)
         else:
-            shone = image if shaded.image is image else where_active(shaded.image, image, active, params)
+            result = where_active(rendered.image, image, active, params)
         return Degraded(
-            shone,
+            result,
             params,
-            valid=lambda: spread_map(shaded.valid(), True),
-            light={name: value for name in _CLEAR if (value := masked_flow(name)) is not None},
+            valid=lambda: map_of_all(rendered.valid(), True),
+            light={name: value for name in _UNCHANGED if (value := lazy_map(name)) is not None},
         )
 
+    @assume_constant_result
+    def _constant_plan(
+        self, _: int, height: int, width: int, dtype: torch.dtype, has_depth: bool, is_exact: bool
+    ) -> PhotometricPlan:
+        # torch.compile takes the plan as a constant and does not trace how it is made. PyTorch 2.11 does so for methods
+        # alone; the identity of the effect among the arguments keeps the plans of different effects apart.
+        effect = self.exact() if is_exact else self
+        return effect.plan_for_dtype(height, width, dtype, has_depth=has_depth)
 
-def clear_maps(names: Iterable[str], image: Tensor) -> dict[str, Map]:
-    """The maps of these names, as they are where nothing is changed."""
-    size, dtype, device = _map_size(image), field_dtype(image.dtype), image.device
 
-    def everywhere(value: float) -> Map:
-        return lambda: torch.full((), value, dtype=dtype, device=device).expand(size)
+def unchanged_maps(names: Iterable[str], image: Tensor) -> dict[str, Map]:
+    """Return lazy maps with the values that they have where an effect changes nothing."""
+    shape, dtype, device = _map_shape(image), field_dtype(image.dtype), image.device
 
-    return {name: everywhere(_CLEAR[name]) for name in names}
+    def constant(value: float) -> Map:
+        return lambda: torch.full((), value, dtype=dtype, device=device).expand(shape)
+
+    return {name: constant(_UNCHANGED[name]) for name in names}
 
 
-def _map_size(image: Tensor) -> tuple[int, ...]:
+def _map_shape(image: Tensor) -> tuple[int, ...]:
     return (image.shape[0], 1, *image.shape[2:])
 
 
-def _choose(value: Tensor, off: float | bool, active: Tensor) -> Tensor:
-    rows = max(value.shape[0], active.shape[0])
-    return torch.where(column(expand_batch(active, rows)), expand_batch(value, rows), off)
+def _active_samples(active: Tensor, params: Any) -> Tensor | None:
+    """(n,): the indices of the active samples, so that only these are computed.
+
+    None if all or none are active, if that cannot be read without waiting, or if parameters require gradients.
+    """
+    flags = None if requires_grad(params) else eager_values(lambda: active)
+    if flags is None or all(flags) or not any(flags):
+        return None
+    return torch.tensor([i for i, flag in enumerate(flags) if flag])
+
+
+def _select(value: Tensor, index: Tensor, batch: int) -> Tensor:
+    """The rows of some samples; (N, ...) has the frames of the B clips one after the other."""
+    return value[_row_numbers(index, value.shape[0] // batch)]
+
+
+def _insert(value: Tensor, index: Tensor, unchanged: Tensor | float, batch: int) -> Tensor:
+    """Put the rows of some samples into a batch whose other rows are `unchanged`."""
+    value = expand_batch(value, max(len(index), value.shape[0]))
+    frames = value.shape[0] // len(index)
+    if not isinstance(unchanged, Tensor):
+        unchanged = value.new_full((batch * frames, *value.shape[1:]), unchanged)
+    return unchanged.index_copy(0, _row_numbers(index, frames), value)
+
+
+def _row_numbers(index: Tensor, frames: int) -> Tensor:
+    return (frames * index[:, None] + torch.arange(frames)).flatten()

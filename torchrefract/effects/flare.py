@@ -145,7 +145,10 @@ class LensFlare(PhotometricEffect):
         radius = max(self.radius_range[1] * math.hypot(*size) * (1 + _ROUNDING), 1e-6)
         # The sun drifts anywhere in a clip; a still one is some distance from the nearest pixel.
         distance = math.hypot(
-            *(_distance_from_frame(getattr(self, f"center_{axis}_range"), side) for axis, side in zip("xy", size))
+            *(
+                _distance_from_frame(getattr(self, f"center_{axis}_range"), side)
+                for axis, side in zip("xy", size, strict=True)
+            )
         )
         if any(getattr(self, f"drift_{axis}_range") != (0.0, 0.0) for axis in "xy"):
             distance = 0.0

@@ -27,7 +27,13 @@ from torchrefract.effects.depth import DepthProvider, LinearDepth
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.fields.depth import check_depth, check_floating, ray_distance
 from torchrefract.fields.fog import blend_fog, extinction, transmission, unblend_fog
-from torchrefract.planning.photometric import FogErrorModel, PhotometricPlan, PhotometricRequest, in_ranges, plan_uniform_fog
+from torchrefract.planning.photometric import (
+    FogErrorModel,
+    PhotometricPlan,
+    PhotometricRequest,
+    in_ranges,
+    plan_uniform_fog,
+)
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 

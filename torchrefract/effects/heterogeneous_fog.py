@@ -169,7 +169,9 @@ class HeterogeneousFog(PhotometricEffect):
         self.wind_y_range = check_wind("wind_y_range", wind_y_range)
         self.wind_z_range = check_wind("wind_z_range", wind_z_range)
         if mode == "image" and self.wind_z_range != (0.0, 0.0):
-            raise ValueError(f"wind_z_range must be (0, 0) for mode='image', which has no depth, got {self.wind_z_range}")
+            raise ValueError(
+                f"wind_z_range must be (0, 0) for mode='image', which has no depth, got {self.wind_z_range}"
+            )
         self.decorrelation_range = check_decorrelation(decorrelation_range)
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> HeterogeneousFogParams:

@@ -12,7 +12,7 @@ from torchrefract._tensor import assume_constant_result, expand_batch
 from torchrefract._validation import eager_bool, eager_values, requires_grad
 from torchrefract.effects.base import Effect
 from torchrefract.effects.batch import per_sample, select_params, where_active
-from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest
+from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, exact_plan
 from torchrefract.planning.plan import check_tolerance
 from torchrefract.types import Degraded, Map
 from torchrefract.warping.grid import field_dtype
@@ -67,16 +67,19 @@ class PhotometricEffect(Effect):
     def params_in_range(self, params: Any) -> Tensor:
         """Return (), bool: all parameters lie in the ranges of the effect, up to rounding."""
 
-    def plan_for_dtype(self, height: int, width: int, dtype: torch.dtype, *, has_depth: bool = False) -> PhotometricPlan:
+    def plan_for_dtype(
+        self, height: int, width: int, dtype: torch.dtype, *, has_depth: bool = False
+    ) -> PhotometricPlan:
         """Return the plan for images of a type, for the depth of the effect or, with `has_depth`, for any depth."""
         request = PhotometricRequest(height, width, self.tolerance, dtype is torch.float64)
         return self.make_plan(request, has_depth=has_depth)
 
     def plan_for(self, image: Tensor, params: Any, depth: Tensor | None) -> PhotometricPlan:
-        """Return the plan for a batch; an exact one if parameters require gradients."""
-        is_exact = requires_grad(params)
+        """Return the plan for a batch; the exact one without a tolerance or if parameters require gradients."""
         height, width = image.shape[2:]
-        return self._constant_plan(id(self), height, width, field_dtype(image.dtype), depth is not None, is_exact)
+        if self.tolerance is None or requires_grad(params):
+            return exact_plan(height, width)
+        return self._constant_plan(id(self), height, width, field_dtype(image.dtype), depth is not None)
 
     def for_params(self, params: Any, height: int, width: int) -> "PhotometricEffect":
         """Return this effect, or an exact one if parameters lie outside the ranges that its plan holds for."""
@@ -134,13 +137,10 @@ class PhotometricEffect(Effect):
         )
 
     @assume_constant_result
-    def _constant_plan(
-        self, _: int, height: int, width: int, dtype: torch.dtype, has_depth: bool, is_exact: bool
-    ) -> PhotometricPlan:
+    def _constant_plan(self, _: int, height: int, width: int, dtype: torch.dtype, has_depth: bool) -> PhotometricPlan:
         # torch.compile takes the plan as a constant and does not trace how it is made. PyTorch 2.11 does so for methods
         # alone; the identity of the effect among the arguments keeps the plans of different effects apart.
-        effect = self.exact() if is_exact else self
-        return effect.plan_for_dtype(height, width, dtype, has_depth=has_depth)
+        return self.plan_for_dtype(height, width, dtype, has_depth=has_depth)
 
 
 def unchanged_maps(names: Iterable[str], image: Tensor) -> dict[str, Map]:

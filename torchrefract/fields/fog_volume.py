@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrefract._tensor import as_device_tensor, cat_bands, exact_matmul, rows_at_once
 from torchrefract._validation import finite_or
 from torchrefract.fields.perlin import fade_out
-from torchrefract.white_noise import lattice
+from torchrefract.random import lattice_noise
 
 # Variance of the noise over all gradients and places in a cell. Each of the 8 nodes adds a third of the mean of
 # (h(p) h(q) h(r))^2 (p^2 + q^2 + r^2); the mean of h^2 is 181 / 462, that of (h p)^2 is 535 / 18018.
@@ -306,7 +306,7 @@ def _gradients(
         x, y, z = (first[:, i, axis, None] + torch.arange(n, device=key.device) for axis, n in enumerate(counts))
         plane = z[:, :, None, None] + i * _OCTAVE
         numbers.append((x[:, None, None] + _LINE * (y[:, None, :, None] + _LINE * plane)).flatten(1))
-    scaled = _UPPER * lattice(key, [torch.cat(numbers, dim=1)], 2)
+    scaled = _UPPER * lattice_noise(key, [torch.cat(numbers, dim=1)], 2)
     upper = scaled.floor()
     lower = scaled - upper
     # Whole turns are dropped in float64: late frames have many.

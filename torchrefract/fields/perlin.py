@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrefract._tensor import exact_matmul
 from torchrefract._validation import eager_bool, requires_grad
-from torchrefract.white_noise import lattice
+from torchrefract.random import lattice_noise
 
 # Multiples of the golden ratio stay apart modulo 1, so that octaves share no lines of nodes.
 _GOLDEN_RATIO = (5**0.5 - 1) / 2
@@ -160,8 +160,8 @@ def _blocks(position: Tensor, nodes: int, step: float, dtype: torch.dtype) -> tu
 def _turns(key: Tensor, nodes: Sequence[Tensor], *, frame: Tensor, decorrelation: Tensor, dtype: torch.dtype) -> Tensor:
     """(N, n, m): the angles of the gradients over 2 pi."""
     if not requires_grad((frame, decorrelation)) and eager_bool((frame / decorrelation == 0).all, of=frame):
-        return lattice(key, nodes, 1)[:, 0, 0].to(dtype)
-    start, speed = lattice(key, nodes, 2)[:, :, 0].unbind(1)
+        return lattice_noise(key, nodes, 1)[:, 0, 0].to(dtype)
+    start, speed = lattice_noise(key, nodes, 2)[:, :, 0].unbind(1)
     elapsed = (frame.double() / (math.pi * decorrelation.double()))[:, None, None]
     # Whole turns are dropped in float64: late frames have many.
     return start.to(dtype) + ((2 * speed - 1).double().erfinv() * elapsed).frac().to(dtype)

@@ -44,7 +44,7 @@ class PhotometricRequest:
     is_double: bool
 
     def remaining(self, *, linear_light: bool = False, scale: float = 1.0) -> float:
-        """Return the part of the tolerance that rounding leaves, levels.
+        """Return the part of the tolerance that rounding leaves, levels; 0 without a tolerance.
 
         Args:
             linear_light: the image is blended in linear light.
@@ -53,7 +53,8 @@ class PhotometricRequest:
         Raises:
             ValueError: the tolerance is smaller than twice the rounding error.
         """
-        assert self.tolerance is not None
+        if self.tolerance is None:
+            return 0.0
         rounding = LEVELS * _ROUNDING_ULPS * _LAST_PLACE[self.is_double] * scale
         rounding *= _STEEPEST_SRGB if linear_light else 1.0
         if self.tolerance < 2 * rounding:
@@ -222,34 +223,37 @@ def plan_flare(light: float, request: PhotometricRequest, *, is_bounded: bool) -
         request: the frame and the tolerance.
         is_bounded: True if the image stays in [0, 1].
     """
-    if request.tolerance is None:
-        return _exact(request, "no tolerance")
-    change = LEVELS * light
-    if change > request.remaining(scale=1.0 if is_bounded else max(1.0, light)):
-        return _exact(request, "the flare can be seen")
-    frame = (request.height, request.width, request.tolerance)
-    return PhotometricPlan(*frame, change, "it is too faint", is_identity=True, dropped=(("flare", change),))
+    budget = request.remaining(scale=1.0 if is_bounded else max(1.0, light))
+    plan = _identity_if_unseen(LEVELS * light, budget, request, name="flare", reason="it is too faint")
+    return plan or _exact(request, "the flare can be seen")
+
+
+def exact_plan(height: int, width: int) -> PhotometricPlan:
+    """Return the plan without a tolerance."""
+    return PhotometricPlan(height, width, None, 0.0, "no tolerance")
 
 
 def _exact(request: PhotometricRequest, reason: str, **terms: Any) -> PhotometricPlan:
-    if request.tolerance is None:
-        reason = "no tolerance"
+    reason = "no tolerance" if request.tolerance is None else reason
     return PhotometricPlan(request.height, request.width, request.tolerance, 0.0, reason, **terms)
 
 
-def _without_fog(
-    model: FogErrorModel, request: PhotometricRequest, *, largest_ratio: float
-) -> PhotometricPlan | None:
+def _without_fog(model: FogErrorModel, request: PhotometricRequest, *, largest_ratio: float) -> PhotometricPlan | None:
     """The plan without any fog, if it cannot be seen where q / <q> is at most `largest_ratio`."""
-    if request.tolerance is None:
-        return None
-    remaining = request.remaining(linear_light=model.linear_light)
-    thickness = model.thickness * largest_ratio if model.thickness > 0 else 0.0
-    change = model.levels(-math.expm1(-thickness))
-    if change > remaining:
+    change = model.levels(-math.expm1(-model.thickness * largest_ratio)) if model.thickness > 0 else 0.0
+    budget = request.remaining(linear_light=model.linear_light)
+    return _identity_if_unseen(change, budget, request, name="fog", reason="it is too thin")
+
+
+def _identity_if_unseen(
+    change: float, budget: float, request: PhotometricRequest, *, name: str, reason: str
+) -> PhotometricPlan | None:
+    if change > budget:
         return None
     frame = (request.height, request.width, request.tolerance)
-    return PhotometricPlan(*frame, change, "it is too thin", is_identity=True, dropped=(("fog", change),))
+    if change == 0:
+        return PhotometricPlan(*frame, 0.0, "its strength is 0", is_identity=True)
+    return PhotometricPlan(*frame, change, reason, is_identity=True, dropped=((name, change),))
 
 
 def _deviation_of_mean(model: FogErrorModel, octaves: Sequence[int], request: PhotometricRequest) -> float:

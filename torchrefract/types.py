@@ -1,8 +1,10 @@
 """Plain values that cross layers."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,6 +20,44 @@ class Inverse(NamedTuple):
 
     flow: Tensor  # (B, 2, H, W), px
     valid: Tensor  # (B, 1, H, W), bool: where it does
+
+
+@dataclass(frozen=True)
+class FlowBounds:
+    """Upper bounds for all flows of an error model, over the frame and a margin around it.
+
+    max_displacement: px.
+    max_gradient: px per px; inf if unknown.
+    max_second_derivative: px per px^2, along any line; inf if unknown.
+    max_third_derivative: px per px^3; inf if the second derivative has kinks.
+    interpolation_error: from strides, an array in px, to the largest error in px of cubic Lagrange polynomials through
+        4 nodes along each axis, wherever the nodes lie; inf if unknown.
+    """
+
+    max_displacement: float
+    max_gradient: float
+    max_second_derivative: float
+    max_third_derivative: float
+    interpolation_error: Callable[[np.ndarray], np.ndarray]
+
+
+class Simplification(NamedTuple):
+    """Parts of a flow that can be left out.
+
+    error_px: the largest error that they cause together.
+    kept: names of the terms that are computed.
+    dropped: names of the others, each with its own largest effect in px.
+    details: a hashable value that the effect finds again as `WarpPlan.details`.
+    can_interpolate: False if the flow must be computed at every pixel.
+    why: a phrase for the printed plan.
+    """
+
+    error_px: float
+    kept: tuple[str, ...] = ()
+    dropped: tuple[tuple[str, float], ...] = ()
+    details: Any = None
+    can_interpolate: bool = True
+    why: str = ""
 
 
 class Folding(NamedTuple):

@@ -1,44 +1,58 @@
-"""Several effects in a row, with one look-up for all warps that follow one another."""
+"""Several effects in a row, with one sampling for all warps that follow one another."""
 
-import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from functools import partial
 from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 
 from torchrefract import random
-from torchrefract._tensor import assume_constant_result
-from torchrefract._validation import check_choice
-from torchrefract.effects.base import Effect, moved
-from torchrefract.effects.compose_plan import ComposePlan, compose_plan
-from torchrefract.effects.plan import TOLERANCE_PX, Plan, PlanRequest, check_tolerance
-from torchrefract.effects.radiance import RadianceEffect
-from torchrefract.effects.refraction import WarpEffect
-from torchrefract.effects.rows import Undrawn, drawn
-from torchrefract.effects.walk import Look, Walk
+from torchrefract._tensor import assume_constant_result, expand_batch
+from torchrefract._validation import check_choice, eager_bool, eager_values, requires_grad
+from torchrefract.effects.base import Effect
+from torchrefract.effects.batch import params_per_frame, params_to, per_sample, select_params, where_active
+from torchrefract.effects.photometric_effect import PhotometricEffect
+from torchrefract.effects.warp_effect import (
+    MIN_PIXELS,
+    BatchFlow,
+    FlowPart,
+    SamplingOptions,
+    WarpEffect,
+    warped,
+)
+from torchrefract.planning.composition import ComposePlan, CompositionPlan, PlannedWarp, plan_composition
+from torchrefract.planning.plan import TOLERANCE_PX, PlanRequest, check_tolerance, lattice_with_stride
 from torchrefract.types import Degraded
-from torchrefract.warping.grid import field_dtype
-from torchrefract.warping.resample import BACKENDS, INTERPOLATIONS, PADDINGS
+from torchrefract.warping.flow import compose_flows
+from torchrefract.warping.grid import field_dtype, inside
+from torchrefract.warping.lattice import LatticeFlow
+from torchrefract.warping.warp import BACKENDS, INTERPOLATIONS, PADDINGS, sees_only_valid
 
-_OPEN = Look()
-_MOST_SETS = 64  # of effects that act together, for each of which there is a plan
+# How photometric maps of several effects combine.
+_COMBINE: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "transmission": torch.mul,
+    "intensity": torch.add,
+    "extinction": torch.add,
+}
 
 
 class ComposeParams(NamedTuple):
     """The parameters of all effects of a composition."""
 
-    applied: Tensor  # (B,), bool: the sample is degraded; where it is not, no effect's own gate is open
+    applied: Tensor  # (B,), bool: the sample is degraded; where it is False, it is False in all children too
     children: tuple[Any, ...]  # of each effect, in order
 
-    def to(self, *args: Any, **kwargs: Any) -> "ComposeParams":
-        """All tensors moved as by `Tensor.to`; a change of type leaves flags as they are."""
-        return ComposeParams(
-            moved(self.applied, *args, **kwargs), tuple(child.to(*args, **kwargs) for child in self.children)
-        )
+    to = params_to
+
+
+class _Leaf(NamedTuple):
+    """An effect that is not a composition, with its parameters and the sampling options of the compositions around."""
+
+    effect: Effect
+    params: Any
+    options: SamplingOptions
 
 
 class Compose(Effect):
@@ -46,23 +60,28 @@ class Compose(Effect):
 
         flow(p) = d_1,  d_i = d_(i+1) + f_i(p + d_(i+1)),  d_n = f_n(p)
 
-    Warps that follow one another look the image up once, along the composite of their flows, so that the image is
-    blurred once. Effects of light between them keep their place: the image is looked up before, and their maps move
-    with the warps after. `restore_flow` is the composite of the flows back, in closed form where the effects have one;
-    it is not valid where it misses by more than 0.5 px, as between the sheets of a fold.
+    Warps that follow one another sample the image once, along their composed flow, so that it is blurred once. Under a
+    tolerance the composed flow is computed at the nodes of one lattice. Photometric effects between warps keep their
+    place: the image is sampled before them, and their maps move with the warps after them. `restore_flow` is the
+    composition of the inverse flows; it is not valid where it misses by more than 0.5 px, as between the sheets of a
+    fold.
 
     Args:
         effects: at least one; compositions may be nested.
-        padding, interpolation, backend: of the look-ups, whatever the effects and compositions inside have; None
-            takes those of the last warp that moves the sample, or of the outermost composition inside that has it.
-        tolerance_px: how far the composite of all flows may be from the exact one, px, see `plan`; None is exact. It
-            takes the place of what the effects and compositions inside have, but an effect that has None stays exact.
-            As for warps, the default is exact in frames too large for it.
-        p: chance that a sample is degraded at all.
+        padding, interpolation, backend: of all samplings, in place of those of the effects and compositions inside;
+            None takes those of the last warp that moves the sample, or of the outermost composition inside that has
+            them.
+        tolerance_px: largest error of the composed flow in px, see `plan`; None is exact. It replaces the tolerance of
+            the effects and compositions inside, but an effect whose own tolerance is None stays exact. In frames too
+            large for the default, the default is exact.
+        p: probability that a sample is degraded.
 
     Raises:
-        ValueError, TypeError: no effect, or something else among them.
+        ValueError: no effect.
+        TypeError: one of them is not an effect.
     """
+
+    params_type = ComposeParams
 
     def __init__(
         self,
@@ -88,183 +107,429 @@ class Compose(Effect):
         self.backend = None if backend is None else check_choice("backend", backend, BACKENDS)
         self.tolerance_px = check_tolerance(tolerance_px)
 
-    params_type = ComposeParams
-
     @property
-    def takes_levels(self) -> bool:
-        """Whether all its effects do."""
-        return all(effect.takes_levels for effect in self._effects())
+    def keeps_uint8(self) -> bool:
+        """Return True if all effects do."""
+        return all(effect.keeps_uint8 for effect in self._children())
 
-    def at_rest(self) -> bool:
-        """Whether none of its effects acts."""
-        return all(effect.idle for effect in self._effects())
+    def sample_params(self, stream: random.Stream, image: Tensor) -> ComposeParams:
+        """Draw the parameters of each effect from a stream of its own."""
+        applied, children_applied = self.sample_applied(stream)
+        inner = random.fold(stream)
+        children = [effect.sample_params(inner.at(i), image) for i, effect in enumerate(self._children())]
+        return ComposeParams(applied, tuple(map(_restrict, children, children_applied)))
 
-    def draw(self, source: random.Stream, image: Tensor) -> ComposeParams:
-        """Each effect's draw, from streams of their own."""
-        return drawn(self.draw_sparingly(source, image))
+    def sample_applied(self, stream: random.Stream) -> tuple[Tensor, list[Tensor]]:
+        """Draw whether the composition is applied, (B,), bool, and whether each of its effects is."""
+        applied = random.uniform(stream, 1)[:, 0] < self.p
+        return applied, [applied] * len(self.effects)
 
-    def draw_sparingly(self, source: random.Stream, image: Tensor) -> ComposeParams:
-        """The same, but what is idle is drawn when somebody reads it."""
-        return self._draw_sparingly(source, image, idle=False)
-
-    def _draw_sparingly(self, source: random.Stream, image: Tensor, *, idle: bool) -> ComposeParams:
-        applied, gates = self._gates(source)
-        inner, idle = random.fold(source), idle or self.p == 0
-        children: list[Any] = []
-        for i, effect in enumerate(self._effects()):
-            if isinstance(effect, Compose):
-                children.append(effect._draw_sparingly(inner.at(i), image, idle=idle))
-            elif idle or effect.idle:
-                children.append(_later(effect, inner.at(i), image))
-            else:
-                children.append(effect.draw(inner.at(i), image))
-        return ComposeParams(applied, tuple(map(_closed, children, gates)))
-
-    def check(self, params: ComposeParams, image: Tensor) -> None:
-        """Raise for parameters that one of the effects refuses."""
+    def validate(self, params: ComposeParams, image: Tensor) -> None:
+        """Raise for parameters that one of the effects rejects."""
         if len(params.children) != len(self.effects):
             raise ValueError(
                 f"params.children must be those of {len(self.effects)} effects, got {len(params.children)}"
             )
-        for effect, child in zip(self._effects(), params.children, strict=True):
+        for effect, child in zip(self._children(), params.children, strict=True):
             effect.check_params(child, image)
 
     def check_params(self, params: Any, image: Tensor) -> None:
-        """Raise for parameters that are not of these effects and this batch."""
+        """Raise for parameters that do not belong to these effects and this batch."""
         if not isinstance(params, ComposeParams):
             raise TypeError(f"params must be ComposeParams, got {type(params).__name__}")
         if params.applied.shape != image.shape[:1]:
             raise ValueError(
-                f"params.applied must have one row for each of the {image.shape[0]} images, got {tuple(params.applied.shape)}"
+                f"params.applied must have one row for each of the {image.shape[0]} images, "
+                f"got {tuple(params.applied.shape)}"
             )
-        self.check(params, image)
-
-    def compute(self, image: Tensor, params: ComposeParams, depth: Tensor | None) -> Degraded:
-        """The batch through all effects."""
-        walk = Walk(image, depth)
-        height, width = image.shape[2:]
-        leaves = list(self.leaves(params))
-        idle = tuple(
-            isinstance(own, Undrawn) or (rests and not _stirs(effect, own, height, width))
-            for (effect, own), rests in zip(leaves, self._idle(), strict=True)
-        )
-        plans = self._constant(id(self), height, width, field_dtype(image.dtype), idle).plans
-        for (effect, own), plan, look, rests in zip(leaves, plans, self._looks(), idle, strict=True):
-            if rests:
-                walk.rest(effect)
-            elif isinstance(effect, WarpEffect):
-                walk.move(effect, own, cast(Plan, plan), look)
-            else:
-                walk.shade(cast(RadianceEffect, effect), own, plan)
-        return walk.arrive(lambda: drawn(params))
-
-    def planned(self, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
-        """The plan for fields of a type."""
-        return self._planned(height, width, dtype, list(self._idle()))
-
-    def _planned(self, height: int, width: int, dtype: torch.dtype, idle: Sequence[bool]) -> ComposePlan:
-        """That without some effects."""
-        ask = PlanRequest(height, width, self.tolerance_px, dtype is torch.float64).of_default
-        return compose_plan(list(zip(self._leaves(), idle, strict=True)), self._together(), ask)
-
-    @assume_constant_result
-    def _constant(self, _: int, height: int, width: int, dtype: torch.dtype, idle: Sequence[bool]) -> ComposePlan:
-        # As for `PlannedLight`.
-        return self._planned(height, width, dtype, idle)
+        self.validate(params, image)
 
     def for_params(self, params: ComposeParams, height: int, width: int) -> "Compose":
-        """The composition, with each effect that relies on ranges which its parameters lie outside of exact."""
-        pairs = zip(self._effects(), params.children, strict=True)
+        """Return the composition with an exact effect wherever parameters lie outside the ranges."""
+        pairs = zip(self._children(), params.children, strict=True)
         effects = [effect.for_params(child, height, width) for effect, child in pairs]
-        if all(new is old for new, old in zip(effects, self._effects(), strict=True)):
+        if all(new is old for new, old in zip(effects, self._children(), strict=True)):
             return self
-        for_params = copy(self)
-        for_params._modules = {**self._modules, "effects": nn.ModuleList(effects)}
-        return for_params
+        composition = copy(self)
+        composition._modules = {**self._modules, "effects": nn.ModuleList(effects)}
+        return composition
 
-    def leaves(self, params: ComposeParams) -> Iterator[tuple[Effect, Any]]:
-        """The effects that are no compositions, in order, with their parameters."""
-        for effect, child in zip(self._effects(), params.children, strict=True):
+    def plan_for_dtype(self, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
+        """Return the plan for all parameters in the ranges."""
+        segments = self._segments(height, width, dtype)
+        leaves = [effect for effect, _ in self._leaf_effects()]
+        plans: dict[int, Any] = {}
+        strides, error, stretch = [], 0.0, 1.0
+        for (places, request), warps in ((segment, self._planned_warps(segment[0])) for segment in segments):
+            plan = plan_composition(warps, request)
+            plans |= dict(zip(places, plan.plans, strict=True))
+            strides.append(plan.stride)
+            error += plan.error_px * stretch if plan.error_px else 0.0
+            stretch *= 1 + plan.max_gradient
+        each = tuple(
+            plans[place] if place in plans else effect.plan_for_dtype(height, width, dtype)
+            for place, effect in enumerate(leaves)
+        )
+        names = tuple(type(effect).__name__ for effect in leaves)
+        samplings = sum(any(not plans[place].is_identity for place in places) for places, _ in segments)
+        return ComposePlan(height, width, self.tolerance_px, names, each, tuple(strides), error, samplings)
+
+    def degrade_batch(self, image: Tensor, params: ComposeParams, depth: Tensor | None) -> Degraded:
+        """Pass the images through all effects."""
+        height, width = image.shape[2:]
+        dtype = field_dtype(image.dtype)
+        leaves = list(self.leaves(params))
+        state = _Progress(image, depth, len(params.applied))
+        places: list[int] = []
+        requests = self._constant_requests(id(self), height, width, dtype)
+        for place, leaf in enumerate(leaves):
+            if isinstance(leaf.effect, WarpEffect):
+                state.has_warps = True
+                if leaf.effect.may_change(leaf.params) and height * width > 1:
+                    places.append(place)
+                continue
+            changes_light = requests[place] is None or leaf.effect.may_change(leaf.params)
+            if places and changes_light:  # the warps before it come first
+                state.move([leaves[i] for i in places], cast(PlanRequest, requests[places[0]]))
+                places = []
+            state.shade(cast(PhotometricEffect, leaf.effect), leaf.params)
+        if places:
+            state.move([leaves[i] for i in places], cast(PlanRequest, requests[places[0]]))
+        return state.result(params)
+
+    def leaves(self, params: ComposeParams) -> Iterator[_Leaf]:
+        """Yield the effects that are not compositions, in order, with their parameters and sampling options."""
+        options = [options for _, options in self._leaf_effects()]
+        yield from (_Leaf(*pair, options[i]) for i, pair in enumerate(self._effects_with_params(params)))
+
+    def _effects_with_params(self, params: ComposeParams) -> Iterator[tuple[Effect, Any]]:
+        for effect, child in zip(self._children(), params.children, strict=True):
             if isinstance(effect, Compose):
-                yield from effect.leaves(child)
+                yield from effect._effects_with_params(child)
             else:
                 yield effect, child
 
-    def _gates(self, source: random.Stream) -> tuple[Tensor, list[Tensor]]:
-        """(B,), bool: that of the composition, and those of its effects."""
-        applied = random.uniform(source, 1)[:, 0] < self.p
-        return applied, [applied] * len(self.effects)
-
-    def _leaves(self) -> Iterator[Effect]:
-        """The effects that are no compositions, in order."""
-        for effect in self._effects():
-            yield from effect._leaves() if isinstance(effect, Compose) else [effect]
-
-    def _looks(self, outer: Look = _OPEN) -> Iterator[Look]:
-        """How each of them is looked up, as far as the compositions say."""
-        own = outer.before(Look(self.padding, self.interpolation, self.backend))
-        for effect in self._effects():
+    def _leaf_effects(self, outer: SamplingOptions = SamplingOptions()) -> Iterator[tuple[Effect, SamplingOptions]]:
+        options = outer.or_else(SamplingOptions(self.padding, self.interpolation, self.backend))
+        for effect in self._children():
             if isinstance(effect, Compose):
-                yield from effect._looks(own)
+                yield from effect._leaf_effects(options)
+            elif isinstance(effect, WarpEffect):
+                yield effect, options.or_else(SamplingOptions(effect.padding, effect.interpolation, effect.backend))
             else:
-                yield own
+                yield effect, options
 
-    def _idle(self, *, idle: bool = False) -> Iterator[bool]:
-        """Whether each of them is idle; in an idle composition all are."""
-        idle = idle or self.p == 0
-        for effect in self._effects():
-            if isinstance(effect, Compose):
-                yield from effect._idle(idle=idle)
+    def _segments(self, height: int, width: int, dtype: torch.dtype) -> list[tuple[list[int], PlanRequest]]:
+        """Return the groups of warps that are sampled together, each with its share of the tolerance.
+
+        A photometric effect that may change something separates groups, whatever is drawn, so that a sample does not
+        depend on the others of its batch.
+        """
+        groups: list[list[int]] = [[]]
+        for place, (effect, _) in enumerate(self._leaf_effects()):
+            if isinstance(effect, WarpEffect):
+                groups[-1].append(place)
+            elif effect.p > 0 and not effect.plan_for_dtype(height, width, dtype).is_identity:
+                groups.append([])
+        groups = [group for group in groups if group]
+        request = PlanRequest(height, width, self.tolerance_px, dtype is torch.float64).with_reachable_default()
+        if request.tolerance_px is None:
+            return [(group, request) for group in groups]
+        request.remaining_px()  # raises for an unreachable tolerance
+        segments, stretch = [], 1.0
+        for group in groups:
+            share = request.tolerance_px / len(groups) / stretch
+            own = PlanRequest(height, width, share if share > 0 else None, request.is_double)
+            own = own if own.is_reachable else PlanRequest(height, width, None, request.is_double)
+            segments.append((group, own))
+            stretch *= 1 + plan_composition(self._planned_warps(group), own).max_gradient
+            stretch = stretch if math.isfinite(stretch) else math.inf
+        return segments
+
+    def _planned_warps(self, places: Sequence[int]) -> tuple[PlannedWarp, ...]:
+        effects = [effect for effect, _ in self._leaf_effects()]
+        return tuple(_planned_warp(cast(WarpEffect, effects[place])) for place in places)
+
+    @assume_constant_result
+    def _constant_requests(
+        self, _: int, height: int, width: int, dtype: torch.dtype
+    ) -> tuple[PlanRequest | None, ...]:
+        """Return for each effect the request of its group; None for a photometric effect that separates groups."""
+        requests: dict[int, PlanRequest] = {}
+        for places, request in self._segments(height, width, dtype):
+            requests |= dict.fromkeys(places, request)
+        exact = PlanRequest(height, width, None, dtype is torch.float64)
+        found = []
+        for place, (effect, _) in enumerate(self._leaf_effects()):
+            if isinstance(effect, WarpEffect):
+                found.append(requests[place])
             else:
-                yield idle or effect.idle
+                changes = effect.p > 0 and not effect.plan_for_dtype(height, width, dtype).is_identity
+                found.append(None if changes else exact)
+        return tuple(found)
 
-    def _together(self) -> list[tuple[int, ...]]:
-        """The effects that are no compositions, by their places in order, as sets that may act on one sample."""
-        first, sets = 0, list[list[tuple[int, ...]]]()
-        for effect in self._effects():
-            own = effect._together() if isinstance(effect, Compose) else [(0,)]
-            sets.append([tuple(first + place for place in places) for places in own])
-            first += 1 + max(itertools.chain.from_iterable(own))
-        return self._joined(sets)
-
-    def _joined(self, sets: Sequence[Sequence[tuple[int, ...]]]) -> list[tuple[int, ...]]:
-        """The sets of all children, from those of each."""
-        if math.prod(map(len, sets)) > _MOST_SETS:
-            return [tuple(sorted({place for own in sets for places in own for place in places}))]
-        return [tuple(itertools.chain.from_iterable(chosen)) for chosen in itertools.product(*sets)]
-
-    def _effects(self) -> Iterator[Effect]:
+    def _children(self) -> Iterator[Effect]:
         return cast(Iterator[Effect], iter(self.effects))
 
 
-def _closed(params: Any, applied: Tensor) -> Any:
-    """Parameters that leave the samples alone for which the gate is closed."""
-    if isinstance(params, Undrawn):
-        return params.then(lambda found: _closed(found, applied))
+class _Segment(NamedTuple):
+    """Warps that were sampled together."""
+
+    applied: Tensor  # (N,), bool: one of the warps is applied
+    active: Tensor  # (N,), bool: and moves the sample
+    flow: BatchFlow
+
+    def sample(self, image: Tensor, options: SamplingOptions) -> Tensor:
+        """Sample images (N, C, H, W) along the flow."""
+        return self.flow.sample(image, self.active, _Applied(self.applied, self.flow.parts[0].flow.nodes), options)
+
+
+class _Applied(NamedTuple):
+    """What `where_active` reads of parameters."""
+
+    applied: Tensor
+    nodes: Tensor
+
+
+class _Progress:
+    """Images on their way through the effects of a composition, and what their maps are computed from."""
+
+    def __init__(self, image: Tensor, depth: Tensor | None, batch: int):
+        self.image, self.depth = image, depth
+        self.frames = image.shape[0] // max(batch, 1)
+        self.has_warps = False
+        self.segments: list[_Segment] = []
+        self.warps: list[tuple[WarpEffect, Any, Callable[[], BatchFlow], Tensor]] = []  # with params, own flow, active
+        self.valid: Callable[[], Tensor] | None = None  # None is everywhere
+        self.light: dict[str, Callable[[], Tensor]] = {}
+
+    def move(self, leaves: Sequence[_Leaf], request: PlanRequest) -> None:
+        """Sample the images along the composed flow of several warps."""
+        rows, _, height, width = self.image.shape
+        leaves = [leaf._replace(params=params_per_frame(leaf.params, self.frames)) for leaf in leaves]
+        warps = [(cast(WarpEffect, leaf.effect), leaf.params) for leaf in leaves]
+        active = [effect.active(params, height, width) for effect, params in warps]
+        groups = _group_samples(warps, active, request)
+        parts = []
+        for index, acting, plan in groups:
+            chosen = [warps[k] for k in acting]
+            if index is not None:
+                chosen = [(effect, select_params(params, index)) for effect, params in chosen]
+            parts.append(FlowPart(index, *_composed_flow(chosen, plan)))
+        applied = torch.stack([params.applied for _, params in warps]).any(dim=0)
+        segment = _Segment(applied, torch.stack(active).any(dim=0), BatchFlow(parts))
+        self.image = _sample_segment(self.image, segment, leaves, active)
+        if self.depth is not None:
+            depth, detached = expand_batch(self.depth, rows), segment._replace(flow=segment.flow.detach())
+            self.depth = detached.sample(depth, SamplingOptions("border", "nearest", "auto"))
+        self.light = {name: _moved(value, segment) for name, value in self.light.items()}
+        for (effect, params), moves in zip(warps, active, strict=True):
+            if request.tolerance_px is None:
+                effect = effect.exact()
+            flow = _remember(lambda effect=effect, params=params: effect.planned_flow(params, height, width))
+            self.warps.append((effect, params, flow, moves))
+            self.valid = _valid_after(self.valid, flow, moves)
+        self.segments.append(segment)
+
+    def shade(self, effect: PhotometricEffect, params: Any) -> None:
+        """Apply a photometric effect."""
+        shaded = effect.degrade_batch(self.image, params, self.depth)
+        rows, before, valid = self.image.shape[0], dict(self.light), self.valid
+        self.image = shaded.image
+        self.valid = (
+            (lambda: expand_batch(shaded.valid, rows))
+            if valid is None
+            else (lambda: valid() & expand_batch(shaded.valid, rows))
+        )
+
+        def own_map(name: str) -> Callable[[], Tensor] | None:
+            return (lambda: expand_batch(getattr(shaded, name), rows)) if shaded.has(name) else None
+
+        transmission = own_map("transmission")
+        if "intensity" in before and transmission is not None:  # light that was added before is attenuated
+            added = before["intensity"]
+            before["intensity"] = lambda: added() * transmission()
+        self.light = before
+        for name, combine in _COMBINE.items():
+            value = own_map(name)
+            if value is not None:
+                earlier = self.light.get(name)
+                self.light[name] = value if earlier is None else _combined(combine, earlier, value)
+
+    def result(self, params: ComposeParams) -> Degraded:
+        """Return the images with all maps."""
+        size, device = self.image.shape, self.image.device
+        valid = self.valid or (lambda: torch.ones(size[0], 1, *size[2:], dtype=torch.bool, device=device))
+        if not self.has_warps:
+            return Degraded(self.image, params, valid=valid, light=self.light)
+        return warped(
+            self.image,
+            params,
+            flow=self._flow,
+            valid=valid,
+            inverse=self._inverse,
+            is_composed=self._is_composed if len(self.warps) > 1 else None,
+            light=self.light,
+        )
+
+    def _flow(self) -> Tensor:
+        """Return (N, 2, H, W), px, the composed flow of all segments."""
+        if not self.segments:
+            rows, _, height, width = self.image.shape
+            return torch.zeros(rows, 2, height, width, dtype=field_dtype(self.image.dtype), device=self.image.device)
+        flow = self.segments[-1].flow.dense
+        for segment in reversed(self.segments[:-1]):
+            flow = torch.where(
+                per_sample(segment.active),
+                compose_flows(segment.flow.dense, flow),
+                flow,
+            )
+        return flow
+
+    def _is_composed(self) -> Tensor:
+        """Return (N,), bool: samples that several warps move."""
+        return torch.stack([moves for _, _, _, moves in self.warps]).sum(dim=0) > 1
+
+    def _inverse(self) -> tuple[Tensor, Tensor]:
+        """Compose the inverse flows of all warps, sample by sample of those that move it."""
+        total: Tensor | None = None
+        for effect, params, flow, moves in self.warps:
+            inverse, exists = effect.masked_inverse_flow(params, flow().dense)
+            exists = exists.expand(len(inverse), 1, *inverse.shape[2:])
+            if total is None:
+                total, valid, moved = inverse, exists, moves
+                continue
+            both, alone = per_sample(moved & moves), per_sample(moves)
+            if eager_bool(both.any, of=both) is not False:
+                exists = torch.where(both, valid & sees_only_valid(exists, total), exists)
+                inverse = torch.where(both, compose_flows(inverse, total), inverse)
+            total, valid = torch.where(alone, inverse, total), torch.where(alone, exists, valid)
+            moved = moved | moves
+        if total is None:
+            flow = self._flow()
+            return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
+        return total, valid
+
+
+def _restrict(params: Any, applied: Tensor) -> Any:
+    """Apply the effect only to samples that the composition around it is applied to."""
     if isinstance(params, ComposeParams):
-        return ComposeParams(params.applied & applied, tuple(_closed(child, applied) for child in params.children))
+        return ComposeParams(params.applied & applied, tuple(_restrict(child, applied) for child in params.children))
     return params._replace(applied=params.applied & applied)
 
 
-def _stirs(effect: Effect, params: Any, height: int, width: int) -> bool:
-    """Whether an effect that is no composition may change a sample, or a gradient is asked for that could."""
-    if isinstance(effect, WarpEffect):
-        return effect.stirs(params, height, width)
-    return cast(RadianceEffect, effect).stirs(params)
+def _remember(compute: Callable[[], BatchFlow]) -> Callable[[], BatchFlow]:
+    """Compute a flow when it is first needed, and keep it."""
+    computed: list[BatchFlow] = []
+
+    def flow() -> BatchFlow:
+        if not computed:
+            computed.append(compute())
+        return computed[0]
+
+    return flow
 
 
-def _later(effect: Effect, source: random.Stream, image: Tensor) -> Undrawn:
-    """The draw of an effect as it is now, whatever becomes of its ranges; compilers follow no copies."""
-    now = effect if torch.compiler.is_compiling() else _as_now(effect)
-    return Undrawn(partial(_draw_for, now, source, image.shape, image.dtype, image.device))  # and holds no picture
+def _valid_after(
+    before: Callable[[], Tensor] | None, flow: Callable[[], BatchFlow], moves: Tensor
+) -> Callable[[], Tensor]:
+    """Return where an image is valid after one more warp."""
+
+    def valid() -> Tensor:
+        own = (flow().exists & inside(flow().dense)) | ~per_sample(moves)
+        return own if before is None else own & sees_only_valid(before(), flow().dense)
+
+    return valid
 
 
-def _draw_for(effect: Effect, source: random.Stream, size: torch.Size, dtype: torch.dtype, device: torch.device) -> Any:
-    return effect.draw(source, torch.empty((), dtype=dtype, device=device).expand(size))
+def _moved(value: Callable[[], Tensor], segment: _Segment) -> Callable[[], Tensor]:
+    """Move a photometric map along."""
+    return lambda: segment.sample(value(), SamplingOptions("border", "bilinear", "auto"))
 
 
-def _as_now(effect: Effect) -> Effect:
-    """What `copy` makes of an effect, in a tenth of its time: most compositions with idle effects never read it."""
-    now = object.__new__(type(effect))
-    vars(now).update(vars(effect))
-    return now
+def _combined(
+    combine: Callable[[Tensor, Tensor], Tensor], first: Callable[[], Tensor], second: Callable[[], Tensor]
+) -> Callable[[], Tensor]:
+    return lambda: combine(first(), second())
+
+
+def _sample_segment(image: Tensor, segment: _Segment, leaves: Sequence[_Leaf], active: Sequence[Tensor]) -> Tensor:
+    """Sample the images, each with the options of the last warp that moves it."""
+    result = segment.sample(image, leaves[-1].options)
+    decided = active[-1]
+    for leaf, moves in zip(reversed(leaves[:-1]), reversed(active[:-1]), strict=True):
+        chosen = moves & ~decided
+        if leaf.options != leaves[-1].options and eager_bool(chosen.any, of=chosen) is not False:
+            result = torch.where(per_sample(chosen), segment.sample(image, leaf.options), result)
+        decided = decided | moves
+    return result
+
+
+def _planned_warp(effect: WarpEffect, model: Any = ...) -> PlannedWarp:
+    if effect.tolerance_px is None:
+        return PlannedWarp(None, effect.rounding_ulps)
+    return PlannedWarp(effect.error_model() if model is ... else model, effect.rounding_ulps)
+
+
+def _group_samples(
+    warps: Sequence[tuple[WarpEffect, Any]], active: Sequence[Tensor], request: PlanRequest
+) -> list[tuple[Tensor | None, list[int], CompositionPlan]]:
+    """Group the samples by the warps that move them and by their plan.
+
+    Returns:
+        For each group the numbers of its samples (None for all), the warps that move them, and the plan. If values
+        cannot be read, one group with all warps, whose plan holds for any subset of them.
+    """
+    flags = None
+    if not any(requires_grad(params) for _, params in warps):
+        flags = eager_values(lambda: torch.stack(list(active), dim=1), of=active[0])
+    everything = list(range(len(warps)))
+    if flags is None:
+        planned = tuple(_planned_warp(effect) for effect, _ in warps)
+        return [(None, everything, plan_composition(planned, request))]
+    is_large = request.height * request.width >= MIN_PIXELS
+    models = [
+        effect.sample_models(params) if is_large and request.tolerance_px else [effect.error_model()] * len(flags)
+        for effect, params in warps
+    ]
+    groups: dict[Any, tuple[list[int], list[int], CompositionPlan]] = {}
+    for i, row in enumerate(flags):
+        acting = [k for k in everything if row[k]] or everything[-1:]
+        plan = plan_composition(tuple(_planned_warp(warps[k][0], models[k][i]) for k in acting), request)
+        groups.setdefault((tuple(acting), plan.key), ([], acting, plan))[0].append(i)
+    if len(groups) == 1:
+        return [(None, acting, plan) for _, acting, plan in groups.values()]
+    return [(torch.tensor(rows), acting, plan) for rows, acting, plan in groups.values()]
+
+
+def _composed_flow(warps: Sequence[tuple[WarpEffect, Any]], plan: CompositionPlan) -> tuple[LatticeFlow, Tensor]:
+    """Compute the composed flow of warps, and where it exists."""
+    if plan.stride == 1 or len(warps) == 1:
+        return _composed_at_pixels(warps, plan)
+    height, width = plan.plans[0].height, plan.plans[0].width
+    lattice = lattice_with_stride(height, width, plan.stride)
+    dtype = next(value.dtype for value in warps[0][1] if value.is_floating_point())
+    points = lattice.points(dtype=dtype, device=warps[0][1].applied.device)
+    total: Tensor | None = None
+    for (effect, params), warp_plan in zip(reversed(warps), reversed(plan.plans), strict=True):
+        if warp_plan.is_identity:
+            continue
+        flow, _ = effect.flow(params, points if total is None else points.displaced(total), warp_plan)
+        flow = where_active(flow, 0.0, effect.active(params, height, width), params)
+        total = flow if total is None else total + flow
+    if total is None:
+        rows, columns = lattice.num_nodes
+        total = torch.zeros(len(warps[0][1].applied), 2, rows, columns, dtype=dtype, device=points.x.device)
+    return LatticeFlow(total, lattice), torch.ones(1, 1, 1, 1, dtype=torch.bool, device=total.device)
+
+
+def _composed_at_pixels(warps: Sequence[tuple[WarpEffect, Any]], plan: CompositionPlan) -> tuple[LatticeFlow, Tensor]:
+    """Compose flows at every pixel; earlier flows are interpolated bilinearly where the later ones lead."""
+    total, exists = warps[-1][0].masked_flow(warps[-1][1], plan.plans[-1])
+    if len(warps) == 1:
+        return total, exists
+    flow = total.dense()
+    for (effect, params), warp_plan in zip(reversed(warps[:-1]), reversed(plan.plans[:-1]), strict=True):
+        if not warp_plan.is_identity:
+            flow = compose_flows(effect.masked_flow(params, warp_plan)[0].dense(), flow)
+    return LatticeFlow(flow, lattice_with_stride(*flow.shape[2:], 1)), torch.ones_like(flow[:, :1], dtype=torch.bool)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchrefract._tensor import is_channels_last, to_float, to_uint8
 from torchrefract._validation import check_tensor
-from torchrefract.labels.rows import is_tv
+from torchrefract.labels.targets import is_tv_tensor
 
 
 class Layout(NamedTuple):
@@ -52,7 +52,7 @@ def check_image(image: Tensor) -> Layout:
     if not image.is_floating_point() and image.dtype is not torch.uint8:
         raise TypeError(f"image must be floating in [0, 1] or uint8, got {image.dtype}")
     lead = tuple(image.shape[:-3])
-    if len(lead) == 1 and not is_tv(image, "Video"):
+    if len(lead) == 1 and not is_tv_tensor(image, "Video"):
         return Layout(lead[0], 1, lead)
     batch, frames = (1, *lead)[-2:] if lead else (1, 1)
     if frames == 0:

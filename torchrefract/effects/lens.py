@@ -2,30 +2,27 @@
 
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._compiled import SMALLEST
 from torchrefract._tensor import as_device_tensor
-from torchrefract._validation import check_flag, check_range, check_values, check_within, eager_bool, eager_values
+from torchrefract._validation import check_flag, check_range, check_values, check_within, eager_bool
 from torchrefract.cameras.distortion import ALL_TERMS, POLYNOMIAL12
 from torchrefract.cameras.models import Camera
-from torchrefract.effects.base import params_to
-from torchrefract.effects.lattice_warp import LatticeWarp
-from torchrefract.effects.lens_parts import plan_in_parts, plan_of_lens
-from torchrefract.effects.lens_plan import kept_terms, params_in_range
-from torchrefract.effects.lens_source import LensSource, cameras_of, correlated, jittered, listed
-from torchrefract.effects.plan import TOLERANCE_PX, Plan, PlanRequest
-from torchrefract.effects.refraction import Moved
-from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, smooth_lens_flow
-from torchrefract.fields.lens_bounds import LensRanges, lens_numbers
+from torchrefract.effects.batch import params_to
+from torchrefract.effects.warp_effect import WarpEffect
+from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, newton_lens_flow
+from torchrefract.fields.lens_error import LensErrorModel, LensRanges, lens_numbers
+from torchrefract.fields.lens_source import LensSource, camera_with_covariance, jittered_camera, lenses_from_cameras
+from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan
 from torchrefract.types import Range
-from torchrefract.warping.lattice import Lattice, LatticeFlow
+from torchrefract.warping.grid import Points
+from torchrefract.warping.lattice import pixel_lattice
 
-_LARGEST = 100.0  # coefficient
+_LARGEST_COEFFICIENT = 100.0
 _FARTHEST = 1e10  # widths
 _MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors are another model in another order)"
 
@@ -40,27 +37,32 @@ class LensParams(NamedTuple):
 
     to = params_to
 
+    @property
+    def is_identity(self) -> Tensor:
+        """Return (B,), bool: all coefficients are zero."""
+        return (self.coefficients == 0).all(dim=1)
 
-class LensDistortion(LatticeWarp):
+
+class LensDistortion(WarpEffect):
     """A frame as seen through a lens of the extended Brown-Conrady model, the polynomial of the paper.
 
         x_d = x (1 + sum k_i r^2i) + 2 p1 x y + p2 (r^2 + 2 x^2) + s1 r^2 + s2 r^4
         y_d = y (1 + sum k_i r^2i) + p1 (r^2 + 2 y^2) + 2 p2 x y + s3 r^2 + s4 r^4,  i = 1 ... 6
 
-    `flow` undistorts (the exact inverse), `restore_flow` distorts (closed form). Pixels that the lens shows nothing
-    at, beyond the radius where the model folds back, are padded and not valid. OpenCV's k4, k5, k6 belong to another
-    model. The defaults are those of one fleet of cheap dashcams: a barrel that folds nowhere. Under a tolerance, where
-    the strongest lens of the ranges asks for a fine lattice or none, those that are drawn go by their parts of the
-    ranges, if values can be read (on the CPU, uncompiled, without gradients of the lens) and frames have 2^16 px.
+    `flow` undistorts (the exact inverse), `restore_flow` distorts (closed form). Pixels beyond the radius where the
+    model folds back show nothing: they are padded and not valid. OpenCV's k4, k5, k6 belong to another model. The
+    defaults are those of a fleet of cheap dashcams: barrel lenses that fold nowhere. Under a tolerance each drawn lens
+    has a lattice of its own where values can be read (on the CPU, without `torch.compile` and without gradients of the
+    lens) and the frame has at least 2^16 px.
 
     Args:
         k1_range ... k6_range: radial coefficients, each within [-100, 100].
-        p1_range, p2_range: decentring (tangential) coefficients.
+        p1_range, p2_range: decentering (tangential) coefficients.
         s1_range ... s4_range: thin-prism coefficients; s1, s2 act on x, s3, s4 on y.
         focal_range: focal length fx in widths of the frame, above 0.
         aspect_range: fy / fx, above 0.
         center_x_range, center_y_range: offset of the principal point from the center of the frame, in widths.
-        strict: raise, instead of warning, where the model folds back inside the frame (on the CPU).
+        strict: raise, instead of warning, if the model folds back inside the frame (on the CPU).
         padding, interpolation, backend, tolerance_px, p: as for every warp.
 
     Raises:
@@ -68,6 +70,10 @@ class LensDistortion(LatticeWarp):
 
     Source: Brown, "Close-range camera calibration", Photogrammetric Engineering 37 (1971), with thin-prism terms.
     """
+
+    params_type = LensParams
+    rounding_ulps = 16  # Newton's method magnifies the rounding of positions
+    has_sample_models = True
 
     def __init__(
         self,
@@ -99,7 +105,7 @@ class LensDistortion(LatticeWarp):
         radial = (k1_range, k2_range, k3_range, k4_range, k5_range, k6_range)
         others = (p1_range, p2_range, s1_range, s2_range, s3_range, s4_range)
         for name, value in zip(POLYNOMIAL12, radial + others, strict=True):
-            bounds = {"low": -_LARGEST, "high": _LARGEST}
+            bounds = {"low": -_LARGEST_COEFFICIENT, "high": _LARGEST_COEFFICIENT}
             setattr(self, f"{name}_range", check_range(f"{name}_range", value, **bounds))
         self.focal_range = check_range("focal_range", focal_range, low=0.01, high=1000.0)
         self.aspect_range = check_range("aspect_range", aspect_range, low=0.01, high=100.0)
@@ -123,28 +129,28 @@ class LensDistortion(LatticeWarp):
         tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ) -> "LensDistortion":
-        """The lens of a calibrated camera, or those near to it.
+        """Build the effect of a calibrated camera, or of cameras near it.
 
         Args:
-            camera: of any model; what is no polynomial is replaced by the nearest.
-            jitter: each number is drawn uniformly up to so large a share of itself off, in [0, 0.99]; focal length,
-                aspect, offset of the principal point, and each coefficient.
-            covariance: (4 + n, 4 + n), of fx, fy, cx, cy in px and n coefficients, in place of `jitter`: numbers are
-                off together, by uniform draws of that covariance. For cameras that are polynomials as they are.
-            residual_px: how far the polynomial may show a ray from where the camera does, px.
+            camera: of any model; another model than the polynomial is replaced by the nearest polynomial.
+            jitter: largest relative change of each number, drawn uniformly, in [0, 0.99]: focal length, aspect, offset
+                of the principal point, and each coefficient.
+            covariance: (4 + n, 4 + n), of fx, fy, cx, cy in px and n coefficients, in place of `jitter`: the numbers
+                vary together. Only for cameras that are polynomials.
+            residual_px: largest distance between the camera and its polynomial, px.
             strict, padding, interpolation, backend, tolerance_px, p: as for `LensDistortion`.
 
         Raises:
-            ValueError: numbers out of range; a camera too far from a polynomial, or that folds inside its frame.
+            ValueError: a number out of range; a camera too far from a polynomial, or that folds inside its frame.
         """
-        if covariance is None:
-            lenses = jittered(camera, jitter=jitter, residual_px=residual_px).ranges
-        elif jitter:
-            raise ValueError(f"jitter must be 0 beside a covariance, got {jitter}")
-        else:
-            lenses = correlated(camera, covariance)
         warp = {"padding": padding, "interpolation": interpolation, "backend": backend, "p": p}
-        return cls._drawn_from(lenses, strict=strict, tolerance_px=tolerance_px, **warp)
+        if covariance is None:
+            ranges = jittered_camera(camera, jitter=jitter, residual_px=residual_px).ranges
+            return cls(**ranges, strict=strict, tolerance_px=tolerance_px, **warp)
+        if jitter:
+            raise ValueError(f"jitter must be 0 if a covariance is given, got {jitter}")
+        source = camera_with_covariance(camera, covariance)
+        return cls._from_source(source, strict=strict, tolerance_px=tolerance_px, **warp)
 
     @classmethod
     def from_lenses(
@@ -159,118 +165,91 @@ class LensDistortion(LatticeWarp):
         tolerance_px: float | None = TOLERANCE_PX,
         p: float = 1.0,
     ) -> "LensDistortion":
-        """One of several real lenses for each sample, each as often as another.
+        """Build an effect that draws one of several real lenses for each sample, each with the same probability.
 
         Args:
-            table: their cameras; None is the table of the package (`torchrefract.cameras.lens_table`).
-            residual_px: how far a polynomial may show a ray from where a camera of another model does, px; lenses of
-                the package's table that are farther off are left out, others raise.
+            table: their cameras; None takes the lens database of the package (`torchrefract.cameras.read_lenses`).
+            residual_px: largest distance between a camera of another model and its polynomial, px; lenses of the
+                database that are farther off are left out, others raise.
             strict, padding, interpolation, backend, tolerance_px, p: as for `LensDistortion`.
 
         Raises:
             ValueError: an empty table; a camera too far from a polynomial, or that folds inside its frame.
         """
         warp = {"padding": padding, "interpolation": interpolation, "backend": backend, "p": p}
-        return cls._drawn_from(listed(table, residual_px=residual_px), strict=strict, tolerance_px=tolerance_px, **warp)
+        source = lenses_from_cameras(table, residual_px=residual_px)
+        return cls._from_source(source, strict=strict, tolerance_px=tolerance_px, **warp)
 
     @classmethod
-    def _drawn_from(cls, lenses: LensSource | dict[str, Range], **arguments: Any) -> "LensDistortion":
-        """Lenses of a source, or of ranges by their names."""
-        ranges = lenses.ranges if isinstance(lenses, LensSource) else lenses
-        made = cls(**ranges, **arguments)
-        made._source = lenses if isinstance(lenses, LensSource) else None
-        return made
+    def _from_source(cls, source: LensSource, **arguments: Any) -> "LensDistortion":
+        effect = cls(**source.ranges, **arguments)
+        effect._source = source
+        return effect
 
-    params_type = LensParams
-
-    def at_rest(self) -> bool:
-        """Whether all lenses are pinholes."""
-        return self._source is None and all(span == (0.0, 0.0) for span in self._ranges().coefficients)
-
-    def draw(self, source: random.Stream, image: Tensor) -> LensParams:
-        """One lens a sample: every number uniform in its range, or one of those of a table or a camera."""
+    def sample_params(self, stream: random.Stream, image: Tensor) -> LensParams:
+        """Draw one lens for each sample: all numbers uniform in their ranges, or a lens of the source."""
         if self._source is None:
-            applied, values = self._uniform(source, self._ranges().numbers, image)
+            applied, values = self.draw_in_ranges(stream, self._ranges().numbers, image)
         else:
-            applied, values = self._uniform(source, self._source.inputs, image)
-            values = self._source.lenses(values)
+            applied, values = self.draw_in_ranges(stream, self._source.draw_ranges, image)
+            values = self._source.select(values)
         fx, aspect = values[:, 12], values[:, 13]
         return LensParams(applied, values[:, :12], torch.stack([fx, fx * aspect], dim=1), values[:, 14:])
 
-    def check(self, params: LensParams, image: Tensor) -> None:
-        """Raise for lenses that are none."""
+    def validate(self, params: LensParams, image: Tensor) -> None:
+        """Raise ValueError for invalid lenses."""
         check_lens(params, image.shape[0])
 
-    def plan_within(self, ask: PlanRequest) -> Plan:
-        """The plan for all lenses of the ranges, or of a table."""
-        return plan_in_parts(self._boxes(), ask)
+    def flow(self, params: LensParams, points: Points, plan: WarpPlan) -> tuple[Tensor, Tensor]:
+        """Undistort the points: `newton_lens_flow` under a tolerance, otherwise `lens_flow`."""
+        height, width = points.lattice.height, points.lattice.width
+        lens = lens_in_px(params, height, width)
+        if plan.details is not None:
+            terms = ALL_TERMS if params.coefficients.requires_grad else plan.details.terms
+            flow = newton_lens_flow(*lens, points, num_steps=plan.details.num_steps, terms=terms)
+            return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=flow.device)
+        flow, exists = lens_flow(*lens, points)
+        if eager_bool(exists.all, of=exists) is False:
+            self._report_fold(params, height, width)
+        return flow, exists
 
-    def plans_of(self, params: LensParams, plan: Plan) -> list[Plan] | None:
-        """For each lens the plan of `plan_of_lens`."""
-        numbers = eager_values(lambda: lens_numbers(*(value.detach() for value in params[1:])), of=params.focal)
-        if numbers is None:
-            return None
-        boxes = self._boxes()
-        ask = PlanRequest(plan.height, plan.width, plan.tolerance_px, params.focal.dtype is torch.float64)
-        return [plan_of_lens(boxes, lens, ask) for lens in numbers]
-
-    def params_in_range(self, params: LensParams, height: int, width: int) -> Tensor:
-        """Whether the lenses lie in the ranges, or near one of a table's."""
-        if self._source is not None:
-            return self._source.params_in_range(params.coefficients, params.focal, params.center)
-        return params_in_range(self._ranges(), params.coefficients, params.focal, params.center)
-
-    def on_lattice(self, params: LensParams, plan: Plan) -> LatticeFlow:
-        """The flow of `smooth_lens_flow`."""
-        lattice = cast(Lattice, plan.lattice)
-        x, y = lattice.places(dtype=params.focal.dtype, device=params.focal.device)
-        terms = ALL_TERMS if params.coefficients.requires_grad else kept_terms(plan)
-        camera, large = in_px(params, lattice.height, lattice.width), lattice.height * lattice.width >= SMALLEST
-        flow = smooth_lens_flow(*camera, x, y, steps=cast(int, plan.steps), terms=terms, large=large)
-        return LatticeFlow(flow, lattice)
-
-    def masked_flow(self, params: LensParams, *, height: int, width: int, plan: Plan | None = None) -> Moved:
-        """The flow, by its own plan or by one that is given; a lens that folds is told."""
-        moved = super().masked_flow(params, height=height, width=width, plan=plan)
-        if eager_bool(moved.exists.all, of=moved.exists) is False:
-            self._check_fold(params, height, width)
-        return moved
-
-    def flow(self, params: LensParams, *, height: int, width: int) -> tuple[Tensor, Tensor]:
-        """The flow of `lens_flow`, and where it exists."""
-        return lens_flow(*in_px(params, height, width), height=height, width=width)
-
-    def undo(self, params: LensParams, flow: Tensor) -> tuple[Tensor, Tensor]:
-        """The flow of `lens_restore_flow`, and where it exists; the closed form needs no flow."""
+    def inverse_flow(self, params: LensParams, flow: Tensor) -> tuple[Tensor, Tensor]:
+        """Distort the pixels, in closed form."""
         height, width = flow.shape[2:]
-        return lens_restore_flow(*in_px(params, height, width), height=height, width=width)
+        points = pixel_lattice(height, width).points(dtype=params.focal.dtype, device=params.focal.device)
+        return lens_restore_flow(*lens_in_px(params, height, width), points)
+
+    def error_model(self, params: LensParams | None = None) -> LensErrorModel:
+        """Return the error bounds of the ranges or of the source, or those of one lens."""
+        if params is None:
+            return LensErrorModel((self._ranges(),) if self._source is None else self._source.boxes)
+        return LensErrorModel.from_lens(lens_numbers(*(value.detach() for value in params[1:]))[0].tolist())
 
     def cameras(self, params: LensParams, *, height: int, width: int) -> list[Camera]:
-        """The camera of each sample's degraded frame, where its focal length and center are those of the clean one's.
+        """Return the camera of each degraded frame; that of the clean frame is the pinhole with the same numbers.
 
-        A pinhole where the gate is closed. Values are read, for which an accelerator is waited for.
+        A sample that is not degraded has a pinhole. Reads values, which waits for an accelerator.
 
         Raises:
-            ValueError: a lens that is no `Camera`.
+            ValueError: a lens that cannot be a `Camera`.
         """
-        return cameras_of(params.applied, *in_px(params, height, width), height=height, width=width)
-
-    def moves(self, params: LensParams) -> Tensor:
-        """The samples with a coefficient that is not zero."""
-        return (params.coefficients != 0).any(dim=1)
-
-    def _boxes(self) -> tuple[LensRanges, ...]:
-        return (self._ranges(),) if self._source is None else self._source.boxes
+        cameras = []
+        rows = zip(*(value.tolist() for value in (params.applied, *lens_in_px(params, height, width))), strict=True)
+        for is_applied, coefficients, (fx, fy), (cx, cy) in rows:
+            numbers = tuple(coefficients) if is_applied else (0.0,) * len(coefficients)
+            pinhole = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+            cameras.append(Camera(**pinhole, coefficients=numbers, model="polynomial12"))
+        return cameras
 
     def _ranges(self) -> LensRanges:
         others = (self.focal_range, self.aspect_range, self.center_x_range, self.center_y_range)
         return LensRanges(tuple(getattr(self, f"{name}_range") for name in POLYNOMIAL12), *others)
 
-    def _check_fold(self, params: LensParams, height: int, width: int) -> None:
-        camera = in_px(params, height, width)
+    def _report_fold(self, params: LensParams, height: int, width: int) -> None:
+        lens = lens_in_px(params, height, width)
 
         def folds() -> Tensor:
-            return (params.applied & folds_inside(*camera, height=height, width=width)).any()
+            return (params.applied & folds_inside(*lens, height=height, width=width)).any()
 
         if not eager_bool(folds, of=params.applied):
             return
@@ -280,9 +259,19 @@ class LensDistortion(LatticeWarp):
         warnings.warn(f"{rule}: pixels beyond have no preimage and are padded, not valid", stacklevel=2)
 
 
-def check_lens(params: Any, batch: int, *, count: int = 12, what: str = _MODEL, bound: float = _LARGEST) -> None:
-    """Raise for parameters with `coefficients`, `focal` and `center` that are no lens of so many coefficients."""
-    for name, width, meaning in (("coefficients", count, what), ("focal", 2, "fx, fy"), ("center", 2, "x, y")):
+def check_lens(
+    params: Any, batch: int, *, count: int = 12, model: str = _MODEL, bound: float = _LARGEST_COEFFICIENT
+) -> None:
+    """Raise ValueError unless `coefficients`, `focal` and `center` of the parameters are valid lenses.
+
+    Args:
+        params: a NamedTuple with these fields.
+        batch: B.
+        count: the number of coefficients.
+        model: which coefficients they are, for the message.
+        bound: the largest magnitude of a coefficient.
+    """
+    for name, width, meaning in (("coefficients", count, model), ("focal", 2, "fx, fy"), ("center", 2, "x, y")):
         value = getattr(params, name)
         if value.shape != (batch, width):
             raise ValueError(f"params.{name} must have shape (B, {width}), {meaning}, got {tuple(value.shape)}")
@@ -293,7 +282,7 @@ def check_lens(params: Any, batch: int, *, count: int = 12, what: str = _MODEL, 
     check_within("params.center", params.center, -_FARTHEST, _FARTHEST)
 
 
-def in_px(params: Any, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The coefficients, and in px the focal lengths and the principal point, of such parameters."""
+def lens_in_px(params: Any, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the coefficients, and the focal lengths and the principal point in px."""
     middle = as_device_tensor([width - 1, height - 1], dtype=params.center.dtype, device=params.center.device) / 2
     return params.coefficients, params.focal * width, middle + params.center * width

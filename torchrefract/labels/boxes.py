@@ -1,4 +1,4 @@
-"""How boxes follow a flow."""
+"""Bounding boxes and quadrilaterals that follow a backward flow."""
 
 from typing import NamedTuple
 
@@ -9,17 +9,17 @@ from torchrefract._validation import check_count, check_flag, check_number, chec
 from torchrefract.labels.points import (
     STEPS,
     TOLERANCE_PX,
-    check_rows,
-    frame_ends,
-    land,
-    on_frame,
-    read_linearly,
-    spread_over,
+    check_coordinates,
+    frame_bounds,
+    in_frame,
+    pixel_subset,
+    sample_linear,
+    solve_points,
 )
 from torchrefract.warping.grid import field_dtype
 
-# Places inside the frame, a side, that tell what it shows of a box whose outline lands nowhere.
-_SHOWN = 49
+# Probes along each side of the frame: they find the part of a box whose outline the frame does not show.
+_NUM_PROBES = 49
 
 
 def warp_boxes(
@@ -31,142 +31,147 @@ def warp_boxes(
     clip: bool = True,
     samples: int = 64,
 ) -> tuple[Tensor, Tensor]:
-    """The bounding boxes of warped boxes, and which of them are worth keeping.
+    """Return the bounding boxes of warped boxes and a mask of the boxes to keep.
 
-    Each outline is sampled and its points follow `warp_points`; with them counts each pixel on the border of the
-    frame that shows the inside of the box. Points of an outline that land nowhere, as where a lens shows nothing, are
-    left out. As boxes bound pixels, not centers, the frame is (-0.5, -0.5, W - 0.5, H - 0.5): boxes that count from
-    the edge of the first pixel, as those of torchvision and COCO, need 0.5 taken off and put back.
+    `warp_points` maps sampled points of each outline. Pixels of the frame, among them all border pixels, that show the
+    inside of the box count as well. Points of the outline that the warped image does not show are ignored. Boxes bound
+    pixels, not pixel centers: the frame is (-0.5, -0.5, W - 0.5, H - 0.5). Subtract 0.5 from boxes of torchvision and
+    COCO, which count from the edge of the first pixel, and add it to the result.
 
     Args:
-        boxes: (B, N, 4), px, x1, y1, x2, y2; (N, 4) beside a flow of (2, H, W).
+        boxes: (B, N, 4), px, x1, y1, x2, y2; (N, 4) for a flow of shape (2, H, W).
         flow: (B, 2, H, W) or (1, 2, H, W), px, backward.
-        min_area: px^2 of a box, clipped, below which it is not kept.
-        min_visibility: the share, in [0, 1], of the warped box's area left by clipping, below which it is not kept.
-        clip: return what the frame shows; otherwise boxes reach beyond it.
-        samples: points on each of the four edges, at least 2.
+        min_area: smallest area of a clipped box to keep, px^2.
+        min_visibility: smallest share of the warped box's area in the frame to keep it, in [0, 1].
+        clip: clip boxes to the frame.
+        samples: number of points on each edge, at least 2.
 
     Returns:
-        boxes: (B, N, 4) or (N, 4), px, float32 or float64, finite; one that is not seen has no area if clipped.
-        keep: (B, N) or (N,), bool: seen, with an area above 0, and within the limits.
+        boxes: (B, N, 4) or (N, 4), px, float32 or float64, finite; an invisible box has zero area if clipped.
+        keep: (B, N) or (N,), bool: the box is visible, has an area above 0, and satisfies both limits.
 
     Raises:
-        ValueError: shapes that do not fit, x2 < x1 or y2 < y1 (on the CPU), a limit out of its range.
-        TypeError: an argument that is no tensor of real numbers.
+        ValueError: if shapes do not fit, x2 < x1 or y2 < y1 (checked on the CPU), or a limit is out of range.
+        TypeError: if an argument is not a tensor of real numbers.
     """
     check_tensor("boxes", boxes)
     check_tensor("flow", flow)
     if boxes.ndim == 2 and flow.ndim == 3:
         limits = {"min_area": min_area, "min_visibility": min_visibility}
-        moved, keep = warp_boxes(boxes[None], flow[None], clip=clip, samples=samples, **limits)
-        return moved[0], keep[0]
-    check_rows("boxes", boxes, flow, 4)
-    check_policy(min_area, min_visibility, clip)
+        warped, keep = warp_boxes(boxes[None], flow[None], clip=clip, samples=samples, **limits)
+        return warped[0], keep[0]
+    check_coordinates("boxes", boxes, flow, 4)
+    check_box_limits(min_area, min_visibility, clip)
     check_count("samples", samples, low=2)
     check_values("boxes", "have x1 <= x2 and y1 <= y2", boxes[..., 2:] - boxes[..., :2], lambda size: size >= 0)
     x1, y1, x2, y2 = boxes.unbind(-1)
     corners = torch.stack([x1, y1, x2, y1, x2, y2, x1, y2], dim=-1).unflatten(-1, (4, 2))
     extent = warp_outlines(corners, flow, samples=samples).extent()
-    return torch.cat(extent.clipped if clip else extent.whole, dim=-1), extent.keep(min_area, min_visibility)
+    return torch.cat(extent.clipped if clip else extent.unclipped, dim=-1), extent.keep(min_area, min_visibility)
 
 
 class Extent(NamedTuple):
-    """The rectangles around warped outlines, each (lowest, highest corner), (B, N, 2), px."""
+    """Rectangles around warped outlines: (lowest corner, highest corner), each (B, N, 2), px."""
 
-    whole: tuple[Tensor, Tensor]
+    unclipped: tuple[Tensor, Tensor]
     clipped: tuple[Tensor, Tensor]
-    seen: Tensor  # (B, N), bool: the frame shows some of it
+    visible: Tensor  # (B, N), bool: the frame shows a part of the outline or of its inside
 
     def keep(self, min_area: float, min_visibility: float) -> Tensor:
-        """(B, N), bool: seen, with an area above 0, and within the limits."""
-        area, whole = ((high - low).prod(dim=-1) for low, high in (self.clipped, self.whole))
-        return self.seen & (area > 0) & (area >= min_area) & (area >= min_visibility * whole)
+        """Return True for visible rectangles with an area above 0 that satisfy both limits: (B, N)."""
+        area, full_area = ((high - low).prod(dim=-1) for low, high in (self.clipped, self.unclipped))
+        return self.visible & (area > 0) & (area >= min_area) & (area >= min_visibility * full_area)
 
 
 class Outlines(NamedTuple):
-    """Outlines of quadrilaterals after a warp, sampled."""
+    """Sampled outlines of warped quadrilaterals."""
 
-    points: Tensor  # (B, N, 4, S, 2), px: where the points of each edge land
-    found: Tensor  # (B, N, 4, S), bool: that they land
-    on_frame: Tensor  # (B, N, 4, S), bool: that they land on the frame, which ends half a pixel off the centers
-    shown: Tensor  # (1, K, 2), px: places on the border of the frame, on its edge, and some inside
-    hits: Tensor  # (B, N, K), bool: which of them show the inside of the quadrilateral
-    middle: Tensor  # (B, N, 2), px: of the frame's point that is nearest to the middle of the quadrilateral as it was
+    points: Tensor  # (B, N, 4, S, 2), px: warped points of each edge
+    converged: Tensor  # (B, N, 4, S), bool: the points have a position in the warped image
+    in_frame: Tensor  # (B, N, 4, S), bool: the points lie on the frame, which ends half a pixel outside the centers
+    probes: Tensor  # (1, K, 2), px: positions at the border of the frame and inside it
+    hits: Tensor  # (B, N, K), bool: the probes that show the inside of the quadrilateral
+    center: Tensor  # (B, N, 2), px: center of the original quadrilateral, clamped to the frame
 
     def extent(self, axes: Tensor | None = None) -> Extent:
-        """The rectangles along x and y, or along the unit vectors `axes`, (B, N, 2, 2), measured along them."""
+        """Return the rectangles along x and y, or in coordinates along the unit vectors `axes`, (B, N, 2, 2)."""
 
-        def along(points: Tensor) -> Tensor:
+        def project(points: Tensor) -> Tensor:
             return points if axes is None else (points[..., None, :] * axes[:, :, None]).sum(dim=-1)
 
-        points, shown = along(self.points.flatten(2, 3)), along(self.shown[:, None])
-        inside = _bounds(shown, self.hits)
-        whole, clipped = (
-            (torch.minimum(low, inside[0]), torch.maximum(high, inside[1]))
-            for low, high in (_bounds(points, self.found.flatten(2)), _bounds(points, self.on_frame.flatten(2)))
-        )
-        middle = along(self.middle[:, :, None])[:, :, 0]
-        seen = (self.on_frame.flatten(2).any(dim=-1)) | self.hits.any(dim=-1)
-        found = self.found.flatten(2).any(dim=-1) | seen
-        low, high = (torch.where(found[..., None], corner, middle) for corner in whole)
-        first, last = (torch.where(seen[..., None], corner, middle) for corner in clipped)
-        return Extent((low, high), (first, last), seen)
+        points, center = project(self.points.flatten(2, 3)), project(self.center[:, :, None])[:, :, 0]
+        low, high = _bounds(project(self.probes[:, None]), self.hits)
+
+        def rectangle(chosen: Tensor, exists: Tensor) -> tuple[Tensor, Tensor]:
+            first, last = _bounds(points, chosen.flatten(2))
+            exists = exists[..., None]
+            return (
+                torch.where(exists, torch.minimum(first, low), center),
+                torch.where(exists, torch.maximum(last, high), center),
+            )
+
+        visible = self.in_frame.flatten(2).any(dim=-1) | self.hits.any(dim=-1)
+        exists = self.converged.flatten(2).any(dim=-1) | visible
+        return Extent(rectangle(self.converged, exists), rectangle(self.in_frame, visible), visible)
 
 
 def warp_outlines(corners: Tensor, flow: Tensor, *, samples: int) -> Outlines:
-    """The outlines of convex quadrilaterals, (B, N, 4, 2) in px, after a warp; the arguments are taken as checked."""
+    """Warp the outlines of convex quadrilaterals, (B, N, 4, 2) in px, without checks."""
     dtype = field_dtype(torch.promote_types(corners.dtype, flow.dtype))
     corners, flow = corners.to(dtype), flow.to(dtype).expand(corners.shape[0], -1, -1, -1)
     t = torch.linspace(0, 1, samples, dtype=dtype, device=flow.device)[:, None]
     start, end = corners[..., None, :], corners.roll(-1, dims=2)[..., None, :]
-    # From the nearer end, so that both ends, and a coordinate that they share, stay as they are.
+    # Interpolate from the nearer end, so that both ends and a coordinate that they share stay exact.
     outline = torch.where(t < 0.5, start + t * (end - start), end - (1 - t) * (end - start))
-    landing = land(outline.flatten(1, 3), flow, STEPS, TOLERANCE_PX)
-    points, found = landing.points.view(outline.shape), landing.found.view(outline.shape[:-1])
-    lands_on_frame = found & on_frame(points, flow, 0.5)
-    # A point that rounding alone has put off the frame is on it.
-    low, high = frame_ends(flow, 0.5)
-    points = torch.where(lands_on_frame[..., None], torch.minimum(torch.maximum(points, low), high), points)
-    shown, content = _shown(flow)
-    middle = torch.minimum(torch.maximum(corners.detach().mean(dim=2), low), high)
-    return Outlines(points, found, lands_on_frame, shown, _in_quadrilateral(content, corners.detach()), middle)
+    solution = solve_points(outline.flatten(1, 3), flow, STEPS, TOLERANCE_PX)
+    points, converged = solution.points.view(outline.shape), solution.converged.view(outline.shape[:-1])
+    is_inside = converged & in_frame(points, flow, 0.5)
+    # Clamp points that only rounding moved off the frame.
+    low, high = frame_bounds(flow, 0.5)
+    points = torch.where(is_inside[..., None], points.maximum(low).minimum(high), points)
+    probes, content = _probe(flow)
+    center = corners.detach().mean(dim=2).maximum(low).minimum(high)
+    return Outlines(points, converged, is_inside, probes, _in_quadrilateral(content, corners.detach()), center)
 
 
-def check_policy(min_area: float, min_visibility: float, clip: bool) -> None:
-    """Raise for limits on boxes that are out of their range."""
+def check_box_limits(min_area: float, min_visibility: float, clip: bool) -> None:
+    """Raise if a limit on boxes is out of its range."""
     check_number("min_area", min_area, low=0.0)
     check_number("min_visibility", min_visibility, low=0.0, high=1.0)
     check_flag("clip", clip)
 
 
-def _shown(flow: Tensor) -> tuple[Tensor, Tensor]:
-    """Places of the frame, (1, K, 2), px, and what they show, (B, K, 2): its border, its edge, and a lattice."""
+def _probe(flow: Tensor) -> tuple[Tensor, Tensor]:
+    """Return probes of the frame, (1, K, 2), px, and the clean positions that they show, (B, K, 2).
+
+    The probes are the border pixels, the points half a pixel outside them, and a lattice over the frame.
+    """
     height, width = flow.shape[2:]
     x, y = (torch.arange(size, dtype=flow.dtype, device=flow.device) for size in (width, height))
-    lattice_x, lattice_y = spread_over(flow, 3, _SHOWN), spread_over(flow, 2, _SHOWN)
-    places = [torch.stack(torch.meshgrid(lattice_x, lattice_y, indexing="xy")).flatten(1)]
-    for rim in (0.0, 0.5):
-        places += [torch.stack([x, torch.full_like(x, edge)]) for edge in (-rim, height - 1 + rim)]
-        places += [torch.stack([torch.full_like(y, edge), y]) for edge in (-rim, width - 1 + rim)]
-    shown = torch.cat(places, dim=1)[None]
-    content = shown + read_linearly(flow, shown.expand(flow.shape[0], -1, -1)).value
-    return shown.mT, content.mT.detach()
+    lattice = torch.meshgrid(pixel_subset(flow, 3, _NUM_PROBES), pixel_subset(flow, 2, _NUM_PROBES), indexing="xy")
+    parts = [torch.stack(lattice).flatten(1)]
+    for border_px in (0.0, 0.5):
+        parts += [torch.stack([x, torch.full_like(x, edge)]) for edge in (-border_px, height - 1 + border_px)]
+        parts += [torch.stack([torch.full_like(y, edge), y]) for edge in (-border_px, width - 1 + border_px)]
+    probes = torch.cat(parts, dim=1)[None]
+    content = probes + sample_linear(flow, probes.expand(flow.shape[0], -1, -1)).value
+    return probes.mT, content.mT.detach()
 
 
 def _in_quadrilateral(points: Tensor, corners: Tensor) -> Tensor:
-    """(B, N, K), bool: which of the points (B, K, 2) lie in the convex quadrilaterals (B, N, 4, 2)."""
+    """Return True for points (B, K, 2) in the convex quadrilaterals (B, N, 4, 2): (B, N, K)."""
     px, py = points[:, None].unbind(-1)
     sides = []
     for start, end in zip(corners.unbind(2), corners.roll(-1, dims=2).unbind(2), strict=True):
         (x, y), (dx, dy) = start[..., None].unbind(2), (end - start)[..., None].unbind(2)
         sides.append(dx * (py - y) - dy * (px - x))
-    low, high = torch.minimum(sides[0], sides[1]), torch.maximum(sides[0], sides[1])
+    low, high = sides[0].minimum(sides[1]), sides[0].maximum(sides[1])
     for side in sides[2:]:
-        low, high = torch.minimum(low, side), torch.maximum(high, side)
+        low, high = low.minimum(side), high.maximum(side)
     return (low >= 0) | (high <= 0)
 
 
 def _bounds(points: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
-    """The lowest and the highest corner, (B, N, 2), of the points (B, N, K, 2) that are chosen."""
+    """Return the lowest and the highest corner, (B, N, 2), of the chosen points among (B, N, K, 2)."""
     chosen = chosen[..., None]
     return torch.where(chosen, points, torch.inf).amin(dim=2), torch.where(chosen, points, -torch.inf).amax(dim=2)

@@ -1,4 +1,4 @@
-"""How masks, depth and optical flow follow a flow."""
+"""Masks, depth maps and optical flow that follow a backward flow."""
 
 import numbers
 from typing import Any
@@ -13,58 +13,58 @@ from torchrefract.warping.resample import sample_image
 
 
 def warp_mask(mask: Tensor, flow: Tensor, *, fill: float = 0, soft: bool = False) -> Tensor:
-    """The mask looked up along a backward flow: each pixel takes the class of the nearest one.
+    """Warp a segmentation mask along a backward flow: each pixel takes the class of the nearest input pixel.
 
     Args:
-        mask: (B, C, H, W) or (C, H, W), whole numbers up to 2^53, bool or floating.
+        mask: (B, C, H, W) or (C, H, W), integers up to 2^53, bool or floating.
         flow: (B, 2, H, W) or (1, 2, H, W), px; (2, H, W) for an unbatched mask.
-        fill: what stands where the nearest pixel lies off the frame, a value that the mask's type can hold.
-        soft: mix the four pixels around, for probabilities in a floating mask.
+        fill: value of pixels whose nearest input pixel lies outside the frame; the dtype of the mask must hold it.
+        soft: interpolate bilinearly instead, for probabilities in a floating mask.
 
     Returns:
-        The mask in its shape and type.
+        The warped mask, of the same shape and dtype.
 
     Raises:
-        ValueError: shapes that do not fit, a fill that the type cannot hold.
-        TypeError: an argument that is no tensor, a soft mask that is not floating.
+        ValueError: if shapes do not fit, or the dtype cannot hold `fill`.
+        TypeError: if an argument is not a tensor, or a soft mask is not floating.
     """
     check_tensor("mask", mask)
     check_tensor("flow", flow)
     check_flag("soft", soft)
     if soft and not mask.is_floating_point():
-        raise TypeError(f"mask must be floating to be soft, got {mask.dtype}")
+        raise TypeError(f"mask must be floating if soft=True, got {mask.dtype}")
     if mask.ndim == 3 and flow.ndim == 3:
         return warp_mask(mask[None], flow[None], fill=fill, soft=soft)[0]
     _check_map("mask", mask, flow)
     _check_fill(fill, mask.dtype)
-    moved, on_frame = _follow(mask, flow, "bilinear" if soft else "nearest")
-    return torch.where(on_frame, moved, torch.full_like(moved, fill))
+    warped, in_frame = _warp_map(mask, flow, "bilinear" if soft else "nearest")
+    return torch.where(in_frame, warped, torch.full_like(warped, fill))
 
 
 def warp_depth(
     depth: Tensor, flow: Tensor, *, fill: float = 0.0, interpolation: str = "nearest"
 ) -> tuple[Tensor, Tensor]:
-    """The depth looked up along a backward flow, and where there is one.
+    """Warp a depth map along a backward flow.
 
     Args:
-        depth: (B, 1, H, W) or (1, H, W), m, floating; inf is the sky, NaN is not known.
-        flow: (B, 2, H, W) or (1, 2, H, W), px; (2, H, W) for an unbatched depth.
-        fill: what stands where there is no depth, m, finite.
-        interpolation: "nearest", or "bilinear", which invents distances between the two sides of an edge.
+        depth: (B, 1, H, W) or (1, H, W), m, floating; inf is the sky, NaN is unknown.
+        flow: (B, 2, H, W) or (1, 2, H, W), px; (2, H, W) for an unbatched depth map.
+        fill: value of invalid pixels, m, finite.
+        interpolation: "nearest", or "bilinear", which mixes the distances on both sides of an edge.
 
     Returns:
-        depth in its shape and type, without NaN, and valid, bool, of that shape: the nearest pixel lies on the frame
-        and its depth (all that are mixed) is known.
+        depth: the warped depth map, of the same shape and dtype, without NaN.
+        valid: bool, of the same shape: the nearest input pixel lies in the frame, and no depth used is NaN.
 
     Raises:
-        ValueError: shapes that do not fit, an unknown interpolation, a fill that is not finite.
-        TypeError: an argument that is no floating tensor.
+        ValueError: if shapes do not fit, the interpolation is unknown, or `fill` is not finite.
+        TypeError: if an argument is not a floating tensor.
     """
     check_tensor("depth", depth)
     check_tensor("flow", flow)
     if depth.ndim == 3 and flow.ndim == 3:
-        moved, valid = warp_depth(depth[None], flow[None], fill=fill, interpolation=interpolation)
-        return moved[0], valid[0]
+        warped, valid = warp_depth(depth[None], flow[None], fill=fill, interpolation=interpolation)
+        return warped[0], valid[0]
     _check_map("depth", depth, flow)
     if depth.shape[1] != 1:
         raise ValueError(f"depth must have one channel, got {tuple(depth.shape)}")
@@ -72,9 +72,9 @@ def warp_depth(
         raise TypeError(f"depth must be of a floating type, got {depth.dtype}")
     check_choice("interpolation", interpolation, ("nearest", "bilinear"))
     _check_fill(fill, depth.dtype)
-    moved, on_frame = _follow(depth, flow, interpolation)
-    valid = on_frame & ~moved.isnan()
-    return torch.where(valid, moved, torch.full_like(moved, fill)), valid
+    warped, in_frame = _warp_map(depth, flow, interpolation)
+    valid = in_frame & ~warped.isnan()
+    return torch.where(valid, warped, torch.full_like(warped, fill)), valid
 
 
 def warp_optical_flow(
@@ -86,98 +86,99 @@ def warp_optical_flow(
     fill: float = 0.0,
     interpolation: str = "nearest",
 ) -> tuple[Tensor, Tensor]:
-    """The optical flow between two degraded frames, from that between the clean ones, and where it is known.
+    """Convert the optical flow between two clean frames to the optical flow between the two degraded frames.
 
-        moved(p) = c(p) + restore_flow(p + c(p)),  c(p) = flow(p) + optical_flow(p + flow(p))
+        warped(p) = c(p) + restore_flow(p + c(p)),  c(p) = flow(p) + optical_flow(p + flow(p))
 
-    What is at p in the first degraded frame is at p + flow(p) in the clean one, moves on by the optical flow there, and
-    is then found in the second degraded frame. Frames that one lens has seen take `flow` and `restore_flow` of one
-    `Degraded`; of a clip `flow` is that of each frame and `restore_flow` that of the next.
+    Pixel p of the first degraded frame shows the clean position p + flow(p). The optical flow moves that position to
+    the second clean frame, and `restore_flow` maps it to the second degraded frame. If one lens degraded both frames,
+    take `flow` and `restore_flow` from one `Degraded`; for a clip, take `restore_flow` from the next frame.
 
     Args:
         optical_flow: (B, 2, H, W) or (2, H, W), px, floating, from the first clean frame to the second; NaN and inf are
-            not known.
-        flow: of the first frame, (B, 2, H, W) or (1, 2, H, W), px; (2, H, W) for an unbatched optical flow.
-        restore_flow: of the second frame, likewise.
-        restore_valid: of the second frame, (B, 1, H, W) or (1, 1, H, W), bool; (1, H, W) for an unbatched optical flow.
-            None is everywhere.
-        fill: what stands where the optical flow is not known, px, finite.
-        interpolation: of the optical flow, "nearest", or "bilinear", which mixes the motions of the two sides of an
-            edge; `restore_flow` is read bilinearly.
+            unknown.
+        flow: flow of the first frame, (B, 2, H, W) or (1, 2, H, W), px; (2, H, W) for an unbatched optical flow.
+        restore_flow: restore flow of the second frame, with the same shapes.
+        restore_valid: validity of `restore_flow`, (B, 1, H, W) or (1, 1, H, W), bool; (1, H, W) for an unbatched
+            optical flow. None means valid everywhere.
+        fill: value of invalid pixels, px, finite.
+        interpolation: interpolation of the optical flow, "nearest", or "bilinear", which mixes the motion on both sides
+            of an edge. `restore_flow` is always interpolated bilinearly.
 
     Returns:
-        moved, in the shape and type of the optical flow, without NaN, and valid, (B, 1, H, W) or (1, H, W), bool: the
-        content comes from the clean frame, its motion is known, and leads to where the second degraded frame shows it.
+        warped: the optical flow between the degraded frames, of the same shape and dtype, without NaN.
+        valid: (B, 1, H, W) or (1, H, W), bool: the pixel shows a part of the clean frame, its motion is known, and the
+            second degraded frame shows where it leads.
 
     Raises:
-        ValueError: shapes that do not fit, an unknown interpolation, a fill that is not finite.
-        TypeError: an argument that is no tensor, an optical flow that is not floating, a mask that is not bool.
+        ValueError: if shapes do not fit, the interpolation is unknown, or `fill` is not finite.
+        TypeError: if an argument is not a tensor, the optical flow is not floating, or the mask is not bool.
     """
-    named = {"optical_flow": optical_flow, "flow": flow, "restore_flow": restore_flow}
-    for name, value in named.items():
+    flows = {"optical_flow": optical_flow, "flow": flow, "restore_flow": restore_flow}
+    for name, value in flows.items():
         check_tensor(name, value)
     if optical_flow.ndim == 3 and flow.ndim == 3 and restore_flow.ndim == 3:
-        known = None if restore_valid is None else restore_valid[None]
-        options: dict[str, Any] = {"restore_valid": known, "fill": fill, "interpolation": interpolation}
-        moved, valid = warp_optical_flow(*(value[None] for value in named.values()), **options)
-        return moved[0], valid[0]
+        mask = None if restore_valid is None else restore_valid[None]
+        options: dict[str, Any] = {"restore_valid": mask, "fill": fill, "interpolation": interpolation}
+        warped, valid = warp_optical_flow(*(value[None] for value in flows.values()), **options)
+        return warped[0], valid[0]
     check_flow("optical_flow", optical_flow)
     for name in ("flow", "restore_flow"):
-        _check_map("optical_flow", optical_flow, named[name], name=name)
+        _check_map("optical_flow", optical_flow, flows[name], flow_name=name)
     check_choice("interpolation", interpolation, ("nearest", "bilinear"))
     _check_fill(fill, optical_flow.dtype)
-    flow, restore_flow = (_beside(optical_flow, value) for value in (flow, restore_flow))
-    motion, valid = _follow(optical_flow, flow, interpolation)
+    flow, restore_flow = (_flow_for(optical_flow, value) for value in (flow, restore_flow))
+    motion, valid = _warp_map(optical_flow, flow, interpolation)
     valid = valid & motion.isfinite().all(dim=1, keepdim=True)
-    there = flow + torch.where(valid, motion, 0)
-    valid = valid & inside(there)
+    displacement = flow + torch.where(valid, motion, 0)
+    valid = valid & inside(displacement)
     if restore_valid is not None:
-        known = _checked_valid(restore_valid, restore_flow)
-        valid = valid & (sample_image(known, there, padding="zeros", interpolation="nearest") > 0.5)
-    moved = compose_flows(restore_flow, there).to(optical_flow.dtype)
-    valid = valid & moved.isfinite().all(dim=1, keepdim=True)
-    return torch.where(valid, moved, fill), valid
+        mask = _validity(restore_valid, restore_flow)
+        valid = valid & (sample_image(mask, displacement, padding="zeros", interpolation="nearest") > 0.5)
+    warped = compose_flows(restore_flow, displacement).to(optical_flow.dtype)
+    valid = valid & warped.isfinite().all(dim=1, keepdim=True)
+    return torch.where(valid, warped, fill), valid
 
 
-def _beside(value: Tensor, flow: Tensor) -> Tensor:
-    """A flow in the type of fields beside a map, one for each sample of it."""
+def _flow_for(value: Tensor, flow: Tensor) -> Tensor:
+    """Return the flow with the batch of a map, in the dtype of coordinates."""
     return flow.to(field_dtype(value.dtype)).expand(value.shape[0], -1, -1, -1)
 
 
-def _checked_valid(restore_valid: Tensor, restore_flow: Tensor) -> Tensor:
-    """(B, 1, H, W), 1 where the mask is true, in the type of the flow."""
+def _validity(restore_valid: Tensor, restore_flow: Tensor) -> Tensor:
+    """Check a mask and return it as (B, 1, H, W) in the dtype of the flow."""
     check_tensor("restore_valid", restore_valid)
     if restore_valid.dtype is not torch.bool:
         raise TypeError(f"restore_valid must be bool, got {restore_valid.dtype}")
     batch, _, *size = restore_flow.shape
     if restore_valid.shape not in ((batch, 1, *size), (1, 1, *size)):
-        raise ValueError(
-            f"restore_valid must have shape {(batch, 1, *size)} beside this flow, got {tuple(restore_valid.shape)}"
-        )
+        raise ValueError(f"restore_valid must have shape {(batch, 1, *size)}, got {tuple(restore_valid.shape)}")
     return restore_valid.to(restore_flow.dtype).expand(batch, -1, -1, -1)
 
 
-def _follow(value: Tensor, flow: Tensor, interpolation: str) -> tuple[Tensor, Tensor]:
-    """The map looked up, and where the nearest pixel lies on the frame."""
-    flow = _beside(value, flow)
-    everywhere = torch.ones_like(flow[:, :1])
-    on_frame = sample_image(everywhere, flow, padding="zeros", interpolation="nearest") > 0.5
-    return sample_image(value, flow, padding="border", interpolation=interpolation), on_frame
+def _warp_map(value: Tensor, flow: Tensor, interpolation: str) -> tuple[Tensor, Tensor]:
+    """Return the warped map and the mask of pixels whose nearest input pixel lies in the frame."""
+    flow = _flow_for(value, flow)
+    ones = torch.ones_like(flow[:, :1])
+    in_frame = sample_image(ones, flow, padding="zeros", interpolation="nearest") > 0.5
+    return sample_image(value, flow, padding="border", interpolation=interpolation), in_frame
 
 
-def _check_map(what: str, value: Tensor, flow: Tensor, *, name: str = "flow") -> None:
-    check_flow(name, flow)
+def _check_map(name: str, value: Tensor, flow: Tensor, *, flow_name: str = "flow") -> None:
+    """Raise unless `value` is a real map (B, C, H, W) and the flow fits it."""
+    check_flow(flow_name, flow)
     if value.ndim != 4:
-        raise ValueError(f"{what} must have shape (B, C, H, W) beside a batched flow, got {tuple(value.shape)}")
+        raise ValueError(f"{name} must have shape (B, C, H, W) for a batched flow, got {tuple(value.shape)}")
     if value.is_complex():
-        raise TypeError(f"{what} must be real, got {value.dtype}")
+        raise TypeError(f"{name} must be real, got {value.dtype}")
     if value.shape[2:] != flow.shape[2:] or flow.shape[0] not in (1, value.shape[0]):
         raise ValueError(
-            f"{name} must have the batch and the size of {what} {tuple(value.shape)}, got {tuple(flow.shape)}"
+            f"{flow_name} must have the batch and the size of {name} {tuple(value.shape)}, got {tuple(flow.shape)}"
         )
 
 
 def _check_fill(fill: float, dtype: torch.dtype) -> None:
+    """Raise unless the dtype can hold the fill value."""
     if dtype.is_floating_point:
         check_number("fill", fill)
         return

@@ -1,4 +1,4 @@
-"""Where points of an image land."""
+"""Points of an image that follow a backward flow."""
 
 from typing import NamedTuple
 
@@ -8,235 +8,236 @@ from torch import Tensor
 from torchrefract._validation import check_count, check_flow, check_positive, check_tensor
 from torchrefract.warping.grid import field_dtype
 
-# Newton steps: smooth flows take 6, and those that nearly fold gain little beyond 16.
+# Smooth flows converge in 6 Newton steps; flows that nearly fold gain little beyond 16.
 STEPS = 16
 TOLERANCE_PX = 0.01
-# Nodes of the lattice, a side, on which the search for a point begins.
-_NODES = 17
-# Outside the frame the flow goes on as its secant over so many px at the border: one pixel's slope would be noise.
-_SECANT = 16
-# Nothing that a frame shows is moved farther; the square of it still fits a float32.
-_FARTHEST = 1e7
-# Rounding of fp32 coordinates, px.
-_ROUNDING = 1e-3
+# Nodes along each side of the lattice from which the search starts.
+_NUM_NODES = 17
+# Outside the frame the flow continues along its secant over this many border pixels: the slope of one pixel is noise.
+_SECANT_PX = 16
+# Larger coordinates count as invalid; the square of this still fits into float32.
+_LARGEST_PX = 1e7
+# Rounding error of float32 coordinates, px.
+_ROUNDING_PX = 1e-3
+# Points that are compared with all nodes at once; this bounds the memory of their distances.
+_CHUNK = 4096
 
 
 def warp_points(
     points_xy: Tensor, flow: Tensor, *, steps: int = STEPS, tolerance_px: float = TOLERANCE_PX
 ) -> tuple[Tensor, Tensor]:
-    """Where points of the input image land in the output, to a fraction of a pixel, and whether they are seen there.
+    """Map points of the input image to the warped image.
 
-        q + flow(q) = p, solved by Newton's method at the points alone, each step halved until the residual falls
+    Newton's method solves the following equation at each point, with steps that are halved until the residual falls.
 
-    The flow is read bilinearly, and beyond the frame as its secant there. The search starts from p - flow(p) or from
-    the best node of a coarse lattice, whichever fits better; where a fold shows a point several times, the landing
-    that it finds from there is the one returned. Differentiable in both arguments by one attached Newton step
-    (implicit function theorem).
+        q + flow(q) = p
+
+    The flow is interpolated bilinearly and extrapolated along its secant. The search starts from p - flow(p) or from
+    the best node of a coarse lattice, whichever has the smaller residual. A fold shows a point several times; the
+    search returns one of these solutions. Gradients of both arguments follow from the implicit function theorem.
 
     Args:
-        points_xy: (B, N, 2), px, x and y; (N, 2) beside a flow of (2, H, W). NaN is a point that is not seen.
-        flow: (B, 2, H, W) or (1, 2, H, W), px, backward; what is not finite shows nothing.
-        steps: Newton steps, at least 1.
-        tolerance_px: the residual up to which a point counts as found, px.
+        points_xy: (B, N, 2), px, x and y; (N, 2) for a flow of shape (2, H, W). A NaN point is invisible.
+        flow: (B, 2, H, W) or (1, 2, H, W), px, backward; pixels with NaN or infinite flow show nothing.
+        steps: number of Newton steps, at least 1.
+        tolerance_px: largest residual of a solution, px.
 
     Returns:
-        points: (B, N, 2) or (N, 2), px, float32 or float64, finite; where nothing is found, the best that was seen.
-        visible: (B, N) or (N,), bool: found, on a pixel center or between some, on a sheet that is not folded over. A
-            sheet is folded over if it is turned against most of the frame, so a mirror image folds nothing.
+        points: (B, N, 2) or (N, 2), px, float32 or float64, finite; the best attempt if the search fails.
+        visible: (B, N) or (N,), bool: the search converged within the pixel centers of the frame, and the image is not
+            folded over at the point, that is, the local orientation is that of most of the frame.
 
     Raises:
-        ValueError: shapes that do not fit, no step, a tolerance that is not positive.
-        TypeError: an argument that is no tensor of real numbers.
+        ValueError: if shapes do not fit, or `steps` or `tolerance_px` is out of range.
+        TypeError: if an argument is not a tensor of real numbers.
     """
     check_tensor("points_xy", points_xy)
     check_tensor("flow", flow)
     if points_xy.ndim == 2 and flow.ndim == 3:
         points, visible = warp_points(points_xy[None], flow[None], steps=steps, tolerance_px=tolerance_px)
         return points[0], visible[0]
-    check_rows("points_xy", points_xy, flow, 2)
+    check_coordinates("points_xy", points_xy, flow, 2)
     check_count("steps", steps)
     check_positive("tolerance_px", tolerance_px)
-    landing = land(points_xy, flow, steps, tolerance_px)
-    return landing.points, landing.found & landing.upright & on_frame(landing.points, flow, 0.0)
+    solution = solve_points(points_xy, flow, steps, tolerance_px)
+    visible = solution.converged & solution.upright & in_frame(solution.points, flow, 0.0)
+    return solution.points, visible
 
 
-class Landing(NamedTuple):
-    """Where points land."""
+class PointSolution(NamedTuple):
+    """Positions of points in the warped image."""
 
     points: Tensor  # (B, N, 2), px
-    found: Tensor  # (B, N), bool: the residual is small, and so far all is known of the flow
-    upright: Tensor  # (B, N), bool: turned like most of the frame
+    converged: Tensor  # (B, N), bool: the residual is small and the flow is valid there
+    upright: Tensor  # (B, N), bool: the local orientation is that of most of the frame
 
 
-class Reading(NamedTuple):
-    """What a table says at some points, and how that changes."""
+class LinearSample(NamedTuple):
+    """Bilinear samples of a map and their derivatives, each (B, C, N)."""
 
-    value: Tensor  # (B, C, N)
-    slope_x: Tensor  # (B, C, N)
-    slope_y: Tensor  # (B, C, N)
+    value: Tensor
+    slope_x: Tensor
+    slope_y: Tensor
 
 
-def land(points: Tensor, flow: Tensor, steps: int, tolerance_px: float) -> Landing:
-    """The landing of points (B, N, 2) in a flow (B or 1, 2, H, W); the arguments are taken as checked."""
+def solve_points(points: Tensor, flow: Tensor, steps: int, tolerance_px: float) -> PointSolution:
+    """Solve q + flow(q) = p for points (B, N, 2) and a flow (B or 1, 2, H, W), without checks."""
     dtype = field_dtype(torch.promote_types(points.dtype, flow.dtype))
     p, flow = points.to(dtype).movedim(-1, 1), flow.to(dtype).expand(points.shape[0], -1, -1, -1)
-    usual, known = p.abs().amax(dim=1, keepdim=True) <= _FARTHEST, flow.abs().amax(dim=1, keepdim=True) <= _FARTHEST
-    p, flow = torch.where(usual, p, 0), torch.where(known, flow, 0)
+    usable = p.abs().amax(dim=1, keepdim=True) <= _LARGEST_PX
+    valid = flow.abs().amax(dim=1, keepdim=True) <= _LARGEST_PX
+    p, flow = torch.where(usable, p, 0), torch.where(valid, flow, 0)
     with torch.no_grad():
-        table = torch.cat([flow, known.to(dtype)], dim=1).detach()
+        table = torch.cat([flow, valid.to(dtype)], dim=1).detach()
         node, orientation = _nearest_node(table, p.detach())
-        near = _clamped(p.detach() - read_linearly(table, _clamped(p.detach(), flow)).value[:, :2], flow)
-        q, error, read = _newton(table, p.detach(), near, node, steps)
-        # Nothing is known where a hole in the flow would have been read.
-        found = (_squared(error) <= tolerance_px**2) & (read.value[:, 2:] > 0.999) & usual
-        upright = _determinant(read) * orientation > 0
+        shifted = p.detach() - sample_linear(table, _clamp(p.detach(), flow)).value[:, :2]
+        q, error, sample = _newton(table, p.detach(), _clamp(shifted, flow), node, steps)
+        # A point is invalid if its bilinear sample touches an invalid pixel of the flow.
+        converged = (_squared_norm(error) <= tolerance_px**2) & (sample.value[:, 2:] > 0.999) & usable
+        upright = _determinant(sample) * orientation > 0
     if torch.is_grad_enabled() and (p.requires_grad or flow.requires_grad):
-        error = read_linearly(flow, q).value - p
-        q = q - _solve(read, error - error.detach())
-    return Landing(q.movedim(1, -1), found[:, 0], upright[:, 0])
+        error = sample_linear(flow, q).value - p
+        q = q - _newton_step(sample, error - error.detach())
+    return PointSolution(q.movedim(1, -1), converged[:, 0], upright[:, 0])
 
 
-def _newton(table: Tensor, p: Tensor, near: Tensor, node: Tensor, steps: int) -> tuple[Tensor, Tensor, Reading]:
-    """The solution (B, 2, N), its error and the reading there, from the better of two places to start."""
-    q = near
-    read = read_linearly(table, q)
-    error = q + read.value[:, :2] - p
+def _newton(table: Tensor, p: Tensor, start: Tensor, node: Tensor, steps: int) -> tuple[Tensor, Tensor, LinearSample]:
+    """Return the solution (B, 2, N), its error and the sample of the table, from the better of two starts."""
+    q = start
+    best = sample_linear(table, q)
+    error = q + best.value[:, :2] - p
     trial, length = node, torch.ones_like(q[:, :1])
     for step in range(steps + 1):
-        reading = read_linearly(table, trial)
-        trial_error = trial + reading.value[:, :2] - p
-        better = _merit(trial_error, reading) < _merit(error, read)
+        sample = sample_linear(table, trial)
+        trial_error = trial + sample.value[:, :2] - p
+        better = _merit(trial_error, sample) < _merit(error, best)
         q, error = torch.where(better, trial, q), torch.where(better, trial_error, error)
-        read = Reading(*(torch.where(better, new, old) for new, old in zip(reading, read, strict=True)))
-        if step > 0:  # the first trial is the other start, and its failure says nothing of the length
+        best = LinearSample(*(torch.where(better, new, old) for new, old in zip(sample, best, strict=True)))
+        if step > 0:  # the first trial is the second start, whose failure says nothing about the step length
             length = torch.where(better, (2 * length).clamp(max=1), length / 2)
-        trial = _clamped(q - length * _solve(read, error), table)
-    return q, error, read
+        trial = _clamp(q - length * _newton_step(best, error), table)
+    return q, error, best
 
 
-def _merit(error: Tensor, read: Reading) -> Tensor:
-    """What the search lessens: the residual, but a hole in the flow, read as no motion, is worse than any."""
-    return _squared(error) + torch.where(read.value[:, 2:] > 0.999, 0, 4 * _FARTHEST**2)
+def _merit(error: Tensor, sample: LinearSample) -> Tensor:
+    """Return the squared residual; invalid flow, which is stored as zero, is worse than any residual."""
+    return _squared_norm(error) + torch.where(sample.value[:, 2:] > 0.999, 0, 4 * _LARGEST_PX**2)
 
 
-def read_linearly(table: Tensor, at: Tensor) -> Reading:
-    """The table (B, C, H, W) at the points (B, 2, N), bilinearly."""
+def sample_linear(table: Tensor, points: Tensor) -> LinearSample:
+    """Sample a map (B, C, H, W) bilinearly at the points (B, 2, N)."""
     height, width = table.shape[2:]
-    left, right, span_x = _cell(at[:, :1], width)
-    top, bottom, span_y = _cell(at[:, 1:], height)
-    tx, ty = (at[:, :1] - left) / span_x, (at[:, 1:] - top) / span_y
+    left, right, span_x = _interval(points[:, :1], width)
+    top, bottom, span_y = _interval(points[:, 1:], height)
+    tx, ty = (points[:, :1] - left) / span_x, (points[:, 1:] - top) / span_y
     flat = table.flatten(2)
     a, b, c, d = (
         flat.gather(2, (row * width + column).expand(-1, table.shape[1], -1))
         for row in (top, bottom)
         for column in (left, right)
     )
-    above, below = a + tx * (b - a), c + tx * (d - c)
-    value = above + ty * (below - above)
-    return Reading(value, ((b - a) + ty * ((d - c) - (b - a))) / span_x, (below - above) / span_y)
+    upper, lower = a + tx * (b - a), c + tx * (d - c)
+    value = upper + ty * (lower - upper)
+    return LinearSample(value, ((b - a) + ty * ((d - c) - (b - a))) / span_x, (lower - upper) / span_y)
 
 
-def _cell(position: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The whole numbers on both sides, and their distance; beyond the frame, those of the secant at its border."""
+def _interval(position: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the pixels on both sides and their distance; outside the frame, those of the secant at its border."""
     outside = (position < 0) | (position > size - 1)
-    span = torch.where(outside, min(_SECANT, max(size - 1, 1)), 1)
+    span = torch.where(outside, min(_SECANT_PX, max(size - 1, 1)), 1)
     low = torch.minimum(position.floor().long().clamp(min=0), size - 1 - span).clamp(min=0)
     return low, (low + span).clamp(max=size - 1), span
 
 
 def _nearest_node(table: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-    """The node of a coarse lattice that shows what is nearest to p, (B, 2, N), and how the lattice is turned."""
-    x, y = spread_over(table, 3, _NODES), spread_over(table, 2, _NODES)
+    """Return the node of a coarse lattice that shows the content nearest to p, (B, 2, N), and the orientation."""
+    x, y = pixel_subset(table, 3, _NUM_NODES), pixel_subset(table, 2, _NUM_NODES)
     nodes = table[:, :, y.long()][..., x.long()]
-    seen, known = torch.stack([nodes[:, 0] + x, nodes[:, 1] + y[:, None]], dim=1), nodes[:, 2:] > 0.5
-    # What is not known is farther than anything that is, and still finite when squared.
-    targets = torch.where(known, seen, 4 * _FARTHEST).flatten(2)
-    nearest = [_nearest(targets, some) for some in p.split(_at_once(p), dim=2)]
-    index = torch.cat(nearest, dim=1)
+    content, valid = torch.stack([nodes[:, 0] + x, nodes[:, 1] + y[:, None]], dim=1), nodes[:, 2:] > 0.5
+    # Invalid nodes get a distance larger than any valid one, whose square is still finite.
+    targets = torch.where(valid, content, 4 * _LARGEST_PX).flatten(2)
+    index = torch.cat([_nearest_target(targets, chunk) for chunk in p.split(_CHUNK, dim=2)], dim=1)
     node = torch.stack([x[index % x.shape[0]], y[index // x.shape[0]]], dim=1)
-    return node, _orientation(x, y, seen, known)
+    return node, _orientation(content, valid)
 
 
-def _nearest(targets: Tensor, p: Tensor) -> Tensor:
-    """(B, N): which of the targets (B, 2, K) is the nearest to each of the points (B, 2, N)."""
-    apart = targets[:, :, None] - p[..., None]
-    return (apart[:, 0].square() + apart[:, 1].square()).argmin(dim=-1)
+def _nearest_target(targets: Tensor, p: Tensor) -> Tensor:
+    """Return the index of the target (B, 2, K) nearest to each of the points (B, 2, N): (B, N)."""
+    difference = targets[:, :, None] - p[..., None]
+    return (difference[:, 0].square() + difference[:, 1].square()).argmin(dim=-1)
 
 
-def _at_once(p: Tensor) -> int:
-    """Points whose distances to all nodes stay in a core's cache; an accelerator, or a compiled graph, takes all."""
-    if p.device.type != "cpu" or torch.compiler.is_compiling():
-        return max(1, p.shape[2])
-    return max(1, (1 << 18) // (max(1, p.shape[0]) * _NODES**2))
-
-
-def spread_over(table: Tensor, dim: int, count: int) -> Tensor:
-    """At most `count` pixel centers from one end of the frame to the other."""
+def pixel_subset(table: Tensor, dim: int, count: int) -> Tensor:
+    """Return at most `count` pixel centers spread from one end of a dimension to the other."""
     size = table.shape[dim]
     return torch.linspace(0, size - 1, min(size, count), dtype=table.dtype, device=table.device).round()
 
 
-def _orientation(x: Tensor, y: Tensor, seen: Tensor, known: Tensor) -> Tensor:
-    """(B, 1, 1): 1, or -1 where most cells of the lattice are shown mirrored."""
-    if x.shape[0] == 1:
-        seen = torch.cat([seen, seen + seen.new_tensor([1, 0]).view(1, 2, 1, 1)], dim=-1)
-        known = known.expand(-1, -1, -1, 2)
-    if y.shape[0] == 1:
-        seen = torch.cat([seen, seen + seen.new_tensor([0, 1]).view(1, 2, 1, 1)], dim=-2)
-        known = known.expand(-1, -1, 2, -1)
-    falling, rising = seen[..., 1:, 1:] - seen[..., :-1, :-1], seen[..., 1:, :-1] - seen[..., :-1, 1:]
+def _orientation(content: Tensor, valid: Tensor) -> Tensor:
+    """Return 1, or -1 if most cells of the lattice are mirrored: (B, 1, 1)."""
+    for dim, step in ((-1, (1.0, 0.0)), (-2, (0.0, 1.0))):
+        if content.shape[dim] == 1:  # one line of nodes has no cells: repeat it one pixel further
+            content = torch.cat([content, content + content.new_tensor(step).view(1, 2, 1, 1)], dim=dim)
+            valid = torch.cat([valid, valid], dim=dim)
+    falling, rising = content[..., 1:, 1:] - content[..., :-1, :-1], content[..., 1:, :-1] - content[..., :-1, 1:]
     area = falling[:, :1] * rising[:, 1:] - falling[:, 1:] * rising[:, :1]
-    whole = known[..., 1:, 1:] & known[..., :-1, :-1] & known[..., 1:, :-1] & known[..., :-1, 1:]
-    turned = torch.where(whole, area.sign(), 0).sum(dim=(2, 3))[..., None]
-    return torch.where(turned < 0, -1, 1).to(seen.dtype)
+    is_complete = valid[..., 1:, 1:] & valid[..., :-1, :-1] & valid[..., 1:, :-1] & valid[..., :-1, 1:]
+    balance = torch.where(is_complete, area.sign(), 0).sum(dim=(2, 3))[..., None]
+    return torch.where(balance < 0, -1, 1).to(content.dtype)
 
 
-def frame_ends(flow: Tensor, rim: float) -> tuple[Tensor, Tensor]:
-    """The lowest and the highest corner, (2,), px, of the frame with a rim around its pixel centers."""
+def frame_bounds(flow: Tensor, border_px: float) -> tuple[Tensor, Tensor]:
+    """Return the lowest and the highest corner, (2,), px, of the pixel centers with a border around them."""
     height, width = flow.shape[2:]
-    ends = torch.tensor([[-rim, -rim], [width - 1 + rim, height - 1 + rim]], dtype=flow.dtype, device=flow.device)
-    return ends[0], ends[1]
+    corners = [[-border_px, -border_px], [width - 1 + border_px, height - 1 + border_px]]
+    low, high = torch.tensor(corners, dtype=flow.dtype, device=flow.device)
+    return low, high
 
 
-def on_frame(points: Tensor, flow: Tensor, rim: float) -> Tensor:
-    """(B, ...), bool: which points (B, ..., 2) lie on the frame with a rim around its pixel centers."""
-    low, high = frame_ends(flow, rim + _ROUNDING)
+def in_frame(points: Tensor, flow: Tensor, border_px: float) -> Tensor:
+    """Return True for points (B, ..., 2) on the pixel centers or a border around them: (B, ...)."""
+    low, high = frame_bounds(flow, border_px + _ROUNDING_PX)
     return ((points >= low) & (points <= high)).all(dim=-1)
 
 
-def _clamped(points: Tensor, flow: Tensor) -> Tensor:
-    """The points (B, 2, N) not farther off than eight frames."""
+def _clamp(points: Tensor, flow: Tensor) -> Tensor:
+    """Clamp points (B, 2, N) to eight frame sizes."""
     reach = 8 * max(flow.shape[2:])
     return points.clamp(-reach, reach)
 
 
-def _squared(vector: Tensor) -> Tensor:
+def _squared_norm(vector: Tensor) -> Tensor:
     return vector[:, :1].square() + vector[:, 1:2].square()
 
 
-def _determinant(read: Reading) -> Tensor:
-    return (1 + read.slope_x[:, :1]) * (1 + read.slope_y[:, 1:2]) - read.slope_y[:, :1] * read.slope_x[:, 1:2]
+def _determinant(sample: LinearSample) -> Tensor:
+    xx, xy, yx, yy = _jacobian(sample)
+    return xx * yy - xy * yx
 
 
-def _solve(read: Reading, error: Tensor) -> Tensor:
-    """(I + slopes)^-1 error, in closed form."""
-    determinant = _determinant(read)
-    # Near a fold the step has no good length; a bounded determinant keeps it finite, the residual tells the rest.
+def _jacobian(sample: LinearSample) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the entries of I + slopes, row by row, each (B, 1, N)."""
+    return 1 + sample.slope_x[:, :1], sample.slope_y[:, :1], sample.slope_x[:, 1:2], 1 + sample.slope_y[:, 1:2]
+
+
+def _newton_step(sample: LinearSample, error: Tensor) -> Tensor:
+    """Return (I + slopes)^-1 error in closed form."""
+    xx, xy, yx, yy = _jacobian(sample)
+    determinant = xx * yy - xy * yx
+    # Near a fold the step length is meaningless: bound it, and let the residual decide.
     determinant = torch.where(determinant >= 0, determinant.clamp(min=1e-3), determinant.clamp(max=-1e-3))
-    a, b = error.split(1, dim=1)
-    x = (1 + read.slope_y[:, 1:2]) * a - read.slope_y[:, :1] * b
-    y = (1 + read.slope_x[:, :1]) * b - read.slope_x[:, 1:2] * a
-    return torch.cat([x, y], dim=1) / determinant
+    u, v = error.split(1, dim=1)
+    return torch.cat([yy * u - xy * v, xx * v - yx * u], dim=1) / determinant
 
 
-def check_rows(name: str, rows: Tensor, flow: Tensor, length: int) -> None:
-    """Raise unless rows are (B, N, length) of real numbers, of the batch of a flow with a pixel."""
+def check_coordinates(name: str, rows: Tensor, flow: Tensor, length: int) -> None:
+    """Raise unless `rows` holds real numbers (B, N, length) and the flow has the same batch and at least one pixel."""
     check_flow("flow", flow)
     if 0 in flow.shape[2:]:
-        raise ValueError(f"flow must have a pixel, got {tuple(flow.shape)}")
+        raise ValueError(f"flow must have at least one pixel, got {tuple(flow.shape)}")
     if rows.ndim != 3 or rows.shape[2] != length:
-        raise ValueError(f"{name} must have shape (B, N, {length}) beside a batched flow, got {tuple(rows.shape)}")
+        raise ValueError(f"{name} must have shape (B, N, {length}) for a batched flow, got {tuple(rows.shape)}")
     if rows.is_complex() or rows.dtype is torch.bool:
-        raise TypeError(f"{name} must be of real numbers, got {rows.dtype}")
+        raise TypeError(f"{name} must contain real numbers, got {rows.dtype}")
     if flow.shape[0] not in (1, rows.shape[0]):
-        raise ValueError(f"flow must have the batch of {name}, {rows.shape[0]}, got {tuple(flow.shape)}")
+        raise ValueError(f"flow must have a batch of 1 or {rows.shape[0]}, as {name}, got {tuple(flow.shape)}")

@@ -1,4 +1,4 @@
-"""Labels of torchvision, in any nesting, that follow a flow."""
+"""Labels in torchvision's tensor types, in any nesting, that follow a backward flow."""
 
 import datetime
 import enum
@@ -6,6 +6,7 @@ import importlib
 import math
 import numbers
 import os
+import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,18 +16,18 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from torchrefract._validation import check_choice, check_flag, check_tensor, eager_bool
-from torchrefract.labels.boxes import check_policy, warp_boxes, warp_outlines
+from torchrefract.labels.boxes import check_box_limits, warp_boxes, warp_outlines
 from torchrefract.labels.maps import warp_mask
-from torchrefract.labels.points import STEPS, TOLERANCE_PX, check_rows, land, on_frame
-from torchrefract.labels.rows import companions, hide, is_tv, kept, siblings_of, wrapped
+from torchrefract.labels.points import STEPS, TOLERANCE_PX, check_coordinates, in_frame, solve_points
 from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, warp
 
-# What rides along with a sample and has no place in the image.
+# Values without a position in the image, which pass unchanged.
 _PLAIN = (
     *(type(None), str, bytes, numbers.Number, np.generic, np.ndarray),
     *(enum.Enum, os.PathLike, datetime.date, datetime.time, datetime.timedelta),
 )
-_SAMPLES = 64
+_SAMPLES_PER_EDGE = 64
+_VISIBILITY_KEYS = ("visible", "visibility")
 
 
 class _Options(NamedTuple):
@@ -34,16 +35,17 @@ class _Options(NamedTuple):
     min_visibility: float = 0.0
     clip: bool = True
     drop: bool = True
+    labels_getter: str | Callable[[Any], Any] | None = "default"
     soft_masks: bool = False
     mask_fill: float = 0
     padding: str = "zeros"
     interpolation: str = "bilinear"
-    leave: bool = False  # samples as they are that the flow leaves where they are
+    keep_unmoved: bool = False  # return samples whose flow is zero unchanged
 
 
-class _Moved(NamedTuple):
+class _Warped(NamedTuple):
     value: Any
-    flags: Tensor | None = None  # of boxes: which to keep; of keypoints: which are visible
+    flags: Tensor | None = None  # of boxes: the boxes to keep; of keypoints: the visible ones
 
 
 def warp_labels(
@@ -60,184 +62,258 @@ def warp_labels(
     padding: str = "zeros",
     interpolation: str = "bilinear",
 ) -> Any:
-    """The target in its nesting, with all that has a place in the image moved along a flow.
+    """Warp all labels of a nested target along a backward flow.
 
-    `Image`, `Video`, `Mask`, `BoundingBoxes` of every format and `KeyPoints` of torchvision follow the flow and come
-    back as what they were. Plain tensors, arrays, numbers, strings, paths, dates and None pass through; anything else
-    raises. Boxes are measured from the edge of the first pixel and keypoints from its center, as torchvision's flips
-    and clamps do. Boxes and keypoints of whole numbers are rounded.
+    `Image`, `Video`, `Mask`, `BoundingBoxes` of every format and `KeyPoints` of torchvision are warped and keep their
+    type. Plain tensors, arrays, numbers, strings, paths, dates and None pass unchanged. Boxes are measured from the
+    edge of the first pixel and keypoints from its center, as in torchvision's flips and clamps. Integer boxes and
+    keypoints are rounded.
 
-    Boxes that the limits reject are dropped as by `SanitizeBoundingBoxes`, which reads values and so waits for an
-    accelerator: with them go their rows of the labels and of the instance masks, (N, H, W), in the same dict. With
-    `drop` off they stay, without an area. A rotated box is the smallest around its warped outline that has the
-    direction of its warped top and bottom. A keypoint that is not seen lies off the canvas: where it lands, or else
-    at (-1, -1); a plain tensor "visible" or "visibility" in the same dict, with an entry for each keypoint, is zeroed.
+    With `drop`, boxes below the limits are removed as by `SanitizeBoundingBoxes`, together with their rows of the
+    labels and of the instance masks, (N, H, W), in the same dict. This reads values, so it waits for an accelerator.
+    Without `drop`, these boxes stay and have zero area. A rotated box becomes the smallest box around its warped
+    outline that has the direction of the warped top and bottom edges. An invisible keypoint gets its position off the
+    canvas, or (-1, -1) if it has none. A plain tensor "visible" or "visibility" in the same dict, with one entry for
+    each keypoint, is set to zero for invisible keypoints.
 
     Args:
-        target: dicts, lists, tuples and named tuples in any nesting.
-        flow: (2, H, W), px, backward, the flow of one sample; or (B, 2, H, W) for a batch, which is either a list or
-            tuple of B samples, or anything else whose tensors have a leading dimension B (boxes never do).
-        min_area, min_visibility, clip: as for `warp_boxes`.
-        drop: remove the boxes that are not worth keeping, instead of leaving them without an area.
-        labels_getter: what is dropped along: "default", the tensor under the key "labels", or else under one that
-            contains "label", beside the boxes in a dict; a function of a sample that returns one or several tensors;
-            None, nothing.
-        soft_masks: look floating masks up bilinearly.
-        mask_fill: what masks show outside.
-        padding, interpolation: of images and videos, as for `warp`.
+        target: nested dicts, lists, tuples and named tuples.
+        flow: (2, H, W), px, backward, for one sample; or (B, 2, H, W) for a batch. A batch is a list or tuple of B
+            samples, or any other target whose tensors have a leading dimension B (not for boxes).
+        min_area, min_visibility, clip: see `warp_boxes`.
+        drop: remove boxes that `warp_boxes` does not keep, instead of giving them zero area.
+        labels_getter: tensors to filter together with the boxes. "default" takes the tensor under the key "labels", or
+            under a key that contains "label", in the dict of the boxes; a function takes the sample and returns one
+            tensor or several; None filters only boxes and instance masks.
+        soft_masks: interpolate floating masks bilinearly.
+        mask_fill: value of masks outside the frame.
+        padding, interpolation: of images and videos, see `warp`.
+
+    Returns:
+        The warped target, in the same nesting.
 
     Raises:
-        TypeError: something in the target that could not be moved and is not plain; labels of boxes to drop that are
-            no tensor.
-        ValueError: shapes that do not fit, options out of their range, boxes to drop outside of a dict, where
-            what belongs to them cannot be known (boxes alone may be dropped).
+        TypeError: if the target holds an unsupported type, or labels of boxes to drop are not a tensor.
+        ValueError: if shapes do not fit, an option is out of range, or boxes to drop are not in a dict, so that their
+            labels are unknown (a target that is a single `BoundingBoxes` has none).
     """
     check_tensor("flow", flow)
     if flow.ndim not in (3, 4) or flow.shape[-3] != 2:
         raise ValueError(f"flow must have shape (2, H, W) or (B, 2, H, W), got {tuple(flow.shape)}")
-    check_policy(min_area, min_visibility, clip)
+    check_box_limits(min_area, min_visibility, clip)
     check_flag("drop", drop)
     check_flag("soft_masks", soft_masks)
     check_choice("padding", padding, PADDINGS)
     check_choice("interpolation", interpolation, INTERPOLATIONS)
     if labels_getter is not None and labels_getter != "default" and not callable(labels_getter):
         raise ValueError(f"labels_getter must be 'default', a function or None, got {labels_getter!r}")
-    options = _Options(min_area, min_visibility, clip, drop, soft_masks, mask_fill, padding, interpolation)
-    return _warp_target(target, flow, options, labels_getter)
+    limits = (min_area, min_visibility, clip, drop, labels_getter)
+    return _warp_target(target, flow, _Options(*limits, soft_masks, mask_fill, padding, interpolation))
 
 
-def follow(target: Any, flow: Tensor) -> Any:
-    """As by `warp_labels`, but labels of a sample that stays where it is are neither clipped nor filtered."""
-    return _warp_target(target, flow, _Options(leave=True), "default")
+def warp_moved_labels(target: Any, flow: Tensor) -> Any:
+    """Warp labels like `warp_labels`, but return samples whose flow is zero unchanged, even if boxes are off the frame."""
+    return _warp_target(target, flow, _Options(keep_unmoved=True))
 
 
-def _warp_target(target: Any, flow: Tensor, options: _Options, labels_getter: Any) -> Any:
+def is_tv_tensor(value: Any, name: str) -> bool:
+    """Return True if a value has the torchvision type `name`; torchvision is not imported for it."""
+    kind = getattr(sys.modules.get("torchvision.tv_tensors"), name, None)
+    return kind is not None and isinstance(value, kind)
+
+
+def wrap_like(value: Tensor, like: Any) -> Any:
+    """Return the tensor in the torchvision type, and with the metadata, of `like`."""
+    return sys.modules["torchvision.tv_tensors"].wrap(value, like=like)
+
+
+def _warp_target(target: Any, flow: Tensor, options: _Options) -> Any:
     if flow.ndim == 4 and type(target) in (list, tuple):
         if len(target) != flow.shape[0]:
             raise ValueError(f"target must have one sample for each of the {flow.shape[0]} flows, got {len(target)}")
-        samples = zip(target, flow, strict=True)
-        return type(target)(_warp_sample(sample, one, options, labels_getter) for sample, one in samples)
-    return _warp_sample(target, flow, options, labels_getter)
+        return type(target)(_warp_sample(*pair, options) for pair in zip(target, flow, strict=True))
+    return _warp_sample(target, flow, options)
 
 
-def _warp_sample(sample: Any, flow: Tensor, options: _Options, labels_getter: Any) -> Any:
-    still = (flow == 0).flatten(-3).all(dim=-1) if options.leave else None
-    if still is not None and eager_bool(still.all, of=still):
+def _warp_sample(sample: Any, flow: Tensor, options: _Options) -> Any:
+    is_zero = (flow == 0).flatten(-3).all(dim=-1) if options.keep_unmoved else None
+    if is_zero is not None and eager_bool(is_zero.all, of=is_zero):
         return sample
     pairs, spec = pytree.tree_flatten_with_path(sample)
     paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]
-    moved = [_move(leaf, flow, options) for leaf in leaves]
-    if still is not None and eager_bool(still.any, of=still) is not False:
-        moved = [_left(leaf, one, still) for leaf, one in zip(leaves, moved, strict=True)]
-    values = [one.value for one in moved]
-    for i, one in enumerate(moved):
+    warped = [_warp_leaf(leaf, flow, options) for leaf in leaves]
+    if is_zero is not None and eager_bool(is_zero.any, of=is_zero) is not False:
+        warped = [_restore_unmoved(leaf, one, is_zero) for leaf, one in zip(leaves, warped, strict=True)]
+    values = [one.value for one in warped]
+    for i, one in enumerate(warped):
         if one.flags is None:
             continue
-        siblings = siblings_of(paths, i)
-        if not is_tv(leaves[i], "BoundingBoxes"):
-            hide(values, leaves, siblings, one.flags)
+        siblings = _siblings(paths, i)
+        if not is_tv_tensor(leaves[i], "BoundingBoxes"):
+            _clear_visibility(values, leaves, siblings, one.flags)
         elif options.drop:
-            for k in companions(sample, paths, leaves, siblings, i, labels_getter):
-                values[k] = kept(values[k], one.flags)
+            for k in _rows_of_boxes(sample, paths, leaves, siblings, i, options.labels_getter):
+                values[k] = _select(values[k], one.flags)
     return pytree.tree_unflatten(values, spec)
 
 
-def _left(leaf: Any, moved: _Moved, still: Tensor) -> _Moved:
-    """What is moved of a leaf, but for the samples, () or (B,), that stay where they are."""
-    if moved.value is leaf:
-        return moved
+def _restore_unmoved(leaf: Any, warped: _Warped, is_zero: Tensor) -> _Warped:
+    """Replace the samples, () or (B,), whose flow is zero by the original ones."""
+    if warped.value is leaf:
+        return warped
 
-    def rows(value: Tensor) -> Tensor:
-        return still.to(value.device).view(*still.shape, *[1] * (value.ndim - still.ndim))
+    def mask(value: Tensor) -> Tensor:
+        return is_zero.to(value.device).view(*is_zero.shape, *[1] * (value.ndim - is_zero.ndim))
 
-    before, after = (value.as_subclass(Tensor) for value in (leaf, moved.value))
-    flags = None if moved.flags is None else moved.flags | rows(moved.flags)
-    return _Moved(wrapped(torch.where(rows(after), before, after), leaf), flags)
+    before, after = (value.as_subclass(Tensor) for value in (leaf, warped.value))
+    flags = None if warped.flags is None else warped.flags | mask(warped.flags)
+    return _Warped(wrap_like(torch.where(mask(after), before, after), leaf), flags)
 
 
-def _move(leaf: Any, flow: Tensor, options: _Options) -> _Moved:
-    """One leaf of a sample, moved; flow is (2, H, W), or (B, 2, H, W) for leaves with a leading B."""
-    if is_tv(leaf, "Image") or is_tv(leaf, "Video"):
+def _warp_leaf(leaf: Any, flow: Tensor, options: _Options) -> _Warped:
+    """Warp one leaf of a sample; flow is (2, H, W), or (B, 2, H, W) for leaves with a leading dimension B."""
+    if is_tv_tensor(leaf, "Image") or is_tv_tensor(leaf, "Video"):
         maps = _as_batch(leaf, flow)
         image, _ = warp(maps, _batched(flow), padding=options.padding, interpolation=options.interpolation)
-        return _Moved(wrapped(image.reshape(leaf.shape), leaf))
-    if is_tv(leaf, "Mask"):
+        return _Warped(wrap_like(image.reshape(leaf.shape), leaf))
+    if is_tv_tensor(leaf, "Mask"):
         maps, soft = _as_batch(leaf, flow), options.soft_masks and leaf.is_floating_point()
         mask = warp_mask(maps, _batched(flow), fill=options.mask_fill, soft=soft)
-        return _Moved(wrapped(mask.reshape(leaf.shape), leaf))
-    if is_tv(leaf, "KeyPoints"):
-        return _move_keypoints(leaf, flow)
-    if is_tv(leaf, "BoundingBoxes"):
-        return _move_boxes(leaf, flow, options)
+        return _Warped(wrap_like(mask.reshape(leaf.shape), leaf))
+    if is_tv_tensor(leaf, "KeyPoints"):
+        return _warp_keypoints(leaf, flow)
+    if is_tv_tensor(leaf, "BoundingBoxes"):
+        return _warp_bounding_boxes(leaf, flow, options)
     if type(leaf) in (Tensor, torch.nn.Parameter) or (isinstance(leaf, _PLAIN) and not isinstance(leaf, Tensor)):
-        return _Moved(leaf)
+        return _Warped(leaf)
     kind = f"{type(leaf).__module__}.{type(leaf).__qualname__}"
-    raise TypeError(f"target must hold what is known how to move, or plain values, got {kind}")
+    raise TypeError(f"target must hold tv_tensors of torchvision or plain values, got {kind}")
 
 
-def _move_keypoints(keypoints: Any, flow: Tensor) -> _Moved:
+def _warp_keypoints(keypoints: Any, flow: Tensor) -> _Warped:
     _check_canvas(keypoints, flow)
     plain, batch = keypoints.as_subclass(Tensor), _batched(flow)
     _check_batch(plain, flow)
     rows = plain.reshape(batch.shape[0], plain[..., 0].numel() // batch.shape[0], 2)
-    check_rows("keypoints", rows, batch, 2)
-    points, found, upright = land(rows, batch, STEPS, TOLERANCE_PX)
-    # A keypoint may lie on the outer half of a pixel at the border, which has no center beyond it.
-    on_canvas = on_frame(points, batch, 0.5)
-    visible = found & upright & on_canvas
+    check_coordinates("keypoints", rows, batch, 2)
+    points, converged, upright = solve_points(rows, batch, STEPS, TOLERANCE_PX)
+    # A keypoint may lie on the outer half of a border pixel.
+    on_canvas = in_frame(points, batch, 0.5)
+    visible = converged & upright & on_canvas
     points = torch.where((visible | ~on_canvas)[..., None], points, -1)
     value = _cast(points.reshape(plain.shape), plain.dtype)
-    return _Moved(wrapped(value, keypoints), visible.reshape(plain.shape[:-1]))
+    return _Warped(wrap_like(value, keypoints), visible.reshape(plain.shape[:-1]))
 
 
-def _move_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Moved:
+def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped:
     _check_canvas(boxes, flow)
     if flow.ndim == 4:
-        raise ValueError(f"target must be a list of samples to hold boxes beside a batch of flows, got {type(boxes)}")
+        raise ValueError(f"target must be a list of samples if it holds boxes and flow is a batch, got {type(boxes)}")
     plain = boxes.as_subclass(Tensor)
     plain = plain if plain.is_floating_point() else plain.to(flow.dtype)
     if boxes.format.name in ("XYWHR", "CXCYWHR", "XYXYXYXY"):
-        moved, keep = _move_rotated(plain, boxes.format.name, flow, options)
+        warped, keep = _warp_rotated_boxes(plain, boxes.format.name, flow, options)
     else:
         corners = _convert(plain, boxes.format.name, "XYXY") - 0.5
-        policy = {"min_area": options.min_area, "min_visibility": options.min_visibility}
-        moved, keep = warp_boxes(corners, flow, clip=options.clip, samples=_SAMPLES, **policy)
+        limits = {"min_area": options.min_area, "min_visibility": options.min_visibility}
+        warped, keep = warp_boxes(corners, flow, clip=options.clip, samples=_SAMPLES_PER_EDGE, **limits)
         if not options.drop:
-            moved = torch.where(keep[:, None], moved, moved[:, :2].repeat(1, 2))
-        moved = _convert(moved + 0.5, "XYXY", boxes.format.name)
-    return _Moved(wrapped(_cast(moved, boxes.dtype), boxes), keep)
+            warped = torch.where(keep[:, None], warped, warped[:, :2].repeat(1, 2))
+        warped = _convert(warped + 0.5, "XYXY", boxes.format.name)
+    return _Warped(wrap_like(_cast(warped, boxes.dtype), boxes), keep)
 
 
-def _move_rotated(plain: Tensor, form: str, flow: Tensor, options: _Options) -> tuple[Tensor, Tensor]:
+def _warp_rotated_boxes(plain: Tensor, form: str, flow: Tensor, options: _Options) -> tuple[Tensor, Tensor]:
     corners = _convert(plain, form, "XYXYXYXY").reshape(1, -1, 4, 2) - 0.5
-    outlines = warp_outlines(corners, flow[None], samples=_SAMPLES)
-    axes = _axes(outlines.points, outlines.found, corners)
+    outlines = warp_outlines(corners, flow[None], samples=_SAMPLES_PER_EDGE)
+    axes = _box_axes(outlines.points, outlines.converged, corners)
     extent = outlines.extent(axes)
     keep = extent.keep(options.min_area, options.min_visibility)
-    low, high = extent.clipped if options.clip else extent.whole
+    low, high = extent.clipped if options.clip else extent.unclipped
     if not options.drop:
         high = torch.where(keep[..., None], high, low)
-    ends = torch.stack([low, torch.stack([high[..., 0], low[..., 1]], dim=-1), high], dim=2)
-    ends = torch.cat([ends, torch.stack([low[..., 0], high[..., 1]], dim=-1)[:, :, None]], dim=2)
-    # Back from the box's own axes: the transpose of a rotation.
-    moved = (ends[..., None] * axes[:, :, None]).sum(dim=-2)
-    return _convert(moved[0].flatten(1) + 0.5, "XYXYXYXY", form), keep[0]
+    (x1, y1), (x2, y2) = low.unbind(-1), high.unbind(-1)
+    rectangle = torch.stack([x1, y1, x2, y1, x2, y2, x1, y2], dim=-1).unflatten(-1, (4, 2))
+    # The transpose of a rotation is its inverse: back from coordinates along the axes.
+    warped = (rectangle[..., None] * axes[:, :, None]).sum(dim=-2)
+    return _convert(warped[0].flatten(1) + 0.5, "XYXYXYXY", form), keep[0]
 
 
-def _axes(points: Tensor, found: Tensor, corners: Tensor) -> Tensor:
-    """(B, N, 2, 2), unit vectors along and across the warped boxes: along the first edge and against the third."""
-    steps = points.diff(dim=3) * (found[..., 1:] & found[..., :-1])[..., None]
+def _box_axes(points: Tensor, converged: Tensor, corners: Tensor) -> Tensor:
+    """Return unit vectors, (B, N, 2, 2), along the top and bottom edges of warped boxes and across them."""
+    steps = points.diff(dim=3) * (converged[..., 1:] & converged[..., :-1])[..., None]
     along = steps[:, :, 0].sum(dim=2) - steps[:, :, 2].sum(dim=2)
-    before = corners[:, :, 1] - corners[:, :, 0]
-    along = torch.where(_length(along) > 1e-6, along, before.to(along.dtype))
-    still = torch.tensor([1.0, 0.0], dtype=along.dtype, device=along.device)
-    along = torch.where(_length(along) > 1e-6, along, still)
+    # A box without a visible edge keeps its direction, and a box without a size gets that of the x axis.
+    original = (corners[:, :, 1] - corners[:, :, 0]).to(along.dtype)
+    x_axis = torch.tensor([1.0, 0.0], dtype=along.dtype, device=along.device)
+    for default in (original, x_axis):
+        along = torch.where(_length(along) > 1e-6, along, default)
     along = along / _length(along)
     return torch.stack([along, torch.stack([-along[..., 1], along[..., 0]], dim=-1)], dim=2)
 
 
 def _length(vector: Tensor) -> Tensor:
     return vector.detach().square().sum(dim=-1, keepdim=True).sqrt()
+
+
+def _siblings(paths: list[Any], i: int) -> dict[str, int]:
+    """Return the indices of the leaves in the dict of leaf i, by their keys in lower case."""
+    path = paths[i]
+    if not path or not isinstance(path[-1], pytree.MappingKey):
+        return {}
+    return {str(other[-1].key).lower(): k for k, other in enumerate(paths) if other[:-1] == path[:-1]}
+
+
+def _rows_of_boxes(
+    sample: Any, paths: list[Any], leaves: list[Any], siblings: dict[str, int], i: int, labels_getter: Any
+) -> list[int]:
+    """Return the indices of the boxes i and of all leaves that have one row for each box."""
+    count = leaves[i].shape[0]
+    masks = [k for k in siblings.values() if is_tv_tensor(leaves[k], "Mask") and leaves[k].ndim > 2]
+    rows = [i, *(k for k in masks if leaves[k].shape[0] == count)]
+    if labels_getter is None or (labels_getter == "default" and leaves[i] is sample):
+        return rows
+    if callable(labels_getter):
+        labels = labels_getter(sample)
+        labels = [] if labels is None else labels if isinstance(labels, list | tuple) else [labels]
+        rows += [k for k, leaf in enumerate(leaves) if any(leaf is label for label in labels)]
+    elif not siblings:
+        raise ValueError("target must hold boxes in a dict with their labels if drop=True, got boxes outside a dict")
+    else:
+        entries = pytree.key_get(sample, paths[i][:-1])
+        rows += _default_labels({str(key).lower(): value for key, value in entries.items()}, siblings)
+    for k in rows:
+        if leaves[k].shape[:1] != (count,):
+            raise ValueError(f"labels must have one row for each of the {count} boxes, got {tuple(leaves[k].shape)}")
+    return sorted(set(rows))
+
+
+def _default_labels(entries: dict[str, Any], siblings: dict[str, int]) -> list[int]:
+    """Return the index of the labels by torchvision's rule: the key "labels", or the first that contains "label"."""
+    keys = ["labels"] if "labels" in entries else [key for key in entries if "label" in key][:1]
+    for key in keys:
+        if not isinstance(entries[key], Tensor):
+            raise TypeError(f"{key} must be a tensor if drop=True, got {type(entries[key]).__name__}")
+    return [siblings[key] for key in keys]
+
+
+def _select(value: Any, keep: Tensor) -> Any:
+    """Return the rows to keep."""
+    if type(value) in (Tensor, torch.nn.Parameter):
+        return value[keep.to(value.device)]
+    return wrap_like(value.as_subclass(Tensor)[keep.to(value.device)], value)
+
+
+def _clear_visibility(values: list[Any], leaves: list[Any], siblings: dict[str, int], visible: Tensor) -> None:
+    """Set the visibility of invisible keypoints to zero, in place in the list of values."""
+    for key in _VISIBILITY_KEYS:
+        k = siblings.get(key)
+        if k is None or type(leaves[k]) is not Tensor:
+            continue
+        if leaves[k].shape not in (visible.shape, (*visible.shape, 1)):
+            shapes = f"{tuple(visible.shape)}, got {tuple(leaves[k].shape)}"
+            raise ValueError(f"{key} must have one entry for each keypoint, {shapes}")
+        values[k] = values[k] * visible.to(values[k].device).view(leaves[k].shape)
 
 
 def _convert(boxes: Tensor, old: str, new: str) -> Tensor:
@@ -254,7 +330,7 @@ def _batched(flow: Tensor) -> Tensor:
 
 
 def _as_batch(leaf: Any, flow: Tensor) -> Tensor:
-    """The maps of a leaf (..., H, W) as channels, (B, C, H, W), B being that of the flow or 1."""
+    """Return a leaf (..., H, W) as (B, C, H, W), where B is the batch of the flow or 1."""
     plain = leaf.as_subclass(Tensor)
     if plain.shape[-2:] != flow.shape[-2:]:
         size = f"{tuple(flow.shape[-2:])}, got {tuple(plain.shape)}"
@@ -266,10 +342,10 @@ def _as_batch(leaf: Any, flow: Tensor) -> Tensor:
 
 def _check_batch(plain: Tensor, flow: Tensor) -> None:
     if flow.ndim == 4 and (plain.ndim < 3 or plain.shape[0] != flow.shape[0]):
-        raise ValueError(f"target must have a batch of {flow.shape[0]} like flow, got {tuple(plain.shape)}")
+        raise ValueError(f"target must have the batch of the flow, {flow.shape[0]}, got {tuple(plain.shape)}")
 
 
 def _check_canvas(leaf: Any, flow: Tensor) -> None:
     if tuple(leaf.canvas_size) != tuple(flow.shape[-2:]):
         size = f"{tuple(flow.shape[-2:])}, got {tuple(leaf.canvas_size)}"
-        raise ValueError(f"{type(leaf).__name__} must have the canvas of the flow, {size}")
+        raise ValueError(f"{type(leaf).__name__} must have the canvas size of the flow, {size}")

@@ -1,0 +1,229 @@
+"""Batches inside an effect: images and clips as (N, C, H, W), and parameters with B rows.
+
+N is B for images, and B T for the frames of B clips, which follow one another. A value that is the same in all frames
+of a clip keeps B rows until it meets one that is not.
+"""
+
+from typing import Any, NamedTuple, cast
+
+import torch
+from torch import Tensor
+
+from torchrefract._tensor import expand_batch, is_channels_last, to_float, to_uint8
+from torchrefract._validation import check_tensor, check_within, eager_bool, requires_grad
+from torchrefract.labels.targets import is_tv_tensor
+from torchrefract.warping.grid import field_dtype
+
+LATEST_FRAME = 1e9  # of a clip, in both directions; float64 still resolves the drift of a field there
+
+
+class BatchShape(NamedTuple):
+    """The dimensions before (C, H, W) of the images that a caller passes."""
+
+    batch: int  # B, of single images or of clips
+    frames: int  # T, 1 for single images
+    leading: tuple[int, ...]  # (), (B,), (T,) or (B, T)
+
+    @property
+    def is_clip(self) -> bool:
+        """Return True if there is a time dimension."""
+        return self.leading not in ((), (self.batch,))
+
+    def restore(self, value: Tensor) -> Tensor:
+        """Give a map with N rows, or with B rows for all frames, the leading dimensions of the images."""
+        if self.leading == (self.batch,):
+            return value
+        value = value.reshape(self.batch, -1 if self.batch else self.frames, *value.shape[1:])
+        value = value.expand(-1, self.frames, *value.shape[2:])
+        return value if len(self.leading) == 2 else value[0] if self.is_clip else value[0, 0]
+
+
+def check_image(image: Tensor) -> BatchShape:
+    """Check images (B, C, H, W) or (C, H, W), or clips (B, T, C, H, W); a torchvision `Video` is a clip.
+
+    Raises:
+        ValueError: another number of dimensions; no channel, no pixel or no frame.
+        TypeError: neither floating nor uint8.
+    """
+    check_tensor("image", image)
+    if image.ndim not in (3, 4, 5) or 0 in image.shape[-3:]:
+        raise ValueError(
+            f"image must have shape (B, C, H, W), (C, H, W) or, for clips, (B, T, C, H, W), got {tuple(image.shape)}"
+        )
+    if not image.is_floating_point() and image.dtype is not torch.uint8:
+        raise TypeError(f"image must be floating in [0, 1] or uint8, got {image.dtype}")
+    leading = tuple(image.shape[:-3])
+    if len(leading) == 1 and not is_tv_tensor(image, "Video"):
+        return BatchShape(leading[0], 1, leading)
+    batch, frames = (1, *leading)[-2:] if leading else (1, 1)
+    if frames == 0:
+        raise ValueError(f"image must have at least one frame in a clip, got {tuple(image.shape)}")
+    return BatchShape(batch, frames, leading)
+
+
+def check_depth_fits(depth: Any, image: Tensor, shape: BatchShape) -> Tensor:
+    """Return the depth as (N, 1, H, W), or (B, 1, H, W) if it is the same in all frames of a clip.
+
+    Raises:
+        TypeError: not a floating tensor.
+        ValueError: not (..., 1, H, W) for an image (..., C, H, W).
+    """
+    if not isinstance(depth, Tensor) or not depth.is_floating_point():
+        raise TypeError(f"depth must be a floating tensor, got {getattr(depth, 'dtype', type(depth).__name__)}")
+    size = (1, *image.shape[-2:])
+    static = (*shape.leading[:-1], 1)
+    if depth.shape != (*shape.leading, *size) and not (shape.is_clip and depth.shape == (*static, *size)):
+        alternative = f", or {(*static, *size)} if it is the same in all frames" if shape.is_clip else ""
+        raise ValueError(
+            f"depth must have one channel and the size of the image, {(*shape.leading, *size)}{alternative}, "
+            f"got {tuple(depth.shape)}"
+        )
+    return depth.reshape(-1, *size)
+
+
+def to_batch(image: Tensor, *, keep_uint8: bool = False) -> Tensor:
+    """Return (N, C, H, W), float32 or float64 in [0, 1]; uint8 stays uint8 if `keep_uint8`."""
+    batch = image if image.ndim == 4 else image.reshape(-1, *image.shape[-3:])
+    if image.dtype is torch.uint8:
+        return batch if keep_uint8 else to_float(batch)
+    return batch if image.dtype is torch.float64 else batch.float()
+
+
+def from_batch(result: Tensor, image: Tensor, batch: Tensor) -> Tensor:
+    """Give a result (N, C, H, W) the shape, type and memory format of the image that `to_batch` made `batch` from."""
+    if result is batch:
+        return image
+    if image.dtype is torch.uint8 and result.is_floating_point():
+        result = to_uint8(result)
+    memory_format = torch.channels_last if is_channels_last(batch) else torch.contiguous_format
+    result = result.to(image.dtype).contiguous(memory_format=memory_format)
+    return result if image.ndim == 4 else result.view(image.shape)
+
+
+def first_frames(image: Tensor, shape: BatchShape) -> Tensor:
+    """Return (B, C, H, W), the first frame of each sample."""
+    if not shape.is_clip:
+        return image if image.ndim == 4 else image[None]
+    return image.reshape(shape.batch, shape.frames, *image.shape[-3:])[:, 0]
+
+
+def frame_numbers(first: float | Tensor, image: Tensor, shape: BatchShape) -> Tensor:
+    """Return (B, T), the numbers of the frames in their clips, from the number of the first one, () or (B,)."""
+    start = torch.as_tensor(first, dtype=field_dtype(image.dtype), device=image.device)
+    if start.ndim > 1 or (start.ndim == 1 and start.shape[0] not in (1, shape.batch)):
+        raise ValueError(f"frame must be a number, or one for each of {shape.batch} samples, got {tuple(start.shape)}")
+    check_within("frame", start, -LATEST_FRAME, LATEST_FRAME)
+    return start.view(-1, 1).expand(shape.batch, 1) + torch.arange(shape.frames, dtype=start.dtype, device=start.device)
+
+
+def check_frames(params: Any, shape: BatchShape) -> None:
+    """Raise ValueError unless the parameters have a frame number for each frame."""
+    for child in getattr(params, "children", ()):
+        check_frames(child, shape)
+    if "frame" in params._fields and params.frame.shape != (shape.batch, shape.frames):
+        raise ValueError(
+            f"params.frame must have shape {(shape.batch, shape.frames)}, a number for each frame of each sample (or "
+            f"pass frame=, that of the first), got {tuple(params.frame.shape)}"
+        )
+
+
+def map_params(params: Any, function: Any) -> Any:
+    """Apply a function to each tensor of the parameters, and to those of the children of a composition."""
+    if isinstance(params, Tensor):
+        return function(params)
+    if isinstance(params, tuple) and not hasattr(params, "_fields"):  # the children of a composition
+        return tuple(map_params(child, function) for child in params)
+    return type(params)(*(map_params(value, function) for value in params))
+
+
+def params_to(params: Any, *args: Any, **kwargs: Any) -> Any:
+    """Move the parameters as by `Tensor.to`; flags and keys keep their type."""
+
+    def move(value: Tensor) -> Tensor:
+        target = (value if value.is_floating_point() else torch.empty(0, device=value.device)).to(*args, **kwargs)
+        return target if value.is_floating_point() else value.to(target.device)
+
+    return map_params(params, move)
+
+
+def promote_params(params: Any, dtype: torch.dtype) -> Any:
+    """Convert floating parameters of a smaller type than `dtype` to it, since flows are never computed in half."""
+
+    def promote(value: Tensor) -> Tensor:
+        return value.to(torch.promote_types(value.dtype, dtype)) if value.is_floating_point() else value
+
+    return map_params(params, promote)
+
+
+def params_at_frames(params: Any, frames: Tensor) -> Any:
+    """Replace the frame numbers (B, T) of the parameters; those without a `frame` stay."""
+    if "children" in params._fields:
+        return params._replace(children=tuple(params_at_frames(child, frames) for child in params.children))
+    return params._replace(frame=frames) if "frame" in params._fields else params
+
+
+def params_per_frame(params: Any, frames: int) -> Any:
+    """Repeat the parameters of B clips for their T frames: B T rows, each with one frame number."""
+    if frames == 1:
+        return params
+    if "frame" in params._fields:
+        frame = params.frame.reshape(-1, 1)
+        repeated = map_params(params, lambda value: value.repeat_interleave(frames, dim=0))
+        return repeated._replace(frame=frame)
+    return map_params(params, lambda value: value.repeat_interleave(frames, dim=0))
+
+
+def select_params(params: Any, index: Tensor) -> Any:
+    """Return the rows of some samples."""
+    return map_params(params, lambda value: value[index])
+
+
+def per_sample(flags: Tensor) -> Tensor:
+    """View (N,) as (N, 1, 1, 1)."""
+    return flags.view(-1, 1, 1, 1)
+
+
+def frame_mean(value: Tensor) -> Tensor:
+    """Return (N, C, 1, 1), the mean of (N, C, H, W) over the frame."""
+    return value.mean(dim=(2, 3), keepdim=True)
+
+
+class _SwapGradient(torch.autograd.Function):
+    """Return the first tensor, and pass the gradient to the second."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(value: Tensor, differentiable: Tensor) -> Tensor:
+        return value.view_as(value)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        return None
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]  # two inputs, two gradients
+        return None, gradient
+
+
+def where_active(changed: Tensor, unchanged: Tensor | float, active: Tensor, params: Any) -> Tensor:
+    """Choose `changed` for active samples and `unchanged`, bit for bit, for the others.
+
+    An applied sample at strength zero is not active, but its parameters keep their gradient, so that an optimizer can
+    start there.
+
+    Args:
+        changed: (N, ...).
+        unchanged: (N, ...), or a number.
+        active: (N,) or (B,), bool.
+        params: with B or N rows; needs `applied` and, for gradients, its tensors.
+    """
+    if eager_bool(active.all, of=active):
+        return changed
+    rows = changed.shape[0]
+    shape = (-1, *[1] * (changed.ndim - 1))
+    value = torch.where(expand_batch(active, rows).view(shape), changed, unchanged)
+    if not requires_grad(value for value in params if isinstance(value, Tensor)):
+        return value
+    differentiable = torch.where(expand_batch(params.applied, rows).view(shape), changed, unchanged)
+    return cast(Tensor, _SwapGradient.apply(value.detach(), differentiable))

@@ -1,0 +1,330 @@
+"""Error bounds for lenses on a lattice, and after a few Newton steps.
+
+The inverse of the lens polynomial has no closed form, and bounds of its derivatives by those of the polynomial are far
+too large near a fold. The errors are therefore measured in float64, for lenses at the corners of the ranges and for
+random ones inside, in cells all over the frame, and multiplied by `_SAFETY`. `benchmarks/tolerance.py` tests them with
+random lenses. That no lens of the ranges folds is proved.
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrefract._tensor import as_device_tensor
+from torchrefract.cameras.distortion import POLYNOMIAL12, Terms, newton_iterates, used_terms
+from torchrefract.types import FlowBounds, Range, Simplification
+
+_SAFETY = 1.25
+_MOST_CORNERS, _RANDOM_LENSES = 128, 16
+_LEVELS = np.array([4.0, 16.0, 64.0, 128.0, 256.0])  # px, strides at which errors are measured
+_FINE = 2  # the first levels, whose nodes lie near the frame, give the derivatives
+_CELLS = 5  # along each axis, in which errors are measured
+# Positions in strides from the corner of a cell, on a line through its middle, and weights of the values there: the
+# error of the cubic through the four nodes, and the second and third derivative.
+_LINE = (-1.0, 0.0, 0.5, 1.0, 2.0)
+_ERROR, _SECOND, _THIRD = (
+    (-1 / 16, 9 / 16, -1.0, 9 / 16, -1 / 16),
+    (0.0, 4.0, -8.0, 4.0, 0.0),
+    (-1.0, 3.0, 0.0, -3.0, 1.0),
+)
+_CONVERGED = 1e-7  # step of Newton's method on the plane z = 1; the error is about its square
+_MAX_STEPS = 12
+_MAX_STRETCH = 3.0  # the sampler clamps positions that lie farther out than this, relative to the frame
+_MIN_GROWTH = 0.05  # a map that grows by less, relative to no lens at all, is near a fold
+# Shares of the budget for dropped terms and for Newton's method; the rest is for the lattice.
+_DROPPED_SHARE, _NEWTON_SHARE = 0.2, 0.1
+# For each coefficient: the power of the radius, and how far it moves a point of the unit circle at most.
+_DEGREES = (*((2 * i + 1, 1.0) for i in range(1, 7)), (2, 3.0), (2, 3.0), (2, 1.0), (4, 1.0), (2, 1.0), (4, 1.0))
+# Terms that are dropped together or not at all, the least important first.
+_GROUPS = (range(8, 12), range(6, 8), (5,), (4,), (3,), (2,), (1,), (0,))
+
+
+class LensRanges(NamedTuple):
+    """Ranges of the 16 numbers of a lens; lengths in widths of the frame."""
+
+    coefficients: tuple[Range, ...]  # 12, k1 ... k6, p1, p2, s1 ... s4
+    focal: Range
+    aspect: Range
+    center_x: Range
+    center_y: Range
+
+    @classmethod
+    def from_numbers(cls, numbers: Sequence[Range]) -> "LensRanges":
+        """Build from the ranges of all 16 numbers."""
+        return cls(tuple(numbers[:12]), *numbers[12:])
+
+    @property
+    def numbers(self) -> tuple[Range, ...]:
+        """Return the ranges of all 16 numbers."""
+        return (*self.coefficients, self.focal, self.aspect, self.center_x, self.center_y)
+
+
+class LensDetails(NamedTuple):
+    """What a plan fixes for the computation of a lens."""
+
+    num_steps: int  # of Newton's method
+    terms: Terms
+
+
+def lens_numbers(coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
+    """Return (B, 16), the numbers in the order of `LensRanges`, from (B, 12), (B, 2) and (B, 2)."""
+    return torch.cat([coefficients, focal[:, :1], focal[:, 1:] / focal[:, :1], center], dim=1)
+
+
+@dataclass(frozen=True)
+class LensErrorModel:
+    """Error bounds for lenses drawn from one of several boxes of ranges; see `ErrorModel`."""
+
+    boxes: tuple[LensRanges, ...]
+
+    is_random = False
+
+    @classmethod
+    def from_lens(cls, numbers: Sequence[float]) -> "LensErrorModel":
+        """Build the model of a single lens from its 16 numbers."""
+        return cls((LensRanges.from_numbers([(number, number) for number in numbers]),))
+
+    def bounds(self, height: int, width: int) -> FlowBounds | None:
+        """Return measured bounds, or None if a lens may fold inside the frame."""
+        measured = _measure(self.boxes, height, width)
+        return None if measured is None else measured.bounds
+
+    def simplify(self, height: int, width: int, budget_px: float) -> Simplification | None:
+        """Drop terms that move less than a share of the budget, and choose the number of Newton steps."""
+        measured = _measure(self.boxes, height, width)
+        if measured is None:
+            return None
+        used = [any(box.coefficients[i] != (0.0, 0.0) for box in self.boxes) for i in range(12)]
+        dropped = _droppable(used, measured.moved_px, _DROPPED_SHARE * budget_px)
+        kept = [i for i in range(12) if used[i] and i not in dropped]
+        steps = next((n for n, error in enumerate(measured.newton_px) if error <= _NEWTON_SHARE * budget_px), None)
+        if steps is None:
+            return None
+        error = sum(measured.moved_px[i] for i in dropped) + measured.newton_px[steps]
+        return Simplification(
+            error,
+            kept=tuple(POLYNOMIAL12[i] for i in kept),
+            dropped=tuple((POLYNOMIAL12[i], measured.moved_px[i]) for i in dropped),
+            details=LensDetails(steps, _terms_with(kept)),
+            why=f"cubic polynomials between nodes, {steps} Newton steps",
+        )
+
+    def contains(self, params: Any) -> Tensor:
+        """Return (), bool: each lens lies in one of the boxes, up to rounding."""
+        numbers = lens_numbers(params.coefficients, params.focal, params.center)
+        boxes = as_device_tensor([box.numbers for box in self.boxes], dtype=numbers.dtype, device=numbers.device)
+        low, high = boxes.unbind(2)
+        margin = 1e-5 * torch.maximum(low.abs(), high.abs())
+        inside = (numbers[:, None] >= low - margin) & (numbers[:, None] <= high + margin)
+        return inside.all(dim=2).any(dim=1).all()
+
+
+class MeasuredErrors(NamedTuple):
+    """Errors of the flows of several lenses."""
+
+    bounds: FlowBounds
+    newton_px: tuple[float, ...]  # after 0, 1, 2 ... steps
+    moved_px: tuple[float, ...]  # by each of the 12 coefficients alone
+
+
+@lru_cache(maxsize=256)
+def _measure(boxes: tuple[LensRanges, ...], height: int, width: int) -> MeasuredErrors | None:
+    """Measure all lenses of the boxes; None if one of them may fold inside the frame."""
+    radii = [_radii(box, height, width) for box in boxes]
+    proofs = [_prove_no_fold(box, radius, width) for box, radius in zip(boxes, radii, strict=True)]
+    proved = [proof for proof in proofs if proof is not None]
+    if len(proved) < len(proofs):
+        return None
+    # A level counts if no lens can fold where its nodes lie.
+    num_levels = min(int((radius <= proof.radius).sum()) for radius, proof in zip(radii, proved, strict=True))
+    if num_levels == 0:
+        return None
+    moved = tuple(float(values.max()) for values in np.array([proof.moved_px for proof in proved]).T)
+    c, focal, center = _sample_lenses(boxes, height, width)
+    points = cell_lines(height, width, num_levels)
+    x, y = ((points[None, :, i] - center[:, i]) / focal[:, i] for i in range(2))
+    iterates = _solve(x, y, c)
+    if iterates is None:
+        return None
+    solved_x, solved_y = iterates[-1]
+    newton = [
+        _SAFETY * float(torch.hypot((near_x - solved_x) * focal[:, 0], (near_y - solved_y) * focal[:, 1]).max())
+        for near_x, near_y in iterates
+    ]
+    flow = torch.stack([(solved_x - x) * focal[:, 0], (solved_y - y) * focal[:, 1]])
+    stretch = torch.hypot(solved_x, solved_y) / torch.hypot(x, y).clamp(min=1e-9)
+    bounds = flow_bounds(flow, num_levels, stretch)
+    return None if bounds is None else MeasuredErrors(bounds, tuple(newton), moved)
+
+
+def cell_lines(height: int, width: int, num_levels: int) -> Tensor:
+    """Return (P, 2), px: for each level and for cells all over the frame, the positions `_LINE` along x and along y."""
+    line = torch.tensor(_LINE, dtype=torch.float64)
+    middle = torch.full_like(line, 0.5)
+    offsets = torch.stack([torch.stack([line, middle], dim=1), torch.stack([middle, line], dim=1)])  # (2, 5, 2)
+    points = []
+    for stride in _LEVELS[:num_levels]:
+        columns, rows = (np.linspace(0, max(math.ceil(side / stride) - 1, 0), _CELLS).round() for side in (width, height))
+        corners = torch.from_numpy(np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 1, 2))
+        points.append((stride * (corners + offsets)).reshape(-1, 2))
+    return torch.cat(points)
+
+
+def flow_bounds(flow: Tensor, num_levels: int, stretch: Tensor) -> FlowBounds | None:
+    """Return the bounds of N flows from their values.
+
+    Args:
+        flow: (2, N, P), px, at the positions of `cell_lines`.
+        num_levels: of these positions.
+        stretch: (N, P), the distance from the center at which a position is sampled, over its own distance.
+    """
+    lines = flow.unflatten(2, (num_levels, _CELLS * _CELLS, 2, 5))  # (2, N, level, cell, axis, position)
+    strides = torch.from_numpy(_LEVELS[:num_levels])
+    # Cubics along y act on values that are already off by the error along x, which they amplify by 5/4 at most.
+    along_x, along_y = torch.hypot(*(lines @ flow.new_tensor(_ERROR))).unbind(-1)  # (N, level, cell)
+    errors = _SAFETY * (along_x + 5 / 4 * along_y).amax(dim=(0, 2))
+    reachable = stretch.unflatten(1, (num_levels, -1)).amax(dim=(0, 2)) <= _MAX_STRETCH
+    errors = torch.where(reachable, errors, torch.inf)
+    if not reachable[0]:
+        return None
+    near, near_strides = lines[:, :, :_FINE], strides[:_FINE, None, None]
+    steps = torch.diff(flow.new_tensor(_LINE))
+    gradient = (torch.hypot(*torch.diff(near, dim=5)) / (near_strides[..., None] * steps)).max()
+    second, third = (
+        (torch.hypot(*(near @ flow.new_tensor(weights))).sum(dim=3).amax(dim=(0, 2)) / strides[:_FINE] ** order).max()
+        for weights, order in ((_SECOND, 2), (_THIRD, 3))
+    )
+    return FlowBounds(
+        max_displacement=_SAFETY * float(torch.hypot(*near).max()),
+        max_gradient=_SAFETY * float(gradient),
+        max_second_derivative=_SAFETY * float(second),
+        max_third_derivative=_SAFETY * float(third),
+        interpolation_error=_between_levels(_LEVELS[:num_levels], errors.numpy()),
+    )
+
+
+def _between_levels(strides: np.ndarray, errors: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the error for any stride: s^4 below the first level, and power laws between levels.
+
+    The error grows at least like s^4 and faster the larger s is, so that both lie above it.
+    """
+    finite = np.isfinite(errors)
+    last = int(np.argmin(finite)) if not finite.all() else len(errors)  # the first level that is unknown
+    log_strides, log_errors = np.log(strides[:last]), np.log(np.maximum(errors[:last], 1e-12))
+
+    def interpolation_error(stride: np.ndarray) -> np.ndarray:
+        logs = np.log(np.maximum(stride, 1e-3))
+        between = np.interp(logs, log_strides, log_errors) + 4 * np.minimum(logs - log_strides[0], 0)
+        return np.where(logs <= log_strides[-1] + 1e-9, np.exp(between), np.inf)
+
+    return interpolation_error
+
+
+class _Proof(NamedTuple):
+    radius: float  # on the plane z = 1, up to which each distorted point has exactly one preimage
+    moved_px: tuple[float, ...]  # by each of the 12 coefficients alone, at most, inside the frame
+
+
+def _prove_no_fold(ranges: LensRanges, radii: np.ndarray, width: int) -> _Proof | None:
+    """Prove for all lenses of the ranges that they have an inverse in the frame.
+
+    Along and across the radius r the radial part grows by f'(r) and f(r) / r, both least for the lowest coefficients,
+    and the other terms take no more than t(r) of that. Where the rest is positive, the symmetric part of the Jacobian
+    is positive and the map has one inverse; it covers the disc of radius f(r) - b(r), b what the other terms move. A
+    term of size d moves the inverse by no more than d over the least growth.
+
+    Args:
+        ranges: of the lenses.
+        radii: on the plane z = 1, of the nodes of each level.
+        width: px, of the frame.
+    """
+    low = [limits[0] for limits in ranges.coefficients[:6]]
+    largest = [max(map(abs, limits)) for limits in ranges.coefficients]
+    p, s2, s4 = (sum(largest[i] for i in group) for group in ((6, 7), (8, 10), (9, 11)))
+    r = radii[0] * np.linspace(0, 8, 4097)[1:]
+    powers = [k * r ** (2 * i) for i, k in enumerate(low, start=1) if k]
+    orders = [i for i, k in enumerate(low, start=1) if k]
+    across = 1 + sum(powers, np.zeros_like(r))
+    along = 1 + sum(((2 * i + 1) * power for i, power in zip(orders, powers, strict=True)), np.zeros_like(r))
+    growth = np.minimum(across, along) - (6 * p + 2 * s2) * r - 4 * s4 * r**3
+    growing = np.minimum.accumulate(growth) >= _MIN_GROWTH
+    covered = np.where(growing, r * across - (3 * p + s2) * r**2 - s4 * r**4, 0)
+    if covered.max() < radii[0]:
+        return None
+    last = int((covered >= radii[0]).argmax())
+    least = growth[: last + 1].min()
+    # Displacements grow faster than the radius, so the shortest focal length moves pixels most.
+    focal = ranges.focal[0] * width * max(1.0, ranges.aspect[1])
+    sizes = zip(largest, _DEGREES, strict=True)
+    moved = tuple(float(focal * size * r[last] ** degree * factor / least) for size, (degree, factor) in sizes)
+    return _Proof(float(covered.max()), moved)
+
+
+def _radii(ranges: LensRanges, height: int, width: int) -> np.ndarray:
+    """Return for each level the radius of the disc on the plane z = 1 that its nodes lie in, for all lenses."""
+    fx, aspect = ranges.focal[0], ranges.aspect[0]
+    x, y = (max(map(abs, offset)) for offset in (ranges.center_x, ranges.center_y))
+    across, down = (np.ceil(side / _LEVELS) * _LEVELS + _LEVELS - (side - 1) / 2 for side in (width, height))
+    return np.hypot((across / width + x) / fx, (down / width + y) / (fx * aspect))
+
+
+def _sample_lenses(boxes: Sequence[LensRanges], height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return coefficients (N, 12, 1), and in px focal lengths and centers (N, 2, 1), of lenses in the boxes."""
+    values = torch.from_numpy(np.concatenate([_corners_and_draws(box) for box in boxes]))[:, :, None]
+    middle = torch.tensor([[width - 1], [height - 1]], dtype=torch.float64) / 2
+    focal = width * torch.cat([values[:, 12:13], values[:, 12:13] * values[:, 13:14]], dim=1)
+    return values[:, :12], focal, middle + width * values[:, 14:]
+
+
+def _corners_and_draws(ranges: LensRanges) -> np.ndarray:
+    """Return (N, 16): corners of the ranges, and random lenses inside."""
+    # All displacements fall faster than 1 / focal, so the shortest focal length is the worst.
+    limits = np.array(ranges._replace(focal=(ranges.focal[0], ranges.focal[0])).numbers)
+    wide = np.flatnonzero(limits[:, 0] != limits[:, 1])
+    if not len(wide):
+        return limits[None, :, 0]
+    random = np.random.default_rng(0)
+    if 2 ** len(wide) <= _MOST_CORNERS:
+        corners = np.array(list(itertools.product((0.0, 1.0), repeat=len(wide))))
+    else:
+        corners = random.integers(0, 2, (_MOST_CORNERS, len(wide))).astype(float)
+        corners[:2] = [[0.0], [1.0]]
+    shares = np.concatenate([corners, random.random((_RANDOM_LENSES, len(wide)))])
+    values = np.repeat(limits[None, :, 0], len(shares), axis=0)
+    values[:, wide] += shares * (limits[wide, 1] - limits[wide, 0])
+    return values
+
+
+def _solve(x: Tensor, y: Tensor, c: Tensor) -> list[tuple[Tensor, Tensor]] | None:
+    """Return the Newton iterates, of which the last has converged; None if none does."""
+    limit = _CONVERGED * (1 + torch.hypot(x, y).max())
+    iterates: list[tuple[Tensor, Tensor]] = []
+    for point in itertools.islice(newton_iterates(x, y, c, terms=used_terms(c[..., 0])), _MAX_STEPS):
+        iterates.append(point)
+        # NaN never counts as converged.
+        if len(iterates) > 1 and all((a - b).abs().max() <= limit for a, b in zip(*iterates[-2:], strict=True)):
+            return iterates
+    return None
+
+
+def _droppable(used: Sequence[bool], moved_px: Sequence[float], budget_px: float) -> list[int]:
+    """Return the terms that may be dropped together."""
+    dropped: list[int] = []
+    for group in _GROUPS:
+        candidates = [i for i in group if used[i]]
+        if sum(moved_px[i] for i in (*dropped, *candidates)) > budget_px:
+            break
+        dropped += candidates
+    return dropped
+
+
+def _terms_with(kept: Sequence[int]) -> Terms:
+    radial = max([0, *(i + 1 for i in kept if i < 6)])
+    return Terms(radial, any(i in (6, 7) for i in kept), any(i > 7 for i in kept), round=False)

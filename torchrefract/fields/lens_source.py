@@ -1,0 +1,175 @@
+"""Sets of real lenses to draw from: a list of cameras, or one camera with a jitter or a covariance."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrefract._validation import check_number
+from torchrefract.cameras.conversion import convert
+from torchrefract.cameras.distortion import POLYNOMIAL12
+from torchrefract.cameras.lens_table import read_lenses
+from torchrefract.cameras.models import Camera
+from torchrefract.fields.lens_error import LensRanges
+from torchrefract.types import Range
+
+_NAMES = (*POLYNOMIAL12, "focal", "aspect", "center_x", "center_y")
+# Positions of the polynomial's coefficients in OpenCV's order: k1, k2, p1, p2, k3, k4 ... k6, s1 ... s4.
+_OPENCV_PLACES = {0: 0, 1: 1, 2: 6, 3: 7, 4: 2, 8: 8, 9: 9, 10: 10, 11: 11}
+
+
+class LensSource(NamedTuple):
+    """Lenses of 16 numbers: 12 coefficients, then focal length, aspect and center as in `LensDistortion`.
+
+    lenses: one is drawn, each with the same probability.
+    spread: 16 rows of m numbers, which multiply m draws that are uniform in [-1, 1] and are added to the lens; empty
+        for none.
+    """
+
+    lenses: tuple[tuple[float, ...], ...]
+    spread: tuple[tuple[float, ...], ...] = ()
+
+    @property
+    def draw_ranges(self) -> list[Range]:
+        """Return the ranges of the uniform numbers that `select` needs."""
+        return [(0.0, 1.0), *[(-1.0, 1.0)] * (len(self.spread[0]) if self.spread else 0)]
+
+    def select(self, draws: Tensor) -> Tensor:
+        """Return (B, 16), the lenses of uniform draws (B, 1 + m) in `draw_ranges`."""
+        # Integer arithmetic: the chosen lens must not depend on the rounding of a type.
+        place = (draws[:, 0] * (1 << 24)).long() * len(self.lenses) >> 24
+        lenses = torch.tensor(self.lenses, dtype=draws.dtype, device=draws.device)[place]
+        if not self.spread:
+            return lenses
+        moved = draws[:, 1:, None] * torch.tensor(self.spread, dtype=draws.dtype, device=draws.device).mT
+        # One order of summation for every batch size, so that draws keep their bits.
+        return lenses + sum(moved.unbind(1))
+
+    @property
+    def boxes(self) -> tuple[LensRanges, ...]:
+        """Return for each lens the ranges of its numbers."""
+        reach = [sum(map(abs, row)) for row in self.spread] or [0.0] * 16
+        return tuple(
+            LensRanges.from_numbers([(n - r, n + r) for n, r in zip(lens, reach, strict=True)]) for lens in self.lenses
+        )
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        """Return ranges that hold all lenses, by the argument names of `LensDistortion`."""
+        columns = zip(*(box.numbers for box in self.boxes), strict=True)
+        limits = [(min(low for low, _ in column), max(high for _, high in column)) for column in columns]
+        return {f"{name}_range": limit for name, limit in zip(_NAMES, limits, strict=True)}
+
+
+def lenses_from_cameras(table: Sequence[Camera] | None, *, residual_px: float) -> LensSource:
+    """Convert cameras to lenses of the polynomial model.
+
+    Args:
+        table: at least one camera; None takes the lens database, without lenses that no polynomial comes near.
+        residual_px: largest distance in px between a camera of another model and its polynomial.
+
+    Raises:
+        TypeError: an element is not a camera.
+        ValueError: an empty table; a camera too far from a polynomial, or that folds back inside its frame.
+    """
+    residual_px = check_number("residual_px", residual_px, low=0.0)
+    if table is None:
+        near = [lens.polynomial for lens in read_lenses() if lens.residual_px <= residual_px]
+        return LensSource(tuple(_numbers(camera) for camera in near if camera is not None))
+    if not table:
+        raise ValueError("table must hold at least one camera, got none")
+    cameras = [as_polynomial(f"table[{i}]", camera, residual_px) for i, camera in enumerate(table)]
+    return LensSource(tuple(map(_numbers, cameras)))
+
+
+def jittered_camera(camera: Camera, *, jitter: float, residual_px: float) -> LensSource:
+    """Vary each number of a camera independently.
+
+    Args:
+        camera: of any model.
+        jitter: largest relative change of each number, in [0, 0.99].
+        residual_px: as for `lenses_from_cameras`.
+    """
+    jitter = check_number("jitter", jitter, low=0.0, high=0.99)
+    lens = _numbers(as_polynomial("camera", camera, check_number("residual_px", residual_px, low=0.0)))
+    return LensSource((lens,), tuple(tuple(jitter * abs(n) * (i == j) for j in range(16)) for i, n in enumerate(lens)))
+
+
+def camera_with_covariance(camera: Camera, covariance: Any) -> LensSource:
+    """Vary the numbers of a camera together, by the covariance of its calibration.
+
+        lens + sqrt(3) S u,  u uniform in [-1, 1], S S^T = covariance: uniform numbers have a variance of 1 / 3
+
+    Args:
+        camera: "polynomial12", or "opencv" without denominator and tilt.
+        covariance: (4 + n, 4 + n) of fx, fy, cx, cy in px and the n coefficients of the camera, in its order.
+
+    Raises:
+        ValueError: another camera; a covariance of another shape, not finite, not symmetric, or not positive.
+    """
+    polynomial = as_polynomial("camera", replace(camera, coefficients=camera.polynomial(), model="polynomial12"), 0.0)
+    size = 4 + len(camera.coefficients)
+    matrix = np.array(covariance, dtype=float)
+    if matrix.shape != (size, size):
+        raise ValueError(
+            f"covariance must have shape ({size}, {size}), of fx, fy, cx, cy and the coefficients, got {matrix.shape}"
+        )
+    if not np.isfinite(matrix).all():
+        raise ValueError("covariance must be finite, got NaN or infinity")
+    scale = np.sqrt(np.outer(matrix.diagonal().clip(0), matrix.diagonal().clip(0)))
+    if (np.abs(matrix - matrix.T) > 1e-6 * scale).any():
+        raise ValueError("covariance must be symmetric, got one that is not")
+    jacobian = _jacobian(camera, size)
+    eigenvalues, vectors = np.linalg.eigh(jacobian @ ((matrix + matrix.T) / 2) @ jacobian.T)
+    if eigenvalues.min() < -1e-6 * max(eigenvalues.max(), 0.0):
+        raise ValueError(f"covariance must have no negative eigenvalue, got {eigenvalues.min():g}")
+    spread = math.sqrt(3) * vectors * np.sqrt(eigenvalues.clip(0))
+    return LensSource((_numbers(polynomial),), tuple(tuple(row) for row in spread.tolist()))
+
+
+def as_polynomial(name: str, camera: Camera, residual_px: float) -> Camera:
+    """Convert a camera to the model "polynomial12".
+
+    Raises:
+        TypeError: not a camera.
+        ValueError: no polynomial is within `residual_px`; the lens folds back, or has a pole, inside the frame.
+    """
+    if not isinstance(camera, Camera):
+        raise TypeError(f"{name} must be a Camera, got {type(camera).__name__}")
+    camera.check_pole(name)
+    converted = convert(camera, to="polynomial12")
+    if converted.covered < 1:
+        raise ValueError(
+            f"{name} must show rays within 80 degrees of its axis in its whole frame, without folding back, got "
+            f"{camera.model} that does so in {converted.covered:.2%} of it"
+        )
+    # A mere change of order is off by rounding.
+    if converted.max_px > max(residual_px, 1e-6):
+        raise ValueError(
+            f"{name} must be within residual_px = {residual_px:g} px of a polynomial, got {camera.model} that is "
+            f"{converted.max_px:.3g} px off"
+        )
+    return converted.camera
+
+
+def _numbers(camera: Camera) -> tuple[float, ...]:
+    """Return the 16 numbers of a camera of the model "polynomial12"."""
+    width, middle = camera.width, ((camera.width - 1) / 2, (camera.height - 1) / 2)
+    center = (camera.cx - middle[0]) / width, (camera.cy - middle[1]) / width
+    return (*camera.coefficients, camera.fx / width, camera.fy / camera.fx, *center)
+
+
+def _jacobian(camera: Camera, size: int) -> np.ndarray:
+    """Return (16, size): derivatives of the 16 numbers with respect to fx, fy, cx, cy and the coefficients."""
+    jacobian = np.zeros((16, size))
+    jacobian[12, 0], jacobian[14, 2], jacobian[15, 3] = (1 / camera.width,) * 3
+    jacobian[13, :2] = -camera.fy / camera.fx**2, 1 / camera.fx
+    for i in range(size - 4):
+        place = i if camera.model == "polynomial12" else _OPENCV_PLACES.get(i)
+        if place is not None:
+            jacobian[place, 4 + i] = 1.0
+    return jacobian

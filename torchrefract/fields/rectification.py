@@ -1,0 +1,185 @@
+"""The flow that shows frames of a camera of any model as a pinhole would have taken them, and the flow back."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrefract._tensor import as_device_tensor
+from torchrefract._validation import check_positive
+from torchrefract.cameras.models import Camera
+from torchrefract.cameras.sheet import columns, image_of, on_plane, radius_within, ray_of
+from torchrefract.fields import lens
+from torchrefract.fields.lens import REACH, border_on_plane, corner_radius, in_bands
+from torchrefract.fields.lens_error import cell_lines, flow_bounds
+from torchrefract.types import FlowBounds, Simplification
+from torchrefract.warping.grid import Points
+from torchrefract.warping.lattice import pixel_lattice
+
+_FAR = 8.0  # frames, to where pixels without a ray are sent
+_CLOSE = 1e-5  # relative rounding error of camera parameters
+
+
+def rectification_flow(
+    coefficients: Tensor, focal: Tensor, center: Tensor, points: Points, *, model: str, zoom: float = 1.0
+) -> tuple[Tensor, Tensor]:
+    """Compute the flow that turns frames of cameras into those of pinholes.
+
+        flow(p) = f (distort(x) - zoom x),  x = (p - c) / (zoom f)
+
+    Differentiable in the first three arguments and in the points. A pixel whose ray the camera does not show is
+    sampled outside the frame.
+
+    Args:
+        coefficients: (B, n), of the model.
+        focal: (B, 2), px, fx and fy.
+        center: (B, 2), px, cx and cy.
+        points: positions in the frame.
+        model: "polynomial12", "opencv", "fisheye" or "division".
+        zoom: of the focal lengths; below 1 the pinhole sees more.
+
+    Returns:
+        flow: (B, 2, h, w), px.
+        exists: (B, 1, h, w), bool: the camera shows that ray, on the sheet that holds the center.
+    """
+    c = columns(coefficients, model)
+    radius = radius_within(coefficients, REACH / zoom * _corner(focal, center, points), model)
+
+    def displacement(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        x, y = x / zoom, y / zoom
+        x_d, y_d, exists = image_of(x, y, torch.ones_like(x), c, model, radius)
+        return x_d - zoom * x, y_d - zoom * y, exists
+
+    return _flow(displacement, focal, center, points)
+
+
+def rectification_restore_flow(
+    coefficients: Tensor, focal: Tensor, center: Tensor, points: Points, *, model: str
+) -> tuple[Tensor, Tensor]:
+    """Compute the flow that undoes `rectification_flow` without a zoom.
+
+        flow(p) = f (undistort(x_d) - x_d),  x_d = (p - c) / f
+
+    Args, Returns: as there; `exists` is False where the camera shows no ray, or one that no pinhole shows.
+    """
+    c = columns(coefficients, model)
+    radius = radius_within(coefficients, REACH * _corner(focal, center, points), model)
+
+    def displacement(x_d: Tensor, y_d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        x, y, exists = on_plane(*ray_of(x_d, y_d, c, model, radius))
+        return x - x_d, y - y_d, exists
+
+    # The inverse reads a table that covers all of its points, so they are not computed in bands.
+    return _flow(displacement, focal, center, points, in_one=True)
+
+
+def is_border_missing(
+    coefficients: Tensor, focal: Tensor, center: Tensor, *, model: str, height: int, width: int
+) -> Tensor:
+    """Return (B,), bool: the camera does not show part of the border of the pinhole's frame."""
+    x, y = (axis.detach().flatten(1) for axis in border_on_plane(focal, center, height, width))
+    reach = REACH * corner_radius(focal.detach(), center.detach(), height, width)
+    radius = radius_within(coefficients, reach, model)
+    return ~image_of(x, y, torch.ones_like(x), columns(coefficients, model), model, radius)[2].all(dim=1)
+
+
+def camera_flow(camera: Camera, *, zoom: float = 1.0) -> tuple[Tensor, Tensor, Camera]:
+    """Compute `rectification_flow` for one camera in float64.
+
+    Args:
+        camera: of the frames.
+        zoom: of its focal lengths; below 1 the pinhole sees more.
+
+    Returns:
+        flow: (1, 2, H, W), px, float32.
+        exists: (1, 1, H, W), bool: the camera shows that ray.
+        pinhole: the new camera.
+
+    Raises:
+        ValueError: a zoom of 0 or below; a camera with a pole inside its frame, see `Camera.check_pole`.
+    """
+    camera.check_pole()
+    zoom = check_positive("zoom", zoom)
+    pinhole = replace(camera, model="opencv", coefficients=(0.0,) * 4, fx=zoom * camera.fx, fy=zoom * camera.fy)
+    numbers = camera.tensors(torch.empty(0, dtype=torch.float64))
+    points = pixel_lattice(camera.height, camera.width).points(dtype=torch.float64, device=torch.device("cpu"))
+    flow, exists = rectification_flow(*numbers, points, model=camera.model, zoom=zoom)
+    return flow.float(), exists, pinhole
+
+
+@dataclass(frozen=True)
+class RectificationErrorModel:
+    """Error bounds for the rectification of one camera, measured as those of a lens; see `ErrorModel`."""
+
+    camera: Camera
+    numbers: tuple[float, ...]  # coefficients, then focal lengths and center as the parameters hold them
+
+    is_random = False
+
+    def bounds(self, height: int, width: int) -> FlowBounds | None:
+        """Return measured bounds, or None if the camera does not show all rays around the frame.
+
+        Raises:
+            ValueError: frames with another ratio of the sides than those of the camera.
+        """
+        return _measure(self.camera.resized(width=width, height=height))
+
+    def simplify(self, height: int, width: int, budget_px: float) -> Simplification | None:
+        """Keep all terms: the model is of one camera, and each of its terms counts."""
+        return Simplification(0.0, why="cubic polynomials between nodes")
+
+    def contains(self, params: Any) -> Tensor:
+        """Return (), bool: the parameters are those of the camera, up to rounding."""
+        values = torch.cat(params[1:], dim=1)
+        numbers = as_device_tensor(self.numbers, dtype=values.dtype, device=values.device)
+        return ((values - numbers).abs() <= _CLOSE * numbers.abs()).all()
+
+
+@lru_cache(maxsize=64)
+def _measure(camera: Camera) -> FlowBounds | None:
+    for num_levels in (5, 3, 2, 1):
+        points = cell_lines(camera.height, camera.width, num_levels)
+        c, focal, center = camera.tensors(points)
+        x, y = ((points[None, :, i] - center[:, i, None]) / focal[:, i, None] for i in range(2))
+        reach = REACH * corner_radius(focal, center, camera.height, camera.width)
+        radius = radius_within(c, reach, camera.model)
+        x_d, y_d, exists = image_of(x, y, torch.ones_like(x), columns(c, camera.model), camera.model, radius)
+        if exists.all():
+            flow = torch.stack([(x_d - x) * focal[:, 0, None], (y_d - y) * focal[:, 1, None]])
+            return flow_bounds(flow, num_levels, torch.hypot(x_d, y_d) / torch.hypot(x, y).clamp(min=1e-9))
+    return None
+
+
+def _corner(focal: Tensor, center: Tensor, points: Points) -> Tensor:
+    return corner_radius(focal.detach(), center.detach(), points.lattice.height, points.lattice.width)
+
+
+def _flow(
+    displacement: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]],
+    focal: Tensor,
+    center: Tensor,
+    points: Points,
+    *,
+    in_one: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Compute f (u, v) from a function of x and y, (B, N), on the plane z = 1, that returns u, v and `exists`."""
+    far = _FAR * max(points.lattice.height, points.lattice.width)
+
+    def flow(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        shape = torch.broadcast_shapes(x.shape, y.shape)
+        flat_x, flat_y = (value.expand(shape).flatten(1) for value in (x, y))
+        u, v, exists = displacement(flat_x, flat_y)
+        # Points without a ray are sent outward, farther than any frame: padded, never extrapolated.
+        with torch.no_grad():
+            outward = far / (flat_x * flat_x + flat_y * flat_y).sqrt().clamp(min=1e-9)
+        u, v = (
+            torch.where(exists, part * focal[:, i, None], (outward * axis).detach())
+            for i, (part, axis) in enumerate(((u, flat_x), (v, flat_y)))
+        )
+        return torch.stack([u, v], dim=1).view(shape[0], 2, *shape[2:]), exists.view(shape)
+
+    x, y = lens.on_plane(points, focal, center)
+    return flow(x, y) if in_one else in_bands(flow, x, y)

@@ -1,0 +1,1 @@
+"""Plans: the cheapest computation of an effect that stays within a tolerance."""

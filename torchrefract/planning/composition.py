@@ -1,0 +1,266 @@
+"""The plan of several warps in a row, whose composed flow is computed at the nodes of one lattice.
+
+The composed flow d_1 of n flows, d_i = d_(i+1) + f_i(p + d_(i+1)), has the error e_1, e_i = e_(i+1) (1 + L_i) + (error
+of f_i), where L_i is the largest gradient of f_i. The error of each flow thus counts times the product of 1 + L of the
+warps before it, and what follows a flow with an unknown gradient is computed exactly.
+
+Between nodes that are s px apart lie cubic polynomials. Let phi = id + d of the flows after f, psi the cubic through
+four values of phi along an axis, at the place x of a pixel, and A its tangent there. The cubic through the values of
+f(phi) is that of f(psi), and as it reproduces cubics, such as f'(A(x)) (psi - A),
+
+    |error| <= error of f on a lattice of s |A'| + sum |w_j r_j| + |f'| |psi(x) - phi(x)|
+    r_j = f(psi_j) - f(A_j) - f'(A(x)) (psi_j - A_j)
+
+The last term is the error of phi, as often as f stretches it. Let u_j be the distances from x to the nodes in strides,
+1 + L the stretch of phi, B and C its second and third derivative, F and G those of f, and |psi_j - A_j| <= B s^2 q_j,
+with q_j for a second derivative that is linear between two values, as that of a cubic is. The part of r_j that is a
+cubic in u_j, of f'' and psi'', is reproduced too, which leaves
+
+    |r_j| <= F (1 + L) C (u_j s)^4 / 6 + F (B s^2 q_j)^2 / 2 + G ((1 + L) |u_j| s + B s^2 q_j)^2 B s^2 q_j / 2
+
+If f'' has kinks there is no G, f' differs by second derivatives alone, and
+
+    |r_j| <= F ((1 + L) |u_j| s + B s^2 q_j) B s^2 q_j
+
+Third differences are two of second ones. With two axes, one after the other, the second takes on the error of the first
+sum |w_j| times, and so it takes on the errors of the nodes.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from torchrefract.planning.plan import ErrorModel, PlanRequest, WarpPlan, plan_warp
+from torchrefract.types import FlowBounds
+
+# px between the nodes of a composition, from coarse to fine
+_STRIDES = (16, 12, 10, 8, 6, 5, 4, 3, 2)
+# Shares of the tolerance that the single flows may use; the rest is for the lattice of the composition.
+_SHARES = (0.7, 0.55, 0.4)
+_MAX_BEND_PX = 4.0  # of phi over one stride, up to which the bound above holds at the border
+
+
+class PlannedWarp(NamedTuple):
+    """A warp of a composition."""
+
+    model: ErrorModel | None  # None if the warp must be computed exactly
+    ulps: int
+
+
+@dataclass(frozen=True)
+class CompositionPlan:
+    """How the composed flow of warps in a row is computed.
+
+    stride: px between the nodes; 1 computes every pixel.
+    plans: of each warp.
+    error_px: largest error of the composed flow.
+    max_gradient: of the composed flow; inf if unknown.
+    """
+
+    stride: int
+    plans: tuple[WarpPlan, ...]
+    error_px: float
+    max_gradient: float
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """Return a value that is equal for plans that compute the same."""
+        return (self.stride, *((plan.stride, plan.details, plan.tolerance_px is None) for plan in self.plans))
+
+
+@dataclass(frozen=True)
+class ComposePlan:
+    """How a `Compose` is computed for frames of one size.
+
+    height, width: px, of the frame.
+    tolerance_px: largest error of the composed flow; None is exact.
+    names, plans: of each effect, in order.
+    strides: px, of the lattice of each group of warps that are sampled together.
+    error_px: largest error of the composed flow.
+    num_samplings: how often the image is sampled.
+    """
+
+    height: int
+    width: int
+    tolerance_px: float | None
+    names: tuple[str, ...]
+    plans: tuple[Any, ...]
+    strides: tuple[int, ...]
+    error_px: float
+    num_samplings: int
+
+    def __str__(self) -> str:
+        tolerance = "none: exact" if self.tolerance_px is None else f"{self.tolerance_px:g} px"
+        lines = [
+            f"frame          {self.height} x {self.width} px",
+            f"tolerance      {tolerance}",
+            f"error at most  {self.error_px:.2g} px",
+            f"samplings      {self.num_samplings}",
+        ]
+        lines += [f"composed flow  every {px} px (cubic polynomials between nodes)" for px in self.strides if px > 1]
+        width = max(map(len, self.names))
+        lines += [f"{name:{width}}  {plan.summary()}" for name, plan in zip(self.names, self.plans, strict=True)]
+        return "\n".join(lines)
+
+
+@lru_cache(maxsize=256)
+def plan_composition(warps: tuple[PlannedWarp, ...], request: PlanRequest) -> CompositionPlan:
+    """Plan warps that are sampled together, in order, the first nearest to the scene.
+
+    Args:
+        warps: at least one.
+        request: the frame and the tolerance of the composed flow.
+
+    Raises:
+        ValueError: the tolerance is below the rounding of positions in such a frame.
+    """
+    if request.tolerance_px is None:
+        plans = tuple(plan_warp(None, request) for _ in warps)
+        return CompositionPlan(1, plans, 0.0, math.inf)
+    if len(warps) == 1:
+        plan = plan_warp(warps[0].model, replace(request, ulps=warps[0].ulps))
+        return CompositionPlan(max(plan.stride, 1), (plan,), plan.error_px, _gradient(plan))
+    best: CompositionPlan | None = None
+    if all(warp.model is not None for warp in warps):
+        for share in _SHARES:
+            plans = _plan_shares(warps, request, share * request.remaining_px())
+            stride, error = _coarsest_stride(plans, request.tolerance_px, best.stride if best else 1)
+            if stride > 1:
+                best = CompositionPlan(stride, tuple(plans), error, _composed_gradient(plans))
+    if best is not None:
+        return best
+    plans = _plan_shares(warps, request, request.remaining_px())
+    pairs = zip(plans, _stretches(plans), strict=True)
+    error = _total([(plan.error_px * stretch, plan.is_random) for plan, stretch in pairs if plan.error_px > 0])
+    return CompositionPlan(1, tuple(plans), error, _composed_gradient(plans))
+
+
+def _plan_shares(warps: Sequence[PlannedWarp], request: PlanRequest, budget_px: float) -> list[WarpPlan]:
+    """Plan each warp with an equal share of the budget, divided by how much the warps before it stretch its error."""
+    plans: list[WarpPlan] = []
+    stretch = 1.0
+    for warp in warps:
+        share = replace(request, tolerance_px=budget_px / len(warps) / stretch, ulps=warp.ulps)
+        if math.isinf(stretch) or warp.model is None or not share.is_reachable:
+            bounds = None if warp.model is None else warp.model.bounds(request.height, request.width)
+            plan = replace(plan_warp(None, replace(share, tolerance_px=None)), bounds=bounds)
+            plan = replace(plan, reason="its share of the tolerance is below rounding" if bounds else plan.reason)
+        else:
+            plan = plan_warp(warp.model, share)
+        plans.append(plan)
+        stretch *= 1 + _gradient(plan)
+    return plans
+
+
+def _gradient(plan: WarpPlan) -> float:
+    return 0.0 if plan.is_identity else plan.max_gradient
+
+
+def _composed_gradient(plans: Sequence[WarpPlan]) -> float:
+    return math.prod(1 + _gradient(plan) for plan in plans) - 1
+
+
+def _stretches(plans: Sequence[WarpPlan]) -> list[float]:
+    """Return how often the error of each flow counts in the composed flow."""
+    stretches = [1.0]
+    for plan in plans[:-1]:
+        stretches.append(stretches[-1] * (1 + _gradient(plan)))
+    return stretches
+
+
+def _total(errors: Sequence[tuple[float, bool]]) -> float:
+    """Add errors in px; those that are marked as random add as squares."""
+    return sum(error for error, is_random in errors if not is_random) + math.hypot(
+        *(error for error, is_random in errors if is_random)
+    )
+
+
+def _coarsest_stride(plans: Sequence[WarpPlan], tolerance_px: float, least: int) -> tuple[int, float]:
+    """Return the largest stride above `least` at which the composed flow stays within the tolerance, and its error."""
+    for stride in _STRIDES:
+        if stride <= least:
+            break
+        error = _composed_error(plans, stride)
+        if error <= tolerance_px:
+            return stride, error
+    return 1, math.inf
+
+
+def _composed_error(plans: Sequence[WarpPlan], stride: int) -> float:
+    """Bound the error of a composed flow whose nodes are so many px apart; inf if there is no bound."""
+    errors: list[tuple[float, bool]] = []
+    cubic, later = _cubic(stride), _LaterFlows()
+    for plan, count in zip(reversed(plans), reversed(_stretches(plans)), strict=True):
+        if plan.is_identity:
+            errors.append((plan.error_px * count, plan.is_random))
+            continue
+        bounds = plan.bounds
+        if bounds is None or math.isinf(bounds.max_second_derivative) or later.second * stride**2 > _MAX_BEND_PX:
+            return math.inf
+        between = float(bounds.interpolation_error(np.array([stride * later.stretch]))[0])
+        # An exact composition interpolates earlier flows bilinearly between pixels.
+        bilinear = bounds.max_second_derivative / 4 if later.count else 0.0
+        node_error = cubic.amplification**2 * plan.error_px
+        errors.append(((node_error + between + bilinear) * count, plan.is_random))
+        errors.append(((1 + cubic.amplification) * cubic.cross_error(bounds, later, stride) * count, False))
+        later = later.after(bounds, stride)
+    return _total(errors)
+
+
+class _LaterFlows(NamedTuple):
+    """Bounds of the flows that are evaluated first, together."""
+
+    count: int = 0
+    stretch: float = 1.0  # 1 + the largest gradient
+    second: float = 0.0  # px per px^2
+    third: float = 0.0  # px per px^3
+
+    def after(self, bounds: FlowBounds, stride: int) -> "_LaterFlows":
+        """Add one flow that is evaluated next."""
+        gradient, bend = bounds.max_gradient, bounds.max_second_derivative
+        second = bend * self.stretch**2 + gradient * self.second
+        third = 3 * bend * self.stretch * self.second + gradient * self.third
+        if math.isfinite(bounds.max_third_derivative):
+            third += bounds.max_third_derivative * self.stretch**3
+        else:
+            third = math.inf
+        third = min(third, 2 * second / stride)
+        return _LaterFlows(self.count + 1, self.stretch * (1 + gradient), self.second + second, self.third + third)
+
+
+class _Cubic(NamedTuple):
+    """Cubic interpolation at the pixels of a cell, from the four nodes around: arrays (stride, 4)."""
+
+    weight: np.ndarray  # |w_j|
+    distance: np.ndarray  # |u_j|
+    q: np.ndarray
+    amplification: float  # the largest sum of |w_j|
+
+    def cross_error(self, bounds: FlowBounds, later: _LaterFlows, stride: int) -> float:
+        """Return the largest sum |w_j r_j| over the pixels of a cell."""
+        second, third = bounds.max_second_derivative, bounds.max_third_derivative
+        along, off = later.stretch * stride * self.distance, later.second * stride**2 * self.q
+        remainder = second * (along + off) * off
+        if math.isfinite(third):
+            smooth = later.stretch * later.third * stride**4 / 6 * self.distance**4 + off**2 / 2
+            remainder = np.minimum(remainder, second * smooth + third / 2 * (along + off) ** 2 * off)
+        return float((self.weight * remainder).sum(axis=1).max())
+
+
+@lru_cache(maxsize=16)
+def _cubic(stride: int) -> _Cubic:
+    t = np.arange(stride)[:, None] / stride
+    nodes = np.arange(-1, 3)
+    weight = np.ones((stride, 4))
+    for j in range(4):
+        for k in range(4):
+            if k != j:
+                weight[:, j] *= (t[:, 0] - nodes[k]) / (nodes[j] - nodes[k])
+    u = nodes - t
+    # The second derivative (1 - t) a + t b, integrated twice from x to a node.
+    q = np.abs((1 - t) * u**2 / 2 - u**3 / 6) + np.abs(t * u**2 / 2 + u**3 / 6)
+    return _Cubic(np.abs(weight), np.abs(u), q, float(np.abs(weight).sum(axis=1).max()))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -10,11 +10,33 @@ from torch import Tensor
 
 from torchrefract._validation import eager_bool, eager_values
 
+if TYPE_CHECKING:
+    from torchrefract.warping.lattice import Lattice
+
 # F.grid_sample spans [-1, 1]; four of these lie well outside whatever the padding, and keep every product finite.
 FAR = 4.0
 # Positions this near to the border pixels count as inside: rounding of fp32 coordinates, 1/1000 px.
 _TOLERANCE = 1e-3
 _HALF = torch.tensor(-0.5, dtype=torch.float32, device="cpu")
+
+
+class Points(NamedTuple):
+    """Hold positions at which a flow is evaluated, px: the nodes of a lattice, displaced or not.
+
+    x, y: (N or 1, 1, h, w); of undisplaced points (1, 1, 1, w) and (1, 1, h, 1).
+    lattice: the lattice of the undisplaced points.
+    is_displaced: True if a flow was added.
+    """
+
+    x: Tensor
+    y: Tensor
+    lattice: "Lattice"
+    is_displaced: bool = False
+
+    def displaced(self, flow: Tensor) -> "Points":
+        """Add a flow (N, 2, h, w), px, at the same points."""
+        u, v = flow.split(1, dim=1)
+        return Points(self.x + u, self.y + v, self.lattice, is_displaced=True)
 
 
 class Positions(NamedTuple):

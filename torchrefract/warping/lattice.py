@@ -1,166 +1,226 @@
-"""Smooth flows on a coarse lattice, and what lies between its nodes."""
+"""Flows at the nodes of a coarse lattice, with cubics between the nodes."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor, assume_constant_result, cached
-from torchrefract.warping.grid import finite, pixel_axes, sampler_axes, sampler_positions
-from torchrefract.warping.sums import across, across_twice, down, matrix_of
+from torchrefract._tensor import exact_matmul
+from torchrefract.ops.cubic import interpolate_nodes, lagrange_basis
+from torchrefract.ops.sampling import grid_sample
+from torchrefract.warping.grid import Points, finite, pixel_axes, sampler_axes, sampler_positions
+from torchrefract.warping.old_lattice import (  # noqa: F401 - the old effects import them here
+    FARTHEST,
+    STREAM_NODES,
+    Lines,
+    _cubics,
+    _curl_weights,
+    along_rows,
+    between_nodes,
+    lagrange_weights,
+    once,
+    row_weights,
+    slope_weights,
+)
+from torchrefract.warping.sums import across_twice, down
 
-# Slopes of cubics are not smooth enough from cell to cell.
-STREAM_NODES = 6
-# In the sampler's coordinates: farther than a flow leads that is computed on a lattice, and finite in all products.
-FARTHEST = 1e4
 
+@dataclass(frozen=True)
+class Lattice:
+    """Describe nodes every `stride` px over a frame, with `margin` more of them before it and beyond it.
 
-class Lattice(NamedTuple):
-    """Nodes every `stride` px over a frame, with those around it that its pixels take."""
+    Node (i, j) lies at x = (j - margin) stride, y = (i - margin) stride. There are as many nodes as a cubic through
+    four of them needs at the last pixel, and margin - 1 more. Stride 1 and margin 0 is the grid of the pixels.
 
-    height: int  # px, of the frame
+    height, width: px, of the frame.
+    stride: px, between nodes.
+    margin: nodes before the first pixel, at least 1, or 0 with stride 1.
+    """
+
+    height: int
     width: int
-    stride: int  # px
-    before: int = 1  # nodes before the frame along each axis
-    after: int = 1  # and behind the last cell
+    stride: int = 1
+    margin: int = 1
+    after: int = 1  # old
+
+    @property
+    def num_nodes(self) -> tuple[int, int]:
+        """Return the numbers of rows and of columns of nodes."""
+        if self.margin == 0:
+            return self.height, self.width
+        rows, columns = (-(-size // self.stride) + 1 + 2 * self.margin for size in (self.height, self.width))
+        return rows, columns
+
+    def points(self, *, dtype: torch.dtype, device: torch.device) -> Points:
+        """Return the positions of the nodes, px."""
+        y, x = (
+            (torch.arange(count, dtype=dtype, device=device) - self.margin) * self.stride for count in self.num_nodes
+        )
+        return Points(x.view(1, 1, 1, -1), y.view(1, 1, -1, 1), self)
+
+    # old: leaves with the old effects
+    before = property(lambda self: self.margin)
+
+    def __getitem__(self, index):
+        return (self.height, self.width, self.stride, self.margin, self.after)[index]
 
     def cells(self) -> tuple[int, int]:
-        """How many strides it takes to cover the rows and the columns."""
         return -(-self.height // self.stride), -(-self.width // self.stride)
 
     def axes(self) -> tuple[range, range]:
-        """Px, of the rows and of the columns of nodes."""
-        start, s = -self.before * self.stride, self.stride
+        start, s = -self.margin * self.stride, self.stride
         rows, columns = (range(start, (count + self.after) * s + 1, s) for count in self.cells())
         return rows, columns
 
     def places(self, *, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-        """x, (1, 1, 1, m), and y, (1, 1, n, 1), px, of the nodes."""
         y, x = (torch.arange(axis.start, axis.stop, axis.step, dtype=dtype, device=device) for axis in self.axes())
         return x.view(1, 1, 1, -1), y.view(1, 1, -1, 1)
 
 
-def between_nodes(nodes: Tensor, lattice: Lattice) -> Tensor:
-    """The field (B, C, H, W) at every pixel, by cubics through four nodes along one axis and then the other.
-
-        f(s (i + t)) = sum_j w_j(t) f_(i + j),  j = -1 ... 2,  w_j the cubic that is 1 at j and 0 at the other three
-
-    Cubics, and so every linear function, come out as they are. Elsewhere, with the derivatives along each axis, in px,
-
-        |error| <= 9/384 s^4 (max |f_xxxx| + 5/4 max |f_yyyy|)
-
-    Args:
-        nodes: (B, C, n, m), the field at the nodes of the lattice.
-        lattice: where they are, one of them before the frame.
-
-    Source: the remainder of Lagrange's interpolation; de Boor, "A practical guide to splines" (1978), chapter 2.
-    """
-    return down(along_rows(nodes, lattice), _cubics(nodes, lattice), lattice.height)
-
-
-def along_rows(nodes: Tensor, lattice: Lattice) -> Tensor:
-    """(B, C, n, W), the field of `between_nodes` in the rows of nodes, at every column of pixels."""
-    return across(nodes, _cubics(nodes, lattice), lattice.width)
-
-
-def row_weights(like: Tensor, lattice: Lattice) -> Tensor:
-    """(H, n), of the rows of nodes for each row of pixels, in the type of a tensor."""
-    return matrix_of(_cubics(like, lattice), len(lattice.axes()[0]), lattice.height)
-
-
-def lagrange_weights(stride: int, count: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(stride, count): weights of `count` nodes, an even number, for the pixels at 0, 1 / stride, 2 / stride ...
-
-    Of the polynomial through the nodes at 1 - count / 2 ... count / 2.
-    """
-    # From numbers, which an accelerator need not be waited for to have.
-    return as_device_tensor(_lagrange(stride, count), dtype=dtype, device=device)
-
-
-def slope_weights(stride: int, count: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(stride, count + 1): those of the nodes at -count / 2 ... count / 2 for (f(+1 px) - f(-1 px)) / 2 of the same."""
-    weight = lagrange_weights(stride, count, dtype=torch.float64, device=device)
-    own = F.pad(weight, (1, 0))
-    # The pixel before belongs to the cell before, whose nodes are one farther to the left; the one behind to the next.
-    last, first = F.pad(weight[-1:], (0, 1)), F.pad(weight[:1], (2, 0))[:, :-1]
-    return ((torch.cat([own[1:], first]) - torch.cat([last, own[:-1]])) / 2).to(dtype)
-
-
-class Lines(NamedTuple):
-    """Where F.grid_sample(align_corners=False) looks, at every pixel of the rows of a lattice's nodes."""
-
-    values: Tensor  # (B, 2, n, W)
-    weight: Tensor  # (2, stride, taps), of x and of y: of the rows around a row of pixels, by its place in its cell
-    height: int  # of the frame
-    x: Tensor | None = None  # (W,), to be added to the x between the rows
-    y: Tensor | None = None  # (H,), to be added to the y
-
-    def grid(self) -> Tensor:
-        """(B, H, W, 2): the same at every pixel."""
-        found = down(self.values, self.weight, self.height)
-        if self.x is not None and self.y is not None:
-            found[:, :1] += self.x
-            found[:, 1:] += self.y[:, None]
-        return found.movedim(1, -1)
+def pixel_lattice(height: int, width: int) -> Lattice:
+    """Return the lattice whose nodes are the pixels of a frame."""
+    return Lattice(height, width, stride=1, margin=0)
 
 
 @dataclass(frozen=True)
 class LatticeFlow:
-    """A flow that is known at the nodes of a lattice, and by `between_nodes` everywhere."""
+    """Hold a flow at the nodes of a lattice; cubic polynomials through four nodes along each axis interpolate it.
 
-    nodes: Tensor  # (B, 2, n, m), px
+    nodes: (N, 2, h, w), px.
+    """
+
+    nodes: Tensor
     lattice: Lattice
-    every: int = 1  # px, between nodes that a composite which ends with it may be known at
+    every: int = 1  # old
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the nodes."""
+        """Return the type of the nodes."""
         return self.nodes.dtype
 
     @property
     def requires_grad(self) -> bool:
-        """Whether the nodes have a gradient."""
+        """Return True if the nodes require a gradient."""
         return self.nodes.requires_grad
 
     def detach(self) -> "LatticeFlow":
-        """The same flow without its gradient."""
+        """Return the flow without its gradient."""
         return self.with_nodes(self.nodes.detach())
 
     def with_nodes(self, nodes: Tensor) -> "LatticeFlow":
-        """The same flow with other nodes."""
+        """Return a flow with other nodes on the same lattice."""
         return replace(self, nodes=nodes)
 
+    def dense(self) -> Tensor:
+        """Return the flow at every pixel, (N, 2, H, W), px."""
+        lattice, nodes = self.lattice, self.nodes
+        is_shared = len(nodes) > 1 and nodes.stride(0) == 0  # one flow for the frames of a clip
+        flow = interpolate_nodes(
+            nodes[:1] if is_shared else nodes,
+            stride=lattice.stride,
+            margin=lattice.margin,
+            height=lattice.height,
+            width=lattice.width,
+        )
+        return flow.contiguous().expand(len(nodes), -1, -1, -1)
+
+    def at(self, points: Points) -> Tensor:
+        """Interpolate the flow at points, which may lie anywhere; positions beyond the nodes are clamped.
+
+        Interpolation is cubic, or bilinear if the stride of the lattice is 1. The result is differentiable with
+        respect to the nodes and the points.
+
+        Args:
+            points: of shape (N or 1, 1, h, w), px.
+
+        Returns:
+            (N, 2, h, w), px.
+        """
+        if not points.is_displaced:
+            if points.lattice == self.lattice:
+                return self.nodes
+            if points.lattice == pixel_lattice(self.lattice.height, self.lattice.width):
+                return self.dense()
+        stride, margin = self.lattice.stride, self.lattice.margin
+        rows, columns = self.nodes.shape[2:]
+        x, y = _in_strides(points.x, stride, margin, columns), _in_strides(points.y, stride, margin, rows)
+        if stride == 1:
+            return _bilinear(self.nodes, x, y)
+        if points.is_displaced:
+            return _cubic(self.nodes, x, y)
+        with torch.autocast(self.nodes.device.type, enabled=False):
+            along = exact_matmul(self.nodes, _weight_matrix(x.flatten(), columns).to(self.dtype).mT)
+            return exact_matmul(_weight_matrix(y.flatten(), rows).to(self.dtype), along)
+
+    # old: leaves with the old effects
     def rows(self, index: Tensor) -> "LatticeFlow":
-        """Some rows of the batch."""
         return self.with_nodes(self.nodes[index])
 
     def weights(self) -> tuple[Tensor, Tensor]:
-        """Of the nodes around, along a row and along a column, (2, stride, taps): for u and v, by place in a cell."""
         weight = _cubics(self.nodes, self.lattice).expand(2, -1, -1)
         return weight, weight
 
-    def dense(self) -> Tensor:
-        """(B, 2, H, W), px."""
-        return between_nodes(self.nodes, self.lattice)
-
     def sampler_grid(self, dtype: torch.dtype) -> Tensor:
-        """(B, H, W, 2): where F.grid_sample(align_corners=False) looks; no flow of that size is written."""
         return self.lines(dtype).grid()
 
     def lines(self, dtype: torch.dtype) -> Lines:
-        """Where it looks, at every pixel of the rows of nodes."""
         x, y = self.lattice.places(dtype=dtype, device=self.nodes.device)
         height, width = self.lattice.height, self.lattice.width
-        # The identity is linear, so it may go through the cubics with the flow.
         positions = finite(sampler_positions(self.nodes.to(dtype), x, y, height=height, width=width), FARTHEST)
         values, weight = along_rows(positions, self.lattice), _cubics(positions, self.lattice)
         return Lines(values, weight.expand(2, -1, -1), height)
 
 
+def _in_strides(position: Tensor, stride: int, margin: int, count: int) -> Tensor:
+    """Convert positions from px to indices of nodes, within [0, count - 1]."""
+    return (position / stride + margin).nan_to_num(nan=0.0).clamp(0, count - 1)
+
+
+def _cell(index: Tensor, count: int) -> Tensor:
+    """Return the second of the four nodes around each fractional index, int64."""
+    return index.detach().floor().clamp(1, count - 3).long()
+
+
+def _weight_matrix(index: Tensor, count: int) -> Tensor:
+    """Return the cubic weights of `count` nodes at fractional indices (n,), as (n, count)."""
+    cell = _cell(index, count)
+    weights = lagrange_basis(index - cell)
+    neighbors = cell[:, None] + torch.arange(-1, 3, device=index.device)
+    return weights.new_zeros(len(index), count).scatter(1, neighbors, weights)
+
+
+def _cubic(nodes: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Interpolate nodes (N, 2, h, w) at fractional indices, each (N or 1, 1, n, m)."""
+    batch = torch.broadcast_shapes(nodes.shape[:1], x.shape[:1], y.shape[:1])[0]
+    size = torch.broadcast_shapes(x.shape[2:], y.shape[2:])
+    columns = nodes.shape[3]
+    column, row = _cell(x, columns), _cell(y, nodes.shape[2])
+    along, across = lagrange_basis(x - column), lagrange_basis(y - row)
+    flat = nodes.flatten(2).expand(batch, -1, -1)
+    result: Tensor | None = None
+    for i in range(4):
+        line: Tensor | None = None
+        for j in range(4):
+            index = (row + (i - 1)) * columns + column + (j - 1)
+            index = index.expand(batch, 1, *size).flatten(2).expand(-1, flat.shape[1], -1)
+            values = flat.gather(2, index).unflatten(2, size) * along[..., j]
+            line = values if line is None else line + values
+        assert line is not None
+        result = line * across[..., i] if result is None else result + line * across[..., i]
+    assert result is not None
+    return result
+
+
+def _bilinear(nodes: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Interpolate nodes (N, 2, h, w) at fractional indices, each (N or 1, 1, n, m)."""
+    rows, columns = nodes.shape[2:]
+    x, y = torch.broadcast_tensors((2 * x + 1) / columns - 1, (2 * y + 1) / rows - 1)
+    grid = torch.cat([x, y], dim=1).movedim(1, -1)
+    batch = max(len(nodes), len(grid))
+    return grid_sample(nodes.expand(batch, -1, -1, -1), grid, padding="border", interpolation="bilinear")
+
+
+# old: leaves with the old effects
 class StreamFlow(LatticeFlow):
     """The curl of a stream function that is known at the nodes of a lattice, (B, 1, n, m), px^2.
 
@@ -192,39 +252,3 @@ class StreamFlow(LatticeFlow):
         """(B, 2, n, W) and (2, stride, taps): (D_y psi, -D_x psi), each times its scale, as in `Lines`."""
         (first, second), between = _curl_weights(self.lattice.stride, scale, nodes.dtype, nodes.device)
         return across_twice(nodes, (first, second), self.lattice.width), between
-
-
-def once(flow: LatticeFlow, work: Callable[[LatticeFlow], Tensor]) -> Tensor:
-    """What is made of a flow, (B, ...), once where all its rows are one, as for the frames of a clip."""
-    nodes = flow.nodes
-    if len(nodes) < 2 or nodes.stride(0) != 0:
-        return work(flow)
-    return work(flow.with_nodes(nodes[:1])).expand(len(nodes), -1, -1, -1)
-
-
-@cached
-def _curl_weights(
-    stride: int, scale: tuple[float, float], dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """Those of a `StreamFlow`, along a row times a scale of u and one of v."""
-    slope = slope_weights(stride, STREAM_NODES, dtype=dtype, device=device)
-    weight = F.pad(lagrange_weights(stride, STREAM_NODES, dtype=dtype, device=device), (1, 0))
-    return torch.stack([scale[0] * weight, -scale[1] * slope]), torch.stack([slope, weight])
-
-
-@assume_constant_result
-def _lagrange(stride: int, count: int) -> list[list[float]]:
-    return _computed_lagrange(stride, count)  # of its own: compilers look through a cache, and warn of it
-
-
-@lru_cache(maxsize=64)
-def _computed_lagrange(stride: int, count: int) -> list[list[float]]:
-    nodes = torch.arange(1 - count // 2, count // 2 + 1, dtype=torch.float64)
-    t = torch.arange(stride, dtype=torch.float64)[:, None] / stride
-    others = torch.stack([nodes[nodes != node] for node in nodes])
-    return ((t[..., None] - others) / (nodes[:, None] - others)).prod(dim=2).tolist()
-
-
-def _cubics(like: Tensor, lattice: Lattice) -> Tensor:
-    """(stride, 4), in the type of a tensor."""
-    return lagrange_weights(lattice.stride, 4, dtype=like.dtype, device=like.device)

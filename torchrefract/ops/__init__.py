@@ -1,0 +1,1 @@
+"""Sampling of images along flows: the PyTorch reference and faster backends with the same results."""

@@ -1,4 +1,4 @@
-"""How the values of a random field hang together over a distance."""
+"""Covariances of stationary isotropic random fields."""
 
 import math
 
@@ -8,12 +8,11 @@ from torch import Tensor
 # Lengths after which less than 4e-4 is left of each covariance.
 REACH = {"exponential": 8.0, "gaussian": 5.0, "matern32": 6.0, "matern52": 6.0}
 COVARIANCES = tuple(REACH)
-# nu of the Matern covariances, of which the exponential one is the roughest.
-_SMOOTHNESS = {"exponential": 0.5, "matern32": 1.5, "matern52": 2.5}
+_SMOOTHNESS = {"exponential": 0.5, "matern32": 1.5, "matern52": 2.5}  # nu of the Matern covariances
 
 
 def covariance(distance: Tensor, length: Tensor, kind: str) -> Tensor:
-    """C(h), with C(0) = 1, at distances h in px for a correlation length l in px; the two broadcast.
+    """Compute C(h), with C(0) = 1, at distances h in px for a correlation length l in px; the two broadcast.
 
         exponential  exp(-h / l)                       gaussian  exp(-h^2 / (2 l^2))
         matern32     (1 + a) exp(-a), a = sqrt(3) h / l
@@ -33,33 +32,30 @@ def covariance(distance: Tensor, length: Tensor, kind: str) -> Tensor:
     return (1 + a + a * a / 3) * torch.exp(-a)
 
 
-def slope_rms(length: Tensor, *, kind: str, aperture: Tensor | None = None) -> Tensor:
-    """(B,), 1/px: the root mean square of the difference between neighboring pixels of a field of variance 1.
+def gradient_rms(length: Tensor, *, kind: str, aperture: Tensor | None = None) -> Tensor:
+    """Compute (N,), 1/px: the root mean square difference of neighboring pixels of a field of variance 1.
 
         sqrt(2 (1 - C(1) / C(0))),  C smoothed by the aperture a twice, for which it is a sum of Gaussians:
-        C(h) = sum w s / (s + 2 a^2) exp(-h^2 / (2 (s + 2 a^2))),  w and s / l^2 as by `as_gaussians`
-
-    An aperture below half a pixel smooths pixels by less than this, up to a tenth.
+        C(h) = sum w s / (s + 2 a^2) exp(-h^2 / (2 (s + 2 a^2))),  w and s / l^2 from `gaussian_mixture`
 
     Args:
-        length: (B,), px.
+        length: (N,), px.
         kind: one of COVARIANCES.
-        aperture: (B,), px.
+        aperture: (N,), px.
     """
-    weight, scale = as_gaussians(kind, length.device)
+    weight, scale = gaussian_mixture(kind, length.device)
     variance = length.double()[:, None].square() * scale
     spread = variance if aperture is None else variance + 2 * aperture.double()[:, None].square()
     weight = weight * variance / spread
     return (-2 * (weight * torch.expm1(-0.5 / spread)).sum(dim=1) / weight.sum(dim=1)).sqrt()
 
 
-def as_gaussians(kind: str, device: torch.device) -> tuple[Tensor, Tensor]:
-    """(n,) and (n,), float64: weights and squared lengths, of l^2, of the Gaussian covariances that a kind is a sum of.
+def gaussian_mixture(kind: str, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return weights (n,) and squared lengths (n,) in l^2, float64, of the Gaussian covariances that sum to a kind.
 
-        C(h) = sum w exp(-h^2 / (2 s l^2)),  s = t / nu,  w = t^nu exp(-t) over equal steps of ln t, of sum 1
+        C(h) = sum w exp(-h^2 / (2 s l^2)),  s = t / nu,  w = t^nu exp(-t) over equal steps of ln t, normalized
 
-    Source: a Matern covariance is a mixture of Gaussian ones; Rasmussen and Williams, "Gaussian processes for machine
-    learning" (2006), section 4.2.
+    Source: Rasmussen and Williams, "Gaussian processes for machine learning" (2006), section 4.2.
     """
     t = torch.ones(1, dtype=torch.float64, device=device)
     if kind == "gaussian":

@@ -1,0 +1,409 @@
+"""Stationary Gaussian random fields with a given covariance, sampled exactly on a periodic domain by FFT.
+
+The frame is cut out of a domain large enough that opposite edges of the frame are uncorrelated. The field is a sum of
+waves, whose amplitudes are the roots of the eigenvalues of the covariance on that domain:
+
+    field_1 + i field_2 = sum_k amplitude_k (n1_k + i n2_k) exp(-2 pi i k . p / size),  n1, n2 white noise
+
+A sum of the lowest frequencies alone is cheaper, and can be evaluated at the nodes of a coarse lattice.
+
+Source: Dietrich and Newsam, "Fast and exact simulation of stationary Gaussian processes through circulant embedding of
+the covariance matrix", SIAM J. Sci. Comput. 18 (1997).
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrefract._tensor import exact_matmul
+from torchrefract.fields.covariance import REACH, covariance
+from torchrefract.random import white_noise, white_noise_at
+
+_APERTURE_REACH = 6.0  # margin of the domain in apertures: a smoothed field is correlated over sqrt(2) of them
+_MAX_POINTS = 1 << 24  # larger domains need gigabytes
+_ROUNDING = 5e-13  # of the transform, relative to the largest eigenvalue
+_NEGLIGIBLE = 1e-16  # of an amplitude
+_POINTS_AT_ONCE = 1 << 22  # frequencies of all samples that are in memory together
+
+
+class FieldParams(NamedTuple):
+    """Sizes, noise and motion of N random fields.
+
+    length: (N,), px, correlation length.
+    aperture: (N,), px, standard deviation of the Gaussian that smooths the field; None for no smoothing.
+    key: (N, 4), int64, of `noise_key`.
+    motion: None for frame 0 of a clip.
+    """
+
+    length: Tensor
+    aperture: Tensor | None
+    key: Tensor
+    motion: "Motion | None" = None
+
+
+class Motion(NamedTuple):
+    """Time and change of N random fields.
+
+    frame: (N,), number of the frame t.
+    wind: (N, 2), px per frame, to the right and down.
+    decorrelation: (N,), frames, above 0; inf for a field that is only moved by the wind.
+    """
+
+    frame: Tensor
+    wind: Tensor
+    decorrelation: Tensor
+
+
+class Frequencies(NamedTuple):
+    """Frequencies on a periodic domain: -rows ... rows and -columns ... columns periods, or all of them.
+
+    size: (Ht, Wt), px, even, of the domain.
+    """
+
+    size: tuple[int, int]
+    rows: int
+    columns: int
+
+    @classmethod
+    def all(cls, size: tuple[int, int]) -> "Frequencies":
+        """Return all frequencies of a domain."""
+        return cls(size, size[0] // 2, size[1] // 2)
+
+    @property
+    def is_all(self) -> bool:
+        """Return True if no frequency is missing."""
+        return 2 * self.rows >= self.size[0] and 2 * self.columns >= self.size[1]
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Return how many frequencies there are along each axis."""
+        return self.size if self.is_all else (2 * self.rows + 1, 2 * self.columns + 1)
+
+    def numbers(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Return the periods (Ky,) and (Kx,), int64: 0 ... N - 1 of all, or those from -rows and -columns on."""
+        if self.is_all:
+            return torch.arange(self.size[0], device=device), torch.arange(self.size[1], device=device)
+        rows = torch.arange(-self.rows, self.rows + 1, device=device)
+        return rows, torch.arange(-self.columns, self.columns + 1, device=device)
+
+
+def embedding_size(height: int, width: int, *, length: float, kind: str, aperture: float = 0.0) -> tuple[int, int]:
+    """Return (Ht, Wt), px: a periodic domain on which opposite edges of a frame are uncorrelated.
+
+    Args:
+        height, width: px, of the frame.
+        length: px, the longest correlation length.
+        kind: one of COVARIANCES.
+        aperture: px, the widest aperture.
+    """
+    # A frame as large as the cap still gets a margin, so that its edges do not join.
+    cap = max(_MAX_POINTS, 2 * height * width)
+    margin = math.ceil(min(math.hypot(REACH[kind] * length, _APERTURE_REACH * aperture), cap))
+    size = _fast_size(height + margin), _fast_size(width + margin)
+    if size[0] * size[1] <= cap:
+        return size
+    # The largest margin for which (height + margin) (width + margin) stays below the cap.
+    half = (height + width) / 2
+    margin = math.floor(math.sqrt(half * half - height * width + cap) - half)
+    return _fast_size_below(height + margin, height), _fast_size_below(width + margin, width)
+
+
+def eigenvalues(frequencies: Frequencies, length: Tensor, *, kind: str) -> Tensor:
+    """Compute (N, rows + 1, columns + 1), float64, up to rounding: eigenvalues of a covariance on a periodic domain.
+
+    They are the discrete Fourier transform of the covariance over the distances on the domain, which is even along both
+    axes: the frequencies from 0 on hold all of them.
+
+    Args:
+        frequencies: to compute.
+        length: (N,), px.
+        kind: one of COVARIANCES.
+    """
+    size, length = frequencies.size, length.double()[:, None, None]
+    y, x = (torch.arange(n // 2 + 1, dtype=torch.float64, device=length.device) for n in size)
+    y = y[:, None]
+    # The covariance of the shortest distance has a kink half-way around the domain, and so negative eigenvalues. The
+    # sum over all ways around has none, but on a domain too small for it the sum is off by more.
+    is_summed = (REACH[kind] * length <= min(size)).double()
+    if kind == "gaussian":  # a product of two functions of one axis
+        rows, columns = (
+            covariance(t, length, kind)
+            + is_summed * (covariance(n - t, length, kind) + covariance(n + t, length, kind))
+            for t, n in ((y, size[0]), (x, size[1]))
+        )
+        rows, columns = (
+            even_transform(rows, 1, frequencies.rows + 1),
+            even_transform(columns, 2, frequencies.columns + 1),
+        )
+        return rows * columns
+    values = covariance((x * x + y * y).sqrt(), length, kind)
+    if kind != "exponential":
+        far_x2, far_y2 = (size[1] - x).square(), (size[0] - y).square()
+        for square in (far_x2 + y * y, x * x + far_y2, far_x2 + far_y2):
+            values = values + is_summed * covariance(square.sqrt(), length, kind)
+    return even_transform(even_transform(values, 2, frequencies.columns + 1), 1, frequencies.rows + 1)
+
+
+def amplitudes(
+    frequencies: Frequencies, length: Tensor, *, kind: str, aperture: Tensor | None, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """Compute the factor of the noise at each frequency, normalized to a field of variance 1.
+
+    It is the root of the eigenvalue, multiplied by exp(-(k a)^2 / 2) for an aperture a: the field is then smoothed by a
+    Gaussian of standard deviation a. Negative eigenvalues count as 0.
+
+    Args:
+        frequencies: to compute.
+        length: (N,), px.
+        kind: one of COVARIANCES.
+        aperture: (N,), px.
+        dtype: of the amplitude.
+
+    Returns:
+        amplitude: (N, rows + 1, columns + 1).
+        clipped: (N,), negative eigenvalues as a share of all.
+    """
+    values = eigenvalues(frequencies, length, kind=kind)
+    if kind != "exponential":  # eigenvalues below rounding would have roots with arbitrary gradients
+        values = torch.where(values.abs() > _ROUNDING * values.amax(dim=(1, 2), keepdim=True), values, 0)
+    positive = values.clamp(min=0)
+    smooth_y, smooth_x = (
+        _smoothing(torch.arange(most + 1, dtype=torch.float64, device=values.device) / n, aperture)
+        for n, most in zip(frequencies.size, (frequencies.rows, frequencies.columns), strict=True)
+    )
+    smooth_y, smooth_x = smooth_y[..., None], smooth_x[..., None, :]
+    counts = [
+        _multiplicity(most + 1, values.device, has_middle=2 * most >= n)
+        for n, most in zip(frequencies.size, (frequencies.rows, frequencies.columns), strict=True)
+    ]
+    weight_y, weight_x = counts[0][:, None] * smooth_y.square(), counts[1] * smooth_x.square()
+
+    def total(eigenvalues: Tensor) -> Tensor:
+        return ((eigenvalues * weight_x).sum(dim=2, keepdim=True) * weight_y).sum(dim=1, keepdim=True)
+
+    variance = total(positive)
+    clipped = 1 - variance / (2 * variance - total(values))
+    amplitude = _root(positive).to(dtype) * (smooth_y / variance.sqrt()).to(dtype) * smooth_x.to(dtype)
+    return amplitude, clipped[:, 0, 0].to(dtype)
+
+
+def coefficients(
+    params: FieldParams, frequencies: Frequencies, *, kind: str, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """Compute the noise times its amplitude, (N, 2, Ky, Kx), real and imaginary part, and the clipped share, (N,)."""
+    quarter, clipped = amplitudes(frequencies, params.length, kind=kind, aperture=params.aperture, dtype=dtype)
+    noise = frequency_noise(params.key, frequencies, dtype=dtype)
+    if params.motion is not None:
+        noise = _evolve(noise, turn_rates(params.key, frequencies, dtype=dtype), frequencies, params.motion)
+    ky, kx = (
+        torch.minimum(k.remainder(n), (-k).remainder(n))
+        for k, n in zip(frequencies.numbers(noise.device), frequencies.size, strict=True)
+    )
+    amplitude = quarter.index_select(2, kx).index_select(1, ky)
+    return noise * amplitude[:, None], clipped
+
+
+def sum_of_waves(values: Tensor, frequencies: Frequencies, rows: range, columns: range) -> Tensor:
+    """Compute Re and Im of sum_k z_k exp(-2 pi i k . p / size), (N, 2, n, m), at rows and columns of the domain.
+
+    Args:
+        values: (N, 2, Ky, Kx), real and imaginary part of z.
+        frequencies: their frequencies.
+        rows, columns: px; positions beyond the domain continue it periodically.
+    """
+    down, across = (
+        _Axis(positions, n, k)
+        for positions, n, k in zip((rows, columns), frequencies.size, frequencies.numbers(values.device), strict=True)
+    )
+    # The compiler supports no complex numbers.
+    if torch.compiler.is_compiling() or not (down.has_transform and across.has_transform):
+        return down.by_products(across.by_products(values.mT).mT)
+    spectrum = across.by_transform(torch.complex(values[:, 0], values[:, 1]), 2)
+    return torch.view_as_real(down.by_transform(spectrum, 1)).movedim(-1, 1)
+
+
+def sample_field(
+    params: FieldParams, frequencies: Frequencies, rows: range, columns: range, *, kind: str, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """Sample two independent fields of mean 0 and variance 1 with a covariance.
+
+    Args:
+        params: of N fields.
+        frequencies: of the domain, all or the lowest ones.
+        rows, columns: px, where the fields are evaluated.
+        kind: one of COVARIANCES.
+        dtype: float32 or float64.
+
+    Returns:
+        field: (N, 2, n, m).
+        clipped: (N,), share of the spectrum that is negative and was set to 0.
+    """
+    parts = []
+    for part in split_params(params, frequencies):
+        values, clipped = coefficients(part, frequencies, kind=kind, dtype=dtype)
+        parts.append((sum_of_waves(values, frequencies, rows, columns), clipped))
+    if len(parts) == 1:
+        return parts[0]
+    fields, clipped = zip(*parts, strict=True)
+    return torch.cat(fields), torch.cat(clipped)
+
+
+def split_params(params: FieldParams, frequencies: Frequencies) -> list[FieldParams]:
+    """Split N fields into groups whose noise fits into memory together."""
+    count = len(params.length)
+    at_once = max(1, _POINTS_AT_ONCE // math.prod(frequencies.counts))
+    if count <= at_once or torch.compiler.is_compiling():
+        return [params]
+    groups = [slice(start, start + at_once) for start in range(0, count, at_once)]
+    return [
+        FieldParams(
+            params.length[group],
+            None if params.aperture is None else params.aperture[group],
+            params.key[group],
+            None if params.motion is None else Motion(*(value[group] for value in params.motion)),
+        )
+        for group in groups
+    ]
+
+
+def frequency_noise(key: Tensor, frequencies: Frequencies, *, dtype: torch.dtype) -> Tensor:
+    """Compute (N, 2, Ky, Kx): the white noise of the frequencies, the same for all and for the lowest ones."""
+    if frequencies.is_all:
+        return white_noise(key, math.prod(frequencies.size)).unflatten(2, frequencies.size).to(dtype)
+    return white_noise_at(key, _indices(frequencies, key.device)).unflatten(2, frequencies.counts).to(dtype)
+
+
+def turn_rates(key: Tensor, frequencies: Frequencies, *, dtype: torch.dtype) -> Tensor:
+    """Compute (N, Ky, Kx), standard normal: how fast the phase of each frequency turns, in 1 / decorrelation."""
+    key = key.flip(1)  # the words of the key in another order are another key
+    half = math.prod(frequencies.size) // 2
+    if frequencies.is_all:
+        return white_noise(key, half).reshape(-1, *frequencies.size).to(dtype)
+    index = _indices(frequencies, key.device)
+    pairs = white_noise_at(key, index % half)
+    return torch.where(index < half, pairs[:, 0], pairs[:, 1]).unflatten(1, frequencies.counts).to(dtype)
+
+
+def _evolve(noise: Tensor, rates: Tensor, frequencies: Frequencies, motion: Motion) -> Tensor:
+    """Turn the noise (N, 2, Ky, Kx) of each frequency (kx, ky) by its own angle.
+
+        n_t = n exp(i phase),  phase = sqrt(2) rate t / decorrelation + 2 pi (kx wind_x / Wt + ky wind_y / Ht) t
+
+    The field moves with the wind, and its correlation with the moved field of frame 0 is exp(-(t / decorrelation)^2),
+    since the rates are normal. Amplitudes stay, and any frame is computed without those before it.
+    """
+    ky, kx = (
+        torch.where(2 * k < n, k, k - n).double() / n
+        for k, n in zip(frequencies.numbers(noise.device), frequencies.size, strict=True)
+    )
+    shift = 2 * math.pi * (motion.frame.double()[:, None] * motion.wind.double())[:, :, None]
+    # Whole turns are subtracted in float64, so that late frames are as exact as the first.
+    drift_x, drift_y = shift[:, :1] * kx, shift[:, 1:].mT * ky[:, None]
+    drift = drift_x.remainder(2 * math.pi).to(noise.dtype) + drift_y.remainder(2 * math.pi).to(noise.dtype)
+    phase = (math.sqrt(2) * motion.frame / motion.decorrelation)[:, None, None].to(noise.dtype) * rates + drift
+    cos, sin = phase.cos(), phase.sin()
+    real, imaginary = noise.unbind(1)
+    return torch.stack([real * cos - imaginary * sin, real * sin + imaginary * cos], dim=1)
+
+
+def even_transform(values: Tensor, dim: int, count: int) -> Tensor:
+    """Transform even, periodic sequences, given and returned by their halves; `count` values from frequency 0 on."""
+    most = values.shape[dim] - 1
+    if torch.compiler.is_compiling():  # the compiler supports no complex numbers
+        k, p = torch.arange(count, device=values.device)[:, None], torch.arange(most + 1, device=values.device)
+        cosine = (math.pi / max(most, 1) * (k * p).remainder(2 * most)).to(values.dtype).cos()
+        matrix = cosine * _multiplicity(most + 1, values.device, has_middle=True)
+        return matrix @ values if dim == 1 else values @ matrix.mT
+    if values.shape[0] == 0:  # PyTorch cannot transform empty batches
+        return values.narrow(dim, 0, count)
+    mirrored = values.narrow(dim, 1, most - 1).flip(dim)
+    return torch.fft.rfft(torch.cat([values, mirrored], dim=dim), dim=dim).narrow(dim, 0, count).real
+
+
+class _Axis(NamedTuple):
+    """Positions along one axis of a domain, px, its size, and the periods (K,) of its frequencies."""
+
+    positions: range
+    size: int
+    periods: Tensor
+
+    @property
+    def has_transform(self) -> bool:
+        """Return True if an FFT of size / step frequencies, which holds all of them, gives the values."""
+        step = self.positions.step
+        return self.size % step == 0 and self.positions.start % step == 0 and self.size // step >= len(self.periods)
+
+    def by_transform(self, values: Tensor, dim: int) -> Tensor:
+        """Transform complex values along an axis by FFT."""
+        length, count = self.size // self.positions.step, len(self.periods)
+        if count < self.size:  # the frequencies below 0 come last
+            shape = list(values.shape)
+            shape[dim] = length - count
+            below, others = values.split([count // 2, count - count // 2], dim=dim)
+            values = torch.cat([others, values.new_zeros(shape), below], dim=dim)
+        if values.shape[0]:  # PyTorch cannot transform empty batches
+            values = torch.fft.fft(values, dim=dim)
+        first, needed = self.positions.start // self.positions.step % length, len(self.positions)
+        if first + needed <= length:
+            return values.narrow(dim, first, needed)
+        return values.index_select(dim, (first + torch.arange(needed, device=values.device)).remainder(length))
+
+    def by_products(self, values: Tensor) -> Tensor:
+        """Transform values (N, 2, K, m), real and imaginary part, along K by a product of real matrices."""
+        span = self.positions
+        positions = torch.arange(span.start, span.stop, span.step, device=values.device)
+        # Whole turns are subtracted from integers, exactly.
+        angle = (positions[:, None] * self.periods).remainder(self.size).to(values.dtype) * (2 * math.pi / self.size)
+        real, imaginary = values.unbind(1)
+        pairs = torch.stack([torch.cat([real, imaginary], dim=1), torch.cat([imaginary, -real], dim=1)], dim=1)
+        return exact_matmul(torch.cat([angle.cos(), angle.sin()], dim=1), pairs)
+
+
+def _indices(frequencies: Frequencies, device: torch.device) -> Tensor:
+    """Return (Ky Kx,), int64: the index of each frequency among all of the domain."""
+    ky, kx = frequencies.numbers(device)
+    height, width = frequencies.size
+    return (ky[:, None].remainder(height) * width + kx.remainder(width)).flatten()
+
+
+def _smoothing(frequency: Tensor, aperture: Tensor | None) -> Tensor:
+    """Compute the factor of a Gaussian aperture, (N, K) or (K,), at frequencies (K,) in cycles per px."""
+    if aperture is None:
+        return torch.ones_like(frequency)
+    factor = torch.exp(-0.5 * (2 * math.pi * aperture.double()[:, None] * frequency).square())
+    # Arithmetic with denormal products of smaller factors is many times slower.
+    return torch.where(factor > _NEGLIGIBLE, factor, 0)
+
+
+def _multiplicity(count: int, device: torch.device, *, has_middle: bool) -> Tensor:
+    """Return (count,), float64: how often each value of a half occurs in the even, periodic sequence."""
+    times = torch.full((count,), 2.0, dtype=torch.float64, device=device)
+    times[:1].fill_(1)  # of slices, since an accelerator waits for a number that is put in one place
+    if has_middle:
+        times[-1:].fill_(1)
+    return times
+
+
+def _root(values: Tensor) -> Tensor:
+    """Compute the square root, with a gradient of 0 where the value is 0."""
+    return torch.where(values > 0, values, 1).sqrt() * (values > 0)
+
+
+def _fast_size(least: int) -> int:
+    """Return the smallest even number from `least` on that has no prime factor above 7."""
+    size = max(2, least + least % 2)
+    while not _has_small_factors(size):
+        size += 2
+    return size
+
+
+def _fast_size_below(most: int, least: int) -> int:
+    """Return the largest such number up to `most`, or the smallest from `least` on if that is below `least`."""
+    sizes = range(most - most % 2, max(least, 2) - 1, -2)
+    return next(filter(_has_small_factors, sizes), _fast_size(least))
+
+
+def _has_small_factors(size: int) -> bool:
+    return 210**64 % size == 0

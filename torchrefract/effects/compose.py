@@ -503,33 +503,25 @@ def _group_samples(
 
 
 def _composed_flow(warps: Sequence[tuple[WarpEffect, Any]], plan: CompositionPlan) -> tuple[LatticeFlow, Tensor]:
-    """Compute the composed flow of warps, and where it exists."""
-    if plan.stride == 1 or len(warps) == 1:
-        return _composed_at_pixels(warps, plan)
+    """Compute the composed flow of warps at the nodes of one lattice, and where it exists."""
+    if len(warps) == 1:
+        return warps[0][0].masked_flow(warps[0][1], plan.plans[0])
     height, width = plan.plans[0].height, plan.plans[0].width
     lattice = lattice_with_stride(height, width, plan.stride)
     dtype = next(value.dtype for value in warps[0][1] if value.is_floating_point())
-    points = lattice.points(dtype=dtype, device=warps[0][1].applied.device)
+    device = warps[0][1].applied.device
+    points = lattice.points(dtype=dtype, device=device)
     total: Tensor | None = None
+    exists = torch.ones(1, 1, 1, 1, dtype=torch.bool, device=device)
     for (effect, params), warp_plan in zip(reversed(warps), reversed(plan.plans), strict=True):
         if warp_plan.is_identity:
             continue
-        flow, _ = effect.flow(params, points if total is None else points.displaced(total), warp_plan)
-        flow = where_active(flow, 0.0, effect.active(params, height, width), params)
+        flow, flow_exists = effect.flow(params, points if total is None else points.displaced(total), warp_plan)
+        active = effect.active(params, height, width)
+        flow = where_active(flow, 0.0, active, params)
         total = flow if total is None else total + flow
+        exists = exists & (flow_exists | ~per_sample(active))
     if total is None:
         rows, columns = lattice.num_nodes
-        total = torch.zeros(len(warps[0][1].applied), 2, rows, columns, dtype=dtype, device=points.x.device)
-    return LatticeFlow(total, lattice), torch.ones(1, 1, 1, 1, dtype=torch.bool, device=total.device)
-
-
-def _composed_at_pixels(warps: Sequence[tuple[WarpEffect, Any]], plan: CompositionPlan) -> tuple[LatticeFlow, Tensor]:
-    """Compose flows at every pixel; earlier flows are interpolated bilinearly where the later ones lead."""
-    total, exists = warps[-1][0].masked_flow(warps[-1][1], plan.plans[-1])
-    if len(warps) == 1:
-        return total, exists
-    flow = total.dense()
-    for (effect, params), warp_plan in zip(reversed(warps[:-1]), reversed(plan.plans[:-1]), strict=True):
-        if not warp_plan.is_identity:
-            flow = compose_flows(effect.masked_flow(params, warp_plan)[0].dense(), flow)
-    return LatticeFlow(flow, lattice_with_stride(*flow.shape[2:], 1)), torch.ones_like(flow[:, :1], dtype=torch.bool)
+        total = torch.zeros(len(warps[0][1].applied), 2, rows, columns, dtype=dtype, device=device)
+    return LatticeFlow(total, lattice), exists if plan.stride == 1 else exists.new_ones(1, 1, 1, 1)

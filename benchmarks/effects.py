@@ -1,200 +1,189 @@
-"""What a whole effect costs, as a multiple of one bare F.grid_sample on the same frame.
+"""Time each effect as a multiple of one bare F.grid_sample, and count the Python calls of one effect.
 
-python benchmarks/effects.py [--size 1080x1920] [--batch 1] [--threads 2] [--repeats 15] [--real PATH]
-                             [--device cpu] [--out benchmarks/results/effects.json]
+python benchmarks/effects.py [--size 1080x1920] [--threads 2] [--repeats 15] [--backend auto torch] [--real PATH]
+                             [--out benchmarks/results/effects.json]
+python benchmarks/effects.py --calls
 """
 
-import argparse
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import torch
 import torch.nn.functional as F
-from arguments import count, frame_of, size
-from subjects import ROUGH, SMOOTH, TOLERANCE_PX, all_warps
 from timing import (
     COPY,
-    FEWEST_REPEATS,
     GRID_SAMPLE,
+    PHOTOMETRIC,
+    RESULTS,
+    TOLERANCE_PX,
+    WARPS,
     Bar,
     Candidate,
     Conditions,
     Timing,
+    all_warps,
+    frame_of,
     measure,
+    parser,
     references,
+    sampling_grid,
     save,
     table,
 )
 from torch import Tensor
 
-from torchrefract import (
-    DivergenceFree,
-    GroundPlaneDepth,
-    HeterogeneousFog,
-    LensDistortion,
-    LensFlare,
-    ThinPlateSpline,
-    Turbulence,
-    UniformFog,
-)
-from torchrefract.fields.perlin import perlin_noise
-from torchrefract.fields.perlin_lattice import octave
-from torchrefract.random import noise_key, stream
-from torchrefract.warping.grid import sampler_grid
+import torchrefract as tr
 
 WHAT = (
-    "Whole effects through the public API, exact, with a new draw in every call: effect(image) without gradients; 'all"
-    " maps' is degrade() with flow, valid, restore_flow and restore_valid; 'to params' asks for the gradient of every "
-    "drawn number (of a lens all 12 coefficients, so that none is skipped as zero), forward alone or forward and "
-    "backward. 'radial' is a lens without decentring, which needs no Newton steps in the plane. On the CPU the bare "
-    "grid_sample threads over the batch alone; the effects use all threads on one frame too. Within 0.05 px the flow "
-    "is computed on lattices: one mild lens, the lenses of the default ranges, each by its part of them, fields of 40 "
-    "px and longer, and rough air that an aperture smooths; the image asks for its gradient, forward alone. How long "
-    "the sampler takes depends on the flow, so bare grid_samples along flows of theirs, ready made, stand beside them, "
-    "and they are told as multiples of these, too."
+    "effect(image) without gradients, with a new draw in every call, through the public API. 'exact' is "
+    "tolerance_px=None. 'torch' in a name is backend='torch', which a machine without numba uses; other rows use the "
+    "default backend. 'default lenses' draws from the default ranges; 'rough turbulence' has an exponential covariance "
+    "and an aperture of 4 to 6 px. 'bare grid_sample along' is F.grid_sample with a precomputed grid from a flow of "
+    "that effect, since the time of the sampler depends on the flow. On the CPU the bare grid_sample keeps one thread "
+    "busy for each sample; the effects use all threads."
 )
-LENS, RADIAL, FOG, FLARE = "LensDistortion", "LensDistortion radial", "UniformFog", "LensFlare"
-PERLIN, DRIFTS, SPACE = "Perlin noise, 6 octaves", "HeterogeneousFog", "HeterogeneousFog in space"
-TURBULENCE, SPLINE, SWIRL = "Turbulence, length 20 px", "ThinPlateSpline, 16 points", "DivergenceFree, length 20 px"
-FLEET = f"LensDistortion within {TOLERANCE_PX} px"
-MILD, PLATE, AIR, STREAM, ALL_FOUR = (f"{name} within {TOLERANCE_PX} px" for name in (*SMOOTH, "all four warps"))
-# Multiples of the bare grid_sample.
-LIMITS = {LENS: 20.0, TURBULENCE: 10.0, SPLINE: 20.0, SWIRL: 10.0, FOG: 0.15, FLARE: 0.25, DRIFTS: 1.8, PERLIN: 1.5}
-LIMITS |= {MILD: 0.8, PLATE: 0.85, AIR: 0.9, STREAM: 0.9, ALL_FOUR: 1.4}
-WARPS = (MILD, PLATE, AIR, STREAM, ALL_FOUR)
-BARS = "bars, set for 1x3x1080x1920 float32 on 2 threads:"
+PACKAGE = str(Path(tr.__file__).parent)
+ALL = "all four warps"
+OTHER_WARPS: Mapping[str, Callable[..., Any]] = {
+    "default lenses": tr.LensDistortion,
+    "rough turbulence": partial(
+        tr.Turbulence, amplitude_range=(1.2, 1.8), length_range=(40.0, 80.0), aperture_range=(4.0, 6.0)
+    ),
+}
+# Largest multiples of the bare grid_sample for 1x3x1080x1920 float32 on two threads.
+LIMITS = {
+    "auto": dict(zip((*WARPS, ALL), (0.9, 0.9, 0.9, 1.0, 1.4), strict=True)),
+    "torch": dict(zip((*WARPS, ALL), (1.6, 1.6, 1.6, 1.6, 3.0), strict=True)),
+}
+PHOTOMETRIC_LIMITS = {"uniform fog": 0.3, "flare": 0.35, "heterogeneous fog": 1.6, "volumetric fog": 1.6}
+LENS, COMPOSITION = "lens", "composition of four warps and fog"
+# Files, functions and calls of the package that one call may cross.
+CALL_LIMITS = {LENS: (14, 60, 120), COMPOSITION: (24, 150, 500)}
+CALL_SIZE = (256, 256)  # px; the counts hardly depend on it
 
 
 def main() -> None:
-    """Measure, print and save; where a bar does not hold it is said, and is no failure of this command."""
-    parser = _parser()
-    args = parser.parse_args()
+    """Measure, print and save; a limit that does not hold is marked and is no failure of the command."""
+    options = parser(__doc__, out=RESULTS / "effects.json")
+    options.add_argument(
+        "--backend", nargs="+", choices=["auto", "torch", "numba"], default=["auto", "torch"], help="auto torch"
+    )
+    options.add_argument("--calls", action="store_true", help="count Python calls instead")
+    args = options.parse_args()
     torch.manual_seed(0)
+    if args.calls:
+        print(*call_bars(), sep="\n")
+        return
     try:
-        frame = frame_of(args.real, args.size).expand(args.batch, -1, -1, -1).contiguous().to(args.device)
-    except (ValueError, RuntimeError) as error:
-        parser.error(str(error))
+        frame = frame_of(args.real, args.size)
+    except (ValueError, RuntimeError, OSError) as error:
+        options.error(str(error))
     conditions = Conditions.now(frame, threads=args.threads, repeats=args.repeats)
     print(WHAT, end="\n\n", flush=True)
-    found = tolerant(frame) if args.within else candidates(frame)
-    timings = measure(found, references=(GRID_SAMPLE, COPY), repeats=args.repeats, threads=args.threads)
-    held = bars(timings)
-    print(table(timings, conditions), "", BARS, *held, sep="\n")
-    save(args.out, timings, conditions, what=WHAT, bars=held)
-    print(f"written to {args.out}")
-
-
-def candidates(frame: Tensor) -> dict[str, Candidate]:
-    """What is compared on a frame (B, C, H, W), by name; the references come first."""
-    lens, fog = LensDistortion(tolerance_px=None), UniformFog()
-    radial = LensDistortion(p1_range=(0.0, 0.0), p2_range=(0.0, 0.0), tolerance_px=None)
-    found = references(frame)
-    others = {
-        TURBULENCE: Turbulence(length_range=(20.0, 20.0), tolerance_px=None),
-        SPLINE: ThinPlateSpline(tolerance_px=None),
-        SWIRL: DivergenceFree(length_range=(20.0, 20.0), tolerance_px=None),
-        FLARE: LensFlare(),
-        DRIFTS: HeterogeneousFog(),
-        SPACE: HeterogeneousFog(mode="ray", depth=GroundPlaneDepth()),
-    }
-    for name, effect in {LENS: lens, RADIAL: radial, FOG: fog, **others}.items():
-        found[name] = lambda effect=effect: effect(frame)
-    found |= tolerant(frame)
-    depth = torch.linspace(1, 200, frame.shape[3], device=frame.device).expand(len(frame), 1, frame.shape[2], -1)
-    for name, effect in ((FOG, fog), (DRIFTS, others[DRIFTS]), (SPACE, others[SPACE])):
-        found[f"{name}, with a depth map"] = lambda effect=effect: effect.degrade(frame, depth=depth)
-    found[PERLIN] = lambda: _perlin(frame)
-    found[f"{LENS}, all maps"] = lambda: _all_maps(lens, frame)
-    for name, effect in ((LENS, lens), (RADIAL, radial), (FOG, fog)):
-        found[f"{name}, to params, forward"] = lambda effect=effect: _forward(effect, frame)
-        found[f"{name}, to params, forward + backward"] = _forward_and_backward(effect, frame)
-    return found
-
-
-def tolerant(frame: Tensor) -> dict[str, Candidate]:
-    """The warps under a tolerance; the references come first."""
-    makers = {**SMOOTH, **ROUGH}
-    warps = {f"{name} within {TOLERANCE_PX} px": make(tolerance_px=TOLERANCE_PX) for name, make in makers.items()}
-    found, learning = references(frame), frame.clone().requires_grad_()
-    warps[FLEET] = LensDistortion(tolerance_px=TOLERANCE_PX)
-    for name, effect in {**warps, ALL_FOUR: all_warps(tolerance_px=TOLERANCE_PX)}.items():
-        grid = sampler_grid(effect.degrade(frame, seed=0).flow).contiguous()
-        found[along(name)] = lambda grid=grid: F.grid_sample(frame, grid, mode="bilinear", align_corners=False)
-        found[name] = lambda effect=effect: effect(learning)
-    return found
-
-
-def along(name: str) -> str:
-    """The bare grid_sample along a flow of a warp."""
-    return f"bare grid_sample along {name.removesuffix(f' within {TOLERANCE_PX} px')}"
-
-
-def bars(timings: Sequence[Timing]) -> list[Bar]:
-    """The limits, beside what was measured; of smooth warps also beside the sampler along such flows."""
-    ratios = {timing.name: timing.ratios[GRID_SAMPLE].median for timing in timings}
-    limits = [(name, limit) for name, limit in LIMITS.items() if name in ratios]
-    found = [Bar(name, ratios[name], "<=", limit, f"x {GRID_SAMPLE}") for name, limit in limits]
-    return found + [
-        Bar(name, ratios[name] / ratios[along(name)], "<=", LIMITS[name], f"x {along(name)}") for name in WARPS
-    ]
-
-
-def _perlin(frame: Tensor) -> Tensor:
-    """The noise of the paper's fog, lattices and all."""
-    batch, _, height, width = frame.shape
-    key, fog = noise_key(stream(0, range(batch))).to(frame.device), HeterogeneousFog()
-    zero = frame.new_zeros(batch)
-    octaves = [
-        octave(
-            key,
-            i,
-            period=scale * width / fog.reference_width,
-            height=height,
-            width=width,
-            frame=zero,
-            wind=torch.stack([zero, zero], dim=1),
-            decorrelation=zero + 1,
-            dtype=frame.dtype,
+    with torch.no_grad():
+        timings = measure(
+            candidates(frame, args.backend), references=(GRID_SAMPLE, COPY), repeats=args.repeats, threads=args.threads
         )
-        for i, scale in enumerate(fog.scales)
-    ]
-    return perlin_noise(octaves, frame.new_tensor(fog.weights).expand(batch, -1))
+    bars = speed_bars(timings)
+    print(table(timings, conditions), "", *bars, sep="\n")
+    save(args.out, timings, conditions, what=WHAT, bars=bars)
 
 
-def _all_maps(lens: LensDistortion, frame: Tensor) -> tuple[Tensor | None, ...]:
-    made = lens.degrade(frame)
-    return made.image, made.flow, made.valid, made.restore_flow, made.restore_valid
+def candidates(frame: Tensor, backends: Sequence[str]) -> dict[str, Candidate]:
+    """Return what is timed on a frame (B, C, H, W), by name; the references come first."""
+    chosen: dict[str, Any] = {}
+    for backend in backends:
+        for name, make in (WARPS | OTHER_WARPS | {ALL: all_warps}).items():
+            for tolerance_px in (TOLERANCE_PX, None):
+                chosen[row(name, tolerance_px, backend)] = make(tolerance_px=tolerance_px, backend=backend)
+    chosen |= {name: make() for name, make in PHOTOMETRIC.items()}
+    timed = references(frame)
+    for name in (*WARPS, ALL):
+        flow = (WARPS | {ALL: all_warps})[name](tolerance_px=TOLERANCE_PX).degrade(frame, seed=0).flow
+        timed[f"{GRID_SAMPLE} along {name}"] = partial(
+            F.grid_sample, frame, sampling_grid(flow), mode="bilinear", align_corners=False
+        )
+    return timed | {name: partial(effect, frame) for name, effect in chosen.items()}
 
 
-def _forward(effect: LensDistortion | UniformFog, frame: Tensor) -> tuple[Tensor, list[Tensor]]:
-    params = effect.sample(frame)
-    leaves = [value.detach().requires_grad_() if value.is_floating_point() else value for value in params]
-    made: Any = effect.apply(frame, type(params)(*leaves))
-    return made.image, [value for value in leaves if value.requires_grad]
+def row(name: str, tolerance_px: float | None, backend: str) -> str:
+    """Return the name of a warp's row."""
+    within = "exact" if tolerance_px is None else f"within {tolerance_px} px"
+    return f"{name}, {within}" + ("" if backend == "auto" else f", {backend}")
 
 
-def _forward_and_backward(effect: LensDistortion | UniformFog, frame: Tensor) -> Callable[[], tuple[Tensor, ...]]:
-    upstream = torch.rand_like(frame)
-
-    def call() -> tuple[Tensor, ...]:
-        image, leaves = _forward(effect, frame)
-        return torch.autograd.grad(image, leaves, upstream)
-
-    return call
+def speed_bars(timings: Sequence[Timing]) -> list[Bar]:
+    """Return the limits of the rows that were timed."""
+    ratios = {timing.name: timing.ratios[GRID_SAMPLE].median for timing in timings}
+    limits = {row(n, TOLERANCE_PX, b): limit for b, named in LIMITS.items() for n, limit in named.items()}
+    limits |= PHOTOMETRIC_LIMITS
+    return [Bar(n, ratios[n], "<=", limit, f"x {GRID_SAMPLE}") for n, limit in limits.items() if n in ratios]
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--size", type=size, default=(1080, 1920), help="height x width of the frame, 1080x1920")
-    parser.add_argument("--batch", type=count(1), default=1, help="frames at once, 1")
-    parser.add_argument("--threads", type=count(1), default=2, help="threads of torch on the CPU, 2")
-    parser.add_argument("--repeats", type=count(FEWEST_REPEATS), default=FEWEST_REPEATS, help="rounds, 15 or more")
-    parser.add_argument("--real", type=Path, help="a picture to use as the frame, instead of noise")
-    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"), help="cpu, or cuda")
-    parser.add_argument("--within", action="store_true", help=f"the warps within {TOLERANCE_PX} px alone")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "effects.json", help="the JSON")
-    return parser
+@dataclass(frozen=True)
+class Calls:
+    """Files and functions of the package that ran, and how often functions were entered."""
+
+    files: int
+    functions: int
+    calls: int
+
+
+def count_calls(call: Candidate) -> Calls:
+    """Count the files, functions and calls inside torchrefract during one call, by sys.setprofile.
+
+    Lambdas, comprehensions and generators count as functions, and each resumption of a generator as a call.
+    """
+    entered: dict[tuple[str, str], int] = {}
+
+    def profile(frame: Any, event: str, _: Any) -> None:
+        code = frame.f_code
+        if event == "call" and code.co_filename.startswith(PACKAGE):
+            key = code.co_filename, code.co_qualname
+            entered[key] = entered.get(key, 0) + 1
+
+    previous = sys.getprofile()
+    sys.setprofile(profile)
+    try:
+        call()
+    finally:
+        sys.setprofile(previous)
+    return Calls(len({file for file, _ in entered}), len(entered), sum(entered.values()))
+
+
+def call_bars() -> list[Bar]:
+    """Count the calls of a lens and of a composition, warm and on the first call of a new range."""
+    image = torch.rand(1, 3, *CALL_SIZE)
+    bars = []
+    for name, make in ((LENS, _lens), (COMPOSITION, _composition)):
+        warm = make(0.0)
+        for _ in range(3):
+            warm(image)
+        counts = [count_calls(lambda warm=warm: warm(image)) for _ in range(5)]
+        cold = make(1e-3)
+        first = count_calls(lambda cold=cold: cold(image))
+        for state, counted in (("warm", _median(counts)), ("first call of a new range", first)):
+            for unit, limit in zip(("files", "functions", "calls"), CALL_LIMITS[name], strict=True):
+                bars.append(Bar(f"{name}, {state}", getattr(counted, unit), "<=", limit, unit))
+    return bars
+
+
+def _lens(offset: float) -> Any:
+    return WARPS["mild lens"](center_x_range=(-0.01 - offset, 0.01), tolerance_px=TOLERANCE_PX)
+
+
+def _composition(offset: float) -> Any:
+    lens = tr.LensDistortion(center_x_range=(-0.01 - offset, 0.01))
+    return tr.Compose([lens, tr.ThinPlateSpline(), tr.Turbulence(), tr.DivergenceFree(), tr.UniformFog()])
+
+
+def _median(counts: Sequence[Calls]) -> Calls:
+    return Calls(*(round(median(getattr(c, unit) for c in counts)) for unit in ("files", "functions", "calls")))
 
 
 if __name__ == "__main__":

@@ -1,15 +1,10 @@
-"""How everything here is timed: candidates take turns in one process, and each is told as a multiple of a reference.
+"""Measure, print and save timings: what all benchmarks share.
 
-A round runs every candidate once, so that what disturbs the machine disturbs all alike; a ratio is taken within a
-round, and its median and quartiles over the rounds. The stretch that is timed follows two calls that are not, which
-bring memory and caches to the state that steady use of that candidate alone would have; a short candidate is called
-several times in it.
-
-Where the C library allows, memory that is freed stays with the process. By default glibc gives it back and takes it
-anew once enough is free at the top of its heap, which depends on what ran before: page faults would then be counted
-against any candidate that is unlucky.
+Candidates take turns in one process. A round runs each of them once, so that a disturbance of the machine affects all
+alike. A ratio is taken within a round; its median and quartiles are over the rounds.
 """
 
+import argparse
 import json
 import os
 import platform
@@ -17,6 +12,7 @@ import subprocess
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from statistics import quantiles
@@ -27,20 +23,48 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils import benchmark
 
-from torchrefract._io import replace_file
-from torchrefract._memory import keep_freed_memory
-from torchrefract.warping.grid import pixel_axes, sampler_grid
+import torchrefract as tr
+from torchrefract.data.images import fit, read_image
 
 Candidate = Callable[[], object]
 
 GRID_SAMPLE = "bare grid_sample"
 COPY = "copy of the frame"
+RESULTS = Path(__file__).parent / "results"
+TOLERANCE_PX = 0.05
 
-FEWEST_REPEATS = 15
-_STRETCH_S = 0.02  # a timed stretch lasts this long at least: far above the clock's grain and a thread's start
-_MOST_CALLS = 1000
+MIN_REPEATS = 15
+_SLOW_S = 0.5  # candidates that take longer run in the first _SLOW_REPEATS rounds only
+_SLOW_REPEATS = 3
+_STRETCH_S = 0.02  # shortest timed stretch, far above the resolution of the clock and the start of a thread
+_MAX_CALLS = 1000
 _REFERENCE_FLOW_PX = 4.0
-_OPENCV = ("opencv-contrib-python-headless", "opencv-contrib-python", "opencv-python-headless", "opencv-python")
+
+# Warps whose flow is smooth enough for a lattice; call with `tolerance_px` and other arguments of a warp.
+WARPS: Mapping[str, Callable[..., Any]] = {
+    "mild lens": partial(tr.LensDistortion, k1_range=(-0.25, -0.25), k2_range=(0.09, 0.09), focal_range=(0.9, 0.9)),
+    "thin-plate spline": tr.ThinPlateSpline,
+    "Gaussian turbulence": partial(tr.Turbulence, covariance="gaussian", length_range=(40.0, 60.0)),
+    "divergence-free": partial(tr.DivergenceFree, length_range=(40.0, 60.0)),
+}
+PHOTOMETRIC: Mapping[str, Callable[..., Any]] = {
+    "uniform fog": tr.UniformFog,
+    "heterogeneous fog": tr.HeterogeneousFog,
+    "volumetric fog": partial(tr.HeterogeneousFog, mode="ray", depth=tr.GroundPlaneDepth()),
+    "flare": tr.LensFlare,
+}
+
+
+def effects(tolerance_px: float | None = TOLERANCE_PX) -> dict[str, Any]:
+    """Return the warps within a tolerance and the photometric effects, by name."""
+    warps = {name: make(tolerance_px=tolerance_px) for name, make in WARPS.items()}
+    return warps | {name: make() for name, make in PHOTOMETRIC.items()}
+
+
+def all_warps(*, tolerance_px: float | None = None, **options: Any) -> tr.Compose:
+    """Return a composition of all warps, which samples the image once."""
+    warps = [make(tolerance_px=tolerance_px) for make in WARPS.values()]
+    return tr.Compose(warps, tolerance_px=tolerance_px, **options)
 
 
 @dataclass(frozen=True)
@@ -57,7 +81,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Timing:
-    """What one candidate took: ms a call, and multiples of each reference by its name."""
+    """Time of one candidate: ms for one call, and multiples of each reference by its name."""
 
     name: str
     calls: int  # in one timed stretch
@@ -67,7 +91,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Bar:
-    """What an issue asks for, beside what was measured."""
+    """A limit and the value that was measured against it."""
 
     name: str
     value: float
@@ -77,7 +101,7 @@ class Bar:
 
     @property
     def holds(self) -> bool:
-        """Whether the measured value keeps the limit."""
+        """Return True if the value satisfies the limit."""
         return self.value >= self.limit if self.sign == ">=" else self.value <= self.limit
 
     def __str__(self) -> str:
@@ -87,17 +111,16 @@ class Bar:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a timing depends on beside the code, None where it cannot be known."""
+    """Conditions of a run; None if unknown."""
 
     date: str
-    commit: str | None  # with "-dirty" behind it where tracked files differ from the commit
+    commit: str | None  # ends in "-dirty" if tracked files differ from the commit
     device: str
     cpu: str | None
-    keeps_freed_memory: bool
-    load: float | None  # of the machine when the run began: mean number of busy threads over a minute
+    load: float | None  # mean number of busy threads of the machine over the minute before
     torch: str
     python: str
-    opencv: str | None
+    packages: dict[str, str]  # versions of the packages that change timings
     threads: int
     repeats: int
     frame: tuple[int, ...]  # (B, C, H, W)
@@ -105,17 +128,16 @@ class Conditions:
 
     @staticmethod
     def now(frame: Tensor, *, threads: int, repeats: int) -> "Conditions":
-        """Those of a run that starts now, on this frame."""
+        """Return the conditions of a run that starts now on this frame."""
         return Conditions(
             date=datetime.now(UTC).isoformat(timespec="seconds"),
             commit=_commit(),
             device=torch.cuda.get_device_name(frame.device) if frame.device.type == "cuda" else frame.device.type,
             cpu=_cpu(),
-            keeps_freed_memory=keep_freed_memory(),
             load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
             torch=torch.__version__,
             python=platform.python_version(),
-            opencv=_opencv(),
+            packages={name: metadata.version(name) for name in ("numpy", "numba", "triton") if _is_installed(name)},
             threads=threads,
             repeats=repeats,
             frame=tuple(frame.shape),
@@ -126,125 +148,209 @@ class Conditions:
 def measure(
     candidates: Mapping[str, Candidate],
     *,
-    references: Sequence[str],
-    repeats: int = FEWEST_REPEATS,
+    references: Sequence[str] = (GRID_SAMPLE,),
+    repeats: int = MIN_REPEATS,
     threads: int = 1,
     clock: Callable[[], float] = benchmark.timer,
 ) -> list[Timing]:
-    """What each candidate takes, in their order.
+    """Time all candidates in turns and return their timings, in order.
+
+    Two untimed calls precede each timed stretch of a fast candidate, so that memory and caches are in the state of
+    steady use. A candidate that takes 0.5 s or more runs three times in all.
 
     Args:
-        candidates: what to call, by name.
-        references: the candidates that ratios are taken to.
-        repeats: rounds, at least 15.
-        threads: of torch, on the CPU.
-        clock: seconds; the default waits for an accelerator to finish before it looks.
+        candidates: functions to call, by name.
+        references: names of the candidates to divide by.
+        repeats: number of rounds, at least 15.
+        threads: number of torch's threads on the CPU.
+        clock: returns seconds; the default waits for an accelerator first.
 
     Raises:
-        ValueError: too few rounds; a reference that is no candidate.
-        RuntimeError: a candidate that fails, named.
+        ValueError: if there are too few rounds, or a reference is not a candidate.
+        RuntimeError: if a candidate fails; the message names it.
     """
-    if repeats < FEWEST_REPEATS:
-        raise ValueError(f"repeats must be at least {FEWEST_REPEATS}, got {repeats}")
-    if unknown := [name for name in references if name not in candidates]:
-        raise ValueError(f"references must be among the candidates, got {unknown}")
+    if repeats < MIN_REPEATS:
+        raise ValueError(f"repeats must be at least {MIN_REPEATS}, got {repeats}")
+    if missing := [name for name in references if name not in candidates]:
+        raise ValueError(f"references must be among the candidates, got {missing}")
+    previous = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        trials = {name: _seconds(name, call, 1, 1, clock) for name, call in candidates.items()}
+        is_slow = {name: trials[name] >= _SLOW_S and name not in references for name in candidates}
+        calls = {name: max(1, min(_MAX_CALLS, round(_STRETCH_S / max(trials[name], 1e-9)))) for name in candidates}
+        rounds = [
+            {
+                name: _seconds(name, call, calls[name], 0 if is_slow[name] else 2, clock)
+                for name, call in candidates.items()
+                if i < _SLOW_REPEATS or not is_slow[name]
+            }
+            for i in range(repeats)
+        ]
+    finally:
+        torch.set_num_threads(previous)
+    return [_timing(name, calls[name], [r for r in rounds if name in r], references) for name in candidates]
 
-    def seconds(name: str, calls: int) -> float:
-        timer = benchmark.Timer("call()", globals={"call": candidates[name]}, timer=clock, num_threads=threads)
-        try:
-            return timer.timeit(calls).median
-        except Exception as error:  # raised again, with the candidate's name
-            raise RuntimeError(f"candidate {name!r} failed: {type(error).__name__}: {error}") from error
 
-    calls = {name: _calls(seconds(name, 1)) for name in candidates}
-    rounds = [{name: seconds(name, calls[name]) for name in candidates} for _ in range(repeats)]
-    return [
-        Timing(
-            name,
-            calls[name],
-            milliseconds=_spread(1e3 * times[name] for times in rounds),
-            ratios={reference: _spread(times[name] / times[reference] for times in rounds) for reference in references},
-        )
-        for name in candidates
-    ]
+def _seconds(name: str, call: Candidate, number: int, warmup: int, clock: Callable[[], float]) -> float:
+    """Return the seconds of one call, as the mean of several after some untimed ones."""
+    try:
+        for _ in range(warmup):
+            call()
+        start = clock()
+        for _ in range(number):
+            call()
+        return (clock() - start) / number
+    except Exception as error:  # raised again with the name of the candidate
+        raise RuntimeError(f"candidate {name!r} failed: {type(error).__name__}: {error}") from error
+
+
+def _timing(name: str, calls: int, rounds: Sequence[Mapping[str, float]], references: Iterable[str]) -> Timing:
+    ratios = {reference: _spread([r[name] / r[reference] for r in rounds]) for reference in references}
+    return Timing(name, calls, _spread([1e3 * r[name] for r in rounds]), ratios)
 
 
 def references(frame: Tensor) -> dict[str, Candidate]:
-    """What the work on a frame (B, C, H, W) is held against: a bare bilinear F.grid_sample, and a copy.
+    """Return the references for a frame (B, C, H, W): a bare bilinear F.grid_sample and a copy.
 
-    The grid is ready made, contiguous, and looks up to 4 px inward, in the frame everywhere, as a weak lens does. On
-    the CPU F.grid_sample threads over the batch alone, so a single frame keeps one thread busy.
+    The grid is precomputed and contiguous. Like a weak lens, it samples up to 4 px toward the center, always inside the
+    frame. On the CPU, F.grid_sample uses one thread for each sample of the batch.
     """
-    grid = sampler_grid(_weak_lens(frame)).contiguous()
+    grid = sampling_grid(_weak_lens(frame))
     return {
         GRID_SAMPLE: lambda: F.grid_sample(frame, grid, mode="bilinear", align_corners=False),
         COPY: frame.clone,
     }
 
 
+def sampling_grid(flow: Tensor) -> Tensor:
+    """Return the grid of F.grid_sample(align_corners=False), (B, H, W, 2), for a flow (B, 2, H, W), px."""
+    height, width = flow.shape[2:]
+    x = torch.arange(width, dtype=flow.dtype, device=flow.device)
+    y = torch.arange(height, dtype=flow.dtype, device=flow.device)[:, None]
+    u, v = flow.unbind(1)
+    return torch.stack([(2 * (x + u) + 1) / width - 1, (2 * (y + v) + 1) / height - 1], dim=-1)
+
+
+def _weak_lens(frame: Tensor) -> Tensor:
+    """Return flow(p) = -a r^2 p / |p|_corner, (B, 2, H, W), px, with p from the center and r = 1 in the corners."""
+    batch, _, height, width = frame.shape
+    x = torch.arange(width, device=frame.device).float() - (width - 1) / 2
+    y = torch.arange(height, device=frame.device).float()[:, None] - (height - 1) / 2
+    corner = max((width - 1) ** 2 + (height - 1) ** 2, 1) ** 0.5 / 2
+    inward = -_REFERENCE_FLOW_PX / corner**3 * (x * x + y * y)
+    return torch.stack([inward * x, inward * y]).expand(batch, -1, -1, -1)
+
+
 def table(timings: Sequence[Timing], conditions: Conditions) -> str:
-    """The timings for a person to read, median and quartiles, under what they were taken with."""
-    held_against = list(timings[0].ratios)
-    head = ["candidate", "ms", *(f"x {name}" for name in held_against)]
-    rows = [[t.name, str(t.milliseconds), *(str(t.ratios[name]) for name in held_against)] for t in timings]
+    """Format the timings, median and quartiles, below the conditions of the run."""
+    names = list(timings[0].ratios)
+    head = ["candidate", "ms", *(f"x {name}" for name in names)]
+    rows = [[t.name, str(t.milliseconds), *(str(t.ratios[name]) for name in names)] for t in timings]
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in (head, *rows)]
     rule = "  ".join("-" * width for width in widths)
     return "\n".join([_describe(conditions), "", lines[0], rule, *lines[1:]])
 
 
-def save(path: Path, timings: Sequence[Timing], conditions: Conditions, *, what: str, bars: Sequence[Bar] = ()) -> None:
-    """A run as JSON, the file there whole or not at all; its folder is made.
+def save(
+    path: Path,
+    timings: Sequence[Timing],
+    conditions: Conditions,
+    *,
+    what: str,
+    bars: Sequence[Bar] = (),
+    **more: Any,
+) -> None:
+    """Write a run as JSON.
 
     Args:
-        path: the file.
+        path: the file; its folder is created.
         timings, conditions: of the run.
-        what: what was compared, in words.
-        bars: the limits it was held against.
+        what: description of what was measured.
+        bars: limits.
+        more: other entries of the file.
     """
-    content: dict[str, Any] = {
+    content = {
         "what": what,
         "conditions": asdict(conditions),
         "timings": [asdict(timing) for timing in timings],
         "bars": [asdict(bar) | {"holds": bar.holds} for bar in bars],
+        **more,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replace_file(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    print(f"written to {path}")
+
+
+def parser(description: str | None, *, out: Path) -> argparse.ArgumentParser:
+    """Return a parser with the options that the benchmarks share.
+
+    Args:
+        description: docstring of the script; its first line is the help text.
+        out: default path of the JSON file.
+    """
+    options = argparse.ArgumentParser(description=(description or "").splitlines()[0])
+    options.add_argument("--size", type=size, default=(1080, 1920), help="height x width of the frame, 1080x1920")
+    options.add_argument("--threads", type=count(1), default=2, help="threads of torch on the CPU, 2")
+    options.add_argument("--repeats", type=count(MIN_REPEATS), default=MIN_REPEATS, help="rounds, 15 or more")
+    options.add_argument("--real", type=Path, help="picture to use as the frame; the default is noise")
+    options.add_argument("--out", type=Path, default=out, help=f"JSON file to write, {out.name}")
+    return options
+
+
+def frame_of(path: Path | None, size: tuple[int, int]) -> Tensor:
+    """Return a picture cropped to a size, or noise if there is no path: (1, 3, H, W)."""
+    return torch.rand(1, 3, *size) if path is None else fit(read_image(path), size)[None].contiguous()
+
+
+def size(text: str) -> tuple[int, int]:
+    """Parse HEIGHTxWIDTH, px."""
+    height, width = _sides(text, 2, "HEIGHTxWIDTH in px")
+    return height, width
+
+
+def shape(text: str) -> tuple[int, ...]:
+    """Parse BATCHxCHANNELSxHEIGHTxWIDTH."""
+    return _sides(text, 4, "BATCHxCHANNELSxHEIGHTxWIDTH")
+
+
+def _sides(text: str, number: int, form: str) -> tuple[int, ...]:
+    sides = text.split("x")
+    if len(sides) != number or not all(side.isdecimal() and int(side) for side in sides):
+        raise argparse.ArgumentTypeError(f"must be {form}, got {text!r}")
+    return tuple(int(side) for side in sides)
+
+
+def count(low: int) -> Callable[[str], int]:
+    """Return a parser of whole numbers of at least `low`."""
+
+    def parse(text: str) -> int:
+        if not text.isdecimal() or int(text) < low:
+            raise argparse.ArgumentTypeError(f"must be a whole number of at least {low}, got {text!r}")
+        return int(text)
+
+    return parse
 
 
 def _digits(value: float) -> str:
-    """Three digits that count, none of them as a power of ten."""
+    """Format a number with three significant digits and without an exponent."""
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
-def _calls(seconds: float) -> int:
-    return max(1, min(_MOST_CALLS, round(_STRETCH_S / max(seconds, 1e-9))))
-
-
-def _spread(values: Iterable[float]) -> Spread:
+def _spread(values: Sequence[float]) -> Spread:
     lower, median, upper = quantiles(values, n=4, method="inclusive")
     return Spread(median, lower, upper)
 
 
-def _weak_lens(frame: Tensor) -> Tensor:
-    """(B, 2, H, W), px: flow(p) = -a r^2 p / |p|_corner, p from the center and r = 1 in the corners."""
-    batch, _, height, width = frame.shape
-    x, y = pixel_axes(height, width, dtype=torch.float32, device=frame.device)
-    x, y = x - (width - 1) / 2, y - (height - 1) / 2
-    corner = max((width - 1) ** 2 + (height - 1) ** 2, 1) ** 0.5 / 2
-    inward = -_REFERENCE_FLOW_PX / corner**3 * (x * x + y * y)
-    return torch.cat([inward * x, inward * y], dim=1).expand(batch, -1, -1, -1)
-
-
 def _describe(conditions: Conditions) -> str:
     c = conditions
-    busy = "" if c.load is None else f", load before {c.load:.1f}"
+    load = "" if c.load is None else f", load before {c.load:.1f}"
+    packages = "".join(f", {name} {version}" for name, version in c.packages.items())
     return "\n".join(
         [
             f"frame {'x'.join(map(str, c.frame))} {c.dtype}, {c.threads} threads, {c.repeats} rounds, on {c.device}",
-            f"{c.cpu}, torch {c.torch}, Python {c.python}, OpenCV {c.opencv}{busy}",
-            f"freed memory {'stays with the process' if c.keeps_freed_memory else 'goes as the C library has it'}",
+            f"{c.cpu}, torch {c.torch}, Python {c.python}{packages}{load}",
             f"{c.date}, commit {c.commit}; median (quartiles)",
         ]
     )
@@ -268,10 +374,9 @@ def _cpu() -> str | None:
     return next(names, platform.processor() or None)
 
 
-def _opencv() -> str | None:
-    for name in _OPENCV:
-        try:
-            return metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return None
+def _is_installed(name: str) -> bool:
+    try:
+        metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return False
+    return True

@@ -1,4 +1,10 @@
-"""Plain values that cross layers."""
+"""Plain values that cross layers, and the vocabulary of the library.
+
+Flow: (B, 2, H, W), px, backward: pixel p of the output shows the position p + flow(p) of the input.
+Restore flow: the flow that undoes a flow; warping the degraded image along it gives the clean image.
+Transmission: the share of the scene's light that reaches the camera, in [0, 1].
+Extinction: the rate at which fog attenuates light, 1/m.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -6,20 +12,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 Range = tuple[float, float]
-
-
 Map = Tensor | Callable[[], Tensor]
+
+# Maps of Degraded that photometric effects give.
 _LIGHT = ("transmission", "extinction", "intensity")
 
 
 class Inverse(NamedTuple):
-    """The flow that undoes a warp."""
+    """Inverse of a flow."""
 
     flow: Tensor  # (B, 2, H, W), px
-    valid: Tensor  # (B, 1, H, W), bool: where it does
+    valid: Tensor  # (B, 1, H, W), bool: the inverse exists and was computed
 
 
 @dataclass(frozen=True)
@@ -61,18 +68,30 @@ class Simplification(NamedTuple):
 
 
 class Folding(NamedTuple):
-    """What folding does to each sample of a batch."""
+    """Folding of each sample of a batch."""
 
     fraction: Tensor  # (B,), share of the pixels that lie on a fold
-    min_determinant: Tensor  # (B,), smallest Jacobian determinant, <= 0 where the map folds
+    min_determinant: Tensor  # (B,), smallest Jacobian determinant, <= 0 where the flow folds the image
+
+
+@dataclass(frozen=True)
+class FlowBounds:
+    """Upper bounds over the frame and a margin around it, for all flows of an error model; inf if unknown."""
+
+    max_displacement: float  # px
+    max_gradient: float  # px/px
+    max_second_derivative: float  # px/px^2
+    max_third_derivative: float  # px/px^3
+    # Strides, px, to bounds on the error of cubic interpolation through 4 nodes, px, wherever the nodes lie.
+    interpolation_error: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 class Frame(NamedTuple):
-    """A clean frame, or a batch of them, before any corruption.
+    """A clean frame, or a batch of frames.
 
     image: (3, H, W) or (B, 3, H, W), float in [0, 1].
-    key: () or (B,), int64, what the draw of a corruption depends on.
-    depth: (1, H, W) or (B, 1, H, W), metres, inf for the sky; an empty tensor where the source knows no depth.
+    key: () or (B,), int64; selects the random draw of the corruption.
+    depth: (1, H, W) or (B, 1, H, W), m, inf for the sky; an empty tensor if the depth is unknown.
     """
 
     image: Tensor
@@ -81,13 +100,13 @@ class Frame(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """A batch to learn a restoration from.
+    """A batch of degraded and clean frames to train a restoration model on.
 
     degraded, clean: (B, 3, H, W), float in [0, 1].
-    flow: (B, 2, H, W), px, with warp(degraded, flow) = clean; zero where the corruption moves nothing.
-    valid: (B, 1, H, W), bool, the pixels that the degraded image can still give back.
-    key: (B,), int64, the key that the corruption was drawn with.
-    transmission: (B, 1, H, W) in [0, 1], the share of the clean light that arrives; (B, 0) where none is asked for.
+    flow: (B, 2, H, W), px, with warp(degraded, flow) = clean; zero if the corruption has no flow.
+    valid: (B, 1, H, W), bool, the pixels of the clean image that the degraded image still shows.
+    key: (B,), int64, the key of the random draw.
+    transmission: (B, 1, H, W) in [0, 1], the share of the clean light that arrives; (B, 0) if it was not requested.
     """
 
     degraded: Tensor
@@ -99,27 +118,32 @@ class Pair(NamedTuple):
 
 
 class Degraded:
-    """What an effect makes of an image, with the maps that tell how; maps are computed when they are first read.
+    """A degraded image with its maps, each of which is computed when it is first read.
 
-    image: as the input, (B, C, H, W), (C, H, W) or (B, T, C, H, W); the maps have the same dimensions before C.
-    params: what was drawn, a NamedTuple of tensors with a leading batch dimension; may be given as a function, too.
-    flow: (B, 2, H, W), px, makes the image from the clean one; None for an effect that moves nothing.
-    valid: (B, 1, H, W), bool, the pixels that show what the clean image holds.
-    restore_flow: (B, 2, H, W), px, warp(image, restore_flow) = clean on restore_valid; None without a flow.
+    image: as the input, (B, C, H, W), (C, H, W) or (B, T, C, H, W). Maps have the same dimensions before C, which are
+        (B, T) for clips.
+    params: the drawn parameters, a NamedTuple of tensors with a leading batch dimension.
+    flow: (B, 2, H, W), px, with warp(clean, flow) = image; None for an effect without a flow.
+    valid: (B, 1, H, W), bool, the pixels that show a part of the clean image.
+    restore_flow: (B, 2, H, W), px, with warp(image, restore_flow) = clean on restore_valid; None without a flow.
     restore_valid: (B, 1, H, W), bool; None without a flow.
-    folding: share of the pixels that lie on a fold of the flow, and its smallest Jacobian determinant, (B,) each,
-        counted on `valid`; None without a flow.
-    restore_residual: (B, 1, H, W), px, how far from its place each pixel is looked up when both flows are applied;
-        None without a flow.
-    transmission: (B, 1, H, W) in [0, 1], the share of the clean light that arrives; None without such a map.
-    extinction: (B, 1, H, W), 1/m, of the air, its mean along the ray of each pixel (the paper's k-map); None without
-        such a map.
-    intensity: (B, 1, H, W), light added; None without such a map.
+    folding: share of folded pixels and smallest Jacobian determinant of the flow on `valid`, (B,) each; None without a
+        flow.
+    restore_residual: (B, 1, H, W), px, distance between a pixel and where the flow and the restore flow together map
+        it; None without a flow.
+    transmission: (B, 1, H, W) in [0, 1], share of the clean light that arrives; None if the effect has no such map.
+    extinction: (B, 1, H, W), 1/m, mean extinction of the fog along the ray of each pixel; None if the effect has no
+        such map.
+    intensity: (B, 1, H, W), added light; None if the effect has no such map.
 
-    Of clips, (B, T, ...), the maps have the dimension of time too. Each map is given as a tensor or as a function that
-    computes it; what needs other maps is handed the result, so that nothing here holds the result itself and its memory
-    is free once it is let go; `restore_valid` is handed what `restore` says of where the flow back exists, too. Those
-    that can be None are typed Any: whoever knows the effect knows which maps it has.
+    Maps are typed Any where they may be None, since a caller knows which maps its effect has.
+
+    Args:
+        image, params: see above; `params` may be a function that returns them.
+        valid, flow, light: maps, or functions that compute them; `light` by name.
+        restore: computes the inverse flow from this result.
+        restore_valid: computes the map from this result and the validity of the inverse flow.
+        residual, folding: compute the map from this result.
     """
 
     def __init__(
@@ -137,12 +161,12 @@ class Degraded:
     ):
         self.image = image
         self._params = params
-        # Each a value, or a function of the result that computes it. Compilers cannot enter the lock of a cached
-        # property.
+        # Values, or functions of this result. Passing the result avoids a reference cycle, so that memory is freed at
+        # once. torch.compile does not support the lock of functools.cached_property.
         self._maps: dict[str, Any] = {
-            "valid": _of_result(valid),
-            "flow": _of_result(flow),
-            **{name: _of_result((light or {}).get(name)) for name in _LIGHT},
+            "valid": _from_result(valid),
+            "flow": _from_result(flow),
+            **{name: _from_result((light or {}).get(name)) for name in _LIGHT},
             "restored": restore,
             "restore_valid": restore_valid and (lambda result: restore_valid(result, result._read("restored").valid)),
             "restore_residual": residual,
@@ -151,63 +175,63 @@ class Degraded:
 
     @property
     def params(self) -> Any:
-        """What was drawn."""
+        """Return the drawn parameters."""
         if callable(self._params):
             self._params = self._params()
         return self._params
 
     @property
     def valid(self) -> Tensor:
-        """Where the image shows what the clean one holds."""
+        """Return the mask of pixels that show a part of the clean image."""
         return self._read("valid")
 
     @property
     def flow(self) -> Any:
-        """The flow that makes the image from the clean one."""
+        """Return the flow from the clean image, px."""
         return self._read("flow")
 
     @property
     def folding(self) -> Any:
-        """How much of the image is folded."""
+        """Return the folding of the flow."""
         return self._read("folding")
 
     @property
     def transmission(self) -> Any:
-        """The share of the clean light that arrives."""
+        """Return the share of the clean light that arrives."""
         return self._read("transmission")
 
     @property
     def extinction(self) -> Any:
-        """The extinction of the air, in 1/m."""
+        """Return the mean extinction along each ray, 1/m."""
         return self._read("extinction")
 
     @property
     def intensity(self) -> Any:
-        """Light added."""
+        """Return the added light."""
         return self._read("intensity")
 
     @property
     def restore_flow(self) -> Any:
-        """The flow that undoes the damage."""
+        """Return the inverse of the flow, px."""
         restored = self._read("restored")
         return None if restored is None else restored.flow
 
     @property
     def restore_valid(self) -> Any:
-        """Where it does."""
+        """Return the mask of pixels at which the restore flow gives the clean image."""
         return self._read("restore_valid")
 
     @property
     def restore_residual(self) -> Any:
-        """By how much it misses, in px."""
+        """Return the distance between each pixel and its position under both flows, px."""
         return self._read("restore_residual")
 
     def has(self, name: str) -> bool:
-        """Whether there is a map of this name, without computing it."""
+        """Return True if the effect has this map, without computing it."""
         return self._maps[name] is not None
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Degraded":
-        """A copy with `function` applied to each map, not to image and params; what is lazy stays so."""
+        """Return a copy with `function` applied to each map, lazily; image and params stay."""
 
         def later(name: str, mapped: Callable[[Any], Any] = function) -> Any:
             return None if self._maps[name] is None else lambda *_: mapped(self._read(name))
@@ -231,10 +255,10 @@ class Degraded:
         return value
 
     def __getstate__(self) -> dict[str, Any]:
-        """All maps computed: what is still to be computed cannot travel to another process."""
+        """Compute all maps, since functions cannot be pickled."""
         return self.__dict__ | {"_params": self.params, "_maps": {name: self._read(name) for name in self._maps}}
 
 
-def _of_result(value: Map | None) -> Any:
-    """A map's function as one of the result."""
+def _from_result(value: Map | None) -> Any:
+    """Return a map's function as a function of the result."""
     return (lambda _: value()) if callable(value) else value

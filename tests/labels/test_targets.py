@@ -33,7 +33,7 @@ def generator(seed: int = 0) -> torch.Generator:
 
 @pytest.fixture
 def wave(pixels, waves) -> Tensor:
-    """(2, H, W), px, a smooth flow."""
+    """Return a smooth flow, (2, H, W), px."""
     return waves(*pixels(*SIZE), 4.0, 15.0)[0].float()
 
 
@@ -59,7 +59,7 @@ def rotated_of(form: str) -> Any:
 
 
 def corner_set(boxes: Any) -> Tensor:
-    """(N, 4, 2): the corners of rotated boxes, from the lowest along a slanted line to the highest."""
+    """Return the corners of rotated boxes, (N, 4, 2), sorted along a slanted line."""
     corners = F.convert_bounding_box_format(boxes, new_format=tv.BoundingBoxFormat.XYXYXYXY)
     corners = corners.as_subclass(Tensor).reshape(-1, 4, 2)
     order = (corners[..., 0] + 0.37 * corners[..., 1]).argsort(dim=1)
@@ -67,7 +67,7 @@ def corner_set(boxes: Any) -> Tensor:
 
 
 def detection() -> dict[str, Any]:
-    """A sample with three boxes, of which the flip of a shift by 20 px leaves two."""
+    """Return a sample with three boxes, of which SHIFT leaves two."""
     boxes = boxes_of([[30.0, 5.0, 50.0, 20.0], [2.0, 3.0, 12.0, 9.0], [15.0, 20.0, 30.0, 30.0]])
     masks = torch.zeros(3, *SIZE, dtype=torch.uint8)
     for i, (x1, y1, x2, y2) in enumerate(boxes.long().tolist()):
@@ -78,62 +78,65 @@ def detection() -> dict[str, Any]:
 SHIFT = torch.tensor([20.0, 0.0]).view(2, 1, 1).expand(2, *SIZE)
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("form", PLAIN_FORMATS)
-@pytest.mark.parametrize(("flow", "flip"), [(hflip(), "horizontal_flip"), (vflip(), "vertical_flip")])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.int64])
-def test_boxes_are_flipped_as_torchvision_flips_them(form, flow, flip, dtype):
+@pytest.mark.parametrize(
+    ("flow", "flip", "dtype"),
+    [(hflip(), "horizontal_flip", torch.float32), (vflip(), "vertical_flip", torch.int64)],
+)
+def test_boxes_are_flipped_like_in_torchvision(form, flow, flip, dtype):
     boxes = boxes_of(torch.tensor([[10, 20, 30, 32], [0, 0, 64, 36], [1, 2, 7, 6]]).to(dtype), form)
-    moved = warp_labels(boxes, flow)
-    assert_close(moved.as_subclass(Tensor), getattr(F, flip)(boxes).as_subclass(Tensor), rtol=0, atol=2e-4)
-    assert (type(moved), moved.format, moved.canvas_size, moved.dtype) == (type(boxes), boxes.format, SIZE, dtype)
+    warped = warp_labels(boxes, flow)
+    assert_close(warped.as_subclass(Tensor), getattr(F, flip)(boxes).as_subclass(Tensor), rtol=0, atol=2e-4)
+    assert (type(warped), warped.format, warped.canvas_size, warped.dtype) == (type(boxes), boxes.format, SIZE, dtype)
 
 
 @pytest.mark.parametrize("form", ROTATED_FORMATS)
 @pytest.mark.parametrize(("flow", "flip"), [(hflip(), "horizontal_flip"), (vflip(), "vertical_flip")])
-def test_rotated_boxes_are_flipped_as_torchvision_flips_them(form, flow, flip):
+def test_rotated_boxes_are_flipped_like_in_torchvision(form, flow, flip):
     boxes = rotated_of(form)
-    moved = warp_labels(boxes, flow)
-    # The rectangles are the same; which of its corners comes first is not.
-    assert_close(corner_set(moved), corner_set(getattr(F, flip)(boxes)), rtol=0, atol=1e-3)
-    assert moved.format == boxes.format
+    warped = warp_labels(boxes, flow)
+    # The rectangles agree; the order of their corners does not.
+    assert_close(corner_set(warped), corner_set(getattr(F, flip)(boxes)), rtol=0, atol=1e-3)
+    assert warped.format == boxes.format
 
 
 @pytest.mark.parametrize("form", ROTATED_FORMATS)
-def test_rotated_boxes_stay_without_a_flow(form):
+def test_zero_flow_keeps_rotated_boxes(form):
     boxes = rotated_of(form)
-    moved = warp_labels(boxes, torch.zeros(2, *SIZE))
-    assert_close(moved.as_subclass(Tensor), boxes.as_subclass(Tensor), rtol=0, atol=1e-3)
+    warped = warp_labels(boxes, torch.zeros(2, *SIZE))
+    assert_close(warped.as_subclass(Tensor), boxes.as_subclass(Tensor), rtol=0, atol=1e-3)
 
 
-def test_rotated_boxes_hold_the_warped_outline(wave):
+def test_rotated_boxes_are_the_tightest_around_their_warped_outline(wave):
     boxes = rotated_of("XYXYXYXY")
     corners = boxes.as_subclass(Tensor).reshape(-1, 4, 2)
     t = torch.linspace(0, 1, 50)[:, None]
     outline = torch.cat([corners[:, k, None] * (1 - t) + corners[:, (k + 1) % 4, None] * t for k in range(4)], dim=1)
-    landed = warp_points(outline.reshape(1, -1, 2) - 0.5, wave[None])[0].view(outline.shape) + 0.5
-    moved = warp_labels(boxes, wave).as_subclass(Tensor).reshape(-1, 4, 2)
-    origin, axes = moved[:, :1], torch.stack([moved[:, 1] - moved[:, 0], moved[:, 3] - moved[:, 0]], dim=1)
+    outline_points = warp_points(outline.reshape(1, -1, 2) - 0.5, wave[None])[0].view(outline.shape) + 0.5
+    warped = warp_labels(boxes, wave).as_subclass(Tensor).reshape(-1, 4, 2)
+    origin, axes = warped[:, :1], torch.stack([warped[:, 1] - warped[:, 0], warped[:, 3] - warped[:, 0]], dim=1)
     assert_close((axes[:, 0] * axes[:, 1]).sum(dim=1), torch.zeros(3), rtol=0, atol=1e-3)
-    share = ((landed - origin)[:, :, None] * axes[:, None]).sum(dim=-1) / axes.square().sum(dim=-1)[:, None]
+    share = ((outline_points - origin)[:, :, None] * axes[:, None]).sum(dim=-1) / axes.square().sum(dim=-1)[:, None]
     assert share.min() > -0.01
     assert share.max() < 1.01
-    # Each side touches it.
+    # Each side touches the outline.
     assert share.amin(dim=1).max() < 0.01
     assert share.amax(dim=1).min() > 0.99
 
 
 @pytest.mark.parametrize(("flow", "flip"), [(hflip(), "horizontal_flip"), (vflip(), "vertical_flip")])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.int64])
-def test_keypoints_are_flipped_as_torchvision_flips_them(flow, flip, dtype):
+def test_keypoints_are_flipped_like_in_torchvision(flow, flip, dtype):
     rows = torch.tensor([[[3, 4], [0, 0]], [[63, 35], [20, 30]], [[11, 7], [0, 35]]]).to(dtype)
     keypoints = tv.KeyPoints(rows, canvas_size=SIZE)
-    moved = warp_labels(keypoints, flow)
-    assert_close(moved.as_subclass(Tensor), getattr(F, flip)(keypoints).as_subclass(Tensor), rtol=0, atol=1e-4)
-    assert (type(moved), moved.canvas_size, moved.dtype) == (type(keypoints), SIZE, dtype)
+    warped = warp_labels(keypoints, flow)
+    assert_close(warped.as_subclass(Tensor), getattr(F, flip)(keypoints).as_subclass(Tensor), rtol=0, atol=1e-4)
+    assert (type(warped), warped.canvas_size, warped.dtype) == (type(keypoints), SIZE, dtype)
 
 
 @pytest.mark.parametrize("flow", [hflip(), vflip()])
-def test_images_and_masks_are_flipped_as_torchvision_flips_them(flow):
+def test_images_and_masks_are_flipped_like_in_torchvision(flow):
     flip = "horizontal_flip" if flow[0].any() else "vertical_flip"
     sample = [
         tv.Image(torch.randint(0, 256, (3, *SIZE), generator=generator(), dtype=torch.uint8)),
@@ -141,12 +144,12 @@ def test_images_and_masks_are_flipped_as_torchvision_flips_them(flow):
         tv.Mask(torch.randint(0, 20, SIZE, generator=generator())),
         tv.Mask(torch.rand(5, *SIZE, generator=generator()) > 0.5),
     ]
-    for leaf, moved in zip(sample, warp_labels(sample, flow), strict=True):
-        assert type(moved) is type(leaf)
-        assert torch.equal(moved, getattr(F, flip)(leaf))
+    for leaf, warped in zip(sample, warp_labels(sample, flow), strict=True):
+        assert type(warped) is type(leaf)
+        assert torch.equal(warped, getattr(F, flip)(leaf))
 
 
-def test_labels_follow_as_the_plain_functions_say(wave):
+def test_each_kind_of_label_matches_its_plain_function(wave):
     image, mask = torch.rand(3, *SIZE, generator=generator()), torch.randint(0, 9, (1, *SIZE), generator=generator())
     points, boxes = torch.tensor([[20.0, 10.0], [33.3, 21.7]]), torch.tensor([[10.0, 8.0, 30.0, 25.0]])
     sample = {
@@ -155,22 +158,22 @@ def test_labels_follow_as_the_plain_functions_say(wave):
         "points": tv.KeyPoints(points, canvas_size=SIZE),
         "boxes": boxes_of(boxes),
     }
-    moved = warp_labels(sample, wave, padding="border", interpolation="bicubic", mask_fill=255, drop=False)
-    assert torch.equal(moved["image"], warp(image, wave, padding="border", interpolation="bicubic")[0])
-    assert torch.equal(moved["mask"], warp_mask(mask, wave, fill=255))
-    assert torch.equal(moved["points"].as_subclass(Tensor), warp_points(points, wave)[0])
-    assert torch.equal(moved["boxes"].as_subclass(Tensor), warp_boxes(boxes - 0.5, wave)[0] + 0.5)
+    warped = warp_labels(sample, wave, padding="border", interpolation="bicubic", mask_fill=255, drop=False)
+    assert torch.equal(warped["image"], warp(image, wave, padding="border", interpolation="bicubic")[0])
+    assert torch.equal(warped["mask"], warp_mask(mask, wave, fill=255))
+    assert torch.equal(warped["points"].as_subclass(Tensor), warp_points(points, wave)[0])
+    assert torch.equal(warped["boxes"].as_subclass(Tensor), warp_boxes(boxes - 0.5, wave)[0] + 0.5)
 
 
-def test_floating_masks_are_soft_on_demand(wave):
+def test_soft_masks_apply_to_floating_masks_only(wave):
     mask = torch.rand(2, *SIZE, generator=generator())
     assert torch.equal(warp_labels(tv.Mask(mask), wave, soft_masks=True), warp_mask(mask, wave, soft=True))
     assert torch.equal(warp_labels(tv.Mask(mask), wave), warp_mask(mask, wave))
-    whole = tv.Mask(mask > 0.5)
-    assert torch.equal(warp_labels(whole, wave, soft_masks=True), warp_mask(mask > 0.5, wave))
+    binary = tv.Mask(mask > 0.5)
+    assert torch.equal(warp_labels(binary, wave, soft_masks=True), warp_mask(mask > 0.5, wave))
 
 
-def test_the_nesting_stays_and_what_is_plain_passes():
+def test_nesting_and_plain_values_are_kept():
     image, ids = (
         tv.Image(torch.randint(0, 256, (3, *SIZE), generator=generator(), dtype=torch.uint8)),
         torch.tensor([1, 2]),
@@ -180,44 +183,44 @@ def test_the_nesting_stays_and_what_is_plain_passes():
         image=OrderedDict(a=[image, (image, None)], b="name"),
         target={"ids": ids, "n": 3, "scale": 1.5, "path": Path("a/b"), "array": array, "empty": [], "flag": True},
     )
-    moved = warp_labels(sample, hflip())
-    assert type(moved) is Sample
-    assert type(moved.image) is OrderedDict
-    assert list(moved.image) == ["a", "b"]
-    assert type(moved.image["a"][1]) is tuple
-    assert torch.equal(moved.image["a"][1][0], F.horizontal_flip(image))
-    assert moved.image["a"][1][1] is None
-    assert moved.target["ids"] is ids
-    assert moved.target["array"] is array
-    rest = {key: moved.target[key] for key in ("n", "scale", "path", "empty", "flag")}
+    warped = warp_labels(sample, hflip())
+    assert type(warped) is Sample
+    assert type(warped.image) is OrderedDict
+    assert list(warped.image) == ["a", "b"]
+    assert type(warped.image["a"][1]) is tuple
+    assert torch.equal(warped.image["a"][1][0], F.horizontal_flip(image))
+    assert warped.image["a"][1][1] is None
+    assert warped.target["ids"] is ids
+    assert warped.target["array"] is array
+    rest = {key: warped.target[key] for key in ("n", "scale", "path", "empty", "flag")}
     assert rest == {"n": 3, "scale": 1.5, "path": Path("a/b"), "empty": [], "flag": True}
 
 
 @pytest.mark.parametrize(
     "wrapped", [lambda d: d, lambda d: (tv.Image(torch.rand(3, *SIZE, generator=generator())), d), lambda d: {"x": [d]}]
 )
-def test_labels_and_masks_go_with_their_boxes(wrapped):
+def test_dropped_boxes_take_their_labels_and_masks_along(wrapped):
     sample = detection()
-    moved = warp_labels(wrapped(sample), SHIFT)
-    while not (isinstance(moved, dict) and "boxes" in moved):
-        moved = moved["x"] if isinstance(moved, dict) else moved[-1]
-    assert moved["boxes"].tolist() == [[10.0, 5.0, 30.0, 20.0], [0.0, 20.0, 10.0, 30.0]]
-    assert moved["labels"].tolist() == [7, 9]
-    assert torch.equal(moved["masks"], warp_mask(sample["masks"].as_subclass(Tensor)[[0, 2]], SHIFT))
-    assert moved["image_id"] == 42
-    assert type(moved["masks"]) is tv.Mask
+    warped = warp_labels(wrapped(sample), SHIFT)
+    while not (isinstance(warped, dict) and "boxes" in warped):
+        warped = warped["x"] if isinstance(warped, dict) else warped[-1]
+    assert warped["boxes"].tolist() == [[10.0, 5.0, 30.0, 20.0], [0.0, 20.0, 10.0, 30.0]]
+    assert warped["labels"].tolist() == [7, 9]
+    assert torch.equal(warped["masks"], warp_mask(sample["masks"].as_subclass(Tensor)[[0, 2]], SHIFT))
+    assert warped["image_id"] == 42
+    assert type(warped["masks"]) is tv.Mask
 
 
-def test_limits_drop_boxes_too():
-    moved = warp_labels(detection(), SHIFT, min_visibility=0.7)
-    assert moved["labels"].tolist() == [7]
-    moved = warp_labels(detection(), SHIFT, min_area=200)
-    assert moved["labels"].tolist() == [7]
-    moved = warp_labels(detection(), SHIFT, clip=False)
-    assert moved["boxes"].tolist() == [[10.0, 5.0, 30.0, 20.0], [-5.0, 20.0, 10.0, 30.0]]
+def test_boxes_below_the_limits_are_dropped():
+    warped = warp_labels(detection(), SHIFT, min_visibility=0.7)
+    assert warped["labels"].tolist() == [7]
+    warped = warp_labels(detection(), SHIFT, min_area=200)
+    assert warped["labels"].tolist() == [7]
+    warped = warp_labels(detection(), SHIFT, clip=False)
+    assert warped["boxes"].tolist() == [[10.0, 5.0, 30.0, 20.0], [-5.0, 20.0, 10.0, 30.0]]
 
 
-def test_without_dropping_torchvision_sanitizes_the_same_sample():
+def test_drop_matches_the_sanitizer_of_torchvision():
     sample = detection()
     kept = warp_labels(sample, SHIFT, drop=False)
     assert kept["labels"] is sample["labels"]
@@ -229,7 +232,7 @@ def test_without_dropping_torchvision_sanitizes_the_same_sample():
 
 
 @pytest.mark.parametrize("form", ROTATED_FORMATS)
-def test_rotated_boxes_that_are_not_seen_are_dropped_or_have_no_area(form):
+def test_invisible_rotated_boxes_are_dropped_or_get_zero_area(form):
     flow = torch.tensor([25.0, 0.0]).view(2, 1, 1).expand(2, *SIZE)
     sample = {"boxes": rotated_of(form), "labels": torch.arange(3)}
     assert warp_labels(sample, flow)["labels"].tolist() == [1, 2]
@@ -238,46 +241,46 @@ def test_rotated_boxes_that_are_not_seen_are_dropped_or_have_no_area(form):
     assert (degenerate[1] - degenerate[1, :1]).abs().max() > 1
 
 
-def test_the_getter_says_what_goes_with_the_boxes():
+def test_labels_getter_selects_the_tensors_to_filter():
     sample = detection() | {"iscrowd": torch.tensor([0, 1, 2])}
-    moved = warp_labels(sample, SHIFT, labels_getter=lambda s: (s["labels"], s["iscrowd"]))
-    assert (moved["labels"].tolist(), moved["iscrowd"].tolist()) == ([7, 9], [0, 2])
-    moved = warp_labels(sample, SHIFT, labels_getter=None)
-    assert (len(moved["boxes"]), len(moved["labels"]), len(moved["masks"])) == (2, 3, 2)
-    moved = warp_labels({"boxes": sample["boxes"], "my_Label": sample["labels"]}, SHIFT)
-    assert moved["my_Label"].tolist() == [7, 9]
-    moved = warp_labels([sample["boxes"], sample["labels"]], SHIFT, labels_getter=lambda s: s[1])
-    assert moved[1].tolist() == [7, 9]
+    warped = warp_labels(sample, SHIFT, labels_getter=lambda s: (s["labels"], s["iscrowd"]))
+    assert (warped["labels"].tolist(), warped["iscrowd"].tolist()) == ([7, 9], [0, 2])
+    warped = warp_labels(sample, SHIFT, labels_getter=None)
+    assert (len(warped["boxes"]), len(warped["labels"]), len(warped["masks"])) == (2, 3, 2)
+    warped = warp_labels({"boxes": sample["boxes"], "my_Label": sample["labels"]}, SHIFT)
+    assert warped["my_Label"].tolist() == [7, 9]
+    warped = warp_labels([sample["boxes"], sample["labels"]], SHIFT, labels_getter=lambda s: s[1])
+    assert warped[1].tolist() == [7, 9]
     assert len(warp_labels(sample["boxes"], SHIFT)) == 2
 
 
-def test_keypoints_that_are_not_seen_lie_off_the_canvas_and_are_told():
+def test_invisible_keypoints_lie_off_the_canvas_and_clear_their_visibility():
     points = tv.KeyPoints(torch.tensor([[[30.0, 10.0], [5.0, 10.0]], [[50.0, 30.0], [0.0, 0.0]]]), canvas_size=SIZE)
     for shape in [(2, 2), (2, 2, 1)]:
         flags = torch.full(shape, 2)
-        moved = warp_labels({"points": points, "visibility": flags, "other": flags}, SHIFT)
-        assert moved["visibility"].flatten().tolist() == [2, 0, 2, 0]
-        assert moved["other"] is flags
-    assert moved["points"].tolist() == [[[10.0, 10.0], [-15.0, 10.0]], [[30.0, 30.0], [-20.0, 0.0]]]
+        warped = warp_labels({"points": points, "visibility": flags, "other": flags}, SHIFT)
+        assert warped["visibility"].flatten().tolist() == [2, 0, 2, 0]
+        assert warped["other"] is flags
+    assert warped["points"].tolist() == [[[10.0, 10.0], [-15.0, 10.0]], [[30.0, 30.0], [-20.0, 0.0]]]
     hole = torch.zeros(2, *SIZE)
     hole[:, 5:15, 25:35] = torch.nan
-    moved = warp_labels(points, hole)
-    assert moved.tolist() == [[[-1.0, -1.0], [5.0, 10.0]], [[50.0, 30.0], [0.0, 0.0]]]
-    singles = tv.wrap(moved.as_subclass(Tensor).reshape(-1, 2), like=moved)
+    warped = warp_labels(points, hole)
+    assert warped.tolist() == [[[-1.0, -1.0], [5.0, 10.0]], [[50.0, 30.0], [0.0, 0.0]]]
+    singles = tv.wrap(warped.as_subclass(Tensor).reshape(-1, 2), like=warped)
     assert v2.SanitizeKeyPoints()({"points": singles})["points"].tolist() == [[5.0, 10.0], [50.0, 30.0], [0.0, 0.0]]
 
 
-def test_keypoints_on_the_outer_half_of_the_border_pixels_are_on_the_canvas():
+def test_keypoints_on_the_outer_half_of_border_pixels_are_visible():
     rows = torch.tensor([[63.4, 20.0], [30.0, 35.4], [-0.4, -0.4], [63.6, 20.0], [5.0, 36.0]])
     points, flags = tv.KeyPoints(rows, canvas_size=SIZE), torch.ones(5)
-    moved = warp_labels({"points": points, "visible": flags}, torch.zeros(2, *SIZE))
-    assert torch.equal(moved["points"], points)
-    assert moved["visible"].tolist() == [1, 1, 1, 0, 0]
+    warped = warp_labels({"points": points, "visible": flags}, torch.zeros(2, *SIZE))
+    assert torch.equal(warped["points"], points)
+    assert warped["visible"].tolist() == [1, 1, 1, 0, 0]
     mirrored = warp_labels(points, hflip())
     assert_close(mirrored[:3].as_subclass(Tensor), F.horizontal_flip(points)[:3].as_subclass(Tensor))
 
 
-def test_a_list_of_samples_has_a_flow_for_each():
+def test_a_list_of_samples_takes_one_flow_each():
     flows = torch.stack([SHIFT, hflip()])
     samples = [(tv.Image(torch.rand(3, *SIZE, generator=generator())), detection()) for _ in range(2)]
     for i, (image, target) in enumerate(warp_labels(samples, flows)):
@@ -286,7 +289,7 @@ def test_a_list_of_samples_has_a_flow_for_each():
         assert all(torch.equal(target[key], alone[1][key]) for key in ("boxes", "labels", "masks"))
 
 
-def test_a_batch_of_maps_has_a_flow_for_each():
+def test_a_batch_of_labels_takes_one_flow_each():
     flows = torch.stack([SHIFT, hflip()])
     sample = {
         "image": tv.Image(torch.rand(2, 3, *SIZE, generator=generator())),
@@ -294,44 +297,44 @@ def test_a_batch_of_maps_has_a_flow_for_each():
         "mask": tv.Mask(torch.randint(0, 5, (2, *SIZE), generator=generator())),
         "points": tv.KeyPoints(torch.rand(2, 3, 2, generator=generator()) * 30, canvas_size=SIZE),
     }
-    moved = warp_labels(sample, flows)
-    for key, leaf in moved.items():
+    warped = warp_labels(sample, flows)
+    for key, leaf in warped.items():
         for i in range(2):
             alone = tv.wrap(sample[key].as_subclass(Tensor)[i], like=sample[key])
             assert torch.equal(leaf[i], warp_labels(alone, flows[i])), key
 
 
-def test_none_of_boxes_masks_or_keypoints_stay_none():
+def test_empty_boxes_masks_and_keypoints_stay_empty():
     sample = {
         "boxes": boxes_of(torch.zeros(0, 4)),
         "labels": torch.zeros(0, dtype=torch.int64),
         "masks": tv.Mask(torch.zeros(0, *SIZE, dtype=torch.bool)),
         "points": tv.KeyPoints(torch.zeros(0, 17, 2), canvas_size=SIZE),
     }
-    moved = warp_labels(sample, SHIFT)
+    warped = warp_labels(sample, SHIFT)
     for key, leaf in sample.items():
-        assert (type(moved[key]), moved[key].shape, moved[key].dtype) == (type(leaf), leaf.shape, leaf.dtype)
+        assert (type(warped[key]), warped[key].shape, warped[key].dtype) == (type(leaf), leaf.shape, leaf.dtype)
 
 
-def test_gradients_reach_soft_labels_and_the_flow(wave):
+def test_gradients_reach_the_flow_through_keypoints_and_boxes(wave):
     flow = wave.clone().requires_grad_()
     points = tv.KeyPoints(torch.tensor([[20.0, 10.0]]), canvas_size=SIZE)
-    moved = warp_labels({"points": points, "boxes": boxes_of([[10.0, 8.0, 30.0, 25.0]])}, flow)
-    for leaf in (moved["points"], moved["boxes"]):
+    warped = warp_labels({"points": points, "boxes": boxes_of([[10.0, 8.0, 30.0, 25.0]])}, flow)
+    for leaf in (warped["points"], warped["boxes"]):
         (gradient,) = torch.autograd.grad(leaf.as_subclass(Tensor).sum(), flow)
         assert gradient.isfinite().all()
         assert gradient.abs().sum() > 0.5
 
 
-def test_unknown_types_raise_and_are_named():
+def test_unsupported_types_raise_a_type_error():
     class Skeleton(tv.TVTensor):
-        """Of torchvision's kind, and none of its types."""
+        """Derive from the base class, not from one of its types."""
 
     class Tagged(Tensor):
-        """A tensor of somebody's own type."""
+        """Derive from Tensor outside torchvision."""
 
     class Polygons:
-        """No tensor at all."""
+        """Hold no tensor."""
 
     picture = pytest.importorskip("PIL.Image", reason="pillow is in the extra train").new("RGB", (SIZE[1], SIZE[0]))
     for leaf in (
@@ -341,18 +344,18 @@ def test_unknown_types_raise_and_are_named():
         picture,
         {1, 2},
     ):
-        with pytest.raises(TypeError, match=f"target must hold .*, got .*{type(leaf).__name__}"):
+        with pytest.raises(TypeError, match=f"target must hold .* got .*{type(leaf).__name__}"):
             warp_labels({"x": [1, leaf]}, SHIFT)
 
 
-def test_a_subclass_of_a_known_type_is_moved_and_kept():
+def test_subclasses_of_tv_tensors_are_warped_and_keep_their_type():
     class Road(tv.Mask):
-        """A mask by another name."""
+        """Rename a mask."""
 
     mask = torch.randint(0, 5, SIZE, generator=generator()).as_subclass(Road)
-    moved = warp_labels(mask, hflip())
-    assert type(moved) is Road
-    assert torch.equal(moved.as_subclass(Tensor), mask.as_subclass(Tensor).flip(-1))
+    warped = warp_labels(mask, hflip())
+    assert type(warped) is Road
+    assert torch.equal(warped.as_subclass(Tensor), mask.as_subclass(Tensor).flip(-1))
 
 
 BOXES = boxes_of([[1.0, 2.0, 3.0, 4.0]])
@@ -360,7 +363,7 @@ SMALL = tv.KeyPoints(torch.zeros(1, 2), canvas_size=(5, 5))
 
 
 @pytest.mark.parametrize(
-    ("target", "options", "kind", "rule"),
+    ("target", "options", "error", "message"),
     [
         (1, {"flow": torch.zeros(5, 6)}, ValueError, r"flow must have shape \(2, H, W\)"),
         (1, {"flow": 3}, TypeError, "flow must be a tensor, got int"),
@@ -375,26 +378,24 @@ SMALL = tv.KeyPoints(torch.zeros(1, 2), canvas_size=(5, 5))
         (1, {"min_size": 3}, TypeError, "min_size"),
         (tv.Mask(torch.zeros(5, 5)), {}, ValueError, "Mask must have the size of the flow"),
         (tv.Mask(torch.zeros(SIZE)), {"mask_fill": torch.inf}, ValueError, "fill must be"),
-        (SMALL, {}, ValueError, r"KeyPoints must have the canvas of the flow, \(36, 64\), got \(5, 5\)"),
+        (SMALL, {}, ValueError, r"KeyPoints must have the canvas size of the flow, \(36, 64\), got \(5, 5\)"),
         ([BOXES, torch.arange(1)], {}, ValueError, "target must hold boxes in a dict with their labels"),
         ({"boxes": BOXES, "labels": torch.arange(2)}, {}, ValueError, "labels must have one row for each of the 1"),
-        ({"boxes": BOXES, "labels": "car"}, {}, TypeError, "labels must be a tensor for boxes to be dropped, got str"),
-        ({"boxes": BOXES, "labels": [3]}, {}, TypeError, "labels must be a tensor for boxes to be dropped, got list"),
-        ([{"boxes": BOXES, "Label": ()}], {}, TypeError, "label must be a tensor for boxes to be dropped, got tuple"),
-        ({"boxes": BOXES, "labels": {"a": torch.ones(1)}}, {}, TypeError, "labels must be a tensor .*, got dict"),
+        ({"boxes": BOXES, "labels": "car"}, {}, TypeError, "labels must be a tensor if drop=True, got str"),
+        ([{"boxes": BOXES, "Label": ()}], {}, TypeError, "label must be a tensor if drop=True, got tuple"),
         ({"p": tv.KeyPoints(torch.zeros(1, 2), canvas_size=SIZE), "visible": torch.ones(2)}, {}, ValueError, "visible"),
         ([1, 2, 3], {"flow": SHIFT[None]}, ValueError, "target must have one sample for each of the 1 flows, got 3"),
-        ({"boxes": BOXES}, {"flow": SHIFT[None]}, ValueError, "target must be a list of samples to hold boxes"),
-        (tv.Mask(torch.zeros(SIZE)), {"flow": SHIFT[None]}, ValueError, "target must have a batch of 1 like flow"),
+        ({"boxes": BOXES}, {"flow": SHIFT[None]}, ValueError, "target must be a list of samples if it holds"),
+        (tv.Mask(torch.zeros(SIZE)), {"flow": SHIFT[None]}, ValueError, "target must have the batch of the flow, 1"),
     ],
 )
-def test_what_does_not_fit_raises(target, options, kind, rule):
+def test_invalid_options_and_targets_raise(target, options, error, message):
     options = {"flow": SHIFT} | options
-    with pytest.raises(kind, match=rule):
+    with pytest.raises(error, match=message):
         warp_labels(target, **options)
 
 
-def test_torchvision_is_not_imported_for_plain_targets():
+def test_plain_targets_do_not_import_torchvision():
     code = """
 import sys, torch
 from torchrefract.labels.targets import warp_labels

@@ -1,1 +1,1 @@
-"""Labels that follow the image. Coordinates are px, and pixel centers are whole numbers."""
+"""Labels that follow a flow. Coordinates are in px; pixel centers have integer coordinates."""

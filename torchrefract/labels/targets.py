@@ -112,7 +112,7 @@ def warp_labels(
 
 
 def warp_moved_labels(target: Any, flow: Tensor) -> Any:
-    """Warp labels like `warp_labels`, but return samples whose flow is zero unchanged, even if boxes are off the frame."""
+    """Warp labels like `warp_labels`, but return samples whose flow is zero unchanged: neither clipped nor dropped."""
     return _warp_target(target, flow, _Options(keep_unmoved=True))
 
 

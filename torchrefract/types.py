@@ -74,18 +74,6 @@ class Folding(NamedTuple):
     min_determinant: Tensor  # (B,), smallest Jacobian determinant, <= 0 where the flow folds the image
 
 
-@dataclass(frozen=True)
-class FlowBounds:
-    """Upper bounds over the frame and a margin around it, for all flows of an error model; inf if unknown."""
-
-    max_displacement: float  # px
-    max_gradient: float  # px/px
-    max_second_derivative: float  # px/px^2
-    max_third_derivative: float  # px/px^3
-    # Strides, px, to bounds on the error of cubic interpolation through 4 nodes, px, wherever the nodes lie.
-    interpolation_error: Callable[[NDArray[np.float64]], NDArray[np.float64]]
-
-
 class Frame(NamedTuple):
     """A clean frame, or a batch of frames.
 
@@ -139,7 +127,7 @@ class Degraded:
     Maps are typed Any where they may be None, since a caller knows which maps its effect has.
 
     Args:
-        image, params: see above; `params` may be a function that returns them.
+        image, params: see above.
         valid, flow, light: maps, or functions that compute them; `light` by name.
         restore: computes the inverse flow from this result.
         restore_valid: computes the map from this result and the validity of the inverse flow.
@@ -160,25 +148,20 @@ class Degraded:
         light: Mapping[str, Map] | None = None,
     ):
         self.image = image
-        self._params = params
+        self.params = params
         # Values, or functions of this result. Passing the result avoids a reference cycle, so that memory is freed at
         # once. torch.compile does not support the lock of functools.cached_property.
         self._maps: dict[str, Any] = {
             "valid": _from_result(valid),
             "flow": _from_result(flow),
-            **{name: _from_result((light or {}).get(name)) for name in _LIGHT},
             "restored": restore,
             "restore_valid": restore_valid and (lambda result: restore_valid(result, result._read("restored").valid)),
             "restore_residual": residual,
             "folding": folding,
+            **dict.fromkeys(_LIGHT),
         }
-
-    @property
-    def params(self) -> Any:
-        """Return the drawn parameters."""
-        if callable(self._params):
-            self._params = self._params()
-        return self._params
+        for name, value in (light or {}).items():
+            self._maps[name] = _from_result(value)
 
     @property
     def valid(self) -> Tensor:
@@ -238,7 +221,7 @@ class Degraded:
 
         return Degraded(
             self.image,
-            lambda: self.params,
+            self.params,
             valid=lambda: function(self.valid),
             flow=later("flow"),
             restore=later("restored", lambda restored: Inverse(*map(function, restored))),
@@ -256,7 +239,7 @@ class Degraded:
 
     def __getstate__(self) -> dict[str, Any]:
         """Compute all maps, since functions cannot be pickled."""
-        return self.__dict__ | {"_params": self.params, "_maps": {name: self._read(name) for name in self._maps}}
+        return self.__dict__ | {"_maps": {name: self._read(name) for name in self._maps}}
 
 
 def _from_result(value: Map | None) -> Any:

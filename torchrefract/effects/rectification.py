@@ -3,7 +3,6 @@
 import warnings
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from torchrefract import random

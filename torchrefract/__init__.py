@@ -9,11 +9,10 @@ flows, which are backward and in pixels: out(p) = image(p + flow(p)).
 
 from torchrefract.cameras.models import Camera
 from torchrefract.effects.compose import Compose, ComposeParams
-from torchrefract.effects.defog import remove_fog
 from torchrefract.effects.depth import DepthProvider, GroundPlaneDepth, LinearDepth
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams
 from torchrefract.effects.flare import FlareParams, LensFlare
-from torchrefract.effects.fog import FogParams, UniformFog
+from torchrefract.effects.fog import FogParams, UniformFog, remove_fog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog, HeterogeneousFogParams
 from torchrefract.effects.lens import LensDistortion, LensParams
 from torchrefract.effects.one_of import OneOf

@@ -12,12 +12,12 @@ from torch.testing import assert_close
 
 from torchrefract import Camera, Compose, GroundPlaneDepth, HeterogeneousFog, LensFlare, LinearDepth, UniformFog
 from torchrefract.effects.depth import DepthProvider
-from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.fields.perlin import perlin_noise
 from torchrefract.fields.perlin_bounds import VARIANCE, error_between, mean_variance
 from torchrefract.fields.perlin_drawn import Coarse, Drawn, drawn_noise
 from torchrefract.fields.perlin_lattice import octave
+from torchrefract.planning.photometric import LightPlan
 from torchrefract.warping.lattice import Lattice, between_nodes
 
 SIZE = (96, 144)

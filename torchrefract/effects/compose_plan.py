@@ -22,10 +22,10 @@ import torch
 from torchrefract.effects.base import Effect
 from torchrefract.effects.composite_errors import SELDOM, Error, Share, errors_of
 from torchrefract.effects.lattice_warp import LatticeWarp
-from torchrefract.effects.light_plan import LightPlan
 from torchrefract.effects.plan import Plan, PlanRequest
 from torchrefract.effects.planned_light import PlannedLight
 from torchrefract.effects.refraction import WarpEffect
+from torchrefract.planning.photometric import LightPlan
 
 # Of the tolerance, what flows may have of it where their composite is known seldom, as is tried.
 _PARTS = (0.7, 0.55, 0.4)

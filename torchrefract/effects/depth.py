@@ -1,4 +1,4 @@
-"""Where depth comes from for an effect that is given none."""
+"""Depth providers: the depth of a frame if no depth map is passed in."""
 
 import math
 from abc import ABC, abstractmethod
@@ -12,16 +12,24 @@ from torchrefract.fields.depth import ground_plane_depth, linear_depth
 
 
 class DepthProvider(ABC):
-    """What knows the depth of a frame from its size alone; derive your own from it."""
+    """The depth of a frame of any size; derive your own provider from it."""
 
     @abstractmethod
     def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
-        """(1, 1, H, W), or (1, 1, H, 1) for rows of one depth, m along the camera's axis, inf for the sky."""
+        """Return the depth along the axis of the camera in m, inf for the sky.
+
+        Args:
+            height, width: px, of the frame.
+            dtype, device: of the result.
+
+        Returns:
+            (1, 1, H, W), or (1, 1, H, 1) if all pixels of a row have one depth.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)
 class LinearDepth(DepthProvider):
-    """The paper's depth, by row: d(y) = (1 - (y + 1/2) / H) max_depth.
+    """The ramp over the rows of the paper: d(y) = (1 - (y + 1/2) / H) max_depth.
 
     max_depth: m, at the top edge of the frame, in [0, 1e12].
     """
@@ -32,20 +40,20 @@ class LinearDepth(DepthProvider):
         object.__setattr__(self, "max_depth", check_number("max_depth", self.max_depth, low=0.0, high=1e12))
 
     def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+        """Return (1, 1, H, 1), m."""
         return linear_depth(height, self.max_depth, dtype=dtype, device=device)
 
 
 @dataclass(frozen=True, kw_only=True)
 class GroundPlaneDepth(DepthProvider):
-    """A flat road below the horizon, by row: the depth along the camera's axis, not along each pixel's ray.
+    """A flat road below the horizon: its depth along the axis of the camera, not along the ray of each pixel.
 
     camera_height: m, above the road.
     focal: focal length of a pinhole, widths of the frame.
-    horizon: where the horizon lies, 0 at the top edge of the frame and 1 at its bottom edge; it may lie outside, in
-        [-10, 10].
-    spread: standard deviation of the horizon, in heights of the frame, in [0, 10], where it is not known well: depth
-        then grows smoothly toward it and above it, instead of jumping there.
-    far: m, the largest depth, which is also that of the sky; may be inf.
+    horizon: its position, 0 at the top edge of the frame and 1 at its bottom edge, in [-10, 10].
+    spread: standard deviation of an uncertain horizon, in heights of the frame, in [0, 10]; depth then grows smoothly
+        across the horizon instead of jumping there.
+    far: m, the largest depth, which is that of the sky; may be inf.
     """
 
     camera_height: float = 1.3
@@ -62,6 +70,7 @@ class GroundPlaneDepth(DepthProvider):
         object.__setattr__(self, "far", check_number("far", self.far, low=1e-6, high=math.inf))
 
     def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+        """Return (1, 1, H, 1), m."""
         return ground_plane_depth(
             height,
             camera_height=self.camera_height,

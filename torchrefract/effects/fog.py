@@ -1,35 +1,54 @@
-"""Fog of one density."""
+"""Fog of uniform density, and what all fogs share."""
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import exact_matmul
-from torchrefract._validation import check_range, finite_or
+from torchrefract._tensor import as_device_tensor, expand_batch
+from torchrefract._validation import (
+    check_color,
+    check_flag,
+    check_number,
+    check_range,
+    check_values,
+    check_within,
+    color_per_channel,
+    finite_or,
+)
 from torchrefract.cameras.models import Camera
-from torchrefract.effects.air import Air, check_fog_params, distances, make_air, squares
-from torchrefract.effects.base import params_to
-from torchrefract.effects.depth import DepthProvider
-from torchrefract.effects.fog_plan import FogPlan, Fogs, fog_plan
-from torchrefract.effects.plan import in_ranges
-from torchrefract.effects.planned_light import PlannedLight
-from torchrefract.effects.radiance import Shaded
-from torchrefract.effects.rows import column, expand_alike
-from torchrefract.fields.fog import extinction, transmission
+from torchrefract.effects.batch import BatchShape, check_image, from_batch, params_to, per_sample, to_batch
+from torchrefract.effects.depth import DepthProvider, LinearDepth
+from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
+from torchrefract.fields.depth import check_depth, check_floating, ray_distance
+from torchrefract.fields.fog import blend_fog, extinction, transmission, unblend_fog
+from torchrefract.planning.photometric import (
+    FogErrorModel,
+    PhotometricPlan,
+    PhotometricRequest,
+    in_ranges,
+    plan_uniform_fog,
+)
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 
-_ROUNDING = 2e-5
+_PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)
+_REC_709 = (0.2126, 0.7152, 0.0722)
+_GRAY = sum(weight * value for weight, value in zip(_REC_709, _PAPER_AIRLIGHT, strict=True))
+_FOCAL = 0.9  # widths of the frame, of the pinhole that stands in for an unknown camera
+_MIN_TRANSMISSION = 1 / 255  # of what 8 bits can recover
+_ROUNDING = 2e-5  # relative, of a drawn extinction
 _ENDLESS = 1e30  # m, of a visibility that float32 hardly holds
-_OPAQUE = 1e20  # 1/m: through so much of it nothing comes, and its products with depths are finite
+_OPAQUE = 1e20  # 1/m; no light passes, and products with depths stay finite
 
 
 class FogParams(NamedTuple):
-    """The fogs of a batch."""
+    """The parameters of uniform fog for a batch."""
 
     applied: Tensor  # (B,), bool: the sample is degraded
     visibility: Tensor  # (B,), m, above 0; inf is clear air
@@ -38,28 +57,174 @@ class FogParams(NamedTuple):
 
     to = params_to
 
+    @property
+    def is_identity(self) -> Tensor:
+        """Return (B,), bool: the air is clear."""
+        return self.visibility == torch.inf
 
-class UniformFog(PlannedLight):
-    """Fog of one density, after Koschmieder.
+
+@dataclass(frozen=True, kw_only=True)
+class FogMedium:
+    """The light of the fog and the distance through it, without its density; fields as arguments of `UniformFog`."""
+
+    airlight: tuple[float, ...] | None
+    threshold: float
+    depth: DepthProvider
+    camera: Camera | None
+    linear_light: bool
+
+    def __post_init__(self) -> None:
+        check_number("threshold", self.threshold, low=1e-6, high=1 - 1e-6)
+        if not isinstance(self.depth, DepthProvider):
+            raise TypeError(f"depth must be a depth provider such as LinearDepth(), got {type(self.depth).__name__}")
+        if self.camera is not None and not isinstance(self.camera, Camera):
+            raise TypeError(f"camera must be a Camera, got {type(self.camera).__name__}")
+        check_flag("linear_light", self.linear_light)
+
+    def __hash__(self) -> int:
+        # Depth providers may have no hash.
+        return hash((self.airlight, self.threshold, self.camera, self.linear_light))
+
+    @property
+    def colors(self) -> tuple[float, ...]:
+        """Return all values that the airlight can have."""
+        return (*_PAPER_AIRLIGHT, _GRAY) if self.airlight is None else tuple(self.airlight)
+
+    def airlight_of(self, image: Tensor, dtype: torch.dtype) -> Tensor:
+        """Return the airlight for images (B, C, H, W) as (B, C)."""
+        batch, channels = image.shape[:2]
+        if self.airlight is None:
+            color = _PAPER_AIRLIGHT if channels == 3 else [_GRAY] * channels
+        else:
+            color = color_per_channel("airlight", self.airlight, channels)
+        return as_device_tensor([color] * batch, dtype=dtype, device=image.device).view(batch, channels)
+
+    def distance(self, image: Tensor, depth: Tensor | None) -> Tensor:
+        """Return how far light travels to each pixel of images (N, C, H, W), along the rays if the camera is known.
+
+        Args:
+            image: gives the size.
+            depth: (N or B, 1, H, W), m; None takes that of the provider.
+
+        Returns:
+            (N, B or 1, 1, H, 1 or W), m.
+        """
+        dtype, (height, width) = field_dtype(image.dtype), image.shape[2:]
+        if depth is None:
+            depth = self.depth(height, width, dtype=dtype, device=image.device)
+        else:
+            check_depth(depth)
+            # On an accelerator nothing is read: invalid values become 0.
+            depth = depth.to(dtype).nan_to_num(nan=0.0, posinf=torch.inf).clamp(min=0)
+        if self.camera is None:
+            return depth
+        camera = self.camera.resized(width=width, height=height)
+        return ray_distance(depth, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy, width=width)
+
+    def pinhole(self, height: int, width: int) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return focal lengths and principal point in px; without a camera, those of a centered pinhole."""
+        if self.camera is None:
+            return (_FOCAL * width, _FOCAL * width), ((width - 1) / 2, (height - 1) / 2)
+        camera = self.camera.resized(width=width, height=height)
+        return (camera.fx, camera.fy), (camera.cx, camera.cy)
+
+    def extinction_range(self, visibility_range: Range, deviation_range: Range) -> Range:
+        """Return the lowest and the highest mean extinction in 1/m, with a margin for rounding."""
+        (near, far), (thin, dense) = visibility_range, deviation_range
+        scale = -math.log(self.threshold)
+        return scale / far * (1 + thin) * (1 - _ROUNDING), scale / near * (1 + dense) * (1 + _ROUNDING)
+
+    def error_model(
+        self, extinction_range: Range, height: int, width: int, *, has_depth: bool, **noise: Any
+    ) -> FogErrorModel:
+        """Return error bounds for a range of mean extinctions in 1/m.
+
+        Args:
+            extinction_range: 1/m.
+            height, width: px, of the frame.
+            has_depth: the depth is passed in, so that the distance has no bound.
+            noise: further fields of `FogErrorModel`.
+        """
+        largest = extinction_range[1]
+        farthest = math.inf if has_depth else _farthest(self, height, width)
+        thickness = largest * min(farthest, 1e12) if largest > 0 else 0.0
+        return FogErrorModel(thickness, self.colors, self.linear_light, **noise)
+
+    def mean_extinction(self, params: Any, dtype: torch.dtype) -> Tensor:
+        """Return k0 (1 + deviation) in 1/m, (B,); fog without a valid extinction is opaque."""
+        k = extinction(params.visibility.to(dtype), self.threshold) * (1 + params.deviation.to(dtype))
+        return k.nan_to_num(nan=_OPAQUE).clamp(0, _OPAQUE)
+
+    def params_in_range(self, params: Any, extinction_range: Range) -> Tensor:
+        """Return (), bool: extinction and airlight lie in the ranges."""
+        k = self.mean_extinction(params, params.visibility.dtype)
+        colors = [(min(self.colors), max(self.colors))] * params.airlight.shape[1]
+        return in_ranges(k[:, None], [extinction_range]) & in_ranges(params.airlight, colors)
+
+    def blend(self, image: Tensor, params: Any, distance: Tensor, k: Tensor, *, is_visible: bool) -> Rendered:
+        """Blend images (N, C, H, W) with fog of the extinction k, (N or B, 1, H or 1, W or 1), in 1/m.
+
+        Args:
+            image: clean.
+            params: with B rows; gives the airlight.
+            distance: (N, B or 1, 1, H, 1 or W), m.
+            k: 1/m.
+            is_visible: False returns the image as it is, and maps.
+        """
+        rows = max(k.shape[0], distance.shape[0])
+        if distance.shape[0] > 1:
+            distance = expand_batch(distance, rows)
+
+        def through() -> Tensor:
+            return transmission(distance, k if k.shape[0] == 1 else expand_batch(k, rows))
+
+        if not is_visible:
+            return Rendered(image, lambda: through() >= _MIN_TRANSMISSION, transmission=through, extinction=k)
+        t, batch = through(), image.shape[0]
+        airlight = finite_or(params.airlight.to(field_dtype(image.dtype)), 0.0)[:, :, None, None]
+        blended = blend_fog(
+            image,
+            t if t.shape[0] == 1 else expand_batch(t, batch),
+            expand_batch(airlight, batch),
+            linear_light=self.linear_light,
+        )
+        return Rendered(blended, lambda: t >= _MIN_TRANSMISSION, transmission=t, extinction=k)
+
+
+def make_medium(
+    *,
+    airlight: float | Sequence[float] | None,
+    threshold: float,
+    depth: DepthProvider | None,
+    camera: Camera | None,
+    linear_light: bool,
+) -> FogMedium:
+    """Make a medium from arguments as `UniformFog` takes them."""
+    color = None if airlight is None else check_color("airlight", airlight, high=1.0)
+    depth = LinearDepth() if depth is None else depth
+    return FogMedium(airlight=color, threshold=threshold, depth=depth, camera=camera, linear_light=linear_light)
+
+
+class UniformFog(PhotometricEffect):
+    """Fog of uniform density by Koschmieder's law.
 
         I = I_clean t + A (1 - t),  t = exp(-k d),  k = -ln(threshold) / V (1 + deviation)
 
-    `transmission` is t and `extinction` k; `valid` are the pixels that 8 bits can still recover, t >= 1/255, by
-    `remove_fog`.
+    `transmission` is t, `extinction` is k, and `valid` is t >= 1/255: the pixels that `remove_fog` can recover from
+    8 bits.
 
     Args:
         visibility_range: V in m, above 0, inf for clear air.
         deviation_range: relative deviation of the extinction, within (-1, 1).
-        airlight: color of the fog in [0, 1], one number for each channel or one for all; None is the paper's
+        airlight: color of the fog in [0, 1], one number for each channel or one for all; None is that of the paper,
             (220, 220, 235) / 255 for three channels and its luminance for any other number.
-        threshold: contrast left at the distance V, in (0, 1); 0.05 is the meteorological optical range.
-        depth: what gives d where no depth is passed in; None is `LinearDepth()`, the paper's ramp over the rows.
-        camera: of the frames; with it depth is taken along its axis and turned into the distance along each ray.
-        linear_light: blend radiance, not stored values (sRGB).
-        tolerance: how far the image may be from the exact one, levels of 1/255, so that pixels behind so much fog that
-            nothing is seen of them are filled with the airlight, those behind too little of it left as they are, and t
-            is a polynomial along the rows of a camera; see `plan`; None is exact. Maps stay exact.
-        p: chance that a sample is degraded at all.
+        threshold: contrast that remains at the distance V, in (0, 1); 0.05 is the meteorological optical range.
+        depth: gives d if no depth is passed in; None is `LinearDepth()`, the ramp over the rows of the paper.
+        camera: of the frames; with it, depth along its axis is converted to the distance along each ray.
+        linear_light: blend linear light, not stored values (sRGB).
+        tolerance: largest error of the image, levels of 1/255; fog too thin to be seen is not computed, see `plan`.
+            None is exact. Maps stay exact.
+        p: probability that a sample is degraded.
 
     Raises:
         ValueError: an argument outside its range; an airlight that does not fit the channels; a depth that is
@@ -67,6 +232,9 @@ class UniformFog(PlannedLight):
 
     Source: Koschmieder, "Theorie der horizontalen Sichtweite", 1924; colors and depth from the torchrefract paper.
     """
+
+    params_type = FogParams
+    maps = ("transmission", "extinction")
 
     def __init__(
         self,
@@ -82,133 +250,136 @@ class UniformFog(PlannedLight):
         p: float = 1.0,
     ):
         super().__init__(tolerance=tolerance, p=p)
-        self.visibility_range = check_visibility(visibility_range)
-        self.deviation_range = check_range("deviation_range", deviation_range, low=-0.999, high=0.999)
-        self.air = make_air(
+        self.visibility_range = check_visibility_range(visibility_range)
+        self.deviation_range = check_deviation_range(deviation_range)
+        self.medium = make_medium(
             airlight=airlight, threshold=threshold, depth=depth, camera=camera, linear_light=linear_light
         )
 
-    params_type = FogParams
-    maps = ("transmission", "extinction")
+    def sample_params(self, stream: random.Stream, image: Tensor) -> FogParams:
+        """Draw V and the deviation uniformly in their ranges."""
+        ranges = [visibility_to_uniform(self.visibility_range), self.deviation_range]
+        applied, values = self.draw_in_ranges(stream, ranges, image)
+        visibility = visibility_from_uniform(values[:, 0], self.visibility_range)
+        return FogParams(applied, visibility, values[:, 1], self.medium.airlight_of(image, values.dtype))
 
-    def at_rest(self) -> bool:
-        """Whether all air is clear."""
-        return self.visibility_range[0] == math.inf
-
-    def draw(self, source: random.Stream, image: Tensor) -> FogParams:
-        """One fog a sample; V and the deviation are uniform in their ranges."""
-        applied, values = self._uniform(source, [visibility_span(self.visibility_range), self.deviation_range], image)
-        visibility = drawn_visibility(values[:, 0], self.visibility_range)
-        return FogParams(applied, visibility, values[:, 1], self.air.light(image, values.dtype))
-
-    def check(self, params: FogParams, image: Tensor) -> None:
-        """Raise for fogs that are none."""
+    def validate(self, params: FogParams, image: Tensor) -> None:
+        """Raise ValueError for invalid parameters."""
         check_fog_params(params, image)
 
-    def acts(self, params: FogParams) -> Tensor:
-        """The samples whose air is not clear."""
-        return params.visibility != torch.inf
-
     def params_in_range(self, params: FogParams) -> Tensor:
-        """(), bool: all fogs lie in the ranges."""
-        return fogs_lie_in(params, extinctions(self), self.air)
+        """Return (), bool: all parameters lie in the ranges."""
+        span = self.medium.extinction_range(self.visibility_range, self.deviation_range)
+        return self.medium.params_in_range(params, span)
 
-    def planned(self, height: int, width: int, dtype: torch.dtype, *, any_depth: bool = False) -> FogPlan:
-        """The plan for images of a type, from the ranges alone; for the depth of the effect, or for any."""
-        fogs = fogs_of(self, height, width, any_depth=any_depth)
-        return fog_plan(fogs, height, width, self.tolerance, dtype is torch.float64)
+    def make_plan(self, request: PhotometricRequest, *, has_depth: bool) -> PhotometricPlan:
+        """Plan frames for the depth of the effect or, with `has_depth`, for any depth."""
+        span = self.medium.extinction_range(self.visibility_range, self.deviation_range)
+        model = self.medium.error_model(span, request.height, request.width, has_depth=has_depth)
+        return plan_uniform_fog(model, request)
 
-    def shade(self, image: Tensor, params: FogParams, depth: Tensor | None) -> Shaded:
-        """The rows behind the fog."""
-        return behind_fog(self.air, image, params, depth, self.plan_for(params, image, depth))
-
-
-def behind_fog(air: Air, image: Tensor, params: Any, depth: Tensor | None, plan: FogPlan) -> Shaded:
-    """Rows behind fog of one density, with a `visibility`, a `deviation` and an `airlight`, as planned."""
-    dtype = field_dtype(image.dtype)
-    k = column(mean_extinction(params, air, dtype))
-
-    def through(distance: Tensor) -> Tensor:
-        return transmission(distance, k) if distance.shape[0] == 1 else transmission(*expand_alike(distance, k))
-
-    def exact() -> Tensor:
-        return through(air.distance(image, depth))
-
-    if not plan.acts:
-        return Shaded(image, valid=lambda: exact() >= 1 / 255, transmission=exact, extinction=k)
-    airlight = finite_or(params.airlight.to(dtype), 0.0)
-    if plan.nodes is None:
-        t = exact()
-        blended = air.blended(image, t, airlight, plan.ends)
-        return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
-    places, weights = along_columns(air, image, plan.nodes)
-    t = exact_matmul(through(air.distance_at(places, image)), weights)
-    blended = air.blended(image, t, airlight, plan.ends)
-    return Shaded(blended, valid=lambda: exact() >= 1 / 255, transmission=exact, extinction=k)
+    def render(self, image: Tensor, params: FogParams, depth: Tensor | None) -> Rendered:
+        """Blend images with fog."""
+        is_visible = not self.plan_for(image, params, depth).is_identity
+        k = per_sample(self.medium.mean_extinction(params, field_dtype(image.dtype)))
+        return self.medium.blend(image, params, self.medium.distance(image, depth), k, is_visible=is_visible)
 
 
-def fogs_of(fog: Any, height: int, width: int, *, any_depth: bool) -> Fogs:
-    """Those of an effect with a `visibility_range`, a `deviation_range` and an `air`, before its own depth or any."""
-    if fog.tolerance is None or any_depth:
-        return Fogs(extinctions(fog), (0.0,) * height, (math.inf,) * height, None, fog.air.blend)
-    near, far = distances(fog.air, height, width)
-    return Fogs(extinctions(fog), near, far, squares(fog.air, height, width), fog.air.blend)
+def visibility_to_uniform(visibility_range: Range) -> Range:
+    """Return the range of the uniform number from which `visibility_from_uniform` makes V."""
+    near, far = visibility_range
+    # An infinite end has no uniform draw, so 1 / V is drawn.
+    return (1 / far, 1 / near) if far > _ENDLESS else visibility_range
 
 
-def extinctions(fog: Any) -> Range:
-    """1/m, of the fogs in the ranges of an effect, with room for rounding."""
-    (near, far), (thin, dense) = fog.visibility_range, fog.deviation_range
-    scale = -math.log(fog.air.threshold)
-    return scale / far * (1 + thin) * (1 - _ROUNDING), scale / near * (1 + dense) * (1 + _ROUNDING)
+def visibility_from_uniform(value: Tensor, visibility_range: Range) -> Tensor:
+    """Return V in m, (B,), of uniform numbers."""
+    return 1 / value if visibility_range[1] > _ENDLESS else value
 
 
-def mean_extinction(params: Any, air: Air, dtype: torch.dtype) -> Tensor:
-    """(B,), 1/m, of fogs with a `visibility` and a `deviation`; what is no number is a wall."""
-    k = extinction(params.visibility.to(dtype), air.threshold) * (1 + params.deviation.to(dtype))
-    return k.nan_to_num(nan=_OPAQUE).clamp(0, _OPAQUE)
-
-
-def fogs_lie_in(params: Any, span: Range, air: Air) -> Tensor:
-    """(), bool: fogs have an extinction in a range, and the light of this air."""
-    k = mean_extinction(params, air, params.visibility.dtype)
-    return in_ranges(k[:, None], [span]) & air.params_in_range(params.airlight)
-
-
-def along_columns(air: Air, image: Tensor, count: int) -> tuple[list[float], Tensor]:
-    """Where t is computed in each row, as squares of tangents, and the weights of these, (count, W).
-
-    At the zeros of a Chebyshev polynomial, and with the weights of Lagrange's.
-    """
-    height, width = image.shape[2:]
-    camera = cast(Camera, air.camera).resized(width=width, height=height)
-    options: Any = {"dtype": torch.float64, "device": image.device}
-    # Computed from numbers alone, for compilers, too.
-    low, high = (
-        f(abs(x - camera.cx) / camera.fx for x in (0, width - 1, min(max(round(camera.cx), 0), width - 1))) ** 2
-        for f in (min, max)
-    )
-    zeros = [math.cos(math.pi * (2 * j + 1) / (2 * count)) for j in range(count)]
-    at = ((torch.arange(width, **options) - camera.cx) / camera.fx).square()
-    u = (2 * at - low - high) / max(high - low, 1e-12)
-    weights = []
-    for j in range(count):
-        others = [(u - zero) / (zeros[j] - zero) for i, zero in enumerate(zeros) if i != j]
-        weights.append(math.prod(others, start=torch.ones_like(u)))
-    places = [(low + high) / 2 + zero * (high - low) / 2 for zero in zeros]
-    return places, torch.stack(weights).to(field_dtype(image.dtype))
-
-
-def check_visibility(value: Range) -> Range:
-    """The range of a visibility in m."""
+def check_visibility_range(value: Range) -> Range:
+    """Return a valid range of V in m."""
     return check_range("visibility_range", value, low=1e-6, high=torch.inf)
 
 
-def visibility_span(limits: Range) -> Range:
-    """What a uniform number is drawn from for `drawn_visibility`."""
-    # An infinite end has no uniform draw: 1/V is drawn there, as it has one.
-    return (1 / limits[1], 1 / limits[0]) if limits[1] > _ENDLESS else limits
+def check_deviation_range(value: Range) -> Range:
+    """Return a valid range of the relative deviation of the extinction."""
+    return check_range("deviation_range", value, low=-0.999, high=0.999)
 
 
-def drawn_visibility(value: Tensor, limits: Range) -> Tensor:
-    """(B,), m, from a number of `visibility_span`."""
-    return 1 / value if limits[1] > _ENDLESS else value
+def check_fog_params(params: Any, image: Tensor) -> None:
+    """Raise ValueError for an invalid visibility, deviation or airlight."""
+    if params.airlight.shape != image.shape[:2]:
+        raise ValueError(
+            f"params.airlight must have shape {tuple(image.shape[:2])}, got {tuple(params.airlight.shape)}"
+        )
+    for name in ("visibility", "deviation"):
+        if getattr(params, name).ndim != 1:
+            raise ValueError(f"params.{name} must have shape (B,), got {tuple(getattr(params, name).shape)}")
+    check_values("params.visibility", "be above 0", params.visibility, lambda v: v > 0)
+    check_values("params.deviation", "be above -1", params.deviation, lambda v: (v > -1) & v.isfinite())
+    check_within("params.airlight", params.airlight, 0.0, 1.0)
+
+
+@lru_cache(maxsize=64)
+def _farthest(medium: FogMedium, height: int, width: int) -> float:
+    """The largest distance in m by the depth provider."""
+    return medium.distance(torch.empty(1, 1, height, width, dtype=torch.float64), None).amax().item()
+
+
+def remove_fog(
+    image: Tensor, transmission: Tensor, airlight: float | Sequence[float] | Tensor, *, linear_light: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Remove fog of a known transmission: the inverse of every fog in closed form.
+
+        J = A + (I - A) / t where t >= 1/255, else I
+
+    A floating result is not clamped, so an image with noise may leave [0, 1].
+
+    Args:
+        image: (B, C, H, W), (C, H, W) or (B, T, C, H, W), floating, or uint8, which is converted, rounded and clamped.
+        transmission: t in [0, 1], (B, 1, H, W), (1, H, W) or (B, T, 1, H, W), or a shape that broadcasts to it.
+        airlight: A, color of the fog: one number in [0, 1], or one for each channel; (C,) or (B, C) as a tensor.
+        linear_light: the fog was blended in linear light, not in stored values (sRGB).
+
+    Returns:
+        The image, with the same shape, type and memory format, and valid, (B, 1, H, W) for (B, C, H, W), bool:
+        t >= 1/255.
+
+    Raises:
+        ValueError: shapes that do not fit; a transmission outside [0, 1] or NaN (on the CPU); an airlight out of range.
+        TypeError: an image that is neither floating nor uint8, a transmission that is no floating tensor.
+    """
+    shape = check_image(image)
+    check_flag("linear_light", linear_light)
+    foggy, t = to_batch(image), _transmission_to_batch(transmission, image, shape)
+    t = t.to(foggy.dtype)
+    valid = t >= _MIN_TRANSMISSION
+    color = _airlight_to_batch(airlight, foggy, shape)
+    clean = unblend_fog(foggy, torch.where(valid, t, 1), color, linear_light=linear_light)
+    clean = torch.where(valid & (t < 1), clean, foggy)
+    return from_batch(clean, image, foggy), shape.restore(valid.expand(foggy.shape[0], 1, *foggy.shape[2:]))
+
+
+def _transmission_to_batch(t: Tensor, image: Tensor, shape: BatchShape) -> Tensor:
+    """(N, 1, H or 1, W or 1)."""
+    full = (*shape.leading, 1, *image.shape[-2:])
+    size = check_floating("transmission", t).shape
+    if len(size) != len(full) or any(side not in (1, largest) for side, largest in zip(size, full, strict=True)):
+        raise ValueError(f"transmission must broadcast to {full} for this image, got {tuple(size)}")
+    check_values("transmission", "be in [0, 1]", t, lambda v: (v >= 0) & (v <= 1))
+    return t.expand(*shape.leading, -1, -1, -1).reshape(shape.batch * shape.frames, *size[-3:])
+
+
+def _airlight_to_batch(airlight: float | Sequence[float] | Tensor, image: Tensor, shape: BatchShape) -> Tensor:
+    """(N or 1, C, 1, 1) for images (N, C, H, W)."""
+    batch, channels = shape.batch, image.shape[1]
+    if isinstance(airlight, Tensor):
+        if airlight.shape not in ((channels,), (1, channels), (batch, channels)):
+            raise ValueError(
+                f"airlight must have shape ({channels},) or ({batch}, {channels}), got {tuple(airlight.shape)}"
+            )
+        check_values("airlight", "be finite", airlight, torch.isfinite)
+        return expand_batch(airlight.to(image.dtype).view(-1, channels), image.shape[0])[:, :, None, None]
+    numbers = color_per_channel("airlight", check_color("airlight", airlight, high=1.0), channels)
+    return as_device_tensor(numbers, dtype=image.dtype, device=image.device)[None, :, None, None]

@@ -1,108 +1,129 @@
-"""Fog in drifts and holes."""
+"""Fog whose density varies: over the image, or in space."""
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import as_device_tensor
-from torchrefract._validation import check_choice, check_number, check_positive, check_range, check_within, finite_or
-from torchrefract.cameras.models import Camera
-from torchrefract.effects.air import check_fog_params, distances, make_air
-from torchrefract.effects.base import params_to
-from torchrefract.effects.depth import DepthProvider
-from torchrefract.effects.drift_plan import DriftPlan, Drifts, drift_plan
-from torchrefract.effects.fog import (
-    behind_fog,
-    check_visibility,
-    drawn_visibility,
-    extinctions,
-    fogs_lie_in,
-    fogs_of,
-    mean_extinction,
-    visibility_span,
+from torchrefract._tensor import as_device_tensor, expand_batch
+from torchrefract._validation import (
+    check_choice,
+    check_number,
+    check_positive,
+    check_range,
+    check_values,
+    check_within,
 )
-from torchrefract.effects.fog_plan import fog_plan
+from torchrefract.cameras.models import Camera
+from torchrefract.effects.batch import params_to, per_sample
+from torchrefract.effects.depth import DepthProvider
+from torchrefract.effects.fog import (
+    check_deviation_range,
+    check_fog_params,
+    check_visibility_range,
+    make_medium,
+    visibility_from_uniform,
+    visibility_to_uniform,
+)
 from torchrefract.effects.motion import check_decorrelation, check_motion, check_wind, drawn_motion, motion_ranges, tame
-from torchrefract.effects.plan import in_ranges
-from torchrefract.effects.planned_light import PlannedLight
-from torchrefract.effects.radiance import Shaded
-from torchrefract.effects.random_field import check_key
-from torchrefract.effects.rows import column, expand_batch, frame_mean
-from torchrefract.effects.scales import check_scales, check_weights, chosen, periods, shares, stretched
-from torchrefract.effects.space_plan import space_plan
-from torchrefract.fields.fog import drifting_transmission_
-from torchrefract.fields.fog_volume import path_mean
-from torchrefract.fields.perlin_drawn import Coarse, Drawn, drawn_noise
-from torchrefract.fields.veils import Drifting
+from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
+from torchrefract.fields.fog_volume import mean_extinction_along_rays
+from torchrefract.fields.heterogeneous_fog import (
+    image_noise,
+    normalize_weights,
+    periods_in_frame,
+    relative_extinction,
+)
+from torchrefract.planning.photometric import (
+    PhotometricPlan,
+    PhotometricRequest,
+    in_ranges,
+    plan_image_fog,
+    plan_uniform_fog,
+    plan_volumetric_fog,
+)
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
-from torchrefract.warping.lattice import Lattice
 
-_FLATTEST, _STARKEST = 0.0, 2.0  # of the contrast
+# Scales and weights of the paper, for noise in the image.
+_PAPER_SCALES = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+_PAPER_WEIGHTS = (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)
+# Scales in m and weights of fog over a road: structures as long as a few cars have the largest variance.
+_ROAD_SCALES = (12.0, 24.0, 48.0, 96.0)
+_ROAD_WEIGHTS = (0.2, 0.3, 0.3, 0.2)
+_CONTRASTS = (0.0, 2.0)
 
 
 class HeterogeneousFogParams(NamedTuple):
-    """The fogs of a batch."""
+    """The parameters of heterogeneous fog for a batch."""
 
     applied: Tensor  # (B,), bool: the sample is degraded
     visibility: Tensor  # (B,), m, above 0, of the mean extinction; inf is clear air
     deviation: Tensor  # (B,), relative deviation of the mean extinction, above -1
     airlight: Tensor  # (B, C), in [0, 1], as stored in the image
     weights: Tensor  # (B, K), of the scales, at least 0 and not all 0
-    contrast: Tensor  # (B,), standard deviation of the logarithm of the extinction in space, 0 or above
+    contrast: Tensor  # (B,), standard deviation of the logarithm of the extinction in space, at least 0
     wind: Tensor  # (B, 3), per frame, to the right, down and ahead: m in space; px of the reference in the image
-    decorrelation: Tensor  # (B,), frames, above 0; inf for fog that only drifts
+    decorrelation: Tensor  # (B,), frames, above 0; inf for fog that only moves with the wind
     frame: Tensor  # (B, T), number of each frame in its clip
     key: Tensor  # (B, 4), int64, of the noise
 
     to = params_to
 
+    @property
+    def is_identity(self) -> Tensor:
+        """Return (B,), bool: the air is clear."""
+        return self.visibility == torch.inf
 
-class HeterogeneousFog(PlannedLight):
+
+class HeterogeneousFog(PhotometricEffect):
     """Fog whose density changes from place to place.
 
         I = I_clean t + A (1 - t),  t = exp(-k d),  k = k0 (1 + deviation) q / <q>,  k0 = -ln(threshold) / V
 
-    In the mode "image", the paper's, q is the sum of the weights times Perlin noise at each scale, in the plane of the
-    image: q = sum w_i (n_i / sqrt(1/2) + 1) / 2 / sum w_i. In the mode "ray" q is the mean along the ray of each pixel
-    up to its depth, through a field in space, exp(contrast g), g a sum of noises of unit variance: fog has depth, near
-    drifts pass faster than far ones. <q> is the mean over the frame, so that V is that of the mean extinction, as in
-    `UniformFog`. `transmission` is t, `extinction` is k, `valid` where t >= 1/255.
+    In the mode "image", that of the paper, q is a sum of Perlin noises n_i in the image plane, one at each scale:
+    q = sum w_i (n_i / sqrt(1/2) + 1) / 2 / sum w_i. In the mode "ray" (volumetric fog) q is the mean along the ray of
+    each pixel, up to its depth, of the field exp(contrast g) in space; g is a sum of noises of unit variance. Near fog
+    then moves faster than far fog. <q> is the mean over the frame, so V is that of the mean extinction, as in
+    `UniformFog`. `transmission` is t, `extinction` is k, and `valid` is t >= 1/255.
 
     Args:
         mode: "image" or "ray".
-        scales: of the noise, above 0; None is the paper's 4, 8, 16, 32, 64, 128 in the image, 12, 24, 48, 96 in space.
-        weights: one for each scale, 0 or above, not all 0; None are those that go with the scales of None.
-        scale_unit: of the scales in the image, "px" (periods, px of a frame `reference_width` wide) or "cells"
+        scales: of the noises, above 0; None is 4, 8, 16, 32, 64, 128 in the image (the paper), 12, 24, 48, 96 in space.
+        weights: one for each scale, at least 0, not all 0; None takes those that belong to the default scales.
+        scale_unit: of the scales in the image, "px" (periods in px of a frame `reference_width` wide) or "cells"
             (periods across the frame); in space they are in m.
         reference_width: px, see `scale_unit` and the wind.
         normalize: of each noise in the image: "theory" maps its bounds +-sqrt(1/2) to [0, 1], "image" its smallest and
-            largest value in the frame, as the paper has it, without a gradient of these.
-        mean: <q> is that over the "image", or over all of the "ensemble": 1/2 in the image; 1 in space, where it is
-            1 % less at a contrast of 1, 11 % at 2.
-        contrast_range: standard deviation of ln q at a point in space, in [0, 2]; 0 is a uniform fog.
-        reach: m, from which on fog in space is uniform.
-        wind_x_range, wind_y_range, wind_z_range: of the drift per frame of a clip, to the right, down and ahead, as
-            seen from the camera: m in space, where a car that goes v m per frame sees -v ahead; px of the reference in
+            largest value in the frame, as in the paper, without a gradient of these.
+        mean: <q> is the mean over the "image", or that of the "ensemble" of all fogs: 1/2 in the image; 1 in space,
+            where the true mean is 1 % less at a contrast of 1 and 11 % less at 2.
+        contrast_range: standard deviation of ln q at a point in space, in [0, 2]; 0 is uniform fog.
+        reach: m; beyond it volumetric fog is uniform.
+        wind_x_range, wind_y_range, wind_z_range: how far the fog moves per frame of a clip, to the right, down and
+            ahead, as seen by the camera: m in space, where a car at v m per frame sees -v ahead; px of the reference in
             the image, which has no z.
-        decorrelation_range: frames, above 0 or inf, until k in the wind is correlated by 1/e; one over it is uniform.
-        tolerance: how far the image may be from the exact one, levels of 1/255, so that pixels behind so much fog that
-            nothing is seen of them are filled with the airlight, those behind too little of it left as they are,
-            octaves in the image left out or known on a coarse lattice only, and fog whose drifts nobody sees is
-            uniform; see `plan`; None is exact. Octaves are all computed where normalize="image" or <q> may come near 0.
+        decorrelation_range: frames, above 0 or inf, until k in the wind has the correlation 1/e with itself; one over
+            it is uniform.
+        tolerance: largest error of the image, levels of 1/255: octaves that are too faint, and fog or a contrast that
+            cannot be seen, are not computed, see `plan`. None is exact. All octaves are computed for
+            normalize="image" and if <q> may come near 0.
         visibility_range, deviation_range, airlight, threshold, depth, camera, linear_light, p: as for `UniformFog`; the
-            rays of space are those of the camera, or of a pinhole of 0.9 widths.
+            rays in space are those of the camera, or of a pinhole with a focal length of 0.9 widths.
 
     Raises:
         ValueError: an argument outside its range; as for `UniformFog`.
 
     Source: the torchrefract paper; Zdrojewska, "Real time rendering of heterogenous fog based on the graphics hardware
-    acceleration", CESCG 2004; in space, Wronski, "Volumetric fog", SIGGRAPH 2014, for the volume before the camera.
+    acceleration", CESCG 2004; in space, Wronski, "Volumetric fog", SIGGRAPH 2014.
     """
+
+    params_type = HeterogeneousFogParams
+    maps = ("transmission", "extinction")
 
     def __init__(
         self,
@@ -132,162 +153,164 @@ class HeterogeneousFog(PlannedLight):
     ):
         super().__init__(tolerance=tolerance, p=p)
         self.mode = check_choice("mode", mode, ("image", "ray"))
-        self.visibility_range = check_visibility(visibility_range)
-        self.deviation_range = check_range("deviation_range", deviation_range, low=-0.999, high=0.999)
-        self.air = make_air(
+        self.visibility_range = check_visibility_range(visibility_range)
+        self.deviation_range = check_deviation_range(deviation_range)
+        self.medium = make_medium(
             airlight=airlight, threshold=threshold, depth=depth, camera=camera, linear_light=linear_light
         )
-        self.scales, self.weights = check_scales(scales, weights, mode=mode)
+        self.scales, self.weights = _check_scales(scales, weights, mode=mode)
         self.scale_unit = check_choice("scale_unit", scale_unit, ("px", "cells"))
         self.reference_width = check_positive("reference_width", reference_width)
         self.normalize = check_choice("normalize", normalize, ("theory", "image"))
         self.mean = check_choice("mean", mean, ("image", "ensemble"))
-        self.contrast_range = check_range("contrast_range", contrast_range, low=_FLATTEST, high=_STARKEST)
+        self.contrast_range = check_range("contrast_range", contrast_range, low=_CONTRASTS[0], high=_CONTRASTS[1])
         self.reach = check_number("reach", reach, low=1.0, high=1e5)
         self.wind_x_range = check_wind("wind_x_range", wind_x_range)
         self.wind_y_range = check_wind("wind_y_range", wind_y_range)
         self.wind_z_range = check_wind("wind_z_range", wind_z_range)
         if mode == "image" and self.wind_z_range != (0.0, 0.0):
-            raise ValueError(f"wind_z_range must be (0, 0) in the image, which has no depth, got {self.wind_z_range}")
+            raise ValueError(
+                f"wind_z_range must be (0, 0) for mode='image', which has no depth, got {self.wind_z_range}"
+            )
         self.decorrelation_range = check_decorrelation(decorrelation_range)
 
-    params_type = HeterogeneousFogParams
-    maps = ("transmission", "extinction")
-
-    def at_rest(self) -> bool:
-        """Whether all air is clear."""
-        return self.visibility_range[0] == math.inf
-
-    def draw(self, source: random.Stream, image: Tensor) -> HeterogeneousFogParams:
-        """One fog a sample, every number uniform in its range."""
+    def sample_params(self, stream: random.Stream, image: Tensor) -> HeterogeneousFogParams:
+        """Draw all parameters uniformly in their ranges, and the key of the noise."""
         winds = (self.wind_x_range, self.wind_y_range, self.wind_z_range)
-        ranges = [visibility_span(self.visibility_range), self.deviation_range, self.contrast_range]
+        ranges = [visibility_to_uniform(self.visibility_range), self.deviation_range, self.contrast_range]
         ranges += motion_ranges(*winds, decorrelation=self.decorrelation_range)
-        applied, values = self._uniform(source, ranges, image)
+        applied, values = self.draw_in_ranges(stream, ranges, image)
+        weights = as_device_tensor([self.weights] * image.shape[0], dtype=values.dtype, device=values.device)
         return HeterogeneousFogParams(
             applied,
-            drawn_visibility(values[:, 0], self.visibility_range),
+            visibility_from_uniform(values[:, 0], self.visibility_range),
             values[:, 1],
-            self.air.light(image, values.dtype),
-            as_device_tensor([self.weights] * image.shape[0], dtype=values.dtype, device=values.device).view(
-                -1, len(self.scales)
-            ),
+            self.medium.airlight_of(image, values.dtype),
+            weights.view(-1, len(self.scales)),
             values[:, 2],
             **drawn_motion(values[:, 3:]),
-            key=random.noise_key(source),
+            key=random.noise_key(stream),
         )
 
-    def check(self, params: HeterogeneousFogParams, image: Tensor) -> None:
-        """Raise for fogs that are none."""
+    def validate(self, params: HeterogeneousFogParams, image: Tensor) -> None:
+        """Raise ValueError for invalid parameters."""
         check_fog_params(params, image)
-        check_key(params)
+        if params.key.shape[1:] != (4,) or params.key.dtype is not torch.int64:
+            raise ValueError(f"params.key must be (B, 4) of int64, got {tuple(params.key.shape)} of {params.key.dtype}")
         check_motion(params, axes=3)
-        check_weights(params.weights, len(self.scales))
+        if params.weights.shape[1:] != (len(self.scales),):
+            raise ValueError(f"params.weights must be (B, {len(self.scales)}), got {tuple(params.weights.shape)}")
+        check_values("params.weights", "be at least 0 and finite", params.weights, lambda v: v.isfinite() & (v >= 0))
+        sums = params.weights.sum(dim=1)
+        check_values("params.weights", "have a sum above 0", sums, lambda v: v > 0)
+        check_values("params.weights", "have a finite sum", sums, torch.isfinite)
         if params.contrast.ndim != 1:
             raise ValueError(f"params.contrast must have shape (B,), got {tuple(params.contrast.shape)}")
-        check_within("params.contrast", params.contrast, _FLATTEST, _STARKEST)
-
-    def acts(self, params: HeterogeneousFogParams) -> Tensor:
-        """The samples whose air is not clear."""
-        return params.visibility != torch.inf
+        check_within("params.contrast", params.contrast, *_CONTRASTS)
 
     def params_in_range(self, params: HeterogeneousFogParams) -> Tensor:
-        """(), bool: all fogs lie in the ranges, and the weights are those of the effect."""
-        limits = [(share, share) for share in self._shares()]
-        own = in_ranges(shares(params.weights), limits) & in_ranges(params.contrast[:, None], [self.contrast_range])
-        return fogs_lie_in(params, extinctions(self), self.air) & own
+        """Return (), bool: fog and contrast lie in the ranges, and the weights are those of the effect."""
+        span = self.medium.extinction_range(self.visibility_range, self.deviation_range)
+        weights = in_ranges(normalize_weights(params.weights), [(weight, weight) for weight in self._unit_weights()])
+        contrast = in_ranges(params.contrast[:, None], [self.contrast_range])
+        return self.medium.params_in_range(params, span) & weights & contrast
 
-    def planned(self, height: int, width: int, dtype: torch.dtype, *, any_depth: bool = False) -> DriftPlan:
-        """The plan for images of a type, from the ranges alone; for the depth of the effect, or for any."""
-        known = self.tolerance is not None and not any_depth
-        farthest = max(distances(self.air, height, width)[1]) if known else math.inf
-        thickness = extinctions(self)[1] * min(farthest, 1e12)
-        lengths = self._periods(height, width) if self.mode == "image" else self.scales
-        drifts = Drifts(thickness, lengths, self._shares(), self.mean == "image", self.air.blend)
-        size, double = (height, width, self.tolerance), dtype is torch.float64
-        if self.mode == "ray" or self.normalize == "image":
-            plan = space_plan(drifts, self.contrast_range[1] if self.mode == "ray" else None, *size, double)
-        else:
-            plan = drift_plan(drifts, *size, double)
-        if not plan.is_uniform:
-            return plan
-        return plan.of_uniform(fog_plan(fogs_of(self, height, width, any_depth=any_depth), *size, double, plan.error))
+    def make_plan(self, request: PhotometricRequest, *, has_depth: bool) -> PhotometricPlan:
+        """Plan frames for the depth of the effect or, with `has_depth`, for any depth."""
+        size = (request.height, request.width)
+        span = self.medium.extinction_range(self.visibility_range, self.deviation_range)
+        model = self.medium.error_model(
+            span,
+            *size,
+            has_depth=has_depth,
+            mean_over_frame=self.mean == "image",
+            periods=self._periods(*size) if self.mode == "image" else (),
+            weights=self._unit_weights(),
+            contrast=self.contrast_range[1] if self.mode == "ray" else 0.0,
+        )
+        if self.mode == "ray":
+            return plan_volumetric_fog(model, request)
+        if self.normalize == "image":
+            # The mean of stretched noises may come near 0, so k has no bound.
+            return plan_uniform_fog(replace(model, thickness=model.thickness and math.inf), request)
+        return plan_image_fog(model, request)
 
-    def shade(self, image: Tensor, params: HeterogeneousFogParams, depth: Tensor | None) -> Shaded:
-        """The rows behind the fog."""
-        plan: DriftPlan = self.plan_for(params, image, depth)
-        if plan.is_uniform:
-            return behind_fog(self.air, image, params, depth, plan)
-        rows, dtype = image.shape[0], field_dtype(image.dtype)
-        distance = self.air.distance(image, depth)
-        mean_k = column(expand_batch(mean_extinction(params, self.air, dtype), rows))
-        distance = expand_batch(distance, rows) if distance.shape[0] > 1 else distance
+    def render(self, image: Tensor, params: HeterogeneousFogParams, depth: Tensor | None) -> Rendered:
+        """Blend images with fog."""
+        plan = self.plan_for(image, params, depth)
+        distance = self.medium.distance(image, depth)
+        k = per_sample(self.medium.mean_extinction(params, field_dtype(image.dtype)))
+        if plan.octaves != ():
+            rows = image.shape[0]
+            distance = expand_batch(distance, rows) if distance.shape[0] > 1 else distance
+            k = expand_batch(k, rows) * self._relative_extinction(params, distance, image, plan)
+        return self.medium.blend(image, params, distance, k, is_visible=not plan.is_identity)
 
-        def drifting() -> Drifting:
-            noise, share, offset = self._field(params, distance, image, plan)
-            return Drifting(noise, share * mean_k, offset * mean_k, distance)
-
-        def k() -> Tensor:
-            # Made again for who asks: kept, it would be a third of the image for who does not.
-            noise, scale, offset, _ = drifting()
-            return noise * scale + offset
-
-        def through() -> Tensor:
-            return drifting_transmission_(*drifting())
-
-        if not plan.acts:
-            return Shaded(image, valid=lambda: through() >= 1 / 255, transmission=through, extinction=k)
-        airlight = finite_or(params.airlight.to(dtype), 0.0)
-        blended, t = self.air.behind_drifts(image, drifting(), airlight, plan.ends)
-        return Shaded(blended, valid=lambda: t >= 1 / 255, transmission=t, extinction=k)
-
-    def _field(
-        self, params: HeterogeneousFogParams, distance: Tensor, image: Tensor, plan: DriftPlan
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """A noise n, (N, 1, H, W), a row for each of the image, and a and b, (N, 1, 1, 1), of q / <q> = a n + b."""
+    def _relative_extinction(
+        self, params: HeterogeneousFogParams, distance: Tensor, image: Tensor, plan: PhotometricPlan
+    ) -> Tensor:
+        """(N, 1, H, W): q / <q>."""
         rows, _, height, width = image.shape
         dtype = field_dtype(image.dtype)
         names = ("key", "weights", "contrast", "wind", "decorrelation")
         key, weights, contrast, wind, decorrelation = (expand_batch(getattr(params, name), rows) for name in names)
-        share = shares(weights.to(dtype))
+        weights = normalize_weights(weights.to(dtype))
         frame, wind, decorrelation = tame(params.frame.reshape(-1), wind, decorrelation)
         if self.mode == "image":
-            in_image = Drawn(key, frame, wind[:, :2] * (width / self.reference_width), decorrelation)
-            return self._in_image(in_image, share, plan)
-        focal, center = self.air.pinhole(height, width)
-        view: Any = {"height": height, "width": width, "focal": focal, "center": center, "reach": self.reach}
-        fog: Any = {"scales": self.scales, "weights": share, "contrast": contrast.to(dtype)}
-        motion: Any = {"frame": frame, "wind": wind, "decorrelation": decorrelation}
-        q = path_mean(key, distance, **view, **fog, **motion, dtype=dtype)
-        return q, self._inverse_mean(q, 1.0), q.new_zeros(1, 1, 1, 1)
+            q = image_noise(
+                key,
+                weights,
+                octaves=range(len(self.scales)) if plan.octaves is None else plan.octaves,
+                periods=self._periods(height, width),
+                height=height,
+                width=width,
+                frame=frame,
+                wind=wind[:, :2] * (width / self.reference_width),
+                decorrelation=decorrelation,
+                stretch=self.normalize == "image",
+            )
+            return relative_extinction(q, mean=None if self.mean == "image" else 0.5)
+        focal, center = self.medium.pinhole(height, width)
+        q = mean_extinction_along_rays(
+            key,
+            distance,
+            height=height,
+            width=width,
+            focal=focal,
+            center=center,
+            scales=self.scales,
+            weights=weights,
+            contrast=contrast.to(dtype),
+            frame=frame,
+            wind=wind,
+            decorrelation=decorrelation,
+            reach=self.reach,
+            dtype=dtype,
+        )
+        return relative_extinction(q, mean=None if self.mean == "image" else 1.0)
 
-    def _in_image(self, drawn: Drawn, share: Tensor, plan: DriftPlan) -> tuple[Tensor, Tensor, Tensor]:
-        """The paper's noise, for weights (N, K) of sum 1."""
-        size: Any = {"height": plan.height, "width": plan.width}
-        octaves = tuple(enumerate(self._periods(**size)))
-        if self.normalize == "image":
-            one = share.new_ones(share.shape[0], 1)
-            noises = (stretched(drawn_noise(drawn, [each], one, **size)) for each in octaves)
-            parts = [column(w) * noise for noise, w in zip(noises, share.unbind(1), strict=True)]
-            q = sum(parts[1:], parts[0])
-            return q, self._inverse_mean(q, 0.5), q.new_zeros(1, 1, 1, 1)
-        coarse = None
-        if plan.coarse:
-            lattice = Lattice(plan.height, plan.width, plan.stride)
-            coarse = Coarse([octaves[i] for i in plan.coarse], chosen(share, plan.coarse), lattice)
-        # q = 1/2 + n / sqrt(2), with the noise n.
-        fine = [octaves[i] for i in plan.fine]
-        noise = drawn_noise(drawn, fine, chosen(share, plan.fine), **size, coarse=coarse)
-        mean = 0.5 + frame_mean(noise) / math.sqrt(2) if self.mean == "image" else noise.new_full((1, 1, 1, 1), 0.5)
-        return noise, math.sqrt(0.5) / mean, 0.5 / mean
-
-    def _shares(self) -> tuple[float, ...]:
+    def _unit_weights(self) -> tuple[float, ...]:
         return tuple(weight / sum(self.weights) for weight in self.weights)
 
-    def _inverse_mean(self, q: Tensor, ensemble: float) -> Tensor:
-        return 1 / frame_mean(q) if self.mean == "image" else q.new_full((1, 1, 1, 1), 1 / ensemble)
-
     def _periods(self, height: int, width: int) -> tuple[float, ...]:
-        """Of the noises, px."""
-        size = {"height": height, "width": width}
-        return periods(self.scales, unit=self.scale_unit, reference_width=self.reference_width, **size)
+        return periods_in_frame(
+            self.scales, unit=self.scale_unit, reference_width=self.reference_width, height=height, width=width
+        )
+
+
+def _check_scales(
+    scales: Sequence[float] | None, weights: Sequence[float] | None, *, mode: str
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Valid scales and as many weights; None are the defaults of the mode."""
+    defaults = (_PAPER_SCALES, _PAPER_WEIGHTS) if mode == "image" else (_ROAD_SCALES, _ROAD_WEIGHTS)
+    if scales is None:
+        scales, weights = defaults[0], defaults[1] if weights is None else weights
+    scales = tuple(check_positive("scales", scale) for scale in scales)
+    if not scales:
+        raise ValueError("scales must be at least one number above 0, got none")
+    if weights is None or len(weights) != len(scales):
+        raise ValueError(f"weights must be one number for each of {len(scales)} scales, got {weights}")
+    weights = tuple(check_number("weights", weight, low=0.0) for weight in weights)
+    if sum(weights) <= 0:
+        raise ValueError(f"weights must have a sum above 0, got {weights}")
+    return scales, weights

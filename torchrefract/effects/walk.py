@@ -11,12 +11,12 @@ from torch import Tensor
 from torchrefract._validation import eager_bool, requires_grad
 from torchrefract.effects.base import Effect
 from torchrefract.effects.lattice_warp import LatticeWarp
-from torchrefract.effects.light_plan import LightPlan
+from torchrefract.effects.photometric_effect import RadianceEffect, clear_maps
 from torchrefract.effects.plan import Plan
-from torchrefract.effects.radiance import RadianceEffect, clear_maps
 from torchrefract.effects.refraction import Moved, WarpEffect, looked_up, moving, sees
 from torchrefract.effects.rows import column, expand_batch, where_active
 from torchrefract.effects.steps import Step, exact, on_grid
+from torchrefract.planning.photometric import LightPlan
 from torchrefract.types import Degraded
 from torchrefract.warping.compose import compose_flows
 from torchrefract.warping.grid import Positions, field_dtype, inside

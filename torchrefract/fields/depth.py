@@ -1,4 +1,4 @@
-"""Depth in meters: of a flat road, along the rays, out of other units, and what is no depth at all."""
+"""Depth in meters: of a flat road, along rays, converted from other units, and checked."""
 
 import math
 
@@ -8,17 +8,15 @@ from torch import Tensor
 from torchrefract._validation import check_number, check_positive, check_tensor, check_values, eager_values
 from torchrefract.warping.grid import field_dtype, pixel_axes
 
-# Farther than anything: from here on a depth is infinite, and has no gradient.
-_FARTHEST = 1e12
-# So many values of a sample tell what kind of map it is; fewer than these of its upper half tell nothing.
-_LOOKED_AT = 128 * 128
-_ENOUGH = 128
+_FARTHEST = 1e12  # m; beyond it a depth is infinite and has no gradient
+_NUM_CHECKED = 128 * 128  # values of a sample by which `check_depth` judges it
+_MIN_UPPER_HALF = 128  # values of its upper half; fewer are not judged
 
 
 def linear_depth(height: int, max_depth: float, *, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(1, 1, H, 1), m: d(y) = (1 - (y + 1/2) / H) D_max, from the far top row to the near bottom row."""
-    half = max_depth / (2 * height)
-    return torch.linspace(max_depth - half, half, height, dtype=dtype, device=device).view(1, 1, height, 1)
+    """Return d(y) = (1 - (y + 1/2) / H) max_depth in m, (1, 1, H, 1), from the far top row to the near bottom row."""
+    margin = max_depth / (2 * height)
+    return torch.linspace(max_depth - margin, margin, height, dtype=dtype, device=device).view(1, 1, height, 1)
 
 
 def ground_plane_depth(
@@ -32,39 +30,39 @@ def ground_plane_depth(
     dtype: torch.dtype,
     device: torch.device,
 ) -> Tensor:
-    """The depth of a flat road below the horizon, along the camera's axis; `far` at the horizon and above it.
+    """Return the depth of a flat road along the axis of the camera; `far` at the horizon and above it.
 
         z(y) = min(h sqrt(f^2 + (c_y - y_h)^2) / b, far),  y_h = horizon H - 1/2,  c_y = (H - 1) / 2
         b = max(y - y_h, 0),  or with s = spread H > 0 its mean (y - y_h) Phi(u) + s phi(u),  u = (y - y_h) / s
 
-    The camera is a pinhole that looks down by theta, tan(theta) = (c_y - y_h) / f, so sqrt(...) is f / cos(theta). With
-    a spread inverse depth is averaged over horizons that are normally distributed.
+    The camera is a pinhole that looks down by theta, tan(theta) = (c_y - y_h) / f, so sqrt(...) is f / cos(theta). A
+    spread averages inverse depth over normally distributed horizons.
 
     Args:
         height: px, of the frame, whose middle is the principal point.
         camera_height: m, h, above the road.
         focal_px: f.
-        horizon: where the horizon lies, 0 at the top edge of the frame and 1 at its bottom edge.
-        spread: standard deviation of that, 0 or above.
+        horizon: its position, 0 at the top edge of the frame and 1 at its bottom edge.
+        spread: standard deviation of the horizon, at least 0.
         far: m, the largest depth; may be inf.
 
     Returns:
         (1, 1, H, 1), m.
     """
     y_h = horizon * height - 0.5
-    # Next to the horizon float32 would lose the digits of the difference.
-    below = torch.arange(height, dtype=torch.float64, device=device) - y_h
-    z = camera_height * math.hypot(focal_px, (height - 1) / 2 - y_h) / _mean_positive(below, spread * height)
+    # Close to the horizon float32 would lose the digits of the difference.
+    rows_below = torch.arange(height, dtype=torch.float64, device=device) - y_h
+    z = camera_height * math.hypot(focal_px, (height - 1) / 2 - y_h) / _mean_positive(rows_below, spread * height)
     return z.clamp(max=far).to(dtype).view(1, 1, height, 1)
 
 
 def _mean_positive(value: Tensor, deviation: float) -> Tensor:
-    """The mean of max(X, 0) for a normal X of this mean and deviation."""
+    """The mean of max(X, 0) for a normal X with this mean and standard deviation."""
     if deviation == 0:
         return value.clamp(min=0)
     u = value / deviation
     density = torch.exp(-0.5 * u * u) / math.sqrt(2 * math.pi)
-    # Far above the horizon rounding could leave less than nothing.
+    # Far above the horizon rounding could make the sum negative.
     return (value * torch.special.ndtr(u) + deviation * density).clamp(min=0)
 
 
@@ -77,12 +75,12 @@ def ray_distance(
     cy: float | Tensor,
     width: int | None = None,
 ) -> Tensor:
-    """The distance along each pixel's ray of a depth along the camera's axis.
+    """Convert depth along the axis of the camera to the distance along the ray of each pixel.
 
-        d = z sqrt((1 + ((v - cy) / fy)^2) + ((u - cx) / fx)^2),  inf where z is
+        d = z sqrt((1 + ((v - cy) / fy)^2) + ((u - cx) / fx)^2),  inf where z is inf
 
     Args:
-        depth: (B, 1, H, W), or (B, 1, H, 1) for rows of one depth, m.
+        depth: (B, 1, H, W), or (B, 1, H, 1) if all pixels of a row have one depth, m.
         fx, fy, cx, cy: px, focal lengths and principal point of a pinhole; a number, or (B,).
         width: px, of the frame; None is that of the depth.
 
@@ -90,8 +88,8 @@ def ray_distance(
         (B, 1, H, W), m, float32, or float64 for such a depth.
 
     Raises:
-        ValueError: a shape that does not fit, a focal length that is not above 0, an intrinsic that is not finite.
-        TypeError: a depth that is no floating tensor.
+        ValueError: an invalid shape, a focal length that is not above 0, an intrinsic that is not finite.
+        TypeError: depth is not a floating tensor.
     """
     _check_rows("depth", depth, width)
     z = depth.to(field_dtype(depth.dtype))
@@ -107,9 +105,9 @@ def ray_distance(
 
 
 def depth_from_disparity(disparity: Tensor, *, focal_px: float, baseline: float) -> Tensor:
-    """Depth of the disparity of a rectified stereo pair.
+    """Convert the disparity of a rectified stereo pair to depth.
 
-        z = (f b) / disparity,  inf where the disparity is 0, or z would be above 1e12 m
+        z = (f b) / disparity,  inf where the disparity is 0 or z would be above 1e12 m
 
     Args:
         disparity: px, at least 0, of any shape.
@@ -117,11 +115,11 @@ def depth_from_disparity(disparity: Tensor, *, focal_px: float, baseline: float)
         baseline: m, b, between the two cameras.
 
     Returns:
-        As the disparity, m, float32, or float64 for such a disparity.
+        Depth in m, of the same shape, float32, or float64 for a float64 disparity.
 
     Raises:
         ValueError: a disparity that is negative or NaN (on the CPU); a focal length or baseline that is not above 0.
-        TypeError: a disparity that is no floating tensor.
+        TypeError: disparity is not a floating tensor.
     """
     product = check_positive("focal_px", focal_px) * check_positive("baseline", baseline)
     check_values("disparity", "be at least 0, in px", check_floating("disparity", disparity), lambda d: d >= 0)
@@ -129,7 +127,7 @@ def depth_from_disparity(disparity: Tensor, *, focal_px: float, baseline: float)
 
 
 def depth_from_normalized(value: Tensor, *, near: float, far: float) -> Tensor:
-    """Depth of a map in which 0 is near, 1 is far and all between is linear in depth.
+    """Convert a map that is linear in depth, 0 at `near` and 1 at `far`.
 
         z = near + value (far - near)
 
@@ -138,33 +136,33 @@ def depth_from_normalized(value: Tensor, *, near: float, far: float) -> Tensor:
         near, far: m, 0 <= near < far, both finite.
 
     Returns:
-        As the value, m, float32, or float64 for such a value.
+        Depth in m, of the same shape, float32, or float64 for a float64 map.
 
     Raises:
         ValueError: a value outside [0, 1] or NaN (on the CPU); a near or far out of range.
-        TypeError: a value that is no floating tensor.
+        TypeError: value is not a floating tensor.
     """
     near, far = check_number("near", near, low=0.0), check_number("far", far)
     return near + _unit(value, near, far) * (far - near)
 
 
 def depth_from_inverse(value: Tensor, *, near: float, far: float) -> Tensor:
-    """Depth of a map in which 1 is near, 0 is far and all between is linear in inverse depth.
+    """Convert a map that is linear in inverse depth, 1 at `near` and 0 at `far`.
 
         z = 1 / (value / near + (1 - value) / far),  inf where that would be above 1e12 m
 
-    Monocular networks such as MiDaS give such maps, once they are scaled to [0, 1].
+    Monocular networks such as MiDaS predict such maps, up to a scale to [0, 1].
 
     Args:
         value: in [0, 1], of any shape.
         near, far: m, 0 < near < far; far may be inf.
 
     Returns:
-        As the value, m, float32, or float64 for such a value.
+        Depth in m, of the same shape, float32, or float64 for a float64 map.
 
     Raises:
         ValueError: a value outside [0, 1] or NaN (on the CPU); a near or far out of range.
-        TypeError: a value that is no floating tensor.
+        TypeError: value is not a floating tensor.
 
     Source: Ranftl et al., "Towards Robust Monocular Depth Estimation", IEEE TPAMI 44 (2022).
     """
@@ -174,36 +172,37 @@ def depth_from_inverse(value: Tensor, *, near: float, far: float) -> Tensor:
 
 
 def check_depth(depth: Tensor, *, name: str = "depth") -> None:
-    """Raise for a depth that is not in meters, where looking costs no wait for a device.
+    """Raise ValueError if a depth is not in meters, as far as reading it costs no wait for a device.
 
-    Each sample, or clip, is judged by itself. Refused are what is negative or NaN, what looks normalized (all that is
-    finite lies in [0, 1], and is not the same everywhere), and what looks like disparity or inverse depth: nothing is
-    inf, a tenth of the upper half is at most 2 % of the largest value, and the median of the lowest quarter is at least
-    20 % of it. Frames of a few pixels are not judged by the latter.
+    Each sample or clip is judged alone. Invalid are negative values and NaN; maps that look normalized (all finite
+    values lie in [0, 1] and differ); and maps that look like disparity or inverse depth: no value is inf, a tenth of
+    the upper half is at most 2 % of the largest value, and the median of the lowest quarter is at least 20 % of it.
+    Frames of a few pixels are not tested for the latter.
 
     Args:
         depth: (B, 1, H, W) or (B, T, 1, H, W), m, inf for the sky.
         name: of the argument, for the message.
 
     Raises:
-        ValueError: a depth that is none.
+        ValueError: an invalid depth.
     """
     lowest = eager_values(lambda: depth.detach().amin(), of=depth) if depth.numel() else None
     if lowest is None:
         return
-    if not lowest >= 0:  # NaN is not either
+    if not lowest >= 0:  # also for NaN
         check_values(name, "be at least 0, in m", depth, lambda v: v >= 0)
     for sample in depth.detach():
-        seen = _sampled(sample)
-        if _in_unit_range(seen) and (ends := _in_unit_range(sample)):
+        values = _subsample(sample)
+        if _ends_in_unit_range(values) and (ends := _ends_in_unit_range(sample)):
             raise ValueError(
                 f"{name} must be in m, not normalized (see depth_from_normalized and depth_from_inverse), "
                 f"got values in [{ends[0]:g}, {ends[1]:g}]"
             )
-        _refuse_inverse(name, seen.double())
+        _check_not_inverse(name, values.double())
 
 
 def check_floating(name: str, value: Tensor) -> Tensor:
+    """Return `value` if it is a floating tensor."""
     if not check_tensor(name, value).is_floating_point():
         raise TypeError(f"{name} must be of a floating type, got {value.dtype}")
     return value
@@ -224,7 +223,7 @@ def _focal(name: str, value: float | Tensor, like: Tensor) -> float | Tensor:
 
 
 def _intrinsic(name: str, value: float | Tensor, like: Tensor) -> float | Tensor:
-    """A number, or a column (B, 1, 1, 1) of the type of `like`."""
+    """A number, or (B, 1, 1, 1) of the type of `like`."""
     if not isinstance(value, Tensor):
         return check_number(name, value)
     if value.ndim > 1 or (like.shape[0] != 1 and value.numel() not in (1, like.shape[0])):
@@ -234,7 +233,7 @@ def _intrinsic(name: str, value: float | Tensor, like: Tensor) -> float | Tensor
 
 
 def _quotient(numerator: float, denominator: Tensor) -> Tensor:
-    """numerator / denominator, inf beyond the farthest; its gradient is finite everywhere."""
+    """numerator / denominator, inf above 1e12, with a gradient that is finite everywhere."""
     near = denominator > numerator / _FARTHEST
     return torch.where(near, numerator / torch.where(near, denominator, 1), torch.inf)
 
@@ -246,15 +245,15 @@ def _unit(value: Tensor, near: float, far: float) -> Tensor:
     return value.to(field_dtype(value.dtype))
 
 
-def _sampled(sample: Tensor) -> Tensor:
-    """(T, h, w): some rows and columns, about _LOOKED_AT values in all."""
+def _subsample(sample: Tensor) -> Tensor:
+    """(T, h, w): evenly spaced rows and columns, about _NUM_CHECKED values in all."""
     height, width = sample.shape[-2:]
-    side = max(16, math.isqrt(_LOOKED_AT // sample.shape[:-2].numel()))
+    side = max(16, math.isqrt(_NUM_CHECKED // sample.shape[:-2].numel()))
     return sample[..., :: -(-height // side), :: -(-width // side)].flatten(0, -3).contiguous()
 
 
-def _in_unit_range(values: Tensor) -> tuple[float, float] | None:
-    """The ends of what is finite, if they lie in [0, 1] and differ."""
+def _ends_in_unit_range(values: Tensor) -> tuple[float, float] | None:
+    """The smallest and the largest finite value, if they lie in [0, 1] and differ."""
     low = values.amin().item()
     if low >= 1:
         return None
@@ -262,10 +261,10 @@ def _in_unit_range(values: Tensor) -> tuple[float, float] | None:
     return (low, high) if low < high <= 1 else None
 
 
-def _refuse_inverse(name: str, seen: Tensor) -> None:
-    top, bottom = seen[:, : seen.shape[1] // 2], seen[:, -max(1, seen.shape[1] // 4) :]
-    largest = seen.amax().item()
-    if top.numel() < _ENOUGH or largest == math.inf:
+def _check_not_inverse(name: str, values: Tensor) -> None:
+    top, bottom = values[:, : values.shape[1] // 2], values[:, -max(1, values.shape[1] // 4) :]
+    largest = values.amax().item()
+    if top.numel() < _MIN_UPPER_HALF or largest == math.inf:
         return
     share, median = (top <= 0.02 * largest).double().mean().item(), bottom.median().item()
     if share >= 0.1 and 0 < 0.2 * largest <= median:

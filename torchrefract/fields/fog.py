@@ -1,16 +1,19 @@
-"""Fog after Koschmieder: what arrives of the light, and what the fog adds."""
+"""Koschmieder's law: how much light arrives through fog, and how much the fog adds."""
 
 import math
 
 import torch
 from torch import Tensor
 
-# Farther than anything.
-_FARTHEST = 1e12
+_FARTHEST = 1e12  # m; depths are clamped to it
 
 
 def extinction(visibility: Tensor, threshold: float) -> Tensor:
-    """k = -ln(threshold) / V in 1/m, the extinction that leaves the contrast `threshold` at V meters; any shape.
+    """Return the extinction k = -ln(threshold) / V in 1/m that leaves the contrast `threshold` at V meters.
+
+    Args:
+        visibility: V in m, above 0, inf for clear air; any shape.
+        threshold: in (0, 1).
 
     Source: Koschmieder 1924; a threshold of 0.05 is the meteorological optical range of CIE and WMO.
     """
@@ -18,70 +21,51 @@ def extinction(visibility: Tensor, threshold: float) -> Tensor:
 
 
 def transmission(depth: Tensor, k: Tensor) -> Tensor:
-    """t = exp(-k d), the share of light that arrives from d meters through an extinction k in 1/m; they broadcast."""
-    return torch.exp(k * -_finite(depth))
-
-
-def drifting_transmission_(noise: Tensor, scale: Tensor, offset: Tensor, depth: Tensor) -> Tensor:
-    """t = exp(-(scale n + offset) d), through an extinction that is a noise n; in its memory if it has no gradient.
+    """Return t = exp(-k d), the share of the light that arrives from d meters through an extinction k in 1/m.
 
     Args:
-        noise: (N, 1, H, W).
-        scale, offset: (N, 1, 1, 1), 1/m.
-        depth: (N or 1, 1, H, W or 1), m.
+        depth: d in m, at least 0, may be inf.
+        k: 1/m, broadcasts with the depth.
     """
-    distance = -_finite(depth)
-    scale, offset = scale * distance, offset * distance
-    if (
-        torch.compiler.is_compiling()
-        or _is_mapped(noise, scale)
-        or any(value.requires_grad for value in (noise, scale, offset))
-    ):
-        return torch.exp(noise * scale + offset)
-    return noise.mul_(scale).add_(offset).exp_()
+    # An infinite depth times an extinction of 0 would be NaN, and so would be the gradient of an infinite product.
+    return torch.exp(k * -depth.clamp(max=_FARTHEST))
 
 
-def veil(image: Tensor, t: Tensor, airlight: Tensor) -> Tensor:
-    """I t + A (1 - t), exactly I where t = 1 and exactly A where t = 0; the three broadcast.
+def blend_fog(image: Tensor, t: Tensor, airlight: Tensor, *, linear_light: bool = False) -> Tensor:
+    """Return I t + A (1 - t), exactly I where t = 1 and exactly A where t = 0 (in stored values).
 
     Args:
-        image: (B, C, H, W).
-        t: (B, 1, H or 1, W or 1), in [0, 1].
-        airlight: (B, C, 1, 1).
+        image: (N, C, H, W), stored values (sRGB) in [0, 1].
+        t: (N or 1, 1, H or 1, W or 1), in [0, 1].
+        airlight: (N or 1, C, 1, 1), stored values.
+        linear_light: blend linear light, not stored values.
+
+    Returns:
+        (N, C, H, W), stored values.
     """
+    if linear_light:
+        blended = torch.lerp(srgb_to_linear(airlight), srgb_to_linear(image), t)
+        return torch.where(t == 1, image, linear_to_srgb(blended))
     if t.shape[3] == 1:
-        # With two numbers for each row the loop over a row's pixels is not vectorized: one is written out, once.
+        # PyTorch does not vectorize a loop over pixels with two operands of stride 0.
         airlight = airlight.expand(-1, -1, -1, image.shape[3]).contiguous()
     return torch.lerp(airlight, image, t)
 
 
-def _is_mapped(*values: Tensor) -> bool:
-    """Whether torch.vmap maps over one of them: what it hides from a sample may have a gradient."""
-    try:
-        for value in values:
-            value.data_ptr()
-    except RuntimeError:  # a sample has no memory of its own
-        return True
-    return False
-
-
-def _finite(depth: Tensor) -> Tensor:
-    # An infinite depth times an extinction of zero would be NaN, and so would be the slope of an infinite product.
-    return depth.clamp(max=_FARTHEST)
+def unblend_fog(image: Tensor, t: Tensor, airlight: Tensor, *, linear_light: bool = False) -> Tensor:
+    """Return A + (I - A) / t, the inverse of `blend_fog` for t above 0; arguments as there."""
+    if linear_light:
+        return linear_to_srgb(torch.lerp(srgb_to_linear(airlight), srgb_to_linear(image), 1 / t))
+    return torch.lerp(airlight, image, 1 / t)
 
 
 def srgb_to_linear(value: Tensor) -> Tensor:
-    """Linear light of stored values in [0, 1], any shape. Source: IEC 61966-2-1."""
-    low = value / 12.92
-    return torch.where(value <= 0.04045, low, _power((value.clamp(min=0.04045) + 0.055) / 1.055, 2.4))
+    """Convert stored values in [0, 1] to linear light, any shape. Source: IEC 61966-2-1."""
+    curve = ((value.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
+    return torch.where(value <= 0.04045, value / 12.92, curve)
 
 
 def linear_to_srgb(value: Tensor) -> Tensor:
-    """Stored values of linear light in [0, 1], any shape. Source: IEC 61966-2-1."""
-    high = 1.055 * _power(value.clamp(min=0.0031308), 1 / 2.4) - 0.055
-    return torch.where(value <= 0.0031308, 12.92 * value, high)
-
-
-def _power(value: Tensor, exponent: float) -> Tensor:
-    """value^exponent of what is above 0, to the same bits in any batch, as `pow` is not."""
-    return torch.exp(exponent * torch.log(value))
+    """Convert linear light in [0, 1] to stored values, any shape. Source: IEC 61966-2-1."""
+    curve = 1.055 * value.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
+    return torch.where(value <= 0.0031308, 12.92 * value, curve)

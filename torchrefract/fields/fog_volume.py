@@ -1,39 +1,78 @@
-"""Fog in space: the mean extinction along each pixel's ray, through banks and holes that drift and change."""
+"""Volumetric fog: the mean extinction along the ray of each pixel, through a random field in space that moves.
+
+The field is evaluated on planes across the camera's axis, along a coarse grid of rays. Means along these rays up to a
+set of distances make a volume in front of the camera, from which every pixel is interpolated.
+"""
 
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._compiled import obstacle
-from torchrefract._tensor import as_device_tensor, cat_bands, exact_matmul
-from torchrefract._validation import finite_or, requires_grad, why_not_eager
-from torchrefract.fields import fog_drawn
-from torchrefract.fields.fog_view import SLICES, View, by_pixel, by_row, keys, view
-from torchrefract.fields.perlin3d import VARIANCE, Rays, deviation_of_mean, noise_on_planes
+from torchrefract._tensor import as_device_tensor, cat_bands, exact_matmul, rows_at_once
+from torchrefract._validation import finite_or
+from torchrefract.fields.perlin import fade_out
+from torchrefract.random import lattice_noise
+
+# Variance of the noise over all gradients and places in a cell. Each of the 8 nodes adds a third of the mean of
+# (h(p) h(q) h(r))^2 (p^2 + q^2 + r^2); the mean of h^2 is 181 / 462, that of (h p)^2 is 535 / 18018.
+VARIANCE = 8 * (181 / 462) ** 2 * (535 / 18018)
+# 1 / r, 1 / r^2 and 1 / r^3 with r^4 = r + 1: multiples of them stay apart modulo 1, so octaves share no nodes.
+_PHASES = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)
+_UPPER = 2048  # a number of 23 bits makes two: its upper 11 bits and the others
+# The coordinates of a node become one number modulo 2^32, so many to a line; octaves are so many planes apart.
+_LINE = 2048
+_OCTAVE = 633
 
 _PLANES = 64  # across the axis, on which the field is evaluated
-# An octave fades out where rays come to lie so many of its periods apart, or planes as many times as many.
+_SLICES = 48  # of the distance, up to which means are kept
+_CELLS = 48  # between rays, over the longer side of the frame
+_FINER = 2  # cells of the image lattice per cell between rays; pixels are interpolated from it linearly
+# An octave fades out where rays are so many of its periods apart, or planes `_LONGER` times as many.
 _SPARSE, _SPARSEST = 0.4, 0.8
 _LONGER = 5.0
-_MOST_CONTRAST = 30.0  # from there on fog is all holes, and its exponentials leave float32
-_FEWEST = 1 << 12  # pixels of a frame that kernels are asked for; smaller ones are PyTorch's to the last digit
+_CACHED_PIXELS = 1 << 15
+_MAX_CONTRAST = 30.0  # above it the exponentials leave float32
 
 
-class _Fog(NamedTuple):
-    """The arguments of `path_mean` that a sample has of its own."""
+class Rays(NamedTuple):
+    """The rays from the camera through the points (left + j step_x, top + i step_y) of the plane z = 1."""
 
-    key: Tensor
-    weights: Tensor
-    contrast: Tensor
-    frame: Tensor
-    wind: Tensor
-    decorrelation: Tensor
+    left: float
+    step_x: float
+    columns: int
+    top: float
+    step_y: float
+    rows: int
+
+    def slopes(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Return x / z, (columns,), and y / z, (rows,), float64."""
+        j = torch.arange(self.columns, dtype=torch.float64, device=device)
+        i = torch.arange(self.rows, dtype=torch.float64, device=device)
+        return self.left + self.step_x * j, self.top + self.step_y * i
+
+    def box(self, depth: float) -> list[tuple[float, float]]:
+        """Return (low, high) in x, y and z of the space that the rays cross from the camera to a depth."""
+        right, bottom = self.left + self.step_x * (self.columns - 1), self.top + self.step_y * (self.rows - 1)
+        ends = ((self.left, right), (self.top, bottom), (0.0, 1.0))
+        return [(depth * min(0.0, low), depth * max(0.0, high)) for low, high in ends]
 
 
-def path_mean(
+class View(NamedTuple):
+    """The grid of rays of a frame, with one more ray beyond each edge."""
+
+    height: int
+    width: int
+    cell: float  # px between rays
+    down: int  # cells
+    across: int
+    rays: Rays
+
+
+def mean_extinction_along_rays(
     key: Tensor,
     distance: Tensor,
     *,
@@ -50,163 +89,252 @@ def path_mean(
     reach: float,
     dtype: torch.dtype,
 ) -> Tensor:
-    """The mean along each pixel's ray, from the camera to a distance, of a field q > 0 with E q = 1.
+    """Average a random extinction q > 0 with E q = 1 along the ray of each pixel, from the camera to its distance.
 
-        m = (1 / d) integral over s from 0 to d of q(s r) as far as the reach, m = 1 + (m(reach) - 1) reach / d beyond,
+        m = (1 / d) integral over s from 0 to d of q(s r) up to the reach, m = 1 + (m(reach) - 1) reach / d beyond it
         q(X) = exp(c g - c^2 / 2),  g = sum of w_i n_i / sqrt(VARIANCE sum of w_i^2),  n_i as by `noise_on_planes`
 
-    q is known on planes at (k / 64)^2 of the reach, along 48 rays over the longer side of the frame; m is interpolated,
-    cubically between rays, linearly between 48 slices of d. What these cannot resolve is missing in g and in its c^2,
-    so that E q = 1: an octave fades out where rays come to lie 0.4 to 0.8 of its periods apart or planes 2 to 4, and on
-    a plane it deviates as its mean from there to the next would. Perlin noise is bounded, as a Gaussian is not: for
-    four octaves E q is 0.99 at c = 1, and 0.89 at c = 2. By a kernel m is as near to that of real numbers, and not the
-    same in its last digits.
+    q is evaluated on planes at (k / 64)^2 of the reach, along 48 rays over the longer side of the frame. m is
+    interpolated cubically between rays and linearly between 48 slices of d. Noise that these cannot resolve is left out
+    of g and of its variance, so that E q = 1: an octave fades out where rays are 0.4 to 0.8 of its periods apart or
+    planes 2 to 4, and on a plane its deviation is that of its mean up to the next plane. Perlin noise is bounded, as a
+    Gaussian is not: for four octaves E q is 0.99 at c = 1, and 0.89 at c = 2.
 
     Args:
         key: (N, 4), int64, of `noise_key`.
         distance: (N or 1, 1, H, 1 or W), m, d along the ray, at least 0, may be inf.
         height, width: px, of the frame.
-        focal: px, fx and fy of a pinhole.
+        focal: px, fx and fy of a pinhole camera.
         center: px, cx and cy, its principal point.
-        scales: m, scale_i, the periods of the octaves.
+        scales: m, the periods of the octaves.
         weights: (N, octaves), w_i, not all 0.
         contrast: (N,), c, the standard deviation of ln q.
         frame: (N,), t.
-        wind: (N, 3), m per frame, to the right, down and ahead, as the camera sees it.
-        decorrelation: (N,), frames, above 0, after which q in the wind is correlated with itself by 1 / e, so that g
-            is by exp(-t^2 ln(1 / r) / decorrelation^2), r = ln(1 + (exp(c^2) - 1) / e) / c^2; may be inf.
-        reach: m.
+        wind: (N, 3), m per frame, to the right, down and ahead, as seen by the camera.
+        decorrelation: (N,), frames, above 0, after which q in the wind has the correlation 1 / e with itself, so that
+            that of g is exp(-t^2 ln(1 / r) / decorrelation^2), r = ln(1 + (exp(c^2) - 1) / e) / c^2; may be inf.
+        reach: m; beyond it the fog is uniform.
         dtype: of the result.
 
     Returns:
         (N, 1, H, W), 0 or above.
 
-    Source: for volumes of rays and slices, Wronski, "Volumetric fog", SIGGRAPH 2014.
+    Source: Wronski, "Volumetric fog", SIGGRAPH 2014, for volumes of rays and slices.
     """
-    if not len(key) * height * width:
-        return distance.new_ones((len(key), 1, height, width), dtype=dtype)
-    own, distance = view(height, width, focal, center), distance.to(dtype)
-    fog = _Fog(key, weights, contrast, frame, wind, decorrelation)
-    if _may_be_drawn(fog, distance, pixels=height * width):
-        return _by_kernel(own, fog, distance, scales=scales, reach=reach)
-    # The result has its type whatever autocast would make of a matrix product.
-    with torch.autocast(key.device.type, enabled=False):
-        if torch.compiler.is_compiling() or key.device.type != "cpu" or len(key) == 1:
-            return _path_mean(own, fog, distance, scales=scales, reach=reach)
-        # Matrix products of several samples round in another way than those of one.
-        each = zip(distance.expand(len(key), -1, -1, -1).split(1), *(value.split(1) for value in fog), strict=True)
-        found = (_path_mean(own, _Fog(*one), d, scales=scales, reach=reach) for d, *one in each)
-        return cat_bands(found, dim=0, length=len(key))
+    view, distance = make_view(height, width, focal, center), distance.to(dtype)
+    with torch.autocast(key.device.type, enabled=False):  # it would round the products of matrices
+        excess = extinction_on_planes(
+            key,
+            view.rays,
+            scales=scales,
+            weights=weights,
+            contrast=contrast,
+            frame=frame,
+            wind=wind,
+            decorrelation=decorrelation,
+            reach=reach,
+            dtype=dtype,
+        )
+        volume = _means_up_to_slices(view.rays, excess)
+        volume = exact_matmul(_cubic_weights(view.down, volume), volume)
+        interpolate = _interpolate_rows if distance.shape[3] == 1 else _interpolate_pixels
+        return interpolate(view, volume, distance, reach)
 
 
-def _may_be_drawn(fog: _Fog, distance: Tensor, *, pixels: int) -> bool:
-    """Whether kernels can make the means."""
-    plain = pixels < _FEWEST or requires_grad((distance, *fog)) or obstacle(distance)
-    return not (plain or any(map(why_not_eager, fog)))
+def make_view(height: int, width: int, focal: tuple[float, float], center: tuple[float, float]) -> View:
+    """Lay a grid of 48 cells over the longer side of a frame."""
+    longer = max(height, width)
+    cell, down, across = longer / _CELLS, -(-height * _CELLS // longer), -(-width * _CELLS // longer)
+    left, top = ((-0.5 - cell - c) / f for c, f in zip(center, focal, strict=True))
+    rays = Rays(left, cell / focal[0], across + 3, top, cell / focal[1], down + 3)
+    return View(height, width, cell, down, across, rays)
 
 
-def _by_kernel(own: View, fog: _Fog, distance: Tensor, *, scales: Sequence[float], reach: float) -> Tensor:
-    planes = _planes(own.rays, tuple(scales), reach, fog.key.device)
-    octaves = _octaves(fog, planes)
-    drawn = fog_drawn.Drawn(fog.key, octaves.amplitude, octaves.half, octaves.moved, octaves.turns)
-    volume = fog_drawn.Volume(own.rays, reach, tuple(scales), planes.counts, _PLANES)
-    return fog_drawn.path_means(own, drawn, volume, distance)
-
-
-def _path_mean(view: View, fog: _Fog, distance: Tensor, *, scales: Sequence[float], reach: float) -> Tensor:
-    volume = _volume(view.rays, fog, scales=scales, reach=reach, dtype=distance.dtype)
-    volume = exact_matmul(keys(view.down, volume), volume)
-    sample_image = by_row if distance.shape[3] == 1 else by_pixel
-    return sample_image(view, volume, distance, reach)
-
-
-def _volume(rays: Rays, fog: _Fog, *, scales: Sequence[float], reach: float, dtype: torch.dtype) -> Tensor:
-    """(N, slices + 1, rows, columns): m - 1 along each ray up to the slices d = reach n (n + 1) / (S (S + 1))."""
-    excess = _excess(rays, fog, scales=scales, reach=reach, dtype=dtype)
-    mean = exact_matmul(_quadrature(excess), excess.flatten(2))
-    x, y = rays.slopes(mean.device)
-    n = torch.arange(SLICES + 1, dtype=torch.float64, device=mean.device)
-    # A ray is longer than its depth, and planes lie at squares.
-    depth = (n * (n + 1) / (SLICES * (SLICES + 1)))[:, None] / (1 + x * x + (y * y)[:, None]).sqrt().flatten()
-    place = _PLANES * depth.sqrt()
-    first = place.long().clamp(max=_PLANES - 1)
-    part, index = (place - first).to(dtype), first.expand(len(mean), -1, -1)
-    volume = torch.lerp(mean.gather(1, index), mean.gather(1, index + 1), part)
-    return volume.view(-1, SLICES + 1, rays.rows, rays.columns)
-
-
-class _Planes(NamedTuple):
-    """Where the field is evaluated."""
-
-    depths: tuple[float, ...]  # m
-    counts: tuple[int, ...]  # of each octave: only so many, the nearest, have it
-    damping: Tensor  # (octaves, planes + 2)
-
-
-def _planes(rays: Rays, scales: tuple[float, ...], reach: float, device: torch.device) -> _Planes:
-    depths = tuple(reach * (k / _PLANES) ** 2 for k in range(_PLANES + 2))
+def extinction_on_planes(
+    key: Tensor,
+    rays: Rays,
+    *,
+    scales: Sequence[float],
+    weights: Tensor,
+    contrast: Tensor,
+    frame: Tensor,
+    wind: Tensor,
+    decorrelation: Tensor,
+    reach: float,
+    dtype: torch.dtype,
+) -> Tensor:
+    """Evaluate q - 1 of `mean_extinction_along_rays` on its planes and one more, (N, 66, rows, columns)."""
+    device = key.device
+    depths = [reach * (k / _PLANES) ** 2 for k in range(_PLANES + 2)]
     lengths = [2 * reach * k / _PLANES**2 for k in range(_PLANES + 2)]  # between planes
     cell = max(rays.step_x, rays.step_y)
     apart = [max(cell * depth, length / _LONGER) for depth, length in zip(depths, lengths, strict=True)]
-    counts = tuple(sum(one < _SPARSEST * scale for one in apart) for scale in scales)
     period, apart_m, length_m = (
         as_device_tensor(value, dtype=torch.float64, device=device) for value in (scales, apart, lengths)
     )
-    return _Planes(depths, counts, _damping(apart_m / period[:, None], length_m / period[:, None]))
-
-
-class _Octaves(NamedTuple):
-    """What ln q, a sum of octaves less its half variance, is made of on the planes, in float64."""
-
-    amplitude: Tensor  # (N, octaves, planes + 2)
-    half: Tensor  # (N, planes + 2)
-    moved: Tensor  # (N, 3), m
-    turns: Tensor  # (N,)
-
-
-def _octaves(fog: _Fog, planes: _Planes) -> _Octaves:
-    weights, frame = fog.weights.double(), fog.frame.double()
-    contrast = finite_or(fog.contrast.double(), 0.0).clamp(0, _MOST_CONTRAST)
-    share = weights * (contrast / (VARIANCE * weights.square().sum(dim=1)).sqrt())[:, None]
-    amplitude = share[:, :, None] * planes.damping
-    half = VARIANCE / 2 * amplitude.square().sum(dim=1)
-    turns = frame / fog.decorrelation.double() * _pace(contrast.square())
-    return _Octaves(amplitude, half, fog.wind.double() * frame[:, None], turns)
-
-
-def _excess(rays: Rays, fog: _Fog, *, scales: Sequence[float], reach: float, dtype: torch.dtype) -> Tensor:
-    """(N, planes + 2, rows, columns): q - 1 on the planes."""
-    planes = _planes(rays, tuple(scales), reach, fog.key.device)
-    amplitude, half, moved, turns = _octaves(fog, planes)
+    sparse = ((apart_m / period[:, None] - _SPARSE) / (_SPARSEST - _SPARSE)).clamp(0, 1)
+    damping = (1 - sparse * sparse * (3 - 2 * sparse)) * deviation_of_mean(length_m / period[:, None])
+    weights, frame = weights.double(), frame.double()
+    contrast = finite_or(contrast.double(), 0.0).clamp(0, _MAX_CONTRAST)
+    deviation = weights * (contrast / (VARIANCE * weights.square().sum(dim=1)).sqrt())[:, None]
+    amplitude = deviation[:, :, None] * damping
     noise = noise_on_planes(
-        fog.key,
+        key,
         rays,
-        planes.depths,
+        depths,
         periods=scales,
-        planes=planes.counts,
+        planes=[sum(value < _SPARSEST * scale for value in apart) for scale in scales],
         amplitude=amplitude.to(dtype),
-        moved=moved,
-        turns=turns,
+        moved=wind.double() * frame[:, None],
+        turns=frame / decorrelation.double() * log_field_pace(contrast.square()),
     )
-    return torch.expm1(noise - half.to(dtype)[:, :, None, None])
+    half_variance = VARIANCE / 2 * amplitude.square().sum(dim=1)
+    return torch.expm1(noise - half_variance.to(dtype)[:, :, None, None])
 
 
-def _pace(variance: Tensor) -> Tensor:
-    """How much slower a Gaussian field of a variance forgets itself than its exponential, up to a correlation of 1/e.
+def log_field_pace(variance: Tensor) -> Tensor:
+    """Return by how much slower a Gaussian field decorrelates than its exponential, to a correlation of 1 / e.
 
     The exponentials of two Gaussians of variance v and correlation r are correlated by (exp(v r) - 1) / (exp(v) - 1).
+
+    Args:
+        variance: v, of any shape.
     """
-    share, little = math.exp(-1), variance < 1e-4
-    some = torch.where(little, 1.0, variance)
+    share, is_small = math.exp(-1), variance < 1e-4
+    safe = torch.where(is_small, 1.0, variance)
     # ln(1 + (exp(v) - 1) / e), which overflows for no v.
-    left = torch.logaddexp(some - 1, torch.full_like(some, math.log1p(-share))) / some
-    return torch.where(little, share + variance * (share - share * share) / 2, left).log().neg().sqrt()
+    correlation = torch.logaddexp(safe - 1, torch.full_like(safe, math.log1p(-share))) / safe
+    series = share + variance * (share - share * share) / 2
+    return torch.where(is_small, series, correlation).log().neg().sqrt()
 
 
-def _damping(apart: Tensor, length: Tensor) -> Tensor:
-    """How much of an octave there is where rays lie so many of its periods apart, and planes so many."""
-    sparse = ((apart - _SPARSE) / (_SPARSEST - _SPARSE)).clamp(0, 1)
-    return (1 - sparse * sparse * (3 - 2 * sparse)) * deviation_of_mean(length)
+def deviation_of_mean(length: Tensor) -> Tensor:
+    """Return the standard deviation of the mean of the noise over a length along an axis, over that of the noise.
+
+        (1 + (length / 0.851)^2)^(-1/4),  within 2.5 %; 0.851 is twice the integral of the correlation
+
+    Args:
+        length: periods, of any shape.
+    """
+    return (1 + (length / 0.851).square()).pow(-0.25)
+
+
+def noise_on_planes(
+    key: Tensor,
+    rays: Rays,
+    depths: Sequence[float],
+    *,
+    periods: Sequence[float],
+    planes: Sequence[int],
+    amplitude: Tensor,
+    moved: Tensor,
+    turns: Tensor,
+) -> Tensor:
+    """Sum octaves of Perlin's gradient noise in space, each times its amplitude, where rays cross planes.
+
+        noise = sum over the 8 nodes around (x, y, z) of h(p) h(q) h(r) (g_x p + g_y q + g_z r)
+        (p, q, r) = (x, y, z) - node,  h(p) = 1 - fade(|p|),  fade(s) = 6 s^5 - 15 s^4 + 10 s^3
+        (x, y, z) = ((X, Y, Z) - moved) / period + phase
+
+    Gradients have length 1, and phases are uniform. Each gradient turns on a great circle at a normal rate: the
+    variance is constant, and the correlation with the noise at turns = 0 is exp(-turns^2).
+
+    Args:
+        key: (N, 4), int64, of `noise_key`.
+        rays: in rows and columns.
+        depths: K of them, m, of the planes, from near to far.
+        periods: m, above 0, between two nodes, of each octave.
+        planes: of each octave, at least 1: the number of planes, the nearest ones, that have it.
+        amplitude: (N, octaves, K), gives the type.
+        moved: (N, 3), m, how far the wind has carried the noise.
+        turns: (N,), time over the time of decorrelation.
+
+    Returns:
+        (N, K, rows, columns); an octave has the standard deviation amplitude sqrt(VARIANCE).
+
+    Source: Perlin, "Improving noise", SIGGRAPH 2002; Perlin and Neyret, "Flow noise", SIGGRAPH 2001 technical sketches,
+    for the turning.
+    """
+    device, dtype = key.device, amplitude.dtype
+    boxes = [rays.box(depths[count - 1] / period) for count, period in zip(planes, periods, strict=True)]
+    nodes = [[math.ceil(high - low) + 2 for low, high in box] for box in boxes]
+    low = as_device_tensor([[end[0] for end in box] for box in boxes], dtype=torch.float64, device=device)
+    number = torch.arange(1, len(periods) + 1, device=device)[:, None]
+    phase = key[:, None, :3].double() * 2.0**-32 + number * as_device_tensor(
+        _PHASES, dtype=torch.float64, device=device
+    )
+    period = as_device_tensor(periods, dtype=torch.float64, device=device)[:, None]
+    origin = phase.frac() - moved.double()[:, None] / period
+    # From the first node on, float32 suffices for positions, however far the wind has carried the noise.
+    first = (origin.detach() + low).floor()
+    gradients = _gradients(key, first.long(), nodes, turns, dtype=dtype)
+    x, y = rays.slopes(device)
+    depth = as_device_tensor(depths, dtype=torch.float64, device=device)
+    total = amplitude.new_zeros(len(key), len(depths), rays.rows, rays.columns)
+    for i, count in enumerate(planes):
+        z = depth[:count] / periods[i]
+        start = (origin - first)[:, i]
+        hat_x, ramp_x = _weights(start[:, 0, None, None] + z[:, None] * x, nodes[i][0], dtype)
+        hat_y, ramp_y = _weights(start[:, 1, None, None] + z[:, None] * y, nodes[i][1], dtype)
+        hat_z, ramp_z = (weight.mT for weight in _weights(start[:, 2, None] + z, nodes[i][2], dtype))
+        # h h h is a product: one axis after the other.
+        gx, gy, gz = (
+            exact_matmul(weight, gradient.flatten(2)).unflatten(2, gradient.shape[2:])
+            for weight, gradient in zip((hat_z, hat_z, ramp_z), gradients[i], strict=True)
+        )
+        along = exact_matmul(gx, ramp_x) + exact_matmul(gz, hat_x)
+        octave = exact_matmul(hat_y.mT, along) + exact_matmul(ramp_y.mT, exact_matmul(gy, hat_x))
+        octave = octave * amplitude[:, i, :count, None, None]
+        total = total + F.pad(octave, (0, 0, 0, 0, 0, len(depths) - count))
+    return total
+
+
+def _weights(position: Tensor, nodes: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """(..., nodes, places): h and h p of every node at positions (..., places)."""
+    node = torch.arange(nodes, dtype=position.dtype, device=position.device)[:, None]
+    distance = (position.unsqueeze(-2) - node).to(dtype)
+    hat = fade_out(distance)
+    return hat, hat * distance
+
+
+def _gradients(
+    key: Tensor, first: Tensor, nodes: Sequence[Sequence[int]], turns: Tensor, *, dtype: torch.dtype
+) -> list[list[Tensor]]:
+    """Of each octave the three components at a box of nodes, (N, nodes along z, along y, along x)."""
+    numbers = []
+    for i, counts in enumerate(nodes):
+        x, y, z = (first[:, i, axis, None] + torch.arange(n, device=key.device) for axis, n in enumerate(counts))
+        plane = z[:, :, None, None] + i * _OCTAVE
+        numbers.append((x[:, None, None] + _LINE * (y[:, None, :, None] + _LINE * plane)).flatten(1))
+    scaled = _UPPER * lattice_noise(key, [torch.cat(numbers, dim=1)], 2)
+    upper = scaled.floor()
+    lower = scaled - upper
+    # Whole turns are dropped in float64: late frames have many.
+    rate = (2 * lower[:, 1].double() - 1).erfinv()
+    turn = upper[:, 1].double() / _UPPER + (rate * (turns.double() / math.pi)[:, None]).frac()
+    # The axis of the great circle, and two directions square to it: (cos cos, cos sin, -sin) and (-sin, cos, 0).
+    cos_axis, around = (2 * upper[:, 0].to(dtype) + 1) / _UPPER - 1, 2 * math.pi * lower[:, 0].to(dtype)
+    angle, sin_axis = 2 * math.pi * turn.to(dtype), (1 - cos_axis * cos_axis).sqrt()
+    cos, sin, cos_around, sin_around = angle.cos(), angle.sin(), around.cos(), around.sin()
+    tilted = cos * cos_axis
+    components = tilted * cos_around - sin * sin_around, tilted * sin_around + sin * cos_around, -cos * sin_axis
+    sizes = [math.prod(counts) for counts in nodes]
+    parts = zip(*(component.split(sizes, dim=1) for component in components), strict=True)
+    return [[part.view(-1, *counts[::-1]) for part in three] for three, counts in zip(parts, nodes, strict=True)]
+
+
+def _means_up_to_slices(rays: Rays, excess: Tensor) -> Tensor:
+    """(N, slices + 1, rows, columns): m - 1 along each ray up to the slices d = reach n (n + 1) / (S (S + 1))."""
+    mean = exact_matmul(_quadrature(excess), excess.flatten(2))
+    x, y = rays.slopes(mean.device)
+    n = torch.arange(_SLICES + 1, dtype=torch.float64, device=mean.device)
+    # A ray is longer than its depth, and planes lie at squares.
+    depth = (n * (n + 1) / (_SLICES * (_SLICES + 1)))[:, None] / (1 + x * x + (y * y)[:, None]).sqrt().flatten()
+    plane = _PLANES * depth.sqrt()
+    first = plane.long().clamp(max=_PLANES - 1)
+    part, index = (plane - first).to(mean.dtype), first.expand(len(mean), -1, -1)
+    volume = torch.lerp(mean.gather(1, index), mean.gather(1, index + 1), part)
+    return volume.view(-1, _SLICES + 1, rays.rows, rays.columns)
 
 
 def _quadrature(like: Tensor) -> Tensor:
@@ -220,3 +348,71 @@ def _quadrature(like: Tensor) -> Tensor:
     lag = end - k
     weight = (lag >= 1).double() + (lag == 1) / 24 + (lag == 0) / 2 - (lag == -1) / 24 + (lag >= 0) * (k == 1) / 12
     return torch.where(end == 0, (k == 0).double(), 2 * k / end.clamp(min=1).square() * weight).to(like.dtype)
+
+
+def _cubic_weights(cells: int, like: Tensor) -> Tensor:
+    """(finer cells + 1, cells + 3): from rays to a finer lattice, by Keys' cubic of a = -1/2."""
+    fine = torch.arange(cells * _FINER + 1, dtype=torch.float64, device=like.device) / _FINER
+    x = (fine[:, None] + 1 - torch.arange(cells + 3, dtype=torch.float64, device=like.device)).abs()
+    near, far = (1.5 * x - 2.5) * x * x + 1, ((-0.5 * x + 2.5) * x - 4) * x + 2
+    return torch.where(x < 1, near, torch.where(x < 2, far, 0)).to(like.dtype)
+
+
+def _slice_of(distance: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The slice below a distance, the part of the way to the next, and reach / d, at most 1."""
+    scale = _SLICES * (_SLICES + 1) / reach
+    # n (n + 1) = scale d has a slope in d at 0 too.
+    n = (distance.clamp(max=reach) * scale + 0.25).sqrt() - 0.5
+    first = n.detach().floor().clamp(0, _SLICES - 1)
+    return first, n - first, reach / distance.clamp(min=reach)
+
+
+def _positions(pixels: int, cell: float, cells: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """The node of the finer lattice before each pixel, int64, and the part of the way to the next."""
+    place = (torch.arange(pixels, dtype=torch.float64, device=like.device) + 0.5) * (_FINER / cell)
+    first = place.floor().clamp(max=cells * _FINER - 1)
+    return first.long(), (place - first).to(like.dtype)
+
+
+def _interpolate_rows(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:
+    """m for distances (N or 1, 1, H, 1): each row of pixels reads one slice, so that matrix products serve."""
+    first, part, share = (value.flatten(1) for value in _slice_of(distance, reach))
+    y, dy = _positions(view.height, view.cell, view.down, volume)
+    batch, slices, rows = volume.shape[:3]
+    start = torch.arange(batch, device=volume.device)[:, None] * slices
+    index, lines = (start + first.long()) * rows + y, volume.flatten(0, 2)
+    near, far = share * (1 - part), share * part
+    corners = ((0, near * (1 - dy)), (1, near * dy), (rows, far * (1 - dy)), (rows + 1, far * dy))
+    row = torch.stack([lines[index + step] * weight[..., None] for step, weight in corners]).sum(dim=0)
+    x, dx = _positions(view.width, view.cell, view.across, volume)
+    finer = _cubic_weights(view.across, volume)
+    mean = exact_matmul(row, torch.lerp(finer[x], finer[x + 1], dx[:, None]).T) + 1
+    return mean.relu().unsqueeze(1)  # cubics overshoot where the contrast is high
+
+
+def _interpolate_pixels(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:
+    """m for distances (N or 1, 1, H, W)."""
+    volume = exact_matmul(volume, _cubic_weights(view.across, volume).T)
+    rows, columns = volume.shape[2:]
+    # The slices lie below one another in one image, and the next slice of each is a second channel.
+    pairs = torch.stack([volume[:, :-1], volume[:, 1:]], dim=1).flatten(2, 3)
+    x, y = (
+        ((2 * (torch.arange(n, dtype=torch.float64, device=volume.device) + 0.5) * (_FINER / view.cell) + 1) / size - 1)
+        for n, size in ((view.width, columns), (view.height, rows * _SLICES))
+    )
+    x, y = x.to(volume.dtype), y.to(volume.dtype)[:, None]
+    # A few rows at a time stay in the cache.
+    size = rows_at_once(volume.device, view.height, each=view.width, cached=_CACHED_PIXELS)
+    bands = (
+        _interpolate_band(pairs, band, x, middle, reach)
+        for band, middle in zip(distance.split(size, dim=2), y.split(size), strict=True)
+    )
+    return cat_bands(bands, dim=2, length=view.height)
+
+
+def _interpolate_band(pairs: Tensor, distance: Tensor, x: Tensor, y: Tensor, reach: float) -> Tensor:
+    first, part, share = _slice_of(distance, reach)
+    y = first[:, 0] * (2 / _SLICES) + y
+    grid = torch.stack([x.expand_as(y), y], dim=3).expand(len(pairs), -1, -1, -1)
+    below, above = F.grid_sample(pairs, grid, align_corners=False).split(1, dim=1)
+    return (torch.lerp(below, above, part) * share + 1).relu()

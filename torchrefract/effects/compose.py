@@ -251,9 +251,7 @@ class Compose(Effect):
         return tuple(_planned_warp(cast(WarpEffect, effects[place])) for place in places)
 
     @assume_constant_result
-    def _constant_requests(
-        self, _: int, height: int, width: int, dtype: torch.dtype
-    ) -> tuple[PlanRequest | None, ...]:
+    def _constant_requests(self, _: int, height: int, width: int, dtype: torch.dtype) -> tuple[PlanRequest | None, ...]:
         """Return for each effect the request of its group; None for a photometric effect that separates groups."""
         requests: dict[int, PlanRequest] = {}
         for places, request in self._segments(height, width, dtype):

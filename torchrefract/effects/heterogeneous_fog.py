@@ -29,7 +29,14 @@ from torchrefract.effects.fog import (
     visibility_from_uniform,
     visibility_to_uniform,
 )
-from torchrefract.effects.motion import check_decorrelation, check_motion, check_wind, drawn_motion, motion_ranges, tame
+from torchrefract.effects.motion import (
+    check_decorrelation,
+    check_motion,
+    check_wind,
+    clamp_motion,
+    drawn_motion,
+    motion_ranges,
+)
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.fields.fog_volume import mean_extinction_along_rays
 from torchrefract.fields.heterogeneous_fog import (
@@ -255,7 +262,7 @@ class HeterogeneousFog(PhotometricEffect):
         names = ("key", "weights", "contrast", "wind", "decorrelation")
         key, weights, contrast, wind, decorrelation = (expand_batch(getattr(params, name), rows) for name in names)
         weights = normalize_weights(weights.to(dtype))
-        frame, wind, decorrelation = tame(params.frame.reshape(-1), wind, decorrelation)
+        frame, wind, decorrelation = clamp_motion(params.frame.reshape(-1), wind, decorrelation)
         if self.mode == "image":
             q = image_noise(
                 key,

@@ -29,7 +29,9 @@ from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.lattice import LatticeFlow
 from torchrefract.warping.warp import BACKENDS, INTERPOLATIONS, PADDINGS, sample_image, sees_only_valid
 
-_MAX_RESIDUAL_PX = 0.5  # of a composed inverse; smooth ones are off by far less, those between two sheets of a fold by more
+_MAX_RESIDUAL_PX = (
+    0.5  # of a composed inverse; smooth ones are off by far less, those between two sheets of a fold by more
+)
 # A plan of its own for each sample pays off if that of the ranges is finer than this, in frames of this size.
 _FINE_STRIDE, MIN_PIXELS = 4, 1 << 16
 

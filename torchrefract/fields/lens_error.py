@@ -171,7 +171,9 @@ def cell_lines(height: int, width: int, num_levels: int) -> Tensor:
     offsets = torch.stack([torch.stack([line, middle], dim=1), torch.stack([middle, line], dim=1)])  # (2, 5, 2)
     points = []
     for stride in _LEVELS[:num_levels]:
-        columns, rows = (np.linspace(0, max(math.ceil(side / stride) - 1, 0), _CELLS).round() for side in (width, height))
+        columns, rows = (
+            np.linspace(0, max(math.ceil(side / stride) - 1, 0), _CELLS).round() for side in (width, height)
+        )
         corners = torch.from_numpy(np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 1, 2))
         points.append((stride * (corners + offsets)).reshape(-1, 2))
     return torch.cat(points)

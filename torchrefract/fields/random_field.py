@@ -12,6 +12,7 @@ the covariance matrix", SIAM J. Sci. Comput. 18 (1997).
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -20,6 +21,7 @@ from torch import Tensor
 from torchrefract._tensor import exact_matmul
 from torchrefract.fields.covariance import REACH, covariance
 from torchrefract.random import white_noise, white_noise_at
+from torchrefract.warping.lattice import Lattice
 
 _APERTURE_REACH = 6.0  # margin of the domain in apertures: a smoothed field is correlated over sqrt(2) of them
 _MAX_POINTS = 1 << 24  # larger domains need gigabytes
@@ -225,7 +227,14 @@ def sum_of_waves(values: Tensor, frequencies: Frequencies, rows: range, columns:
 
 
 def sample_field(
-    params: FieldParams, frequencies: Frequencies, rows: range, columns: range, *, kind: str, dtype: torch.dtype
+    params: FieldParams,
+    frequencies: Frequencies,
+    rows: range,
+    columns: range,
+    *,
+    kind: str,
+    dtype: torch.dtype,
+    transform: Callable[[Tensor, Frequencies], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Sample two independent fields of mean 0 and variance 1 with a covariance.
 
@@ -235,6 +244,7 @@ def sample_field(
         rows, columns: px, where the fields are evaluated.
         kind: one of COVARIANCES.
         dtype: float32 or float64.
+        transform: changes the coefficients of the waves, (N, 2, Ky, Kx).
 
     Returns:
         field: (N, 2, n, m).
@@ -243,11 +253,19 @@ def sample_field(
     parts = []
     for part in split_params(params, frequencies):
         values, clipped = coefficients(part, frequencies, kind=kind, dtype=dtype)
+        values = values if transform is None else transform(values, frequencies)
         parts.append((sum_of_waves(values, frequencies, rows, columns), clipped))
     if len(parts) == 1:
         return parts[0]
     fields, clipped = zip(*parts, strict=True)
     return torch.cat(fields), torch.cat(clipped)
+
+
+def node_positions(lattice: Lattice) -> tuple[range, range]:
+    """Return the rows and columns of the nodes of a lattice, px."""
+    start, step = -lattice.margin * lattice.stride, lattice.stride
+    rows, columns = (range(start, start + count * step, step) for count in lattice.num_nodes)
+    return rows, columns
 
 
 def split_params(params: FieldParams, frequencies: Frequencies) -> list[FieldParams]:

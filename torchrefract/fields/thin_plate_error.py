@@ -1,94 +1,105 @@
-"""What a thin plate will compute under a tolerance.
+"""Error bounds for thin-plate splines on a lattice.
 
-A plate is linear in the displacements of its control points, so the error of the cubics between nodes is, too: with
-normal displacements it is normal at every pixel, with a deviation that the splines through one displaced point each
-give. Cubics leave nothing of the affine part. The kernel r^2 ln r has no second derivative at its control point, where
-their error falls with the square of the stride alone; so that is where it is looked at, `_MARGIN` times. The kernel is
-the same in all directions: along axes that are not square to one another the error is less.
+A thin-plate spline is linear in the displacements of its control points, so the error of cubics between nodes is, too:
+with normal displacements it is normal at every pixel. Its variance is the sum of squared errors of the splines that
+displace one point by 1 each. Cubics reproduce the affine part. The kernel r^2 ln r has no second derivative at its
+control point, where the error falls with the square of the stride only. The errors are therefore measured around the
+control points, and multiplied by `_SAFETY`. The kernel is the same in all directions: along axes that are not at right
+angles the error is smaller.
 """
 
 import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
+from torch import Tensor
 
-from torchrefract.effects.plan import Plan, PlanRequest, Smoothness, coarsest
-from torchrefract.types import Range
-from torchrefract.warping.lattice import lagrange_weights
+from torchrefract.random import LARGEST_NORMAL
+from torchrefract.types import FlowBounds, Range, Simplification
 
-_SIGMAS = 7.0  # the two components of the error are longer with a chance of exp(-_SIGMAS^2 / 2), 2e-11
-_SLOPE_SIGMAS = 4.0
-_MARGIN = 1.25
-_MOST_POINTS = 64  # that errors are looked at
-_INSIDE = (1, 3, 5)  # sixths of a cell
-_PLACES = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (0.25, 0.25))  # of a kink in its cell
-_NEAREST = math.exp(-1)  # px, from a kink: what ln r is there it is in the mean over the first px
-_Arguments = tuple[tuple[int, int], float, int, int]
-
-
-@lru_cache(maxsize=256)
-def plate_plan(amplitude: float, points: tuple[int, int], smoothing: Range, ask: PlanRequest) -> Plan:
-    """The plan for plates.
-
-    Args:
-        amplitude: px, the largest.
-        points: rows and columns of control points, corner to corner.
-        smoothing: the range.
-        ask: for what.
-    """
-    if ask.tolerance_px is None:
-        return ask.plan(1, 0.0, "no tolerance")
-    room, most = ask.room(), 2 * _SIGMAS * amplitude
-    if most <= room:
-        return ask.plan(0, most, "it moves too little", random=True)
-    if most > min(ask.height, ask.width):
-        return ask.plan(1, 0.0, "it moves too far for a lattice")
-    plates = [(points, value, ask.height, ask.width) for value in set(smoothing)]
-    # Errors and slopes are not at their largest in one place.
-    slope, bend = (_SLOPE_SIGMAS * amplitude * max(f(_plate(*plate)) for plate in plates) for f in (_slope, _bend))
-    largest = _MARGIN * _SIGMAS * amplitude
-    lines = largest * max(_deviation(plate, 1, 2) for plate in plates)
-    more: dict[str, Any] = {"slope": slope, "smooth": Smoothness(bend, math.inf, lines, Cubics(largest, tuple(plates)))}
-
-    def attempt(stride: int) -> Plan | None:
-        off = largest * max(_deviation(plate, stride, 4) for plate in plates)
-        if off > room:
-            return None
-        error = off + cast(float, ask.tolerance_px) - room
-        return ask.plan(stride, error, "kinks of the second derivative", random=True, **more)
-
-    return coarsest(attempt) or ask.plan(1, 0.0, "the plate bends too much for cubics", **more)
+_SIGMAS = 7.0  # the two components of the error are longer with a probability of exp(-_SIGMAS^2 / 2), 2e-11
+_DERIVATIVE_SIGMAS = 4.0  # errors and derivatives are not at their largest in the same place
+_SAFETY = 1.25
+_MAX_POINTS = 64  # at which errors are measured
+_LEVELS = np.array([2.0, 16.0, 64.0, 256.0])  # px, strides at which errors are measured
+_INSIDE = (1, 3, 5)  # positions in a cell, sixths
+_PLACES = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (0.25, 0.25))  # of a control point in its cell
+_NEAREST = math.exp(-1)  # px from a control point: ln r there is its mean over the first px
 
 
 @dataclass(frozen=True)
-class Cubics:
-    """As for `Smoothness`."""
+class ThinPlateErrorModel:
+    """Error bounds for thin-plate splines through a lattice of points with normal displacements; see `ErrorModel`.
 
-    largest: float  # px, times a deviation
-    plates: tuple[_Arguments, ...]
+    amplitude: px, the largest standard deviation of the displacements.
+    lattice: rows and columns of control points, from corner to corner.
+    smoothing: range.
+    """
 
-    def __call__(self, stride: float) -> float:
-        """Px, the largest error."""
-        return self.largest * max(_deviation(plate, stride, 4, at) for plate in self.plates for at in _PLACES)
+    amplitude: float
+    lattice: tuple[int, int]
+    smoothing: Range
+
+    is_random = True
+
+    def bounds(self, height: int, width: int) -> FlowBounds:
+        """Return bounds of the displacement, and measured ones of its derivatives and of the error of cubics."""
+        return _bounds(self, height, width)
+
+    def simplify(self, height: int, width: int, budget_px: float) -> Simplification:
+        """Leave out nothing; a flow that is longer than the frame is computed at every pixel."""
+        if _max_displacement(self) > min(height, width):
+            return Simplification(0.0, can_interpolate=False, why="the flow is longer than the frame")
+        return Simplification(0.0, why="kinks of the second derivative")
+
+    def contains(self, params: Any) -> Tensor:
+        """Return (), bool: displacements and smoothing are such as can be drawn; points are not compared."""
+        low, high = (end * (1 + sign * 1e-5) for end, sign in zip(self.smoothing, (-1, 1), strict=True))
+        is_smooth = (params.smoothing >= low) & (params.smoothing <= high)
+        return is_smooth.all() & (params.displacement.abs() <= LARGEST_NORMAL * self.amplitude * (1 + 1e-5)).all()
 
 
-class _Plate(NamedTuple):
-    """A lattice of N control points, in units of their rms radius."""
+def _max_displacement(model: ThinPlateErrorModel) -> float:
+    return 2 * _SIGMAS * model.amplitude
 
-    points: np.ndarray  # (N, 2)
+
+@lru_cache(maxsize=256)
+def _bounds(model: ThinPlateErrorModel, height: int, width: int) -> FlowBounds:
+    splines = [_unit_splines(model.lattice, value, height, width) for value in sorted(set(model.smoothing))]
+    steep, largest = _DERIVATIVE_SIGMAS * model.amplitude, _SAFETY * _SIGMAS * model.amplitude
+    errors = np.array([max(_deviation(spline, level) for spline in splines) for level in _LEVELS])
+    log_levels, log_errors = np.log(_LEVELS), np.log(np.maximum(errors, 1e-30))
+
+    def interpolation_error(strides: np.ndarray) -> np.ndarray:
+        # The error is a sum of a second and a fourth power of the stride: lines between logarithms lie above it.
+        between = largest * np.exp(np.interp(np.log(strides), log_levels, log_errors))
+        return np.where(np.asarray(strides) > _LEVELS[-1], np.inf, between)
+
+    return FlowBounds(
+        _max_displacement(model),
+        steep * max(map(_gradient, splines)),
+        steep * max(map(_second_derivative, splines)),
+        math.inf,
+        interpolation_error,
+    )
+
+
+class _UnitSplines(NamedTuple):
+    """Splines through a lattice of P control points, each of which displaces one point by 1."""
+
+    points: np.ndarray  # (P, 2), in units of their rms radius
     center: np.ndarray  # (2,), px
     scale: float  # px, of the unit
-    weights: np.ndarray  # (N + 3, N): of the kernels and of 1, x, y, one column for each point that is displaced by 1
-    looked_at: np.ndarray  # (n, 2), px: some of the points, at which the kernels have kinks
+    weights: np.ndarray  # (P + 3, P): of the kernels and of 1, x, y, one column for each spline
+    measured: np.ndarray  # (n, 2), px: some of the points
 
 
 @lru_cache(maxsize=64)
-def _plate(points: tuple[int, int], smoothing: float, height: int, width: int) -> _Plate:
-    y, x = (np.linspace(0, max(size - 1, 1), count) for size, count in zip((height, width), points, strict=True))
+def _unit_splines(lattice: tuple[int, int], smoothing: float, height: int, width: int) -> _UnitSplines:
+    y, x = (np.linspace(0, max(size - 1, 1), count) for size, count in zip((height, width), lattice, strict=True))
     at = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1).reshape(-1, 2)
     center = at.mean(axis=0)
     scale = float(np.sqrt(((at - center) ** 2).sum(axis=1).mean()))
@@ -97,55 +108,54 @@ def _plate(points: tuple[int, int], smoothing: float, height: int, width: int) -
     kernel = _kernel(unit[:, None] - unit) + smoothing * np.eye(len(unit))
     system = np.block([[kernel, plane], [plane.T, np.zeros((3, 3))]])
     weights = np.linalg.solve(system, np.eye(len(unit) + 3))[:, : len(unit)]
-    chosen = np.unique(np.linspace(0, len(at) - 1, min(len(at), _MOST_POINTS)).round().astype(int))
-    return _Plate(unit, center, scale, weights, at[chosen])
+    chosen = np.unique(np.linspace(0, len(at) - 1, min(len(at), _MAX_POINTS)).round().astype(int))
+    return _UnitSplines(unit, center, scale, weights, at[chosen])
 
 
-@lru_cache(maxsize=1024)
-def _deviation(plate: _Arguments, stride: float, taps: int, place: tuple[float, float] | None = None) -> float:
-    """Of the largest error of polynomials through so many nodes along each axis, for displacements of deviation 1.
-
-    plate: arguments as for `_plate`.
-    place: of each kink in its cell, cells; None for a lattice that begins where the frame does.
-    """
-    unit, center, scale, weights, looked_at = _plate(*plate)
-    step = stride / scale
+def _deviation(splines: _UnitSplines, stride: float) -> float:
+    """Measure the deviation of the largest error of cubics, for displacements of deviation 1."""
+    unit, center, scale, weights, measured = splines
     around = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
-    first = np.floor(looked_at / stride) if place is None else looked_at / stride - place
-    cells = np.unique((first[:, None] + around).reshape(-1, 2), axis=0)
-    corners = (cells * stride - center) / scale
-    own = np.arange(1 - taps // 2, taps // 2 + 1)
-    nodes = np.stack(np.meshgrid(own, own), axis=-1).reshape(-1, 2)
-    known = _kernel(corners[:, None, None] + step * nodes[:, None] - unit)  # (cells, nodes, N)
-    largest = 0.0
-    through = lagrange_weights(6, taps, dtype=torch.float64, device=torch.device("cpu")).numpy()
-    for x, y in itertools.product(_INSIDE, repeat=2):
-        between = np.einsum("j,cjn->cn", np.outer(through[y], through[x]).ravel(), known)
-        error = (_kernel(corners[:, None] + step * np.array([x, y]) / 6 - unit) - between) @ weights[: len(unit)]
-        largest = max(largest, float(np.sqrt((error**2).sum(axis=1)).max()))
+    offsets = np.arange(-1, 3)
+    nodes = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
+    step, largest = stride / scale, 0.0
+    for place in _PLACES:
+        cells = np.unique(((measured / stride - place)[:, None] + around).reshape(-1, 2), axis=0)
+        corners = (cells * stride - center) / scale
+        at_nodes = _kernel(corners[:, None, None] + step * nodes[:, None] - unit)  # (cells, nodes, P)
+        for x, y in itertools.product(_INSIDE, repeat=2):
+            between = np.einsum("j,cjp->cp", np.outer(_cubic_weights(y / 6), _cubic_weights(x / 6)).ravel(), at_nodes)
+            error = (_kernel(corners[:, None] + step * np.array([x, y]) / 6 - unit) - between) @ weights[: len(unit)]
+            largest = max(largest, float(np.sqrt((error**2).sum(axis=1)).max()))
     return largest
 
 
-def _slope(plate: _Plate) -> float:
-    """The deviation of the steepest slope, for displacements of deviation 1."""
+def _cubic_weights(t: float) -> np.ndarray:
+    """Return the weights of the nodes -1, 0, 1, 2 in the cubic Lagrange polynomial at t."""
+    return np.array(
+        [-t * (t - 1) * (t - 2) / 6, (t * t - 1) * (t - 2) / 2, -t * (t + 1) * (t - 2) / 2, t * (t * t - 1) / 6]
+    )
+
+
+def _gradient(splines: _UnitSplines) -> float:
+    """Measure the deviation of the largest gradient, for displacements of deviation 1."""
     pixel = np.array([[[1.0, 0.0]], [[-1.0, 0.0]], [[0.0, 1.0]], [[0.0, -1.0]]])
-    at = (plate.looked_at + pixel - plate.center) / plate.scale  # (4, n, 2)
+    at = (splines.measured + pixel - splines.center) / splines.scale  # (4, n, 2)
     plane = np.concatenate([np.ones_like(at[..., :1]), at], axis=-1)
-    right, left, down, up = np.concatenate([_kernel(at[:, :, None] - plate.points), plane], axis=-1) @ plate.weights
-    slopes = np.stack([right - left, down - up]) / 2
-    return float(np.sqrt((slopes**2).sum(axis=-1)).max())
+    right, left, down, up = np.concatenate([_kernel(at[:, :, None] - splines.points), plane], axis=-1) @ splines.weights
+    gradients = np.stack([right - left, down - up]) / 2
+    return float(np.sqrt((gradients**2).sum(axis=-1)).max())
 
 
-def _bend(plate: _Plate) -> float:
-    """The deviation of the largest second derivative along a line, for displacements of deviation 1."""
+def _second_derivative(splines: _UnitSplines) -> float:
+    """Measure the deviation of the largest second derivative along a line, for displacements of deviation 1."""
     largest = 0.0
     for line in np.array([[1.0, 0.0], [0.0, 1.0], [0.5**0.5, 0.5**0.5], [0.5**0.5, -(0.5**0.5)]]):
-        at = plate.looked_at[:, None] + _NEAREST * line
-        step = 0.1 * line / plate.scale
-        places = (at - plate.center) / plate.scale + np.array([-step, 0 * step, step])  # (n, 3, 2)
-        before, here, behind = (_kernel(places[:, i, None] - plate.points) for i in range(3))
-        bends = (before - 2 * here + behind) / 0.1**2 @ plate.weights[: len(plate.points)]
-        largest = max(largest, float(np.sqrt((bends**2).sum(axis=-1)).max()))
+        at = (splines.measured[:, None] + _NEAREST * line - splines.center) / splines.scale
+        step = 0.1 * line / splines.scale
+        values = _kernel((at + np.array([-step, 0 * step, step]))[:, :, None] - splines.points)  # (n, 3, P)
+        second = (values[:, 0] - 2 * values[:, 1] + values[:, 2]) / 0.1**2 @ splines.weights[: len(splines.points)]
+        largest = max(largest, float(np.sqrt((second**2).sum(axis=-1)).max()))
     return largest
 
 

@@ -72,6 +72,7 @@ class LensDistortion(WarpEffect):
     """
 
     params_type = LensParams
+    has_closed_form = True
     rounding_ulps = 16  # Newton's method magnifies the rounding of positions
     has_sample_models = True
 

@@ -50,8 +50,8 @@ class Rectification(WarpEffect):
         flow(p) = f (distort((p - c) / f) - (p - c) / f)
 
     `flow` distorts (closed form), `restore_flow` undistorts (the exact inverse): it is `LensDistortion` in the other
-    direction. Before other warps in a `Compose` it shares their sampling, so that raw frames are degraded like rectified
-    ones without being blurred twice:
+    direction. Before other warps in a `Compose` it shares their sampling, so that raw frames are degraded like
+    rectified ones without being blurred twice:
 
         scene = Compose([Rectification(camera), LensDistortion()])
         d = scene.degrade(raw)  # d.image from the raw frame, sampled once
@@ -72,6 +72,7 @@ class Rectification(WarpEffect):
     """
 
     params_type = RectificationParams
+    has_closed_form = True
     rounding_ulps = 16  # Newton's method magnifies the rounding of positions
 
     def __init__(

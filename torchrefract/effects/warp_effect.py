@@ -65,6 +65,7 @@ class WarpEffect(Effect):
     """
 
     rounding_ulps = DEFAULT_ULPS
+    has_closed_form = False  # whether `flow` computes any point without a lattice of its own
     has_sample_models = False  # whether `error_model` accepts the parameters of one sample
 
     def __init__(
@@ -178,9 +179,9 @@ class WarpEffect(Effect):
     def sample_models(self, params: Any) -> Sequence[ErrorModel | None]:
         """Return the error model of each sample; that of the ranges if values cannot be read."""
         count = len(params.applied)
-        if not self.has_sample_models or eager_bool(lambda: params.applied.any(), of=params.applied) is None:
+        if not self.has_sample_models or eager_bool(params.applied.any, of=params.applied) is None:
             return [self.error_model()] * count
-        return [self.error_model(select_params(params, slice(i, i + 1))) for i in range(count)]
+        return [self.error_model(select_params(params, torch.tensor([i]))) for i in range(count)]
 
     def degrade_batch(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """Sample the images along the flow."""
@@ -208,7 +209,7 @@ class WarpEffect(Effect):
 class FlowPart(NamedTuple):
     """The flow of some samples of a batch."""
 
-    index: Tensor | None  # (n,), their numbers; None for the whole batch
+    samples: Tensor | None  # (n,), their numbers; None for the whole batch
     flow: LatticeFlow
     exists: Tensor  # bool, broadcasts to (n, 1, H, W)
 
@@ -269,7 +270,7 @@ class BatchFlow:
         result = torch.empty_like(image)
         frames = image.shape[0] // self.num_rows
         for index, flow, _ in self.parts:
-            assert index is not None
+            assert index is not None  # of several parts
             rows = rows_of_samples(index, frames * len(flow.nodes) // len(index))
             nodes = expand_batch(flow.nodes, len(rows))
             part = sample_image(

@@ -522,7 +522,7 @@ def _composed_flow(warps: Sequence[tuple[WarpEffect, Any]], plan: CompositionPla
     total: Tensor | None = None
     exists = torch.ones(1, 1, 1, 1, dtype=torch.bool, device=device)
     for (effect, params), warp_plan in zip(reversed(warps), reversed(plan.plans), strict=True):
-        if warp_plan.is_identity:
+        if warp_plan.stride == 0:
             continue
         flow, flow_exists = effect.flow(params, points if total is None else points.displaced(total), warp_plan)
         active = effect.active(params, height, width)

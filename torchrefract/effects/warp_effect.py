@@ -20,6 +20,7 @@ from torchrefract.planning.plan import (
     PlanRequest,
     WarpPlan,
     check_tolerance,
+    lattice_with_stride,
     plan_warp,
 )
 from torchrefract.types import Degraded, Inverse, Map
@@ -89,7 +90,7 @@ class WarpEffect(Effect):
 
         Args:
             params: with B rows.
-            points: the nodes of `plan.lattice`, or in a composition any points, with N rows.
+            points: the nodes of the plan's lattice, or in a composition any points, with N rows.
             plan: how exact the flow has to be.
 
         Returns:
@@ -144,11 +145,12 @@ class WarpEffect(Effect):
     def masked_flow(self, params: Any, plan: WarpPlan) -> tuple[LatticeFlow, Tensor]:
         """Compute the flow at the nodes of a plan, zero for samples that do not move, and where it exists."""
         dtype = next(value.dtype for value in params if value.is_floating_point())
-        nodes, exists = self.flow(params, plan.lattice.points(dtype=dtype, device=params.applied.device), plan)
+        lattice = lattice_with_stride(plan.height, plan.width, plan.stride)
+        nodes, exists = self.flow(params, lattice.points(dtype=dtype, device=params.applied.device), plan)
         active = expand_batch(self.active(params, plan.height, plan.width), nodes.shape[0])
         if plan.stride > 1:
             exists = active.new_ones(1, 1, 1, 1)
-        return LatticeFlow(where_active(nodes, 0.0, active, params), plan.lattice), exists | ~per_sample(active)
+        return LatticeFlow(where_active(nodes, 0.0, active, params), lattice), exists | ~per_sample(active)
 
     def masked_inverse_flow(self, params: Any, flow: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the flow that undoes a masked one (N, 2, H, W), zero for samples that do not move."""

@@ -126,11 +126,6 @@ class WarpPlan:
     num_samplings: int = 1
 
     @property
-    def lattice(self) -> Lattice:
-        """Return the lattice at whose nodes the flow is computed."""
-        return lattice_with_stride(self.height, self.width, self.stride)
-
-    @property
     def is_identity(self) -> bool:
         """Return True if no flow is computed, because none would exceed the tolerance."""
         return self.stride == 0

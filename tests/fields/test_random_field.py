@@ -247,7 +247,7 @@ def test_a_field_is_the_sum_of_its_waves_at_any_rows_and_columns(frequencies, dt
     # By FFT if the step divides the domain, otherwise by products of matrices.
     rows, columns = range(-4 * step, 9 * step, step), range(-step, 25 * step, step)
     values = torch.randn(2, 2, *frequencies.counts, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    ky, kx = (2 * math.pi / n * k for k, n in zip(frequencies.numbers(values.device), (12, 20), strict=True))
+    ky, kx = (2 * math.pi / n * k.double() for k, n in zip(frequencies.numbers(values.device), (12, 20), strict=True))
     phase = [k[:, None] * torch.tensor(list(p)).double() for k, p in ((ky, rows), (kx, columns))]
     waves = [torch.polar(torch.ones_like(angle), -angle) for angle in phase]
     expected = torch.einsum("bkl,ky,lx->byx", torch.complex(*values.unbind(1)), *waves)
@@ -377,8 +377,8 @@ def test_gradients_are_finite_at_zero_aperture_and_at_clipped_eigenvalues():
     assert torch.autograd.grad(amplitude(length.detach(), aperture).square().sin().sum(), aperture)[0].item() == 0
 
 
-@pytest.mark.parametrize("kind", ["exponential", "gaussian"])
-def test_one_graph_computes_the_same_field_and_gradient(kind):
+def test_one_graph_computes_the_same_field_and_gradient():
+    kind = "gaussian"
     frequencies = Frequencies.all(embedding_size(9, 14, length=4.0, kind=kind))
 
     def field(length: Tensor, aperture: Tensor) -> Tensor:

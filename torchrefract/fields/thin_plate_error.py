@@ -22,7 +22,7 @@ from torchrefract.types import FlowBounds, Range, Simplification
 
 _SIGMAS = 7.0  # the two components of the error are longer with a probability of exp(-_SIGMAS^2 / 2), 2e-11
 _DERIVATIVE_SIGMAS = 4.0  # errors and derivatives are not at their largest in the same place
-_SAFETY = 1.25
+_SAFETY, _GRADIENT_SAFETY = 1.25, 1.05
 _MAX_POINTS = 64  # at which errors are measured
 _LEVELS = np.array([2.0, 16.0, 64.0, 256.0])  # px, strides at which errors are measured
 _INSIDE = (1, 3, 5)  # positions in a cell, sixths
@@ -80,7 +80,7 @@ def _bounds(model: ThinPlateErrorModel, height: int, width: int) -> FlowBounds:
 
     return FlowBounds(
         _max_displacement(model),
-        steep * max(map(_gradient, splines)),
+        _GRADIENT_SAFETY * steep * max(map(_gradient, splines)),
         steep * max(map(_second_derivative, splines)),
         math.inf,
         interpolation_error,

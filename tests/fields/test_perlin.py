@@ -9,10 +9,10 @@ import torch
 from scipy import stats
 from torch import Tensor
 from torch.testing import assert_close
+from torchrefract.fields.perlin_lattice import Octave, octave
 
 from torchrefract import random
 from torchrefract.fields.perlin import perlin_noise
-from torchrefract.fields.perlin_lattice import Octave, octave
 
 PERIODS = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 WEIGHTS = (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)

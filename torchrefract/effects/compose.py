@@ -20,6 +20,7 @@ from torchrefract.effects.warp_effect import (
     FlowPart,
     SamplingOptions,
     WarpEffect,
+    flow_dtype,
     warped,
 )
 from torchrefract.planning.composition import ComposePlan, CompositionPlan, PlannedWarp, plan_composition
@@ -305,14 +306,16 @@ class _Progress:
         warps = [(cast(WarpEffect, leaf.effect), leaf.params) for leaf in leaves]
         active = [effect.active(params, height, width) for effect, params in warps]
         groups = _group_samples(warps, active, request)
+        applied, moved = torch.stack([params.applied for _, params in warps]).any(dim=0), torch.stack(active).any(dim=0)
         parts = []
         for index, acting, plan in groups:
             chosen = [warps[k] for k in acting]
             if index is not None:
                 chosen = [(effect, select_params(params, index)) for effect, params in chosen]
             parts.append(FlowPart(index, *_composed_flow(chosen, plan)))
-        applied = torch.stack([params.applied for _, params in warps]).any(dim=0)
-        segment = _Segment(applied, torch.stack(active).any(dim=0), BatchFlow(parts))
+            if all(warp_plan.stride == 0 for warp_plan in plan.plans) and not _needs_gradient(chosen):
+                moved = torch.zeros_like(moved) if index is None else moved.index_fill(0, index, False)
+        segment = _Segment(applied, moved, BatchFlow(parts))
         self.image = _sample_segment(self.image, segment, leaves, active)
         if self.depth is not None:
             depth, detached = expand_batch(self.depth, rows), segment._replace(flow=segment.flow.detach())
@@ -484,7 +487,7 @@ def _group_samples(
         cannot be read, one group with all warps, whose plan holds for any subset of them.
     """
     flags = None
-    if not any(requires_grad(params) for _, params in warps):
+    if not _needs_gradient(warps):
         flags = eager_values(lambda: torch.stack(list(active), dim=1), of=active[0])
     everything = list(range(len(warps)))
     if flags is None:
@@ -499,6 +502,10 @@ def _group_samples(
     if len(groups) == 1:
         return [(None, acting, plan) for _, acting, plan in groups.values()]
     return [(torch.tensor(rows), acting, plan) for rows, acting, plan in groups.values()]
+
+
+def _needs_gradient(warps: Sequence[tuple[WarpEffect, Any]]) -> bool:
+    return any(requires_grad(params) for _, params in warps)
 
 
 def _planned_samples(effect: WarpEffect, params: Any, request: PlanRequest) -> list[PlannedWarp]:
@@ -516,7 +523,7 @@ def _composed_flow(warps: Sequence[tuple[WarpEffect, Any]], plan: CompositionPla
         return warps[0][0].masked_flow(warps[0][1], plan.plans[0])
     height, width = plan.plans[0].height, plan.plans[0].width
     lattice = lattice_with_stride(height, width, plan.stride)
-    dtype = next(value.dtype for value in warps[0][1] if value.is_floating_point())
+    dtype = flow_dtype(warps[0][1])
     device = warps[0][1].applied.device
     points = lattice.points(dtype=dtype, device=device)
     total: Tensor | None = None

@@ -144,9 +144,13 @@ class WarpEffect(Effect):
 
     def masked_flow(self, params: Any, plan: WarpPlan) -> tuple[LatticeFlow, Tensor]:
         """Compute the flow at the nodes of a plan, zero for samples that do not move, and where it exists."""
-        dtype = next(value.dtype for value in params if value.is_floating_point())
+        dtype, device = flow_dtype(params), params.applied.device
         lattice = lattice_with_stride(plan.height, plan.width, plan.stride)
-        nodes, exists = self.flow(params, lattice.points(dtype=dtype, device=params.applied.device), plan)
+        if plan.stride == 0 and not requires_grad(params):
+            zero = torch.zeros(1, 2, plan.height, plan.width, dtype=dtype, device=device)
+            everywhere = torch.ones(1, 1, 1, 1, dtype=torch.bool, device=device)
+            return LatticeFlow(zero.expand(len(params.applied), -1, -1, -1), lattice), everywhere
+        nodes, exists = self.flow(params, lattice.points(dtype=dtype, device=device), plan)
         active = expand_batch(self.active(params, plan.height, plan.width), nodes.shape[0])
         if plan.stride > 1:
             exists = active.new_ones(1, 1, 1, 1)
@@ -161,22 +165,26 @@ class WarpEffect(Effect):
 
     def planned_flow(self, params: Any, height: int, width: int) -> "BatchFlow":
         """Compute the flow by the plan of the ranges, or by one for each sample."""
-        dtype = next(value.dtype for value in params if value.is_floating_point())
+        dtype = flow_dtype(params)
         plan = self._constant_plan(id(self), height, width, dtype)
         if not plan.is_per_sample or requires_grad(params):
-            return BatchFlow([FlowPart(None, *self.masked_flow(params, plan))])
+            return BatchFlow([self._flow_part(None, params, plan)])
         request = self.plan_request(height, width, dtype)
         plans = [plan_warp(model, request) for model in self.sample_models(params)]
         groups: dict[Any, list[int]] = {}
         for i, sample_plan in enumerate(plans):
             groups.setdefault((sample_plan.stride, sample_plan.details), []).append(i)
         if len(groups) == 1:
-            return BatchFlow([FlowPart(None, *self.masked_flow(params, plans[0]))])
+            return BatchFlow([self._flow_part(None, params, plans[0])])
         parts = []
         for group in groups.values():
             index = torch.tensor(group)
-            parts.append(FlowPart(index, *self.masked_flow(select_params(params, index), plans[group[0]])))
+            parts.append(self._flow_part(index, select_params(params, index), plans[group[0]]))
         return BatchFlow(parts)
+
+    def _flow_part(self, samples: Tensor | None, params: Any, plan: WarpPlan) -> "FlowPart":
+        is_zero = plan.stride == 0 and not requires_grad(params)
+        return FlowPart(samples, *self.masked_flow(params, plan), is_zero)
 
     def sample_models(self, params: Any) -> Sequence[ErrorModel | None]:
         """Return the error model of each sample; that of the ranges if values cannot be read."""
@@ -191,6 +199,8 @@ class WarpEffect(Effect):
         if not self.may_change(params) or height * width == 1:
             return unchanged(image, params)
         flow = self.planned_flow(params, height, width)
+        if flow.is_zero:
+            return unchanged(image, params)
         active = expand_batch(self.active(params, height, width), image.shape[0])
         options = SamplingOptions(self.padding, self.interpolation, self.backend)
         return warped(
@@ -214,6 +224,7 @@ class FlowPart(NamedTuple):
     samples: Tensor | None  # (n,), their numbers; None for the whole batch
     flow: LatticeFlow
     exists: Tensor  # bool, broadcasts to (n, 1, H, W)
+    is_zero: bool = False  # whether the plan computes no flow
 
 
 class BatchFlow:
@@ -227,6 +238,11 @@ class BatchFlow:
     def num_rows(self) -> int:
         """Return B, or B T for flows that change over a clip."""
         return sum(len(part.flow.nodes) for part in self.parts)
+
+    @property
+    def is_zero(self) -> bool:
+        """Return True if no flow was computed, because none exceeds the tolerance."""
+        return all(part.is_zero for part in self.parts)
 
     @property
     def dense(self) -> Tensor:
@@ -271,7 +287,7 @@ class BatchFlow:
             return sample_image(image, flow.with_nodes(nodes), active=active, **options)
         result = torch.empty_like(image)
         frames = image.shape[0] // self.num_rows
-        for index, flow, _ in self.parts:
+        for index, flow, *_ in self.parts:
             assert index is not None  # of several parts
             rows = rows_of_samples(index, frames * len(flow.nodes) // len(index))
             nodes = expand_batch(flow.nodes, len(rows))
@@ -285,10 +301,15 @@ class BatchFlow:
         if len(values) == 1:
             return values[0]
         result = values[0].new_empty(sum(map(len, values)), *values[0].shape[1:])
-        for (index, _, _), value in zip(self.parts, values, strict=True):
+        for (index, *_), value in zip(self.parts, values, strict=True):
             assert index is not None
             result = result.index_copy(0, rows_of_samples(index, len(value) // len(index)), value)
         return result
+
+
+def flow_dtype(params: Any) -> torch.dtype:
+    """Return the type of the flow that parameters give."""
+    return next(value.dtype for value in params if value.is_floating_point())
 
 
 def rows_of_samples(index: Tensor, frames: int) -> Tensor:

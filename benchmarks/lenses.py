@@ -27,7 +27,7 @@ from torch import Tensor
 from torchrefract import Camera
 from torchrefract._io import replace_file
 from torchrefract.cameras.conversion import Conversion, convert
-from torchrefract.cameras.lens_table import COLUMNS
+from torchrefract.cameras.lens_database import COLUMNS
 
 WHAT = (
     "Rays of all pixels of a frame that are a step apart, put into OpenCV's forward formula again: px from the pixel. "

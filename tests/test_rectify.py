@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchrefract.cameras.io.opencv import read_opencv, write_opencv
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 from torchrefract.fields.rectifying import camera_flow
 from torchrefract.videos import video_facts
 

@@ -7,7 +7,7 @@ from omegaconf import DictConfig
 
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_number
-from torchrefract.board_prints import board_page
+from torchrefract.cameras.calibration.board_page import board_page
 from torchrefract.cli.command import as_they_are, command, job, make, naming
 
 _FORMATS = (".pdf", ".png")

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchrefract import Camera
-from torchrefract.cameras.lens_table import read_lenses
+from torchrefract.cameras.lens_database import read_lenses
 
 WEBCAM = Camera(width=64, height=48, fx=50.0, fy=51.0, cx=31.0, cy=24.0, coefficients=(-0.33, 0.05, 1e-3, -2e-3, 0.06))
 FISHEYE = replace(WEBCAM, fx=25.0, fy=25.0, coefficients=(-0.02, 0.05, -0.05, 0.01), model="fisheye")

@@ -6,9 +6,9 @@ lenses. Files of other programs are read and written by the modules of `torchref
 """
 
 from torchrefract.cameras.conversion import Conversion, convert
-from torchrefract.cameras.lens_table import Lens, read_lenses
-from torchrefract.cameras.models import Camera
-from torchrefract.cameras.points import PointResult, distort, project, undistort, unproject, valid_radius
+from torchrefract.cameras.lens_database import Lens, read_lenses
+from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.projection import PointResult, distort, project, undistort, unproject, valid_radius
 
 __all__ = [
     "Camera",

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from torchrefract._validation import check_choice, check_number
-from torchrefract.cameras.models import Camera
-from torchrefract.cameras.points import image_of_rays
+from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.projection import image_of_rays
 from torchrefract.cameras.sheet import MODELS
 
 # Places along each side of the frame at which a model is fitted, and others at which it is measured.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrefract.cameras.distortion import newton_radius
+from torchrefract.cameras.brown_conrady import newton_radius
 from torchrefract.cameras.growth import first_root, growth_of_powers
 from torchrefract.cameras.radial import limit_of_curve, radial, radial_slope, reach_of
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrefract.cameras.distortion import ALL_TERMS, bent, bent_slopes, newton_radius
+from torchrefract.cameras.brown_conrady import ALL_TERMS, bent, bent_slopes, newton_radius
 from torchrefract.cameras.growth import first_root, growth_of_ratio
 from torchrefract.cameras.radial import limit_of_curve, radial, radial_slope, reach_of
 from torchrefract.warping.jacobian import Jacobian

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrefract.cameras.distortion import (
+from torchrefract.cameras.brown_conrady import (
     Jacobian,
     distort_polynomial,
     implicit,

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract.cameras.distortion import newton_iterates, used_terms
+from torchrefract.cameras.brown_conrady import newton_iterates, used_terms
 from torchrefract.types import Range
 from torchrefract.warping.lattice import Lattice
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._validation import check_positive
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.sheet import columns, image_of, on_plane, radius_within, ray_of
 from torchrefract.fields.lens import REACH, axes_on_plane, border, corner_radius, lens_rows, stacked
 from torchrefract.fields.lens_bounds import LensErrors, cubic_errors, lines_of_cells

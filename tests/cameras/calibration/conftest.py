@@ -8,7 +8,7 @@ import pytest
 from torchrefract.cameras.calibration.boards import Board, Charuco
 from torchrefract.cameras.calibration.detection import View
 from torchrefract.cameras.calibration.synthetic import render_views
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 
 SMALL = Camera(
     width=640, height=400, fx=380.0, fy=381.0, cx=322.3, cy=196.6, coefficients=(-0.25, 0.08, 0.003, -0.002, 0.01)

@@ -4,7 +4,7 @@ import pytest
 from torchrefract.cameras.calibration.boards import Chessboard
 from torchrefract.cameras.calibration.detection import View
 from torchrefract.cameras.calibration.straightness import rectified, straightness
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 
 BOARD = Chessboard(squares="9x7", square_mm=25)
 MATRIX = np.array([[700.0, 0, 405.0], [0, 702.0, 297.0], [0, 0, 1]])

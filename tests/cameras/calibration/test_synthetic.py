@@ -5,7 +5,7 @@ import torch
 from torchrefract.cameras.calibration import synthetic
 from torchrefract.cameras.calibration.boards import Chessboard
 from torchrefract.cameras.calibration.synthetic import Rays, rays_of, render_views
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 
 
 def test_rays_between_pixels_are_those_of_the_camera(small_camera):

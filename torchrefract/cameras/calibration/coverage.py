@@ -6,7 +6,7 @@ import numpy as np
 
 from torchrefract.cameras.calibration.detection import View
 from torchrefract.cameras.calibration.fit import Fit
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 
 CELLS = (6, 8)  # rows and columns of parts of the frame
 _SIGMAS = 2.0  # standard deviations, within which a coefficient is not told from zero

@@ -7,7 +7,7 @@ import torch
 
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.detection import View
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 
 _FEWEST = 3  # points of a line; two are always on one
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from torchrefract.cameras.calibration.boards import Board, Charuco
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 
 CAMERA = Camera(
     width=960, height=600, fx=470.0, fy=472.0, cx=487.3, cy=292.6, coefficients=(-0.25, 0.1, 0.006, -0.005, 0.03)

@@ -13,7 +13,7 @@ from torchrefract.cameras.io.documents import (
     whole,
     write_text,
 )
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 
 # Pinhole and coefficients out of the parameters. COLMAP's order: f or fx fy, cx, cy, then the lens.
 _Parts = tuple[Sequence[float], Sequence[float]]

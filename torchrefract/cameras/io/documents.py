@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrefract._io import replace_file
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 
 # A list that YAML's aliases fold into itself is small in memory, and without end in print.
 _SHORT = reprlib.Repr()

@@ -16,7 +16,7 @@ from torchrefract.cameras.io.documents import (
     write_text,
 )
 from torchrefract.cameras.io.yaml_documents import dump_yaml, parse_yaml
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 
 _MODELS = {"radtan": "opencv", "equidistant": "fisheye", "none": "opencv"}
 

@@ -15,7 +15,7 @@ from torchrefract.cameras.io.documents import (
     write_text,
 )
 from torchrefract.cameras.io.yaml_documents import parse_yaml
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 
 _XML, _YAML = ".xml", (".yml", ".yaml")
 

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract.cameras.distortion import (
+from torchrefract.cameras.brown_conrady import (
     POLYNOMIAL12,
     RadialLimit,
     Terms,

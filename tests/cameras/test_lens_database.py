@@ -5,7 +5,7 @@ import math
 import pytest
 
 from torchrefract.cameras.conversion import convert
-from torchrefract.cameras.lens_table import COLUMNS, read_lenses
+from torchrefract.cameras.lens_database import COLUMNS, read_lenses
 
 ROW = {
     **{"id": "a1", "camera": "Webcam", "lens": "", "model": "opencv", "width": "640", "height": "480"},

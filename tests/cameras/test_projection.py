@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import Camera
-from torchrefract.cameras.points import distort, project, undistort, unproject, valid_radius
+from torchrefract.cameras.projection import distort, project, undistort, unproject, valid_radius
 
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 FOCAL = 2000.0

@@ -23,14 +23,14 @@ import torch
 
 from torchrefract._io import replace_file
 from torchrefract._tensor import to_float, to_uint8
-from torchrefract.cli.calibration import pictures_of, read_gray
-from torchrefract.cameras.calibration.report import camera_of
 from torchrefract.cameras.calibration.boards import Board, Charuco, Chessboard
 from torchrefract.cameras.calibration.detection import SEARCH, View, detect, is_enough
 from torchrefract.cameras.calibration.fit import Fit, fit, held_out, rms
 from torchrefract.cameras.calibration.outliers import drop_outliers
+from torchrefract.cameras.calibration.report import camera_of
 from torchrefract.cameras.calibration.straightness import straightness
 from torchrefract.cameras.camera import Camera
+from torchrefract.cli.calibration import pictures_of, read_gray
 from torchrefract.fields.rectifying import camera_flow
 from torchrefract.warping.resample import warp
 

@@ -9,8 +9,8 @@ import pytest
 
 from torchrefract.cameras.calibration.boards import Charuco
 from torchrefract.cameras.calibration.synthetic import CAMERA, render_views
-from torchrefract.cameras.io.opencv import read_opencv
 from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.io.opencv import read_opencv
 
 SMALL = Camera(width=640, height=400, fx=380.0, fy=381.0, cx=322.3, cy=196.6, coefficients=(-0.25, 0.08, 0.003, -0.002))
 BOARD = Charuco(squares="6x5", square_mm=30, marker_mm=20, dictionary="DICT_4X4_50")

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchrefract.cameras.io.opencv import read_opencv, write_opencv
 from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.io.opencv import read_opencv, write_opencv
 from torchrefract.fields.rectifying import camera_flow
 from torchrefract.videos import video_facts
 

@@ -10,14 +10,21 @@ from omegaconf import DictConfig
 
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_choice, check_number
-from torchrefract.cli.calibration import Look, look_at, main_size, pictures_of, shown_instead
-from torchrefract.cameras.calibration.report import CAMERA_FILE, Calibration, camera_of, set_aside, write_looks, write_report
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.coverage import faults
 from torchrefract.cameras.calibration.fit import FEWEST_VIEWS, MODELS, held_out
 from torchrefract.cameras.calibration.outliers import drop_outliers
+from torchrefract.cameras.calibration.report import (
+    CAMERA_FILE,
+    Calibration,
+    camera_of,
+    set_aside,
+    write_looks,
+    write_report,
+)
 from torchrefract.cameras.calibration.synthetic import CAMERA, VIEWS, render_views
 from torchrefract.cameras.io.opencv import write_opencv
+from torchrefract.cli.calibration import Look, look_at, main_size, pictures_of, shown_instead
 from torchrefract.cli.command import as_they_are, command, job, make, naming, progress
 
 _RENDERED = "synthetic"

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_number
-from torchrefract.cameras.io.opencv import read_opencv, write_opencv
 from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.io.opencv import read_opencv, write_opencv
 from torchrefract.cli.command import as_they_are, command, job, naming, progress
 from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
 from torchrefract.fields.rectifying import camera_flow

@@ -48,7 +48,7 @@ def test_what_others_leave_is_counted():
 
 def test_a_fisheye_is_compared_where_a_plane_shows_it():
     wide = replace(FISHEYE, fx=14.0, fy=14.0)
-    assert wide.unproject(wide.places(3)).points[:, 2].min() < 0
+    assert wide.unproject(wide.grid(3)).points[:, 2].min() < 0
     row = lenses.inverse_row("wide", wide, step=4)
     assert row.kornia_px is None
     assert (row.wrong, row.opencv_wrong) == (0, 0)

@@ -15,10 +15,10 @@ from torchrefract.cameras.brown_conrady import (
     Terms,
     distort_polynomial,
     jacobian_polynomial,
+    radial_limit,
     undistort_polynomial,
     used_terms,
 )
-from torchrefract.cameras.radial import radial_limit
 
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 FOCAL = 2000.0
@@ -224,8 +224,8 @@ def test_terms_that_are_left_out_are_those_of_zeros():
     x, y = points(0.7, 9)
     names = {"k1": -0.2, "k3": 0.05}
     assert used_terms(lens(names)[..., 0]) == Terms(radial=3, tangential=False, prism=False)
-    assert used_terms(lens({"p2": 0.1})[..., 0]) == Terms(radial=0, tangential=True, prism=False, round=False)
-    assert used_terms(lens({"s3": 0.1})[..., 0]) == Terms(radial=0, tangential=False, prism=True, round=False)
+    assert used_terms(lens({"p2": 0.1})[..., 0]) == Terms(radial=0, tangential=True, prism=False)
+    assert used_terms(lens({"s3": 0.1})[..., 0]) == Terms(radial=0, tangential=False, prism=True)
     # A coefficient whose gradient is asked for counts, at zero too.
     assert used_terms(lens({})[..., 0].requires_grad_()) == Terms()
     c, few = lens(names), Terms(3, False, False)

@@ -82,7 +82,7 @@ def test_a_wide_fisheye_is_no_polynomial_and_that_is_reported(published):
 def test_rays_that_no_plane_shows_are_left_out_and_counted(published):
     camera = published["ov_rs_t265_cam0"]  # sees past 90 degrees
     made = convert(camera, to="opencv", most_angle_deg=70)
-    rays = camera.unproject(camera.places(129)).points
+    rays = camera.unproject(camera.grid(129)).points
     assert made.covered == pytest.approx((rays[:, 2] > math.cos(math.radians(70))).double().mean().item(), abs=1e-3)
     assert made.max_px < 0.1
 
@@ -96,7 +96,7 @@ def test_a_camera_comes_back_from_the_other_model(model, coefficients):
     there = convert(camera, to="opencv", count=14)
     back = convert(there.camera, to=model)
     assert there.max_px < 1e-3
-    pixels = camera.places(17)
+    pixels = camera.grid(17)
     assert (back.camera.project(camera.unproject(pixels).points).points - pixels).abs().max() < 3e-3
     assert convert(camera, to=model).camera is camera
 

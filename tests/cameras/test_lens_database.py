@@ -50,7 +50,7 @@ def test_a_polynomial_of_the_table_is_as_near_as_the_table_says():
             assert lens.residual_px == 0
             assert lens.polynomial.coefficients == lens.camera.polynomial()
         else:
-            pixels = lens.camera.places(65)
+            pixels = lens.camera.grid(65)
             seen = lens.polynomial.project(lens.camera.unproject(pixels).points)
             assert seen.valid.all()
             error = (seen.points - pixels).norm(dim=1).max().item()

@@ -1,4 +1,4 @@
-"""A table of real lenses: numbers that others have published, each with its source."""
+"""A database of real lenses: published calibrations, each with its source."""
 
 import csv
 import json
@@ -11,19 +11,19 @@ COLUMNS = (
     *("id", "camera", "lens", "model", "width", "height", "fx", "fy", "cx", "cy", "coefficients"),
     *("polynomial12", "residual_px", "covered", "source", "licence"),
 )
-_SHIPPED = Path(__file__).with_name("lenses.csv")
+_PACKAGED = Path(__file__).with_name("lenses.csv")
 
 
 class Lens(NamedTuple):
-    """A row of the table.
+    """A row of the database.
 
-    name: of the row.
-    title: camera and lens, in words.
-    camera: as it was published.
-    polynomial: the same in "polynomial12", where one comes near to it.
-    residual_px: how far apart the two show a ray of the frame at most, px; of the nearest where `polynomial` is None.
-    source: the repository and the file in it that the numbers are from.
-    licence: that the source states.
+    name: unique name of the row.
+    title: camera and lens.
+    camera: as published.
+    polynomial: the camera converted to "polynomial12"; None if no polynomial comes close.
+    residual_px: largest distance between the two over the frame, px, or of the closest polynomial if it is None.
+    source: repository and file that the numbers come from.
+    licence: stated by the source.
     """
 
     name: str
@@ -36,15 +36,15 @@ class Lens(NamedTuple):
 
 
 def read_lenses(path: str | Path | None = None) -> tuple[Lens, ...]:
-    """The lenses of a table, a CSV with the columns `COLUMNS`.
+    """Read a CSV of lenses with the columns `COLUMNS`.
 
     Args:
-        path: of the table; None is the one of the package, with dashcams, phones, action, car and robot cameras.
+        path: of the CSV; None reads the one of the package, with dashcams, phones, action, car and robot cameras.
 
     Raises:
-        ValueError: a table without these columns or without rows; a row that is no lens, NaN included.
+        ValueError: the file has no such columns or no rows, or a row has an invalid value.
     """
-    path = _SHIPPED if path is None else Path(path)
+    path = _PACKAGED if path is None else Path(path)
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
@@ -60,19 +60,19 @@ def read_lenses(path: str | Path | None = None) -> tuple[Lens, ...]:
 
 
 def _lens(path: Path, row: dict[str, str]) -> Lens:
-    title = " ".join(filter(None, (row["camera"], row["lens"])))
     try:
         camera = _camera(row, row["model"], row["coefficients"])
-        near = row["model"] == "polynomial12" or not row["residual_px"]
-        # What is no fit is another order of the same numbers.
-        polynomial = _camera(row, "polynomial12", json.dumps(camera.polynomial())) if near else None
+        polynomial = None
         if row["polynomial12"]:
             polynomial = _camera(row, "polynomial12", row["polynomial12"])
+        elif row["model"] == "polynomial12" or not row["residual_px"]:  # the same numbers in another order, not a fit
+            polynomial = _camera(row, "polynomial12", json.dumps(camera.polynomial()))
         residual = float(row["residual_px"] or 0.0)
         if not residual >= 0:
             raise ValueError(f"residual_px must be at least 0, got {residual}")
-    except (TypeError, ValueError, OverflowError, RecursionError) as error:  # the last of lists in lists
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:  # json raises the last for deep nesting
         raise ValueError(f"path must hold lenses, got {path} with the row {row['id']}: {str(error)[:400]}") from error
+    title = " ".join(filter(None, (row["camera"], row["lens"])))
     return Lens(row["id"], title, camera, polynomial, residual, row["source"], row["licence"])
 
 

@@ -81,7 +81,7 @@ def kept_terms(plan: Plan) -> Terms:
     """Those of the polynomial that a plan keeps."""
     kept = [POLYNOMIAL12.index(name) for name in plan.kept]
     radial = max([0, *(i + 1 for i in kept if i < 6)])
-    return Terms(radial, any(i in (6, 7) for i in kept), any(i > 7 for i in kept), round=False)
+    return Terms(radial, any(i in (6, 7) for i in kept), any(i > 7 for i in kept))
 
 
 def _terms(

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrefract._validation import check_positive
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.sheet import columns, image_of, on_plane, radius_within, ray_of
+from torchrefract.cameras.projection import columns, image_of, on_plane, radius_within, ray_of
 from torchrefract.fields.lens import REACH, axes_on_plane, border, corner_radius, lens_rows, stacked
 from torchrefract.fields.lens_bounds import LensErrors, cubic_errors, lines_of_cells
 from torchrefract.warping.grid import pixel_axes

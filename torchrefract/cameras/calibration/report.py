@@ -9,13 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torchrefract._io import replace_file
-from torchrefract.cli.calibration import Look, read_gray
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.coverage import CELLS, coverage, doubts
 from torchrefract.cameras.calibration.fit import Fit, rms
 from torchrefract.cameras.calibration.outliers import Kept
 from torchrefract.cameras.calibration.straightness import rectified, straightness
 from torchrefract.cameras.camera import Camera
+from torchrefract.cli.calibration import Look, read_gray
 
 CAMERA_FILE = "camera.yaml"
 _PICTURES = ("coverage.png", "residuals.png")

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io.documents import (
     camera_of,
     numbers,
@@ -13,7 +14,6 @@ from torchrefract.cameras.io.documents import (
     whole,
     write_text,
 )
-from torchrefract.cameras.camera import Camera
 
 # Pinhole and coefficients out of the parameters. COLMAP's order: f or fx fy, cx, cy, then the lens.
 _Parts = tuple[Sequence[float], Sequence[float]]

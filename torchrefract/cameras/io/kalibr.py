@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io.documents import (
     camera_of,
     entry,
@@ -16,7 +17,6 @@ from torchrefract.cameras.io.documents import (
     write_text,
 )
 from torchrefract.cameras.io.yaml_documents import dump_yaml, parse_yaml
-from torchrefract.cameras.camera import Camera
 
 _MODELS = {"radtan": "opencv", "equidistant": "fisheye", "none": "opencv"}
 

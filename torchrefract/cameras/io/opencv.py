@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io.documents import (
     camera_of,
     entry,
@@ -15,7 +16,6 @@ from torchrefract.cameras.io.documents import (
     write_text,
 )
 from torchrefract.cameras.io.yaml_documents import parse_yaml
-from torchrefract.cameras.camera import Camera
 
 _XML, _YAML = ".xml", (".yml", ".yaml")
 

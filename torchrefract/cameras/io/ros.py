@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io.documents import (
     camera_of,
     entry,
@@ -15,7 +16,6 @@ from torchrefract.cameras.io.documents import (
     write_text,
 )
 from torchrefract.cameras.io.yaml_documents import dump_yaml, parse_yaml
-from torchrefract.cameras.camera import Camera
 
 _MODELS = {"plumb_bob": "opencv", "rational_polynomial": "opencv", "equidistant": "fisheye"}
 

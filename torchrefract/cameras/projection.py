@@ -110,7 +110,8 @@ def undistort(points: Tensor, coefficients: Tensor, *, model: str) -> PointResul
     check_coefficients(coefficients, model)
     points, finite = _replace_non_finite("points", points, 2, coefficients)
     lens = _lens(coefficients, model)
-    ray, valid = ray_of(*points.unbind(-1), *lens)
+    x_d, y_d = points.unbind(-1)
+    ray, valid = ray_of(x_d, y_d, *lens)
     x, y, valid = on_plane(ray, valid & finite)
     residual = _residual((x, y, torch.ones_like(x)), points, *lens)
     return PointResult(torch.stack([x, y], dim=-1), valid, residual)
@@ -135,7 +136,8 @@ def project(points: Tensor, coefficients: Tensor, *, focal: Tensor, center: Tens
     check_coefficients(coefficients, model)
     _check_pinhole(focal, center, coefficients)
     points, finite = _replace_non_finite("points", points, 3, coefficients)
-    x_d, y_d, valid = image_of(*points.unbind(-1), *_lens(coefficients, model))
+    x, y, z = points.unbind(-1)
+    x_d, y_d, valid = image_of(x, y, z, *_lens(coefficients, model))
     pixels = torch.stack([x_d, y_d], dim=-1) * focal[:, None] + center[:, None]
     return PointResult(pixels, valid & finite, torch.zeros_like(x_d))
 
@@ -158,7 +160,8 @@ def unproject(pixels: Tensor, coefficients: Tensor, *, focal: Tensor, center: Te
     pixels, finite = _replace_non_finite("pixels", pixels, 2, coefficients)
     lens = _lens(coefficients, model)
     points = (pixels - center[:, None]) / focal[:, None]
-    ray, valid = ray_of(*points.unbind(-1), *lens)
+    x_d, y_d = points.unbind(-1)
+    ray, valid = ray_of(x_d, y_d, *lens)
     valid = valid & finite
     rays = torch.stack([torch.where(valid, a, axis) for a, axis in zip(ray, (0.0, 0.0, 1.0), strict=True)], dim=-1)
     residual = _residual(rays.unbind(-1), points, *lens, scale=focal)
@@ -363,6 +366,7 @@ def _residual(
 ) -> Tensor:
     """Return (B, N), the distance between projected rays and points (B, N, 2) in focal lengths, times `scale`."""
     with torch.no_grad():
-        x_d, y_d, _ = image_of(*ray, c, model, radius)
+        x, y, z = ray
+        x_d, y_d, _ = image_of(x, y, z, c, model, radius)
         error = torch.stack([x_d, y_d], dim=-1) - points
         return (error if scale is None else error * scale[:, None]).square().sum(dim=-1).sqrt()

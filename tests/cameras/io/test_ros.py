@@ -75,7 +75,7 @@ def test_a_shorter_vector_is_filled_up(tmp_path, make_camera):
     [
         ("plumb_bob", "thin_prism", "distortion_model of plumb_bob, .*, equidistant, got .*thin_prism"),
         ("image_height: 480\n", "", "path must hold image_height"),
-        ("438.783367, 0.0", "438.783367, 2.0", "camera_matrix without skew, got .* with 2"),
+        ("438.783367, 0.0", "438.783367, 2.0", "camera_matrix without skew, got .* with skew 2"),
         ("438.783367", "-1", "a camera, got .*ost.yaml: fx must be above 0, got -1"),
         ("data: [438", "date: [438", "path must hold data, got .* with rows, cols, date"),
         ("camera_matrix:\n  rows: 3", "camera_matrix: 4\nother:\n  rows: 3", "rows, cols and data as camera_matrix"),

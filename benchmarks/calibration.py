@@ -24,13 +24,13 @@ import torch
 from torchrefract._io import replace_file
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract.cameras.calibration.boards import Board, Charuco, Chessboard
-from torchrefract.cameras.calibration.detection import SEARCH, View, detect, is_enough
-from torchrefract.cameras.calibration.fit import Fit, fit, held_out, rms
+from torchrefract.cameras.calibration.detection import SEARCH_FLAGS, View, detect, has_enough_corners
+from torchrefract.cameras.calibration.fit import Fit, fit, cross_validate, rms
 from torchrefract.cameras.calibration.outliers import drop_outliers
 from torchrefract.cameras.calibration.report import camera_of
-from torchrefract.cameras.calibration.straightness import straightness
+from torchrefract.cameras.calibration.quality import straightness
 from torchrefract.cameras.camera import Camera
-from torchrefract.cli.calibration import pictures_of, read_gray
+from torchrefract.cli.calibration import find_pictures, read_gray
 from torchrefract.fields.rectifying import camera_flow
 from torchrefract.warping.resample import warp
 
@@ -77,15 +77,15 @@ def board_of(entry: dict[str, Any]) -> Board:
 
 def measure(name: str, entry: dict[str, Any], folder: Path) -> Row:
     """The figures of one set."""
-    board, pictures = board_of(entry), {path.name: read_gray(path) for path in pictures_of(folder)}
+    board, pictures = board_of(entry), {path.name: read_gray(path) for path in find_pictures(folder)}
     size = (entry["image_size"][0], entry["image_size"][1])
     pictures = {name: gray for name, gray in pictures.items() if gray.shape == size[::-1]}
-    views = [view for view in (detect(gray, board, name=n) for n, gray in pictures.items()) if is_enough(view, board)]
+    views = [view for view in (detect(gray, board, name=n) for n, gray in pictures.items()) if has_enough_corners(view, board)]
     kept = drop_outliers(views, board, model=_MODEL, size=size)
-    plain_views = [view for view in (_plain(gray, board, n) for n, gray in pictures.items()) if is_enough(view, board)]
+    plain_views = [view for view in (_plain(gray, board, n) for n, gray in pictures.items()) if has_enough_corners(view, board)]
     plain = fit(plain_views, board, model=_MODEL, size=size)
     planted = _plant(views, pictures, board, size)
-    fx, fy, cx, cy, *coefficients = kept.fitted.lens.numbers.tolist()
+    fx, fy, cx, cy, *coefficients = kept.fitted.intrinsics.values.tolist()
     published = entry.get("published")
     bent, straight = _straight(kept.views, pictures, board, camera_of(kept.fitted, size))
     return Row(
@@ -97,7 +97,7 @@ def measure(name: str, entry: dict[str, Any], folder: Path) -> Row:
 
 
 def _held(views: list[View], board: Board, fitted: Fit, size: tuple[int, int]) -> float:
-    return rms(np.concatenate(held_out(views, board, fitted, size=size)))
+    return rms(np.concatenate(cross_validate(views, board, fitted, size=size)))
 
 
 def _plain(gray: np.ndarray, board: Board, name: str) -> View:
@@ -105,11 +105,11 @@ def _plain(gray: np.ndarray, board: Board, name: str) -> View:
     ids, corners = None, None
     if isinstance(board, Charuco):
         for picture in (gray, 255 - gray):
-            corners, ids, _, _ = cv2.aruco.CharucoDetector(board.opencv(False)).detectBoard(picture)
+            corners, ids, _, _ = cv2.aruco.CharucoDetector(board.to_opencv(legacy=False)).detectBoard(picture)
             if ids is not None:
                 break
     else:
-        found, corners = cv2.findChessboardCornersSB(gray, board.inner, flags=SEARCH)
+        found, corners = cv2.findChessboardCornersSB(gray, board.num_corners, flags=SEARCH_FLAGS)
         ids = np.arange(len(corners)) if found else None
     if ids is None or corners is None:
         return View(name, np.empty(0, dtype=int), np.empty((0, 2)))
@@ -142,7 +142,7 @@ def bad_corners(view: View, size: tuple[int, int]) -> dict[str, View]:
 
 
 def _fate(bad: View, views: list[View], board: Board, size: tuple[int, int]) -> str:
-    if not is_enough(bad, board):
+    if not has_enough_corners(bad, board):
         return "no view"
     among = [bad if view.name == bad.name else view for view in views]
     return "named" if bad.name in drop_outliers(among, board, model=_MODEL, size=size).dropped else "missed"

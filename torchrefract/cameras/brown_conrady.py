@@ -100,9 +100,7 @@ def jacobian_polynomial(x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms
 
     J = g I + 2 dg/d(r^2) (x, y)^T (x, y) + the derivatives of `decentering`
     """
-    k, p, s = _groups(coefficients, terms)
-    r2 = x * x + y * y
-    return lens_jacobian(x, y, r2, radial_factor(r2, k), radial_factor_slope(r2, k), p, s)
+    return distort_with_jacobian(x, y, coefficients, terms)[1]
 
 
 def distort_with_jacobian(

@@ -8,8 +8,8 @@ from torchrefract.cameras.calibration.boards import Charuco, Chessboard
 @pytest.mark.parametrize("squares", ["6x5", "5x8"])
 def test_a_charuco_board_is_black_where_opencv_draws_it_black(squares, legacy):
     board = Charuco(squares=squares, square_mm=30, marker_mm=18, dictionary="DICT_4X4_50", legacy=legacy)
-    columns, rows = board.counts
-    drawn = board.opencv(legacy).generateImage((100 * columns, 100 * rows), marginSize=0)
+    columns, rows = board.num_squares
+    drawn = board.to_opencv(legacy=legacy).generateImage((100 * columns, 100 * rows), marginSize=0)
     y, x = np.mgrid[0 : 100 * rows, 0 : 100 * columns]
     assert np.array_equal(board.is_black((x + 0.5) * 0.3, (y + 0.5) * 0.3), drawn == 0)
 
@@ -22,7 +22,7 @@ def test_an_inverted_board_is_the_negative():
 
 @pytest.mark.parametrize("board", [Charuco(), Chessboard(), Charuco(squares="5x8", legacy=True)], ids=str)
 def test_a_board_has_one_color_between_its_breaks(board):
-    (xs, ys), dice = board.breaks(), np.random.default_rng(0)
+    (xs, ys), dice = board.color_edges(), np.random.default_rng(0)
     x = xs[:-1] + np.diff(xs) * dice.uniform(0.01, 0.99, (5, 1))
     y = ys[:-1] + np.diff(ys) * dice.uniform(0.01, 0.99, (5, 1))
     middle = board.is_black(*np.meshgrid((xs[1:] + xs[:-1]) / 2, (ys[1:] + ys[:-1]) / 2))
@@ -32,9 +32,9 @@ def test_a_board_has_one_color_between_its_breaks(board):
 
 def test_corners_are_those_of_opencvs_board():
     board = Charuco(squares="7x4", square_mm=25, marker_mm=15)
-    np.testing.assert_allclose(board.corners(), board.opencv(False).getChessboardCorners())
+    np.testing.assert_allclose(board.corners(), board.to_opencv(legacy=False).getChessboardCorners())
     np.testing.assert_allclose(
-        board.corners(np.array([8, 0])), np.asarray(board.opencv(False).getChessboardCorners())[[8, 0]]
+        board.corners(np.array([8, 0])), np.asarray(board.to_opencv(legacy=False).getChessboardCorners())[[8, 0]]
     )
 
 

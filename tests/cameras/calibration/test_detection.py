@@ -4,7 +4,7 @@ import pytest
 
 from torchrefract.cameras.calibration import detection
 from torchrefract.cameras.calibration.boards import Charuco, Chessboard
-from torchrefract.cameras.calibration.detection import View, detect, is_enough
+from torchrefract.cameras.calibration.detection import View, detect, has_enough_corners
 from torchrefract.cameras.calibration.synthetic import render_views
 
 
@@ -21,7 +21,7 @@ def test_corners_are_found_to_a_tenth_of_a_pixel(rendered, small_board, small_ca
     for name, gray, pose in rendered:
         view = detect(gray, small_board, name=name)
         assert view.name == name
-        assert is_enough(view, small_board)
+        assert has_enough_corners(view, small_board)
         assert error(view.corners, expected(small_camera, small_board, view, pose)) < 0.1
 
 
@@ -42,7 +42,7 @@ def test_pattern_and_colors_need_not_be_said(squares, legacy, inverted, small_ca
     shown = Charuco(**known, legacy=legacy, inverted=inverted)
     _, gray, pose = next(render_views(shown, small_camera, count=1))
     view = detect(gray, Charuco(**known))
-    assert is_enough(view, shown)
+    assert has_enough_corners(view, shown)
     assert error(view.corners, expected(small_camera, shown, view, pose)) < 0.1
     other = Charuco(**known, inverted=not inverted)
     assert len(detect(gray, other).ids) == 0
@@ -76,7 +76,7 @@ def test_an_overexposed_chessboard_keeps_its_corners(small_camera):
 def test_refined_corners_of_a_chessboard_are_taken_where_they_lie_as_smoothly(small_camera, monkeypatch, noise, taken):
     board, dice = Chessboard(squares="7x6", square_mm=30), np.random.default_rng(0)
     _, gray, _ = next(render_views(board, small_camera, count=1))
-    found = np.asarray(cv2.findChessboardCornersSB(gray, board.inner, flags=detection.SEARCH)[1]).reshape(-1, 2)
+    found = np.asarray(cv2.findChessboardCornersSB(gray, board.num_corners, flags=detection.SEARCH_FLAGS)[1]).reshape(-1, 2)
     rough = found + dice.normal(0, noise, found.shape)
     monkeypatch.setattr(detection, "_refined", lambda *_: (np.arange(30), rough))
     np.testing.assert_allclose(detect(gray, board).corners, rough if taken else found, atol=1e-6)
@@ -93,4 +93,4 @@ def test_a_picture_without_a_board_shows_no_corner():
 )
 def test_six_corners_in_two_rows_are_enough(ids, enough):
     view = View("", np.array(ids), np.zeros((len(ids), 2)))
-    assert is_enough(view, Charuco(squares="11x8")) == enough
+    assert has_enough_corners(view, Charuco(squares="11x8")) == enough

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from torchrefract.cameras.calibration.boards import Chessboard
-from torchrefract.cameras.calibration.fit import Lens, errors_of, fit, held_out, rms
+from torchrefract.cameras.calibration.fit import Lens, errors_in_best_pose, fit, cross_validate, rms
 
 BOARD = Chessboard(squares="9x7", square_mm=25)
 SIZE = (800, 600)
@@ -21,11 +21,11 @@ def test_a_known_camera_is_found_from_exact_corners(model, projected):
     views = projected(BOARD, MATRIX, np.array(VECTORS[model]), fisheye=model == "fisheye")
     found = fit(views, BOARD, model=model, size=SIZE)
     assert found.rms < 1e-3  # corners go to OpenCV as float32
-    np.testing.assert_allclose(found.lens.numbers[:4], MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]], rtol=1e-4)
+    np.testing.assert_allclose(found.intrinsics.values[:4], MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]], rtol=1e-4)
     if model != "opencv8":  # whose coefficients trade with one another
-        np.testing.assert_allclose(found.lens.numbers[4:], VECTORS[model], atol=1e-3)
-    assert found.lens.names[:5] == ("fx", "fy", "cx", "cy", "k1")
-    assert len(found.lens.names) == len(found.lens.numbers) == 4 + len(VECTORS[model])
+        np.testing.assert_allclose(found.intrinsics.values[4:], VECTORS[model], atol=1e-3)
+    assert found.intrinsics.names[:5] == ("fx", "fy", "cx", "cy", "k1")
+    assert len(found.intrinsics.names) == len(found.intrinsics.values) == 4 + len(VECTORS[model])
 
 
 def test_rms_and_deviations_are_those_of_opencv(projected):
@@ -44,8 +44,8 @@ def test_deviations_tell_how_far_off_a_fisheye_is(projected):
     truth = np.concatenate([MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]], VECTORS["fisheye"]])
     views = projected(BOARD, MATRIX, np.array(VECTORS["fisheye"]), noise=0.2, fisheye=True)
     found = fit(views, BOARD, model="fisheye", size=SIZE)
-    assert (np.abs(found.lens.numbers - truth) < 4 * found.deviations).all()
-    assert (np.abs(found.lens.numbers - truth) > 0.01 * found.deviations).sum() >= 6
+    assert (np.abs(found.intrinsics.values - truth) < 4 * found.deviations).all()
+    assert (np.abs(found.intrinsics.values - truth) > 0.01 * found.deviations).sum() >= 6
 
 
 def test_a_view_that_was_held_out_is_seen_in_its_best_pose(projected):
@@ -57,13 +57,13 @@ def test_a_view_that_was_held_out_is_seen_in_its_best_pose(projected):
     theirs = view.corners - cv2.projectPoints(BOARD.corners(view.ids), turn, move, MATRIX, vector)[0].reshape(-1, 2)
     start = np.concatenate([turn.ravel() + 0.05, move.ravel() + 5])
     assert solved
-    np.testing.assert_allclose(errors_of(view, BOARD, lens, start), theirs, atol=1e-3)
+    np.testing.assert_allclose(errors_in_best_pose(view, BOARD, lens, start), theirs, atol=1e-3)
 
 
 def test_errors_held_out_are_larger_than_those_of_a_fit(projected):
     views = projected(BOARD, MATRIX, np.array(VECTORS["opencv5"]), noise=0.3)
     found = fit(views, BOARD, model="opencv5", size=SIZE)
-    held = held_out(views, BOARD, found, size=SIZE, folds=3)
+    held = cross_validate(views, BOARD, found, size=SIZE, folds=3)
     assert [len(errors) for errors in held] == [len(view.ids) for view in views]
     # Noise of 0.3 px in x and in y.
     assert found.rms < rms(np.concatenate(held)) < 1.3 * 0.3 * np.sqrt(2)
@@ -81,7 +81,7 @@ def test_a_fit_has_the_same_bits_every_time_and_leaves_opencv_its_threads(projec
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
     try:
-        found = {fit(views, BOARD, model="opencv5", size=SIZE).lens.matrix.tobytes() for _ in range(15)}
+        found = {fit(views, BOARD, model="opencv5", size=SIZE).intrinsics.matrix.tobytes() for _ in range(15)}
         assert cv2.getNumThreads() == 2
     finally:
         cv2.setNumThreads(before)

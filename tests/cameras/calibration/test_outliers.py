@@ -33,15 +33,15 @@ def test_a_planted_bad_view_is_dropped_and_named(projected, bad):
     kept = drop_outliers(mixed, BOARD, model="opencv5", size=SIZE)
     assert set(kept.dropped) == {views[i].name for i in bad}
     good = fit([view for i, view in enumerate(views) if i not in bad], BOARD, model="opencv5", size=SIZE)
-    np.testing.assert_allclose(kept.fitted.lens.numbers, good.lens.numbers, rtol=1e-6)
+    np.testing.assert_allclose(kept.fitted.intrinsics.values, good.intrinsics.values, rtol=1e-6)
     assert all(reason.startswith("held out it is off by ") for reason in kept.dropped.values())
 
 
 def test_no_more_views_than_allowed_are_dropped(projected):
     views = projected(BOARD, MATRIX, VECTOR, noise=0.2)
     mixed = [bent(view) if i in (0, 7) else view for i, view in enumerate(views)]
-    assert len(drop_outliers(mixed, BOARD, model="opencv5", size=SIZE, most=0.15).dropped) == 1
-    assert drop_outliers(mixed, BOARD, model="opencv5", size=SIZE, most=0.0).dropped == {}
+    assert len(drop_outliers(mixed, BOARD, model="opencv5", size=SIZE, max_share=0.15).dropped) == 1
+    assert drop_outliers(mixed, BOARD, model="opencv5", size=SIZE, max_share=0.0).dropped == {}
 
 
 def test_leaving_a_view_out_is_a_fit_to_the_others(projected):

@@ -3,7 +3,7 @@ import pytest
 
 from torchrefract.cameras.calibration.boards import Chessboard
 from torchrefract.cameras.calibration.detection import View
-from torchrefract.cameras.calibration.straightness import rectified, straightness
+from torchrefract.cameras.calibration.quality import rectified, straightness
 from torchrefract.cameras.camera import Camera
 
 BOARD = Chessboard(squares="9x7", square_mm=25)

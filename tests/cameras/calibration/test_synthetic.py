@@ -4,14 +4,14 @@ import torch
 
 from torchrefract.cameras.calibration import synthetic
 from torchrefract.cameras.calibration.boards import Chessboard
-from torchrefract.cameras.calibration.synthetic import Rays, rays_of, render_views
+from torchrefract.cameras.calibration.synthetic import Rays, camera_rays, render_views
 from torchrefract.cameras.camera import Camera
 
 
 def test_rays_between_pixels_are_those_of_the_camera(small_camera):
     where = np.zeros((small_camera.height, small_camera.width), dtype=bool)
     where[5:395:13, 5:635:13] = True
-    found = rays_of(small_camera).between(where)
+    found = camera_rays(small_camera).subpixel_points(where)
     steps = (np.arange(6) + 0.5) / 6 - 0.5
     y, x = np.nonzero(where)
     u, v = x[:, None, None] + steps[None, None], y[:, None, None] + steps[None, :, None]
@@ -49,4 +49,4 @@ def test_the_board_goes_over_the_frame(small_board, small_camera):
     x, y = np.array(middles).T
     np.testing.assert_allclose(sorted(set(x.round(6))), 0.04 + 0.92 * np.array([1, 3, 5]) / 6, atol=1e-5)
     np.testing.assert_allclose(sorted(set(y.round(6))), 0.04 + 0.92 * np.array([1, 3]) / 4, atol=1e-5)
-    assert isinstance(rays_of(small_camera), Rays)
+    assert isinstance(camera_rays(small_camera), Rays)

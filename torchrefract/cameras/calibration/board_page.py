@@ -1,4 +1,4 @@
-"""Boards on paper, at true scale, with their definition below."""
+"""Pages with a board at true scale, with a ruler and the definition of the board below it."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -7,56 +7,55 @@ from matplotlib.path import Path
 
 from torchrefract.cameras.calibration.boards import Board
 
-_INCH = 25.4  # mm
-_TEXT = 12.0  # mm of height below the margin of the board
-_RULER = 100.0  # mm
-_SMALL = 2.6  # mm, the height of letters
+_MM_PER_INCH = 25.4
+_CAPTION_MM = 12.0  # height of the strip below the margin
+_RULER_MM = 100.0
+_FONT_MM = 2.6
 
 
 def board_page(board: Board, *, margin_mm: float) -> Figure:
-    """A page with a board, a margin around it, and below that a ruler and the definition.
+    """Draw a board with a margin and, below it, a ruler and the definition of the board.
 
-    Saved as PDF it is as many mm large as its board needs; saved as PNG it has dpi / 25.4 px for each mm.
+    A PDF of the figure has true scale; a PNG has dpi / 25.4 px for each mm.
 
     Args:
-        board: in its first pattern and colors where it may have two.
-        margin_mm: around the board, white, or black around one that is inverted.
+        board: to draw; "auto" patterns are drawn as False.
+        margin_mm: around the board, white, or black for an inverted board.
     """
     (width, height), margin = board.size_mm, float(margin_mm)
-    page = width + 2 * margin, height + 2 * margin + _TEXT
-    figure = Figure(figsize=(page[0] / _INCH, page[1] / _INCH))
+    page = width + 2 * margin, height + 2 * margin + _CAPTION_MM
+    figure = Figure(figsize=(page[0] / _MM_PER_INCH, page[1] / _MM_PER_INCH))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_xlim(-margin, page[0] - margin)
     axes.set_ylim(page[1] - margin, -margin)
     axes.set_axis_off()
-    axes.add_patch(PathPatch(_black(board, margin), facecolor="black", lw=0, snap=False))
-    _write(figure, board, (margin, page[1] - _TEXT), page)
+    axes.add_patch(PathPatch(_black_outline(board, margin), facecolor="black", lw=0, snap=False))
+    _draw_caption(figure, board, margin, page)
     return figure
 
 
-def _write(figure: Figure, board: Board, start: tuple[float, float], page: tuple[float, float]) -> None:
-    """A ruler from a place, mm from the upper left, and texts."""
-    (left, top), axes = start, figure.axes[0]
-    long = min(_RULER, 10 * (board.size_mm[0] // 10))
-    origin = axes.get_xlim()[0]
-    y = top + 2 + origin
-    axes.plot([left + origin, left + origin + long], [y, y], color="black", lw=0.6)
-    for x in (0.0, long):
+def _draw_caption(figure: Figure, board: Board, margin: float, page: tuple[float, float]) -> None:
+    """Draw the ruler and two lines of text; they start at the left edge of the board."""
+    axes, top = figure.axes[0], page[1] - _CAPTION_MM
+    length = min(_RULER_MM, 10 * (board.size_mm[0] // 10))
+    y = top + 2 - margin
+    axes.plot([0, length], [y, y], color="black", lw=0.6)
+    for x in (0.0, length):
         axes.plot([x, x], [y - 1, y + 1], color="black", lw=0.6)
-    points = _SMALL / _INCH * 72
-    text = f"this line is {long:g} mm long if printed at true scale (100 %)"
-    figure.text(left / page[0], 1 - (top + 6.5) / page[1], text, fontsize=points, parse_math=False)
-    figure.text(left / page[0], 1 - (top + 10.0) / page[1], board.describe(), fontsize=points, parse_math=False)
+    lines = (f"this line is {length:g} mm long if printed at true scale (100 %)", board.describe())
+    for text, offset in zip(lines, (6.5, 10.0), strict=True):
+        place = margin / page[0], 1 - (top + offset) / page[1]
+        figure.text(*place, text, fontsize=_FONT_MM / _MM_PER_INCH * 72, parse_math=False)
 
 
-def _black(board: Board, margin: float) -> Path:
-    """The outline of all that is black, in one piece, so that no viewer draws seams between rectangles that touch."""
-    xs, ys = (np.concatenate([[-margin], breaks, [breaks[-1] + margin]]) for breaks in board.breaks())
+def _black_outline(board: Board, margin: float) -> Path:
+    """Return everything black as one path: viewers draw seams between separate rectangles that touch."""
+    xs, ys = (np.concatenate([[-margin], edges, [edges[-1] + margin]]) for edges in board.color_edges())
     x, y = np.meshgrid((xs[1:] + xs[:-1]) / 2, (ys[1:] + ys[:-1]) / 2)
     corners, codes = [], []
     for j, row in enumerate(board.is_black(x, y)):
-        edges = np.flatnonzero(np.diff(row.astype(int), prepend=0, append=0))
-        for start, end in edges.reshape(-1, 2):
+        runs = np.flatnonzero(np.diff(row.astype(int), prepend=0, append=0))
+        for start, end in runs.reshape(-1, 2):
             left, right, top, bottom = xs[start], xs[end], ys[j], ys[j + 1]
             corners += [(left, top), (right, top), (right, bottom), (left, bottom), (left, top)]
             codes += [Path.MOVETO, Path.LINETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]

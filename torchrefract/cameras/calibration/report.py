@@ -1,6 +1,6 @@
-"""What a calibration came to: a report in Markdown and its pictures."""
+"""Report of a calibration in Markdown, with figures of the corners and of the errors."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,93 +10,104 @@ from matplotlib.figure import Figure
 
 from torchrefract._io import replace_file
 from torchrefract.cameras.calibration.boards import Board
-from torchrefract.cameras.calibration.coverage import CELLS, coverage, doubts
-from torchrefract.cameras.calibration.fit import Fit, rms
-from torchrefract.cameras.calibration.outliers import Kept
-from torchrefract.cameras.calibration.straightness import rectified, straightness
+from torchrefract.cameras.calibration.detection import Detection
+from torchrefract.cameras.calibration.fit import Fit, cross_validate, rms
+from torchrefract.cameras.calibration.outliers import Selection, drop_outliers
+from torchrefract.cameras.calibration.quality import (
+    CELLS,
+    calibration_warnings,
+    corner_counts,
+    straightness,
+    undistort_views,
+)
 from torchrefract.cameras.camera import Camera
-from torchrefract.cli.calibration import Look, read_gray
 
-CAMERA_FILE = "camera.yaml"
-_PICTURES = ("coverage.png", "residuals.png")
+CAMERA_FILE, REPORT_FILE = "camera.yaml", "report.md"
+_FIGURES = ("coverage.png", "residuals.png")
 _DPI = 100
-_SHOWN = 12  # views whose corners are drawn, those that cost the others most
-_ACROSS = 4  # of them in a row
-_ARROW = 0.05  # of the width of the frame, an error as long as the rms of all
+_MAX_DRAWN = 12  # views in the figure of errors, those that cost the others most
+_COLUMNS = 4  # of that figure
+_ARROW = 0.05  # of the width of the frame: the length of an arrow for an error as large as the rms
 
 
 class Calibration(NamedTuple):
-    """A camera, and what it was found from."""
+    """A calibrated camera with the data that it was fitted to."""
 
     board: Board
-    looks: Sequence[Look]
-    kept: Kept
-    held: Sequence[np.ndarray]  # (N, 2) of each view, px, of `held_out`
+    detections: Sequence[Detection]
+    selection: Selection
+    held_out_errors: Sequence[np.ndarray]  # for each view (N, 2), px, by `cross_validate`
     camera: Camera
 
     @property
-    def fitted(self) -> Fit:
-        """The camera and the poses."""
-        return self.kept.fitted
+    def fit(self) -> Fit:
+        """Return the fit of camera and poses."""
+        return self.selection.fit
 
     @property
-    def held_rms(self) -> float:
-        """px, of views that the camera was not fitted to."""
-        return rms(np.concatenate(self.held))
+    def held_out_rms(self) -> float:
+        """Return the rms error of views that the camera was not fitted to, px."""
+        return rms(np.concatenate(self.held_out_errors))
 
 
-def camera_of(fitted: Fit, size: tuple[int, int]) -> Camera:
-    """The camera of a fit to pictures of that width and height."""
-    fx, fy, cx, cy, *coefficients = fitted.lens.numbers.tolist()
-    model = "fisheye" if fitted.lens.model == "fisheye" else "opencv"
-    pinhole = {"width": size[0], "height": size[1], "fx": fx, "fy": fy, "cx": cx, "cy": cy}
-    return Camera(**pinhole, coefficients=tuple(coefficients), model=model)
-
-
-def write_report(found: Calibration, files: dict[str, Path], out: Path) -> None:
-    """report.md, coverage.png and residuals.png in a folder.
+def calibrate_camera(
+    detections: Sequence[Detection], board: Board, *, model: str, size: tuple[int, int], max_drop_share: float
+) -> Calibration:
+    """Fit a camera to all usable detections, without views that do not fit the others.
 
     Args:
-        found: the calibration.
-        files: the pictures by the names of their views.
-        out: the folder.
+        detections: with at least four that have no problem.
+        board: that was detected.
+        model: of `fit.LENS_MODELS`.
+        size: width and height of the pictures, px.
+        max_drop_share: of the views that may be dropped.
+
+    Raises:
+        ValueError: no camera fits the views.
     """
-    for name, figure in zip(_PICTURES, (_coverage(found), _residuals(found, files)), strict=True):
-        with replace_file(out / name) as path:
+    views = [detection.view for detection in detections if not detection.problem]
+    selection = drop_outliers(views, board, model=model, size=size, max_share=max_drop_share)
+    held_out = cross_validate(selection.views, board, selection.fit, size=size)
+    return Calibration(board, detections, selection, held_out, selection.fit.intrinsics.camera(size))
+
+
+def write_report(calibration: Calibration, read_gray: Callable[[str], np.ndarray], folder: Path) -> None:
+    """Write report.md, coverage.png and residuals.png.
+
+    Args:
+        calibration: to report.
+        read_gray: returns the picture of a view by its name, (H, W), uint8.
+        folder: to write to.
+    """
+    figures = _draw_coverage(calibration), _draw_residuals(calibration, read_gray)
+    for name, figure in zip(_FIGURES, figures, strict=True):
+        with replace_file(folder / name) as path:
             figure.savefig(path)
-    _write(out / "report.md", _report(found))
+    _write(folder / REPORT_FILE, _report(calibration))
 
 
-def set_aside(out: Path) -> str:
-    """What a calibration of before has left in a folder gets other names, so that it is not taken for that of today.
+def write_failure(board: Board, detections: Sequence[Detection], problem: str, folder: Path) -> None:
+    """Write report.md of a failed calibration, and rename the results of an earlier one.
 
-    Returns:
-        The new name of its camera, or empty.
-    """
-    for name in (CAMERA_FILE, *_PICTURES):
-        path = out / name
-        if path.is_file():
-            path.replace(_before(path))
-    return _before(out / CAMERA_FILE).name if _before(out / CAMERA_FILE).is_file() else ""
-
-
-def write_looks(board: Board, looks: Sequence[Look], problem: str, aside: str, out: Path) -> None:
-    """report.md of a calibration that could not be: the problem, and what was seen in each picture.
+    An earlier camera.yaml becomes camera_before.yaml, so that it is not mistaken for the result of this run.
 
     Args:
-        board: that was looked for.
-        looks: at the pictures.
+        board: that was searched.
+        detections: in the pictures.
         problem: why there is no camera.
-        aside: the name of the camera of a calibration before, or empty.
-        out: the folder.
+        folder: to write to.
     """
-    lines = ["# Calibration", "", f"There is no camera: {problem}", "", f"Board: `{board.describe()}`", ""]
-    if aside:
-        lines += [f"`{aside}` is of a calibration before.", ""]
-    _write(out / "report.md", [*lines, *_table(("picture", "corners", "remark"), [_looked(look) for look in looks])])
+    for name in (CAMERA_FILE, *_FIGURES):
+        if (folder / name).is_file():
+            (folder / name).replace(_earlier(folder / name))
+    lines = ["# Calibration", "", f"The calibration failed: {problem}", "", f"Board: `{board.describe()}`", ""]
+    if _earlier(folder / CAMERA_FILE).is_file():
+        lines += [f"`{_earlier(folder / CAMERA_FILE).name}` is the camera of an earlier calibration.", ""]
+    rows = [(d.view.name, str(len(d.view.ids)), d.problem) for d in detections]
+    _write(folder / REPORT_FILE, [*lines, *_table(("picture", "corners", "problem"), rows)])
 
 
-def _before(path: Path) -> Path:
+def _earlier(path: Path) -> Path:
     return path.with_name(f"{path.stem}_before{path.suffix}")
 
 
@@ -105,109 +116,110 @@ def _write(path: Path, lines: Sequence[str]) -> None:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _looked(look: Look) -> tuple[str, ...]:
-    return look.view.name, str(len(look.view.ids)), look.reason
-
-
-def _report(found: Calibration) -> list[str]:
-    fitted, views, camera = found.fitted, found.kept.views, found.camera
-    corners = sum(len(view.ids) for view in views)
-    numbers = zip(fitted.lens.names, fitted.lens.numbers, fitted.deviations, strict=True)
+def _report(calibration: Calibration) -> list[str]:
+    fit, views, camera = calibration.fit, calibration.selection.views, calibration.camera
+    num_corners = sum(len(view.ids) for view in views)
+    parameters = zip(fit.intrinsics.names, fit.intrinsics.values, fit.deviations, strict=True)
     lines = [
         "# Calibration",
         "",
-        f"Board: `{found.board.describe()}`",
-        f"Model: {fitted.lens.model}, frames of {camera.width} x {camera.height} px",
-        f"Used: {len(views)} views of {len(found.looks)} pictures, {corners} corners",
+        f"Board: `{calibration.board.describe()}`",
+        f"Lens model: {fit.intrinsics.model}, frames of {camera.width} x {camera.height} px",
+        f"Used: {len(views)} views of {len(calibration.detections)} pictures, {num_corners} corners",
         "",
-        "| px | rms |",
-        "| --- | --- |",
-        f"| reprojection error | {fitted.rms:.4f} |",
-        f"| the same on views held out | {found.held_rms:.4f} |",
-        *_straight(found),
+        *_table(("error", "px rms"), _error_rows(calibration)),
         "",
-        "The rms is over corners, of the distance in the picture. A view held out is seen by a camera that was fitted",
-        "to other views; only its pose is its own.",
+        "Errors are distances in the picture, over all corners. A held-out view is not used to fit the camera; only",
+        "its pose is fitted.",
         "",
         "## Camera",
         "",
-        *_table(("", "value", "standard deviation"), [(n, f"{v:.6g}", f"{d:.2g}") for n, v, d in numbers]),
+        *_table(
+            ("parameter", "value", "standard deviation"),
+            [(name, f"{value:.6g}", f"{deviation:.2g}") for name, value, deviation in parameters],
+        ),
         "",
-        *[f"- {doubt}" for doubt in doubts(views, fitted, camera)],
+        *[f"- {message}" for message in calibration_warnings(views, fit, camera)],
         "",
-        "![Where the corners lie](coverage.png)",
+        "![Corners in the frame](coverage.png)",
         "",
         "## Views",
         "",
-        "Each was left out in turn; those without which the others fit best come first. A view is an outlier from its",
-        "limit on.",
+        "Each view was left out of the fit in turn. The view that costs the others most comes first. A view is an",
+        "outlier if its held-out error is above its limit. All errors are in px rms.",
         "",
-        *_table(("view", "corners", "rms", "held out", "limit", "the others without it"), _ranked(found)),
+        *_table(("view", "corners", "error", "held-out error", "limit", "others without it"), _view_rows(calibration)),
         "",
-        "![What is left over](residuals.png)",
+        "![Reprojection errors](residuals.png)",
     ]
-    others = [(name, f"dropped: {reason}") for name, reason in found.kept.dropped.items()]
-    others += [(look.view.name, look.reason) for look in found.looks if look.reason]
-    return [*lines, "", "## Not used", "", *_table(("picture", "reason"), others)] if others else lines
+    unused = [(name, f"dropped: {reason}") for name, reason in calibration.selection.dropped.items()]
+    unused += [(d.view.name, d.problem) for d in calibration.detections if d.problem]
+    return [*lines, "", "## Pictures not used", "", *_table(("picture", "reason"), unused)] if unused else lines
 
 
-def _straight(found: Calibration) -> list[str]:
-    before, after = found.kept.views, rectified(found.kept.views, found.camera)
-    places = (("in the pictures", before), ("rectified", after))
-    return [f"| corners off straight lines, {name} | {straightness(v, found.board):.4f} |" for name, v in places]
+def _error_rows(calibration: Calibration) -> list[tuple[str, str]]:
+    views, board = calibration.selection.views, calibration.board
+    values = {
+        "reprojection error": calibration.fit.rms,
+        "reprojection error of held-out views": calibration.held_out_rms,
+        "corners off straight lines, in the pictures": straightness(views, board),
+        "corners off straight lines, rectified": straightness(undistort_views(views, calibration.camera), board),
+    }
+    return [(name, f"{value:.4f}") for name, value in values.items()]
 
 
-def _ranked(found: Calibration) -> list[tuple[str, ...]]:
-    own = {view.name: (len(view.ids), rms(e)) for view, e in zip(found.kept.views, found.fitted.errors, strict=True)}
-    return [
-        (
-            left.name,
-            str(own[left.name][0]),
-            *(f"{v:.3f}" for v in (own[left.name][1], left.error, left.limit, left.others)),
-        )
-        for left in found.kept.ranking
-    ]
+def _view_rows(calibration: Calibration) -> list[tuple[str, ...]]:
+    views, ranking = calibration.selection.views, calibration.selection.ranking
+    fits = {view.name: (len(view.ids), rms(e)) for view, e in zip(views, calibration.fit.errors, strict=True)}
+    rows = []
+    for result in ranking:
+        num_corners, error = fits[result.name]
+        numbers = (f"{value:.3f}" for value in (error, result.error, result.limit, result.others))
+        rows.append((result.name, str(num_corners), *numbers))
+    return rows
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)]
 
 
-def _coverage(found: Calibration) -> Figure:
-    camera, views = found.camera, found.kept.views
+def _draw_coverage(calibration: Calibration) -> Figure:
+    """Draw all corners, over the number of corners in each cell of the frame."""
+    camera, views = calibration.camera, calibration.selection.views
     figure = Figure(figsize=(9.6, 9.6 * camera.height / camera.width + 0.9), dpi=_DPI, layout="constrained")
     axes = figure.add_subplot()
-    counts, (rows, columns) = coverage(views, (camera.width, camera.height)), CELLS
+    counts, (rows, columns) = corner_counts(views, (camera.width, camera.height)), CELLS
     extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
-    shown = axes.imshow(np.where(counts > 0, counts, np.nan), extent=extent, cmap="Blues", alpha=0.6, vmin=0)
+    image = axes.imshow(np.where(counts > 0, counts, np.nan), extent=extent, cmap="Blues", alpha=0.6, vmin=0)
     for j, i in zip(*np.nonzero(counts == 0), strict=True):
         place = ((i + 0.5) * camera.width / columns, (j + 0.5) * camera.height / rows)
         axes.text(*place, "none", ha="center", va="center", color="#b03000")
     corners = np.concatenate([view.corners for view in views])
     axes.plot(*corners.T, ".", markersize=3, color="#08306b")
     axes.set_title(f"{len(corners)} corners of {len(views)} views")
-    figure.colorbar(shown, ax=axes, label="corners in a part of the frame", shrink=0.8)
+    figure.colorbar(image, ax=axes, label="corners in a cell of the frame", shrink=0.8)
     return figure
 
 
-def _residuals(found: Calibration, files: dict[str, Path]) -> Figure:
-    """The views that cost the others most, each with its corners and what the camera leaves over."""
-    names = [left.name for left in found.kept.ranking[:_SHOWN]]
-    by_name = {view.name: i for i, view in enumerate(found.kept.views)}
-    rows, shape = -(-len(names) // _ACROSS), found.camera.height / found.camera.width
-    figure = Figure(figsize=(16, rows * (4 * shape + 0.4) + 0.6), dpi=_DPI, layout="constrained")
-    scale = _ARROW * found.camera.width / max(found.fitted.rms, 1e-6)
+def _draw_residuals(calibration: Calibration, read_gray: Callable[[str], np.ndarray]) -> Figure:
+    """Draw the views that cost the others most, each with the errors of its corners."""
+    names = [result.name for result in calibration.selection.ranking[:_MAX_DRAWN]]
+    index = {view.name: i for i, view in enumerate(calibration.selection.views)}
+    rows, aspect = -(-len(names) // _COLUMNS), calibration.camera.height / calibration.camera.width
+    figure = Figure(figsize=(16, rows * (4 * aspect + 0.4) + 0.6), dpi=_DPI, layout="constrained")
+    scale = _ARROW * calibration.camera.width / max(calibration.fit.rms, 1e-6)
     figure.suptitle(
-        f"corners found less corners expected, {scale:.0f} times as long; rms of all {found.fitted.rms:.3f} px"
+        f"detected minus projected corners, {scale:.0f} times enlarged; rms of all {calibration.fit.rms:.3f} px"
     )
     for k, name in enumerate(names):
-        _draw_view(figure.add_subplot(rows, _ACROSS, k + 1), found, by_name[name], read_gray(files[name]), scale)
+        axes = figure.add_subplot(rows, _COLUMNS, k + 1)
+        _draw_view(axes, calibration, index[name], read_gray(name), scale)
     return figure
 
 
-def _draw_view(axes: Axes, found: Calibration, i: int, gray: np.ndarray, scale: float) -> None:
-    view, errors = found.kept.views[i], found.fitted.errors[i]
-    axes.imshow(gray, cmap="gray", vmin=-255, vmax=255)  # pale, so that arrows are seen
+def _draw_view(axes: Axes, calibration: Calibration, i: int, gray: np.ndarray, scale: float) -> None:
+    view, errors = calibration.selection.views[i], calibration.fit.errors[i]
+    axes.imshow(gray, cmap="gray", vmin=-255, vmax=255)  # pale, so that the arrows stand out
     axes.quiver(
         *view.corners.T, *errors.T, angles="xy", scale_units="xy", scale=1 / scale, color="#d00000", width=0.004
     )

@@ -76,7 +76,9 @@ def test_an_overexposed_chessboard_keeps_its_corners(small_camera):
 def test_refined_corners_of_a_chessboard_are_taken_where_they_lie_as_smoothly(small_camera, monkeypatch, noise, taken):
     board, dice = Chessboard(squares="7x6", square_mm=30), np.random.default_rng(0)
     _, gray, _ = next(render_views(board, small_camera, count=1))
-    found = np.asarray(cv2.findChessboardCornersSB(gray, board.num_corners, flags=detection.SEARCH_FLAGS)[1]).reshape(-1, 2)
+    found = np.asarray(cv2.findChessboardCornersSB(gray, board.num_corners, flags=detection.SEARCH_FLAGS)[1]).reshape(
+        -1, 2
+    )
     rough = found + dice.normal(0, noise, found.shape)
     monkeypatch.setattr(detection, "_refined", lambda *_: (np.arange(30), rough))
     np.testing.assert_allclose(detect(gray, board).corners, rough if taken else found, atol=1e-6)

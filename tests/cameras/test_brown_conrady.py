@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import cv2
@@ -139,7 +140,7 @@ def test_newton_steps_without_a_table_converge_quadratically():
     for steps in range(4):
         x_u, y_u = newton_undistort(x_d, y_d, c, steps=steps)
         errors.append(torch.maximum((x_u - x).abs(), (y_u - y).abs()).max().item())
-    assert all(after < 10 * before**2 for before, after in zip(errors[:-1], errors[1:], strict=True) if after > 1e-14)
+    assert all(after < 10 * before**2 for before, after in itertools.pairwise(errors) if after > 1e-14)
     assert errors[3] < 1e-9
 
 

@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 
 from torchrefract.cameras.calibration.boards import Chessboard
-from torchrefract.cameras.calibration.quality import coverage, doubts
 from torchrefract.cameras.calibration.detection import View
 from torchrefract.cameras.calibration.fit import fit
+from torchrefract.cameras.calibration.quality import coverage, doubts
 from torchrefract.cameras.camera import Camera
 
 BOARD = Chessboard(squares="9x7", square_mm=25)

@@ -6,7 +6,7 @@ import pytest
 
 from torchrefract.cameras.calibration.boards import Charuco, Chessboard
 from torchrefract.cameras.calibration.detection import detect
-from torchrefract.cameras.calibration.diagnosis import edge_width, explain_failure, describe_other_board
+from torchrefract.cameras.calibration.diagnosis import describe_other_board, edge_width, explain_failure
 from torchrefract.cameras.calibration.synthetic import render_views
 
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from torchrefract.cameras.calibration.boards import Chessboard
-from torchrefract.cameras.calibration.fit import Lens, errors_in_best_pose, fit, cross_validate, rms
+from torchrefract.cameras.calibration.fit import Lens, cross_validate, errors_in_best_pose, fit, rms
 
 BOARD = Chessboard(squares="9x7", square_mm=25)
 SIZE = (800, 600)

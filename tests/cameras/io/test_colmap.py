@@ -1,4 +1,3 @@
-
 from torchrefract.cameras.io.colmap import read_colmap, write_colmap
 
 # The layout of COLMAP's documentation; parameters in the order of its camera models.

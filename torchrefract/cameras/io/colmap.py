@@ -4,16 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io.documents import (
-    abbreviate,
-    check_opencv_model,
-    create_camera,
-    fit_length,
-    integer,
-    numbers,
-    read_text,
-    write_text,
-)
+from torchrefract.cameras.io import documents
 
 # For each model of COLMAP: its number of parameters, the model here, and how the parameters split into pinhole and
 # coefficients. COLMAP's order is f or fx fy, cx, cy, then the lens.
@@ -42,7 +33,9 @@ def read_colmap(path: str | Path) -> dict[int, Camera]:
         ValueError: a line is not a camera, or its model has no counterpart (FOV, THIN_PRISM_FISHEYE and others).
     """
     path = Path(path)
-    lines = [line.split() for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
+    lines = [
+        line.split() for line in documents.read_text(path).splitlines() if line.strip() and not line.startswith("#")
+    ]
     return dict(_camera(path, words) for words in lines)
 
 
@@ -64,27 +57,30 @@ def write_colmap(path: str | Path, cameras: Mapping[int, Camera]) -> None:
         pinhole = (camera.fx, camera.fy, camera.cx + _OFFSET, camera.cy + _OFFSET)
         values = " ".join(map(repr, (*pinhole, *coefficients)))
         lines.append(f"{number} {model} {camera.width} {camera.height} {values}")
-    write_text(Path(path), "\n".join(lines) + "\n")
+    documents.write_text(Path(path), "\n".join(lines) + "\n")
 
 
 def _camera(path: Path, words: list[str]) -> tuple[int, Camera]:
     if len(words) < 4:
         raise ValueError(
-            f"path must have a number, model, width and height in each line, got {path} with {abbreviate(words)}"
+            f"path must have a number, model, width and height in each line, got {path} with "
+            f"{documents.abbreviate(words)}"
         )
-    number, width, height = (integer(path, "CAMERA_ID, WIDTH or HEIGHT", words[i]) for i in (0, 2, 3))
+    number, width, height = (documents.integer(path, "CAMERA_ID, WIDTH or HEIGHT", words[i]) for i in (0, 2, 3))
     if words[1] not in _MODELS:
         raise ValueError(f"path must have a camera model of {', '.join(_MODELS)}, got {path} with {words[1][:80]}")
     count, model, split = _MODELS[words[1]]
-    (fx, fy, cx, cy), coefficients = split(numbers(path, f"parameters of {words[1]}", words[4:], count=count))
-    return number, create_camera(path, (width, height), (fx, fy, cx - _OFFSET, cy - _OFFSET), coefficients, model)
+    (fx, fy, cx, cy), coefficients = split(documents.numbers(path, f"parameters of {words[1]}", words[4:], count=count))
+    return number, documents.create_camera(
+        path, (width, height), (fx, fy, cx - _OFFSET, cy - _OFFSET), coefficients, model
+    )
 
 
 def _model(camera: Camera) -> tuple[str, Sequence[float]]:
-    check_opencv_model(camera)
+    documents.check_opencv_model(camera)
     if camera.model == "fisheye":
         return "OPENCV_FISHEYE", camera.coefficients
     if not any(camera.coefficients):
         return "PINHOLE", ()
     is_short = not any(camera.coefficients[4:])
-    return ("OPENCV", fit_length(camera, 4)) if is_short else ("FULL_OPENCV", fit_length(camera, 8))
+    return ("OPENCV", documents.fit_length(camera, 4)) if is_short else ("FULL_OPENCV", documents.fit_length(camera, 8))

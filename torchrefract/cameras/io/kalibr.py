@@ -5,17 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io.documents import (
-    abbreviate,
-    check_opencv_model,
-    create_camera,
-    entry,
-    fit_length,
-    integer,
-    numbers,
-    read_text,
-    write_text,
-)
+from torchrefract.cameras.io import documents
 from torchrefract.cameras.io.yaml_documents import dump_yaml, parse_yaml
 
 _MODELS = {"radtan": "opencv", "equidistant": "fisheye", "none": "opencv"}
@@ -31,7 +21,7 @@ def read_kalibr(path: str | Path) -> dict[str, Camera]:
             distortion_model (fov).
     """
     path = Path(path)
-    document = parse_yaml(path, read_text(path))
+    document = parse_yaml(path, documents.read_text(path))
     return {str(name): _camera(path, str(name), chain) for name, chain in document.items()}
 
 
@@ -45,35 +35,40 @@ def write_kalibr(path: str | Path, cameras: Mapping[str, Camera]) -> None:
     Raises:
         ValueError: a camera has another model or other coefficients.
     """
-    write_text(Path(path), dump_yaml({name: _chain(camera) for name, camera in cameras.items()}))
+    documents.write_text(Path(path), dump_yaml({name: _chain(camera) for name, camera in cameras.items()}))
 
 
 def _camera(path: Path, name: str, chain: Any) -> Camera:
     if not isinstance(chain, dict):
-        raise ValueError(f"path must hold a camera as {name}, got {path} with {abbreviate(chain)}")
-    kind, lens = entry(path, chain, "camera_model"), chain.get("distortion_model", "none")
+        raise ValueError(f"path must hold a camera as {name}, got {path} with {documents.abbreviate(chain)}")
+    kind, lens = documents.entry(path, chain, "camera_model"), chain.get("distortion_model", "none")
     if kind != "pinhole":
-        raise ValueError(f"path must have pinhole as the camera_model of {name}, got {path} with {abbreviate(kind)}")
+        raise ValueError(
+            f"path must have pinhole as the camera_model of {name}, got {path} with {documents.abbreviate(kind)}"
+        )
     if not isinstance(lens, str) or lens not in _MODELS:
         raise ValueError(
-            f"path must have a distortion_model of {', '.join(_MODELS)} for {name}, got {path} with {abbreviate(lens)}"
+            f"path must have a distortion_model of {', '.join(_MODELS)} for {name}, got {path} with "
+            f"{documents.abbreviate(lens)}"
         )
-    pinhole = numbers(path, "intrinsics", entry(path, chain, "intrinsics"), count=4)
-    resolution = numbers(path, "resolution", entry(path, chain, "resolution"), count=2)
-    size = [integer(path, "resolution", value) for value in resolution]
+    pinhole = documents.numbers(path, "intrinsics", documents.entry(path, chain, "intrinsics"), count=4)
+    resolution = documents.numbers(path, "resolution", documents.entry(path, chain, "resolution"), count=2)
+    size = [documents.integer(path, "resolution", value) for value in resolution]
     coefficients = [0.0] * 4
     if lens != "none":
-        coefficients = numbers(path, "distortion_coeffs", entry(path, chain, "distortion_coeffs"), count=4)
-    return create_camera(path, size, pinhole, coefficients, _MODELS[lens])
+        coefficients = documents.numbers(
+            path, "distortion_coeffs", documents.entry(path, chain, "distortion_coeffs"), count=4
+        )
+    return documents.create_camera(path, size, pinhole, coefficients, _MODELS[lens])
 
 
 def _chain(camera: Camera) -> dict[str, Any]:
-    check_opencv_model(camera)
+    documents.check_opencv_model(camera)
     is_radtan = camera.model == "opencv"
     return {
         "camera_model": "pinhole",
         "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
         "distortion_model": "radtan" if is_radtan else "equidistant",
-        "distortion_coeffs": list(fit_length(camera, 4) if is_radtan else camera.coefficients),
+        "distortion_coeffs": list(documents.fit_length(camera, 4) if is_radtan else camera.coefficients),
         "resolution": [camera.width, camera.height],
     }

@@ -5,17 +5,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io.documents import (
-    abbreviate,
-    check_opencv_model,
-    create_camera,
-    entry,
-    integer,
-    numbers,
-    pinhole_of_matrix,
-    read_text,
-    write_text,
-)
+from torchrefract.cameras.io import documents
 from torchrefract.cameras.io.yaml_documents import parse_yaml
 
 _XML, _YAML = ".xml", (".yml", ".yaml")
@@ -33,12 +23,14 @@ def read_opencv(path: str | Path) -> Camera:
         ValueError: the file holds no such camera.
     """
     path = Path(path)
-    document = _from_xml(path) if _is_xml(path) else parse_yaml(path, _plain_yaml(read_text(path)))
-    size = [integer(path, name, entry(path, document, name)) for name in ("image_width", "image_height")]
-    pinhole = pinhole_of_matrix(path, "camera_matrix", _data(path, document, "camera_matrix"))
-    coefficients = numbers(path, "distortion_coefficients", _data(path, document, "distortion_coefficients"))
-    is_fisheye = integer(path, "fisheye_model", document.get("fisheye_model", 0))
-    return create_camera(path, size, pinhole, coefficients, "fisheye" if is_fisheye else "opencv")
+    document = _from_xml(path) if _is_xml(path) else parse_yaml(path, _plain_yaml(documents.read_text(path)))
+    size = [
+        documents.integer(path, name, documents.entry(path, document, name)) for name in ("image_width", "image_height")
+    ]
+    pinhole = documents.pinhole_of_matrix(path, "camera_matrix", _data(path, document, "camera_matrix"))
+    coefficients = documents.numbers(path, "distortion_coefficients", _data(path, document, "distortion_coefficients"))
+    is_fisheye = documents.integer(path, "fisheye_model", document.get("fisheye_model", 0))
+    return documents.create_camera(path, size, pinhole, coefficients, "fisheye" if is_fisheye else "opencv")
 
 
 def write_opencv(path: str | Path, camera: Camera) -> None:
@@ -52,7 +44,7 @@ def write_opencv(path: str | Path, camera: Camera) -> None:
         ValueError: the camera has another model, or the path another ending.
     """
     path = Path(path)
-    check_opencv_model(camera)
+    documents.check_opencv_model(camera)
     scalars = {"image_width": camera.width, "image_height": camera.height}
     scalars["fisheye_model"] = int(camera.model == "fisheye")
     matrix = [value for row in camera.matrix for value in row]
@@ -60,7 +52,7 @@ def write_opencv(path: str | Path, camera: Camera) -> None:
         "camera_matrix": (3, 3, matrix),
         "distortion_coefficients": (len(camera.coefficients), 1, list(camera.coefficients)),
     }
-    write_text(path, (_xml_text if _is_xml(path) else _yaml_text)(scalars, matrices))
+    documents.write_text(path, (_xml_text if _is_xml(path) else _yaml_text)(scalars, matrices))
 
 
 def _is_xml(path: Path) -> bool:
@@ -77,7 +69,7 @@ def _plain_yaml(text: str) -> str:
 
 def _from_xml(path: Path) -> dict[str, Any]:
     try:
-        root = ElementTree.fromstring(read_text(path))
+        root = ElementTree.fromstring(documents.read_text(path))
     except ElementTree.ParseError as error:
         raise ValueError(f"path must hold XML, got {path}: {error}") from error
     return {node.tag: _from_node(node) for node in root}
@@ -91,9 +83,9 @@ def _from_node(node: ElementTree.Element) -> Any:
 
 
 def _data(path: Path, document: Any, name: str) -> Any:
-    matrix = entry(path, document, name)
+    matrix = documents.entry(path, document, name)
     if not isinstance(matrix, dict) or "data" not in matrix:
-        raise ValueError(f"path must hold a matrix as {name}, got {path} with {abbreviate(matrix)}")
+        raise ValueError(f"path must hold a matrix as {name}, got {path} with {documents.abbreviate(matrix)}")
     return matrix["data"]
 
 

@@ -4,18 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io.documents import (
-    abbreviate,
-    check_opencv_model,
-    create_camera,
-    entry,
-    fit_length,
-    integer,
-    numbers,
-    pinhole_of_matrix,
-    read_text,
-    write_text,
-)
+from torchrefract.cameras.io import documents
 from torchrefract.cameras.io.yaml_documents import dump_yaml, parse_yaml
 
 _MODELS = {"plumb_bob": "opencv", "rational_polynomial": "opencv", "equidistant": "fisheye"}
@@ -31,16 +20,18 @@ def read_ros(path: str | Path) -> Camera:
         ValueError: the file holds no such camera, or one with another distortion_model.
     """
     path = Path(path)
-    document = parse_yaml(path, read_text(path))
-    size = [integer(path, name, entry(path, document, name)) for name in ("image_width", "image_height")]
-    name = entry(path, document, "distortion_model")
+    document = parse_yaml(path, documents.read_text(path))
+    size = [
+        documents.integer(path, name, documents.entry(path, document, name)) for name in ("image_width", "image_height")
+    ]
+    name = documents.entry(path, document, "distortion_model")
     if not isinstance(name, str) or name not in _MODELS:
         raise ValueError(
-            f"path must have a distortion_model of {', '.join(_MODELS)}, got {path} with {abbreviate(name)}"
+            f"path must have a distortion_model of {', '.join(_MODELS)}, got {path} with {documents.abbreviate(name)}"
         )
-    pinhole = pinhole_of_matrix(path, "camera_matrix", _data(path, document, "camera_matrix"))
-    coefficients = numbers(path, "distortion_coefficients", _data(path, document, "distortion_coefficients"))
-    return create_camera(path, size, pinhole, coefficients, _MODELS[name])
+    pinhole = documents.pinhole_of_matrix(path, "camera_matrix", _data(path, document, "camera_matrix"))
+    coefficients = documents.numbers(path, "distortion_coefficients", _data(path, document, "distortion_coefficients"))
+    return documents.create_camera(path, size, pinhole, coefficients, _MODELS[name])
 
 
 def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None:
@@ -54,11 +45,11 @@ def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None
     Raises:
         ValueError: the camera has another model or other coefficients.
     """
-    check_opencv_model(camera)
+    documents.check_opencv_model(camera)
     coefficients, model = camera.coefficients, "equidistant"
     if camera.model == "opencv":
         is_short = not any(coefficients[5:])
-        coefficients = fit_length(camera, 5 if is_short else 8)
+        coefficients = documents.fit_length(camera, 5 if is_short else 8)
         model = "plumb_bob" if is_short else "rational_polynomial"
     (fx, _, cx), (_, fy, cy), _ = camera.matrix
     document = {
@@ -71,14 +62,16 @@ def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None
         "rectification_matrix": _matrix(3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
         "projection_matrix": _matrix(3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
     }
-    write_text(Path(path), dump_yaml(document))
+    documents.write_text(Path(path), dump_yaml(document))
 
 
 def _data(path: Path, document: Any, name: str) -> Any:
-    matrix = entry(path, document, name)
+    matrix = documents.entry(path, document, name)
     if not isinstance(matrix, dict):
-        raise ValueError(f"path must hold rows, cols and data as {name}, got {path} with {abbreviate(matrix)}")
-    return entry(path, matrix, "data")
+        raise ValueError(
+            f"path must hold rows, cols and data as {name}, got {path} with {documents.abbreviate(matrix)}"
+        )
+    return documents.entry(path, matrix, "data")
 
 
 def _matrix(rows: int, columns: int, data: list[float]) -> dict[str, Any]:

@@ -13,16 +13,6 @@ except ModuleNotFoundError as missing:
 
 
 _MAX_MESSAGE = 400  # characters of PyYAML's error to repeat
-# PyYAML raises these for malformed scalars, for keys that are lists, and for deep nesting.
-_PARSE_ERRORS = (
-    yaml.YAMLError,
-    ValueError,
-    TypeError,
-    ArithmeticError,
-    LookupError,
-    AttributeError,
-    RecursionError,
-)
 
 
 class _Loader(yaml.SafeLoader):
@@ -55,7 +45,7 @@ def parse_yaml(path: Path, text: str) -> Mapping[str, Any]:
     """
     try:
         document = yaml.load(text, Loader=_Loader)
-    except _PARSE_ERRORS as error:
+    except Exception as error:  # malformed scalars and keys raise many types besides YAMLError
         raise ValueError(f"path must hold YAML, got {path}: {' '.join(str(error).split())[:_MAX_MESSAGE]}") from error
     if not isinstance(document, Mapping):
         raise ValueError(f"path must hold a mapping of names to values, got {path} with {type(document).__name__}")

@@ -11,15 +11,14 @@ from torch.testing import assert_close
 
 from torchrefract.cameras.brown_conrady import (
     POLYNOMIAL12,
-    RadialLimit,
     Terms,
     distort_polynomial,
     jacobian_polynomial,
     newton_undistort,
-    radial_limit,
     undistort_polynomial,
     used_terms,
 )
+from torchrefract.cameras.radial import RadialLimit, radial_limit
 
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 FOCAL = 2000.0

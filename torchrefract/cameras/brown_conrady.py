@@ -2,7 +2,7 @@
 
 The model maps a point (x, y) of the plane z = 1 to the point where the lens shows it, in focal lengths from the
 principal point. All functions take x and y as separate tensors of any shapes (B, ...) that broadcast with coefficients
-(B, 12, ...), in the order of `POLYNOMIAL12`. To add a radial term, extend `RADIAL`.
+(B, 12, ...), in the order of `POLYNOMIAL12`. To add a radial term, extend `RADIAL` in `radial.py`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,15 +14,14 @@ from torch import Tensor
 
 from torchrefract._validation import eager_values
 from torchrefract.cameras.radial import (
+    RADIAL,
     RadialLimit,
-    limit_of_polynomial,
     newton_radius,
     radial_factor,
     radial_factor_slope,
 )
 from torchrefract.warping.jacobian import Jacobian
 
-RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")
 TANGENTIAL = ("p1", "p2")
 PRISM = ("s1", "s2", "s3", "s4")
 POLYNOMIAL12 = (*RADIAL, *TANGENTIAL, *PRISM)
@@ -142,19 +141,6 @@ def lens_jacobian(
         a, b = 2 * s1 + 4 * s2 * r2, 2 * s3 + 4 * s4 * r2
         xx, xy, yx, yy = xx + a * x, xy + a * y, yx + b * x, yy + b * y
     return Jacobian(xx, xy, yx, yy)
-
-
-def radial_limit(coefficients: Tensor, reach: Tensor, image_reach: Tensor) -> RadialLimit:
-    """Compute how far out the radial terms can be inverted; see `radial.limit_of_polynomial`.
-
-    Args:
-        coefficients: (B, 12, ...), viewed with one dimension for each dimension of the points.
-        reach: (B,), the radius on the plane z = 1 up to which a fold is searched.
-        image_reach: (B,), the largest radius after distortion that will be inverted.
-    """
-    with torch.no_grad():
-        k = coefficients.flatten(1)[:, : len(RADIAL), None].unbind(1)
-        return limit_of_polynomial(k, reach, image_reach, ndim=coefficients.ndim - 1)
 
 
 def undistort_polynomial(

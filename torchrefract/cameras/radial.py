@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")  # of the Brown-Conrady polynomial, its first coefficients
 _NODES = 2048  # of a lattice of radii
 _MAX_IMAGE_RADIUS = 1e3  # focal lengths; farther points are outside every lens and must not coarsen the table
 _DOUBLINGS = 12  # of the radius after distortion, to bracket the radius before it
@@ -110,18 +111,22 @@ class RadialLimit(NamedTuple):
         return torch.lerp(low, high, position - node)
 
 
-def limit_of_polynomial(k: Sequence[Tensor], reach: Tensor, image_reach: Tensor, *, ndim: int) -> RadialLimit:
-    """Compute the limit of r (1 + sum k_i r^2i), searched on a lattice of radii that is refined twice.
+def radial_limit(coefficients: Tensor, reach: Tensor, image_reach: Tensor) -> RadialLimit:
+    """Compute how far out the radial terms of the Brown-Conrady polynomial can be inverted.
+
+    The fold is searched on a lattice of radii that is refined twice.
 
     Args:
-        k: k_1 ... k_n, each (B, 1).
+        coefficients: (B, 12, ...), with one dimension for each dimension of the points.
         reach: (B,), the largest radius on the plane z = 1 to search.
         image_reach: (B,), the largest radius after distortion that will be inverted.
-        ndim: number of dimensions of `radius` and `image_radius`.
     """
-    growth = growth_of_polynomial(k)
-    radius, folds = first_fall(lambda r: radial_factor(r * r, growth) <= 0, reach)
-    return _tabulate(radius, folds, image_reach, lambda r: r * radial_factor(r * r, k), (-1,) + (1,) * (ndim - 1))
+    with torch.no_grad():
+        k = coefficients.flatten(1)[:, : len(RADIAL), None].unbind(1)
+        growth = growth_of_polynomial(k)
+        radius, folds = first_fall(lambda r: radial_factor(r * r, growth) <= 0, reach)
+        shape = (-1,) + (1,) * (coefficients.ndim - 2)
+        return _tabulate(radius, folds, image_reach, lambda r: r * radial_factor(r * r, k), shape)
 
 
 def first_fall(falls: Callable[[Tensor], Tensor], reach: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,11 +13,10 @@ from torchrefract.cameras.brown_conrady import (
     implicit,
     jacobian_polynomial,
     newton_undistort,
-    radial_limit,
     undistort_polynomial,
     used_terms,
 )
-from torchrefract.cameras.radial import RadialLimit
+from torchrefract.cameras.radial import RadialLimit, radial_limit
 from torchrefract.warping.grid import pixel_axes
 
 # The preimage of a pixel is looked for up to so many half-diagonals of the frame; beyond, nothing of it is seen.

@@ -1,5 +1,4 @@
 import csv
-import json
 import math
 
 import pytest
@@ -69,12 +68,8 @@ def test_a_user_table_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("change", "rule"),
     [
-        ({"fx": "nan"}, "with the row a1: fx must not be NaN"),
         ({"coefficients": "[NaN, 0, 0, 0]"}, "with the row a1: coefficients must not be NaN"),
-        ({"coefficients": json.dumps([0.0] * 3)}, "with the row a1: coefficients must be 4 or 5"),
-        ({"coefficients": "[-0.2,"}, "with the row a1: Expecting value"),
         ({"coefficients": ""}, "with the row a1: Expecting value"),
-        ({"width": "wide"}, "with the row a1: invalid literal"),
         ({"model": "ptlens"}, "with the row a1: model must be one of"),
         ({"model": "fisheye"}, "with the row a1: model must be polynomial12, or opencv without"),
         ({"residual_px": str(math.nan)}, "with the row a1: residual_px must be at least 0, got nan"),

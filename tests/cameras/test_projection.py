@@ -230,32 +230,6 @@ def test_empty_batches_give_empty_results(model):
         assert function(torch.zeros(0, 5, 2).double(), c[:0], model=model).valid.shape == (0, 5)
 
 
-def test_a_focal_length_and_two_coefficients_are_learned_from_correspondences():
-    generator = torch.Generator().manual_seed(5)
-    rays = torch.cat([scattered(0.7, 300), torch.ones(1, 300, 1).double()], dim=2)
-    rays = rays * (1 + torch.rand(1, 300, 1, generator=generator).double())
-    center = torch.tensor([[318.0, 243.0]]).double()
-
-    def pixels_of(focal: Tensor, k: Tensor) -> Tensor:
-        c = torch.cat([k, k.new_zeros(6)])[None]
-        return project(rays, c, focal=focal.expand(1, 2), center=center, model="opencv").points
-
-    k_true = torch.tensor([-0.27, 0.09]).double()
-    pixels = pixels_of(torch.tensor(512.0).double(), k_true)
-    focal, k = torch.tensor(5.5).double().requires_grad_(), torch.zeros_like(k_true).requires_grad_()
-    optimizer = torch.optim.LBFGS([focal, k], max_iter=200, line_search_fn="strong_wolfe", tolerance_change=1e-15)
-
-    def loss() -> float:
-        optimizer.zero_grad()
-        value = (pixels_of(100 * focal, k) - pixels).square().mean()
-        value.backward()
-        return value.item()
-
-    optimizer.step(loss)
-    assert 100 * focal.item() == pytest.approx(512.0, abs=0.01)
-    assert_close(k.detach(), k_true, rtol=0, atol=1e-4)
-
-
 def test_the_inverse_of_every_published_lens_is_right_or_marked(published, oracle):
     assert len(published) > 50
     for name, camera in published.items():

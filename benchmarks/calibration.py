@@ -194,9 +194,10 @@ def _line_errors(
 
 def camera_from_row(row: Mapping[str, Any]) -> Camera:
     """Create the camera of a row of the JSON table."""
-    numbers = {name: float(row[name]) for name in ("fx", "fy", "cx", "cy")}
-    size = {"width": int(row["width"]), "height": int(row["height"])}
-    return Camera(**size, **numbers, coefficients=tuple(row["coeffs"]), model=_MODELS[row["model"]])
+    fx, fy, cx, cy = (float(row[name]) for name in ("fx", "fy", "cx", "cy"))
+    width, height = int(row["width"]), int(row["height"])
+    coefficients, model = tuple(row["coeffs"]), _MODELS[row["model"]]
+    return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=coefficients, model=model)
 
 
 def measure_lens(name: str, camera: Camera, *, step: int) -> LensRow:

@@ -201,7 +201,7 @@ def test_image_gradients_are_those_of_finite_differences(field):
 
 @pytest.mark.parametrize(
     "terms",
-    [ALL_TERMS, Terms(6, False, False, False), Terms(2, False, False), Terms(3, True, False), Terms(0, False, True)],
+    [ALL_TERMS, Terms(6, False, False), Terms(2, False, False), Terms(3, True, False), Terms(0, False, True)],
     ids=str,
 )
 @pytest.mark.parametrize("steps", [0, 1, 4])

@@ -1,11 +1,10 @@
 import csv
-import json
 import math
 
 import pytest
 
 from torchrefract.cameras.conversion import convert
-from torchrefract.cameras.lens_table import COLUMNS, read_lenses
+from torchrefract.cameras.lens_database import COLUMNS, read_lenses
 
 ROW = {
     **{"id": "a1", "camera": "Webcam", "lens": "", "model": "opencv", "width": "640", "height": "480"},
@@ -22,7 +21,8 @@ def written(path, *rows, columns=COLUMNS):
     return path
 
 
-def test_the_table_of_the_package_has_sources_and_nothing_share_alike():
+@pytest.mark.quick
+def test_the_packaged_lenses_have_sources_and_no_share_alike_licence():
     lenses = read_lenses()
     assert len(lenses) > 40
     assert len({lens.name for lens in lenses}) == len(lenses)
@@ -34,14 +34,14 @@ def test_the_table_of_the_package_has_sources_and_nothing_share_alike():
     assert {lens.camera.model for lens in lenses} == {"opencv", "fisheye"}
 
 
-def test_its_numbers_are_those_of_the_shared_table(published):
+def test_the_packaged_lenses_match_the_published_calibrations(published):
     lenses = read_lenses()
     assert {lens.name for lens in lenses} == {name for name, camera in published.items() if any(camera.coefficients)}
     for lens in lenses:
         assert lens.camera == published[lens.name]
 
 
-def test_a_polynomial_of_the_table_is_as_near_as_the_table_says():
+def test_packaged_polynomials_have_the_stated_residual():
     lenses = read_lenses()
     for lens in lenses:
         if lens.polynomial is None:
@@ -50,14 +50,14 @@ def test_a_polynomial_of_the_table_is_as_near_as_the_table_says():
             assert lens.residual_px == 0
             assert lens.polynomial.coefficients == lens.camera.polynomial()
         else:
-            pixels = lens.camera.places(65)
-            seen = lens.polynomial.project(lens.camera.unproject(pixels).points)
-            assert seen.valid.all()
-            error = (seen.points - pixels).norm(dim=1).max().item()
+            pixels = lens.camera.grid(65)
+            result = lens.polynomial.project(lens.camera.unproject(pixels).points)
+            assert result.valid.all()
+            error = (result.points - pixels).norm(dim=1).max().item()
             assert error == pytest.approx(lens.residual_px, rel=0.2)
 
 
-def test_a_table_of_ones_own_is_read(tmp_path):
+def test_a_user_table_is_read(tmp_path):
     (lens,) = read_lenses(written(tmp_path / "mine.csv", ROW))
     assert (lens.name, lens.title, lens.source, lens.licence) == ("a1", "Webcam", "somewhere", "CC0-1.0")
     assert lens.camera.coefficients == (-0.2, 0.05, 0.0, 0.001)
@@ -68,18 +68,14 @@ def test_a_table_of_ones_own_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("change", "rule"),
     [
-        ({"fx": "nan"}, "with the row a1: fx must not be NaN"),
         ({"coefficients": "[NaN, 0, 0, 0]"}, "with the row a1: coefficients must not be NaN"),
-        ({"coefficients": json.dumps([0.0] * 3)}, "with the row a1: coefficients must be 4 or 5"),
-        ({"coefficients": "[-0.2,"}, "with the row a1: Expecting value"),
         ({"coefficients": ""}, "with the row a1: Expecting value"),
-        ({"width": "wide"}, "with the row a1: invalid literal"),
         ({"model": "ptlens"}, "with the row a1: model must be one of"),
         ({"model": "fisheye"}, "with the row a1: model must be polynomial12, or opencv without"),
         ({"residual_px": str(math.nan)}, "with the row a1: residual_px must be at least 0, got nan"),
     ],
 )
-def test_a_row_that_is_no_lens_is_named(change, rule, tmp_path):
+def test_an_invalid_row_is_named(change, rule, tmp_path):
     path = written(tmp_path / "mine.csv", ROW | {"id": "a0"}, ROW | change)
     with pytest.raises(ValueError, match=f"path must hold lenses, got .*mine.csv {rule}"):
         read_lenses(path)

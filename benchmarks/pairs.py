@@ -26,10 +26,10 @@ from omegaconf import OmegaConf
 from timing import Bar
 
 from torchrefract._io import CONFIG_DIR, replace_file
-from torchrefract.data.pair_files import FORMATS, decode_pair, encode_pair
-from torchrefract.data.pairs.making import Job, Maker, Recipe
-from torchrefract.data.pairs.running import work_alone
+from torchrefract.data.pairs.files import FORMATS, decode_pair, encode_pair
+from torchrefract.data.pairs.generator import Job, Maker, Recipe
 from torchrefract.data.pairs.sources import Reader, find_sources
+from torchrefract.data.pairs.workers import work_alone
 
 WHAT = (
     "A run of torchrefract.generate: pairs a second, its start among the time; the share of the cores' time that it "

@@ -20,16 +20,16 @@ from omegaconf import DictConfig, OmegaConf
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_number, check_size
 from torchrefract.cli.command import check_seed, command, job, leave, make, naming, with_text
-from torchrefract.data.frame_folder import some
-from torchrefract.data.pair_files import FORMATS
-from torchrefract.data.pair_manifest import manifests, scan
+from torchrefract.cli.generation import watched
+from torchrefract.data.frames import some
 from torchrefract.data.pairs.card import HISTOGRAMS, contents, write_card
-from torchrefract.data.pairs.ledger import Ledger, claim
-from torchrefract.data.pairs.making import Job, Maker, Recipe
-from torchrefract.data.pairs.running import make_ready, run
+from torchrefract.data.pairs.files import FORMATS
+from torchrefract.data.pairs.generator import Job, Maker, Recipe
+from torchrefract.data.pairs.manifest import manifests, scan
+from torchrefract.data.pairs.output import Ledger, claim
 from torchrefract.data.pairs.sources import Sources, find_sources
-from torchrefract.data.pairs.watching import watched
-from torchrefract.data.pairs.writing import Folders, Store, Tars
+from torchrefract.data.pairs.storage import Folders, Store, Tars
+from torchrefract.data.pairs.workers import make_ready, run
 from torchrefract.effects.base import Effect
 
 _TRIED = 4  # pairs that tell how much room the others will take

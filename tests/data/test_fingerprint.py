@@ -8,8 +8,8 @@ from PIL import Image
 from torch.utils.data import Dataset
 
 from torchrefract.data.fingerprint import fingerprint
-from torchrefract.data.frame_folder import FrameFolder
-from torchrefract.data.paired_folder import PairedFolder
+from torchrefract.data.frames import FrameFolder
+from torchrefract.data.pairs.dataset import PairedFolder
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.types import Frame
 

@@ -6,8 +6,9 @@ import torch.nn.functional as F
 from torch.testing import assert_close
 from torch.utils.data import DataLoader
 
-from torchrefract.data.road_bodies import plain
-from torchrefract.data.road_geometry import (
+from torchrefract.data.road_scenes import RoadScenes, draw_scene, render_road_scenes
+from torchrefract.data.road_scenes.bodies import plain
+from torchrefract.data.road_scenes.geometry import (
     Shape,
     View,
     ball_sides,
@@ -18,9 +19,8 @@ from torchrefract.data.road_geometry import (
     noise,
     rays,
 )
-from torchrefract.data.road_paint import band, dashes
-from torchrefract.data.road_scenes import RoadScenes, draw_scene, render_road_scenes
-from torchrefract.data.road_visibility import NO_BODY, Group, shadows, visibility
+from torchrefract.data.road_scenes.paint import band, dashes
+from torchrefract.data.road_scenes.visibility import NO_BODY, Group, shadows, visibility
 
 CENTER = ((0.0, 0.0),)
 SAMPLES = 5  # rays a pixel

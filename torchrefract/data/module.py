@@ -9,8 +9,8 @@ from pytorch_lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, DistributedSampler, default_collate
 
 from torchrefract._validation import check_count, check_flag
-from torchrefract.data.frame_folder import FrameFolder
-from torchrefract.data.paired_folder import PairedFolder
+from torchrefract.data.frames import FrameFolder
+from torchrefract.data.pairs.dataset import PairedFolder
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.effects.base import Effect
 from torchrefract.types import Frame, Pair

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from torchrefract.data.pair_files import DamagedPairError
-from torchrefract.data.paired_folder import PairedFolder
+from torchrefract.data.pairs.dataset import PairedFolder
+from torchrefract.data.pairs.files import DamagedPairError
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from PIL import Image
 from safetensors.numpy import load_file
 
 from torchrefract import presets, warp
-from torchrefract.data.frame_folder import FrameFolder
+from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import read_image
 
 COUNT = 10

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchrefract.data.images import UnreadableImageError, fit, pixels_of, read_image
-from torchrefract.data.paired_folder import PairedFolder
+from torchrefract.data.pairs.dataset import PairedFolder
 from torchrefract.data.pairs.sources import Reader, Source, draw_of, find_sources
 from torchrefract.videos import read_video, write_video
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchrefract.data.pair_manifest import PairRow
+from torchrefract.data.pairs.manifest import PairRow
 
 HISTOGRAMS = "parameters.png"
 

@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from torchrefract._validation import UsageError
-from torchrefract.data.frame_folder import path_key, place_frames, val_drives, walk
+from torchrefract.data.frames import path_key, place_frames, val_drives, walk
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, as_image, fit, pixels_of, read_pixels
 from torchrefract.videos import VIDEOS, read_video, video_facts
 

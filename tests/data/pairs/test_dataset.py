@@ -12,8 +12,8 @@ from torch.utils.data import DataLoader
 from torchrefract import Pair, presets
 from torchrefract._io import CONFIG_DIR
 from torchrefract.data.module import PairData, frames, pairs
-from torchrefract.data.pair_files import beyond, decode_flow, encode_flow
-from torchrefract.data.paired_folder import PairedFolder, PairStream
+from torchrefract.data.pairs.dataset import PairedFolder, PairStream
+from torchrefract.data.pairs.files import beyond, decode_flow, encode_flow
 from torchrefract.restoration.tasks import Undistort
 
 SIZE = (32, 48)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract.data.road_geometry import Point, View
+from torchrefract.data.road_scenes.geometry import Point, View
 from torchrefract.draws import stream, uniform
 
 _LANE = 0x5CE4E

@@ -6,7 +6,7 @@ All lengths in meters in the body's own axes: x across, y up from its foot, z al
 import torch
 from torch import Tensor
 
-from torchrefract.data.road_geometry import Point, Shape, Sides, noise
+from torchrefract.data.road_scenes.geometry import Point, Shape, Sides, noise
 
 GLASS = (0.035, 0.05, 0.065)
 _TIRE = 0.33

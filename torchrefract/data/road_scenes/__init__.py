@@ -8,11 +8,11 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from torchrefract._validation import check_count, check_tensor
-from torchrefract.data.road_geometry import View, ground_depth, rays
-from torchrefract.data.road_layout import Dice, Light, Road, draw_light, draw_road, draw_view
-from torchrefract.data.road_objects import draw_groups
-from torchrefract.data.road_paint import backdrop, paint_bodies
-from torchrefract.data.road_visibility import Group, shadows, visibility
+from torchrefract.data.road_scenes.geometry import View, ground_depth, rays
+from torchrefract.data.road_scenes.layout import Dice, Light, Road, draw_light, draw_road, draw_view
+from torchrefract.data.road_scenes.objects import draw_groups
+from torchrefract.data.road_scenes.paint import backdrop, paint_bodies
+from torchrefract.data.road_scenes.visibility import Group, shadows, visibility
 from torchrefract.types import Frame
 
 _SMALLEST = 8  # px a side

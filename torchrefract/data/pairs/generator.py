@@ -13,8 +13,8 @@ import torch
 from torchrefract._validation import UsageError
 from torchrefract.cli.command import naming
 from torchrefract.data.images import UnreadableImageError, pixels_of
-from torchrefract.data.pair_files import FLOWS, LIGHTS, PairArrays, beyond, encode_pair
-from torchrefract.data.pair_manifest import PairRow, Stored
+from torchrefract.data.pairs.files import FLOWS, LIGHTS, PairArrays, beyond, encode_pair
+from torchrefract.data.pairs.manifest import PairRow, Stored
 from torchrefract.data.pairs.sources import Reader, Source, draw_of
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose

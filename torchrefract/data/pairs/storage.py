@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchrefract._io import replace_file
-from torchrefract.data.pair_manifest import PairRow, pair_name
-from torchrefract.data.pairs.making import Job, Made, Maker
+from torchrefract.data.pairs.generator import Job, Made, Maker
+from torchrefract.data.pairs.manifest import PairRow, pair_name
 
 _FOLDER = 1000  # pairs in a folder
 _HEAD = 512  # bytes of a tar before each of its files

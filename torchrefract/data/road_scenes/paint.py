@@ -5,9 +5,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract.data.road_geometry import Point, View, eye, noise, own_point, pick, pick_point
-from torchrefract.data.road_layout import Light, Road
-from torchrefract.data.road_visibility import CHUNK, NO_BODY, Group
+from torchrefract.data.road_scenes.geometry import Point, View, eye, noise, own_point, pick, pick_point
+from torchrefract.data.road_scenes.layout import Light, Road
+from torchrefract.data.road_scenes.visibility import CHUNK, NO_BODY, Group
 
 _CEILING = 900.0  # m, of the clouds
 _CLOUD_SCALE = 170.0  # how much larger than the ground's their texture is

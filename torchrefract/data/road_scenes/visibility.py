@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract.data.road_geometry import (
+from torchrefract.data.road_scenes.geometry import (
     Point,
     Shape,
     Sides,

@@ -15,9 +15,9 @@ import torch
 
 from torchrefract._memory import keep_freed_memory
 from torchrefract._validation import UsageError
-from torchrefract.data.pair_manifest import PairRow
-from torchrefract.data.pairs.making import Job, Maker, Recipe
-from torchrefract.data.pairs.writing import Store
+from torchrefract.data.pairs.generator import Job, Maker, Recipe
+from torchrefract.data.pairs.manifest import PairRow
+from torchrefract.data.pairs.storage import Store
 
 _AHEAD = 2  # units for each worker, made or waiting
 
@@ -78,7 +78,7 @@ def make_ready() -> None:
             __name__,
             "torchrefract.cli.command",
             "torchrefract.data.pairs.card",
-            "torchrefract.data.pairs.ledger",
+            "torchrefract.data.pairs.output",
         ]
         multiprocessing.set_forkserver_preload(preloaded)
         forkserver.ensure_running()

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrefract.data import road_bodies as bodies
-from torchrefract.data.road_geometry import Shape, ball_sides, meet_ball
-from torchrefract.data.road_layout import Dice, Road, cosine_sine
-from torchrefract.data.road_visibility import Group
+from torchrefract.data.road_scenes import bodies
+from torchrefract.data.road_scenes.geometry import Shape, ball_sides, meet_ball
+from torchrefract.data.road_scenes.layout import Dice, Road, cosine_sine
+from torchrefract.data.road_scenes.visibility import Group
 
 
 def draw_groups(dice: Dice, road: Road) -> list[Group]:

@@ -14,7 +14,7 @@ from PIL import Image
 from torch.testing import assert_close
 from torch.utils.data import DataLoader
 
-from torchrefract.data.frame_folder import FrameFolder, name_prefix
+from torchrefract.data.frames import FrameFolder, name_prefix
 from torchrefract.data.images import UnreadableImageError, fit, read_image
 
 SIZE = (4, 6)

@@ -1,38 +1,31 @@
-"""Road scenes rendered from a key, with their true depth: the data source that needs no files."""
+"""Rendered dashcam frames of southern African roads, with their true depth: clean frames without files."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from torchrefract._validation import check_count, check_tensor
-from torchrefract.data.road_scenes.geometry import View, ground_depth, rays
-from torchrefract.data.road_scenes.layout import Dice, Light, Road, draw_light, draw_road, draw_view
-from torchrefract.data.road_scenes.objects import draw_groups
-from torchrefract.data.road_scenes.paint import backdrop, paint_bodies
-from torchrefract.data.road_scenes.visibility import Group, shadows, visibility
+from torchrefract.data.road_scenes.render import render
+from torchrefract.data.road_scenes.scene import draw_scene
 from torchrefract.types import Frame
 
 _SMALLEST = 8  # px a side
-# Where in a pixel its color is sampled, px from its center, on distinct rows and columns; the first gives the depth.
-_OFFSETS = ((0.0, 0.0), (-0.15, -0.4), (0.4, -0.15), (0.15, 0.4), (-0.4, 0.15))
-
-
-class Scene(NamedTuple):
-    """All that a frame shows, for B keys."""
-
-    road: Road
-    view: View
-    light: Light
-    groups: list[Group]
+_BITS = (1 << 64) - 1  # negative seeds and keys count modulo 2^64
 
 
 class RoadScenes(Dataset[Frame]):
-    """Rendered road scenes of the keys first, ..., first + count - 1, each with its depth.
+    """Rendered road scenes, each with its depth.
 
-    `size`: (height, width), px. A key and a seed make one scene, at every size; see `render_road_scenes`.
+    A key and a seed make one scene, at every size; see `render_road_scenes`.
+
+    Args:
+        count: number of scenes.
+        size: (height, width), px, each at least 8.
+        seed: any integer of 64 bits.
+        first: key of the first scene; the others follow.
     """
 
     def __init__(self, count: int, *, size: Sequence[int] = (64, 112), seed: int = 0, first: int = 0):
@@ -48,36 +41,32 @@ class RoadScenes(Dataset[Frame]):
         return self.count
 
     def __getitem__(self, index: int) -> Frame:
-        return self.__getitems__([index])[0]
-
-    def __getitems__(self, indices: Sequence[int]) -> list[Frame]:
-        """The frames of a batch, rendered at once: torch's DataLoader asks for them so."""
-        keys = torch.tensor([self._key(index) for index in indices], dtype=torch.int64)
-        if len(keys) == 0:
-            return []
-        image, depth = render_road_scenes(keys, *self.size, seed=self.seed)
-        return [Frame(*sample) for sample in zip(image, keys, depth, strict=True)]
-
-    def _key(self, index: int) -> int:
+        """Render a frame: image (3, H, W), key () and depth (1, H, W)."""
         if not -self.count <= index < self.count:
             raise IndexError(f"index must lie in [{-self.count}, {self.count - 1}], got {index}")
-        return self.first + index % self.count
+        key = torch.tensor(self.first + index % self.count)
+        image, depth = render_road_scenes(key[None], *self.size, seed=self.seed)
+        return Frame(image[0], key, depth[0])
 
 
 def render_road_scenes(keys: Tensor, height: int, width: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Dashcam frames of southern African roads, and their depth.
+    """Render road scenes on the CPU.
 
-    A frame depends on its key and the seed alone: on a CPU its bits are the same for every batch and thread count.
-    The color of a pixel is the mean over five rays; its depth is that of the ray through its center.
+    A frame depends on its key and the seed alone. The color of a pixel is the mean of five rays. Its depth is that of
+    the ray through its center.
 
     Args:
-        keys: (B,), int64, with B >= 1.
-        height, width: px, at least 8. The longer of them sets the field of view, so that one scene fits all sizes.
-        seed: tells apart worlds with the same keys.
+        keys: (B,), int64, B >= 1.
+        height, width: px, at least 8. The longer side sets the field of view, so that a scene is alike at all sizes.
+        seed: any integer of 64 bits; scenes of different seeds are independent.
 
     Returns:
-        image: (B, 3, H, W), float32, in [0, 1]; depth: (B, 1, H, W), float32, m along the
-        camera's axis, inf for the sky.
+        image: (B, 3, H, W), float32, in [0, 1], on the device of `keys`.
+        depth: (B, 1, H, W), float32, m along the camera's axis; inf for the sky.
+
+    Raises:
+        ValueError: `keys` has another shape, or a side is below 8.
+        TypeError: `keys` is not an int64 tensor.
     """
     if check_tensor("keys", keys).ndim != 1 or len(keys) == 0:
         raise ValueError(f"keys must have shape (B,) with B >= 1, got {tuple(keys.shape)}")
@@ -85,22 +74,8 @@ def render_road_scenes(keys: Tensor, height: int, width: int, *, seed: int = 0) 
         raise TypeError(f"keys must be int64, got {keys.dtype}")
     check_count("height", height, low=_SMALLEST)
     check_count("width", width, low=_SMALLEST)
-    road, view, light, groups = draw_scene(keys, seed=seed)
-    ray = rays(view, height, width, _OFFSETS)
-    ground = ground_depth(view, ray)
-    dark = shadows(groups, view, ray, ground, light.sun)
-    depth, slot = visibility(groups, view, ray, ground)
-    lit, dim = backdrop(road, light, view, (ray[0][0], ray[1][0], ray[2][0]))
-    samples = torch.where(dark, dim[:, None], lit[:, None])
-    paint_bodies(samples, groups, light, view, ray, depth, slot)
-    # One by one: torch may sum a dimension in another order for another batch size.
-    image = sum(samples.unbind(1), torch.zeros_like(lit)) / len(_OFFSETS)
-    return image.movedim(0, 1).contiguous(), depth[0, :, None].clone()
-
-
-def draw_scene(keys: Tensor, *, seed: int = 0) -> Scene:
-    """What the frames of some keys show; `keys`: (B,), int64."""
-    dice = Dice(seed, keys)
-    road = draw_road(dice)
-    view = draw_view(dice, road)
-    return Scene(road, view, draw_light(dice), draw_groups(dice, road))
+    generators = [np.random.default_rng((seed & _BITS, key & _BITS)) for key in keys.tolist()]
+    images, depths = zip(*(render(draw_scene(random), height, width) for random in generators), strict=True)
+    image = torch.stack([torch.from_numpy(image).permute(2, 0, 1).contiguous() for image in images])
+    depth = torch.stack([torch.from_numpy(depth)[None] for depth in depths])
+    return image.to(keys.device), depth.to(keys.device)

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 from torch.utils.data import Dataset
 
-from torchrefract.data.fingerprint import fingerprint
 from torchrefract.data.frames import FrameFolder
+from torchrefract.data.module import fingerprint
 from torchrefract.data.pairs.dataset import PairedFolder
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.types import Frame

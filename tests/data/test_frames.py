@@ -251,14 +251,14 @@ def test_many_bad_frames_are_an_error(tmp_path):
     put(tmp_path, *numbered("x_", 20))
     for number in (0, 1, 2, 3, 19):
         (tmp_path / f"x_{number:04d}.png").write_bytes(b"no picture")
-    with pytest.raises(ValueError, match=r"got 5 of 20 in .* that are not: x_0000\.png is not a .* and 2 more"):
+    with pytest.raises(ValueError, match=r"got 5 of 20 in .* that are unreadable: x_0000\.png is not a .* and 2 more"):
         FrameFolder(tmp_path, size=SIZE)
 
 
 @pytest.mark.parametrize("size", [(9, 6), (4, 13), (64, 112)])
 def test_frames_smaller_than_the_size_are_an_error(tmp_path, size):
     with pytest.raises(
-        ValueError, match=rf"size = {size[0]}x{size[1]} .* got x_0000\.png of 8x12 in .*; ask for a smaller size"
+        ValueError, match=rf"size = {size[0]}x{size[1]} .* got x_0000\.png of 8x12 in .*; choose a smaller size"
     ):
         FrameFolder(put(tmp_path, *numbered("x_", 1)), size=size)
 

@@ -179,7 +179,7 @@ def test_bytes_after_the_end_do_no_harm(tmp_path, suffix, count):
     ("data", "reason"),
     [
         (b"", r"is empty \(0 bytes\)"),
-        (b"\xff\xd8", "is not a JPEG, PNG, WebP or BMP picture"),
+        (b"\xff\xd8", "is not a JPEG, PNG, WebP or BMP image"),
         (b"<html>404</html>", "is not a JPEG"),
         (b"RIFF\x04\0\0\0WAVE", "is not a JPEG"),
         (b"BM\x02\0\0\0", "is truncated"),

@@ -1,7 +1,7 @@
 """A folder of clean frames, split by drive.
 
-Neighboring frames of a drive look alike: a split by frame would test on what was trained on. So whole drives go to
-training or to validation, and what a drive is follows from the folders or the file names.
+Neighboring frames of a drive look alike, so a split by frame would validate on nearly the training frames. Whole drives
+go to training or to validation instead. Folders or file names tell the drives apart.
 """
 
 import hashlib
@@ -23,44 +23,53 @@ from torchrefract._validation import check_choice, check_number, check_size
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, image_size, read_image
 from torchrefract.types import Frame
 
-_SPLITS = {"train": "train", "val": "val", "valid": "val", "validation": "val"}  # names of folders that are a split
-_NO_NAME = "."  # the drive of frames that lie in the root itself, or whose names are bare numbers
-_BAD_SHARE = 0.1  # more unreadable frames than this are no accident
+_SPLITS = {"train": "train", "val": "val", "valid": "val", "validation": "val"}  # folder names
+_UNNAMED = "."  # the drive of frames in the root itself, or with bare numbers as names
+_MAX_UNREADABLE = 0.1  # share of the frames
 _SHOWN = 3  # examples in a message
 _DATE = re.compile(r"(?:^|.*?[^0-9])(?:19|20)\d\d[-_.]?\d\d[-_.]?\d\d(?=[-_. T]?\d\d[-_.:]?\d\d[-_.:]?\d\d$)")
 _NUMBERED = re.compile(r"\d[A-Za-z]?$")
 _NUMBER = re.compile(r"[-_.\s\d]*\d[A-Za-z]?")
 
 
-class Placed(NamedTuple):
-    """Where a frame belongs."""
+class AssignedFrame(NamedTuple):
+    """A frame with its drive and split."""
 
-    path: str  # below the root, in posix form
+    path: str  # relative to the root, with forward slashes
     drive: str
-    split: str  # train, val, or empty where a root with given splits has it in neither
+    split: str  # train, val, or empty for frames outside of the folders train and val
 
 
 class FrameFolder(Dataset[Frame]):
-    """The frames below a folder, cut to one size, all of them or those of one split.
+    """The frames in a folder and its sub-folders, cropped and reduced to one size.
 
-    Files are found in all sub-folders, hidden ones aside, and in sorted order; links are followed, each folder is
-    visited once. What belongs together is a drive, and `drive_by` says how it is told:
+    Hidden files are ignored, links are followed, each folder is visited once, and files are sorted. `drive_by` selects
+    how drives are told apart:
 
-    - "folder": a drive is a sub-folder, at the first level where the frames part into several.
-    - "prefix": a drive is what `name_prefix` leaves of the file name; folders do not matter.
-    - "auto": where the root has sub-folders train and val (or valid, validation), these are the splits as given.
-      Otherwise by folder where the frames lie in more than one, else by prefix.
+    - "folder": a drive is a sub-folder, at the first level where the frames are in several folders.
+    - "prefix": a drive is `name_prefix` of the file name, in any folder.
+    - "auto": if the root has sub-folders train and val (or valid, validation), they are the splits. Otherwise "folder"
+      if the frames are in several folders, and "prefix" if they are in one.
 
-    Without given splits, drives go to val whole, in an order that depends on `seed` and their names alone, as long as
-    that brings val closer to `val_share` of the frames. Neither more frames of a drive nor a renamed root changes the
-    order, so a new drive moves few of the others. Recorders that cut a drive into clips make each clip a drive, by
-    name: give each drive a folder.
+    Without sub-folders train and val, drives are sorted by a hash of `seed` and their names. Each goes to val if that
+    brings val closer to `val_share` of the frames. A new drive therefore moves few of the others.
 
-    Every file's header and end are checked at once: unreadable ones are skipped with one warning and listed in
-    `skipped`; more than a tenth of them, or a frame smaller than `size`, is an error. Pixels are read in
-    `__getitem__`; its key hashes the path below `root`, so a frame keeps its corruption when others come and go.
+    The header and the end of every file are checked at once. Unreadable frames are listed in `skipped`, with one
+    warning. Pixels are read on access. The key of a frame is a hash of its path relative to `root`, so that a frame
+    keeps its corruption if other frames are added or removed.
 
-    `size`: (height, width), px.
+    Args:
+        root: the folder.
+        size: (height, width), px.
+        split: "all", "train" or "val".
+        drive_by: "auto", "folder" or "prefix".
+        val_share: share of the frames in val, between 0 and 1.
+        seed: of the split.
+
+    Raises:
+        ValueError: an argument is out of range; the folder has no frames, or has only one drive to split; more than a
+            tenth of the frames are unreadable; a frame is smaller than `size`.
+        OSError: the folder does not exist or is not readable.
     """
 
     def __init__(
@@ -79,55 +88,59 @@ class FrameFolder(Dataset[Frame]):
         check_choice("drive_by", drive_by, ("auto", "folder", "prefix"))
         if not 0 < check_number("val_share", val_share) < 1:
             raise ValueError(f"val_share must be a number between 0 and 1, got {val_share}")
-        found = _find(self.root)
-        drive_of = _select(self.root, found, split=split, drive_by=drive_by, val_share=val_share, seed=seed)
-        kept, self.skipped = _check_frames(self.root, sorted(drive_of), self.size)
-        self.paths = [self.root / path for path in kept]
-        self.drives = sorted({drive_of[path] for path in kept})
-        self.keys = [path_key(path) for path in kept]
+        paths = _find_frames(self.root)
+        drive_of = _select_split(self.root, paths, split=split, drive_by=drive_by, val_share=val_share, seed=seed)
+        readable, self.skipped = _check_frames(self.root, sorted(drive_of), self.size)
+        self.paths = [self.root / path for path in readable]
+        self.drives = sorted({drive_of[path] for path in readable})
+        self.keys = [path_key(path) for path in readable]
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> Frame:
-        """Frame of an image (3, h, w), a key () and an empty depth, for no depth is known."""
+        """Read a frame: image (3, h, w), key () and an empty depth (0,)."""
         image = read_image(self.paths[index])
         return Frame(fit(image, self.size), torch.tensor(self.keys[index]), torch.empty(0))
 
 
-def place_frames(
+def assign_frames(
     root: Path, *, size: Sequence[int] | None, drive_by: str = "auto", val_share: float = 0.2, seed: int = 0
-) -> tuple[list[Placed], list[tuple[Path, str]]]:
-    """All frames of a root, in the order and the splits that `FrameFolder` gives them, and those that are unreadable.
+) -> tuple[list[AssignedFrame], list[tuple[Path, str]]]:
+    """Assign all frames of a root to drives and splits, as `FrameFolder` does.
 
-    A root with a single drive, which cannot be split, is all for training. Arguments and errors as for `FrameFolder`;
-    without a size, frames of any size will do.
+    All frames of a root with a single drive are for training. Arguments and errors are those of `FrameFolder`; with
+    size None, frames may have any size.
+
+    Returns:
+        the readable frames in order, and the unreadable ones with the reasons.
     """
     options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
-    found = _find(root)
-    drive_of = _select(root, found, split="all", **options)
-    kept, skipped = _check_frames(root, sorted(drive_of), (1, 1) if size is None else check_size("size", size))
-    given = drive_by == "auto" and bool(_given_splits(root))
-    if not given and len(set(drive_of.values())) < 2:
-        return [Placed(path, drive_of[path], "train") for path in kept], skipped
-    val = _select(root, found, split="val", **options)
-    train = _select(root, found, split="train", **options) if given else drive_of.keys() - val.keys()
-    return [Placed(p, drive_of[p], "val" if p in val else "train" if p in train else "") for p in kept], skipped
+    paths = _find_frames(root)
+    drive_of = _select_split(root, paths, split="all", **options)
+    readable, skipped = _check_frames(root, sorted(drive_of), (1, 1) if size is None else check_size("size", size))
+    has_splits = drive_by == "auto" and bool(_split_folders(root))
+    if not has_splits and len(set(drive_of.values())) < 2:
+        return [AssignedFrame(path, drive_of[path], "train") for path in readable], skipped
+    val = _select_split(root, paths, split="val", **options)
+    train = _select_split(root, paths, split="train", **options) if has_splits else drive_of.keys() - val.keys()
+    split_of = {path: "val" if path in val else "train" if path in train else "" for path in readable}
+    return [AssignedFrame(path, drive_of[path], split) for path, split in split_of.items()], skipped
 
 
 def name_prefix(stem: str) -> str:
-    """The drive that a file name, without its extension, tells of: the name up to what tells one frame from the next.
+    """Return the drive of a file name without extension: the name up to the number of the frame.
 
-    In doubt it takes off more rather than less: drives merged by mistake cost variety, a drive cut in two would put
-    neighboring frames on both sides of the split.
+    In doubt, the prefix is shorter. Merged drives cost variety, but a drive cut in two would put neighboring frames on
+    both sides of the split.
 
     - A name that ends in a date and a time is cut after the date: `cam_2024-05-01_12-30-07` -> `cam_2024-05-01`.
-    - Otherwise the name is a row of words, divided by `_` or blanks, or by `-` where there are none of those. It is
-      cut before its last word; or, where that does not end in a digit (one letter may follow), before the last word
-      that is a number, if there is one. The first word always stays: `drive-07_000123` -> `drive-07`,
+    - Otherwise the name is a row of words, divided by `_` or blanks, or by `-` if there are neither. It is cut before
+      its last word if that ends in a digit (one letter may follow), else before the last word that is a number, else
+      before the last word. The first word always stays: `drive-07_000123` -> `drive-07`,
       `GH010123_000456` -> `GH010123`, `2024-05-01_12-30-00_0001` -> `2024-05-01_12-30-00`,
       `aachen_000000_000019_left` -> `aachen_000000`, `highway_clear` -> `highway`.
-    - A single word gives the letters before its number, `frame.0012` -> `frame`, or "." where it is nothing like it.
+    - A single word gives the letters before its number, `frame.0012` -> `frame`, or "." if there are none.
     """
     if date := _DATE.match(stem):
         return date.group()
@@ -135,44 +148,44 @@ def name_prefix(stem: str) -> str:
     ends = [match.start() for match in re.finditer(divider, stem) if match.start() > 0]
     if not ends:
         word = re.fullmatch(r"(\D*?)[-_.\s]*\d+", stem)
-        return (word and word.group(1)) or _NO_NAME
+        return (word and word.group(1)) or _UNNAMED
     words = {end: stem[end:following] for end, following in zip(ends, [*ends[1:], len(stem)], strict=True)}
     numbers = [end for end in ends if _NUMBER.fullmatch(words[end])]
     return stem[: ends[-1] if _NUMBERED.search(stem) or not numbers else numbers[-1]]
 
 
-def _find(root: Path) -> list[str]:
-    """The picture files below `root`, relative to it, in posix form, sorted."""
+def _find_frames(root: Path) -> list[str]:
+    """List the image files of a root: sorted paths relative to it, with forward slashes."""
     try:
         is_folder = stat.S_ISDIR(root.stat().st_mode)
     except PermissionError as error:
-        _refuse(error)
+        _raise_permission_error(error)
     except OSError as error:
         raise FileNotFoundError(f"root must be a folder of frames, got {root}, which does not exist") from error
     if not is_folder:
         raise NotADirectoryError(f"root must be a folder of frames, got the file {root}; give the folder it lies in")
-    files = sorted(path.relative_to(root).as_posix() for path in walk(root))
-    found = [file for file in files if file.lower().endswith(EXTENSIONS)]
-    if not found:
+    files = sorted(path.relative_to(root).as_posix() for path in list_files(root))
+    frames = [file for file in files if file.lower().endswith(EXTENSIONS)]
+    if not frames:
         raise ValueError(
             f"root must hold {', '.join(EXTENSIONS)} files, got {root} with {len(files)} other files; "
             "of a video, extract the frames first"
         )
-    return found
+    return frames
 
 
-def walk(root: Path) -> Iterator[Path]:
-    """The files below `root`, hidden ones aside; links are followed, each folder is visited once."""
-    seen = set()
-    for folder, subfolders, files in os.walk(root, followlinks=True, onerror=_refuse):
+def list_files(root: Path) -> Iterator[Path]:
+    """Yield the files of a root and its sub-folders without hidden ones; follow links, visit each folder once."""
+    visited = set()
+    for folder, subfolders, files in os.walk(root, followlinks=True, onerror=_raise_permission_error):
         status = os.stat(folder)
-        new = (status.st_dev, status.st_ino) not in seen  # links may make a loop, or show a folder twice
-        seen.add((status.st_dev, status.st_ino))
-        subfolders[:] = sorted(name for name in subfolders if new and not name.startswith("."))
-        yield from (Path(folder, name) for name in files if new and not name.startswith("."))
+        is_new = (status.st_dev, status.st_ino) not in visited  # links may form a loop, or lead to a folder twice
+        visited.add((status.st_dev, status.st_ino))
+        subfolders[:] = sorted(name for name in subfolders if is_new and not name.startswith("."))
+        yield from (Path(folder, name) for name in files if is_new and not name.startswith("."))
 
 
-def _refuse(error: OSError) -> NoReturn:
+def _raise_permission_error(error: OSError) -> NoReturn:
     if isinstance(error, PermissionError):
         raise PermissionError(
             f"root must be readable with all its folders, got no permission for {error.filename}; change that"
@@ -180,34 +193,37 @@ def _refuse(error: OSError) -> NoReturn:
     raise error
 
 
-def _select(root: Path, found: list[str], *, split: str, drive_by: str, val_share: float, seed: int) -> dict[str, str]:
-    """The drive of each file in the split."""
-    given = _given_splits(root) if drive_by == "auto" else {}
-    if given:
-        return _select_given(root, found, split=split, given=given)
-    drive_of = _drives(found, drive_by)
+def _select_split(
+    root: Path, paths: list[str], *, split: str, drive_by: str, val_share: float, seed: int
+) -> dict[str, str]:
+    """Return the drive of each frame in a split."""
+    folders = _split_folders(root) if drive_by == "auto" else {}
+    if folders:
+        return _select_split_folder(root, paths, split=split, folders=folders)
+    drive_of = _drives(paths, drive_by)
     if split == "all":
         return drive_of
-    val = val_drives(root, drive_of, val_share=val_share, seed=seed)
+    val = select_val_drives(root, drive_of, val_share=val_share, seed=seed)
     return {path: drive for path, drive in drive_of.items() if (drive in val) == (split == "val")}
 
 
-def _given_splits(root: Path) -> dict[str, str]:
-    """Split by sub-folder where `root` has both, else nothing."""
+def _split_folders(root: Path) -> dict[str, str]:
+    """Return the split of each sub-folder named train or val; empty unless the root has both."""
     splits = {path.name: _SPLITS[path.name.lower()] for path in root.iterdir() if path.name.lower() in _SPLITS}
     splits = {name: split for name, split in splits.items() if (root / name).is_dir()}
     return splits if len(set(splits.values())) == 2 else {}
 
 
-def _select_given(root: Path, found: list[str], *, split: str, given: dict[str, str]) -> dict[str, str]:
-    """Train and val by the folders of that name; frames beside them belong to "all" alone."""
+def _select_split_folder(root: Path, paths: list[str], *, split: str, folders: dict[str, str]) -> dict[str, str]:
+    """Return the drive of each frame in a split that is a folder; frames outside of both belong to "all" alone."""
     groups: dict[str, list[str]] = {"train": [], "val": [], "": []}
-    for path in found:
-        groups[given.get(PurePosixPath(path).parts[0], "")].append(path)
-    drives = {name: _drives(group, "auto", below=1 if name else 0) for name, group in groups.items()}
-    shared = sorted(set(drives["train"].values()) & set(drives["val"].values()) - {_NO_NAME})
+    for path in paths:
+        groups[folders.get(PurePosixPath(path).parts[0], "")].append(path)
+    drives = {name: _drives(group, "auto", skip_levels=1 if name else 0) for name, group in groups.items()}
+    shared = sorted(set(drives["train"].values()) & set(drives["val"].values()) - {_UNNAMED})
     if shared:
-        message = f"train and val in {root} both hold frames of {some(shared)}, by name; a drive belongs in one of them"
+        names = first_names(shared)
+        message = f"train and val in {root} both hold frames of {names}, by name; a drive belongs in one of them"
         warnings.warn(message, stacklevel=4)
     if split == "all":
         return drives["train"] | drives["val"] | drives[""]
@@ -216,21 +232,27 @@ def _select_given(root: Path, found: list[str], *, split: str, given: dict[str, 
     return drives[split]
 
 
-def _drives(paths: list[str], drive_by: str, *, below: int = 0) -> dict[str, str]:
-    """The drive of each path; of its folders, the first `below` do not count."""
-    folders = {path: PurePosixPath(path).parts[below:-1] for path in paths}
+def _drives(paths: list[str], drive_by: str, *, skip_levels: int = 0) -> dict[str, str]:
+    """Return the drive of each path, without regard to its first folders."""
+    folders = {path: PurePosixPath(path).parts[skip_levels:-1] for path in paths}
     if drive_by == "prefix" or (drive_by == "auto" and len(set(folders.values())) < 2):
         return {path: name_prefix(PurePosixPath(path).stem) for path in paths}
-    # A drive's level is where the folders first part; deeper ones, as in drive_1/front and drive_1/rear, belong to it.
+    # Deeper folders, as in drive_1/front and drive_1/rear, belong to the same drive.
     level = len(PurePosixPath(posixpath.commonpath("/".join(parts) for parts in folders.values())).parts) + 1
-    return {path: "/".join(parts[:level]) or _NO_NAME for path, parts in folders.items()}
+    return {path: "/".join(parts[:level]) or _UNNAMED for path, parts in folders.items()}
 
 
-def val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: float, seed: int) -> set[str]:
-    """The drives that go to val, by the drive of each frame.
+def select_val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: float, seed: int) -> set[str]:
+    """Select the drives of val.
+
+    Args:
+        root: for messages.
+        drive_of: the drive of each frame.
+        val_share: share of the frames in val, between 0 and 1.
+        seed: of the order of drives.
 
     Raises:
-        ValueError: fewer than two drives.
+        ValueError: there are fewer than two drives.
     """
     frames = Counter(drive_of.values())
     if len(frames) < 2:
@@ -239,9 +261,10 @@ def val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: float, see
             "drive in a sub-folder of its own, or name its frames <drive>_<number>, or make sub-folders train and val"
         )
     if 2 * len(frames) > len(drive_of) > _SHOWN:
+        names = first_names(sorted(frames))
         message = (
-            f"{len(drive_of)} frames in {root} seem to come from {len(frames)} drives ({some(sorted(frames))}): if "
-            "that is wrong, train and val share drives; put each drive in a sub-folder of its own"
+            f"{len(drive_of)} frames in {root} seem to come from {len(frames)} drives ({names}): if that is wrong, "
+            "train and val share drives; put each drive in a sub-folder of its own"
         )
         warnings.warn(message, stacklevel=4)
     val, missing = set(), val_share * len(drive_of)
@@ -251,29 +274,29 @@ def val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: float, see
             val.add(drive)
             missing -= frames[drive]
     smallest = min(order, key=lambda drive: frames[drive])
-    return (val or {smallest}) if len(val) < len(frames) else val - {smallest}  # each split has a drive at least
+    return (val or {smallest}) if len(val) < len(frames) else val - {smallest}  # each split has at least one drive
 
 
 def _check_frames(root: Path, paths: list[str], size: tuple[int, int]) -> tuple[list[str], list[tuple[Path, str]]]:
-    """The paths that can be read, and the others with what is wrong with them."""
+    """Return the readable paths, and the unreadable ones with the reasons."""
     with ThreadPoolExecutor() as pool:
         results = list(pool.map(_size_or_reason, [root / path for path in paths]))
     skipped = [(root / path, result) for path, result in zip(paths, results, strict=True) if isinstance(result, str)]
     if skipped:
-        examples = some([f"{path.relative_to(root).as_posix()} {reason}" for path, reason in skipped])
-        if len(skipped) > _BAD_SHARE * len(paths):
+        examples = first_names([f"{path.relative_to(root).as_posix()} {reason}" for path, reason in skipped])
+        if len(skipped) > _MAX_UNREADABLE * len(paths):
             raise ValueError(
-                f"root must hold readable frames, got {len(skipped)} of {len(paths)} in {root} that are not: "
+                f"root must hold readable frames, got {len(skipped)} of {len(paths)} in {root} that are unreadable: "
                 f"{examples}; remove them or copy them again"
             )
-        message = f"{len(skipped)} of {len(paths)} frames in {root} cannot be read and are skipped: {examples}"
+        message = f"{len(skipped)} of {len(paths)} frames in {root} are unreadable and skipped: {examples}"
         warnings.warn(message, stacklevel=3)
     sizes = {path: result for path, result in zip(paths, results, strict=True) if not isinstance(result, str)}
     small = [f"{path} of {H}x{W}" for path, (H, W) in sizes.items() if size[0] > H or size[1] > W]
     if small:
         raise ValueError(
-            f"frames must be at least size = {size[0]}x{size[1]} (height x width), got {some(small)} in {root}; "
-            "ask for a smaller size or remove them"
+            f"frames must be at least size = {size[0]}x{size[1]} (height x width), got {first_names(small)} in {root}; "
+            "choose a smaller size or remove them"
         )
     return list(sizes), skipped
 
@@ -285,12 +308,15 @@ def _size_or_reason(path: Path) -> tuple[int, int] | str:
         return str(error).removeprefix(f"{path} ")
 
 
-def some(names: Sequence[str]) -> str:
-    """The first names, and how many more there are."""
+def first_names(names: Sequence[str]) -> str:
+    """Join the first names and the number of the others, for a message."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + more
 
 
 def path_key(text: str) -> int:
-    """A whole number below 2^63, the same on every machine; names that are no valid Unicode count by their bytes."""
+    """Hash a path to an integer below 2^63 that is the same on every machine.
+
+    A path that is not valid Unicode is hashed by its bytes.
+    """
     return int.from_bytes(hashlib.blake2b(os.fsencode(text), digest_size=8).digest(), "big") >> 1

@@ -43,7 +43,7 @@ def disk(tmp_path) -> Iterator[Callable[[str], Path]]:
         ("count=0", "count: count must be at least 1, got 0"),
         ("size=[0,4]", "size: size must be at least 1, got 0"),
         ("size=[400,400]", "source: frames must be at least size = 400x400"),
-        ("source=nowhere", "source must be a folder of pictures or videos, or a video, got nowhere, which does not"),
+        ("source=nowhere", "source must be a folder of images or videos, or a video, got nowhere, which does not"),
         ("shards=2", "shard must be given together with shards, got None of 2"),
         ("tar=0", "tar: tar must be at least 1, got 0"),
         ("workers=-1", "workers: workers must be at least 0, got -1"),
@@ -108,7 +108,7 @@ def test_a_frame_that_cannot_be_decoded_is_left_out_and_said(call, words, frames
     path.write_bytes(data)
     arguments = [*(word for word in words("out") if not word.startswith("source=")), "source=frames"]
     outcome = call("generate", *arguments)
-    assert "11 there, 1 frames could not be read" in outcome.out
+    assert "11 in total, 1 frames are unreadable" in outcome.out
     (row,) = [row for row in rows(tmp_path / "out") if row["skipped"]]
     assert row["source"] == "drive1/005.png"
     assert row["skipped"].startswith("drive1/005.png is damaged")
@@ -127,16 +127,16 @@ def test_links_that_make_a_loop_do_not_hang(call, words, frames, tmp_path):
 def test_a_disk_that_is_too_small_is_refused_beforehand(call, words, disk):
     place = disk("size=64k")
     message = call("generate", *words(place / "out")).message
-    assert message.startswith("out must have room, got too little: 12 pairs take about")
+    assert message.startswith("out must have enough space, got too little: 12 pairs take about")
     assert not list(place.rglob("*.png"))
 
 
 def test_a_disk_that_becomes_full_leaves_whole_pairs_and_a_run_that_goes_on(call, words, disk, sums, monkeypatch):
     place = disk("size=256k")
-    monkeypatch.setattr("torchrefract.generate._check_room", lambda *_: None)  # as where others write to the disk
+    monkeypatch.setattr("torchrefract.cli.generation._check_disk", lambda *_: None)  # as where others write to the disk
     message = call("generate", *words(place / "out")).message
     assert "no space left on device" in message
-    assert "the same command goes on" in message
+    assert "the same command continues" in message
     pictures = list(place.rglob("*.clean.png"))
     assert 0 < len(pictures) < 12
     assert all(np.asarray(Image.open(path)).shape == (32, 48, 3) for path in pictures)
@@ -151,10 +151,10 @@ def test_a_run_that_is_interrupted_says_how_to_go_on(call, words, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchrefract.generate.run", interrupted)
+    monkeypatch.setattr("torchrefract.cli.generation.generate_pairs", interrupted)
     outcome = call("generate", *words("out"))
     assert (outcome.code, outcome.err) == (130, "")
-    assert outcome.out.endswith("stopped; the same command goes on\n")
+    assert outcome.out.endswith("stopped; the same command continues\n")
 
 
 def test_a_folder_that_cannot_be_written_to_is_said(call, words, disk):
@@ -176,7 +176,7 @@ def test_a_manifest_that_leads_elsewhere_is_refused(call, words, tmp_path, path)
     assert call("generate", *words("out", "count=2")).code == 0
     manifest = tmp_path / "out" / "manifest.jsonl"
     manifest.write_text(manifest.read_text().replace("pairs/00000/00000001.clean.png", path))
-    with pytest.raises(DamagedPairError, match="files must lie in pairs/ or tars/ beside the manifest, got"):
+    with pytest.raises(DamagedPairError, match="files must lie in pairs/ or tars/ of the set, got"):
         PairedFolder(tmp_path / "out")
 
 
@@ -184,7 +184,7 @@ def test_a_damaged_pair_is_named_with_the_way_out(call, words, tmp_path):
     assert call("generate", *words("out", "count=2")).code == 0
     os.truncate(tmp_path / "out" / "pairs/00000/00000001.flow.png", 0)
     os.truncate(tmp_path / "out" / "pairs/00000/00000001.restore_flow.png", 30)
-    with pytest.raises(DamagedPairError, match=r"pair 1 in .* must be whole, got .* is truncated; .* verify=true"):
+    with pytest.raises(DamagedPairError, match=r"pair 1 in .* must be complete, got .* is truncated; .* verify=true"):
         PairedFolder(tmp_path / "out")[1]
 
 

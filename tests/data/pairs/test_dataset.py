@@ -13,7 +13,7 @@ from torchrefract import Pair, presets
 from torchrefract._io import CONFIG_DIR
 from torchrefract.data.module import PairData, frames, pairs
 from torchrefract.data.pairs.dataset import PairedFolder, PairStream
-from torchrefract.data.pairs.files import beyond, decode_flow, encode_flow
+from torchrefract.data.pairs.files import count_out_of_range, decode_flow, encode_flow
 from torchrefract.restoration.tasks import Undistort
 
 SIZE = (32, 48)
@@ -180,4 +180,4 @@ def test_a_flow_beyond_the_range_is_marked():
     found, mask = decode_flow(encode_flow(flow, valid))
     assert mask.tolist() == [[True, True, False, True, False]]
     assert np.abs(found - flow)[:, mask].max() <= 1 / 128
-    assert beyond(flow, valid) == 2
+    assert count_out_of_range(flow, valid) == 2

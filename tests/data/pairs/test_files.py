@@ -141,7 +141,7 @@ def test_a_row_makes_its_pair_again_and_has_every_parameter(refractive, rows, fr
     _, d = made_again(row, frames, presets.paper_refractive(width=192))
     lens = d.params.children[0]
     (found,) = row["effects"]
-    assert set(found) == {"effect", *lens._fields} - {"gate"}
+    assert set(found) == {"effect", *lens._fields} - {"applied"}
     assert found["coefficients"] == lens.coefficients[0].tolist()
     assert (row["height"], row["width"]) == (32, 48)
 
@@ -175,4 +175,4 @@ def test_a_license_is_any_text(call, words, tmp_path, license_of):
     kept = [word for word in words("out", "count=4") if not word.startswith("license=")]
     assert call("generate", *kept, f"license={license_of}").code == 0
     stated = license_of.strip("'") if license_of[0] == "'" else license_of
-    assert f"as stated by who made this set:** {stated}\n" in (tmp_path / "out" / "README.md").read_text()
+    assert f"as stated by the creator of this set:** {stated}\n" in (tmp_path / "out" / "README.md").read_text()

@@ -99,7 +99,7 @@ def test_a_run_that_is_killed_ends_as_if_it_never_was(tmp_path, words, sums, who
         run.communicate()
         # No worker outlives the run, or it would write beside the next one.
         wait_for(lambda children=children: not any(is_running(child) for child in children))
-    assert "are there already" in finished(started(*arguments))
+    assert "exist already" in finished(started(*arguments))
     assert sums(out) == sums(whole)
 
 
@@ -118,7 +118,7 @@ def test_a_worker_that_is_killed_ends_the_run_with_a_reason(tmp_path, words):
         os.kill(int(worker), signal.SIGKILL)
     _, err = run.communicate(timeout=100)
     assert run.returncode == 1, err
-    assert err.startswith("error: workers must leave memory for each, got 1 of which one was killed")
+    assert err.startswith("error: workers must fit the memory, got 1 of which one was killed")
 
 
 @pytest.mark.parametrize("shards", [2, 5])
@@ -169,7 +169,7 @@ def test_what_is_damaged_is_found_and_made_again(call, tmp_path, words, sums, ta
     data = bytearray(altered.read_bytes())
     data[1500] ^= 1
     altered.write_bytes(data)
-    assert "8 pairs are there already" in call("generate", *arguments).out
+    assert "8 pairs exist already" in call("generate", *arguments).out
     assert "made again" in call("generate", *arguments, "verify=true").out
     assert sums(out) == before
 
@@ -184,8 +184,8 @@ def test_a_file_that_is_cut_or_gone_is_seen_without_being_read(call, tmp_path, w
     with (out / "manifest.jsonl").open("a") as manifest:
         manifest.write('{"number":7,"sour')
     outcome = call("generate", *arguments)
-    assert "6 pairs are there already" in outcome.out
-    assert ": 2 pairs made, 8 there" in outcome.out
+    assert "6 pairs exist already" in outcome.out
+    assert ": 2 pairs made, 8 in total" in outcome.out
     assert sums(out) == before
 
 
@@ -194,7 +194,7 @@ def test_a_set_grows_and_its_first_pairs_stay(call, tmp_path, words, sums):
     before = {name: value for name, value in sums(tmp_path / "out").items() if name.startswith("pairs/")}
     outcome = call("generate", *words("out", "count=15"))
     assert "each frame is used up to 2 times, with new keys" in outcome.out
-    assert ": 3 pairs made, 15 there" in outcome.out
+    assert ": 3 pairs made, 15 in total" in outcome.out
     after = sums(tmp_path / "out")
     assert before.items() <= after.items()
     assert len(set(after) - set(before)) == 3 * 6 + 4

@@ -10,7 +10,7 @@ import torch
 
 from torchrefract.data.images import UnreadableImageError, fit, pixels_of, read_image
 from torchrefract.data.pairs.dataset import PairedFolder
-from torchrefract.data.pairs.sources import Reader, Source, draw_of, find_sources
+from torchrefract.data.pairs.sources import Source, SourceReader, draw_of, find_sources
 from torchrefract.videos import read_video, write_video
 
 OPTIONS = {"size": None, "every": 1, "drive_by": "auto", "val_share": 0.3, "seed": 0}
@@ -29,7 +29,7 @@ def videos(tmp_path_factory) -> Path:
 
 def test_frames_are_those_of_the_video_forward_backward_and_across(videos):
     plain = {name: [frame for _, frame in read_video(videos / name, range(FRAMES))] for name in ("a.mp4", "b.mp4")}
-    reader = Reader(videos, None)
+    reader = SourceReader(videos, None)
     for name, t in [("a.mp4", 0), ("a.mp4", 4), ("b.mp4", 4), ("b.mp4", 8), ("b.mp4", 2), ("a.mp4", 5), ("a.mp4", 5)]:
         image, pixels = reader.read(Source(name, name, "train", t))
         assert torch.equal(image, plain[name][t][0])
@@ -37,7 +37,7 @@ def test_frames_are_those_of_the_video_forward_backward_and_across(videos):
 
 
 def test_a_video_that_ends_early_is_named(videos):
-    reader = Reader(videos, None)
+    reader = SourceReader(videos, None)
     with pytest.raises(UnreadableImageError, match=r"a\.mp4 ends before its frame 9"):
         reader.read(Source("a.mp4", "a", "train", FRAMES))
     assert reader.read(Source("a.mp4", "a", "train", 1))[0].shape == (3, 32, 48)
@@ -48,7 +48,7 @@ def test_a_video_that_ends_early_is_named(videos):
 def test_a_picture_comes_with_its_bytes(size, kind, tmp_path):
     levels = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (40, 60, 3), endpoint=True).astype(kind)
     assert cv2.imwrite(str(tmp_path / "a.png"), levels[..., ::-1])
-    image, pixels = Reader(tmp_path, size).read(Source("a.png", ".", "train"))
+    image, pixels = SourceReader(tmp_path, size).read(Source("a.png", ".", "train"))
     expected = fit(read_image(tmp_path / "a.png"), size or (40, 60))
     assert torch.equal(image, expected)
     assert image.is_contiguous()
@@ -69,13 +69,13 @@ def test_each_video_is_a_drive_and_lies_in_one_split(videos):
 
 def test_a_source_that_is_used_again_has_a_new_key_and_no_key_is_used_twice(videos):
     found = find_sources(videos, **OPTIONS)
-    keys = [draw_of(frame, seed=3, lap=lap)[1] for lap in range(3) for frame in found.frames]
+    keys = [draw_of(frame, seed=3, repeat=repeat)[1] for repeat in range(3) for frame in found.frames]
     assert len(set(keys)) == 3 * 3 * FRAMES
-    assert {draw_of(frame, seed=3, lap=0)[0] for frame in found.frames} == {3 << 32, (3 << 32) + 1}
+    assert {draw_of(frame, seed=3, repeat=0)[0] for frame in found.frames} == {3 << 32, (3 << 32) + 1}
 
 
 def test_fewer_pairs_than_frames_are_of_all_parts_of_the_source(videos):
-    found = find_sources(videos, **OPTIONS).thinned(6)
+    found = find_sources(videos, **OPTIONS).limited(6)
     assert [frame.path for frame in found.frames] == ["a.mp4"] * 2 + ["b.mp4"] * 2 + ["c.mp4"] * 2
 
 
@@ -99,7 +99,7 @@ def test_pictures_beside_videos_are_refused(call, videos, frames, tmp_path):
     (both / "a.mp4").symlink_to(videos / "a.mp4")
     (both / "a.png").symlink_to(frames / "drive0" / "000.png")
     words = ("scene=limpopo_sun_glare", "source=both", "out=out", "license=CC0")
-    message = "source must hold pictures or videos, got both in both, such as a.png and a.mp4"
+    message = "source must hold images or videos, got both in both, such as a.png and a.mp4"
     assert call("generate", *words).message == message
 
 
@@ -110,4 +110,4 @@ def test_videos_that_cannot_be_read_are_named_and_left_out(call, videos, tmp_pat
     (tmp_path / "videos" / "empty.mp4").touch()
     assert find_sources(tmp_path / "videos", **OPTIONS).skipped == ["cut.mp4", "empty.mp4"]
     words = ("scene=limpopo_sun_glare", "source=videos", "out=out", "license=CC0", "workers=0", "count=2")
-    assert "2 files of the source cannot be read: cut.mp4, empty.mp4\n" in call("generate", *words).out
+    assert "2 files of the source are unreadable: cut.mp4, empty.mp4\n" in call("generate", *words).out

@@ -1,4 +1,4 @@
-"""Pairs from disk, as `torchrefract.generate` writes them: any of them by its number, or one after another."""
+"""Datasets of pairs on disk, as `torchrefract.generate` writes them."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -12,29 +12,36 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 from torchrefract._tensor import to_float
 from torchrefract._validation import check_choice, check_count, check_flag
 from torchrefract.data.pairs.files import DamagedPairError, decode_pair
-from torchrefract.data.pairs.manifest import PairRow, Place, lines_of, manifests, read_row, read_stored, scan
+from torchrefract.data.pairs.manifest import (
+    PairRow,
+    RowLocation,
+    find_manifests,
+    read_lines,
+    read_row,
+    read_stored,
+    scan_rows,
+)
 from torchrefract.types import Pair
 
 _SPLITS = ("all", "train", "val")
-_FLOW, _PASSED = "restore_flow", "transmission"
-_NEEDED = (_FLOW, "restore_valid")
+_FLOW, _VALID, _TRANSMISSION = "restore_flow", "restore_valid", "transmission"
 
 
 class PairedFolder(Dataset[Pair]):
-    """The pairs in a folder, all of them or those of one split, in the order of their numbers.
+    """The pairs in a folder in the order of their numbers.
 
-    A pair is what `make_pair` would have made of its frame on the fly, in the precision of its files. Rows of the
-    manifest are read when they are asked for, so that a set of any size takes 24 bytes a pair.
+    A pair equals what `make_pair` computes from its frame, in the precision of its files. Rows of the manifest are
+    read on access, so that the dataset takes 24 bytes of memory a pair.
 
     Args:
-        root: the folder, with pairs/ or tars/ in it.
-        split: "all", "train" or "val", by drive.
-        transmission: whether pairs are read with theirs.
-        flow: whether pairs must have one; of those that need none it is zero.
+        root: the folder with pairs/ or tars/.
+        split: "all", "train" or "val".
+        transmission: True to load the transmission of each pair.
+        flow: True to require a flow in each pair; otherwise, a pair without one has a flow of zeros.
 
     Raises:
-        ValueError: a folder without pairs of the split; a damaged manifest; in `[]`, a damaged file, or a pair without
-            the transmission or the flow that is asked for.
+        ValueError: the folder has no pairs of the split, or a manifest is damaged. On access: a file is damaged, or
+            the pair lacks a required map.
     """
 
     def __init__(self, root: str | Path, *, split: str = "all", transmission: bool = False, flow: bool = False):
@@ -42,74 +49,83 @@ class PairedFolder(Dataset[Pair]):
         self.split = check_choice("split", split, _SPLITS)
         self.transmission = check_flag("transmission", transmission)
         self.flow = check_flag("flow", flow)
-        self._manifests = manifests(self.root)
+        self._manifests = find_manifests(self.root)
         if not self._manifests:
             raise ValueError(f"root must be a folder with manifest.jsonl, got {self.root}")
         numbers = {path: i for i, path in enumerate(self._manifests)}
-        found = [
-            (row.number, numbers[at.manifest], at.offset, at.length) for row, at in scan(self._manifests, self._has)
+        rows = [
+            (row.number, numbers[location.manifest], location.offset, location.length)
+            for row, location in scan_rows(self._manifests, self._is_in_split)
         ]
-        if not found:
+        if not rows:
             raise ValueError(f"root must hold pairs of the split {split}, got none in {self.root}")
-        self._places = np.array(sorted(found), dtype=np.int64)[:, 1:]
+        self._locations = np.array(sorted(rows), dtype=np.int64)[:, 1:]
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._locations)
 
     def __getitem__(self, index: int) -> Pair:
-        """Pair of a degraded and a clean image (3, H, W), a flow (2, H, W), its mask (1, H, W) and a key ().
+        """Load a pair.
 
-        And a transmission, (1, H, W), or (0,) where none is asked for.
+        Returns:
+            degraded and clean image (3, H, W), flow (2, H, W), validity mask (1, H, W), key () and transmission
+            (1, H, W), or (0,) if it is not loaded.
         """
         row = self.row(index)
         try:
             arrays = decode_pair(
                 {suffix: partial(read_stored, self.root, file) for suffix, file in row.files.items()},
-                (*_NEEDED, _PASSED) if self.transmission else _NEEDED,
+                (_FLOW, _VALID, _TRANSMISSION) if self.transmission else (_FLOW, _VALID),
             )
         except DamagedPairError as error:
             raise DamagedPairError(
-                f"pair {row.number} in {self.root} must be whole, got {error}; torchrefract.generate with verify=true "
-                "makes it again"
+                f"pair {row.number} in {self.root} must be complete, got {error}; torchrefract.generate with "
+                "verify=true makes it again"
             ) from error
-        asked = ((self.transmission, _PASSED, "transmission, as of fog"), (self.flow, _FLOW, "flow, as of a lens"))
-        for wanted, name, words in asked:
-            if wanted and name not in arrays.maps:
-                raise ValueError(f"root must hold pairs with a {words}, got {row.number} in {self.root}")
+        required = (
+            (self.transmission, _TRANSMISSION, "transmission, as of fog"),
+            (self.flow, _FLOW, "flow, as of a lens"),
+        )
+        for is_required, name, description in required:
+            if is_required and name not in arrays.maps:
+                raise ValueError(f"root must hold pairs with a {description}, got {row.number} in {self.root}")
         size = arrays.clean.shape[:2]
         flow = arrays.maps.get(_FLOW, np.zeros((2, *size), np.float32))
-        valid = arrays.maps["restore_valid"] if _FLOW in arrays.maps else np.ones(size, dtype=bool)
-        degraded, clean = _image(arrays.corrupted), _image(arrays.clean)
-        passed = torch.from_numpy(arrays.maps[_PASSED])[None] if self.transmission else torch.empty(0)
+        valid = arrays.maps[_VALID] if _FLOW in arrays.maps else np.ones(size, dtype=bool)
         return Pair(
-            degraded, clean, torch.from_numpy(flow), torch.from_numpy(valid)[None], torch.tensor(row.key), passed
+            _image(arrays.corrupted),
+            _image(arrays.clean),
+            torch.from_numpy(flow),
+            torch.from_numpy(valid)[None],
+            torch.tensor(row.key),
+            torch.from_numpy(arrays.maps[_TRANSMISSION])[None] if self.transmission else torch.empty(0),
         )
 
     def row(self, index: int) -> PairRow:
-        """What the manifest says of a pair of the split."""
-        number, offset, length = self._places[index].tolist()
-        (line,) = lines_of([Place(self._manifests[number], offset, length)])
+        """Read the manifest's row of a pair."""
+        number, offset, length = self._locations[index].tolist()
+        (line,) = read_lines([RowLocation(self._manifests[number], offset, length)])
         return read_row(line)
 
     def rows(self) -> Iterator[PairRow]:
-        """What the manifest says of all pairs of the split, in its order."""
-        return (row for row, _ in scan(self._manifests, self._has))
+        """Read all rows of the split, in the order of the manifest."""
+        return (row for row, _ in scan_rows(self._manifests, self._is_in_split))
 
-    def _has(self, row: PairRow) -> bool:
+    def _is_in_split(self, row: PairRow) -> bool:
         return not row.skipped and self.split in ("all", row.split)
 
 
 class PairStream(IterableDataset[Pair]):
-    """The pairs of a folder one after another, for sets in tars or on slow disks; each once an epoch.
+    """The pairs in a folder one after another, for tars and slow disks; each pair once an epoch.
 
-    Every reader, a worker of a DataLoader in one of `ranks` processes, has a stretch of the set of its own, and reads
-    it from one end to the other; an order of the epoch comes of a buffer.
+    Each worker of a DataLoader in each process reads its own contiguous part of the set, from start to end. A buffer
+    shuffles the order.
 
     Args:
         root, split: as for `PairedFolder`.
-        buffer: pairs to choose the next one from; 1 keeps their order.
-        seed: of the order.
-        rank, ranks: which of how many processes this is.
+        buffer: number of pairs to choose the next one from; 1 keeps their order.
+        seed: of the order, at least 0.
+        rank, ranks: index of this process, and number of processes.
     """
 
     def __init__(
@@ -125,29 +141,29 @@ class PairStream(IterableDataset[Pair]):
         self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
-        """The order is that of this epoch."""
+        """Select the order of an epoch, at least 0."""
         self.epoch = check_count("epoch", epoch, low=0)
 
     def __iter__(self) -> Iterator[Pair]:
         worker = get_worker_info()
-        number, readers = (worker.id, worker.num_workers) if worker else (0, 1)
-        reader, readers = self.rank * readers + number, self.ranks * readers
-        count = len(self.pairs)
-        mine = range(reader * count // readers, (reader + 1) * count // readers)
-        yield from map(self.pairs.__getitem__, _mixed(mine, self.buffer, (self.seed, self.epoch, reader)))
+        index, count = (worker.id, worker.num_workers) if worker else (0, 1)
+        reader, readers = self.rank * count + index, self.ranks * count
+        total = len(self.pairs)
+        part = range(reader * total // readers, (reader + 1) * total // readers)
+        yield from map(self.pairs.__getitem__, _shuffled(part, self.buffer, (self.seed, self.epoch, reader)))
 
 
-def _mixed(numbers: range, size: int, seed: tuple[int, int, int]) -> Iterator[int]:
-    """The numbers, each time one out of the next `size` that are left."""
-    dice, held = np.random.default_rng(seed), list[int]()
+def _shuffled(numbers: range, size: int, seed: tuple[int, int, int]) -> Iterator[int]:
+    """Yield the numbers, each drawn from a buffer of `size`."""
+    generator, buffer = np.random.default_rng(seed), list[int]()
     for number in numbers:
-        held.append(number)
-        if len(held) == size:
-            yield held.pop(dice.integers(len(held)))
-    while held:
-        yield held.pop(dice.integers(len(held)))
+        buffer.append(number)
+        if len(buffer) == size:
+            yield buffer.pop(generator.integers(len(buffer)))
+    while buffer:
+        yield buffer.pop(generator.integers(len(buffer)))
 
 
 def _image(pixels: np.ndarray) -> Tensor:
-    """(3, H, W), float32 in [0, 1], of (H, W, 3), uint8."""
+    """Convert (H, W, 3), uint8, into (3, H, W), float32, in [0, 1]."""
     return to_float(torch.from_numpy(pixels).permute(2, 0, 1).contiguous())

@@ -1,4 +1,4 @@
-"""One pair: a frame read, degraded by its own draw, and put into files."""
+"""Generation of one pair: read a frame, degrade it by its own draw, encode the files."""
 
 import hashlib
 import math
@@ -11,24 +11,26 @@ import numpy as np
 import torch
 
 from torchrefract._validation import UsageError
-from torchrefract.cli.command import naming
 from torchrefract.data.images import UnreadableImageError, pixels_of
-from torchrefract.data.pairs.files import FLOWS, LIGHTS, PairArrays, beyond, encode_pair
-from torchrefract.data.pairs.manifest import PairRow, Stored
-from torchrefract.data.pairs.sources import Reader, Source, draw_of
+from torchrefract.data.pairs.files import FLOWS, LIGHTS, PairArrays, count_out_of_range, encode_pair
+from torchrefract.data.pairs.manifest import PairRow, StoredFile
+from torchrefract.data.pairs.sources import Source, SourceReader, draw_of
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
 from torchrefract.types import Degraded
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """All that a pair depends on beside its number and its frame.
+class GenerationConfig:
+    """Everything that a pair depends on, apart from its number and its frame.
 
-    effect: what degrades the frames; scene: what it is called.
-    root: of the frames; size: (height, width), px, that they are cut and reduced to, or None.
-    seed: of the draws.
-    maps: the form of the maps, "png", "npz" or "safetensors".
+    Args:
+        effect: degrades the frames.
+        scene: name of the effect.
+        root: folder of the frames.
+        size: (height, width), px, to crop and reduce frames to; None keeps their size.
+        seed: of the draws.
+        maps: format of the maps: "png", "npz" or "safetensors".
     """
 
     effect: Effect
@@ -39,78 +41,89 @@ class Recipe:
     maps: str
 
 
-class Job(NamedTuple):
-    """A pair to make."""
+class PairTask(NamedTuple):
+    """A pair to generate."""
 
     number: int
     source: Source
-    lap: int  # how often the source was used before
+    repeat: int  # how many times the source was used before
 
 
-class Made(NamedTuple):
-    """A pair in files that are not written yet."""
+class GeneratedPair(NamedTuple):
+    """An encoded pair."""
 
-    row: PairRow  # its files without a place
-    data: dict[str, bytes]
+    row: PairRow  # its files have no path yet
+    data: dict[str, bytes]  # content of each file by the suffix of its name; empty if the frame was skipped
 
 
-class Maker:
-    """Makes the pairs of a recipe, on the CPU, each by itself, so that it has the same bits whoever makes it."""
+class PairGenerator:
+    """Generates pairs on the CPU, one at a time, so that a pair has the same bytes in any order and process."""
 
-    def __init__(self, recipe: Recipe):
-        self.recipe = recipe
-        self._reader = Reader(recipe.root, recipe.size)
+    def __init__(self, config: GenerationConfig):
+        self.config = config
+        self._reader = SourceReader(config.root, config.size)
 
-    def make(self, job: Job) -> Made:
-        """The pair of a job; a frame that cannot be read gives none, and a row that says so."""
+    def generate(self, task: PairTask) -> GeneratedPair:
+        """Generate a pair. An unreadable frame gives a row with the reason and no files.
+
+        Raises:
+            UsageError: the scene, the size or the format of the maps does not suit the frame.
+        """
+        config = self.config
         try:
-            image, pixels = self._reader.read(job.source)
+            image, pixels = self._reader.read(task.source)
         except UnreadableImageError as error:
-            return Made(self._row(job, (0, 0), skipped=str(error).replace(f"{self.recipe.root}/", "")), {})
+            return GeneratedPair(self._row(task, (0, 0), skipped=str(error).replace(f"{config.root}/", "")), {})
         except ValueError as error:
             raise UsageError(f"size: {error}") from error
-        seed, key = draw_of(job.source, seed=self.recipe.seed, lap=job.lap)
-        with naming("scene"), warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore", UserWarning)  # of folds, which the masks leave out
-            degraded = self.recipe.effect.degrade(image[None], seed=seed, keys=[key])
-            pair = PairArrays(pixels, pixels_of(degraded.image[0]), _maps(degraded))
-        with naming("maps"):
-            data = encode_pair(pair, self.recipe.maps)
-        rest = {
-            "effects": acting(self.recipe.effect, degraded.params),
-            "beyond": _beyond(pair) if self.recipe.maps == "png" else {},
-            "files": {name: Stored("", len(value), hashlib.sha256(value).hexdigest()) for name, value in data.items()},
-        }
-        return Made(self._row(job, tuple(image.shape[1:]), **rest), data)
+        seed, key = draw_of(task.source, seed=config.seed, repeat=task.repeat)
+        try:
+            with warnings.catch_warnings(), torch.no_grad():
+                warnings.simplefilter("ignore", UserWarning)  # of folded pixels, which the masks exclude
+                degraded = config.effect.degrade(image[None], seed=seed, keys=[key])
+        except (ValueError, TypeError, OSError) as error:
+            raise UsageError(f"scene: {error}") from error
+        pair = PairArrays(pixels, pixels_of(degraded.image[0]), _maps(degraded))
+        try:
+            data = encode_pair(pair, config.maps)
+        except ValueError as error:
+            raise UsageError(f"maps: {error}") from error
+        row = self._row(
+            task,
+            (image.shape[1], image.shape[2]),
+            effects=applied_effects(config.effect, degraded.params),
+            beyond=_count_out_of_range(pair) if config.maps == "png" else {},
+            files={name: StoredFile("", len(x), hashlib.sha256(x).hexdigest()) for name, x in data.items()},
+        )
+        return GeneratedPair(row, data)
 
-    def _row(self, job: Job, size: tuple[int, ...], **rest: Any) -> PairRow:
-        seed, key = draw_of(job.source, seed=self.recipe.seed, lap=job.lap)
+    def _row(self, task: PairTask, size: tuple[int, int], **rest: Any) -> PairRow:
+        seed, key = draw_of(task.source, seed=self.config.seed, repeat=task.repeat)
+        source, (height, width) = task.source, size
+        origin = (source.path, source.frame, source.drive, source.split)
         empty: dict[str, Any] = {"effects": [], "beyond": {}, "files": {}}
-        source, (height, width) = job.source, size
-        where = (source.path, source.frame, source.drive, source.split)
-        return PairRow(job.number, *where, self.recipe.scene, seed, key, height, width, **(empty | rest))
+        return PairRow(task.number, *origin, self.config.scene, seed, key, height, width, **(empty | rest))
 
 
-def acting(effect: Effect, params: Any) -> list[dict[str, Any]]:
-    """The effects that acted on the first sample, in order, each with its name and all its parameters but the gate."""
+def applied_effects(effect: Effect, params: Any) -> list[dict[str, Any]]:
+    """Return the name and the parameters of each effect that was applied to the first sample, in order."""
     leaves = effect.leaves(params) if isinstance(effect, Compose) else [(effect, params)]
-    found = []
-    for leaf, own in leaves:
-        if own.applied[0]:
-            values = {name: _plain(value[0].tolist()) for name, value in own._asdict().items() if name != "gate"}
-            found.append({"effect": type(leaf).__name__} | values)
-    return found
+    return [
+        {"effect": type(leaf).__name__}
+        | {name: _plain(value[0].tolist()) for name, value in values._asdict().items() if name != "applied"}
+        for leaf, values in leaves
+        if values.applied[0]
+    ]
 
 
 def _plain(value: Any) -> Any:
-    """A number, or nested lists of them; JSON has no infinity, so that it becomes a word."""
+    """Replace infinite numbers by words, because JSON has no infinity."""
     if isinstance(value, list):
-        return [_plain(row) for row in value]
+        return [_plain(item) for item in value]
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _maps(degraded: Degraded) -> dict[str, np.ndarray]:
-    """The maps that there are, of one sample."""
     maps = {"valid": degraded.valid[0, 0].numpy()}
     if degraded.has("flow"):
         maps["restore_valid"] = degraded.restore_valid[0, 0].numpy()
@@ -118,7 +131,7 @@ def _maps(degraded: Degraded) -> dict[str, np.ndarray]:
     return maps | {name: getattr(degraded, name)[0, 0].float().numpy() for name in LIGHTS if degraded.has(name)}
 
 
-def _beyond(pair: PairArrays) -> dict[str, int]:
-    """How many valid pixels a PNG cannot hold, of the flows that have some."""
-    counts = {name: beyond(pair.maps[name], pair.maps[mask]) for name, mask in FLOWS.items() if name in pair.maps}
+def _count_out_of_range(pair: PairArrays) -> dict[str, int]:
+    maps = pair.maps
+    counts = {name: count_out_of_range(maps[name], maps[mask]) for name, mask in FLOWS.items() if name in maps}
     return {name: count for name, count in counts.items() if count}

@@ -1,8 +1,8 @@
-"""Where pairs go: files in folders of a thousand pairs, or tars. A pair or a tar is there whole or not at all.
+"""Storage of pairs: files in folders of a thousand pairs, or tars. A pair or a tar is always complete.
 
-Files are written under a hidden name and moved. Their data is not forced to the disk one by one, which would take
-longer than all the rest: after a kill nothing is lost, as the system still has it; after a power cut files may be
-short, which the next run sees by their sizes, or hold zeros, which verify=true finds.
+Files are written under a hidden name and then renamed. They are not flushed to disk one by one, which would take longer
+than everything else. A kill loses nothing. After a power cut, a file may be short, which the next run detects by its
+size, or hold zeros, which verify=true detects.
 """
 
 import io
@@ -13,100 +13,101 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchrefract._io import replace_file
-from torchrefract.data.pairs.generator import Job, Made, Maker
+from torchrefract.data.pairs.generator import GeneratedPair, PairGenerator, PairTask
 from torchrefract.data.pairs.manifest import PairRow, pair_name
 
-_FOLDER = 1000  # pairs in a folder
-_HEAD = 512  # bytes of a tar before each of its files
+_PAIRS_PER_FOLDER = 1000
+_DISK_BLOCK, _TAR_BLOCK = 4096, 512  # bytes
 
 
-class Store(ABC):
-    """Writes units of pairs; a unit is what is there whole or not at all."""
+class PairStorage(ABC):
+    """Writes units of pairs. A unit is written completely or not at all.
+
+    Args:
+        out: the folder of the set.
+        unit: number of pairs in a unit.
+    """
 
     def __init__(self, out: Path, unit: int):
         self.out, self.unit = out, unit
 
     @abstractmethod
-    def write(self, jobs: Sequence[Job], maker: Maker) -> list[PairRow]:
-        """Make the pairs of a unit and write them; returns their rows."""
+    def write(self, tasks: Sequence[PairTask], generator: PairGenerator) -> list[PairRow]:
+        """Generate and write the pairs of a unit; return their rows."""
 
     @abstractmethod
-    def bytes_of(self, made: Made) -> int:
-        """What a pair takes on a disk, about."""
+    def disk_bytes(self, pair: GeneratedPair) -> int:
+        """Estimate the size of a pair on disk."""
 
 
-class Folders(Store):
-    """A file for each picture and map, pairs/00012/00012345.clean.png; a unit is a pair."""
+class FileStorage(PairStorage):
+    """Writes each image and map to a file of its own, pairs/00012/00012345.clean.png; a unit is a pair."""
 
     def __init__(self, out: Path):
         super().__init__(out, 1)
 
-    def write(self, jobs: Sequence[Job], maker: Maker) -> list[PairRow]:
-        """Write the files of the pairs."""
-        return [self._write(maker.make(job)) for job in jobs]
+    def write(self, tasks: Sequence[PairTask], generator: PairGenerator) -> list[PairRow]:
+        """Generate pairs and write their files; return their rows."""
+        return [self._write(generator.generate(task)) for task in tasks]
 
-    def bytes_of(self, made: Made) -> int:
-        """All its files, in blocks of 4 KiB."""
-        return sum(-(-len(data) // 4096) * 4096 for data in made.data.values())
+    def disk_bytes(self, pair: GeneratedPair) -> int:
+        """Add up the sizes of the files, each rounded up to a block of the file system."""
+        return sum(-(-len(data) // _DISK_BLOCK) * _DISK_BLOCK for data in pair.data.values())
 
-    def _write(self, made: Made) -> PairRow:
-        folder = f"pairs/{made.row.number // _FOLDER:05d}"
-        if made.data:
+    def _write(self, pair: GeneratedPair) -> PairRow:
+        folder = f"pairs/{pair.row.number // _PAIRS_PER_FOLDER:05d}"
+        if pair.data:
             (self.out / folder).mkdir(parents=True, exist_ok=True)
         files = {}
-        for suffix, data in made.data.items():
-            file = made.row.files[suffix]._replace(path=f"{folder}/{made.row.name}.{suffix}")
+        for suffix, data in pair.data.items():
+            file = pair.row.files[suffix]._replace(path=f"{folder}/{pair.row.name}.{suffix}")
             with replace_file(self.out / file.path, alone=True) as temporary:
                 temporary.write_bytes(data)
             files[suffix] = file
-        return made.row._replace(files=files)
+        return pair.row._replace(files=files)
 
 
-class Tars(Store):
-    """tars/00000012.tar, of so many pairs that follow one another, as WebDataset has them; a unit is a tar.
+class TarStorage(PairStorage):
+    """Writes consecutive pairs to a tar in WebDataset's layout, tars/00000012.tar; a unit is a tar.
 
-    Beside its files each pair has a .json with what the manifest says of it.
+    A pair has its row of the manifest as a further file, with the suffix json.
     """
 
-    def __init__(self, out: Path, unit: int):
-        super().__init__(out, unit)
-
-    def write(self, jobs: Sequence[Job], maker: Maker) -> list[PairRow]:
-        """Write a tar."""
-        path = f"tars/{pair_name(jobs[0].number // self.unit)}.tar"
+    def write(self, tasks: Sequence[PairTask], generator: PairGenerator) -> list[PairRow]:
+        """Generate pairs and write them to a tar; return their rows."""
+        path = f"tars/{pair_name(tasks[0].number // self.unit)}.tar"
         target = self.out / path
         target.parent.mkdir(parents=True, exist_ok=True)
         with (
             replace_file(target, alone=True) as temporary,
             tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar,
         ):
-            return [_add_pair(tar, maker.make(job), path) for job in jobs]
+            return [_add_pair(tar, generator.generate(task), path) for task in tasks]
 
-    def bytes_of(self, made: Made) -> int:
-        """Its files, each with a head and filled up to 512 bytes."""
-        sizes = [len(_about(made.row)), *map(len, made.data.values())]
-        return sum(_HEAD + -(-size // _HEAD) * _HEAD for size in sizes)
+    def disk_bytes(self, pair: GeneratedPair) -> int:
+        """Add up the sizes of the files, each with a header and rounded up to a block of the tar."""
+        sizes = [len(_row_without_files(pair.row)), *map(len, pair.data.values())]
+        return sum(_TAR_BLOCK + -(-size // _TAR_BLOCK) * _TAR_BLOCK for size in sizes)
 
 
-def _about(row: PairRow) -> bytes:
-    """What the manifest says of a pair, without its files."""
+def _row_without_files(row: PairRow) -> bytes:
     document = row._asdict()
     del document["files"]
     return json.dumps(document).encode()
 
 
-def _add_pair(tar: tarfile.TarFile, made: Made, path: str) -> PairRow:
-    files = {}
-    for suffix, data in made.data.items():
-        files[suffix] = made.row.files[suffix]._replace(path=path, offset=_add(tar, f"{made.row.name}.{suffix}", data))
+def _add_pair(tar: tarfile.TarFile, pair: GeneratedPair, path: str) -> PairRow:
+    row, files = pair.row, {}
+    for suffix, data in pair.data.items():
+        files[suffix] = row.files[suffix]._replace(path=path, offset=_add_file(tar, f"{row.name}.{suffix}", data))
     if files:
-        _add(tar, f"{made.row.name}.json", _about(made.row))
-    return made.row._replace(files=files)
+        _add_file(tar, f"{row.name}.json", _row_without_files(row))
+    return row._replace(files=files)
 
 
-def _add(tar: tarfile.TarFile, name: str, data: bytes) -> int:
-    """Add a file, of no time and no owner; returns where its bytes begin."""
+def _add_file(tar: tarfile.TarFile, name: str, data: bytes) -> int:
+    """Add a file without time and owner, so that its bytes are reproducible; return the offset of its content."""
     start, info = tar.offset, tarfile.TarInfo(name)
     info.size = len(data)
     tar.addfile(info, io.BytesIO(data))
-    return start + _HEAD
+    return start + _TAR_BLOCK

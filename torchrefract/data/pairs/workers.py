@@ -1,4 +1,4 @@
-"""Units of pairs made by several processes, no more than a few of them at a time."""
+"""Generation of pairs in several processes."""
 
 import multiprocessing
 import os
@@ -7,120 +7,94 @@ import threading
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import forkserver
 from multiprocessing.context import BaseContext
 
 import cv2
 import torch
 
-from torchrefract._memory import keep_freed_memory
 from torchrefract._validation import UsageError
-from torchrefract.data.pairs.generator import Job, Maker, Recipe
+from torchrefract.data.pairs.generator import GenerationConfig, PairGenerator, PairTask
 from torchrefract.data.pairs.manifest import PairRow
-from torchrefract.data.pairs.storage import Store
+from torchrefract.data.pairs.storage import PairStorage
 
-_AHEAD = 2  # units for each worker, made or waiting
+_QUEUED_UNITS = 2  # for each worker, so that none waits
 
 
-def run(units: Iterable[Sequence[Job]], recipe: Recipe, store: Store, *, workers: int) -> Iterator[list[PairRow]]:
-    """Make and write units; yields the rows of each when it is written, in no order.
+def generate_pairs(
+    units: Iterable[Sequence[PairTask]], config: GenerationConfig, storage: PairStorage, *, workers: int
+) -> Iterator[list[PairRow]]:
+    """Generate and write units of pairs; yield the rows of each when it is written, in any order.
 
     Args:
-        units: of `store`.
-        recipe: of the pairs.
-        store: where they go.
-        workers: processes, after `make_ready`; until they have started this one makes pairs, and all where they are 0.
+        units: of `storage`.
+        config: of the pairs.
+        storage: writes them.
+        workers: number of processes; 0 to generate the pairs in this process.
 
     Raises:
-        UsageError: a worker that died.
-        Exception: what a worker raised, after the others have finished what they are at.
+        UsageError: a worker was killed.
+        Exception: any error of a worker, after the others have finished their units.
     """
     if workers == 0:
-        maker = Maker(recipe)
-        yield from (store.write(unit, maker) for unit in units)
+        use_one_thread()
+        generator = PairGenerator(config)
+        yield from (storage.write(unit, generator) for unit in units)
         return
-    pool = ProcessPoolExecutor(workers, mp_context=_context(), initializer=_start, initargs=(recipe, store))
+    pool = ProcessPoolExecutor(workers, mp_context=_context(), initializer=_start, initargs=(config, storage))
+    pending = set[Future[list[PairRow]]]()
     try:
-        # The first one waits for what workers are forked off to have imported all.
-        start = threading.Thread(target=pool.submit, args=(os.getpid,), daemon=True)
-        start.start()
-        units, maker = iter(units), Maker(recipe)
-        while start.is_alive() and (unit := next(units, None)) is not None:
-            yield store.write(unit, maker)
-        start.join()
-        waiting = set[Future[list[PairRow]]]()
         for unit in units:
-            waiting.add(pool.submit(_write, unit))
-            if len(waiting) >= _AHEAD * workers:
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            pending.add(pool.submit(_write, unit))
+            if len(pending) >= _QUEUED_UNITS * workers:
+                done, pending = wait(pending, return_when=FIRST_COMPLETED)
                 yield from (future.result() for future in done)
-        while waiting:
-            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+        while pending:
+            done, pending = wait(pending, return_when=FIRST_COMPLETED)
             yield from (future.result() for future in done)
     except BrokenProcessPool as error:
         raise UsageError(
-            f"workers must leave memory for each, got {workers} of which one was killed, as for lack of memory; what "
-            "is written stays, and the same command goes on"
+            f"workers must fit the memory, got {workers} of which one was killed; pairs that are written stay, and the "
+            "same command continues"
         ) from error
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def make_ready() -> None:
-    """Let what workers import be imported beside what this process does before it has work for them.
-
-    That takes one core: threads that wait for each other would wait for it.
-    """
-    work_alone()
-    if "forkserver" in multiprocessing.get_all_start_methods():
-        # All that the command imports beside itself, since each worker imports the command again.
-        preloaded = [
-            __name__,
-            "torchrefract.cli.command",
-            "torchrefract.data.pairs.card",
-            "torchrefract.data.pairs.output",
-        ]
-        multiprocessing.set_forkserver_preload(preloaded)
-        forkserver.ensure_running()
+def use_one_thread() -> None:
+    """Limit PyTorch and OpenCV to one thread in this process."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
 
 
 def _context() -> BaseContext:
-    """Workers are forked off a process that has imported what they need, and computed nothing yet.
-
-    A fork of this process, which has threads, may hang; spawned ones would each import everything anew.
-    """
-    there = "forkserver" in multiprocessing.get_all_start_methods()
-    return multiprocessing.get_context("forkserver" if there else "spawn")
+    """Choose the start method of workers: forking this process, which has threads, could hang."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    multiprocessing.set_forkserver_preload([__name__])  # imported once, not in each worker
+    return multiprocessing.get_context("forkserver")
 
 
 class _Worker:
-    """What a worker process keeps between units."""
+    """The state of a worker process between units."""
 
-    maker: Maker
-    store: Store
-
-
-def _start(recipe: Recipe, store: Store) -> None:
-    work_alone()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers itself
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    _Worker.maker, _Worker.store = Maker(recipe), store
+    generator: PairGenerator
+    storage: PairStorage
 
 
-def work_alone() -> None:
-    """Make pairs as fast as one thread can: as many workers as cores leave nothing for more."""
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    keep_freed_memory()
+def _start(config: GenerationConfig, storage: PairStorage) -> None:
+    use_one_thread()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    _Worker.generator, _Worker.storage = PairGenerator(config), storage
 
 
-def _end_with_parent() -> None:
-    """Else workers of a parent that was killed would wait for it for ever, or write beside its successor."""
+def _exit_with_parent() -> None:
+    """Exit if the parent is killed; otherwise the worker could write at the same time as the next run."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
         os._exit(1)
 
 
-def _write(unit: Sequence[Job]) -> list[PairRow]:
-    return _Worker.store.write(unit, _Worker.maker)
+def _write(unit: Sequence[PairTask]) -> list[PairRow]:
+    return _Worker.storage.write(unit, _Worker.generator)

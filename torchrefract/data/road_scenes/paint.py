@@ -7,9 +7,6 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
-import torch
-
-from torchrefract.draws import stream, uniform
 
 Array = np.ndarray
 Color = Array | tuple[float, ...]
@@ -22,7 +19,7 @@ _WHEEL = 0.33  # m, radius
 
 @cache
 def _noise_tile() -> Array:
-    return uniform(stream(0, torch.arange(_TILE)), _TILE).numpy().ravel() * 2 - 1
+    return np.random.default_rng(0).uniform(-1, 1, _TILE * _TILE).astype(np.float32)
 
 
 def noise(x: Array, y: Array | float) -> Array:

@@ -22,8 +22,15 @@ def during(data: PairData, *, epoch: int = 0, training: bool = True, ranks: int 
 
 
 def scenes(*, effect: LensDistortion | UniformFog | None = None, batch_size: int = 4, workers: int = 0, seed: int = 0):
-    options = {"train_count": COUNT, "val_count": 5, "batch_size": batch_size, "workers": workers, "seed": seed}
-    return road_scenes(effect=effect or LensDistortion(), size=SIZE, **options)
+    return road_scenes(
+        effect=effect or LensDistortion(),
+        size=SIZE,
+        train_count=COUNT,
+        val_count=5,
+        batch_size=batch_size,
+        workers=workers,
+        seed=seed,
+    )
 
 
 def random_frames(count: int = 2) -> Frame:
@@ -93,19 +100,19 @@ def test_batches_have_their_transmission_in_training_and_validation():
 
 
 @pytest.mark.parametrize(
-    ("effect", "required", "message"),
+    ("effect", "flow", "message"),
     [
-        (UniformFog(), "flow", "effect must have a flow, as a lens has, got UniformFog"),
-        (LensDistortion(), "transmission", "effect must have a transmission, as fog has, got LensDistortion"),
+        (UniformFog(), True, "effect must have a flow, as a lens has, got UniformFog"),
+        (LensDistortion(), False, "effect must have a transmission, as fog has, got LensDistortion"),
     ],
 )
-def test_an_effect_without_a_required_map_raises(effect, required, message):
+def test_an_effect_without_a_required_map_raises(effect, flow, message):
     with pytest.raises(ValueError, match=message):
-        make_pair(random_frames(), effect, seed=0, **{required: True})
-    options = {"size": SIZE, "train_count": 4, "val_count": 4, "batch_size": 2, "workers": 0}
+        make_pair(random_frames(), effect, seed=0, flow=flow, transmission=not flow)
+    scenes = RoadScenes(4, size=SIZE)
     with pytest.raises(ValueError, match=message):
-        road_scenes(effect=effect, **options, **{required: True}).check_pair()
-    road_scenes(effect=effect, **options).check_pair()
+        PairData(scenes, scenes, effect=effect, batch_size=2, flow=flow, transmission=not flow).check_pair()
+    PairData(scenes, scenes, effect=effect, batch_size=2).check_pair()
 
 
 def test_a_warp_has_a_flow_even_if_it_is_not_applied():

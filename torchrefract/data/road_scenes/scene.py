@@ -232,13 +232,13 @@ def _horizon(random: np.random.Generator) -> list[Panel]:
 
 
 def _buildings(random: np.random.Generator, road: Road) -> list[Panel]:
-    """Draw houses with gable roofs or flat ones, and blocks of flats behind a town."""
+    """Draw houses with gable roofs or flat ones, and apartment blocks farther away."""
     panels = []
     for i, z in enumerate((17, 24, 40, 47, 68, 75, 150, 220)):
-        is_block, size = i >= 6, 1 + (i >= 6)
+        is_block, scale = i >= 6, 1 + (i >= 6)
         if random.random() > (0.85 if road.is_town else 0.12):
             continue
-        half_width, half_length = random.uniform(3.5, 5.5) * size, random.uniform(3, 4.5) * size
+        half_width, half_length = random.uniform(3.5, 5.5) * scale, random.uniform(3, 4.5) * scale
         is_flat, seed = is_block or random.random() < 0.35, random.random()
         wall = 2.6 + 2.9 * (random.integers(2, 7) if is_block else random.integers(0, 2) * is_flat)
         offset, turn = road.half_width + random.uniform(6, 12) + half_width + 25 * is_block, random.uniform(-0.1, 0.1)
@@ -249,10 +249,9 @@ def _buildings(random: np.random.Generator, road: Road) -> list[Panel]:
         end = paint.building(color, seed, wall)
         panels += body.prism((half_width, wall + rise * is_flat, half_length), end, end, end, roof)
         if not is_flat:
+            size = (half_width, rise, half_length)
             panels += body.prism((half_width, wall + rise, half_length), side, end, end, roof)[:2]
-            panels += body.prism((half_width, rise, half_length), end, roof, roof, roof, foot=wall, inset=half_length)[
-                2:
-            ]
+            panels += body.prism(size, end, roof, roof, roof, foot=wall, inset=half_length)[2:]
     return panels
 
 

@@ -289,7 +289,7 @@ def _check_frames(root: Path, paths: list[str], size: tuple[int, int]) -> tuple[
                 f"root must hold readable frames, got {len(skipped)} of {len(paths)} in {root} that are unreadable: "
                 f"{examples}; remove them or copy them again"
             )
-        message = f"{len(skipped)} of {len(paths)} frames in {root} are unreadable and skipped: {examples}"
+        message = f"{len(skipped)} of {len(paths)} frames in {root} cannot be read and are skipped: {examples}"
         warnings.warn(message, stacklevel=3)
     sizes = {path: result for path, result in zip(paths, results, strict=True) if not isinstance(result, str)}
     small = [f"{path} of {H}x{W}" for path, (H, W) in sizes.items() if size[0] > H or size[1] > W]

@@ -179,7 +179,7 @@ def test_a_damaged_pair_raises_with_the_remedy(call, words, tmp_path):
     assert call("generate", *words("out", "count=2")).code == 0
     os.truncate(tmp_path / "out" / "pairs/00000/00000001.flow.png", 0)
     os.truncate(tmp_path / "out" / "pairs/00000/00000001.restore_flow.png", 30)
-    with pytest.raises(DamagedPairError, match=r"pair 1 in .* must be complete, got .* is truncated; .* verify=true"):
+    with pytest.raises(DamagedPairError, match=r"pair 1 in .* must be whole, got .* is truncated; .* verify=true"):
         PairedFolder(tmp_path / "out")[1]
 
 

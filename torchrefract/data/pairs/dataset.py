@@ -79,7 +79,7 @@ class PairedFolder(Dataset[Pair]):
             )
         except DamagedPairError as error:
             raise DamagedPairError(
-                f"pair {row.number} in {self.root} must be complete, got {error}; torchrefract.generate with "
+                f"pair {row.number} in {self.root} must be whole, got {error}; torchrefract.generate with "
                 "verify=true makes it again"
             ) from error
         required = (

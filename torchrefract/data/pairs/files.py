@@ -167,7 +167,7 @@ def _encode_npz(arrays: dict[str, Any]) -> bytes:
 def _decode_npz(data: bytes) -> dict[str, np.ndarray]:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         if sum(member.file_size for member in archive.infolist()) > len(data):
-            raise ValueError("its members are larger than the file, which is not compressed")
+            raise ValueError("it claims more bytes than it has, and is not compressed")
     with np.load(io.BytesIO(data), allow_pickle=False) as archive:
         return {name: archive[name] for name in archive.files}
 

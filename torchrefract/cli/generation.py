@@ -201,7 +201,7 @@ def _check_disk(options: Options, missing: Sequence[int], storage: PairStorage) 
     """Print the estimated size of the missing pairs; raise UsageError if the disk has less space."""
     generator, step = PairGenerator(options.config), max(1, len(missing) // _SAMPLES)
     samples = [generator.generate(options.task(number)) for number in missing[::step][:_SAMPLES]]
-    sizes = [storage.disk_bytes(pair) + len(pair.row.to_line()) for pair in samples if pair.data]
+    sizes = [storage.disk_bytes(pair) + len(pair.row.as_line()) for pair in samples if pair.data]
     mean = sum(sizes) / max(1, len(sizes))
     needed, free = mean * len(missing), shutil.disk_usage(storage.out).free
     estimate = f"{len(missing)} pairs take about {_size(needed)} on disk, {_size(mean)} each; {_size(free)} are free"

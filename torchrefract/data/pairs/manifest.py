@@ -53,7 +53,7 @@ class PairRow(NamedTuple):
         """The beginning of the names of the pair's files."""
         return pair_name(self.number)
 
-    def to_line(self) -> str:
+    def as_line(self) -> str:
         """Return the row as a line of JSON."""
         document = self._asdict() | {"files": {suffix: file._asdict() for suffix, file in self.files.items()}}
         return json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n"
@@ -213,7 +213,7 @@ class Manifest:
     def add(self, rows: Iterable[PairRow]) -> None:
         """Append the rows of pairs whose files are written."""
         with self.path.open("ab") as stream:
-            stream.write("".join(row.to_line() for row in rows).encode())
+            stream.write("".join(row.as_line() for row in rows).encode())
 
     def close(self) -> None:
         """Sort the rows by number."""

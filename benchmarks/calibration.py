@@ -43,8 +43,8 @@ from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.conversion import Conversion, convert
 from torchrefract.cameras.lens_database import COLUMNS
 from torchrefract.cli.calibration import find_pictures, read_gray
-from torchrefract.fields.rectifying import camera_flow
-from torchrefract.warping.resample import warp
+from torchrefract.fields.rectification import camera_flow
+from torchrefract.warping.warp import warp
 
 LENS_MODEL = "opencv5"
 MAX_ERROR_PX = 1e-6

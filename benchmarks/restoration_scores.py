@@ -17,7 +17,7 @@ from torchrefract.presets import paper_refractive, paper_weather
 from torchrefract.restoration.metrics import endpoint_error, masked_mean, psnr, ssim
 from torchrefract.restoration.tasks import Restored
 from torchrefract.types import Frame, Pair
-from torchrefract.warping.resample import warp
+from torchrefract.warping.warp import warp
 
 METRIC_SIZE = (1080, 1920)  # px, that the paper gives its endpoint errors at
 MIX = "all of the paper's"

@@ -7,7 +7,7 @@ parameters, and `effect.apply(image, params)`, which replays a draw. `warp`, `in
 flows, which are backward and in pixels: out(p) = image(p + flow(p)).
 """
 
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 from torchrefract.effects.compose import Compose, ComposeParams
 from torchrefract.effects.depth import DepthProvider, GroundPlaneDepth, LinearDepth
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams
@@ -31,10 +31,10 @@ from torchrefract.labels.maps import warp_depth, warp_mask, warp_optical_flow
 from torchrefract.labels.points import warp_points
 from torchrefract.labels.targets import warp_labels
 from torchrefract.types import Degraded, Folding, Frame, Pair
-from torchrefract.warping.compose import compose_flows
+from torchrefract.warping.flow import compose_flows
 from torchrefract.warping.invert import invert_flow
-from torchrefract.warping.jacobian import folding, jacobian_determinant
-from torchrefract.warping.resample import warp
+from torchrefract.warping.flow import folding, jacobian_determinant
+from torchrefract.warping.warp import warp
 
 __all__ = [
     "Camera",

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchrefract._tensor import to_float, to_uint8
-from torchrefract.cameras.distortion import POLYNOMIAL12
+from torchrefract.cameras.brown_conrady import POLYNOMIAL12
 from torchrefract.effects.air import Air
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
@@ -30,8 +30,8 @@ from torchrefract.viz import (
     transmission_to_rgb,
 )
 from torchrefract.warping.grid import length
-from torchrefract.warping.jacobian import folded
-from torchrefract.warping.resample import warp
+from torchrefract.warping.flow import folded
+from torchrefract.warping.warp import warp
 
 _COLUMNS = ("frame", "corrupted", "checkerboard", "map", "restored")
 _LARGEST = 480  # px, the longer side of an image as drawn

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import warp
-from torchrefract.cameras.distortion import ALL_TERMS, POLYNOMIAL12, Terms
+from torchrefract.cameras.brown_conrady import ALL_TERMS, POLYNOMIAL12, Terms
 from torchrefract.fields.lens import folds_inside, frame_limit, lens_flow, lens_restore_flow, smooth_lens_flow
 from torchrefract.warping.grid import inside
 

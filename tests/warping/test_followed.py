@@ -12,7 +12,7 @@ from torchrefract.warping.followed import FollowedFlow, followed, of_readings
 from torchrefract.warping.grid import sampler_grid
 from torchrefract.warping.lattice import Lattice, LatticeFlow
 from torchrefract.warping.mixed import dense
-from torchrefract.warping.resample import sample_image
+from torchrefract.warping.warp import sample_image
 
 SIZE = (131, 190)
 LINEAR: dict[str, Any] = {"padding": "border", "interpolation": "bilinear"}

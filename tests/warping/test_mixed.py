@@ -6,7 +6,7 @@ import torch
 from torchrefract import warp
 from torchrefract.warping.lattice import Lattice, LatticeFlow, StreamFlow
 from torchrefract.warping.mixed import Flow, MixedFlow, dense, flow_rows, grid_of, known
-from torchrefract.warping.resample import sample_image
+from torchrefract.warping.warp import sample_image
 
 HEIGHT, WIDTH = 33, 47
 

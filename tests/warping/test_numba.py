@@ -23,7 +23,7 @@ from torchrefract.warping.followed import FollowedFlow, followed
 from torchrefract.warping.grid import Positions, sampler_grid
 from torchrefract.warping.lattice import Lattice, LatticeFlow, StreamFlow
 from torchrefract.warping.mixed import Flow, MixedFlow
-from torchrefract.warping.resample import sample_image
+from torchrefract.warping.warp import sample_image
 
 SIZES = [(1, 1), (1, 7), (9, 1), (3, 4), (37, 53), (131, 127), (270, 481)]
 PADDINGS = ["zeros", "border", "reflection"]

@@ -20,7 +20,7 @@ from torchrefract.cameras.radial import (
     radial_factor,
     radial_factor_slope,
 )
-from torchrefract.warping.jacobian import Jacobian
+from torchrefract.warping.flow import Jacobian
 
 TANGENTIAL = ("p1", "p2")
 PRISM = ("s1", "s2", "s3", "s4")

@@ -34,7 +34,7 @@ from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io.opencv import read_opencv, write_opencv
 from torchrefract.cli.command import make, naming, progress
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, pixels_of, read_image
-from torchrefract.fields.rectifying import camera_flow
+from torchrefract.fields.rectification import camera_flow
 from torchrefract.footage import (
     check_apart,
     find_footage,
@@ -44,7 +44,7 @@ from torchrefract.footage import (
     write_picture,
     written_as,
 )
-from torchrefract.warping.resample import warp
+from torchrefract.warping.warp import warp
 
 _SYNTHETIC = "synthetic"
 _MIN_USABLE = MIN_VIEWS + 1  # views, so that each can be left out of the fit

@@ -21,7 +21,7 @@ from torchrefract._validation import (
     color_per_channel,
     finite_or,
 )
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import BatchShape, check_image, from_batch, params_to, per_sample, to_batch
 from torchrefract.effects.depth import DepthProvider, LinearDepth
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered

@@ -18,7 +18,7 @@ from torchrefract._validation import (
     check_values,
     check_within,
 )
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import params_to, per_sample
 from torchrefract.effects.depth import DepthProvider
 from torchrefract.effects.fog import (

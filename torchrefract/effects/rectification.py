@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import eager_bool
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import params_to
 from torchrefract.effects.lens import check_lens, lens_in_px
 from torchrefract.effects.warp_effect import WarpEffect

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor
-from torchrefract.cameras.distortion import POLYNOMIAL12, Terms, newton_iterates, used_terms
+from torchrefract.cameras.brown_conrady import POLYNOMIAL12, Terms, newton_iterates, used_terms
 from torchrefract.types import FlowBounds, Range, Simplification
 
 _SAFETY = 1.25
@@ -327,4 +327,4 @@ def _droppable(used: Sequence[bool], moved_px: Sequence[float], budget_px: float
 
 def _terms_with(kept: Sequence[int]) -> Terms:
     radial = max([0, *(i + 1 for i in kept if i < 6)])
-    return Terms(radial, any(i in (6, 7) for i in kept), any(i > 7 for i in kept), round=False)
+    return Terms(radial, any(i in (6, 7) for i in kept), any(i > 7 for i in kept))

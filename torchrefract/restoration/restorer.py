@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torchrefract._validation import check_choice, check_count
 from torchrefract.restoration.tasks import Restored
 from torchrefract.restoration.tiles import in_tiles
-from torchrefract.warping.resample import INTERPOLATIONS, warp
+from torchrefract.warping.warp import INTERPOLATIONS, warp
 from torchrefract.warping.resize import resize_flow, resize_image
 
 _RADIUS = 1  # px of the small picture, of the windows that tell how a change depends on it

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from torchrefract._validation import check_flow
 from torchrefract.warping.grid import field_dtype
-from torchrefract.warping.resample import sample_image
+from torchrefract.warping.warp import sample_image
 
 
 def compose_flows(first: Tensor, then: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from torch import Tensor
 
 from torchrefract._validation import eager_values
 from torchrefract.warping.grid import near_border, pixel_axes, sampler_grid_at
-from torchrefract.warping.resample import sampled, sampler_dtype
+from torchrefract.warping.warp import sampled, sampler_dtype
 
 
 def mixes_only(good: Tensor, flow: Tensor) -> Tensor:

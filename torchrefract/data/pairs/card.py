@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from torchrefract.cameras.distortion import POLYNOMIAL12
+from torchrefract.cameras.brown_conrady import POLYNOMIAL12
 from torchrefract.data.pairs.manifest import PairRow
 
 HISTOGRAMS = "parameters.png"

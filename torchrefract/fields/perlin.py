@@ -96,8 +96,11 @@ def perlin_noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
 
     Source: Perlin, "Improving noise", SIGGRAPH 2002.
     """
-    batch, height = octaves[0].y.shape
-    tables, indices, factors, row = list[Tensor](), list[Tensor](), list[Tensor](), 0
+    (batch, height), width = octaves[0].y.shape, octaves[0].x.shape[1]
+    tables: list[Tensor] = []
+    indices: list[Tensor] = []
+    factors: list[Tensor] = []
+    row = 0
     with torch.autocast(weights.device.type, enabled=False):  # it would round the products of matrices
         for octave, weight in zip(octaves, weights.unbind(1), strict=True):
             nodes = octave.gradient.shape[2]
@@ -109,7 +112,7 @@ def perlin_noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
             factors += [hat, hat * distance]
             row += 2 * nodes
         index = torch.cat(indices, dim=2) + row * torch.arange(batch, device=weights.device)[:, None, None]
-        lines = torch.cat(tables, dim=1).flatten(0, 1).index_select(0, index.flatten()).view(*index.shape, -1)
+        lines = torch.cat(tables, dim=1).flatten(0, 1).index_select(0, index.flatten()).view(*index.shape, width)
         noise = exact_matmul(torch.cat(factors, dim=2).mT, lines).flatten(1, 2)
     return noise[:, None, :height]
 

@@ -10,6 +10,7 @@ from torch.testing import assert_close
 from torchrefract import random
 from torchrefract.fields.fog_volume import (
     VARIANCE,
+    ExtinctionField,
     Rays,
     deviation_of_mean,
     extinction_on_planes,
@@ -54,8 +55,9 @@ def distances(samples: int, height: int, width: int, dtype: torch.dtype = torch.
 
 
 def mean_extinction(key: Tensor, distance: Tensor, **options: Any) -> Tensor:
-    options = {"scales": SCALES, "reach": REACH, "dtype": distance.dtype} | SMALL | options
-    return mean_extinction_along_rays(key, distance, **options)
+    options = {"scales": SCALES, "reach": REACH} | SMALL | options
+    field = ExtinctionField(key, *(options.pop(name) for name in ExtinctionField._fields[1:]))
+    return mean_extinction_along_rays(field, distance, **options)
 
 
 def mean_up_to(distance: float, key: Tensor | None = None, **options: Any) -> Tensor:
@@ -69,7 +71,7 @@ def extinction_at_camera(parameters: dict[str, Any]) -> Tensor:
     """Return q at the camera, (N,)."""
     key = keys(len(parameters["frame"]))
     options: dict[str, Any] = {"scales": SCALES, "reach": 1e-3, "dtype": torch.float64}
-    return 1 + extinction_on_planes(key, ONE_RAY, **parameters, **options)[:, 0, 0, 0]
+    return 1 + extinction_on_planes(ExtinctionField(key, **parameters), ONE_RAY, **options)[:, 0, 0, 0]
 
 
 def correlation_of(first: Tensor, second: Tensor) -> float:
@@ -292,7 +294,7 @@ def test_float32_is_as_exact_at_late_frames_as_at_first():
     for frame in (0.0, 1e5):
         parameters["frame"] = torch.full((1,), frame).double()
         double, single = (
-            mean_extinction(keys(1), distance, **parameters, dtype=t) for t in (torch.float64, torch.float32)
+            mean_extinction(keys(1), distance.to(t), **parameters) for t in (torch.float64, torch.float32)
         )
         assert_close(single.double(), double, rtol=0, atol=1e-4)
 

@@ -216,8 +216,8 @@ def test_gradients_of_weights_gradients_and_positions_match_finite_differences()
     x = torch.tensor([[0.0, 0.4, 1.0, 1.7], [0.2, 0.9, 1.1, 2.0]], dtype=torch.float64)
     y = torch.tensor([[0.1, 0.8, 1.3], [1.0, 1.5, 1.9]], dtype=torch.float64)
 
-    def noise(weights: Tensor, *parts: Tensor) -> Tensor:
-        return perlin_noise([Octave(*parts, 1.0)], weights)
+    def noise(weights: Tensor, gradient: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        return perlin_noise([Octave(gradient, x, y, 1.0)], weights)
 
     inputs = (weights, unit_gradients(2, 3, 3, seed=3), x, y)
     assert torch.autograd.gradcheck(noise, [value.requires_grad_() for value in inputs])
@@ -245,8 +245,11 @@ def test_one_graph_vmap_and_autocast_give_the_same_noise():
     expected = moving_noise(*arguments)
     compiled = torch.compile(moving_noise, fullgraph=True, backend="aot_eager")
     assert_close(compiled(*arguments), expected, rtol=0, atol=1e-5)
-    mapped = torch.func.vmap(lambda *sample: moving_noise(*(value[None] for value in sample))[0])
-    assert_close(mapped(*arguments), expected, rtol=0, atol=1e-5)
+
+    def noise_of_sample(*sample: Tensor) -> Tensor:
+        return moving_noise(*(value[None] for value in sample))[0]
+
+    assert_close(torch.func.vmap(noise_of_sample)(*arguments), expected, rtol=0, atol=1e-5)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert torch.equal(moving_noise(*arguments), expected)
 

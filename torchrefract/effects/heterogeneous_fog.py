@@ -38,7 +38,7 @@ from torchrefract.effects.motion import (
     motion_ranges,
 )
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
-from torchrefract.fields.fog_volume import mean_extinction_along_rays
+from torchrefract.fields.fog_volume import ExtinctionField, mean_extinction_along_rays
 from torchrefract.fields.heterogeneous_fog import (
     image_noise,
     normalize_weights,
@@ -279,20 +279,14 @@ class HeterogeneousFog(PhotometricEffect):
             return relative_extinction(q, mean=None if self.mean == "image" else 0.5)
         focal, center = self.medium.pinhole(height, width)
         q = mean_extinction_along_rays(
-            key,
+            ExtinctionField(key, weights, contrast.to(dtype), frame, wind, decorrelation),
             distance,
             height=height,
             width=width,
             focal=focal,
             center=center,
             scales=self.scales,
-            weights=weights,
-            contrast=contrast.to(dtype),
-            frame=frame,
-            wind=wind,
-            decorrelation=decorrelation,
             reach=self.reach,
-            dtype=dtype,
         )
         return relative_extinction(q, mean=None if self.mean == "image" else 1.0)
 

@@ -84,7 +84,7 @@ def draw_octave(
             position = position - before + 2 * pixel
         axes.append(position)
     angle = 2 * math.pi * _turns(key, nodes, frame=frame, decorrelation=decorrelation, dtype=dtype).mT
-    return Octave(torch.stack([angle.cos(), angle.sin()], dim=1), *axes, min(step, 2.0))
+    return Octave(torch.stack([angle.cos(), angle.sin()], dim=1), axes[0], axes[1], min(step, 2.0))
 
 
 def perlin_noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:

@@ -205,7 +205,7 @@ def test_near_fog_moves_faster_than_far_fog():
         "mean": "ensemble",
     }
     effect = HeterogeneousFog(mode="ray", wind_x_range=(0.5, 0.5), **motionless)
-    # A pinhole of 0.9 widths, 144 px here: 0.5 m per frame are 72 px m / distance.
+    # A pinhole of 0.9 widths, 144 px: 0.5 m per frame are 72 px m / distance.
     near, far = shift_per_frame_px(layer(effect, 14.0, 18.0, 9)), shift_per_frame_px(layer(effect, 110.0, 125.0, 41))
     for px_per_frame, distance in ((near, 16.0), (far, 117.5)):
         assert px_per_frame * distance / 72 == pytest.approx(1, abs=0.15)

@@ -217,7 +217,7 @@ def test_check_depth_accepts_unusual_depths_in_meters():
 
 def test_a_map_is_normalized_only_if_all_values_lie_in_the_unit_range():
     depth = random_in(0.0, 1.0, 1, 1, 700, 900)
-    depth[0, 0, 1, 1] = 1.5  # between the rows and columns that are looked at first
+    depth[0, 0, 1, 1] = 1.5  # between the rows and columns that are tested first
     check_depth(depth)
     depth[0, 0, 1, 1] = 0.5
     low, high = depth.amin().item(), depth.amax().item()

@@ -226,10 +226,8 @@ class HeterogeneousFog(PhotometricEffect):
         """Plan frames for the depth of the effect or, with `has_depth`, for any depth."""
         size = (request.height, request.width)
         span = self.medium.extinction_range(self.visibility_range, self.deviation_range)
-        model = self.medium.error_model(
-            span,
-            *size,
-            has_depth=has_depth,
+        model = replace(
+            self.medium.error_model(span, *size, has_depth=has_depth),
             mean_over_frame=self.mean == "image",
             periods=self._periods(*size) if self.mode == "image" else (),
             weights=self._unit_weights(),

@@ -53,7 +53,7 @@ def blend_fog(image: Tensor, t: Tensor, airlight: Tensor, *, linear_light: bool 
 
 
 def unblend_fog(image: Tensor, t: Tensor, airlight: Tensor, *, linear_light: bool = False) -> Tensor:
-    """Return A + (I - A) / t, the inverse of `blend_fog` for t above 0; arguments as there."""
+    """Return A + (I - A) / t, the inverse of `blend_fog` with the same arguments, for t above 0."""
     if linear_light:
         return linear_to_srgb(torch.lerp(srgb_to_linear(airlight), srgb_to_linear(image), 1 / t))
     return torch.lerp(airlight, image, 1 / t)

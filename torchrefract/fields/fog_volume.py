@@ -286,7 +286,7 @@ def _weights(position: Tensor, nodes: int, dtype: torch.dtype) -> tuple[Tensor, 
 def _gradients(
     key: Tensor, first: Tensor, nodes: Sequence[Sequence[int]], turns: Tensor, *, dtype: torch.dtype
 ) -> list[list[Tensor]]:
-    """Of each octave the three components at a box of nodes, (N, nodes along z, along y, along x)."""
+    """The three components of each octave at a box of nodes, (N, nodes along z, along y, along x)."""
     numbers = []
     for i, counts in enumerate(nodes):
         x, y, z = (first[:, i, axis, None] + torch.arange(n, device=key.device) for axis, n in enumerate(counts))

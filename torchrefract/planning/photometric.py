@@ -68,7 +68,7 @@ class PhotometricRequest:
 
 @dataclass(frozen=True)
 class PhotometricPlan:
-    """How a photometric effect is computed for frames of one size.
+    """The computation of a photometric effect for frames of one size.
 
     height, width: px, of the frame.
     tolerance: largest error of the image that was requested, levels of 1/255; None is exact.

@@ -28,7 +28,7 @@ def transmission(depth: Tensor, k: Tensor) -> Tensor:
         k: 1/m, broadcasts with the depth.
     """
     # An infinite depth times an extinction of 0 would be NaN, and so would be the gradient of an infinite product.
-    return torch.exp(k * -depth.clamp(max=_FARTHEST))
+    return (k * -depth.clamp(max=_FARTHEST)).exp_()
 
 
 def blend_fog(image: Tensor, t: Tensor, airlight: Tensor, *, linear_light: bool = False) -> Tensor:

@@ -372,8 +372,8 @@ def _interpolate_rows(view: View, volume: Tensor, distance: Tensor, reach: float
     row = torch.stack([lines[index + step] * weight[..., None] for step, weight in corners]).sum(dim=0)
     x, dx = _positions(view.width, view.cell, view.across, volume)
     finer = _cubic_weights(view.across, volume)
-    mean = exact_matmul(row, torch.lerp(finer[x], finer[x + 1], dx[:, None]).T) + 1
-    return mean.relu().unsqueeze(1)  # cubics overshoot where the contrast is high
+    mean = exact_matmul(row, torch.lerp(finer[x], finer[x + 1], dx[:, None]).T).add_(1)
+    return mean.relu_().unsqueeze(1)  # cubics overshoot where the contrast is high
 
 
 def _interpolate_pixels(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:

@@ -8,7 +8,8 @@ import onnxruntime
 import pytest
 import torch
 
-from torchrefract import programs, warp
+from torchrefract import warp
+from torchrefract.restoration import export as programs
 from torchrefract.restoration import loading
 
 SIZE = (40, 72)  # of frames, of other sides than those that the model sees

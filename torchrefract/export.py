@@ -11,10 +11,10 @@ from omegaconf import DictConfig
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_choice
 from torchrefract.cli.command import as_they_are, command, job, naming
-from torchrefract.programs import FORMATS, outputs_of, save_program, traced
+from torchrefract.restoration.export import FORMATS, outputs_of, save_program, traced
+from torchrefract.restoration.inference import Restoring
 from torchrefract.restoration.loading import Loaded, load_model
 from torchrefract.restoration.module import Restoration
-from torchrefract.restoration.restorer import Restoring
 
 _BARS = {"restored": 1e-3, "flow": 1e-2}  # of the range of an image, and px
 

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from torchrefract.restoration.models.coordinates import Located
+from torchrefract.restoration.models.coordconv import Located
 from torchrefract.restoration.models.pretrained import find_weights, weights_license
 from torchrefract.restoration.models.resunet import ResUNet
 from torchrefract.restoration.models.segformer import SegFormer

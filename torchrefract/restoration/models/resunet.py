@@ -2,7 +2,7 @@
 
 import segmentation_models_pytorch as smp
 
-from torchrefract.restoration.models.coordinates import Located
+from torchrefract.restoration.models.coordconv import Located
 
 
 class ResUNet(Located):

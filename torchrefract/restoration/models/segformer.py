@@ -4,7 +4,7 @@ from functools import partial
 
 import segmentation_models_pytorch as smp
 
-from torchrefract.restoration.models.coordinates import Located
+from torchrefract.restoration.models.coordconv import Located
 
 
 class SegFormer(Located):

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 from torchrefract import warp
-from torchrefract.restoration.restorer import Restorer, Restoring, with_change
+from torchrefract.restoration.inference import Restorer, Restoring, with_change
 from torchrefract.restoration.tasks import Restored
 
 

@@ -6,7 +6,7 @@ import torch
 from numpy.polynomial import Chebyshev
 from torch.testing import assert_close
 
-from torchrefract.restoration.models.coordinates import Located
+from torchrefract.restoration.models.coordconv import Located
 from torchrefract.restoration.models.resunet import ResUNet
 from torchrefract.restoration.models.segformer import SegFormer
 

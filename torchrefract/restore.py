@@ -1,6 +1,20 @@
 """Restore pictures and videos: `python -m torchrefract.restore ckpt_path=<run>/best.ckpt input=DIR out=DIR`."""
 
-from torchrefract.cli.restoration import main
+import hydra
+from omegaconf import DictConfig
+
+from torchrefract._io import CONFIG_DIR
+from torchrefract.cli.command import as_they_are, command, job
+from torchrefract.cli.restoration import restore
+
+
+@command("restore", prepare=as_they_are)
+@hydra.main(config_path=CONFIG_DIR, config_name="restore", version_base="1.3")
+@job
+def main(cfg: DictConfig) -> None:
+    """Restore all pictures and videos of a folder."""
+    restore(cfg)
+
 
 if __name__ == "__main__":
     main()

@@ -251,7 +251,7 @@ def _score_model(
         if is_sampled:
             model.steps = steps
         by_effect = {
-            name: score((_call(model, pair.degraded) for pair in some), some) for name, some in batches.items()
+            name: score((_call(model, pair.degraded) for pair in chosen), chosen) for name, chosen in batches.items()
         }
         call = partial(_call_and_wait, model, first[0].degraded[:1])
         milliseconds = 1e3 * median(seconds(call, before=i == 0) for i in range(3))

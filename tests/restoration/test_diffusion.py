@@ -311,7 +311,7 @@ def test_a_nan_loss_stops_the_training_and_names_the_keys(trainer, pairs, loader
     ("options", "message"),
     [
         ({"steps": 0}, "steps must be at least 1, got 0"),
-        ({"steps": 1001}, "steps must be at most the 1000 levels of noise of the training, got 1001"),
+        ({"steps": 1001}, "steps must be at most the 1000 noise levels of the training, got 1001"),
         ({"val_steps": 0}, "val_steps must be at least 1, got 0"),
         ({"sampler": "euler"}, "sampler must be one of ddpm, ddim, dpm_solver, got 'euler'"),
         ({"prediction": "flow"}, "prediction must be one of v_prediction, epsilon, got 'flow'"),

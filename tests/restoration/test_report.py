@@ -105,7 +105,7 @@ def test_metrics_without_a_value_are_rejected_and_the_old_picture_stays(metrics,
     metrics.write_text(text)
     out = metrics.with_name("curves.png")
     out.write_text("old")
-    with pytest.raises(ValueError, match="metrics must hold a loss, psnr or epe of some epoch"):
+    with pytest.raises(ValueError, match="metrics must hold a loss, psnr or epe of an epoch"):
         save_curves(metrics.parent, out)
     assert out.read_text() == "old"
 

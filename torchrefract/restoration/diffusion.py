@@ -293,7 +293,7 @@ def noise_levels() -> DDPMScheduler:
 def check_steps(name: str, steps: int) -> int:
     """Return `steps` if it is from 1 to 1000."""
     if check_count(name, steps) > NUM_LEVELS:
-        raise ValueError(f"{name} must be at most the {NUM_LEVELS} levels of noise of the training, got {steps}")
+        raise ValueError(f"{name} must be at most the {NUM_LEVELS} noise levels of the training, got {steps}")
     return steps
 
 

@@ -37,6 +37,8 @@ def export_model(loaded: Loaded, out: Path, *, size: tuple[int, int], interpolat
     Raises:
         UsageError: a package is missing, ONNX has no operator for the model, or the file disagrees with the model.
     """
+    if out.suffix == ".onnx":
+        _import("onnxscript")  # fail before the trace, which takes longer
     height, width = size
     network = FullSizeModel(loaded.model, size=loaded.size, interpolation=interpolation).eval()
     images = torch.rand(2, 3, height, width, generator=torch.Generator().manual_seed(0))
@@ -69,7 +71,6 @@ def save_program(program: torch.export.ExportedProgram, path: Path, *, metadata:
     if path.suffix == ".pt2":
         torch.export.save(program, path, extra_files={METADATA: text})
         return
-    _import("onnxscript")
     logging.getLogger("onnxscript").setLevel(logging.ERROR)  # it warns of operators that it does not optimize
     logging.getLogger("onnx_ir").setLevel(logging.WARNING)
     outputs = list(metadata["outputs"]) if isinstance(metadata["outputs"], list) else []

@@ -162,7 +162,7 @@ def plot_curves(run: Path, *, epe_unit: str) -> Figure:
     columns = _read_columns(run, [style.column.format(quantity) for quantity in units for style in _STYLES])
     shown = {q: unit for q, unit in units.items() if any(style.column.format(q) in columns for style in _STYLES)}
     if not shown:
-        raise ValueError(f"metrics must hold a loss, psnr or epe of some epoch, got none in {run}")
+        raise ValueError(f"metrics must hold a loss, psnr or epe of an epoch, got none in {run}")
     figure = Figure(figsize=(4.8 * len(shown), 4.4), dpi=120, layout=ConstrainedLayoutEngine(w_pad=0.12))
     for axes, (quantity, unit) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
         for style in _STYLES:

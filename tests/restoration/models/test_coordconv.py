@@ -135,7 +135,7 @@ def test_segformer_returns_the_values_of_its_cells_without_enlarging_them():
 @pytest.mark.quick
 @pytest.mark.parametrize("encoder", ["nonsense", "tu-nonsense"])
 def test_an_unknown_encoder_is_named(encoder):
-    with pytest.raises(ValueError, match=f"encoder must be known to .*, got {encoder}"):
+    with pytest.raises(ValueError, match=f"encoder must be a name of .*, got {encoder}"):
         ResUNet(2, encoder=encoder)
 
 

@@ -160,7 +160,7 @@ def test_damaged_weights_are_rejected(tmp_path, encoder):
     folder = write_weights(tmp_path / "weights", encoder)
     tensors = folder / "model.safetensors"
     tensors.write_bytes(tensors.read_bytes()[:5000])
-    with pytest.raises(ValueError, match=f"pretrained must hold whole weights of {encoder}, got "):
+    with pytest.raises(ValueError, match=f"pretrained must hold intact weights of {encoder}, got "):
         KINDS[encoder](2, encoder=encoder, pretrained=str(folder))
 
 

@@ -77,10 +77,10 @@ def load_network(architecture: Callable[..., Any], encoder: str, weights: Weight
             network.encoder.load_state_dict(load_file(weights.file))
     except _LOAD_ERRORS as error:
         if weights is not None:
-            raise ValueError(f"pretrained must hold whole weights of {encoder}, got {weights.file}") from error
+            raise ValueError(f"pretrained must hold intact weights of {encoder}, got {weights.file}") from error
         raise ValueError(
-            "encoder must be known to segmentation-models-pytorch, or to timm with tu- in front, and have features "
-            f"at five scales, got {encoder}"
+            "encoder must be a name of segmentation-models-pytorch, or tu- and a name of timm, with features at five "
+            f"scales, got {encoder}"
         ) from error
     return network
 

@@ -20,6 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from torchrefract.fields.rectifying import camera_flow
 
 from torchrefract._io import replace_file
 from torchrefract._tensor import to_float, to_uint8
@@ -31,8 +32,7 @@ from torchrefract.cameras.calibration.fit import Fit, fit, held_out, rms
 from torchrefract.cameras.calibration.outliers import drop_outliers
 from torchrefract.cameras.calibration.straightness import straightness
 from torchrefract.cameras.models import Camera
-from torchrefract.fields.rectifying import camera_flow
-from torchrefract.warping.resample import warp
+from torchrefract.warping.warp import warp
 
 _SAG = 0.01  # of the width of the frame
 _STILL = 0.7  # of the corners

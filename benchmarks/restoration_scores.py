@@ -5,11 +5,11 @@ from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
+from torchrefract.effects.defog import remove_fog
 
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract.data.module import make_pair
 from torchrefract.effects.base import Effect
-from torchrefract.effects.defog import remove_fog
 from torchrefract.effects.flare import LensFlare
 from torchrefract.effects.lens import LensDistortion
 from torchrefract.effects.one_of import OneOf
@@ -17,7 +17,7 @@ from torchrefract.presets import paper_refractive, paper_weather
 from torchrefract.restoration.metrics import endpoint_error, masked_mean, psnr, ssim
 from torchrefract.restoration.tasks import Restored
 from torchrefract.types import Frame, Pair
-from torchrefract.warping.resample import warp
+from torchrefract.warping.warp import warp
 
 METRIC_SIZE = (1080, 1920)  # px, that the paper gives its endpoint errors at
 MIX = "all of the paper's"

@@ -14,7 +14,7 @@ import torchrefract as tr
 from torchrefract.page import as_drawn
 from torchrefract.sheet import Scale, SheetRow, drawn, make_row, sheet
 from torchrefract.viz import checkerboard, flow_to_rgb, flow_wheel, transmission_to_rgb
-from torchrefract.warping.jacobian import folded
+from torchrefract.warping.flow import folded
 
 SIZE = (32, 40)  # drawn with 8 x 8 px for each
 SWIRL = tr.DivergenceFree(amplitude_range=(1.0, 1.0), length_range=(12.0, 12.0))

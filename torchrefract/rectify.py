@@ -25,7 +25,7 @@ from torchrefract.footage import (
     write_picture,
     written_as,
 )
-from torchrefract.warping.resample import warp
+from torchrefract.warping.warp import warp
 
 
 @command("rectify", prepare=as_they_are)

@@ -29,9 +29,9 @@ from torchrefract.viz import (
     rounded_up,
     transmission_to_rgb,
 )
+from torchrefract.warping.flow import folded
 from torchrefract.warping.grid import length
-from torchrefract.warping.jacobian import folded
-from torchrefract.warping.resample import warp
+from torchrefract.warping.warp import warp
 
 _COLUMNS = ("frame", "corrupted", "checkerboard", "map", "restored")
 _LARGEST = 480  # px, the longer side of an image as drawn

@@ -13,7 +13,7 @@ import torchrefract as tr
 from torchrefract.effects.base import Effect
 from torchrefract.fields.covariance import COVARIANCES
 from torchrefract.types import Range
-from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS
+from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS
 
 WARNED = pytest.mark.filterwarnings(
     "ignore:.*folds back inside the frame:UserWarning",  # of a rectification; test_rectification.py holds it

@@ -17,7 +17,7 @@ from torch import Tensor
 import torchrefract as tr
 from torchrefract.effects.base import Effect
 from torchrefract.effects.refraction import WarpEffect
-from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS
+from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS
 
 Case = tuple[str, Callable[[], None]]
 

@@ -16,7 +16,7 @@ from torch.testing import assert_close
 
 import torchrefract as tr
 from torchrefract.effects.refraction import WarpEffect
-from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS
+from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 SIZES = [(1, 1), (1, 37), (31, 1), (23, 29), (40, 64)]

@@ -2,11 +2,11 @@ import math
 
 import pytest
 import torch
-
-from torchrefract.fields.covariance import COVARIANCES, as_gaussians, covariance
 from torchrefract.fields.field_bounds import FieldRanges, FieldSpectrum, error_of_cubics, field_spectrum
 from torchrefract.fields.gaussian import spectrum
-from torchrefract.warping.lattice import lagrange_weights
+
+from torchrefract.fields.covariance import COVARIANCES, as_gaussians, covariance
+from torchrefract.ops.cubic import lagrange_weights
 
 SIZE = (512, 640)
 CASES = [("exponential", 20.0, 2.0), ("exponential", 40.0, 4.0), ("matern32", 12.0, 2.5), ("matern52", 25.0, 6.0)]
@@ -66,7 +66,7 @@ def test_derivatives_are_as_large_as_stated(kind, length, aperture):
 @pytest.mark.parametrize(("kind", "length", "aperture"), CASES)
 def test_cubics_between_nodes_are_as_far_off_as_stated(kind, length, aperture, stride):
     own, (y, x) = power(kind, length, aperture), frequencies()
-    weights = lagrange_weights(stride, 4, dtype=torch.float64, device=torch.device("cpu"))
+    weights = lagrange_weights(stride, dtype=torch.float64, device=torch.device("cpu"))
     nodes = stride * torch.arange(-1, 3, dtype=torch.float64)
 
     def transfer(place: int, k: torch.Tensor) -> torch.Tensor:

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from torchrefract import invert_flow, warp
 from torchrefract.warping import invert
 from torchrefract.warping.grid import inside
-from torchrefract.warping.resample import sampled
+from torchrefract.warping.warp import sampled
 
 SIZE = (80, 110)
 

@@ -7,7 +7,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchrefract.warping.grid import inside, pixel_axes, sampler_grid
 from torchrefract.warping.invert import invert_flow
-from torchrefract.warping.masks import mixes_only
+from torchrefract.warping.warp import mixes_only
 
 SIZES = [(1, 1), (3, 40), (37, 53), (96, 128)]
 

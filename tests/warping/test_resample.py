@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import warp
-from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS
+from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS
 
 # Large enough for a reach of 4 px: beyond 1.5 sizes from its center a frame is not reflected any further.
 SIZES = [(1, 1), (1, 7), (9, 1), (3, 4), (37, 53)]

@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract.warping.resize import resize_flow, resize_image
+from torchrefract.warping.flow import resize_flow, resize_image
 
 SIZES = [(1, 1), (7, 9), (20, 24), (57, 61), (20, 5)]
 

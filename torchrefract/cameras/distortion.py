@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrefract._validation import eager_bool, eager_values
 from torchrefract.cameras.radial import RadialLimit, radial, radial_slope
-from torchrefract.warping.jacobian import Jacobian
+from torchrefract.warping.flow import Jacobian
 
 POLYNOMIAL12 = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
 _SMALLEST_RADIAL = 0.1  # of a first guess

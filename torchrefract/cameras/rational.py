@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrefract.cameras.distortion import ALL_TERMS, bent, bent_slopes, newton_radius
 from torchrefract.cameras.growth import first_root, growth_of_ratio
 from torchrefract.cameras.radial import limit_of_curve, radial, radial_slope, reach_of
-from torchrefract.warping.jacobian import Jacobian
+from torchrefract.warping.flow import Jacobian
 
 OPENCV_COUNTS = (4, 5, 8, 12, 14)
 _STEPS = 8  # of Newton's method in the plane; a lens that is far from round needs more than the 5 of most

@@ -9,7 +9,6 @@ from pytorch_lightning import LightningModule, Trainer, seed_everything
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
 from torchrefract._io import replace_file
-from torchrefract._memory import keep_freed_memory
 from torchrefract._validation import UsageError
 from torchrefract.cli.command import check_seed, make, naming
 from torchrefract.data.fingerprint import fingerprint
@@ -29,7 +28,6 @@ class Job(NamedTuple):
 def make_job(cfg: DictConfig, *, needs_checkpoint: bool = False) -> Job:
     """Data, model and trainer of a configuration, the checkpoint checked, the resolved configuration written."""
     OmegaConf.resolve(cfg)
-    keep_freed_memory()  # before the loader forks its workers, which degrade frames
     seed_everything(check_seed(cfg.seed), workers=True, verbose=False)
     if needs_checkpoint and cfg.ckpt_path is None:
         raise UsageError("ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none")

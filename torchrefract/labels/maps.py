@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from torchrefract._validation import check_choice, check_flag, check_flow, check_number, check_tensor
-from torchrefract.warping.compose import compose_flows
+from torchrefract.warping.flow import compose_flows
 from torchrefract.warping.grid import field_dtype, inside
-from torchrefract.warping.resample import sample_image
+from torchrefract.warping.warp import sample_image
 
 
 def warp_mask(mask: Tensor, flow: Tensor, *, fill: float = 0, soft: bool = False) -> Tensor:

@@ -19,7 +19,7 @@ from torchrefract._validation import check_choice, check_flag, check_tensor, eag
 from torchrefract.labels.boxes import check_box_limits, warp_boxes, warp_outlines
 from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.points import STEPS, TOLERANCE_PX, check_coordinates, in_frame, solve_points
-from torchrefract.warping.resample import INTERPOLATIONS, PADDINGS, warp
+from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS, warp
 
 # Values without a position in the image, which pass unchanged.
 _PLAIN = (

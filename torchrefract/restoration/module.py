@@ -15,7 +15,7 @@ from torchrefract.restoration.metrics import endpoint_error, psnr, ssim
 from torchrefract.restoration.schedules import SCHEDULES, schedule
 from torchrefract.restoration.tasks import Restored, Task
 from torchrefract.types import Pair
-from torchrefract.warping.resample import warp
+from torchrefract.warping.warp import warp
 
 _NOTHING: tuple[Tensor, ...] = (torch.zeros(0), torch.zeros(0))
 

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torchrefract._validation import check_choice, check_count
 from torchrefract.restoration.tasks import Restored
 from torchrefract.restoration.tiles import in_tiles
-from torchrefract.warping.resample import INTERPOLATIONS, warp
-from torchrefract.warping.resize import resize_flow, resize_image
+from torchrefract.warping.flow import resize_flow, resize_image
+from torchrefract.warping.warp import INTERPOLATIONS, warp
 
 _RADIUS = 1  # px of the small picture, of the windows that tell how a change depends on it
 _NOISE = 1e-5  # variance below which a window tells nothing: that of rounding to bytes

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torchrefract._tensor import as_device_tensor
 from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
 from torchrefract.types import Pair
-from torchrefract.warping.resample import warp
+from torchrefract.warping.warp import warp
 
 _MU = 100.0
 

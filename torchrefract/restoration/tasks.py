@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrefract._validation import check_flag
 from torchrefract.restoration.metrics import masked_mean
 from torchrefract.types import Pair
-from torchrefract.warping.resample import warp
+from torchrefract.warping.warp import warp
 
 _CELL = 4
 

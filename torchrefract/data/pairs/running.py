@@ -13,7 +13,6 @@ from multiprocessing.context import BaseContext
 import cv2
 import torch
 
-from torchrefract._memory import keep_freed_memory
 from torchrefract._validation import UsageError
 from torchrefract.data.pair_manifest import PairRow
 from torchrefract.data.pairs.making import Job, Maker, Recipe
@@ -111,7 +110,6 @@ def work_alone() -> None:
     """Make pairs as fast as one thread can: as many workers as cores leave nothing for more."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    keep_freed_memory()
 
 
 def _end_with_parent() -> None:

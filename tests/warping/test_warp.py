@@ -342,7 +342,7 @@ def test_bicubic_gradients_are_those_of_finite_differences():
 @pytest.mark.parametrize(
     ("image", "flow", "rule"),
     [
-        ((3, 8, 9), (1, 2, 8, 9), r"image must have shape \(B, C, H, W\) beside a batched flow"),
+        ((3, 8, 9), (1, 2, 8, 9), r"image must have shape \(B, C, H, W\) with a batched flow"),
         ((1, 3, 8, 9), (2, 8, 9), r"flow must have shape \(B, 2, H, W\)"),
         ((1, 3, 8, 9), (1, 3, 8, 9), r"flow must have shape \(B, 2, H, W\)"),
         ((1, 3, 8, 9), (1, 2, 9, 8), "flow must have the batch and the size of the image"),

@@ -37,7 +37,7 @@ def field_dtype(dtype: torch.dtype) -> torch.dtype:
 
 
 def pixel_axes(height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return the pixel centers, px: x, (1, 1, 1, W), and y, (1, 1, H, 1), whole numbers."""
+    """Return the pixel centers, px: x, (1, 1, 1, W), and y, (1, 1, H, 1), integers in a floating type."""
     x = torch.arange(width, dtype=dtype, device=device).view(1, 1, 1, width)
     return x, torch.arange(height, dtype=dtype, device=device).view(1, 1, height, 1)
 

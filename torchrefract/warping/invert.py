@@ -102,7 +102,7 @@ def _solve_band(
     is_eager: bool,
     is_upright: bool | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Solve for some rows of a frame.
+    """Solve for a band of rows of a frame.
 
     flow, gradient: of the frame. x, y: pixel centers of the rows, in the coordinates of F.grid_sample. first_error,
     first_gradient: flow and gradient in these rows. is_upright: True if no determinant is small.

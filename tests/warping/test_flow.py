@@ -193,12 +193,6 @@ def test_resized_flows_agree_with_the_cubics_of_torch(waves, pixels, oracle):
     oracle("resized flow, torch's cubics", resize_flow(flow, (57, 61))[inner], expected[inner], 1e-12)
 
 
-def test_a_flow_of_one_pixel_is_repeated():
-    flow = torch.tensor([2.0, -3.0]).view(1, 2, 1, 1)
-    expected = torch.tensor([10.0, -9.0]).view(1, 2, 1, 1).expand(1, 2, 3, 5)
-    assert torch.equal(resize_flow(flow, (3, 5)), expected)
-
-
 def test_gradients_of_resized_flows_are_those_of_finite_differences(waves, pixels):
     flow = waves(*pixels(4, 5), 1.0, 2.0).requires_grad_()
     assert torch.autograd.gradcheck(lambda value: resize_flow(value, (6, 3)), (flow,))

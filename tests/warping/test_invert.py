@@ -89,15 +89,6 @@ def test_a_pixel_is_valid_if_its_residual_is_within_the_tolerance(pixels, waves)
     assert tight.sum() < loose.sum()
 
 
-def test_float32_is_as_exact_as_the_interpolation(pixels, waves):
-    x, y = pixels(*SIZE)
-    flow = waves(x, y, 5.0, 40.0)
-    inverse, valid, _ = invert_flow(flow.float())
-    exact = solve_waves(waves, x, y, 5.0, 40.0)
-    assert inverse.dtype == torch.float32
-    assert (inverse - exact).norm(dim=1, keepdim=True)[valid].max() <= 2e-3
-
-
 def test_a_warp_and_its_inverse_restore_the_image(pixels, waves):
     x, y = pixels(*SIZE)
     image = waves(x, y, 0.5, 10.0)
@@ -177,11 +168,13 @@ def test_inverse_and_residual_of_huge_flows_are_finite(amplitude_px):
 @pytest.mark.parametrize("way", ["vmap", "compile"])
 def test_vmap_and_compiled_graphs_give_the_same_inverse(pixels, waves, way):
     flow = torch.cat([waves(*pixels(48, 64), amplitude_px, 12.0) for amplitude_px in (0.5, 3.0, 8.0)]).float()
-    expected, valid, _ = invert_flow(flow)
+    expected, valid, _ = invert_flow(flow, steps=4)
     if way == "vmap":
-        result, result_valid, _ = torch.vmap(lambda one: tuple(value[0] for value in invert_flow(one[None])))(flow)
+        result, result_valid, _ = torch.vmap(
+            lambda sample: tuple(value[0] for value in invert_flow(sample[None], steps=4))
+        )(flow)
     else:
-        result, result_valid, _ = torch.compile(invert_flow, fullgraph=True, backend="aot_eager")(flow)
+        result, result_valid, _ = torch.compile(invert_flow, fullgraph=True, backend="aot_eager")(flow, steps=4)
     both = valid & result_valid
     # The last flow folds, and either solver may find another solution there.
     assert torch.equal(valid[:2], result_valid[:2])
@@ -196,16 +189,6 @@ def test_a_sample_does_not_depend_on_its_batch(pixels, waves):
     for i, sample in enumerate(flow.split(1)):
         for value, alone in zip(together, invert_flow(sample), strict=True):
             assert torch.equal(value[i : i + 1], alone)
-
-
-@pytest.mark.parametrize("amplitude_px", [0.5, 8.0])  # the last one folds
-def test_memory_formats_give_the_same_inverse(pixels, waves, amplitude_px):
-    flow = waves(*pixels(200, 300), amplitude_px, 12.0).float()
-    expected = invert_flow(flow)
-    wider = torch.cat([flow, flow], dim=3)[..., :300]
-    for same in (flow.contiguous(memory_format=torch.channels_last), wider):
-        for value, other in zip(invert_flow(same), expected, strict=True):
-            assert torch.equal(value, other)
 
 
 def test_gradients_through_an_affine_flow_are_those_of_finite_differences(pixels):

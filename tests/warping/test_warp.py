@@ -15,7 +15,7 @@ from torch.testing import assert_close
 from torchrefract import warp
 from torchrefract.warping.grid import inside, pixel_axes
 from torchrefract.warping.lattice import Lattice, LatticeFlow
-from torchrefract.warping.warp import BACKENDS, INTERPOLATIONS, PADDINGS, sample_image, sees_only_valid
+from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS, sample_image, sees_only_valid
 
 # The flow reaches 4 px. Positions beyond 1.5 frames from the center are not reflected any further.
 SIZES = [(1, 1), (1, 7), (9, 1), (3, 4), (37, 53)]
@@ -434,13 +434,3 @@ def test_a_lattice_flow_warps_like_its_dense_flow(backend, dtype):
     result, expected = sample_image(image, flow, **options), sample_image(image, flow.dense(), **options)
     difference = (result.double() - expected.double()).abs().max()
     assert difference <= (1 if dtype is torch.uint8 else 1e-4)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_every_backend_is_a_choice_of_warp(backend):
-    image, flow = noise(1, 1, 8, 9).float(), random_flow(1, 8, 9).float()
-    if backend == "triton":
-        with pytest.raises(ValueError, match="backend='triton' supports"):
-            warp(image, flow, backend=backend)
-        return
-    assert_close(warp(image, flow, backend=backend)[0], warp(image, flow)[0], rtol=0, atol=1e-5)

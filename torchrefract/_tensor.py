@@ -101,13 +101,6 @@ def scatter_batch(parts: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
     return result
 
 
-def by_samples(values: Tensor, work: Callable[[Tensor], Tensor]) -> Tensor:
-    """Apply `work` to each sample of (B, ...) alone on the CPU, where products of matrices round by their batch."""
-    if len(values) <= 1 or values.device.type != "cpu" or torch.compiler.is_compiling():
-        return work(values)
-    return torch.cat([work(row.clone()) for row in values.split(1)])
-
-
 def is_channels_last(image: Tensor) -> bool:
     """Return True if the image (B, C, H, W) has the channels_last memory format and is not contiguous as well."""
     return (

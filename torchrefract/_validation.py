@@ -185,7 +185,7 @@ def why_not_eager(value: Tensor) -> str | None:
     if forward_ad.unpack_dual(value).tangent is not None:
         return "with forward-mode gradients"
     try:
-        value.detach().numpy()
+        value.detach().data_ptr()
     except RuntimeError:
         return "inside torch.func"
     return None

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -66,7 +67,7 @@ def test_numba_agrees_with_torch_along_flows_on_lattices(stride, padding):
 @pytest.mark.parametrize("channels", [1, 3, 4, 7])
 def test_numba_reads_images_of_any_layout(dtype, channels):
     image, flow = random_image(1, channels, 60, 50, dtype=dtype), random_flow(1, 2, 60, 50)
-    options = {"padding": "border", "interpolation": "bilinear"}
+    options: dict[str, Any] = {"padding": "border", "interpolation": "bilinear"}
     reference = sample(image, flow, backend="torch", **options)
     interleaved = image[0].movedim(0, -1).contiguous().movedim(-1, 0)[None]
     cropped = torch.nn.functional.pad(image, (3, 4, 5, 6))[..., 5:-6, 3:-4]

@@ -8,23 +8,21 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import invert_flow, warp
-from torchrefract.warping import invert
 from torchrefract.warping.grid import inside
-from torchrefract.warping.warp import sampled
 
 SIZE = (80, 110)
 
 
-def read(flow: Tensor, at: Tensor) -> Tensor:
-    """The flow (1, 2, H, W) read bilinearly at p + at(p), by SciPy."""
+def sample_by_scipy(flow: Tensor, at: Tensor) -> Tensor:
+    """Sample a flow (1, 2, H, W) bilinearly at p + at(p)."""
     y, x = torch.meshgrid(*(torch.arange(n).double() for n in flow.shape[2:]), indexing="ij")
-    places = [(y + at[0, 1]).numpy(), (x + at[0, 0]).numpy()]
-    planes = [ndimage.map_coordinates(plane.numpy(), places, order=1, mode="nearest") for plane in flow[0]]
+    positions = [(y + at[0, 1]).numpy(), (x + at[0, 0]).numpy()]
+    planes = [ndimage.map_coordinates(plane.numpy(), positions, order=1, mode="nearest") for plane in flow[0]]
     return torch.stack([torch.from_numpy(plane) for plane in planes])[None]
 
 
 def solve_waves(waves, x: Tensor, y: Tensor, amplitude_px: float, length: float) -> Tensor:
-    """v with v(q) + u(q + v) = 0 for the analytic flow u, by 60 Newton steps in fp64."""
+    """Solve v(q) + u(q + v) = 0 for the analytic flow u by 60 Newton steps in float64."""
 
     def u(at: Tensor) -> Tensor:
         return waves(at[0], at[1], amplitude_px, length)[0]
@@ -41,12 +39,12 @@ def solve_waves(waves, x: Tensor, y: Tensor, amplitude_px: float, length: float)
 
 
 @pytest.mark.parametrize(("amplitude_px", "length"), [(5.0, 40.0), (4.0, 20.0), (1.0, 8.0), (0.02, 60.0)])
-def test_the_inverse_of_waves_is_the_analytic_one_up_to_interpolation(pixels, waves, amplitude_px, length, oracle):
+def test_the_inverse_of_a_wave_is_the_analytic_one_up_to_interpolation(pixels, waves, amplitude_px, length, oracle):
     x, y = pixels(*SIZE)
     flow = waves(x, y, amplitude_px, length)
     inverse, valid, _ = invert_flow(flow, steps=20)
     exact = solve_waves(waves, x, y, amplitude_px, length)
-    # Read bilinearly u errs by amplitude / (4 length^2), which the inverse passes on times 1 / (1 - slope).
+    # Sampled bilinearly u is off by amplitude / (4 length^2), which the inverse passes on times 1 / (1 - slope).
     slope = 2**0.5 * amplitude_px / length
     floor = amplitude_px / (4 * length**2) / (1 - slope)
     assert valid.float().mean() > 0.75
@@ -57,6 +55,7 @@ def test_the_inverse_of_waves_is_the_analytic_one_up_to_interpolation(pixels, wa
         oracle("inverse of a weak wave, 60 Newton steps", inverse[inside], exact[inside], 1e-6)
 
 
+@pytest.mark.quick
 def test_an_affine_flow_is_inverted_exactly(pixels):
     x, y = pixels(*SIZE)
     matrix = torch.tensor([[0.1, -0.2], [0.15, -0.05]], dtype=torch.float64)
@@ -73,16 +72,16 @@ def test_an_affine_flow_is_inverted_exactly(pixels):
     assert residual[valid].max() < 1e-9
 
 
-def test_the_residual_is_what_it_says_and_vanishes_where_valid(pixels, waves):
+def test_the_residual_is_the_length_of_inverse_plus_flow(pixels, waves):
     flow = waves(*pixels(*SIZE), 4.0, 20.0)
     inverse, valid, residual = invert_flow(flow, steps=2)
-    expected = (inverse + read(flow, inverse)).norm(dim=1, keepdim=True)
+    expected = (inverse + sample_by_scipy(flow, inverse)).norm(dim=1, keepdim=True)
     assert_close(residual, expected, rtol=0, atol=1e-10)
     inverse, valid, residual = invert_flow(flow, steps=20)
     assert residual[valid].max() < 1e-6
 
 
-def test_a_looser_tolerance_accepts_what_a_tighter_one_does_not(pixels, waves):
+def test_a_pixel_is_valid_if_its_residual_is_within_the_tolerance(pixels, waves):
     flow = waves(*pixels(*SIZE), 8.0, 12.0)
     _, loose, residual = invert_flow(flow, steps=1, tolerance_px=1.0)
     _, tight, _ = invert_flow(flow, steps=1, tolerance_px=1e-3)
@@ -90,29 +89,20 @@ def test_a_looser_tolerance_accepts_what_a_tighter_one_does_not(pixels, waves):
     assert tight.sum() < loose.sum()
 
 
-def test_single_precision_reaches_the_floor_of_interpolation(pixels, waves):
+def test_a_warp_and_its_inverse_restore_the_image(pixels, waves):
     x, y = pixels(*SIZE)
-    flow = waves(x, y, 5.0, 40.0)
-    inverse, valid, _ = invert_flow(flow.float())
-    exact = solve_waves(waves, x, y, 5.0, 40.0)
-    assert inverse.dtype == torch.float32
-    assert (inverse - exact).norm(dim=1, keepdim=True)[valid].max() <= 2e-3
-
-
-def test_a_warp_and_its_inverse_give_the_picture_back(pixels, waves):
-    x, y = pixels(*SIZE)
-    picture = waves(x, y, 0.5, 10.0)
+    image = waves(x, y, 0.5, 10.0)
     flow = waves(x, y, 4.0, 30.0)
     inverse, valid, _ = invert_flow(flow)
-    moved, seen = warp(picture, flow)
-    back, _ = warp(moved, inverse)
-    whole = valid & (warp(seen.double(), inverse)[0] == 1)
-    # Two bilinear look-ups, the second of a picture stretched by up to 1.2, and the floor of the inverse.
+    warped, seen = warp(image, flow)
+    back, _ = warp(warped, inverse)
+    is_restored = valid & (warp(seen.double(), inverse)[0] == 1)
+    # Two bilinear samplings, the second of an image stretched by up to 1.2, and the error of the inverse.
     bound = 0.01 / 8 * (1 + 1.2**2) + 0.05 * 2e-3
-    assert (back - picture).abs().amax(dim=1, keepdim=True)[whole].max() <= bound
+    assert (back - image).abs().amax(dim=1, keepdim=True)[is_restored].max() <= bound
 
 
-def test_what_leaves_the_frame_is_not_valid():
+def test_pixels_whose_inverse_leaves_the_frame_are_not_valid():
     flow = torch.zeros(1, 2, 8, 12, dtype=torch.float64)
     flow[:, 0] = 3.0
     inverse, valid, _ = invert_flow(flow)
@@ -122,7 +112,7 @@ def test_what_leaves_the_frame_is_not_valid():
     assert torch.equal(inverse.where(valid, -flow), -flow)
 
 
-def test_a_mirrored_or_collapsed_sheet_is_not_valid(pixels):
+def test_mirrored_and_collapsed_maps_are_not_valid(pixels):
     x, y = pixels(9, 11)
     mirror = torch.stack([-2 * (x - 5), 0 * y])[None]
     collapse = torch.stack([5.5 - x, 4.5 - y])[None]
@@ -133,21 +123,21 @@ def test_a_mirrored_or_collapsed_sheet_is_not_valid(pixels):
         assert residual.isfinite().all()
 
 
-def test_where_the_map_folds_only_upright_sheets_are_valid(pixels):
+def test_valid_pixels_of_a_folding_map_have_a_positive_determinant(pixels):
     x, y = pixels(40, 200)
     length = 8.0
     flow = torch.stack([-1.5 * length * torch.sin(x / length), 0 * y])[None]
     inverse, valid, _ = invert_flow(flow, steps=40)
     stretch = 1 - 1.5 * torch.cos((x + inverse[0, 0]) / length)
-    # Where central differences, one pixel long, can tell: not at the very edge of a fold.
+    # Central differences, one pixel long, do not resolve the very edge of a fold.
     assert (stretch[valid[0, 0]] > -2 / length).all()
-    assert_close(inverse.where(valid, 0), -read(flow, inverse).where(valid, 0), rtol=0, atol=0.05)
+    assert_close(inverse.where(valid, 0), -sample_by_scipy(flow, inverse).where(valid, 0), rtol=0, atol=0.05)
     assert 0.1 < valid.double().mean() < 1
     assert inverse.isfinite().all()
 
 
 @pytest.mark.parametrize("poison", [torch.nan, torch.inf, -torch.inf])
-def test_nothing_is_valid_that_is_read_from_a_hole(poison):
+def test_pixels_that_sample_an_invalid_flow_are_not_valid(poison):
     flow = torch.full((1, 2, 20, 40), 5.0, dtype=torch.float64)
     flow[:, 1] = 0
     flow[:, :, 8:12, 20:25] = poison
@@ -160,15 +150,15 @@ def test_nothing_is_valid_that_is_read_from_a_hole(poison):
     solved = valid & expected
     assert not (valid & ~expected).any()
     assert_close(inverse.where(solved, 0)[:, 0], (-5.0 * solved[:, 0]).double(), rtol=0, atol=1e-9)
-    # A hole's own place has no flow, but its inverse is read beside it: only there may we be more careful.
+    # The flow is invalid in the hole, but its inverse there samples valid pixels, so either answer is right.
     expected[..., 8:12, 20:25] = False
     assert (valid | ~expected).all()
 
 
 @pytest.mark.parametrize("amplitude_px", [1e3, 1e6, 1e9, 1e11, 9e11])
-def test_flows_of_any_length_have_a_finite_inverse(amplitude_px):
+def test_inverse_and_residual_of_huge_flows_are_finite(amplitude_px):
     source = torch.Generator().manual_seed(0)
-    spikes = torch.rand(40, 1, 23, 31, generator=source) < 0.2  # beside which the map turns over
+    spikes = torch.rand(40, 1, 23, 31, generator=source) < 0.2  # next to which the map turns over
     noise = torch.randn(40, 2, 23, 31, generator=source).clamp(-1, 1)
     inverse, _, residual = invert_flow(amplitude_px * noise * spikes)
     assert inverse.isfinite().all()
@@ -176,59 +166,29 @@ def test_flows_of_any_length_have_a_finite_inverse(amplitude_px):
 
 
 @pytest.mark.parametrize("way", ["vmap", "compile"])
-def test_where_no_value_can_be_read_the_inverse_is_the_same(pixels, waves, way):
+def test_vmap_and_compiled_graphs_give_the_same_inverse(pixels, waves, way):
     flow = torch.cat([waves(*pixels(48, 64), amplitude_px, 12.0) for amplitude_px in (0.5, 3.0, 8.0)]).float()
-    expected, valid, _ = invert_flow(flow)
+    expected, valid, _ = invert_flow(flow, steps=4)
     if way == "vmap":
-        found, known, _ = torch.vmap(lambda one: tuple(value[0] for value in invert_flow(one[None])))(flow)
+        result, result_valid, _ = torch.vmap(
+            lambda sample: tuple(value[0] for value in invert_flow(sample[None], steps=4))
+        )(flow)
     else:
-        found, known, _ = torch.compile(invert_flow, fullgraph=True, backend="aot_eager")(flow)
-    both = valid & known
-    # The last of them folds, and where it does either may be the one that is solved.
-    assert torch.equal(valid[:2], known[:2])
+        result, result_valid, _ = torch.compile(invert_flow, fullgraph=True, backend="aot_eager")(flow, steps=4)
+    both = valid & result_valid
+    # The last flow folds, and either solver may find another solution there.
+    assert torch.equal(valid[:2], result_valid[:2])
     assert both.sum() > 0.99 * valid.sum()
     # A residual of 1/1000 px at most in either, which a slope of 1/4 along an axis passes on by a third more.
-    assert (found - expected).norm(dim=1, keepdim=True)[:2][both[:2]].max() <= 2 * 1e-3 / (1 - 0.25)
+    assert (result - expected).norm(dim=1, keepdim=True)[:2][both[:2]].max() <= 2 * 1e-3 / (1 - 0.25)
 
 
-def test_a_sample_depends_on_no_other(pixels, waves):
+def test_a_sample_does_not_depend_on_its_batch(pixels, waves):
     flow = torch.cat([waves(*pixels(48, 64), amplitude_px, 12.0) for amplitude_px in (0.5, 3.0, 8.0)]).float()
     together = invert_flow(flow)
-    for i, own in enumerate(flow.split(1)):
-        for value, alone in zip(together, invert_flow(own), strict=True):
+    for i, sample in enumerate(flow.split(1)):
+        for value, alone in zip(together, invert_flow(sample), strict=True):
             assert torch.equal(value[i : i + 1], alone)
-
-
-@pytest.mark.parametrize("amplitude_px", [0.5, 3.0, 8.0])  # the last one folds
-def test_it_does_not_matter_how_a_flow_lies_in_memory(pixels, waves, amplitude_px):
-    flow = waves(*pixels(200, 300), amplitude_px, 12.0).float()
-    expected = invert_flow(flow)
-    wider = torch.cat([flow, flow], dim=3)[..., :300]
-    for same in (flow.contiguous(memory_format=torch.channels_last), wider):
-        for value, other in zip(invert_flow(same), expected, strict=True):
-            assert torch.equal(value, other)
-
-
-def test_a_fold_in_one_place_does_not_cost_steps_everywhere(pixels, waves, monkeypatch):
-    positions = list[int]()
-
-    def counted(source: Tensor, grid: Tensor, **options: str) -> Tensor:
-        positions.append(grid[..., 0].numel())
-        return sampled(source, grid, **options)
-
-    monkeypatch.setattr(invert, "sampled", counted)
-    monkeypatch.setattr(invert, "obstacle", lambda *_: "where reads are counted")
-    x, y = pixels(200, 300)
-    tame = waves(x, y, 0.5, 20.0)
-    folded = tame.clone()
-    folded[:, 0, 90:100, 140:160] += 15 * torch.sin(x[90:100, 140:160])
-    reads = []
-    for flow in (tame, folded):
-        positions.clear()
-        invert_flow(flow.float(), steps=30)
-        reads.append(sum(positions) / flow[0, 0].numel())
-    assert reads[1] > reads[0]
-    assert reads[1] < reads[0] + 1.5
 
 
 def test_gradients_through_an_affine_flow_are_those_of_finite_differences(pixels):
@@ -243,15 +203,8 @@ def test_gradients_through_a_curved_flow_are_those_of_finite_differences(pixels,
     assert torch.autograd.gradcheck(lambda f: invert_flow(f, steps=60)[0][..., 2:-1, 2:-1], [flow])
 
 
-def test_the_gradient_is_not_paid_for_where_nobody_asks():
-    flow = torch.full((1, 2, 5, 6), 0.3)
-    assert not invert_flow(flow)[0].requires_grad
-    with torch.no_grad():
-        assert not invert_flow(flow.requires_grad_())[0].requires_grad
-
-
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 1)])
-def test_a_frame_of_one_row_or_column_is_inverted_too(size):
+def test_zero_flows_of_tiny_frames_are_their_own_inverse(size):
     flow = torch.zeros(2, 2, *size)
     inverse, valid, residual = invert_flow(flow)
     assert torch.equal(inverse, flow)
@@ -259,7 +212,7 @@ def test_a_frame_of_one_row_or_column_is_inverted_too(size):
     assert not residual.any()
 
 
-def test_a_batch_of_none_stays_one():
+def test_an_empty_batch_stays_empty():
     inverse, valid, residual = invert_flow(torch.zeros(0, 2, 5, 6))
     assert [t.shape for t in (inverse, valid, residual)] == [(0, 2, 5, 6), (0, 1, 5, 6), (0, 1, 5, 6)]
 
@@ -273,27 +226,27 @@ def test_options_out_of_range_raise(options, rule):
         invert_flow(torch.zeros(1, 2, 5, 6), **options)
 
 
-def test_what_is_no_flow_raises():
+def test_flows_of_another_shape_raise():
     with pytest.raises(ValueError, match=r"flow must have shape \(B, 2, H, W\)"):
         invert_flow(torch.zeros(1, 3, 5, 6))
 
 
 @pytest.mark.parametrize(("amplitude_px", "length"), [(4.0, 20.0), (3.0, 12.0)])
-def test_the_inverse_is_that_of_simpleitk(pixels, waves, amplitude_px, length, oracle):
+def test_the_inverse_agrees_with_simpleitk(pixels, waves, amplitude_px, length, oracle):
     x, y = pixels(*SIZE)
     flow = waves(x, y, amplitude_px, length)
     field = SimpleITK.GetImageFromArray(flow[0].movedim(0, -1).numpy(), isVector=True)
-    # Its own defaults stop at a tenth of a pixel.
-    theirs = SimpleITK.InvertDisplacementField(
+    # The defaults stop at a tenth of a pixel.
+    inverted = SimpleITK.InvertDisplacementField(
         field, maximumNumberOfIterations=200, maxErrorToleranceThreshold=1e-5, meanErrorToleranceThreshold=1e-6
     )
-    expected = torch.from_numpy(SimpleITK.GetArrayFromImage(theirs)).movedim(-1, 0)[None]
+    expected = torch.from_numpy(SimpleITK.GetArrayFromImage(inverted)).movedim(-1, 0)[None]
     inverse, valid, _ = invert_flow(flow)
-    # It holds the border still, which reaches as far inward as displacements do.
+    # SimpleITK keeps the border fixed, which affects pixels within the largest displacement.
     margin = 2 * math.ceil(amplitude_px) + 2
     inner = torch.zeros_like(valid)
     inner[..., margin:-margin, margin:-margin] = True
     at = (valid & inner).expand_as(inverse)
     oracle("inverse, SimpleITK", inverse[at], expected[at], 1e-2)
     assert (valid & inner).double().mean() > 0.5
-    assert (expected + flow).abs().max() > 0.5  # it is another thing than -flow
+    assert (expected + flow).abs().max() > 0.5  # the inverse is not just -flow

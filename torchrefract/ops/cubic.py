@@ -62,7 +62,7 @@ def interpolate_nodes(nodes: Tensor, *, stride: int, margin: int, height: int, w
 
 @assume_constant_result
 def _constant_weights(stride: int) -> list[list[float]]:
-    return _cached_weights(stride)  # a function of its own, since torch.compile warns of caches that it traces
+    return _cached_weights(stride)  # called indirectly, since torch.compile warns of caches that it traces
 
 
 @lru_cache(maxsize=64)

@@ -20,7 +20,7 @@ from torchrefract._tensor import is_channels_last
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _SMALLEST_BAND = 1 << 14  # pixels that are worth a thread
-_BANDS_PER_THREAD = 4  # a thread that is held up leaves its bands to the others
+_BANDS_PER_THREAD = 4  # several, so that a slow thread leaves bands to the others
 _PADDINGS = {"zeros": 0, "border": 1, "reflection": 2}
 _LARGEST_OFFSET = 2**31 - 1  # elements from the first to the last pixel of a channel, counted in int32
 
@@ -53,7 +53,7 @@ def sample(image: Tensor, flow: Tensor, *, padding: str, limit: float, active: T
         image: (N, C, H, W), float32 or uint8, of any strides.
         flow: (N or 1, 2, H, W), px, float32.
         padding: "zeros", "border" or "reflection".
-        limit: the largest position, in the coordinates of F.grid_sample; NaN is read there.
+        limit: the largest position, in the coordinates of F.grid_sample; NaN counts as that position.
         active: (N,), bool, samples to warp; the others are copied. None for all.
 
     Returns:
@@ -72,7 +72,7 @@ def sample_lattice(
     limit: float,
     active: Tensor | None = None,
 ) -> Tensor:
-    """Sample an image along a flow that is known at the nodes of a lattice, by cubics between them.
+    """Sample an image along a flow at the nodes of a lattice, with cubics between them.
 
     Args:
         image: (N, C, H, W), float32 or uint8, of any strides.
@@ -114,7 +114,7 @@ def _sample(
         mask.numpy(),
         _PADDINGS[padding],
         np.float32(limit),
-        np.float32(0.5 if image.dtype is torch.uint8 else 0),  # what rounds to the nearest whole number
+        np.float32(0.5 if image.dtype is torch.uint8 else 0),  # rounds to the nearest integer when uint8 truncates
         _elements(out),
         out.stride(),
     )
@@ -152,7 +152,7 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="torchrefract")
 
 
-if hasattr(os, "register_at_fork"):  # a forked process has none of the threads
+if hasattr(os, "register_at_fork"):  # a forked process has no threads of the pool
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
@@ -176,13 +176,13 @@ def _sample_rows(
                 for j in range(width):
                     out[target + j * out_strides[3]] = source[first + j * strides[3]]
             continue
-        known = flow[sample if flow.shape[0] > 1 else 0]
+        sample_flow = flow[sample if flow.shape[0] > 1 else 0]
         if lattice[0] > 0:
-            _lattice_positions(known, i, lattice, table, line, x, y)
+            _lattice_positions(sample_flow, i, lattice, table, line, x, y)
         else:
             for j in range(width):
-                x[j] = np.float32(j) + known[0, i, j]
-                y[j] = np.float32(i) + known[1, i, j]
+                x[j] = np.float32(j) + sample_flow[0, i, j]
+                y[j] = np.float32(i) + sample_flow[1, i, j]
         _pad(x, width, padding, limit)
         _pad(y, height, padding, limit)
         _set_taps(x, y, height, width, strides[2], strides[3], offset, weight)

@@ -1,6 +1,6 @@
 """Sample images along flows: the choice of a backend, and the PyTorch reference.
 
-A flow is dense, (N or 1, 2, H, W) in px, or known at the nodes of a lattice, (N or 1, 2, h, w) in px.
+A flow is dense, (N or 1, 2, H, W) in px, or at the nodes of a lattice, (N or 1, 2, h, w) in px.
 """
 
 import importlib
@@ -186,7 +186,7 @@ def _finite(values: Tensor, limit: float) -> Tensor:
 
 
 def _clamp_to_range(sampled: Tensor, source: Tensor, padding: str) -> Tensor:
-    # As bounds, pixels that are not finite would spread over the whole image.
+    # As bounds, pixels that are not finite would spread over the image.
     is_finite, source = source.isfinite(), source.detach()
     low = torch.where(is_finite, source, torch.inf).amin(dim=(2, 3), keepdim=True)
     high = torch.where(is_finite, source, -torch.inf).amax(dim=(2, 3), keepdim=True)

@@ -1,7 +1,7 @@
 """Sample images on a GPU along flows on lattices with one Triton kernel: bilinear, forward only, float32.
 
-No grid of the size of the image is written. The operator is visible to torch.compile, whose own code would write that
-grid or compute each position once for each channel.
+The kernel writes no grid of the size of the image. torch.compile sees it as one operator, because the code that it
+would generate writes that grid or computes each position once for each channel.
 """
 
 # Triton compiles a language that only looks like Python, so two rules of the type checker do not apply:
@@ -17,13 +17,13 @@ from torch.library import triton_op, wrap_triton
 
 _ROWS, _COLUMNS = 16, 128  # pixels of one program
 _LARGEST_PLANE = 2**31 - 1  # elements of an image, which the kernel counts in int32
-_MOST_PROGRAMS = 65535  # along the batch, and along the rows
+_LARGEST_GRID = 65535  # along the batch, and along the rows
 _PADDINGS = {"zeros": 0, "border": 1, "reflection": 2}
 
 
 def why_unsupported(image: Tensor, nodes: Tensor) -> str | None:
     """Say why the kernel cannot sample an image (N, C, H, W) along a flow on a lattice; None if it can."""
-    if image[:1].numel() > _LARGEST_PLANE or max(image.shape[0], image.shape[2]) > _MOST_PROGRAMS:
+    if image[:1].numel() > _LARGEST_PLANE or max(image.shape[0], image.shape[2]) > _LARGEST_GRID:
         return f"an image of shape {tuple(image.shape)}"
     if torch.compiler.is_compiling():
         # While a graph is traced, only this flag tells an export, which has no such operator, from a compilation.
@@ -45,7 +45,7 @@ def sample_lattice(
     limit: float,
     active: Tensor | None = None,
 ) -> Tensor:
-    """Sample an image along a flow that is known at the nodes of a lattice, by cubics between them.
+    """Sample an image along a flow at the nodes of a lattice, with cubics between them.
 
     Args:
         image: (N, C, H, W), float32, of any layout.
@@ -89,7 +89,7 @@ def sample_lattice_kernel(
     rows: tl.constexpr,
     columns: tl.constexpr,
 ):
-    """Sample a source (N, C, H, W) along a flow at nodes, for some rows of one row of cells.
+    """Sample a source (N, C, H, W) along a flow at nodes, for a block of rows within one row of cells.
 
         u = sum_i w_i(t_y) sum_j w_j(t_x) nodes_u(cell_y + i, cell_x + j),  v likewise
 

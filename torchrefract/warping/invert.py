@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torchrefract._tensor import rows_at_once
 from torchrefract._validation import check_count, check_flow, check_positive, eager_bool, eager_values
 from torchrefract.ops.sampling import grid_sample, sample, sampling_dtype
 from torchrefract.warping.grid import field_dtype, inside, pixel_axes
@@ -16,6 +17,7 @@ _SMALLEST_DETERMINANT = 0.5
 # Steps of all pixels with the gradient of the flow at p, while more than this share of them is unsolved. Afterwards the
 # unsolved pixels are gathered, and the gradient is sampled at p + inverse.
 _SHARED_STEPS, _MANY = 3, 1 / 8
+_BAND_PIXELS = 1 << 14  # whose 20 planes of float32 fit into the cache of one core
 
 
 def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> tuple[Tensor, Tensor, Tensor]:
@@ -68,68 +70,124 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
         return solution, valid, residual
     moved = _sample(flow, solution)
     gradient = _cell_gradient(flow.detach(), solution)
-    return _newton_step(solution, moved - moved.detach(), gradient), valid, residual
+    matrix = _inverse_jacobian(gradient, _determinant(gradient))
+    return _newton_step(solution, moved - moved.detach(), matrix), valid, residual
 
 
 def _solve(flow: Tensor, steps: int, *, is_eager: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Return the inverse (B, 2, H, W), its residual, px, and the Jacobian determinant at p + inverse, (B, 1, H, W)."""
     height, width = flow.shape[2:]
-    axes = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
-    pixels = torch.cat(torch.broadcast_tensors(*axes), dim=1)  # (1, 2, H, W)
-    gradient = torch.cat([_central_differences(flow, 3), _central_differences(flow, 2)], dim=1)
-    determinant = _determinant(gradient)
-    # Near a fold a step by the gradient may lead anywhere.
-    first_gradient = torch.where(determinant >= _SMALLEST_DETERMINANT, gradient, 0)
-    inverse = _newton_step(torch.zeros_like(flow), flow, first_gradient)
-    error = inverse + _sample_at(flow, pixels + inverse)
-    threshold = _SOLVED_PX[flow.dtype] ** 2
-    index: Tensor | None = None
-    for step in range(steps):
-        is_unsolved = _squared_length(error) > threshold
-        if not is_eager:
-            slopes = _sample_at(gradient, pixels + inverse)
-            inverse = torch.where(is_unsolved, _newton_step(inverse, error, slopes), inverse)
-            error = inverse + _sample_at(flow, pixels + inverse)
-            continue
-        index = is_unsolved.flatten().nonzero()[:, 0]
-        if len(index) == 0:
-            break
-        if step < _SHARED_STEPS and len(index) > _MANY * height * width:
-            inverse = _newton_step(inverse, error, first_gradient)
-            error = inverse + _sample_at(flow, pixels + inverse)
-            continue
-        p, u, e = (_gather(field, index) for field in (pixels, inverse, error))
-        u = _newton_step(u, e, _sample_at(gradient, p + u))
-        e = u + _sample_at(flow, p + u)
-        for field, values in ((inverse, u), (error, e)):
-            field.flatten(2).index_copy_(2, index, values[..., 0])
-    if not eager_bool(lambda: determinant.amin() >= _SMALLEST_DETERMINANT, of=determinant):
-        determinant = _sample_at(determinant, pixels + inverse)
-    return inverse, _squared_length(error).sqrt(), determinant
+    gradient = _gradient(flow)
+    is_upright = eager_bool(lambda: _determinant(gradient).amin() >= _SMALLEST_DETERMINANT, of=flow)
+    rows = rows_at_once(flow.device, height, each=width, cached=_BAND_PIXELS, shared=True) if is_eager else height
+    bands = []
+    for start in range(0, height, rows):
+        band = flow[:, :, start : start + rows], gradient[:, :, start : start + rows]
+        x, y = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
+        x, y = (2 * x + 1) / width - 1, (2 * y[:, :, start : start + rows] + 1) / height - 1
+        bands.append(_solve_band(flow, gradient, x, y, *band, steps=steps, is_eager=is_eager, is_upright=is_upright))
+    inverse, residual, determinant = (torch.cat(parts, dim=2) for parts in zip(*bands, strict=True))
+    return inverse, residual, determinant
 
 
-def _gather(field: Tensor, index: Tensor) -> Tensor:
-    """Gather pixels (n,) of a field (1, C, H, W), as (1, C, n, 1)."""
-    return field.flatten(2)[:, :, index, None]
+def _solve_band(
+    flow: Tensor,
+    gradient: Tensor,
+    x: Tensor,
+    y: Tensor,
+    first_error: Tensor,
+    first_gradient: Tensor,
+    *,
+    steps: int,
+    is_eager: bool,
+    is_upright: bool | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Solve for a band of rows of a frame.
 
-
-def _newton_step(inverse: Tensor, error: Tensor, gradient: Tensor) -> Tensor:
-    """Return the inverse after one Newton step, bounded so that it stays finite.
-
-    inverse, error: (B, 2, h, w), px. gradient: (B, 4, h, w), as of `_central_differences` along x and y.
+    flow, gradient: of the frame. x, y: pixel centers of the rows, in the coordinates of F.grid_sample. first_error,
+    first_gradient: flow and gradient in these rows. is_upright: True if no determinant is small.
     """
+    determinant = _determinant(first_gradient)
+    matrix = _inverse_jacobian(first_gradient, determinant)
+    if not is_upright:
+        # Near a fold a step by the gradient may lead anywhere.
+        identity = matrix.new_tensor([1.0, 0.0, 0.0, 1.0]).view(1, 4, 1, 1)
+        matrix = torch.where(determinant >= _SMALLEST_DETERMINANT, matrix, identity)
+    inverse = _newton_step(torch.zeros_like(first_error), first_error, matrix)
+    error = _sample_at(flow, x, y, inverse).add_(inverse)
+    threshold = _SOLVED_PX[flow.dtype] ** 2
+    for step in range(steps):
+        squared_error = _squared_length(error)
+        is_unsolved = squared_error > threshold
+        if not is_eager:
+            slopes = _sample_at(gradient, x, y, inverse)
+            stepped = _newton_step(inverse, error, _inverse_jacobian(slopes, _determinant(slopes)))
+            inverse = torch.where(is_unsolved, stepped, inverse)
+            error = _sample_at(flow, x, y, inverse) + inverse
+            continue
+        num_unsolved = int(is_unsolved.count_nonzero())
+        if num_unsolved == 0:
+            break
+        if step == _SHARED_STEPS or num_unsolved <= _MANY * is_unsolved.numel():
+            _solve_pixels(flow, gradient, x, y, inverse, error, is_unsolved, steps=steps - step)
+            break
+        inverse = _newton_step(inverse, error, matrix)
+        error = _sample_at(flow, x, y, inverse).add_(inverse)
+    if not is_upright:
+        determinant = _sample_at(_determinant(gradient), x, y, inverse)
+    return inverse, _squared_length(error).sqrt_(), determinant
+
+
+def _solve_pixels(
+    flow: Tensor,
+    gradient: Tensor,
+    x: Tensor,
+    y: Tensor,
+    inverse: Tensor,
+    error: Tensor,
+    is_unsolved: Tensor,
+    *,
+    steps: int,
+) -> None:
+    """Take Newton steps at the unsolved pixels alone, with the gradient at p + inverse; write inverse and error."""
+    index = is_unsolved.flatten().nonzero()[:, 0]
+    width = x.shape[3]
+    x, y = x.index_select(3, index % width), y.index_select(2, index // width).mT
+    solution, remainder = (field.flatten(2).index_select(2, index).unsqueeze(2) for field in (inverse, error))
+    for _ in range(steps):
+        slopes = _sample_at(gradient, x, y, solution)
+        solution = _newton_step(solution, remainder, _inverse_jacobian(slopes, _determinant(slopes)))
+        remainder = _sample_at(flow, x, y, solution).add_(solution)
+        for field, values in ((inverse, solution), (error, remainder)):
+            field.view(1, 2, -1).index_copy_(2, index, values[:, :, 0])
+        remaining = (_squared_length(remainder) > _SOLVED_PX[flow.dtype] ** 2).flatten().nonzero()[:, 0]
+        if len(remaining) == 0:
+            break
+        index = index[remaining]
+        x, y, solution, remainder = (values.index_select(3, remaining) for values in (x, y, solution, remainder))
+
+
+def _newton_step(inverse: Tensor, error: Tensor, matrix: Tensor) -> Tensor:
+    """Subtract the inverse Jacobian (B, 4, h, w) times the error, px, bounded so that it stays finite."""
+    xx, xy, yx, yy = matrix.split(1, dim=1)
+    a, b = error.split(1, dim=1)
+    u, v = inverse.split(1, dim=1)
+    u = torch.addcmul(torch.addcmul(u, xx, a, value=-1), xy, b, value=-1)
+    v = torch.addcmul(torch.addcmul(v, yx, a, value=-1), yy, b, value=-1)
+    return torch.cat([u, v], dim=1).clamp(-_LARGEST_FLOW, _LARGEST_FLOW)
+
+
+def _inverse_jacobian(gradient: Tensor, determinant: Tensor) -> Tensor:
+    """Return (I + gradient)^-1, (B, 4, h, w), row by row, with |determinant| clamped to at least 0.1."""
     u_x, v_x, u_y, v_y = gradient.split(1, dim=1)
-    determinant = _determinant(gradient)
     # Near a fold no step has a good length; the residual shows whether it led to a solution.
     scale = 1 / determinant.abs().clamp(min=0.1).copysign(determinant)
-    a, b = error.split(1, dim=1)
-    step = torch.cat([(1 + v_y) * a - u_y * b, (1 + u_x) * b - v_x * a], dim=1) * scale
-    return (inverse - step).clamp(-_LARGEST_FLOW, _LARGEST_FLOW)
+    return torch.cat([(1 + v_y) * scale, -u_y * scale, -v_x * scale, (1 + u_x) * scale], dim=1)
 
 
 def _determinant(gradient: Tensor) -> Tensor:
     u_x, v_x, u_y, v_y = gradient.split(1, dim=1)
-    return (1 + u_x) * (1 + v_y) - u_y * v_x
+    return torch.addcmul((1 + u_x) * (1 + v_y), u_y, v_x, value=-1)
 
 
 def _squared_length(flow: Tensor) -> Tensor:
@@ -137,29 +195,39 @@ def _squared_length(flow: Tensor) -> Tensor:
     return torch.addcmul(u * u, v, v)
 
 
-def _central_differences(flow: Tensor, dim: int) -> Tensor:
-    """Return the gradient of u and of v along a dimension, one-sided at the border; (B, 2, H, W)."""
-    return torch.zeros_like(flow) if flow.shape[dim] == 1 else torch.gradient(flow, dim=dim)[0]
+def _gradient(flow: Tensor) -> Tensor:
+    """Return central differences of u and v along x, then along y, one-sided at the border; (B, 4, H, W)."""
+    differences = []
+    for dim in (3, 2):
+        size = flow.shape[dim]
+        if size == 1:
+            differences.append(torch.zeros_like(flow))
+            continue
+        center = (flow.narrow(dim, 2, size - 2) - flow.narrow(dim, 0, size - 2)) / 2
+        first, last = (flow.narrow(dim, i + 1, 1) - flow.narrow(dim, i, 1) for i in (0, size - 2))
+        differences.append(torch.cat([first, center, last], dim=dim))
+    return torch.cat(differences, dim=1)
 
 
 def _cell_gradient(flow: Tensor, at: Tensor) -> Tensor:
     """Return the gradient of the bilinear interpolant itself at p + at(p), (B, 4, H, W)."""
     height, width = flow.shape[2:]
     axes = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
-    x, y = (axis + shift for axis, shift in zip(axes, at.split(1, dim=1), strict=True))
-    left, top = x.floor(), y.floor()
-    differences = [
-        _sample_at(flow, torch.cat(high, dim=1)) - _sample_at(flow, torch.cat(low, dim=1))
-        for low, high in (((left, y), (left + 1, y)), ((x, top), (x, top + 1)))
-    ]
+    differences = []
+    for channel, axis in enumerate(axes):
+        low = at.clone()
+        low[:, channel : channel + 1] = (axis + at[:, channel : channel + 1]).floor() - axis
+        high = low.clone()
+        high[:, channel] += 1
+        differences.append(_sample(flow, high) - _sample(flow, low))
     return torch.cat(differences, dim=1)
 
 
-def _sample_at(field: Tensor, positions: Tensor) -> Tensor:
-    """Sample a field (B, C, H, W) at positions (B, 2, h, w), px, bilinearly."""
+def _sample_at(field: Tensor, x: Tensor, y: Tensor, shift: Tensor) -> Tensor:
+    """Sample a field (B, C, H, W) bilinearly at (x, y), in the coordinates of F.grid_sample, plus a shift in px."""
     height, width = field.shape[2:]
-    x, y = positions.split(1, dim=1)
-    grid = torch.cat([(2 * x + 1) / width - 1, (2 * y + 1) / height - 1], dim=1).movedim(1, -1)
+    u, v = shift.split(1, dim=1)
+    grid = torch.cat([torch.add(x, u, alpha=2 / width), torch.add(y, v, alpha=2 / height)], dim=1).movedim(1, -1)
     return grid_sample(field, grid, padding="border", interpolation="bilinear")
 
 

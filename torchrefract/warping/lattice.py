@@ -8,21 +8,7 @@ from torch import Tensor
 from torchrefract._tensor import exact_matmul
 from torchrefract.ops.cubic import interpolate_nodes, lagrange_basis
 from torchrefract.ops.sampling import grid_sample
-from torchrefract.warping.grid import Points, finite, pixel_axes, sampler_axes, sampler_positions
-from torchrefract.warping.old_lattice import (  # noqa: F401 - the old effects import them here
-    FARTHEST,
-    STREAM_NODES,
-    Lines,
-    _cubics,
-    _curl_weights,
-    along_rows,
-    between_nodes,
-    lagrange_weights,
-    once,
-    row_weights,
-    slope_weights,
-)
-from torchrefract.warping.sums import across_twice, down
+from torchrefract.warping.grid import Points
 
 
 @dataclass(frozen=True)
@@ -41,7 +27,6 @@ class Lattice:
     width: int
     stride: int = 1
     margin: int = 1
-    after: int = 1  # old
 
     @property
     def num_nodes(self) -> tuple[int, int]:
@@ -58,24 +43,6 @@ class Lattice:
         )
         return Points(x.view(1, 1, 1, -1), y.view(1, 1, -1, 1), self)
 
-    # old: leaves with the old effects
-    before = property(lambda self: self.margin)
-
-    def __getitem__(self, index):
-        return (self.height, self.width, self.stride, self.margin, self.after)[index]
-
-    def cells(self) -> tuple[int, int]:
-        return -(-self.height // self.stride), -(-self.width // self.stride)
-
-    def axes(self) -> tuple[range, range]:
-        start, s = -self.margin * self.stride, self.stride
-        rows, columns = (range(start, (count + self.after) * s + 1, s) for count in self.cells())
-        return rows, columns
-
-    def places(self, *, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-        y, x = (torch.arange(axis.start, axis.stop, axis.step, dtype=dtype, device=device) for axis in self.axes())
-        return x.view(1, 1, 1, -1), y.view(1, 1, -1, 1)
-
 
 def pixel_lattice(height: int, width: int) -> Lattice:
     """Return the lattice whose nodes are the pixels of a frame."""
@@ -91,7 +58,6 @@ class LatticeFlow:
 
     nodes: Tensor
     lattice: Lattice
-    every: int = 1  # old
 
     @property
     def dtype(self) -> torch.dtype:
@@ -152,24 +118,6 @@ class LatticeFlow:
             along = exact_matmul(self.nodes, _weight_matrix(x.flatten(), columns).to(self.dtype).mT)
             return exact_matmul(_weight_matrix(y.flatten(), rows).to(self.dtype), along)
 
-    # old: leaves with the old effects
-    def rows(self, index: Tensor) -> "LatticeFlow":
-        return self.with_nodes(self.nodes[index])
-
-    def weights(self) -> tuple[Tensor, Tensor]:
-        weight = _cubics(self.nodes, self.lattice).expand(2, -1, -1)
-        return weight, weight
-
-    def sampler_grid(self, dtype: torch.dtype) -> Tensor:
-        return self.lines(dtype).grid()
-
-    def lines(self, dtype: torch.dtype) -> Lines:
-        x, y = self.lattice.places(dtype=dtype, device=self.nodes.device)
-        height, width = self.lattice.height, self.lattice.width
-        positions = finite(sampler_positions(self.nodes.to(dtype), x, y, height=height, width=width), FARTHEST)
-        values, weight = along_rows(positions, self.lattice), _cubics(positions, self.lattice)
-        return Lines(values, weight.expand(2, -1, -1), height)
-
 
 def _in_strides(position: Tensor, stride: int, margin: int, count: int) -> Tensor:
     """Convert positions from px to indices of nodes, within [0, count - 1]."""
@@ -218,37 +166,3 @@ def _bilinear(nodes: Tensor, x: Tensor, y: Tensor) -> Tensor:
     grid = torch.cat([x, y], dim=1).movedim(1, -1)
     batch = max(len(nodes), len(grid))
     return grid_sample(nodes.expand(batch, -1, -1, -1), grid, padding="border", interpolation="bilinear")
-
-
-# old: leaves with the old effects
-class StreamFlow(LatticeFlow):
-    """The curl of a stream function that is known at the nodes of a lattice, (B, 1, n, m), px^2.
-
-        flow = (D_y psi, -D_x psi) of psi between nodes, by polynomials through six of them along each axis
-
-    The lattice has three nodes before the frame and two behind its last cell.
-
-    D is the central difference, as in `curl`: the divergence taken with it vanishes, which that of a flow between nodes
-    of its own does not.
-    """
-
-    def dense(self) -> Tensor:
-        """(B, 2, H, W), px."""
-        return down(*self._lines(self.nodes, (1.0, 1.0)), self.lattice.height)
-
-    def lines(self, dtype: torch.dtype) -> Lines:
-        """Where F.grid_sample(align_corners=False) looks, at every pixel of the rows of nodes."""
-        height, width = self.lattice.height, self.lattice.width
-        x, y = pixel_axes(height, width, dtype=dtype, device=self.nodes.device)
-        x, y = sampler_axes(x, y, height=height, width=width)
-        nodes = finite(self.nodes.to(dtype), FARTHEST)
-        return Lines(*self._lines(nodes, (2 / width, 2 / height)), height, x.flatten(), y.flatten())
-
-    def weights(self) -> tuple[Tensor, Tensor]:
-        """Of the nodes around, along a row and along a column, (2, stride, taps): for u and v, by place in a cell."""
-        return _curl_weights(self.lattice.stride, (1.0, 1.0), self.nodes.dtype, self.nodes.device)
-
-    def _lines(self, nodes: Tensor, scale: tuple[float, float]) -> tuple[Tensor, Tensor]:
-        """(B, 2, n, W) and (2, stride, taps): (D_y psi, -D_x psi), each times its scale, as in `Lines`."""
-        (first, second), between = _curl_weights(self.lattice.stride, scale, nodes.dtype, nodes.device)
-        return across_twice(nodes, (first, second), self.lattice.width), between

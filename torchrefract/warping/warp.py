@@ -100,7 +100,7 @@ def sees_only_valid(valid: Tensor, flow: Tensor) -> Tensor:
 def _check_match(image: Tensor, flow: Tensor) -> None:
     check_flow("flow", flow)
     if image.ndim != 4:
-        raise ValueError(f"image must have shape (B, C, H, W) beside a batched flow, got {tuple(image.shape)}")
+        raise ValueError(f"image must have shape (B, C, H, W) with a batched flow, got {tuple(image.shape)}")
     if image.is_complex():
         raise TypeError(f"image must be real, got {image.dtype}")
     if image.shape[2:] != flow.shape[2:] or flow.shape[0] not in (1, image.shape[0]):

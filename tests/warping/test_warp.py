@@ -6,16 +6,19 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from scipy import ndimage
 from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import warp
-from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS
+from torchrefract.warping.grid import inside, pixel_axes
+from torchrefract.warping.lattice import Lattice, LatticeFlow
+from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS, sample_image, sees_only_valid
 
-# Large enough for a reach of 4 px: beyond 1.5 sizes from its center a frame is not reflected any further.
+# The flow reaches 4 px. Positions beyond 1.5 frames from the center are not reflected any further.
 SIZES = [(1, 1), (1, 7), (9, 1), (3, 4), (37, 53)]
-# What SciPy calls the paddings of F.grid_sample(align_corners=False).
+# Names of the paddings of F.grid_sample(align_corners=False) in SciPy.
 SCIPY_MODES = {"zeros": "grid-constant", "border": "nearest", "reflection": "reflect"}
 CV2_BORDERS = {"zeros": cv2.BORDER_CONSTANT, "border": cv2.BORDER_REPLICATE}
 
@@ -29,7 +32,7 @@ def random_flow(batch: int, height: int, width: int, reach: float = 4.0) -> Tens
 
 
 def positions(flow: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """x and y of p + flow(p), (B, H, W)."""
+    """Return x and y of p + flow(p), each (B, H, W)."""
     y, x = np.mgrid[: flow.shape[2], : flow.shape[3]]
     return x + flow[:, 0].numpy(), y + flow[:, 1].numpy()
 
@@ -44,7 +47,7 @@ def by_scipy(image: Tensor, flow: Tensor, order: int, padding: str) -> Tensor:
 
 
 def by_opencv(image: Tensor, flow: Tensor, interpolation: int, border: int = cv2.BORDER_REPLICATE) -> Tensor:
-    """The first sample of a batch, by cv2.remap with maps in float32."""
+    """Warp the first sample of a batch by cv2.remap with maps in float32."""
     x, y = (position[0].astype(np.float32) for position in positions(flow))
     source = np.ascontiguousarray(image[0].movedim(0, -1).numpy())
     return torch.from_numpy(cv2.remap(source, x, y, interpolation, borderMode=border)).movedim(-1, 0)[None]
@@ -53,14 +56,14 @@ def by_opencv(image: Tensor, flow: Tensor, interpolation: int, border: int = cv2
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("padding", PADDINGS)
 @pytest.mark.parametrize(("interpolation", "order"), [("bilinear", 1), ("nearest", 0)])
-def test_double_precision_agrees_with_scipy(size, padding, interpolation, order, oracle):
+def test_float64_agrees_with_scipy(size, padding, interpolation, order, oracle):
     image, flow = noise(2, 3, *size), random_flow(2, *size)
     warped, _ = warp(image, flow, padding=padding, interpolation=interpolation)
     oracle("sampling, map_coordinates, fp64", warped, by_scipy(image, flow, order, padding), 1e-12, unit="")
 
 
 @pytest.mark.parametrize("padding", CV2_BORDERS)
-def test_bilinear_single_precision_agrees_with_opencv(padding, oracle):
+def test_bilinear_float32_agrees_with_opencv(padding, oracle):
     image, flow = noise(1, 3, 270, 480).float(), random_flow(1, 270, 480).float()
     expected = by_opencv(image, flow, cv2.INTER_LINEAR, CV2_BORDERS[padding])
     oracle("sampling, cv2.remap, fp32", warp(image, flow, padding=padding)[0], expected, 5e-4, unit="")
@@ -74,7 +77,7 @@ def test_bicubic_agrees_with_opencv_up_to_the_clamp():
     assert_close(warped, expected, rtol=0, atol=5e-4)
 
 
-def test_bytes_agree_with_opencv_within_one_level():
+def test_uint8_agrees_with_opencv_within_one_level():
     image = (noise(1, 3, 120, 160) * 255).round().to(torch.uint8)
     flow = random_flow(1, 120, 160).float()
     warped, _ = warp(image, flow, padding="border")
@@ -106,8 +109,8 @@ def test_only_positions_within_the_outermost_pixel_centers_are_valid():
     ("dtype", "largest"),
     [(torch.int64, 2**40), (torch.int32, 2**31 - 1), (torch.int16, 2**15 - 1), (torch.uint8, 255)],
 )
-def test_nearest_keeps_the_numbers_of_integer_masks(dtype, largest):
-    # Up to 2^53 for int64: the sampler has no wider type than float64.
+def test_nearest_keeps_the_values_of_integer_masks(dtype, largest):
+    # The sampler works in float64, so integers are exact up to 2^53.
     image = torch.randint(largest - 50, largest + 1, (2, 1, 31, 29), generator=torch.Generator().manual_seed(0))
     flow = random_flow(2, 31, 29)
     warped, _ = warp(image.to(dtype), flow.float(), padding="border", interpolation="nearest")
@@ -115,7 +118,7 @@ def test_nearest_keeps_the_numbers_of_integer_masks(dtype, largest):
     assert torch.equal(warped.long(), by_scipy(image.double(), flow, 0, "border").long())
 
 
-def test_nearest_keeps_the_truth_of_boolean_masks():
+def test_nearest_keeps_boolean_masks():
     image, flow = noise(2, 1, 31, 29) > 0.5, random_flow(2, 31, 29)
     warped, _ = warp(image, flow.float(), padding="border", interpolation="nearest")
     assert torch.equal(warped, by_scipy(image.double(), flow, 0, "border") > 0.5)
@@ -128,56 +131,32 @@ def test_bilinear_rounds_integers_to_the_nearest():
     assert warped.flatten().tolist() == [2, 16, 21]
 
 
-@pytest.mark.parametrize("size", [(131, 127), (257, 64), (128, 128)])
-@pytest.mark.parametrize("padding", PADDINGS)
-@pytest.mark.parametrize("interpolation", INTERPOLATIONS)
-def test_the_split_into_bands_of_rows_changes_no_bit(on_threads, size, padding, interpolation):
-    image, flow = noise(1, 3, *size).float(), random_flow(1, *size).float()
-    results = []
-    for threads in (1, 2, 3):
-        on_threads(threads)
-        results.append(warp(image, flow, padding=padding, interpolation=interpolation))
-    for warped, valid in results[1:]:
-        assert torch.equal(warped, results[0][0])
-        assert torch.equal(valid, results[0][1])
-
-
-def test_the_split_into_bands_of_rows_keeps_the_gradients(on_threads):
-    weights = noise(1, 2, 131, 127, seed=2)
-    gradients = []
-    for threads in (1, 3):
-        on_threads(threads)
-        image, flow = noise(1, 2, 131, 127).requires_grad_(), random_flow(1, 131, 127).requires_grad_()
-        gradients.append(torch.autograd.grad((warp(image, flow)[0] * weights).sum(), [image, flow]))
-    assert_close(gradients[1], gradients[0], rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("size", [(1080, 1920), (2160, 3840)])
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_half_types_are_computed_in_single_precision(size, dtype):
+def test_half_types_are_sampled_in_float32(size, dtype):
     image = noise(1, 1, *size).to(dtype)
     flow = torch.tensor([0.25, -0.5]).view(1, 2, 1, 1).expand(-1, -1, *size)
     warped, _ = warp(image, flow, padding="border")
     assert warped.dtype == dtype
-    # The same weights by hand: 3/4 and 1/4 along the row, 1/2 and 1/2 of this row and the one above.
+    # The bilinear weights are 3/4 and 1/4 along a row, and 1/2 and 1/2 of this row and the one above.
     exact = image.double()
     rows = 0.5 * exact[..., 1:, :] + 0.5 * exact[..., :-1, :]
     expected = 0.75 * rows[..., :-1] + 0.25 * rows[..., 1:]
-    # Half a unit in the last place of 1, and what fp32 coordinates are off.
+    # Half a unit in the last place of 1, plus the rounding of float32 coordinates.
     tolerance = torch.finfo(dtype).eps / 2 + 1e-3
     assert_close(warped[..., 1:, :-1].double(), expected, rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_a_half_flow_is_read_as_what_it_says(dtype):
+def test_a_half_flow_is_converted_to_float32(dtype):
     image, flow = noise(1, 1, 31, 300).float(), random_flow(1, 31, 300).to(dtype)
     assert torch.equal(warp(image, flow)[0], warp(image, flow.float())[0])
 
 
-POISON = """
+INVALID_FLOWS = """
 import itertools, math, torch
 from torchrefract import warp
-for padding, kind, dtype, poison in itertools.product(
+for padding, kind, dtype, value in itertools.product(
     ("zeros", "border", "reflection"), ("nearest", "bilinear", "bicubic"), (torch.float32, torch.float64),
     (math.nan, math.inf, -math.inf, 3e38, -3e38, 1e10),
 ):
@@ -185,30 +164,32 @@ for padding, kind, dtype, poison in itertools.product(
     flow = torch.full((1, 2, 9, 11), 0.3, dtype=dtype)
     clean, _ = warp(image, flow, padding=padding, interpolation=kind)
     bad = flow.clone()
-    bad[0, 0, 4, 5] = bad[0, 1, 2, 3] = poison
+    bad[0, 0, 4, 5] = bad[0, 1, 2, 3] = value
     bad.requires_grad_()
     warped, valid = warp(image, bad, padding=padding, interpolation=kind)
     warped.square().sum().backward()
-    case = f"{padding} {kind} {dtype} {poison}"
+    case = f"{padding} {kind} {dtype} {value}"
     spot = torch.zeros(1, 1, 9, 11, dtype=torch.bool)
     spot[..., 4, 5] = spot[..., 2, 3] = True
     assert warped.isfinite().all() and bad.grad.isfinite().all() and image.grad.isfinite().all(), case
     assert not valid[spot].any() and torch.equal(valid[~spot], warp(image, flow)[1][~spot]), case
     assert torch.equal(warped.where(~spot, 0), clean.where(~spot, 0)), case
     assert padding != "zeros" or not warped.where(spot, 0).any(), case
-print("lived")
+print("done")
 """
 
 
-def test_poisoned_flows_neither_crash_nor_spread_forward_or_backward():
-    # In a process of its own: what this guards against ends the process.
-    run = subprocess.run([sys.executable, "-c", POISON], capture_output=True, text=True, check=False, timeout=120)
-    assert (run.returncode, run.stdout.strip()) == (0, "lived"), run.stderr
+def test_invalid_flow_values_neither_crash_nor_affect_other_pixels():
+    # NaN in a grid can end the process, so the test starts another one.
+    run = subprocess.run(
+        [sys.executable, "-c", INVALID_FLOWS], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert (run.returncode, run.stdout.strip()) == (0, "done"), run.stderr
 
 
 @pytest.mark.parametrize("shift", [1e6, -1e6])
 @pytest.mark.parametrize("interpolation", INTERPOLATIONS)
-def test_a_million_pixels_away_lies_the_padding(shift, interpolation):
+def test_positions_a_million_pixels_away_get_the_padding(shift, interpolation):
     image = noise(1, 1, 8, 9).float()
     flow = torch.full((1, 2, 8, 9), shift)
     corner = image[..., -1, -1] if shift > 0 else image[..., 0, 0]
@@ -218,15 +199,15 @@ def test_a_million_pixels_away_lies_the_padding(shift, interpolation):
         assert not valid.any()
 
 
-@pytest.mark.parametrize("poison", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
 @pytest.mark.parametrize(("interpolation", "support"), [("nearest", 0.5), ("bilinear", 1), ("bicubic", 2)])
-def test_poisoned_pixels_stay_local(poison, interpolation, support):
+def test_invalid_pixels_affect_only_their_neighbors(value, interpolation, support):
     image, flow = noise(2, 2, 40, 30).float() > 0.5, random_flow(2, 40, 30).float()
     image = image * 0.6 + 0.2
-    poisoned = image.clone()
-    poisoned[0, 1, 20, 10] = poison
+    changed = image.clone()
+    changed[0, 1, 20, 10] = value
     clean, _ = warp(image, flow, padding="border", interpolation=interpolation)
-    warped, _ = warp(poisoned, flow, padding="border", interpolation=interpolation)
+    warped, _ = warp(changed, flow, padding="border", interpolation=interpolation)
     x, y = positions(flow[:1])
     near = torch.from_numpy((np.abs(x - 10) < support + 1e-3) & (np.abs(y - 20) < support + 1e-3))
     assert torch.equal(warped[1], clean[1])
@@ -241,7 +222,7 @@ def test_bicubic_keeps_a_binary_image_in_its_range(padding):
     warped, _ = warp(image, random_flow(2, 40, 30).float(), padding=padding, interpolation="bicubic")
     assert warped.amin() >= 0
     assert warped.amax() <= 1
-    # The bound is that of the values, not of [0, 1].
+    # The bounds are those of the image, not [0, 1].
     warped, _ = warp(3 - image, random_flow(2, 40, 30).float(), padding="border", interpolation="bicubic")
     assert warped.amin() >= 2
     assert warped.amax() <= 3
@@ -249,7 +230,7 @@ def test_bicubic_keeps_a_binary_image_in_its_range(padding):
 
 @pytest.mark.parametrize("interpolation", INTERPOLATIONS)
 @pytest.mark.parametrize("shape", [(3, 1, 1, 1), (2, 4, 1, 13), (2, 4, 13, 1), (1, 12, 31, 37), (2, 1, 16, 16)])
-def test_every_channel_and_sample_is_warped_by_itself(shape, interpolation):
+def test_each_channel_and_sample_is_warped_alone(shape, interpolation):
     image, flow = noise(*shape).float(), random_flow(shape[0], *shape[2:]).float()
     warped, valid = warp(image, flow, interpolation=interpolation)
     for i, channel in itertools.product(range(shape[0]), range(shape[1])):
@@ -259,12 +240,12 @@ def test_every_channel_and_sample_is_warped_by_itself(shape, interpolation):
 
 
 @pytest.mark.parametrize("interpolation", INTERPOLATIONS)
-def test_a_batch_of_none_stays_one(interpolation):
+def test_an_empty_batch_stays_empty(interpolation):
     warped, valid = warp(torch.zeros(0, 3, 5, 7), torch.zeros(0, 2, 5, 7), interpolation=interpolation)
     assert (warped.shape, valid.shape, valid.dtype) == ((0, 3, 5, 7), (0, 1, 5, 7), torch.bool)
 
 
-def test_the_layout_in_memory_changes_nothing_and_is_kept():
+def test_the_memory_format_is_kept_and_changes_no_value():
     image, flow = noise(2, 3, 12, 16).float(), random_flow(2, 12, 16).float()
     expected, _ = warp(image, flow)
     last, _ = warp(image.contiguous(memory_format=torch.channels_last), flow)
@@ -277,23 +258,14 @@ def test_the_layout_in_memory_changes_nothing_and_is_kept():
 
 
 @pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
-def test_vmap_over_flows_looks_one_image_up_along_each(layout):
+def test_vmap_over_flows_warps_one_image_along_each(layout):
     image = noise(1, 3, 6, 8).float().contiguous(memory_format=layout)
     flows = random_flow(4, 6, 8).float()[:, None]
-    found, valid = torch.vmap(lambda flow: warp(image, flow))(flows)
+    warped, valid = torch.vmap(lambda flow: warp(image, flow))(flows)
     for i, flow in enumerate(flows):
-        expected, inside = warp(image, flow)
-        assert_close(found[i], expected, rtol=0, atol=1e-6)
-        assert torch.equal(valid[i], inside)
-
-
-def test_a_map_over_images_and_flows_of_any_layout_is_each_of_them_alone():
-    images, flows = noise(3, 1, 2, 16, 12).float().mT, random_flow(3, 16, 12).float()[:, None].mT
-    together, valid = torch.vmap(warp)(images, flows)
-    for i in range(3):
-        alone, seen = warp(images[i], flows[i])
-        assert_close(together[i], alone, rtol=0, atol=1e-6)
-        assert torch.equal(valid[i], seen)
+        expected, expected_valid = warp(image, flow)
+        assert_close(warped[i], expected, rtol=0, atol=1e-6)
+        assert torch.equal(valid[i], expected_valid)
 
 
 def test_an_unbatched_image_is_a_batch_of_one():
@@ -311,34 +283,34 @@ def test_one_flow_serves_a_whole_batch():
 
 @pytest.mark.parametrize("size", [(3, 7680), (4320, 3), (2, 8192), (1, 40000), (40000, 1)])
 @pytest.mark.parametrize("shift", [0, 3])
-def test_coordinates_of_large_frames_are_right_to_a_thousandth_of_a_pixel(size, shift):
-    # A triangle wave of slope 1 and small values: what it changes by is the error in px, its own rounding is 1e-5.
-    place = torch.arange(max(size))
-    wave = ((place % 128) - 64).abs().float()
+def test_positions_in_large_frames_are_exact_to_a_thousandth_of_a_pixel(size, shift):
+    # A triangle wave has slope 1 and small values, so its change is the error in px; its rounding is 1e-5.
+    position = torch.arange(max(size))
+    wave = ((position % 128) - 64).abs().float()
     image = (wave if size[1] > size[0] else wave[:, None]).expand(1, 1, *size)
     flow = torch.zeros(1, 2, *size)
     flow[:, 0 if size[1] > size[0] else 1] = shift
     warped, valid = warp(image, flow, padding="border")
-    expected = ((((place + shift).clamp(max=max(size) - 1)) % 128) - 64).abs().float()
+    expected = ((((position + shift).clamp(max=max(size) - 1)) % 128) - 64).abs().float()
     expected = (expected if size[1] > size[0] else expected[:, None]).expand(1, 1, *size)
     assert_close(warped, expected, rtol=0, atol=1e-3 - 1e-5)
     assert valid.sum() == valid.numel() // max(size) * (max(size) - shift)
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
-def test_at_8k_a_frame_that_does_not_move_stays_to_a_thousandth_of_a_pixel(axis):
+def test_a_zero_flow_keeps_an_8k_frame_to_a_thousandth_of_a_pixel(axis):
     height, width = 4320, 7680
-    # The coordinate itself, as the distance from the nearest multiple of 128: fp32 holds that to 1e-5.
-    place = torch.arange(width) if axis == "x" else torch.arange(height)[:, None]
-    image = ((place % 128) - 64).abs().float().expand(1, 1, height, width)
-    still = torch.zeros(1, 1, 1, 1).expand(1, 2, height, width)
-    warped, valid = warp(image, still)
+    # The distance of the coordinate from a multiple of 128 is exact to 1e-5 in float32.
+    position = torch.arange(width) if axis == "x" else torch.arange(height)[:, None]
+    image = ((position % 128) - 64).abs().float().expand(1, 1, height, width)
+    zero_flow = torch.zeros(1, 1, 1, 1).expand(1, 2, height, width)
+    warped, valid = warp(image, zero_flow)
     assert (warped - image).abs().max() < 1e-3
     assert valid.all()
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
-def test_a_line_of_40000_pixels_that_does_not_move_stays_to_a_thousandth_of_a_pixel(axis):
+def test_a_zero_flow_keeps_a_line_of_40000_pixels_to_a_thousandth_of_a_pixel(axis):
     size = (1, 40000) if axis == "x" else (40000, 1)
     ramp = torch.arange(40000.0).view(1, 1, *size)
     for padding in PADDINGS:
@@ -348,21 +320,9 @@ def test_a_line_of_40000_pixels_that_does_not_move_stays_to_a_thousandth_of_a_pi
 
 
 @pytest.mark.parametrize("padding", PADDINGS)
-@pytest.mark.parametrize("interpolation", INTERPOLATIONS)
-def test_a_large_sample_does_not_depend_on_the_batch_around_it(padding, interpolation):
-    # So large that the look-up takes some rows at a time, and how many depends on the batch.
-    image, flow = noise(3, 2, 263, 701).float(), random_flow(3, 263, 701).float()
-    together, valid = warp(image, flow, padding=padding, interpolation=interpolation)
-    for i in range(3):
-        alone, seen = warp(image[i], flow[i], padding=padding, interpolation=interpolation)
-        assert torch.equal(alone, together[i])
-        assert torch.equal(seen, valid[i])
-
-
-@pytest.mark.parametrize("padding", PADDINGS)
 def test_bilinear_gradients_are_those_of_finite_differences(padding):
     image = noise(2, 2, 4, 5).requires_grad_()
-    # Off whole pixels, where bilinear sampling has no derivative, and in part outside.
+    # Bilinear sampling has no derivative at whole pixels. Parts of the flow lead outside.
     flow = (torch.randint(-2, 3, (2, 2, 4, 5), generator=torch.Generator().manual_seed(3)) + 0.37).double()
     assert torch.autograd.gradcheck(lambda i, f: warp(i, f, padding=padding)[0], [image, flow.requires_grad_()])
 
@@ -370,7 +330,7 @@ def test_bilinear_gradients_are_those_of_finite_differences(padding):
 def test_bicubic_gradients_are_those_of_finite_differences():
     image = (0.5 + 0.1 * noise(1, 1, 7, 8)).index_put((torch.tensor(0),) * 4, torch.tensor(9.0).double())
     flow = torch.full((1, 2, 7, 8), 0.37, dtype=torch.float64)
-    flow[..., :4, :4] += 2  # away from the one pixel that sets the range, so that nothing is clamped above
+    flow[..., :4, :4] += 2  # away from the pixel that sets the range, so that no value is clamped
 
     def interior(image: Tensor, flow: Tensor) -> Tensor:
         return warp(image - 9, flow, interpolation="bicubic")[0][..., :3, :4]
@@ -381,7 +341,7 @@ def test_bicubic_gradients_are_those_of_finite_differences():
 @pytest.mark.parametrize(
     ("image", "flow", "rule"),
     [
-        ((3, 8, 9), (1, 2, 8, 9), r"image must have shape \(B, C, H, W\) beside a batched flow"),
+        ((3, 8, 9), (1, 2, 8, 9), r"image must have shape \(B, C, H, W\) with a batched flow"),
         ((1, 3, 8, 9), (2, 8, 9), r"flow must have shape \(B, 2, H, W\)"),
         ((1, 3, 8, 9), (1, 3, 8, 9), r"flow must have shape \(B, 2, H, W\)"),
         ((1, 3, 8, 9), (1, 2, 9, 8), "flow must have the batch and the size of the image"),
@@ -389,7 +349,7 @@ def test_bicubic_gradients_are_those_of_finite_differences():
         ((8, 9), (1, 2, 8, 9), "image must have shape"),
     ],
 )
-def test_shapes_that_do_not_fit_raise(image, flow, rule):
+def test_shapes_that_do_not_match_raise(image, flow, rule):
     with pytest.raises(ValueError, match=rule):
         warp(torch.zeros(image), torch.zeros(flow))
 
@@ -415,6 +375,52 @@ def test_an_unknown_option_raises(options, rule):
         (torch.zeros(1, 1, 2, 2), None, "flow must be a tensor"),
     ],
 )
-def test_types_that_do_not_fit_raise(image, flow, rule):
+def test_types_that_are_not_supported_raise(image, flow, rule):
     with pytest.raises(TypeError, match=rule):
         warp(image, flow)
+
+
+def smooth_flow(seed: int, size: tuple[int, int], px: float) -> Tensor:
+    """Return a flow (2, 2, H, W) with displacements of about `px`."""
+    nodes = torch.randn(2, 2, 4, 5, generator=torch.Generator().manual_seed(seed))
+    return px * F.interpolate(nodes, size=size, mode="bilinear")
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("size", [(1, 1), (3, 40), (37, 53)])
+@pytest.mark.parametrize("px", [0.0, 2.0, 400.0])
+def test_inside_compares_positions_with_the_frame(size, px):
+    height, width = size
+    flow = smooth_flow(0, size, px)
+    x, y = pixel_axes(height, width, dtype=torch.float64, device=flow.device)
+    u, v = flow.double().split(1, dim=1)
+    expected = (x + u >= -1e-3) & (x + u <= width - 1 + 1e-3) & (y + v >= -1e-3) & (y + v <= height - 1 + 1e-3)
+    assert torch.equal(inside(flow), expected)
+
+
+@pytest.mark.quick
+def test_a_pixel_sees_only_valid_pixels_if_all_with_a_weight_are_valid():
+    valid = torch.ones(1, 1, 20, 30, dtype=torch.bool)
+    valid[..., 8, 12] = False
+    flow = smooth_flow(1, (20, 30), 2.0)[:1]
+    x, y = positions(flow)
+    # The bilinear weight of the invalid pixel, and the share of the 2 x 2 pixels that is on the frame.
+    weight = np.clip(1 - np.abs(x - 12), 0, 1) * np.clip(1 - np.abs(y - 8), 0, 1)
+    share = np.clip(np.minimum(x + 1, 30 - x), 0, 1) * np.clip(np.minimum(y + 1, 20 - y), 0, 1)
+    expected = torch.from_numpy(share - weight)[:, None]
+    is_clear = (expected - 0.999).abs() > 1e-4
+    result = sees_only_valid(valid, flow)
+    assert torch.equal(result[is_clear], (expected > 0.999)[is_clear])
+    assert 0 < (~result).sum() < result.numel()
+
+
+@pytest.mark.parametrize("backend", ["auto", "torch"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.uint8])
+def test_a_lattice_flow_warps_like_its_dense_flow(backend, dtype):
+    lattice = Lattice(150, 140, stride=16, margin=2)
+    flow = LatticeFlow(3 * torch.randn(2, 2, *lattice.num_nodes, generator=torch.Generator().manual_seed(0)), lattice)
+    image = (255 * noise(2, 3, 150, 140)).to(dtype) if dtype is torch.uint8 else noise(2, 3, 150, 140).to(dtype)
+    options = {"padding": "zeros", "interpolation": "bilinear", "backend": backend}
+    result, expected = sample_image(image, flow, **options), sample_image(image, flow.dense(), **options)
+    difference = (result.double() - expected.double()).abs().max()
+    assert difference <= (1 if dtype is torch.uint8 else 1e-4)

@@ -3,7 +3,7 @@ import pytest
 from torchrefract._io import replace_file
 
 
-def test_the_old_file_is_there_until_the_new_one_is_whole(tmp_path):
+def test_the_old_file_stays_until_the_new_one_is_complete(tmp_path):
     path = tmp_path / "panel.png"
     path.write_text("old")
     with replace_file(path) as temporary:
@@ -14,8 +14,9 @@ def test_the_old_file_is_there_until_the_new_one_is_whole(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-def test_a_failure_keeps_the_old_file_and_leaves_no_other(tmp_path, error):
+def test_a_failure_keeps_the_old_file_and_deletes_the_temporary_one(tmp_path, error):
     path = tmp_path / "panel.png"
     path.write_text("old")
 
@@ -30,13 +31,13 @@ def test_a_failure_keeps_the_old_file_and_leaves_no_other(tmp_path, error):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_new_file_can_be_read_by_whom_the_umask_lets(tmp_path):
+def test_a_new_file_has_the_permissions_of_the_umask(tmp_path):
     (tmp_path / "plain").write_text("")
     with replace_file(tmp_path / "replaced") as temporary:
         temporary.write_text("")
     assert (tmp_path / "replaced").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
-def test_a_block_that_writes_nothing_is_an_error(tmp_path):
+def test_a_block_that_writes_nothing_raises(tmp_path):
     with pytest.raises(FileNotFoundError), replace_file(tmp_path / "panel.png"):
         pass

@@ -24,7 +24,8 @@ def positive(value):
     return value > 0
 
 
-def test_a_number_inside_its_bounds_comes_back_as_a_float():
+@pytest.mark.quick
+def test_check_number_returns_a_float():
     value = check_number("p", 1, low=0.0, high=1.0)
     assert (value, type(value)) == (1.0, float)
     assert check_number("depth", math.inf, low=0.0, high=math.inf) == math.inf
@@ -40,23 +41,23 @@ def test_a_number_inside_its_bounds_comes_back_as_a_float():
         (math.nan, "p must not be NaN"),
     ],
 )
-def test_a_number_outside_its_bounds_raises(value, rule):
+def test_numbers_outside_of_the_bounds_raise(value, rule):
     with pytest.raises(ValueError, match=rule):
         check_number("p", value, low=0.0, high=1.0)
 
 
-def test_what_lies_within_but_for_rounding_passes_and_what_does_not_is_told():
+def test_check_within_allows_rounding_and_names_the_wrong_value():
     check_within("v", torch.tensor([1e-3, 5.0, 1e6 * (1 + 5e-6), 1e-3 * (1 - 5e-6)], dtype=torch.float64), 1e-3, 1e6)
     for value in (9e-4, 1.1e6, math.inf, -1.0):
         with pytest.raises(ValueError, match=re.escape(f"v must lie in [0.001, 1e+06], got {value:g}")):
             check_within("v", torch.tensor([1.0, value]), 1e-3, 1e6)
 
 
-def test_numbers_of_numpy_are_numbers():
+def test_numpy_numbers_are_accepted():
     numbers: list[Any] = [np.float32(0.5), np.int64(1), np.int8(0), np.uint8(3), np.float64(3)]
     half, one, zero, three, broken = numbers
-    found = [check_number("p", half), check_number("p", one), *check_range("r", (zero, one))]
-    assert [(value, type(value)) for value in found] == [(0.5, float), (1.0, float), (0.0, float), (1.0, float)]
+    result = [check_number("p", half), check_number("p", one), *check_range("r", (zero, one))]
+    assert [(value, type(value)) for value in result] == [(0.5, float), (1.0, float), (0.0, float), (1.0, float)]
     count = check_count("steps", three)
     assert (count, type(count)) == (3, int)
     with pytest.raises(TypeError, match="steps must be a whole number, got"):
@@ -64,49 +65,49 @@ def test_numbers_of_numpy_are_numbers():
 
 
 @pytest.mark.parametrize("value", ["1", None, True, np.True_, [1.0], 1j, torch.tensor(1.0), np.array([1.0])])
-def test_what_is_no_real_number_raises(value):
+def test_values_that_are_not_real_numbers_raise(value):
     with pytest.raises(TypeError, match="p must be a real number, got"):
         check_number("p", value)
 
 
 @pytest.mark.parametrize("value", [(1, 2), [1, 2], (1.0, 1.0)])
-def test_a_range_comes_back_as_two_floats(value):
+def test_check_range_returns_two_floats(value):
     result = check_range("k1_range", value)
     assert result == tuple(value)
     assert [type(end) for end in result] == [float, float]
 
 
-def test_a_range_may_end_at_an_infinite_bound_only_where_one_is_given():
+def test_infinite_ends_need_an_infinite_bound():
     assert check_range("visibility_range", (1.0, math.inf), low=0.0, high=math.inf) == (1.0, math.inf)
     with pytest.raises(ValueError, match="visibility_range must be"):
         check_range("visibility_range", (math.inf, math.inf), low=0.0, high=100.0)
 
 
 @pytest.mark.parametrize("value", [(2.0, 1.0), (-1.0, 0.5), (0.5, 1.5), (math.nan, 1.0), (0.0, math.nan)])
-def test_a_range_out_of_order_or_bounds_raises(value):
+def test_ranges_out_of_order_or_bounds_raise(value):
     with pytest.raises(ValueError, match="beta_range must"):
         check_range("beta_range", value, low=0.0, high=1.0)
 
 
 @pytest.mark.parametrize("value", [1.0, (1.0,), (1.0, 2.0, 3.0), "12", None, {1.0, 2.0}])
-def test_what_is_no_pair_raises(value):
+def test_ranges_without_two_ends_raise(value):
     with pytest.raises(ValueError, match=r"beta_range must be \(low, high\), got"):
         check_range("beta_range", value)
 
 
 @pytest.mark.parametrize("value", [("0", "1"), (None, 1.0), (False, True)])
-def test_a_pair_of_no_numbers_raises(value):
+def test_ranges_of_other_types_raise(value):
     with pytest.raises(TypeError, match="beta_range must be a real number"):
         check_range("beta_range", value)
 
 
-def test_a_choice_is_one_of_its_names():
+def test_check_choice_lists_the_choices():
     assert check_choice("padding", "zeros", ("zeros", "border")) == "zeros"
     with pytest.raises(ValueError, match="padding must be one of zeros, border, got 'wrap'"):
         check_choice("padding", "wrap", ("zeros", "border"))
 
 
-def test_a_count_is_a_whole_number_from_its_lowest_on():
+def test_check_count_names_the_lowest_value():
     assert check_count("steps", 1) == 1
     assert check_count("steps", 0, low=0) == 0
     with pytest.raises(ValueError, match="steps must be at least 1, got 0"):
@@ -114,72 +115,72 @@ def test_a_count_is_a_whole_number_from_its_lowest_on():
 
 
 @pytest.mark.parametrize("value", [1.0, "1", True, None])
-def test_what_is_no_whole_number_is_no_count(value):
+def test_counts_that_are_not_whole_numbers_raise(value):
     with pytest.raises(TypeError, match="steps must be a whole number, got"):
         check_count("steps", value)
 
 
-def test_what_is_no_tensor_raises():
+def test_values_that_are_not_tensors_raise():
     with pytest.raises(TypeError, match="image must be a tensor, got list"):
-        check_tensor("image", [1.0])  # pyright: ignore[reportArgumentType]  # what is tested
+        check_tensor("image", [1.0])  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("shape", [(2, 3, 4), (1, 3, 4, 5), (2,), (1, 1, 2, 4, 5)])
-def test_a_flow_of_another_shape_raises(shape):
+def test_flows_of_another_shape_raise(shape):
     with pytest.raises(ValueError, match=r"flow must have shape \(B, 2, H, W\), got"):
         check_flow("flow", torch.zeros(shape))
 
 
 @pytest.mark.parametrize("dtype", [torch.int64, torch.uint8, torch.bool, torch.complex64])
-def test_a_flow_of_no_floats_raises(dtype):
+def test_flows_of_another_type_raise(dtype):
     with pytest.raises(TypeError, match="flow must be of a floating type, got"):
         check_flow("flow", torch.zeros(1, 2, 3, 4, dtype=dtype))
 
 
-def test_a_wrong_value_in_a_tensor_is_named():
+def test_check_values_names_the_first_wrong_value():
     check_values("depth", "be above 0, in m", torch.tensor([1.0, 2.0]), positive)
     with pytest.raises(ValueError, match=r"depth must be above 0, in m, got -2\.5"):
         check_values("depth", "be above 0, in m", torch.tensor([1.0, -2.5, -3.0]), positive)
 
 
-def test_nothing_is_read_from_a_device_that_would_make_us_wait():
-    elsewhere = torch.empty(3, device="meta")
-    check_values("depth", "be above 0, in m", elsewhere, positive)
-    assert eager_bool((elsewhere > 0).all) is None
+def test_values_on_a_device_are_not_check_and_add():
+    on_meta = torch.empty(3, device="meta")
+    check_values("depth", "be above 0, in m", on_meta, positive)
+    assert eager_bool((on_meta > 0).all) is None
 
 
-def test_what_cannot_be_read_is_not_even_computed():
-    elsewhere, computed = torch.empty(3, device="meta"), list[torch.Tensor]()
+def test_values_on_a_device_are_not_computed():
+    on_meta, computed = torch.empty(3, device="meta"), list[torch.Tensor]()
 
-    def kept(value: torch.Tensor) -> torch.Tensor:
+    def record(value: torch.Tensor) -> torch.Tensor:
         computed.append(value)
         return value
 
-    assert eager_bool(lambda: kept(elsewhere).all(), of=elsewhere) is None
-    assert eager_values(lambda: kept(elsewhere), of=elsewhere) is None
-    check_values("depth", "be above 0, in m", elsewhere, lambda value: kept(value) > 0)
+    assert eager_bool(lambda: record(on_meta).all(), of=on_meta) is None
+    assert eager_values(lambda: record(on_meta), of=on_meta) is None
+    check_values("depth", "be above 0, in m", on_meta, lambda value: record(value) > 0)
     assert computed == []
-    assert eager_values(lambda: kept(torch.arange(2)), of=torch.empty(0)) == [0, 1]
+    assert eager_values(lambda: record(torch.arange(2)), of=torch.empty(0)) == [0, 1]
     assert len(computed) == 1
 
 
-def test_nothing_is_read_while_compiling():
+def test_values_are_not_checked_while_compiling():
     @torch.compile(fullgraph=True, backend="eager")
-    def checked(value):
+    def check_and_add(value):
         check_values("depth", "be above 0, in m", value, positive)
         return value + 1
 
-    assert torch.equal(checked(torch.tensor([-1.0])), torch.tensor([0.0]))
+    assert torch.equal(check_and_add(torch.tensor([-1.0])), torch.tensor([0.0]))
 
 
-def test_nothing_is_read_inside_vmap():
-    def checked(value):
+def test_values_are_not_checked_inside_vmap():
+    def check_and_add(value):
         check_values("depth", "be above 0, in m", value, positive)
         return value + 1
 
-    assert torch.equal(torch.vmap(checked)(torch.tensor([[-1.0], [1.0]])), torch.tensor([[0.0], [2.0]]))
+    assert torch.equal(torch.vmap(check_and_add)(torch.tensor([[-1.0], [1.0]])), torch.tensor([[0.0], [2.0]]))
 
 
-def test_the_truth_of_a_readable_tensor_is_told():
+def test_eager_bool_returns_the_value_of_a_tensor_on_the_cpu():
     assert eager_bool(lambda: torch.tensor(True)) is True
     assert eager_bool(lambda: torch.tensor(False)) is False

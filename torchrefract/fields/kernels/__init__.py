@@ -1,1 +1,0 @@
-"""What numba compiles; imported by `_compiled.kernels` alone."""

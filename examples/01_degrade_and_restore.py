@@ -6,7 +6,7 @@ import torch
 from matplotlib.figure import Figure
 
 import torchrefract as tr
-from torchrefract import viz
+from torchrefract import visualization
 from torchrefract.data.road_scenes import render_road_scenes
 
 out = sys.argv[1] if len(sys.argv) > 1 else "degrade_and_restore.png"
@@ -23,8 +23,8 @@ t = misty.transmission.clamp(min=1 / 255)
 unveiled = torch.where(misty.valid, (misty.image - airlight * (1 - t)) / t, airlight)
 
 rows = {
-    "LensDistortion": (clean, lens.image, viz.flow_to_rgb(lens.flow * lens.valid), unbent * seen),
-    "UniformFog": (clean, misty.image, viz.transmission_to_rgb(misty.transmission), unveiled),
+    "LensDistortion": (clean, lens.image, visualization.flow_to_rgb(lens.flow * lens.valid), unbent * seen),
+    "UniformFog": (clean, misty.image, visualization.transmission_to_rgb(misty.transmission), unveiled),
 }
 columns = ("clean", "degraded", "flow / transmission", "restored by the map")
 figure = Figure(figsize=(13.2, 4.1), layout="constrained")

@@ -10,8 +10,8 @@ from PIL import Image
 
 from torchrefract import warp
 from torchrefract.data.images import read_image
+from torchrefract.data.media import video_facts
 from torchrefract.restoration.checkpoints import read_checkpoint
-from torchrefract.videos import video_facts
 
 SIZES = {"a.png": (48, 96), "one/b.png": (90, 70), "one/two/b.png": (48, 96), "one/c.bmp": (1, 1)}
 LIMIT = 0.25  # of Undistort, in widths and heights

@@ -14,9 +14,7 @@ from torchrefract._validation import UsageError, check_number
 from torchrefract.cameras.io.opencv import read_opencv, write_opencv
 from torchrefract.cameras.models import Camera
 from torchrefract.cli.command import as_they_are, command, job, naming, progress
-from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
-from torchrefract.fields.rectifying import camera_flow
-from torchrefract.footage import (
+from torchrefract.data.footage import (
     check_apart,
     find_footage,
     is_video,
@@ -25,6 +23,8 @@ from torchrefract.footage import (
     write_picture,
     written_as,
 )
+from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
+from torchrefract.fields.rectifying import camera_flow
 from torchrefract.warping.resample import warp
 
 

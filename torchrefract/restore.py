@@ -17,9 +17,7 @@ from torch import Tensor
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_count, check_flag, check_size
 from torchrefract.cli.command import as_they_are, command, job, naming, progress
-from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
-from torchrefract.data.pairs.ledger import claim
-from torchrefract.footage import (
+from torchrefract.data.footage import (
     check_apart,
     find_footage,
     is_video,
@@ -28,10 +26,12 @@ from torchrefract.footage import (
     write_picture,
     written_as,
 )
+from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
+from torchrefract.data.media import video_facts
+from torchrefract.data.pairs.ledger import claim
 from torchrefract.restoration.loading import load_model
 from torchrefract.restoration.restorer import Restorer
 from torchrefract.restoration.tasks import Undistort
-from torchrefract.videos import video_facts
 
 _T = TypeVar("_T")
 

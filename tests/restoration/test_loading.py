@@ -98,7 +98,7 @@ class Trap:
         "torchrefract._io.os.replace",
         "torchrefract.restoration.module.torch.nn.Linear",
         "torchrefract.restoration.module.LightningModule",
-        "torchrefract.videos.write_video",
+        "torchrefract.data.media.write_video",
         "torchrefract.restoration.no_module.Network",
         "torchrefract.Camera",
         "torchrefract.",

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchrefract.restoration.report import PanelRows, _curves, _panel, save_curves, save_panel
-from torchrefract.viz import flow_to_rgb
+from torchrefract.visualization.color import flow_to_rgb
 
 # As CSVLogger writes it: columns by name, a validation row and a training row an epoch, most cells empty.
 METRICS = """\

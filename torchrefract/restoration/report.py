@@ -15,9 +15,9 @@ from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from torchrefract._io import replace_file
-from torchrefract.page import Page, as_drawn
 from torchrefract.restoration.history import metrics_rows
-from torchrefract.viz import flow_to_rgb, flow_wheel, full_color_px, hatch_invalid
+from torchrefract.visualization.color import flow_to_rgb, flow_wheel, full_color_px, hatch_invalid
+from torchrefract.visualization.page import Page, as_drawn
 
 _Columns = dict[str, dict[int, float]]  # name -> epoch -> value
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrefract._validation import UsageError
 from torchrefract.data.frame_folder import path_key, place_frames, val_drives, walk
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, as_image, fit, pixels_of, read_pixels
-from torchrefract.videos import VIDEOS, read_video, video_facts
+from torchrefract.data.media import VIDEOS, read_video, video_facts
 
 
 class Source(NamedTuple):

@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import torchrefract as tr
-from torchrefract.page import as_drawn
-from torchrefract.sheet import Scale, SheetRow, drawn, make_row, sheet
-from torchrefract.viz import checkerboard, flow_to_rgb, flow_wheel, transmission_to_rgb
+from torchrefract.visualization.color import checkerboard, flow_to_rgb, flow_wheel, transmission_to_rgb
+from torchrefract.visualization.figures import Scale, SheetRow, drawn, make_row, sheet
+from torchrefract.visualization.page import as_drawn
 from torchrefract.warping.jacobian import folded
 
 SIZE = (32, 40)  # drawn with 8 x 8 px for each

@@ -20,12 +20,12 @@ from torch import Tensor
 
 from torchrefract.cli.command import naming, progress
 from torchrefract.data.images import pixels_of
+from torchrefract.data.media import write_video
 from torchrefract.effects.base import Effect
-from torchrefract.page import Page, as_drawn
-from torchrefract.sheet import Scale, draw_legend, drawn, map_picture, map_scales
 from torchrefract.types import Degraded
-from torchrefract.videos import write_video
-from torchrefract.viz import hatch_invalid
+from torchrefract.visualization.color import hatch_invalid
+from torchrefract.visualization.figures import Scale, draw_legend, drawn, map_picture, map_scales
+from torchrefract.visualization.page import Page, as_drawn
 
 _STACKED = 3  # effects below one another; more of them stand in pairs, and are drawn smaller
 _LARGEST = (480, 320)  # px, the longer side of an image as drawn, of few effects and of many

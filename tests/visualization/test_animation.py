@@ -13,8 +13,8 @@ from torch import Tensor
 import torchrefract as tr
 from torchrefract._validation import UsageError
 from torchrefract.effects.base import Effect
-from torchrefract.film import Film, Footage, formats, make_film, save_film
-from torchrefract.viz import flow_to_rgb, transmission_to_rgb
+from torchrefract.visualization.animation import Film, Footage, formats, make_film, save_film
+from torchrefract.visualization.color import flow_to_rgb, transmission_to_rgb
 
 SIZE = (24, 40)  # drawn with 8 x 8 px for each
 FAST: dict[str, Any] = {"wind_x_range": (2.0, 2.0), "decorrelation_range": (2.0, 4.0)}

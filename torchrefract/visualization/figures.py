@@ -16,10 +16,9 @@ from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
 from torchrefract.effects.defog import remove_fog
 from torchrefract.effects.flare import LensFlare
-from torchrefract.page import Page, as_drawn
 from torchrefract.restoration.metrics import psnr
 from torchrefract.types import Degraded
-from torchrefract.viz import (
+from torchrefract.visualization.color import (
     checkerboard,
     flow_to_rgb,
     flow_wheel,
@@ -29,6 +28,7 @@ from torchrefract.viz import (
     rounded_up,
     transmission_to_rgb,
 )
+from torchrefract.visualization.page import Page, as_drawn
 from torchrefract.warping.grid import length
 from torchrefract.warping.jacobian import folded
 from torchrefract.warping.resample import warp

@@ -21,9 +21,9 @@ from torchrefract._validation import UsageError
 from torchrefract.cli.command import with_picture
 from torchrefract.data.images import fit, read_image
 from torchrefract.data.road_scenes import render_road_scenes
-from torchrefract.film import Film
 from torchrefract.presets import cape_town_fog, limpopo_sun_glare
-from torchrefract.sheet import make_row
+from torchrefract.visualization.animation import Film
+from torchrefract.visualization.figures import make_row
 
 # One quick row.
 BRIEFLY = ("scene=cheap_dashcam",)
@@ -221,7 +221,7 @@ def test_a_wrong_word_is_one_line_of_error_and_no_sheet(call, picture, tmp_path,
 
 
 def test_a_folder_that_is_not_there_is_found_before_the_work(call, picture, monkeypatch):
-    monkeypatch.setattr("torchrefract.preview.make_row", None)
+    monkeypatch.setattr("torchrefract.cli.preview.make_row", None)
     assert "could not be written" in call("preview", "frame.png", "out=none/sheet.png").message
 
 
@@ -498,7 +498,7 @@ def test_a_full_disk_keeps_the_old_film(call, picture, tmp_path, monkeypatch, su
 def test_a_run_that_is_killed_keeps_the_old_film(picture, tmp_path):
     (tmp_path / "sun.mp4").write_text("old")
     words = ("-m", "torchrefract.preview", "frame.png", *SUN, "out=sun.mp4", "frames=100000")
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
     with subprocess.Popen([sys.executable, *words], cwd=tmp_path, env=environment) as run:
         begun = time.monotonic()
         while not any(path.stat().st_size > 0 for path in tmp_path.glob(".sun-*.mp4")):
@@ -510,7 +510,7 @@ def test_a_run_that_is_killed_keeps_the_old_film(picture, tmp_path):
 
 
 def test_an_installed_package_draws_a_sheet_in_a_process_of_its_own(spawn, picture, tmp_path):
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     shutil.copytree(root / "torchrefract", tmp_path / "torchrefract", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(root / "conf", tmp_path / "torchrefract" / "conf")
     outcome = spawn("-m", "torchrefract.preview", "frame.png", *BRIEFLY, cwd=tmp_path)

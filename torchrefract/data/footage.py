@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrefract._validation import UsageError
 from torchrefract.data.frame_folder import walk
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, image_size
-from torchrefract.videos import VIDEOS, read_video, video_facts, write_video
+from torchrefract.data.media import VIDEOS, read_video, video_facts, write_video
 
 _FPS = 25.0  # of a video that does not say
 _QUALITY = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95], ".jpeg": [cv2.IMWRITE_JPEG_QUALITY, 95]}

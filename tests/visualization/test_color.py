@@ -6,7 +6,7 @@ import torch
 from matplotlib import colormaps
 from torch.testing import assert_close
 
-from torchrefract.viz import (
+from torchrefract.visualization.color import (
     checkerboard,
     flow_to_rgb,
     flow_wheel,

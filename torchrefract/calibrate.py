@@ -18,14 +18,14 @@ from torchrefract.cameras.calibration.fit import FEWEST_VIEWS, MODELS, held_out
 from torchrefract.cameras.calibration.outliers import drop_outliers
 from torchrefract.cameras.calibration.synthetic import CAMERA, VIEWS, render_views
 from torchrefract.cameras.io.opencv import write_opencv
-from torchrefract.cli.command import as_they_are, command, job, make, naming, progress
+from torchrefract.cli.command import command, job, make, naming, progress
 
 _RENDERED = "synthetic"
 _NEEDED = FEWEST_VIEWS + 1  # views, so that each can be left out
 _LONGEST = 300  # letters of what is said of single pictures in one line
 
 
-@command("calibrate", prepare=as_they_are)
+@command("calibrate")
 @hydra.main(config_path=CONFIG_DIR, config_name="calibrate", version_base="1.3")
 @job
 def main(cfg: DictConfig) -> None:

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_choice
-from torchrefract.cli.command import as_they_are, command, job, naming
+from torchrefract.cli.command import command, job, naming
 from torchrefract.programs import FORMATS, outputs_of, save_program, traced
 from torchrefract.restoration.loading import Loaded, load_model
 from torchrefract.restoration.module import Restoration
@@ -19,7 +19,7 @@ from torchrefract.restoration.restorer import Restoring
 _BARS = {"restored": 1e-3, "flow": 1e-2}  # of the range of an image, and px
 
 
-@command("export", prepare=as_they_are)
+@command("export")
 @hydra.main(config_path=CONFIG_DIR, config_name="export", version_base="1.3")
 @job
 def main(cfg: DictConfig) -> None:

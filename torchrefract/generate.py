@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_number, check_size
-from torchrefract.cli.command import check_seed, command, job, leave, make, naming, with_text
+from torchrefract.cli.command import check_seed, command, job, leave, make, naming, quote_option
 from torchrefract.data.frame_folder import some
 from torchrefract.data.pair_files import FORMATS
 from torchrefract.data.pair_manifest import manifests, scan
@@ -73,7 +73,7 @@ class _Asked(NamedTuple):
         return Job(number, self.sources.frames[place], lap)
 
 
-@command("generate", prepare=with_text("license"))
+@command("generate", prepare=quote_option("license"))
 @hydra.main(config_path=CONFIG_DIR, config_name="generate", version_base="1.3")
 @job
 def main(cfg: DictConfig) -> None:

@@ -8,12 +8,12 @@ from omegaconf import DictConfig
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_number
 from torchrefract.board_prints import board_page
-from torchrefract.cli.command import as_they_are, command, job, make, naming
+from torchrefract.cli.command import command, job, make, naming
 
 _FORMATS = (".pdf", ".png")
 
 
-@command("make_board", prepare=as_they_are)
+@command("make_board")
 @hydra.main(config_path=CONFIG_DIR, config_name="make_board", version_base="1.3")
 @job
 def main(cfg: DictConfig) -> None:

@@ -4,11 +4,11 @@ import hydra
 from omegaconf import DictConfig
 
 from torchrefract._io import CONFIG_DIR
-from torchrefract.cli.command import command, job, with_picture
+from torchrefract.cli.command import command, job, picture_as_option
 from torchrefract.cli.preview import preview
 
 
-@command("preview", prepare=with_picture)
+@command("preview", prepare=picture_as_option)
 @hydra.main(config_path=CONFIG_DIR, config_name="preview", version_base="1.3")
 @job
 def main(cfg: DictConfig) -> None:

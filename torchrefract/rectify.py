@@ -13,22 +13,22 @@ from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_number
 from torchrefract.cameras.io.opencv import read_opencv, write_opencv
 from torchrefract.cameras.models import Camera
-from torchrefract.cli.command import as_they_are, command, job, naming, progress
-from torchrefract.data.footage import (
-    check_apart,
-    find_footage,
-    is_video,
-    is_written,
-    write_frames,
-    write_picture,
-    written_as,
-)
+from torchrefract.cli.command import command, job, naming, progress
 from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
+from torchrefract.data.media import (
+    check_output_folder,
+    convert_video,
+    find_media,
+    is_complete,
+    is_video,
+    output_name,
+    write_picture,
+)
 from torchrefract.fields.rectifying import camera_flow
 from torchrefract.warping.resample import warp
 
 
-@command("rectify", prepare=as_they_are)
+@command("rectify")
 @hydra.main(config_path=CONFIG_DIR, config_name="rectify", version_base="1.3")
 @job
 def main(cfg: DictConfig) -> None:
@@ -38,10 +38,10 @@ def main(cfg: DictConfig) -> None:
         zoom = check_number("zoom", cfg.zoom, low=0.05, high=20.0)
     with naming("camera"):
         lens = _Lens(read_opencv(str(cfg.camera)), zoom)
-    files = find_footage(source)
+    files = find_media(source)
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
-    check_apart(out, source)
+    check_output_folder(out, source)
     _claim(out, lens)
     if lens.black:
         print(
@@ -96,12 +96,12 @@ def _claim(out: Path, lens: _Lens) -> None:
 
 def _rectify(file: Path, lens: _Lens, out: Path) -> bool:
     """Whether a picture or video had to be rectified."""
-    target = out / written_as(file).name
-    if is_written(file, target):
+    target = out / output_name(file).name
+    if is_complete(file, target):
         return False
     with replace_file(target) as path:
         if is_video(file):
-            write_frames(file, path, change=partial(map, lens))
+            convert_video(file, path, change=partial(map, lens))
         else:
             write_picture(lens(read_image(file)[None].contiguous()), path)
     return True

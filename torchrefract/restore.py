@@ -16,18 +16,18 @@ from torch import Tensor
 
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_count, check_flag, check_size
-from torchrefract.cli.command import as_they_are, command, job, naming, progress
-from torchrefract.data.footage import (
-    check_apart,
-    find_footage,
-    is_video,
-    is_written,
-    write_frames,
-    write_picture,
-    written_as,
-)
+from torchrefract.cli.command import command, job, naming, progress
 from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
-from torchrefract.data.media import video_facts
+from torchrefract.data.media import (
+    check_output_folder,
+    convert_video,
+    find_media,
+    is_complete,
+    is_video,
+    output_name,
+    video_info,
+    write_picture,
+)
 from torchrefract.data.pairs.ledger import claim
 from torchrefract.restoration.loading import load_model
 from torchrefract.restoration.restorer import Restorer
@@ -48,11 +48,11 @@ class _Asked(NamedTuple):
 
     def target(self, file: Path) -> Path:
         """Where what comes of a file is written."""
-        return self.out / written_as(file).relative_to(self.source)
+        return self.out / output_name(file).relative_to(self.source)
 
     def is_done(self, file: Path) -> bool:
         """Whether that is there."""
-        return is_written(file, self.target(file), beside=1 + self.side_by_side)
+        return is_complete(file, self.target(file), num_columns=1 + self.side_by_side)
 
     def restored(self, images: Sequence[Tensor]) -> Iterator[np.ndarray]:
         """Images (3, H, W) in [0, 1] as they are written: (H, W, 3), uint8, RGB."""
@@ -62,14 +62,14 @@ class _Asked(NamedTuple):
             yield pixels_of(shown)
 
 
-@command("restore", prepare=as_they_are)
+@command("restore")
 @hydra.main(config_path=CONFIG_DIR, config_name="restore", version_base="1.3")
 @job
 def main(cfg: DictConfig) -> None:
     """Restore what is not there yet."""
     source, out = Path(str(cfg.input)), Path(str(cfg.out))
-    files = find_footage(source, deep=True)
-    check_apart(out, source, deep=True)
+    files = find_media(source, deep=True)
+    check_output_folder(out, source, deep=True)
     asked = _asked(cfg, source if source.is_dir() else source.parent, out)
     with naming("out"):
         claim(out, _settings(cfg, asked), count=0, about={})
@@ -170,14 +170,14 @@ def _videos(files: Sequence[Path], asked: _Asked, failed: dict[Path, str]) -> in
 
 
 def _video(file: Path, target: Path, asked: _Asked) -> int:
-    total = video_facts(file)[0]
+    total = video_info(file)[0]
 
     def change(frames: Iterable[Tensor]) -> Iterator[np.ndarray]:
         for some in _batches(progress(frames, f"restoring {file.name}", count=total), asked.batch):
             yield from asked.restored([frame[0] for frame in some])
 
     with replace_file(target) as path:
-        return write_frames(file, path, change=change)
+        return convert_video(file, path, change=change)
 
 
 def _skip(file: Path, error: UnreadableImageError, failed: dict[Path, str]) -> None:

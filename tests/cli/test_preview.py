@@ -18,12 +18,12 @@ from PIL import Image
 import torchrefract as tr
 from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
-from torchrefract.cli.command import with_picture
+from torchrefract.cli.command import picture_as_option
 from torchrefract.data.images import fit, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.presets import cape_town_fog, limpopo_sun_glare
-from torchrefract.visualization.animation import Film
-from torchrefract.visualization.figures import make_row
+from torchrefract.visualization.animation import Animation
+from torchrefract.visualization.figures import contact_sheet_row
 
 # One quick row.
 BRIEFLY = ("scene=cheap_dashcam",)
@@ -62,11 +62,13 @@ def test_a_picture_becomes_a_sheet_of_its_effects(call, picture, tmp_path):
     assert outcome.out == "preview.png: cheap_dashcam on frame.png\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frame.png", "preview.png"]
     frame = read_image(picture)[None]
-    row = make_row("", tr.LensDistortion(), frame=frame, seed=3)  # the scene is a lens with its defaults
+    row = contact_sheet_row("", tr.LensDistortion(), frame=frame, seed=3)  # the scene is a lens with its defaults
     assert row.restored is not None
     for cell in (row.frame, row.corrupted, row.checkerboard, row.restored):
         assert holds(tmp_path / "preview.png", cell)
-    assert not holds(tmp_path / "preview.png", make_row("", tr.LensDistortion(), frame=frame, seed=4).corrupted)
+    assert not holds(
+        tmp_path / "preview.png", contact_sheet_row("", tr.LensDistortion(), frame=frame, seed=4).corrupted
+    )
 
 
 def test_all_effects_are_drawn_on_a_rendered_scene_where_no_picture_is_given(call, tmp_path):
@@ -81,7 +83,7 @@ def test_all_effects_are_drawn_on_a_rendered_scene_where_no_picture_is_given(cal
 def test_fog_knows_the_depth_of_a_rendered_scene(call, tmp_path):
     assert call("preview", "scene=cape_town_fog", "size=[24,32]", "seed=7").code == 0
     frame, depth = render_road_scenes(torch.tensor([7]), 24, 32)
-    row = make_row("", cape_town_fog(), frame=frame, seed=7, depth=depth)
+    row = contact_sheet_row("", cape_town_fog(), frame=frame, seed=7, depth=depth)
     assert row.map is not None
     for cell in (row.frame, row.corrupted, row.map):
         assert holds(tmp_path / "preview.png", cell)
@@ -95,7 +97,9 @@ def test_the_settings_of_an_effect_can_be_changed(call, picture, tmp_path):
     air = tr.Turbulence(amplitude_range=(1, 1), length_range=(60, 90), aperture_range=(8, 10))
     fog = tr.UniformFog(visibility_range=(9, 9), depth=tr.GroundPlaneDepth())
     for effect in (air, fog):
-        assert holds(tmp_path / "preview.png", make_row("", effect, frame=read_image(picture)[None], seed=0).corrupted)
+        assert holds(
+            tmp_path / "preview.png", contact_sheet_row("", effect, frame=read_image(picture)[None], seed=0).corrupted
+        )
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_one_others(call, picture, tmp_path):
@@ -109,7 +113,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_one_others(call, picture
 def test_a_picture_is_cut_and_reduced_before_it_is_degraded(call, picture, tmp_path):
     assert call("preview", "frame.png", *BRIEFLY, "size=[12,8]").code == 0
     frame = read_image(picture)[None, :, ::2, 8:24:2]
-    row = make_row("", tr.LensDistortion(), frame=frame.contiguous(), seed=0)
+    row = contact_sheet_row("", tr.LensDistortion(), frame=frame.contiguous(), seed=0)
     assert holds(tmp_path / "preview.png", row.frame)
     assert holds(tmp_path / "preview.png", row.corrupted)
 
@@ -141,7 +145,7 @@ NAMES = (
 def test_any_name_of_a_file_reaches_the_configuration_letter_by_letter(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     Path(name).touch()
-    (word,) = with_picture("preview", [name])
+    (word,) = picture_as_option("preview", [name])
     with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
         assert compose("preview", overrides=[word]).image == name
 
@@ -157,13 +161,13 @@ def test_a_picture_with_an_odd_name_is_drawn(call, picture, tmp_path, name):
 def test_words_that_are_no_picture_stay_as_they_are(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["seed=1", "--config-dir", "mine", "-c", "job", "~effects.Compose", "+a=b", "--resolve"]
-    assert with_picture("preview", words) == words
-    assert with_picture("preview", [*words, "frame.png"]) == [*words, "image='frame.png'"]
+    assert picture_as_option("preview", words) == words
+    assert picture_as_option("preview", [*words, "frame.png"]) == [*words, "image='frame.png'"]
 
 
 def test_two_pictures_are_one_too_many():
     with pytest.raises(UsageError, match=r"one picture, in quotes .*, got my and frame\.png"):
-        with_picture("preview", ["my", "frame.png"])
+        picture_as_option("preview", ["my", "frame.png"])
 
 
 def test_the_configuration_can_be_looked_at_without_a_picture_being_read(call, tmp_path):
@@ -221,7 +225,7 @@ def test_a_wrong_word_is_one_line_of_error_and_no_sheet(call, picture, tmp_path,
 
 
 def test_a_folder_that_is_not_there_is_found_before_the_work(call, picture, monkeypatch):
-    monkeypatch.setattr("torchrefract.cli.preview.make_row", None)
+    monkeypatch.setattr("torchrefract.cli.preview.contact_sheet_row", None)
     assert "could not be written" in call("preview", "frame.png", "out=none/sheet.png").message
 
 
@@ -242,7 +246,7 @@ def test_a_sheet_that_cannot_be_drawn_keeps_the_old_one(call, picture, tmp_path)
 
 def test_a_scene_has_the_severity_that_is_asked_for(call, picture, tmp_path):
     assert call("preview", "frame.png", "scene=cape_town_fog", "scene.severity=5").code == 0
-    thick, usual = (make_row("", cape_town_fog(s), frame=read_image(picture)[None], seed=0) for s in (5, 3))
+    thick, usual = (contact_sheet_row("", cape_town_fog(s), frame=read_image(picture)[None], seed=0) for s in (5, 3))
     assert holds(tmp_path / "preview.png", thick.corrupted)
     assert not holds(tmp_path / "preview.png", usual.corrupted)
     assert (
@@ -264,7 +268,7 @@ def meters() -> np.ndarray:
 def foggy(frame: torch.Tensor, depth: np.ndarray) -> torch.Tensor:
     """(3, h, w), as drawn."""
     given = torch.from_numpy(depth.astype(np.float32))[None, None]
-    return make_row("", cape_town_fog(), frame=frame, seed=0, depth=given).corrupted
+    return contact_sheet_row("", cape_town_fog(), frame=frame, seed=0, depth=given).corrupted
 
 
 def test_a_depth_array_is_that_of_the_picture_at_any_size_of_its_shape(call, picture, tmp_path):
@@ -282,7 +286,8 @@ def test_a_depth_array_is_that_of_the_picture_at_any_size_of_its_shape(call, pic
         assert outcome.out == "preview.png: cape_town_fog on frame.png\n"
         assert holds(tmp_path / "preview.png", expected)
     assert not holds(
-        tmp_path / "preview.png", make_row("", cape_town_fog(), frame=read_image(picture)[None], seed=0).corrupted
+        tmp_path / "preview.png",
+        contact_sheet_row("", cape_town_fog(), frame=read_image(picture)[None], seed=0).corrupted,
     )
 
 
@@ -340,7 +345,7 @@ def test_depth_is_cut_with_its_picture(call, picture, tmp_path):
         (
             "d.npy",
             np.array([{}], dtype=object),
-            "depth must be an array of numbers, got d.npy, which is damaged or none",
+            "depth must be an array of numbers, got d.npy, which is damaged or not an array",
         ),
         ("d.png", np.zeros((12, 16), np.uint16), "depth must be known in half of the pixels .* d.png with 100.0% at 0"),
         ("d.png", np.ones((12, 16), np.uint8), "depth must be a gray PNG of 16 bits, or a .npy in m, got d.png"),
@@ -487,8 +492,8 @@ def test_a_full_disk_keeps_the_old_film(call, picture, tmp_path, monkeypatch, su
         yield next(original(self, times))
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    original = Film.pages
-    monkeypatch.setattr(Film, "pages", fill)
+    original = Animation.render
+    monkeypatch.setattr(Animation, "render", fill)
     message = call("preview", "frame.png", *SUN, f"out=sun{suffix}", "frames=3").message
     assert message == f"sun{suffix} could not be written: No space left on device"
     assert (tmp_path / f"sun{suffix}").read_text() == "old"

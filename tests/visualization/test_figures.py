@@ -9,11 +9,11 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 from torch.testing import assert_close
+from torchrefract.visualization.page import as_drawn
 
 import torchrefract as tr
 from torchrefract.visualization.color import checkerboard, flow_to_rgb, flow_wheel, transmission_to_rgb
 from torchrefract.visualization.figures import Scale, SheetRow, drawn, make_row, sheet
-from torchrefract.visualization.page import as_drawn
 from torchrefract.warping.jacobian import folded
 
 SIZE = (32, 40)  # drawn with 8 x 8 px for each

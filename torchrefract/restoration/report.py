@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrefract._io import replace_file
 from torchrefract.restoration.history import metrics_rows
 from torchrefract.visualization.color import flow_to_rgb, flow_wheel, full_color_px, hatch_invalid
-from torchrefract.visualization.page import Page, as_drawn
+from torchrefract.visualization.figures import FigureLayout, resize_for_display
 
 _Columns = dict[str, dict[int, float]]  # name -> epoch -> value
 
@@ -158,7 +158,7 @@ def _panel(rows: PanelRows) -> Figure:
     columns = _columns(rows, scale)
     lines = 1 + max(caption.count("\n") for caption in rows.captions)
     height, width = columns["clean"].shape[2:]
-    page = Page(len(rows.clean), len(columns), height, width, lines)
+    page = FigureLayout(len(rows.clean), len(columns), height, width, lines)
     figure = page.figure()
     for j, (title, images) in enumerate(columns.items()):
         page.write(figure, title, page.left(j) + page.width / 2, 2 * page.text, ha="center", weight="bold")
@@ -178,8 +178,8 @@ def _columns(rows: PanelRows, scale: float) -> dict[str, Tensor]:
             derived[title] = flow_to_rgb(flow, max_px=scale)
     if len(derived) == 1:
         derived["|restored - clean| x 4"] = 4 * (rows.restored - rows.clean).abs()
-    hatched = {title: hatch_invalid(as_drawn(image), rows.valid) for title, image in derived.items()}
-    return {"clean": as_drawn(rows.clean), "corrupted": as_drawn(rows.degraded)} | hatched
+    hatched = {title: hatch_invalid(resize_for_display(image), rows.valid) for title, image in derived.items()}
+    return {"clean": resize_for_display(rows.clean), "corrupted": resize_for_display(rows.degraded)} | hatched
 
 
 def _full_color_px(rows: PanelRows) -> float:
@@ -188,7 +188,7 @@ def _full_color_px(rows: PanelRows) -> float:
     return full_color_px(moving[0], rows.valid) if moving else 1.0
 
 
-def _draw_key(figure: Figure, page: Page, rows: PanelRows, scale: float) -> None:
+def _draw_key(figure: Figure, page: FigureLayout, rows: PanelRows, scale: float) -> None:
     """A stripe below all rows: what hatching means and, where there is flow, the color wheel with its scale."""
     text, y = page.text, page.top(page.rows) - page.text
     if not rows.valid.all():

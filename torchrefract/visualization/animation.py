@@ -1,278 +1,228 @@
-"""Effects in motion: each beside its map, frame by frame, as an animation in a file."""
+"""Animations of effects: each degraded frame and its map, written as GIF, WebP, APNG or MP4."""
 
-import struct
 import textwrap
 import warnings
-import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image, features
-from PIL.GifImagePlugin import getdata, getheader
 from torch import Tensor
 
-from torchrefract.cli.command import naming, progress
+from torchrefract._validation import UsageError
 from torchrefract.data.images import pixels_of
 from torchrefract.data.media import write_video
 from torchrefract.effects.base import Effect
 from torchrefract.types import Degraded
-from torchrefract.visualization.color import hatch_invalid
-from torchrefract.visualization.figures import Scale, draw_legend, drawn, map_picture, map_scales
-from torchrefract.visualization.page import Page, as_drawn
+from torchrefract.visualization.figures import (
+    FigureLayout,
+    MapScale,
+    describe_params,
+    draw_invalid_key,
+    draw_legend,
+    map_image,
+    map_scales,
+    resize_for_display,
+)
 
-_STACKED = 3  # effects below one another; more of them stand in pairs, and are drawn smaller
-_LARGEST = (480, 320)  # px, the longer side of an image as drawn, of few effects and of many
-_LINES = 4  # of a caption
-_SURVEYED = 5  # frames that tell the scale of a map and the colors of a palette
-_WHITE, _SAME = 0, 255  # of the colors of a GIF; the other one leaves a pixel as it was
-_GRAIN = 8.0  # of 255, from the darkest to the brightest place of the pattern that hides the steps of a palette
+_MAX_STACKED = 3  # effects below one another; more stand in two columns, and are drawn smaller
+_LARGEST_SIDE = (480, 320)  # px, largest longer side of an image, of few effects and of many
+_MAX_CAPTION_LINES = 4
+_NUM_SAMPLED = 5  # frames that decide the scale of a map and the palette of a GIF
+_PALETTE_COLORS = 254  # of 256: one is white, one is the transparent color of unchanged pixels
+_DITHER = 8.0  # of 255, range of the dither matrix
 
 
-class Footage(NamedTuple):
-    """Frames to degrade, read when they are asked for."""
+class FrameSequence(NamedTuple):
+    """Frames of one size, read when they are needed."""
 
-    total: int
-    frames: Callable[[Iterable[int]], Iterator[tuple[int, Tensor]]]  # rising numbers -> each with (1, 3, H, W)
+    num_frames: int
+    read: Callable[[Iterable[int]], Iterator[tuple[int, Tensor]]]  # rising numbers t -> (t, frame (1, 3, H, W))
 
 
-class FilmRow(NamedTuple):
-    """An effect, and what is said of it."""
+class Panel(NamedTuple):
+    """An effect of an animation."""
 
     name: str
     effect: Effect
     caption: str
-    scales: tuple[Scale, ...]  # of its map, the same in all frames
+    scales: tuple[MapScale, ...]  # of its map, the same in all frames
 
 
 @dataclass(frozen=True)
-class Film:
-    """Effects on footage; `page` says where the images lie, left those that are degraded, right of each its map.
+class Animation:
+    """Effects on a sequence of frames; each degraded frame stands left of its map.
 
-    backdrop: (height, width, 3), uint8, both even: all that stands still.
+    background: (height, width, 3), uint8, both even: texts and legends, which do not change.
     """
 
-    rows: Sequence[FilmRow]
-    footage: Footage
-    page: Page
-    backdrop: np.ndarray
+    panels: Sequence[Panel]
+    frames: FrameSequence
+    layout: FigureLayout
+    background: np.ndarray
     seed: int
     depth: Tensor | None
 
-    def pages(self, times: Iterable[int]) -> Iterator[np.ndarray]:
-        """What the film shows at some times, which rise, each as the backdrop; one after the other."""
-        for t, frame in self.footage.frames(times):
-            page = self.backdrop.copy()
-            for i, row in enumerate(self.rows):
-                degraded = _degraded(row.name, row.effect, frame, self.seed, self.depth, t)
-                self._put(page, as_drawn(degraded.image, largest=_largest(len(self.rows)))[0], i, 0)
-                if row.scales:
-                    picture = map_picture(degraded, row.scales, largest=_largest(len(self.rows)))
-                    self._put(page, picture, i, 1)
-            yield page
+    def render(self, times: Iterable[int]) -> Iterator[np.ndarray]:
+        """Render the pictures (height, width, 3), uint8, at rising times, one by one."""
+        largest = _largest_side(len(self.panels))
+        for t, frame in self.frames.read(times):
+            picture = self.background.copy()
+            for i, panel in enumerate(self.panels):
+                degraded = _degrade(panel.name, panel.effect, frame, self.seed, self.depth, t)
+                images = [resize_for_display(degraded.image, largest=largest)[0]]
+                if panel.scales:
+                    images.append(map_image(degraded, panel.scales, largest=largest))
+                for column, image in enumerate(images):
+                    x, y = self.position(i, column)
+                    picture[y : y + image.shape[1], x : x + image.shape[2]] = pixels_of(image)
+            yield picture
 
-    def _put(self, page: np.ndarray, image: Tensor, i: int, column: int) -> None:
-        x, y = self.place(i, column)
-        height, width = image.shape[1:]
-        page[y : y + height, x : x + width] = pixels_of(image)
-
-    def place(self, i: int, column: int) -> tuple[int, int]:
-        """The upper left corner of an effect's image, column 0, or map, column 1."""
-        row, left = divmod(i, self.page.columns // 2)
-        return self.page.left(2 * left + column), self.page.top(row)
+    def position(self, i: int, column: int) -> tuple[int, int]:
+        """Return the upper left corner (x, y), px, of an effect's image (column 0) or map (column 1)."""
+        row, pair = divmod(i, self.layout.columns // 2)
+        return self.layout.left(2 * pair + column), self.layout.top(row)
 
 
-def make_film(effects: Mapping[str, Effect], footage: Footage, *, seed: int, depth: Tensor | None = None) -> Film:
-    """The film of effects on footage: frame t is `effect.degrade(frame, seed=seed, depth=depth, frame=t)`.
+def make_animation(
+    effects: Mapping[str, Effect], frames: FrameSequence, *, seed: int, depth: Tensor | None = None
+) -> Animation:
+    """Prepare an animation whose frame t is `effect.degrade(frame, seed=seed, depth=depth, frame=t)`.
 
     Args:
-        effects: at least one, by what they are called.
-        footage: at least one frame, all of one size.
+        effects: at least one, by name.
+        frames: at least one.
         seed: of the draws.
-        depth: (1, 1, H, W), m, of all frames, for the effects that ask for it.
+        depth: (1, 1, H, W), m, of all frames, for effects that depend on it.
 
     Raises:
-        UsageError: what an effect raises for the first frames.
+        UsageError: if an effect cannot degrade the frames; the message names the effect.
     """
-    rows: dict[str, FilmRow] = {}
-    shape: tuple[int, ...] = ()
-    for t, frame in footage.frames(_survey(footage.total)):
-        shape = as_drawn(frame, largest=_largest(len(effects))).shape[2:]
+    panels: dict[str, Panel] = {}
+    height = width = 0
+    for t, frame in frames.read(_sample_times(frames.num_frames)):
+        height, width = resize_for_display(frame, largest=_largest_side(len(effects))).shape[2:]
         for name, effect in effects.items():
-            degraded = _degraded(name, effect, frame, seed, depth, t)
-            found = FilmRow(name, effect, f"{name}: {drawn(effect, degraded.params)}", map_scales(degraded))
-            rows[name] = _joined(rows.get(name, found), found)
-    page, backdrop = _set_up(list(rows.values()), *shape)
-    return Film(list(rows.values()), footage, page, backdrop, seed, depth)
+            degraded = _degrade(name, effect, frame, seed, depth, t)
+            scales = map_scales(degraded)
+            if name not in panels:
+                panels[name] = Panel(name, effect, f"{name}: {describe_params(effect, degraded.params)}", scales)
+            else:
+                panels[name] = _with_larger_scales(panels[name], dict(scales))
+    layout, background = _draw_background(list(panels.values()), height, width)
+    return Animation(list(panels.values()), frames, layout, background, seed, depth)
 
 
-def formats() -> list[str]:
-    """The suffixes that a film can be saved with here."""
-    able = {".webp": features.check("webp"), ".mp4": cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG)}
-    return [suffix for suffix in _WRITERS if able.get(suffix, True)]
+def animation_formats() -> list[str]:
+    """Return the suffixes of files that the installed Pillow and OpenCV can write."""
+    available = {".webp": features.check("webp"), ".mp4": cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG)}
+    return [suffix for suffix in (".gif", ".webp", ".apng", ".mp4") if available.get(suffix, True)]
 
 
-def save_film(film: Film, path: Path, *, fps: float, name: str) -> None:
-    """Write a film, with a line of progress where somebody watches. No more than a few pages are in memory at a time.
+def save_animation(animation: Animation, path: Path, *, fps: float, times: Iterable[int] | None = None) -> None:
+    """Write an animation that repeats forever. MP4 is written frame by frame, other formats are held in memory.
 
     Args:
-        film: what to write.
-        path: where; its suffix is one of `formats()`.
-        fps: frames a second, rounded to hundredths of a second each in a GIF and to thousandths in a WebP.
-        name: what the line of progress says.
+        animation: to write.
+        path: its suffix is one of `animation_formats()`.
+        fps: frames per second; GIF rounds the times of frames to 1/100 s, WebP and APNG to 1/1000 s.
+        times: numbers of the frames, rising; None for all. An iterable can report progress.
 
     Raises:
-        OSError: what cannot be written.
+        OSError: if the file cannot be written.
     """
-    times = progress(range(film.footage.total), name, count=film.footage.total)
-    _WRITERS[path.suffix.lower()](film, film.pages(times), path, fps)
+    pictures = animation.render(range(animation.frames.num_frames) if times is None else times)
+    suffix = path.suffix.lower()
+    if suffix == ".mp4":
+        height, width = animation.background.shape[:2]
+        write_video(pictures, path, fps=fps, size=(width, height))
+        return
+    if suffix == ".gif":
+        samples = animation.render(_sample_times(animation.frames.num_frames))
+        palette = _palette(np.concatenate(list(samples)))
+        images = [_quantize(picture, palette) for picture in pictures]
+    else:
+        images = [Image.fromarray(picture) for picture in pictures]
+    unit = 10 if suffix == ".gif" else 1  # ms
+    # The end of each frame is rounded, so that errors do not add up.
+    ends = [unit * round(1000 * (i + 1) / fps / unit) for i in range(len(images))]
+    durations = [end - start for start, end in zip([0, *ends], ends, strict=False)]
+    # WebP frames that build on one another would all be redrawn now and then, which is seen as a pulse.
+    options: dict[str, Any] = {"quality": 90, "kmin": 0, "kmax": 1} if suffix == ".webp" else {}
+    format_name = "PNG" if suffix == ".apng" else suffix[1:].upper()
+    images[0].save(path, format_name, save_all=True, append_images=images[1:], duration=durations, loop=0, **options)
 
 
-def _largest(effects: int) -> int:
-    return _LARGEST[effects > _STACKED]
+def _largest_side(num_effects: int) -> int:
+    return _LARGEST_SIDE[num_effects > _MAX_STACKED]
 
 
-def _survey(count: int) -> list[int]:
-    """A few times of a clip, its ends among them."""
-    parts = max(1, min(count, _SURVEYED) - 1)
-    return sorted({i * (count - 1) // parts for i in range(parts + 1)})
+def _sample_times(num_frames: int) -> list[int]:
+    """Return a few frame numbers, spread evenly from the first to the last."""
+    steps = max(1, min(num_frames, _NUM_SAMPLED) - 1)
+    return sorted({i * (num_frames - 1) // steps for i in range(steps + 1)})
 
 
-def _degraded(name: str, effect: Effect, frame: Tensor, seed: int, depth: Tensor | None, t: int) -> Degraded:
-    with naming(name), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of folds
-        return effect.degrade(frame, seed=seed, depth=depth, frame=t)
+def _degrade(name: str, effect: Effect, frame: Tensor, seed: int, depth: Tensor | None, t: int) -> Degraded:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # Every frame would warn of the same folds.
+        try:
+            return effect.degrade(frame, seed=seed, depth=depth, frame=t)
+        except (ValueError, TypeError) as error:
+            raise UsageError(f"{name}: {error}") from error
 
 
-def _joined(row: FilmRow, later: FilmRow) -> FilmRow:
-    """A row whose scales hold for both."""
-    tops = dict(later.scales)
-    return row._replace(scales=tuple(Scale(s.name, max(s.top, tops.get(s.name, s.top))) for s in row.scales))
+def _with_larger_scales(panel: Panel, tops: Mapping[str, float]) -> Panel:
+    """Return the panel with scales that hold for both of two frames."""
+    return panel._replace(scales=tuple(MapScale(name, max(top, tops.get(name, top))) for name, top in panel.scales))
 
 
-def _set_up(rows: Sequence[FilmRow], height: int, width: int) -> tuple[Page, np.ndarray]:
-    """The page of a film, and what stands still on it."""
-    across = 1 if len(rows) <= _STACKED else 2
-    page = Page(-(-len(rows) // across), 2 * across, height, width, 2, header_lines=0)
-    page = page._replace(narrowest=33 - width // page.text)  # leaves 17 lines from a map's left side, for its legend
-    letters = round(1.9 * page.pitch / page.text)
-    captions = [textwrap.wrap(row.caption, letters, max_lines=_LINES, placeholder=" …") for row in rows]
-    page = page._replace(caption_lines=max(2, *map(len, captions)))
-    figure, bottom = page.figure(), page.top(page.rows - 1) + height + page.text
-    for i, (row, caption) in enumerate(zip(rows, captions, strict=True)):
-        column, y = 2 * (i % across), page.top(i // across)
-        page.write(figure, "\n".join(caption), page.left(column), y - 0.3 * page.text, weight="bold")
-        draw_legend(figure, page, row.scales, x=page.left(column + 1), y=y)
-    if any(scale.name == "flow" for row in rows for scale in row.scales):
-        stripes = hatch_invalid(torch.zeros(1, 3, height, width), torch.zeros(1, 1, 1, 1, dtype=torch.bool))
-        page.explain(figure, stripes[0], "not valid: lost, or outside the frame", x=page.left(0), y=bottom)
-        bottom += 3 * page.text
+def _draw_background(panels: Sequence[Panel], height: int, width: int) -> tuple[FigureLayout, np.ndarray]:
+    """Lay out images of (height, width), and draw captions and legends."""
+    across = 1 if len(panels) <= _MAX_STACKED else 2
+    layout = FigureLayout(-(-len(panels) // across), 2 * across, height, width, 2, header_lines=0)
+    # The legend of a map takes 17 lines from its left side.
+    layout = layout._replace(min_column_lines=33 - width // layout.text)
+    letters = round(1.9 * layout.column_px / layout.text)
+    captions = [
+        textwrap.wrap(panel.caption, letters, max_lines=_MAX_CAPTION_LINES, placeholder=" …") for panel in panels
+    ]
+    layout = layout._replace(caption_lines=max(2, *map(len, captions)))
+    figure, bottom = layout.figure(), layout.top(layout.rows - 1) + height + layout.text
+    for i, (panel, caption) in enumerate(zip(panels, captions, strict=True)):
+        column, y = 2 * (i % across), layout.top(i // across)
+        layout.write(figure, "\n".join(caption), layout.left(column), y - 0.3 * layout.text, weight="bold")
+        draw_legend(figure, layout, panel.scales, x=layout.left(column + 1), y=y)
+    if any(scale.name == "flow" for panel in panels for scale in panel.scales):
+        draw_invalid_key(figure, layout, x=layout.left(0), y=bottom)
+        bottom += 3 * layout.text
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    still = np.asarray(canvas.buffer_rgba())[:bottom, :, :3]
-    # Videos take even sides only.
-    return page, np.pad(still, [(0, still.shape[0] % 2), (0, still.shape[1] % 2), (0, 0)], constant_values=255)
+    drawn = np.asarray(canvas.buffer_rgba())[:bottom, :, :3]
+    # Video codecs need even sides.
+    return layout, np.pad(drawn, [(0, drawn.shape[0] % 2), (0, drawn.shape[1] % 2), (0, 0)], constant_values=255)
 
 
-def _write_gif(film: Film, pages: Iterator[np.ndarray], path: Path, fps: float) -> None:
-    palette = _palette(np.concatenate(list(film.pages(_survey(film.footage.total)))))
-    before = np.full(film.backdrop.shape[:2], _SAME, np.uint8)
-    with path.open("wb") as stream:
-        for i, page in enumerate(pages):
-            image = Image.fromarray(_grained(page)).quantize(palette=palette, dither=Image.Dither.NONE)
-            colors = np.where((page == 255).all(axis=2), np.uint8(_WHITE), np.asarray(image))
-            if i == 0:
-                stream.writelines(getheader(image, info={"loop": 0})[0])
-            changed = Image.fromarray(np.where(colors == before, np.uint8(_SAME), colors))
-            # Hundredths of a second, so that each frame ends at its time.
-            shown = round(100 * (i + 1) / fps) - round(100 * i / fps)
-            stream.writelines(getdata(changed, duration=10 * shown, transparency=_SAME, disposal=1))
-            before = colors
-        stream.write(b";")
-
-
-def _palette(pages: np.ndarray) -> Image.Image:
-    """An image whose palette has the colors of pages, white, and one to spare."""
-    # The octree keeps rare colors too, such as the ends of a legend, but no pure white.
-    found = Image.fromarray(pages).quantize(_SAME - 1, method=Image.Quantize.FASTOCTREE).getpalette() or []
+def _palette(pictures: np.ndarray) -> Image.Image:
+    """Return an image whose palette has pure white first, and then the colors of the pictures."""
+    # The octree keeps rare colors, such as the ends of a color bar, but no pure white.
+    reduced = Image.fromarray(pictures).quantize(_PALETTE_COLORS, method=Image.Quantize.FASTOCTREE)
     palette = Image.new("P", (1, 1))
-    palette.putpalette([255, 255, 255, *found])
+    palette.putpalette([255, 255, 255, *(reduced.getpalette() or [])])
     return palette
 
 
-def _grained(page: np.ndarray) -> np.ndarray:
-    """The page with a pattern of 8 x 8 px that stands still, unlike the noise of other dithering."""
-    height, width = page.shape[:2]
-    pattern = np.zeros((1, 1))
+def _quantize(picture: np.ndarray, palette: Image.Image) -> Image.Image:
+    """Reduce a picture to a palette by ordered dithering, which stands still where the picture does."""
+    height, width = picture.shape[:2]
+    matrix = np.zeros((1, 1))  # Bayer's, 8 x 8
     for _ in range(3):
-        pattern = np.block([[4 * pattern, 4 * pattern + 2], [4 * pattern + 3, 4 * pattern + 1]])
-    offset = np.tile(_GRAIN * ((pattern + 0.5) / 64 - 0.5), (-(-height // 8), -(-width // 8)))[:height, :width]
-    return (page + offset[..., None]).round().clip(0, 255).astype(np.uint8)
-
-
-class _Rest:
-    """Pages as Pillow asks for images: each when it is looked for, none kept."""
-
-    def __init__(self, pages: Iterator[np.ndarray], count: int):
-        self.pages, self.n_frames = pages, count
-
-    def seek(self, frame: int) -> None:
-        """The next page is that of this number."""
-        self.image = Image.fromarray(next(self.pages))
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.image, name)
-
-
-def _write_webp(film: Film, pages: Iterator[np.ndarray], path: Path, fps: float) -> None:
-    first = Image.fromarray(next(pages))
-    rest: list[Any] = [_Rest(pages, film.footage.total - 1)] if film.footage.total > 1 else []
-    # Every frame for itself: with frames that build on others all would be redrawn now and then, which pulses.
-    alone: dict[str, Any] = {"kmin": 0, "kmax": 1}
-    first.save(path, save_all=True, append_images=rest, duration=1000 / fps, loop=0, quality=90, **alone)
-
-
-def _write_apng(film: Film, pages: Iterator[np.ndarray], path: Path, fps: float) -> None:
-    height, width = film.backdrop.shape[:2]
-    delay = Fraction(1 / fps).limit_denominator(1000)
-    with path.open("wb") as stream:
-        stream.write(b"\x89PNG\r\n\x1a\n")
-        _chunk(stream, b"IHDR", struct.pack(">2I5B", width, height, 8, 2, 0, 0, 0))
-        _chunk(stream, b"acTL", struct.pack(">2I", film.footage.total, 0))
-        for i, page in enumerate(pages):
-            # Chunks of frames are numbered throughout: the first frame has one, the others two.
-            frame = (max(0, 2 * i - 1), width, height, 0, 0, *delay.as_integer_ratio(), 0, 0)
-            _chunk(stream, b"fcTL", struct.pack(">5I2H2B", *frame))
-            pixels = _packed(page)
-            _chunk(stream, *((b"fdAT", struct.pack(">I", 2 * i) + pixels) if i else (b"IDAT", pixels)))
-        _chunk(stream, b"IEND", b"")
-
-
-def _packed(page: np.ndarray) -> bytes:
-    """The pixels as a PNG has them: each row as its difference to the one above, the filter that is called 2."""
-    rows = page.reshape(len(page), -1)
-    rows = np.diff(rows, axis=0, prepend=np.zeros_like(rows[:1]))
-    return zlib.compress(np.insert(rows, 0, 2, axis=1).tobytes())
-
-
-def _chunk(stream: BinaryIO, name: bytes, data: bytes) -> None:
-    stream.write(struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)))
-
-
-def _write_mp4(film: Film, pages: Iterator[np.ndarray], path: Path, fps: float) -> None:
-    height, width = film.backdrop.shape[:2]
-    write_video(pages, path, fps=fps, size=(width, height))
-
-
-_WRITERS: dict[str, Callable[[Film, Iterator[np.ndarray], Path, float], None]] = {
-    ".gif": _write_gif,
-    ".webp": _write_webp,
-    ".apng": _write_apng,
-    ".mp4": _write_mp4,
-}
+        matrix = np.block([[4 * matrix, 4 * matrix + 2], [4 * matrix + 3, 4 * matrix + 1]])
+    offset = np.tile(_DITHER * ((matrix + 0.5) / 64 - 0.5), (-(-height // 8), -(-width // 8)))[:height, :width, None]
+    # White areas stay free of the pattern.
+    dithered = np.where((picture == 255).all(axis=2, keepdims=True), 255, (picture + offset).round().clip(0, 255))
+    return Image.fromarray(dithered.astype(np.uint8)).quantize(palette=palette, dither=Image.Dither.NONE)

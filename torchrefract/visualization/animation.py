@@ -223,6 +223,9 @@ def _quantize(picture: np.ndarray, palette: Image.Image) -> Image.Image:
     for _ in range(3):
         matrix = np.block([[4 * matrix, 4 * matrix + 2], [4 * matrix + 3, 4 * matrix + 1]])
     offset = np.tile(_DITHER * ((matrix + 0.5) / 64 - 0.5), (-(-height // 8), -(-width // 8)))[:height, :width, None]
-    # White areas stay free of the pattern.
-    dithered = np.where((picture == 255).all(axis=2, keepdims=True), 255, (picture + offset).round().clip(0, 255))
-    return Image.fromarray(dithered.astype(np.uint8)).quantize(palette=palette, dither=Image.Dither.NONE)
+    dithered = Image.fromarray((picture + offset).round().clip(0, 255).astype(np.uint8))
+    colors = np.array(dithered.quantize(palette=palette, dither=Image.Dither.NONE))
+    colors[(picture == 255).all(axis=2)] = 0  # Pillow takes almost white for white.
+    image = Image.fromarray(colors)
+    image.putpalette(palette.getpalette() or [])
+    return image

@@ -334,8 +334,8 @@ def _restore(effect: Effect, degraded: Degraded) -> _Restored | None:
     """Undo the flow or the fog; None for an effect that has neither."""
     if degraded.has("flow"):
         image = warp(degraded.image, degraded.restore_flow, interpolation="bicubic")[0]
-        has_light = degraded.has("transmission") or degraded.has("intensity")
-        label = "restored, fog and flare remain" if has_light else "restored"
+        remaining = [text for name, text in (("transmission", "fog"), ("intensity", "flare")) if degraded.has(name)]
+        label = f"restored except {' and '.join(remaining)}" if remaining else "restored"
         return _Restored(image, degraded.restore_valid, label)
     air = getattr(effect, "air", None)
     if not isinstance(air, Air):

@@ -8,7 +8,7 @@ import math
 import textwrap
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 import torch.nn.functional as F
@@ -17,7 +17,6 @@ from torch import Tensor
 
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract.cameras.distortion import POLYNOMIAL12
-from torchrefract.effects.air import Air
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
 from torchrefract.effects.defog import remove_fog
@@ -239,7 +238,7 @@ def describe_params(effect: Effect, params: Any) -> str:
     if isinstance(effect, Compose):
         leaves = [
             f"{type(leaf).__name__} ({describe_params(leaf, leaf_params)})"
-            for leaf, leaf_params in effect.leaves(params)
+            for leaf, leaf_params, *_ in effect.leaves(params)
             if leaf_params.applied[0]
         ]
         return " + ".join(leaves) or "not applied"
@@ -337,13 +336,12 @@ def _restore(effect: Effect, degraded: Degraded) -> _Restored | None:
         remaining = [text for name, text in (("transmission", "fog"), ("intensity", "flare")) if degraded.has(name)]
         label = f"restored except {' and '.join(remaining)}" if remaining else "restored"
         return _Restored(image, degraded.restore_valid, label)
-    air = getattr(effect, "air", None)
-    if not isinstance(air, Air):
+    if "airlight" not in degraded.params._fields:
         return None
     # A float image would be restored exactly, which no image file allows.
-    stored = to_float(to_uint8(degraded.image))
+    stored, fog = to_float(to_uint8(degraded.image)), cast(Any, effect)
     t, airlight = degraded.transmission, degraded.params.airlight
-    return _Restored(*remove_fog(stored, t, airlight, linear_light=air.linear_light), "restored from 8 bits")
+    return _Restored(*remove_fog(stored, t, airlight, linear_light=fog.air.linear_light), "restored from 8 bits")
 
 
 def _scores(degraded: Degraded, frame: Tensor, *, restored: _Restored | None, folds: Tensor) -> str:

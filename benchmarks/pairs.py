@@ -21,8 +21,8 @@ from typing import NamedTuple
 
 from arguments import count, size
 from hydra.utils import instantiate
-from looks import LOOKS, seconds
 from omegaconf import OmegaConf
+from slow_timing import NUM_ROUNDS, seconds
 from timing import Bar
 
 from torchrefract._io import CONFIG_DIR, replace_file
@@ -157,7 +157,7 @@ def one_by_one(args: argparse.Namespace) -> Single:
 
 
 def _typical(call: Callable[[], object]) -> float:
-    return median(seconds(call) for _ in range(LOOKS))
+    return median(seconds(call) for _ in range(NUM_ROUNDS))
 
 
 def _scene(name: str) -> dict[str, object]:

@@ -19,7 +19,7 @@ import peer_warps
 import peer_weather
 import torch
 from arguments import count, frame_of, size
-from looks import timed
+from slow_timing import timed
 from timing import FEWEST_REPEATS, GRID_SAMPLE, Candidate, Conditions, Timing, references, save, table
 from torch import Tensor
 

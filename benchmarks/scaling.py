@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from arguments import count
-from looks import timed
 from memory import peak_bytes
+from slow_timing import timed
 from subjects import SMOOTH, TOLERANCE_PX, all_warps, effects
 from timing import FEWEST_REPEATS, GRID_SAMPLE, Conditions, references
 

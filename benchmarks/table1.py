@@ -23,8 +23,8 @@ from statistics import median
 
 import torch
 from arguments import count
-from looks import seconds
 from restoration_scores import METRIC_SIZE, MIX, Restore, Scores, corrupted, effects_of, mean_of, references, score
+from slow_timing import seconds
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 

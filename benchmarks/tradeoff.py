@@ -18,8 +18,8 @@ from pathlib import Path
 import torch
 from accuracy import SEED, decibels, draw_params, frame_errors, together
 from arguments import count, size
-from looks import timed
 from pareto import Point, draw, front
+from slow_timing import timed
 from sweeps import DENSE, ITSELF, SWEEPS, Variant
 from timing import FEWEST_REPEATS, GRID_SAMPLE, Candidate, Conditions, Spread, references
 from torch import Tensor

@@ -12,8 +12,8 @@ from typing import Any
 
 import torch
 from arguments import count, size
-from looks import timed
 from peers import albumentations, find_peers, versions
+from slow_timing import timed
 from subjects import SMOOTH, effects
 from timing import FEWEST_REPEATS, GRID_SAMPLE, Bar, Conditions, Timing, references, table
 from torch import Tensor

@@ -42,7 +42,7 @@ def score(clean: Tensor, degraded: tr.Degraded) -> float:
     expected, detected = model(clean), model(degraded.image)
     if degraded.flow is not None:
         expected = tr.warp_mask(expected.float(), degraded.flow, soft=True) > 0.25
-        outside = dilate(~tr.warp(clean, degraded.flow)[1], 5)  # black, with an edge of its own
+        outside = dilate(~tr.warp(clean, degraded.flow)[1], 5)  # black padding, whose border is an edge too
         expected, detected = expected & ~outside, detected & ~outside
     recall = (expected & dilate(detected, 3)).sum() / expected.sum()
     precision = (detected & dilate(expected, 3)).sum() / detected.sum().clamp(min=1)

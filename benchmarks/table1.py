@@ -25,7 +25,7 @@ from typing import NamedTuple, cast
 
 import torch
 from arguments import count
-from looks import seconds
+from slow_timing import seconds
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 

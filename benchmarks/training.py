@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 from arguments import count, size
-from looks import alternate
+from slow_timing import alternate
 from subjects import effects
 from timing import FEWEST_REPEATS, GRID_SAMPLE, Bar, Candidate, Conditions, Timing, measure, references, table
 from torch import Tensor

@@ -10,8 +10,8 @@ from PIL import Image
 
 from torchrefract import warp
 from torchrefract.data.images import read_image
+from torchrefract.data.media import video_info
 from torchrefract.restoration.checkpoints import read_checkpoint
-from torchrefract.videos import video_facts
 
 SIZES = {"a.png": (48, 96), "one/b.png": (90, 70), "one/two/b.png": (48, 96), "one/c.bmp": (1, 1)}
 LIMIT = 0.25  # of Undistort, in widths and heights
@@ -166,7 +166,7 @@ def test_a_video_keeps_its_number_and_rate_of_frames(call, folder, brighter):
     outcome = call("restore", *words)
     assert outcome.out.startswith("out: 5 restored")
     assert outcome.out.splitlines()[1].startswith("9 frames, ")
-    assert video_facts(folder / "out" / "one" / "clip.mp4") == (5, 12.0)
+    assert video_info(folder / "out" / "one" / "clip.mp4") == (5, 12.0)
     capture = cv2.VideoCapture(str(folder / "out" / "one" / "clip.mp4"))
     for k in range(5):
         frame = np.asarray(capture.read()[1])[..., ::-1].astype(float)

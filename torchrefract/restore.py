@@ -4,11 +4,11 @@ import hydra
 from omegaconf import DictConfig
 
 from torchrefract._io import CONFIG_DIR
-from torchrefract.cli.command import as_they_are, command, job
+from torchrefract.cli.command import command, job
 from torchrefract.cli.restoration import restore
 
 
-@command("restore", prepare=as_they_are)
+@command("restore")
 @hydra.main(config_path=CONFIG_DIR, config_name="restore", version_base="1.3")
 @job
 def main(cfg: DictConfig) -> None:

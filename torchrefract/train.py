@@ -4,11 +4,11 @@ import hydra
 from omegaconf import DictConfig
 
 from torchrefract._io import CONFIG_DIR
-from torchrefract.cli.command import command, job
+from torchrefract.cli.command import command, job, require_task
 from torchrefract.cli.training import train
 
 
-@command("train")
+@command("train", prepare=require_task)
 @hydra.main(config_path=CONFIG_DIR, config_name="train", version_base="1.3")
 @job
 def main(cfg: DictConfig) -> None:

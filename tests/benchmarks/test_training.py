@@ -1,12 +1,12 @@
 import json
 import sys
 
-import looks
 import pytest
+import slow_timing
 import timing
 import torch
 import training
-from looks import alternate
+from slow_timing import alternate
 from timing import Spread
 from torch.testing import assert_close
 
@@ -62,7 +62,7 @@ def test_slow_candidates_alternate(monkeypatch):
 
         return call
 
-    monkeypatch.setattr(looks.benchmark, "timer", lambda: now[0])
+    monkeypatch.setattr(slow_timing.benchmark, "timer", lambda: now[0])
     one, two = alternate({"one": candidate("one", 1.0), "two": candidate("two", 2.0)}, reference="one", rounds=3)
     assert calls == ["one", "two"] * 4
     # Calls number 3, 5, 7 and 4, 6, 8 are timed.

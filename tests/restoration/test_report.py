@@ -27,7 +27,7 @@ from torchrefract.restoration.report import (
     summary,
 )
 from torchrefract.restoration.tasks import Deweather, Restored, Undistort
-from torchrefract.viz import flow_to_rgb
+from torchrefract.visualization.color import flow_to_rgb
 
 # CSVLogger writes a row for validation and a row for training in each epoch, most cells empty.
 METRICS = """\

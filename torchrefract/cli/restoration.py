@@ -18,21 +18,21 @@ from torchrefract._validation import UsageError, check_choice, check_count, chec
 from torchrefract.cli.command import naming, progress
 from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
 from torchrefract.data.pairs.ledger import claim
-from torchrefract.footage import (
-    check_apart,
-    find_footage,
+from torchrefract.data.media import (
+    check_output_folder,
+    find_media,
     is_video,
-    is_written,
-    write_frames,
+    is_complete,
+    convert_video,
     write_picture,
-    written_as,
+    output_name,
 )
 from torchrefract.restoration.checkpoints import load_model
 from torchrefract.restoration.export import FORMATS, export_model
 from torchrefract.restoration.inference import Restorer
 from torchrefract.restoration.module import Restoration
 from torchrefract.restoration.tasks import Undistort
-from torchrefract.videos import video_facts
+from torchrefract.data.media import video_info
 
 _T = TypeVar("_T")
 
@@ -40,8 +40,8 @@ _T = TypeVar("_T")
 def restore(cfg: DictConfig) -> None:
     """Restore all pictures and videos of a folder that are not restored yet; print their number and the rate."""
     source, out = Path(str(cfg.input)), Path(str(cfg.out))
-    files = find_footage(source, deep=True)
-    check_apart(out, source, deep=True)
+    files = find_media(source, deep=True)
+    check_output_folder(out, source, deep=True)
     job = _make_job(cfg, source if source.is_dir() else source.parent, out)
     with naming("out"):
         claim(out, _settings(cfg, job), count=0, about={})
@@ -90,11 +90,11 @@ class _Job(NamedTuple):
 
     def target(self, file: Path) -> Path:
         """Return the path of the output for a file."""
-        return self.out / written_as(file).relative_to(self.source)
+        return self.out / output_name(file).relative_to(self.source)
 
     def is_done(self, file: Path) -> bool:
         """Return True if the output of a file is complete."""
-        return is_written(file, self.target(file), beside=1 + self.side_by_side)
+        return is_complete(file, self.target(file), num_columns=1 + self.side_by_side)
 
     def restore(self, images: Sequence[Tensor]) -> Iterator[np.ndarray]:
         """Restore images (3, H, W) in [0, 1] to pixels (H, W, 3), uint8, RGB."""
@@ -180,14 +180,14 @@ def _restore_videos(files: Sequence[Path], job: _Job, failed: dict[Path, str]) -
 
 
 def _restore_video(file: Path, target: Path, job: _Job) -> int:
-    num_frames = video_facts(file)[0]
+    num_frames = video_info(file)[0]
 
     def change(frames: Iterable[Tensor]) -> Iterator[np.ndarray]:
         for chunk in _batches(progress(frames, f"restoring {file.name}", count=num_frames), job.batch):
             yield from job.restore([frame[0] for frame in chunk])
 
     with replace_file(target) as path:
-        return write_frames(file, path, change=change)
+        return convert_video(file, path, change=change)
 
 
 def _skip(file: Path, error: UnreadableImageError, failed: dict[Path, str]) -> None:

@@ -17,12 +17,12 @@ from pytorch_lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from torchrefract._io import replace_file
-from torchrefract.page import Page, as_drawn
+from torchrefract.visualization.figures import FigureLayout, resize_for_display
 from torchrefract.restoration.metrics import psnr
 from torchrefract.restoration.module import RestorationModule
 from torchrefract.restoration.tasks import Restored
 from torchrefract.types import Pair
-from torchrefract.viz import flow_to_rgb, flow_wheel, full_color_px, hatch_invalid
+from torchrefract.visualization.color import flow_to_rgb, flow_wheel, full_color_px, hatch_invalid
 
 METRICS, METRICS_BEFORE = "metrics.csv", "metrics_before.csv"
 _PANEL_ROWS = 4
@@ -242,7 +242,7 @@ def draw_panel(rows: PanelRows) -> Figure:
     columns = _panel_columns(rows, scale)
     lines = 1 + max(caption.count("\n") for caption in rows.captions)
     height, width = columns["clean"].shape[2:]
-    page = Page(len(rows.clean), len(columns), height, width, lines)
+    page = FigureLayout(len(rows.clean), len(columns), height, width, lines)
     figure = page.figure()
     for j, (title, images) in enumerate(columns.items()):
         page.write(figure, title, page.left(j) + page.width / 2, 2 * page.text, ha="center", weight="bold")
@@ -282,8 +282,8 @@ def _panel_columns(rows: PanelRows, scale: float) -> dict[str, Tensor]:
             derived[title] = flow_to_rgb(flow, max_px=scale)
     if len(derived) == 1:
         derived["|restored - clean| x 4"] = 4 * (rows.restored - rows.clean).abs()
-    hatched = {title: hatch_invalid(as_drawn(image), rows.valid) for title, image in derived.items()}
-    return {"clean": as_drawn(rows.clean), "corrupted": as_drawn(rows.degraded)} | hatched
+    hatched = {title: hatch_invalid(resize_for_display(image), rows.valid) for title, image in derived.items()}
+    return {"clean": resize_for_display(rows.clean), "corrupted": resize_for_display(rows.degraded)} | hatched
 
 
 def _full_color_px(rows: PanelRows) -> float:
@@ -292,7 +292,7 @@ def _full_color_px(rows: PanelRows) -> float:
     return full_color_px(flows[0], rows.valid) if flows else 1.0
 
 
-def _draw_legend(figure: Figure, page: Page, rows: PanelRows, scale: float) -> None:
+def _draw_legend(figure: Figure, page: FigureLayout, rows: PanelRows, scale: float) -> None:
     """Explain the hatching and the colors of a flow below the last row."""
     text, y = page.text, page.top(page.rows) - page.text
     if not rows.valid.all():

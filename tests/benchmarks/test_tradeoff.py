@@ -16,9 +16,9 @@ from accuracy import Errors, compare, decibels, frame_errors, together
 from PIL import Image
 from sweeps import SWEEPS, Variant
 from torch.testing import assert_close
+from torchrefract.effects.lattice_warp import LatticeWarp
 
 from torchrefract.data.images import image_size
-from torchrefract.effects.lattice_warp import LatticeWarp
 
 SIZE = (96, 128)
 

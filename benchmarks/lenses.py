@@ -20,8 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from arguments import count
-from timing import Conditions
+from timing import Conditions, count
 from torch import Tensor
 
 from torchrefract import Camera

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from arguments import frame_of, size
-from timing import Bar, Conditions
+from timing import Bar, Conditions, frame_of, size
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 

@@ -19,11 +19,10 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import NamedTuple
 
-from arguments import count, size
 from hydra.utils import instantiate
 from looks import LOOKS, seconds
 from omegaconf import OmegaConf
-from timing import Bar
+from timing import Bar, count, size
 
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract.data.pair_files import FORMATS, decode_pair, encode_pair

@@ -13,12 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from arguments import count
 from looks import timed
 from memory import peak_bytes
-from subjects import SMOOTH, TOLERANCE_PX, all_warps, effects
-from timing import FEWEST_REPEATS, GRID_SAMPLE, Conditions, references
+from timing import GRID_SAMPLE, MIN_REPEATS, TOLERANCE_PX, WARPS, Conditions, count, effects, references
 
+from torchrefract import Compose
 from torchrefract._io import replace_file
 from torchrefract.effects.base import Effect
 
@@ -127,7 +126,7 @@ def free_bytes() -> float:
 
 def by_pixels() -> list[Step]:
     """One frame of each size, through all effects, the warps exact too."""
-    exact = {f"{name}, exact": make() for name, make in SMOOTH.items()}
+    exact = {f"{name}, exact": make(tolerance_px=None) for name, make in WARPS.items()}
     return [Step(h * w, (1, 3, h, w), {**effects(), **exact}) for h, w in SIZES]
 
 
@@ -140,7 +139,11 @@ def by_effects() -> list[Step]:
     """More and more warps in one look-up."""
     within = f"warps within {TOLERANCE_PX} px"
     return [
-        Step(n, (1, 3, *COMPOSED), {within: all_warps(n, tolerance_px=TOLERANCE_PX), "warps, exact": all_warps(n)})
+        Step(
+            n,
+            (1, 3, *COMPOSED),
+            {within: _first_warps(n, TOLERANCE_PX), "warps, exact": _first_warps(n, None)},
+        )
         for n in COUNTS
     ]
 
@@ -169,10 +172,15 @@ def table(found: Sequence[Growth]) -> list[str]:
     return lines + [f"{growth.effect} skipped at {reason}" for growth in found for reason in growth.skipped]
 
 
+def _first_warps(count: int, tolerance_px: float | None) -> Compose:
+    warps = [make(tolerance_px=tolerance_px) for make in list(WARPS.values())[:count]]
+    return Compose(warps, tolerance_px=tolerance_px)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--threads", type=count(1), default=2, help="threads of torch on the CPU, 2")
-    parser.add_argument("--repeats", type=count(FEWEST_REPEATS), default=FEWEST_REPEATS, help="rounds, 15 or more")
+    parser.add_argument("--repeats", type=count(MIN_REPEATS), default=MIN_REPEATS, help="rounds, 15 or more")
     parser.add_argument("--memory", type=float, help="GiB that an effect may take, 70 %% of what is free")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "scaling.json", help="the JSON")
     return parser

@@ -22,9 +22,9 @@ from pathlib import Path
 from statistics import median
 
 import torch
-from arguments import count
 from looks import seconds
 from restoration_scores import METRIC_SIZE, MIX, Restore, Scores, corrupted, effects_of, mean_of, references, score
+from timing import count
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 

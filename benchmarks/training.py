@@ -12,10 +12,21 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from arguments import count, size
 from looks import alternate
-from subjects import effects
-from timing import FEWEST_REPEATS, GRID_SAMPLE, Bar, Candidate, Conditions, Timing, measure, references, table
+from timing import (
+    GRID_SAMPLE,
+    MIN_REPEATS,
+    Bar,
+    Candidate,
+    Conditions,
+    Timing,
+    count,
+    effects,
+    measure,
+    references,
+    size,
+    table,
+)
 from torch import Tensor
 
 from torchrefract import presets
@@ -123,7 +134,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--batch", type=count(1), default=16, help="frames at once, 16")
     parser.add_argument("--size", type=size, default=(256, 256), help="height x width of the frames, 256x256")
     parser.add_argument("--threads", type=count(1), default=2, help="threads of torch on the CPU, 2")
-    parser.add_argument("--repeats", type=count(FEWEST_REPEATS), default=FEWEST_REPEATS, help="rounds, 15 or more")
+    parser.add_argument("--repeats", type=count(MIN_REPEATS), default=MIN_REPEATS, help="rounds, 15 or more")
     parser.add_argument("--rounds", type=count(1), default=5, help="of steps, 5")
     parser.add_argument("--encoder", default="tu-resnet34", help="of the ResUNet, tu-resnet34")
     out = Path(__file__).parent / "results" / "training.json"

@@ -11,11 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from arguments import count, size
 from looks import timed
-from peers import albumentations, find_peers, versions
-from subjects import SMOOTH, effects
-from timing import FEWEST_REPEATS, GRID_SAMPLE, Bar, Conditions, Timing, references, table
+from peers import albumentations, find_packages
+from timing import GRID_SAMPLE, MIN_REPEATS, WARPS, Bar, Conditions, Timing, count, effects, references, size, table
 from torch import Tensor
 from torch.utils import benchmark
 from torch.utils.data import DataLoader, Dataset
@@ -84,9 +82,9 @@ def main() -> None:
     torch.manual_seed(0)
     frame = torch.rand(1, 3, *args.size)
     within = effects()
-    chosen = {**within, **{f"{name}, exact": make() for name, make in SMOOTH.items()}}
-    peers, missing = find_peers()
-    print(WHAT, versions(peers), *(line for line in missing if "albumentations" in line), "", sep="\n", flush=True)
+    chosen = {**within, **{f"{name}, exact": make(tolerance_px=None) for name, make in WARPS.items()}}
+    peers, missing = find_packages()
+    print(WHAT, *(line for line in missing if "albumentations" in line), "", sep="\n", flush=True)
     ((timings, notes, conditions),) = loader(Measured(chosen, frame, args.repeats))
     held = bars(timings, list(within))
     print(table(timings, conditions), *notes, "", *held, "", sep="\n", flush=True)
@@ -151,7 +149,7 @@ def _save(
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--size", type=size, default=(1080, 1920), help="height x width of the frame, 1080x1920")
-    parser.add_argument("--repeats", type=count(FEWEST_REPEATS), default=FEWEST_REPEATS, help="rounds, 15 or more")
+    parser.add_argument("--repeats", type=count(MIN_REPEATS), default=MIN_REPEATS, help="rounds, 15 or more")
     parser.add_argument("--seconds", type=float, default=5.0, help="that frames are counted for, 5")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "workers.json", help="the JSON")
     return parser

@@ -53,7 +53,7 @@ def test_the_command_measures_along_every_axis(monkeypatch, tmp_path, capsys, on
     for name, values in (small | {"SIDE": 24, "COMPOSED": (24, 32)}).items():
         monkeypatch.setattr(scaling, name, values)
     monkeypatch.setattr(scaling, "effects", lambda: {"fog": UniformFog()})
-    monkeypatch.setattr(scaling, "SMOOTH", {"mild lens": scaling.SMOOTH["mild lens"]})
+    monkeypatch.setattr(scaling, "WARPS", {"mild lens": scaling.WARPS["mild lens"]})
     out = tmp_path / "new" / "scaling.json"
     monkeypatch.setattr(sys, "argv", ["scaling.py", "--threads", "1", "--memory", "2", "--out", str(out)])
     scaling.main()

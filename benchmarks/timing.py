@@ -40,13 +40,13 @@ _MAX_CALLS = 1000
 _REFERENCE_FLOW_PX = 4.0
 
 # Warps whose flow is smooth enough for a lattice; call with `tolerance_px` and other arguments of a warp.
-WARPS: Mapping[str, Callable[..., Any]] = {
+WARPS: dict[str, Callable[..., Any]] = {
     "mild lens": partial(tr.LensDistortion, k1_range=(-0.25, -0.25), k2_range=(0.09, 0.09), focal_range=(0.9, 0.9)),
     "thin-plate spline": tr.ThinPlateSpline,
     "Gaussian turbulence": partial(tr.Turbulence, covariance="gaussian", length_range=(40.0, 60.0)),
     "divergence-free": partial(tr.DivergenceFree, length_range=(40.0, 60.0)),
 }
-PHOTOMETRIC: Mapping[str, Callable[..., Any]] = {
+PHOTOMETRIC: dict[str, Callable[..., Any]] = {
     "uniform fog": tr.UniformFog,
     "heterogeneous fog": tr.HeterogeneousFog,
     "volumetric fog": partial(tr.HeterogeneousFog, mode="ray", depth=tr.GroundPlaneDepth()),

@@ -23,10 +23,10 @@ def road() -> torch.Tensor:
 
 @pytest.mark.parametrize("name", ["mild lens", "all four warps"])
 def test_errors_stay_within_each_tolerance(road, name):
-    exact, *within = frame_errors(variants(name, "tolerance_px"), road, 0)
-    assert exact.largest_px < 1e-3
-    assert exact.mean_levels < 1e-3
-    assert all(error.largest_px <= px for px, error in zip(tradeoff.TOLERANCES_PX, within, strict=True))
+    errors = frame_errors(variants(name, "tolerance_px"), road, 0)
+    limits = (1e-3, *tradeoff.TOLERANCES_PX)  # of the exact effect in float32 first
+    assert all(0 < (error.largest_px or 0) <= px for px, error in zip(limits, errors, strict=True))
+    assert errors[0].mean_levels < 1e-3
 
 
 def test_better_interpolation_is_closer_to_splines(road):
@@ -35,7 +35,7 @@ def test_better_interpolation_is_closer_to_splines(road):
 
 
 def test_more_steps_are_closer_to_the_reference(road):
-    errors = [error.largest_px for error in frame_errors(variants("divergence-free", "steps"), road, 0)]
+    errors = [error.largest_px or 0 for error in frame_errors(variants("divergence-free", "steps"), road, 0)]
     assert errors == sorted(errors, reverse=True)
 
 

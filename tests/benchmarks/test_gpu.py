@@ -18,15 +18,6 @@ def test_without_a_gpu_the_command_prints_one_line_and_fails(monkeypatch, capsys
     assert capsys.readouterr() == ("", "error: cuda must be a device of this machine, but torch finds no GPU\n")
 
 
-def test_a_failing_candidate_is_skipped_and_reported():
-    def fail() -> None:
-        raise RuntimeError("out of memory\nwith a long report")
-
-    good, failures = gpu.working({"fine": lambda: None, "broken": fail})
-    assert list(good) == ["fine"]
-    assert failures == ["broken is skipped: RuntimeError: out of memory"]
-
-
 def test_the_command_times_eager_and_compiled_effects_and_compares_devices(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(timing, "_STRETCH_S", 0.0)
     subjects = {"flare": LensFlare(), "spline": ThinPlateSpline()}

@@ -1,11 +1,7 @@
 import importlib
-import json
-import sys
-from functools import partial
 
 import peers
 import pytest
-import timing
 import torch
 from timing import GRID_SAMPLE, Spread, Timing
 from torch.testing import assert_close
@@ -68,15 +64,3 @@ def test_standings_list_the_other_packages_of_each_task():
     lens, fog = peers.standings(timings)
     assert lens == "lens: torchrefract A 8 x; faster: OpenCV C 0.7 x; slower: kornia B 9 x"
     assert fog == "fog: torchrefract D 0.3 x; faster: none; slower: none"
-
-
-def test_the_command_runs_without_other_packages(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(timing, "_STRETCH_S", 0.0)
-    monkeypatch.setattr(peers, "find_packages", lambda: ({}, ["kornia is skipped"]))
-    lens = "lens: torchrefract LensDistortion, exact"
-    monkeypatch.setattr(peers, "ours", lambda frame, _: {lens: partial(torch.clone, frame)})
-    out = tmp_path / "peers.json"
-    monkeypatch.setattr(sys, "argv", ["peers.py", "--size", "24x40", "--threads", "1", "--out", str(out)])
-    peers.main()
-    assert "kornia is skipped" in capsys.readouterr().out
-    assert [row["name"] for row in json.loads(out.read_text())["timings"]][2:] == [lens]

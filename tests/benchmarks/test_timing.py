@@ -46,19 +46,6 @@ def test_twice_the_work_has_a_ratio_of_two(seconds):
     assert twice.ratios["once"].median == pytest.approx(2, rel=0.01)
 
 
-def test_one_disturbed_round_does_not_change_median_and_quartiles():
-    clock = FakeClock()
-    calls = iter(range(10**6))
-
-    def disturbed() -> None:
-        clock.now += 5.0 if next(calls) == 20 else 0.1
-
-    _, timed = measure(
-        {"steady": clock.candidate("steady", 0.1), "disturbed": disturbed}, references=["steady"], clock=clock
-    )
-    assert_close(torch.tensor([timed.ratios["steady"].lower, timed.ratios["steady"].upper]), torch.ones(2))
-
-
 def test_candidates_take_turns_and_slow_ones_have_three_rounds():
     clock = FakeClock()
     seconds = {"a": 0.1, "b": 0.1, "slow": 2.0}
@@ -67,16 +54,6 @@ def test_candidates_take_turns_and_slow_ones_have_three_rounds():
     turns = [name for name, _ in groupby(clock.log)]
     assert turns == ["a", "b", "slow"] * 4 + ["a", "b"] * 12  # a trial, then 15 rounds
     assert slow.milliseconds == Spread(2e3, 2e3, 2e3)
-
-
-def test_short_candidates_are_called_often_in_one_stretch():
-    clock = FakeClock()
-    short, long = measure(
-        {"short": clock.candidate("short", 1e-3), "long": clock.candidate("long", 0.4)},
-        references=["long"],
-        clock=clock,
-    )
-    assert (short.calls, long.calls) == (20, 1)
 
 
 def test_the_number_of_threads_is_set_and_restored(on_threads):
@@ -100,11 +77,10 @@ def test_invalid_measurements_raise(options, error, message):
         measure({"fine": lambda: None, "broken": lambda: 1 / 0}, **options)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (24, 40)])
-def test_the_bare_sampler_matches_warp_along_a_weak_lens(size):
-    frame = torch.rand(2, 3, *size)
+def test_the_bare_sampler_matches_warp_along_a_weak_lens():
+    frame = torch.rand(2, 3, 24, 40)
     flow = timing._weak_lens(frame)
-    assert_close(flow.norm(dim=1).max().item(), 4.0 if size != (1, 1) else 0.0, atol=1e-4, rtol=0)
+    assert_close(flow.norm(dim=1).max().item(), 4.0, atol=1e-4, rtol=0)
     candidates = references(frame)
     assert_close(candidates[timing.GRID_SAMPLE](), warp(frame, flow)[0])
     grid = timing.sampling_grid(flow)
@@ -129,13 +105,6 @@ def test_a_saved_run_contains_timings_conditions_and_bars(tmp_path, capsys):
     text = table([timed], conditions())
     assert "frame 2x3x5x7 float32, 1 threads, 15 rounds" in text
     assert "2 (1.9-2.1)" in text
-
-
-@pytest.mark.parametrize(("value", "holds"), [(0.25, True), (0.2501, False)])
-def test_a_bar_holds_up_to_its_limit(value, holds):
-    bar = Bar("fog", value, "<=", 0.25, "x reference")
-    assert bar.holds is holds
-    assert ("DOES NOT HOLD" in str(bar)) is not holds
 
 
 def test_sizes_and_shapes_are_parsed():

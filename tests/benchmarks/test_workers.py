@@ -68,7 +68,7 @@ def test_the_command_counts_frames_per_second(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(timing, "_STRETCH_S", 0.0)
     monkeypatch.setattr(workers, "effects", lambda: {"fog": UniformFog()})
     monkeypatch.setattr(workers, "WARPS", {})
-    monkeypatch.setattr(workers, "find_peers", lambda: ({}, ["albumentations is left out (not here)"]))
+    monkeypatch.setattr(workers, "find_packages", lambda: ({}, ["albumentations is left out (not here)"]))
     out = tmp_path / "new" / "workers.json"
     monkeypatch.setattr(sys, "argv", ["workers.py", "--size", "24x32", "--seconds", "0", "--out", str(out)])
     workers.main()

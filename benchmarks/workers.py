@@ -90,7 +90,8 @@ def main() -> None:
     print(table(timings, conditions), *notes, "", *held, "", sep="\n", flush=True)
     pixels = to_uint8(frame)[0]
     rates = {}
-    for name, frames in datasets(chosen, albumentations(peers, args.size[1]), pixels).items():
+    transforms = albumentations(peers["albumentations"], args.size[1]) if "albumentations" in peers else {}
+    for name, frames in datasets(chosen, transforms, pixels).items():
         rates[name] = rate(frames, seconds=args.seconds)
         print(f"{name:56} {rates[name]:8.1f} frames/s", flush=True)
     _save(args.out, timings, conditions, bars=held, rates=rates)

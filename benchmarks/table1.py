@@ -28,7 +28,7 @@ from arguments import count
 from slow_timing import seconds
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
-from torchrefract.data.frame_folder import FrameFolder
+from torchrefract.data.frames import FrameFolder
 from torchrefract.effects.defog import remove_fog
 from torchrefract.warping.resample import warp
 

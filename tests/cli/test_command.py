@@ -8,7 +8,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from PIL import Image
-from torchrefract.data.frame_folder import FrameFolder
+from torchrefract.data.frames import FrameFolder
 
 from torchrefract._validation import UsageError
 from torchrefract.cli.command import command, naming, progress, quote_option

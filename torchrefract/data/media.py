@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrefract._tensor import to_float
 from torchrefract._validation import UsageError
-from torchrefract.data.frame_folder import walk
+from torchrefract.data.frames import list_files
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, image_size, opened
 
 # OpenCV and its FFmpeg print to the terminal; problems are raised as errors instead.
@@ -40,7 +40,7 @@ def find_media(source: Path, *, deep: bool = False) -> Sequence[Path]:
     if not source.exists():
         raise UsageError(f"input must be a folder, a picture or a video, got {source}, which does not exist")
     suffixes = (*EXTENSIONS, *VIDEOS)
-    candidates = [source] if not source.is_dir() else sorted(walk(source)) if deep else files_in(source, suffixes)
+    candidates = [source] if not source.is_dir() else sorted(list_files(source)) if deep else files_in(source, suffixes)
     files = [file for file in candidates if file.suffix.lower() in suffixes]
     if not files:
         raise UsageError(f"input must be, or hold, {', '.join(suffixes)}, got {source}")

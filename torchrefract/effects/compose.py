@@ -183,7 +183,8 @@ class Compose(Effect):
         """Pass the images through all effects."""
         height, width = image.shape[2:]
         dtype = field_dtype(image.dtype)
-        leaves = list(self.leaves(params))
+        pairs = zip(self.effects_with_params(params), self._leaf_effects(), strict=True)
+        leaves = [_Leaf(effect, own, options) for (effect, own), (_, options) in pairs]
         state = _Progress(image, depth, len(params.applied))
         places: list[int] = []
         requests = self._constant_requests(id(self), height, width, dtype)
@@ -202,15 +203,11 @@ class Compose(Effect):
             state.move([leaves[i] for i in places], cast(PlanRequest, requests[places[0]]))
         return state.result(params)
 
-    def leaves(self, params: ComposeParams) -> Iterator[_Leaf]:
-        """Yield the effects that are not compositions, in order, with their parameters and sampling options."""
-        options = [options for _, options in self._leaf_effects()]
-        yield from (_Leaf(*pair, options[i]) for i, pair in enumerate(self._effects_with_params(params)))
-
-    def _effects_with_params(self, params: ComposeParams) -> Iterator[tuple[Effect, Any]]:
+    def effects_with_params(self, params: ComposeParams) -> Iterator[tuple[Effect, Any]]:
+        """Yield the effects that are not compositions, in order, with their parameters."""
         for effect, child in zip(self._children(), params.children, strict=True):
             if isinstance(effect, Compose):
-                yield from effect._effects_with_params(child)
+                yield from effect.effects_with_params(child)
             else:
                 yield effect, child
 

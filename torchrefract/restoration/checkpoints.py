@@ -64,7 +64,7 @@ class Origin(Callback):
 
     Args:
         config: the resolved configuration of the run.
-        data: the training data, as of `torchrefract.data.fingerprint`.
+        data: the training data, as of `torchrefract.data.module`.
         licenses: by source of the model, the license, or None if it is unknown.
     """
 

@@ -11,10 +11,9 @@ from pytorch_lightning.callbacks import WeightAveraging
 from pytorch_lightning.trainer.states import TrainerFn
 from torch import Tensor, nn
 
-from torchrefract import white_noise
 from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import check_choice, check_count, check_number
-from torchrefract.draws import Stream, noise_key, stream, uniform
+from torchrefract.random import Stream, noise_key, stream, uniform, white_noise
 from torchrefract.restoration.metrics import masked_mean
 from torchrefract.restoration.models.denoiser import conditions
 from torchrefract.restoration.module import RestorationModule
@@ -300,7 +299,7 @@ def check_steps(name: str, steps: int) -> int:
 def normal(source: Stream, like: Tensor) -> Tensor:
     """Draw standard normal noise in the shape (B, C, H, W) of `like`; each sample depends only on its own stream."""
     count = like[0].numel()
-    pairs = white_noise.noise(noise_key(source).to(like.device), -(-count // 2))
+    pairs = white_noise(noise_key(source).to(like.device), -(-count // 2))
     return pairs.flatten(1)[:, :count].view_as(like)
 
 

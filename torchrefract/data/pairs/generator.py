@@ -107,7 +107,7 @@ class PairGenerator:
 
 def applied_effects(effect: Effect, params: Any) -> list[dict[str, Any]]:
     """Return the name and the parameters of each effect that was applied to the first sample, in order."""
-    leaves = effect.leaves(params) if isinstance(effect, Compose) else [(effect, params)]
+    leaves = effect.effects_with_params(params) if isinstance(effect, Compose) else [(effect, params)]
     return [
         {"effect": type(leaf).__name__}
         | {name: _plain(value[0].tolist()) for name, value in values._asdict().items() if name != "applied"}

@@ -1,188 +1,235 @@
-"""How fast pairs are written to disk, beside decoding and encoding the same pictures and nothing else.
+"""Time the writing of pairs, and the effects in a worker of a DataLoader, by frame size, and by their peak memory.
 
-python benchmarks/pairs.py --source DIR [--scene paper_refractive] [--count 1000] [--size 360x640] [--workers N]
-    [--maps png] [--kills 0] [--out benchmarks/results/pairs.json]
+python benchmarks/pairs.py --source DIR [--scene paper_refractive] [--count 200] [--size 360x640] [--workers 1 2]
+    [--maps png] [--out benchmarks/results/pairs.json]
 """
 
 import argparse
-import hashlib
 import json
 import os
-import random
-import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean, median
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
+import torch
 from arguments import count, size
 from hydra.utils import instantiate
-from looks import LOOKS, seconds
 from omegaconf import OmegaConf
-from timing import Bar
+from torch.profiler import ProfilerActivity, profile
+from torch.utils.benchmark import Timer
+from torch.utils.data import DataLoader, Dataset
 
-from torchrefract._io import CONFIG_DIR, replace_file
-from torchrefract.data.pair_files import FORMATS, decode_pair, encode_pair
-from torchrefract.data.pairs.making import Job, Maker, Recipe
-from torchrefract.data.pairs.running import work_alone
-from torchrefract.data.pairs.sources import Reader, find_sources
-
-WHAT = (
-    "A run of torchrefract.generate: pairs a second, its start among the time; the share of the cores' time that it "
-    "used, looked at twenty times a second, and the memory of all its processes, shared pages counted once, looked at "
-    "every two seconds, since a look takes time from each of them. And one pair on one thread: read, "
-    "degraded and encoded, beside reading the same frame and encoding the same arrays: means over pairs, of the median "
-    "of three calls each."
+from torchrefract import (
+    DivergenceFree,
+    HeterogeneousFog,
+    LensDistortion,
+    LensFlare,
+    ThinPlateSpline,
+    Turbulence,
+    UniformFog,
 )
-LIMIT = 1.5
-BUSY = 0.85
-_TRIED = 24  # pairs that are timed singly
-_PAUSE = 0.05  # s, between two looks at the processes: what one uses after the last of them is not counted
-_BETWEEN_MEMORY = 2.0  # s, between two at their memory
+from torchrefract._io import CONFIG_DIR, replace_file
+from torchrefract.data.pairs.files import FORMATS, decode_pair, encode_pair
+from torchrefract.data.pairs.generator import GenerationConfig, PairGenerator, PairTask
+from torchrefract.data.pairs.sources import SourceReader, find_sources
+from torchrefract.data.pairs.workers import use_one_thread
+from torchrefract.effects.base import Effect
+
+PROTOCOL = {
+    "written": "A run of torchrefract.generate for each number of workers, with its start: pairs a second, share of "
+    "the cores' time, and peak memory of all its processes (proportional set size, sampled each second).",
+    "one_pair": "One pair on one thread: read, degrade and encode; and, as the reference, read the frame and encode "
+    "ready arrays. Means over pairs of the median of three calls, s.",
+    "loader": "Frames a second from a DataLoader with one worker, which degrades one frame (3, H, W), uint8, by a new "
+    "draw in each call.",
+    "scaling": "Time of effect(image) on one thread at several sizes, ms, and the slope of log time over log pixels: 1 "
+    "is proportional.",
+    "memory": "Peak of the memory that torch allocates in effect(image), with the result and without the image, in "
+    "multiples of the float32 image.",
+}
+SCALES = (0.25, 0.5, 1.0)  # of the sides of the frame
+_SAMPLES = 12  # pairs that are timed one by one
+_SAMPLE_INTERVAL = 1.0  # s, between two readings of the processes
 
 
 class Run(NamedTuple):
-    """What a run of the command took."""
+    """Measurements of one run of the command."""
 
-    pairs: int
-    seconds: float
-    busy: float  # share of the cores' time
+    workers: int
+    pairs_per_second: float
+    core_share: float
     peak_bytes: int
-    disk_bytes: int
-
-
-class Single(NamedTuple):
-    """Means over pairs on one thread, s, as a rate has them."""
-
-    made: float
-    bare: float
+    disk_bytes_per_pair: float
 
 
 def main() -> None:
-    """Measure, print and save; where a bar does not hold it is said, and is no failure of this command."""
+    """Measure, print and save."""
     args = _parser().parse_args()
-    with tempfile.TemporaryDirectory(dir=args.room) as room:
-        words = command(args, Path(room) / "pairs")
-        found = measured(words, args.count, Path(room) / "pairs", cores=args.workers)
-        broken = killed(args, Path(room), random.Random(0)) if args.kills else None
-    single = one_by_one(args)
-    bars = [
-        Bar("the time of a pair", single.made / single.bare, "<=", LIMIT, "x bare decode and encode"),
-        Bar("the cores' time", found.busy, ">=", BUSY, "of all"),
-    ]
-    print(WHAT, "")
-    print(f"{found.pairs} pairs in {found.seconds:.1f} s: {found.pairs / found.seconds:.2f} a second on {args.workers}")
-    print(f"{found.peak_bytes / 1e6:.0f} MB of memory at most, {found.disk_bytes / found.pairs / 1e6:.3f} MB a pair")
-    print(f"one pair {1e3 * single.made:.1f} ms, bare {1e3 * single.bare:.1f} ms", *bars, sep="\n")
-    if broken is not None:
-        shown = f": {', '.join(broken[:3])}" if broken else ""
-        print(f"after {args.kills} kills {len(broken)} files differ from those of a run that was not killed{shown}")
-    content = {
-        "what": WHAT,
-        "words": words,
-        "cores": os.cpu_count(),
-        "run": found._asdict(),
-        "single": single._asdict(),
+    results: dict[str, Any] = {"written": []}
+    for workers in args.workers:
+        with tempfile.TemporaryDirectory(dir=args.disk) as folder:
+            results["written"].append(measure_run(args, Path(folder) / "pairs", workers)._asdict())
+    results["one_pair"] = measure_one_pair(args)
+    effects = make_effects()
+    image = torch.rand(1, 3, *args.size)
+    results["loader"] = {name: measure_loader(effect, image, args.seconds) for name, effect in effects.items()}
+    results["scaling"] = {name: measure_scaling(effect, args.size) for name, effect in effects.items()}
+    results["memory"] = {
+        name: peak_bytes(lambda effect=effect: effect(image)) / image.nbytes for name, effect in effects.items()
     }
+    for name, text in PROTOCOL.items():
+        print(name, text, json.dumps(results[name], indent=2), sep="\n", end="\n\n")
     args.out.parent.mkdir(parents=True, exist_ok=True)
+    conditions = {"cores": os.cpu_count(), "torch": torch.__version__, "size": args.size, "scene": args.scene}
     with replace_file(args.out) as path:
-        path.write_text(json.dumps(content | {"differ_after_kills": broken}, indent=2) + "\n", encoding="utf-8")
+        content = {"protocol": PROTOCOL, "conditions": conditions, **results}
+        path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     print(f"written to {args.out}")
 
 
-def command(args: argparse.Namespace, out: Path) -> list[str]:
-    """The words that write the pairs."""
-    scene = [f"scene={args.scene}", *([f"scene.width={args.size[1]}"] if "width" in _scene(args.scene) else [])]
-    frame = f"size=[{args.size[0]},{args.size[1]}]"
-    rest = [f"source={args.source}", f"out={out}", f"count={args.count}", f"workers={args.workers}", frame]
-    return [sys.executable, "-m", "torchrefract.generate", *scene, *rest, f"maps={args.maps}", "license=benchmark"]
+def make_effects() -> dict[str, Effect]:
+    """Return each effect with its default ranges, by the name of its class."""
+    kinds = (LensDistortion, Turbulence, ThinPlateSpline, DivergenceFree, UniformFog, HeterogeneousFog, LensFlare)
+    return {kind.__name__: kind() for kind in kinds}
 
 
-def measured(words: Sequence[str], pairs: int, out: Path, *, cores: int) -> Run:
-    """A run of the command."""
-    start, peak, used = time.perf_counter(), 0, dict[int, float]()
-    looked = start
-    with subprocess.Popen(words, stdout=subprocess.DEVNULL) as run:
+def measure_run(args: argparse.Namespace, out: Path, workers: int) -> Run:
+    """Run the command once."""
+    words = [f"scene={args.scene}", f"source={args.source}", f"out={out}", f"count={args.count}", f"workers={workers}"]
+    words += [f"size=[{args.size[0]},{args.size[1]}]", f"maps={args.maps}", "license=benchmark", *_scene(args)[1]]
+    start, peak, core_seconds = time.perf_counter(), 0, dict[int, float]()
+    command = [sys.executable, "-m", "torchrefract.generate", *words]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as run:
+        next_sample = start
         while run.poll() is None:
-            family = _family(run.pid)
-            if time.perf_counter() - looked > _BETWEEN_MEMORY:
-                peak, looked = max(peak, sum(map(_memory, family))), time.perf_counter()
-            # The system adds up what workers have used only for who waits for them, which a server of forks does not.
-            used |= {process: own for process in family if (own := _used(process))}
-            time.sleep(_PAUSE)
-    took = time.perf_counter() - start
+            processes = _descendants(run.pid)
+            core_seconds |= {process: used for process in processes if (used := _core_seconds(process))}
+            if time.perf_counter() >= next_sample:
+                peak, next_sample = max(peak, sum(map(_memory, processes))), time.perf_counter() + _SAMPLE_INTERVAL
+            time.sleep(0.05)
+    seconds = time.perf_counter() - start
     if run.returncode:
-        raise SystemExit(f"the run ended with {run.returncode}")
+        raise SystemExit(f"torchrefract.generate failed with code {run.returncode}")
     disk = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
-    return Run(pairs, took, sum(used.values()) / took / cores, peak, disk)
+    share = sum(core_seconds.values()) / seconds / max(workers, 1)
+    return Run(workers, args.count / seconds, share, peak, disk / args.count)
 
 
-def killed(args: argparse.Namespace, room: Path, dice: random.Random) -> list[str]:
-    """The files of a run that is killed so often, at random moments, which differ from those of the other one."""
-    words = command(args, room / "killed")
-    for _ in range(args.kills):
-        with subprocess.Popen(words, stdout=subprocess.DEVNULL) as run:
-            there = len(list((room / "killed").rglob("*.png")))
-            # Not in the seconds of its start: where it writes.
-            while run.poll() is None and len(list((room / "killed").rglob("*.png"))) == there:
-                time.sleep(0.01)
-            time.sleep(dice.uniform(0, 1))
-            run.send_signal(signal.SIGKILL)
-    subprocess.run(words, stdout=subprocess.DEVNULL, check=True)
-    whole, broken = (_sums(room / name) for name in ("pairs", "killed"))
-    return sorted({name for name, _ in whole.items() ^ broken.items()})
-
-
-def one_by_one(args: argparse.Namespace) -> Single:
-    """Pairs made by this process, on one thread."""
-    work_alone()
-    cfg = _scene(args.scene)
-    if "width" in cfg:
-        cfg["width"] = args.size[1]
+def measure_one_pair(args: argparse.Namespace) -> dict[str, float]:
+    """Time single pairs in this process, and the reading and encoding alone."""
+    use_one_thread()
     options = {"every": 1, "drive_by": "auto", "val_share": 0.2, "seed": 0}
-    sources = find_sources(args.source, size=args.size, **options).thinned(_TRIED)
-    reader = Reader(sources.root, args.size)
-    maker = Maker(Recipe(instantiate(cfg), args.scene, sources.root, args.size, 0, args.maps))
-    made, bare = [], []
-    for job in (Job(i, source, 0) for i, source in enumerate(sources.frames)):
-        files = maker.make(job).data
+    sources = find_sources(args.source, size=args.size, **options).limited(_SAMPLES)
+    reader, (scene, _) = SourceReader(sources.root, args.size), _scene(args)
+    generator = PairGenerator(GenerationConfig(instantiate(scene), args.scene, sources.root, args.size, 0, args.maps))
+    generated, reference = [], []
+    for number, source in enumerate(sources.frames):
+        task = PairTask(number, source, 0)
+        files = generator.generate(task).data
         arrays = decode_pair({suffix: lambda data=data: data for suffix, data in files.items()})
-        made.append(_typical(lambda job=job: maker.make(job)))
-        bare.append(_typical(lambda job=job, arrays=arrays: (reader.read(job.source), encode_pair(arrays, args.maps))))
-    return Single(fmean(made), fmean(bare))
+        generated.append(_median_seconds(lambda task=task: generator.generate(task)))
+        reference.append(
+            _median_seconds(lambda source=source, arrays=arrays: (reader.read(source), encode_pair(arrays, args.maps)))
+        )
+    return {"generated": fmean(generated), "read_and_encode": fmean(reference)}
 
 
-def _typical(call: Callable[[], object]) -> float:
-    return median(seconds(call) for _ in range(LOOKS))
+class _OneFrame(Dataset[torch.Tensor]):
+    """One frame, degraded again and again."""
+
+    def __init__(self, effect: Effect, frame: torch.Tensor):
+        self.effect, self.frame = effect, frame
+
+    def __len__(self) -> int:
+        return 1 << 20
+
+    def __getitem__(self, index: int) -> torch.Tensor:
+        return self.effect(self.frame)
 
 
-def _scene(name: str) -> dict[str, object]:
-    scene = OmegaConf.to_container(OmegaConf.load(Path(CONFIG_DIR, "scene", f"{name}.yaml")))
-    return {str(key): value for key, value in scene.items()} if isinstance(scene, dict) else {}
+def measure_loader(effect: Effect, image: torch.Tensor, seconds: float) -> float:
+    """Count the frames a second from a DataLoader with one worker, without the first one."""
+    frame = (image[0] * 255).round().to(torch.uint8)
+    batches = iter(DataLoader(_OneFrame(effect, frame), batch_size=None, num_workers=1))
+    next(batches)
+    start, frames = time.perf_counter(), 0
+    while frames < 3 or time.perf_counter() - start < seconds:
+        next(batches)
+        frames += 1
+    return frames / (time.perf_counter() - start)
 
 
-def _sums(out: Path) -> dict[str, str]:
-    files = (path for path in out.rglob("*") if path.is_file())
-    return {path.relative_to(out).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+def measure_scaling(effect: Effect, frame_size: tuple[int, int]) -> dict[str, Any]:
+    """Time an effect at several sizes."""
+    pixels, milliseconds = [], []
+    for scale in SCALES:
+        image = torch.rand(1, 3, *(max(8, round(scale * side)) for side in frame_size))
+        effect(image)
+        timer = Timer("effect(image)", globals={"effect": effect, "image": image}, num_threads=1)
+        pixels.append(image[0, 0].numel())
+        milliseconds.append(1e3 * timer.blocked_autorange(min_run_time=0.2).median)
+    return {"pixels": pixels, "milliseconds": milliseconds, "slope": slope(pixels, milliseconds)}
 
 
-def _family(process: int) -> list[int]:
-    """A process and all that come of it."""
-    found = [process]
-    for parent in found:
+def slope(sizes: Sequence[float], values: Sequence[float]) -> float:
+    """Fit a line to the logarithms and return its slope."""
+    return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
+
+
+def peak_bytes(call: Callable[[], object]) -> int:
+    """Measure the largest total of the memory that torch allocates during a call, its result included."""
+    os.environ.setdefault("KINETO_LOG_LEVEL", "9")  # silences the profiler's own log
+    call()  # allocations that are kept for later calls do not count
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as run:
+        result = call()
+    held = peak = 0
+    results: Any = run.profiler.kineto_results if run.profiler else None
+    for event in sorted(
+        (event for event in results.events() if event.name() == "[memory]"), key=lambda event: event.start_ns()
+    ):
+        held += event.nbytes()
+        peak = max(peak, held)
+    del result
+    return peak
+
+
+def _scene(args: argparse.Namespace) -> tuple[Mapping[str, Any], list[str]]:
+    """Return the configuration of the scene, and the option of its width if it has one."""
+    cfg: Any = OmegaConf.load(Path(CONFIG_DIR, "scene", f"{args.scene}.yaml"))
+    if "width" not in cfg:
+        return cfg, []
+    cfg.width = args.size[1]
+    return cfg, [f"scene.width={args.size[1]}"]
+
+
+def _median_seconds(call: Callable[[], object]) -> float:
+    times = []
+    for _ in range(3):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return median(times)
+
+
+def _descendants(process: int) -> list[int]:
+    """Return a process and all its descendants."""
+    processes = [process]
+    for parent in processes:
         try:
-            found += [int(child) for child in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()]
+            processes += [int(child) for child in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()]
         except OSError:
             continue
-    return found
+    return processes
 
 
 def _memory(process: int) -> int:
-    """Bytes of a process, its part of what it shares; 0 for one that is gone."""
+    """Return the proportional set size of a process, bytes; 0 if it has ended."""
     try:
         lines = Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()
     except OSError:
@@ -190,8 +237,8 @@ def _memory(process: int) -> int:
     return sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Pss:"))
 
 
-def _used(process: int) -> float:
-    """Seconds of a core that a process has used; 0 for one that is gone."""
+def _core_seconds(process: int) -> float:
+    """Return the time that a process has used on all cores, s; 0 if it has ended."""
     try:
         fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     except OSError:
@@ -202,13 +249,13 @@ def _used(process: int) -> float:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--source", type=Path, required=True, help="a folder of frames, or a video")
-    parser.add_argument("--scene", default="paper_refractive", help="one of conf/scene, paper_refractive")
-    parser.add_argument("--count", type=count(1), default=1000, help="pairs, 1000")
+    parser.add_argument("--scene", default="paper_refractive", help="name of a file in conf/scene, paper_refractive")
+    parser.add_argument("--count", type=count(1), default=200, help="number of pairs, 200")
     parser.add_argument("--size", type=size, default=(360, 640), help="height x width of the frames, 360x640")
-    parser.add_argument("--workers", type=count(1), default=os.cpu_count() or 1, help="processes, as many as cores")
-    parser.add_argument("--maps", choices=FORMATS, default="png", help="the form of the maps, png")
-    parser.add_argument("--kills", type=count(0), default=0, help="kill a second run so often, and compare, 0")
-    parser.add_argument("--room", type=Path, help="a folder for the pairs, which are removed; a temporary one")
+    parser.add_argument("--workers", type=count(0), nargs="+", default=[1, 2], help="numbers of processes, 1 2")
+    parser.add_argument("--maps", choices=FORMATS, default="png", help="format of the maps, png")
+    parser.add_argument("--seconds", type=float, default=2.0, help="duration of a measurement of the loader, 2")
+    parser.add_argument("--disk", type=Path, help="folder for temporary pairs, the system's default")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "pairs.json", help="the JSON")
     return parser
 

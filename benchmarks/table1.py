@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
 from torchrefract._io import replace_file
-from torchrefract.data.frame_folder import FrameFolder
+from torchrefract.data.frames import FrameFolder
 from torchrefract.restoration.diffusion import Diffusion
 from torchrefract.restoration.loading import Loaded, load_model
 from torchrefract.restoration.tasks import Restored

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from torchrefract.cli import command as _command
-from torchrefract.data.frame_folder import FrameFolder
+from torchrefract.data.frames import FrameFolder
 from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint
 
 # Loads the data and the model, and trains for no epoch.

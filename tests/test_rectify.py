@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
+from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io.opencv import read_opencv, write_opencv
-from torchrefract.cameras.models import Camera
-from torchrefract.fields.rectifying import camera_flow
+from torchrefract.fields.rectification import camera_flow
 from torchrefract.videos import video_facts
 
 PINHOLE = {"width": 96, "height": 64, "fx": 70.0, "fy": 71.0, "cx": 46.2, "cy": 33.1}
@@ -34,7 +34,7 @@ def maps(camera: Camera, zoom: float) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    """Three pictures, in the folder that commands run in."""
+    """Write three pictures and a camera to the folder in which commands run."""
     (tmp_path / "raw").mkdir()
     for k in range(3):
         cv2.imwrite(str(tmp_path / "raw" / f"{k}.png"), np.roll(waves(), 7 * k, axis=1))
@@ -42,9 +42,8 @@ def folder(tmp_path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("zoom", [1.0, 0.7])
-@pytest.mark.parametrize("name", CAMERAS)
-def test_the_flow_is_opencvs_map(name, zoom, oracle):
+@pytest.mark.parametrize(("name", "zoom"), [("opencv", 1.0), ("opencv", 0.7), ("rational", 1.0), ("fisheye", 0.7)])
+def test_the_flow_matches_the_maps_of_opencv(name, zoom, oracle):
     flow, exists, pinhole = camera_flow(CAMERAS[name], zoom=zoom)
     y, x = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
     expected = torch.from_numpy(np.stack(maps(CAMERAS[name], zoom)))
@@ -54,7 +53,7 @@ def test_the_flow_is_opencvs_map(name, zoom, oracle):
     assert (pinhole.cx, pinhole.cy, pinhole.coefficients) == (46.2, 33.1, (0.0,) * 4)
 
 
-def test_rays_that_a_camera_does_not_show_are_outside():
+def test_rays_beyond_the_fold_point_outside_the_frame():
     # It folds where 1 - 3 * 1.2 r^2 = 0: at 0.527 focal lengths from its center.
     camera = Camera(**PINHOLE, coefficients=(-1.2, 0.0, 0.0, 0.0))
     flow, exists, _ = camera_flow(camera)
@@ -65,49 +64,49 @@ def test_rays_that_a_camera_does_not_show_are_outside():
     assert ((u < -3) | (u > 98) | (v < -3) | (v > 66)).all()
 
 
-@pytest.mark.parametrize("name", CAMERAS)
-def test_pictures_keep_their_names_and_lose_their_lens(call, folder, name):
+@pytest.mark.parametrize("name", ["opencv", "fisheye"])
+def test_rectified_pictures_match_opencv(call, folder, name):
     write_opencv(folder / "cam.yaml", CAMERAS[name])
     outcome = call("rectify", "input=raw", "camera=cam.yaml")
-    expected = "rectified: 3 rectified, 0 were there already, 0 skipped; their camera is rectified/camera.yaml\n"
+    expected = "rectified: 3 rectified, 0 already existed, 0 skipped; camera of the results: rectified/camera.yaml\n"
     assert (outcome.out, outcome.err) == (expected, "")
     for k in range(3):
-        found = cv2.imread(str(folder / "rectified" / f"{k}.png"))
+        result = cv2.imread(str(folder / "rectified" / f"{k}.png"))
         raw = np.roll(waves(), 7 * k, axis=1).astype(np.float32)
         theirs = cv2.remap(raw, *maps(CAMERAS[name], 1.0), cv2.INTER_CUBIC)
-        error = np.abs(np.asarray(found) - theirs.clip(0, 255))[4:-4, 4:-4]
+        error = np.abs(np.asarray(result) - theirs.clip(0, 255))[4:-4, 4:-4]
         assert error.mean() < 1
-        assert np.abs(np.asarray(found) - raw)[4:-4, 4:-4].mean() > 5
+        assert np.abs(np.asarray(result) - raw)[4:-4, 4:-4].mean() > 5
     assert read_opencv(folder / "rectified" / "camera.yaml") == camera_flow(CAMERAS[name])[2]
 
 
-def test_a_run_that_was_stopped_goes_on(call, folder):
+def test_an_interrupted_run_continues(call, folder):
     assert call("rectify", "input=raw", "camera=cam.yaml", "out=out").code == 0
-    whole = (folder / "out" / "1.png").read_bytes()
+    content = (folder / "out" / "1.png").read_bytes()
     (folder / "out" / "0.png").unlink()
-    (folder / "out" / "1.png").write_bytes(whole[: len(whole) // 2])
+    (folder / "out" / "1.png").write_bytes(content[: len(content) // 2])
     before = (folder / "out" / "2.png").stat().st_mtime_ns
     outcome = call("rectify", "input=raw", "camera=cam.yaml", "out=out")
-    assert outcome.out.startswith("out: 2 rectified, 1 were there already, 0 skipped")
-    assert (folder / "out" / "1.png").read_bytes() == whole
+    assert outcome.out.startswith("out: 2 rectified, 1 already existed, 0 skipped")
+    assert (folder / "out" / "1.png").read_bytes() == content
     assert (folder / "out" / "2.png").stat().st_mtime_ns == before
 
 
-def test_a_folder_of_another_camera_is_not_gone_on_with(call, folder):
+def test_a_folder_of_another_camera_is_rejected(call, folder):
     assert call("rectify", "input=raw", "camera=cam.yaml", "out=out").code == 0
     message = call("rectify", "input=raw", "camera=cam.yaml", "out=out", "zoom=0.5").message
     assert message == "out must be a folder of the same camera and zoom, got out with another camera.yaml"
 
 
-def test_a_smaller_frame_has_a_smaller_camera(call, folder):
+def test_smaller_frames_use_the_resized_camera(call, folder):
     small = cv2.resize(waves(), (48, 32), interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(folder / "small.png"), small)
     assert call("rectify", "input=small.png", "camera=cam.yaml", "out=out").code == 0
     theirs = cv2.remap(
         small.astype(np.float32), *maps(CAMERAS["opencv"].resized(width=48, height=32), 1.0), cv2.INTER_CUBIC
     )
-    found = np.asarray(cv2.imread(str(folder / "out" / "small.png")))
-    assert np.abs(found - theirs.clip(0, 255))[4:-4, 4:-4].mean() < 1
+    result = np.asarray(cv2.imread(str(folder / "out" / "small.png")))
+    assert np.abs(result - theirs.clip(0, 255))[4:-4, 4:-4].mean() < 1
 
 
 def test_a_video_is_rectified_frame_by_frame(call, folder):
@@ -120,50 +119,38 @@ def test_a_video_is_rectified_frame_by_frame(call, folder):
     frame = np.asarray(cv2.VideoCapture(str(folder / "out" / "clip.mp4")).read()[1]).astype(float)
     theirs = cv2.remap(waves().astype(np.float32), *maps(CAMERAS["opencv"], 1.0), cv2.INTER_CUBIC)
     assert np.abs(frame - theirs)[4:-4, 4:-4].mean() < 12  # two codecs in between
-    assert "0 rectified, 1 were there already" in call("rectify", "input=clip.avi", "camera=cam.yaml", "out=out").out
+    assert "0 rectified, 1 already existed" in call("rectify", "input=clip.avi", "camera=cam.yaml", "out=out").out
 
 
-def test_a_model_that_folds_inside_the_frame_is_told(call, folder):
+def test_a_fold_inside_the_frame_is_warned_of(call, folder):
     # At 0.527 focal lengths from its center, see above.
     write_opencv(folder / "cam.yaml", Camera(**PINHOLE, coefficients=(-1.2, 0.0, 0.0, 0.0)))
     outcome = call("rectify", "input=raw", "camera=cam.yaml")
     y, x = np.mgrid[:64, :96]
     black = ((x - 46.2) / 70) ** 2 + ((y - 33.1) / 71) ** 2 > 1 / 3.6
-    told = f"camera: {black.mean():.1%} of the frame has no ray and stays black: the model folds back\n"
-    assert (outcome.code, outcome.err) == (0, told)
+    share = f"{black.mean():.1%}"
+    message = f"warning: the camera's model folds back inside the frame: {share} of it stays black\n"
+    assert (outcome.code, outcome.err) == (0, message)
     assert not np.asarray(cv2.imread(str(folder / "rectified" / "0.png")))[black].any()
 
 
-def test_a_pole_inside_the_frame_stops_before_anything_is_written(call, folder):
+def test_a_pole_inside_the_frame_raises_before_anything_is_written(call, folder):
     write_opencv(folder / "cam.yaml", Camera(**PINHOLE, coefficients=(0.0,) * 5 + (-3.0, 0.0, 0.0)))
     message = call("rectify", "input=raw", "camera=cam.yaml").message
     assert message.startswith("camera: camera must keep its denominator 1 + k4 r^2 + k5 r^4 + k6 r^6 above zero inside")
     assert not (folder / "rectified").exists()
 
 
-def test_what_a_stop_left_half_written_is_no_picture(call, folder):
-    (folder / "raw" / ".0-0123abcd.png").write_bytes(b"half")
-    outcome = call("rectify", "input=raw", "camera=cam.yaml")
-    assert (outcome.out[:24], outcome.err) == ("rectified: 3 rectified, ", "")
-
-
-def test_a_damaged_picture_is_named_and_skipped(call, folder):
+def test_unreadable_pictures_are_reported_and_skipped(call, folder):
     (folder / "raw" / "1.png").write_bytes(b"")
     outcome = call("rectify", "input=raw", "camera=cam.yaml", "out=out")
     assert outcome.code == 0
     assert outcome.err == "skipped: raw/1.png is empty (0 bytes)\n"
-    assert outcome.out.startswith("out: 2 rectified, 0 were there already, 1 skipped")
-
-
-def test_a_picture_of_another_shape_is_named_and_skipped(call, folder):
-    cv2.imwrite(str(folder / "raw" / "wide.png"), np.zeros((10, 90, 3), np.uint8))
-    outcome = call("rectify", "input=raw", "camera=cam.yaml", "out=out")
-    assert outcome.err.startswith("skipped: raw/wide.png: image must have the shape of the camera's frames, ")
-    assert outcome.out.startswith("out: 3 rectified, 0 were there already, 1 skipped")
+    assert outcome.out.startswith("out: 2 rectified, 0 already existed, 1 skipped")
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("options", "message"),
     [
         (("input=raw",), "camera must be given, as in camera=…, got nothing"),
         (
@@ -175,10 +162,6 @@ def test_a_picture_of_another_shape_is_named_and_skipped(call, folder):
             "camera: path must hold a mapping of names to values, got bad.yaml with str",
         ),
         (
-            ("input=raw", "camera=broken.yaml"),
-            "camera: path must hold YAML, got broken.yaml: while parsing",
-        ),
-        (
             ("input=raw", "camera=short.yaml"),
             "camera: path must hold a camera, got short.yaml: coefficients must be 4 or 5 or 8 or 12 or 14 numbers for "
             "the model opencv, got 3",
@@ -187,16 +170,15 @@ def test_a_picture_of_another_shape_is_named_and_skipped(call, folder):
         (("input=raw", "camera=cam.yaml", "out=raw"), "out must be another folder than that of input, got raw"),
         (
             ("input=wide.png", "camera=cam.yaml"),
-            "input must hold what can be rectified, got wide.png: image must have the shape",
+            "input must hold a file that can be rectified, got wide.png: image must have the shape",
         ),
     ],
 )
-def test_a_wrong_word_is_one_line_of_error(call, folder, words, message):
+def test_invalid_options_are_one_line_of_error(call, folder, options, message):
     (folder / "bad.yaml").write_text("no camera")
-    whole = (folder / "cam.yaml").read_text()
-    (folder / "broken.yaml").write_text(whole.replace(" ]", "", 1))
-    (folder / "short.yaml").write_text(whole.rsplit(",", 1)[0] + " ]\n")
+    text = (folder / "cam.yaml").read_text()
+    (folder / "short.yaml").write_text(text.rsplit(",", 1)[0] + " ]\n")
     cv2.imwrite(str(folder / "wide.png"), np.zeros((10, 90, 3), np.uint8))
-    outcome = call("rectify", *words)
+    outcome = call("rectify", *options)
     assert outcome.code == 1
     assert outcome.err.splitlines()[-1].startswith(f"error: {message}")

@@ -9,7 +9,7 @@ import torch
 from omegaconf import OmegaConf
 from PIL import Image
 
-from torchrefract.data.paired_folder import PairedFolder
+from torchrefract.data.pairs import PairedFolder
 from torchrefract.restoration.checkpoints import read_checkpoint
 
 # A run that goes on leaves best.ckpt of the one before where it is; Lightning says so.

@@ -7,7 +7,7 @@ parameters, and `effect.apply(image, params)`, which replays a draw. `warp`, `in
 flows, which are backward and in pixels: out(p) = image(p + flow(p)).
 """
 
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 from torchrefract.effects.compose import Compose, ComposeParams
 from torchrefract.effects.depth import DepthProvider, GroundPlaneDepth, LinearDepth
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams

@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from torchrefract._validation import UsageError
-from torchrefract.data.frame_folder import walk
+from torchrefract.data.frames import walk
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, image_size
 from torchrefract.videos import VIDEOS, read_video, video_facts, write_video
 

@@ -18,7 +18,7 @@ from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract._validation import UsageError, check_count, check_flag, check_size
 from torchrefract.cli.command import as_they_are, command, job, naming, progress
 from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
-from torchrefract.data.pairs.ledger import claim
+from torchrefract.data.pairs.manifest import claim
 from torchrefract.footage import (
     check_apart,
     find_footage,

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchrefract._tensor import to_float, to_uint8
-from torchrefract.cameras.distortion import POLYNOMIAL12
+from torchrefract.cameras.brown_conrady import POLYNOMIAL12
 from torchrefract.effects.air import Air
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose

@@ -1,58 +1,46 @@
 import json
 import sys
+from dataclasses import replace
 
 import calibration
-import cv2
 import numpy as np
 import pytest
 
-from torchrefract.cameras.calibration.boards import Charuco, Chessboard
+from torchrefract import Camera
 from torchrefract.cameras.calibration.detection import View
-from torchrefract.cameras.calibration.synthetic import render_views
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.lens_database import read_lenses
 
-CAMERA = Camera(
-    width=640, height=400, fx=380.0, fy=381.0, cx=322.3, cy=196.6, coefficients=(-0.25, 0.08, 0.003, -0.002)
-)
-BOARD = Charuco(squares="6x5", square_mm=30, marker_mm=20, dictionary="DICT_4X4_50")
-WORDS = {"squares_x": 6, "squares_y": 5, "square_m": 0.03, "marker_m": 0.02, "dictionary": "DICT_4X4_50"}
+WEBCAM = Camera(width=64, height=48, fx=50.0, fy=51.0, cx=31.0, cy=24.0, coefficients=(-0.33, 0.05, 1e-3, -2e-3, 0.06))
+FISHEYE = replace(WEBCAM, fx=25.0, fy=25.0, coefficients=(-0.02, 0.05, -0.05, 0.01), model="fisheye")
 
 
-def test_a_board_is_that_of_its_entry():
-    assert calibration.board_of({"board": WORDS}) == BOARD
-    entry = {"pattern_inner_corners": [9, 6], "square_m": 0.05}
-    assert calibration.board_of(entry) == Chessboard(squares="10x7", square_mm=50.0)
+def table_row(name: str, camera: Camera, model: str, licence: str) -> dict:
+    numbers = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    source = {"source_repo": "a/b", "source_path": "c.yaml", "commit": "1234", "camera": "Webcam", "lens": None}
+    return {"id": name, "model": model, "coeffs": camera.coefficients, "licence": licence} | numbers | source
 
 
-def test_bad_corners_are_as_bad_as_they_are_said_to_be():
-    corners = np.random.default_rng(0).uniform(0, 99, (8, 2))
-    bad = calibration.bad_corners(View("a", np.arange(8), corners), (101, 201))
-    np.testing.assert_allclose(bad["enlarged"].corners - (50, 100), 1.1 * (corners - (50, 100)))
-    moved = np.linalg.norm(bad["one off"].corners - corners, axis=1)
-    assert sorted(moved.round(9)) == [0] * 7 + [5]
-    different = np.flatnonzero((bad["swapped"].corners != corners).any(axis=1))
-    np.testing.assert_array_equal(bad["swapped"].corners[different], corners[different[::-1]])
-    assert len(different) == 2
-
-
-def test_a_set_is_measured_beside_opencv_and_bad_views_are_planted(monkeypatch, tmp_path, capsys):
-    folder = tmp_path / "charuco" / "rendered"
-    folder.mkdir(parents=True)
-    for name, gray, _ in render_views(BOARD, CAMERA, count=7):
-        cv2.imwrite(str(folder / name), gray)
-    entry = {"board": WORDS, "image_size": [640, 400], "published": {"fx": 380.0}}
-    (tmp_path / "charuco" / "reference.json").write_text(json.dumps({"rendered": entry}))
-    (tmp_path / "chessboard").mkdir()
-    (tmp_path / "chessboard" / "reference.json").write_text("{}")
-    out = tmp_path / "run.json"
-    monkeypatch.setattr(sys, "argv", ["calibration.py", str(tmp_path), "--out", str(out)])
+def test_errors_of_lenses_are_measured_and_the_table_is_written(monkeypatch, tmp_path, capsys):
+    # A ray of a pixel 1 px off has an error of 1 px.
+    pixels = WEBCAM.grid(4)
+    rays = WEBCAM.unproject(pixels + pixels.new_tensor([0.6, 0.8])).points
+    assert calibration.forward_error(WEBCAM, rays.numpy(), pixels.numpy()) == pytest.approx(np.ones(16), abs=1e-9)
+    view = View("a", np.arange(8), np.random.default_rng(0).uniform(0, 99, (8, 2)))
+    off = np.linalg.norm(calibration.bad_corners(view, (101, 201))["one off"].corners - view.corners, axis=1)
+    assert sorted(off.round(9)) == [0] * 7 + [5]
+    rows = [
+        table_row("one", WEBCAM, "opencv5", "MIT"),
+        table_row("two", FISHEYE, "fisheye4", "CC0-1.0"),
+        table_row("shared", WEBCAM, "opencv5", "CC-BY-SA-3.0 (x)"),
+    ]
+    (tmp_path / "lenses.json").write_text(json.dumps(rows))
+    options = ["lenses", "lenses.json", "--step", "16", "--out", "run.json", "--table", "lenses.csv"]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["calibration.py", *options])
     calibration.main()
-    (row,) = json.loads(out.read_text())
-    assert (row["name"], row["pictures"], row["views"], row["plain_views"]) == ("rendered", 7, 7, 7)
-    assert row["fx"] == pytest.approx(380, rel=5e-3)
-    assert row["reference_fx_percent"] == pytest.approx(100 * (row["fx"] / 380 - 1))
-    assert 0 < row["rms"] < row["plain_rms"] < 0.3
-    assert row["straight"] < 0.2 < row["bent"]
-    assert row["planted"]["bent"] == row["planted"]["swapped"] == row["planted"]["one off"] == "named"
-    assert row["planted"]["mirrored"] == "no view"
-    assert "rendered" in capsys.readouterr().out
+    assert "not marked: ours 0 and OpenCV 2 of 3, kornia 2 of 2" in capsys.readouterr().out
+    results = json.loads((tmp_path / "run.json").read_text())
+    assert [(row["name"], row["ours_wrong"], row["invalid"]) for row in results] == [(row["id"], 0, 0) for row in rows]
+    lenses = read_lenses(tmp_path / "lenses.csv")
+    assert [(lens.name, lens.camera) for lens in lenses] == [("one", WEBCAM), ("two", FISHEYE)]
+    assert lenses[1].source == "a/b@1234: c.yaml"

@@ -1,45 +1,67 @@
 import json
+import sys
 from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
 import pairs
 import pytest
+import torch
 from PIL import Image
+
+from torchrefract import UniformFog
 
 
 @pytest.fixture
-def frames(tmp_path) -> Path:
-    """Four pictures of two drives."""
-    dice = np.random.default_rng(0)
+def args(tmp_path, monkeypatch) -> Namespace:
+    """Options for four images of two drives."""
+    generator = np.random.default_rng(0)
     for number in range(4):
         path = tmp_path / "frames" / f"drive{number % 2}" / f"{number}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(dice.integers(0, 256, (24, 40, 3)).astype(np.uint8)).save(path)
-    return tmp_path / "frames"
-
-
-def test_a_pair_takes_longer_than_its_decoding_and_encoding(frames, on_threads):
-    on_threads(1)
-    single = pairs.one_by_one(Namespace(source=frames, scene="paper_refractive", size=(24, 40), maps="png"))
-    assert single.made > single.bare > 0
-
-
-def test_a_run_is_measured_and_its_files_are_counted(frames, tmp_path, monkeypatch):
+        Image.fromarray(generator.integers(0, 256, (24, 40, 3)).astype(np.uint8)).save(path)
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
-    options = {
-        "source": frames,
-        "scene": "limpopo_sun_glare",
-        "size": (24, 40),
-        "maps": "png",
-        "count": 4,
-        "workers": 1,
-    }
+    return Namespace(source=tmp_path / "frames", scene="paper_refractive", size=(24, 40), maps="png", count=4)
+
+
+def test_a_pair_takes_longer_than_its_reading_and_encoding(args, on_threads):
+    on_threads(1)
+    seconds = pairs.measure_one_pair(args)
+    assert seconds["generated"] > seconds["read_and_encode"] > 0
+
+
+def test_a_run_is_measured_and_its_files_are_counted(args, tmp_path):
     out = tmp_path / "out"
-    found = pairs.measured(pairs.command(Namespace(**options), out), 4, out, cores=1)
-    rows = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
-    stored = sum(file["bytes"] for row in rows for file in row["files"].values())
-    others = sum(path.stat().st_size for path in out.iterdir() if path.is_file())
-    assert (len(rows), found.disk_bytes) == (4, stored + others)
-    assert found.busy > 0
-    assert found.peak_bytes > 50e6
+    run = pairs.measure_run(args, out, 0)
+    assert len((out / "manifest.jsonl").read_text().splitlines()) == 4
+    assert run.disk_bytes_per_pair == sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 4
+    assert run.core_share > 0
+    assert run.peak_bytes > 50e6
+
+
+def test_the_peak_memory_is_what_a_call_holds_at_once():
+    x = torch.zeros(64, 1024)
+    for call, tensors in ((x.clone, 1), (lambda: (x + 1) * 2, 2), (lambda: (x + 1) + (x + 2), 3)):
+        assert pairs.peak_bytes(call) == pytest.approx(tensors * x.nbytes, rel=1e-3)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("power", [0.0, 0.7, 2.0])
+def test_the_slope_is_the_power(power):
+    sizes = [64, 256, 5000]
+    assert pairs.slope(sizes, [0.3 * size**power for size in sizes]) == pytest.approx(power, abs=1e-9)
+
+
+def test_the_command_writes_all_measurements(args, tmp_path, monkeypatch):
+    monkeypatch.setattr(pairs, "make_effects", lambda: {"fog": UniformFog()})
+    monkeypatch.setattr(pairs, "measure_run", lambda *_: pairs.Run(1, 2.0, 1.0, 10, 20.0))
+    monkeypatch.setattr(pairs, "measure_one_pair", lambda _: {"generated": 2.0, "read_and_encode": 1.0})
+    out = tmp_path / "new" / "pairs.json"
+    words = ["--source", str(args.source), "--size", "24x40", "--workers", "1", "--seconds", "0", "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", ["pairs.py", *words])
+    pairs.main()
+    content = json.loads(out.read_text())
+    assert pairs.PROTOCOL.keys() <= content.keys()
+    assert content["loader"]["fog"] > 0
+    assert 1 <= content["memory"]["fog"] <= 3
+    assert content["scaling"]["fog"]["pixels"] == [8 * 10, 12 * 20, 24 * 40]

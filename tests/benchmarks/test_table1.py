@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 from torchrefract import LensDistortion, UniformFog
-from torchrefract.data.frame_folder import FrameFolder
+from torchrefract.data.frames import FrameFolder
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.restoration.diffusion import Diffusion
 from torchrefract.restoration.loading import Loaded, load_model

@@ -10,7 +10,7 @@ _MODELS = {"opencv5": "opencv", "rational8": "opencv", "thin-prism12": "opencv",
 
 @pytest.fixture(scope="session")
 def published(shared_data) -> dict[str, Camera]:
-    """The cameras of the shared table that have a focal length, by their ids."""
+    """Return the published cameras with a focal length by their ids."""
     rows = json.loads((shared_data / "lenses.json").read_text())
     return {
         row["id"]: Camera(
@@ -27,7 +27,7 @@ def published(shared_data) -> dict[str, Camera]:
 
 @pytest.fixture
 def make_camera() -> Callable[..., Camera]:
-    """A camera of a model, of 640 x 480 px."""
+    """Return a function that creates a camera of 640 x 480 px."""
 
     def make(coefficients: tuple[float, ...], model: str = "opencv") -> Camera:
         numbers = {"fx": 510.25, "fy": 505.75, "cx": 322.5, "cy": 237.125}

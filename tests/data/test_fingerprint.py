@@ -7,28 +7,28 @@ import pytest
 from PIL import Image
 from torch.utils.data import Dataset
 
-from torchrefract.data.fingerprint import fingerprint
-from torchrefract.data.frame_folder import FrameFolder
-from torchrefract.data.paired_folder import PairedFolder
+from torchrefract.data.frames import FrameFolder
+from torchrefract.data.module import fingerprint
+from torchrefract.data.pairs.dataset import PairedFolder
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.types import Frame
 
 
 @pytest.fixture
 def frames(tmp_path) -> Path:
-    """Six pictures of two drives."""
-    dice = np.random.default_rng(0)
+    """Write six images of two drives."""
+    generator = np.random.default_rng(0)
     for number in range(6):
         path = tmp_path / "frames" / f"drive{number // 3}" / f"{number}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(dice.integers(0, 256, (32, 48, 3)).astype(np.uint8)).save(path)
+        Image.fromarray(generator.integers(0, 256, (32, 48, 3)).astype(np.uint8)).save(path)
     return tmp_path / "frames"
 
 
-def test_a_folder_is_told_by_the_names_and_sizes_of_its_files(frames):
-    told = fingerprint(FrameFolder(frames, size=(16, 24)))
+def test_the_fingerprint_of_a_folder_hashes_names_and_sizes_of_files(frames):
+    result = fingerprint(FrameFolder(frames, size=(16, 24)))
     lines = [f"drive{k // 3}/{k}.png {(frames / f'drive{k // 3}' / f'{k}.png').stat().st_size}\n" for k in range(6)]
-    assert told == {
+    assert result == {
         "source": "FrameFolder",
         "root": str(frames),
         "frames": 6,
@@ -37,10 +37,10 @@ def test_a_folder_is_told_by_the_names_and_sizes_of_its_files(frames):
         "license": None,
         "sha256": hashlib.sha256("".join(lines).encode()).hexdigest(),
     }
-    json.dumps(told)
+    json.dumps(result)
 
 
-def test_another_file_or_name_is_another_folder(frames):
+def test_another_file_or_name_changes_the_fingerprint(frames):
     before = fingerprint(FrameFolder(frames, size=(16, 24)))["sha256"]
     assert fingerprint(FrameFolder(frames, size=(32, 48)))["sha256"] == before
     (frames / "drive0" / "0.png").rename(frames / "drive0" / "9.png")
@@ -50,7 +50,7 @@ def test_another_file_or_name_is_another_folder(frames):
     assert len({before, renamed, fingerprint(FrameFolder(frames, size=(16, 24)))["sha256"]}) == 3
 
 
-def test_pairs_are_told_by_their_checksums_and_come_with_a_license(call, frames):
+def test_the_fingerprint_of_pairs_hashes_checksums_and_has_the_license(call, frames):
     words = ("scene=paper_weather", f"source={frames}", "license=CC0", "workers=0")
     for out, seed in (("one", 0), ("same", 0), ("other", 1)):
         assert call("generate", *words, f"out={out}", f"seed={seed}").code == 0
@@ -63,15 +63,15 @@ def test_pairs_are_told_by_their_checksums_and_come_with_a_license(call, frames)
     assert (train["frames"], train["drives"]) == (3, 1)
 
 
-def test_scenes_are_told_by_what_they_are_rendered_from():
-    told = fingerprint(RoadScenes(4, size=(16, 24)))
-    assert (told["root"], told["drives"], told["frames"], told["size"]) == (None, None, 4, [16, 24])
+def test_the_fingerprint_of_road_scenes_hashes_their_arguments():
+    result = fingerprint(RoadScenes(4, size=(16, 24)))
+    assert (result["root"], result["drives"], result["frames"], result["size"]) == (None, None, 4, [16, 24])
     others = [RoadScenes(4, size=(16, 24), first=1), RoadScenes(4, size=(16, 24), seed=1), RoadScenes(5, size=(16, 24))]
-    assert len({told["sha256"], *(fingerprint(other)["sha256"] for other in others)}) == 4
+    assert len({result["sha256"], *(fingerprint(other)["sha256"] for other in others)}) == 4
 
 
-def test_a_set_of_the_users_own_is_told_by_its_name_and_length():
-    class Mine(Dataset[Frame]):
+def test_the_fingerprint_of_another_dataset_has_its_class_and_length():
+    class Custom(Dataset[Frame]):
         """Two frames."""
 
         def __len__(self) -> int:
@@ -80,5 +80,5 @@ def test_a_set_of_the_users_own_is_told_by_its_name_and_length():
         def __getitem__(self, index: int) -> Frame:
             return RoadScenes(2, size=(16, 24))[index]
 
-    told = fingerprint(Mine())
-    assert (told["source"], told["frames"], told["size"], told["root"]) == ("Mine", 2, [16, 24], None)
+    result = fingerprint(Custom())
+    assert (result["source"], result["frames"], result["size"], result["root"]) == ("Custom", 2, [16, 24], None)

@@ -31,11 +31,12 @@ def encode(pixels: np.ndarray, **options) -> bytes:
 
 
 def as_tensor(pixels: np.ndarray) -> torch.Tensor:
-    """The definition of reading: (H, W, 3) whole numbers over the largest of their type."""
+    """Divide (H, W, 3) integers by the largest one of their type."""
     scale = np.float32(np.iinfo(pixels.dtype).max)
     return torch.from_numpy((pixels.astype(np.float32) / scale).transpose(2, 0, 1).copy())
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("suffix", ["png", "bmp", "lossless.webp"])
 def test_eight_bit_pixels_come_back_exactly(tmp_path, suffix):
     path = tmp_path / f"frame.{suffix}"
@@ -44,24 +45,17 @@ def test_eight_bit_pixels_come_back_exactly(tmp_path, suffix):
     assert_close(read_image(str(path)), read_image(path), rtol=0, atol=0)
 
 
-def test_what_was_read_from_eight_bits_is_written_as_it_was(tmp_path):
+def test_pixels_of_inverts_read_image_of_eight_bits(tmp_path):
     every = np.arange(3 * 256, dtype=np.uint8).reshape(3, 256).T.reshape(16, 16, 3).copy()
     cv2.imwrite(str(tmp_path / "all.png"), every[..., ::-1])
     image = read_image(tmp_path / "all.png")
     for same in (image, image.contiguous(), torch.cat([image, image], dim=2)[..., :16]):
-        found = pixels_of(same)
-        assert found.flags["C_CONTIGUOUS"]
-        np.testing.assert_array_equal(found, every)
+        pixels = pixels_of(same)
+        assert pixels.flags["C_CONTIGUOUS"]
+        np.testing.assert_array_equal(pixels, every)
 
 
-def test_large_pictures_are_written_as_they_were_too():
-    every = np.random.default_rng(0).integers(0, 256, (301, 500, 3), dtype=np.uint8)
-    image = torch.from_numpy(every).permute(2, 0, 1) / 255
-    for same in (image, image.contiguous()):
-        np.testing.assert_array_equal(pixels_of(same), every)
-
-
-def test_values_become_the_nearest_level_and_none_leaves_the_range():
+def test_pixels_of_rounds_to_the_nearest_level_and_clips():
     values = torch.tensor([-9.0, -0.1, 0.0, 0.49 / 255, 0.51 / 255, 254.4 / 255, 254.6 / 255, 1.0, 1.1, 300.0])
     image = values.expand(3, 2, -1).contiguous().requires_grad_()
     assert pixels_of(image)[1, :, 2].tolist() == [0, 0, 0, 0, 1, 254, 255, 255, 255, 255]
@@ -76,20 +70,20 @@ def test_sixteen_bit_pixels_come_back_exactly(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", ["png", "bmp"])
-def test_a_gray_picture_has_three_equal_channels(tmp_path, suffix):
+def test_a_gray_image_has_three_equal_channels(tmp_path, suffix):
     Image.fromarray(PIXELS[..., 0]).save(tmp_path / f"frame.{suffix}")
     expected = as_tensor(np.repeat(PIXELS[..., :1], 3, axis=2))
     assert_close(read_image(tmp_path / f"frame.{suffix}"), expected, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("suffix", ["png", "bmp", "webp"])
-def test_alpha_is_dropped_and_blends_nothing(tmp_path, suffix):
+def test_an_alpha_channel_is_ignored(tmp_path, suffix):
     alpha = np.dstack([PIXELS, PIXELS[..., :1]])
-    Image.fromarray(alpha).save(tmp_path / f"frame.{suffix}", lossless=True, exact=True)  # words for WebP alone
+    Image.fromarray(alpha).save(tmp_path / f"frame.{suffix}", lossless=True, exact=True)  # options of WebP alone
     assert_close(read_image(tmp_path / f"frame.{suffix}"), as_tensor(PIXELS), rtol=0, atol=0)
 
 
-def test_palette_pictures_and_bits_are_read_in_their_colors(tmp_path):
+def test_palettes_and_single_bits_are_read_in_their_colors(tmp_path):
     palette = Image.fromarray(PIXELS).convert("P", palette=Image.Palette.ADAPTIVE)
     palette.save(tmp_path / "palette.png")
     assert_close(read_image(tmp_path / "palette.png"), as_tensor(np.asarray(palette.convert("RGB"))), rtol=0, atol=0)
@@ -99,7 +93,7 @@ def test_palette_pictures_and_bits_are_read_in_their_colors(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "progressive.jpg", "webp"])
-def test_lossy_pictures_agree_with_another_decoder(tmp_path, suffix):
+def test_lossy_images_agree_with_pillow(tmp_path, suffix):
     path = tmp_path / f"frame.{suffix}"
     path.write_bytes(encode(SMOOTH, quality=95, **FORMATS[suffix]))
     expected = as_tensor(np.asarray(Image.open(path).convert("RGB")))
@@ -109,7 +103,7 @@ def test_lossy_pictures_agree_with_another_decoder(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
 @pytest.mark.parametrize(("orientation", "quarter_turns"), [(1, 0), (3, 2), (6, 3), (8, 1)])
-def test_the_exif_orientation_is_honored(tmp_path, suffix, orientation, quarter_turns):
+def test_the_exif_orientation_is_applied(tmp_path, suffix, orientation, quarter_turns):
     exif = Image.Exif()
     exif[0x0112] = orientation
     path = tmp_path / f"frame.{suffix}"
@@ -119,22 +113,15 @@ def test_the_exif_orientation_is_honored(tmp_path, suffix, orientation, quarter_
     assert image_size(path) == expected.shape[1:]
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_the_size_is_told_from_the_header(tmp_path, suffix):
-    path = tmp_path / f"frame.{suffix}"
-    path.write_bytes(encode(PIXELS, **FORMATS[suffix]))
-    assert image_size(path) == (36, 50)
-
-
-def test_the_content_counts_and_not_the_extension(tmp_path):
+def test_the_format_follows_from_the_content_and_not_from_the_suffix(tmp_path):
     (tmp_path / "frame.jpg").write_bytes(encode(PIXELS, format="PNG"))
     assert_close(read_image(tmp_path / "frame.jpg"), as_tensor(PIXELS), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("read", [read_image, image_size])
 @pytest.mark.parametrize("suffix", FORMATS)
-@pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.9, 0.999])
-def test_a_truncated_picture_is_refused_in_silence(tmp_path, capfd, read, suffix, share):
+@pytest.mark.parametrize("share", [0.3, 0.999])
+def test_a_truncated_image_raises_and_prints_nothing(tmp_path, capfd, read, suffix, share):
     data = encode(SMOOTH, **FORMATS[suffix])
     path = tmp_path / f"frame_12.{suffix}"
     path.write_bytes(data[: max(16, min(int(share * len(data)), len(data) - 2))])
@@ -145,7 +132,7 @@ def test_a_truncated_picture_is_refused_in_silence(tmp_path, capfd, read, suffix
 
 @pytest.mark.parametrize("read", [read_image, image_size])
 @pytest.mark.parametrize("suffix", ["jpg", "progressive.jpg", "png"])
-def test_a_picture_whose_second_half_was_never_written_is_refused(tmp_path, read, suffix):
+def test_an_image_with_a_zeroed_second_half_raises(tmp_path, read, suffix):
     data = encode(SMOOTH, **FORMATS[suffix])
     half = len(data) // 2
     (tmp_path / "frame").write_bytes(data[:half] + bytes(len(data) - half))
@@ -154,7 +141,7 @@ def test_a_picture_whose_second_half_was_never_written_is_refused(tmp_path, read
 
 
 @pytest.mark.parametrize("read", [read_image, image_size])
-def test_the_end_of_a_thumbnail_is_not_the_end_of_the_picture(tmp_path, read):
+def test_the_end_of_a_thumbnail_is_not_the_end_of_the_image(tmp_path, read):
     data = encode(SMOOTH, format="JPEG")
     thumbnail = b"Exif\0\0" + encode(PIXELS[:8, :8], format="JPEG")
     segment = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
@@ -164,12 +151,11 @@ def test_the_end_of_a_thumbnail_is_not_the_end_of_the_picture(tmp_path, read):
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-@pytest.mark.parametrize("count", [1, 10_000])
-def test_bytes_after_the_end_do_no_harm(tmp_path, suffix, count):
+def test_bytes_after_the_end_are_ignored(tmp_path, suffix):
     path = tmp_path / f"frame.{suffix}"
     path.write_bytes(encode(SMOOTH, **FORMATS[suffix]))
     expected = read_image(path)
-    path.write_bytes(path.read_bytes() + bytes(count))
+    path.write_bytes(path.read_bytes() + bytes(10_000))
     assert_close(read_image(path), expected, rtol=0, atol=0)
     assert image_size(path) == (36, 50)
 
@@ -179,43 +165,43 @@ def test_bytes_after_the_end_do_no_harm(tmp_path, suffix, count):
     ("data", "reason"),
     [
         (b"", r"is empty \(0 bytes\)"),
-        (b"\xff\xd8", "is not a JPEG, PNG, WebP or BMP picture"),
+        (b"\xff\xd8", "is not a JPEG, PNG, WebP or BMP image"),
         (b"<html>404</html>", "is not a JPEG"),
         (b"RIFF\x04\0\0\0WAVE", "is not a JPEG"),
         (b"BM\x02\0\0\0", "is truncated"),
     ],
 )
-def test_what_is_no_picture_is_named_with_the_reason(tmp_path, read, data, reason):
+def test_a_file_that_is_not_an_image_raises_with_the_reason(tmp_path, read, data, reason):
     (tmp_path / "frame_7.jpg").write_bytes(data)
     with pytest.raises(UnreadableImageError, match=rf"frame_7\.jpg {reason}"):
         read(tmp_path / "frame_7.jpg")
 
 
 @pytest.mark.parametrize("read", [read_image, image_size])
-def test_a_missing_file_is_named_with_the_reason(tmp_path, read):
+def test_a_missing_file_raises_with_the_reason(tmp_path, read):
     with pytest.raises(UnreadableImageError, match=r"gone\.jpg cannot be opened \(No such file"):
         read(tmp_path / "gone.jpg")
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 @pytest.mark.parametrize("read", [read_image, image_size])
-def test_a_pipe_is_not_waited_for(tmp_path, read):
+def test_a_pipe_raises_instead_of_blocking(tmp_path, read):
     os.mkfifo(tmp_path / "frame.jpg")
     with pytest.raises(UnreadableImageError, match=r"frame\.jpg cannot be opened \(a pipe or a device\)"):
         read(tmp_path / "frame.jpg")
 
 
-def test_the_files_of_a_folder_are_listed_by_name_without_folders_and_what_is_hidden(tmp_path):
+def test_files_in_lists_files_by_name_without_folders_and_hidden_files(tmp_path):
     for name in ("b.png", "a.JPG", "notes.txt", "._b.png", "dead.png"):
         (tmp_path / name).touch()
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "dead.png").unlink()
-    (tmp_path / "dead.png").symlink_to("gone.png")  # what somebody wanted to be there is to be told
+    (tmp_path / "dead.png").symlink_to("gone.png")  # a broken link is listed, so that reading it raises
     assert [file.name for file in files_in(tmp_path)] == ["a.JPG", "b.png", "dead.png"]
     assert [file.name for file in files_in(tmp_path, (".txt",))] == ["notes.txt"]
 
 
-def test_damage_between_header_and_end_is_found_on_reading(tmp_path, capfd):
+def test_damage_between_header_and_end_raises_on_reading(tmp_path, capfd):
     data = bytearray(encode(PIXELS, format="PNG"))
     middle = len(data) // 2
     data[middle : middle + 200] = bytes(200)
@@ -228,7 +214,7 @@ def test_damage_between_header_and_end_is_found_on_reading(tmp_path, capfd):
     assert "WARN" not in capfd.readouterr().err
 
 
-def test_a_header_without_sense_is_refused(tmp_path):
+def test_an_invalid_header_raises(tmp_path):
     data = bytearray(encode(PIXELS, format="BMP"))
     data[14:18] = (9).to_bytes(4, "little")  # no BMP header has 9 bytes
     (tmp_path / "frame.bmp").write_bytes(data)
@@ -237,7 +223,7 @@ def test_a_header_without_sense_is_refused(tmp_path):
 
 
 def box_weights(coarse: int, fine: int) -> torch.Tensor:
-    """(coarse, fine): the share of each fine cell in each coarse one, from the overlap of their intervals."""
+    """Return (coarse, fine), the overlap of each fine cell and each coarse one, in units of a coarse cell."""
     ends = torch.arange(coarse, dtype=torch.float64)[:, None] * fine / coarse
     cells = torch.arange(fine, dtype=torch.float64)
     overlap = torch.minimum(ends + fine / coarse, cells + 1) - torch.maximum(ends, cells)
@@ -245,29 +231,24 @@ def box_weights(coarse: int, fine: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("size", "crop"), [((18, 25), (36, 50)), ((9, 16), (28, 50)), ((8, 8), (36, 36))])
-def test_fit_is_the_area_average_of_the_middle(size, crop):
+def test_fit_is_the_area_average_of_the_center(size, crop):
     image = as_tensor(PIXELS)
     top, left = (36 - crop[0]) // 2, (50 - crop[1]) // 2
-    middle = image[:, top : top + crop[0], left : left + crop[1]].double()
-    expected = box_weights(size[0], crop[0]) @ middle @ box_weights(size[1], crop[1]).T
+    center = image[:, top : top + crop[0], left : left + crop[1]].double()
+    expected = box_weights(size[0], crop[0]) @ center @ box_weights(size[1], crop[1]).T
     result = fit(image, size)
     assert_close(result, expected.float(), rtol=0, atol=1e-6)
     assert result.is_contiguous()
 
 
-def test_fit_to_the_same_size_changes_nothing():
-    assert_close(fit(as_tensor(PIXELS), [36, 50]), as_tensor(PIXELS), rtol=0, atol=0)
-
-
-def test_fit_leaves_the_picture_as_it_was():
+def test_fit_to_the_same_size_copies_the_image():
     image = as_tensor(PIXELS)
     fit(image, (36, 50)).zero_()
-    fit(image, (5, 7)).zero_()
-    assert_close(image, as_tensor(PIXELS), rtol=0, atol=0)
+    assert_close(fit(image, [36, 50]), as_tensor(PIXELS), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("size", [(37, 50), (36, 51), (64, 112)])
-def test_fit_never_enlarges(size):
+@pytest.mark.parametrize("size", [(37, 50), (36, 51)])
+def test_fit_raises_instead_of_enlarging(size):
     with pytest.raises(ValueError, match=r"image must be at least size = .* got 36x50"):
         fit(as_tensor(PIXELS), size)
 
@@ -288,22 +269,13 @@ def test_fit_never_enlarges(size):
         ),
     ],
 )
-def test_fit_names_a_wrong_argument(image, size, error, message):
+def test_fit_raises_for_an_invalid_argument(image, size, error, message):
     with pytest.raises(error, match=message):
         fit(image, size)
 
 
-def test_real_frames_are_read_as_another_decoder_reads_them(shared_data):
+def test_real_frames_agree_with_pillow(shared_data):
     path = sorted((shared_data / "frames" / "val").glob("*.jpg"))[0]
     image = read_image(path)
     assert image.shape == (3, 360, 640)
     assert (image - as_tensor(np.asarray(Image.open(path)))).abs().mean() < 1 / 255
-
-
-@pytest.mark.parametrize("read", [read_image, image_size])
-@pytest.mark.parametrize("share", [0.01, 0.5, 0.99])
-def test_real_frames_cut_short_are_refused(shared_data, tmp_path, read, share):
-    data = sorted((shared_data / "frames" / "val").glob("*.jpg"))[0].read_bytes()
-    (tmp_path / "cut.jpg").write_bytes(data[: int(share * len(data))])
-    with pytest.raises(UnreadableImageError, match=r"cut\.jpg is truncated"):
-        read(tmp_path / "cut.jpg")

@@ -13,8 +13,9 @@ def depth_of(provider: DepthProvider, height: int, width: int, dtype: torch.dtyp
     return provider(height, width, dtype=dtype, device=torch.device("cpu"))
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_papers_depth_falls_by_the_row(dtype):
+def test_linear_depth_falls_row_by_row(dtype):
     expected = torch.tensor([160 * (1 - (y + 0.5) / 7) for y in range(7)], dtype=dtype).view(1, 1, 7, 1)
     assert_close(depth_of(LinearDepth(), 7, 3, dtype), expected)
     assert_close(depth_of(LinearDepth(max_depth=40), 7, 3, dtype), expected / 4)
@@ -22,7 +23,7 @@ def test_the_papers_depth_falls_by_the_row(dtype):
 
 
 @pytest.mark.parametrize("size", [(90, 160), (160, 90), (1, 1)])
-def test_a_point_of_the_road_is_seen_in_the_row_of_its_depth(size):
+def test_a_point_of_the_road_projects_to_the_row_of_its_depth(size):
     road, (height, width) = GroundPlaneDepth(camera_height=1.4, focal=0.8, horizon=0.3, far=math.inf), size
     focal, middle = 0.8 * width, (height - 1) / 2
     pitch = math.atan((middle - (0.3 * height - 0.5)) / focal)
@@ -49,10 +50,10 @@ def test_a_horizon_above_the_frame_leaves_no_sky_and_one_below_no_road():
     assert (depth_of(GroundPlaneDepth(horizon=1.0), 20, 30) == 200).all()
 
 
-@pytest.mark.parametrize("height", [1, 2, 720])
-@pytest.mark.parametrize("horizon", [-10.0, 0.0, 0.5, 10.0])
+@pytest.mark.parametrize("height", [1, 720])
+@pytest.mark.parametrize("horizon", [-10.0, 0.5, 10.0])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_no_road_is_nearer_than_its_camera_or_farther_than_asked(height, horizon, dtype):
+def test_depth_is_positive_and_at_most_far(height, horizon, dtype):
     depth = depth_of(GroundPlaneDepth(horizon=horizon, far=50.0), height, 33, dtype)
     assert (depth > 0).all()
     assert (depth <= 50).all()
@@ -65,9 +66,9 @@ def test_providers_are_plain_values():
     assert dataclasses.replace(GroundPlaneDepth(), horizon=0.5).horizon == 0.5
 
 
-def test_a_provider_has_to_say_how_deep():
+def test_a_provider_must_implement_call():
     with pytest.raises(TypeError, match="abstract"):
-        DepthProvider()  # pyright: ignore[reportAbstractUsage]  # that is the test
+        DepthProvider()  # pyright: ignore[reportAbstractUsage]  # the abstract class is what is tested
 
 
 def test_a_provider_compiles_into_one_graph():
@@ -76,7 +77,10 @@ def test_a_provider_compiles_into_one_graph():
     def double(image):
         return 2 * road(*image.shape[2:], dtype=image.dtype, device=image.device)
 
-    assert_close(torch.compile(double, fullgraph=True)(torch.zeros(1, 3, 20, 30)), double(torch.zeros(1, 3, 20, 30)))
+    assert_close(
+        torch.compile(double, fullgraph=True, backend="aot_eager")(torch.zeros(1, 3, 20, 30)),
+        double(torch.zeros(1, 3, 20, 30)),
+    )
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ GENTLE: dict[str, Any] = {"amplitude_range": (3.0, 3.0), "length_range": (12.0, 
 
 
 def divergence(flow: Tensor) -> Tensor:
-    """By central differences, inside the frame."""
+    """Return the divergence by central differences, inside the frame."""
     u_x = (flow[:, 0, 1:-1, 2:] - flow[:, 0, 1:-1, :-2]) / 2
     v_y = (flow[:, 1, 2:, 1:-1] - flow[:, 1, :-2, 1:-1]) / 2
     return u_x + v_y
@@ -21,11 +21,11 @@ def divergence(flow: Tensor) -> Tensor:
 @pytest.mark.parametrize("covariance", COVARIANCES)
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-4), (torch.float64, 1e-12)])
 def test_the_flow_has_no_divergence(covariance, dtype, bound):
-    effect = DivergenceFree(**GENTLE, covariance=covariance)
+    effect = DivergenceFree(**GENTLE, covariance=covariance, tolerance_px=None)
     flow = effect.degrade(torch.zeros(2, 1, 61, 83, dtype=dtype), seed=1).flow
     slope = (flow[:, 0, :, 2:] - flow[:, 0, :, :-2]).square().mean().sqrt() / 2
     assert divergence(flow).abs().max() < bound * slope
-    # It swirls instead: the other sum of slopes is as large as they are.
+    # The curl is as large as the gradients.
     curl = (flow[:, 1, 1:-1, 2:] - flow[:, 1, 1:-1, :-2] - flow[:, 0, 2:, 1:-1] + flow[:, 0, :-2, 1:-1]) / 2
     assert curl.square().mean().sqrt() > slope
 
@@ -37,19 +37,19 @@ def test_the_amplitude_is_the_standard_deviation_of_each_component(covariance):
     assert_close(flow.square().mean(dim=(0, 2, 3)).sqrt(), torch.full((2,), 2.0), rtol=0.03, atol=0)
 
 
-def test_normalized_by_the_maximum_the_longest_displacement_is_the_amplitude():
+def test_the_longest_displacement_is_the_amplitude_if_normalized_by_the_maximum():
     flow = DivergenceFree(**GENTLE, normalize="max").degrade(torch.zeros(3, 1, 61, 83), seed=1).flow
     assert_close(flow.norm(dim=1).amax(dim=(1, 2)), torch.full((3,), 3.0), rtol=1e-5, atol=0)
 
 
-def test_not_normalized_the_amplitude_multiplies_the_curl_itself():
+def test_the_amplitude_multiplies_the_curl_without_normalization():
     image = torch.zeros(48, 1, 160, 160)
     effect = DivergenceFree(amplitude_range=(3.0, 3.0), length_range=(10.0, 10.0), normalize="none")
     flow = effect.degrade(image, seed=1).flow
     assert flow.square().mean().sqrt().item() == pytest.approx(0.3, rel=0.04)  # a Gaussian psi has a slope of 1 / l
 
 
-def test_steps_keep_areas_better_and_the_map_one_to_one():
+def test_steps_preserve_areas_better_and_keep_the_map_one_to_one():
     image = torch.zeros(4, 1, 96, 128, dtype=torch.float64)
     strong: dict[str, Any] = {"amplitude_range": (4.0, 4.0), "length_range": (10.0, 10.0)}
     once, often = (DivergenceFree(**strong, steps=n).degrade(image, seed=1).flow for n in (1, 16))
@@ -69,11 +69,11 @@ def test_the_change_of_areas_is_what_the_stream_function_predicts():
     change = jacobian_determinant(flow) - 1
     expected = 12**0.5 * (amplitude / length) ** 2
     assert change.std().item() == pytest.approx(expected, rel=0.1)
-    # The smallest of four corners is told, so a little below none.
+    # The determinant is the smallest of four corners, so its mean lies a little below 1.
     assert -0.5 * expected < change.mean().item() < 0
 
 
-def test_an_amplitude_that_folds_is_told_and_its_folds_are_not_valid():
+def test_an_amplitude_that_folds_is_measured_and_folded_pixels_are_not_valid():
     image = torch.rand(2, 3, 64, 96, generator=torch.Generator().manual_seed(0))
     calm, wild = (
         DivergenceFree(amplitude_range=(a, a), length_range=(12.0, 12.0)).degrade(image, seed=1) for a in (1.0, 40.0)
@@ -86,17 +86,22 @@ def test_an_amplitude_that_folds_is_told_and_its_folds_are_not_valid():
     assert wild.restore_flow.isfinite().all()
     assert wild.restore_valid.double().mean() < 0.5 < calm.restore_valid.double().mean()
     assert wild.restore_residual[wild.restore_valid].max() < 0.05
-    # What is valid is brought back: the coordinates themselves, up to the bilinear reading of them.
+    # Valid coordinates come back, up to bilinear interpolation.
     ramp = torch.arange(96.0).expand(2, 1, 64, 96)
-    there, _ = warp(ramp, wild.flow)
-    back, _ = warp(there, wild.restore_flow)
-    assert (back - ramp)[wild.restore_valid].abs().max() < 0.05
+    degraded, _ = warp(ramp, wild.flow)
+    restored, _ = warp(degraded, wild.restore_flow)
+    assert (restored - ramp)[wild.restore_valid].abs().max() < 0.05
 
 
-def test_one_step_is_the_displacement_itself():
-    effect, image = DivergenceFree(**GENTLE, tolerance_px=None), torch.zeros(2, 1, 31, 37)
-    degraded = effect.degrade(image, seed=1)
-    assert torch.equal(degraded.flow, effect.displacement(degraded.params, height=31, width=37))
+@pytest.mark.quick
+def test_the_flow_on_a_lattice_is_the_exact_one_within_the_tolerance():
+    image = torch.zeros(2, 1, 300, 400)
+    coarse, exact = (DivergenceFree(tolerance_px=value) for value in (0.05, None))
+    assert coarse.plan(300, 400).stride > 4
+    flow = coarse.degrade(image, seed=1).flow
+    error = (flow - exact.degrade(image, seed=1).flow).norm(dim=1).max()
+    assert 1e-5 < error <= 0.05
+    assert divergence(flow).abs().max() < 0.01
 
 
 @pytest.mark.parametrize(

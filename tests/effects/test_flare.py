@@ -18,10 +18,10 @@ def picture(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
 
 
-def sun(
+def flare_params(
     image: Tensor, *, center: tuple[float, float] = (0.4, 0.2), radius: float = 0.3, strength: float = 0.6
 ) -> FlareParams:
-    """The same sun for each image, white."""
+    """Return the same white sun for each image."""
     batch, channels = image.shape[:2]
 
     def row(*values: float) -> Tensor:
@@ -33,64 +33,65 @@ def sun(
 
 
 def expected_mask(center: tuple[float, float], radius: float) -> Tensor:
-    """m, by the paper's formula, the center from the upper left corner of the frame."""
+    """Compute m by the formula of the paper, with the center from the upper left corner of the frame."""
     height, width = SIZE
     y, x = np.mgrid[:height, :width]
     distance = np.hypot(x + 0.5 - center[0] * width, y + 0.5 - center[1] * height)
     return torch.from_numpy(np.exp(-0.5 * (distance / (radius * DIAGONAL)) ** 2))
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("center", [(0.4, 0.2), (-0.5, 1.5), (0.5 / SIZE[1], 0.5 / SIZE[0])])
-def test_the_image_is_what_the_formulas_say(center, oracle):
+def test_the_image_is_the_closed_form(center):
     image = picture(2, 3, *SIZE)
     m = expected_mask(center, 0.3)
-    params = sun(image, center=center)
+    params = flare_params(image, center=center)
     degraded = LensFlare().apply(image, params)
     added = image + 0.6 * m
-    oracle("flare, image", degraded.image, added.clamp(0, 1), 1e-12, unit="")
-    oracle("flare, intensity", degraded.intensity, (0.6 * m).expand(2, 1, -1, -1), 1e-12, unit="")
+    assert_close(degraded.image, added.clamp(0, 1), rtol=0, atol=1e-12)
+    assert_close(degraded.intensity, (0.6 * m).expand(2, 1, -1, -1), rtol=0, atol=1e-12)
     assert torch.equal(degraded.valid, (added <= 1).all(dim=1, keepdim=True))
     assert degraded.flow is None
     assert degraded.transmission is None
     unclipped = LensFlare(clip=False).apply(image, params)
-    oracle("flare, image", unclipped.image, added, 1e-12, unit="")
+    assert_close(unclipped.image, added, rtol=0, atol=1e-12)
     assert torch.equal(unclipped.valid, degraded.valid)
     screen = LensFlare(blend="screen").apply(image, params)
-    oracle("flare, image", screen.image, 1 - (1 - image) * (1 - 0.6 * m), 1e-12, unit="")
+    assert_close(screen.image, 1 - (1 - image) * (1 - 0.6 * m), rtol=0, atol=1e-12)
     assert screen.valid.all()
 
 
-def test_the_intensity_takes_the_flare_off_again_where_it_is_valid():
+def test_subtracting_the_intensity_restores_valid_pixels():
     image = picture(2, 3, *SIZE)
     effect = LensFlare(color=(1.0, 0.8, 0.5))
     d = effect.degrade(image, seed=3)
     assert 0.1 < d.valid.double().mean() < 0.9
     restored = d.image - d.intensity * d.params.color[..., None, None]
     assert_close(torch.where(d.valid, restored, image), image, rtol=0, atol=1e-12)
-    lost = ~d.valid.expand_as(image) & (d.image == 1)
-    assert (restored < image - 1e-6)[lost].any()
+    saturated = ~d.valid.expand_as(image) & (d.image == 1)
+    assert (restored < image - 1e-6)[saturated].any()
 
 
-def test_a_sun_too_strong_for_a_second_exposure_is_not_valid():
+def test_screened_pixels_without_contrast_are_invalid():
     image = picture(1, 3, *SIZE)
-    d = LensFlare(blend="screen").apply(image, sun(image, strength=3.0))
+    d = LensFlare(blend="screen").apply(image, flare_params(image, strength=3.0))
     assert d.image.max() == 1
     assert torch.equal(d.valid, 3 * expected_mask((0.4, 0.2), 0.3)[None, None] <= 1 - 1 / 255)
 
 
-def test_draws_fill_the_intervals_of_the_paper():
+def test_draws_fill_the_ranges_of_the_paper():
     params = LensFlare().sample(torch.zeros(4000, 3, 4, 4), seed=1)
-    drawn = {"x": params.center[:, 0], "y": params.center[:, 1], "rho": params.radius, "beta": params.strength}
+    values = {"x": params.center[:, 0], "y": params.center[:, 1], "rho": params.radius, "beta": params.strength}
     for name, (low, high) in {"x": (0.3, 0.7), "y": (0.0, 0.3), "rho": (0.25, 0.35), "beta": (0.55, 0.65)}.items():
-        assert low <= drawn[name].min() < low + 0.01 * (high - low)
-        assert high >= drawn[name].max() > high - 0.01 * (high - low)
+        assert low <= values[name].min() < low + 0.01 * (high - low)
+        assert high >= values[name].max() > high - 0.01 * (high - low)
     assert (params.color == 1).all()
 
 
 @pytest.mark.parametrize("off", [{"radius": 0.0}, {"strength": 0.0}])
-def test_without_a_sun_even_values_out_of_range_stay(off):
+def test_a_flare_of_zero_strength_or_size_keeps_values_outside_the_range(off):
     image = 3 * picture(2, 3, *SIZE) - 1
-    d = LensFlare().apply(image, sun(image, **off))
+    d = LensFlare().apply(image, flare_params(image, **off))
     assert torch.equal(d.image, image)
     assert not d.intensity.any()
     assert d.valid.all()
@@ -98,7 +99,7 @@ def test_without_a_sun_even_values_out_of_range_stay(off):
 
 def test_a_white_image_stays_white_and_passes_no_gradient():
     image = torch.ones(1, 3, *SIZE, dtype=torch.float64, requires_grad=True)
-    params = sun(image)
+    params = flare_params(image)
     strength = params.strength.requires_grad_()
     d = LensFlare().apply(image, params._replace(strength=strength))
     assert (d.image == 1).all()
@@ -108,10 +109,10 @@ def test_a_white_image_stays_white_and_passes_no_gradient():
 
 
 @pytest.mark.parametrize("options", [{}, {"clip": False}, {"blend": "screen"}])
-def test_gradients_are_those_of_finite_differences(options):
+def test_gradients_match_finite_differences(options):
     # Dark enough that nothing saturates, where the slope jumps; one sun has its center on a pixel.
     image = 0.3 * picture(2, 3, 5, 7)
-    params = sun(image)._replace(center=torch.tensor([[3.5 / 7, 2.5 / 5], [0.31, 0.17]], dtype=torch.float64))
+    params = flare_params(image)._replace(center=torch.tensor([[3.5 / 7, 2.5 / 5], [0.31, 0.17]], dtype=torch.float64))
     effect = LensFlare(**options)
     names = ("center", "radius", "strength", "color", "drift", "frame")
 
@@ -149,9 +150,9 @@ def test_arguments_out_of_range_raise(options: dict[str, Any], rule: str):
         LensFlare(**options)
 
 
-def test_a_flag_that_is_none_raises():
+def test_an_invalid_flag_raises():
     with pytest.raises(TypeError, match="clip must be True or False, got 1"):
-        LensFlare(clip=1)  # pyright: ignore[reportArgumentType]  # that is what is wrong
+        LensFlare(clip=1)  # pyright: ignore[reportArgumentType]  # the invalid argument
 
 
 def test_a_color_for_other_channels_raises():
@@ -162,7 +163,7 @@ def test_a_color_for_other_channels_raises():
 @pytest.mark.parametrize("field", ["radius", "strength", "color"])
 def test_negative_params_raise(field):
     image = picture(2, 3, 4, 5)
-    params = sun(image)
+    params = flare_params(image)
     wrong = getattr(params, field).clone()
     wrong.view(-1)[-1] = -0.25
     with pytest.raises(ValueError, match=rf"params\.{field} must be at least 0 and finite, got -0\.25"):

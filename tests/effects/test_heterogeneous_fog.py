@@ -11,8 +11,7 @@ from torch.testing import assert_close
 
 from torchrefract import Camera, GroundPlaneDepth, HeterogeneousFog, LinearDepth, UniformFog, remove_fog
 from torchrefract.data.road_scenes import render_road_scenes
-from torchrefract.fields.perlin import perlin_noise
-from torchrefract.fields.perlin_lattice import octave
+from torchrefract.fields.perlin import draw_octave, perlin_noise
 
 SIZE = (36, 64)
 PAPER = {"scales": (4, 8, 16, 32, 64, 128), "weights": (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)}
@@ -22,7 +21,7 @@ def picture(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
 
 
-def rows_of_the_paper(height: int) -> Tensor:
+def linear_depth_rows(height: int) -> Tensor:
     return torch.tensor([(1 - (y + 0.5) / height) * 160.0 for y in range(height)], dtype=torch.float64)[:, None]
 
 
@@ -30,35 +29,38 @@ def mean_extinction(params: Any) -> Tensor:
     return -math.log(0.05) / params.visibility * (1 + params.deviation)
 
 
-# --- the paper's mode
+# --- mode="image"
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize(("unit", "width"), [("px", 1920.0), ("px", 64.0), ("cells", 1920.0)])
-def test_the_maps_and_the_image_are_what_the_formulas_say(unit, width, oracle):
+def test_image_and_maps_are_the_closed_form(unit, width):
     effect = HeterogeneousFog(scale_unit=unit, reference_width=width, visibility_range=(50.0, 150.0))
     image = picture(3, 3, *SIZE)
     d = effect.degrade(image, seed=4)
     periods = [SIZE[1] / s if unit == "cells" else s * SIZE[1] / width for s in PAPER["scales"]]
-    still: dict[str, Any] = {
+    motionless: dict[str, Any] = {
         "frame": torch.zeros(3),
         "wind": torch.zeros(3, 2),
         "decorrelation": torch.full((3,), math.inf),
     }
-    mixed = torch.zeros(3, 1, *SIZE, dtype=torch.float64)
+    q = torch.zeros(3, 1, *SIZE, dtype=torch.float64)
     for i, (period, weight) in enumerate(zip(periods, PAPER["weights"], strict=True)):
         options: dict[str, Any] = {"period": period, "height": SIZE[0], "width": SIZE[1], "dtype": torch.float64}
-        noise = perlin_noise([octave(d.params.key, i, **options, **still)], torch.ones(3, 1, dtype=torch.float64))
-        mixed += weight * (noise / math.sqrt(0.5) + 1) / 2
-    mixed /= sum(PAPER["weights"])
-    k = mean_extinction(d.params)[:, None, None, None] * mixed / mixed.mean(dim=(2, 3), keepdim=True)
-    t = torch.exp(-k * rows_of_the_paper(SIZE[0]))
+        noise = perlin_noise(
+            [draw_octave(d.params.key, i, **options, **motionless)], torch.ones(3, 1, dtype=torch.float64)
+        )
+        q += weight * (noise / math.sqrt(0.5) + 1) / 2
+    q /= sum(PAPER["weights"])
+    k = mean_extinction(d.params)[:, None, None, None] * q / q.mean(dim=(2, 3), keepdim=True)
+    t = torch.exp(-k * linear_depth_rows(SIZE[0]))
     airlight = torch.tensor([220, 220, 235], dtype=torch.float64)[:, None, None] / 255
-    oracle("heterogeneous fog, k-map in 1/m", d.extinction, k, 1e-12, unit="")
-    oracle("heterogeneous fog, transmission", d.transmission, t, 1e-12, unit="")
-    oracle("heterogeneous fog, image", d.image, image * t + airlight * (1 - t), 1e-12, unit="")
+    assert_close(d.extinction, k, rtol=0, atol=1e-12)
+    assert_close(d.transmission, t, rtol=0, atol=1e-12)
+    assert_close(d.image, image * t + airlight * (1 - t), rtol=0, atol=1e-12)
     assert torch.equal(d.valid, d.transmission >= 1 / 255)
     single = effect.apply(image.float(), d.params.to(torch.float32))
-    oracle("heterogeneous fog, image in float32", single.image, d.image.float(), 1e-6, unit="")
+    assert_close(single.image, d.image.float(), rtol=0, atol=1e-6)
     assert d.extinction.std() > 0.05 * d.extinction.mean()
 
 
@@ -71,15 +73,15 @@ def test_the_mean_extinction_is_that_of_the_visibility(options):
 
 
 @pytest.mark.parametrize("options", [{}, {"mode": "ray"}])
-def test_the_mean_of_the_ensemble_is_that_of_the_visibility_over_many_fogs(options, oracle):
+def test_the_mean_over_many_fogs_is_that_of_the_visibility(options):
     effect = HeterogeneousFog(mean="ensemble", deviation_range=(0.0, 0.0), **options)
-    k = effect.degrade(picture(400, 1, 18, 32), seed=4).extinction
+    k = effect.degrade(picture(150, 1, 9, 16, dtype=torch.float32), seed=4).extinction
     expected = -math.log(0.05) / 100
-    oracle(f"extinction over 400 fogs, of that stated, {options}", k.mean() / expected, k.new_ones(()), 0.02, unit="")
+    assert (k.mean() / expected).item() == pytest.approx(1, abs=0.02)
     assert (k.mean(dim=(1, 2, 3)) - expected).abs().max() > 0.005 * expected
 
 
-def test_cells_across_the_frame_are_periods_of_its_share_of_the_width():
+def test_cells_are_periods_across_the_width():
     image = picture(2, 3, *SIZE)
     cells = HeterogeneousFog(scale_unit="cells", scales=(4.0, 10.0), weights=(1.0, 2.0)).degrade(image, seed=1)
     periods = [SIZE[1] / 4, SIZE[1] / 10]
@@ -87,14 +89,14 @@ def test_cells_across_the_frame_are_periods_of_its_share_of_the_width():
     assert_close(cells.image, px.image, rtol=0, atol=1e-12)
 
 
-def test_a_scale_is_the_same_share_of_every_frame():
+def test_noise_scales_with_the_frame():
     effect = HeterogeneousFog(scales=(160.0,), weights=(1.0,), depth=LinearDepth(max_depth=50.0))
     large = effect.degrade(torch.zeros(1, 1, 108, 192, dtype=torch.float64), seed=1).extinction
     small = effect.degrade(torch.zeros(1, 1, 36, 64, dtype=torch.float64), seed=1).extinction
     assert_close(large[..., 1::3, 1::3], small, rtol=2e-3, atol=0)
 
 
-def test_each_noise_is_stretched_to_its_extremes_in_the_frame():
+def test_normalization_by_the_image_stretches_noise_to_its_extremes():
     effect = HeterogeneousFog(normalize="image", scales=(400.0,), weights=(3.0,), mean="ensemble")
     k = effect.degrade(picture(4, 1, *SIZE), seed=1)
     q = k.extinction / mean_extinction(k.params)[:, None, None, None]
@@ -102,7 +104,7 @@ def test_each_noise_is_stretched_to_its_extremes_in_the_frame():
     assert_close(q.amax(dim=(1, 2, 3)), torch.full((4,), 2.0, dtype=torch.float64), rtol=0, atol=1e-12)
 
 
-def test_only_the_ratio_of_the_weights_counts():
+def test_weights_are_relative():
     image = picture(2, 3, *SIZE)
     one, five = (
         HeterogeneousFog(scales=(40.0, 90.0, 200.0), weights=[f * w for w in (0.5, 0.0, 0.3)]).degrade(image, seed=1)
@@ -111,7 +113,7 @@ def test_only_the_ratio_of_the_weights_counts():
     assert_close(one.image, five.image, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.37, 1e3, 1e6, 7.31])
+@pytest.mark.parametrize("scale", [1.0, 0.37, 1e6, 7.31])
 def test_odd_scales_are_finite_and_keep_the_mean(scale):
     effect = HeterogeneousFog(scales=(scale,), weights=(1.0,), reference_width=SIZE[1])
     for normalize in ("theory", "image"):
@@ -122,7 +124,7 @@ def test_odd_scales_are_finite_and_keep_the_mean(scale):
         assert_close(d.extinction.mean(dim=(1, 2, 3)), mean_extinction(d.params), rtol=1e-9, atol=0)
 
 
-def test_a_fog_of_one_scale_far_larger_than_the_frame_is_uniform():
+def test_noise_far_larger_than_the_frame_is_uniform_fog():
     image = picture(2, 3, *SIZE)
     d = HeterogeneousFog(scales=(1e11,), weights=(1.0,)).degrade(image, seed=1)
     uniform = UniformFog().apply(image, UniformFog.params_type(*d.params[:4]))
@@ -135,33 +137,33 @@ def test_a_frame_of_one_pixel_has_the_mean_extinction(options):
     assert_close(d.extinction[:, 0, 0, 0], mean_extinction(d.params), rtol=1e-9, atol=0)
 
 
-# --- in space
+# --- mode="ray"
 
 
 @pytest.mark.parametrize("kind", ["rows", "map", "plane", "camera"])
-def test_a_constant_field_in_space_is_uniform_fog(kind, oracle):
+def test_volumetric_fog_without_contrast_is_uniform_fog(kind):
     image, depth = picture(2, 3, *SIZE), 300 * picture(2, 1, *SIZE)
     depth[0, 0, :10] = math.inf
     depth[1, 0, 4, 5:9] = 0
-    given = {"depth": depth} if kind in ("map", "camera") else {}
+    passed = {"depth": depth} if kind in ("map", "camera") else {}
     options: dict[str, Any] = {"depth": GroundPlaneDepth()} if kind == "plane" else {}
     if kind == "camera":
         options["camera"] = Camera(width=1280, height=720, fx=900, fy=950, cx=600, cy=380, coefficients=(0,) * 4)
-    d = HeterogeneousFog(mode="ray", contrast_range=(0.0, 0.0), **options).degrade(image, seed=1, **given)
-    uniform = UniformFog(**options).apply(image, UniformFog.params_type(*d.params[:4]), **given)
-    oracle("fog in space without contrast, uniform fog", d.image, uniform.image, 1e-6, unit="")
-    oracle("fog in space without contrast, uniform fog", d.transmission, uniform.transmission, 1e-6, unit="")
+    d = HeterogeneousFog(mode="ray", contrast_range=(0.0, 0.0), **options).degrade(image, seed=1, **passed)
+    uniform = UniformFog(**options).apply(image, UniformFog.params_type(*d.params[:4]), **passed)
+    assert_close(d.image, uniform.image, rtol=0, atol=1e-6)
+    assert_close(d.transmission, uniform.transmission, rtol=0, atol=1e-6)
 
 
-def test_the_visibility_of_fog_in_space_is_kept_over_frames_and_draws(oracle):
+def test_volumetric_fog_keeps_its_visibility_over_frames_and_draws():
     effect = HeterogeneousFog(mode="ray", mean="ensemble", deviation_range=(0.0, 0.0), wind_z_range=(-3.0, -3.0))
     depth = torch.full((30, 1, 1, *SIZE), 250.0)
     k = effect.degrade(torch.zeros(30, 4, 1, *SIZE), seed=3, depth=depth, frame=10.0).extinction
     visibility = -math.log(0.05) / k.mean()
-    oracle("visibility over 30 clips of fog in space", visibility, torch.tensor(100.0), 2.0, unit="m")
+    assert visibility.item() == pytest.approx(100, abs=2)
 
 
-def test_stronger_contrast_in_space_is_more_uneven():
+def test_volumetric_fog_varies_with_its_contrast():
     spreads = []
     for contrast in (0.0, 0.3, 0.6, 1.2):
         effect = HeterogeneousFog(mode="ray", contrast_range=(contrast, contrast))
@@ -173,7 +175,7 @@ def test_stronger_contrast_in_space_is_more_uneven():
 
 
 def layer(effect: HeterogeneousFog, near: float, far: float, frames: int) -> Tensor:
-    """(T, H, W): what the fog between two distances adds to the optical depth, its mean taken out."""
+    """Return the optical depth between two distances, less its mean, (T, H, W)."""
     clip = torch.zeros(1, frames, 1, 90, 160, dtype=torch.float64)
     params = effect.sample(clip, seed=5)
     thickness = []
@@ -184,40 +186,39 @@ def layer(effect: HeterogeneousFog, near: float, far: float, frames: int) -> Ten
     return added - added.mean(dim=(1, 2), keepdim=True)
 
 
-def drift_px(fields: Tensor) -> float:
-    """px per frame, to the right, by which the first field matches the last best."""
+def shift_per_frame_px(fields: Tensor) -> float:
+    """Return the shift to the right at which the first field matches the last one best."""
     first, last = fields[0].numpy(), fields[-1].numpy()
     shifts = range(60)
 
-    def match(s: int) -> float:
+    def correlation(s: int) -> float:
         a, b = first[:, : first.shape[1] - s].ravel(), last[:, s:].ravel()
         return float(np.corrcoef(a, b)[0, 1])
 
-    return max(shifts, key=match) / (len(fields) - 1)
+    return max(shifts, key=correlation) / (len(fields) - 1)
 
 
-def test_near_drifts_pass_faster_than_far_ones(oracle):
-    still: dict[str, Any] = {
+def test_near_fog_moves_faster_than_far_fog():
+    motionless: dict[str, Any] = {
         "contrast_range": (0.5, 0.5),
         "decorrelation_range": (math.inf, math.inf),
         "mean": "ensemble",
     }
-    effect = HeterogeneousFog(mode="ray", wind_x_range=(0.5, 0.5), **still)
-    # A pinhole of 0.9 widths, 144 px here: 0.5 m per frame are 72 px m / distance.
-    near, far = drift_px(layer(effect, 14.0, 18.0, 9)), drift_px(layer(effect, 110.0, 125.0, 41))
-    for found, distance in ((near, 16.0), (far, 117.5)):
-        pace = torch.tensor(found * distance / 72)
-        oracle(f"pace of drifts {distance} m away, f v / z", pace, torch.tensor(1.0), 0.15, unit="")
+    effect = HeterogeneousFog(mode="ray", wind_x_range=(0.5, 0.5), **motionless)
+    # A pinhole of 0.9 widths, 144 px: 0.5 m per frame are 72 px m / distance.
+    near, far = shift_per_frame_px(layer(effect, 14.0, 18.0, 9)), shift_per_frame_px(layer(effect, 110.0, 125.0, 41))
+    for px_per_frame, distance in ((near, 16.0), (far, 117.5)):
+        assert px_per_frame * distance / 72 == pytest.approx(1, abs=0.15)
     assert near > 5 * far
 
 
 @pytest.mark.parametrize("mode", ["image", "ray"])
-def test_with_the_true_depth_of_a_scene_near_things_stay_and_far_ones_vanish(mode, oracle):
+def test_near_objects_stay_visible_and_far_ones_vanish(mode):
     image, depth = render_road_scenes(torch.arange(4), 54, 96)
     d = HeterogeneousFog(mode=mode).degrade(image, seed=1, depth=depth)
     expected = torch.exp(-d.extinction * depth)
     assert_close(d.transmission, expected, rtol=1e-5, atol=1e-7)
-    oracle("transmission in RoadScenes, fp32, exp(-k d)", d.transmission, expected, 1e-6, unit="")
+    assert_close(d.transmission, expected, rtol=0, atol=1e-6)
     change = (d.image - image).abs().mean(dim=1, keepdim=True)
     assert change[depth < 6].mean() < 0.1
     assert (d.image - d.params.airlight[..., None, None]).abs().amax(dim=1, keepdim=True)[depth > 250].max() < 0.02
@@ -226,7 +227,7 @@ def test_with_the_true_depth_of_a_scene_near_things_stay_and_far_ones_vanish(mod
 
 
 @pytest.mark.parametrize("mode", ["image", "ray"])
-def test_the_fog_is_removed_in_closed_form(mode):
+def test_remove_fog_inverts_heterogeneous_fog(mode):
     image = picture(2, 3, *SIZE)
     d = HeterogeneousFog(mode=mode, visibility_range=(150.0, 150.0)).degrade(image, seed=1)
     clean, valid = remove_fog(d.image, d.transmission, d.params.airlight)
@@ -234,7 +235,7 @@ def test_the_fog_is_removed_in_closed_form(mode):
     assert_close(torch.where(valid, clean, image), image, rtol=0, atol=1e-6)
 
 
-def test_the_transmission_through_measured_depth_is_that_of_the_formula(shared_data, oracle):
+def test_the_transmission_for_measured_depth_is_that_of_the_extinction_map(shared_data):
     for name in ("clear_road_lidar", "haze_road_lidar"):
         path = shared_data / "references" / name / "depth_dense_derived_640x360.png"
         stored: Any = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
@@ -249,27 +250,27 @@ def test_the_transmission_through_measured_depth_is_that_of_the_formula(shared_d
         ):
             d = effect.degrade(picture(1, 3, 360, 640), seed=1, depth=depth)
             expected = torch.exp(-d.extinction * depth * along)
-            oracle("transmission through measured depth, exp(-k d)", d.transmission, expected, 1e-12, unit="")
+            assert_close(d.transmission, expected, rtol=0, atol=1e-12)
             assert d.transmission[depth < 8].min() > 0.6
             assert d.transmission[depth > 200].max() < 0.02
 
 
 @pytest.mark.parametrize("mode", ["image", "ray"])
-def test_gradients_of_everything_and_of_depth_are_those_of_finite_differences(mode):
+def test_gradients_of_all_parameters_and_depth_match_finite_differences(mode):
     image, depth = picture(2, 3, 3, 4), 10 + 80 * picture(2, 1, 3, 4)
     effect = HeterogeneousFog(mode=mode)
     params = effect.sample(image, seed=3, frame=2.5)
     names = ("visibility", "deviation", "airlight", "weights", "contrast", "wind", "decorrelation", "frame")
 
-    def fogged(image: Tensor, depth: Tensor, *values: Tensor) -> Tensor:
+    def foggy(image: Tensor, depth: Tensor, *values: Tensor) -> Tensor:
         return effect.apply(image, params._replace(**dict(zip(names, values, strict=True))), depth=depth).image
 
     inputs = [image, depth, *(getattr(params, name).clone() for name in names)]
-    assert torch.autograd.gradcheck(fogged, [value.requires_grad_() for value in inputs])
+    assert torch.autograd.gradcheck(foggy, [value.requires_grad_() for value in inputs], fast_mode=True)
 
 
 @pytest.mark.parametrize("mode", ["image", "ray"])
-def test_fog_in_a_clip_neither_pulses_nor_jumps(mode):
+def test_fog_changes_smoothly_over_a_clip(mode):
     effect = HeterogeneousFog(mode=mode, decorrelation_range=(20.0, 20.0), wind_x_range=(0.2, 0.2))
     k = effect.degrade(torch.zeros(2, 60, 1, 72, 128), seed=3).extinction[:, :, 0].double()
     steps = k.diff(dim=1).square().mean(dim=(2, 3)).sqrt()
@@ -279,11 +280,11 @@ def test_fog_in_a_clip_neither_pulses_nor_jumps(mode):
     assert_close(k.mean(dim=(2, 3)), k.mean(dim=(1, 2, 3))[:, None].expand(-1, 60), rtol=1e-5, atol=0)
 
 
-# --- ends of the domain, bad input
+# --- ends of the domain, invalid arguments
 
 
 @pytest.mark.parametrize("mode", ["image", "ray"])
-def test_clear_air_changes_nothing_and_a_wall_of_fog_shows_its_color(mode):
+def test_clear_air_keeps_the_image_and_opaque_fog_shows_its_color(mode):
     image = picture(2, 3, *SIZE)
     effect = HeterogeneousFog(mode=mode)
     params = effect.sample(image, seed=1)
@@ -291,9 +292,9 @@ def test_clear_air_changes_nothing_and_a_wall_of_fog_shows_its_color(mode):
     assert torch.equal(clear.image, image)
     assert (clear.transmission == 1).all()
     visibility = torch.full((2,), 1e-3, dtype=torch.float64, requires_grad=True)
-    wall = effect.apply(image, params._replace(visibility=visibility))
-    assert torch.equal(wall.image, params.airlight[..., None, None].expand_as(image))
-    assert torch.autograd.grad(wall.image.sum(), visibility)[0].isfinite().all()
+    opaque = effect.apply(image, params._replace(visibility=visibility))
+    assert torch.equal(opaque.image, params.airlight[..., None, None].expand_as(image))
+    assert torch.autograd.grad(opaque.image.sum(), visibility)[0].isfinite().all()
     depth = torch.zeros(2, 1, *SIZE, dtype=torch.float64)
     assert torch.equal(effect.apply(image, params, depth=depth).image, image)
     assert not effect.apply(image, params, depth=depth + math.inf).transmission.any()
@@ -316,7 +317,7 @@ def test_clear_air_changes_nothing_and_a_wall_of_fog_shows_its_color(mode):
         ({"normalize": "max"}, "normalize must be one of theory, image"),
         ({"mean": "time"}, "mean must be one of image, ensemble"),
         ({"contrast_range": (-0.1, 0.2)}, "contrast_range must be"),
-        ({"wind_z_range": (-1.0, 0.0)}, r"wind_z_range must be \(0, 0\) in the image, which has no depth"),
+        ({"wind_z_range": (-1.0, 0.0)}, r"wind_z_range must be \(0, 0\) for mode='image', which has no depth"),
         ({"decorrelation_range": (0.0, 1.0)}, "decorrelation_range must be"),
         ({"reach": 0.0}, "reach must be"),
         ({"visibility_range": (0.0, 1.0)}, "visibility_range must be"),
@@ -328,7 +329,7 @@ def test_arguments_out_of_range_raise(options: dict[str, Any], rule: str):
 
 
 @pytest.mark.parametrize("wrong", [{"depth": 100.0}, {"camera": "dashcam"}, {"linear_light": 1}])
-def test_arguments_of_another_kind_raise(wrong: dict[str, Any]):
+def test_arguments_of_another_type_raise(wrong: dict[str, Any]):
     (name,) = wrong
     with pytest.raises(TypeError, match=f"{name} must be"):
         HeterogeneousFog(**wrong)
@@ -355,11 +356,11 @@ def test_params_out_of_range_raise(field, value, rule):
 
 
 @pytest.mark.parametrize("depth", [-1.0, math.nan])
-def test_a_depth_that_is_none_raises(depth):
+def test_an_invalid_depth_raises(depth):
     image = picture(1, 3, 8, 9)
     with pytest.raises(ValueError, match="depth must be at least 0, in m"):
         HeterogeneousFog().degrade(image, depth=torch.full((1, 1, 8, 9), depth))
     with pytest.raises(ValueError, match="depth must be in m, not normalized"):
         HeterogeneousFog().degrade(image, depth=picture(1, 1, 8, 9))
-    with pytest.raises(ValueError, match="depth must have one channel of the size of the image"):
+    with pytest.raises(ValueError, match="depth must have one channel and the size of the image"):
         HeterogeneousFog().degrade(image, depth=torch.ones(1, 1, 9, 8))

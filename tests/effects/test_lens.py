@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import Compose, Degraded, LensDistortion, LensParams, OneOf, warp
-from torchrefract.cameras.distortion import POLYNOMIAL12
+from torchrefract.cameras.brown_conrady import POLYNOMIAL12
 
 FOLDING: dict[str, Any] = {"k1_range": (-0.6, -0.6), "k2_range": (0.0, 0.0), "focal_range": (0.7, 0.7)}
 

@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 from torchrefract import Camera, LensDistortion, LensParams
 from torchrefract.cameras.conversion import convert
-from torchrefract.cameras.lens_table import read_lenses
+from torchrefract.cameras.lens_database import read_lenses
 
 CAR = Camera(
     width=640, height=360, fx=560.0, fy=565.0, cx=325.0, cy=178.0, coefficients=(-0.25, 0.09, 1e-3, -8e-4, 0.0)

@@ -26,12 +26,12 @@ from torchrefract.cameras.io.colmap import read_colmap, write_colmap
 from torchrefract.cameras.io.kalibr import read_kalibr, write_kalibr
 from torchrefract.cameras.io.opencv import read_opencv, write_opencv
 from torchrefract.cameras.io.ros import read_ros, write_ros
-from torchrefract.cameras.lens_table import COLUMNS, read_lenses
-from torchrefract.data.frame_folder import FrameFolder
+from torchrefract.cameras.lens_database import COLUMNS, read_lenses
+from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import UnreadableImageError, image_size, read_image
-from torchrefract.data.pair_files import FORMATS, DamagedPairError, PairArrays, encode_pair
-from torchrefract.data.pair_manifest import PairRow, Stored, read_row
-from torchrefract.data.paired_folder import PairedFolder
+from torchrefract.data.pairs.files import FORMATS, DamagedPairError, PairArrays, encode_pair
+from torchrefract.data.pairs.manifest import PairRow, Stored, read_row
+from torchrefract.data.pairs import PairedFolder
 from torchrefract.restoration.checkpoints import CheckpointError, check_fits, read_checkpoint
 
 SECONDS = 10.0  # for one small file, on a machine that is busy

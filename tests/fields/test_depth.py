@@ -19,32 +19,33 @@ from torchrefract.fields.depth import (
     ray_distance,
 )
 
-HERE = {"dtype": torch.float64, "device": torch.device("cpu")}
+OPTIONS = {"dtype": torch.float64, "device": torch.device("cpu")}
 INTRINSICS: dict[str, Any] = {"fx": 11.0, "fy": 9.0, "cx": 4.3, "cy": 2.9}
 
 
-def number(low: float, high: float, *shape: int) -> Tensor:
+def random_in(low: float, high: float, *shape: int) -> Tensor:
     return low + (high - low) * torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
 
 def real_depths(shared_data) -> list[Tensor]:
-    """The depth of two real roads, interpolated from lidar."""
+    """Return the depth of two real roads, interpolated from lidar."""
     paths = sorted((shared_data / "references").glob("*/depth_dense_derived_640x360.png"))
     assert len(paths) == 2
     pictures = [np.float64(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)) for path in paths]
     return [torch.from_numpy(np.where(p == 65535, np.inf, p / 256))[None, None] for p in pictures]
 
 
+@pytest.mark.quick
 def test_linear_depth_runs_from_the_far_top_row_to_the_near_bottom_row():
-    depth = linear_depth(4, 160.0, **HERE)
+    depth = linear_depth(4, 160.0, **OPTIONS)
     assert depth.flatten().tolist() == [140.0, 100.0, 60.0, 20.0]
     assert depth.shape == (1, 1, 4, 1)
 
 
-@pytest.mark.parametrize("height", [1, 90, 1081])
-@pytest.mark.parametrize("pitch", [-0.2, 0.0, 0.05, 0.7])
+@pytest.mark.parametrize("height", [1, 90])
+@pytest.mark.parametrize("pitch", [-0.2, 0.0, 0.7])
 @pytest.mark.parametrize("far", [60.0, math.inf])
-def test_the_ground_is_where_the_rays_of_a_pitched_camera_meet_it(height, pitch, far):
+def test_the_ground_plane_is_where_the_rays_of_a_pitched_camera_meet_it(height, pitch, far):
     focal, above, middle = 1.7 * height, 1.3, (height - 1) / 2
     # The camera's axes down and ahead, in the world's (down, ahead).
     down = np.array([math.cos(pitch), -math.sin(pitch)])
@@ -57,21 +58,21 @@ def test_the_ground_is_where_the_rays_of_a_pitched_camera_meet_it(height, pitch,
         if fall > 0:  # the ray has 1 m ahead of the camera for each unit of its length
             expected[y] = min(above / fall, far)
     options = {"camera_height": above, "focal_px": focal, "horizon": (row + 0.5) / height, "far": far}
-    depth = ground_plane_depth(height, **options, **HERE)
+    depth = ground_plane_depth(height, **options, **OPTIONS)
     assert_close(depth, torch.from_numpy(expected).view(1, 1, height, 1), rtol=1e-9, atol=0)
     single = ground_plane_depth(height, **options, dtype=torch.float32, device=torch.device("cpu"))
     assert torch.equal(single, depth.float())
 
 
 def test_the_row_of_the_horizon_is_as_far_as_the_sky():
-    depth = ground_plane_depth(10, camera_height=2.0, focal_px=8.0, horizon=0.45, far=math.inf, **HERE).flatten()
+    depth = ground_plane_depth(10, camera_height=2.0, focal_px=8.0, horizon=0.45, far=math.inf, **OPTIONS).flatten()
     assert depth[:5].isinf().all()
     assert depth[5:].tolist() == pytest.approx([2 * math.hypot(8, 0.5) / rows for rows in range(1, 6)])
 
 
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-14), (torch.float32, 1e-6), (torch.float16, 1e-6)])
 def test_the_ray_distance_is_the_length_of_the_vector_to_the_point(dtype, rtol):
-    depth = number(1.0, 90.0, 2, 1, 6, 9).to(dtype)
+    depth = random_in(1.0, 90.0, 2, 1, 6, 9).to(dtype)
     depth[1, 0, 2, 3] = math.inf
     v, u = np.mgrid[:6, :9]
     for sample in (0, 1):
@@ -85,14 +86,14 @@ def test_the_ray_distance_is_the_length_of_the_vector_to_the_point(dtype, rtol):
 
 
 def test_rows_of_one_depth_are_stretched_over_the_width():
-    rows = number(1.0, 90.0, 1, 1, 6, 1)
+    rows = random_in(1.0, 90.0, 1, 1, 6, 1)
     focal = torch.tensor([7.0, 12.0])
-    found = ray_distance(rows, fx=focal, fy=9.0, cx=4.0, cy=2.5, width=9)
-    assert torch.equal(found, ray_distance(rows.expand(2, -1, -1, 9), fx=focal, fy=9.0, cx=4.0, cy=2.5))
+    result = ray_distance(rows, fx=focal, fy=9.0, cx=4.0, cy=2.5, width=9)
+    assert torch.equal(result, ray_distance(rows.expand(2, -1, -1, 9), fx=focal, fy=9.0, cx=4.0, cy=2.5))
 
 
-def test_gradients_of_the_ray_distance_are_those_of_finite_differences():
-    values = [number(1.0, 90.0, 2, 1, 3, 4), *(value + number(0.0, 1.0, 2) for value in INTRINSICS.values())]
+def test_gradients_of_the_ray_distance_match_finite_differences():
+    values = [random_in(1.0, 90.0, 2, 1, 3, 4), *(value + random_in(0.0, 1.0, 2) for value in INTRINSICS.values())]
 
     def distance(depth, fx, fy, cx, cy):
         return ray_distance(depth, fx=fx, fy=fy, cx=cx, cy=cy)
@@ -124,45 +125,45 @@ def test_the_sky_gives_the_intrinsics_no_gradient():
         ({"cy": torch.zeros(3)}, ValueError, r"cy must be a number or have shape \(2,\), got \(3,\)"),
     ],
 )
-def test_what_is_no_camera_raises(changed, error, rule):
+def test_invalid_intrinsics_raise(changed, error, rule):
     with pytest.raises(error, match=rule):
         ray_distance(**({"depth": torch.ones(2, 1, 6, 9)} | INTRINSICS | changed))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_converters_are_their_formulas_and_exact_at_both_ends(dtype):
-    value = torch.cat([torch.tensor([0.0, 1.0]), number(0.0, 1.0, 20)]).to(dtype)
+    value = torch.cat([torch.tensor([0.0, 1.0]), random_in(0.0, 1.0, 20)]).to(dtype)
     v = value.double().numpy()
     with np.errstate(divide="ignore"):
-        wanted = [360.5 / v, 2 + 78 * v, 1 / (v / 2 + (1 - v) / 80), 2 / v]
-    found = [
+        formulas = [360.5 / v, 2 + 78 * v, 1 / (v / 2 + (1 - v) / 80), 2 / v]
+    result = [
         depth_from_disparity(value, focal_px=721.0, baseline=0.5),
         depth_from_normalized(value, near=2.0, far=80.0),
         depth_from_inverse(value, near=2.0, far=80.0),
         depth_from_inverse(value, near=2.0, far=math.inf),
     ]
-    for depth, expected in zip(found, wanted, strict=True):
+    for depth, expected in zip(result, formulas, strict=True):
         assert_close(depth, torch.from_numpy(expected).to(dtype))
-    assert found[0][0] == found[3][0] == math.inf
-    assert found[1][:2].tolist() == [2.0, 80.0]
-    assert found[2][:2].tolist() == [80.0, 2.0]
+    assert result[0][0] == result[3][0] == math.inf
+    assert result[1][:2].tolist() == [2.0, 80.0]
+    assert result[2][:2].tolist() == [80.0, 2.0]
 
 
-def test_gradients_of_the_converters_are_those_of_finite_differences_and_finite_at_infinity():
+def test_gradients_of_the_converters_match_finite_differences_and_are_finite_at_infinity():
     functions = (
         lambda v: depth_from_disparity(100 * v, focal_px=721.0, baseline=0.5),
         lambda v: depth_from_normalized(v, near=2.0, far=80.0),
         lambda v: depth_from_inverse(v, near=2.0, far=math.inf),
     )
     for function in functions:
-        assert torch.autograd.gradcheck(function, number(0.1, 0.9, 7).requires_grad_())
+        assert torch.autograd.gradcheck(function, random_in(0.1, 0.9, 7).requires_grad_())
         far = torch.tensor([0.0, 1e-30, 1e-12]).requires_grad_()
         (gradient,) = torch.autograd.grad(function(far).sum(), far)
         assert gradient.isfinite().all()
 
 
 @pytest.mark.parametrize("wrong", [-0.25, math.nan, -math.inf])
-def test_values_of_no_map_raise(wrong):
+def test_values_outside_the_range_of_a_map_raise(wrong):
     value = torch.tensor([0.5, wrong])
     with pytest.raises(ValueError, match="disparity must be at least 0, in px, got"):
         depth_from_disparity(value, focal_px=1.0, baseline=1.0)
@@ -177,36 +178,36 @@ def test_values_of_no_map_raise(wrong):
             convert(value, near=2.0, far=2.0)
 
 
-def refused(depth: Tensor) -> str:
+def error_of(depth: Tensor) -> str:
     with pytest.raises(ValueError, match="depth must be in m, not") as error:
         check_depth(depth)
     return str(error.value)
 
 
-@pytest.mark.parametrize("size", [(64, 112), (128, 224), (96, 40)])
-def test_the_depth_of_road_scenes_passes_and_what_is_none_does_not(size):
-    _, depth = render_road_scenes(torch.arange(20), *size)
+@pytest.mark.parametrize("size", [(64, 112), (96, 40)])
+def test_check_depth_accepts_road_scenes_and_rejects_converted_ones(size):
+    _, depth = render_road_scenes(torch.arange(8), *size)
     check_depth(depth)
     check_depth(depth.clamp(max=80.0))
     for sample in depth.split(1):
-        assert "not disparity or inverse depth" in refused(360.5 / sample)
-        assert "not normalized" in refused(sample.amin() / sample)
+        assert "not disparity or inverse depth" in error_of(360.5 / sample)
+        assert "not normalized" in error_of(sample.amin() / sample)
         farthest = sample[sample.isfinite()].amax()
-        assert "not normalized" in refused((sample / farthest).clamp(max=1.0))
-        assert "not normalized" in refused(sample / farthest)
+        assert "not normalized" in error_of((sample / farthest).clamp(max=1.0))
+        assert "not normalized" in error_of(sample / farthest)
 
 
-def test_the_depth_of_real_roads_passes_and_what_is_none_does_not(shared_data):
+def test_check_depth_accepts_real_roads_and_rejects_converted_ones(shared_data):
     for depth in real_depths(shared_data):
         for kind in (torch.float64, torch.float32, torch.float16):
             check_depth(depth.to(kind))
         check_depth(depth.clamp(max=80.0))
         check_depth(depth.nan_to_num(posinf=0.0))  # as where 0 is no measurement
-        assert "not disparity or inverse depth" in refused(360.5 / depth)
-        assert "not disparity or inverse depth" in refused(1000 / depth)
+        assert "not disparity or inverse depth" in error_of(360.5 / depth)
+        assert "not disparity or inverse depth" in error_of(1000 / depth)
 
 
-def test_depths_that_look_odd_but_are_in_meters_pass():
+def test_check_depth_accepts_unusual_depths_in_meters():
     ramp = torch.linspace(0, 1, 200).view(1, 1, -1, 1).expand(1, 1, 200, 300)
     for depth in (0 * ramp, 0 * ramp + 0.5, 0 * ramp + 1, 1 + 149 * ramp, 150 * ramp, 160 * (1 - ramp), ramp / 0):
         check_depth(depth.nan_to_num(posinf=math.inf))
@@ -214,37 +215,37 @@ def test_depths_that_look_odd_but_are_in_meters_pass():
     check_depth(torch.tensor([[[[0.0, 9.0]]]]))
 
 
-def test_only_what_lies_in_the_unit_range_everywhere_is_normalized():
-    depth = number(0.0, 1.0, 1, 1, 700, 900)
-    depth[0, 0, 1, 1] = 1.5  # between the rows and columns that are looked at first
+def test_a_map_is_normalized_only_if_all_values_lie_in_the_unit_range():
+    depth = random_in(0.0, 1.0, 1, 1, 700, 900)
+    depth[0, 0, 1, 1] = 1.5  # between the rows and columns that are tested first
     check_depth(depth)
     depth[0, 0, 1, 1] = 0.5
     low, high = depth.amin().item(), depth.amax().item()
-    assert refused(depth).endswith(f"got values in [{low:g}, {high:g}]")
+    assert error_of(depth).endswith(f"got values in [{low:g}, {high:g}]")
 
 
 def test_each_sample_and_clip_is_judged_by_itself():
-    depth = number(1.0, 90.0, 3, 1, 20, 30)
+    depth = random_in(1.0, 90.0, 3, 1, 20, 30)
     depth[1] /= 100
-    assert refused(depth).endswith(f"got values in [{depth[1].amin():g}, {depth[1].amax():g}]")
-    clips = number(1.0, 90.0, 2, 5, 1, 40, 30)
+    assert error_of(depth).endswith(f"got values in [{depth[1].amin():g}, {depth[1].amax():g}]")
+    clips = random_in(1.0, 90.0, 2, 5, 1, 40, 30)
     check_depth(clips)
     clips[1] = torch.linspace(-60, 90, 40).clamp(min=0).double().view(40, 1)  # of a road below a horizon
-    assert "not disparity or inverse depth" in refused(clips)
+    assert "not disparity or inverse depth" in error_of(clips)
     clips[1] /= 100
-    assert "not normalized" in refused(clips)
+    assert "not normalized" in error_of(clips)
 
 
 @pytest.mark.parametrize("wrong", [-1.0, math.nan, -math.inf])
-def test_what_is_negative_or_nan_raises_wherever_it_lies(wrong):
-    depth = number(1.0, 90.0, 2, 1, 300, 400)
+def test_a_negative_or_nan_value_raises_wherever_it_lies(wrong):
+    depth = random_in(1.0, 90.0, 2, 1, 300, 400)
     depth[1, 0, 1, 399] = wrong
     with pytest.raises(ValueError, match=f"range must be at least 0, in m, got {wrong:g}"):
         check_depth(depth, name="range")
 
 
-def test_a_graph_a_device_and_vmap_are_never_waited_for():
-    depth, focal = number(1.0, 90.0, 2, 1, 6, 9), torch.tensor([8.0, 9.0]).double()
+def test_one_graph_vmap_and_meta_tensors_are_not_read():
+    depth, focal = random_in(1.0, 90.0, 2, 1, 6, 9), torch.tensor([8.0, 9.0]).double()
 
     def distance(depth, fx):
         check_depth(depth)
@@ -252,11 +253,11 @@ def test_a_graph_a_device_and_vmap_are_never_waited_for():
             depth / 90, near=1, far=9
         )
         depth = depth_from_disparity(depth, focal_px=9.0, baseline=0.5)
-        road = ground_plane_depth(6, camera_height=1.3, focal_px=9.0, horizon=0.2, far=50.0, **HERE)
+        road = ground_plane_depth(6, camera_height=1.3, focal_px=9.0, horizon=0.2, far=50.0, **OPTIONS)
         return ray_distance(torch.minimum(depth, road), fx=fx, fy=9.0, cx=4.0, cy=2.0)
 
     together = distance(depth, focal)
-    assert_close(torch.compile(distance, fullgraph=True)(depth, focal), together)
+    assert_close(torch.compile(distance, fullgraph=True, backend="aot_eager")(depth, focal), together)
     mapped = torch.vmap(lambda depth, fx: distance(depth[None], fx)[0])(depth, focal)
     assert_close(mapped, together)
     # On a device that holds no values, reading one would raise.
@@ -264,26 +265,17 @@ def test_a_graph_a_device_and_vmap_are_never_waited_for():
     depth_from_disparity(torch.empty(2, 1, 6, 9, device="meta"), focal_px=9.0, baseline=0.5)
 
 
-def test_a_sample_does_not_depend_on_the_batch_or_the_threads(on_threads):
-    depth, focal = number(1.0, 90.0, 5, 1, 181, 319).float(), number(8.0, 9.0, 5)
-    on_threads(1)
-    alone = [ray_distance(depth[i : i + 1], fx=focal[i : i + 1], fy=9.0, cx=4.0, cy=2.0) for i in range(5)]
-    for threads in (1, 2, 3):
-        on_threads(threads)
-        assert torch.equal(ray_distance(depth, fx=focal, fy=9.0, cx=4.0, cy=2.0), torch.cat(alone))
-
-
 def test_a_spread_averages_inverse_depth_over_horizons():
-    options = {"camera_height": 1.4, "focal_px": 40.0, "far": math.inf, **HERE}
-    found = ground_plane_depth(24, horizon=0.4, spread=0.15, **options).flatten()
+    options = {"camera_height": 1.4, "focal_px": 40.0, "far": math.inf, **OPTIONS}
+    result = ground_plane_depth(24, horizon=0.4, spread=0.15, **options).flatten()
     y_h, s = 0.4 * 24 - 0.5, 0.15 * 24
     distance = 1.4 * math.hypot(40.0, 11.5 - y_h)
     shifts = np.linspace(-9, 9, 200_001)
     share = np.exp(-0.5 * shifts**2)
     share /= share.sum()
     inverse = [(share * np.maximum(y - y_h - s * shifts, 0)).sum() / distance for y in range(24)]
-    assert_close(1 / found, torch.tensor(inverse, dtype=torch.float64), rtol=1e-6, atol=1e-12)
+    assert_close(1 / result, torch.tensor(inverse, dtype=torch.float64), rtol=1e-6, atol=1e-12)
     sharp = ground_plane_depth(24, horizon=0.4, **options).flatten()
-    assert_close(found[-1:], sharp[-1:], rtol=1e-4, atol=0)
-    assert (found[:9].isfinite() & sharp[:9].isinf()).all()
-    assert (found.diff() < 0).all()
+    assert_close(result[-1:], sharp[-1:], rtol=1e-4, atol=0)
+    assert (result[:9].isfinite() & sharp[:9].isinf()).all()
+    assert (result.diff() < 0).all()

@@ -5,29 +5,30 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from torchrefract.fields.fog import extinction, linear_to_srgb, srgb_to_linear, transmission, veil
+from torchrefract.fields.fog import blend_fog, extinction, linear_to_srgb, srgb_to_linear, transmission, unblend_fog
 
 
 def srgb_by_the_standard(linear: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1, one number at a time."""
+    """Convert linear light by IEC 61966-2-1, one number at a time."""
     return np.array([12.92 * v if v <= 0.0031308 else 1.055 * math.pow(v, 1 / 2.4) - 0.055 for v in linear])
 
 
-def test_the_extinction_of_a_hundred_meters_is_that_of_the_specification():
+@pytest.mark.quick
+def test_the_extinction_is_koschmieders():
     assert extinction(torch.tensor(100.0).double(), 0.05).item() == pytest.approx(0.029957, abs=5e-7)
-    # A contrast of 2 % is Koschmieder's own 3.912 / V.
+    # A contrast of 2 % is Koschmieder's 3.912 / V.
     assert extinction(torch.tensor(50.0).double(), 0.02).item() == pytest.approx(3.912 / 50, abs=1e-5)
     assert extinction(torch.tensor(math.inf), 0.05).item() == 0
 
 
-@pytest.mark.parametrize("visibility", [1e-3, 10.0, 100.0, 1e6])
+@pytest.mark.parametrize("visibility", [1e-3, 100.0, 1e6])
 @pytest.mark.parametrize("threshold", [0.02, 0.05, 0.5])
-def test_at_the_visibility_the_threshold_is_what_arrives(visibility, threshold):
+def test_the_threshold_arrives_from_the_distance_of_the_visibility(visibility, threshold):
     v = torch.tensor(visibility, dtype=torch.float64)
     assert transmission(v, extinction(v, threshold)).item() == pytest.approx(threshold, rel=1e-12)
 
 
-def test_light_through_two_layers_is_the_product():
+def test_the_transmission_through_two_layers_is_the_product():
     near, far, k = (torch.tensor(value).double() for value in (13.0, 29.0, 0.03))
     assert_close(transmission(near + far, k), transmission(near, k) * transmission(far, k))
 
@@ -37,7 +38,7 @@ def test_light_through_two_layers_is_the_product():
     ("depth", "k", "t"),
     [(math.inf, 0.03, 0.0), (math.inf, 0.0, 1.0), (0.0, 3e6, 1.0), (1e30, 3e6, 0.0), (5.0, 0.0, 1.0)],
 )
-def test_the_ends_of_the_transmission_are_exact_and_have_finite_gradients(dtype, depth, k, t):
+def test_the_transmission_is_exact_at_its_ends_and_has_finite_gradients(dtype, depth, k, t):
     d, k = (torch.tensor(value, dtype=dtype).requires_grad_() for value in (depth, k))
     result = transmission(d, k)
     assert result.item() == t
@@ -45,16 +46,26 @@ def test_the_ends_of_the_transmission_are_exact_and_have_finite_gradients(dtype,
         assert gradient.isfinite()
 
 
-def test_the_veil_is_exact_at_both_ends():
+@pytest.mark.parametrize("columns", [1, 5])
+def test_the_blend_is_exact_at_both_ends(columns):
     image, airlight = torch.rand(2, 3, 4, 5), torch.rand(2, 3, 1, 1)
-    assert torch.equal(veil(image, torch.ones(2, 1, 4, 5), airlight), image)
-    assert torch.equal(veil(image, torch.zeros(2, 1, 4, 5), airlight), airlight.expand_as(image))
-    middle = veil(image, torch.full((2, 1, 4, 1), 0.25), airlight)
+    assert torch.equal(blend_fog(image, torch.ones(2, 1, 4, columns), airlight), image)
+    assert torch.equal(blend_fog(image, torch.ones(2, 1, 4, columns), airlight, linear_light=True), image)
+    assert torch.equal(blend_fog(image, torch.zeros(2, 1, 4, columns), airlight), airlight.expand_as(image))
+    middle = blend_fog(image, torch.full((2, 1, 4, columns), 0.25), airlight)
     assert_close(middle, 0.25 * image + 0.75 * airlight)
 
 
-def test_stored_values_and_linear_light_agree_with_the_standard():
-    # Around the joint at 0.0031308 too.
+@pytest.mark.parametrize("linear_light", [False, True])
+def test_unblending_inverts_the_blend(linear_light):
+    image, t, airlight = torch.rand(2, 3, 4, 5).double(), 0.1 + 0.9 * torch.rand(2, 1, 4, 5).double(), torch.rand(3)
+    foggy = blend_fog(image, t, airlight.double().view(1, 3, 1, 1), linear_light=linear_light)
+    clean = unblend_fog(foggy, t, airlight.double().view(1, 3, 1, 1), linear_light=linear_light)
+    # The curves of the standard and their inverses differ by 1e-7 where their pieces meet.
+    assert_close(clean, image, rtol=0, atol=2e-6 if linear_light else 1e-12)
+
+
+def test_the_srgb_curves_are_those_of_the_standard():
     linear = np.concatenate([np.linspace(0, 0.006, 200), np.linspace(0.006, 1, 200)])
     stored = torch.from_numpy(srgb_by_the_standard(linear))
     assert_close(linear_to_srgb(torch.from_numpy(linear)), stored, rtol=0, atol=1e-14)
@@ -68,7 +79,7 @@ def test_black_has_a_finite_gradient(convert):
     assert_close(gradient, torch.full((3,), 12.92 if convert is linear_to_srgb else 1 / 12.92))
 
 
-def test_gradients_are_those_of_finite_differences():
+def test_gradients_in_linear_light_match_finite_differences():
     generator = torch.Generator().manual_seed(0)
     image, airlight, depth = (
         torch.rand(shape, generator=generator, dtype=torch.float64).requires_grad_()
@@ -76,9 +87,8 @@ def test_gradients_are_those_of_finite_differences():
     )
     visibility = torch.tensor([20.0, 90.0], dtype=torch.float64).requires_grad_()
 
-    def fogged(image, airlight, depth, visibility):
+    def foggy(image, airlight, depth, visibility):
         k = extinction(visibility, 0.05).view(-1, 1, 1, 1)
-        mixed = veil(srgb_to_linear(image), transmission(100 * depth, k), airlight)
-        return linear_to_srgb(mixed)
+        return blend_fog(image, transmission(100 * depth, k), airlight, linear_light=True)
 
-    assert torch.autograd.gradcheck(fogged, [image, airlight, depth, visibility])
+    assert torch.autograd.gradcheck(foggy, [image, airlight, depth, visibility])

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import warp
-from torchrefract.cameras.distortion import ALL_TERMS, POLYNOMIAL12, Terms
+from torchrefract.cameras.brown_conrady import ALL_TERMS, POLYNOMIAL12, Terms
 from torchrefract.fields.lens import folds_inside, frame_limit, lens_flow, lens_restore_flow, smooth_lens_flow
 from torchrefract.warping.grid import inside
 
@@ -201,7 +201,7 @@ def test_image_gradients_are_those_of_finite_differences(field):
 
 @pytest.mark.parametrize(
     "terms",
-    [ALL_TERMS, Terms(6, False, False, False), Terms(2, False, False), Terms(3, True, False), Terms(0, False, True)],
+    [ALL_TERMS, Terms(6, False, False), Terms(2, False, False), Terms(3, True, False), Terms(0, False, True)],
     ids=str,
 )
 @pytest.mark.parametrize("steps", [0, 1, 4])

@@ -1,97 +1,134 @@
 import math
 
+import numpy as np
 import pytest
 import torch
-from torchrefract.fields.field_bounds import FieldRanges, FieldSpectrum, error_of_cubics, field_spectrum
-from torchrefract.fields.gaussian import spectrum
+from torch import Tensor
 
-from torchrefract.fields.covariance import COVARIANCES, as_gaussians, covariance
-from torchrefract.ops.cubic import lagrange_weights
+from torchrefract.fields import turbulence_error
+from torchrefract.fields.random_field import Frequencies, amplitudes
+from torchrefract.fields.turbulence_error import RandomFieldErrorModel
 
 SIZE = (512, 640)
-CASES = [("exponential", 20.0, 2.0), ("exponential", 40.0, 4.0), ("matern32", 12.0, 2.5), ("matern52", 25.0, 6.0)]
+CASES = [("exponential", 20.0, 2.0), ("matern32", 12.0, 2.5), ("matern52", 25.0, 6.0), ("gaussian", 9.0, 0.0)]
 
 
-def power(kind: str, length: float, aperture: float) -> torch.Tensor:
-    """(Ht, Wt): the variance at each frequency of the torus, of sum 1."""
-    tensors = (torch.tensor([value], dtype=torch.float64) for value in (length, aperture))
-    found = spectrum(SIZE, next(tensors), kind=kind, aperture=next(tensors), dtype=torch.float64).amplitude[0]
-    half = torch.cat([found, found[:, 1:-1].flip(1)], dim=1)
+def power(kind: str, length: float, aperture: float) -> Tensor:
+    """Return (Ht, Wt): the variance of each frequency, of sum 1."""
+    lengths, apertures = (torch.tensor([value], dtype=torch.float64) for value in (length, aperture))
+    options = {"kind": kind, "aperture": apertures, "dtype": torch.float64}
+    quarter = amplitudes(Frequencies.all(SIZE), lengths, **options)[0][0]
+    half = torch.cat([quarter, quarter[:, 1:-1].flip(1)], dim=1)
     return torch.cat([half, half[1:-1].flip(0)]).square()
 
 
-def frequencies() -> tuple[torch.Tensor, torch.Tensor]:
+def stream_power(length: float) -> Tensor:
+    """Return the variance of each frequency of u = D_y psi for a Gaussian psi, of sum 1."""
+    values = power("gaussian", length, 0.0) * radians()[0].sin().square()
+    return values / values.sum()
+
+
+def radians() -> tuple[Tensor, Tensor]:
     y, x = (2 * math.pi * torch.fft.fftfreq(n, dtype=torch.float64) for n in SIZE)
     return y[:, None], x
 
 
-def ranges(kind: str, length: float, aperture: float) -> FieldRanges:
-    return FieldRanges((1.0, 1.0), (length, 2 * length), (aperture, 2 * aperture), kind=kind)
+def model(kind: str, length: float, aperture: float, *, is_stream: bool = False) -> RandomFieldErrorModel:
+    ranges = ((0.5, 1.0), (length, 2 * length), (aperture, 2 * aperture))
+    return RandomFieldErrorModel(*ranges, covariance=kind, is_stream=is_stream)
 
 
-def bounds(kind: str, length: float, aperture: float) -> FieldSpectrum:
-    found = field_spectrum(ranges(kind, length, aperture))
-    assert found is not None
-    return found
+def interpolation_error(spectrum: Tensor, stride: int) -> float:
+    """Return the largest deviation of the error of cubics at any pixel between the nodes."""
+    nodes = torch.arange(-1, 3, dtype=torch.float64)
 
+    def transfer(place: int, k: Tensor) -> Tensor:
+        t = place / stride
+        weights = [math.prod((t - m) / (n - m) for m in range(-1, 3) if m != n) for n in range(-1, 3)]
+        return (torch.tensor(weights).double() * torch.exp(1j * k[..., None] * stride * (nodes - t))).sum(dim=-1)
 
-@pytest.mark.parametrize("kind", COVARIANCES)
-def test_covariances_are_sums_of_gaussian_ones(kind):
-    h, length = torch.linspace(0, 300, 200, dtype=torch.float64), torch.tensor(30.0, dtype=torch.float64)
-    weight, scale = as_gaussians(kind, h.device)
-    found = torch.exp(-0.5 * h[:, None].square() / (scale * length**2)) @ weight
-    torch.testing.assert_close(found, covariance(h, length, kind), rtol=0, atol=2e-6)
-
-
-@pytest.mark.parametrize(("kind", "length", "aperture"), CASES)
-def test_frequencies_beyond_a_cutoff_are_as_weak_as_stated(kind, length, aperture):
-    own, (y, x) = power(kind, length, aperture), frequencies()
-    assert own.sum() == pytest.approx(1)
-    for error in (0.1, 1e-2, 1e-3):
-        cutoff = bounds(kind, length, aperture).cutoff(error)
-        left_out = own[(y.abs() > cutoff) | (x.abs() > cutoff)].sum().sqrt()
-        assert 0.5 * error < left_out <= error
-
-
-@pytest.mark.parametrize(("kind", "length", "aperture"), CASES)
-def test_derivatives_are_as_large_as_stated(kind, length, aperture):
-    own, (_, x) = power(kind, length, aperture), frequencies()
-    for order in (1, 2, 3):
-        found = (own * x.abs() ** (2 * order)).sum().sqrt()
-        bound = bounds(kind, length, aperture).derivative(order)
-        assert 0.8 * bound < found <= bound
-
-
-@pytest.mark.parametrize("stride", [2, 3, 5])
-@pytest.mark.parametrize(("kind", "length", "aperture"), CASES)
-def test_cubics_between_nodes_are_as_far_off_as_stated(kind, length, aperture, stride):
-    own, (y, x) = power(kind, length, aperture), frequencies()
-    weights = lagrange_weights(stride, dtype=torch.float64, device=torch.device("cpu"))
-    nodes = stride * torch.arange(-1, 3, dtype=torch.float64)
-
-    def transfer(place: int, k: torch.Tensor) -> torch.Tensor:
-        return (weights[place] * torch.exp(1j * k[..., None] * (nodes - place))).sum(dim=-1)
-
-    errors = [
-        (own * (1 - transfer(i, y) * transfer(j, x)).abs().square()).sum().sqrt().item()
+    y, x = radians()
+    return max(
+        (spectrum * (1 - transfer(i, y) * transfer(j, x)).abs().square()).sum().sqrt().item()
         for i in range(stride)
         for j in range(stride)
-    ]
-    bound = bounds(kind, length, aperture).error_between(stride, 4)
-    assert 0.8 * bound < max(errors) <= bound
-    assert bound < error_of_cubics(ranges(kind, length, aperture), stride)
+    )
 
 
-def test_pixels_may_be_too_coarse_for_a_field():
-    assert field_spectrum(FieldRanges((1.0, 1.0), (50.0, 50.0), (0.0, 5.0), kind="exponential")) is None
-    assert field_spectrum(FieldRanges((1.0, 1.0), (2.0, 50.0), (0.0, 0.0))) is None
-    assert field_spectrum(FieldRanges((1.0, 1.0), (2.0, 50.0), (3.0, 3.0))) is not None
+@pytest.mark.quick
+@pytest.mark.parametrize(("kind", "length", "aperture"), CASES)
+def test_frequencies_that_are_left_out_use_their_share_of_the_budget(kind, length, aperture):
+    spectrum, (y, x) = power(kind, length, aperture), radians()
+    for budget in (0.02, 0.2):
+        simplified = model(kind, length, aperture).simplify(600, 700, budget)
+        assert simplified is not None
+        rows, columns = simplified.details[1:]
+        size = simplified.details.size
+        left_out = (y.abs() > 2 * math.pi * rows / size[0]) | (x.abs() > 2 * math.pi * columns / size[1])
+        deviation = spectrum[left_out].sum().sqrt().item()
+        assert 0.3 * simplified.error_px < 7 * deviation <= simplified.error_px <= 0.31 * budget
 
 
+@pytest.mark.quick
+@pytest.mark.parametrize(("kind", "length", "aperture"), CASES)
+def test_derivatives_and_errors_of_cubics_are_bounded_closely(kind, length, aperture):
+    spectrum, (_, x) = power(kind, length, aperture), radians()
+    bounds = model(kind, length, aperture).bounds(600, 700)
+    assert bounds.max_displacement == 7
+    derivatives = (bounds.max_gradient, bounds.max_second_derivative, bounds.max_third_derivative)
+    for order, bound in enumerate(derivatives, start=1):
+        assert 0.8 * bound < 4 * (spectrum * x.abs() ** (2 * order)).sum().sqrt() <= bound * (1 + 1e-9)
+    for stride in (2, 3, 5):
+        bound = bounds.interpolation_error(np.array([1.0, float(stride)]))[1]
+        assert 0.6 * bound < 7 * interpolation_error(spectrum, stride) <= bound
+
+
+@pytest.mark.quick
+def test_the_bounds_of_a_stream_function_hold_for_its_curl():
+    length = 12.0
+    spectrum, (y, _) = stream_power(length), radians()
+    bounds = model("gaussian", length, 0.0, is_stream=True).bounds(600, 700)
+    derivatives = (bounds.max_gradient, bounds.max_second_derivative, bounds.max_third_derivative)
+    for order, bound in enumerate(derivatives, start=1):
+        assert 0.8 * bound < 4 * (spectrum * y.abs() ** (2 * order)).sum().sqrt() <= bound
+    for stride in (2, 4, 7):
+        bound = bounds.interpolation_error(np.array([float(stride)]))[0]
+        assert 0.6 * bound < 7 * interpolation_error(spectrum, stride) <= bound
+
+
+@pytest.mark.quick
+def test_fields_that_pixels_do_not_resolve_have_no_lattice():
+    for ranges in [((0.5, 1.0), (50.0, 50.0), (0.0, 5.0), "exponential"), ((0.5, 1.0), (2.0, 50.0))]:
+        coarse = RandomFieldErrorModel(*ranges)
+        simplified = coarse.simplify(300, 400, 0.02)
+        assert simplified is not None
+        assert simplified.details is None
+        assert not simplified.can_interpolate
+        assert np.isinf(coarse.bounds(300, 400).interpolation_error(np.array([2.0, 3.0]))).all()
+    assert math.isfinite(
+        RandomFieldErrorModel((0.5, 1.0), (50.0, 50.0), covariance="exponential").bounds(9, 9).max_gradient
+    )
+
+
+@pytest.mark.quick
+def test_parameters_are_compared_with_all_ranges():
+    class Params:
+        amplitude, length, aperture = (torch.tensor([value, value]) for value in (0.7, 15.0, 3.0))
+
+    turbulence, stream = model("matern32", 12.0, 2.5), model("gaussian", 12.0, 0.0, is_stream=True)
+    assert turbulence.contains(Params)
+    assert stream.contains(Params)
+    Params.aperture = torch.tensor([3.0, 6.0])
+    assert not turbulence.contains(Params)
+    Params.length = torch.tensor([11.0, 13.0])
+    assert not stream.contains(Params)
+
+
+@pytest.mark.quick
 @pytest.mark.parametrize("angle", [0.0, 0.4, math.pi / 4])
-@pytest.mark.parametrize("k", [0.5, 1.0, 1.5, 2.0, 2.2])
-def test_what_pixels_fold_back_is_no_more_than_the_margin_takes_it_for(k, angle):
+@pytest.mark.parametrize("k", [0.5, 1.5, 2.2])
+def test_aliased_power_is_below_the_margin(k, angle):
     x, y = k * math.cos(angle), k * math.sin(angle)
-    places = [(i, j) for i in range(-80, 81) for j in range(-80, 81) if (i, j) != (0, 0)]
-    folded = sum((k / math.hypot(x + 2 * math.pi * i, y + 2 * math.pi * j)) ** 3 for i, j in places)
-    assert 0.03 * k**3 < folded <= 0.045 * k**3
+    waves = [(i, j) for i in range(-80, 81) for j in range(-80, 81) if (i, j) != (0, 0)]
+    aliased = sum((k / math.hypot(x + 2 * math.pi * i, y + 2 * math.pi * j)) ** 3 for i, j in waves)
+    assert 0.03 * k**3 < aliased <= turbulence_error._ALIASED * k**3

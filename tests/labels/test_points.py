@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import LensDistortion, Turbulence, warp_points
-from torchrefract.cameras.distortion import distort_polynomial
+from torchrefract.cameras.brown_conrady import distort_polynomial
 
 SIZE = (90, 140)
 

@@ -1,14 +1,14 @@
-"""Cameras: a pinhole and one of four lens models, and points, rays and tables of them.
+"""Cameras: a pinhole and one of four lens models, with points, rays, conversion and a database of real lenses.
 
-`Camera` is one camera in plain numbers; `distort`, `undistort`, `project` and `unproject` take a batch of them as
-tensors, with gradients. `convert` finds the nearest camera of another model, `read_lenses` reads a table of real
-lenses. Files of other programs are read and written by the modules of `torchrefract.cameras.io`.
+`Camera` is one camera in plain numbers. `distort`, `undistort`, `project` and `unproject` take a batch of cameras as
+tensors, with gradients. `convert` fits another lens model to a camera. `read_lenses` reads real lenses. The modules of
+`torchrefract.cameras.io` read and write the files of OpenCV, ROS, Kalibr and COLMAP.
 """
 
+from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.conversion import Conversion, convert
-from torchrefract.cameras.lens_table import Lens, read_lenses
-from torchrefract.cameras.models import Camera
-from torchrefract.cameras.points import PointResult, distort, project, undistort, unproject, valid_radius
+from torchrefract.cameras.lens_database import Lens, read_lenses
+from torchrefract.cameras.projection import PointResult, distort, project, undistort, unproject, valid_radius
 
 __all__ = [
     "Camera",

@@ -1,4 +1,4 @@
-"""A camera in another lens model, fitted by least squares, with what the fit leaves."""
+"""Conversion of a camera to another lens model, fitted by least squares, with the error that remains."""
 
 import math
 from collections.abc import Callable
@@ -9,24 +9,22 @@ import torch
 from torch import Tensor
 
 from torchrefract._validation import check_choice, check_number
-from torchrefract.cameras.models import Camera
-from torchrefract.cameras.points import image_of_rays
-from torchrefract.cameras.sheet import MODELS
+from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.projection import MODELS, image_of_rays
 
-# Places along each side of the frame at which a model is fitted, and others at which it is measured.
-_FITTED, _MEASURED = 41, 129
-_MOST_STEPS = 60
-_SETTLED = 1e-9  # a step that lowers the squares by no larger a share is the last
-_WEAKEST, _STRONGEST = 1e-15, 1e9  # damping
-_COUNTS = {"polynomial12": 12, "opencv": 8, "fisheye": 4, "division": 1}
+_FIT_GRID, _TEST_GRID = 41, 129  # points along each side of the frame for the fit, and for its error
+_MAX_STEPS = 60
+_CONVERGED = 1e-9  # relative decrease of the sum of squares at which the fit stops
+_MIN_DAMPING, _MAX_DAMPING = 1e-15, 1e9
+_DEFAULT_COUNTS = {"polynomial12": 12, "opencv": 8, "fisheye": 4, "division": 1}
 
 
 class Conversion(NamedTuple):
-    """A camera in another model, and how far it is from the one it was made of.
+    """A converted camera and its distance from the original.
 
-    camera: with the pinhole of the other one.
-    max_px, rms_px: how far apart both show the same rays, px, over the part of the frame that is covered.
-    covered: the share of the frame whose rays both cameras show, within the angle that was asked for.
+    camera: with the pinhole of the original.
+    max_px, rms_px: distance between the pixels where both show the same ray, over the covered part of the frame.
+    covered: share of the frame whose rays lie within `most_angle_deg` and are shown by both cameras.
     """
 
     camera: Camera
@@ -36,98 +34,96 @@ class Conversion(NamedTuple):
 
 
 def convert(camera: Camera, *, to: str, count: int | None = None, most_angle_deg: float = 80.0) -> Conversion:
-    """The camera of another model that shows the rays of a frame where this one shows them, as nearly as it can.
+    """Fit the coefficients of another model to a camera.
 
-        coefficients = argmin sum |project(ray(p)) - p|^2  over places p of the frame, ray = camera.unproject
+        coefficients = argmin sum |project(ray(p)) - p|^2  over pixels p of the frame, ray = camera.unproject
 
-    Levenberg and Marquardt's method in float64; the pinhole stays. A polynomial in the radius on the plane z = 1 holds
-    a fisheye up to about 55 degrees from the axis, a ratio up to about 80: read `max_px` before using what comes out.
+    The pinhole stays. "polynomial12" represents a fisheye up to about 55 degrees from the axis, "opencv" up to
+    about 80. Read `max_px` before you use the result.
 
     Args:
-        camera: to be converted.
+        camera: to convert.
         to: "polynomial12", "opencv", "fisheye" or "division".
-        count: of the coefficients, where the model has several; None is 8 for "opencv".
-        most_angle_deg: rays farther from the axis are left out; below 90.
+        count: number of coefficients if `to` allows several; None is 8 for "opencv".
+        most_angle_deg: rays farther from the axis are ignored; in [1, 89.9].
 
     Raises:
-        ValueError: arguments out of range; a camera whose frame shows no ray within the angle.
+        ValueError: an argument is out of range, or no ray of the frame lies within `most_angle_deg`.
     """
     check_choice("to", to, tuple(MODELS))
-    count = _COUNTS[to] if count is None else count
+    count = _DEFAULT_COUNTS[to] if count is None else count
     if count not in MODELS[to]:
         raise ValueError(f"count must be {' or '.join(map(str, MODELS[to]))} for the model {to}, got {count}")
-    least_z = math.cos(math.radians(check_number("most_angle_deg", most_angle_deg, low=1.0, high=89.9)))
-    exact = _exact(camera, to, count)
-    if exact is None:
-        exact = replace(camera, model=to, coefficients=_fitted(camera, to, count, least_z))
-    return _measured(camera, exact, least_z)
+    min_z = math.cos(math.radians(check_number("most_angle_deg", most_angle_deg, low=1.0, high=89.9)))
+    if to == camera.model and count == len(camera.coefficients):
+        converted = camera
+    elif to == "polynomial12" and camera.is_polynomial:
+        converted = replace(camera, model=to, coefficients=camera.polynomial())
+    else:
+        converted = replace(camera, model=to, coefficients=_fit(camera, to, count, min_z))
+    return _measure(camera, converted, min_z)
 
 
-def _exact(camera: Camera, to: str, count: int) -> Camera | None:
-    """The camera itself, or its coefficients in another order, where that is all there is to do."""
-    if to == camera.model:
-        return camera if count == len(camera.coefficients) else None
-    plain = to == "polynomial12" and camera.is_polynomial
-    return replace(camera, model=to, coefficients=camera.polynomial()) if plain else None
-
-
-def _fitted(camera: Camera, to: str, count: int, least_z: float) -> tuple[float, ...]:
-    pixels, rays, seen = _rays(camera, _FITTED, least_z)
-    if not seen.any():
+def _fit(camera: Camera, to: str, count: int, min_z: float) -> tuple[float, ...]:
+    pixels, rays, valid = _rays(camera, _FIT_GRID, min_z)
+    if not valid.any():
         raise ValueError(f"camera must show rays nearer to its axis than most_angle_deg, got {camera}")
     _, focal, center = camera.tensors(pixels)
-    x, y, z = rays[seen, :, None].unbind(1)
-    goal = pixels[seen]
+    x, y, z = rays[valid, :, None].unbind(1)
+    target = pixels[valid]
 
     def error(coefficients: Tensor) -> Tensor:
-        seen_at = torch.cat(image_of_rays(x, y, z, coefficients, to), dim=1)
-        return seen_at * focal + center - goal
+        points = torch.cat(image_of_rays(x, y, z, coefficients, to), dim=1)
+        return points * focal + center - target
 
-    return tuple(least_squares(error, torch.zeros(count, dtype=torch.float64), rows=len(goal)).tolist())
+    return tuple(least_squares(error, torch.zeros(count, dtype=torch.float64), rows=len(target)).tolist())
 
 
 def least_squares(error: Callable[[Tensor], Tensor], start: Tensor, *, rows: int) -> Tensor:
-    """The parameters at which the squares of a function's values are least, by Levenberg and Marquardt's method.
+    """Minimize the sum of squares of a function by the Levenberg-Marquardt method.
 
-    Each step solves (J^T J + damping diag(J^T J)) step = -J^T error, as a least-squares problem of its own.
+    Each step solves (J^T J + damping diag(J^T J)) step = -J^T error as a linear least-squares problem.
 
     Args:
-        error: from a copy of the parameters for each row, (rows, n), to values (rows, k), each row by its copy alone.
+        error: maps parameters (rows, n), one copy for each row, to values (rows, k); row i depends on copy i only.
         start: (n,), float64.
-        rows: so many.
+        rows: number of rows.
+
+    Returns:
+        (n,), the parameters.
 
     Source: Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", SIAM J. 11 (1963).
     """
-    found, damping = start, 1e-3
-    value, jacobian = _linearized(error, found, rows)
-    for _ in range(_MOST_STEPS):
+    parameters, damping = start, 1e-3
+    value, jacobian = _linearize(error, parameters, rows)
+    for _ in range(_MAX_STEPS):
         before = value.square().sum()
-        while damping < _STRONGEST:
-            tried = found + _step(jacobian, value, damping)
-            # A step past a pole gives no number, and is none.
-            if error(tried.expand(rows, -1)).square().sum() < before:
+        while damping < _MAX_DAMPING:
+            candidate = parameters + _step(jacobian, value, damping)
+            # A step past a pole gives NaN, which compares as false.
+            if error(candidate.expand(rows, -1)).square().sum() < before:
                 break
             damping *= 10
         else:
-            return found
-        found, damping = tried, max(damping / 10, _WEAKEST)
-        value, jacobian = _linearized(error, found, rows)
-        if before - value.square().sum() <= _SETTLED * before:
-            return found
-    return found
+            return parameters
+        parameters, damping = candidate, max(damping / 10, _MIN_DAMPING)
+        value, jacobian = _linearize(error, parameters, rows)
+        if before - value.square().sum() <= _CONVERGED * before:
+            break
+    return parameters
 
 
-def _linearized(error: Callable[[Tensor], Tensor], found: Tensor, rows: int) -> tuple[Tensor, Tensor]:
-    """The values, (rows k,), and their derivatives, (rows k, n): a backward pass for each of the k columns."""
+def _linearize(error: Callable[[Tensor], Tensor], parameters: Tensor, rows: int) -> tuple[Tensor, Tensor]:
+    """Return the values (rows k,) and their derivatives (rows k, n), by one backward pass for each of the k columns."""
     with torch.enable_grad():
-        copies = found.detach().expand(rows, -1).clone().requires_grad_()
+        copies = parameters.detach().expand(rows, -1).clone().requires_grad_()
         columns = error(copies).unbind(1)
         slopes = [torch.autograd.grad(column.sum(), copies, retain_graph=True)[0] for column in columns]
     return torch.cat(columns).detach(), torch.cat(slopes)
 
 
 def _step(jacobian: Tensor, value: Tensor, damping: float) -> Tensor:
-    # Columns of one length: radii to the power of 13 and of 3 stand side by side.
+    # Columns hold r^3 up to r^13: scaled to equal length, so that the problem is well conditioned.
     scale = jacobian.square().sum(dim=0).sqrt().clamp(min=1e-12)
     damped = math.sqrt(damping) * torch.eye(len(scale), dtype=scale.dtype)
     right = torch.cat([-value, value.new_zeros(len(scale))])
@@ -135,19 +131,19 @@ def _step(jacobian: Tensor, value: Tensor, damping: float) -> Tensor:
     return step[:, 0] / scale
 
 
-def _measured(camera: Camera, made: Camera, least_z: float) -> Conversion:
-    pixels, rays, seen = _rays(camera, _MEASURED, least_z)
-    shown = made.project(rays)
-    seen = seen & shown.valid
-    if not seen.any():
-        return Conversion(made, math.inf, math.inf, 0.0)
-    missed = (shown.points - pixels)[seen].norm(dim=1)
-    rms = missed.square().mean().sqrt().item()
-    return Conversion(made, missed.max().item(), rms, seen.double().mean().item())
+def _measure(camera: Camera, converted: Camera, min_z: float) -> Conversion:
+    pixels, rays, valid = _rays(camera, _TEST_GRID, min_z)
+    projected = converted.project(rays)
+    valid = valid & projected.valid
+    if not valid.any():
+        return Conversion(converted, math.inf, math.inf, 0.0)
+    distance = (projected.points - pixels)[valid].norm(dim=1)
+    rms = distance.square().mean().sqrt().item()
+    return Conversion(converted, distance.max().item(), rms, valid.double().mean().item())
 
 
-def _rays(camera: Camera, places: int, least_z: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels (N, 2) all over the frame, their rays (N, 3), and which of them there are within the angle."""
-    pixels = camera.places(places)
+def _rays(camera: Camera, count: int, min_z: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return pixels (N, 2) on a grid over the frame, their rays (N, 3), and which of them lie within the angle."""
+    pixels = camera.grid(count)
     rays, valid, _ = camera.unproject(pixels)
-    return pixels, rays, valid & (rays[:, 2] >= least_z)
+    return pixels, rays, valid & (rays[:, 2] >= min_z)

@@ -1,24 +1,96 @@
-"""The radial part of a lens, and how far out it can be inverted."""
+"""Radial factors of lens models: their values, how far out they can be inverted, and their inverse.
 
-from collections.abc import Callable
-from typing import NamedTuple
+A radially symmetric lens maps the radius r to r_d = r g(r^2). For the polynomial models
+g(r^2) = 1 + k_1 r^2 + ... + k_n r^2n. A fisheye is the same with the angle to the axis in place of r.
+
+The lens is one-to-one from its center up to the radius where dr_d/dr reaches zero: beyond it the image folds back.
+dr_d/dr is, up to a positive factor, a polynomial 1 + a_1 q + ... + a_n q^n in q = r^2, called the growth here.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-_NODES = 2048
-_FARTHEST = 1e3  # on the plane z = 1
-_DOUBLINGS = 12  # of the radius after distortion, in search of the radius before it
+RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")  # of the Brown-Conrady polynomial, its first coefficients
+_NODES = 2048  # of a lattice of radii
+_MAX_IMAGE_RADIUS = 1e3  # focal lengths; farther points are outside every lens and must not coarsen the table
+_DOUBLINGS = 12  # of the radius after distortion, to bracket the radius before it
+
+
+def radial_factor(r2: Tensor, k: Sequence[Tensor]) -> Tensor:
+    """Evaluate g = 1 + sum k_i r^2i by Horner's rule; `k` may be empty."""
+    value = torch.zeros_like(r2)
+    for coefficient in reversed(k):
+        value = (value + coefficient) * r2
+    return 1 + value
+
+
+def radial_factor_slope(r2: Tensor, k: Sequence[Tensor]) -> Tensor:
+    """Evaluate dg/d(r^2) = sum i k_i r^(2i - 2)."""
+    value = torch.zeros_like(r2)
+    for i, coefficient in reversed(list(enumerate(k, start=1))):
+        value = value * r2 + i * coefficient
+    return value
+
+
+def growth_of_polynomial(k: Sequence[Any]) -> list[Any]:
+    """Return a_1 ... a_n of d/dr [r (1 + sum k_i r^2i)] = 1 + sum (2 i + 1) k_i q^i."""
+    return [(2 * i + 1) * value for i, value in enumerate(k, start=1)]
+
+
+def growth_of_ratio(numerator: Sequence[Any], denominator: Sequence[Any]) -> list[Any]:
+    """Return a_1 ... a_n of the growth of r N / D with N = 1 + sum n_i q^i and D = 1 + sum d_i q^i.
+
+    d/dr [r N / D] = [N D + 2 q (N' D - N D')] / D^2, so that n_i d_j (1 + 2 (i - j)) belongs to q^(i + j).
+    """
+    numerator, denominator = (1.0, *numerator), (1.0, *denominator)
+    powers: list[Any] = [0.0] * (len(numerator) + len(denominator) - 1)
+    for i, n in enumerate(numerator):
+        for j, d in enumerate(denominator):
+            powers[i + j] = powers[i + j] + (1 + 2 * (i - j)) * n * d
+    return powers[1:]
+
+
+def first_root(a: Tensor) -> Tensor:
+    """Return the smallest positive root of 1 + a_1 q + ... + a_n q^n, or inf if there is none.
+
+    With z = 1 / q it is the largest positive root of z^n + a_1 z^(n - 1) + ... + a_n, an eigenvalue of a companion
+    matrix. A root where the polynomial touches zero without crossing it counts.
+
+    Args:
+        a: (B, n), float64.
+
+    Returns:
+        (B,), float64, without gradient.
+    """
+    with torch.no_grad():
+        batch, n = a.shape
+        companion = torch.diag_embed(a.new_ones(batch, n - 1), offset=-1)
+        companion[:, 0] = -a
+        z = torch.linalg.eigvals(companion)
+        is_real = (z.imag.abs() <= 1e-7 * z.abs()) & (z.real > 1e-30)
+        return 1 / torch.where(is_real, z.real, 0.0).amax(dim=1)
+
+
+def falls_before(a: Sequence[float], q_max: float) -> bool:
+    """Return True if 1 + a_1 q + ... is zero or below at one of 16 points up to `q_max`.
+
+    Uses Python numbers, which torch.compile can trace.
+    """
+    points = (q_max * i / 16 for i in range(1, 17))
+    return any(1 + sum(value * q**i for i, value in enumerate(a, start=1)) <= 0 for q in points)
 
 
 class RadialLimit(NamedTuple):
-    """How far out the radial part of a lens can be inverted, and a table of its inverse.
+    """How far out a radial map can be inverted, with a table of its inverse.
 
     radius: (B, 1, ...), the largest radius before distortion, on the plane z = 1.
-    image_radius: (B, 1, ...), the largest radius after distortion that the table covers.
-    folds: (B,), bool: the radial part stops growing there; otherwise it was only followed so far.
-    table: (B, 2049), the radius before distortion at r_d = image_radius (1 - (1 - i / 2048)^2): where the map folds,
-        the inverse grows as a square root, and on these nodes it is smooth.
+    image_radius: (B, 1, ...), the largest radius after distortion in the table.
+    folds: (B,), bool: the map stops growing at `radius`; False if it was not searched farther.
+    table: (B, 2049), the radius before distortion at r_d = image_radius (1 - (1 - i / 2048)^2). Near a fold the inverse
+        behaves like a square root, and on these nodes it is smooth.
     """
 
     radius: Tensor
@@ -26,123 +98,120 @@ class RadialLimit(NamedTuple):
     folds: Tensor
     table: Tensor
 
-    def sample_image(self, r_d: Tensor) -> Tensor:
-        """The radius (B, ...) that the radial part maps to r_d, from the table; `radius` where there is none."""
-        place = _NODES * (1 - (1 - r_d / self.image_radius).clamp(min=0).sqrt())
-        node = place.long().clamp(0, _NODES - 1)
-        flat = node.flatten(1)
-        low = self.table.gather(1, flat).view(node.shape)
-        high = self.table.gather(1, flat + 1).view(node.shape)
-        return torch.lerp(low, high, place - node)
+    def inverse(self, r_d: Tensor) -> Tensor:
+        """Interpolate the radius before distortion in the table, to about 1e-6; beyond the table it is `radius`.
+
+        Args:
+            r_d: (B, ...), the radius after distortion.
+        """
+        position = _NODES * (1 - (1 - r_d / self.image_radius).clamp(min=0).sqrt())
+        node = position.long().clamp(0, _NODES - 1)
+        index = node.flatten(1)
+        low, high = (self.table.gather(1, index + i).view(node.shape) for i in (0, 1))
+        return torch.lerp(low, high, position - node)
 
 
 def radial_limit(coefficients: Tensor, reach: Tensor, image_reach: Tensor) -> RadialLimit:
-    """The limit of the radial part of (B, 12, ...) coefficients.
+    """Compute how far out the radial terms of the Brown-Conrady polynomial can be inverted.
 
-    The limit is the first root of d/dr [r (1 + sum k_i r^2i)], found on a lattice that is refined twice.
+    The fold is searched on a lattice of radii that is refined twice.
 
     Args:
-        coefficients: (B, 12, ...).
-        reach: (B,), the radius up to which a root is looked for, on the plane z = 1.
-        image_reach: (B,), the radius after distortion up to which the inverse is asked for.
+        coefficients: (B, 12, ...), with one dimension for each dimension of the points.
+        reach: (B,), the largest radius on the plane z = 1 to search.
+        image_reach: (B,), the largest radius after distortion that will be inverted.
     """
     with torch.no_grad():
-        k = coefficients.flatten(1)[:, :6, None].unbind(1)
-        radius, folds = first_fall(lambda r: _falls(r, k), reach)
+        k = coefficients.flatten(1)[:, : len(RADIAL), None].unbind(1)
+        growth = growth_of_polynomial(k)
+        radius, folds = first_fall(lambda r: radial_factor(r * r, growth) <= 0, reach)
         shape = (-1,) + (1,) * (coefficients.ndim - 2)
-        return _tabulated(radius, folds, image_reach, lambda r: r * radial(r * r, k, 6), shape)
+        return _tabulate(radius, folds, image_reach, lambda r: r * radial_factor(r * r, k), shape)
 
 
 def first_fall(falls: Callable[[Tensor], Tensor], reach: Tensor) -> tuple[Tensor, Tensor]:
-    """How far from the center a radial part grows, within a reach: on a lattice that is refined twice.
+    """Search the radius where a radial map stops growing, on a lattice that is refined twice.
 
     Args:
-        falls: from radii (B, n) to (B, n), bool: it does not grow there.
-        reach: (B,), up to which a fall is looked for.
+        falls: maps radii (B, n) to (B, n), bool: the map does not grow there.
+        reach: (B,), the largest radius to search.
 
     Returns:
-        radius: (B,), before the first fall; the reach where there is none.
-        found: (B,), bool: there is one.
+        radius: (B,), just before the first fall; `reach` if there is none.
+        has_fall: (B,), bool.
     """
-    found = falls(reach[:, None] * _steps(reach)).any(dim=1)
+    has_fall = falls(reach[:, None] * _steps(reach)).any(dim=1)
     radius, width = torch.zeros_like(reach), reach
     for _ in range(3):
         first = falls(radius[:, None] + width[:, None] * _steps(reach)).long().argmax(dim=1)
         width = width / _NODES
-        radius = torch.where(found, radius + (first - 1).clamp(min=0) * width, reach)
-    return radius, found
+        radius = torch.where(has_fall, radius + (first - 1).clamp(min=0) * width, reach)
+    return radius, has_fall
 
 
 def limit_of_curve(radius: Tensor, image_reach: Tensor, curve: Callable[[Tensor], Tensor]) -> RadialLimit:
-    """The limit of any radial part that grows up to a radius that is known.
+    """Compute the limit of any radial map that grows up to a given radius.
 
     Args:
-        radius: (B,), up to which it grows; inf where it always does.
-        image_reach: (B,), the radius after distortion up to which the inverse is asked for.
-        curve: from radii (B, n) before distortion to those after it.
+        radius: (B,), inf if the map always grows.
+        image_reach: (B,), the largest radius after distortion that will be inverted.
+        curve: maps radii (B, n) before distortion to radii after it.
 
     Returns:
-        The limit, each tensor of it with one dimension behind B.
+        The limit; `radius` and `image_radius` have shape (B, 1).
     """
     with torch.no_grad():
-        powers = torch.arange(_DOUBLINGS + 1, dtype=radius.dtype, device=radius.device).exp2()
+        # A radius far beyond the points would make the table coarse: bracket what they need by doubling.
+        powers = 2.0 ** torch.arange(_DOUBLINGS + 1, dtype=radius.dtype, device=radius.device)
         radii = torch.minimum(image_reach[:, None] * powers, radius[:, None])
         first = (curve(radii) < image_reach[:, None]).sum(dim=1, keepdim=True).clamp(max=_DOUBLINGS)
         reach = radii.gather(1, first)[:, 0]
-        limit = _tabulated(reach, reach == radius, image_reach, curve, (-1, 1))
+        limit = _tabulate(reach, reach == radius, image_reach, curve, (-1, 1))
         return limit._replace(radius=radius[:, None])
 
 
 def reach_of(r_d: Tensor) -> Tensor:
-    """(B,), how far a table must reach for radii (B, N) after distortion."""
-    none = r_d.new_zeros(r_d.shape[0], 1)
-    # What is farther than a lens shows anything must not make the table coarse.
-    return 1.1 * torch.cat([none, r_d], dim=1).clamp(max=_FARTHEST).amax(dim=1).clamp(min=1e-3)
+    """Return (B,), the radius after distortion that a table for radii (B, N) must cover."""
+    zero = r_d.new_zeros(r_d.shape[0], 1)
+    return 1.1 * torch.cat([zero, r_d], dim=1).clamp(max=_MAX_IMAGE_RADIUS).amax(dim=1).clamp(min=1e-3)
 
 
-def _tabulated(
+def newton_radius(
+    r_d: Tensor, start: Tensor, limit: RadialLimit, factor_and_slope: Callable[[Tensor], tuple[Tensor, Tensor]]
+) -> Tensor:
+    """Solve r g(r^2) = r_d for r by Newton's method from a start with an error of about 1e-6.
+
+    Takes 2 steps in float32 and 3 in float64.
+
+    Args:
+        r_d, start: (B, ...).
+        limit: of the map.
+        factor_and_slope: maps r^2 to g and dg/d(r^2).
+    """
+    r = start
+    for _ in range(3 if r.dtype is torch.float64 else 2):
+        r2 = r * r
+        g, slope = factor_and_slope(r2)
+        growth = (g + 2 * r2 * slope).clamp(min=torch.finfo(r.dtype).eps)
+        r = torch.minimum((r - (r * g - r_d) / growth).clamp(min=0), limit.radius)
+    return r
+
+
+def _tabulate(
     radius: Tensor, folds: Tensor, image_reach: Tensor, curve: Callable[[Tensor], Tensor], shape: tuple[int, ...]
 ) -> RadialLimit:
     r = radius[:, None] * _steps(radius)
-    # Only what is asked for goes into the table, which is finer so.
+    # The table ends where `image_reach` is covered: a shorter table is finer.
     last = (curve(r) < image_reach[:, None]).sum(dim=1, keepdim=True).clamp(max=_NODES)
     r = r.gather(1, last) * _steps(radius)
     r_d = curve(r)
-    image_radius = r_d[:, -1]
-    return RadialLimit(radius.view(shape), image_radius.view(shape), folds, _inverse_table(r, r_d))
-
-
-def _falls(r: Tensor, k: tuple[Tensor, ...]) -> Tensor:
-    return radial(r * r, k, 6) + 2 * r * r * radial_slope(r * r, k, 6) <= 0
-
-
-def _inverse_table(r: Tensor, r_d: Tensor) -> Tensor:
-    nodes = r_d[:, -1:] * (1 - (1 - _steps(r[:, 0])).square())
+    nodes = r_d[:, -1:] * (1 - (1 - _steps(radius)).square())
     node = torch.searchsorted(r_d.contiguous(), nodes.contiguous()).clamp(1, _NODES)
     low, high = r_d.gather(1, node - 1), r_d.gather(1, node)
-    share = ((nodes - low) / (high - low).clamp(min=torch.finfo(r.dtype).tiny)).clamp(0, 1)
-    return torch.lerp(r.gather(1, node - 1), r.gather(1, node), share)
+    weight = ((nodes - low) / (high - low).clamp(min=torch.finfo(r.dtype).tiny)).clamp(0, 1)
+    table = torch.lerp(r.gather(1, node - 1), r.gather(1, node), weight)
+    return RadialLimit(radius.view(shape), r_d[:, -1].view(shape), folds, table)
 
 
 def _steps(like: Tensor) -> Tensor:
     return torch.arange(_NODES + 1, dtype=like.dtype, device=like.device) / _NODES
-
-
-def radial(r2: Tensor, k: tuple[Tensor, ...], order: int) -> Tensor:
-    """1 + sum k_i r^2i."""
-    if order == 0:
-        return torch.ones_like(r2)
-    value = k[order - 1] * r2
-    for i in reversed(range(order - 1)):
-        value = (k[i] + value) * r2
-    return 1 + value
-
-
-def radial_slope(r2: Tensor, k: tuple[Tensor, ...], order: int) -> Tensor:
-    """The derivative of `radial` with respect to r^2: sum i k_i r^(2i - 2)."""
-    if order == 0:
-        return torch.zeros_like(r2)
-    value = order * k[order - 1]
-    for i in reversed(range(order - 1)):
-        value = (i + 1) * k[i] + r2 * value
-    return value

@@ -26,7 +26,7 @@ from yaml import YAMLError
 from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
 from torchrefract.data.images import UnreadableImageError
-from torchrefract.data.pair_files import DamagedPairError
+from torchrefract.data.pairs.files import DamagedPairError
 
 _T = TypeVar("_T")
 _OF_FILES = (UnreadableImageError, DamagedPairError)

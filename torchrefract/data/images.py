@@ -1,8 +1,7 @@
-"""Reading clean pictures, and cutting them to one size.
+"""Reading of images from files, and cropping and reducing them to one size.
 
-A damaged picture must not slip in: a decoder may fill what is missing with gray and call it a success. So a file
-counts as readable only where its format's own mark of completeness is there: the end marker of JPEG and PNG, the
-length that WebP and BMP state at their start.
+A decoder may fill the missing part of a truncated file with gray and report success. A file is therefore readable only
+if it is complete: if it has the end marker of JPEG and PNG, or the length that the header of WebP and BMP states.
 """
 
 import io
@@ -25,75 +24,78 @@ from torchrefract._validation import check_size, check_tensor
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 
-_TAIL = 4096  # bytes read first in the search for an end marker: nearly all files have it in the last few
+_TAIL = 4096  # bytes at the end that are searched first for an end marker
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"
 _JPEG_END = b"\xff\xd9"
 _START_OF_SCAN = 0xDA
-_BARE_MARKERS = (0x01, *range(0xD0, 0xD8))  # TEM and RST0 to RST7 carry no length
+_BARE_MARKERS = (0x01, *range(0xD0, 0xD8))  # TEM and RST0 to RST7 have no length
 _ORIENTATION = 0x0112
-_TURNED = (5, 6, 7, 8)  # EXIF orientations that swap height and width
-_QUIETING = Lock()
-_levels: list[int] = []  # OpenCV's log level before, once for each thread that has it off
+_TRANSPOSED = (5, 6, 7, 8)  # EXIF orientations that swap height and width
+_LOG_LOCK = Lock()
+_log_levels: list[int] = []  # OpenCV's previous log level, once for each thread that has silenced it
 
 
 class UnreadableImageError(ValueError):
-    """A file that is no complete picture. The message names it and says what is wrong."""
+    """Raised for a file that is not a complete image."""
 
 
 def read_image(path: str | Path) -> Tensor:
-    """The picture in a JPEG, PNG, WebP or BMP file, upright as its EXIF orientation says, without its alpha channel.
+    """Read a JPEG, PNG, WebP or BMP file, rotated by its EXIF orientation, without its alpha channel.
 
     Returns:
-        (3, H, W), float32 in [0, 1], RGB, 8-bit values / 255 and 16-bit values / 65535; strides as decoded, so
-        channels last.
+        (3, H, W), float32, in [0, 1], RGB: 8-bit values / 255 or 16-bit values / 65535; in memory, channels last.
+
+    Raises:
+        UnreadableImageError: the file is missing, damaged or not an image.
     """
     return as_image(read_pixels(path))
 
 
 def read_pixels(path: str | Path) -> np.ndarray:
-    """The picture of `read_image` as the file has it: (H, W, 3), RGB, uint8 or uint16."""
+    """Read a file as `read_image` does, without conversion: (H, W, 3), RGB, uint8 or uint16."""
     with opened(path) as stream:
         data = stream.read()
-    _check_whole(path, io.BytesIO(data), len(data))
-    if data.startswith(_PNG) and not png_fits(data):
-        raise UnreadableImageError(f"{path} is damaged: its parts are not as long as they say")
-    # Where a header claims 30000 x 30000 pixels OpenCV would make them, though the file holds a hundred bytes.
+    _check_complete(path, io.BytesIO(data), len(data))
+    if data.startswith(_PNG) and not has_complete_png_chunks(data):
+        raise UnreadableImageError(f"{path} is damaged: its chunks are shorter than they state")
+    # OpenCV would allocate any size that a header states; Pillow raises an error for a decompression bomb.
     _header_size(path, io.BytesIO(data))
     return _decode(path, data)
 
 
 def as_image(pixels: np.ndarray) -> Tensor:
-    """(3, H, W), float32 in [0, 1], of a picture (H, W, 3), uint8 or uint16."""
+    """Convert (H, W, 3), uint8 or uint16, into (3, H, W), float32, in [0, 1]."""
     return to_float(torch.from_numpy(pixels)).permute(2, 0, 1)
 
 
 def pixels_of(image: Tensor) -> np.ndarray:
-    """(H, W, 3), uint8, round(255 v) of each value v of a picture (3, H, W), which is cut to [0, 1] first.
+    """Convert an image (3, H, W) into (H, W, 3), uint8: round(255 v) of each value v, clipped to [0, 1].
 
-    What `read_image` has read from 8 bits comes back as it was.
+    It inverts `read_image` of an image of 8 bits exactly.
     """
     levels = to_uint8(image.detach().cpu()[None])[0]
-    # OpenCV interleaves planes sooner than a copy in another order of strides does.
+    # OpenCV interleaves planes faster than a strided copy.
     return last.numpy() if (last := levels.permute(1, 2, 0)).is_contiguous() else cv2.merge([*levels.numpy()])
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """(H, W) of what `read_image` returns, from the file's header and tail, without decoding a pixel.
+    """Return (H, W) of an image from the header and the end of its file, without decoding pixels.
 
-    A file that lacks its end, is empty, or is no picture raises UnreadableImageError, as `read_image` does; one that
-    is damaged in between is found by `read_image` alone.
+    Raises:
+        UnreadableImageError: the file is empty, truncated or not an image. Damage in between is detected by
+            `read_image` alone.
     """
     with opened(path) as stream:
-        _check_whole(path, stream, os.fstat(stream.fileno()).st_size)
+        _check_complete(path, stream, os.fstat(stream.fileno()).st_size)
         return _header_size(path, stream)
 
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[BinaryIO]:
-    """A file to read from; what the system says against it is an UnreadableImageError.
+    """Open a file for reading; turn errors of the system into UnreadableImageError.
 
-    A pipe is refused: opening it would wait for somebody who writes.
+    Pipes and devices raise, because opening them could wait for ever.
     """
     try:
         mode = os.stat(path).st_mode
@@ -106,16 +108,16 @@ def opened(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def files_in(folder: Path, suffixes: Sequence[str] = EXTENSIONS) -> list[Path]:
-    """The files of a folder whose names end so, in any case, by name; folders and hidden files aside.
+    """List the files of a folder with some suffixes, in any case, sorted by name, without folders and hidden files."""
+    files = (file for file in folder.glob("[!.]*") if file.suffix.lower() in suffixes)
+    return sorted(file for file in files if not file.is_dir())
 
-    What is hidden is no picture of the user's, but what a stop has left half written, or another system's notes.
+
+def has_complete_png_chunks(data: bytes) -> bool:
+    """Return True if the data holds every chunk of a PNG up to its end.
+
+    OpenCV allocates the length that a chunk states, so a damaged length could exhaust the memory.
     """
-    found = (file for file in folder.glob("[!.]*") if file.suffix.lower() in suffixes)
-    return sorted(file for file in found if not file.is_dir())
-
-
-def png_fits(data: bytes) -> bool:
-    """Whether every part of a PNG, up to its end, lies in the file: OpenCV makes room for as much as a part claims."""
     position = len(_PNG) if data.startswith(_PNG) else len(data)
     while position + 12 <= len(data):
         end = position + 12 + int.from_bytes(data[position : position + 4], "big")
@@ -126,17 +128,21 @@ def png_fits(data: bytes) -> bool:
 
 
 def fit(image: Tensor, size: Sequence[int]) -> Tensor:
-    """The middle of a picture, cut to the aspect of `size` and reduced to it by area averaging.
+    """Crop the center of an image to the aspect ratio of `size` and reduce it by area averaging.
 
-    Each output pixel is the mean of the input pixels that it covers, those at its border by the share covered: a
-    scene seen by a coarser sensor. (An antialiased bilinear filter would reach twice as far and blur more.)
+    Each output pixel is the mean of the input pixels that it covers, weighted by the covered area, as of a coarser
+    sensor.
 
     Args:
-        image: (3, H, W), float32 in [0, 1], on the CPU.
-        size: (h, w), at most (H, W): nothing is ever enlarged.
+        image: (3, H, W), float32, in [0, 1], on the CPU.
+        size: (h, w), at most (H, W).
 
     Returns:
-        (3, h, w), float32 in [0, 1].
+        (3, h, w), float32, in [0, 1].
+
+    Raises:
+        ValueError: the image is smaller than `size` or has another shape.
+        TypeError: the image is not float32 on the CPU.
     """
     height, width = check_size("size", size)
     _check_image(image)
@@ -149,7 +155,7 @@ def fit(image: Tensor, size: Sequence[int]) -> Tensor:
     top, left = (H - crop_height) // 2, (W - crop_width) // 2
     crop = image.detach()[:, top : top + crop_height, left : left + crop_width].permute(1, 2, 0).contiguous().numpy()
     small = cv2.resize(crop, (width, height), interpolation=cv2.INTER_AREA)
-    # Weights that sum to 1 only up to rounding may step over 1.
+    # The weights sum to 1 up to rounding, so a mean may exceed 1.
     return torch.from_numpy(small).permute(2, 0, 1).contiguous().clamp_(0, 1)
 
 
@@ -163,19 +169,19 @@ def _check_image(image: Tensor) -> None:
 
 def _header_size(path: str | Path, stream: BinaryIO) -> tuple[int, int]:
     try:
-        with Image.open(stream) as picture:
-            width, height = picture.size
-            # Asked without need, Pillow decodes a whole PNG in search of EXIF data behind its pixels.
-            turned = "exif" in picture.info and picture.getexif().get(_ORIENTATION) in _TURNED
+        with Image.open(stream) as header:
+            width, height = header.size
+            # Without the first test, Pillow decodes a whole PNG to search for EXIF data behind its pixels.
+            is_transposed = "exif" in header.info and header.getexif().get(_ORIENTATION) in _TRANSPOSED
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise UnreadableImageError(f"{path} has a damaged header ({error})") from error
-    return (width, height) if turned else (height, width)
+    return (width, height) if is_transposed else (height, width)
 
 
 def _decode(path: str | Path, data: bytes) -> np.ndarray:
-    # Decoding from memory: from a file OpenCV would fill the missing rows of a cut JPEG with gray, and call it well.
+    # From a file instead of memory, OpenCV would fill the missing rows of a truncated JPEG with gray.
     try:
-        with _quiet():
+        with _silent_opencv():
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
     except cv2.error as error:
         raise UnreadableImageError(f"{path} cannot be decoded ({error.err})") from error
@@ -185,42 +191,42 @@ def _decode(path: str | Path, data: bytes) -> np.ndarray:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """OpenCV's log lines off: what they say is raised as an error."""
-    # The level is the process's own: of threads that read at once, the first sets it, and the last sets it back.
-    with _QUIETING:
+def _silent_opencv() -> Iterator[None]:
+    """Silence OpenCV's log, because failures raise an error."""
+    # The level belongs to the process: of threads that decode at once, the first sets it, and the last restores it.
+    with _LOG_LOCK:
         level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        _levels.append(_levels[0] if _levels else level)
+        _log_levels.append(_log_levels[0] if _log_levels else level)
     try:
         yield
     finally:
-        with _QUIETING:
-            level = _levels.pop()
-            if not _levels:
+        with _LOG_LOCK:
+            level = _log_levels.pop()
+            if not _log_levels:
                 cv2.utils.logging.setLogLevel(level)
 
 
-def _check_whole(path: str | Path, stream: BinaryIO, length: int) -> None:
-    """Raise unless `stream`, of `length` bytes, is a picture file with its end in place."""
+def _check_complete(path: str | Path, stream: BinaryIO, length: int) -> None:
+    """Raise UnreadableImageError unless a stream of `length` bytes is an image file with its end."""
     if length == 0:
         raise UnreadableImageError(f"{path} is empty (0 bytes)")
     head = stream.read(16)
     if head.startswith(b"\xff\xd8\xff"):
-        whole = _contains(stream, _JPEG_END, _scan_start(stream, length), length)
+        is_complete = _contains(stream, _JPEG_END, _scan_start(stream, length), length)
     elif head.startswith(_PNG):
-        whole = _contains(stream, _PNG_END, 8, length)
+        is_complete = _contains(stream, _PNG_END, 8, length)
     elif head.startswith(b"RIFF") and head[8:12] == b"WEBP":
-        whole = int.from_bytes(head[4:8], "little") + 8 <= length
+        is_complete = int.from_bytes(head[4:8], "little") + 8 <= length
     elif head.startswith(b"BM"):
-        whole = length >= 26 and int.from_bytes(head[2:6], "little") <= length
+        is_complete = length >= 26 and int.from_bytes(head[2:6], "little") <= length
     else:
-        raise UnreadableImageError(f"{path} is not a JPEG, PNG, WebP or BMP picture")
-    if not whole:
+        raise UnreadableImageError(f"{path} is not a JPEG, PNG, WebP or BMP image")
+    if not is_complete:
         raise UnreadableImageError(f"{path} is truncated ({length} bytes, its end is missing)")
 
 
 def _contains(stream: BinaryIO, marker: bytes, start: int, length: int) -> bool:
-    """Whether `marker` lies at `start` or later: programs append bytes to whole pictures, so not just at the end."""
+    """Return True if the marker is at `start` or later; programs may append bytes to a complete image."""
     for begin in (max(start, length - _TAIL), start):
         stream.seek(begin)
         if marker in stream.read():
@@ -229,7 +235,7 @@ def _contains(stream: BinaryIO, marker: bytes, start: int, length: int) -> bool:
 
 
 def _scan_start(stream: BinaryIO, length: int) -> int:
-    """Where the coded pixels of a JPEG begin, or its length: what lies before may hold a thumbnail with its own end."""
+    """Return the position of the first scan of a JPEG, or its length; a thumbnail with its own end may precede it."""
     position = 2
     while position + 4 <= length:
         stream.seek(position)

@@ -1,6 +1,8 @@
-"""Batches to learn from: clean frames come out of workers, and are corrupted on the device that trains."""
+"""Batches for training: workers load clean frames, and the training device degrades them."""
 
-from collections.abc import Sequence
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -9,30 +11,33 @@ from pytorch_lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, DistributedSampler, default_collate
 
 from torchrefract._validation import check_count, check_flag
-from torchrefract.data.frame_folder import FrameFolder
-from torchrefract.data.paired_folder import PairedFolder
+from torchrefract.data.frames import FrameFolder
+from torchrefract.data.pairs.dataset import PairedFolder
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.effects.base import Effect
 from torchrefract.types import Frame, Pair
 
-# Seeds of the epochs of training lie above the one of validation.
+# Validation has the seed of epoch 0, so training begins at 1.
 _FIRST_EPOCH = 1
 
 
 class PairData(LightningDataModule):
-    """Pairs of clean and degraded frames.
+    """Pairs of clean and degraded frames for Lightning.
 
-    In training a frame is degraded anew each epoch, by the draw of (seed, epoch, key of the frame); in validation it is
-    degraded alike each time. So a run that goes on after a stop sees what it would have seen.
+    In training, the draw of a frame depends on (seed, epoch, key of the frame); in validation, on the seed and the key.
+    A resumed run therefore sees the same pairs as an uninterrupted one.
 
     Args:
-        train, val: clean frames, or pairs from disk; val of drives that train has none of.
-        effect: what degrades them; None for pairs.
-        batch_size: frames in a batch, of each device.
-        workers: processes that read or render frames; 0 does it in the training process.
-        seed: of the draws and of the order.
-        transmission: whether pairs made on the fly have theirs.
-        flow: whether they must have one.
+        train, val: clean frames, or pairs from disk; `val` should be of other drives than `train`.
+        effect: degrades the frames; None for pairs.
+        batch_size: frames in a batch on each device.
+        workers: processes that load frames; 0 loads them in the training process.
+        seed: of the draws and the order, at least 0.
+        transmission: True to add the transmission to pairs of frames.
+        flow: True to require a flow in pairs of frames.
+
+    Raises:
+        ValueError: an argument is out of range, or `batch_size` exceeds the number of training frames.
     """
 
     def __init__(
@@ -52,46 +57,46 @@ class PairData(LightningDataModule):
         self.batch_size = check_count("batch_size", batch_size)
         self.workers = check_count("workers", workers, low=0)
         self.seed = check_count("seed", seed, low=0)
-        self.asked = {"transmission": check_flag("transmission", transmission), "flow": check_flag("flow", flow)}
+        self._maps = {"transmission": check_flag("transmission", transmission), "flow": check_flag("flow", flow)}
         self.check_ranks(1)
 
     def check_ranks(self, ranks: int) -> None:
-        """Raise ValueError unless each of so many processes has frames for a batch."""
+        """Raise ValueError unless each of `ranks` processes has enough training frames for a batch."""
         count = len(self.train) // ranks  # pyright: ignore[reportArgumentType]  # a map-style dataset has a length
         if count < self.batch_size:
             share = "" if ranks == 1 else f" that each of {ranks} processes has"
             raise ValueError(f"batch_size must be at most the {count} training frames{share}, got {self.batch_size}")
 
     def check_pair(self) -> None:
-        """Raise ValueError where the first pair cannot be had, or lacks what is asked for."""
+        """Raise ValueError if the first pair is unreadable or lacks a required map."""
         first = self.train[0]
         if isinstance(first, Frame) and self.effect is not None:
-            make_pair(default_collate([first]), self.effect, seed=0, **self.asked)
+            make_pair(default_collate([first]), self.effect, seed=0, **self._maps)
 
     def train_dataloader(self) -> DataLoader[Any]:
-        """Batches of frames, or pairs, in an order of the epoch."""
+        """Return batches of training frames or pairs, shuffled in each epoch."""
         return self._loader(self.train, training=True)
 
     def val_dataloader(self) -> DataLoader[Any]:
-        """Batches of frames, or pairs, in their order."""
+        """Return batches of validation frames or pairs, in order."""
         return self._loader(self.val, training=False)
 
     def transfer_batch_to_device(self, batch: Frame | Pair, device: torch.device, dataloader_idx: int) -> Frame | Pair:
-        """The batch on the device, but for its keys: draws are computed on the CPU, which would wait to have them."""
+        """Move a batch to a device, except for its keys: draws on the CPU would have to wait for them."""
         return super().transfer_batch_to_device(batch, device, dataloader_idx)._replace(key=batch.key)
 
     def on_after_batch_transfer(self, batch: Frame | Pair, dataloader_idx: int) -> Pair:
-        """The batch and its degraded copy, made on the device that it has come to; pairs as they are."""
+        """Degrade a batch of frames on its device; return pairs unchanged."""
         if isinstance(batch, Pair) or self.effect is None:
             return cast(Pair, batch)
         training = self.trainer is not None and self.trainer.training
         epoch = _FIRST_EPOCH + self.trainer.current_epoch if training and self.trainer else 0
-        return make_pair(batch, self.effect, seed=(self.seed << 32) + epoch, **self.asked)
+        return make_pair(batch, self.effect, seed=(self.seed << 32) + epoch, **self._maps)
 
     def _loader(self, frames: Dataset[Any], *, training: bool) -> DataLoader[Any]:
         ranks, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
         self.check_ranks(ranks)
-        # Every rank its own frames, none twice in training; Lightning sets the epoch.
+        # Each rank has its own frames, in training without repetition; Lightning sets the epoch.
         sampler = DistributedSampler(frames, ranks, rank, shuffle=training, seed=self.seed, drop_last=training)
         return DataLoader(
             frames,
@@ -106,21 +111,72 @@ class PairData(LightningDataModule):
 
 @torch.no_grad()
 def make_pair(frames: Frame, effect: Effect, *, seed: int, transmission: bool = False, flow: bool = False) -> Pair:
-    """A batch of frames and what an effect makes of it, on the device of the frames; its transmission, if asked for.
+    """Degrade a batch of frames on its device.
+
+    Args:
+        frames: image (B, 3, H, W), key (B,), and depth (B, 1, H, W) or an empty tensor.
+        effect: degrades the frames.
+        seed: of the draws.
+        transmission: True to add the transmission.
+        flow: True to require a flow; otherwise, an effect without one gives a flow of zeros.
+
+    Returns:
+        degraded and clean images, restore_flow (B, 2, H, W), its validity mask (B, 1, H, W), keys (B,), transmission
+        (B, 1, H, W) or (B, 0).
 
     Raises:
-        ValueError: a transmission or a flow is asked for, and the effect has none.
+        ValueError: the effect lacks a required map.
     """
     depth = frames.depth if frames.depth.ndim == 4 else None
     degraded = effect.degrade(frames.image, seed=seed, keys=frames.key, depth=depth)
-    for wanted, name, example in ((transmission, "transmission", "fog"), (flow, "flow", "a lens")):
-        if wanted and not degraded.has(name):
+    for is_required, name, example in ((transmission, "transmission", "fog"), (flow, "flow", "a lens")):
+        if is_required and not degraded.has(name):
             raise ValueError(f"effect must have a {name}, as {example} has, got {type(effect).__name__}")
     like = frames.image[:, :1]
-    moved = torch.zeros_like(like).expand(-1, 2, -1, -1) if degraded.restore_flow is None else degraded.restore_flow
+    restore = torch.zeros_like(like).expand(-1, 2, -1, -1) if degraded.restore_flow is None else degraded.restore_flow
     valid = torch.ones_like(like, dtype=torch.bool) if degraded.restore_valid is None else degraded.restore_valid
-    passed = degraded.transmission if transmission else frames.image.new_empty(len(frames.image), 0)
-    return Pair(degraded.image, frames.image, moved, valid, frames.key, passed)
+    transmitted = degraded.transmission if transmission else frames.image.new_empty(len(frames.image), 0)
+    return Pair(degraded.image, frames.image, restore, valid, frames.key, transmitted)
+
+
+def fingerprint(frames: Dataset[Frame] | Dataset[Pair]) -> dict[str, Any]:
+    """Describe a dataset in plain values, so that a checkpoint can state what it was trained on.
+
+    Returns:
+        source: name of the dataset's class.
+        root: its folder; None for rendered scenes.
+        drives: number of drives; None if unknown.
+        license: of the frames; None if unknown.
+        frames: number of frames.
+        size: [height, width] of the first frame, px.
+        sha256: of the names and sizes of the files, of the checksums of pairs, or of the arguments of rendered scenes.
+    """
+    result: dict[str, Any] = {"source": type(frames).__name__, "root": None, "drives": None, "license": None}
+    lines: Iterable[str] = ()
+    if isinstance(frames, FrameFolder):
+        result |= {"root": str(frames.root), "drives": len(frames.drives)}
+        lines = (f"{path.relative_to(frames.root).as_posix()} {path.stat().st_size}" for path in frames.paths)
+    elif isinstance(frames, PairedFolder):
+        rows = list(frames.rows())
+        result |= {"root": str(frames.root), "drives": len({row.drive for row in rows}), "license": _license(frames)}
+        lines = (f"{row.name}.{suffix} {file.sha256}" for row in rows for suffix, file in sorted(row.files.items()))
+    elif isinstance(frames, RoadScenes):
+        lines = [f"{frames.seed} {frames.first} {frames.count} {frames.size[0]}x{frames.size[1]}"]
+    digest = hashlib.sha256()
+    for line in lines:
+        digest.update(line.encode(errors="surrogateescape") + b"\n")
+    result |= {"frames": len(frames), "size": list(frames[0][0].shape[-2:])}  # pyright: ignore[reportArgumentType]  # a map-style dataset has a length
+    return result | {"sha256": digest.hexdigest()}
+
+
+def _license(pairs: PairedFolder) -> str | None:
+    """Read the license of the frames from config.json."""
+    try:
+        document = json.loads((pairs.root / "config.json").read_bytes())
+    except (OSError, ValueError):
+        return None
+    text = document.get("license") if isinstance(document, dict) else None
+    return text if isinstance(text, str) else None
 
 
 def road_scenes(
@@ -135,7 +191,7 @@ def road_scenes(
     transmission: bool = False,
     flow: bool = False,
 ) -> PairData:
-    """Pairs of rendered road scenes; arguments as for `RoadScenes` and `PairData`."""
+    """Make the data of rendered road scenes; see `RoadScenes` and `PairData` for the arguments."""
     train = RoadScenes(train_count, size=size, seed=seed)
     val = RoadScenes(val_count, size=size, seed=seed, first=train_count)
     options = {"batch_size": batch_size, "workers": workers, "seed": seed, "transmission": transmission, "flow": flow}
@@ -155,7 +211,7 @@ def frames(
     transmission: bool = False,
     flow: bool = False,
 ) -> PairData:
-    """Pairs of a folder's frames, split by drive; arguments as for `FrameFolder` and `PairData`."""
+    """Make the data of a folder of frames, split by drive; see `FrameFolder` and `PairData` for the arguments."""
     train, val = (
         FrameFolder(root, size=size, split=split, drive_by=drive_by, val_share=val_share, seed=seed)
         for split in ("train", "val")
@@ -173,6 +229,6 @@ def pairs(
     transmission: bool = False,
     flow: bool = False,
 ) -> PairData:
-    """Pairs from disk, split by drive when they were made; arguments as for `PairedFolder` and `PairData`."""
+    """Make the data of pairs from disk, with their splits; see `PairedFolder` and `PairData` for the arguments."""
     train, val = (PairedFolder(root, split=split, transmission=transmission, flow=flow) for split in ("train", "val"))
     return PairData(train, val, effect=None, batch_size=batch_size, workers=workers, seed=seed)

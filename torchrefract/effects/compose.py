@@ -1,8 +1,8 @@
 """Several effects in a row, with one sampling for all warps that follow one another."""
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
+from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -20,10 +20,11 @@ from torchrefract.effects.warp_effect import (
     FlowPart,
     SamplingOptions,
     WarpEffect,
+    flow_dtype,
     warped,
 )
 from torchrefract.planning.composition import ComposePlan, CompositionPlan, PlannedWarp, plan_composition
-from torchrefract.planning.plan import TOLERANCE_PX, PlanRequest, check_tolerance, lattice_with_stride
+from torchrefract.planning.plan import TOLERANCE_PX, ErrorModel, PlanRequest, check_tolerance, lattice_with_stride
 from torchrefract.types import Degraded
 from torchrefract.warping.flow import compose_flows
 from torchrefract.warping.grid import field_dtype, inside
@@ -36,6 +37,8 @@ _COMBINE: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "intensity": torch.add,
     "extinction": torch.add,
 }
+
+_UNDECIDED = SamplingOptions()
 
 
 class ComposeParams(NamedTuple):
@@ -156,22 +159,24 @@ class Compose(Effect):
 
     def plan_for_dtype(self, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
         """Return the plan for all parameters in the ranges."""
-        segments = self._segments(height, width, dtype)
-        leaves = [effect for effect, _ in self._leaf_effects()]
+        effects = [effect for effect, _ in self._leaf_effects()]
+        requests = self._requests(height, width, dtype)
         plans: dict[int, Any] = {}
         strides, error, stretch = [], 0.0, 1.0
-        for (places, request), warps in ((segment, self._planned_warps(segment[0])) for segment in segments):
-            plan = plan_composition(warps, request)
-            plans |= dict(zip(places, plan.plans, strict=True))
+        groups = self._groups([request is None for request in requests])
+        for group in groups:
+            warps = _planned_warps([effects[place] for place in group])
+            plan = plan_composition(warps, cast(PlanRequest, requests[group[0]]))
+            plans |= dict(zip(group, plan.plans, strict=True))
             strides.append(plan.stride)
             error += plan.error_px * stretch if plan.error_px else 0.0
             stretch *= 1 + plan.max_gradient
         each = tuple(
             plans[place] if place in plans else effect.plan_for_dtype(height, width, dtype)
-            for place, effect in enumerate(leaves)
+            for place, effect in enumerate(effects)
         )
-        names = tuple(type(effect).__name__ for effect in leaves)
-        samplings = sum(any(not plans[place].is_identity for place in places) for places, _ in segments)
+        names = tuple(type(effect).__name__ for effect in effects)
+        samplings = sum(any(not plans[place].is_identity for place in group) for group in groups)
         return ComposePlan(height, width, self.tolerance_px, names, each, tuple(strides), error, samplings)
 
     def degrade_batch(self, image: Tensor, params: ComposeParams, depth: Tensor | None) -> Degraded:
@@ -209,7 +214,7 @@ class Compose(Effect):
             else:
                 yield effect, child
 
-    def _leaf_effects(self, outer: SamplingOptions = SamplingOptions()) -> Iterator[tuple[Effect, SamplingOptions]]:
+    def _leaf_effects(self, outer: SamplingOptions = _UNDECIDED) -> Iterator[tuple[Effect, SamplingOptions]]:
         options = outer.or_else(SamplingOptions(self.padding, self.interpolation, self.backend))
         for effect in self._children():
             if isinstance(effect, Compose):
@@ -219,52 +224,45 @@ class Compose(Effect):
             else:
                 yield effect, options
 
-    def _segments(self, height: int, width: int, dtype: torch.dtype) -> list[tuple[list[int], PlanRequest]]:
-        """Return the groups of warps that are sampled together, each with its share of the tolerance.
+    def _groups(self, separates: Sequence[bool]) -> list[list[int]]:
+        """Return the places of the warps that are sampled together."""
+        groups: list[list[int]] = [[]]
+        for place, (effect, _) in enumerate(self._leaf_effects()):
+            if separates[place]:
+                groups.append([])
+            elif isinstance(effect, WarpEffect):
+                groups[-1].append(place)
+        return [group for group in groups if group]
+
+    def _requests(self, height: int, width: int, dtype: torch.dtype) -> tuple[PlanRequest | None, ...]:
+        """Return for each effect the request of its group of warps, or None if it separates groups.
 
         A photometric effect that may change something separates groups, whatever is drawn, so that a sample does not
         depend on the others of its batch.
         """
-        groups: list[list[int]] = [[]]
-        for place, (effect, _) in enumerate(self._leaf_effects()):
-            if isinstance(effect, WarpEffect):
-                groups[-1].append(place)
-            elif effect.p > 0 and not effect.plan_for_dtype(height, width, dtype).is_identity:
-                groups.append([])
-        groups = [group for group in groups if group]
-        request = PlanRequest(height, width, self.tolerance_px, dtype is torch.float64).with_reachable_default()
-        if request.tolerance_px is None:
-            return [(group, request) for group in groups]
-        request.remaining_px()  # raises for an unreachable tolerance
-        segments, stretch = [], 1.0
-        for group in groups:
-            share = request.tolerance_px / len(groups) / stretch
-            own = PlanRequest(height, width, share if share > 0 else None, request.is_double)
-            own = own if own.is_reachable else PlanRequest(height, width, None, request.is_double)
-            segments.append((group, own))
-            stretch *= 1 + plan_composition(self._planned_warps(group), own).max_gradient
-            stretch = stretch if math.isfinite(stretch) else math.inf
-        return segments
-
-    def _planned_warps(self, places: Sequence[int]) -> tuple[PlannedWarp, ...]:
         effects = [effect for effect, _ in self._leaf_effects()]
-        return tuple(_planned_warp(cast(WarpEffect, effects[place])) for place in places)
+        request = PlanRequest(height, width, self.tolerance_px, dtype is torch.float64).with_reachable_default()
+        requests: list[PlanRequest | None] = [
+            request if isinstance(effect, WarpEffect) or not _may_change(effect, height, width, dtype) else None
+            for effect in effects
+        ]
+        if request.tolerance_px is None:
+            return tuple(requests)
+        request.remaining_px()  # raises for an unreachable tolerance
+        tolerance_px = request.tolerance_px
+        groups, stretch = self._groups([request is None for request in requests]), 1.0
+        for group in groups if len(groups) > 1 else ():
+            share = replace(request, tolerance_px=tolerance_px / len(groups) / stretch)
+            if not share.is_reachable:
+                share = replace(request, tolerance_px=None)
+            for place in group:
+                requests[place] = share
+            stretch *= 1 + plan_composition(_planned_warps([effects[place] for place in group]), share).max_gradient
+        return tuple(requests)
 
     @assume_constant_result
     def _constant_requests(self, _: int, height: int, width: int, dtype: torch.dtype) -> tuple[PlanRequest | None, ...]:
-        """Return for each effect the request of its group; None for a photometric effect that separates groups."""
-        requests: dict[int, PlanRequest] = {}
-        for places, request in self._segments(height, width, dtype):
-            requests |= dict.fromkeys(places, request)
-        exact = PlanRequest(height, width, None, dtype is torch.float64)
-        found = []
-        for place, (effect, _) in enumerate(self._leaf_effects()):
-            if isinstance(effect, WarpEffect):
-                found.append(requests[place])
-            else:
-                changes = effect.p > 0 and not effect.plan_for_dtype(height, width, dtype).is_identity
-                found.append(None if changes else exact)
-        return tuple(found)
+        return self._requests(height, width, dtype)
 
     def _children(self) -> Iterator[Effect]:
         return cast(Iterator[Effect], iter(self.effects))
@@ -308,23 +306,24 @@ class _Progress:
         warps = [(cast(WarpEffect, leaf.effect), leaf.params) for leaf in leaves]
         active = [effect.active(params, height, width) for effect, params in warps]
         groups = _group_samples(warps, active, request)
+        applied, moved = torch.stack([params.applied for _, params in warps]).any(dim=0), torch.stack(active).any(dim=0)
         parts = []
         for index, acting, plan in groups:
             chosen = [warps[k] for k in acting]
             if index is not None:
                 chosen = [(effect, select_params(params, index)) for effect, params in chosen]
             parts.append(FlowPart(index, *_composed_flow(chosen, plan)))
-        applied = torch.stack([params.applied for _, params in warps]).any(dim=0)
-        segment = _Segment(applied, torch.stack(active).any(dim=0), BatchFlow(parts))
+            if all(warp_plan.stride == 0 for warp_plan in plan.plans) and not _needs_gradient(chosen):
+                moved = torch.zeros_like(moved) if index is None else moved.index_fill(0, index, False)
+        segment = _Segment(applied, moved, BatchFlow(parts))
         self.image = _sample_segment(self.image, segment, leaves, active)
         if self.depth is not None:
             depth, detached = expand_batch(self.depth, rows), segment._replace(flow=segment.flow.detach())
             self.depth = detached.sample(depth, SamplingOptions("border", "nearest", "auto"))
         self.light = {name: _moved(value, segment) for name, value in self.light.items()}
         for (effect, params), moves in zip(warps, active, strict=True):
-            if request.tolerance_px is None:
-                effect = effect.exact()
-            flow = _remember(lambda effect=effect, params=params: effect.planned_flow(params, height, width))
+            planned = effect if request.tolerance_px else effect.exact()
+            flow = _remember(lambda planned=planned, params=params: planned.planned_flow(params, height, width))
             self.warps.append((effect, params, flow, moves))
             self.valid = _valid_after(self.valid, flow, moves)
         self.segments.append(segment)
@@ -391,6 +390,7 @@ class _Progress:
     def _inverse(self) -> tuple[Tensor, Tensor]:
         """Compose the inverse flows of all warps, sample by sample of those that move it."""
         total: Tensor | None = None
+        valid = moved = torch.empty(0)
         for effect, params, flow, moves in self.warps:
             inverse, exists = effect.masked_inverse_flow(params, flow().dense)
             exists = exists.expand(len(inverse), 1, *inverse.shape[2:])
@@ -463,10 +463,18 @@ def _sample_segment(image: Tensor, segment: _Segment, leaves: Sequence[_Leaf], a
     return result
 
 
-def _planned_warp(effect: WarpEffect, model: Any = ...) -> PlannedWarp:
-    if effect.tolerance_px is None:
-        return PlannedWarp(None, effect.rounding_ulps)
-    return PlannedWarp(effect.error_model() if model is ... else model, effect.rounding_ulps)
+def _may_change(effect: Effect, height: int, width: int, dtype: torch.dtype) -> bool:
+    return effect.p > 0 and not effect.plan_for_dtype(height, width, dtype).is_identity
+
+
+def _planned_warps(effects: Sequence[Effect]) -> tuple[PlannedWarp, ...]:
+    """Return warps as a plan needs them, with the error models of their ranges."""
+    warps = cast(Sequence[WarpEffect], effects)
+    return tuple([_planned_warp(warp, warp.error_model() if warp.tolerance_px else None) for warp in warps])
+
+
+def _planned_warp(warp: WarpEffect, model: ErrorModel | None) -> PlannedWarp:
+    return PlannedWarp(model, warp.rounding_ulps, warp.has_closed_form)
 
 
 def _group_samples(
@@ -479,25 +487,34 @@ def _group_samples(
         cannot be read, one group with all warps, whose plan holds for any subset of them.
     """
     flags = None
-    if not any(requires_grad(params) for _, params in warps):
+    if not _needs_gradient(warps):
         flags = eager_values(lambda: torch.stack(list(active), dim=1), of=active[0])
     everything = list(range(len(warps)))
     if flags is None:
-        planned = tuple(_planned_warp(effect) for effect, _ in warps)
+        planned = _planned_warps([effect for effect, _ in warps])
         return [(None, everything, plan_composition(planned, request))]
-    is_large = request.height * request.width >= MIN_PIXELS
-    models = [
-        effect.sample_models(params) if is_large and request.tolerance_px else [effect.error_model()] * len(flags)
-        for effect, params in warps
-    ]
+    planned = [_planned_samples(effect, params, request) for effect, params in warps]
     groups: dict[Any, tuple[list[int], list[int], CompositionPlan]] = {}
     for i, row in enumerate(flags):
         acting = [k for k in everything if row[k]] or everything[-1:]
-        plan = plan_composition(tuple(_planned_warp(warps[k][0], models[k][i]) for k in acting), request)
+        plan = plan_composition(tuple([planned[k][i] for k in acting]), request)
         groups.setdefault((tuple(acting), plan.key), ([], acting, plan))[0].append(i)
     if len(groups) == 1:
         return [(None, acting, plan) for _, acting, plan in groups.values()]
     return [(torch.tensor(rows), acting, plan) for rows, acting, plan in groups.values()]
+
+
+def _needs_gradient(warps: Sequence[tuple[WarpEffect, Any]]) -> bool:
+    return any(requires_grad(params) for _, params in warps)
+
+
+def _planned_samples(effect: WarpEffect, params: Any, request: PlanRequest) -> list[PlannedWarp]:
+    """Return the warp as a plan needs it for each sample."""
+    if not effect.has_sample_models or request.height * request.width < MIN_PIXELS or request.tolerance_px is None:
+        return list(_planned_warps([effect])) * len(params.applied)
+    if effect.tolerance_px is None:
+        return [_planned_warp(effect, None)] * len(params.applied)
+    return [_planned_warp(effect, model) for model in effect.sample_models(params)]
 
 
 def _composed_flow(warps: Sequence[tuple[WarpEffect, Any]], plan: CompositionPlan) -> tuple[LatticeFlow, Tensor]:
@@ -506,13 +523,13 @@ def _composed_flow(warps: Sequence[tuple[WarpEffect, Any]], plan: CompositionPla
         return warps[0][0].masked_flow(warps[0][1], plan.plans[0])
     height, width = plan.plans[0].height, plan.plans[0].width
     lattice = lattice_with_stride(height, width, plan.stride)
-    dtype = next(value.dtype for value in warps[0][1] if value.is_floating_point())
+    dtype = flow_dtype(warps[0][1])
     device = warps[0][1].applied.device
     points = lattice.points(dtype=dtype, device=device)
     total: Tensor | None = None
     exists = torch.ones(1, 1, 1, 1, dtype=torch.bool, device=device)
     for (effect, params), warp_plan in zip(reversed(warps), reversed(plan.plans), strict=True):
-        if warp_plan.is_identity:
+        if warp_plan.stride == 0:
             continue
         flow, flow_exists = effect.flow(params, points if total is None else points.displaced(total), warp_plan)
         active = effect.active(params, height, width)

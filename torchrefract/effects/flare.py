@@ -184,7 +184,7 @@ class LensFlare(PhotometricEffect):
 
 
 def _distance_from_frame(center_range: Range, size: int) -> float:
-    """How far in px the nearest center of a range, in shares of a side, is from the nearest pixel along an axis."""
+    """Distance in px along an axis from the nearest center of a range, in shares of a side, to the nearest pixel."""
     margin = 1e-5 * size * max(1.0, *map(math.fabs, center_range))  # rounding of given parameters
     low, high = (end * size - 0.5 for end in center_range)
     return max(low - margin - (size - 1), -high - margin, 0.0)

@@ -21,7 +21,7 @@ from torchrefract._validation import (
     color_per_channel,
     finite_or,
 )
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import BatchShape, check_image, from_batch, params_to, per_sample, to_batch
 from torchrefract.effects.depth import DepthProvider, LinearDepth
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
@@ -134,21 +134,18 @@ class FogMedium:
         scale = -math.log(self.threshold)
         return scale / far * (1 + thin) * (1 - _ROUNDING), scale / near * (1 + dense) * (1 + _ROUNDING)
 
-    def error_model(
-        self, extinction_range: Range, height: int, width: int, *, has_depth: bool, **noise: Any
-    ) -> FogErrorModel:
-        """Return error bounds for a range of mean extinctions in 1/m.
+    def error_model(self, extinction_range: Range, height: int, width: int, *, has_depth: bool) -> FogErrorModel:
+        """Return error bounds of uniform fog for a range of mean extinctions in 1/m.
 
         Args:
             extinction_range: 1/m.
             height, width: px, of the frame.
             has_depth: the depth is passed in, so that the distance has no bound.
-            noise: further fields of `FogErrorModel`.
         """
         largest = extinction_range[1]
         farthest = math.inf if has_depth else _farthest(self, height, width)
         thickness = largest * min(farthest, 1e12) if largest > 0 else 0.0
-        return FogErrorModel(thickness, self.colors, self.linear_light, **noise)
+        return FogErrorModel(thickness, self.colors, self.linear_light)
 
     def mean_extinction(self, params: Any, dtype: torch.dtype) -> Tensor:
         """Return k0 (1 + deviation) in 1/m, (B,); fog without a valid extinction is opaque."""

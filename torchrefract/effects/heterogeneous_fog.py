@@ -18,7 +18,7 @@ from torchrefract._validation import (
     check_values,
     check_within,
 )
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import params_to, per_sample
 from torchrefract.effects.depth import DepthProvider
 from torchrefract.effects.fog import (
@@ -38,12 +38,12 @@ from torchrefract.effects.motion import (
     motion_ranges,
 )
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
-from torchrefract.fields.fog_volume import mean_extinction_along_rays
+from torchrefract.fields.fog_volume import ExtinctionField, mean_extinction_along_rays
 from torchrefract.fields.heterogeneous_fog import (
     image_noise,
     normalize_weights,
     periods_in_frame,
-    relative_extinction,
+    scale_to_mean,
 )
 from torchrefract.planning.photometric import (
     PhotometricPlan,
@@ -226,10 +226,8 @@ class HeterogeneousFog(PhotometricEffect):
         """Plan frames for the depth of the effect or, with `has_depth`, for any depth."""
         size = (request.height, request.width)
         span = self.medium.extinction_range(self.visibility_range, self.deviation_range)
-        model = self.medium.error_model(
-            span,
-            *size,
-            has_depth=has_depth,
+        model = replace(
+            self.medium.error_model(span, *size, has_depth=has_depth),
             mean_over_frame=self.mean == "image",
             periods=self._periods(*size) if self.mode == "image" else (),
             weights=self._unit_weights(),
@@ -250,13 +248,13 @@ class HeterogeneousFog(PhotometricEffect):
         if plan.octaves != ():
             rows = image.shape[0]
             distance = expand_batch(distance, rows) if distance.shape[0] > 1 else distance
-            k = expand_batch(k, rows) * self._relative_extinction(params, distance, image, plan)
+            k = self._extinction(expand_batch(k, rows), params, distance, image, plan)
         return self.medium.blend(image, params, distance, k, is_visible=not plan.is_identity)
 
-    def _relative_extinction(
-        self, params: HeterogeneousFogParams, distance: Tensor, image: Tensor, plan: PhotometricPlan
+    def _extinction(
+        self, k: Tensor, params: HeterogeneousFogParams, distance: Tensor, image: Tensor, plan: PhotometricPlan
     ) -> Tensor:
-        """(N, 1, H, W): q / <q>."""
+        """(N, 1, H, W): k q / <q>, 1/m, of the mean extinction k, (N, 1, 1, 1)."""
         rows, _, height, width = image.shape
         dtype = field_dtype(image.dtype)
         names = ("key", "weights", "contrast", "wind", "decorrelation")
@@ -276,25 +274,19 @@ class HeterogeneousFog(PhotometricEffect):
                 decorrelation=decorrelation,
                 stretch=self.normalize == "image",
             )
-            return relative_extinction(q, mean=None if self.mean == "image" else 0.5)
+            return scale_to_mean(q, k, mean=None if self.mean == "image" else 0.5)
         focal, center = self.medium.pinhole(height, width)
         q = mean_extinction_along_rays(
-            key,
+            ExtinctionField(key, weights, contrast.to(dtype), frame, wind, decorrelation),
             distance,
             height=height,
             width=width,
             focal=focal,
             center=center,
             scales=self.scales,
-            weights=weights,
-            contrast=contrast.to(dtype),
-            frame=frame,
-            wind=wind,
-            decorrelation=decorrelation,
             reach=self.reach,
-            dtype=dtype,
         )
-        return relative_extinction(q, mean=None if self.mean == "image" else 1.0)
+        return scale_to_mean(q, k, mean=None if self.mean == "image" else 1.0)
 
     def _unit_weights(self) -> tuple[float, ...]:
         return tuple(weight / sum(self.weights) for weight in self.weights)

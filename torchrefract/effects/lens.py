@@ -10,8 +10,8 @@ from torch import Tensor
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import check_flag, check_range, check_values, check_within, eager_bool
-from torchrefract.cameras.distortion import ALL_TERMS, POLYNOMIAL12
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.brown_conrady import ALL_TERMS, POLYNOMIAL12
+from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import params_to
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, newton_lens_flow
@@ -72,6 +72,7 @@ class LensDistortion(WarpEffect):
     """
 
     params_type = LensParams
+    has_closed_form = True
     rounding_ulps = 16  # Newton's method magnifies the rounding of positions
     has_sample_models = True
 

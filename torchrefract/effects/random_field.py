@@ -12,7 +12,7 @@ from torchrefract._tensor import expand_batch
 from torchrefract._validation import check_range, check_within, eager_values
 from torchrefract.effects.motion import check_key, check_motion, is_still
 from torchrefract.fields.random_field import FieldParams, Motion
-from torchrefract.planning.plan import WarpPlan
+from torchrefract.planning.plan import WarpPlan, lattice_with_stride
 from torchrefract.types import Range
 from torchrefract.warping.grid import Points
 from torchrefract.warping.lattice import Lattice, LatticeFlow
@@ -59,11 +59,12 @@ def flow_at_points(compute: Callable[[Lattice], Tensor], points: Points, plan: W
         points: nodes of the plan, or other points.
         plan: gives the stride.
     """
-    if not points.is_displaced and points.lattice == plan.lattice:
-        return compute(plan.lattice)
+    lattice = lattice_with_stride(plan.height, plan.width, plan.stride)
+    if not points.is_displaced and points.lattice == lattice:
+        return compute(lattice)
     stride = max(1, plan.stride)
-    lattice = Lattice(plan.height, plan.width, stride, margin=math.ceil(_MARGIN_PX / stride))
-    return LatticeFlow(compute(lattice), lattice).at(points)
+    wide = Lattice(plan.height, plan.width, stride, margin=math.ceil(_MARGIN_PX / stride))
+    return LatticeFlow(compute(wide), wide).at(points)
 
 
 def warn_if_clipped(clipped: Tensor, params: Any, size: tuple[int, int]) -> None:

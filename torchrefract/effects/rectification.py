@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import eager_bool
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import params_to
 from torchrefract.effects.lens import check_lens, lens_in_px
 from torchrefract.effects.warp_effect import WarpEffect
@@ -50,8 +50,8 @@ class Rectification(WarpEffect):
         flow(p) = f (distort((p - c) / f) - (p - c) / f)
 
     `flow` distorts (closed form), `restore_flow` undistorts (the exact inverse): it is `LensDistortion` in the other
-    direction. Before other warps in a `Compose` it shares their sampling, so that raw frames are degraded like rectified
-    ones without being blurred twice:
+    direction. Before other warps in a `Compose` it shares their sampling, so that raw frames are degraded like
+    rectified ones without being blurred twice:
 
         scene = Compose([Rectification(camera), LensDistortion()])
         d = scene.degrade(raw)  # d.image from the raw frame, sampled once
@@ -72,6 +72,7 @@ class Rectification(WarpEffect):
     """
 
     params_type = RectificationParams
+    has_closed_form = True
     rounding_ulps = 16  # Newton's method magnifies the rounding of positions
 
     def __init__(

@@ -59,6 +59,7 @@ class ThinPlateSpline(WarpEffect):
     """
 
     params_type = ThinPlateParams
+    has_closed_form = True
 
     def __init__(
         self,

@@ -20,6 +20,7 @@ from torchrefract.planning.plan import (
     PlanRequest,
     WarpPlan,
     check_tolerance,
+    lattice_with_stride,
     plan_warp,
 )
 from torchrefract.types import Degraded, Inverse, Map
@@ -65,6 +66,7 @@ class WarpEffect(Effect):
     """
 
     rounding_ulps = DEFAULT_ULPS
+    has_closed_form = False  # whether `flow` computes any point without a lattice of its own
     has_sample_models = False  # whether `error_model` accepts the parameters of one sample
 
     def __init__(
@@ -88,7 +90,7 @@ class WarpEffect(Effect):
 
         Args:
             params: with B rows.
-            points: the nodes of `plan.lattice`, or in a composition any points, with N rows.
+            points: the nodes of the plan's lattice, or in a composition any points, with N rows.
             plan: how exact the flow has to be.
 
         Returns:
@@ -142,12 +144,17 @@ class WarpEffect(Effect):
 
     def masked_flow(self, params: Any, plan: WarpPlan) -> tuple[LatticeFlow, Tensor]:
         """Compute the flow at the nodes of a plan, zero for samples that do not move, and where it exists."""
-        dtype = next(value.dtype for value in params if value.is_floating_point())
-        nodes, exists = self.flow(params, plan.lattice.points(dtype=dtype, device=params.applied.device), plan)
+        dtype, device = flow_dtype(params), params.applied.device
+        lattice = lattice_with_stride(plan.height, plan.width, plan.stride)
+        if plan.stride == 0 and not requires_grad(params):
+            zero = torch.zeros(1, 2, plan.height, plan.width, dtype=dtype, device=device)
+            everywhere = torch.ones(1, 1, 1, 1, dtype=torch.bool, device=device)
+            return LatticeFlow(zero.expand(len(params.applied), -1, -1, -1), lattice), everywhere
+        nodes, exists = self.flow(params, lattice.points(dtype=dtype, device=device), plan)
         active = expand_batch(self.active(params, plan.height, plan.width), nodes.shape[0])
         if plan.stride > 1:
             exists = active.new_ones(1, 1, 1, 1)
-        return LatticeFlow(where_active(nodes, 0.0, active, params), plan.lattice), exists | ~per_sample(active)
+        return LatticeFlow(where_active(nodes, 0.0, active, params), lattice), exists | ~per_sample(active)
 
     def masked_inverse_flow(self, params: Any, flow: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the flow that undoes a masked one (N, 2, H, W), zero for samples that do not move."""
@@ -158,29 +165,33 @@ class WarpEffect(Effect):
 
     def planned_flow(self, params: Any, height: int, width: int) -> "BatchFlow":
         """Compute the flow by the plan of the ranges, or by one for each sample."""
-        dtype = next(value.dtype for value in params if value.is_floating_point())
+        dtype = flow_dtype(params)
         plan = self._constant_plan(id(self), height, width, dtype)
         if not plan.is_per_sample or requires_grad(params):
-            return BatchFlow([FlowPart(None, *self.masked_flow(params, plan))])
+            return BatchFlow([self._flow_part(None, params, plan)])
         request = self.plan_request(height, width, dtype)
         plans = [plan_warp(model, request) for model in self.sample_models(params)]
         groups: dict[Any, list[int]] = {}
         for i, sample_plan in enumerate(plans):
             groups.setdefault((sample_plan.stride, sample_plan.details), []).append(i)
         if len(groups) == 1:
-            return BatchFlow([FlowPart(None, *self.masked_flow(params, plans[0]))])
+            return BatchFlow([self._flow_part(None, params, plans[0])])
         parts = []
         for group in groups.values():
             index = torch.tensor(group)
-            parts.append(FlowPart(index, *self.masked_flow(select_params(params, index), plans[group[0]])))
+            parts.append(self._flow_part(index, select_params(params, index), plans[group[0]]))
         return BatchFlow(parts)
+
+    def _flow_part(self, samples: Tensor | None, params: Any, plan: WarpPlan) -> "FlowPart":
+        is_zero = plan.stride == 0 and not requires_grad(params)
+        return FlowPart(samples, *self.masked_flow(params, plan), is_zero)
 
     def sample_models(self, params: Any) -> Sequence[ErrorModel | None]:
         """Return the error model of each sample; that of the ranges if values cannot be read."""
         count = len(params.applied)
-        if not self.has_sample_models or eager_bool(lambda: params.applied.any(), of=params.applied) is None:
+        if not self.has_sample_models or eager_bool(params.applied.any, of=params.applied) is None:
             return [self.error_model()] * count
-        return [self.error_model(select_params(params, slice(i, i + 1))) for i in range(count)]
+        return [self.error_model(select_params(params, torch.tensor([i]))) for i in range(count)]
 
     def degrade_batch(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """Sample the images along the flow."""
@@ -188,6 +199,8 @@ class WarpEffect(Effect):
         if not self.may_change(params) or height * width == 1:
             return unchanged(image, params)
         flow = self.planned_flow(params, height, width)
+        if flow.is_zero:
+            return unchanged(image, params)
         active = expand_batch(self.active(params, height, width), image.shape[0])
         options = SamplingOptions(self.padding, self.interpolation, self.backend)
         return warped(
@@ -208,9 +221,10 @@ class WarpEffect(Effect):
 class FlowPart(NamedTuple):
     """The flow of some samples of a batch."""
 
-    index: Tensor | None  # (n,), their numbers; None for the whole batch
+    samples: Tensor | None  # (n,), their numbers; None for the whole batch
     flow: LatticeFlow
     exists: Tensor  # bool, broadcasts to (n, 1, H, W)
+    is_zero: bool = False  # whether the plan computes no flow
 
 
 class BatchFlow:
@@ -224,6 +238,11 @@ class BatchFlow:
     def num_rows(self) -> int:
         """Return B, or B T for flows that change over a clip."""
         return sum(len(part.flow.nodes) for part in self.parts)
+
+    @property
+    def is_zero(self) -> bool:
+        """Return True if no flow was computed, because none exceeds the tolerance."""
+        return all(part.is_zero for part in self.parts)
 
     @property
     def dense(self) -> Tensor:
@@ -268,8 +287,8 @@ class BatchFlow:
             return sample_image(image, flow.with_nodes(nodes), active=active, **options)
         result = torch.empty_like(image)
         frames = image.shape[0] // self.num_rows
-        for index, flow, _ in self.parts:
-            assert index is not None
+        for index, flow, *_ in self.parts:
+            assert index is not None  # of several parts
             rows = rows_of_samples(index, frames * len(flow.nodes) // len(index))
             nodes = expand_batch(flow.nodes, len(rows))
             part = sample_image(
@@ -282,10 +301,15 @@ class BatchFlow:
         if len(values) == 1:
             return values[0]
         result = values[0].new_empty(sum(map(len, values)), *values[0].shape[1:])
-        for (index, _, _), value in zip(self.parts, values, strict=True):
+        for (index, *_), value in zip(self.parts, values, strict=True):
             assert index is not None
             result = result.index_copy(0, rows_of_samples(index, len(value) // len(index)), value)
         return result
+
+
+def flow_dtype(params: Any) -> torch.dtype:
+    """Return the type of the flow that parameters give."""
+    return next(value.dtype for value in params if value.is_floating_point())
 
 
 def rows_of_samples(index: Tensor, frames: int) -> Tensor:

@@ -1,6 +1,7 @@
 """The light that the sun scatters over a lens: a Gaussian around the sun."""
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 _MIN_RADIUS = 1e-6  # px
@@ -37,7 +38,11 @@ def add_light(image: Tensor, along_x: Tensor, along_y: Tensor, *, clip: bool) ->
         clip: clip the sum.
     """
     result = torch.addcmul(image, along_y, along_x)
-    return result.clamp(0, 1) if clip else result
+    if not clip:
+        return result
+    if result.requires_grad or torch.compiler.is_compiling():
+        return result.clamp(0, 1)
+    return F.hardtanh(result, 0.0, 1.0, inplace=True)  # a clamp in place that torch.vmap supports
 
 
 def screen_light(image: Tensor, along_x: Tensor, along_y: Tensor) -> Tensor:

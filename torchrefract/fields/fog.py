@@ -28,7 +28,7 @@ def transmission(depth: Tensor, k: Tensor) -> Tensor:
         k: 1/m, broadcasts with the depth.
     """
     # An infinite depth times an extinction of 0 would be NaN, and so would be the gradient of an infinite product.
-    return torch.exp(k * -depth.clamp(max=_FARTHEST))
+    return (k * -depth.clamp(max=_FARTHEST)).exp_()
 
 
 def blend_fog(image: Tensor, t: Tensor, airlight: Tensor, *, linear_light: bool = False) -> Tensor:
@@ -53,7 +53,7 @@ def blend_fog(image: Tensor, t: Tensor, airlight: Tensor, *, linear_light: bool 
 
 
 def unblend_fog(image: Tensor, t: Tensor, airlight: Tensor, *, linear_light: bool = False) -> Tensor:
-    """Return A + (I - A) / t, the inverse of `blend_fog` for t above 0; arguments as there."""
+    """Return A + (I - A) / t, the inverse of `blend_fog` with the same arguments, for t above 0."""
     if linear_light:
         return linear_to_srgb(torch.lerp(srgb_to_linear(airlight), srgb_to_linear(image), 1 / t))
     return torch.lerp(airlight, image, 1 / t)

@@ -61,6 +61,26 @@ class Rays(NamedTuple):
         return [(depth * min(0.0, low), depth * max(0.0, high)) for low, high in ends]
 
 
+class ExtinctionField(NamedTuple):
+    """The random extinction of each sample, see `mean_extinction_along_rays`.
+
+    key: (N, 4), int64, of `noise_key`.
+    weights: (N, octaves), w_i, not all 0.
+    contrast: (N,), c, the standard deviation of ln q.
+    frame: (N,), t.
+    wind: (N, 3), m per frame, to the right, down and ahead, as seen by the camera.
+    decorrelation: (N,), frames, above 0, after which q in the wind has the correlation 1 / e with itself, so that that
+        of g is exp(-t^2 ln(1 / r) / decorrelation^2), r = ln(1 + (exp(c^2) - 1) / e) / c^2; may be inf.
+    """
+
+    key: Tensor
+    weights: Tensor
+    contrast: Tensor
+    frame: Tensor
+    wind: Tensor
+    decorrelation: Tensor
+
+
 class View(NamedTuple):
     """The grid of rays of a frame, with one more ray beyond each edge."""
 
@@ -73,7 +93,7 @@ class View(NamedTuple):
 
 
 def mean_extinction_along_rays(
-    key: Tensor,
+    field: ExtinctionField,
     distance: Tensor,
     *,
     height: int,
@@ -81,13 +101,7 @@ def mean_extinction_along_rays(
     focal: tuple[float, float],
     center: tuple[float, float],
     scales: Sequence[float],
-    weights: Tensor,
-    contrast: Tensor,
-    frame: Tensor,
-    wind: Tensor,
-    decorrelation: Tensor,
     reach: float,
-    dtype: torch.dtype,
 ) -> Tensor:
     """Average a random extinction q > 0 with E q = 1 along the ray of each pixel, from the camera to its distance.
 
@@ -101,40 +115,22 @@ def mean_extinction_along_rays(
     Gaussian is not: for four octaves E q is 0.99 at c = 1, and 0.89 at c = 2.
 
     Args:
-        key: (N, 4), int64, of `noise_key`.
-        distance: (N or 1, 1, H, 1 or W), m, d along the ray, at least 0, may be inf.
+        field: of N samples.
+        distance: (N or 1, 1, H, 1 or W), m, d along the ray, at least 0, may be inf; gives the type.
         height, width: px, of the frame.
         focal: px, fx and fy of a pinhole camera.
         center: px, cx and cy, its principal point.
         scales: m, the periods of the octaves.
-        weights: (N, octaves), w_i, not all 0.
-        contrast: (N,), c, the standard deviation of ln q.
-        frame: (N,), t.
-        wind: (N, 3), m per frame, to the right, down and ahead, as seen by the camera.
-        decorrelation: (N,), frames, above 0, after which q in the wind has the correlation 1 / e with itself, so that
-            that of g is exp(-t^2 ln(1 / r) / decorrelation^2), r = ln(1 + (exp(c^2) - 1) / e) / c^2; may be inf.
         reach: m; beyond it the fog is uniform.
-        dtype: of the result.
 
     Returns:
         (N, 1, H, W), 0 or above.
 
     Source: Wronski, "Volumetric fog", SIGGRAPH 2014, for volumes of rays and slices.
     """
-    view, distance = make_view(height, width, focal, center), distance.to(dtype)
-    with torch.autocast(key.device.type, enabled=False):  # it would round the products of matrices
-        excess = extinction_on_planes(
-            key,
-            view.rays,
-            scales=scales,
-            weights=weights,
-            contrast=contrast,
-            frame=frame,
-            wind=wind,
-            decorrelation=decorrelation,
-            reach=reach,
-            dtype=dtype,
-        )
+    view = make_view(height, width, focal, center)
+    with torch.autocast(distance.device.type, enabled=False):  # it would round the products of matrices
+        excess = extinction_on_planes(field, view.rays, scales=scales, reach=reach, dtype=distance.dtype)
         volume = _means_up_to_slices(view.rays, excess)
         volume = exact_matmul(_cubic_weights(view.down, volume), volume)
         interpolate = _interpolate_rows if distance.shape[3] == 1 else _interpolate_pixels
@@ -151,20 +147,10 @@ def make_view(height: int, width: int, focal: tuple[float, float], center: tuple
 
 
 def extinction_on_planes(
-    key: Tensor,
-    rays: Rays,
-    *,
-    scales: Sequence[float],
-    weights: Tensor,
-    contrast: Tensor,
-    frame: Tensor,
-    wind: Tensor,
-    decorrelation: Tensor,
-    reach: float,
-    dtype: torch.dtype,
+    field: ExtinctionField, rays: Rays, *, scales: Sequence[float], reach: float, dtype: torch.dtype
 ) -> Tensor:
     """Evaluate q - 1 of `mean_extinction_along_rays` on its planes and one more, (N, 66, rows, columns)."""
-    device = key.device
+    device = field.key.device
     depths = [reach * (k / _PLANES) ** 2 for k in range(_PLANES + 2)]
     lengths = [2 * reach * k / _PLANES**2 for k in range(_PLANES + 2)]  # between planes
     cell = max(rays.step_x, rays.step_y)
@@ -174,19 +160,19 @@ def extinction_on_planes(
     )
     sparse = ((apart_m / period[:, None] - _SPARSE) / (_SPARSEST - _SPARSE)).clamp(0, 1)
     damping = (1 - sparse * sparse * (3 - 2 * sparse)) * deviation_of_mean(length_m / period[:, None])
-    weights, frame = weights.double(), frame.double()
-    contrast = finite_or(contrast.double(), 0.0).clamp(0, _MAX_CONTRAST)
+    weights, frame = field.weights.double(), field.frame.double()
+    contrast = finite_or(field.contrast.double(), 0.0).clamp(0, _MAX_CONTRAST)
     deviation = weights * (contrast / (VARIANCE * weights.square().sum(dim=1)).sqrt())[:, None]
     amplitude = deviation[:, :, None] * damping
     noise = noise_on_planes(
-        key,
+        field.key,
         rays,
         depths,
         periods=scales,
         planes=[sum(value < _SPARSEST * scale for value in apart) for scale in scales],
         amplitude=amplitude.to(dtype),
-        moved=wind.double() * frame[:, None],
-        turns=frame / decorrelation.double() * log_field_pace(contrast.square()),
+        moved=field.wind.double() * frame[:, None],
+        turns=frame / field.decorrelation.double() * log_field_pace(contrast.square()),
     )
     half_variance = VARIANCE / 2 * amplitude.square().sum(dim=1)
     return torch.expm1(noise - half_variance.to(dtype)[:, :, None, None])
@@ -300,7 +286,7 @@ def _weights(position: Tensor, nodes: int, dtype: torch.dtype) -> tuple[Tensor, 
 def _gradients(
     key: Tensor, first: Tensor, nodes: Sequence[Sequence[int]], turns: Tensor, *, dtype: torch.dtype
 ) -> list[list[Tensor]]:
-    """Of each octave the three components at a box of nodes, (N, nodes along z, along y, along x)."""
+    """The three components of each octave at a box of nodes, (N, nodes along z, along y, along x)."""
     numbers = []
     for i, counts in enumerate(nodes):
         x, y, z = (first[:, i, axis, None] + torch.arange(n, device=key.device) for axis, n in enumerate(counts))
@@ -386,8 +372,8 @@ def _interpolate_rows(view: View, volume: Tensor, distance: Tensor, reach: float
     row = torch.stack([lines[index + step] * weight[..., None] for step, weight in corners]).sum(dim=0)
     x, dx = _positions(view.width, view.cell, view.across, volume)
     finer = _cubic_weights(view.across, volume)
-    mean = exact_matmul(row, torch.lerp(finer[x], finer[x + 1], dx[:, None]).T) + 1
-    return mean.relu().unsqueeze(1)  # cubics overshoot where the contrast is high
+    mean = exact_matmul(row, torch.lerp(finer[x], finer[x + 1], dx[:, None]).T).add_(1)
+    return mean.relu_().unsqueeze(1)  # cubics overshoot where the contrast is high
 
 
 def _interpolate_pixels(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:

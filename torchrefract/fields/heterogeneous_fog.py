@@ -1,4 +1,4 @@
-"""Fog whose density varies over the image: the relative extinction q / <q> of Perlin noise."""
+"""Fog whose density varies over the image: an extinction k q / <q> with q a mix of Perlin noises."""
 
 from collections.abc import Sequence
 
@@ -61,7 +61,7 @@ def image_noise(
     # A list as an index would make a device wait.
     chosen = torch.stack([weights[:, i] for i in octaves], dim=1)
     if not stretch:
-        return perlin_noise(drawn, chosen * 0.5**0.5) + 0.5
+        return perlin_noise(drawn, chosen * 0.5**0.5).add_(0.5)
     one = torch.ones_like(chosen[:, :1])
     q = 0.0
     for octave, weight in zip(drawn, chosen.unbind(1), strict=True):
@@ -69,9 +69,15 @@ def image_noise(
     return torch.as_tensor(q)
 
 
-def relative_extinction(q: Tensor, *, mean: float | None) -> Tensor:
-    """Return q / <q>, (N, 1, H, W), with <q> the mean over each frame, or `mean` if it is given."""
-    return q / (q.mean(dim=(2, 3), keepdim=True) if mean is None else mean)
+def scale_to_mean(q: Tensor, k: Tensor, *, mean: float | None) -> Tensor:
+    """Return k q / <q>, with <q> the mean over each frame, or `mean` if it is given.
+
+    Args:
+        q: (N, 1, H, W).
+        k: (N, 1, 1, 1), 1/m, the mean extinction.
+        mean: <q>.
+    """
+    return q * (k / (q.mean(dim=(2, 3), keepdim=True) if mean is None else mean))
 
 
 def stretch_to_unit(noise: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor, rows_at_once
 from torchrefract._validation import eager_bool
-from torchrefract.cameras.distortion import (
+from torchrefract.cameras.brown_conrady import (
     Terms,
     distort_polynomial,
     distort_with_jacobian,

@@ -7,7 +7,6 @@ random lenses. That no lens of the ranges folds is proved.
 """
 
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor
-from torchrefract.cameras.distortion import POLYNOMIAL12, Terms, newton_iterates, used_terms
+from torchrefract.cameras.brown_conrady import POLYNOMIAL12, Terms, newton_iterates, used_terms
 from torchrefract.types import FlowBounds, Range, Simplification
 
 _SAFETY = 1.25
@@ -171,11 +170,10 @@ def cell_lines(height: int, width: int, num_levels: int) -> Tensor:
     offsets = torch.stack([torch.stack([line, middle], dim=1), torch.stack([middle, line], dim=1)])  # (2, 5, 2)
     points = []
     for stride in _LEVELS[:num_levels]:
-        columns, rows = (
-            np.linspace(0, max(math.ceil(side / stride) - 1, 0), _CELLS).round() for side in (width, height)
-        )
+        # The last cell lies worst if the border of the frame cuts it in the middle.
+        columns, rows = (np.linspace(0, max(side - 1 - stride / 2, 0), _CELLS) for side in (width, height))
         corners = torch.from_numpy(np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 1, 2))
-        points.append((stride * (corners + offsets)).reshape(-1, 2))
+        points.append((corners + stride * offsets).reshape(-1, 2))
     return torch.cat(points)
 
 
@@ -273,7 +271,7 @@ def _radii(ranges: LensRanges, height: int, width: int) -> np.ndarray:
     """Return for each level the radius of the disc on the plane z = 1 that its nodes lie in, for all lenses."""
     fx, aspect = ranges.focal[0], ranges.aspect[0]
     x, y = (max(map(abs, offset)) for offset in (ranges.center_x, ranges.center_y))
-    across, down = (np.ceil(side / _LEVELS) * _LEVELS + _LEVELS - (side - 1) / 2 for side in (width, height))
+    across, down = ((side - 1) / 2 + 2 * _LEVELS for side in (width, height))
     return np.hypot((across / width + x) / fx, (down / width + y) / (fx * aspect))
 
 
@@ -329,4 +327,4 @@ def _droppable(used: Sequence[bool], moved_px: Sequence[float], budget_px: float
 
 def _terms_with(kept: Sequence[int]) -> Terms:
     radial = max([0, *(i + 1 for i in kept if i < 6)])
-    return Terms(radial, any(i in (6, 7) for i in kept), any(i > 7 for i in kept), round=False)
+    return Terms(radial, any(i in (6, 7) for i in kept), any(i > 7 for i in kept))

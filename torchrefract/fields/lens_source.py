@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from torchrefract._validation import check_number
+from torchrefract.cameras.brown_conrady import POLYNOMIAL12
+from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.conversion import convert
-from torchrefract.cameras.distortion import POLYNOMIAL12
-from torchrefract.cameras.lens_table import read_lenses
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.lens_database import read_lenses
 from torchrefract.fields.lens_error import LensRanges
 from torchrefract.types import Range
 

@@ -22,10 +22,10 @@ _BLOCK = 32  # px; the pixels of a block are interpolated from the same nodes by
 class Octave(NamedTuple):
     """One octave of a frame: the gradients at its nodes and the positions of the pixels between them.
 
-    gradient: (N, 2, m, n), (g_x, g_y) at the nodes.
+    gradient: (N, 2, m, n), (g_x, g_y) at the nodes that pixels lie between.
     x: (N, W), float64, of each column of pixels, in cells; 0 is the first column of nodes.
     y: (N, H), float64, of each row of pixels, likewise.
-    step: cells between two pixels.
+    step: cells between two pixels, up to less than a cell.
     """
 
     gradient: Tensor
@@ -70,12 +70,21 @@ def draw_octave(
     phase = (2.0**-32 * key[:, :2].double() + _GOLDEN_RATIO * (index + 1)).frac()
     start = (0.5 - wind.double() * frame.double()[:, None]) / period + phase
     first = start.detach().floor()
+    step = 1 / period
     axes, nodes = [], [torch.full((len(key), 1), index, device=key.device)]
     for size, offset, node in zip((width, height), (start - first).unbind(1), first.long().unbind(1), strict=True):
-        axes.append(offset[:, None] + torch.arange(size, dtype=torch.float64, device=key.device) / period)
-        nodes.append(node[:, None] + torch.arange(math.ceil(size / period) + 2, device=key.device))
+        pixel = torch.arange(size, dtype=torch.float64, device=key.device)
+        position = offset[:, None] + step * pixel
+        if step < 2:
+            nodes.append(node[:, None] + torch.arange(math.ceil(size * step) + 2, device=key.device))
+        else:
+            # Pixels this far apart share no nodes; only the two nodes beside each are drawn.
+            before = position.detach().floor()
+            nodes.append(node[:, None] + torch.stack([before, before + 1], dim=2).long().flatten(1))
+            position = position - before + 2 * pixel
+        axes.append(position)
     angle = 2 * math.pi * _turns(key, nodes, frame=frame, decorrelation=decorrelation, dtype=dtype).mT
-    return Octave(torch.stack([angle.cos(), angle.sin()], dim=1), *axes, 1 / period)
+    return Octave(torch.stack([angle.cos(), angle.sin()], dim=1), axes[0], axes[1], min(step, 2.0))
 
 
 def perlin_noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
@@ -96,8 +105,11 @@ def perlin_noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
 
     Source: Perlin, "Improving noise", SIGGRAPH 2002.
     """
-    batch, height = octaves[0].y.shape
-    tables, indices, factors, row = list[Tensor](), list[Tensor](), list[Tensor](), 0
+    (batch, height), width = octaves[0].y.shape, octaves[0].x.shape[1]
+    tables: list[Tensor] = []
+    indices: list[Tensor] = []
+    factors: list[Tensor] = []
+    row = 0
     with torch.autocast(weights.device.type, enabled=False):  # it would round the products of matrices
         for octave, weight in zip(octaves, weights.unbind(1), strict=True):
             nodes = octave.gradient.shape[2]
@@ -109,7 +121,7 @@ def perlin_noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
             factors += [hat, hat * distance]
             row += 2 * nodes
         index = torch.cat(indices, dim=2) + row * torch.arange(batch, device=weights.device)[:, None, None]
-        lines = torch.cat(tables, dim=1).flatten(0, 1).index_select(0, index.flatten()).view(*index.shape, -1)
+        lines = torch.cat(tables, dim=1).flatten(0, 1).index_select(0, index.flatten()).view(*index.shape, width)
         noise = exact_matmul(torch.cat(factors, dim=2).mT, lines).flatten(1, 2)
     return noise[:, None, :height]
 

@@ -331,7 +331,7 @@ def even_transform(values: Tensor, dim: int, count: int) -> Tensor:
     most = values.shape[dim] - 1
     if torch.compiler.is_compiling():  # the compiler supports no complex numbers
         k, p = torch.arange(count, device=values.device)[:, None], torch.arange(most + 1, device=values.device)
-        cosine = (math.pi / max(most, 1) * (k * p).remainder(2 * most)).to(values.dtype).cos()
+        cosine = ((k * p).remainder(2 * most).to(values.dtype) * (math.pi / most)).cos()
         matrix = cosine * _multiplicity(most + 1, values.device, has_middle=True)
         return matrix @ values if dim == 1 else values @ matrix.mT
     if values.shape[0] == 0:  # PyTorch cannot transform empty batches

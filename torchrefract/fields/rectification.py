@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import check_positive
-from torchrefract.cameras.models import Camera
-from torchrefract.cameras.sheet import columns, image_of, on_plane, radius_within, ray_of
+from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.projection import columns, image_of, on_plane, radius_within, ray_of
 from torchrefract.fields import lens
 from torchrefract.fields.lens import REACH, border_on_plane, corner_radius, in_bands
 from torchrefract.fields.lens_error import cell_lines, flow_bounds

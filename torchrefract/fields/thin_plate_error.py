@@ -22,7 +22,7 @@ from torchrefract.types import FlowBounds, Range, Simplification
 
 _SIGMAS = 7.0  # the two components of the error are longer with a probability of exp(-_SIGMAS^2 / 2), 2e-11
 _DERIVATIVE_SIGMAS = 4.0  # errors and derivatives are not at their largest in the same place
-_SAFETY = 1.25
+_SAFETY, _GRADIENT_SAFETY = 1.25, 1.05
 _MAX_POINTS = 64  # at which errors are measured
 _LEVELS = np.array([2.0, 16.0, 64.0, 256.0])  # px, strides at which errors are measured
 _INSIDE = (1, 3, 5)  # positions in a cell, sixths
@@ -80,7 +80,7 @@ def _bounds(model: ThinPlateErrorModel, height: int, width: int) -> FlowBounds:
 
     return FlowBounds(
         _max_displacement(model),
-        steep * max(map(_gradient, splines)),
+        _GRADIENT_SAFETY * steep * max(map(_gradient, splines)),
         steep * max(map(_second_derivative, splines)),
         math.inf,
         interpolation_error,
@@ -95,12 +95,14 @@ class _UnitSplines(NamedTuple):
     scale: float  # px, of the unit
     weights: np.ndarray  # (P + 3, P): of the kernels and of 1, x, y, one column for each spline
     measured: np.ndarray  # (n, 2), px: some of the points
+    between: np.ndarray  # (n, 2), px: a lattice four times as fine, or some of it
 
 
 @lru_cache(maxsize=64)
 def _unit_splines(lattice: tuple[int, int], smoothing: float, height: int, width: int) -> _UnitSplines:
-    y, x = (np.linspace(0, max(size - 1, 1), count) for size, count in zip((height, width), lattice, strict=True))
-    at = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1).reshape(-1, 2)
+    at = _lattice_points(lattice, height, width)
+    rows, columns = lattice
+    between = _lattice_points((4 * rows - 3, 4 * columns - 3), height, width)
     center = at.mean(axis=0)
     scale = float(np.sqrt(((at - center) ** 2).sum(axis=1).mean()))
     unit = (at - center) / scale
@@ -108,13 +110,21 @@ def _unit_splines(lattice: tuple[int, int], smoothing: float, height: int, width
     kernel = _kernel(unit[:, None] - unit) + smoothing * np.eye(len(unit))
     system = np.block([[kernel, plane], [plane.T, np.zeros((3, 3))]])
     weights = np.linalg.solve(system, np.eye(len(unit) + 3))[:, : len(unit)]
-    chosen = np.unique(np.linspace(0, len(at) - 1, min(len(at), _MAX_POINTS)).round().astype(int))
-    return _UnitSplines(unit, center, scale, weights, at[chosen])
+    return _UnitSplines(unit, center, scale, weights, _choose(at, _MAX_POINTS), _choose(between, 4 * _MAX_POINTS))
+
+
+def _lattice_points(lattice: tuple[int, int], height: int, width: int) -> np.ndarray:
+    y, x = (np.linspace(0, max(size - 1, 1), count) for size, count in zip((height, width), lattice, strict=True))
+    return np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1).reshape(-1, 2)
+
+
+def _choose(points: np.ndarray, count: int) -> np.ndarray:
+    return points[np.unique(np.linspace(0, len(points) - 1, min(len(points), count)).round().astype(int))]
 
 
 def _deviation(splines: _UnitSplines, stride: float) -> float:
     """Measure the deviation of the largest error of cubics, for displacements of deviation 1."""
-    unit, center, scale, weights, measured = splines
+    unit, center, scale, weights, measured, _ = splines
     around = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
     offsets = np.arange(-1, 3)
     nodes = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
@@ -140,7 +150,7 @@ def _cubic_weights(t: float) -> np.ndarray:
 def _gradient(splines: _UnitSplines) -> float:
     """Measure the deviation of the largest gradient, for displacements of deviation 1."""
     pixel = np.array([[[1.0, 0.0]], [[-1.0, 0.0]], [[0.0, 1.0]], [[0.0, -1.0]]])
-    at = (splines.measured + pixel - splines.center) / splines.scale  # (4, n, 2)
+    at = (splines.between + pixel - splines.center) / splines.scale  # (4, n, 2)
     plane = np.concatenate([np.ones_like(at[..., :1]), at], axis=-1)
     right, left, down, up = np.concatenate([_kernel(at[:, :, None] - splines.points), plane], axis=-1) @ splines.weights
     gradients = np.stack([right - left, down - up]) / 2

@@ -91,14 +91,14 @@ def _bounds(model: RandomFieldErrorModel) -> FlowBounds:
             gradient = _NARROW_APERTURE * steep
             gradient *= gradient_rms(shortest, kind=model.covariance, aperture=narrowest).item()
         return FlowBounds(largest, gradient, math.inf, math.inf, lambda strides: np.full(np.shape(strides), np.inf))
-    derivatives = [steep * _derivative_rms(spectrum, order, is_stream=model.is_stream) for order in (1, 2, 3)]
+    first, second, third = (steep * _derivative_rms(spectrum, n, is_stream=model.is_stream) for n in (1, 2, 3))
 
     def interpolation_error(strides: np.ndarray) -> np.ndarray:
         spacing = np.multiply.outer(np.asarray(strides, dtype=float), spectrum.deviation)
         power = _cubic_error(spacing, is_stream=model.is_stream) @ spectrum.weight
         return _SKEW * spectrum.margin * largest * np.sqrt(power)
 
-    return FlowBounds(largest, *derivatives, interpolation_error)
+    return FlowBounds(largest, first, second, third, interpolation_error)
 
 
 @lru_cache(maxsize=256)

@@ -37,6 +37,7 @@ import numpy as np
 from torchrefract.planning.plan import ErrorModel, PlanRequest, WarpPlan, plan_warp
 from torchrefract.types import FlowBounds
 
+_CLOSED_FORM_SHARE = 0.05  # of the budget of the single flows, for each that drops terms only
 # px between the nodes of a composition, from coarse to fine
 _STRIDES = (16, 12, 10, 8, 6, 5, 4, 3, 2)
 # Shares of the tolerance that the single flows may use; the rest is for the lattice of the composition.
@@ -49,6 +50,7 @@ class PlannedWarp(NamedTuple):
 
     model: ErrorModel | None  # None if the warp must be computed exactly
     ulps: int
+    has_closed_form: bool  # the flow at a displaced point needs no lattice of its own
 
 
 @dataclass(frozen=True)
@@ -128,32 +130,49 @@ def plan_composition(warps: tuple[PlannedWarp, ...], request: PlanRequest) -> Co
     if all(warp.model is not None for warp in warps):
         for share in _SHARES:
             plans = _plan_shares(warps, request, share * request.remaining_px())
-            stride, error = _coarsest_stride(plans, request.tolerance_px, best.stride if best else 1)
+            stride, error = _coarsest_stride(warps, plans, request.tolerance_px, best.stride if best else 1)
             if stride > 1:
                 best = CompositionPlan(stride, tuple(plans), error, _composed_gradient(plans))
     if best is not None:
         return best
     plans = _plan_shares(warps, request, request.remaining_px())
-    pairs = zip(plans, _stretches(plans), strict=True)
-    error = _total([(plan.error_px * stretch, plan.is_random) for plan, stretch in pairs if plan.error_px > 0])
+    errors = [_own_error(plan, warp) for plan, warp in zip(plans, warps, strict=True)]
+    counted = zip(errors, _stretches(plans), plans, strict=True)
+    error = _total([(own * stretch, plan.is_random) for own, stretch, plan in counted if own > 0])
     return CompositionPlan(1, tuple(plans), error, _composed_gradient(plans))
 
 
 def _plan_shares(warps: Sequence[PlannedWarp], request: PlanRequest, budget_px: float) -> list[WarpPlan]:
-    """Plan each warp with an equal share of the budget, divided by how much the warps before it stretch its error."""
+    """Plan each warp with a share of the budget, divided by how much the warps before it stretch its error.
+
+    Warps with a lattice of their own have equal shares; those of independent random errors add as squares.
+    """
+    num_closed = sum(warp.has_closed_form for warp in warps)
+    lattices = [(1.0, warp.model is not None and warp.model.is_random) for warp in warps if not warp.has_closed_form]
+    closed_share = _CLOSED_FORM_SHARE if lattices else 1 / len(warps)
+    lattice_share = (1 - num_closed * closed_share) / max(_total(lattices), 1.0)
     plans: list[WarpPlan] = []
     stretch = 1.0
     for warp in warps:
-        share = replace(request, tolerance_px=budget_px / len(warps) / stretch, ulps=warp.ulps)
+        part = closed_share if warp.has_closed_form else lattice_share
+        # What a closed form drops has a small share, which need not cover the rounding as well.
+        share = replace(request, tolerance_px=part * budget_px / stretch, ulps=0 if warp.has_closed_form else warp.ulps)
         if math.isinf(stretch) or warp.model is None or not share.is_reachable:
             bounds = None if warp.model is None else warp.model.bounds(request.height, request.width)
             plan = replace(plan_warp(None, replace(share, tolerance_px=None)), bounds=bounds)
             plan = replace(plan, reason="its share of the tolerance is below rounding" if bounds else plan.reason)
         else:
             plan = plan_warp(warp.model, share)
+        if warp.has_closed_form and not plan.is_identity:
+            plan = replace(plan, node_error_px=plan.node_error_px + replace(request, ulps=warp.ulps).rounding_px)
         plans.append(plan)
         stretch *= 1 + _gradient(plan)
     return plans
+
+
+def _own_error(plan: WarpPlan, warp: PlannedWarp) -> float:
+    """Return the error of a flow at a displaced point."""
+    return plan.node_error_px if warp.has_closed_form and not plan.is_identity else plan.error_px
 
 
 def _gradient(plan: WarpPlan) -> float:
@@ -179,22 +198,24 @@ def _total(errors: Sequence[tuple[float, bool]]) -> float:
     )
 
 
-def _coarsest_stride(plans: Sequence[WarpPlan], tolerance_px: float, least: int) -> tuple[int, float]:
+def _coarsest_stride(
+    warps: Sequence[PlannedWarp], plans: Sequence[WarpPlan], tolerance_px: float, least: int
+) -> tuple[int, float]:
     """Return the largest stride above `least` at which the composed flow stays within the tolerance, and its error."""
     for stride in _STRIDES:
         if stride <= least:
             break
-        error = _composed_error(plans, stride)
+        error = _composed_error(warps, plans, stride)
         if error <= tolerance_px:
             return stride, error
     return 1, math.inf
 
 
-def _composed_error(plans: Sequence[WarpPlan], stride: int) -> float:
+def _composed_error(warps: Sequence[PlannedWarp], plans: Sequence[WarpPlan], stride: int) -> float:
     """Bound the error of a composed flow whose nodes are so many px apart; inf if there is no bound."""
     errors: list[tuple[float, bool]] = []
     cubic, later = _cubic(stride), _LaterFlows()
-    for plan, count in zip(reversed(plans), reversed(_stretches(plans)), strict=True):
+    for warp, plan, count in zip(reversed(warps), reversed(plans), reversed(_stretches(plans)), strict=True):
         if plan.is_identity:
             errors.append((plan.error_px * count, plan.is_random))
             continue
@@ -202,9 +223,10 @@ def _composed_error(plans: Sequence[WarpPlan], stride: int) -> float:
         if bounds is None or math.isinf(bounds.max_second_derivative) or later.second * stride**2 > _MAX_BEND_PX:
             return math.inf
         between = float(bounds.interpolation_error(np.array([stride * later.stretch]))[0])
-        # An exact composition interpolates earlier flows bilinearly between pixels.
-        bilinear = bounds.max_second_derivative / 4 if later.count else 0.0
-        node_error = cubic.amplification**2 * plan.error_px
+        # Flows without a closed form are interpolated bilinearly, here between nodes and if exact between pixels.
+        is_read = later.num_flows > 0 and not warp.has_closed_form
+        bilinear = bounds.max_second_derivative * (stride**2 + 1) / 4 if is_read else 0.0
+        node_error = cubic.amplification**2 * _own_error(plan, warp)
         errors.append(((node_error + between + bilinear) * count, plan.is_random))
         errors.append(((1 + cubic.amplification) * cubic.cross_error(bounds, later, stride) * count, False))
         later = later.after(bounds, stride)
@@ -214,7 +236,7 @@ def _composed_error(plans: Sequence[WarpPlan], stride: int) -> float:
 class _LaterFlows(NamedTuple):
     """Bounds of the flows that are evaluated first, together."""
 
-    count: int = 0
+    num_flows: int = 0
     stretch: float = 1.0  # 1 + the largest gradient
     second: float = 0.0  # px per px^2
     third: float = 0.0  # px per px^3
@@ -229,7 +251,7 @@ class _LaterFlows(NamedTuple):
         else:
             third = math.inf
         third = min(third, 2 * second / stride)
-        return _LaterFlows(self.count + 1, self.stretch * (1 + gradient), self.second + second, self.third + third)
+        return _LaterFlows(self.num_flows + 1, self.stretch * (1 + gradient), self.second + second, self.third + third)
 
 
 class _Cubic(NamedTuple):

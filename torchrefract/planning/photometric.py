@@ -68,7 +68,7 @@ class PhotometricRequest:
 
 @dataclass(frozen=True)
 class PhotometricPlan:
-    """How a photometric effect is computed for frames of one size.
+    """The computation of a photometric effect for frames of one size.
 
     height, width: px, of the frame.
     tolerance: largest error of the image that was requested, levels of 1/255; None is exact.
@@ -150,7 +150,7 @@ def plan_image_fog(model: FogErrorModel, request: PhotometricRequest) -> Photome
     With q = sum of w_i s_i, s_i in [0, 1], m = <q> and an optical thickness x, t = exp(-x q / m). Octaves of the total
     weight w that are replaced by their mean change q by e <= w / 2 and m by f, so that
 
-        |change of t| <= 1 - exp(-x e / (m - f)) + f / (m - f) max over y of y exp(-y)
+        |change of t| <= 1 - exp(-x e / (m - f)) + f / (m - f) max over y <= x / (m - f) of y exp(-y)
 
     f is 0 for the mean of the random field; over a frame it is the mean of the octaves, within 7 standard deviations.
     """
@@ -168,8 +168,9 @@ def plan_image_fog(model: FogErrorModel, request: PhotometricRequest) -> Photome
         weight = sum(model.weights[i] for i in dropped)
         mean = _NOISE_BOUND * min(_NOISE_BOUND * weight, _deviation_of_mean(model, dropped, request))
         smallest = lowest - mean
-        thick = min(model.thickness, 1e12)
-        return model.levels(-math.expm1(-thick * weight / 2 / smallest) + mean / smallest / math.e)
+        largest = min(model.thickness, 1e12) / smallest
+        y = min(1.0, largest)
+        return model.levels(-math.expm1(-largest * weight / 2) + mean / smallest * y * math.exp(-y))
 
     faintest = sorted(octaves, key=lambda i: model.weights[i])
     dropped: list[int] = []

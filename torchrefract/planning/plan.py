@@ -106,6 +106,7 @@ class WarpPlan:
     is_per_sample: True if each drawn sample gets a plan of its own where its values can be read.
     details: what the effect needs to compute the flow, from `Simplification.details`.
     bounds: of the flow; None if unknown.
+    node_error_px: part of the error that the flow has at the nodes already.
     num_samplings: how often the image is sampled.
     """
 
@@ -121,12 +122,8 @@ class WarpPlan:
     is_per_sample: bool = False
     details: Any = None
     bounds: FlowBounds | None = None
+    node_error_px: float = 0.0
     num_samplings: int = 1
-
-    @property
-    def lattice(self) -> Lattice:
-        """Return the lattice at whose nodes the flow is computed."""
-        return lattice_with_stride(self.height, self.width, self.stride)
 
     @property
     def is_identity(self) -> bool:
@@ -198,6 +195,7 @@ def plan_warp(model: ErrorModel | None, request: PlanRequest) -> WarpPlan:
         dropped=simplified.dropped,
         is_random=model.is_random,
         details=simplified.details,
+        node_error_px=simplified.error_px + request.rounding_px,
     )
 
 

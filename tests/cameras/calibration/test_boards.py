@@ -4,14 +4,15 @@ import pytest
 from torchrefract.cameras.calibration.boards import Charuco, Chessboard
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("legacy", [False, True])
 @pytest.mark.parametrize("squares", ["6x5", "5x8"])
-def test_a_charuco_board_is_black_where_opencv_draws_it_black(squares, legacy):
+def test_a_charuco_board_is_black_where_opencv_draws_black(squares, legacy):
     board = Charuco(squares=squares, square_mm=30, marker_mm=18, dictionary="DICT_4X4_50", legacy=legacy)
-    columns, rows = board.counts
-    drawn = board.opencv(legacy).generateImage((100 * columns, 100 * rows), marginSize=0)
+    columns, rows = board.num_squares
+    image = board.to_opencv(legacy=legacy).generateImage((100 * columns, 100 * rows), marginSize=0)
     y, x = np.mgrid[0 : 100 * rows, 0 : 100 * columns]
-    assert np.array_equal(board.is_black((x + 0.5) * 0.3, (y + 0.5) * 0.3), drawn == 0)
+    assert np.array_equal(board.is_black((x + 0.5) * 0.3, (y + 0.5) * 0.3), image == 0)
 
 
 def test_an_inverted_board_is_the_negative():
@@ -21,34 +22,24 @@ def test_an_inverted_board_is_the_negative():
 
 
 @pytest.mark.parametrize("board", [Charuco(), Chessboard(), Charuco(squares="5x8", legacy=True)], ids=str)
-def test_a_board_has_one_color_between_its_breaks(board):
-    (xs, ys), dice = board.breaks(), np.random.default_rng(0)
-    x = xs[:-1] + np.diff(xs) * dice.uniform(0.01, 0.99, (5, 1))
-    y = ys[:-1] + np.diff(ys) * dice.uniform(0.01, 0.99, (5, 1))
+def test_a_board_has_one_color_between_its_color_edges(board):
+    (xs, ys), generator = board.color_edges(), np.random.default_rng(0)
+    x = xs[:-1] + np.diff(xs) * generator.uniform(0.01, 0.99, (5, 1))
+    y = ys[:-1] + np.diff(ys) * generator.uniform(0.01, 0.99, (5, 1))
     middle = board.is_black(*np.meshgrid((xs[1:] + xs[:-1]) / 2, (ys[1:] + ys[:-1]) / 2))
     for row, column in zip(x, y, strict=True):
         assert np.array_equal(board.is_black(*np.meshgrid(row, column)), middle)
 
 
-def test_corners_are_those_of_opencvs_board():
+def test_corners_match_opencv():
     board = Charuco(squares="7x4", square_mm=25, marker_mm=15)
-    np.testing.assert_allclose(board.corners(), board.opencv(False).getChessboardCorners())
-    np.testing.assert_allclose(
-        board.corners(np.array([8, 0])), np.asarray(board.opencv(False).getChessboardCorners())[[8, 0]]
-    )
-
-
-def test_four_squares_cross_at_every_corner():
-    board = Chessboard(squares="9x6", square_mm=10)
-    x, y, _ = board.corners().T
-    around = [board.is_black(x + dx, y + dy) for dx, dy in ((1, 1), (-1, -1), (1, -1), (-1, 1))]
-    assert (around[0] == around[1]).all()
-    assert (around[2] == around[3]).all()
-    assert (around[0] != around[2]).all()
+    expected = np.asarray(board.to_opencv(legacy=False).getChessboardCorners())
+    np.testing.assert_allclose(board.corners(), expected)
+    np.testing.assert_allclose(board.corners(np.array([8, 0])), expected[[8, 0]])
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("options", "message"),
     [
         ({"squares": "11"}, "squares must be columns x rows, such as 11x8, got '11'"),
         ({"squares": "2x8"}, "squares must be from 3 to 100 in columns and rows, got 2x8"),
@@ -60,10 +51,10 @@ def test_four_squares_cross_at_every_corner():
         ({"inverted": None}, "inverted must be auto, true or false, got None"),
     ],
 )
-def test_a_wrong_definition_is_an_error(words, message):
+def test_invalid_boards_raise(options, message):
     with pytest.raises(ValueError, match=message):
-        Charuco(**words)
+        Charuco(**options)
 
 
-def test_a_description_is_the_words_of_the_command():
+def test_a_description_lists_the_options_of_the_command():
     assert Chessboard(squares="9x6", square_mm=10.5).describe() == "board=chessboard squares=9x6 square_mm=10.5"

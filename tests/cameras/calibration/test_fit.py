@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from torchrefract.cameras.calibration.boards import Chessboard
-from torchrefract.cameras.calibration.fit import Lens, errors_of, fit, held_out, rms
+from torchrefract.cameras.calibration.fit import Intrinsics, cross_validate, errors_in_best_pose, fit_camera, rms
 
 BOARD = Chessboard(squares="9x7", square_mm=25)
 SIZE = (800, 600)
@@ -16,73 +16,73 @@ VECTORS = {
 }
 
 
+@pytest.fixture(scope="module")
+def noisy(projected):
+    """Return views of opencv5 with noise of 0.3 px in x and in y."""
+    return projected(BOARD, MATRIX, np.array(VECTORS["opencv5"]), noise=0.3)
+
+
+@pytest.mark.quick
 @pytest.mark.parametrize("model", VECTORS)
-def test_a_known_camera_is_found_from_exact_corners(model, projected):
+def test_exact_corners_give_the_exact_camera(model, projected):
     views = projected(BOARD, MATRIX, np.array(VECTORS[model]), fisheye=model == "fisheye")
-    found = fit(views, BOARD, model=model, size=SIZE)
-    assert found.rms < 1e-3  # corners go to OpenCV as float32
-    np.testing.assert_allclose(found.lens.numbers[:4], MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]], rtol=1e-4)
-    if model != "opencv8":  # whose coefficients trade with one another
-        np.testing.assert_allclose(found.lens.numbers[4:], VECTORS[model], atol=1e-3)
-    assert found.lens.names[:5] == ("fx", "fy", "cx", "cy", "k1")
-    assert len(found.lens.names) == len(found.lens.numbers) == 4 + len(VECTORS[model])
+    fit = fit_camera(views, BOARD, model=model, size=SIZE)
+    assert fit.rms < 1e-3  # corners go to OpenCV as float32
+    np.testing.assert_allclose(fit.intrinsics.values[:4], MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]], rtol=1e-4)
+    if model != "opencv8":  # its coefficients are strongly correlated
+        np.testing.assert_allclose(fit.intrinsics.values[4:], VECTORS[model], atol=1e-3)
+    assert fit.intrinsics.names[:5] == ("fx", "fy", "cx", "cy", "k1")
+    assert len(fit.intrinsics.names) == len(fit.intrinsics.values) == 4 + len(VECTORS[model])
 
 
-def test_rms_and_deviations_are_those_of_opencv(projected):
-    views = projected(BOARD, MATRIX, np.array(VECTORS["opencv5"]), noise=0.2)
-    found = fit(views, BOARD, model="opencv5", size=SIZE)
-    objects = [BOARD.corners(view.ids).astype(np.float32) for view in views]
-    images = [view.corners.astype(np.float32) for view in views]
+def test_errors_and_deviations_match_opencv(noisy):
+    fit = fit_camera(noisy, BOARD, model="opencv5", size=SIZE)
+    objects = [BOARD.corners(view.ids).astype(np.float32) for view in noisy]
+    images = [view.corners.astype(np.float32) for view in noisy]
     theirs = cv2.calibrateCameraExtended(objects, images, SIZE, np.eye(3), np.zeros(5))
-    assert found.rms == pytest.approx(theirs[0], rel=1e-4)
-    np.testing.assert_allclose(found.deviations, theirs[5].ravel()[:9], rtol=1e-2)
-    per_view = [rms(errors) for errors in found.errors]
-    np.testing.assert_allclose(per_view, theirs[7].ravel(), rtol=1e-2)
+    assert fit.rms == pytest.approx(theirs[0], rel=1e-4)
+    np.testing.assert_allclose(fit.deviations, theirs[5].ravel()[:9], rtol=1e-2)
+    np.testing.assert_allclose([rms(errors) for errors in fit.errors], theirs[7].ravel(), rtol=1e-2)
 
 
-def test_deviations_tell_how_far_off_a_fisheye_is(projected):
-    truth = np.concatenate([MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]], VECTORS["fisheye"]])
+def test_deviations_of_a_fisheye_match_its_errors(projected):
+    exact = np.concatenate([MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]], VECTORS["fisheye"]])
     views = projected(BOARD, MATRIX, np.array(VECTORS["fisheye"]), noise=0.2, fisheye=True)
-    found = fit(views, BOARD, model="fisheye", size=SIZE)
-    assert (np.abs(found.lens.numbers - truth) < 4 * found.deviations).all()
-    assert (np.abs(found.lens.numbers - truth) > 0.01 * found.deviations).sum() >= 6
+    fit = fit_camera(views, BOARD, model="fisheye", size=SIZE)
+    assert (np.abs(fit.intrinsics.values - exact) < 4 * fit.deviations).all()
+    assert (np.abs(fit.intrinsics.values - exact) > 0.01 * fit.deviations).sum() >= 6
 
 
-def test_a_view_that_was_held_out_is_seen_in_its_best_pose(projected):
-    vector = np.array(VECTORS["opencv5"])
-    (view, *_) = projected(BOARD, MATRIX, vector, noise=0.3)
-    lens = Lens("opencv5", MATRIX, vector)
-    solved, turn, move = cv2.solvePnP(BOARD.corners(view.ids), view.corners, MATRIX, vector)
-    turn, move = cv2.solvePnPRefineLM(BOARD.corners(view.ids), view.corners, MATRIX, vector, turn, move)
-    theirs = view.corners - cv2.projectPoints(BOARD.corners(view.ids), turn, move, MATRIX, vector)[0].reshape(-1, 2)
+def test_the_best_pose_matches_opencv(noisy):
+    vector, view = np.array(VECTORS["opencv5"]), noisy[0]
+    corners = BOARD.corners(view.ids)
+    _, turn, move = cv2.solvePnP(corners, view.corners, MATRIX, vector)
+    turn, move = cv2.solvePnPRefineLM(corners, view.corners, MATRIX, vector, turn, move)
+    theirs = view.corners - cv2.projectPoints(corners, turn, move, MATRIX, vector)[0].reshape(-1, 2)
     start = np.concatenate([turn.ravel() + 0.05, move.ravel() + 5])
-    assert solved
-    np.testing.assert_allclose(errors_of(view, BOARD, lens, start), theirs, atol=1e-3)
+    errors = errors_in_best_pose(view, BOARD, Intrinsics("opencv5", MATRIX, vector), start)
+    np.testing.assert_allclose(errors, theirs, atol=1e-3)
 
 
-def test_errors_held_out_are_larger_than_those_of_a_fit(projected):
-    views = projected(BOARD, MATRIX, np.array(VECTORS["opencv5"]), noise=0.3)
-    found = fit(views, BOARD, model="opencv5", size=SIZE)
-    held = held_out(views, BOARD, found, size=SIZE, folds=3)
-    assert [len(errors) for errors in held] == [len(view.ids) for view in views]
-    # Noise of 0.3 px in x and in y.
-    assert found.rms < rms(np.concatenate(held)) < 1.3 * 0.3 * np.sqrt(2)
-    assert found.rms == pytest.approx(0.3 * np.sqrt(2), rel=0.1)
+def test_errors_of_held_out_views_are_larger_than_those_of_the_fit(noisy):
+    fit = fit_camera(noisy, BOARD, model="opencv5", size=SIZE)
+    held_out = cross_validate(noisy, BOARD, fit, size=SIZE, folds=3)
+    assert [len(errors) for errors in held_out] == [len(view.ids) for view in noisy]
+    assert fit.rms < rms(np.concatenate(held_out)) < 1.3 * 0.3 * np.sqrt(2)
+    assert fit.rms == pytest.approx(0.3 * np.sqrt(2), rel=0.1)
 
 
-def test_two_views_are_too_few(projected):
-    views = projected(BOARD, MATRIX, np.array(VECTORS["opencv5"]))[:2]
+def test_two_views_are_too_few(noisy):
     with pytest.raises(ValueError, match="views must be at least 3, got 2"):
-        fit(views, BOARD, model="opencv5", size=SIZE)
+        fit_camera(noisy[:2], BOARD, model="opencv5", size=SIZE)
 
 
-def test_a_fit_has_the_same_bits_every_time_and_leaves_opencv_its_threads(projected):
-    views = projected(BOARD, MATRIX, np.array(VECTORS["opencv5"]), noise=0.2)
+def test_a_fit_is_reproducible_and_restores_the_threads_of_opencv(noisy):
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
     try:
-        found = {fit(views, BOARD, model="opencv5", size=SIZE).lens.matrix.tobytes() for _ in range(15)}
+        matrices = {fit_camera(noisy, BOARD, model="opencv5", size=SIZE).intrinsics.matrix.tobytes() for _ in range(8)}
         assert cv2.getNumThreads() == 2
     finally:
         cv2.setNumThreads(before)
-    assert len(found) == 1
+    assert len(matrices) == 1

@@ -2,55 +2,49 @@ import numpy as np
 import pytest
 
 from torchrefract.cameras.calibration.boards import Chessboard
-from torchrefract.cameras.calibration.fit import fit
+from torchrefract.cameras.calibration.fit import fit_camera, rms
 from torchrefract.cameras.calibration.outliers import drop_outliers, leave_each_out
 
 BOARD = Chessboard(squares="9x7", square_mm=25)
-SIZE = (800, 600)
+OPTIONS = {"model": "opencv5", "size": (800, 600)}
 MATRIX = np.array([[700.0, 0, 405.0], [0, 702.0, 297.0], [0, 0, 1]])
-VECTOR = np.array([-0.2, 0.06, 0.002, -0.001, 0.01])
 
 
-def bent(view):
-    """The corners of a board that hangs through by 8 px."""
+@pytest.fixture(scope="module")
+def views(projected):
+    """Return nine views with noise of 0.2 px."""
+    return projected(BOARD, MATRIX, np.array([-0.2, 0.06, 0.002, -0.001, 0.01]), noise=0.2)
+
+
+def bend(view):
+    """Shift the corners as on a board that sags by 8 px."""
     x = view.corners[:, 0]
-    across = 2 * (x - x.min()) / (x.max() - x.min()) - 1
-    return view._replace(corners=view.corners + np.stack([0 * x, 8 * (1 - across**2)], axis=1))
+    t = 2 * (x - x.min()) / (x.max() - x.min()) - 1
+    return view._replace(corners=view.corners + np.stack([0 * x, 8 * (1 - t**2)], axis=1))
 
 
-def test_no_view_of_a_good_set_is_dropped(projected):
-    views = projected(BOARD, MATRIX, VECTOR, noise=0.2)
-    kept = drop_outliers(views, BOARD, model="opencv5", size=SIZE)
-    assert kept.dropped == {}
-    assert [view.name for view in kept.views] == [view.name for view in views]
-    assert [left.others for left in kept.ranking] == sorted(left.others for left in kept.ranking)
+def test_no_view_of_a_good_set_is_dropped(views):
+    selection = drop_outliers(views, BOARD, **OPTIONS)
+    assert selection.dropped == {}
+    assert [view.name for view in selection.views] == [view.name for view in views]
+    assert [result.others for result in selection.ranking] == sorted(result.others for result in selection.ranking)
 
 
-@pytest.mark.parametrize("bad", [(2,), (0, 7)])
-def test_a_planted_bad_view_is_dropped_and_named(projected, bad):
-    views = projected(BOARD, MATRIX, VECTOR, noise=0.2)
-    mixed = [bent(view) if i in bad else view for i, view in enumerate(views)]
-    kept = drop_outliers(mixed, BOARD, model="opencv5", size=SIZE)
-    assert set(kept.dropped) == {views[i].name for i in bad}
-    good = fit([view for i, view in enumerate(views) if i not in bad], BOARD, model="opencv5", size=SIZE)
-    np.testing.assert_allclose(kept.fitted.lens.numbers, good.lens.numbers, rtol=1e-6)
-    assert all(reason.startswith("held out it is off by ") for reason in kept.dropped.values())
+def test_bent_views_are_dropped_with_a_reason(views):
+    mixed = [bend(view) if i in (0, 7) else view for i, view in enumerate(views)]
+    selection = drop_outliers(mixed, BOARD, **OPTIONS)
+    assert set(selection.dropped) == {views[0].name, views[7].name}
+    good = fit_camera([view for i, view in enumerate(views) if i not in (0, 7)], BOARD, **OPTIONS)
+    np.testing.assert_allclose(selection.fit.intrinsics.values, good.intrinsics.values, rtol=1e-6)
+    assert all(reason.startswith("its error is ") for reason in selection.dropped.values())
+    assert len(drop_outliers(mixed, BOARD, **OPTIONS, max_share=0.15).dropped) == 1
+    assert drop_outliers(mixed, BOARD, **OPTIONS, max_share=0.0).dropped == {}
 
 
-def test_no_more_views_than_allowed_are_dropped(projected):
-    views = projected(BOARD, MATRIX, VECTOR, noise=0.2)
-    mixed = [bent(view) if i in (0, 7) else view for i, view in enumerate(views)]
-    assert len(drop_outliers(mixed, BOARD, model="opencv5", size=SIZE, most=0.15).dropped) == 1
-    assert drop_outliers(mixed, BOARD, model="opencv5", size=SIZE, most=0.0).dropped == {}
-
-
-def test_leaving_a_view_out_is_a_fit_to_the_others(projected):
-    views = projected(BOARD, MATRIX, VECTOR, noise=0.2)
-    fitted = fit(views, BOARD, model="opencv5", size=SIZE)
-    left = leave_each_out(views, BOARD, fitted, size=SIZE)[3]
-    alone = fit(views[:3] + views[4:], BOARD, model="opencv5", size=SIZE)
-    assert left.name == views[3].name
-    assert left.others == pytest.approx(alone.rms, rel=1e-5)
-    each = [float(np.sqrt((errors**2).sum(axis=1).mean())) for errors in alone.errors]
-    assert left.median == pytest.approx(float(np.median(each)), rel=1e-4)
-    assert left.limit >= 3 * left.median
+def test_leaving_a_view_out_is_a_fit_to_the_others(views):
+    result = leave_each_out(views, BOARD, fit_camera(views, BOARD, **OPTIONS), size=OPTIONS["size"])[3]
+    others = fit_camera(views[:3] + views[4:], BOARD, **OPTIONS)
+    assert result.name == views[3].name
+    assert result.others == pytest.approx(others.rms, rel=1e-5)
+    assert result.median == pytest.approx(float(np.median([rms(errors) for errors in others.errors])), rel=1e-4)
+    assert result.limit >= 3 * result.median

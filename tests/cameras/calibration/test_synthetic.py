@@ -4,25 +4,25 @@ import torch
 
 from torchrefract.cameras.calibration import synthetic
 from torchrefract.cameras.calibration.boards import Chessboard
-from torchrefract.cameras.calibration.synthetic import Rays, rays_of, render_views
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.calibration.synthetic import camera_rays, render_views
+from torchrefract.cameras.camera import Camera
 
 
-def test_rays_between_pixels_are_those_of_the_camera(small_camera):
-    where = np.zeros((small_camera.height, small_camera.width), dtype=bool)
-    where[5:395:13, 5:635:13] = True
-    found = rays_of(small_camera).between(where)
+def test_subpixel_rays_match_the_camera(small_camera):
+    mask = np.zeros((small_camera.height, small_camera.width), dtype=bool)
+    mask[5:395:13, 5:635:13] = True
+    points = camera_rays(small_camera).subpixel_points(mask)
     steps = (np.arange(6) + 0.5) / 6 - 0.5
-    y, x = np.nonzero(where)
+    y, x = np.nonzero(mask)
     u, v = x[:, None, None] + steps[None, None], y[:, None, None] + steps[None, :, None]
     pixels = torch.from_numpy(np.stack(np.broadcast_arrays(u, v), axis=-1).reshape(-1, 2))
     rays = small_camera.unproject(pixels).points.numpy()
-    exact = (rays[:, :2] / rays[:, 2:]).reshape(found.shape)
-    assert np.abs(found - exact).max() * small_camera.fx < 1e-2
-    assert np.abs(found - exact).mean() * small_camera.fx < 1e-3
+    exact = (rays[:, :2] / rays[:, 2:]).reshape(points.shape)
+    assert np.abs(points - exact).max() * small_camera.fx < 1e-2
+    assert np.abs(points - exact).mean() * small_camera.fx < 1e-3
 
 
-def test_a_pixel_is_the_share_of_black_in_it(monkeypatch):
+def test_a_pixel_is_the_mean_over_its_area(monkeypatch):
     # A pinhole in front of the board: 1 mm is 1 px, and squares of 10.5 px end in the middle of every second pixel.
     board = Chessboard(squares="6x4", square_mm=10.5)
     camera = Camera(width=90, height=70, fx=100.0, fy=100.0, cx=0.0, cy=0.0, coefficients=(0.0,) * 4)
@@ -30,7 +30,7 @@ def test_a_pixel_is_the_share_of_black_in_it(monkeypatch):
     monkeypatch.setattr(synthetic, "_pose", lambda *_: pose)
     monkeypatch.setattr(synthetic, "_NOISE", 0.0)
     _, picture, _ = next(render_views(board, camera, count=1))
-    # The share of each pixel by areas: along x and along y the parity is a product of signs.
+    # The exact mean over each pixel: the parity of squares is a product of signs along x and along y.
     edges = [np.clip(np.arange(n + 1) - 0.5 - start, 0, None) for n, start in ((90, 9.5), (70, 11.5))]
     waves = [np.diff(np.abs((edge + 10.5) % 21 - 10.5)) for edge in edges]
     x, y = slice(10, 9 + 63), slice(12, 11 + 42)
@@ -39,7 +39,8 @@ def test_a_pixel_is_the_share_of_black_in_it(monkeypatch):
     assert np.abs(picture[y, x] - expected).max() <= 1
 
 
-def test_the_board_goes_over_the_frame(small_board, small_camera):
+def test_the_board_moves_over_the_frame(small_board, small_camera, monkeypatch):
+    monkeypatch.setattr(synthetic, "_render", lambda *_: np.zeros((small_camera.height, small_camera.width)))
     middles = []
     for _, _, pose in render_views(small_board, small_camera, count=6):
         width, height = small_board.size_mm
@@ -49,4 +50,3 @@ def test_the_board_goes_over_the_frame(small_board, small_camera):
     x, y = np.array(middles).T
     np.testing.assert_allclose(sorted(set(x.round(6))), 0.04 + 0.92 * np.array([1, 3, 5]) / 6, atol=1e-5)
     np.testing.assert_allclose(sorted(set(y.round(6))), 0.04 + 0.92 * np.array([1, 3]) / 4, atol=1e-5)
-    assert isinstance(rays_of(small_camera), Rays)

@@ -1,5 +1,3 @@
-import pytest
-
 from torchrefract.cameras.io.colmap import read_colmap, write_colmap
 
 # The layout of COLMAP's documentation; parameters in the order of its camera models.
@@ -29,7 +27,7 @@ LENSES = {
 }
 
 
-def test_the_cameras_of_colmap_are_read_with_their_centers_half_a_pixel_up_and_left(tmp_path):
+def test_colmap_cameras_are_read_with_centers_half_a_pixel_lower(tmp_path):
     path = tmp_path / "cameras.txt"
     path.write_text(TEXT)
     cameras = read_colmap(path)
@@ -40,7 +38,7 @@ def test_the_cameras_of_colmap_are_read_with_their_centers_half_a_pixel_up_and_l
         assert (camera.cx, camera.cy) == ((camera.width - 1) / 2, (camera.height - 1) / 2)
 
 
-def test_what_is_written_has_the_layout_of_colmap_and_reads_back(tmp_path, make_camera):
+def test_written_files_have_the_layout_of_colmap_and_are_read_back(tmp_path, make_camera):
     path = tmp_path / "cameras.txt"
     cameras = {
         1: make_camera((0.0, 0.0, 0.0, 0.0)),
@@ -56,30 +54,3 @@ def test_what_is_written_has_the_layout_of_colmap_and_reads_back(tmp_path, make_
     assert [line[2:8] for line in lines] == [["640", "480", "510.25", "505.75", "323.0", "237.625"]] * 4
     write_colmap(path, {1: make_camera((-0.3, 0.1, 0.002, 0.0, 0.01))})
     assert read_colmap(path)[1] == make_camera((-0.3, 0.1, 0.002, 0.0, 0.01, 0.0, 0.0, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("line", "rule"),
-    [
-        ("1 FOV 640 480 500 505 320 240 0.9", "a camera model of SIMPLE_PINHOLE, .* got .* with FOV"),
-        ("1 THIN_PRISM_FISHEYE 640 480 1 1 1 1 0 0 0 0 0 0 0 0", "got .* with THIN_PRISM_FISHEYE"),
-        ("1 OPENCV 640 480 500 505 320 240 0.1", "path must hold 8 numbers as parameters of OPENCV, got .* with 5"),
-        ("1 PINHOLE 640", "a number, model, width and height in each line"),
-        ("1 PINHOLE 640.5 480 1 1 1 1", "path must hold a whole number as CAMERA_ID, WIDTH or HEIGHT"),
-        ("1 PINHOLE 640 480 1 x 1 1", "path must hold numbers as parameters of PINHOLE"),
-        ("1 PINHOLE 640 480 -1 1 1 1", "a camera, got .*cameras.txt: fx must be above 0"),
-        ("1 SIMPLE_RADIAL 640 480 500 320 240 nan", "coefficients must not be NaN"),
-    ],
-)
-def test_a_broken_file_is_named_with_what_is_wrong(line, rule, tmp_path):
-    path = tmp_path / "cameras.txt"
-    path.write_text(f"# Number of cameras: 1\n{line}\n")
-    with pytest.raises(ValueError, match=rule):
-        read_colmap(path)
-
-
-def test_what_colmap_has_no_name_for_raises(tmp_path, make_camera):
-    with pytest.raises(ValueError, match=r"model opencv or fisheye .* got division"):
-        write_colmap(tmp_path / "cameras.txt", {1: make_camera((-0.2,), "division")})
-    with pytest.raises(ValueError, match="camera must have at most 8 coefficients for this file"):
-        write_colmap(tmp_path / "cameras.txt", {1: make_camera((0.0,) * 8 + (0.1, 0.0, 0.0, 0.0))})

@@ -1,4 +1,3 @@
-import pytest
 import yaml
 
 from torchrefract.cameras.io.kalibr import read_kalibr, write_kalibr
@@ -32,7 +31,7 @@ cam2:
 """
 
 
-def test_a_chain_of_kalibr_is_read(tmp_path):
+def test_kalibr_chains_are_read(tmp_path):
     path = tmp_path / "camchain.yaml"
     path.write_text(TEXT)
     cameras = read_kalibr(path)
@@ -44,7 +43,7 @@ def test_a_chain_of_kalibr_is_read(tmp_path):
     assert (third.model, third.coefficients) == ("opencv", (0.0,) * 4)
 
 
-def test_what_is_written_has_the_layout_of_kalibr_and_reads_back(tmp_path, make_camera):
+def test_written_files_have_the_layout_of_kalibr_and_are_read_back(tmp_path, make_camera):
     path = tmp_path / "camchain.yaml"
     cameras = {
         "cam0": make_camera((-0.3, 0.1, 0.002, 1e-7)),
@@ -52,37 +51,8 @@ def test_what_is_written_has_the_layout_of_kalibr_and_reads_back(tmp_path, make_
     }
     write_kalibr(path, cameras)
     assert read_kalibr(path) == cameras
-    found, layout = yaml.safe_load(path.read_text()), yaml.safe_load(TEXT)
-    assert set(found["cam0"]) <= set(layout["cam0"])
-    assert [found[name]["distortion_model"] for name in cameras] == ["radtan", "equidistant"]
+    written, layout = yaml.safe_load(path.read_text()), yaml.safe_load(TEXT)
+    assert set(written["cam0"]) <= set(layout["cam0"])
+    assert [written[name]["distortion_model"] for name in cameras] == ["radtan", "equidistant"]
     write_kalibr(path, {"cam0": make_camera((-0.3, 0.1, 0.002, 0.0, 0.0))})
     assert read_kalibr(path)["cam0"] == make_camera((-0.3, 0.1, 0.002, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "rule"),
-    [
-        ("camera_model: pinhole", "camera_model: omni", "pinhole as the camera_model of cam0, got .* with 'omni'"),
-        ("radtan", "fov", "distortion_model of radtan, equidistant, none for cam0, got .* with 'fov'"),
-        ("[752, 480]", "[752]", "path must hold 2 numbers as resolution, got .* with 1"),
-        ("246.0]", "246.0, 1.0]", "path must hold 4 numbers as intrinsics"),
-        ("0.0001]", "]", "path must hold 4 numbers as distortion_coeffs, got .* with 3"),
-        ("-0.27", ".nan", "a camera, got .*camchain.yaml: coefficients must not be NaN"),
-        ("  intrinsics: [461.6, 460.1, 362.6, 246.0]\n", "", "path must hold intrinsics, got .* with cam_overlaps"),
-        ("cam0:\n", "units: px\ncam0:\n", "path must hold a camera as units, got .* with 'px'"),
-        ("[1]", "[1", "path must hold YAML"),
-    ],
-)
-def test_a_broken_file_is_named_with_what_is_wrong(old, new, rule, tmp_path):
-    path = tmp_path / "camchain.yaml"
-    assert old in TEXT
-    path.write_text(TEXT.replace(old, new, 1))
-    with pytest.raises(ValueError, match=rule):
-        read_kalibr(path)
-
-
-def test_what_kalibr_has_no_name_for_raises(tmp_path, make_camera):
-    with pytest.raises(ValueError, match=r"model opencv or fisheye .* got division"):
-        write_kalibr(tmp_path / "camchain.yaml", {"cam0": make_camera((-0.2,), "division")})
-    with pytest.raises(ValueError, match="camera must have at most 4 coefficients for this file"):
-        write_kalibr(tmp_path / "camchain.yaml", {"cam0": make_camera((-0.2, 0.0, 0.0, 0.0, 0.1))})

@@ -12,9 +12,9 @@ VECTORS = {
 }
 
 
-@pytest.mark.parametrize("ending", [".yaml", ".yml", ".xml"])
+@pytest.mark.parametrize("ending", [".yml", ".xml"])
 @pytest.mark.parametrize("name", VECTORS)
-def test_what_is_written_reads_back_here_and_by_opencv(name, ending, tmp_path, make_camera):
+def test_written_files_are_read_back_and_by_opencv(name, ending, tmp_path, make_camera):
     camera = make_camera(*VECTORS[name])
     path = tmp_path / f"camera{ending}"
     write_opencv(path, camera)
@@ -30,7 +30,7 @@ def test_what_is_written_reads_back_here_and_by_opencv(name, ending, tmp_path, m
 
 
 @pytest.mark.parametrize("ending", [".yaml", ".xml"])
-def test_what_opencv_writes_is_read(ending, tmp_path, make_camera):
+def test_files_written_by_opencv_are_read(ending, tmp_path, make_camera):
     camera = make_camera((-0.28, 0.17, 8e-4, -4e-20, -0.05))
     path = tmp_path / f"camera{ending}"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
@@ -44,60 +44,9 @@ def test_what_opencv_writes_is_read(ending, tmp_path, make_camera):
     assert read_opencv(path) == camera
 
 
-def test_a_file_is_replaced_whole_and_nothing_is_left_beside_it(tmp_path, make_camera):
+def test_a_file_is_replaced_atomically(tmp_path, make_camera):
     path = tmp_path / "camera.yaml"
     path.write_text("old")
     write_opencv(path, make_camera((0.0,) * 4))
     assert [entry.name for entry in tmp_path.iterdir()] == ["camera.yaml"]
     assert read_opencv(path) == make_camera((0.0,) * 4)
-
-
-HEAD = "%YAML:1.0\n---\nimage_width: 64\nimage_height: 48\n"
-MATRIX = (
-    "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
-    "   data: [ 5., {skew}, 3., 0., 5., 4., 0., 0., 1. ]\n"
-)
-LENS = "distortion_coefficients: !!opencv-matrix\n   rows: {n}\n   cols: 1\n   dt: d\n   data: [ {data} ]\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "rule"),
-    [
-        ("%YAML:1.0\n---\nimage_width: [64\n", "path must hold YAML, got .*camera.yaml: while parsing"),
-        ("just words", "path must hold a mapping of names to values"),
-        ("%YAML:1.0\n---\nimage_height: 48\n", "path must hold image_width, got .* with image_height"),
-        (HEAD, "path must hold camera_matrix"),
-        (HEAD.replace("64", "64.5"), "path must hold a whole number as image_width, got .* with 64.5"),
-        (HEAD.replace("64", "wide"), "path must hold numbers as image_width, got .* with .'wide'"),
-        (HEAD + "camera_matrix: 7\n", "path must hold a matrix as camera_matrix"),
-        (HEAD + MATRIX.format(skew="x"), "path must hold numbers as camera_matrix"),
-        (HEAD + MATRIX.format(skew="0., 1."), "path must hold 9 numbers as camera_matrix, got .* with 10"),
-        (HEAD + MATRIX.format(skew="0.5"), "camera_matrix without skew, got .* with skew 0.5"),
-        (HEAD + MATRIX.format(skew="0."), "path must hold distortion_coefficients"),
-        (HEAD + MATRIX.format(skew="0.") + LENS.format(n=2, data="0., 0."), "a camera, got .*: coefficients must be 4"),
-        (HEAD + MATRIX.format(skew="0.") + LENS.format(n=4, data="0., .nan, 0., 0."), "coefficients must not be NaN"),
-    ],
-)  # fmt: skip  # one line for each file
-def test_a_broken_file_is_named_with_what_is_wrong(text, rule, tmp_path):
-    path = tmp_path / "camera.yaml"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=rule):
-        read_opencv(path)
-
-
-def test_broken_xml_is_named(tmp_path):
-    path = tmp_path / "camera.xml"
-    path.write_text("<opencv_storage><image_width>64")
-    with pytest.raises(ValueError, match=r"path must hold XML, got .*camera.xml: "):
-        read_opencv(path)
-    path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ValueError, match="path must hold text in UTF-8"):
-        read_opencv(path)
-
-
-def test_what_opencv_has_no_name_for_raises(tmp_path, make_camera):
-    with pytest.raises(ValueError, match=r"camera must be of the model opencv or fisheye .* got division"):
-        write_opencv(tmp_path / "camera.yaml", make_camera((-0.2,), "division"))
-    with pytest.raises(ValueError, match=r"path must end in .xml, .yml or .yaml, got .*camera.txt"):
-        write_opencv(tmp_path / "camera.txt", make_camera((0.0,) * 4))
-    assert not list(tmp_path.iterdir())

@@ -13,22 +13,22 @@ SIZE = (32, 48)
 
 @pytest.fixture(scope="session")
 def frames(tmp_path_factory) -> Path:
-    """Twelve pictures of three drives, with waves and with grain, each its own."""
+    """Write twelve different images of three drives, with waves and noise."""
     root = tmp_path_factory.mktemp("frames")
-    dice = np.random.default_rng(0)
+    generator = np.random.default_rng(0)
     y, x = np.mgrid[: SIZE[0], : SIZE[1]]
     for number in range(12):
         waves = [np.sin(x / (5 + number % 3) + c + number) * np.cos(y / 6 - c) for c in range(3)]
         path = root / f"drive{number // 4}" / f"{number:03d}.png"
         path.parent.mkdir(exist_ok=True)
-        pixels = 127 + 90 * np.stack(waves, axis=2) + dice.uniform(-30, 30, (*SIZE, 3))
+        pixels = 127 + 90 * np.stack(waves, axis=2) + generator.uniform(-30, 30, (*SIZE, 3))
         Image.fromarray(pixels.round().astype(np.uint8)).save(path)
     return root
 
 
 @pytest.fixture(scope="session")
 def words(frames) -> Callable[..., tuple[str, ...]]:
-    """The words of the command for the frames, made in the process that is asked, unless others are given."""
+    """Return the options of the command for the frames; without workers, unless they are given."""
 
     def of(out: Path | str, *more: str, scene: str = "paper_refractive") -> tuple[str, ...]:
         chosen = (f"scene={scene}", "scene.width=192") if scene == "paper_refractive" else (f"scene={scene}",)
@@ -39,7 +39,7 @@ def words(frames) -> Callable[..., tuple[str, ...]]:
 
 @pytest.fixture(scope="session")
 def sums() -> Callable[[Path], dict[str, str]]:
-    """The checksum of each file of a set, hidden ones too."""
+    """Return the checksum of each file of a set, hidden ones included."""
 
     def of(out: Path) -> dict[str, str]:
         files = sorted(path for path in out.rglob("*") if path.is_file())
@@ -50,5 +50,5 @@ def sums() -> Callable[[Path], dict[str, str]]:
 
 @pytest.fixture(scope="session")
 def rows() -> Callable[[Path], list[Any]]:
-    """The rows of a manifest, as JSON has them."""
+    """Return the rows of a manifest as JSON documents."""
     return lambda out: [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]

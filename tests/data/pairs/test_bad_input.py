@@ -1,4 +1,4 @@
-"""What a user can mend is said in one line, and nothing is spoiled."""
+"""Errors that a user can fix are one line, and existing files stay."""
 
 import os
 import re
@@ -11,27 +11,27 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from torchrefract.data.pair_files import DamagedPairError
-from torchrefract.data.paired_folder import PairedFolder
+from torchrefract.data.pairs.dataset import PairedFolder
+from torchrefract.data.pairs.files import DamagedPairError
 
 
 @pytest.fixture
 def disk(tmp_path) -> Iterator[Callable[[str], Path]]:
-    """Mounts a small file system of its own, with some options."""
+    """Mount a small file system with some options."""
     mounted = list[Path]()
 
     def mount(options: str) -> Path:
-        place = tmp_path / "disk"
-        place.mkdir()
+        folder = tmp_path / "disk"
+        folder.mkdir()
         tool = shutil.which("mount")
-        if tool is None or subprocess.run([tool, "-t", "tmpfs", "-o", options, "none", place], check=False).returncode:
+        if tool is None or subprocess.run([tool, "-t", "tmpfs", "-o", options, "none", folder], check=False).returncode:
             pytest.skip("needs the right to mount a tmpfs")
-        mounted.append(place)
-        return place
+        mounted.append(folder)
+        return folder
 
     yield mount
-    for place in mounted:
-        subprocess.run(["umount", place], check=True)
+    for folder in mounted:
+        subprocess.run(["umount", folder], check=True)
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def disk(tmp_path) -> Iterator[Callable[[str], Path]]:
         ("count=0", "count: count must be at least 1, got 0"),
         ("size=[0,4]", "size: size must be at least 1, got 0"),
         ("size=[400,400]", "source: frames must be at least size = 400x400"),
-        ("source=nowhere", "source must be a folder of pictures or videos, or a video, got nowhere, which does not"),
+        ("source=nowhere", "source must be a folder of images or videos, or a video, got nowhere, which does not"),
         ("shards=2", "shard must be given together with shards, got None of 2"),
         ("tar=0", "tar: tar must be at least 1, got 0"),
         ("workers=-1", "workers: workers must be at least 0, got -1"),
@@ -54,24 +54,24 @@ def disk(tmp_path) -> Iterator[Callable[[str], Path]]:
         ("scene.severity=9", "scene: severity must be one of 1, 2, 3, 4, 5, got 9"),
     ],
 )
-def test_a_wrong_word_is_refused_before_anything_is_written(call, words, tmp_path, word, message):
-    kept = [own for own in words("out") if own.partition("=")[0] != word.partition("=")[0]]
+def test_an_invalid_option_raises_before_anything_is_written(call, words, tmp_path, word, message):
+    kept = [option for option in words("out") if option.partition("=")[0] != word.partition("=")[0]]
     assert message in call("generate", *kept, word).message
     assert not (tmp_path / "out").exists()
 
 
-def test_a_shard_beyond_the_last_is_refused(call, words):
+def test_a_shard_beyond_the_last_raises(call, words):
     assert call("generate", *words("out", "shards=2", "shard=2")).message == "shard must be below shards = 2, got 2"
 
 
-def test_without_a_license_or_a_scene_there_are_no_pairs(call, words):
+def test_a_license_and_a_scene_are_required(call, words):
     kept = words("out")
     without = [word for word in kept if not word.startswith("license=")]
     assert call("generate", *without).message == "license must be given, as in license=…, got nothing"
     assert "scene" in call("generate", *(word for word in kept if not word.startswith("scene"))).message
 
 
-def test_a_folder_of_another_configuration_is_refused_with_the_difference(call, words, tmp_path, sums):
+def test_a_folder_of_another_configuration_raises_with_the_differences(call, words, tmp_path, sums):
     assert call("generate", *words("out", "count=12")).code == 0
     before = sums(tmp_path / "out")
     message = call("generate", *words("out", "count=12", "seed=5", "scene.severity=2")).message
@@ -79,19 +79,19 @@ def test_a_folder_of_another_configuration_is_refused_with_the_difference(call, 
     assert sums(tmp_path / "out") == before
 
 
-def test_a_folder_of_something_else_is_refused(call, words, tmp_path):
+def test_a_folder_with_other_files_raises(call, words, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("words")
     message = call("generate", *words("out")).message
     assert message == "out must be a new folder or one of this command, got out, which holds thesis.tex"
 
 
-def test_pairs_are_not_written_among_their_sources(call, words, frames):
+def test_an_output_folder_inside_the_source_raises(call, words, frames):
     assert "out must lie outside of source" in call("generate", *words(frames / "pairs")).message
     assert not (frames / "pairs").exists()
 
 
-def test_sources_that_changed_are_noticed(call, words, frames, tmp_path):
+def test_changed_sources_raise(call, words, frames, tmp_path):
     shutil.copytree(frames, tmp_path / "frames")
     arguments = [word for word in words("out") if not word.startswith("source=")]
     assert call("generate", *arguments, "source=frames").code == 0
@@ -100,7 +100,7 @@ def test_sources_that_changed_are_noticed(call, words, frames, tmp_path):
     assert re.search(r"frames is 12 there and 11 here, sources is \w+ there", message)
 
 
-def test_a_frame_that_cannot_be_decoded_is_left_out_and_said(call, words, frames, tmp_path, rows):
+def test_an_undecodable_frame_is_skipped_and_reported(call, words, frames, tmp_path, rows):
     shutil.copytree(frames, tmp_path / "frames")
     path = tmp_path / "frames" / "drive1" / "005.png"
     data = bytearray(path.read_bytes())
@@ -108,7 +108,7 @@ def test_a_frame_that_cannot_be_decoded_is_left_out_and_said(call, words, frames
     path.write_bytes(data)
     arguments = [*(word for word in words("out") if not word.startswith("source=")), "source=frames"]
     outcome = call("generate", *arguments)
-    assert "11 there, 1 frames could not be read" in outcome.out
+    assert "11 in total, 1 frames are unreadable" in outcome.out
     (row,) = [row for row in rows(tmp_path / "out") if row["skipped"]]
     assert row["source"] == "drive1/005.png"
     assert row["skipped"].startswith("drive1/005.png is damaged")
@@ -117,52 +117,47 @@ def test_a_frame_that_cannot_be_decoded_is_left_out_and_said(call, words, frames
     assert ": 0 pairs made" in call("generate", *arguments).out
 
 
-def test_links_that_make_a_loop_do_not_hang(call, words, frames, tmp_path):
-    shutil.copytree(frames, tmp_path / "frames")
-    (tmp_path / "frames" / "drive0" / "loop").symlink_to(tmp_path / "frames", target_is_directory=True)
-    arguments = [word for word in words("out") if not word.startswith("source=")]
-    assert ": 12 pairs made" in call("generate", *arguments, "source=frames").out
+def test_a_disk_that_is_too_small_raises_before_a_pair_is_written(call, words, disk):
+    folder = disk("size=64k")
+    message = call("generate", *words(folder / "out")).message
+    assert message.startswith("out must have enough space, got too little: 12 pairs take about")
+    assert not list(folder.rglob("*.png"))
 
 
-def test_a_disk_that_is_too_small_is_refused_beforehand(call, words, disk):
-    place = disk("size=64k")
-    message = call("generate", *words(place / "out")).message
-    assert message.startswith("out must have room, got too little: 12 pairs take about")
-    assert not list(place.rglob("*.png"))
-
-
-def test_a_disk_that_becomes_full_leaves_whole_pairs_and_a_run_that_goes_on(call, words, disk, sums, monkeypatch):
-    place = disk("size=256k")
-    monkeypatch.setattr("torchrefract.generate._check_room", lambda *_: None)  # as where others write to the disk
-    message = call("generate", *words(place / "out")).message
+def test_a_disk_that_becomes_full_keeps_complete_pairs_and_the_run_continues(call, words, disk, sums, monkeypatch):
+    folder = disk("size=256k")
+    monkeypatch.setattr(
+        "torchrefract.cli.generation._check_disk", lambda *_: None
+    )  # as if another process filled the disk
+    message = call("generate", *words(folder / "out")).message
     assert "no space left on device" in message
-    assert "the same command goes on" in message
-    pictures = list(place.rglob("*.clean.png"))
+    assert "the same command continues" in message
+    pictures = list(folder.rglob("*.clean.png"))
     assert 0 < len(pictures) < 12
     assert all(np.asarray(Image.open(path)).shape == (32, 48, 3) for path in pictures)
-    assert not list(place.rglob("*.part"))
-    subprocess.run(["mount", "-o", "remount,size=8m", place], check=True)
-    assert call("generate", *words(place / "out")).code == 0
+    assert not list(folder.rglob("*.part"))
+    subprocess.run(["mount", "-o", "remount,size=8m", folder], check=True)
+    assert call("generate", *words(folder / "out")).code == 0
     assert call("generate", *words("out")).code == 0
-    assert sums(place / "out") == sums(Path("out"))
+    assert sums(folder / "out") == sums(Path("out"))
 
 
-def test_a_run_that_is_interrupted_says_how_to_go_on(call, words, monkeypatch):
+def test_an_interrupted_run_prints_how_to_continue(call, words, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchrefract.generate.run", interrupted)
+    monkeypatch.setattr("torchrefract.cli.generation.generate_pairs", interrupted)
     outcome = call("generate", *words("out"))
     assert (outcome.code, outcome.err) == (130, "")
-    assert outcome.out.endswith("stopped; the same command goes on\n")
+    assert outcome.out.endswith("stopped; the same command continues\n")
 
 
-def test_a_folder_that_cannot_be_written_to_is_said(call, words, disk):
-    place = disk("ro,size=64k")
-    assert "Read-only file system" in call("generate", *words(place / "out")).message
+def test_a_read_only_folder_raises(call, words, disk):
+    folder = disk("ro,size=64k")
+    assert "Read-only file system" in call("generate", *words(folder / "out")).message
 
 
-def test_an_output_that_is_a_file_is_said(call, words, tmp_path):
+def test_a_file_as_output_folder_raises(call, words, tmp_path):
     (tmp_path / "out").write_text("")
     assert (
         "out must be a folder that can be written to, got out (File exists)" in call("generate", *words("out")).message
@@ -172,15 +167,15 @@ def test_an_output_that_is_a_file_is_said(call, words, tmp_path):
 @pytest.mark.parametrize(
     "path", ["../secret.png", "/etc/hostname", "pairs/../../x.clean.png", "pairs/00000\\\\x.png", "pairs/0/a/b.png"]
 )
-def test_a_manifest_that_leads_elsewhere_is_refused(call, words, tmp_path, path):
+def test_a_manifest_with_paths_outside_of_the_set_raises(call, words, tmp_path, path):
     assert call("generate", *words("out", "count=2")).code == 0
     manifest = tmp_path / "out" / "manifest.jsonl"
     manifest.write_text(manifest.read_text().replace("pairs/00000/00000001.clean.png", path))
-    with pytest.raises(DamagedPairError, match="files must lie in pairs/ or tars/ beside the manifest, got"):
+    with pytest.raises(DamagedPairError, match="files must lie in pairs/ or tars/ of the set, got"):
         PairedFolder(tmp_path / "out")
 
 
-def test_a_damaged_pair_is_named_with_the_way_out(call, words, tmp_path):
+def test_a_damaged_pair_raises_with_the_remedy(call, words, tmp_path):
     assert call("generate", *words("out", "count=2")).code == 0
     os.truncate(tmp_path / "out" / "pairs/00000/00000001.flow.png", 0)
     os.truncate(tmp_path / "out" / "pairs/00000/00000001.restore_flow.png", 30)
@@ -188,6 +183,6 @@ def test_a_damaged_pair_is_named_with_the_way_out(call, words, tmp_path):
         PairedFolder(tmp_path / "out")[1]
 
 
-def test_a_folder_without_pairs_is_no_data_set(tmp_path):
+def test_a_folder_without_pairs_raises(tmp_path):
     with pytest.raises(ValueError, match=r"root must be a folder with manifest\.jsonl, got"):
         PairedFolder(tmp_path)

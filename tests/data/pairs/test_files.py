@@ -1,4 +1,4 @@
-"""Pairs on disk are opened without our code, and hold what the effect made."""
+"""Other programs open the files of pairs, which hold the results of the effect."""
 
 import io
 import json
@@ -14,7 +14,7 @@ from PIL import Image
 from safetensors.numpy import load_file
 
 from torchrefract import presets, warp
-from torchrefract.data.frame_folder import FrameFolder
+from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import read_image
 
 COUNT = 10
@@ -22,19 +22,19 @@ COUNT = 10
 
 @pytest.fixture
 def refractive(call, words, tmp_path) -> Path:
-    """Ten pairs of warps as files."""
+    """Write ten pairs of warps as files."""
     assert call("generate", *words("out", f"count={COUNT}")).code == 0
     return tmp_path / "out"
 
 
 def made_again(row, frames, effect):
-    """What the row says of a pair, made of its source alone."""
+    """Make a pair again from its row and its source."""
     clean = read_image(frames / row["source"])[None].contiguous()
     return clean, effect.degrade(clean, seed=row["seed"], keys=[row["key"]])
 
 
 def kitti(path: Path):
-    """Flow and mask as the KITTI benchmark's kit defines them, u, v, valid in red, green, blue."""
+    """Read flow and mask as the kit of the KITTI benchmark does: u, v, valid in red, green, blue."""
     stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert stored is not None
     assert stored.dtype == np.uint16
@@ -47,7 +47,7 @@ def psnr(image, clean, valid):
     return -10 * math.log10(float(error))
 
 
-def test_flows_as_opencv_reads_them_are_within_a_hundredth_of_a_pixel(refractive, rows, frames):
+def test_flows_read_by_opencv_agree_within_a_hundredth_of_a_pixel(refractive, rows, frames):
     effect, seen = presets.paper_refractive(width=192), set()
     for row in rows(refractive):
         _, d = made_again(row, frames, effect)
@@ -61,7 +61,7 @@ def test_flows_as_opencv_reads_them_are_within_a_hundredth_of_a_pixel(refractive
     assert len(seen) >= 3
 
 
-def test_pictures_as_pillow_reads_them_are_those_of_the_effect_in_8_bits(refractive, rows, frames):
+def test_images_read_by_pillow_are_those_of_the_effect_in_8_bits(refractive, rows, frames):
     for row in rows(refractive):
         clean, d = made_again(row, frames, presets.paper_refractive(width=192))
         for name, image in (("clean", clean), ("corrupted", d.image)):
@@ -69,7 +69,7 @@ def test_pictures_as_pillow_reads_them_are_those_of_the_effect_in_8_bits(refract
             assert np.abs(pixels / 255 - image[0].permute(1, 2, 0).numpy()).max() <= 0.5 / 255 + 1e-6
 
 
-def test_restoring_from_disk_is_as_good_as_on_the_fly(refractive, rows, frames):
+def test_restoring_from_files_is_as_accurate_as_on_the_fly(refractive, rows, frames):
     for row in rows(refractive):
         clean, d = made_again(row, frames, presets.paper_refractive(width=192))
         flow, valid = kitti(refractive / row["files"]["restore_flow.png"]["path"])
@@ -81,7 +81,7 @@ def test_restoring_from_disk_is_as_good_as_on_the_fly(refractive, rows, frames):
         assert abs(stored - live) <= 0.3
 
 
-def test_light_is_stored_in_16_bits(call, words, rows, frames, tmp_path):
+def test_transmission_and_intensity_have_16_bits(call, words, rows, frames, tmp_path):
     assert call("generate", *words("out", f"count={COUNT}", scene="paper_weather")).code == 0
     for row in rows(tmp_path / "out"):
         _, d = made_again(row, frames, presets.paper_weather())
@@ -108,7 +108,7 @@ def test_a_composition_has_both_flows_and_light(call, words, rows, frames, tmp_p
 
 
 @pytest.mark.parametrize("form", ["npz", "safetensors"])
-def test_maps_in_full_precision_are_read_by_their_own_libraries(call, words, rows, frames, tmp_path, form):
+def test_npz_and_safetensors_hold_maps_in_full_precision(call, words, rows, frames, tmp_path, form):
     assert call("generate", *words("out", "count=3", f"maps={form}")).code == 0
     for row in rows(tmp_path / "out"):
         _, d = made_again(row, frames, presets.paper_refractive(width=192))
@@ -119,9 +119,9 @@ def test_maps_in_full_precision_are_read_by_their_own_libraries(call, words, row
             assert np.array_equal(value, getattr(d, name)[0].numpy().reshape(value.shape)), name
 
 
-@pytest.mark.filterwarnings("ignore::ResourceWarning")  # webdataset leaves its tars to the garbage collector to close,
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # where pytest wraps the same warning
-def test_tars_are_read_by_webdataset(call, words, rows, sums, tmp_path):
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # webdataset does not close its tars,
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # and pytest wraps the same warning
+def test_webdataset_reads_tars(call, words, rows, sums, tmp_path):
     assert call("generate", *words("tars", "count=7", "tar=3")).code == 0
     assert call("generate", *words("files", "count=7")).code == 0
     urls = sorted(str(path) for path in (tmp_path / "tars" / "tars").glob("*.tar"))
@@ -136,43 +136,43 @@ def test_tars_are_read_by_webdataset(call, words, rows, sums, tmp_path):
         assert np.asarray(Image.open(io.BytesIO(sample["clean.png"]))).shape == (32, 48, 3)
 
 
-def test_a_row_makes_its_pair_again_and_has_every_parameter(refractive, rows, frames):
+def test_a_row_has_every_parameter_of_its_effect(refractive, rows, frames):
     row = next(row for row in rows(refractive) if row["effects"][0]["effect"] == "LensDistortion")
     _, d = made_again(row, frames, presets.paper_refractive(width=192))
     lens = d.params.children[0]
-    (found,) = row["effects"]
-    assert set(found) == {"effect", *lens._fields} - {"gate"}
-    assert found["coefficients"] == lens.coefficients[0].tolist()
+    (effect,) = row["effects"]
+    assert set(effect) == {"effect", *lens._fields} - {"applied"}
+    assert effect["coefficients"] == lens.coefficients[0].tolist()
     assert (row["height"], row["width"]) == (32, 48)
 
 
-def test_splits_are_those_of_the_folder_and_no_drive_is_in_both(refractive, rows, frames):
-    found = {row["source"]: row["split"] for row in rows(refractive)}
+def test_splits_are_those_of_frame_folder(refractive, rows, frames):
+    splits = {row["source"]: row["split"] for row in rows(refractive)}
     for split in ("train", "val"):
         folder = FrameFolder(frames, size=(32, 48), split=split)
         expected = {path.relative_to(frames).as_posix() for path in folder.paths}
-        assert {source for source, own in found.items() if own == split} <= expected
+        assert {source for source, name in splits.items() if name == split} <= expected
     drives = {split: {row["drive"] for row in rows(refractive) if row["split"] == split} for split in ("train", "val")}
     assert drives["train"]
     assert drives["val"]
     assert not drives["train"] & drives["val"]
 
 
-def test_the_card_counts_what_is_there_and_states_the_license(refractive, rows):
+def test_the_card_has_counts_and_the_license(refractive, rows):
     card, listed = (refractive / "README.md").read_text(), rows(refractive)
     assert f"# {COUNT} pairs of the scene paper_refractive" in card
     assert "CC0" in card
     for split in ("train", "val"):
-        own = [row for row in listed if row["split"] == split]
-        assert f"| {split} | {len(own)} | {len({row['drive'] for row in own})} |" in card
+        part = [row for row in listed if row["split"] == split]
+        assert f"| {split} | {len(part)} | {len({row['drive'] for row in part})} |" in card
     for name in {row["effects"][0]["effect"] for row in listed}:
         assert f"| {name} | {sum(row['effects'][0]['effect'] == name for row in listed)} |" in card
     assert np.asarray(Image.open(refractive / "parameters.png")).std() > 10
 
 
 @pytest.mark.parametrize("license_of", ["CC BY 4.0, MIT (two sources)", "the owner's: ask [us]", "'in quotes, too'"])
-def test_a_license_is_any_text(call, words, tmp_path, license_of):
-    kept = [word for word in words("out", "count=4") if not word.startswith("license=")]
-    assert call("generate", *kept, f"license={license_of}").code == 0
+def test_a_license_may_be_any_text(call, words, tmp_path, license_of):
+    options = [word for word in words("out", "count=4") if not word.startswith("license=")]
+    assert call("generate", *options, f"license={license_of}").code == 0
     stated = license_of.strip("'") if license_of[0] == "'" else license_of
-    assert f"as stated by who made this set:** {stated}\n" in (tmp_path / "out" / "README.md").read_text()
+    assert f"as stated by the creator of this set:** {stated}\n" in (tmp_path / "out" / "README.md").read_text()

@@ -1,4 +1,4 @@
-"""Frames of videos are those of the video, in whatever order they are asked for."""
+"""Sources of pairs: images and frames of videos, in any order."""
 
 import shutil
 from pathlib import Path
@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from torchrefract.data.images import UnreadableImageError, fit, pixels_of, read_image
-from torchrefract.data.paired_folder import PairedFolder
-from torchrefract.data.pairs.sources import Reader, Source, draw_of, find_sources
+from torchrefract.data.pairs.dataset import PairedFolder
+from torchrefract.data.pairs.sources import Source, SourceReader, draw_of, find_sources
 from torchrefract.videos import read_video, write_video
 
 OPTIONS = {"size": None, "every": 1, "drive_by": "auto", "val_share": 0.3, "seed": 0}
@@ -19,25 +19,25 @@ FRAMES = 9
 
 @pytest.fixture(scope="module")
 def videos(tmp_path_factory) -> Path:
-    """Three videos of nine frames each, of noise on a shade."""
-    root, dice = tmp_path_factory.mktemp("videos"), np.random.default_rng(0)
+    """Write three videos of nine frames each, of noise on a shade."""
+    root, generator = tmp_path_factory.mktemp("videos"), np.random.default_rng(0)
     for name in ("a.mp4", "b.mp4", "c.mp4"):
-        pages = [dice.integers(20 * i, 20 * i + 60, (32, 48, 3)).astype(np.uint8) for i in range(FRAMES)]
+        pages = [generator.integers(20 * i, 20 * i + 60, (32, 48, 3)).astype(np.uint8) for i in range(FRAMES)]
         assert write_video(pages, root / name, fps=10, size=(48, 32)) == FRAMES
     return root
 
 
-def test_frames_are_those_of_the_video_forward_backward_and_across(videos):
+def test_frames_of_videos_are_read_in_any_order(videos):
     plain = {name: [frame for _, frame in read_video(videos / name, range(FRAMES))] for name in ("a.mp4", "b.mp4")}
-    reader = Reader(videos, None)
+    reader = SourceReader(videos, None)
     for name, t in [("a.mp4", 0), ("a.mp4", 4), ("b.mp4", 4), ("b.mp4", 8), ("b.mp4", 2), ("a.mp4", 5), ("a.mp4", 5)]:
         image, pixels = reader.read(Source(name, name, "train", t))
         assert torch.equal(image, plain[name][t][0])
         assert np.array_equal(pixels, pixels_of(image))
 
 
-def test_a_video_that_ends_early_is_named(videos):
-    reader = Reader(videos, None)
+def test_a_video_that_ends_early_raises(videos):
+    reader = SourceReader(videos, None)
     with pytest.raises(UnreadableImageError, match=r"a\.mp4 ends before its frame 9"):
         reader.read(Source("a.mp4", "a", "train", FRAMES))
     assert reader.read(Source("a.mp4", "a", "train", 1))[0].shape == (3, 32, 48)
@@ -45,10 +45,10 @@ def test_a_video_that_ends_early_is_named(videos):
 
 @pytest.mark.parametrize("size", [None, (40, 60), (20, 30)])
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-def test_a_picture_comes_with_its_bytes(size, kind, tmp_path):
+def test_an_image_is_read_as_floats_and_as_bytes(size, kind, tmp_path):
     levels = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (40, 60, 3), endpoint=True).astype(kind)
     assert cv2.imwrite(str(tmp_path / "a.png"), levels[..., ::-1])
-    image, pixels = Reader(tmp_path, size).read(Source("a.png", ".", "train"))
+    image, pixels = SourceReader(tmp_path, size).read(Source("a.png", ".", "train"))
     expected = fit(read_image(tmp_path / "a.png"), size or (40, 60))
     assert torch.equal(image, expected)
     assert image.is_contiguous()
@@ -57,29 +57,29 @@ def test_a_picture_comes_with_its_bytes(size, kind, tmp_path):
         assert np.array_equal(pixels, levels)
 
 
-def test_each_video_is_a_drive_and_lies_in_one_split(videos):
-    found = find_sources(videos, **{**OPTIONS, "every": 2})
-    assert [(frame.path, frame.frame) for frame in found.frames] == [
+def test_each_video_is_a_drive_in_one_split(videos):
+    sources = find_sources(videos, **{**OPTIONS, "every": 2})
+    assert [(frame.path, frame.frame) for frame in sources.frames] == [
         (name, t) for name in ("a.mp4", "b.mp4", "c.mp4") for t in range(0, FRAMES, 2)
     ]
-    splits = {drive: {frame.split for frame in found.frames if frame.drive == drive} for drive in ("a.mp4", "c.mp4")}
-    assert all(len(own) == 1 for own in splits.values())
-    assert {frame.split for frame in found.frames} == {"train", "val"}
+    splits = {drive: {frame.split for frame in sources.frames if frame.drive == drive} for drive in ("a.mp4", "c.mp4")}
+    assert all(len(names) == 1 for names in splits.values())
+    assert {frame.split for frame in sources.frames} == {"train", "val"}
 
 
-def test_a_source_that_is_used_again_has_a_new_key_and_no_key_is_used_twice(videos):
-    found = find_sources(videos, **OPTIONS)
-    keys = [draw_of(frame, seed=3, lap=lap)[1] for lap in range(3) for frame in found.frames]
+def test_a_repeated_source_has_a_new_key(videos):
+    sources = find_sources(videos, **OPTIONS)
+    keys = [draw_of(frame, seed=3, repeat=repeat)[1] for repeat in range(3) for frame in sources.frames]
     assert len(set(keys)) == 3 * 3 * FRAMES
-    assert {draw_of(frame, seed=3, lap=0)[0] for frame in found.frames} == {3 << 32, (3 << 32) + 1}
+    assert {draw_of(frame, seed=3, repeat=0)[0] for frame in sources.frames} == {3 << 32, (3 << 32) + 1}
 
 
-def test_fewer_pairs_than_frames_are_of_all_parts_of_the_source(videos):
-    found = find_sources(videos, **OPTIONS).thinned(6)
-    assert [frame.path for frame in found.frames] == ["a.mp4"] * 2 + ["b.mp4"] * 2 + ["c.mp4"] * 2
+def test_fewer_pairs_than_frames_are_spread_over_the_source(videos):
+    sources = find_sources(videos, **OPTIONS).limited(6)
+    assert [frame.path for frame in sources.frames] == ["a.mp4"] * 2 + ["b.mp4"] * 2 + ["c.mp4"] * 2
 
 
-def test_pairs_of_a_video_have_its_frames(call, videos, tmp_path):
+def test_pairs_of_a_video_hold_its_frames(call, videos, tmp_path):
     words = ("scene=limpopo_sun_glare", f"source={videos / 'b.mp4'}", "out=out", "license=CC0", "workers=0", "every=4")
     outcome = call("generate", *words, "count=5")
     assert "the source has a single drive" in outcome.out
@@ -93,21 +93,21 @@ def test_pairs_of_a_video_have_its_frames(call, videos, tmp_path):
     assert not torch.equal(folder[0].degraded, folder[3].degraded)
 
 
-def test_pictures_beside_videos_are_refused(call, videos, frames, tmp_path):
+def test_images_together_with_videos_raise(call, videos, frames, tmp_path):
     both = tmp_path / "both"
     both.mkdir()
     (both / "a.mp4").symlink_to(videos / "a.mp4")
     (both / "a.png").symlink_to(frames / "drive0" / "000.png")
     words = ("scene=limpopo_sun_glare", "source=both", "out=out", "license=CC0")
-    message = "source must hold pictures or videos, got both in both, such as a.png and a.mp4"
+    message = "source must hold images or videos, got both in both, such as a.png and a.mp4"
     assert call("generate", *words).message == message
 
 
-def test_videos_that_cannot_be_read_are_named_and_left_out(call, videos, tmp_path):
+def test_unreadable_videos_are_reported_and_skipped(call, videos, tmp_path):
     shutil.copytree(videos, tmp_path / "videos")
-    whole = (videos / "a.mp4").read_bytes()
-    (tmp_path / "videos" / "cut.mp4").write_bytes(whole[: len(whole) // 2])
+    data = (videos / "a.mp4").read_bytes()
+    (tmp_path / "videos" / "cut.mp4").write_bytes(data[: len(data) // 2])
     (tmp_path / "videos" / "empty.mp4").touch()
     assert find_sources(tmp_path / "videos", **OPTIONS).skipped == ["cut.mp4", "empty.mp4"]
     words = ("scene=limpopo_sun_glare", "source=videos", "out=out", "license=CC0", "workers=0", "count=2")
-    assert "2 files of the source cannot be read: cut.mp4, empty.mp4\n" in call("generate", *words).out
+    assert "2 files of the source are unreadable: cut.mp4, empty.mp4\n" in call("generate", *words).out

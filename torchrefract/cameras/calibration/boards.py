@@ -1,4 +1,4 @@
-"""Boards to calibrate with: where their corners are, and where they are black."""
+"""Calibration boards: their corners, and where they are black."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,7 +9,7 @@ import numpy as np
 from torchrefract._validation import check_choice, check_positive
 
 DICTIONARIES = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
-# Each of these begins with the markers of the smaller ones of its kind.
+# Each of these begins with the markers of the smaller dictionaries of its kind.
 LARGEST_DICTIONARIES = (
     "DICT_4X4_1000",
     "DICT_5X5_1000",
@@ -21,78 +21,94 @@ LARGEST_DICTIONARIES = (
     "DICT_APRILTAG_36h10",
     "DICT_APRILTAG_36h11",
 )
-_SMALLEST, _LARGEST = 3, 100  # squares of a side
-TRIED = ("auto", True, False)  # values of what is tried both ways, or said
+_MIN_SQUARES, _MAX_SQUARES = 3, 100  # along a side
 
 
 @dataclass(frozen=True, kw_only=True)
 class Board:
-    """A plane of squares, black and white in turn; x goes right and y down, from its upper left corner, in mm.
+    """A plane of alternating black and white squares.
 
-    squares: "11x8", columns x rows of squares, at least 3 of each.
-    square_mm: the side of a square.
+    Coordinates are in mm from the upper left corner of the board, x to the right and y down.
+
+    Args:
+        squares: columns x rows of squares, such as "11x8", at least 3 of each.
+        square_mm: side of a square.
+
+    Raises:
+        ValueError: an argument is out of range.
     """
 
     squares: str = "11x8"
     square_mm: float = 22.0
 
     def __post_init__(self) -> None:
-        _counts(self.squares)
+        _parse_squares(self.squares)
         check_positive("square_mm", self.square_mm)
 
     @cached_property
-    def counts(self) -> tuple[int, int]:
-        """Columns and rows of squares."""
-        return _counts(self.squares)
+    def num_squares(self) -> tuple[int, int]:
+        """Return the numbers of columns and rows of squares."""
+        return _parse_squares(self.squares)
 
     @property
-    def inner(self) -> tuple[int, int]:
-        """Columns and rows of the corners where four squares meet."""
-        columns, rows = self.counts
+    def num_corners(self) -> tuple[int, int]:
+        """Return the numbers of columns and rows of inner corners, where four squares meet."""
+        columns, rows = self.num_squares
         return columns - 1, rows - 1
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Width and height."""
-        columns, rows = self.counts
+        """Return width and height."""
+        columns, rows = self.num_squares
         return columns * self.square_mm, rows * self.square_mm
 
     def corners(self, ids: np.ndarray | None = None) -> np.ndarray:
-        """(N, 3), mm, the inner corners of these numbers, or all, row by row; z = 0."""
-        columns, rows = self.inner
+        """Return the inner corners with these ids, (N, 3), mm, z = 0; None returns all, row by row."""
+        columns, rows = self.num_corners
         ids = np.arange(columns * rows) if ids is None else ids
         row, column = np.divmod(ids, columns)
         return np.stack([column + 1, row + 1, np.zeros_like(row)], axis=1) * float(self.square_mm)
 
     def is_black(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Where the board is black, at places in mm; what lies outside it is white."""
-        columns, rows = self.counts
-        i, j = np.floor(x / self.square_mm).astype(int), np.floor(y / self.square_mm).astype(int)
-        return ((i + j) % 2 == 0) & (i >= 0) & (j >= 0) & (i < columns) & (j < rows)
+        """Return True where the board is black at points in mm; everything outside of it is white."""
+        i, j, inside = self._square_at(x, y)
+        return ((i + j) % 2 == 0) & inside
 
-    def breaks(self) -> tuple[np.ndarray, np.ndarray]:
-        """The x and the y, mm, between which the board is of one color; both begin and end with its border."""
-        columns, rows = self.counts
+    def color_edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return sorted x and y, mm, from border to border, such that each cell between them has one color."""
+        columns, rows = self.num_squares
         return np.arange(columns + 1) * float(self.square_mm), np.arange(rows + 1) * float(self.square_mm)
 
     def describe(self) -> str:
-        """The definition in one line, as the commands take it."""
+        """Return the options of the commands that define this board."""
         return f"board=chessboard squares={self.squares} square_mm={self.square_mm:g}"
+
+    def _square_at(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return column and row of the square at points in mm, and whether it is on the board."""
+        columns, rows = self.num_squares
+        i, j = np.floor(x / self.square_mm).astype(int), np.floor(y / self.square_mm).astype(int)
+        return i, j, (i >= 0) & (j >= 0) & (i < columns) & (j < rows)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Chessboard(Board):
-    """A chessboard: no square differs from the others, so that all of it must be seen."""
+    """A chessboard; all of it must be visible, since its squares look alike."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Charuco(Board):
-    """A chessboard with a marker in each white square, of which any part can be seen.
+    """A chessboard with an ArUco marker in each white square; any part of it may be visible.
 
-    marker_mm: the side of a marker, below that of a square.
-    dictionary: OpenCV's name of the set of markers, whose first ones fill the board row by row.
-    legacy: OpenCV's pattern up to version 4.6, another one where the rows are even in number: "auto" finds either.
-    inverted: black and white exchanged: "auto" finds either.
+    Args:
+        squares, square_mm: as for `Board`.
+        marker_mm: side of a marker, below `square_mm`.
+        dictionary: OpenCV's name of the set of markers; its first markers fill the board row by row.
+        legacy: True for the pattern of OpenCV up to version 4.6, which differs on boards with an even number of rows;
+            "auto" detects either.
+        inverted: True if black and white are exchanged; "auto" detects either.
+
+    Raises:
+        ValueError: an argument is out of range, or the dictionary has too few markers.
     """
 
     marker_mm: float = 14.0
@@ -106,81 +122,85 @@ class Charuco(Board):
             raise ValueError(f"marker_mm must be below square_mm = {self.square_mm:g}, got {self.marker_mm:g}")
         check_choice("dictionary", self.dictionary, DICTIONARIES)
         for name in ("legacy", "inverted"):
-            if getattr(self, name) not in TRIED:
+            if getattr(self, name) not in ("auto", True, False):
                 raise ValueError(f"{name} must be auto, true or false, got {getattr(self, name)!r}")
-        held = len(markers(self.dictionary).bytesList)
-        if self.markers > held:
+        available = len(marker_dictionary(self.dictionary).bytesList)
+        if self.num_markers > available:
             raise ValueError(
-                f"dictionary must hold the {self.markers} markers of a board of {self.squares} squares, "
-                f"got {self.dictionary} with {held}"
+                f"dictionary must hold the {self.num_markers} markers of a board of {self.squares} squares, "
+                f"got {self.dictionary} with {available}"
             )
 
     @property
-    def markers(self) -> int:
-        """How many there are."""
-        columns, rows = self.counts
+    def num_markers(self) -> int:
+        """Return the number of markers."""
+        columns, rows = self.num_squares
         return columns * rows // 2
 
-    def opencv(self, legacy: bool) -> "cv2.aruco.CharucoBoard":
-        """OpenCV's board in mm."""
-        board = cv2.aruco.CharucoBoard(self.counts, self.square_mm, self.marker_mm, markers(self.dictionary))
+    def to_opencv(self, *, legacy: bool) -> "cv2.aruco.CharucoBoard":
+        """Create OpenCV's board, in mm."""
+        board = cv2.aruco.CharucoBoard(
+            self.num_squares, self.square_mm, self.marker_mm, marker_dictionary(self.dictionary)
+        )
         board.setLegacyPattern(legacy)
         return board
 
+    @property
+    def _white_parity(self) -> int:
+        """Return (column + row) % 2 of white squares."""
+        return 0 if self.legacy is True and self.num_squares[1] % 2 == 0 else 1
+
     @cached_property
-    def _modules(self) -> np.ndarray:
-        """(rows, columns, n, n), bool: the white cells of each square's marker; all of a black square are black."""
-        columns, rows = self.counts
-        first = self.legacy is True and rows % 2 == 0
-        side = markers(self.dictionary).markerSize + 2
+    def _marker_cells(self) -> np.ndarray:
+        """Return (rows, columns, n, n), bool: the white cells of the marker in each white square."""
+        columns, rows = self.num_squares
+        dictionary = marker_dictionary(self.dictionary)
+        side = dictionary.markerSize + 2
         cells = np.zeros((rows, columns, side, side), dtype=bool)
-        places = [(j, i) for j in range(rows) for i in range(columns) if (i + j + first) % 2]
-        for number, (j, i) in enumerate(places):
-            cells[j, i] = cv2.aruco.generateImageMarker(markers(self.dictionary), number, side, borderBits=1) > 0
+        white = [(j, i) for j in range(rows) for i in range(columns) if (i + j) % 2 == self._white_parity]
+        for number, (j, i) in enumerate(white):
+            cells[j, i] = cv2.aruco.generateImageMarker(dictionary, number, side, borderBits=1) > 0
         return cells
 
     def is_black(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Where the board is black, at places in mm; what lies outside it is white, or black if it is inverted."""
-        columns, rows = self.counts
-        i, j = np.floor(x / self.square_mm).astype(int), np.floor(y / self.square_mm).astype(int)
-        inside = (i >= 0) & (j >= 0) & (i < columns) & (j < rows)
+        """Return True where the board is black at points in mm; outside is white, or black if it is inverted."""
+        i, j, inside = self._square_at(x, y)
+        columns, rows = self.num_squares
         i, j = i.clip(0, columns - 1), j.clip(0, rows - 1)
-        side = self._modules.shape[2]
-        module, margin = self.marker_mm / side, (self.square_mm - self.marker_mm) / 2
-        u, v = (np.floor((p - k * self.square_mm - margin) / module).astype(int) for p, k in ((x, i), (y, j)))
-        marked = (u >= 0) & (v >= 0) & (u < side) & (v < side)
-        first = self.legacy is True and rows % 2 == 0
-        white = (i + j + first) % 2 == 1
-        dark = ~self._modules[j, i, v.clip(0, side - 1), u.clip(0, side - 1)]
-        black = inside & (~white | (marked & dark))
+        side = self._marker_cells.shape[2]
+        cell_mm, margin = self.marker_mm / side, (self.square_mm - self.marker_mm) / 2
+        u, v = (np.floor((p - k * self.square_mm - margin) / cell_mm).astype(int) for p, k in ((x, i), (y, j)))
+        on_marker = (u >= 0) & (v >= 0) & (u < side) & (v < side)
+        is_black_cell = ~self._marker_cells[j, i, v.clip(0, side - 1), u.clip(0, side - 1)]
+        black = inside & (((i + j) % 2 != self._white_parity) | (on_marker & is_black_cell))
         return ~black if self.inverted is True else black
 
-    def breaks(self) -> tuple[np.ndarray, np.ndarray]:
-        """The x and the y, mm, between which the board is of one color; both begin and end with its border."""
-        side = self._modules.shape[2]
+    def color_edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return sorted x and y, mm, from border to border, such that each cell between them has one color."""
+        side = self._marker_cells.shape[2]
         margin = (self.square_mm - self.marker_mm) / 2
-        modules = margin + np.arange(side + 1) * self.marker_mm / side
-        x, y = ((np.arange(n)[:, None] * self.square_mm + modules).ravel() for n in self.counts)
-        square_x, square_y = super().breaks()
+        cells = margin + np.arange(side + 1) * self.marker_mm / side
+        x, y = ((np.arange(n)[:, None] * self.square_mm + cells).ravel() for n in self.num_squares)
+        square_x, square_y = super().color_edges()
         return np.union1d(square_x, x), np.union1d(square_y, y)
 
     def describe(self) -> str:
-        """The definition in one line, as the commands take it."""
+        """Return the options of the commands that define this board."""
         return (
             f"board=charuco squares={self.squares} square_mm={self.square_mm:g} marker_mm={self.marker_mm:g} "
             f"dictionary={self.dictionary} legacy={str(self.legacy).lower()} inverted={str(self.inverted).lower()}"
         )
 
 
-def markers(dictionary: str) -> "cv2.aruco.Dictionary":
-    """OpenCV's set of markers of a name."""
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+def marker_dictionary(name: str) -> "cv2.aruco.Dictionary":
+    """Return OpenCV's set of markers of a name."""
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def _counts(squares: str) -> tuple[int, int]:
+def _parse_squares(squares: str) -> tuple[int, int]:
     columns, _, rows = str(squares).lower().partition("x")
     if not (columns.isdecimal() and rows.isdecimal()):
         raise ValueError(f"squares must be columns x rows, such as 11x8, got {squares!r}")
-    if not all(_SMALLEST <= int(n) <= _LARGEST for n in (columns, rows)):
-        raise ValueError(f"squares must be from {_SMALLEST} to {_LARGEST} in columns and rows, got {squares}")
+    if not all(_MIN_SQUARES <= int(n) <= _MAX_SQUARES for n in (columns, rows)):
+        raise ValueError(f"squares must be from {_MIN_SQUARES} to {_MAX_SQUARES} in columns and rows, got {squares}")
     return int(columns), int(rows)

@@ -1,4 +1,4 @@
-"""The corners of a board in a picture."""
+"""Detection of the corners of a board in a picture."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -8,171 +8,190 @@ import numpy as np
 
 from torchrefract.cameras.calibration.boards import Board, Charuco
 
-FEWEST_CORNERS = 6
-SEARCH = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
-# Half the side of the window that a corner is refined in: of the way to the nearest marker, or of half a square, but
-# so many px, of which less tell little, if that is no larger share of a square.
-_CLEAR, _WINDOWS, _LEAST = 0.7, (5, 10), 0.15
+MIN_CORNERS = 6
+SEARCH_FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
+# Half the side of the window for the refinement of a corner: this share of the distance to the nearest marker, or of
+# half a square, within these bounds in px. On small squares the lower bound is a share of the square.
+_WINDOW_SHARE, _MIN_WINDOW_PX, _MAX_WINDOW_PX, _MIN_WINDOW_SQUARES = 0.7, 5, 10, 0.15
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
-_FARTHEST = 0.05  # squares that a refinement may move a corner by, or 1 px
-_MISFIT = 0.2  # squares from where its neighbors say that a corner is
-_NEIGHBORS = 8
-_SMOOTHER = 0.9  # times as far off their neighbors, rms, corners as they were found are taken in place of refined ones
-_BESIDE = 0.1  # squares from a corner, along x and y, where its four squares are looked at
-_CONTRAST = 0.4  # of the median contrast of the corners that one must have
-_SURE = 0.75  # of the corners that a refinement must keep to be believed
+_MAX_MOVE = 0.05  # squares that the refinement may move a corner, or 1 px
+_MAX_MISFIT = 0.2  # squares between a corner and its place by the homography of its neighbors
+_NUM_NEIGHBORS = 8
+_SMOOTHNESS = 0.9  # refined corners are used unless their rms misfit exceeds the original one divided by this
+_PROBE = 0.1  # squares from a corner, along x and y, at which the colors of its four squares are read
+_MIN_CONTRAST = 0.4  # of the median contrast of all corners
+_MIN_REFINED = 0.75  # share of the corners that must stay near; otherwise none is refined
 
 
 class View(NamedTuple):
-    """What was found of a board in a picture; pixel centers are whole numbers."""
+    """The corners of a board in a picture; pixel centers are whole numbers."""
 
     name: str
     ids: np.ndarray  # (N,), int, of `Board.corners`
     corners: np.ndarray  # (N, 2), float64, px
 
 
-def detect(gray: np.ndarray, board: Board, *, name: str = "") -> View:
-    """The corners of a board that a picture shows, to a few hundredths of a pixel.
+class Detection(NamedTuple):
+    """The result of the search for a board in a picture."""
 
-    A ChArUco board is found by its markers, in the patterns and colors that it may have, whichever shows more; a
-    chessboard by `findChessboardCornersSB`, or else by `findChessboardCorners`. Each corner is then refined in a window
-    that holds little but its four squares. Left out are those that move far, lie at the border of the picture, are not
-    where their neighbors say, or, of a ChArUco board, not where black and white cross, as behind a finger. Where many
-    would move far, or corners of a chessboard be off their neighbors by more than before, as on an overexposed board
-    whose squares do not touch, all stay where they were found.
+    view: View
+    size: tuple[int, int]  # width and height, px; (0, 0) for an unreadable picture
+    edge_width_px: float  # of the sharpest edges
+    problem: str  # why the view cannot be used; empty if it can
+
+
+def detect(gray: np.ndarray, board: Board, *, name: str = "") -> View:
+    """Find the corners of a board in a picture, to a few hundredths of a pixel.
+
+    A ChArUco board is found by its markers, in the pattern and colors that give most corners. A chessboard is found by
+    OpenCV's `findChessboardCornersSB`, or else by `findChessboardCorners`. Each corner is then refined in a window
+    that contains little but its four squares.
+
+    Drops corners that the refinement moves far, that lie at the border of the picture, or that do not fit their
+    neighbors. Drops corners of a ChArUco board where black and white do not cross, such as behind a finger. Keeps the
+    corners unrefined if many would move far, or if refined corners of a chessboard fit their neighbors worse, as on an
+    overexposed board whose black squares do not touch.
 
     Args:
         gray: (H, W), uint8.
-        board: to look for.
+        board: to search.
         name: of the view.
 
     Returns:
-        The view, of no corner where no board was found.
+        The view, without corners if no board was found.
     """
     if isinstance(board, Charuco):
-        ids, corners = _markers_and_corners(gray, board)
-        share = (board.square_mm - board.marker_mm) / board.square_mm / 2
+        ids, corners = _find_charuco(gray, board)
+        clearance = (board.square_mm - board.marker_mm) / board.square_mm / 2
     else:
-        ids, corners = _chessboard(gray, board)
-        share = 0.5
+        ids, corners = _find_chessboard(gray, board)
+        clearance = 0.5
     if len(ids):
-        refined = _refined(gray, ids, corners, _CLEAR * share)
-        # Those of ChArUco boards are found by way of their markers, and lie smoothly wherever they are.
+        refined = _refine(gray, ids, corners, _WINDOW_SHARE * clearance)
+        # Corners of ChArUco boards are interpolated from markers, so that they are smooth even where they are wrong.
         if isinstance(board, Charuco) or _is_as_smooth(board, refined, (ids, corners)):
             ids, corners = refined
-        ids, corners = _consistent(board, ids, corners)
-        if isinstance(board, Charuco):  # a chessboard was seen as a whole
-            ids, corners = _crossed(gray, board, ids, corners)
+        ids, corners = _drop_misfits(board, ids, corners)
+        if isinstance(board, Charuco):  # a chessboard is always visible as a whole
+            ids, corners = _drop_covered(gray, board, ids, corners)
     return View(name, ids, corners.astype(np.float64).reshape(-1, 2))
 
 
-def is_enough(view: View, board: Board) -> bool:
-    """Whether a view has six corners at least, not all in one row or column."""
-    columns = board.inner[0]
-    spread = min(len(set((view.ids // columns).tolist())), len(set((view.ids % columns).tolist())))
-    return len(view.ids) >= FEWEST_CORNERS and spread > 1
+def has_enough_corners(view: View, board: Board) -> bool:
+    """Return True if a view has at least six corners that are not all in one row or column."""
+    row, column = np.divmod(view.ids, board.num_corners[0])
+    return len(view.ids) >= MIN_CORNERS and len(np.unique(row)) > 1 and len(np.unique(column)) > 1
 
 
-def both(value: str | bool) -> tuple[bool, ...]:
-    """The values to try."""
-    return (False, True) if value == "auto" else (bool(value),)
+def candidates(option: str | bool) -> tuple[bool, ...]:
+    """Return the values to try for an option that may be "auto"."""
+    return (False, True) if option == "auto" else (bool(option),)
 
 
-def _markers_and_corners(gray: np.ndarray, board: Charuco) -> tuple[np.ndarray, np.ndarray]:
+def _find_charuco(gray: np.ndarray, board: Charuco) -> tuple[np.ndarray, np.ndarray]:
     best = np.empty(0, dtype=int), np.empty((0, 2))
-    one = cv2.aruco.CharucoParameters()
-    one.minMarkers = 1  # beside a corner, so that those near the border of the picture count; what misfits goes below
-    legacies = both(board.legacy) if board.counts[1] % 2 == 0 else (False,)  # of odd rows both are the same
-    for inverted in both(board.inverted):
+    parameters = cv2.aruco.CharucoParameters()
+    # One marker next to a corner is enough, so that corners near the border of the picture count.
+    parameters.minMarkers = 1
+    # On boards with an odd number of rows both patterns are equal.
+    legacies = candidates(board.legacy) if board.num_squares[1] % 2 == 0 else (False,)
+    for inverted in candidates(board.inverted):
         picture = 255 - gray if inverted else gray
         for legacy in legacies:
-            corners, ids, _, _ = cv2.aruco.CharucoDetector(board.opencv(legacy), one).detectBoard(picture)
+            detector = cv2.aruco.CharucoDetector(board.to_opencv(legacy=legacy), parameters)
+            corners, ids, _, _ = detector.detectBoard(picture)
             if ids is not None and len(ids) > len(best[0]):
                 best = ids.ravel(), corners.reshape(-1, 2)
     return best
 
 
-def _chessboard(gray: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
-    found, corners = cv2.findChessboardCornersSB(gray, board.inner, flags=SEARCH)
-    if not found:
-        found, corners = cv2.findChessboardCorners(gray, board.inner)
-    if not found:
+def _find_chessboard(gray: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
+    has_board, corners = cv2.findChessboardCornersSB(gray, board.num_corners, flags=SEARCH_FLAGS)
+    if not has_board:
+        has_board, corners = cv2.findChessboardCorners(gray, board.num_corners)
+    if not has_board:
         return np.empty(0, dtype=int), np.empty((0, 2))
     return np.arange(len(corners)), corners.reshape(-1, 2)
 
 
-def _refined(gray: np.ndarray, ids: np.ndarray, corners: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """The corners refined in windows of that share of the distance to the next corner."""
+def _refine(gray: np.ndarray, ids: np.ndarray, corners: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Refine corners in windows with half sides of `share` times the distance to the next corner."""
     height, width = gray.shape
-    moved, near, inside = corners.copy(), [], []
+    refined, is_near, is_inside = corners.copy(), [], []
     for k, spacing in enumerate(_spacings(corners)):
-        least = min(_WINDOWS[0], max(2, int(_LEAST * spacing)))
-        half = int(np.clip(share * spacing, least, _WINDOWS[1]))
+        smallest = min(_MIN_WINDOW_PX, max(2, int(_MIN_WINDOW_SQUARES * spacing)))
+        half = int(np.clip(share * spacing, smallest, _MAX_WINDOW_PX))
         start = corners[k].astype(np.float32).reshape(1, 1, 2)
-        moved[k] = cv2.cornerSubPix(gray, start.copy(), (half, half), (-1, -1), _STOP).reshape(2)
-        near.append(np.hypot(*(moved[k] - corners[k])) <= max(1.0, _FARTHEST * spacing))
-        inside.append(min(*moved[k], width - 1 - moved[k][0], height - 1 - moved[k][1]) > half + 1)
-    if np.mean(near) < _SURE:
+        x, y = refined[k] = cv2.cornerSubPix(gray, start.copy(), (half, half), (-1, -1), _STOP).reshape(2)
+        is_near.append(np.hypot(*(refined[k] - corners[k])) <= max(1.0, _MAX_MOVE * spacing))
+        is_inside.append(min(x, y, width - 1 - x, height - 1 - y) > half + 1)
+    if np.mean(is_near) < _MIN_REFINED:
         return ids, corners
-    kept = np.logical_and(near, inside)
-    return ids[kept], moved[kept]
+    keep = np.logical_and(is_near, is_inside)
+    return ids[keep], refined[keep]
 
 
-def _is_as_smooth(board: Board, new: tuple[np.ndarray, np.ndarray], old: tuple[np.ndarray, np.ndarray]) -> bool:
-    """Whether corners lie where their neighbors say, nearly as well as those of the same numbers did before."""
-    (ids, corners), before = new, old[1][np.isin(old[0], new[0])]
+def _is_as_smooth(
+    board: Board, refined: tuple[np.ndarray, np.ndarray], original: tuple[np.ndarray, np.ndarray]
+) -> bool:
+    """Return True if refined corners fit their neighbors nearly as well as the original ones."""
+    (ids, corners), before = refined, original[1][np.isin(original[0], refined[0])]
     plane = board.corners(ids)[:, :2]
-    first, then = (np.square(_misfits(plane, places) * _spacings(places)).mean() for places in (before, corners))
-    return bool(first >= _SMOOTHER**2 * then)
+    error, refined_error = (np.square(_misfits(plane, c) * _spacings(c)).mean() for c in (before, corners))
+    return bool(error >= _SMOOTHNESS**2 * refined_error)
 
 
 def _spacings(corners: np.ndarray) -> np.ndarray:
-    """The distance of each corner to the next one."""
-    apart = np.linalg.norm(corners[:, None] - corners[None], axis=2)
-    np.fill_diagonal(apart, np.inf)
-    return apart.min(axis=1) if len(corners) > 1 else np.zeros(len(corners))
+    """Return the distance of each corner to the nearest other one."""
+    distances = np.linalg.norm(corners[:, None] - corners[None], axis=2)
+    np.fill_diagonal(distances, np.inf)
+    return distances.min(axis=1) if len(corners) > 1 else np.zeros(len(corners))
 
 
-def _consistent(board: Board, ids: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Those that lie where their neighbors say; the one that is farthest off goes first, as it misleads others."""
-    while len(ids) > FEWEST_CORNERS:
+def _drop_misfits(board: Board, ids: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Drop corners that do not fit their neighbors, the worst one first, since it misleads the others."""
+    while len(ids) > MIN_CORNERS:
         errors = _misfits(board.corners(ids)[:, :2], corners)
         worst = int(errors.argmax())
-        if errors[worst] <= _MISFIT:
+        if errors[worst] <= _MAX_MISFIT:
             break
         ids, corners = np.delete(ids, worst), np.delete(corners, worst, axis=0)
     return ids, corners
 
 
 def _misfits(plane: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(N,), squares, between each corner and where the homography of its neighbors puts it."""
+    """Return (N,), squares, the distance of each corner from its place by the homography of its neighbors."""
     spacings, errors = _spacings(corners), np.zeros(len(corners))
     for k, matrix in enumerate(_homographies(plane, corners)):
         if matrix is not None:
-            place = cv2.perspectiveTransform(plane[None, k : k + 1], matrix).reshape(2)
-            errors[k] = np.hypot(*(place - corners[k])) / spacings[k]
+            expected = cv2.perspectiveTransform(plane[None, k : k + 1], matrix).reshape(2)
+            errors[k] = np.hypot(*(expected - corners[k])) / spacings[k]
     return errors
 
 
 def _homographies(plane: np.ndarray, corners: np.ndarray) -> Iterator[np.ndarray | None]:
-    """From the board to the picture near each corner, by its neighbors; None where these are in a line."""
-    apart = np.linalg.norm(plane[:, None] - plane[None], axis=2)
+    """Yield the homography from board to picture by the neighbors of each corner; None if these are collinear."""
+    distances = np.linalg.norm(plane[:, None] - plane[None], axis=2)
     for k in range(len(corners)):
-        others = np.argsort(apart[k], kind="stable")[1 : _NEIGHBORS + 1]
-        flat = np.linalg.matrix_rank(plane[others] - plane[others].mean(axis=0)) < 2
-        yield None if flat or len(others) < 4 else cv2.findHomography(plane[others], corners[others], 0)[0]
+        others = np.argsort(distances[k], kind="stable")[1 : _NUM_NEIGHBORS + 1]
+        is_line = np.linalg.matrix_rank(plane[others] - plane[others].mean(axis=0)) < 2
+        yield None if is_line or len(others) < 4 else cv2.findHomography(plane[others], corners[others], 0)[0]
 
 
-def _crossed(gray: np.ndarray, board: Board, ids: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Those where two squares are clearly darker than the two others."""
-    plane, gaps = board.corners(ids)[:, :2], np.full(len(ids), np.nan)
+def _drop_covered(
+    gray: np.ndarray, board: Board, ids: np.ndarray, corners: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Drop corners where two opposite squares are not clearly darker than the two others."""
+    plane, contrasts = board.corners(ids)[:, :2], np.full(len(ids), np.nan)
     signs = np.array([(-1, -1), (1, 1), (-1, 1), (1, -1)])
     for k, matrix in enumerate(_homographies(plane, corners)):
         if matrix is not None:
-            around = np.vstack([plane[k], plane[k] + _BESIDE * board.square_mm * signs])
-            places = cv2.perspectiveTransform(around[None], matrix).reshape(-1, 2)
-            x, y = (places[1:] - places[0] + corners[k]).astype(np.float32).T
-            seen = cv2.remap(gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float).ravel()
-            gaps[k] = max(seen[:2].min() - seen[2:].max(), seen[2:].min() - seen[:2].max())
-    kept = np.isnan(gaps) | (gaps > _CONTRAST * np.nanmedian(gaps)) if not np.isnan(gaps).all() else gaps != 0
-    return ids[kept], corners[kept]
+            points = np.vstack([plane[k], plane[k] + _PROBE * board.square_mm * signs])
+            pixels = cv2.perspectiveTransform(points[None], matrix).reshape(-1, 2)
+            x, y = (pixels[1:] - pixels[0] + corners[k]).astype(np.float32).T
+            values = cv2.remap(gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float).ravel()
+            contrasts[k] = max(values[:2].min() - values[2:].max(), values[2:].min() - values[:2].max())
+    if np.isnan(contrasts).all():
+        return ids, corners
+    keep = np.isnan(contrasts) | (contrasts > _MIN_CONTRAST * np.nanmedian(contrasts))
+    return ids[keep], corners[keep]

@@ -1,4 +1,4 @@
-"""Views that do not fit the others, found by leaving each one out."""
+"""Detection of views that do not fit the others, by leaving each one out."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,88 +7,96 @@ import numpy as np
 
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.detection import View
-from torchrefract.cameras.calibration.fit import FEWEST_VIEWS, Fit, errors_of, fit, rms
+from torchrefract.cameras.calibration.fit import MIN_VIEWS, Fit, errors_in_best_pose, fit_camera, rms
 
-_DEVIATIONS = 6.0  # of the other views' errors, by their median deviation
-_TIMES = 3.0  # the median of the others
-_TO_SIGMA = 1.4826  # a normal distribution's standard deviation, in median deviations
+_NUM_DEVIATIONS = 6.0  # standard deviations of the rms of the other views
+_RATIO = 3.0  # to the median rms of the other views
+_MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
-class Left(NamedTuple):
-    """What leaving a view out shows."""
+class LeaveOneOut(NamedTuple):
+    """The effect of leaving one view out of the fit; all errors in px rms.
+
+    name: of the view.
+    error: of the view with the camera fitted to the others.
+    others: of the others without the view.
+    median: of the errors of each of the others.
+    limit: above which the view is an outlier.
+    """
 
     name: str
-    error: float  # px rms, of this view, with the camera that the others give
-    others: float  # px rms, of the others without it
-    median: float  # px, the median of the rms of each other view
-    limit: float  # px, from where on this view is an outlier
+    error: float
+    others: float
+    median: float
+    limit: float
 
     @property
     def is_outlier(self) -> bool:
-        """Whether the view fits the others far worse than they fit one another."""
+        """Return True if the view fits the others far worse than they fit each other."""
         return self.error > self.limit
 
     def reason(self, before: float) -> str:
-        """Why the view is dropped, where all views together have so many px rms."""
+        """Say why the view is dropped; `before` is the rms of the other views in a fit to all of them, px."""
         return (
-            f"held out it is off by {self.error:.2f} px rms, where the others are by {self.median:.2f} in the median "
-            f"and {self.limit:.2f} is the limit; without it all others come to {self.others:.2f} px instead of "
-            f"{before:.2f} with it"
+            f"its error is {self.error:.2f} px rms if it is left out of the fit; the others have a median of "
+            f"{self.median:.2f} px, and the limit is {self.limit:.2f} px. Without it the others have "
+            f"{self.others:.2f} px instead of {before:.2f} px"
         )
 
 
-class Kept(NamedTuple):
-    """The views that fit one another."""
+class Selection(NamedTuple):
+    """The views that fit each other."""
 
     views: list[View]
-    fitted: Fit  # to these
-    ranking: list[Left]  # of these, the one that costs the others most first
-    dropped: dict[str, str]  # by name, the reason
+    fit: Fit  # to these views
+    ranking: list[LeaveOneOut]  # of these views, the one that costs the others most first
+    dropped: dict[str, str]  # the reason by the name of each dropped view
 
 
-def leave_each_out(views: Sequence[View], board: Board, fitted: Fit, *, size: tuple[int, int]) -> list[Left]:
-    """What leaving each view out shows, in their order.
+def leave_each_out(views: Sequence[View], board: Board, fit: Fit, *, size: tuple[int, int]) -> list[LeaveOneOut]:
+    """Leave each view out in turn.
 
         limit = max(3 m, m + 6 * 1.4826 median |e_j - m|),  m = median e_j,  e_j the rms of the other views
 
     Args:
-        views, board, size: as for `fit`, one view more than it needs.
-        fitted: to all of them.
+        views, board, size: as for `fit_camera`, with at least four views.
+        fit: to all views.
     """
-    return [_leave_out(i, views, board, fitted, size) for i in range(len(views))]
+    return [_leave_out(i, views, board, fit, size) for i in range(len(views))]
 
 
 def drop_outliers(
-    views: Sequence[View], board: Board, *, model: str, size: tuple[int, int], most: float = 0.25
-) -> Kept:
-    """The views without those that do not fit the others.
+    views: Sequence[View], board: Board, *, model: str, size: tuple[int, int], max_share: float = 0.25
+) -> Selection:
+    """Drop views that do not fit the others, one at a time.
 
-    Of the outliers the one goes whose absence leaves the others the smallest rms; then all is fitted again, until there
-    is no outlier, or no view more may go.
+    Of all outliers, drops the one whose absence gives the others the smallest rms. Then fits again, until no outlier
+    remains or no more views may be dropped.
 
     Args:
-        views, board, model, size: as for `fit`, one view more than it needs.
-        most: the share of the views that may go; those that must stay for a fit stay.
+        views, board, model, size: as for `fit_camera`, with at least four views.
+        max_share: of the views that may be dropped; at least four views always stay.
     """
     kept, dropped = list(views), dict[str, str]()
-    may_go = min(int(most * len(kept)), len(kept) - FEWEST_VIEWS - 1)
+    max_dropped = min(int(max_share * len(kept)), len(kept) - MIN_VIEWS - 1)
     while True:
-        fitted = fit(kept, board, model=model, size=size)
-        ranking = sorted(leave_each_out(kept, board, fitted, size=size), key=lambda left: left.others)
-        outliers = [left for left in ranking if left.is_outlier]
-        if not outliers or len(dropped) >= may_go:
-            return Kept(kept, fitted, ranking, dropped)
+        fit = fit_camera(kept, board, model=model, size=size)
+        ranking = sorted(leave_each_out(kept, board, fit, size=size), key=lambda result: result.others)
+        outliers = [result for result in ranking if result.is_outlier]
+        if not outliers or len(dropped) >= max_dropped:
+            return Selection(kept, fit, ranking, dropped)
         worst = outliers[0]
-        before = [errors for view, errors in zip(kept, fitted.errors, strict=True) if view.name != worst.name]
+        before = [errors for view, errors in zip(kept, fit.errors, strict=True) if view.name != worst.name]
         dropped[worst.name] = worst.reason(rms(np.concatenate(before)))
         kept = [view for view in kept if view.name != worst.name]
 
 
-def _leave_out(i: int, views: Sequence[View], board: Board, fitted: Fit, size: tuple[int, int]) -> Left:
+def _leave_out(i: int, views: Sequence[View], board: Board, fit: Fit, size: tuple[int, int]) -> LeaveOneOut:
     others = [view for j, view in enumerate(views) if j != i]
-    found = fit(others, board, model=fitted.lens.model, size=size, start=fitted.lens)
-    each = np.array([rms(errors) for errors in found.errors])
-    middle = float(np.median(each))
-    spread = _TO_SIGMA * float(np.median(np.abs(each - middle)))
-    error = rms(errors_of(views[i], board, found.lens, fitted.poses[i]))
-    return Left(views[i].name, error, found.rms, middle, max(_TIMES * middle, middle + _DEVIATIONS * spread))
+    other_fit = fit_camera(others, board, model=fit.intrinsics.model, size=size, start=fit.intrinsics)
+    errors = np.array([rms(errors) for errors in other_fit.errors])
+    median = float(np.median(errors))
+    deviation = _MAD_TO_SIGMA * float(np.median(np.abs(errors - median)))
+    error = rms(errors_in_best_pose(views[i], board, other_fit.intrinsics, fit.poses[i]))
+    limit = max(_RATIO * median, median + _NUM_DEVIATIONS * deviation)
+    return LeaveOneOut(views[i].name, error, other_fit.rms, median, limit)

@@ -1,1 +1,1 @@
-"""Cameras read from and written to the files of other programs; YAML needs the `calibration` extra."""
+"""Readers and writers of camera files: `opencv`, `ros`, `kalibr` and `colmap`; YAML needs the `calibration` extra."""

@@ -1,4 +1,4 @@
-"""What the readers and writers of all formats share: text, numbers, and errors that name the file."""
+"""Helpers of all camera readers and writers: text, checked numbers, and errors that name the file."""
 
 import reprlib
 from collections.abc import Mapping, Sequence
@@ -6,27 +6,27 @@ from pathlib import Path
 from typing import Any
 
 from torchrefract._io import replace_file
-from torchrefract.cameras.models import Camera
+from torchrefract.cameras.camera import Camera
 
-# A list that YAML's aliases fold into itself is small in memory, and without end in print.
+# A list that refers to itself through YAML's aliases is small in memory but endless in print.
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxstring, _SHORT.maxother = 2, 14, 80, 80
 
 
-def shown(value: Any) -> str:
-    """A value of a file as an error prints it, short whatever the file holds."""
+def abbreviate(value: Any) -> str:
+    """Return a short representation of a value of a file, for errors."""
     try:
         return _SHORT.repr(value)
-    except ValueError:  # a whole number of more digits than Python prints
+    except ValueError:  # an integer with more digits than Python prints
         return type(value).__name__
 
 
 def read_text(path: Path) -> str:
-    """The text of a file.
+    """Read a text file in UTF-8.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: bytes that are no UTF-8.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is not UTF-8.
     """
     try:
         return path.read_text(encoding="utf-8")
@@ -35,58 +35,62 @@ def read_text(path: Path) -> str:
 
 
 def write_text(path: Path, text: str) -> None:
-    """A file that is there whole or not at all."""
+    """Write a text file in UTF-8; readers find the old file or the complete new one."""
     with replace_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def entry(path: Path, document: Mapping[str, Any], name: str) -> Any:
-    """What a document has under a name.
-
-    Raises:
-        ValueError: nothing.
-    """
+    """Return the value of a name in a document, or raise ValueError if it is missing."""
     if name not in document:
         raise ValueError(f"path must hold {name}, got {path} with {', '.join(map(str, document)) or 'nothing'}")
     return document[name]
 
 
 def numbers(path: Path, name: str, values: Any, *, count: int | None = None) -> list[float]:
-    """A list of so many numbers.
+    """Return values as a list of `count` numbers, or of any number of them if it is None.
 
     Raises:
-        ValueError: something else.
+        ValueError: the values are not numbers, or not as many.
     """
     try:
         if isinstance(values, str | Mapping):
             raise TypeError
-        found = [float(value) for value in values]
+        result = [float(value) for value in values]
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"path must hold numbers as {name}, got {path} with {shown(values)}") from None
-    if count is not None and len(found) != count:
-        raise ValueError(f"path must hold {count} numbers as {name}, got {path} with {len(found)}")
-    return found
+        raise ValueError(f"path must hold numbers as {name}, got {path} with {abbreviate(values)}") from None
+    if count is not None and len(result) != count:
+        raise ValueError(f"path must hold {count} numbers as {name}, got {path} with {len(result)}")
+    return result
 
 
-def whole(path: Path, name: str, value: Any) -> int:
-    """A whole number.
+def integer(path: Path, name: str, value: Any) -> int:
+    """Return a value as an integer, or raise ValueError if it is not a whole number."""
+    (result,) = numbers(path, name, [value])
+    if not result.is_integer():
+        raise ValueError(f"path must hold a whole number as {name}, got {path} with {abbreviate(value)}")
+    return int(result)
+
+
+def pinhole_of_matrix(path: Path, name: str, values: Any) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy of the nine numbers of a camera matrix, row by row.
 
     Raises:
-        ValueError: something else.
+        ValueError: the values are not nine numbers, or the matrix has skew or another last row than 0, 0, 1.
     """
-    (found,) = numbers(path, name, [value])
-    if not found.is_integer():
-        raise ValueError(f"path must hold a whole number as {name}, got {path} with {shown(value)}")
-    return int(found)
+    fx, skew, cx, _, fy, cy, *last = numbers(path, name, values, count=9)
+    if skew != 0 or last != [0.0, 0.0, 1.0]:
+        raise ValueError(f"path must hold a {name} without skew, got {path} with skew {skew:g}, last row {last}")
+    return fx, fy, cx, cy
 
 
-def camera_of(
+def create_camera(
     path: Path, size: Sequence[int], pinhole: Sequence[float], coefficients: Sequence[float], model: str
 ) -> Camera:
-    """The camera of (width, height), (fx, fy, cx, cy) and coefficients.
+    """Create a camera of (width, height), (fx, fy, cx, cy) and coefficients.
 
     Raises:
-        ValueError: numbers that are no camera, with the file's name.
+        ValueError: a number is out of range; the error names the file.
     """
     fx, fy, cx, cy = pinhole
     try:
@@ -97,11 +101,11 @@ def camera_of(
         raise ValueError(f"path must hold a camera, got {path}: {error}") from error
 
 
-def shortened(camera: Camera, count: int) -> tuple[float, ...]:
-    """OpenCV's coefficients cut or filled up to a count.
+def fit_length(camera: Camera, count: int) -> tuple[float, ...]:
+    """Return OpenCV's coefficients truncated or padded with zeros to `count`.
 
     Raises:
-        ValueError: others that are not zero.
+        ValueError: a coefficient that would be dropped is not zero.
     """
     first, rest = camera.coefficients[:count], camera.coefficients[count:]
     if any(rest):
@@ -109,9 +113,10 @@ def shortened(camera: Camera, count: int) -> tuple[float, ...]:
     return (*first, *(0.0,) * (count - len(first)))
 
 
-def unknown_model(camera: Camera, known: str) -> ValueError:
-    """The error for a camera of a model that a format has no name for."""
-    return ValueError(
-        f"camera must be of the model {known} for this file (convert(camera, to=...) finds the nearest), "
-        f"got {camera.model}"
-    )
+def check_opencv_model(camera: Camera) -> None:
+    """Raise ValueError unless the camera has a model of OpenCV, "opencv" or "fisheye"."""
+    if camera.model not in ("opencv", "fisheye"):
+        raise ValueError(
+            "camera must be of the model opencv or fisheye for this file (convert(camera, to=...) finds the nearest), "
+            f"got {camera.model}"
+        )

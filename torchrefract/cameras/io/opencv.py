@@ -1,68 +1,58 @@
-"""Cameras in OpenCV's own files, YAML or XML, under the names that its calibration sample uses."""
+"""Cameras in OpenCV's own files, YAML or XML, under the names of its calibration sample."""
 
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from torchrefract.cameras.io.documents import (
-    camera_of,
-    entry,
-    numbers,
-    read_text,
-    shown,
-    unknown_model,
-    whole,
-    write_text,
-)
+from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.io import documents
 from torchrefract.cameras.io.yaml_documents import parse_yaml
-from torchrefract.cameras.models import Camera
 
 _XML, _YAML = ".xml", (".yml", ".yaml")
 
 
 def read_opencv(path: str | Path) -> Camera:
-    """The camera of a file with image_width, image_height, camera_matrix, distortion_coefficients and fisheye_model.
+    """Read image_width, image_height, camera_matrix, distortion_coefficients and fisheye_model of a camera.
 
-    Where fisheye_model is missing or 0 the model is "opencv", else "fisheye".
+    The model is "fisheye" if fisheye_model is present and not 0, otherwise "opencv".
 
     Args:
         path: ending in .xml, .yml or .yaml.
 
     Raises:
-        ValueError: a file that holds no such camera.
+        ValueError: the file holds no such camera.
     """
     path = Path(path)
-    document = _from_xml(path) if _is_xml(path) else parse_yaml(path, _plain_yaml(read_text(path)))
-    size = [whole(path, name, entry(path, document, name)) for name in ("image_width", "image_height")]
-    fx, skew, cx, _, fy, cy, *last = _matrix(path, document, "camera_matrix", count=9)
-    if skew != 0 or last != [0.0, 0.0, 1.0]:
-        raise ValueError(f"path must hold a camera_matrix without skew, got {path} with skew {skew:g}, last row {last}")
-    coefficients = _matrix(path, document, "distortion_coefficients")
-    fisheye = whole(path, "fisheye_model", document.get("fisheye_model", 0))
-    return camera_of(path, size, (fx, fy, cx, cy), coefficients, "fisheye" if fisheye else "opencv")
+    document = _from_xml(path) if _is_xml(path) else parse_yaml(path, _plain_yaml(documents.read_text(path)))
+    size = [
+        documents.integer(path, name, documents.entry(path, document, name)) for name in ("image_width", "image_height")
+    ]
+    pinhole = documents.pinhole_of_matrix(path, "camera_matrix", _data(path, document, "camera_matrix"))
+    coefficients = documents.numbers(path, "distortion_coefficients", _data(path, document, "distortion_coefficients"))
+    is_fisheye = documents.integer(path, "fisheye_model", document.get("fisheye_model", 0))
+    return documents.create_camera(path, size, pinhole, coefficients, "fisheye" if is_fisheye else "opencv")
 
 
 def write_opencv(path: str | Path, camera: Camera) -> None:
-    """A file that `read_opencv` and `cv2.FileStorage` read.
+    """Write a file that `read_opencv` and `cv2.FileStorage` read.
 
     Args:
         path: ending in .xml, .yml or .yaml.
         camera: of the model "opencv" or "fisheye".
 
     Raises:
-        ValueError: another model, another ending.
+        ValueError: the camera has another model, or the path another ending.
     """
     path = Path(path)
-    if camera.model not in ("opencv", "fisheye"):
-        raise unknown_model(camera, "opencv or fisheye")
-    plain = {"image_width": camera.width, "image_height": camera.height}
-    plain["fisheye_model"] = int(camera.model == "fisheye")
+    documents.check_opencv_model(camera)
+    scalars = {"image_width": camera.width, "image_height": camera.height}
+    scalars["fisheye_model"] = int(camera.model == "fisheye")
     matrix = [value for row in camera.matrix for value in row]
     matrices = {
         "camera_matrix": (3, 3, matrix),
         "distortion_coefficients": (len(camera.coefficients), 1, list(camera.coefficients)),
     }
-    write_text(path, (_xml_text if _is_xml(path) else _yaml_text)(plain, matrices))
+    documents.write_text(path, (_xml_text if _is_xml(path) else _yaml_text)(scalars, matrices))
 
 
 def _is_xml(path: Path) -> bool:
@@ -72,14 +62,14 @@ def _is_xml(path: Path) -> bool:
 
 
 def _plain_yaml(text: str) -> str:
-    # OpenCV's first line, %YAML:1.0, is no directive of YAML.
+    # OpenCV's first line, %YAML:1.0, is not a valid directive of YAML.
     first, _, rest = text.partition("\n")
     return rest if first.startswith("%YAML") else text
 
 
 def _from_xml(path: Path) -> dict[str, Any]:
     try:
-        root = ElementTree.fromstring(read_text(path))
+        root = ElementTree.fromstring(documents.read_text(path))
     except ElementTree.ParseError as error:
         raise ValueError(f"path must hold XML, got {path}: {error}") from error
     return {node.tag: _from_node(node) for node in root}
@@ -92,28 +82,28 @@ def _from_node(node: ElementTree.Element) -> Any:
     return (node.text or "").strip()
 
 
-def _matrix(path: Path, document: Any, name: str, *, count: int | None = None) -> list[float]:
-    matrix = entry(path, document, name)
+def _data(path: Path, document: Any, name: str) -> Any:
+    matrix = documents.entry(path, document, name)
     if not isinstance(matrix, dict) or "data" not in matrix:
-        raise ValueError(f"path must hold a matrix as {name}, got {path} with {shown(matrix)}")
-    return numbers(path, name, matrix["data"], count=count)
+        raise ValueError(f"path must hold a matrix as {name}, got {path} with {documents.abbreviate(matrix)}")
+    return matrix["data"]
 
 
-def _yaml_text(plain: dict[str, int], matrices: dict[str, tuple[int, int, list[float]]]) -> str:
-    lines = ["%YAML:1.0", "---", *(f"{name}: {value}" for name, value in plain.items())]
+def _yaml_text(scalars: dict[str, int], matrices: dict[str, tuple[int, int, list[float]]]) -> str:
+    lines = ["%YAML:1.0", "---", *(f"{name}: {value}" for name, value in scalars.items())]
     for name, (rows, columns, values) in matrices.items():
         lines += [f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d"]
         lines.append(f"   data: [ {', '.join(map(_number, values))} ]")
     return "\n".join(lines) + "\n"
 
 
-def _xml_text(plain: dict[str, int], matrices: dict[str, tuple[int, int, list[float]]]) -> str:
+def _xml_text(scalars: dict[str, int], matrices: dict[str, tuple[int, int, list[float]]]) -> str:
     lines = ['<?xml version="1.0"?>', "<opencv_storage>"]
-    lines += [f"<{name}>{value}</{name}>" for name, value in plain.items()]
+    lines += [f"<{name}>{value}</{name}>" for name, value in scalars.items()]
     for name, (rows, columns, values) in matrices.items():
         data = " ".join(map(_number, values))
-        inside = f"<rows>{rows}</rows><cols>{columns}</cols><dt>d</dt><data>{data}</data>"
-        lines.append(f'<{name} type_id="opencv-matrix">{inside}</{name}>')
+        content = f"<rows>{rows}</rows><cols>{columns}</cols><dt>d</dt><data>{data}</data>"
+        lines.append(f'<{name} type_id="opencv-matrix">{content}</{name}>')
     return "\n".join([*lines, "</opencv_storage>"]) + "\n"
 
 

@@ -3,62 +3,54 @@
 from pathlib import Path
 from typing import Any
 
-from torchrefract.cameras.io.documents import (
-    camera_of,
-    entry,
-    numbers,
-    read_text,
-    shortened,
-    shown,
-    unknown_model,
-    whole,
-    write_text,
-)
+from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.io import documents
 from torchrefract.cameras.io.yaml_documents import dump_yaml, parse_yaml
-from torchrefract.cameras.models import Camera
 
 _MODELS = {"plumb_bob": "opencv", "rational_polynomial": "opencv", "equidistant": "fisheye"}
 
 
 def read_ros(path: str | Path) -> Camera:
-    """The camera of a file with image_width, image_height, camera_matrix, distortion_model, distortion_coefficients.
+    """Read image_width, image_height, camera_matrix, distortion_model and distortion_coefficients of a camera.
 
-    plumb_bob and rational_polynomial are the model "opencv", equidistant is "fisheye". Rectification and projection
-    matrices are not read: they are a choice of a view, not the camera's.
+    plumb_bob and rational_polynomial become "opencv", equidistant becomes "fisheye". The rectification and projection
+    matrices are ignored: they describe a rectified view.
 
     Raises:
-        ValueError: a file that holds no such camera; another distortion_model.
+        ValueError: the file holds no such camera, or one with another distortion_model.
     """
     path = Path(path)
-    document = parse_yaml(path, read_text(path))
-    size = [whole(path, name, entry(path, document, name)) for name in ("image_width", "image_height")]
-    name = entry(path, document, "distortion_model")
+    document = parse_yaml(path, documents.read_text(path))
+    size = [
+        documents.integer(path, name, documents.entry(path, document, name)) for name in ("image_width", "image_height")
+    ]
+    name = documents.entry(path, document, "distortion_model")
     if not isinstance(name, str) or name not in _MODELS:
-        raise ValueError(f"path must have a distortion_model of {', '.join(_MODELS)}, got {path} with {shown(name)}")
-    fx, skew, cx, _, fy, cy, *_ = _data(path, document, "camera_matrix", count=9)
-    if skew != 0:
-        raise ValueError(f"path must hold a camera_matrix without skew, got {path} with {skew:g}")
-    coefficients = _data(path, document, "distortion_coefficients")
-    return camera_of(path, size, (fx, fy, cx, cy), coefficients, _MODELS[name])
+        raise ValueError(
+            f"path must have a distortion_model of {', '.join(_MODELS)}, got {path} with {documents.abbreviate(name)}"
+        )
+    pinhole = documents.pinhole_of_matrix(path, "camera_matrix", _data(path, document, "camera_matrix"))
+    coefficients = documents.numbers(path, "distortion_coefficients", _data(path, document, "distortion_coefficients"))
+    return documents.create_camera(path, size, pinhole, coefficients, _MODELS[name])
 
 
 def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None:
-    """A file that `read_ros` and ROS read, for frames that are not rectified yet.
+    """Write a file that `read_ros` and ROS read, for frames that are not rectified.
 
     Args:
         path: to write.
-        camera: of the model "fisheye", or "opencv" without tilt.
+        camera: "fisheye", or "opencv" without prism and tilt.
         name: of the camera.
 
     Raises:
-        ValueError: another model; more coefficients than the formats have.
+        ValueError: the camera has another model or other coefficients.
     """
-    if camera.model not in ("opencv", "fisheye"):
-        raise unknown_model(camera, "opencv or fisheye")
+    documents.check_opencv_model(camera)
     coefficients, model = camera.coefficients, "equidistant"
     if camera.model == "opencv":
-        few = not any(coefficients[5:])
-        coefficients, model = shortened(camera, 5 if few else 8), "plumb_bob" if few else "rational_polynomial"
+        is_short = not any(coefficients[5:])
+        coefficients = documents.fit_length(camera, 5 if is_short else 8)
+        model = "plumb_bob" if is_short else "rational_polynomial"
     (fx, _, cx), (_, fy, cy), _ = camera.matrix
     document = {
         "image_width": camera.width,
@@ -70,14 +62,16 @@ def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None
         "rectification_matrix": _matrix(3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
         "projection_matrix": _matrix(3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
     }
-    write_text(Path(path), dump_yaml(document))
+    documents.write_text(Path(path), dump_yaml(document))
 
 
-def _data(path: Path, document: Any, name: str, *, count: int | None = None) -> list[float]:
-    matrix = entry(path, document, name)
+def _data(path: Path, document: Any, name: str) -> Any:
+    matrix = documents.entry(path, document, name)
     if not isinstance(matrix, dict):
-        raise ValueError(f"path must hold rows, cols and data as {name}, got {path} with {shown(matrix)}")
-    return numbers(path, name, entry(path, matrix, "data"), count=count)
+        raise ValueError(
+            f"path must hold rows, cols and data as {name}, got {path} with {documents.abbreviate(matrix)}"
+        )
+    return documents.entry(path, matrix, "data")
 
 
 def _matrix(rows: int, columns: int, data: list[float]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""YAML, as OpenCV, ROS and Kalibr write it."""
+"""YAML as OpenCV, ROS and Kalibr write it; the only module here that needs PyYAML."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,16 +12,14 @@ except ModuleNotFoundError as missing:
     ) from missing
 
 
-_SHOWN = 400  # letters of an error
-# What PyYAML makes of a scalar that is not what its tag or its look says, of keys that are lists, and of deep nesting.
-_BROKEN = (yaml.YAMLError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError, RecursionError)
+_MAX_MESSAGE = 400  # characters of PyYAML's error to repeat
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain values only, and OpenCV's matrices as mappings."""
+    """Load plain values only, and OpenCV's matrices as mappings."""
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        """Raise for merge keys, which no program writes, and by which a few lines can fill the memory."""
+        """Raise for merge keys: no camera file has them, and a few lines of them can fill the memory."""
         for key, _ in node.value:
             if key.tag == "tag:yaml.org,2002:merge":
                 raise yaml.constructor.ConstructorError(None, None, "found a merge key", key.start_mark)
@@ -36,20 +34,24 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
 
 
 def parse_yaml(path: Path, text: str) -> Mapping[str, Any]:
-    """The mapping that a YAML text holds; `path` is for the errors.
+    """Parse a YAML text that holds a mapping.
+
+    Args:
+        path: of the file, for errors.
+        text: to parse.
 
     Raises:
-        ValueError: no YAML, or no mapping.
+        ValueError: the text is not YAML or not a mapping.
     """
     try:
         document = yaml.load(text, Loader=_Loader)
-    except _BROKEN as error:
-        raise ValueError(f"path must hold YAML, got {path}: {' '.join(str(error).split())[:_SHOWN]}") from error
+    except Exception as error:  # malformed scalars and keys raise many types besides YAMLError
+        raise ValueError(f"path must hold YAML, got {path}: {' '.join(str(error).split())[:_MAX_MESSAGE]}") from error
     if not isinstance(document, Mapping):
         raise ValueError(f"path must hold a mapping of names to values, got {path} with {type(document).__name__}")
     return document
 
 
 def dump_yaml(document: Mapping[str, Any]) -> str:
-    """A YAML text with lists on one line, in the order given."""
+    """Return a mapping as YAML, in its order, with each list on one line."""
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000)

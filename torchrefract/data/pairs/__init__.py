@@ -1,1 +1,5 @@
-"""Pairs written to disk: sources, making and writing, in processes and shards, with a card that tells of them."""
+"""Pair sets on disk: generation, files, manifest and datasets."""
+
+from torchrefract.data.pairs.dataset import PairedFolder, PairStream
+
+__all__ = ["PairStream", "PairedFolder"]

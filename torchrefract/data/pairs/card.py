@@ -1,55 +1,71 @@
-"""The card of a set of pairs: what is in it, how its files are read, and whose the frames are."""
+"""The card of a pair set: a README.md with its content, its file formats and the license of its frames."""
 
+import io
+import math
 from array import array
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
-from torchrefract.data.pair_manifest import PairRow
+from torchrefract.cameras.brown_conrady import POLYNOMIAL12
+from torchrefract.data.pairs.manifest import PairRow
 
 HISTOGRAMS = "parameters.png"
 
-Values = Mapping[tuple[str, str], list["array[float]"]]
-
-_UNSEEN = ("effect", "key", "frame", "wind", "drift", "decorrelation")  # no numbers, or none that a single frame shows
-_READ = {
-    "clean.png": "8 bits, RGB: the frame",
-    "corrupted.png": "8 bits, RGB: what the effects made of it",
+_NOT_SHOWN = ("effect", "key", "frame", "wind", "drift", "decorrelation")  # not numbers, or without effect on a frame
+_FORMATS = {
+    "clean.png": "8 bits, RGB: the clean frame",
+    "corrupted.png": "8 bits, RGB: the degraded frame",
     "flow.png": "16 bits: u = (red - 32768) / 64, v = (green - 32768) / 64 px, blue 1 where valid; "
     "corrupted(p) = clean(p + flow(p))",
-    "restore_flow.png": "the same, of the flow that undoes it: clean(p) = corrupted(p + restore_flow(p))",
-    "transmission.png": "16 bits, gray: value / 65535 is the share of the clean light that arrives",
-    "intensity.png": "16 bits, gray: value / 32768 is the light added",
-    "valid.png": "255 where corrupted shows what clean holds",
-    "restore_valid.png": "255 where restore_flow gives clean back",
-    "maps.npz": "flow, restore_flow (px), transmission, intensity, valid, restore_valid, those that there are, as "
-    "NumPy has them; corrupted(p) = clean(p + flow(p)), clean(p) = corrupted(p + restore_flow(p))",
+    "restore_flow.png": "16 bits, in the same format: the flow that restores the clean frame, clean(p) = corrupted(p + "
+    "restore_flow(p))",
+    "transmission.png": "16 bits, gray: value / 65535 is the fraction of the clean light that reaches the camera",
+    "intensity.png": "16 bits, gray: value / 32768 is the light that flare adds",
+    "valid.png": "255 where corrupted shows content of clean",
+    "restore_valid.png": "255 where restore_flow restores clean",
+    "maps.npz": "NumPy arrays: flow, restore_flow (px), transmission, intensity, valid, restore_valid, as far as the "
+    "scene has them; corrupted(p) = clean(p + flow(p)), clean(p) = corrupted(p + restore_flow(p))",
 }
-_READ["maps.safetensors"] = _READ["maps.npz"].replace("NumPy has", "safetensors has")
+_FORMATS["maps.safetensors"] = _FORMATS["maps.npz"].replace("NumPy arrays", "tensors")
+_COLUMNS, _MAX_BINS = 4, 30
+_AXES = ("x", "y", "z")
+_UNITS = {
+    "amplitude": "px",
+    "length": "px",
+    "aperture": "px",
+    "displacement": "px",
+    "visibility": "m",
+    "focal": "image widths",
+    "radius": "image diagonals",
+}
 
 
-class Contents(NamedTuple):
-    """What the rows of a set come to."""
+class Summary(NamedTuple):
+    """Counts over the rows of a set."""
 
     splits: Counter[str]
     drives: dict[str, set[str]]  # of each split
     effects: Counter[str]
     sizes: Counter[str]
-    sources: int
-    skipped: list[str]
-    beyond: Counter[str]  # pairs with pixels of a flow that a PNG cannot hold
-    files: tuple[str, ...]  # of a pair
-    bytes: int
-    values: Values  # of each effect's parameters, by component
+    num_sources: int
+    skipped: list[str]  # reasons
+    beyond: Counter[str]  # pairs with pixels that the PNG of a flow cannot hold, by flow
+    files: tuple[str, ...]  # suffixes of the files of a pair
+    num_bytes: int
+    parameters: Mapping[tuple[str, str], list["array[float]"]]  # by effect and name, for each component
 
 
-def contents(rows: Iterable[PairRow]) -> Contents:
-    """What rows come to."""
+def summarize(rows: Iterable[PairRow]) -> Summary:
+    """Count what the rows of a set hold."""
     splits, effects, sizes, beyond = Counter[str](), Counter[str](), Counter[str](), Counter[str]()
-    drives, values = defaultdict[str, set[str]](set), defaultdict[tuple[str, str], list["array[float]"]](list)
-    sources, skipped, files, total = set[tuple[str, int | None]](), [], (), 0
+    drives, parameters = defaultdict[str, set[str]](set), defaultdict[tuple[str, str], list["array[float]"]](list)
+    sources, skipped, files, num_bytes = set[tuple[str, int | None]](), [], (), 0
     for row in rows:
         if row.skipped:
             skipped.append(row.skipped)
@@ -60,64 +76,102 @@ def contents(rows: Iterable[PairRow]) -> Contents:
         sizes[f"{row.width} x {row.height}"] += 1
         sources.add((row.source, row.frame))
         beyond.update(row.beyond.keys())
-        files, total = tuple(row.files), total + sum(file.bytes for file in row.files.values())
+        files, num_bytes = tuple(row.files), num_bytes + sum(file.bytes for file in row.files.values())
         effects[" + ".join(str(effect["effect"]) for effect in row.effects) or "none"] += 1
-        _collect(row.effects, values)
-    return Contents(splits, drives, effects, sizes, len(sources), skipped, beyond, files, total, values)
+        for effect in row.effects:
+            _add_parameters(effect, parameters)
+    return Summary(splits, drives, effects, sizes, len(sources), skipped, beyond, files, num_bytes, parameters)
 
 
-def write_card(found: Contents, *, settings: Mapping[str, Any], license_of: str, pictured: bool) -> str:
-    """The card, in Markdown.
+def format_card(summary: Summary, *, settings: Mapping[str, Any], license_text: str, has_histograms: bool) -> str:
+    """Format the card in Markdown.
 
     Args:
-        found: in the set.
-        settings: of the set.
-        license_of: the source, as the user says.
-        pictured: whether there is a picture of histograms.
+        summary: of the set.
+        settings: of the set, as in config.json.
+        license_text: license of the frames, as the user states it.
+        has_histograms: True if the file of `HISTOGRAMS` exists.
     """
-    scene, count = settings["scene"]["name"], found.splits.total()
-    splits = [f"| {split} | {pairs} | {len(found.drives[split])} |" for split, pairs in sorted(found.splits.items())]
-    effects = [f"| {name} | {pairs} |" for name, pairs in sorted(found.effects.items())]
-    files = [f"- `{suffix}`: {_READ[suffix]}" for suffix in found.files]
+    scene, count = settings["scene"]["name"], summary.splits.total()
+    splits = [f"| {name} | {pairs} | {len(summary.drives[name])} |" for name, pairs in sorted(summary.splits.items())]
+    effects = [f"| {name} | {pairs} |" for name, pairs in sorted(summary.effects.items())]
+    sizes = ", ".join(sorted(summary.sizes))
+    figure = ["## Parameters", "", f"![Histograms of the parameters]({HISTOGRAMS})", ""]
+    remarks = [
+        f"{pairs} pairs have pixels whose {name} exceeds the range of a 16-bit PNG, 512 px; they are marked as invalid."
+        for name, pairs in sorted(summary.beyond.items())
+    ]
+    if summary.skipped:
+        remarks.append(f"{len(summary.skipped)} frames are unreadable and have no pair, such as: {summary.skipped[0]}.")
     lines = [
         f"# {count} pairs of the scene {scene}",
         "",
-        f"Clean frames, what `{settings['scene']['_target_']}` of torchrefract made of them, and the maps that undo "
-        f"it: {found.bytes / 1e9:.3g} GB, of {found.sources} frames, {', '.join(sorted(found.sizes))} px (width x "
+        f"Clean frames, the same frames degraded by `{settings['scene']['_target_']}` of torchrefract, and the maps "
+        f"between them: {summary.num_bytes / 1e9:.3g} GB, from {summary.num_sources} frames, {sizes} px (width x "
         "height).",
         "",
-        "**License of the frames, as stated by who made this set:** " + license_of,
+        f"**License of the frames, as stated by the creator of this set:** {license_text}",
         "",
         *("| split | pairs | drives |", "| --- | --- | --- |", *splits, ""),
         *("| effect | pairs |", "| --- | --- |", *effects, ""),
-        *_remarks(found),
-        *(["## Parameters", "", f"![Histograms of the parameters]({HISTOGRAMS})", ""] if pictured else []),
-        *("## Files", "", "Flows are in pixels, u to the right and v down; pixel centers are whole numbers.", ""),
-        *(*files, ""),
-        "`manifest.jsonl`, or several manifest-….jsonl that can be put together, has a line of JSON for each pair: its "
-        "source, drive and split, all parameters, and its files with their checksums. `degrade(clean, seed=seed, "
-        "keys=[key])` makes the pair again. `config.json` has the configuration.",
+        *(line for remark in remarks for line in (remark, "")),
+        *(figure if has_histograms else []),
+        *("## Files", "", "Flows are in pixels, u to the right and v down. Pixel centers are integers.", ""),
+        *(f"- `{suffix}`: {_FORMATS[suffix]}" for suffix in summary.files),
+        "",
+        "`manifest.jsonl` has a line of JSON for each pair: source, drive, split, all parameters, and files with "
+        "checksums. Several files `manifest-*.jsonl` can be concatenated. `degrade(clean, seed=seed, keys=[key])` "
+        "makes a pair again. `config.json` holds the configuration.",
     ]
     return "\n".join(lines) + "\n"
 
 
-def _collect(effects: Sequence[Mapping[str, Any]], values: dict[tuple[str, str], list["array[float]"]]) -> None:
-    for effect in effects:
-        for name, value in effect.items():
-            if name not in _UNSEEN:
-                numbers = np.array(value, dtype=np.float64).ravel()  # of a word too: "inf"
-                columns = values[str(effect["effect"]), name]
-                columns.extend(array("d") for _ in range(len(numbers) - len(columns)))
-                for column, number in zip(columns, numbers, strict=False):
-                    column.append(number)
+def draw_histograms(summary: Summary) -> bytes | None:
+    """Draw a histogram of each parameter that varies; return a PNG, or None if none varies."""
+    panels = list(_histogram_panels(summary))
+    if not panels:
+        return None
+    rows = -(-len(panels) // _COLUMNS)
+    width, height = 3.2 * _COLUMNS, 2.3 * rows
+    figure = Figure(figsize=(width, height), dpi=100)
+    # Margins in inches keep all panels of the same size.
+    figure.subplots_adjust(0.6 / width, 0.5 / height, 1 - 0.15 / width, 1 - 0.3 / height, wspace=0.25, hspace=0.55)
+    FigureCanvasAgg(figure)
+    for i, (title, label, values) in enumerate(panels):
+        axes = figure.add_subplot(rows, _COLUMNS, i + 1)
+        axes.hist(values, bins=min(_MAX_BINS, math.isqrt(len(values)) + 1), color="tab:blue", edgecolor="white")
+        axes.set_title(title, fontsize=9)
+        axes.set_xlabel(label, fontsize=8)
+        axes.set_ylabel("count" if i % _COLUMNS == 0 else "", fontsize=8)
+        axes.tick_params(labelsize=7)
+        axes.xaxis.set_major_locator(MaxNLocator(4))
+        axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    return stream.getvalue()
 
 
-def _remarks(found: Contents) -> list[str]:
-    remarks = [
-        f"{pairs} pairs have pixels whose {name} is longer than a PNG of 16 bits holds, 512 px; it marks them as not "
-        "valid."
-        for name, pairs in sorted(found.beyond.items())
-    ]
-    if found.skipped:
-        remarks.append(f"{len(found.skipped)} frames could not be read and have no pair, such as: {found.skipped[0]}.")
-    return [line for remark in remarks for line in (remark, "")]
+def _add_parameters(effect: Mapping[str, Any], parameters: dict[tuple[str, str], list["array[float]"]]) -> None:
+    for name, value in effect.items():
+        if name in _NOT_SHOWN:
+            continue
+        numbers = np.array(value, dtype=np.float64).ravel()  # parses the word "inf", too
+        columns = parameters[str(effect["effect"]), name]
+        columns.extend(array("d") for _ in range(len(numbers) - len(columns)))
+        for column, number in zip(columns, numbers, strict=False):
+            column.append(number)
+
+
+def _histogram_panels(summary: Summary) -> Iterable[tuple[str, str, np.ndarray]]:
+    """Yield title, label and values of each parameter that varies; many components share one panel."""
+    for (effect, name), columns in sorted(summary.parameters.items()):
+        arrays = [np.frombuffer(column) for column in columns]
+        varied = {i: column for i, column in enumerate(arrays) if np.isfinite(column).all() and np.ptp(column) > 0}
+        unit = f", {_UNITS[name]}" if name in _UNITS else ""
+        if name == "coefficients" and len(arrays) == len(POLYNOMIAL12):
+            yield from ((effect, POLYNOMIAL12[i], column) for i, column in varied.items())
+        elif len(arrays) > len(_AXES) and varied:
+            yield effect, f"{name}{unit}, all components", np.concatenate(list(varied.values()))
+        else:
+            for i, column in varied.items():
+                yield effect, f"{name}{f' {_AXES[i]}' if len(arrays) > 1 else ''}{unit}", column

@@ -1,0 +1,167 @@
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.utils.data import DataLoader
+
+from torchrefract import Pair, presets
+from torchrefract.data.module import PairData, frames, pairs
+from torchrefract.data.pairs.dataset import PairedFolder, PairStream
+from torchrefract.data.pairs.files import count_out_of_range, decode_flow, encode_flow
+from torchrefract.restoration.tasks import Undistort
+
+SIZE = (32, 48)
+SCENE = ("scene=paper_refractive", "scene.width=192")
+
+
+@pytest.fixture
+def source(tmp_path) -> Path:
+    """Write sixteen images of four drives."""
+    generator = np.random.default_rng(1)
+    for number in range(16):
+        path = tmp_path / "frames" / f"drive{number // 4}" / f"{number}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        coarse = Image.fromarray(generator.integers(0, 256, (8, 12, 3)).astype(np.uint8))
+        coarse.resize((SIZE[1], SIZE[0]), Image.Resampling.BICUBIC).save(path)
+    return tmp_path / "frames"
+
+
+@pytest.fixture
+def made(call, source):
+    """Return a function that writes pairs of the images."""
+
+    def make(*more: str, out: str = "out", scene: tuple[str, ...] = SCENE) -> Path:
+        assert call("generate", *scene, f"source={source}", f"out={out}", "license=CC0", "workers=0", *more).code == 0
+        return source.parent / out
+
+    return make
+
+
+def during(data: PairData, *, training: bool) -> PairData:
+    """Attach what `PairData` reads of Lightning's trainer in the first epoch."""
+    run = SimpleNamespace(training=training, current_epoch=0, world_size=1, global_rank=0)
+    data.trainer = run  # pyright: ignore[reportAttributeAccessIssue]  # only these attributes are read
+    return data
+
+
+def batches(data: PairData, *, training: bool) -> list[Pair]:
+    during(data, training=training)
+    loader = data.train_dataloader() if training else data.val_dataloader()
+    return [data.on_after_batch_transfer(batch, 0) for batch in loader]
+
+
+@pytest.mark.parametrize("maps", ["png", "npz", "safetensors"])
+def test_pairs_from_disk_equal_pairs_on_the_fly(made, source, maps):
+    out = made(f"maps={maps}")
+    stored = pairs(root=out, batch_size=4, workers=0)
+    live = frames(root=source, effect=presets.paper_refractive(width=192), size=SIZE, batch_size=4, workers=0)
+    for training in (True, False):
+        for disk, fly in zip(batches(stored, training=training), batches(live, training=training), strict=True):
+            assert torch.equal(disk.key, fly.key)
+            assert torch.equal(disk.valid, fly.valid)
+            assert (disk.flow - fly.flow).abs().max() <= (0.5 / 64 if maps == "png" else 0)
+            assert torch.equal(disk.clean, fly.clean)
+            assert (disk.degraded - fly.degraded).abs().max() <= 0.5 / 255 + 1e-6
+
+
+@pytest.mark.parametrize("maps", ["png", "safetensors"])
+def test_pairs_of_weather_from_disk_have_their_transmission_and_no_flow(made, source, maps):
+    out = made(f"maps={maps}", scene=("scene=paper_weather",))
+    stored = pairs(root=out, batch_size=4, workers=0, transmission=True)
+    scene = presets.paper_weather()
+    live = frames(root=source, effect=scene, size=SIZE, batch_size=4, workers=0, transmission=True)
+    for disk, fly in zip(batches(stored, training=True), batches(live, training=True), strict=True):
+        assert disk.transmission.shape == (4, 1, *SIZE)
+        assert not disk.flow.any()
+        assert disk.valid.all()
+        assert (disk.transmission - fly.transmission).abs().max() <= (0.51 / 65535 if maps == "png" else 0)
+
+
+def test_pairs_without_a_required_transmission_raise(made):
+    folder = PairedFolder(made(), transmission=True)
+    with pytest.raises(ValueError, match="root must hold pairs with a transmission, as of fog, got 0 in "):
+        folder[0]
+
+
+def test_pairs_without_a_required_flow_raise(made):
+    out = made(scene=("scene=paper_weather",))
+    with pytest.raises(ValueError, match="root must hold pairs with a flow, as of a lens, got 0 in "):
+        PairedFolder(out, flow=True)[0]
+    with pytest.raises(ValueError, match="root must hold pairs with a flow, as of a lens, got "):
+        pairs(root=out, batch_size=4, workers=0, flow=True).check_pair()
+    pairs(root=made(out="moved"), batch_size=4, workers=0, flow=True).check_pair()
+
+
+def test_training_from_disk_has_the_losses_of_training_on_the_fly(made, source):
+    stored = pairs(root=made("count=16"), batch_size=2, workers=0)
+    live = frames(root=source, effect=presets.paper_refractive(width=192), size=SIZE, batch_size=2, workers=0)
+    losses = []
+    for data in (stored, live):
+        torch.manual_seed(0)
+        task, network = Undistort(), torch.nn.Conv2d(3, 2, 5, padding=2)
+        optimizer, values = torch.optim.SGD(network.parameters(), lr=0.003), []
+        epoch = batches(data, training=True)
+        for batch in (20 * epoch)[:20]:
+            loss = task.loss(task.restore(network(batch.degraded), batch.degraded), batch)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            values.append(loss.item())
+        losses.append(torch.tensor(values))
+    # 1/255 of an image rounded, on the average a quarter of it, and 1/64 px of a flow likewise, in halves of 48 px.
+    assert (losses[0] - losses[1]).abs().max() <= 0.25 / 255 + 0.25 / 64 / 16
+    assert losses[1][-1] < 0.6 * losses[1][0]
+
+
+def test_files_and_tars_hold_the_same_pairs(made):
+    folder, tars = PairedFolder(made()), PairedFolder(made("tar=5", out="tars"))
+    assert len(folder) == len(tars) == 16
+    for i in range(16):
+        for name, a, b in zip(Pair._fields, folder[i], tars[i], strict=True):
+            assert torch.equal(a, b), name
+
+
+def test_concatenated_manifests_of_shards_are_one_set(made):
+    single = made()
+    out, *_ = [made("shards=3", f"shard={shard}", out="shards") for shard in range(3)]
+    texts = [path.read_text() for path in sorted(out.glob("manifest-*"), reverse=True)]
+    for path in out.glob("manifest-*"):
+        path.unlink()
+    (out / "manifest.jsonl").write_text("".join(texts))
+    one, several = PairedFolder(single, split="val"), PairedFolder(out, split="val")
+    assert [one.row(i) for i in range(len(one))] == [several.row(i) for i in range(len(several))]
+
+
+@pytest.mark.parametrize(("workers", "ranks", "buffer"), [(0, 1, 1), (0, 3, 16), (2, 2, 3)])
+def test_a_stream_yields_each_pair_once(made, workers, ranks, buffer):
+    out = made("tar=4")
+    keys = []
+    for rank in range(ranks):
+        stream = PairStream(out, buffer=buffer, rank=rank, ranks=ranks)
+        keys += [int(pair.key) for pair in DataLoader(stream, batch_size=None, num_workers=workers)]
+    expected = [int(pair.key) for pair in (PairedFolder(out)[i] for i in range(16))]
+    assert sorted(keys) == sorted(expected)
+    assert (keys == expected) == (buffer == 1)
+
+
+def test_the_order_of_a_stream_depends_on_the_epoch(made):
+    stream = PairStream(made(), buffer=16, seed=5)
+    orders = []
+    for epoch in (0, 1, 0):
+        stream.set_epoch(epoch)
+        orders.append([int(pair.key) for pair in stream])
+    assert orders[0] == orders[2] != orders[1]
+
+
+@pytest.mark.quick
+def test_pixels_of_a_flow_beyond_512_px_are_marked_as_invalid():
+    flow = np.zeros((2, 1, 5), np.float32)
+    flow[0, 0], flow[1, 0] = [0, 511.98, 512, -512, -513], [0, 0, 0, 0, 0]
+    valid = np.array([[True, True, True, True, True]])
+    decoded, mask = decode_flow(encode_flow(flow, valid))
+    assert mask.tolist() == [[True, True, False, True, False]]
+    assert np.abs(decoded - flow)[:, mask].max() <= 1 / 128
+    assert count_out_of_range(flow, valid) == 2

@@ -1,0 +1,229 @@
+"""Report of a calibration in Markdown, with figures of the corners and of the errors."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from torchrefract._io import replace_file
+from torchrefract.cameras.calibration.boards import Board
+from torchrefract.cameras.calibration.detection import Detection
+from torchrefract.cameras.calibration.fit import Fit, cross_validate, rms
+from torchrefract.cameras.calibration.outliers import Selection, drop_outliers
+from torchrefract.cameras.calibration.quality import (
+    CELLS,
+    calibration_warnings,
+    corner_counts,
+    straightness,
+    undistort_views,
+)
+from torchrefract.cameras.camera import Camera
+
+CAMERA_FILE, REPORT_FILE = "camera.yaml", "report.md"
+_FIGURES = ("coverage.png", "residuals.png")
+_DPI = 100
+_MAX_DRAWN = 12  # views in the figure of errors, those that cost the others most
+_COLUMNS = 4  # of that figure
+_ARROW = 0.05  # of the width of the frame: the length of an arrow for an error as large as the rms
+
+
+class Calibration(NamedTuple):
+    """A calibrated camera with the data that it was fitted to."""
+
+    board: Board
+    detections: Sequence[Detection]
+    selection: Selection
+    held_out_errors: Sequence[np.ndarray]  # for each view (N, 2), px, by `cross_validate`
+    camera: Camera
+
+    @property
+    def fit(self) -> Fit:
+        """Return the fit of camera and poses."""
+        return self.selection.fit
+
+    @property
+    def held_out_rms(self) -> float:
+        """Return the rms error of views that the camera was not fitted to, px."""
+        return rms(np.concatenate(self.held_out_errors))
+
+
+def calibrate_camera(
+    detections: Sequence[Detection], board: Board, *, model: str, size: tuple[int, int], max_drop_share: float
+) -> Calibration:
+    """Fit a camera to all usable detections, without views that do not fit the others.
+
+    Args:
+        detections: with at least four that have no problem.
+        board: that was detected.
+        model: of `fit.LENS_MODELS`.
+        size: width and height of the pictures, px.
+        max_drop_share: of the views that may be dropped.
+
+    Raises:
+        ValueError: no camera fits the views.
+    """
+    views = [detection.view for detection in detections if not detection.problem]
+    selection = drop_outliers(views, board, model=model, size=size, max_share=max_drop_share)
+    held_out = cross_validate(selection.views, board, selection.fit, size=size)
+    return Calibration(board, detections, selection, held_out, selection.fit.intrinsics.camera(size))
+
+
+def write_report(calibration: Calibration, read_gray: Callable[[str], np.ndarray], folder: Path) -> None:
+    """Write report.md, coverage.png and residuals.png.
+
+    Args:
+        calibration: to report.
+        read_gray: returns the picture of a view by its name, (H, W), uint8.
+        folder: to write to.
+    """
+    figures = _draw_coverage(calibration), _draw_residuals(calibration, read_gray)
+    for name, figure in zip(_FIGURES, figures, strict=True):
+        with replace_file(folder / name) as path:
+            figure.savefig(path)
+    _write(folder / REPORT_FILE, _report(calibration))
+
+
+def write_failure(board: Board, detections: Sequence[Detection], problem: str, folder: Path) -> None:
+    """Write report.md of a failed calibration, and rename the results of an earlier one.
+
+    An earlier camera.yaml becomes camera_before.yaml, so that it is not mistaken for the result of this run.
+
+    Args:
+        board: that was searched.
+        detections: in the pictures.
+        problem: why there is no camera.
+        folder: to write to.
+    """
+    for name in (CAMERA_FILE, *_FIGURES):
+        if (folder / name).is_file():
+            (folder / name).replace(_earlier(folder / name))
+    lines = ["# Calibration", "", f"The calibration failed: {problem}", "", f"Board: `{board.describe()}`", ""]
+    if _earlier(folder / CAMERA_FILE).is_file():
+        lines += [f"`{_earlier(folder / CAMERA_FILE).name}` is the camera of an earlier calibration.", ""]
+    rows = [(d.view.name, str(len(d.view.ids)), d.problem) for d in detections]
+    _write(folder / REPORT_FILE, [*lines, *_table(("picture", "corners", "problem"), rows)])
+
+
+def _earlier(path: Path) -> Path:
+    return path.with_name(f"{path.stem}_before{path.suffix}")
+
+
+def _write(path: Path, lines: Sequence[str]) -> None:
+    with replace_file(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _report(calibration: Calibration) -> list[str]:
+    fit, views, camera = calibration.fit, calibration.selection.views, calibration.camera
+    num_corners = sum(len(view.ids) for view in views)
+    parameters = zip(fit.intrinsics.names, fit.intrinsics.values, fit.deviations, strict=True)
+    lines = [
+        "# Calibration",
+        "",
+        f"Board: `{calibration.board.describe()}`",
+        f"Lens model: {fit.intrinsics.model}, frames of {camera.width} x {camera.height} px",
+        f"Used: {len(views)} views of {len(calibration.detections)} pictures, {num_corners} corners",
+        "",
+        *_table(("error", "px rms"), _error_rows(calibration)),
+        "",
+        "Errors are distances in the picture, over all corners. A held-out view is not used to fit the camera; only",
+        "its pose is fitted.",
+        "",
+        "## Camera",
+        "",
+        *_table(
+            ("parameter", "value", "standard deviation"),
+            [(name, f"{value:.6g}", f"{deviation:.2g}") for name, value, deviation in parameters],
+        ),
+        "",
+        *[f"- {message}" for message in calibration_warnings(views, fit, camera)],
+        "",
+        "![Corners in the frame](coverage.png)",
+        "",
+        "## Views",
+        "",
+        "Each view was left out of the fit in turn. The view that costs the others most comes first. A view is an",
+        "outlier if its held-out error is above its limit. All errors are in px rms.",
+        "",
+        *_table(("view", "corners", "error", "held-out error", "limit", "others without it"), _view_rows(calibration)),
+        "",
+        "![Reprojection errors](residuals.png)",
+    ]
+    unused = [(name, f"dropped: {reason}") for name, reason in calibration.selection.dropped.items()]
+    unused += [(d.view.name, d.problem) for d in calibration.detections if d.problem]
+    return [*lines, "", "## Pictures not used", "", *_table(("picture", "reason"), unused)] if unused else lines
+
+
+def _error_rows(calibration: Calibration) -> list[tuple[str, str]]:
+    views, board = calibration.selection.views, calibration.board
+    values = {
+        "reprojection error": calibration.fit.rms,
+        "reprojection error of held-out views": calibration.held_out_rms,
+        "corners off straight lines, in the pictures": straightness(views, board),
+        "corners off straight lines, rectified": straightness(undistort_views(views, calibration.camera), board),
+    }
+    return [(name, f"{value:.4f}") for name, value in values.items()]
+
+
+def _view_rows(calibration: Calibration) -> list[tuple[str, ...]]:
+    views, ranking = calibration.selection.views, calibration.selection.ranking
+    fits = {view.name: (len(view.ids), rms(e)) for view, e in zip(views, calibration.fit.errors, strict=True)}
+    rows = []
+    for result in ranking:
+        num_corners, error = fits[result.name]
+        numbers = (f"{value:.3f}" for value in (error, result.error, result.limit, result.others))
+        rows.append((result.name, str(num_corners), *numbers))
+    return rows
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)]
+
+
+def _draw_coverage(calibration: Calibration) -> Figure:
+    """Draw all corners, over the number of corners in each cell of the frame."""
+    camera, views = calibration.camera, calibration.selection.views
+    figure = Figure(figsize=(9.6, 9.6 * camera.height / camera.width + 0.9), dpi=_DPI, layout="constrained")
+    axes = figure.add_subplot()
+    counts, (rows, columns) = corner_counts(views, (camera.width, camera.height)), CELLS
+    extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
+    image = axes.imshow(np.where(counts > 0, counts, np.nan), extent=extent, cmap="Blues", alpha=0.6, vmin=0)
+    for j, i in zip(*np.nonzero(counts == 0), strict=True):
+        place = ((i + 0.5) * camera.width / columns, (j + 0.5) * camera.height / rows)
+        axes.text(*place, "none", ha="center", va="center", color="#b03000")
+    corners = np.concatenate([view.corners for view in views])
+    axes.plot(*corners.T, ".", markersize=3, color="#08306b")
+    axes.set_title(f"{len(corners)} corners of {len(views)} views")
+    figure.colorbar(image, ax=axes, label="corners in a cell of the frame", shrink=0.8)
+    return figure
+
+
+def _draw_residuals(calibration: Calibration, read_gray: Callable[[str], np.ndarray]) -> Figure:
+    """Draw the views that cost the others most, each with the errors of its corners."""
+    names = [result.name for result in calibration.selection.ranking[:_MAX_DRAWN]]
+    index = {view.name: i for i, view in enumerate(calibration.selection.views)}
+    rows, aspect = -(-len(names) // _COLUMNS), calibration.camera.height / calibration.camera.width
+    figure = Figure(figsize=(16, rows * (4 * aspect + 0.4) + 0.6), dpi=_DPI, layout="constrained")
+    scale = _ARROW * calibration.camera.width / max(calibration.fit.rms, 1e-6)
+    figure.suptitle(
+        f"detected minus projected corners, {scale:.0f} times enlarged; rms of all {calibration.fit.rms:.3f} px"
+    )
+    for k, name in enumerate(names):
+        axes = figure.add_subplot(rows, _COLUMNS, k + 1)
+        _draw_view(axes, calibration, index[name], read_gray(name), scale)
+    return figure
+
+
+def _draw_view(axes: Axes, calibration: Calibration, i: int, gray: np.ndarray, scale: float) -> None:
+    view, errors = calibration.selection.views[i], calibration.fit.errors[i]
+    axes.imshow(gray, cmap="gray", vmin=-255, vmax=255)  # pale, so that the arrows stand out
+    axes.quiver(
+        *view.corners.T, *errors.T, angles="xy", scale_units="xy", scale=1 / scale, color="#d00000", width=0.004
+    )
+    axes.set_xlim(-0.5, gray.shape[1] - 0.5)
+    axes.set_ylim(gray.shape[0] - 0.5, -0.5)
+    axes.set_axis_off()
+    axes.set_title(f"{view.name}: {rms(errors):.3f} px", fontsize=10, parse_math=False)

@@ -1,0 +1,333 @@
+"""The commands `calibrate`, `rectify` and `make_board`."""
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from omegaconf import DictConfig
+from torch import Tensor
+
+from torchrefract._io import replace_file
+from torchrefract._validation import UsageError, check_choice, check_number
+from torchrefract.cameras.calibration.board_page import board_page
+from torchrefract.cameras.calibration.boards import Board
+from torchrefract.cameras.calibration.detection import Detection, View, detect, has_enough_corners
+from torchrefract.cameras.calibration.diagnosis import describe_other_board, edge_width, explain_failure
+from torchrefract.cameras.calibration.fit import LENS_MODELS, MIN_VIEWS
+from torchrefract.cameras.calibration.quality import camera_warnings
+from torchrefract.cameras.calibration.report import (
+    CAMERA_FILE,
+    REPORT_FILE,
+    Calibration,
+    calibrate_camera,
+    write_failure,
+    write_report,
+)
+from torchrefract.cameras.calibration.synthetic import CAMERA, NUM_VIEWS, render_views
+from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.io.opencv import read_opencv, write_opencv
+from torchrefract.cli.command import make, naming, progress
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, pixels_of, read_image
+from torchrefract.fields.rectification import camera_flow
+from torchrefract.footage import (
+    check_apart,
+    find_footage,
+    is_video,
+    is_written,
+    write_frames,
+    write_picture,
+    written_as,
+)
+from torchrefract.warping.warp import warp
+
+_SYNTHETIC = "synthetic"
+_MIN_USABLE = MIN_VIEWS + 1  # views, so that each can be left out of the fit
+_MAX_REASONS = 300  # characters
+_CACHE_VERSION = 2  # of detections.jsonl; files of other versions are ignored
+_MIN_SAME_SIZE = 0.75  # share of the pictures
+_NUM_DIAGNOSED = 3  # pictures in which another board is searched if the expected one is missing
+_BOARD_FORMATS = (".pdf", ".png")
+
+
+def make_board(cfg: DictConfig) -> None:
+    """Write a board as PDF or PNG."""
+    board, out = make(cfg, "board"), Path(str(cfg.out))
+    with naming("dpi"):
+        dpi = check_number("dpi", cfg.dpi, low=20.0, high=2400.0)
+    with naming("margin_mm"):
+        margin = check_number("margin_mm", cfg.margin_mm, low=0.0, high=1000.0)
+    if out.suffix.lower() not in _BOARD_FORMATS:
+        raise UsageError(f"out must end in {' or '.join(_BOARD_FORMATS)}, got {out}")
+    try:
+        with replace_file(out) as path:
+            board_page(board, margin_mm=margin).savefig(path, dpi=dpi)
+    except OSError as error:
+        raise UsageError(f"{out} could not be written: {error.strerror}") from error
+    width, height = board.size_mm
+    print(f"{out}: {board.describe()}, {width:g} x {height:g} mm; print it at 100 % and measure the ruler below it")
+
+
+def calibrate(cfg: DictConfig) -> None:
+    """Detect the board in pictures, fit the camera, and write camera.yaml and report.md.
+
+    Detections are kept in detections.jsonl, so that an interrupted run continues.
+    """
+    board = make(cfg, "board")
+    with naming("lens_model"):
+        model = check_choice("lens_model", str(cfg.lens_model), LENS_MODELS)
+    with naming("drop_share"):
+        max_drop_share = check_number("drop_share", cfg.drop_share, low=0.0, high=0.9)
+    out = Path(str(cfg.out))
+    with naming("out"):
+        out.mkdir(parents=True, exist_ok=True)
+    files = _rendered(board, out / "rendered") if str(cfg.images) == _SYNTHETIC else find_pictures(str(cfg.images))
+    search = detect_all(files, board, out / "detections.jsonl")
+    detections = list(progress(search, "detecting the board", count=len(files)))
+    paths = {file.name: file for file in files}
+    try:
+        size = _common_size(detections)
+        detections = [_check_size(detection, size) for detection in detections]
+        _check_count(detections, paths, board)
+        calibration = calibrate_camera(detections, board, model=model, size=size, max_drop_share=max_drop_share)
+    except (UsageError, ValueError) as error:
+        write_failure(board, detections, str(error), out)
+        raise UsageError(f"{error} ({out / REPORT_FILE} lists all pictures)") from error
+    write_opencv(out / CAMERA_FILE, calibration.camera)
+    write_report(calibration, lambda name: read_gray(paths[name]), out)
+    _print_summary(calibration, out)
+
+
+def find_pictures(folder: str | Path) -> list[Path]:
+    """Return the pictures of a folder, sorted by name.
+
+    Raises:
+        UsageError: the folder does not exist or holds no pictures.
+    """
+    if not (folder := Path(folder)).is_dir():
+        raise UsageError(f"images must be an existing folder of pictures, got {folder}")
+    if not (files := files_in(folder)):
+        raise UsageError(f"images must be a folder that holds {', '.join(EXTENSIONS)}, got {folder}")
+    return files
+
+
+def read_gray(path: Path) -> np.ndarray:
+    """Read a picture (H, W), uint8, converted to gray by OpenCV."""
+    return cv2.cvtColor(pixels_of(read_image(path)), cv2.COLOR_RGB2GRAY)
+
+
+def detect_all(files: Sequence[Path], board: Board, cache: Path) -> Iterator[Detection]:
+    """Detect a board in pictures; results of an earlier run for the same board and file are read from the cache.
+
+    Args:
+        files: the pictures.
+        board: to detect.
+        cache: file with a line of JSON for each picture.
+
+    Yields:
+        A detection for each picture.
+    """
+    key = {"version": _CACHE_VERSION, "opencv": cv2.__version__, "board": board.describe()}
+    cached = _read_cache(cache, key)
+    with replace_file(cache) as path:
+        lines = [key, *(_to_json(detection, stamp) for (_, stamp), detection in cached.items())]
+        path.write_text("".join(f"{json.dumps(line)}\n" for line in lines), encoding="utf-8")
+    with cache.open("a", encoding="utf-8") as stream:
+        for file in files:
+            stamp = _stamp(file)
+            if (detection := cached.get((file.name, stamp))) is None:
+                detection = _detect_in_file(file, board)
+                stream.write(json.dumps(_to_json(detection, stamp)) + "\n")
+                stream.flush()
+            yield detection
+
+
+def _detect_in_file(file: Path, board: Board) -> Detection:
+    try:
+        gray = read_gray(file)
+    except UnreadableImageError as error:
+        return Detection(View(file.name, np.empty(0, dtype=int), np.empty((0, 2))), (0, 0), 0.0, f"unreadable: {error}")
+    view = detect(gray, board, name=file.name)
+    problem = "" if has_enough_corners(view, board) else explain_failure(gray, view, board)
+    return Detection(view, (gray.shape[1], gray.shape[0]), edge_width(gray), problem)
+
+
+def _stamp(file: Path) -> str:
+    """Return a text that changes when the file changes; empty if the file is missing."""
+    try:
+        stat = file.stat()
+    except OSError:
+        return ""
+    return f"{stat.st_size} {stat.st_mtime_ns}"
+
+
+def _read_cache(path: Path, key: dict[str, Any]) -> dict[tuple[str, str], Detection]:
+    """Return cached detections by name and stamp; an incomplete line of an interrupted run is ignored."""
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []
+    documents = [_parse_json(line) for line in lines]
+    if not documents or documents[0] != key:
+        return {}
+    cached = {}
+    for d in documents[1:]:
+        if d is not None:
+            corners = np.array(d["corners"], dtype=np.float64).reshape(-1, 2)
+            view = View(d["name"], np.array(d["ids"], dtype=int), corners)
+            cached[view.name, d["stamp"]] = Detection(view, (d["width"], d["height"]), d["edges"], d["reason"])
+    return cached
+
+
+def _parse_json(line: str) -> Any:
+    try:
+        return json.loads(line)
+    except ValueError:
+        return None
+
+
+def _to_json(detection: Detection, stamp: str) -> dict[str, Any]:
+    view, (width, height) = detection.view, detection.size
+    facts = {"width": width, "height": height, "edges": detection.edge_width_px, "reason": detection.problem}
+    return {"name": view.name, "stamp": stamp, **facts, "ids": view.ids.tolist(), "corners": view.corners.tolist()}
+
+
+def _common_size(detections: Sequence[Detection]) -> tuple[int, int]:
+    """Return the width and height of nearly all pictures, or raise UsageError."""
+    counts = Counter(detection.size for detection in detections if detection.size != (0, 0))
+    if not counts:
+        first = detections[0].problem
+        raise UsageError(f"images must hold a readable picture, got {len(detections)} files without one: {first}")
+    (size, count), *_ = counts.most_common()
+    if count < _MIN_SAME_SIZE * counts.total():
+        sizes = ", ".join(f"{count} of {width} x {height}" for (width, height), count in counts.most_common())
+        raise UsageError(f"images must be of one size, since they are of one camera, got {sizes} (width x height)")
+    return size
+
+
+def _check_size(detection: Detection, size: tuple[int, int]) -> Detection:
+    if detection.problem or detection.size == size:
+        return detection
+    width, height = detection.size
+    return detection._replace(problem=f"{width} x {height} px, other pictures have {size[0]} x {size[1]} px")
+
+
+def _check_count(detections: Sequence[Detection], paths: dict[str, Path], board: Board) -> None:
+    """Raise UsageError if too few pictures show the board, with the likely cause."""
+    failed = [detection for detection in detections if detection.problem]
+    if (count := len(detections) - len(failed)) >= _MIN_USABLE:
+        return
+    parts = [f"images must show the board ({board.describe()}) in at least {_MIN_USABLE} pictures, got {count}"]
+    for detection in sorted((d for d in failed if d.size != (0, 0)), key=lambda d: d.edge_width_px)[:_NUM_DIAGNOSED]:
+        if other := describe_other_board(read_gray(paths[detection.view.name]), board):
+            parts.append(f"{detection.view.name} shows {other}")
+            break
+    reasons = "; ".join(f"{detection.view.name}: {detection.problem}" for detection in failed)
+    if reasons:
+        parts.append(reasons if len(reasons) <= _MAX_REASONS else f"{reasons[:_MAX_REASONS]} …")
+    raise UsageError(". ".join(parts))
+
+
+def _rendered(board: Board, folder: Path) -> list[Path]:
+    """Return pictures of the board by a known camera; they are rendered unless the folder holds them already."""
+    marker, content = folder / "rendered.txt", f"{board.describe()}\n{CAMERA}\n"
+    if not marker.is_file() or marker.read_text(encoding="utf-8") != content:
+        folder.mkdir(exist_ok=True)
+        for name, picture, _ in progress(render_views(board), "rendering", count=NUM_VIEWS):
+            with replace_file(folder / name) as path:
+                cv2.imwrite(str(path), picture)
+        with replace_file(marker) as path:
+            path.write_text(content, encoding="utf-8")
+    return find_pictures(folder)
+
+
+def _print_summary(calibration: Calibration, out: Path) -> None:
+    for name, reason in calibration.selection.dropped.items():
+        print(f"{name} dropped: {reason}")
+    for message in camera_warnings(calibration.camera):
+        print(f"warning: {message}", file=sys.stderr)
+    print(
+        f"{out / CAMERA_FILE}: {calibration.fit.intrinsics.model} from {len(calibration.selection.views)} views in "
+        f"{len(calibration.detections)} pictures, error {calibration.fit.rms:.3f} px rms, of held-out views "
+        f"{calibration.held_out_rms:.3f} px rms; see {out / REPORT_FILE}"
+    )
+
+
+def rectify(cfg: DictConfig) -> None:
+    """Rectify pictures and videos that are not in the output folder yet, and write the camera of the results."""
+    source, out = Path(str(cfg.input)), Path(str(cfg.out))
+    with naming("zoom"):
+        zoom = check_number("zoom", cfg.zoom, low=0.05, high=20.0)
+    with naming("camera"):
+        rectifier = _Rectifier(read_opencv(str(cfg.camera)), zoom)
+    files = find_footage(source)
+    with naming("out"):
+        out.mkdir(parents=True, exist_ok=True)
+    check_apart(out, source)
+    _write_cameras(out, rectifier)
+    if rectifier.black_share:
+        print(
+            f"warning: the camera's model folds back inside the frame: {rectifier.black_share:.1%} of it stays black",
+            file=sys.stderr,
+        )
+    num_written, skipped = 0, dict[Path, str]()
+    for file in progress(files, "rectifying", count=len(files)):
+        try:
+            num_written += _rectify_file(file, rectifier, out)
+        except ValueError as error:
+            skipped[file] = str(error) if isinstance(error, UnreadableImageError) else f"{file}: {error}"
+            print(f"skipped: {skipped[file]}", file=sys.stderr)
+    if len(skipped) == len(files):
+        raise UsageError(f"input must hold a file that can be rectified, got {next(iter(skipped.values()))}")
+    num_existing = len(files) - len(skipped) - num_written
+    print(
+        f"{out}: {num_written} rectified, {num_existing} already existed, {len(skipped)} skipped; camera of the "
+        f"results: {out}/{CAMERA_FILE}"
+    )
+
+
+class _Rectifier:
+    """Removal of a camera's distortion from frames, with a flow for each of the last two frame sizes."""
+
+    def __init__(self, camera: Camera, zoom: float):
+        self.camera, self.zoom = camera, zoom
+        _, exists, self.pinhole = camera_flow(camera, zoom=zoom)
+        self.black_share = 1 - exists.double().mean().item()  # of the frame
+        self._flow = lru_cache(maxsize=2)(self._compute_flow)
+
+    def _compute_flow(self, height: int, width: int) -> Tensor:
+        return camera_flow(self.camera.resized(width=width, height=height), zoom=self.zoom)[0]
+
+    def __call__(self, frame: Tensor) -> np.ndarray:
+        """Rectify a frame (1, 3, H, W) in [0, 1] to (H, W, 3), uint8, RGB."""
+        image = warp(frame, self._flow(*frame.shape[2:]), interpolation="bicubic")[0]
+        return pixels_of(image[0])
+
+
+def _write_cameras(out: Path, rectifier: _Rectifier) -> None:
+    """Write the original camera and the one of the results; raise UsageError if the folder has different ones."""
+    for path, camera in ((out / "lens.yaml", rectifier.camera), (out / CAMERA_FILE, rectifier.pinhole)):
+        if path.is_file():
+            with naming("out"):
+                existing = read_opencv(path)
+            if existing != camera:
+                raise UsageError(
+                    f"out must be a folder of the same camera and zoom, got {out} with another {path.name}"
+                )
+        else:
+            write_opencv(path, camera)
+
+
+def _rectify_file(file: Path, rectifier: _Rectifier, out: Path) -> bool:
+    """Rectify a picture or video; return False if its result exists already."""
+    target = out / written_as(file).name
+    if is_written(file, target):
+        return False
+    with replace_file(target) as path:
+        if is_video(file):
+            write_frames(file, path, change=partial(map, rectifier))
+        else:
+            write_picture(rectifier(read_image(file)[None].contiguous()), path)
+    return True

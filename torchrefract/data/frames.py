@@ -1,0 +1,322 @@
+"""A folder of clean frames, split by drive.
+
+Neighboring frames of a drive look alike, so a split by frame would validate on nearly the training frames. Whole drives
+go to training or to validation instead. Folders or file names tell the drives apart.
+"""
+
+import hashlib
+import os
+import posixpath
+import re
+import stat
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple, NoReturn
+
+import torch
+from torch.utils.data import Dataset
+
+from torchrefract._validation import check_choice, check_number, check_size
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, image_size, read_image
+from torchrefract.types import Frame
+
+_SPLITS = {"train": "train", "val": "val", "valid": "val", "validation": "val"}  # folder names
+_UNNAMED = "."  # the drive of frames in the root itself, or with bare numbers as names
+_MAX_UNREADABLE = 0.1  # share of the frames
+_SHOWN = 3  # examples in a message
+_DATE = re.compile(r"(?:^|.*?[^0-9])(?:19|20)\d\d[-_.]?\d\d[-_.]?\d\d(?=[-_. T]?\d\d[-_.:]?\d\d[-_.:]?\d\d$)")
+_NUMBERED = re.compile(r"\d[A-Za-z]?$")
+_NUMBER = re.compile(r"[-_.\s\d]*\d[A-Za-z]?")
+
+
+class AssignedFrame(NamedTuple):
+    """A frame with its drive and split."""
+
+    path: str  # relative to the root, with forward slashes
+    drive: str
+    split: str  # train, val, or empty for frames outside of the folders train and val
+
+
+class FrameFolder(Dataset[Frame]):
+    """The frames in a folder and its sub-folders, cropped and reduced to one size.
+
+    Hidden files are ignored, links are followed, each folder is visited once, and files are sorted. `drive_by` selects
+    how drives are told apart:
+
+    - "folder": a drive is a sub-folder, at the first level where the frames are in several folders.
+    - "prefix": a drive is `name_prefix` of the file name, in any folder.
+    - "auto": if the root has sub-folders train and val (or valid, validation), they are the splits. Otherwise "folder"
+      if the frames are in several folders, and "prefix" if they are in one.
+
+    Without sub-folders train and val, drives are sorted by a hash of `seed` and their names. Each goes to val if that
+    brings val closer to `val_share` of the frames. A new drive therefore moves few of the others.
+
+    The header and the end of every file are checked at once. Unreadable frames are listed in `skipped`, with one
+    warning. Pixels are read on access. The key of a frame is a hash of its path relative to `root`, so that a frame
+    keeps its corruption if other frames are added or removed.
+
+    Args:
+        root: the folder.
+        size: (height, width), px.
+        split: "all", "train" or "val".
+        drive_by: "auto", "folder" or "prefix".
+        val_share: share of the frames in val, between 0 and 1.
+        seed: of the split.
+
+    Raises:
+        ValueError: an argument is out of range; the folder has no frames, or has only one drive to split; more than a
+            tenth of the frames are unreadable; a frame is smaller than `size`.
+        OSError: the folder does not exist or is not readable.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        size: Sequence[int] = (64, 112),
+        split: str = "all",
+        drive_by: str = "auto",
+        val_share: float = 0.2,
+        seed: int = 0,
+    ):
+        self.root = Path(root).expanduser()
+        self.size = check_size("size", size)
+        check_choice("split", split, ("all", "train", "val"))
+        check_choice("drive_by", drive_by, ("auto", "folder", "prefix"))
+        if not 0 < check_number("val_share", val_share) < 1:
+            raise ValueError(f"val_share must be a number between 0 and 1, got {val_share}")
+        paths = _find_frames(self.root)
+        drive_of = _select_split(self.root, paths, split=split, drive_by=drive_by, val_share=val_share, seed=seed)
+        readable, self.skipped = _check_frames(self.root, sorted(drive_of), self.size)
+        self.paths = [self.root / path for path in readable]
+        self.drives = sorted({drive_of[path] for path in readable})
+        self.keys = [path_key(path) for path in readable]
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Read a frame: image (3, h, w), key () and an empty depth (0,)."""
+        image = read_image(self.paths[index])
+        return Frame(fit(image, self.size), torch.tensor(self.keys[index]), torch.empty(0))
+
+
+def assign_frames(
+    root: Path, *, size: Sequence[int] | None, drive_by: str = "auto", val_share: float = 0.2, seed: int = 0
+) -> tuple[list[AssignedFrame], list[tuple[Path, str]]]:
+    """Assign all frames of a root to drives and splits, as `FrameFolder` does.
+
+    All frames of a root with a single drive are for training. Arguments and errors are those of `FrameFolder`; with
+    size None, frames may have any size.
+
+    Returns:
+        the readable frames in order, and the unreadable ones with the reasons.
+    """
+    options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
+    paths = _find_frames(root)
+    drive_of = _select_split(root, paths, split="all", **options)
+    readable, skipped = _check_frames(root, sorted(drive_of), (1, 1) if size is None else check_size("size", size))
+    has_splits = drive_by == "auto" and bool(_split_folders(root))
+    if not has_splits and len(set(drive_of.values())) < 2:
+        return [AssignedFrame(path, drive_of[path], "train") for path in readable], skipped
+    val = _select_split(root, paths, split="val", **options)
+    train = _select_split(root, paths, split="train", **options) if has_splits else drive_of.keys() - val.keys()
+    split_of = {path: "val" if path in val else "train" if path in train else "" for path in readable}
+    return [AssignedFrame(path, drive_of[path], split) for path, split in split_of.items()], skipped
+
+
+def name_prefix(stem: str) -> str:
+    """Return the drive of a file name without extension: the name up to the number of the frame.
+
+    In doubt, the prefix is shorter. Merged drives cost variety, but a drive cut in two would put neighboring frames on
+    both sides of the split.
+
+    - A name that ends in a date and a time is cut after the date: `cam_2024-05-01_12-30-07` -> `cam_2024-05-01`.
+    - Otherwise the name is a row of words, divided by `_` or blanks, or by `-` if there are neither. It is cut before
+      its last word if that ends in a digit (one letter may follow), else before the last word that is a number, else
+      before the last word. The first word always stays: `drive-07_000123` -> `drive-07`,
+      `GH010123_000456` -> `GH010123`, `2024-05-01_12-30-00_0001` -> `2024-05-01_12-30-00`,
+      `aachen_000000_000019_left` -> `aachen_000000`, `highway_clear` -> `highway`.
+    - A single word gives the letters before its number, `frame.0012` -> `frame`, or "." if there are none.
+    """
+    if date := _DATE.match(stem):
+        return date.group()
+    divider = r"[_\s]+" if re.search(r"[_\s]", stem.strip("_ ")) else r"-+"
+    ends = [match.start() for match in re.finditer(divider, stem) if match.start() > 0]
+    if not ends:
+        word = re.fullmatch(r"(\D*?)[-_.\s]*\d+", stem)
+        return (word and word.group(1)) or _UNNAMED
+    words = {end: stem[end:following] for end, following in zip(ends, [*ends[1:], len(stem)], strict=True)}
+    numbers = [end for end in ends if _NUMBER.fullmatch(words[end])]
+    return stem[: ends[-1] if _NUMBERED.search(stem) or not numbers else numbers[-1]]
+
+
+def _find_frames(root: Path) -> list[str]:
+    """List the image files of a root: sorted paths relative to it, with forward slashes."""
+    try:
+        is_folder = stat.S_ISDIR(root.stat().st_mode)
+    except PermissionError as error:
+        _raise_permission_error(error)
+    except OSError as error:
+        raise FileNotFoundError(f"root must be a folder of frames, got {root}, which does not exist") from error
+    if not is_folder:
+        raise NotADirectoryError(f"root must be a folder of frames, got the file {root}; give the folder it lies in")
+    files = sorted(path.relative_to(root).as_posix() for path in list_files(root))
+    frames = [file for file in files if file.lower().endswith(EXTENSIONS)]
+    if not frames:
+        raise ValueError(
+            f"root must hold {', '.join(EXTENSIONS)} files, got {root} with {len(files)} other files; "
+            "of a video, extract the frames first"
+        )
+    return frames
+
+
+def list_files(root: Path) -> Iterator[Path]:
+    """Yield the files of a root and its sub-folders without hidden ones; follow links, visit each folder once."""
+    visited = set()
+    for folder, subfolders, files in os.walk(root, followlinks=True, onerror=_raise_permission_error):
+        status = os.stat(folder)
+        is_new = (status.st_dev, status.st_ino) not in visited  # links may form a loop, or lead to a folder twice
+        visited.add((status.st_dev, status.st_ino))
+        subfolders[:] = sorted(name for name in subfolders if is_new and not name.startswith("."))
+        yield from (Path(folder, name) for name in files if is_new and not name.startswith("."))
+
+
+def _raise_permission_error(error: OSError) -> NoReturn:
+    if isinstance(error, PermissionError):
+        raise PermissionError(
+            f"root must be readable with all its folders, got no permission for {error.filename}; change that"
+        ) from error
+    raise error
+
+
+def _select_split(
+    root: Path, paths: list[str], *, split: str, drive_by: str, val_share: float, seed: int
+) -> dict[str, str]:
+    """Return the drive of each frame in a split."""
+    folders = _split_folders(root) if drive_by == "auto" else {}
+    if folders:
+        return _select_split_folder(root, paths, split=split, folders=folders)
+    drive_of = _drives(paths, drive_by)
+    if split == "all":
+        return drive_of
+    val = select_val_drives(root, drive_of, val_share=val_share, seed=seed)
+    return {path: drive for path, drive in drive_of.items() if (drive in val) == (split == "val")}
+
+
+def _split_folders(root: Path) -> dict[str, str]:
+    """Return the split of each sub-folder named train or val; empty unless the root has both."""
+    splits = {path.name: _SPLITS[path.name.lower()] for path in root.iterdir() if path.name.lower() in _SPLITS}
+    splits = {name: split for name, split in splits.items() if (root / name).is_dir()}
+    return splits if len(set(splits.values())) == 2 else {}
+
+
+def _select_split_folder(root: Path, paths: list[str], *, split: str, folders: dict[str, str]) -> dict[str, str]:
+    """Return the drive of each frame in a split that is a folder; frames outside of both belong to "all" alone."""
+    groups: dict[str, list[str]] = {"train": [], "val": [], "": []}
+    for path in paths:
+        groups[folders.get(PurePosixPath(path).parts[0], "")].append(path)
+    drives = {name: _drives(group, "auto", skip_levels=1 if name else 0) for name, group in groups.items()}
+    shared = sorted(set(drives["train"].values()) & set(drives["val"].values()) - {_UNNAMED})
+    if shared:
+        names = first_names(shared)
+        message = f"train and val in {root} both hold frames of {names}, by name; a drive belongs in one of them"
+        warnings.warn(message, stacklevel=4)
+    if split == "all":
+        return drives["train"] | drives["val"] | drives[""]
+    if not groups[split]:
+        raise ValueError(f"root must hold frames in its folder for {split}, got none in {root}")
+    return drives[split]
+
+
+def _drives(paths: list[str], drive_by: str, *, skip_levels: int = 0) -> dict[str, str]:
+    """Return the drive of each path, without regard to its first folders."""
+    folders = {path: PurePosixPath(path).parts[skip_levels:-1] for path in paths}
+    if drive_by == "prefix" or (drive_by == "auto" and len(set(folders.values())) < 2):
+        return {path: name_prefix(PurePosixPath(path).stem) for path in paths}
+    # Deeper folders, as in drive_1/front and drive_1/rear, belong to the same drive.
+    level = len(PurePosixPath(posixpath.commonpath("/".join(parts) for parts in folders.values())).parts) + 1
+    return {path: "/".join(parts[:level]) or _UNNAMED for path, parts in folders.items()}
+
+
+def select_val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: float, seed: int) -> set[str]:
+    """Select the drives of val.
+
+    Args:
+        root: for messages.
+        drive_of: the drive of each frame.
+        val_share: share of the frames in val, between 0 and 1.
+        seed: of the order of drives.
+
+    Raises:
+        ValueError: there are fewer than two drives.
+    """
+    frames = Counter(drive_of.values())
+    if len(frames) < 2:
+        raise ValueError(
+            f"root must hold two or more drives to be split, got one, {next(iter(frames))!r}, in {root}; put each "
+            "drive in a sub-folder of its own, or name its frames <drive>_<number>, or make sub-folders train and val"
+        )
+    if 2 * len(frames) > len(drive_of) > _SHOWN:
+        names = first_names(sorted(frames))
+        message = (
+            f"{len(drive_of)} frames in {root} seem to come from {len(frames)} drives ({names}): if that is wrong, "
+            "train and val share drives; put each drive in a sub-folder of its own"
+        )
+        warnings.warn(message, stacklevel=4)
+    val, missing = set(), val_share * len(drive_of)
+    order = sorted(frames, key=lambda drive: path_key(f"{seed}/{drive}"))
+    for drive in order:
+        if abs(missing - frames[drive]) < missing:
+            val.add(drive)
+            missing -= frames[drive]
+    smallest = min(order, key=lambda drive: frames[drive])
+    return (val or {smallest}) if len(val) < len(frames) else val - {smallest}  # each split has at least one drive
+
+
+def _check_frames(root: Path, paths: list[str], size: tuple[int, int]) -> tuple[list[str], list[tuple[Path, str]]]:
+    """Return the readable paths, and the unreadable ones with the reasons."""
+    with ThreadPoolExecutor() as pool:
+        results = list(pool.map(_size_or_reason, [root / path for path in paths]))
+    skipped = [(root / path, result) for path, result in zip(paths, results, strict=True) if isinstance(result, str)]
+    if skipped:
+        examples = first_names([f"{path.relative_to(root).as_posix()} {reason}" for path, reason in skipped])
+        if len(skipped) > _MAX_UNREADABLE * len(paths):
+            raise ValueError(
+                f"root must hold readable frames, got {len(skipped)} of {len(paths)} in {root} that are unreadable: "
+                f"{examples}; remove them or copy them again"
+            )
+        message = f"{len(skipped)} of {len(paths)} frames in {root} cannot be read and are skipped: {examples}"
+        warnings.warn(message, stacklevel=3)
+    sizes = {path: result for path, result in zip(paths, results, strict=True) if not isinstance(result, str)}
+    small = [f"{path} of {H}x{W}" for path, (H, W) in sizes.items() if size[0] > H or size[1] > W]
+    if small:
+        raise ValueError(
+            f"frames must be at least size = {size[0]}x{size[1]} (height x width), got {first_names(small)} in {root}; "
+            "choose a smaller size or remove them"
+        )
+    return list(sizes), skipped
+
+
+def _size_or_reason(path: Path) -> tuple[int, int] | str:
+    try:
+        return image_size(path)
+    except UnreadableImageError as error:
+        return str(error).removeprefix(f"{path} ")
+
+
+def first_names(names: Sequence[str]) -> str:
+    """Join the first names and the number of the others, for a message."""
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more
+
+
+def path_key(text: str) -> int:
+    """Hash a path to an integer below 2^63 that is the same on every machine.
+
+    A path that is not valid Unicode is hashed by its bytes.
+    """
+    return int.from_bytes(hashlib.blake2b(os.fsencode(text), digest_size=8).digest(), "big") >> 1

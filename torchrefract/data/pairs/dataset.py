@@ -1,0 +1,169 @@
+"""Datasets of pairs on disk, as `torchrefract.generate` writes them."""
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset, IterableDataset, get_worker_info
+
+from torchrefract._tensor import to_float
+from torchrefract._validation import check_choice, check_count, check_flag
+from torchrefract.data.pairs.files import DamagedPairError, decode_pair
+from torchrefract.data.pairs.manifest import (
+    PairRow,
+    RowLocation,
+    find_manifests,
+    read_lines,
+    read_row,
+    read_stored,
+    scan_rows,
+)
+from torchrefract.types import Pair
+
+_SPLITS = ("all", "train", "val")
+_FLOW, _VALID, _TRANSMISSION = "restore_flow", "restore_valid", "transmission"
+
+
+class PairedFolder(Dataset[Pair]):
+    """The pairs in a folder in the order of their numbers.
+
+    A pair equals what `make_pair` computes from its frame, in the precision of its files. Rows of the manifest are
+    read on access, so that the dataset takes 24 bytes of memory a pair.
+
+    Args:
+        root: the folder with pairs/ or tars/.
+        split: "all", "train" or "val".
+        transmission: True to load the transmission of each pair.
+        flow: True to require a flow in each pair; otherwise, a pair without one has a flow of zeros.
+
+    Raises:
+        ValueError: the folder has no pairs of the split, or a manifest is damaged. On access: a file is damaged, or
+            the pair lacks a required map.
+    """
+
+    def __init__(self, root: str | Path, *, split: str = "all", transmission: bool = False, flow: bool = False):
+        self.root = Path(root).expanduser()
+        self.split = check_choice("split", split, _SPLITS)
+        self.transmission = check_flag("transmission", transmission)
+        self.flow = check_flag("flow", flow)
+        self._manifests = find_manifests(self.root)
+        if not self._manifests:
+            raise ValueError(f"root must be a folder with manifest.jsonl, got {self.root}")
+        numbers = {path: i for i, path in enumerate(self._manifests)}
+        rows = [
+            (row.number, numbers[location.manifest], location.offset, location.length)
+            for row, location in scan_rows(self._manifests, self._is_in_split)
+        ]
+        if not rows:
+            raise ValueError(f"root must hold pairs of the split {split}, got none in {self.root}")
+        self._locations = np.array(sorted(rows), dtype=np.int64)[:, 1:]
+
+    def __len__(self) -> int:
+        return len(self._locations)
+
+    def __getitem__(self, index: int) -> Pair:
+        """Load a pair.
+
+        Returns:
+            degraded and clean image (3, H, W), flow (2, H, W), validity mask (1, H, W), key () and transmission
+            (1, H, W), or (0,) if it is not loaded.
+        """
+        row = self.row(index)
+        try:
+            arrays = decode_pair(
+                {suffix: partial(read_stored, self.root, file) for suffix, file in row.files.items()},
+                (_FLOW, _VALID, _TRANSMISSION) if self.transmission else (_FLOW, _VALID),
+            )
+        except DamagedPairError as error:
+            raise DamagedPairError(
+                f"pair {row.number} in {self.root} must be whole, got {error}; torchrefract.generate with "
+                "verify=true makes it again"
+            ) from error
+        required = (
+            (self.transmission, _TRANSMISSION, "transmission, as of fog"),
+            (self.flow, _FLOW, "flow, as of a lens"),
+        )
+        for is_required, name, description in required:
+            if is_required and name not in arrays.maps:
+                raise ValueError(f"root must hold pairs with a {description}, got {row.number} in {self.root}")
+        size = arrays.clean.shape[:2]
+        flow = arrays.maps.get(_FLOW, np.zeros((2, *size), np.float32))
+        valid = arrays.maps[_VALID] if _FLOW in arrays.maps else np.ones(size, dtype=bool)
+        return Pair(
+            _image(arrays.corrupted),
+            _image(arrays.clean),
+            torch.from_numpy(flow),
+            torch.from_numpy(valid)[None],
+            torch.tensor(row.key),
+            torch.from_numpy(arrays.maps[_TRANSMISSION])[None] if self.transmission else torch.empty(0),
+        )
+
+    def row(self, index: int) -> PairRow:
+        """Read the manifest's row of a pair."""
+        number, offset, length = self._locations[index].tolist()
+        (line,) = read_lines([RowLocation(self._manifests[number], offset, length)])
+        return read_row(line)
+
+    def rows(self) -> Iterator[PairRow]:
+        """Read all rows of the split, in the order of the manifest."""
+        return (row for row, _ in scan_rows(self._manifests, self._is_in_split))
+
+    def _is_in_split(self, row: PairRow) -> bool:
+        return not row.skipped and self.split in ("all", row.split)
+
+
+class PairStream(IterableDataset[Pair]):
+    """The pairs in a folder one after another, for tars and slow disks; each pair once an epoch.
+
+    Each worker of a DataLoader in each process reads its own contiguous part of the set, from start to end. A buffer
+    shuffles the order.
+
+    Args:
+        root, split: as for `PairedFolder`.
+        buffer: number of pairs to choose the next one from; 1 keeps their order.
+        seed: of the order, at least 0.
+        rank, ranks: index of this process, and number of processes.
+    """
+
+    def __init__(
+        self, root: str | Path, *, split: str = "all", buffer: int = 1, seed: int = 0, rank: int = 0, ranks: int = 1
+    ):
+        self.pairs = PairedFolder(root, split=split)
+        self.buffer = check_count("buffer", buffer)
+        self.seed = check_count("seed", seed, low=0)
+        self.ranks = check_count("ranks", ranks)
+        self.rank = check_count("rank", rank, low=0)
+        if rank >= ranks:
+            raise ValueError(f"rank must be below ranks = {ranks}, got {rank}")
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Select the order of an epoch, at least 0."""
+        self.epoch = check_count("epoch", epoch, low=0)
+
+    def __iter__(self) -> Iterator[Pair]:
+        worker = get_worker_info()
+        index, count = (worker.id, worker.num_workers) if worker else (0, 1)
+        reader, readers = self.rank * count + index, self.ranks * count
+        total = len(self.pairs)
+        part = range(reader * total // readers, (reader + 1) * total // readers)
+        yield from map(self.pairs.__getitem__, _shuffled(part, self.buffer, (self.seed, self.epoch, reader)))
+
+
+def _shuffled(numbers: range, size: int, seed: tuple[int, int, int]) -> Iterator[int]:
+    """Yield the numbers, each drawn from a buffer of `size`."""
+    generator, buffer = np.random.default_rng(seed), list[int]()
+    for number in numbers:
+        buffer.append(number)
+        if len(buffer) == size:
+            yield buffer.pop(generator.integers(len(buffer)))
+    while buffer:
+        yield buffer.pop(generator.integers(len(buffer)))
+
+
+def _image(pixels: np.ndarray) -> Tensor:
+    """Convert (H, W, 3), uint8, into (3, H, W), float32, in [0, 1]."""
+    return to_float(torch.from_numpy(pixels).permute(2, 0, 1).contiguous())

@@ -1,0 +1,243 @@
+"""The manifest of a pair set: one line of JSON for each pair, in one or several files manifest*.jsonl."""
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torchrefract._io import replace_file
+from torchrefract.data.pairs.files import DamagedPairError
+
+_MANIFESTS = "manifest*.jsonl"
+# A manifest may come from an untrusted source, so only these paths are opened.
+_PATH = re.compile(r"pairs/[0-9]+/[0-9]+\.[a-z_]+\.[a-z]+|tars/[0-9]+\.tar")
+_SUFFIX = re.compile(r"[a-z_]+\.[a-z]+")
+_INT64_END = 2**63
+_CHUNK = 256  # rows that are checked in parallel
+
+
+class StoredFile(NamedTuple):
+    """The location of a file of a pair: a file of its own, or part of a tar."""
+
+    path: str  # relative to the folder of the manifest, with forward slashes
+    bytes: int
+    sha256: str
+    offset: int = 0  # of the first byte in the file at `path`
+
+
+class PairRow(NamedTuple):
+    """The description of a pair in the manifest."""
+
+    number: int
+    source: str  # path relative to the source folder, with forward slashes
+    frame: int | None  # index in a video
+    drive: str
+    split: str  # train, val, or empty for frames outside of the folders train and val
+    scene: str
+    seed: int  # degrade(clean, seed=seed, keys=[key]) makes the pair again
+    key: int
+    height: int
+    width: int
+    effects: list[dict[str, Any]]  # the effects that were applied, in order, with their parameters
+    beyond: dict[str, int]  # number of valid pixels of each flow that its PNG cannot hold
+    files: dict[str, StoredFile]  # by the suffix of the file name
+    skipped: str = ""  # the reason if the pair does not exist
+
+    @property
+    def name(self) -> str:
+        """The beginning of the names of the pair's files."""
+        return pair_name(self.number)
+
+    def as_line(self) -> str:
+        """Return the row as a line of JSON."""
+        document = self._asdict() | {"files": {suffix: file._asdict() for suffix, file in self.files.items()}}
+        return json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n"
+
+
+class RowLocation(NamedTuple):
+    """The location of a row in a manifest file."""
+
+    manifest: Path
+    offset: int
+    length: int
+
+
+def pair_name(number: int) -> str:
+    """Return the beginning of the names of a pair's files."""
+    return f"{number:08d}"
+
+
+def read_row(line: bytes) -> PairRow:
+    """Parse a line of a manifest.
+
+    Raises:
+        DamagedPairError: the line is invalid, or the path of a file leads outside of pairs/ and tars/.
+    """
+    try:
+        document = json.loads(line)
+        files = {suffix: StoredFile(**file) for suffix, file in document.pop("files").items()}
+        row = PairRow(**document, files=files)
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise DamagedPairError(f"a row must be one of torchrefract.generate, got {line[:80]!r}") from error
+    if not _has_valid_types(row):
+        raise DamagedPairError(f"a row must hold values of the types of torchrefract.generate, got {line[:80]!r}")
+    for suffix, file in row.files.items():
+        if not isinstance(file.path, str) or not _PATH.fullmatch(file.path) or not _SUFFIX.fullmatch(suffix):
+            raise DamagedPairError(f"files must lie in pairs/ or tars/ of the set, got {file.path!r} for {suffix!r}")
+    return row
+
+
+def _has_valid_types(row: PairRow) -> bool:
+    """Return True if all values have their types and all integers fit 64 bits."""
+    counts = [row.number, row.height, row.width, *row.beyond.values()] if isinstance(row.beyond, dict) else [None]
+    counts += [number for file in row.files.values() for number in (file.bytes, file.offset)]
+    counts += [] if row.frame is None else [row.frame]
+    texts = (row.source, row.drive, row.split, row.scene, row.skipped, *(file.sha256 for file in row.files.values()))
+    return (
+        all(type(number) is int and 0 <= number < _INT64_END for number in counts)
+        and all(type(number) is int and -_INT64_END <= number < _INT64_END for number in (row.seed, row.key))
+        and all(isinstance(text, str) for text in texts)
+        and isinstance(row.effects, list)
+        and all(isinstance(effect, dict) for effect in row.effects)
+    )
+
+
+def find_manifests(root: Path) -> list[Path]:
+    """Return the manifest files in a folder, sorted."""
+    return sorted(root.glob(_MANIFESTS))
+
+
+def scan_rows(
+    paths: Iterable[Path], keep: Callable[[PairRow], bool], *, skip_invalid: bool = False
+) -> Iterator[tuple[PairRow, RowLocation]]:
+    """Yield rows and their locations; of a pair that has several rows, the first one.
+
+    Args:
+        paths: the manifest files.
+        keep: returns True for the rows to yield.
+        skip_invalid: True to skip invalid lines, which a kill or a full disk leaves behind.
+
+    Raises:
+        DamagedPairError: a line is invalid, and `skip_invalid` is False.
+    """
+    seen = set[int]()
+    for path in paths:
+        offset = 0
+        with path.open("rb") as stream:
+            for line in stream:
+                try:
+                    row = read_row(line)
+                except DamagedPairError as error:
+                    if not skip_invalid:
+                        raise DamagedPairError(f"{path}, byte {offset}: {error}") from error
+                else:
+                    if row.number not in seen and keep(row):
+                        seen.add(row.number)
+                        yield row, RowLocation(path, offset, len(line))
+                offset += len(line)
+
+
+def read_lines(locations: Iterable[RowLocation]) -> Iterator[bytes]:
+    """Yield the lines at some locations, each with its line break."""
+    streams = {}
+    try:
+        for location in locations:
+            path = location.manifest
+            stream = streams.get(path) or streams.setdefault(path, path.open("rb"))
+            stream.seek(location.offset)
+            yield stream.read(location.length).rstrip(b"\n") + b"\n"
+    finally:
+        for stream in streams.values():
+            stream.close()
+
+
+def read_stored(root: Path, file: StoredFile) -> bytes:
+    """Read a file of a pair.
+
+    Raises:
+        DamagedPairError: the file is missing or too short.
+    """
+    try:
+        with (root / file.path).open("rb") as stream:
+            stream.seek(file.offset)
+            # `read` allocates the full count first, which an invalid manifest could make larger than memory.
+            data = stream.read(min(file.bytes, os.fstat(stream.fileno()).st_size))
+    except OSError as error:
+        raise DamagedPairError(f"{root / file.path} cannot be read ({error.strerror})") from error
+    if len(data) != file.bytes:
+        raise DamagedPairError(f"{root / file.path} is truncated")
+    return data
+
+
+class Manifest:
+    """The manifest that a shard writes.
+
+    A set of one shard has manifest.jsonl; a set of several has one file for each shard.
+    """
+
+    def __init__(self, out: Path, shard: int, shards: int):
+        self.out = out
+        self.path = out / ("manifest.jsonl" if shards == 1 else f"manifest-{shard:05d}-of-{shards:05d}.jsonl")
+
+    def open(self, is_in_shard: Callable[[int], bool], *, verify: bool) -> tuple[set[int], int]:
+        """Write the rows of this shard whose files exist, from all manifests of the folder.
+
+        Args:
+            is_in_shard: returns True for the number of a pair of this shard.
+            verify: True to compare checksums instead of sizes. Files that disagree are then deleted, and frames that
+                were skipped are dropped, to be tried again.
+
+        Returns:
+            the numbers of complete pairs, and the number of damaged pairs that `verify` has detected.
+        """
+        rows = scan_rows(find_manifests(self.out), lambda row: is_in_shard(row.number), skip_invalid=True)
+        kept, damaged = [], 0
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            while chunk := list(islice(rows, _CHUNK)):
+                check = self._has_checksums if verify else self._has_sizes
+                for (row, location), is_complete in zip(chunk, pool.map(check, [row for row, _ in chunk]), strict=True):
+                    if is_complete and not (verify and row.skipped):
+                        kept.append((row.number, location))
+                    elif verify:
+                        damaged += bool(row.files)
+                        for path in {file.path for file in row.files.values()}:
+                            (self.out / path).unlink(missing_ok=True)
+        self._write(kept)
+        return {number for number, _ in kept}, damaged
+
+    def add(self, rows: Iterable[PairRow]) -> None:
+        """Append the rows of pairs whose files are written."""
+        with self.path.open("ab") as stream:
+            stream.write("".join(row.as_line() for row in rows).encode())
+
+    def close(self) -> None:
+        """Sort the rows by number."""
+        rows = scan_rows([self.path], lambda _: True, skip_invalid=True)
+        self._write([(row.number, location) for row, location in rows])
+
+    def _write(self, rows: Sequence[tuple[int, RowLocation]]) -> None:
+        with replace_file(self.path, alone=True) as temporary, temporary.open("wb") as stream:
+            stream.writelines(read_lines(location for _, location in sorted(rows)))
+
+    def _has_sizes(self, row: PairRow) -> bool:
+        try:
+            sizes = {path: (self.out / path).stat().st_size for path in {file.path for file in row.files.values()}}
+        except OSError:
+            return False
+        # A tar continues after a file.
+        return all(
+            sizes[file.path] >= file.offset + file.bytes if file.offset else sizes[file.path] == file.bytes
+            for file in row.files.values()
+        )
+
+    def _has_checksums(self, row: PairRow) -> bool:
+        try:
+            files = [(read_stored(self.out, file), file.sha256) for file in row.files.values()]
+        except DamagedPairError:
+            return False
+        return self._has_sizes(row) and all(hashlib.sha256(data).hexdigest() == expected for data, expected in files)

@@ -1,13 +1,14 @@
-"""The baselines on both tasks, effect by effect, beside what needs no network; and what the paper reports.
+"""Score the baselines on both tasks, effect by effect, next to methods without a network and the values of the paper.
 
-python benchmarks/table1.py --source FRAMES [--form small|gpu|paper] [--rows resunet_undistort segformer_deweather ...]
-    [--frames 0] [--apart br_] [--steps 10 50 250] [--sampled 8] [--device cpu] [--threads 2]
+python benchmarks/table1.py --source FRAMES [--scale small|gpu|paper] [--rows resunet_undistort segformer_deweather ...]
+    [--frames 0] [--groups br_] [--steps 10 50 250] [--sampled 8] [--device cpu] [--threads 2]
     [--out benchmarks/results/table1_small]
 
-Rows whose training is in `--out` are loaded, what was stopped goes on, the others are trained. `--frames` of the drives
-held out are scored, 0 for all; of a diffusion model `--sampled`, with each number of steps. The best constant flow
-knows which effect it undoes; the mix is the mean of its effects, told once more for the frames whose names begin with
-each of `--apart`, and for those of none. A diffusion model is compared with doing nothing to the same frames.
+Rows with a finished training in `--out` are loaded, stopped trainings are resumed, and the others are started.
+`--frames` frames of the held-out drives are scored; 0 scores all. A diffusion model restores only `--sampled` of them,
+once for each number of steps, and is compared with doing nothing on the same frames. The best constant flow is fitted
+to each effect separately. The score of the mix is the mean over its effects. It is repeated for the frames whose names
+start with each prefix of `--groups`, and for the remaining frames.
 """
 
 import argparse
@@ -15,66 +16,102 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple, cast
 
 import torch
 from arguments import count
-from looks import seconds
-from restoration_scores import METRIC_SIZE, MIX, Restore, Scores, corrupted, effects_of, mean_of, references, score
+from slow_timing import seconds
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
 from torchrefract._io import replace_file
-from torchrefract.data.frames import FrameFolder
+from torchrefract._tensor import to_float, to_uint8
+from torchrefract.data.frame_folder import FrameFolder
+from torchrefract.data.module import make_pair
+from torchrefract.effects.base import Effect
+from torchrefract.effects.defog import remove_fog
+from torchrefract.effects.flare import LensFlare
+from torchrefract.effects.lens import LensDistortion
+from torchrefract.effects.one_of import OneOf
+from torchrefract.presets import paper_refractive, paper_weather
+from torchrefract.restoration.checkpoints import Loaded, load_model
 from torchrefract.restoration.diffusion import Diffusion
-from torchrefract.restoration.loading import Loaded, load_model
+from torchrefract.restoration.metrics import endpoint_error, masked_mean, psnr, ssim
 from torchrefract.restoration.tasks import Restored
 from torchrefract.types import Frame, Pair
+from torchrefract.warping.warp import warp
 
 TASKS = ("undistort", "deweather")
 ROWS = tuple(f"{model}_{task}" for task in TASKS for model in ("resunet", "segformer", "ddpm"))
-# PSNR in dB and endpoint error in px at 1920 x 1080, as the paper has them, of its own frames.
+SCALES = ("small", "gpu", "paper")
+# PSNR in dB and endpoint error in px at 1920 x 1080, from the paper, on its own frames.
 PAPER = {
     "undistort": {"ResUNet": (23.24, 5.76), "SegFormer": (16.29, 69.82), "DDPM": (22.80, 6.01)},
     "deweather": {"ResUNet": (32.54, None), "SegFormer": (28.99, None), "DDPM": (30.80, None)},
 }
-_FORMS = {"small": "_small", "gpu": "_gpu", "paper": ""}  # of the experiments, by the ends of their names
+METRIC_SIZE = (1080, 1920)  # px, the frame of the paper's endpoint errors
+MIX = "all of the paper's"
 _BATCH = 8
 _ALL = "all"
 _NOTHING = "do nothing"
-_NONE = Scores(*[math.nan] * 6)
+_SEED = 1 << 40  # above the seeds of training and validation
+_CONSTANT_DRAWS = 256
+
+Restore = Callable[[Tensor], Restored]
+
+
+class Scores(NamedTuple):
+    """Means over frames; flow_loss and epe are NaN for a task without a flow.
+
+    loss: image_loss + flow_loss, the training loss.
+    image_loss: mean |restored - clean| over valid pixels.
+    flow_loss: mean |flow - true flow| over valid pixels, in units of half the frame.
+    psnr: dB.
+    ssim: at most 1.
+    epe: endpoint error, px at METRIC_SIZE.
+    """
+
+    loss: float
+    image_loss: float
+    flow_loss: float
+    psnr: float
+    ssim: float
+    epe: float
+
+
+_NO_SCORES = Scores(*[math.nan] * 6)
 
 
 @dataclass(frozen=True)
 class Line:
-    """What one method reaches on one effect."""
+    """The scores of one method on one effect."""
 
     task: str
     effect: str
-    which: str  # frames
+    group: str  # of frames
     method: str
     scores: Scores
     frames: int
     size: tuple[int, int]
     parameters: int | None = None
-    milliseconds: float | None = None  # of one frame of that size
+    milliseconds: float | None = None  # for one frame of `size`
 
 
 def main() -> None:
-    """Train or load, score, print and save."""
+    """Train or load the models, score them, print the tables and save them."""
     args = _parser().parse_args()
-    args.out = args.out or Path(__file__).parent / "results" / f"table1_{args.form}"
+    args.out = args.out or Path(__file__).parent / "results" / f"table1_{args.scale}"
     torch.set_num_threads(args.threads)
     lines = list[Line]()
     for task in TASKS:
         rows = [row for row in args.rows if row.endswith(task)]
-        models = {row: load_model(trained(row, args)) for row in rows}
-        lines += scored(task, models, args)
-    text = page(lines)
+        lines += score_task(task, {row: load_model(train(row, args)) for row in rows}, args)
+    text = format_tables(lines)
     print(text)
     args.out.mkdir(parents=True, exist_ok=True)
     for name, content in (("table.md", text), ("table.json", json.dumps([asdict(line) for line in lines], indent=2))):
@@ -83,124 +120,199 @@ def main() -> None:
     print(f"written to {args.out}; each row has its curves.png and panel.png")
 
 
-def trained(row: str, args: argparse.Namespace) -> Path:
-    """The best checkpoint of a row, which is trained first, or further, where that is not done."""
+def train(row: str, args: argparse.Namespace) -> Path:
+    """Return the best checkpoint of a row; start or resume its training unless it is finished."""
     runs = sorted(args.out.glob(f"{row}*"), key=lambda run: run.stat().st_mtime)
-    done = next((run for run in runs if (run / "curves.png").is_file()), None)
-    if done is None:
-        done = args.out / f"{row}_{len(runs)}"
+    finished = next((run for run in runs if (run / "curves.png").is_file()), None)
+    if finished is None:
+        finished = args.out / f"{row}_{len(runs)}"
         stopped = next((run / "last.ckpt" for run in reversed(runs) if (run / "last.ckpt").is_file()), None)
-        words = [f"+experiment=table1_{row}{_FORMS[args.form]}", f"data.root={args.source}"]
+        words = [f"+experiment=table1_{row}", f"scale={args.scale}", f"data.root={args.source}"]
         words += [] if stopped is None else [f"ckpt_path={stopped}"]
-        subprocess.run([sys.executable, "-m", "torchrefract.train", *words, f"hydra.run.dir={done}"], check=True)
-    return done / "best.ckpt"
+        subprocess.run([sys.executable, "-m", "torchrefract.train", *words, f"hydra.run.dir={finished}"], check=True)
+    return finished / "best.ckpt"
 
 
-def scored(task: str, models: dict[str, Loaded], args: argparse.Namespace) -> Iterator[Line]:
-    """The lines of a task: those of no network first, for each size of frames that models were trained on."""
+def effects_of(task: str, width: int) -> dict[str, tuple[Effect, bool]]:
+    """Return the scored effects of a task by name, each with True if it is in the paper's mix."""
+    if task == "undistort":
+        names = ("cheap_dashcam lens", "turbulence", "thin-plate spline", "divergence-free")
+        wide = LensDistortion(k1_range=(-0.4, 0.2), focal_range=(0.9, 1.1))
+        return _in_mix(paper_refractive(width=width), names) | {"wide lens": (wide, False)}
+    return _in_mix(paper_weather(), ("uniform fog", "heterogeneous fog", "lens flare"))
+
+
+def _in_mix(mix: OneOf, names: Sequence[str]) -> dict[str, tuple[Effect, bool]]:
+    return {name: (cast(Effect, effect), True) for name, effect in zip(names, mix.effects, strict=True)}
+
+
+def corrupt(frames: Iterable[Frame], effect: Effect) -> list[Pair]:
+    """Degrade batches of frames; the draws depend on the keys of the frames only."""
+    return [make_pair(frame, effect, seed=_SEED) for frame in frames]
+
+
+def score_references(task: str, effect: Effect, frames: Iterable[Frame], pairs: list[Pair]) -> dict[str, Tensor]:
+    """Score the methods without a network, see `score`: nothing, the best constant flow, and the true map."""
+    if task == "undistort":
+        constant = constant_flow(effect, pairs[0].clean)
+        methods: dict[str, Iterator[Restored]] = {
+            _NOTHING: (Restored(pair.degraded, torch.zeros_like(pair.flow)) for pair in pairs),
+            "best constant flow": (_warp_back(pair, constant.expand_as(pair.flow)) for pair in pairs),
+            "the true flow": (_warp_back(pair, pair.flow) for pair in pairs),
+        }
+    else:
+        methods = {
+            _NOTHING: (Restored(pair.degraded) for pair in pairs),
+            "the true map": (Restored(remove_weather(frame, effect)) for frame in frames),
+        }
+    return {name: score(restored, pairs) for name, restored in methods.items()}
+
+
+def score(restored: Iterable[Restored], pairs: list[Pair]) -> Tensor:
+    """Score each frame; return (N, 6), float64, in the order of `Scores`."""
+    return torch.cat([_scores(one, pair) for one, pair in zip(restored, pairs, strict=True)]).double().cpu()
+
+
+def mean_of(frames: Tensor) -> Scores:
+    """Average the scores (N, 6) of frames."""
+    return Scores(*frames.mean(dim=0).tolist())
+
+
+def constant_flow(effect: Effect, like: Tensor) -> Tensor:
+    """Average the valid restore flows of an effect over draws that are not scored; return (1, 2, H, W), px."""
+    total, count = torch.zeros_like(like[:1, :2], dtype=torch.float64), torch.zeros_like(like[:1, :1])
+    for keys in torch.arange(_CONSTANT_DRAWS, device=like.device).split(8):
+        blank = Frame(like.new_zeros(len(keys), *like.shape[1:]), keys, torch.empty(0))
+        pair = make_pair(blank, effect, seed=_SEED - 1)
+        total += (pair.flow * pair.valid).sum(dim=0, keepdim=True)
+        count += pair.valid.sum(dim=0, keepdim=True)
+    return (total / count.clamp(min=1)).to(like)
+
+
+def remove_weather(frame: Frame, effect: Effect) -> Tensor:
+    """Restore the degraded image, rounded to 8 bits, by its true map; return (B, 3, H, W)."""
+    degraded = effect.degrade(frame.image, seed=_SEED, keys=frame.key)
+    image = to_float(to_uint8(degraded.image))
+    if isinstance(effect, LensFlare):
+        return torch.where(degraded.valid, image - degraded.intensity, image)
+    return remove_fog(image, degraded.transmission, degraded.params.airlight)[0].clamp(0, 1)
+
+
+def _warp_back(pair: Pair, flow: Tensor) -> Restored:
+    return Restored(warp(pair.degraded, flow, padding="border")[0], flow)
+
+
+def _scores(restored: Restored, pair: Pair) -> Tensor:
+    """Score each frame of a batch; return (B, 6), in the order of `Scores`."""
+    image = restored.image.float().clamp(0, 1)
+    image_loss = masked_mean((image - pair.clean).abs(), pair.valid)
+    flow_loss = epe = torch.full_like(image_loss, torch.nan)
+    if restored.flow is not None:
+        size = pair.flow.new_tensor([pair.flow.shape[3], pair.flow.shape[2]]).view(1, 2, 1, 1)
+        flow_loss = masked_mean((restored.flow - pair.flow).abs() * 2 / size, pair.valid)
+        epe = endpoint_error(restored.flow, pair.flow, pair.valid, size=METRIC_SIZE)
+    loss = image_loss + flow_loss.nan_to_num()
+    similarity = psnr(image, pair.clean, pair.valid), ssim(image, pair.clean, pair.valid)
+    return torch.stack([loss, image_loss, flow_loss, *similarity, epe], dim=1)
+
+
+def score_task(task: str, models: dict[str, Loaded], args: argparse.Namespace) -> Iterator[Line]:
+    """Yield the lines of a task: methods without a network first, for each frame size of the models."""
     for size in dict.fromkeys(loaded.size for loaded in models.values()):
-        own = {row: loaded for row, loaded in models.items() if loaded.size == size}
         held_out = FrameFolder(args.source, size=size, split="val")
-        frames = _frames(held_out, args.frames, args.device)
+        frames = _load_frames(held_out, args.frames, args.device)
         effects = effects_of(task, size[1])
-        pairs = {name: corrupted(frames, effect) for name, (effect, _) in effects.items()}
-        groups = _groups(held_out, args.apart)
-        found, keys = dict[str, dict[str, Tensor]](), _keys(frames)
+        pairs = {name: corrupt(frames, effect) for name, (effect, _) in effects.items()}
+        groups = _group_keys(held_out, args.groups)
+        references, keys = dict[str, dict[str, Tensor]](), _keys(frames)
         for name, (effect, _) in effects.items():
-            for rival, scores in references(task, effect, frames, pairs[name]).items():
-                found.setdefault(rival, {})[name] = scores
-        for rival, each in found.items():
-            yield from _lines(Line(task, "", "", rival, _NONE, 0, size), each, keys, groups)
-        for loaded in own.values():
+            for method, scores in score_references(task, effect, frames, pairs[name]).items():
+                references.setdefault(method, {})[name] = scores
+        for method, by_effect in references.items():
+            yield from _lines(Line(task, "", "", method, _NO_SCORES, 0, size), by_effect, keys, groups)
+        for loaded in (loaded for loaded in models.values() if loaded.size == size):
             if isinstance(loaded.model, Diffusion) and args.sampled < len(keys):
-                few = _evenly(len(keys), args.sampled)
-                nothing = {name: scores[few] for name, scores in found[_NOTHING].items()}
-                line = Line(task, "", "", f"{_NOTHING}, frames of DDPM", _NONE, 0, size)
-                yield from _lines(line, nothing, [keys[i] for i in few], groups)
-            yield from _of_model(task, loaded, pairs, groups, args)
+                sampled = _evenly(len(keys), args.sampled)
+                nothing = {name: scores[sampled] for name, scores in references[_NOTHING].items()}
+                line = Line(task, "", "", f"{_NOTHING}, frames of DDPM", _NO_SCORES, 0, size)
+                yield from _lines(line, nothing, [keys[i] for i in sampled], groups)
+            yield from _score_model(task, loaded, pairs, groups, args)
 
 
-def _of_model(
+def _score_model(
     task: str, loaded: Loaded, pairs: dict[str, list[Pair]], groups: dict[str, set[int]], args: argparse.Namespace
 ) -> Iterator[Line]:
     model = loaded.model.to(args.device)
-    parameters = sum(parameter.numel() for parameter in model.network.parameters())  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]  # of every Learner
-    sampled = isinstance(model, Diffusion)
-    few = {name: _thinned(batches, args.sampled if sampled else 0) for name, batches in pairs.items()}
-    some = next(iter(few.values()))
-    for steps in args.steps if sampled else [0]:
-        if sampled:
+    parameters = sum(parameter.numel() for parameter in model.network.parameters())  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]  # of every RestorationModule
+    is_sampled = isinstance(model, Diffusion)
+    batches = {name: _subsample(every, args.sampled if is_sampled else 0) for name, every in pairs.items()}
+    first = next(iter(batches.values()))
+    for steps in args.steps if is_sampled else [0]:
+        if is_sampled:
             model.steps = steps
-        each = {name: score(_restored(model, batches), batches) for name, batches in few.items()}
-        # What has come to the CPU has been computed, on any device.
-        call = partial(_brought, model, some[0].degraded[:1])
+        by_effect = {
+            name: score((_call(model, pair.degraded) for pair in chosen), chosen) for name, chosen in batches.items()
+        }
+        call = partial(_call_and_wait, model, first[0].degraded[:1])
         milliseconds = 1e3 * median(seconds(call, before=i == 0) for i in range(3))
-        name = f"DDPM, {steps} steps" if sampled else loaded.name
-        line = Line(task, "", "", name, _NONE, 0, loaded.size, parameters, milliseconds)
-        yield from _lines(line, each, _keys(some), groups)
+        name = f"DDPM, {steps} steps" if is_sampled else loaded.name
+        line = Line(task, "", "", name, _NO_SCORES, 0, loaded.size, parameters, milliseconds)
+        yield from _lines(line, by_effect, _keys(first), groups)
 
 
-def _lines(of: Line, each: dict[str, Tensor], keys: list[int], groups: dict[str, set[int]]) -> Iterator[Line]:
-    """A method's lines: the mix of all frames, that of each group, and the effects; from scores frame by frame."""
+def _lines(of: Line, by_effect: dict[str, Tensor], keys: list[int], groups: dict[str, set[int]]) -> Iterator[Line]:
+    """Yield the lines of a method from its scores by effect and frame: the mix for each group, then the effects."""
     effects = effects_of(of.task, of.size[1])
-    mixed = torch.stack([each[name] for name, (_, in_mix) in effects.items() if in_mix]).mean(dim=0)
-    for which, group in groups.items():
+    mixed = torch.stack([by_effect[name] for name, (_, in_mix) in effects.items() if in_mix]).mean(dim=0)
+    for name, group in groups.items():
         chosen = mixed[[key in group for key in keys]]
-        yield replace(of, effect=MIX, which=which, scores=mean_of(chosen), frames=len(chosen))
-    for effect, scores in each.items():
-        yield replace(of, effect=effect, which=_ALL, scores=mean_of(scores), frames=len(scores))
+        yield replace(of, effect=MIX, group=name, scores=mean_of(chosen), frames=len(chosen))
+    for effect, scores in by_effect.items():
+        yield replace(of, effect=effect, group=_ALL, scores=mean_of(scores), frames=len(scores))
 
 
-def page(lines: Sequence[Line]) -> str:
-    """The tables, one for each task and effect, in Markdown."""
+def format_tables(lines: Sequence[Line]) -> str:
+    """Format a Markdown table for each task, effect and group."""
     parts = []
-    for task, effect, which in dict.fromkeys((line.task, line.effect, line.which) for line in lines):
-        own = [line for line in lines if (line.task, line.effect, line.which) == (task, effect, which)]
-        size = f"{own[0].size[1]}x{own[0].size[0]}"
+    for task, effect, group in dict.fromkeys((line.task, line.effect, line.group) for line in lines):
+        of_table = [line for line in lines if (line.task, line.effect, line.group) == (task, effect, group)]
+        size = f"{of_table[0].size[1]}x{of_table[0].size[0]}"
         head = ["method", "L", "L_rec", "L_k", "PSNR (dB)", "SSIM", f"EPE (px at {METRIC_SIZE[1]}x{METRIC_SIZE[0]})"]
         head += ["x do nothing", "frames", "parameters", f"ms per frame of {size}"]
-        nothing = {line.frames: line.scores for line in own if line.method.startswith(_NOTHING)}
-        rows = [head, ["---"] * len(head), *(_cells(line, nothing[line.frames]) for line in own)]
-        if effect == MIX and which == _ALL:
-            rows += [_paper(name, *figures) for name, figures in PAPER[task].items()]
-        title = f"### {task}: {effect}" + ("" if which == _ALL else f", frames {which}")
+        nothing = {line.frames: line.scores for line in of_table if line.method.startswith(_NOTHING)}
+        rows = [head, ["---"] * len(head), *(_cells(line, nothing[line.frames]) for line in of_table)]
+        if effect == MIX and group == _ALL:
+            rows += [_paper_cells(name, *values) for name, values in PAPER[task].items()]
+        title = f"### {task}: {effect}" + ("" if group == _ALL else f", frames {group}")
         parts.append("\n".join([title, "", *("| " + " | ".join(row) + " |" for row in rows)]))
     return "\n\n".join(parts)
 
 
 def _cells(line: Line, nothing: Scores) -> list[str]:
     s = line.scores
-    numbers = [f"{s.loss:.4f}", f"{s.image_loss:.4f}", _or_none(s.flow_loss, ".4f"), f"{s.psnr:.2f}", f"{s.ssim:.3f}"]
-    numbers += [_or_none(s.epe, ".2f"), _or_none(s.epe / nothing.epe if nothing.epe else s.epe, ".2f")]
+    numbers = [f"{s.loss:.4f}", f"{s.image_loss:.4f}", _or_empty(s.flow_loss, ".4f"), f"{s.psnr:.2f}", f"{s.ssim:.3f}"]
+    numbers += [_or_empty(s.epe, ".2f"), _or_empty(s.epe / nothing.epe if nothing.epe else s.epe, ".2f")]
     cost = [str(line.frames), "" if line.parameters is None else f"{line.parameters / 1e6:.1f} M"]
     return [line.method, *numbers, *cost, "" if line.milliseconds is None else f"{line.milliseconds:.0f}"]
 
 
-def _paper(name: str, psnr: float, epe: float | None) -> list[str]:
-    return [
-        f"paper: {name}, on its own frames",
-        "",
-        "",
-        "",
-        f"{psnr:.2f}",
-        "",
-        "" if epe is None else f"{epe:.2f}",
-        *[""] * 4,
-    ]
+def _paper_cells(name: str, psnr: float, epe: float | None) -> list[str]:
+    scores = [*[""] * 3, f"{psnr:.2f}", "", "" if epe is None else f"{epe:.2f}"]
+    return [f"paper: {name}, on its own frames", *scores, *[""] * 4]
 
 
-def _or_none(value: float, form: str) -> str:
+def _or_empty(value: float, form: str) -> str:
     return "" if math.isnan(value) else format(value, form)
 
 
-def _frames(held_out: FrameFolder, most: int, device: torch.device) -> list[Frame]:
-    """Batches of the frames of drives that no training has seen, or as many of them, evenly."""
-    chosen = Subset(held_out, _evenly(len(held_out), most))
+def _load_frames(held_out: FrameFolder, limit: int, device: torch.device) -> list[Frame]:
+    """Load batches of up to `limit` held-out frames, evenly chosen; 0 loads all."""
+    chosen = Subset(held_out, _evenly(len(held_out), limit))
     return [Frame(*(value.to(device) for value in batch)) for batch in DataLoader(chosen, batch_size=_BATCH)]
 
 
-def _groups(held_out: FrameFolder, prefixes: Sequence[str]) -> dict[str, set[int]]:
-    """The keys of all frames, and of those whose names begin alike, and of the others."""
+def _group_keys(held_out: FrameFolder, prefixes: Sequence[str]) -> dict[str, set[int]]:
+    """Return the keys of all frames, of those whose names start with each prefix, and of the others."""
     names = {key: path.name for key, path in zip(held_out.keys, held_out.paths, strict=True)}
     groups = {f"{start}*": {key for key, name in names.items() if name.startswith(start)} for start in prefixes}
     others = {"others": set(names).difference(*groups.values())} if groups else {}
@@ -211,18 +323,19 @@ def _keys(batches: Sequence[Frame | Pair]) -> list[int]:
     return [key for batch in batches for key in batch.key.tolist()]
 
 
-def _thinned(pairs: list[Pair], most: int) -> list[Pair]:
-    """So many of the frames of batches, evenly, in new batches; all of them for 0."""
-    if not most:
+def _subsample(pairs: list[Pair], limit: int) -> list[Pair]:
+    """Choose up to `limit` frames of the batches, evenly, in new batches; 0 keeps all."""
+    if not limit:
         return pairs
     every = [torch.cat(values) for values in zip(*pairs, strict=True)]
-    chosen = torch.tensor(_evenly(len(every[0]), most), device=every[0].device)
-    return [Pair(*(value[some] for value in every)) for some in chosen.split(_BATCH)]
+    chosen = torch.tensor(_evenly(len(every[0]), limit), device=every[0].device)
+    return [Pair(*(value[rows] for value in every)) for rows in chosen.split(_BATCH)]
 
 
-def _evenly(count: int, most: int) -> list[int]:
-    kept = min(count, most or count)
-    return [i * count // kept for i in range(kept)]
+def _evenly(count: int, limit: int) -> list[int]:
+    """Return `limit` of the numbers below `count`, evenly; all of them for 0."""
+    chosen = min(count, limit or count)
+    return [i * count // chosen for i in range(chosen)]
 
 
 @torch.inference_mode()
@@ -230,26 +343,23 @@ def _call(model: Restore, image: Tensor) -> Restored:
     return model(image)
 
 
-def _brought(model: Restore, image: Tensor) -> Tensor:
+def _call_and_wait(model: Restore, image: Tensor) -> Tensor:
+    # The copy to the CPU waits until the device has finished.
     return _call(model, image).image.cpu()
-
-
-def _restored(model: Restore, pairs: Sequence[Pair]) -> Iterator[Restored]:
-    return (_call(model, pair.degraded) for pair in pairs)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--source", type=Path, required=True, help="a folder of frames, of several drives")
-    parser.add_argument("--form", choices=_FORMS, default="small", help="of the experiments, small")
-    parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS), help="all six")
-    parser.add_argument("--frames", type=count(0), default=0, help="held-out frames that are scored, all")
-    parser.add_argument("--steps", type=count(1), nargs="+", default=[10, 50, 250], help="of diffusion models")
+    parser.add_argument("--source", type=Path, required=True, help="a folder of frames of several drives")
+    parser.add_argument("--scale", choices=SCALES, default="small", help="scale of the experiments, small")
+    parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS), help="models and tasks, all six")
+    parser.add_argument("--frames", type=count(0), default=0, help="number of held-out frames to score, all")
+    parser.add_argument("--steps", type=count(1), nargs="+", default=[10, 50, 250], help="steps of diffusion models")
     parser.add_argument("--sampled", type=count(1), default=8, help="frames that a diffusion model restores, 8")
-    parser.add_argument("--apart", nargs="+", default=[], help="beginnings of frames' names, each a kind of its own")
-    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"), help="that scores, cpu")
-    parser.add_argument("--threads", type=count(1), default=2, help="2")
-    parser.add_argument("--out", type=Path, help="a folder for trainings of one form, benchmarks/results/table1_FORM")
+    parser.add_argument("--groups", nargs="+", default=[], help="prefixes of frame names, each scored as a group")
+    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"), help="device that scores, cpu")
+    parser.add_argument("--threads", type=count(1), default=2, help="CPU threads, 2")
+    parser.add_argument("--out", type=Path, help="folder of the trainings, benchmarks/results/table1_SCALE")
     return parser
 
 

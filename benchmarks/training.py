@@ -1,4 +1,4 @@
-"""What effects cost in training: with gradients, and beside a step of the ResUNet.
+"""Time effects with gradients, and training steps of the ResUNet with corruption on the fly.
 
 python benchmarks/training.py [--batch 16] [--size 256x256] [--threads 2] [--repeats 15] [--rounds 5]
                               [--encoder tu-resnet34] [--out benchmarks/results/training.json]
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 from arguments import count, size
-from looks import alternate
+from slow_timing import alternate
 from subjects import effects
 from timing import FEWEST_REPEATS, GRID_SAMPLE, Bar, Candidate, Conditions, Timing, measure, references, table
 from torch import Tensor
@@ -28,10 +28,10 @@ from torchrefract.restoration.tasks import Deweather, Task, Undistort
 from torchrefract.types import Frame
 
 WHAT = (
-    "First: effect(image) with a new draw in every call, the gradient of the image asked for, forward and backward, in "
-    "multiples of a bare F.grid_sample of the same batch with the same gradient; warps within 0.05 px. Then: a step of "
-    "training, forward, loss, backward and AdamW, of the ResUNet from pairs made before, and the same with the pairs "
-    "made on the fly (degraded image, flow back and where it is valid), in turn; median, least and most of the rounds."
+    "First table: effect(image) with new draws in every call and the gradient of the image, forward and backward, in "
+    "multiples of a bare F.grid_sample of the same batch with the same gradient; warps within 0.05 px. Further tables: "
+    "a training step of the ResUNet (forward, loss, backward, AdamW) from pairs made before, and with pairs made on "
+    "the fly (degraded image, restore flow and its validity), in turn; median, least and most of the rounds."
 )
 BARE = f"{GRID_SAMPLE}, forward + backward"
 BEFORE, FLY = "step, pairs made before", "step, pairs made on the fly"
@@ -44,7 +44,7 @@ TASKS: Mapping[str, tuple[Callable[[], Task], Callable[[], Effect]]] = {
 
 
 def main() -> None:
-    """Measure, print and save; where a bar does not hold it is said, and is no failure of this command."""
+    """Measure, print and save; a limit that is exceeded is printed and does not fail the command."""
     args = _parser().parse_args()
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
@@ -52,22 +52,21 @@ def main() -> None:
     image, depth = render_road_scenes(keys, *args.size, seed=SEED)
     conditions = Conditions.now(image, threads=args.threads, repeats=args.repeats)
     print(WHAT, end="\n\n", flush=True)
-    found = candidates(image, effects())
-    timings = measure(found, references=(BARE,), repeats=args.repeats, threads=args.threads)
-    held = [Bar(t.name, t.ratios[BARE].median, "<=", EFFECT_LIMIT, "x bare") for t in timings if t.name != BARE]
-    print(table(timings, conditions), "", *held, "", sep="\n", flush=True)
-    trained = {}
+    timings = measure(candidates(image, effects()), references=(BARE,), repeats=args.repeats, threads=args.threads)
+    bars = [Bar(t.name, t.ratios[BARE].median, "<=", EFFECT_LIMIT, "x bare") for t in timings if t.name != BARE]
+    print(table(timings, conditions), "", *bars, "", sep="\n", flush=True)
+    steps_by_task = {}
     for name, (task, scene) in TASKS.items():
         steps = training_steps(Frame(image, keys, depth), task(), scene(), encoder=args.encoder)
-        trained[name] = alternate(steps, reference=BEFORE, rounds=args.rounds)
-        held.append(Bar(name, trained[name][1].ratios[BEFORE].median, "<=", STEP_LIMIT, f"x the {BEFORE}"))
-        print(table(trained[name], conditions).partition("\n\n")[2], held[-1], "", sep="\n", flush=True)
-    _save(args.out, timings, conditions, bars=held, trained=trained)
+        steps_by_task[name] = alternate(steps, reference=BEFORE, rounds=args.rounds)
+        bars.append(Bar(name, steps_by_task[name][1].ratios[BEFORE].median, "<=", STEP_LIMIT, f"x the {BEFORE}"))
+        print(table(steps_by_task[name], conditions).partition("\n\n")[2], bars[-1], "", sep="\n", flush=True)
+    _save(args.out, timings, conditions, bars=bars, steps=steps_by_task)
     print(f"written to {args.out}")
 
 
 def candidates(frames: Tensor, chosen: Mapping[str, Effect]) -> dict[str, Candidate]:
-    """The effects on a batch (B, C, H, W) with a gradient, forward and backward; the reference comes first."""
+    """Return calls that run forward and backward on a batch (B, C, H, W), one an effect; the reference is first."""
     image = frames.clone().requires_grad_()
     upstream = torch.rand_like(frames)
     forward: dict[str, Candidate] = {BARE: references(image)[GRID_SAMPLE]}
@@ -81,14 +80,14 @@ def candidates(frames: Tensor, chosen: Mapping[str, Effect]) -> dict[str, Candid
 
 
 def training_steps(frames: Frame, task: Task, scene: Effect, *, encoder: str) -> dict[str, Candidate]:
-    """A step with the pairs made before, and one that makes them."""
+    """Return a training step with fixed pairs, and one that makes its pairs."""
     network = ResUNet(task.channels, smooth=task.smooth, encoder=encoder).train()
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4)
-    made = make_pair(frames, scene, seed=SEED)
+    fixed = make_pair(frames, scene, seed=SEED)
     seeds = iter(range(1 << 30))
 
     def step(on_the_fly: bool) -> Tensor:
-        pair = make_pair(frames, scene, seed=next(seeds)) if on_the_fly else made
+        pair = make_pair(frames, scene, seed=next(seeds)) if on_the_fly else fixed
         loss = task.loss(task.restore(network(pair.degraded), pair.degraded), pair)
         optimizer.zero_grad()
         loss.backward()
@@ -104,13 +103,13 @@ def _save(
     conditions: Conditions,
     *,
     bars: Sequence[Bar],
-    trained: Mapping[str, Sequence[Timing]],
+    steps: Mapping[str, Sequence[Timing]],
 ) -> None:
     content = {
         "what": WHAT,
         "conditions": asdict(conditions),
         "timings": [asdict(timing) for timing in timings],
-        "steps": {name: [asdict(timing) for timing in found] for name, found in trained.items()},
+        "steps": {name: [asdict(timing) for timing in timings] for name, timings in steps.items()},
         "bars": [asdict(bar) | {"holds": bar.holds} for bar in bars],
     }
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,7 @@
-"""Effects in the transforms.Compose of a training script: degraded by the workers, with boxes that move along."""
+"""Use effects in the torchvision transforms of a training script: DataLoader workers degrade frames and move boxes.
+
+python examples/03_train_with_transforms.py [PICTURE.png]
+"""
 
 import sys
 
@@ -15,7 +18,7 @@ SIZE = (180, 320)
 
 
 class Scenes(Dataset):
-    """Rendered roads, with the box of a part of each."""
+    """Rendered roads with the box of the road ahead."""
 
     def __init__(self, transform: v2.Transform):
         self.frames, self.transform = RoadScenes(64, size=SIZE), transform
@@ -31,20 +34,20 @@ class Scenes(Dataset):
 
 
 def main() -> None:
-    """One batch, as a training step would get it."""
+    """Draw one batch."""
     out = sys.argv[1] if len(sys.argv) > 1 else "train_with_transforms.png"
     weather = tr.OneOf([tr.UniformFog(visibility_range=(60, 200)), tr.Turbulence(amplitude_range=(0.5, 1.0))], p=0.8)
     transform = v2.Compose([v2.RandomHorizontalFlip(), weather, tr.LensDistortion(padding="border", p=0.8)])
-    torch.manual_seed(0)  # seeds the workers, and they the effects
+    torch.manual_seed(0)  # seeds the workers, which seed the effects
     loader = DataLoader(
         Scenes(transform), batch_size=8, num_workers=2, collate_fn=lambda batch: list(zip(*batch, strict=True))
     )
     images, targets = next(iter(loader))
-    shown = [
+    drawn = [
         draw_bounding_boxes((255 * image).byte(), target["boxes"], colors="yellow", width=2)
         for image, target in zip(images, targets, strict=True)
     ]
-    save_image(make_grid(torch.stack(shown).float() / 255, nrow=4), out)
+    save_image(make_grid(torch.stack(drawn).float() / 255, nrow=4), out)
 
 
 if __name__ == "__main__":

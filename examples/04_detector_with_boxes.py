@@ -1,6 +1,7 @@
-"""An effect inside a detector: in training it corrupts the batch, on its device, and the boxes move along.
+"""Use effects inside a detector: in training it degrades the batch on its device, and the boxes move along.
 
-A sign is painted on each frame, so that the boxes can be held against what the corrupted frames show of it.
+Each frame has a magenta sign, so that the moved boxes can be compared with the degraded image.
+python examples/04_detector_with_boxes.py [PICTURE.png]
 """
 
 import sys
@@ -21,7 +22,7 @@ DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
 
 class RobustDetector(nn.Module):
-    """A detector that trains on corrupted frames, and looks at frames as they are."""
+    """A detector that degrades its input in training only."""
 
     def __init__(self):
         super().__init__()
@@ -50,10 +51,10 @@ for step in range(4):
     loss.backward()
     optimizer.step()
     print(f"step {step}: loss {loss.item():.2f}")
-corrupted, moved = model.effect(frames, targets)
-seen = masks_to_boxes(corrupted[:, ::2].amin(dim=1) - corrupted[:, 1] > 0.5) + torch.tensor([0, 0, 1, 1], device=DEVICE)
-for name, boxes in (("moved", moved), ("unmoved", targets)):
-    fit = [box_iou(target["boxes"], one[None]).item() for target, one in zip(boxes, seen, strict=True)]
-    print(f"IoU of the {name} boxes with what is seen:", *(f"{value:.3f}" for value in fit))
-shown = [draw_bounding_boxes(image, one["boxes"], colors="yellow") for image, one in zip(corrupted, moved, strict=True)]
-save_image(make_grid(torch.stack(shown), nrow=2), sys.argv[1] if len(sys.argv) > 1 else "detector_with_boxes.png")
+images, moved = model.effect(frames, targets)
+signs = masks_to_boxes(images[:, ::2].amin(dim=1) - images[:, 1] > 0.5) + torch.tensor([0, 0, 1, 1], device=DEVICE)
+for name, boxes in (("moved", moved), ("original", targets)):
+    iou = [box_iou(target["boxes"], sign[None]).item() for target, sign in zip(boxes, signs, strict=True)]
+    print(f"IoU of the {name} boxes with the degraded signs:", *(f"{value:.3f}" for value in iou))
+drawn = [draw_bounding_boxes(image, t["boxes"], colors="yellow") for image, t in zip(images, moved, strict=True)]
+save_image(make_grid(torch.stack(drawn), nrow=2), sys.argv[1] if len(sys.argv) > 1 else "detector_with_boxes.png")

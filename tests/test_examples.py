@@ -1,3 +1,4 @@
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -6,10 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("0*.py"))
+EXAMPLES = Path(__file__).parents[1] / "examples"
+SCRIPTS = sorted(EXAMPLES.glob("0*.py"))
 
 
-@pytest.mark.parametrize("script", EXAMPLES, ids=lambda path: path.name)
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
 def test_an_example_is_short_and_draws_its_picture(script: Path, tmp_path: Path):
     assert len(script.read_text().splitlines()) <= 60
     picture = tmp_path / "picture.png"
@@ -17,3 +19,10 @@ def test_an_example_is_short_and_draws_its_picture(script: Path, tmp_path: Path)
     pixels = np.asarray(Image.open(picture).convert("RGB"))
     assert min(pixels.shape[:2]) >= 200
     assert pixels.std() > 20
+
+
+@pytest.mark.quick
+def test_the_guide_links_every_example_and_only_existing_files():
+    links = set(re.findall(r"\]\(([^)]+)\)", (EXAMPLES / "README.md").read_text()))
+    assert {script.name for script in SCRIPTS} <= links
+    assert all((EXAMPLES / link).is_file() for link in links)

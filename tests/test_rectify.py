@@ -8,7 +8,7 @@ import torch
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io.opencv import read_opencv, write_opencv
 from torchrefract.fields.rectification import camera_flow
-from torchrefract.videos import video_facts
+from torchrefract.data.media import video_info
 
 PINHOLE = {"width": 96, "height": 64, "fx": 70.0, "fy": 71.0, "cx": 46.2, "cy": 33.1}
 CAMERAS = {
@@ -115,7 +115,7 @@ def test_a_video_is_rectified_frame_by_frame(call, folder):
         writer.write(np.roll(waves(), 3 * k, axis=1))
     writer.release()
     assert call("rectify", "input=clip.avi", "camera=cam.yaml", "out=out").code == 0
-    assert video_facts(folder / "out" / "clip.mp4") == (5, 12.0)
+    assert video_info(folder / "out" / "clip.mp4") == (5, 12.0)
     frame = np.asarray(cv2.VideoCapture(str(folder / "out" / "clip.mp4")).read()[1]).astype(float)
     theirs = cv2.remap(waves().astype(np.float32), *maps(CAMERAS["opencv"], 1.0), cv2.INTER_CUBIC)
     assert np.abs(frame - theirs)[4:-4, 4:-4].mean() < 12  # two codecs in between

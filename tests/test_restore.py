@@ -10,15 +10,15 @@ from PIL import Image
 
 from torchrefract import warp
 from torchrefract.data.images import read_image
+from torchrefract.data.media import video_info
 from torchrefract.restoration.checkpoints import read_checkpoint
-from torchrefract.videos import video_facts
 
 SIZES = {"a.png": (48, 96), "one/b.png": (90, 70), "one/two/b.png": (48, 96), "one/c.bmp": (1, 1)}
 LIMIT = 0.25  # of Undistort, in widths and heights
 
 
 def picture(height: int, width: int, seed: int = 0) -> np.ndarray:
-    """(H, W, 3), uint8: smooth, so that a video keeps it."""
+    """Return (H, W, 3), uint8, smooth enough for a video codec."""
     y, x = np.mgrid[:height, :width]
     return np.stack([127 + 100 * np.sin(x / (9 + c) + seed) * np.cos(y / (11 - c)) for c in range(3)], -1).astype(
         np.uint8
@@ -32,7 +32,7 @@ def write(path: Path, pixels: np.ndarray) -> None:
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    """Pictures of several sizes in folders, in the folder that commands run in."""
+    """Write pictures of several sizes into raw/ and return the working folder."""
     for i, (name, size) in enumerate(SIZES.items()):
         write(tmp_path / "raw" / name, picture(*size, seed=i))
     return tmp_path
@@ -40,13 +40,13 @@ def folder(tmp_path) -> Path:
 
 @pytest.fixture(scope="module")
 def shifted(known_model) -> Path:
-    """A model that looks 1/16 of the width to the right and 1/32 of the height up."""
+    """Return a model whose flow points 1/16 of the width to the right and 1/32 of the height up."""
     return known_model("undistort", (math.atanh(1 / 16 / LIMIT), math.atanh(-1 / 32 / LIMIT)))
 
 
 @pytest.fixture(scope="module")
 def brighter(known_model) -> Path:
-    """A model that adds a fifth to the red, and takes a tenth off the blue."""
+    """Return a model that adds 0.2 to red and subtracts 0.1 from blue."""
     return known_model("deweather", (0.2, 0.0, -0.1))
 
 
@@ -55,16 +55,16 @@ def written(folder: Path) -> list[str]:
 
 
 def rate(outcome) -> float:
-    """Frames a second, as the last line tells them."""
+    """Return the frames a second of the last line."""
     words = outcome.out.splitlines()[-1].split()
     assert words[1:2] + words[3:] == ["frames,", "frames", "a", "second", "on", "cpu"]
     return float(words[2])
 
 
 @pytest.mark.parametrize("interpolation", ["bicubic", "bilinear"])
-def test_pictures_keep_their_names_and_sizes_and_lose_their_distortion(call, folder, shifted, interpolation):
+def test_pictures_keep_their_names_and_sizes_and_are_warped_along_the_flow(call, folder, shifted, interpolation):
     outcome = call("restore", f"ckpt_path={shifted}", "input=raw", "out=out", f"interpolation={interpolation}")
-    assert outcome.out.splitlines()[0] == "out: 4 restored, 0 were there already, 0 skipped"
+    assert outcome.out.splitlines()[0] == "out: 4 restored, 0 already existed, 0 skipped"
     assert rate(outcome) > 0
     assert outcome.err == ""
     assert written(folder / "out") == sorted([*SIZES, "config.json"])
@@ -72,12 +72,12 @@ def test_pictures_keep_their_names_and_sizes_and_lose_their_distortion(call, fol
         flow = torch.tensor([width / 16, -height / 32]).view(1, 2, 1, 1).expand(1, 2, height, width)
         image = read_image(folder / "raw" / name)[None].contiguous()
         expected = warp(image, flow, padding="border", interpolation=interpolation)[0][0]
-        # Rounded to bytes.
+        # Files hold bytes.
         assert (read_image(folder / "out" / name) - expected).abs().max() < 0.51 / 255 + 1e-4
 
 
 @pytest.mark.parametrize("tile", ["null", "32", "[20,40]"])
-def test_weather_is_taken_off_whole_or_in_tiles(call, folder, brighter, tile):
+def test_weather_is_removed_from_resized_pictures_and_in_tiles(call, folder, brighter, tile):
     assert call("restore", f"ckpt_path={brighter}", "input=raw", "out=out", f"tile={tile}").code == 0
     change = torch.tensor([0.2, 0.0, -0.1]).view(3, 1, 1)
     for name in SIZES:
@@ -85,7 +85,7 @@ def test_weather_is_taken_off_whole_or_in_tiles(call, folder, brighter, tile):
         assert (read_image(folder / "out" / name) - expected).abs().max() < 0.51 / 255 + 1e-3
 
 
-def test_both_stand_side_by_side(call, folder, brighter):
+def test_side_by_side_writes_input_and_restoration(call, folder, brighter):
     words = (f"ckpt_path={brighter}", "input=raw", "out=out", "side_by_side=true")
     assert call("restore", *words).code == 0
     for name, (_, width) in SIZES.items():
@@ -93,55 +93,47 @@ def test_both_stand_side_by_side(call, folder, brighter):
         raw = read_image(folder / "raw" / name)
         assert torch.equal(left, raw)
         assert (right[0] - (raw[0] + 0.2).clamp(0, 1)).abs().max() < 0.51 / 255 + 1e-3
-    assert "0 restored, 4 were there already" in call("restore", *words).out
+    assert "0 restored, 4 already existed" in call("restore", *words).out
 
 
-def test_a_run_that_was_stopped_goes_on(call, folder, brighter):
+def test_a_stopped_run_is_resumed(call, folder, brighter):
     words = (f"ckpt_path={brighter}", "input=raw", "out=out", "batch=3")
     assert call("restore", *words).code == 0
-    whole = {name: (folder / "out" / name).read_bytes() for name in SIZES}
+    complete = {name: (folder / "out" / name).read_bytes() for name in SIZES}
     times = {name: (folder / "out" / name).stat().st_mtime_ns for name in SIZES}
     (folder / "out" / "a.png").unlink()
-    (folder / "out" / "one" / "b.png").write_bytes(whole["one/b.png"][:100])
+    (folder / "out" / "one" / "b.png").write_bytes(complete["one/b.png"][:100])
     outcome = call("restore", *words)
-    assert outcome.out.startswith("out: 2 restored, 2 were there already, 0 skipped")
-    assert {name: (folder / "out" / name).read_bytes() for name in SIZES} == whole
+    assert outcome.out.startswith("out: 2 restored, 2 already existed, 0 skipped")
+    assert {name: (folder / "out" / name).read_bytes() for name in SIZES} == complete
     assert [name for name in SIZES if (folder / "out" / name).stat().st_mtime_ns == times[name]] == [*SIZES][2:]
 
 
-@pytest.mark.parametrize(
-    ("word", "told"),
-    [
-        ("side_by_side=true", "side_by_side is False there and True here"),
-        ("tile=16", "tile is None there and [16, 16] here"),
-        ("size=[64,128]", "size is [32, 64] there and [64, 128] here"),
-    ],
-)
-def test_a_folder_of_other_options_is_not_gone_on_with(call, folder, brighter, word, told):
+def test_a_folder_of_other_settings_is_not_continued(call, folder, brighter, shifted):
     words = (f"ckpt_path={brighter}", "input=raw", "out=out")
     assert call("restore", *words).code == 0
-    message = call("restore", *words, word).message
-    assert message.startswith("out must be a folder of the same configuration, got out, where ")
-    assert told in message
-
-
-def test_a_folder_of_another_checkpoint_is_not_gone_on_with(call, folder, brighter, shifted):
-    assert call("restore", f"ckpt_path={brighter}", "input=raw", "out=out").code == 0
-    message = call("restore", f"ckpt_path={shifted}", "input=raw", "out=out").message
-    assert "checkpoint is" in message
+    for word, difference in (
+        ("side_by_side=true", "side_by_side is "),
+        ("tile=16", "tile is "),
+        ("size=[64,128]", "size is "),
+        (f"ckpt_path={shifted}", "checkpoint is "),
+    ):
+        message = call("restore", *(w for w in words if w.split("=")[0] != word.split("=")[0]), word).message
+        assert message.startswith("out must be a folder of the same configuration, got out, where ")
+        assert difference in message
     settings = json.loads((folder / "out" / "config.json").read_text())["settings"]
     assert settings["input"] == str(folder / "raw")
 
 
-def test_a_folder_of_something_else_is_left_alone(call, folder, brighter):
+def test_a_folder_of_other_files_is_left_alone(call, folder, brighter):
     write(folder / "out" / "a.png", picture(48, 96))
     before = (folder / "out" / "a.png").read_bytes()
     message = call("restore", f"ckpt_path={brighter}", "input=raw", "out=out").message
-    assert message == "out must be a new folder or one of this command, got out, which holds a.png"
+    assert message.startswith("out must be a new folder or one of this command, got out, which holds a.png")
     assert (folder / "out" / "a.png").read_bytes() == before
 
 
-def test_gray_pictures_and_those_of_16_bits_are_restored(call, folder, brighter):
+def test_gray_and_16_bit_pictures_are_restored(call, folder, brighter):
     gray = picture(40, 60)[..., 0]
     write(folder / "more" / "gray.png", gray)
     write(folder / "more" / "deep.png", gray.astype(np.uint16) * 257)
@@ -152,11 +144,11 @@ def test_gray_pictures_and_those_of_16_bits_are_restored(call, folder, brighter)
         assert (red - (green + 0.2).clamp(0, 1)).abs().max() < 0.51 / 255 + 1e-3
 
 
-def test_a_damaged_picture_is_named_and_skipped(call, folder, brighter):
-    whole = (folder / "raw" / "one" / "b.png").read_bytes()
-    (folder / "raw" / "one" / "b.png").write_bytes(whole[: len(whole) // 2])
+def test_a_damaged_picture_is_reported_and_skipped(call, folder, brighter):
+    data = (folder / "raw" / "one" / "b.png").read_bytes()
+    (folder / "raw" / "one" / "b.png").write_bytes(data[: len(data) // 2])
     outcome = call("restore", f"ckpt_path={brighter}", "input=raw", "out=out", "batch=1")
-    assert outcome.out.startswith("out: 3 restored, 0 were there already, 1 skipped")
+    assert outcome.out.startswith("out: 3 restored, 0 already existed, 1 skipped")
     assert outcome.err.startswith("skipped: raw/one/b.png is truncated")
     assert written(folder / "out") == sorted({*SIZES, "config.json"} - {"one/b.png"})
 
@@ -168,38 +160,38 @@ def clip(path: Path, count: int, *, height: int = 64) -> None:
     writer.release()
 
 
-def test_a_video_gives_a_video_of_as_many_frames(call, folder, brighter):
+def test_a_video_keeps_its_number_and_rate_of_frames(call, folder, brighter):
     clip(folder / "raw" / "one" / "clip.avi", 5)
     words = (f"ckpt_path={brighter}", "input=raw", "out=out", "batch=2", "side_by_side=true")
     outcome = call("restore", *words)
     assert outcome.out.startswith("out: 5 restored")
     assert outcome.out.splitlines()[1].startswith("9 frames, ")
-    assert video_facts(folder / "out" / "one" / "clip.mp4") == (5, 12.0)
+    assert video_info(folder / "out" / "one" / "clip.mp4") == (5, 12.0)
     capture = cv2.VideoCapture(str(folder / "out" / "one" / "clip.mp4"))
     for k in range(5):
         frame = np.asarray(capture.read()[1])[..., ::-1].astype(float)
         raw = picture(64, 96, seed=k)
         expected = np.concatenate([raw, (raw + np.array([51, 0, -25.5])).clip(0, 255)], axis=1)
-        assert np.abs(frame - expected).mean() < 8  # two codecs in between
-    assert "0 restored, 5 were there already" in call("restore", *words).out
+        assert np.abs(frame - expected).mean() < 8  # two lossy codecs
+    assert "0 restored, 5 already existed" in call("restore", *words).out
 
 
-def test_a_video_with_an_odd_side_is_told(call, tmp_path, brighter):
+def test_a_video_with_an_odd_side_is_rejected(call, tmp_path, brighter):
     pages = [Image.fromarray(picture(63, 96, seed=k)) for k in range(2)]
     pages[0].save(tmp_path / "clip.gif", save_all=True, append_images=pages[1:])
     outcome = call("restore", f"ckpt_path={brighter}", "input=clip.gif", "out=out")
     assert outcome.code == 1
-    assert outcome.err.splitlines()[-1].startswith("error: input must hold what can be restored, got ")
+    assert outcome.err.splitlines()[-1].startswith("error: input must hold a file that can be restored, got ")
     assert outcome.err.endswith("clip.gif would give frames of 96 x 63, and videos take even sides only\n")
     assert written(tmp_path / "out") == ["config.json"]
 
 
-def test_the_checkpoint_of_a_training_is_enough(call, folder, trained):
+def test_the_checkpoint_of_a_training_is_sufficient(call, folder, trained):
     best = trained.folder / "best.ckpt"
     assert call("restore", f"ckpt_path={best}", "input=raw", "out=out").code == 0
-    found = read_checkpoint(best)
-    assert found["config"]["data"]["train_count"] == 32
-    assert found["data"] | {"sha256": ""} == {
+    checkpoint = read_checkpoint(best)
+    assert checkpoint["config"]["data"]["train_count"] == 32
+    assert checkpoint["data"] | {"sha256": ""} == {
         "source": "RoadScenes",
         "root": None,
         "frames": 32,
@@ -227,27 +219,27 @@ def test_the_checkpoint_of_a_training_is_enough(call, folder, trained):
         (("batch=0",), "batch: batch must be at least 1, got 0"),
         (("interpolation=cubic",), "interpolation: interpolation must be one of nearest, bilinear, bicubic"),
         (("side_by_side=2",), "side_by_side: side_by_side must be True or False, got 2"),
-        (("device=gpu",), "device must be auto, cpu or one that torch finds here, got gpu"),
+        (("device=gpu",), "device must be auto, cpu or another device of this machine, got gpu"),
         (("ckpt_path=none.ckpt",), "ckpt_path must be a checkpoint file, such as <run>/last.ckpt, got none.ckpt"),
-        (("ckpt_path=raw/a.png",), "ckpt_path must be a whole checkpoint, got raw/a.png, which is damaged or none"),
+        (("ckpt_path=raw/a.png",), "ckpt_path must be an intact checkpoint, got raw/a.png, which is damaged"),
         (("tiles=3",), "an option must be one of ckpt_path, input, out, size, tile,"),
-        (("+model.depth=3",), "ckpt_path must be of a model that can be made"),
+        (("+model.depth=3",), "ckpt_path must be of a model that can be built"),
     ],
 )
-def test_a_wrong_word_is_one_line_of_error(call, folder, brighter, words, message):
+def test_an_invalid_option_is_one_line_of_error(call, folder, brighter, words, message):
     (folder / "empty").mkdir()
-    said = {word.split("=")[0] for word in words}
-    others = [w for w in (f"ckpt_path={brighter}", "input=raw", "out=out") if w.split("=")[0] not in said]
+    given = {word.split("=")[0] for word in words}
+    others = [w for w in (f"ckpt_path={brighter}", "input=raw", "out=out") if w.split("=")[0] not in given]
     assert call("restore", *others, *words).message.startswith(message)
     assert sorted(path.name for path in folder.iterdir()) == ["empty", "raw"]
 
 
-def test_a_model_that_predicts_a_flow_takes_no_tiles(call, folder, shifted):
+def test_a_model_that_predicts_a_flow_has_no_tiles(call, folder, shifted):
     message = call("restore", f"ckpt_path={shifted}", "input=raw", "tile=32").message
-    assert message == "tile must be null for undistort, whose model must see the whole frame, got 32"
+    assert message == "tile must be null for undistort, whose model needs the complete frame, got 32"
 
 
-def test_a_checkpoint_without_its_configuration_is_told(call, folder, tmp_path):
+def test_a_checkpoint_without_its_configuration_is_rejected(call, folder, tmp_path):
     torch.save({"state_dict": {}, "task": "undistort"}, tmp_path / "old.ckpt")
     message = call("restore", "ckpt_path=old.ckpt", "input=raw").message
     assert message.startswith("ckpt_path must be a checkpoint with its configuration")

@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import torchrefract as tr
-from torchrefract.page import as_drawn
-from torchrefract.sheet import Scale, SheetRow, drawn, make_row, sheet
-from torchrefract.viz import checkerboard, flow_to_rgb, flow_wheel, transmission_to_rgb
+from torchrefract.visualization.figures import resize_for_display
+from torchrefract.visualization.figures import Scale, SheetRow, drawn, make_row, sheet
+from torchrefract.visualization.color import checkerboard, flow_to_rgb, flow_wheel, transmission_to_rgb
 from torchrefract.warping.flow import folded
 
 SIZE = (32, 40)  # drawn with 8 x 8 px for each
@@ -264,7 +264,7 @@ def test_a_sheet_shows_its_rows_in_order_each_with_its_own_scale(frame):
 
 @pytest.mark.parametrize(("side", "drawn_side"), [(1, 320), (40, 320), (250, 250), (319, 319), (480, 480), (481, 480)])
 def test_a_frame_is_drawn_with_whole_pixels_and_no_larger_than_asked_for(side, drawn_side):
-    assert max(as_drawn(torch.rand(1, 3, side, 7 if side > 7 else 1), largest=480).shape) == drawn_side
+    assert max(resize_for_display(torch.rand(1, 3, side, 7 if side > 7 else 1), largest=480).shape) == drawn_side
 
 
 def test_a_large_frame_is_degraded_in_its_own_pixels_and_shrunk_by_area():

@@ -1,4 +1,5 @@
 import csv
+import re
 import signal
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,8 @@ from PIL import Image
 from torchrefract.data.pairs import PairedFolder
 from torchrefract.restoration.checkpoints import read_checkpoint
 
-# A run that goes on leaves best.ckpt of the one before where it is; Lightning says so.
-
 FILES = ["best.ckpt", "config.yaml", "curves.png", "last.ckpt", "metrics.csv", "panel.png"]
-# A training that ends itself as `kill -9` would, in the middle of its second epoch.
+# A training that receives SIGKILL in its second epoch.
 KILLED = """
 import os, signal
 from torchrefract.restoration.module import Restoration
@@ -23,79 +22,64 @@ from torchrefract.train import main
 
 step = Restoration.training_step
 
-def dying_step(self, batch, index):
+def killed_step(self, batch, index):
     if (self.current_epoch, index) == (1, 2):
         os.kill(os.getpid(), signal.SIGKILL)
     return step(self, batch, index)
 
-Restoration.training_step = dying_step
+Restoration.training_step = killed_step
 main()
 """
+DDPM = ("model=ddpm", "model.network.widths=[8,16]", "model.network.attention=[false,true]", "model.network.layers=1")
+DDPM += ("model.network.groups=4", "model.val_steps=3", "model.lr=0.002", "data.train_count=16", "data.val_count=8")
+DDPM += ("data.batch_size=8", "data.size=[16,32]", "data.workers=0")
 
 
 def metrics(run: Path, name: str, *, file: str = "metrics.csv") -> dict[int, float]:
-    """The last value of each epoch in a table of a run."""
+    """Return the last value of each epoch in a table of a run."""
     with (run / file).open(newline="") as table:
         return {int(row["epoch"]): float(row[name]) for row in csv.DictReader(table) if row[name]}
 
 
-@pytest.fixture(scope="module")
-def stopped(tmp_path_factory, spawn, small) -> Path:
-    """The folder of a run that was killed."""
-    folder = tmp_path_factory.mktemp("stopped")
-    outcome = spawn("-c", KILLED, "+task=undistort", *small, "hydra.run.dir=run", cwd=folder)
-    assert outcome.code == -signal.SIGKILL, outcome.err
-    return folder / "run"
-
-
-def test_a_run_folder_holds_everything(trained):
+def test_a_run_folder_holds_checkpoints_pictures_and_the_resolved_configuration(trained):
     assert sorted(path.name for path in trained.folder.iterdir()) == FILES
     assert trained.folder.parts[-3:-1] == ("runs", "undistort")
     for name in ("curves.png", "panel.png"):
         with Image.open(trained.folder / name) as picture:
             picture.load()
             assert min(picture.size) > 300
-
-
-def test_the_configuration_of_a_run_is_resolved_and_repeats_it(trained):
     text = (trained.folder / "config.yaml").read_text()
     assert "${" not in text
     assert "???" not in text
-    configuration: Any = OmegaConf.create(text)
-    assert configuration.data.train_count == 32
-    assert configuration.model.network.encoder == "tu-mobilenetv3_small_050"
-    assert configuration.data.effect._target_ == "torchrefract.presets.cheap_dashcam"
-    assert configuration.run_dir == str(trained.folder)
+    config: Any = OmegaConf.create(text)
+    assert config.data.train_count == 32
+    assert config.model.network.encoder == "tu-mobilenetv3_small_050"
+    assert config.data.effect._target_ == "torchrefract.presets.cheap_dashcam"
+    assert config.run_dir == str(trained.folder)
 
 
-def test_a_run_says_last_how_the_model_compares_and_where_everything_is(trained):
-    head, nothing, constant, model, where = trained.outcome.out.splitlines()[-5:]
+def test_a_run_prints_a_comparison_with_the_baselines_and_nothing_of_the_libraries(trained):
+    head, nothing, constant, model, files = trained.outcome.out.splitlines()[-5:]
     assert "px at 1920x1080" in head
     assert nothing.startswith("do nothing ")
     assert "(1.00 x do nothing)" in nothing
     assert constant.startswith("best constant flow ")
-    assert where == f"{trained.folder}: {', '.join(FILES)}"
-    last = {
-        name: metrics(trained.folder, f"val/{name}")[2] for name in ("psnr", "psnr_identity", "epe", "epe_identity")
-    }
-    assert model.split()[:3] == ["model", f"{last['psnr']:.2f}", f"({last['psnr'] - last['psnr_identity']:+.2f})"]
-    assert f"{last['epe']:.2f} ({last['epe'] / last['epe_identity']:.2f} x do nothing)" in model
-
-
-def test_a_run_has_no_traceback_and_no_advice_of_libraries(trained):
+    assert files == f"{trained.folder}: {', '.join(FILES)}"
+    psnr, nothing_psnr, epe, nothing_epe = (
+        metrics(trained.folder, f"val/{name}")[2] for name in ("psnr", "psnr_identity", "epe", "epe_identity")
+    )
+    assert model.split()[:3] == ["model", f"{psnr:.2f}", f"({psnr - nothing_psnr:+.2f})"]
+    assert f"{epe:.2f} ({epe / nothing_epe:.2f} x do nothing)" in model
     assert trained.outcome.err == ""
     for word in ("Traceback", "Warning", "Tip:"):
         assert word not in trained.outcome.out
 
 
-def test_each_epoch_has_its_scores_of_training_and_validation(trained):
+def test_each_epoch_logs_its_scores_and_constant_baselines(trained):
     for name in ("train/loss", "train/psnr", "train/epe", "val/loss", "val/psnr", "val/epe", "val/epe_constant"):
         assert sorted(metrics(trained.folder, name)) == [0, 1, 2]
     loss = metrics(trained.folder, "train/loss")
     assert loss[2] < loss[0]
-
-
-def test_doing_nothing_scores_the_same_in_every_epoch(trained):
     for name in ("val/psnr_identity", "val/epe_identity", "val/ssim_identity"):
         assert len(set(metrics(trained.folder, name).values())) == 1
 
@@ -106,31 +90,28 @@ def test_the_checkpoints_are_those_of_the_last_and_of_the_best_epoch(trained):
     assert read_checkpoint(trained.folder / "best.ckpt", task="undistort")["epoch"] == min(loss, key=loss.__getitem__)
 
 
-def test_a_kill_in_mid_epoch_leaves_the_checkpoint_of_the_epoch_before(stopped):
-    assert read_checkpoint(stopped / "last.ckpt", task="undistort")["epoch"] == 0
-    assert read_checkpoint(stopped / "best.ckpt", task="undistort")["epoch"] == 0
-
-
-def test_a_stopped_run_goes_on_at_its_epoch_and_ends_as_if_never_stopped(call, stopped, trained):
+def test_a_killed_run_resumes_at_its_epoch_and_ends_like_an_uninterrupted_one(call, spawn, small, trained, tmp_path):
+    outcome = spawn("-c", KILLED, "+task=undistort", *small, "hydra.run.dir=killed", cwd=tmp_path)
+    assert outcome.code == -signal.SIGKILL, outcome.err
+    stopped = tmp_path / "killed"
+    for name in ("last.ckpt", "best.ckpt"):
+        assert read_checkpoint(stopped / name, task="undistort")["epoch"] == 0
     outcome = call("train", *trained.words, f"ckpt_path={stopped / 'last.ckpt'}", "hydra.run.dir=run")
     assert "Traceback" not in outcome.err
     folder = outcome.folder
     assert {*FILES} <= {path.name for path in folder.iterdir()}
     for name in ("train/loss", "train/epe", "val/loss", "val/psnr", "val/epe", "val/epe_constant"):
-        found, expected = metrics(folder, name), metrics(trained.folder, name)
-        assert sorted(found) == [1, 2]
+        resumed, expected = metrics(folder, name), metrics(trained.folder, name)
         assert metrics(folder, name, file="metrics_before.csv") == pytest.approx({0: expected[0]}, rel=1e-3)
-        assert found == pytest.approx({epoch: expected[epoch] for epoch in (1, 2)}, rel=1e-3)
-    weights, others = (
-        read_checkpoint(run / "last.ckpt", task="undistort")["state_dict"] for run in (folder, trained.folder)
-    )
+        assert resumed == pytest.approx({epoch: expected[epoch] for epoch in (1, 2)}, rel=1e-3)
+    weights, expected = (read_checkpoint(run / "last.ckpt")["state_dict"] for run in (folder, trained.folder))
     name = "network.network.segmentation_head.0.weight"
-    assert torch.allclose(weights[name], others[name], rtol=0, atol=1e-4)
+    assert torch.allclose(weights[name], expected[name], rtol=0, atol=1e-4)
 
 
-def test_a_finished_run_says_that_nothing_is_left_to_do(call, trained):
-    outcome = call("train", *trained.words, f"ckpt_path={trained.folder / 'last.ckpt'}", "hydra.run.dir=run")
-    assert "trainer.max_epochs" in outcome.message
+def test_a_finished_run_cannot_be_resumed(call, trained):
+    message = call("train", *trained.words, f"ckpt_path={trained.folder / 'last.ckpt'}", "hydra.run.dir=run").message
+    assert message == "trainer.max_epochs must be above the 3 epochs of ckpt_path, got 3"
 
 
 @pytest.mark.parametrize(
@@ -149,15 +130,22 @@ def test_a_finished_run_says_that_nothing_is_left_to_do(call, trained):
         (("+task=undistort", "model.weight_decay=-1"), "model: weight_decay must be a number of at least 0, got -1"),
         (("+task=undistort", "model.warmup_steps=-1"), "model: warmup_steps must be at least 0, got -1"),
         (("+task=undistort", "model.metric_size=[1080]"), "model: metric_size must be (height, width), got [1080]"),
+        (("+task=undistort", *DDPM, "model.steps=0"), "model: steps must be at least 1, got 0"),
+        (("+task=undistort", *DDPM, "model.network.pretrained=./none"), "model: pretrained must be null, a folder "),
     ],
 )
-def test_what_cannot_be_trained_is_one_line_of_error(call, small, words, message):
-    assert call("train", *small, *words).message.startswith(message)
+def test_an_invalid_option_is_one_line_of_error(call, small, words, message):
+    options = [word for word in small if not word.startswith("model.")] if "model=ddpm" in words else small
+    assert call("train", *options, *words).message.startswith(message)
 
 
-def test_a_run_folder_that_is_not_there_yet_is_made(call, small, tmp_path):
-    assert call("train", "+task=undistort", *small, "trainer.max_epochs=1", "run_dir=new/run").code == 0
-    assert sorted(path.name for path in (tmp_path / "new" / "run").iterdir()) == FILES
+def test_a_loss_that_is_not_finite_stops_the_training_and_names_its_keys(call, small):
+    message = call("train", "+task=undistort", *small, "hydra.run.dir=run", "model.lr=1e30").message
+    match = re.fullmatch(
+        r"loss must be finite, got (nan|inf) in step \d+ of epoch \d for the keys ((\d+, ){7}\d+)", message
+    )
+    assert match, message
+    assert {int(key) for key in match[2].split(", ")} <= {*range(32)}
 
 
 def test_a_damaged_pair_is_one_line_of_error(call, small, tmp_path):
@@ -175,16 +163,56 @@ def test_a_damaged_pair_is_one_line_of_error(call, small, tmp_path):
     options = ("data=pairs", "data.root=out", "data.batch_size=2", "data.workers=1")
     outcome = call("train", "+task=undistort", *model, *options)
     assert outcome.code == 1
-    message = f"error: pair {last.number} in out must be whole, got out/{last.files['clean.png'].path} is "
-    assert outcome.err.splitlines()[-1].startswith(message), outcome.err
+    assert outcome.err.splitlines()[-1].startswith(f"error: pair {last.number} in out must be "), outcome.err
+    assert f"got out/{last.files['clean.png'].path} is " in outcome.err
 
 
-def test_deweathering_is_trained_by_the_same_command(call, small, tmp_path):
-    outcome = call("train", "+task=deweather", *small, "trainer.max_epochs=1", "hydra.run.dir=run")
-    folder = outcome.folder
-    assert folder == tmp_path / "run"
-    assert sorted(path.name for path in folder.iterdir()) == FILES
+def test_deweathering_trains_by_the_same_command_into_a_new_folder(call, small, tmp_path):
+    outcome = call("train", "+task=deweather", *small, "trainer.max_epochs=1", "run_dir=new/run")
+    assert sorted(path.name for path in (tmp_path / "new" / "run").iterdir()) == FILES
     head, nothing, model = outcome.out.splitlines()[-4:-1]
     assert "endpoint" not in head
     assert (nothing[:10], model[:5]) == ("do nothing", "model")
-    assert read_checkpoint(folder / "last.ckpt", task="deweather")["epoch"] == 0
+    assert read_checkpoint(tmp_path / "new" / "run" / "last.ckpt", task="deweather")["epoch"] == 0
+
+
+def model_line(text: str) -> list[str]:
+    return next(line for line in reversed(text.splitlines()) if line.startswith("model ")).split()
+
+
+def test_a_diffusion_model_trains_and_its_evaluation_by_the_moving_average_repeats_the_validation(call):
+    trained = call("train", "+task=undistort", *DDPM, "trainer.max_epochs=1", "hydra.run.dir=run")
+    path = trained.folder / "last.ckpt"
+    checkpoint, name = read_checkpoint(path, task="undistort"), "network.network.conv_out.weight"
+    assert not checkpoint["state_dict"][name].equal(checkpoint["current_model_state"][name])
+    evaluated = call("eval", "+task=undistort", *DDPM, f"ckpt_path={path}", "hydra.run.dir=again", "model.steps=3")
+    assert evaluated.code == 0, evaluated.err
+    assert model_line(evaluated.out) == model_line(trained.out)
+
+
+def test_an_evaluation_repeats_the_scores_of_the_training_and_leaves_its_folder_alone(call, trained, tmp_path):
+    before = {path: path.stat().st_mtime_ns for path in trained.folder.iterdir()}
+    checkpoint = trained.folder / "best.ckpt"
+    outcome = call("eval", *trained.words, f"ckpt_path={checkpoint}")
+    folder = outcome.folder
+    assert folder.is_relative_to(tmp_path / "runs" / "eval_undistort")
+    assert {"config.yaml", "metrics.csv", "panel.png"} == {path.name for path in folder.iterdir()}
+    assert OmegaConf.select(OmegaConf.load(folder / "config.yaml"), "ckpt_path") == str(checkpoint)
+    assert {path: path.stat().st_mtime_ns for path in trained.folder.iterdir()} == before
+    best = read_checkpoint(checkpoint, task="undistort")["epoch"]
+    with (trained.folder / "metrics.csv").open(newline="") as file:
+        expected = next(row for row in csv.DictReader(file) if row["epoch"] == str(best) and row["val/loss"])
+    with (folder / "metrics.csv").open(newline="") as file:
+        (scores,) = csv.DictReader(file)
+    names = [name for name in expected if name.startswith("val/")]
+    assert {"val/psnr", "val/epe", "val/epe_constant", "val/ssim_identity"} <= set(names)
+    for name in names:
+        assert float(scores[name]) == pytest.approx(float(expected[name]), rel=1e-4), name
+
+
+def test_an_evaluation_needs_a_checkpoint_of_its_task(call, trained, small):
+    message = call("eval", "+task=undistort", *small).message
+    assert message == "ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none"
+    checkpoint = trained.folder / "best.ckpt"
+    message = call("eval", "+task=deweather", *small, f"ckpt_path={checkpoint}").message
+    assert message.endswith(f"a checkpoint of the task deweather, got {checkpoint} of undistort")

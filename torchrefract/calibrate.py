@@ -5,10 +5,10 @@ from omegaconf import DictConfig
 
 from torchrefract._io import CONFIG_DIR
 from torchrefract.cli.calibration import calibrate
-from torchrefract.cli.command import as_they_are, command, job
+from torchrefract.cli.command import command, job
 
 
-@command("calibrate", prepare=as_they_are)
+@command("calibrate")
 @hydra.main(config_path=CONFIG_DIR, config_name="calibrate", version_base="1.3")
 @job
 def main(cfg: DictConfig) -> None:

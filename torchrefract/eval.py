@@ -4,17 +4,16 @@ import hydra
 from omegaconf import DictConfig
 
 from torchrefract._io import CONFIG_DIR
-from torchrefract.cli.command import command, job
-from torchrefract.cli.training import make_job
+from torchrefract.cli.command import command, job, require_task
+from torchrefract.cli.training import evaluate
 
 
-@command("eval")
+@command("eval", prepare=require_task)
 @hydra.main(config_path=CONFIG_DIR, config_name="eval", version_base="1.3")
 @job
 def main(cfg: DictConfig) -> None:
-    """Validate the checkpoint on the data of a configuration."""
-    made = make_job(cfg, needs_checkpoint=True)
-    made.trainer.validate(made.model, made.data, ckpt_path=cfg.ckpt_path, verbose=False, weights_only=True)
+    """Score a checkpoint on the validation data of a configuration."""
+    evaluate(cfg)
 
 
 if __name__ == "__main__":

@@ -11,13 +11,13 @@ from torch import Tensor
 from torchrefract._validation import UsageError
 from torchrefract.data.frames import walk
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, image_size
-from torchrefract.videos import VIDEOS, read_video, video_facts, write_video
+from torchrefract.data.media import VIDEOS, read_video, video_info, write_video
 
 _FPS = 25.0  # of a video that does not say
 _QUALITY = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95], ".jpeg": [cv2.IMWRITE_JPEG_QUALITY, 95]}
 
 
-def find_footage(source: Path, *, deep: bool = False) -> Sequence[Path]:
+def find_media(source: Path, *, deep: bool = False) -> Sequence[Path]:
     """The pictures and videos in a folder, in those below it too if `deep`, or the one that is named.
 
     Raises:
@@ -30,13 +30,13 @@ def find_footage(source: Path, *, deep: bool = False) -> Sequence[Path]:
     files = [file for file in inside if file.suffix.lower() in known]
     if not files:
         raise UsageError(f"input must be, or hold, {', '.join(known)}, got {source}")
-    names = [written_as(file) for file in files]
+    names = [output_name(file) for file in files]
     if double := {str(name) for name in names if names.count(name) > 1}:
         raise UsageError(f"input must not hold two videos of one name, got {', '.join(sorted(double))}")
     return files
 
 
-def check_apart(out: Path, source: Path, *, deep: bool = False) -> None:
+def check_output_folder(out: Path, source: Path, *, deep: bool = False) -> None:
     """Raise UsageError where what is written would take the place of what is read, or, if `deep`, lie among it."""
     folder = (source if source.is_dir() else source.parent).resolve()
     if out.resolve() == folder:
@@ -50,12 +50,12 @@ def is_video(file: Path) -> bool:
     return file.suffix.lower() in VIDEOS
 
 
-def written_as(file: Path) -> Path:
+def output_name(file: Path) -> Path:
     """The name that what comes of a file gets."""
     return file.with_suffix(".mp4") if is_video(file) else file
 
 
-def is_written(file: Path, target: Path, *, beside: int = 1) -> bool:
+def is_complete(file: Path, target: Path, *, beside: int = 1) -> bool:
     """Whether what comes of a file is there whole: a picture with the sides, a video with the frames.
 
     `beside`: pictures that stand side by side in it.
@@ -63,7 +63,7 @@ def is_written(file: Path, target: Path, *, beside: int = 1) -> bool:
     if not target.is_file():
         return False
     if is_video(file):
-        return video_facts(target)[0] == video_facts(file)[0] > 0
+        return video_info(target)[0] == video_info(file)[0] > 0
     try:
         height, width = image_size(file)
         return image_size(target) == (height, beside * width)
@@ -83,7 +83,7 @@ def write_picture(pixels: np.ndarray, path: Path) -> None:
     path.write_bytes(data.tobytes())
 
 
-def write_frames(file: Path, path: Path, *, change: Callable[[Iterator[Tensor]], Iterable[np.ndarray]]) -> int:
+def convert_video(file: Path, path: Path, *, change: Callable[[Iterator[Tensor]], Iterable[np.ndarray]]) -> int:
     """Write the frames of a video, changed, at the same rate; returns how many.
 
     Args:
@@ -100,5 +100,5 @@ def write_frames(file: Path, path: Path, *, change: Callable[[Iterator[Tensor]],
     height, width = first.shape[:2]
     if height % 2 or width % 2:
         raise UnreadableImageError(f"{file} would give frames of {width} x {height}, and videos take even sides only")
-    fps = video_facts(file)[1] or _FPS
+    fps = video_info(file)[1] or _FPS
     return write_video(chain([first], pages), path, fps=fps, size=(width, height))

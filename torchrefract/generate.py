@@ -4,11 +4,11 @@ import hydra
 from omegaconf import DictConfig
 
 from torchrefract._io import CONFIG_DIR
-from torchrefract.cli.command import command, job, leave, with_text
+from torchrefract.cli.command import command, job, leave, quote_option
 from torchrefract.cli.generation import generate
 
 
-@command("generate", prepare=with_text("license"))
+@command("generate", prepare=quote_option("license"))
 @hydra.main(config_path=CONFIG_DIR, config_name="generate", version_base="1.3")
 @job
 def main(cfg: DictConfig) -> None:

@@ -5,10 +5,10 @@ from omegaconf import DictConfig
 
 from torchrefract._io import CONFIG_DIR
 from torchrefract.cli.calibration import make_board
-from torchrefract.cli.command import as_they_are, command, job
+from torchrefract.cli.command import command, job
 
 
-@command("make_board", prepare=as_they_are)
+@command("make_board")
 @hydra.main(config_path=CONFIG_DIR, config_name="make_board", version_base="1.3")
 @job
 def main(cfg: DictConfig) -> None:

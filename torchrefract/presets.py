@@ -1,9 +1,9 @@
-"""Named scenes: each says which phenomena it has, and nothing else.
+"""Scenes: effects with the parameters of a place, as a function of severity.
 
-`severity` runs from 1 (hardly seen) over 3 (what the place is known for) to 5 (hardly anything is seen), in a quantity
-that each scene states, so that a model's score can be drawn over it.
+`severity` is 1 (barely visible), 2, 3 (typical of the place), 4 or 5 (barely anything else is visible). It sets a
+physical quantity, which each scene states, so that the score of a model can be plotted over it.
 
-Scenes that move pixels count in px of a frame `width` wide; give the width of yours.
+Displacements are in px of a frame 1920 px wide and scale with `width`, the width of your frames.
 """
 
 from collections.abc import Sequence
@@ -25,22 +25,23 @@ from torchrefract.types import Range
 SEVERITIES = (1, 2, 3, 4, 5)
 
 _REFERENCE_WIDTH = 1920.0
-_DUST = (0.78, 0.71, 0.61)  # of laterite in the air
+_DUST = (0.78, 0.71, 0.61)  # airlight of laterite dust
 _LOW_SUN = (1.0, 0.94, 0.82)
-# Dashcams point somewhat upward, and each another way.
+# Dashcams point slightly upward, at an angle that varies from car to car.
 _ROAD = GroundPlaneDepth(horizon=0.55, spread=0.1)
-_Chosen = TypeVar("_Chosen")
+_T = TypeVar("_T")
 
 
 def cheap_dashcam(severity: int = 3) -> LensDistortion:
-    """A fleet of one cheap dashcam: a barrel lens with a small spread of decentring and tilt that folds nowhere.
+    """Create the lenses of a fleet of cheap dashcams: barrel distortion, slightly off center, without folds.
 
-    severity: radial coefficient k1, of a focal length of 0.7 to 1.1 widths, from -0.03 … -0.10 over -0.15 … -0.35 to
-        -0.45 … -0.60.
+    Args:
+        severity: 1 to 5, radial coefficient k1 of -0.03 … -0.10 at 1, -0.15 … -0.35 at 3, -0.45 … -0.60 at 5, for focal
+            lengths of 0.7 to 1.1 widths.
     """
-    k1, k2 = _chosen(
+    k1, k2 = _at_severity(
         severity,
-        # k2 >= 0.45 k1^2 keeps r (1 + k1 r^2 + k2 r^4) growing for every r.
+        # k2 >= 0.45 k1^2: r (1 + k1 r^2 + k2 r^4) increases for every r.
         [
             ((-0.10, -0.03), (0.005, 0.02)),
             ((-0.20, -0.10), (0.02, 0.05)),
@@ -61,11 +62,12 @@ def cheap_dashcam(severity: int = 3) -> LensDistortion:
 
 
 def cape_town_fog(severity: int = 3) -> HeterogeneousFog:
-    """Morning fog off the cold sea, in drifts that the car drives through at 50 to 70 km/h, at 30 frames a second.
+    """Create heterogeneous morning fog, through which the car drives at 50 to 70 km/h, at 30 frames per second.
 
-    severity: visibility, from 500 … 1000 m over 60 … 200 m to 20 … 40 m.
+    Args:
+        severity: 1 to 5, visibility of 500 … 1000 m at 1, 60 … 200 m at 3, 20 … 40 m at 5.
     """
-    visibility = _chosen(severity, [(500.0, 1000.0), (200.0, 500.0), (60.0, 200.0), (40.0, 60.0), (20.0, 40.0)])
+    visibility = _at_severity(severity, [(500.0, 1000.0), (200.0, 500.0), (60.0, 200.0), (40.0, 60.0), (20.0, 40.0)])
     return HeterogeneousFog(
         mode="ray",
         visibility_range=visibility,
@@ -77,30 +79,35 @@ def cape_town_fog(severity: int = 3) -> HeterogeneousFog:
 
 
 def limpopo_sun_glare(severity: int = 3) -> LensFlare:
-    """The low sun of the dry season ahead, shining into the lens.
+    """Create the flare of a low sun ahead.
 
-    severity: light added at the sun, beta, from 0.2 over the paper's 0.6 to 1.0, each +-0.05, and with it the radius of
-        the flare, rho, from 0.2 over 0.3 to 0.4 diagonals of the frame, each +-0.05.
+    Args:
+        severity: 1 to 5, light added at the sun of 0.2 at 1, 0.6 at 3 (as in the paper), 1.0 at 5, and radius of 0.2,
+            0.3, 0.4 diagonals of the frame; each +-0.05.
     """
-    beta, rho = _chosen(severity, [(0.2, 0.2), (0.4, 0.25), (0.6, 0.3), (0.8, 0.35), (1.0, 0.4)])
-    return LensFlare(strength_range=_around(beta, 0.05), radius_range=_around(rho, 0.05), color=_LOW_SUN)
+    strength, radius = _at_severity(severity, [(0.2, 0.2), (0.4, 0.25), (0.6, 0.3), (0.8, 0.35), (1.0, 0.4)])
+    return LensFlare(strength_range=_around(strength, 0.05), radius_range=_around(radius, 0.05), color=_LOW_SUN)
 
 
 def highveld_heat_haze(severity: int = 3, *, width: float = _REFERENCE_WIDTH) -> Turbulence:
-    """Hot air over a tarred road at noon: edges wobble and never come to rest.
+    """Create turbulence over a tarred road at noon.
 
-    severity: standard deviation of the displacement, from 0.5 over 1.5 to 3.0 px of a frame 1920 px wide, each +-20 %.
+    Args:
+        severity: 1 to 5, standard deviation of the displacement of 0.5 at 1, 1.5 at 3, 3.0 px at 5, each +-20 %.
+        width: of the frames, px.
     """
-    return _hot_air(_chosen(severity, [0.5, 1.0, 1.5, 2.2, 3.0]), width)
+    return _turbulence(_at_severity(severity, [0.5, 1.0, 1.5, 2.2, 3.0]), width)
 
 
 def unpaved_road(severity: int = 3, *, width: float = _REFERENCE_WIDTH) -> Compose:
-    """The dust of the car ahead over a gravel road, and hot air before it.
+    """Create the dust of a car ahead on a gravel road, as heterogeneous fog, seen through turbulence.
 
-    severity: visibility in the dust, from 400 … 800 m over 80 … 200 m to 25 … 50 m, and the displacement by hot air,
-        from 0.3 over 0.8 to 1.5 px of a frame 1920 px wide, each +-20 %.
+    Args:
+        severity: 1 to 5, visibility of 400 … 800 m at 1, 80 … 200 m at 3, 25 … 50 m at 5, and standard deviation of the
+            displacement of 0.3, 0.8, 1.5 px, each +-20 %.
+        width: of the frames, px.
     """
-    visibility, amplitude = _chosen(
+    visibility, amplitude = _at_severity(
         severity,
         [((400.0, 800.0), 0.3), ((200.0, 400.0), 0.5), ((80.0, 200.0), 0.8), ((50.0, 80.0), 1.1), ((25.0, 50.0), 1.5)],
     )
@@ -116,16 +123,17 @@ def unpaved_road(severity: int = 3, *, width: float = _REFERENCE_WIDTH) -> Compo
         wind_z_range=(-0.5, -0.3),
         decorrelation_range=(30.0, 60.0),
     )
-    return Compose([dust, _hot_air(amplitude, width)])
+    return Compose([dust, _turbulence(amplitude, width)])
 
 
 def paper_refractive(severity: int = 3, *, width: float = _REFERENCE_WIDTH) -> OneOf:
-    """One of the paper's four refractive distortions for each frame.
+    """Create the paper's four refractive distortions, one of them for each sample.
 
-    severity: every coefficient and displacement at severity / 3 of the effects' own ranges, in px of a frame 1920 px
-        wide; the lens as in `cheap_dashcam`.
+    Args:
+        severity: 1 to 5, displacements of severity / 3 times the paper's; the lens is that of `cheap_dashcam`.
+        width: of the frames, px.
     """
-    scale = _chosen(severity, [1 / 3, 2 / 3, 1.0, 4 / 3, 5 / 3])
+    scale = _at_severity(severity, [1 / 3, 2 / 3, 1.0, 4 / 3, 5 / 3])
     px = check_positive("width", width) / _REFERENCE_WIDTH
     return OneOf(
         [
@@ -142,28 +150,29 @@ def paper_refractive(severity: int = 3, *, width: float = _REFERENCE_WIDTH) -> O
 
 
 def paper_weather(severity: int = 3) -> OneOf:
-    """One of the paper's three weathers for each frame, with its numbers: fog, fog in drifts, or glare.
+    """Create the paper's three weather effects, one of them for each sample: uniform fog, heterogeneous fog or flare.
 
-    severity: visibility of 300 m / severity, and light added at the sun of 0.2 severity +-0.05.
+    Args:
+        severity: 1 to 5, visibility of 300 m / severity, and light added at the sun of 0.2 severity +-0.05.
     """
-    visibility, beta = _chosen(severity, [(300 / s, 0.2 * s) for s in SEVERITIES])
+    visibility, strength = _at_severity(severity, [(300 / s, 0.2 * s) for s in SEVERITIES])
     limits = (visibility, visibility)
     return OneOf(
         [
             UniformFog(visibility_range=limits),
             HeterogeneousFog(visibility_range=limits),
-            LensFlare(strength_range=_around(beta, 0.05)),
+            LensFlare(strength_range=_around(strength, 0.05)),
         ]
     )
 
 
-def _hot_air(amplitude: float, width: float) -> Turbulence:
+def _turbulence(amplitude: float, width: float) -> Turbulence:
     px = check_positive("width", width) / _REFERENCE_WIDTH
     return Turbulence(
         amplitude_range=(0.8 * amplitude * px, 1.2 * amplitude * px),
         length_range=(40.0 * px, 80.0 * px),
         aperture_range=(4.0 * px, 6.0 * px),
-        # Hot air rises.
+        # Thermal convection moves upward.
         wind_x_range=(-1.5 * px, 1.5 * px),
         wind_y_range=(-3.0 * px, -1.0 * px),
     )
@@ -173,7 +182,7 @@ def _around(value: float, spread: float) -> Range:
     return value - spread, value + spread
 
 
-def _chosen(severity: int, choices: Sequence[_Chosen]) -> _Chosen:
+def _at_severity(severity: int, values: Sequence[_T]) -> _T:
     if isinstance(severity, bool) or severity not in SEVERITIES:
         raise ValueError(f"severity must be one of 1, 2, 3, 4, 5, got {severity}")
-    return choices[severity - 1]
+    return values[severity - 1]

@@ -16,10 +16,10 @@ from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
 from torchrefract.effects.defog import remove_fog
 from torchrefract.effects.flare import LensFlare
-from torchrefract.page import Page, as_drawn
+from torchrefract.visualization.figures import FigureLayout, resize_for_display
 from torchrefract.restoration.metrics import psnr
 from torchrefract.types import Degraded
-from torchrefract.viz import (
+from torchrefract.visualization.color import (
     checkerboard,
     flow_to_rgb,
     flow_wheel,
@@ -29,8 +29,8 @@ from torchrefract.viz import (
     rounded_up,
     transmission_to_rgb,
 )
-from torchrefract.warping.flow import folded
 from torchrefract.warping.grid import length
+from torchrefract.warping.flow import folded
 from torchrefract.warping.warp import warp
 
 _COLUMNS = ("frame", "corrupted", "checkerboard", "map", "restored")
@@ -161,8 +161,8 @@ def map_picture(degraded: Degraded, scales: Sequence[Scale], *, largest: int) ->
     """
     if scales[0].name == "flow":
         rgb = flow_to_rgb(degraded.flow[:1], max_px=scales[0].top)
-        return hatch_invalid(as_drawn(rgb, largest=largest), degraded.valid[:1])[0]
-    lights = (as_drawn(getattr(degraded, scale.name)[:1] / scale.top, largest=largest) for scale in scales)
+        return hatch_invalid(resize_for_display(rgb, largest=largest), degraded.valid[:1])[0]
+    lights = (resize_for_display(getattr(degraded, scale.name)[:1] / scale.top, largest=largest) for scale in scales)
     first, *others = (transmission_to_rgb(light)[0] for light in lights)
     middle = first.shape[2] // 2
     return torch.cat([first[..., :middle], others[0][..., middle:]], dim=2) if others else first
@@ -175,7 +175,7 @@ def sheet(rows: Sequence[SheetRow], *, title: str) -> Figure:
         rows: at least one, all of one frame.
         title: one line.
     """
-    page = Page(len(rows), len(_COLUMNS), *rows[0].frame.shape[1:], caption_lines=1, header_lines=4, footer_lines=1)
+    page = FigureLayout(len(rows), len(_COLUMNS), *rows[0].frame.shape[1:], caption_lines=1, header_lines=4, footer_lines=1)
     # A letter is about half as wide as a line is high; a caption ends where the legend of the map begins.
     letters = 2 * _COLUMNS.index("map") * page.pitch // page.text
     captions = [(textwrap.wrap(row.title, letters), textwrap.wrap(row.scores, letters)) for row in rows]
@@ -198,7 +198,7 @@ def _moves(degraded: Degraded) -> bool:
 
 
 def _shrunk(image: Tensor) -> Tensor:
-    return as_drawn(image, largest=_LARGEST)
+    return resize_for_display(image, largest=_LARGEST)
 
 
 def _folded(degraded: Degraded) -> Tensor:
@@ -255,7 +255,7 @@ def _named(effect: Effect, values: dict[str, Tensor]) -> dict[str, Tensor]:
     return values
 
 
-def _draw_row(figure: Figure, page: Page, row: SheetRow, i: int) -> None:
+def _draw_row(figure: Figure, page: FigureLayout, row: SheetRow, i: int) -> None:
     images = (row.frame, row.corrupted, row.checkerboard, row.map, row.restored)
     for j, image in enumerate(images):
         if image is not None:
@@ -266,7 +266,7 @@ def _draw_row(figure: Figure, page: Page, row: SheetRow, i: int) -> None:
     draw_legend(figure, page, row.scales, x=page.left(_COLUMNS.index("map")), y=page.top(i))
 
 
-def draw_legend(figure: Figure, page: Page, scales: Sequence[Scale], *, x: int, y: int) -> None:
+def draw_legend(figure: Figure, page: FigureLayout, scales: Sequence[Scale], *, x: int, y: int) -> None:
     """Above a map with its upper left corner at x and y: the color wheel, or the colors of light, with their scale."""
     text = page.text
     if scales and scales[0].name == "flow":
@@ -284,7 +284,7 @@ def draw_legend(figure: Figure, page: Page, scales: Sequence[Scale], *, x: int, 
         page.write(figure, f"{scale.top:g}{_UNITS.get(scale.name, '')} {scale.name}{side}", x + 4.4 * text, line)
 
 
-def _draw_key(figure: Figure, page: Page) -> None:
+def _draw_key(figure: Figure, page: FigureLayout) -> None:
     """A stripe below all rows: what the marks mean."""
     plain, none = torch.zeros(1, 3, page.height, page.width), torch.zeros(1, 1, 1, 1, dtype=torch.bool)
     y = page.top(page.rows) - 2 * page.text

@@ -7,20 +7,20 @@ import cv2
 import pytest
 import table1
 import torch
-from restoration_scores import MIX, Scores, constant_flow, corrupted, effects_of, mean_of, references, score
+from table1 import MIX, Scores, constant_flow, corrupt, effects_of, mean_of, score, score_references
 from torch import Tensor, nn
 from torch.testing import assert_close
 
 from torchrefract import LensDistortion, UniformFog
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.road_scenes import render_road_scenes
+from torchrefract.restoration.checkpoints import Loaded, load_model
 from torchrefract.restoration.diffusion import Diffusion
-from torchrefract.restoration.loading import Loaded, load_model
 from torchrefract.restoration.tasks import Restored, Undistort
-from torchrefract.types import Frame, Pair
+from torchrefract.types import Frame
 
 SIZE = (48, 80)
-PLAIN: dict[str, Any] = {"device": torch.device("cpu"), "apart": ["drive2"]}
+OPTIONS: dict[str, Any] = {"device": torch.device("cpu"), "groups": ["drive2"], "frames": 0, "sampled": 1}
 
 
 def frames(count: int = 3) -> list[Frame]:
@@ -29,82 +29,73 @@ def frames(count: int = 3) -> list[Frame]:
     return [Frame(image, keys, torch.empty(0))]
 
 
-def still(pair: Pair) -> Restored:
-    return Restored(pair.degraded, torch.zeros_like(pair.flow))
-
-
-def test_doing_nothing_is_off_by_the_flow_itself_and_the_true_flow_by_nothing():
+def test_doing_nothing_is_off_by_the_flow_and_the_true_flow_by_nothing():
     lens = LensDistortion(k1_range=(-0.3, -0.2))
-    pairs = corrupted(frames(), lens)
-    found = {name: mean_of(each) for name, each in references("undistort", lens, frames(), pairs).items()}
+    pairs = corrupt(frames(), lens)
+    scores = {name: mean_of(each) for name, each in score_references("undistort", lens, frames(), pairs).items()}
     (pair,) = pairs
-    # In px of 1920 x 1080, on valid pixels, the mean of the frames.
-    length = (pair.flow * torch.tensor([1920 / 80, 1080 / 48]).view(1, 2, 1, 1)).norm(dim=1, keepdim=True)
-    expected = torch.stack([own[valid].mean() for own, valid in zip(length, pair.valid, strict=True)]).mean()
-    assert found["do nothing"].epe == pytest.approx(expected.item(), rel=1e-5)
-    assert found["the true flow"].epe == 0
-    assert found["the true flow"].psnr > found["best constant flow"].psnr > found["do nothing"].psnr
+    # In px of 1920 x 1080, over valid pixels, averaged over frames.
+    lengths = (pair.flow * torch.tensor([1920 / 80, 1080 / 48]).view(1, 2, 1, 1)).norm(dim=1, keepdim=True)
+    means = [length[valid].mean() for length, valid in zip(lengths, pair.valid, strict=True)]
+    assert scores["do nothing"].epe == pytest.approx(torch.stack(means).mean().item(), rel=1e-5)
+    assert scores["the true flow"].epe == 0
+    assert scores["the true flow"].psnr > scores["best constant flow"].psnr > scores["do nothing"].psnr
 
 
-def test_the_constant_flow_is_the_mean_of_many_others():
-    still: dict[str, Any] = {f"{name}_range": (0.0, 0.0) for name in ("center_x", "center_y", "p1", "p2", "k2", "k3")}
-    lens = LensDistortion(k1_range=(-0.25, -0.25), focal_range=(1.0, 1.0), aspect_range=(1.0, 1.0), **still)
-    (pair,) = corrupted(frames(1), lens)
-    seen = pair.valid.expand(1, 2, -1, -1)
-    assert_close(constant_flow(lens, pair.clean)[seen], pair.flow[seen], rtol=0, atol=1e-4)
+def test_the_constant_flow_of_an_effect_without_randomness_is_its_flow():
+    zero: dict[str, Any] = {f"{name}_range": (0.0, 0.0) for name in ("center_x", "center_y", "p1", "p2", "k2", "k3")}
+    lens = LensDistortion(k1_range=(-0.25, -0.25), focal_range=(1.0, 1.0), aspect_range=(1.0, 1.0), **zero)
+    (pair,) = corrupt(frames(1), lens)
+    valid = pair.valid.expand(1, 2, -1, -1)
+    assert_close(constant_flow(lens, pair.clean)[valid], pair.flow[valid], rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["uniform fog", "heterogeneous fog", "lens flare"])
-def test_the_true_map_undoes_weather_as_far_as_eight_bits_allow(name):
+def test_the_true_map_undoes_weather_up_to_rounding_to_8_bits(name):
     effect, in_mix = effects_of("deweather", SIZE[1])[name]
     assert in_mix
-    every = references("deweather", effect, frames(), corrupted(frames(), effect))
-    found = {name: mean_of(each) for name, each in every.items()}
-    assert found["the true map"].psnr > found["do nothing"].psnr + 4
-    assert math.isnan(found["the true map"].epe)
+    scores = score_references("deweather", effect, frames(), corrupt(frames(), effect))
+    assert mean_of(scores["the true map"]).psnr > mean_of(scores["do nothing"]).psnr + 4
+    assert math.isnan(mean_of(scores["the true map"]).epe)
 
 
-def test_losses_are_those_that_the_networks_learn_by():
-    lens = LensDistortion(k1_range=(-0.3, -0.2))
-    pairs = corrupted(frames(), lens)
+def test_losses_are_those_of_the_training():
+    pairs = corrupt(frames(), LensDistortion(k1_range=(-0.3, -0.2)))
     (pair,) = pairs
-    flow = torch.full_like(pair.flow, 2.0)
-    found = mean_of(score([Restored(pair.degraded, flow)], pairs))
-    image, halves = [], []
-    for i in range(3):
-        where = pair.valid[i, 0]
-        image.append((pair.degraded[i] - pair.clean[i])[:, where].abs().mean())
-        halves.append(((2.0 - pair.flow[i])[:, where].abs() / torch.tensor([[40.0], [24.0]])).mean())
-    assert found.image_loss == pytest.approx(torch.stack(image).mean().item(), rel=1e-5)
-    assert found.flow_loss == pytest.approx(torch.stack(halves).mean().item(), rel=1e-5)
-    assert found.loss == pytest.approx(found.image_loss + found.flow_loss, rel=1e-6)
+    restored = Restored(pair.degraded, torch.full_like(pair.flow, 2.0))
+    scores = mean_of(score([restored], pairs))
+    assert scores.loss == pytest.approx(Undistort().loss(restored, pair).item(), rel=1e-5)
+    assert scores.loss == pytest.approx(scores.image_loss + scores.flow_loss, rel=1e-6)
+    only_flow = mean_of(score([restored._replace(image=pair.clean)], pairs))
+    assert (only_flow.image_loss, only_flow.flow_loss) == (0, scores.flow_loss)
 
 
-def test_the_mix_is_the_mean_of_its_effects_for_all_frames_and_for_each_kind():
-    of = table1.Line("deweather", "", "", "a method", Scores(*[math.nan] * 6), 0, SIZE)
-    effects = effects_of("deweather", SIZE[1])
-    # Each frame's score is a power of two: a sum tells which frames are in it.
-    each = {name: 2.0 ** torch.arange(4).double()[:, None].expand(4, 6) * (1 + i) for i, name in enumerate(effects)}
+def test_the_mix_is_the_mean_of_its_effects_for_all_frames_and_for_each_group():
+    line = table1.Line("deweather", "", "", "a method", Scores(*[math.nan] * 6), 0, SIZE)
+    # The score of each frame is another power of two, so a sum identifies its frames.
+    powers = 2.0 ** torch.arange(4).double()[:, None].expand(4, 6)
+    by_effect = {name: powers * (1 + i) for i, name in enumerate(effects_of("deweather", SIZE[1]))}
     groups = {"all": {7, 8, 9, 11}, "br_*": {8, 11}, "others": {7, 9}}
-    lines = list(table1._lines(of, each, [7, 8, 9, 11], groups))
-    mix = {line.which: (line.scores.psnr, line.frames) for line in lines if line.effect == MIX}
+    lines = list(table1._lines(line, by_effect, [7, 8, 9, 11], groups))
+    mix = {line.group: (line.scores.psnr, line.frames) for line in lines if line.effect == MIX}
     assert mix == {"all": (2 * 15 / 4, 4), "br_*": (2 * (2 + 8) / 2, 2), "others": (2 * (1 + 4) / 2, 2)}
-    own = {line.effect: line.scores.psnr for line in lines if line.effect != MIX}
-    assert own == {name: (1 + i) * 15 / 4 for i, name in enumerate(effects)}
+    effects = {line.effect: line.scores.psnr for line in lines if line.effect != MIX}
+    assert effects == {name: (1 + i) * 15 / 4 for i, name in enumerate(by_effect)}
 
 
-def test_frames_are_taken_evenly():
+@pytest.mark.quick
+def test_frames_are_chosen_evenly():
     assert table1._evenly(10, 0) == list(range(10))
     assert table1._evenly(10, 3) == [0, 3, 6]
     assert table1._evenly(2, 5) == [0, 1]
     lens = LensDistortion(k1_range=(-0.3, -0.2))
-    pairs = [pair for some in (frames(3), frames(2)) for pair in corrupted(some, lens)]
-    (thin,) = table1._thinned(pairs, 3)
-    assert thin.key.tolist() == [0, 1, 0]  # of 0 1 2 0 1
-    assert_close(thin.degraded, torch.stack([pairs[0].degraded[0], pairs[0].degraded[1], pairs[1].degraded[0]]))
+    pairs = [pair for batch in (frames(3), frames(2)) for pair in corrupt(batch, lens)]
+    (chosen,) = table1._subsample(pairs, 3)
+    assert chosen.key.tolist() == [0, 1, 0]  # of 0 1 2 0 1
+    assert_close(chosen.degraded, torch.stack([pairs[0].degraded[0], pairs[0].degraded[1], pairs[1].degraded[0]]))
 
 
-def folder(tmp_path: Path) -> Path:
+def write_frames(tmp_path: Path) -> Path:
     image, _ = render_road_scenes(torch.arange(4), *SIZE, seed=2)
     for i, picture in enumerate(image):
         path = tmp_path / "frames" / ("train" if i < 2 else "val") / f"drive{i}_{i:04d}.png"
@@ -113,69 +104,66 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "frames"
 
 
-def test_what_is_trained_is_loaded_and_the_page_tells_all(tmp_path, known_model):
-    out, made = tmp_path / "out", known_model("undistort", (0.0, 0.0), size=SIZE)
-    run = out / "resunet_undistort_0"
+def test_a_finished_training_is_loaded_and_the_tables_hold_all_methods(tmp_path, known_model):
+    run = tmp_path / "out" / "resunet_undistort_0"
     run.mkdir(parents=True)
-    (run / "best.ckpt").write_bytes(made.read_bytes())
+    (run / "best.ckpt").write_bytes(known_model("undistort", (0.0, 0.0), size=SIZE).read_bytes())
     (run / "curves.png").write_bytes(b"")
-    args = argparse.Namespace(source=folder(tmp_path), out=out, frames=0, form="small", steps=[2], sampled=1, **PLAIN)
-    path = table1.trained("resunet_undistort", args)
+    args = argparse.Namespace(source=write_frames(tmp_path), out=run.parent, scale="small", steps=[2], **OPTIONS)
+    path = table1.train("resunet_undistort", args)
     assert path == run / "best.ckpt"
-    lines = list(table1.scored("undistort", {"resunet_undistort": load_model(path)}, args))
-    found = {(line.method, line.effect): line.scores for line in lines if line.which == "all"}
+    lines = list(table1.score_task("undistort", {"resunet_undistort": load_model(path)}, args))
+    scores = {(line.method, line.effect): line.scores for line in lines if line.group == "all"}
     model = next(line.method for line in lines if line.method.startswith("ResUNet"))
-    # A network that answers 0 does nothing.
+    # This network predicts 0.
     for effect in (*effects_of("undistort", SIZE[1]), MIX):
-        assert found[model, effect].epe == pytest.approx(found["do nothing", effect].epe, rel=1e-4), effect
-    text = table1.page(lines)
+        assert scores[model, effect].epe == pytest.approx(scores["do nothing", effect].epe, rel=1e-4), effect
+    text = table1.format_tables(lines)
     assert "### undistort: wide lens" in text
     assert "| paper: SegFormer, on its own frames |  |  |  | 16.29 |  | 69.82 |" in text
     assert text.count("best constant flow") == 8
     assert "### undistort: all of the paper's, frames drive2*" in text
-    assert {line.which: line.frames for line in lines} == {"all": 2, "drive2*": 1, "others": 1}
+    assert {line.group: line.frames for line in lines} == {"all": 2, "drive2*": 1, "others": 1}
 
 
-def test_a_diffusion_model_is_compared_with_doing_nothing_to_the_same_frames(tmp_path):
-    class Quiet(nn.Module):
+def test_a_diffusion_model_is_compared_with_doing_nothing_on_the_same_frames(tmp_path):
+    class Zero(nn.Module):
         def forward(self, noisy: Tensor, time: Tensor, condition: Tensor) -> Tensor:
             return torch.zeros_like(noisy)
 
-    args = argparse.Namespace(source=folder(tmp_path), frames=0, steps=[1], sampled=1, **PLAIN)
-    model = Diffusion(lambda _: Quiet(), Undistort(0.1))
-    loaded = Loaded(model, "Quiet", "undistort", SIZE, {})
-    lines = list(table1.scored("undistort", {"ddpm_undistort": loaded}, args))
-    found = {(line.method, line.effect): line for line in lines if line.which == "all"}
-    every, one, own = (
-        found[name, "wide lens"] for name in ("do nothing", "do nothing, frames of DDPM", "DDPM, 1 steps")
-    )
-    assert (every.frames, one.frames, own.frames) == (2, 1, 1)
-    assert one.scores.epe != pytest.approx(every.scores.epe, rel=1e-3)
-    held_out = FrameFolder(args.source, size=SIZE, split="val")
-    first = [Frame(*(value[None] for value in held_out[0]))]
-    (alone,) = corrupted(first, effects_of("undistort", SIZE[1])["wide lens"][0])
-    assert one.scores.epe == pytest.approx(mean_of(score([still(alone)], [alone])).epe, rel=1e-6)
-    part = table1.page(lines).partition("### undistort: wide lens\n")[2].partition("###")[0]
-    (row,) = (line.split(" | ") for line in part.splitlines() if line.startswith("| DDPM"))
-    assert float(row[7]) == pytest.approx(own.scores.epe / one.scores.epe, abs=0.006)
+    args = argparse.Namespace(source=write_frames(tmp_path), steps=[1], **OPTIONS)
+    loaded = Loaded(Diffusion(lambda _: Zero(), Undistort(0.1)), "Zero", "undistort", SIZE, {})
+    lines = list(table1.score_task("undistort", {"ddpm_undistort": loaded}, args))
+    by_method = {line.method: line for line in lines if (line.group, line.effect) == ("all", "wide lens")}
+    every, same, model = (by_method[name] for name in ("do nothing", "do nothing, frames of DDPM", "DDPM, 1 steps"))
+    assert (every.frames, same.frames, model.frames) == (2, 1, 1)
+    assert same.scores.epe != pytest.approx(every.scores.epe, rel=1e-3)
+    first = Frame(*(value[None] for value in FrameFolder(args.source, size=SIZE, split="val")[0]))
+    (pair,) = corrupt([first], effects_of("undistort", SIZE[1])["wide lens"][0])
+    nothing = mean_of(score([Restored(pair.degraded, torch.zeros_like(pair.flow))], [pair]))
+    assert same.scores.epe == pytest.approx(nothing.epe, rel=1e-6)
+    table = table1.format_tables(lines).partition("### undistort: wide lens\n")[2].partition("###")[0]
+    (row,) = (line.split(" | ") for line in table.splitlines() if line.startswith("| DDPM"))
+    assert float(row[7]) == pytest.approx(model.scores.epe / same.scores.epe, abs=0.006)
 
 
-def test_a_stopped_training_goes_on_and_what_is_not_there_is_trained(tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr(table1.subprocess, "run", lambda words, check: asked.append(words))
-    args = argparse.Namespace(source=Path("frames"), out=tmp_path, form="small")
-    assert table1.trained("ddpm_deweather", args) == tmp_path / "ddpm_deweather_0" / "best.ckpt"
+@pytest.mark.quick
+def test_a_stopped_training_is_resumed_and_a_missing_one_is_started(tmp_path, monkeypatch):
+    commands = []
+    monkeypatch.setattr(table1.subprocess, "run", lambda words, check: commands.append(words))
+    args = argparse.Namespace(source=Path("frames"), out=tmp_path, scale="small")
+    assert table1.train("ddpm_deweather", args) == tmp_path / "ddpm_deweather_0" / "best.ckpt"
     (tmp_path / "ddpm_deweather_0").mkdir()
     (tmp_path / "ddpm_deweather_0" / "last.ckpt").touch()
-    assert table1.trained("ddpm_deweather", args) == tmp_path / "ddpm_deweather_1" / "best.ckpt"
-    first, second = asked
-    assert "+experiment=table1_ddpm_deweather_small" in first
+    assert table1.train("ddpm_deweather", args) == tmp_path / "ddpm_deweather_1" / "best.ckpt"
+    first, second = commands
+    assert {"+experiment=table1_ddpm_deweather", "scale=small"} < {*first}
     assert not any(word.startswith("ckpt_path=") for word in first)
     assert f"ckpt_path={tmp_path / 'ddpm_deweather_0' / 'last.ckpt'}" in second
 
 
 def test_fog_has_no_flow_and_its_cells_are_empty():
-    found = references("deweather", UniformFog(), frames(), corrupted(frames(), UniformFog()))
-    scores = mean_of(found["do nothing"])
+    references = score_references("deweather", UniformFog(), frames(), corrupt(frames(), UniformFog()))
+    scores = mean_of(references["do nothing"])
     cells = table1._cells(table1.Line("deweather", "uniform fog", "all", "do nothing", scores, 3, SIZE), scores)
     assert cells[3] == cells[6] == cells[7] == ""

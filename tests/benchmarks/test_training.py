@@ -1,12 +1,12 @@
 import json
 import sys
 
-import looks
 import pytest
+import slow_timing
 import timing
 import torch
 import training
-from looks import alternate
+from slow_timing import alternate
 from timing import Spread
 from torch.testing import assert_close
 
@@ -17,21 +17,21 @@ from torchrefract.types import Frame
 SMALL = "tu-mobilenetv3_small_050"
 
 
-def test_candidates_go_forward_and_backward():
+def test_candidates_return_the_gradient_of_the_image():
     frames = torch.rand(2, 3, 16, 24)
-    # Air that is all but clear, and light that is added, hand the gradient on as it comes.
+    # Thin fog and added light pass the gradient on unchanged.
     fog = UniformFog(visibility_range=(1e6, 1e6), deviation_range=(0.0, 0.0))
     torch.manual_seed(3)
-    found = training.candidates(frames, {"clear": fog, "flare": LensFlare(clip=False)})
+    candidates = training.candidates(frames, {"clear": fog, "flare": LensFlare(clip=False)})
     torch.manual_seed(3)
     upstream = torch.rand_like(frames)
-    assert list(found) == [training.BARE, "clear", "flare"]
-    clear, flare = (torch.as_tensor(found[name]()) for name in ("clear", "flare"))
+    assert list(candidates) == [training.BARE, "clear", "flare"]
+    clear, flare = (torch.as_tensor(candidates[name]()) for name in ("clear", "flare"))
     assert_close(clear, upstream, atol=1e-3, rtol=0)
     assert_close(flare, upstream)
 
 
-def test_a_step_trains_and_pairs_on_the_fly_are_new(monkeypatch):
+def test_a_step_changes_the_weights_and_draws_new_pairs_on_the_fly(monkeypatch):
     frames = Frame(torch.rand(2, 3, 64, 64), torch.arange(2), torch.empty(0))
     seeds = []
     make = training.make_pair
@@ -45,14 +45,14 @@ def test_a_step_trains_and_pairs_on_the_fly_are_new(monkeypatch):
     steps = training.training_steps(frames, Deweather(), UniformFog(), encoder=SMALL)
     before, fly = steps[training.BEFORE], steps[training.FLY]
     losses = [torch.as_tensor(before()).item() for _ in range(3)]
-    assert len(set(losses)) == 3  # the weights have moved
+    assert len(set(losses)) == 3  # the weights have changed
     assert seeds == [training.SEED]
     for _ in range(2):
         fly()
     assert seeds == [training.SEED, 0, 1]
 
 
-def test_very_slow_candidates_take_turns(monkeypatch):
+def test_slow_candidates_alternate(monkeypatch):
     now, calls = [0.0], []
 
     def candidate(name: str, length: float):
@@ -62,7 +62,7 @@ def test_very_slow_candidates_take_turns(monkeypatch):
 
         return call
 
-    monkeypatch.setattr(looks.benchmark, "timer", lambda: now[0])
+    monkeypatch.setattr(slow_timing.benchmark, "timer", lambda: now[0])
     one, two = alternate({"one": candidate("one", 1.0), "two": candidate("two", 2.0)}, reference="one", rounds=3)
     assert calls == ["one", "two"] * 4
     # Calls number 3, 5, 7 and 4, 6, 8 are timed.
@@ -71,7 +71,7 @@ def test_very_slow_candidates_take_turns(monkeypatch):
     assert two.ratios["one"].median == pytest.approx(12 / 5)
 
 
-def test_the_command_tells_both_bars(monkeypatch, tmp_path, capsys, on_threads):
+def test_the_command_prints_and_saves_both_limits(monkeypatch, tmp_path, capsys, on_threads):
     on_threads(1)
     monkeypatch.setattr(timing, "_STRETCH_S", 0.0)
     monkeypatch.setattr(training, "effects", lambda: {"fog": UniformFog()})

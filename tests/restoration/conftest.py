@@ -1,10 +1,18 @@
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import pytest
-from pytorch_lightning import Trainer
+import torch
+from pytorch_lightning import Callback, Trainer
+from torch.utils.data import DataLoader
 
+from torchrefract import Pair
+from torchrefract.data.module import make_pair
+from torchrefract.data.road_scenes import RoadScenes
+from torchrefract.effects.base import Effect
 from torchrefract.restoration.checkpoints import AtomicCheckpointIO
+from torchrefract.types import Frame
 
 
 @pytest.fixture
@@ -20,3 +28,39 @@ def trainer(tmp_path) -> Callable[..., Trainer]:
         num_sanity_val_steps=0,
         plugins=[AtomicCheckpointIO()],
     )
+
+
+@pytest.fixture(scope="session")
+def make_batches() -> Callable[..., list[Pair]]:
+    """Return a function that renders road scenes and corrupts them: batches with consecutive keys."""
+
+    def make(effect: Effect, count: int, *, first: int = 0, size: tuple[int, int], batch: int = 4) -> list[Pair]:
+        batches = []
+        for start in range(first, first + count * batch, batch):
+            scenes = RoadScenes(batch, size=size, first=start)
+            frame = Frame(*(torch.stack(part) for part in zip(*(scenes[i] for i in range(batch)), strict=True)))
+            batches.append(make_pair(frame, effect, seed=start))
+        return batches
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def loader() -> Callable[[list[Pair]], DataLoader[Pair]]:
+    """Return a function that wraps batches in a DataLoader."""
+    return lambda batches: DataLoader(batches, batch_size=None)  # pyright: ignore[reportArgumentType]  # a list is a map-style dataset
+
+
+class Losses(Callback):
+    """Keep the loss of each training step."""
+
+    def __init__(self):
+        self.values: list[float] = []
+
+    def on_train_batch_end(self, trainer, pl_module, outputs: Any, batch, batch_idx) -> None:
+        self.values.append(float(outputs["loss"]))
+
+
+@pytest.fixture
+def losses() -> type[Losses]:
+    return Losses

@@ -1,18 +1,35 @@
+import csv
 import math
-from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import matplotlib.image
 import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
-from torch import Tensor
+from PIL import Image
+from torch import Tensor, nn
 
-from torchrefract.restoration.report import PanelRows, _curves, _panel, save_curves, save_panel
-from torchrefract.viz import flow_to_rgb
+from torchrefract import Pair
+from torchrefract.restoration import report
+from torchrefract.restoration.module import Restoration
+from torchrefract.restoration.report import (
+    PanelRows,
+    RunSummary,
+    carry_over,
+    draw_panel,
+    metrics_rows,
+    plot_curves,
+    save_curves,
+    save_panel,
+    summary,
+)
+from torchrefract.restoration.tasks import Deweather, Restored, Undistort
+from torchrefract.visualization.color import flow_to_rgb
 
-# As CSVLogger writes it: columns by name, a validation row and a training row an epoch, most cells empty.
+# CSVLogger writes a row for validation and a row for training in each epoch, most cells empty.
 METRICS = """\
 epoch,step,train/loss,train/psnr,val/epe,val/epe_constant,val/epe_identity,val/loss,val/psnr,val/psnr_identity
 0,9,,,6.0,9.5,14.0,0.5,20.0,21.0
@@ -32,21 +49,21 @@ def metrics(tmp_path) -> Path:
 
 
 def curves(figure: Figure) -> dict[str, dict[str, tuple[list[float], list[float]]]]:
-    """Label of the vertical axis -> label of the curve without its last value -> epochs, values."""
+    """Return label of the vertical axis -> label of the curve without its last value -> epochs, values."""
+
+    def points(line) -> tuple[list[float], list[float]]:
+        return list(np.asarray(line.get_xdata())), list(np.asarray(line.get_ydata()))
+
     return {
-        axes.get_ylabel(): {
-            str(line.get_label()).split(" (")[0]: (
-                list(np.asarray(line.get_xdata())),
-                list(np.asarray(line.get_ydata())),
-            )
-            for line in axes.lines
-        }
+        axes.get_ylabel(): {str(line.get_label()).split(" (")[0]: points(line) for line in axes.lines}
         for axes in figure.axes
     }
 
 
-def test_curves_show_each_quantity_with_its_unit_and_what_needs_no_network(metrics):
-    drawn = curves(_curves(metrics.parent, epe_unit="px at 1920x1080"))
+@pytest.mark.quick
+def test_curves_show_each_quantity_and_the_baselines(metrics):
+    figure = plot_curves(metrics.parent, epe_unit="px at 1920x1080")
+    drawn = curves(figure)
     assert drawn["PSNR (dB)"] == {
         "training": ([0, 1, 2], [19, 23, 25]),
         "validation": ([0, 1, 2], [20, 24, 26]),
@@ -57,66 +74,47 @@ def test_curves_show_each_quantity_with_its_unit_and_what_needs_no_network(metri
         "do nothing": ([0, 1, 2], [14, 14, 14]),
         "best constant flow": ([0, 1, 2], [9.5, 9.5, 9.5]),
     }
-    assert list(drawn["loss"]) == ["training", "validation"]
+    assert drawn["loss"]["training"] == ([0, 1, 2], [0.6, 0.4, 0.3])
+    np.testing.assert_array_equal(drawn["loss"]["validation"][1], [0.5, math.nan, 0.2])  # NaN leaves a gap
+    for line in (line for axes in figure.axes for line in axes.lines):
+        is_result = str(line.get_label()).startswith(("training", "validation"))
+        assert line.get_linestyle() == ("-" if is_result else "--")
 
 
-def test_a_nan_leaves_a_gap_in_its_curve_only(metrics):
-    drawn = curves(_curves(metrics.parent, epe_unit="px"))["loss"]
-    assert drawn["training"] == ([0, 1, 2], [0.6, 0.4, 0.3])
-    np.testing.assert_array_equal(drawn["validation"][1], [0.5, math.nan, 0.2])
+def test_an_epoch_is_the_mean_of_its_training_rows_and_its_last_validation_row(metrics):
+    metrics.write_text("epoch,step,train/loss,val/loss\n0,1,1.0,\n0,2,3.0,\n0,2,,8.0\n0,3,,5.0\n,9,,\n")
+    assert curves(plot_curves(metrics.parent, epe_unit="px")) == {
+        "loss": {"training": ([0], [2]), "validation": ([0], [5])}
+    }
 
 
-def test_references_are_dashed_and_results_are_not(metrics):
-    for axes in _curves(metrics.parent, epe_unit="px").axes:
-        for line in axes.lines:
-            is_result = str(line.get_label()).startswith(("training", "validation"))
-            assert line.get_linestyle() == ("-" if is_result else "--")
-
-
-def test_several_rows_of_an_epoch_are_a_mean_in_training_and_the_last_in_validation(metrics):
-    metrics.write_text("epoch,step,train/loss,val/loss\n0,1,1.0,\n0,2,3.0,\n0,2,,8.0\n0,3,,5.0\n")
-    assert curves(_curves(metrics.parent, epe_unit="px"))["loss"] == {"training": ([0], [2]), "validation": ([0], [5])}
-
-
-def test_one_epoch_still_shows_its_references_and_whole_epochs_on_the_axis(metrics):
+def test_a_single_epoch_shows_its_baselines_as_lines_over_the_full_width(metrics):
     metrics.write_text("".join(METRICS.splitlines(keepends=True)[:3]))
-    figure = _curves(metrics.parent, epe_unit="px")
+    figure = plot_curves(metrics.parent, epe_unit="px")
     figure.canvas.draw()
     epe = figure.axes[2]
     left, right = epe.get_xlim()
     assert [tick for tick in epe.get_xticks() if left <= tick <= right] == [0]
-    reference = next(line for line in epe.lines if str(line.get_label()).startswith("do nothing"))
-    assert list(np.asarray(reference.get_ydata())) == [14, 14]
-    assert np.ptp(reference.get_window_extent().get_points()[:, 0]) == pytest.approx(epe.bbox.width)
+    baseline = next(line for line in epe.lines if str(line.get_label()).startswith("do nothing"))
+    assert list(np.asarray(baseline.get_ydata())) == [14, 14]
+    assert np.ptp(baseline.get_window_extent().get_points()[:, 0]) == pytest.approx(epe.bbox.width)
 
 
-def test_a_quantity_without_columns_has_no_panel(metrics):
-    metrics.write_text("epoch,step,val/psnr,lr\n0,9,20.0,\n,9,,0.001\n1,19,22.0,\n")
-    assert curves(_curves(metrics.parent, epe_unit="px")) == {"PSNR (dB)": {"validation": ([0, 1], [20, 22])}}
-
-
-@pytest.mark.parametrize("text", ["", "epoch,step,val/loss\n", "epoch,step,val/loss\n0,9,\n", "epoch,step,lr\n0,9,1\n"])
-def test_metrics_without_a_value_to_draw_are_refused_and_the_old_picture_stays(metrics, text):
+@pytest.mark.parametrize("text", ["", "epoch,step,val/loss\n0,9,\n", "epoch,step,lr\n0,9,1\n"])
+def test_metrics_without_a_value_are_rejected_and_the_old_picture_stays(metrics, text):
     metrics.write_text(text)
     out = metrics.with_name("curves.png")
     out.write_text("old")
-    with pytest.raises(ValueError, match="metrics must hold a loss, psnr or epe of some epoch"):
+    with pytest.raises(ValueError, match="metrics must hold a loss, psnr or epe of an epoch"):
         save_curves(metrics.parent, out)
     assert out.read_text() == "old"
 
 
-def test_saved_curves_are_a_picture_and_the_only_new_file(metrics):
-    out = metrics.with_name("curves.png")
-    save_curves(metrics.parent, out, epe_unit="px at 1920x1080")
-    assert sorted(out.parent.iterdir()) == [out, metrics]
-    assert np.ptp(matplotlib.image.imread(out)[..., :3]) > 0.5
-
-
-CAPTION = r"run_$\no$"  # an error where it is taken for a formula
+CAPTION = r"run_$\no$"  # an error if matplotlib parses it as a formula
 
 
 def rows(*, flow: Tensor | None = None, predicted_flow: Tensor | None = None, size: tuple[int, int] = (8, 10)):
-    """Two rows of random images whose left half is not valid in the second."""
+    """Return two examples of random images; the left half of the second is invalid."""
     degraded, clean, restored = torch.rand(3, 2, 3, *size)
     valid = torch.ones(2, 1, *size, dtype=torch.bool)
     valid[1, :, :, : size[1] // 2] = False
@@ -124,7 +122,7 @@ def rows(*, flow: Tensor | None = None, predicted_flow: Tensor | None = None, si
 
 
 def cells(figure: Figure, columns: int) -> list[list[Tensor]]:
-    """The picture of each column and row, (3, height, width) in [0, 1]."""
+    """Return the drawn images by column and row, each (3, height, width) in [0, 1]."""
     drawn = [torch.from_numpy(np.asarray(axes.images[0].get_array())).movedim(-1, 0) / 255 for axes in figure.axes]
     return [drawn[2 * j : 2 * j + 2] for j in range(columns)]
 
@@ -133,96 +131,79 @@ def texts(figure: Figure) -> list[str]:
     return [text.get_text() for text in figure.texts]
 
 
-def enlarged(image: Tensor) -> Tensor:
-    """(3, 8, 10) as drawn: 10 px become the least multiple of 10 that is 320 or more."""
+def enlarge(image: Tensor) -> Tensor:
+    """Enlarge (3, 8, 10) by 32, the smallest factor that makes the longer side at least 320."""
     return torch.kron(image.contiguous(), torch.ones(1, 32, 32))
 
 
-def test_images_are_drawn_pixel_by_pixel_in_their_columns():
+def test_a_panel_draws_images_in_their_columns_with_captions():
     sample = rows()
-    figure = _panel(sample)
-    drawn = cells(figure, 4)
+    sample.restored[0, :, 0, 0] = math.nan
+    figure = draw_panel(sample)
     error = (4 * (sample.restored - sample.clean).abs()).clamp(max=1)
-    for column, images in zip(drawn, (sample.clean, sample.degraded, sample.restored, error), strict=True):
-        assert (column[0] - enlarged(images[0])).abs().max() <= 0.5 / 255 + 1e-6
+    images = (sample.clean, sample.degraded, sample.restored, error)
+    for column, image in zip(cells(figure, 4), images, strict=True):
+        # A value that is not finite is drawn gray.
+        assert (column[0] - enlarge(image[0].nan_to_num(nan=0.5))).abs().max() <= 0.5 / 255 + 1e-6
     assert texts(figure)[:4] == ["clean", "corrupted", "restored", "|restored - clean| x 4"]
-    assert {"20 -> 25 dB", CAPTION} < set(texts(figure))
+    assert {"20 -> 25 dB", CAPTION, "not valid: lost in the corrupted image"} < set(texts(figure))
+    valid = rows()._replace(valid=torch.ones(2, 1, 8, 10, dtype=torch.bool))
+    assert "not valid: lost in the corrupted image" not in texts(draw_panel(valid))
 
 
-def test_both_flows_have_the_scale_of_the_longest_valid_true_flow_and_the_key_states_it():
+def test_both_flows_share_the_scale_of_the_longest_valid_true_flow():
     flow = torch.randn(2, 2, 8, 10).clamp(-2, 2)
     flow[0, :, 4, 5] = torch.tensor([22.0, -29.2])  # |flow| = 36.56
     flow[0, 0, 1, 1] = math.inf
-    flow[1, :, 0, 0] = 500.0  # not valid
+    flow[1, :, 0, 0] = 500.0  # invalid
     predicted_flow = 10 * torch.randn(2, 2, 8, 10)
-    figure = _panel(rows(flow=flow, predicted_flow=predicted_flow))
+    figure = draw_panel(rows(flow=flow, predicted_flow=predicted_flow))
     drawn = cells(figure, 5)
     for column, shown in ((drawn[3], flow), (drawn[4], predicted_flow)):
-        expected = enlarged(flow_to_rgb(shown, max_px=37.0)[0])
+        expected = enlarge(flow_to_rgb(shown, max_px=37.0)[0])
         assert (column[0] - expected).abs().max() <= 0.5 / 255 + 1e-6
     assert texts(figure)[3:5] == ["true flow", "predicted flow"]
     assert "full color = 37 px at 10x8" in texts(figure)
+    alone = texts(draw_panel(rows(predicted_flow=torch.full((2, 2, 8, 10), 0.3))))  # |flow| = 0.424
+    assert "true flow" not in alone
+    assert "full color = 0.43 px at 10x8" in alone
 
 
-def test_the_stripes_are_explained_where_there_are_any():
-    striped, whole = rows(), replace(rows(), valid=torch.ones(2, 1, 8, 10, dtype=torch.bool))
-    line = "not valid: lost in the corrupted image"
-    assert line in texts(_panel(striped))
-    assert line not in texts(_panel(whole))
-
-
-def test_a_prediction_without_truth_has_its_own_scale():
-    figure = _panel(rows(predicted_flow=torch.full((2, 2, 8, 10), 0.3)))  # |flow| = 0.424
-    assert "predicted flow" in texts(figure)
-    assert "true flow" not in texts(figure)
-    assert "full color = 0.43 px at 10x8" in texts(figure)
-
-
-def test_pixels_that_are_not_valid_are_striped_gray_after_the_second_column():
+def test_invalid_pixels_are_hatched_from_the_third_column_on():
     flow = torch.randn(2, 2, 8, 10)
-    for column, (first, second) in enumerate(cells(_panel(rows(flow=flow, predicted_flow=flow)), 5)):
-        lost, kept = second[:, :, :160], second[:, :, 160:]
-        is_gray = (lost == lost[:1]).all()
+    for column, (first, second) in enumerate(cells(draw_panel(rows(flow=flow, predicted_flow=flow)), 5)):
+        invalid, valid = second[:, :, :160], second[:, :, 160:]
+        is_gray = (invalid == invalid[:1]).all()
         assert is_gray == (column >= 2)
-        assert not (kept == kept[:1]).all()
+        assert not (valid == valid[:1]).all()
         assert not (first == first[:1]).all()
         if column >= 2:
-            assert len(lost.unique()) == 2
+            assert len(invalid.unique()) == 2
 
 
-@pytest.mark.parametrize("size", [(64, 112), (37, 53), (720, 1281)])
-def test_the_saved_picture_holds_the_cells_without_resampling(tmp_path, size):
+@pytest.mark.parametrize("size", [(37, 53), (720, 1281)])
+def test_a_saved_panel_holds_its_images_without_resampling(tmp_path, size):
     sample = rows(size=size)
     save_panel(sample, tmp_path / "panel.png")
     page = matplotlib.image.imread(tmp_path / "panel.png")[..., :3]
-    figure = _panel(sample)
-    for axes in figure.axes:
+    for axes in draw_panel(sample).axes:
         image = np.asarray(axes.images[0].get_array())
         left, right = (round(x * page.shape[1]) for x in axes.get_position().intervalx)
         bottom, top = (round(y * page.shape[0]) for y in axes.get_position().intervaly)
-        np.testing.assert_allclose(
-            page[page.shape[0] - top : page.shape[0] - bottom, left:right], image / 255, atol=1e-6
-        )
+        saved = page[page.shape[0] - top : page.shape[0] - bottom, left:right]
+        np.testing.assert_allclose(saved, image / 255, atol=1e-6)
 
 
-@pytest.mark.parametrize("size", [(64, 112), (360, 640), (112, 48), (112, 8), (16, 16)])
-def test_nothing_overlaps_and_nothing_leaves_the_page(size):
+@pytest.mark.parametrize("size", [(360, 640), (112, 8), (16, 16)])
+def test_nothing_on_a_panel_overlaps_or_leaves_the_page(size):
     flow = torch.randn(2, 2, *size)
-    figure = _panel(rows(flow=flow, predicted_flow=flow, size=size))
+    figure = draw_panel(rows(flow=flow, predicted_flow=flow, size=size))
     figure.canvas.draw()
     boxes = [axes.get_window_extent() for axes in figure.axes] + [text.get_window_extent() for text in figure.texts]
     for i, box in enumerate(boxes):
         assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
         assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1
         assert not any(box.padded(-0.5).overlaps(other) for other in boxes[i + 1 :])
-
-
-def test_a_restoration_that_diverged_is_drawn_gray(tmp_path):
-    sample = rows()
-    sample.restored[0, :, 0, 0] = math.nan
-    save_panel(sample, tmp_path / "panel.png")
-    drawn = cells(_panel(sample), 4)
-    assert drawn[2][0][:, :32, :32].sub(0.5).abs().max() < 0.5 / 255 + 1e-6
 
 
 def test_a_panel_that_cannot_be_saved_keeps_the_old_one(tmp_path, monkeypatch):
@@ -239,15 +220,120 @@ def test_a_panel_that_cannot_be_saved_keeps_the_old_one(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_wrong_rows_are_refused():
-    image, valid = torch.rand(2, 3, 4, 5), torch.ones(2, 1, 4, 5, dtype=torch.bool)
-    with pytest.raises(ValueError, match=r"clean must have shape .* with N from 1 to 8, got"):
-        PanelRows(image, torch.rand(9, 3, 4, 5), image, valid, ["", ""])
-    with pytest.raises(ValueError, match=r"restored must have shape \(2, 3, 4, 5\), got \(1, 3, 4, 5\)"):
-        PanelRows(image, image, image[:1], valid, ["", ""])
-    with pytest.raises(ValueError, match=r"flow must have shape \(2, 2, 4, 5\)"):
-        PanelRows(image, image, image, valid, ["", ""], flow=image)
-    with pytest.raises(TypeError, match="valid must be of type bool"):
-        PanelRows(image, image, image, valid.float(), ["", ""])
-    with pytest.raises(ValueError, match="captions must be 2 texts, got 1"):
-        PanelRows(image, image, image, valid, [""])
+SCORES = {
+    "val/loss": 0.04,
+    "val/psnr": 26.0,
+    "val/psnr_constant": 25.25,
+    "val/psnr_identity": 20.5,
+    "val/ssim": 0.8,
+    "val/ssim_constant": 0.75,
+    "val/ssim_identity": 0.7,
+    "val/epe": 5.0,
+    "val/epe_constant": 6.0,
+    "val/epe_identity": 20.0,
+    "train/psnr": 99.0,
+}
+
+
+def scores(**changes: float) -> dict[str, Tensor]:
+    changed = {f"val/{name}": value for name, value in changes.items()}
+    return {name: torch.tensor(value) for name, value in (SCORES | changed).items()}
+
+
+def words(lines: list[str]) -> list[str]:
+    return [" ".join(line.split()) for line in lines]
+
+
+@pytest.mark.quick
+def test_the_table_compares_the_model_with_the_baselines():
+    head, *lines = summary(scores(), (1080, 1920))
+    assert "px at 1920x1080" in head
+    assert words(lines) == [
+        "do nothing 20.50 (+0.00) 0.700 20.00 (1.00 x do nothing)",
+        "best constant flow 25.25 (+4.75) 0.750 6.00 (0.30 x do nothing)",
+        "model 26.00 (+5.50) 0.800 5.00 (0.25 x do nothing)",
+    ]
+    assert len({len(line) for line in lines}) == 1
+    worse = words(summary(scores(psnr=18.0, epe=30.0), (1080, 1920)))[-1]
+    assert worse == "model 18.00 (-2.50) 0.800 30.00 (1.50 x do nothing)"
+    assert len(summary(scores(epe=0.0, epe_constant=0.0, epe_identity=0.0), (1080, 1920))) == 4
+    without_flow = {name: value for name, value in scores().items() if "epe" not in name and "constant" not in name}
+    head, *lines = summary(without_flow, (1080, 1920))
+    assert "endpoint" not in head
+    assert words(lines) == ["do nothing 20.50 (+0.00) 0.700", "model 26.00 (+5.50) 0.800"]
+
+
+def make_pair(seed: int = 0, batch: int = 6) -> Pair:
+    generator = torch.Generator().manual_seed(seed)
+    clean = 0.25 + 0.5 * torch.rand(batch, 3, 20, 30, generator=generator)
+    flow = torch.randn(batch, 2, 20, 30, generator=generator)
+    return Pair(clean + 0.1, clean, flow, torch.ones(batch, 1, 20, 30, dtype=torch.bool), torch.arange(batch))
+
+
+def finish(run: Path, task: Any, *batches: Pair, rank: int = 0, stage: str = "validate") -> None:
+    """Run the callback after a validation whose restorations are off by 0.01 and whose flows are doubled."""
+    trainer: Any = SimpleNamespace(is_global_zero=rank == 0, callback_metrics=scores())
+    model, callback = Restoration(lambda channels, smooth: nn.Conv2d(3, channels, 1), task), RunSummary(str(run))
+    for number, batch in enumerate(batches):
+        flow = 2 * batch.flow if isinstance(task, Undistort) else None
+        callback.on_validation_batch_end(trainer, model, Restored(batch.clean + 0.01, flow)._asdict(), batch, number)
+    callback.teardown(trainer, model, stage)
+
+
+def test_the_panel_shows_four_examples_of_the_first_batch_by_degradation(tmp_path, monkeypatch):
+    panels: list[PanelRows] = []
+    monkeypatch.setattr(report, "save_panel", lambda rows, out: panels.append(rows))
+    first = make_pair()
+    offset = torch.tensor([0.01, 0.1, 0.02, 0.2, 0.05, 0.04])
+    first = first._replace(degraded=first.clean + offset.view(6, 1, 1, 1))
+    chosen = [3, 1, 5, 2]  # of 3 1 4 5 2 0
+    finish(tmp_path, Undistort(), first, make_pair(seed=1))
+    finish(tmp_path, Deweather(), make_pair(batch=2))
+    panel, without_flow = panels
+    assert torch.equal(panel.clean, first.clean[chosen])
+    assert torch.equal(panel.degraded, first.degraded[chosen])
+    assert torch.equal(panel.restored, first.clean[chosen] + 0.01)
+    assert panel.flow is not None
+    assert panel.predicted_flow is not None
+    assert torch.equal(panel.flow, first.flow[chosen])
+    assert torch.equal(panel.predicted_flow, 2 * first.flow[chosen])
+    # An offset of 0.1 is 20 dB, one of 0.01 is 40 dB.
+    assert panel.captions == [f"{before} -> 40.0 dB" for before in ("14.0", "20.0", "28.0", "34.0")]
+    assert (without_flow.flow, without_flow.predicted_flow, len(without_flow.clean)) == (None, None, 2)
+
+
+def test_a_training_leaves_both_pictures_and_ends_with_the_names_of_its_files(tmp_path, capsys):
+    (tmp_path / "metrics.csv").write_text("epoch,step,train/loss,val/loss\n0,3,,0.3\n0,3,0.5,\n1,7,,0.2\n1,7,0.4,\n")
+    (tmp_path / "folder").mkdir()
+    finish(tmp_path, Undistort(), make_pair(), stage="fit")
+    for name in ("curves.png", "panel.png"):
+        with Image.open(tmp_path / name) as picture:
+            assert min(picture.size) > 300
+            assert np.ptp(np.asarray(picture.convert("L"))) > 128
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == [*summary(scores(), (1080, 1920)), f"{tmp_path}: curves.png, metrics.csv, panel.png"]
+
+
+def test_other_ranks_and_runs_without_validation_write_nothing(tmp_path, capsys):
+    finish(tmp_path, Undistort(), make_pair(), rank=1)
+    finish(tmp_path, Undistort())
+    assert capsys.readouterr().out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_resumed_run_copies_complete_metrics_of_the_epochs_before_its_checkpoint(tmp_path):
+    stopped, run = tmp_path / "stopped", tmp_path / "run"
+    stopped.mkdir()
+    run.mkdir()
+    carry_over(stopped, run, before_epoch=5)
+    assert list(run.iterdir()) == []
+    # This run was itself resumed, and was killed while it wrote a row.
+    (stopped / "metrics_before.csv").write_text("epoch,val/loss\n0,9\n")
+    (stopped / "metrics.csv").write_text("epoch,val/loss,val/epe\n1,8,70\n2,7,60\n2")
+    carry_over(stopped, run, before_epoch=2)
+    (run / "metrics.csv").write_text("epoch,val/loss\n2,6\n3,5\n")
+    assert [(row["epoch"], row["val/loss"]) for row in metrics_rows(run)] == [*zip("0123", "9865", strict=True)]
+    with (run / "metrics_before.csv").open(newline="") as file:
+        assert [row["val/epe"] for row in csv.DictReader(file)] == ["", "70"]
+    carry_over(stopped, tmp_path, before_epoch=3)
+    assert [(row["epoch"], row["val/loss"]) for row in metrics_rows(tmp_path)] == [*zip("012", "987", strict=True)]

@@ -35,14 +35,14 @@ from torchrefract.cameras.io.opencv import read_opencv, write_opencv
 from torchrefract.cli.command import make, naming, progress
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, pixels_of, read_image
 from torchrefract.fields.rectification import camera_flow
-from torchrefract.footage import (
-    check_apart,
-    find_footage,
+from torchrefract.data.media import (
+    check_output_folder,
+    find_media,
     is_video,
-    is_written,
-    write_frames,
+    is_complete,
+    convert_video,
     write_picture,
-    written_as,
+    output_name,
 )
 from torchrefract.warping.warp import warp
 
@@ -262,10 +262,10 @@ def rectify(cfg: DictConfig) -> None:
         zoom = check_number("zoom", cfg.zoom, low=0.05, high=20.0)
     with naming("camera"):
         rectifier = _Rectifier(read_opencv(str(cfg.camera)), zoom)
-    files = find_footage(source)
+    files = find_media(source)
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
-    check_apart(out, source)
+    check_output_folder(out, source)
     _write_cameras(out, rectifier)
     if rectifier.black_share:
         print(
@@ -322,12 +322,12 @@ def _write_cameras(out: Path, rectifier: _Rectifier) -> None:
 
 def _rectify_file(file: Path, rectifier: _Rectifier, out: Path) -> bool:
     """Rectify a picture or video; return False if its result exists already."""
-    target = out / written_as(file).name
-    if is_written(file, target):
+    target = out / output_name(file).name
+    if is_complete(file, target):
         return False
     with replace_file(target) as path:
         if is_video(file):
-            write_frames(file, path, change=partial(map, rectifier))
+            convert_video(file, path, change=partial(map, rectifier))
         else:
             write_picture(rectifier(read_image(file)[None].contiguous()), path)
     return True

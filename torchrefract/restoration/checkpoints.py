@@ -1,124 +1,247 @@
-"""Checkpoints: written whole or not at all, and looked at before they are used."""
+"""Checkpoints: written atomically, verified before use, and sufficient to rebuild their model safely."""
 
 import pickle
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from pkgutil import resolve_name
+from typing import Any, NamedTuple
 
 import torch
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from pytorch_lightning import Callback, LightningModule, Trainer
 from pytorch_lightning.plugins.io import TorchCheckpointIO
-from torch import nn
+from torch import Tensor, nn
 
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError
+from torchrefract.restoration.tasks import Task
 
-# What a damaged archive, or a file that is none, makes the readers raise.
-_DAMAGE = (zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, EOFError, LookupError, OSError, RuntimeError)
-_DAMAGE += (struct.error, ValueError, TypeError, AttributeError, ArithmeticError, AssertionError)
+_PACKAGE = "torchrefract."
+_ALLOWED = (nn.Module, Task)  # the classes that a checkpoint may instantiate
+# Parts of the names of weights in older checkpoints, and the parts that replaced them.
+_RENAMED = {"whole": "polynomial_head", "place": "coordinate_weight"}
+# zipfile and torch.load raise these for files that are damaged or no archives.
+_READ_ERRORS = (zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, EOFError, LookupError, OSError, RuntimeError)
+_READ_ERRORS += (struct.error, ValueError, TypeError, AttributeError, ArithmeticError, AssertionError)
 
 
 class CheckpointError(UsageError):
-    """A checkpoint that cannot be read, does not fit, or cannot be written; the message says what to do."""
+    """A checkpoint is unreadable, does not fit, or cannot be written; the message says what to do."""
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """A checkpoint takes the place of its predecessor when it is complete, so a full disk leaves the last good one."""
+    """Replace a checkpoint only by a complete one, so that a full disk leaves the last good file."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Write the checkpoint beside `path`, then move it there."""
+        """Write the checkpoint to a temporary file, then move it to `path`.
+
+        Raises:
+            CheckpointError: the file cannot be written.
+        """
         path = Path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with replace_file(path) as temporary:
                 torch.save(checkpoint, temporary)
-        # torch reports a disk that is full while it writes as a RuntimeError of its archive writer.
+        # If the disk is full, torch raises a RuntimeError of its archive writer.
         except (OSError, RuntimeError) as error:
-            kept = f"; {path} of an earlier epoch is whole" if path.exists() else ""
+            previous = f"; {path} of an earlier epoch is intact" if path.exists() else ""
             reason = error.strerror if isinstance(error, OSError) else "the disk may be full"
             raise CheckpointError(
-                f"{path} could not be written ({reason}){kept}: make room or choose another hydra.run.dir, and go on "
-                "with ckpt_path="
+                f"{path} could not be written ({reason}){previous}: free disk space or choose another hydra.run.dir, "
+                "and resume with ckpt_path="
             ) from error
 
 
 class Origin(Callback):
-    """Checkpoints say where they come from, in plain values, which load with weights only.
+    """Add to each checkpoint its origin, in plain values that load with `weights_only=True`.
 
     Args:
         config: the resolved configuration of the run.
-        data: what the model is trained on, as by `fingerprint`.
-        licenses: of what the model is made from, by what that is; None where it is not known.
+        data: the training data, as of `torchrefract.data.fingerprint`.
+        licenses: by source of the model, the license, or None if it is unknown.
     """
 
     def __init__(self, config: Mapping[str, Any], *, data: Mapping[str, Any], licenses: Mapping[str, str | None]):
         self.origin = {"config": dict(config), "data": dict(data), "licenses": dict(licenses)}
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Configuration, data and licenses go along."""
+        """Add configuration, data and licenses."""
         checkpoint.update(self.origin)
 
 
-def model_name(model: Mapping[str, Any]) -> str:
-    """What the model of a configuration is called: its network, and the encoder of that, as "ResUNet (tu-resnet34)"."""
-    network = model.get("network", model)
-    name = str(network.get("_target_", "a network")).rsplit(".", 1)[-1]
-    return f"{name} ({network['encoder']})" if "encoder" in network else name
+class Loaded(NamedTuple):
+    """A model and the facts about it that its checkpoint holds.
+
+    model: in evaluation mode; maps images (B, 3, H, W) in [0, 1] to `Restored`.
+    name: as of `model_name`.
+    task: the name of its task.
+    size: (height, width) of the frames that it was trained on, px.
+    licenses: by source of the model, the license, or None if it is unknown.
+    """
+
+    model: LightningModule
+    name: str
+    task: str
+    size: tuple[int, int]
+    licenses: dict[str, Any]
+
+
+def load_model(path: Path, *, changes: Mapping[str, Any] | None = None) -> Loaded:
+    """Build the model of a checkpoint from the configuration inside the checkpoint.
+
+    Only networks, models and tasks of torchrefract are instantiated. Pretrained weights are not loaded, because the
+    checkpoint holds all weights.
+
+    Args:
+        path: the checkpoint.
+        changes: values that replace those of the model's configuration.
+
+    Raises:
+        CheckpointError: see `read_checkpoint` and `check_fits`; the configuration is missing or of something else.
+    """
+    checkpoint = read_checkpoint(path)
+    config, data = (checkpoint.get(part) for part in ("config", "data"))
+    if not (isinstance(config, dict) and isinstance(config.get("model"), dict) and isinstance(data, dict)):
+        raise CheckpointError(
+            f"ckpt_path must be a checkpoint with its configuration, as torchrefract.train writes them, got {path}"
+        )
+    model = _instantiate(config["model"], changes or {}, path)
+    check_fits(checkpoint, model, path, config=config["model"])
+    model.on_load_checkpoint(checkpoint)
+    model.load_state_dict(checkpoint["state_dict"])
+    licenses = checkpoint.get("licenses", {})
+    name = model_name(config["model"])
+    return Loaded(model.eval(), name, str(checkpoint["task"]), _frame_size(data.get("size"), path), licenses)
 
 
 def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
-    """What the file holds, read without running code from it.
+    """Read a checkpoint without running code from it.
 
     Args:
-        path: of the file.
-        task: that it must be of; None takes any.
+        path: the checkpoint.
+        task: the task that it must be of; None accepts any.
 
     Raises:
-        CheckpointError: no such file, a file that is no checkpoint or damaged, one of another task.
+        CheckpointError: the file is missing, damaged, no checkpoint of torchrefract, or of another task.
     """
     if not path.is_file():
         raise CheckpointError(f"ckpt_path must be a checkpoint file, such as <run>/last.ckpt, got {path}")
     try:
-        # torch itself compares no checksum: a hole in the file would come back as other weights.
+        # torch.load compares no checksums, so a hole in the file would silently change weights.
         with zipfile.ZipFile(path) as archive:
             if (damaged := archive.testzip()) is not None:
                 raise zipfile.BadZipFile(damaged)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except _DAMAGE as error:
-        raise CheckpointError(f"ckpt_path must be a whole checkpoint, got {path}, which is damaged or none") from error
-    if not isinstance(checkpoint, dict) or not _has_parts(checkpoint):
+    except _READ_ERRORS as error:
+        raise CheckpointError(
+            f"ckpt_path must be an intact checkpoint, got {path}, which is damaged or another kind of file"
+        ) from error
+    if not isinstance(checkpoint, dict) or not _has_weights_and_task(checkpoint):
         raise CheckpointError(f"ckpt_path must be a checkpoint of torchrefract, got {path}")
     if task not in (None, checkpoint["task"]):
         raise CheckpointError(f"ckpt_path must be a checkpoint of the task {task}, got {path} of {checkpoint['task']}")
+    checkpoint["state_dict"] = rename_weights(checkpoint["state_dict"])
     return checkpoint
 
 
-def _has_parts(checkpoint: dict[Any, Any]) -> bool:
-    """Whether there are weights by their names, and the name of a task."""
-    weights = checkpoint.get("state_dict")
-    if not isinstance(weights, dict) or not isinstance(checkpoint.get("task"), str):
-        return False
-    return all(isinstance(name, str) and isinstance(value, torch.Tensor) for name, value in weights.items())
+def rename_weights(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Give weights of an older version the names of this one."""
+    return {".".join(_RENAMED.get(part, part) for part in name.split(".")): weights[name] for name in weights}
 
 
 def check_fits(
     checkpoint: Mapping[str, Any], model: nn.Module, path: Path, *, config: Mapping[str, Any] | None = None
 ) -> None:
-    """Raise CheckpointError unless the weights of the checkpoint at `path` are those of such a model.
+    """Raise CheckpointError unless the weights of a checkpoint have the names and shapes of a model's.
 
-    `config`: what the model was made from, to name it beside that of the checkpoint.
+    Args:
+        checkpoint: as of `read_checkpoint`.
+        model: the model.
+        path: the checkpoint, for the message.
+        config: the configuration of the model, for the message.
     """
     shapes = {name: value.shape for name, value in model.state_dict().items()}
     saved = {name: value.shape for name, value in checkpoint["state_dict"].items()}
     differing = sorted(name for name in shapes.keys() | saved.keys() if shapes.get(name) != saved.get(name))
     if not differing:
         return
-    wanted, found = (model_name(part) for part in (config or {}, checkpoint.get("config", {}).get("model", {})))
-    if wanted != found and config and "config" in checkpoint:
-        raise CheckpointError(f"ckpt_path must be a checkpoint of {wanted}, which model= names, got {path} of {found}")
+    expected, given = (model_name(part) for part in (config or {}, checkpoint.get("config", {}).get("model", {})))
+    if expected != given and config and "config" in checkpoint:
+        raise CheckpointError(
+            f"ckpt_path must be a checkpoint of {expected}, which model= names, got {path} of {given}"
+        )
     raise CheckpointError(
         f"ckpt_path must be a checkpoint of the model that model= names, got {path}, where {differing[0]} differs"
     )
+
+
+def model_name(model: Mapping[str, Any]) -> str:
+    """Return the network of a model's configuration and its encoder, such as "ResUNet (tu-resnet34)"."""
+    network = model.get("network", model)
+    name = str(network.get("_target_", "a network")).rsplit(".", 1)[-1]
+    return f"{name} ({network['encoder']})" if "encoder" in network else name
+
+
+def _has_weights_and_task(checkpoint: dict[Any, Any]) -> bool:
+    weights = checkpoint.get("state_dict")
+    if not isinstance(weights, dict) or not isinstance(checkpoint.get("task"), str):
+        return False
+    return all(isinstance(name, str) and isinstance(value, Tensor) for name, value in weights.items())
+
+
+def _instantiate(config: dict[str, Any], changes: Mapping[str, Any], path: Path) -> LightningModule:
+    """Instantiate the configuration of a model after checking that it can do nothing else."""
+    try:
+        plain = OmegaConf.to_container(OmegaConf.merge(config, dict(changes)), resolve=False)
+        for node in _mappings(plain):
+            _check_node(node, path)
+        model = instantiate(plain)
+    except (InstantiationException, OmegaConfBaseException, ValueError, TypeError) as error:
+        reason = error.__cause__ or error
+        raise CheckpointError(f"ckpt_path must be of a model that can be built, got {path}: {reason}") from error
+    if not isinstance(model, LightningModule):
+        raise CheckpointError(f"ckpt_path must be of a model, got {path} of {type(model).__name__}")
+    return model
+
+
+def _mappings(value: Any) -> Iterator[dict[Any, Any]]:
+    """Yield all mappings in nested plain values."""
+    if isinstance(value, dict):
+        yield value
+    for child in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        yield from _mappings(child)
+
+
+def _check_node(node: dict[Any, Any], path: Path) -> None:
+    """Raise CheckpointError if a mapping could run foreign code or read other files; drop its pretrained weights."""
+    if any(isinstance(value, str) and "${" in value for value in node.values()):
+        raise CheckpointError(f"ckpt_path must hold a resolved configuration, got {path} with ${{…}} in it")
+    if node.get("pretrained") is not None:
+        node["pretrained"] = None
+    target = node.get("_target_")
+    if "_target_" in node and not _is_allowed(target):
+        raise CheckpointError(f"ckpt_path must name models and tasks of torchrefract only, got {path} with {target!r}")
+
+
+def _is_allowed(target: Any) -> bool:
+    if not isinstance(target, str) or not target.startswith(_PACKAGE):
+        return False
+    try:
+        value = resolve_name(target)
+    except (ImportError, ValueError, AttributeError):
+        return False
+    # Our modules have classes of other packages as attributes, so the module that defines the class decides.
+    return isinstance(value, type) and issubclass(value, _ALLOWED) and value.__module__.startswith(_PACKAGE)
+
+
+def _frame_size(size: Any, path: Path) -> tuple[int, int]:
+    if not (isinstance(size, list) and len(size) == 2 and all(isinstance(side, int) and side > 0 for side in size)):
+        raise CheckpointError(f"ckpt_path must hold the size of its frames, got {path} with {size!r}")
+    return size[0], size[1]

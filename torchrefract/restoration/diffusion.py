@@ -1,73 +1,79 @@
-"""Restoration by diffusion: noise is turned into the restoration step by step, seeing the degraded image."""
+"""Conditional diffusion: sample the flow or the clean image from noise, given the degraded image."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+from diffusers import DDPMScheduler, DPMSolverMultistepScheduler
 from pytorch_lightning import Callback
 from pytorch_lightning.callbacks import WeightAveraging
 from pytorch_lightning.trainer.states import TrainerFn
 from torch import Tensor, nn
 
+from torchrefract import white_noise
+from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import check_choice, check_count, check_number
-from torchrefract.random import Stream, stream, uniform
+from torchrefract.draws import Stream, noise_key, stream, uniform
 from torchrefract.restoration.metrics import masked_mean
 from torchrefract.restoration.models.denoiser import conditions
-from torchrefract.restoration.module import Learner
-from torchrefract.restoration.sampler import LEVELS, SAMPLERS, check_steps, noise_levels, normal, sample
-from torchrefract.restoration.targets import target_of
-from torchrefract.restoration.tasks import Restored, Task
+from torchrefract.restoration.module import RestorationModule
+from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
 from torchrefract.types import Pair
 from torchrefract.warping.grid import inside
+from torchrefract.warping.warp import warp
 
-_NOISE_WEIGHT = 0.8
+SAMPLERS = ("ddpm", "ddim", "dpm_solver")
+NUM_LEVELS = 1000  # noise levels of the training
 _PREDICTIONS = ("v_prediction", "epsilon")
+_NOISE_WEIGHT = 0.8
+_MU = 100.0
 
 
-class _Part(NamedTuple):
-    """What a network sees at once of a batch of pairs."""
+class _Region(NamedTuple):
+    """A crop of a batch, or the batch itself."""
 
     pair: Pair
     condition: Tensor
-    size: Sequence[int]  # height and width of the frames that it is cut from
+    frame_size: Sequence[int]  # height and width of the uncropped frames, px
 
 
-class Diffusion(Learner):
-    """A conditional diffusion model of the restoration.
+class Diffusion(RestorationModule):
+    """Train a conditional diffusion model that restores images.
 
         noisy = sqrt(a) target + sqrt(1 - a) noise
-        loss = 0.8 |found noise - noise|_1 + a |restored(found target) - clean|^2
+        loss = 0.8 mean |predicted noise - noise| + a mean (restored(predicted target) - clean)^2
 
-    on the valid pixels, at one of 1000 levels of noise for each sample, a falling by variances that grow linearly from
-    0.0001 to 0.02. The target is the flow that undoes a warp, companded as by `FlowTarget`, or the clean image from -1
-    to 1. What the network predicts gives both that are found:
+    Both means are over valid pixels. Each sample has one of 1000 noise levels; a is the cumulative product of
+    1 - variance, and the variances grow linearly from 0.0001 to 0.02. The target is the flow that undoes a warp, as of
+    `FlowTarget`, or the clean image in [-1, 1]. Noise and target follow from the prediction of the network:
 
-        epsilon:       found noise = predicted,  found target = (noisy - sqrt(1 - a) predicted) / sqrt(a)
-        v_prediction:  found noise = sqrt(1 - a) noisy + sqrt(a) predicted,
-                       found target = sqrt(a) noisy - sqrt(1 - a) predicted
+        epsilon:       noise = predicted,  target = (noisy - sqrt(1 - a) predicted) / sqrt(a)
+        v_prediction:  noise = sqrt(1 - a) noisy + sqrt(a) predicted
+                       target = sqrt(a) noisy - sqrt(1 - a) predicted
 
-    Where there is little but noise, a small error of a predicted noise is a large one of the target, which the degraded
-    image tells all the same. So the velocity is the default; published weights predict the noise.
+    If a is small, a small error of a predicted noise is a large error of the target, although the degraded image
+    determines the target. So the velocity is the default; published weights predict the noise.
 
-    The weights that validate, are saved, and restore are a moving average of those that learn. Noise, levels and crops
-    depend on the seed, the step and the keys of a batch alone, and what `forward` draws on the seed and the key.
+    Validation, checkpoints and restorations use a moving average of the trained weights. Noise, levels and crops depend
+    only on the seed, the step and the keys of a batch; the noise of `forward` depends only on the seed and the key.
 
     Args:
-        network: makes the network, given the number of channels of the target; called with a noisy target, its level
-            and the conditions, as is `Denoiser`.
+        network: builds the network from the number of channels of the target, see `Denoiser`.
         task: Undistort or Deweather.
-        lr, weight_decay, warmup_steps, schedule, metric_size: as for `Learner`.
-        prediction: "v_prediction" or "epsilon", what the network predicts.
-        sampler: "ddim", "dpm_solver" or "ddpm", which wants many steps.
-        steps: of the sampler in `forward` and in an evaluation, from 1 to 1000.
-        val_steps: of the sampler in a validation during training.
-        crop: side of the squares that training looks at, px; None for whole frames, as where these are smaller.
-        ema_decay: the share of the average that a step keeps, once there have been enough: of n, (1 + n) / (10 + n).
-        seed: of all draws.
+        lr, weight_decay, warmup_steps, schedule, metric_size: see `RestorationModule`.
+        prediction: "v_prediction" or "epsilon", the output of the network.
+        sampler: "ddim", "dpm_solver" or "ddpm"; "ddpm" needs many steps.
+        steps: steps of the sampler in `forward` and in an evaluation, from 1 to 1000.
+        val_steps: steps of the sampler in a validation during training, from 1 to 1000.
+        crop: side of the squares that training uses, px; a shorter side of the frame is not cropped. None uses whole
+            frames.
+        ema_decay: upper limit of the decay of the moving average, which is (1 + n) / (10 + n) after n steps.
+        seed: seed of all draws.
 
     Raises:
-        ValueError: a number outside its range, a sampler or a prediction that is not known.
-        TypeError: a number of the wrong kind, another task.
+        ValueError: a number is outside its range; the sampler or the prediction is unknown.
+        TypeError: a number has the wrong type, or the task is another one.
 
     Source: Ho, Jain, Abbeel, "Denoising diffusion probabilistic models", NeurIPS 2020; Salimans, Ho, "Progressive
     distillation for fast sampling of diffusion models", ICLR 2022, for the velocity.
@@ -104,73 +110,73 @@ class Diffusion(Learner):
         self.levels = noise_levels()
 
     def forward(self, degraded: Tensor, key: Tensor | None = None) -> Restored:
-        """The restoration of images (B, 3, H, W) in [0, 1], each by itself; arguments as for `Learner`."""
+        """Restore images (B, 3, H, W) in [0, 1]; see `RestorationModule.forward`."""
         return self._sample(degraded, key, steps=self.steps)
 
-    def learn(self, batch: Pair) -> tuple[Tensor, None]:
-        """The loss at a level for each sample; the step is part of the draw, so that none comes twice."""
-        source = self._draws(batch.key, 1 + self.global_step)
-        return self._loss(self._crop(_whole(batch), source.at(0)), source), None
+    def training_loss(self, batch: Pair) -> tuple[Tensor, None]:
+        """Compute the loss at a random level for each sample; each step has its own draws."""
+        source = self._stream(batch.key, 1 + self.global_step)
+        return self._loss(self._crop(_whole_region(batch), source.at(0)), source), None
 
-    def judge(self, batch: Pair) -> tuple[Tensor, Restored]:
-        """The loss on whole frames, of the same draws each time, and the restoration."""
-        loss = self._loss(_whole(batch), self._draws(batch.key, 0))
-        training = self.trainer.state.fn == TrainerFn.FITTING
-        return loss, self._sample(batch.degraded, batch.key, steps=self.val_steps if training else self.steps)
+    def validation_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
+        """Compute the loss on whole frames with the same draws each time, and the restoration."""
+        loss = self._loss(_whole_region(batch), self._stream(batch.key, 0))
+        is_training = self.trainer.state.fn == TrainerFn.FITTING
+        return loss, self._sample(batch.degraded, batch.key, steps=self.val_steps if is_training else self.steps)
 
     def configure_callbacks(self) -> list[Callback]:
-        """In training, the moving average of the weights."""
+        """Add the moving average of the weights to a training."""
         return [WeightAveraging(avg_fn=self._average)] if self.trainer.state.fn == TrainerFn.FITTING else []
 
     def _average(self, average: Tensor, new: Tensor, count: Tensor) -> Tensor:
-        # A short training would otherwise end with the weights that it began with.
-        keep = ((1 + count) / (10 + count)).clamp(max=self.ema_decay)
-        return torch.lerp(average, new, (1 - keep).to(average.dtype))
+        # With a constant decay, a short training would end near its initial weights.
+        decay = ((1 + count) / (10 + count)).clamp(max=self.ema_decay)
+        return torch.lerp(average, new, (1 - decay).to(average.dtype))
 
-    def _draws(self, key: Tensor, step: int) -> Stream:
-        # The complement: the corruption of a batch is drawn by the same keys, and seeds that are not negative.
+    def _stream(self, key: Tensor, step: int) -> Stream:
+        # The corruption of a batch has the same keys and seeds >= 0, so the complement gives independent numbers.
         return stream(~((self.seed << 32) + step), key, device=self.device)
 
-    def _crop(self, whole: _Part, source: Stream) -> _Part:
-        """A square of each sample, or all of a side that is shorter; look-ups that leave it are not valid."""
-        height, width = whole.size
+    def _crop(self, region: _Region, source: Stream) -> _Region:
+        """Cut a square out of each sample; flows that point out of it become invalid."""
+        height, width = region.frame_size
         if self.crop is None or (height <= self.crop and width <= self.crop):
-            return whole
+            return region
         size = (min(self.crop, height), min(self.crop, width))
-        room = torch.tensor([height - size[0] + 1, width - size[1] + 1])
-        corners = (uniform(source.to(torch.device("cpu")), 2) * room).long().tolist()
+        positions = torch.tensor([height - size[0] + 1, width - size[1] + 1])
+        corners = (uniform(source.to(torch.device("cpu")), 2) * positions).long().tolist()
 
         def cut(value: Tensor) -> Tensor:
             rows = zip(value, corners, strict=True)
             return torch.stack([v[:, y : y + size[0], x : x + size[1]] for v, (y, x) in rows])
 
-        degraded, clean, flow, valid = (cut(value) for value in whole.pair[:4])
-        pair = whole.pair._replace(degraded=degraded, clean=clean, flow=flow, valid=valid & inside(flow))
-        return _Part(pair, cut(whole.condition), whole.size)
+        degraded, clean, flow, valid = (cut(value) for value in region.pair[:4])
+        pair = region.pair._replace(degraded=degraded, clean=clean, flow=flow, valid=valid & inside(flow))
+        return _Region(pair, cut(region.condition), region.frame_size)
 
-    def _loss(self, part: _Part, source: Stream) -> Tensor:
-        """(), with noise and levels from a source."""
-        pair, size = part.pair, part.size
+    def _loss(self, region: _Region, source: Stream) -> Tensor:
+        pair, size = region.pair, region.frame_size
         target = self.target.encode(pair, size)
         noise = normal(source.at(1), target)
-        time = (uniform(source.at(2), 1)[:, 0] * LEVELS).long()
+        time = (uniform(source.at(2), 1)[:, 0] * NUM_LEVELS).long()
         noisy = self.levels.add_noise(target, noise, time)  # pyright: ignore[reportArgumentType]  # takes any int tensor
-        found_noise, found = self._find(noisy, time, part.condition)
-        restored = self.target.decode(found, pair.degraded, size)
-        noise_error = masked_mean((found_noise - noise).abs(), pair.valid)
+        predicted_noise, predicted_target = self._predict(noisy, time, region.condition)
+        restored = self.target.decode(predicted_target, pair.degraded, size)
+        noise_error = masked_mean((predicted_noise - noise).abs(), pair.valid)
         image_error = masked_mean((restored.image - pair.clean).square(), pair.valid)
-        return (_NOISE_WEIGHT * noise_error + self._kept(time) * image_error).mean()
+        return (_NOISE_WEIGHT * noise_error + self._signal_share(time) * image_error).mean()
 
-    def _find(self, noisy: Tensor, time: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
-        """The noise and the target."""
+    def _predict(self, noisy: Tensor, time: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
+        """Predict the noise and the target."""
         predicted = self.network(noisy, time, condition)
-        kept = self._kept(time).view(-1, 1, 1, 1)
-        signal, spread = kept.sqrt(), (1 - kept).sqrt()
+        share = self._signal_share(time).view(-1, 1, 1, 1)
+        signal, spread = share.sqrt(), (1 - share).sqrt()
         if self.prediction == "epsilon":
             return predicted, (noisy - spread * predicted) / signal
         return spread * noisy + signal * predicted, signal * noisy - spread * predicted
 
-    def _kept(self, time: Tensor) -> Tensor:
+    def _signal_share(self, time: Tensor) -> Tensor:
+        """Return a of the class docstring, (B,)."""
         return self.levels.alphas_cumprod.to(time.device)[time]
 
     @torch.no_grad()
@@ -179,15 +185,167 @@ class Diffusion(Learner):
             key = torch.zeros(len(degraded), dtype=torch.int64)
         condition = conditions(degraded)
 
-        def estimate(noisy: Tensor, time: Tensor) -> Tensor:
-            return self._find(noisy, time, condition)[1].clamp(-1, 1)
+        def predict_target(noisy: Tensor, time: Tensor) -> Tensor:
+            return self._predict(noisy, time, condition)[1].clamp(-1, 1)
 
-        # A lane of its own: the loss of the validation has drawn from the others.
-        source = self._draws(key, 0).at(3)
+        # The loss of a validation draws from lanes 1 and 2 of the same stream.
+        source = self._stream(key, 0).at(3)
         start = normal(source, condition[:, : self.target.channels])
-        target = sample(start, estimate, source.at(4), name=self.sampler, steps=steps)
+        target = sample(start, predict_target, source.at(4), name=self.sampler, steps=steps)
         return self.target.decode(target, degraded, degraded.shape[2:])
 
 
-def _whole(pair: Pair) -> _Part:
-    return _Part(pair, conditions(pair.degraded), pair.clean.shape[2:])
+class Target(nn.Module, ABC):
+    """Represent a restoration by maps in about [-1, 1].
+
+    Buffers that `decode` needs are in the state dict, so that weights of another representation do not fit.
+    """
+
+    channels: int
+
+    @abstractmethod
+    def encode(self, pair: Pair, size: Sequence[int]) -> Tensor:
+        """Encode the true restoration of a pair that was cropped from frames of `size` = (height, width).
+
+        Returns:
+            (B, channels, H, W), in [-1, 1].
+        """
+
+    @abstractmethod
+    def decode(self, target: Tensor, degraded: Tensor, size: Sequence[int]) -> Restored:
+        """Restore images (B, 3, H, W) that were cropped from frames of `size` by their target."""
+
+
+class FlowTarget(Target):
+    """Represent the flow that undoes a warp by its companded value.
+
+        target = sign(r) ln(1 + mu |r|) / ln(1 + mu),  r = flow / (limit (W, H)),  mu = 100
+
+    Most flows of a mix are a few hundredths of the longest one. The noise that a denoiser leaves has the same size
+    everywhere and would hide them if the target were r itself. Companding gives each factor of ten a similar range.
+
+    Args:
+        limit: largest displacement, as a share of the width and the height of the frame.
+
+    Source: the mu-law of ITU-T G.711, Pulse code modulation (1988), with mu = 255 for speech.
+    """
+
+    channels = 2
+    mu: Tensor
+
+    def __init__(self, limit: float):
+        super().__init__()
+        self.limit = limit
+        self.register_buffer("mu", torch.tensor(_MU))
+
+    def encode(self, pair: Pair, size: Sequence[int]) -> Tensor:
+        """Encode the flow, clamped to the limit."""
+        # Invalid pixels may have any flow, and the network sees them next to valid ones.
+        share = (pair.flow / self._limit_px(pair.flow, size)).nan_to_num(0.0).clamp(-1, 1)
+        return torch.log1p(self.mu * share.abs()).copysign(share) / self.mu.log1p()
+
+    def decode(self, target: Tensor, degraded: Tensor, size: Sequence[int]) -> Restored:
+        """Warp the images along the flow."""
+        target = target.clamp(-1, 1)  # from 1 to 2, the inverse of the companding grows by a factor of 100
+        share = torch.expm1(self.mu.log1p() * target.abs()).copysign(target) / self.mu
+        flow = share * self._limit_px(target, size)
+        return Restored(warp(degraded, flow, padding="border")[0], flow)
+
+    def _limit_px(self, like: Tensor, size: Sequence[int]) -> Tensor:
+        return self.limit * as_device_tensor([size[1], size[0]], dtype=like.dtype, device=like.device).view(1, 2, 1, 1)
+
+
+class ImageTarget(Target):
+    """Represent the clean image by 2 clean - 1."""
+
+    channels = 3
+
+    def encode(self, pair: Pair, size: Sequence[int]) -> Tensor:
+        """Map the clean image to [-1, 1]."""
+        return 2 * pair.clean - 1
+
+    def decode(self, target: Tensor, degraded: Tensor, size: Sequence[int]) -> Restored:
+        """Map the target to [0, 1]."""
+        return Restored((target + 1) / 2)
+
+
+def target_of(task: Task) -> Target:
+    """Choose the representation of a task's restoration.
+
+    Raises:
+        TypeError: the task is neither Undistort nor Deweather.
+        ValueError: the task also predicts a transmission.
+    """
+    if isinstance(task, Undistort):
+        return FlowTarget(task.limit)
+    if isinstance(task, Deweather):
+        if task.channels != ImageTarget.channels:
+            raise ValueError("task.transmission_head must be false for a diffusion model, got true")
+        return ImageTarget()
+    raise TypeError(f"task must be Undistort or Deweather for a diffusion model, got {type(task).__name__}")
+
+
+def noise_levels() -> DDPMScheduler:
+    """Create the noise levels of the training: 1000 variances that grow linearly from 0.0001 to 0.02."""
+    return DDPMScheduler(NUM_LEVELS, beta_schedule="linear")
+
+
+def check_steps(name: str, steps: int) -> int:
+    """Return `steps` if it is from 1 to 1000."""
+    if check_count(name, steps) > NUM_LEVELS:
+        raise ValueError(f"{name} must be at most the {NUM_LEVELS} noise levels of the training, got {steps}")
+    return steps
+
+
+def normal(source: Stream, like: Tensor) -> Tensor:
+    """Draw standard normal noise in the shape (B, C, H, W) of `like`; each sample depends only on its own stream."""
+    count = like[0].numel()
+    pairs = white_noise.noise(noise_key(source).to(like.device), -(-count // 2))
+    return pairs.flatten(1)[:, :count].view_as(like)
+
+
+def sample(
+    start: Tensor, predict_target: Callable[[Tensor, Tensor], Tensor], source: Stream, *, name: str, steps: int
+) -> Tensor:
+    """Sample a target, starting from noise.
+
+    "ddpm" adds fresh noise after each step and needs many steps. "ddim" and "dpm_solver" follow the mean path, the
+    latter by second-order steps, of which it needs fewer.
+
+    Args:
+        start: (B, C, H, W), standard normal.
+        predict_target: predicts the target from a noisy one and its level (B,).
+        source: stream of the fresh noise.
+        name: one of SAMPLERS.
+        steps: from 1 to 1000.
+
+    Returns:
+        (B, C, H, W).
+
+    Source: Ho, Jain, Abbeel, "Denoising diffusion probabilistic models", NeurIPS 2020; Song, Meng, Ermon, "Denoising
+    diffusion implicit models", ICLR 2021; Lu et al., "DPM-Solver++", 2022.
+    """
+    scheduler = _scheduler(check_choice("sampler", name, SAMPLERS))
+    # From the highest level down. The spacing of diffusers is uneven, or off by one, if `steps` does not divide 1000.
+    levels = [NUM_LEVELS * (steps - i) // steps - 1 for i in range(check_steps("steps", steps))]
+    scheduler.set_timesteps(timesteps=levels)
+    # CPU generators draw the same numbers for every device.
+    generators = [torch.Generator().manual_seed(word) for word in noise_key(source)[:, 0].tolist()]
+    noisy = start
+    for time in scheduler.timesteps.tolist():
+        target = predict_target(noisy, torch.full((len(start),), time, device=start.device))
+        generator: Any = generators  # the annotation of diffusers allows one generator only
+        noisy = scheduler.step(target, time, noisy, generator=generator, return_dict=False)[0]
+    return noisy
+
+
+def _scheduler(name: str) -> DDPMScheduler | DPMSolverMultistepScheduler:
+    if name == "ddpm":
+        return DDPMScheduler(NUM_LEVELS, beta_schedule="linear", prediction_type="sample", clip_sample=False)
+    # DDIM is the first-order solver. DDIMScheduler of diffusers requires that the steps divide 1000.
+    order = 1 if name == "ddim" else 2
+    return DPMSolverMultistepScheduler(NUM_LEVELS, beta_schedule="linear", prediction_type="sample", solver_order=order)
+
+
+def _whole_region(pair: Pair) -> _Region:
+    return _Region(pair, conditions(pair.degraded), pair.clean.shape[2:])

@@ -1,40 +1,47 @@
-"""What learns to restore pairs: what all networks share, and those that restore in one step."""
+"""The training loop that all networks share, and the module of networks that restore in a single pass."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from diffusers.optimization import get_cosine_schedule_with_warmup
 from pytorch_lightning import LightningModule
 from torch import Tensor, nn
+from torch.optim import Optimizer
 from torch.optim.lr_scheduler import ReduceLROnPlateau
 
-from torchrefract._validation import check_choice, check_count, check_number, check_size
-from torchrefract.restoration.finite import check_finite
+from torchrefract._validation import UsageError, check_choice, check_count, check_number, check_size
+from torchrefract.restoration.checkpoints import rename_weights
 from torchrefract.restoration.metrics import endpoint_error, psnr, ssim
-from torchrefract.restoration.schedules import SCHEDULES, schedule
 from torchrefract.restoration.tasks import Restored, Task
 from torchrefract.types import Pair
 from torchrefract.warping.warp import warp
 
-_NOTHING: tuple[Tensor, ...] = (torch.zeros(0), torch.zeros(0))
+SCHEDULES = ("cosine", "plateau")
+_NO_FLOWS: tuple[Tensor, ...] = (torch.zeros(0), torch.zeros(0))
 
 
-class Learner(LightningModule, ABC):
-    """A network that learns to restore pairs.
+class NotFiniteError(UsageError):
+    """A loss is NaN or infinite; the message names the step, the epoch and the keys of the batch."""
 
-    Logged each epoch: the loss; for val, and for train where a restoration comes with the loss, PSNR in dB and, for a
-    task with a flow, the endpoint error in px at `metric_size`; for val also SSIM, and all scores of the degraded image
-    as it is (`…_identity`) and of the mean flow of the training set (`…_constant`).
+
+class RestorationModule(LightningModule, ABC):
+    """Train and validate a network that restores pairs.
+
+    Logs for each epoch: the loss; PSNR in dB and, for a task with a flow, the endpoint error in px of `metric_size`,
+    for val, and for train if the loss needs a restoration anyway; for val also SSIM and the scores of two baselines:
+    the degraded image (`…_identity`) and the mean flow of the training set (`…_constant`).
 
     Args:
-        network: of this task.
-        task: what is to be restored.
+        network: predicts the maps of the task.
+        task: the kind of restoration.
         lr: peak learning rate of AdamW.
-        weight_decay: of AdamW.
+        weight_decay: weight decay of AdamW.
         warmup_steps: steps of linear warm-up of the schedule "cosine".
-        schedule: of the learning rate, "cosine" down to zero, or "plateau", halved where val/loss stays.
-        metric_size: (height, width) of the frame whose pixels the endpoint error is given in.
+        schedule: "cosine" decays the learning rate to zero; "plateau" halves it when val/loss stops falling.
+        metric_size: (height, width) of the frame whose pixels are the unit of the endpoint error.
     """
 
     def __init__(
@@ -55,100 +62,102 @@ class Learner(LightningModule, ABC):
         self.warmup_steps = check_count("warmup_steps", warmup_steps, low=0)
         self.schedule = check_choice("schedule", schedule, SCHEDULES)
         self.metric_size = check_size("metric_size", metric_size)
-        # For a rival without eyes: flows summed on valid pixels, and how many; of all ranks, and new ones of this one.
-        self.flows, self.new_flows = _NOTHING, _NOTHING
+        # For the constant baseline: the sum of the valid flows (2, H, W) and their number (1, H, W), over all ranks,
+        # and those of this rank that are not yet added.
+        self.flows, self.new_flows = _NO_FLOWS, _NO_FLOWS
 
     @abstractmethod
     def forward(self, degraded: Tensor, key: Tensor | None = None) -> Restored:
-        """The restoration of images (B, 3, H, W) in [0, 1].
+        """Restore images.
 
         Args:
-            degraded: the images.
-            key: (B,), int64, what draws of numbers depend on where a network needs some; None stands for zeros.
+            degraded: (B, 3, H, W), in [0, 1].
+            key: (B,), int64, the keys of the random numbers that a network draws; None stands for zeros.
         """
 
     @abstractmethod
-    def learn(self, batch: Pair) -> tuple[Tensor, Restored | None]:
-        """The loss of a batch of training, and its restoration where that takes no more work."""
+    def training_loss(self, batch: Pair) -> tuple[Tensor, Restored | None]:
+        """Compute the loss () of a training batch; also return the restoration if the loss needs it."""
 
     @abstractmethod
-    def judge(self, batch: Pair) -> tuple[Tensor, Restored]:
-        """The loss of a batch of validation, and its restoration."""
+    def validation_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
+        """Compute the loss () of a validation batch and its restoration."""
 
     def training_step(self, batch: Pair, _: int) -> Tensor:
-        """The loss of a batch.
+        """Compute and log the loss of a batch.
 
         Raises:
-            NotFiniteError: a loss that is NaN or infinite.
+            NotFiniteError: the loss is NaN or infinite.
         """
-        loss, restored = self.learn(batch)
+        loss, restored = self.training_loss(batch)
         check_finite(loss, batch.key, step=self.global_step, epoch=self.current_epoch)
         self._log("train", {"loss": loss} | ({} if restored is None else self._scores(restored, batch)), batch)
-        self._count_flow(batch)
+        self._add_flows(batch)
         return loss
 
     def validation_step(self, batch: Pair, _: int) -> dict[str, Any]:
-        """The scores of a batch, beside those of rivals that need no network."""
-        loss, restored = self.judge(batch)
+        """Log the scores of the model and of the baselines; return the restoration as a dict."""
+        loss, restored = self.validation_loss(batch)
         self._log("val", {"loss": loss}, batch)
-        rivals = {"": restored, "_identity": Restored(batch.degraded)}
+        methods = {"": restored, "_identity": Restored(batch.degraded)}
         if restored.flow is not None:
             constant = self.constant_flow(batch.flow)
-            rivals["_identity"] = Restored(batch.degraded, torch.zeros_like(constant))
-            rivals["_constant"] = Restored(warp(batch.degraded, constant, padding="border")[0], constant)
-        for suffix, rival in rivals.items():
-            scores = self._scores(rival, batch) | {"ssim": ssim(rival.image, batch.clean, batch.valid)}
+            methods["_identity"] = Restored(batch.degraded, torch.zeros_like(constant))
+            methods["_constant"] = Restored(warp(batch.degraded, constant, padding="border")[0], constant)
+        for suffix, result in methods.items():
+            scores = self._scores(result, batch) | {"ssim": ssim(result.image, batch.clean, batch.valid)}
             self._log("val", scores, batch, suffix=suffix)
         return restored._asdict()
 
     def on_validation_start(self) -> None:
-        """The flows that the ranks have seen are put together, for the rival that needs them now."""
+        """Add up the flows of all ranks, because the constant baseline needs them now."""
         self._gather_flows()
 
     def on_train_epoch_end(self) -> None:
-        """The flows that the ranks have seen are put together, for the checkpoint."""
+        """Add up the flows of all ranks, because the checkpoint holds them."""
         self._gather_flows()
 
     def constant_flow(self, like: Tensor) -> Tensor:
-        """The mean of the training set's flows on valid pixels, zero where there was none, in the shape of `like`."""
+        """Return the mean valid flow of the training set in the shape of `like`; 0 without a valid flow."""
         flow_sum, count = self.flows
         if flow_sum.shape != like.shape[1:]:
             return torch.zeros_like(like)
         return (flow_sum / count.clamp(min=1)).to(like).expand_as(like)
 
     def configure_optimizers(self) -> Any:
-        """AdamW with its schedule."""
+        """Create AdamW and its learning rate schedule."""
         optimizer = torch.optim.AdamW(self.parameters(), lr=self.lr, weight_decay=self.weight_decay)
         steps = int(self.trainer.estimated_stepping_batches)
-        scheduler = schedule(self.schedule, optimizer, warmup_steps=self.warmup_steps, steps=steps)
+        scheduler = make_schedule(self.schedule, optimizer, warmup_steps=self.warmup_steps, steps=steps)
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
 
     def on_fit_start(self) -> None:
-        """The seed of the run is kept."""
+        """Keep the seed of the run."""
         self.run_seed = torch.initial_seed()
 
     def on_train_batch_start(self, batch: Pair, batch_idx: int) -> None:
-        """What a network drops depends on the seed of the run and on the step: a run that goes on drops the same."""
+        """Seed dropout by the run and the step, so that a resumed run drops the same units."""
         torch.manual_seed(self.run_seed + self.global_step)
 
     def on_validation_epoch_end(self) -> None:
-        """A plateau is told the loss before the checkpoint is written: Lightning would do it after."""
+        """Step a plateau schedule before the checkpoint is written; Lightning would step it afterwards."""
         plateau = self.lr_schedulers()
         if isinstance(plateau, ReduceLROnPlateau) and not self.trainer.sanity_checking:
             plateau.step(self.trainer.callback_metrics["val/loss"])
 
     def lr_scheduler_step(self, scheduler: Any, metric: Any) -> None:
-        """A step of what is no plateau."""
+        """Step every schedule except a plateau."""
         if not isinstance(scheduler, ReduceLROnPlateau):
             scheduler.step()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """The task, and the flows counted so far, go along."""
+        """Add the task and the sums of the flows to a checkpoint."""
         checkpoint["task"] = self.task.name
         checkpoint["flows"] = self.flows
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """The flows counted so far come back."""
+        """Restore the sums of the flows; rename weights of an older version."""
+        checkpoint["state_dict"] = rename_weights(checkpoint["state_dict"])
         self.flows = checkpoint["flows"]
 
     def _scores(self, restored: Restored, pair: Pair) -> dict[str, Tensor]:
@@ -161,23 +170,23 @@ class Learner(LightningModule, ABC):
         values = {f"{split}/{name}{suffix}": value.mean() for name, value in scores.items()}
         self.log_dict(values, on_step=False, on_epoch=True, batch_size=len(batch.clean), sync_dist=True)
 
-    def _count_flow(self, pair: Pair) -> None:
+    def _add_flows(self, pair: Pair) -> None:
         weight = pair.valid.double()
         self.new_flows = _add(self.new_flows, ((pair.flow.double() * weight).sum(dim=0), weight.sum(dim=0)))
 
     def _gather_flows(self) -> None:
         if len(self.new_flows[0]):
             ranks = (self.trainer.strategy.reduce(value.to(self.device), reduce_op="sum") for value in self.new_flows)
-            self.flows, self.new_flows = _add(self.flows, tuple(ranks)), _NOTHING
+            self.flows, self.new_flows = _add(self.flows, tuple(ranks)), _NO_FLOWS
 
 
-class Restoration(Learner):
-    """A network that restores an image in one step.
+class Restoration(RestorationModule):
+    """Train a network that restores an image in a single pass.
 
     Args:
-        network: makes the network, given the number of channels to predict and whether they are `smooth`, as of `Task`.
-        task: what is to be restored.
-        lr, weight_decay, warmup_steps, schedule, metric_size: as for `Learner`.
+        network: builds the network, called as `network(channels, smooth=...)` with the values of the task.
+        task: the kind of restoration.
+        lr, weight_decay, warmup_steps, schedule, metric_size: see `RestorationModule`.
     """
 
     def __init__(
@@ -195,17 +204,52 @@ class Restoration(Learner):
         super().__init__(network(task.channels, smooth=task.smooth), task, metric_size=metric_size, **options)
 
     def forward(self, degraded: Tensor, key: Tensor | None = None) -> Restored:
-        """The restoration of images (B, 3, H, W) in [0, 1]; no draw, so no key counts."""
+        """Restore images (B, 3, H, W) in [0, 1]. The key has no effect, because nothing is random."""
         return self.task.restore(self.network(degraded), degraded)
 
-    def learn(self, batch: Pair) -> tuple[Tensor, Restored]:
-        """The loss of the task, and the restoration."""
+    def training_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
+        """Compute the loss of the task and the restoration."""
         restored = self(batch.degraded)
         return self.task.loss(restored, batch), restored
 
-    def judge(self, batch: Pair) -> tuple[Tensor, Restored]:
-        """The same as in training."""
-        return self.learn(batch)
+    def validation_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
+        """Compute the loss of the task and the restoration."""
+        return self.training_loss(batch)
+
+
+def check_finite(loss: Tensor, keys: Tensor, *, step: int, epoch: int) -> None:
+    """Raise NotFiniteError unless the loss () is finite.
+
+    The corruption of a frame is drawn from (seed, epoch, key), so the message is enough to repeat the batch.
+
+    Args:
+        loss: the loss of a batch.
+        keys: (B,), the keys of the batch.
+        step: the step of the training.
+        epoch: the epoch of the training.
+    """
+    value = float(loss.detach())
+    if not math.isfinite(value):
+        listed = ", ".join(str(key) for key in keys.tolist())
+        raise NotFiniteError(
+            f"loss must be finite, got {value:g} in step {step} of epoch {epoch} for the keys {listed}"
+        )
+
+
+def make_schedule(name: str, optimizer: Optimizer, *, warmup_steps: int, steps: int) -> dict[str, Any]:
+    """Create a learning rate schedule in the form that Lightning expects.
+
+    Args:
+        name: "cosine", a linear warm-up and a cosine down to zero, or "plateau", which halves the rate after more than
+            5 epochs without a lower val/loss.
+        optimizer: the optimizer to schedule.
+        warmup_steps: steps of the warm-up; at most a tenth of all steps are used.
+        steps: steps of the complete training.
+    """
+    if name == "plateau":
+        return {"scheduler": ReduceLROnPlateau(optimizer, factor=0.5, patience=5), "monitor": "val/loss"}
+    cosine = get_cosine_schedule_with_warmup(optimizer, min(warmup_steps, steps // 10), steps)
+    return {"scheduler": cosine, "interval": "step"}
 
 
 def _add(old: tuple[Tensor, ...], new: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

@@ -1,25 +1,125 @@
-"""Two pictures of a training run: its curves over the epochs, and a panel of examples."""
+"""The report of a training: its curves, a panel of examples, and a table that compares the model with the baselines."""
 
+import csv
+import math
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
+from pytorch_lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from torchrefract._io import replace_file
-from torchrefract.page import Page, as_drawn
-from torchrefract.restoration.history import metrics_rows
-from torchrefract.viz import flow_to_rgb, flow_wheel, full_color_px, hatch_invalid
+from torchrefract.visualization.figures import FigureLayout, resize_for_display
+from torchrefract.restoration.metrics import psnr
+from torchrefract.restoration.module import RestorationModule
+from torchrefract.restoration.tasks import Restored
+from torchrefract.types import Pair
+from torchrefract.visualization.color import flow_to_rgb, flow_wheel, full_color_px, hatch_invalid
+
+METRICS, METRICS_BEFORE = "metrics.csv", "metrics_before.csv"
+_PANEL_ROWS = 4
+_METHODS = {"do nothing": "_identity", "best constant flow": "_constant", "model": ""}
 
 _Columns = dict[str, dict[int, float]]  # name -> epoch -> value
+
+
+class RunSummary(Callback):
+    """Save curves.png and panel.png into the run folder, and print a table that compares the model with the baselines.
+
+    Args:
+        run_dir: the run folder.
+        ckpt_path: the checkpoint that the run resumes from; the metrics next to it are copied into the run folder.
+    """
+
+    def __init__(self, run_dir: str, ckpt_path: str | None = None):
+        self.run_dir = Path(run_dir)
+        self.resumed_run = None if ckpt_path is None else Path(ckpt_path).parent
+        self._rows: PanelRows | None = None
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Copy the metrics of the run that this one resumes."""
+        if self.resumed_run is not None and trainer.is_global_zero:
+            carry_over(self.resumed_run, self.run_dir, before_epoch=trainer.current_epoch)
+
+    def on_validation_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Keep examples of the first batch for the panel."""
+        if batch_idx == 0:
+            self._rows = _choose_rows(Restored(**outputs), batch)
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Save the pictures; print the table and the files of the run."""
+        if self._rows is None or not trainer.is_global_zero or not isinstance(pl_module, RestorationModule):
+            return
+        height, width = pl_module.metric_size
+        # With fast_dev_run, the logger writes no metrics.
+        if stage == "fit" and any(metrics_rows(self.run_dir)):
+            save_curves(self.run_dir, self.run_dir / "curves.png", epe_unit=f"px at {width}x{height}")
+        save_panel(self._rows, self.run_dir / "panel.png")
+        print("\n".join(summary(trainer.callback_metrics, pl_module.metric_size)))
+        print(f"{self.run_dir}: {', '.join(sorted(path.name for path in self.run_dir.iterdir() if path.is_file()))}")
+
+
+def summary(metrics: Mapping[str, Tensor], metric_size: tuple[int, int]) -> list[str]:
+    """Format a table of validation scores with a line for each baseline and for the model."""
+    values = {name.removeprefix("val/"): float(value) for name, value in metrics.items() if name.startswith("val/")}
+    lines = [f"{'validation':<20}{'PSNR (dB)':>18}{'SSIM':>8}"]
+    if "epe" in values:
+        lines[0] += f"{f'endpoint error (px at {metric_size[1]}x{metric_size[0]})':>40}"
+    for name, suffix in _METHODS.items():
+        if f"psnr{suffix}" in values:
+            lines.append(f"{name:<20}" + _format_scores(values, suffix))
+    return lines
+
+
+def _format_scores(values: dict[str, float], suffix: str) -> str:
+    psnr, ssim = values[f"psnr{suffix}"], values[f"ssim{suffix}"]
+    line = f"{psnr:.2f} ({psnr - values['psnr_identity']:+.2f})".rjust(18) + f"{ssim:8.3f}"
+    if "epe" in values:
+        epe = values[f"epe{suffix}"]
+        line += f"{epe:.2f} ({epe / max(values['epe_identity'], 1e-9):.2f} x do nothing)".rjust(40)
+    return line
+
+
+def metrics_rows(run: Path) -> Iterator[dict[str, str]]:
+    """Yield the rows of metrics of a run folder; rows of runs that it resumes come first."""
+    for name in (METRICS_BEFORE, METRICS):
+        if (path := run / name).is_file():
+            with path.open(newline="") as file:
+                yield from csv.DictReader(file)
+
+
+def carry_over(resumed: Path, run: Path, *, before_epoch: int) -> None:
+    """Copy the metrics of the epochs below `before_epoch` from the folder `resumed` into the folder `run`."""
+    rows = [row for row in metrics_rows(resumed) if _epoch_of(row) < before_epoch]
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    if not rows:
+        return
+    with replace_file(run / METRICS_BEFORE) as path, path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, names, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _epoch_of(row: dict[str, str]) -> float:
+    # A killed run can leave an incomplete last row, which lacks its last cells.
+    is_complete = None not in row.values() and row.get("epoch", "").isdigit()
+    return int(row["epoch"]) if is_complete else math.inf
 
 
 class _Style(NamedTuple):
@@ -38,79 +138,78 @@ _STYLES = (
 
 
 def save_curves(run: Path, out: Path, *, epe_unit: str = "px") -> None:
-    """The curves of a run as a picture: loss, PSNR and endpoint error over the epochs, beside what needs no network.
+    """Plot loss, PSNR and endpoint error of a run over its epochs, together with the baselines.
 
-    A quantity whose columns are missing has no panel. Training values are means over an epoch's rows, validation
-    values the last of an epoch; a value that is not finite leaves a gap. A label holds the last value in brackets.
+    A quantity without columns gets no plot. Training values are means over the rows of an epoch, validation values the
+    last of an epoch; a value that is not finite leaves a gap. Labels hold the last value in brackets.
 
     Args:
-        run: the run folder, with the metrics.csv of Lightning's CSVLogger and, after a stop, metrics_before.csv.
-        out: the picture to write; the suffix is its format.
-        epe_unit: the unit of the endpoint error, with the image size that it holds for: "px at 1920x1080".
+        run: the run folder with the metrics.csv of Lightning's CSVLogger and, after a resume, metrics_before.csv.
+        out: the picture to write; its suffix selects the format.
+        epe_unit: the unit of the endpoint error with the image size that it refers to, such as "px at 1920x1080".
+
+    Raises:
+        ValueError: the metrics hold no value to plot.
     """
-    figure = _curves(run, epe_unit=epe_unit)
+    figure = plot_curves(run, epe_unit=epe_unit)
     with replace_file(out) as path:
         figure.savefig(path)
 
 
-def _curves(run: Path, *, epe_unit: str) -> Figure:
+def plot_curves(run: Path, *, epe_unit: str) -> Figure:
+    """Create the figure of `save_curves`."""
     units = {"loss": "loss", "psnr": "PSNR (dB)", "epe": f"endpoint error ({epe_unit})"}
     columns = _read_columns(run, [style.column.format(quantity) for quantity in units for style in _STYLES])
     shown = {q: unit for q, unit in units.items() if any(style.column.format(q) in columns for style in _STYLES)}
     if not shown:
-        raise ValueError(f"metrics must hold a loss, psnr or epe of some epoch, got none in {run}")
+        raise ValueError(f"metrics must hold a loss, psnr or epe of an epoch, got none in {run}")
     figure = Figure(figsize=(4.8 * len(shown), 4.4), dpi=120, layout=ConstrainedLayoutEngine(w_pad=0.12))
     for axes, (quantity, unit) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
-        _draw_quantity(axes, columns, quantity)
+        for style in _STYLES:
+            if column := columns.get(style.column.format(quantity)):
+                _plot_curve(axes, column, style)
+        axes.set_xlabel("epoch")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+        axes.grid(color="#e4e4e4", linewidth=0.8)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False, fontsize=9)
         axes.set_ylabel(unit, parse_math=False)
         axes.set_title(f"{unit.split(' (')[0]}, {'higher' if quantity == 'psnr' else 'lower'} is better", fontsize=11)
     return figure
 
 
-def _draw_quantity(axes: Axes, columns: _Columns, quantity: str) -> None:
-    for style in _STYLES:
-        if column := columns.get(style.column.format(quantity)):
-            _draw_curve(axes, column, style)
-    axes.set_xlabel("epoch")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
-    axes.grid(color="#e4e4e4", linewidth=0.8)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False, fontsize=9)
-
-
-def _draw_curve(axes: Axes, column: dict[int, float], style: _Style) -> None:
+def _plot_curve(axes: Axes, column: dict[int, float], style: _Style) -> None:
     epochs, values = list(column), list(column.values())
     label = f"{style.label} ({values[-1]:.4g})"
-    if style.line == "--" and len(values) == 1:  # one point of a dashed line would not be seen
+    if style.line == "--" and len(values) == 1:  # a dashed line with one point would be invisible
         axes.axhline(values[0], color=style.color, linestyle=style.line, label=label)
         return
-    # Markers also show a point that stands alone between gaps.
+    # Without markers, a single point between gaps would be invisible.
     marker = "" if style.line == "--" else "o"
     axes.plot(epochs, values, style.line, color=style.color, marker=marker, markersize=3, linewidth=1.6, label=label)
 
 
 def _read_columns(run: Path, names: Sequence[str]) -> _Columns:
-    """Those of the columns `names` that have a value at all; a logger leaves most cells of a row empty."""
+    """Read the columns `names` that have a value; a logger leaves most cells of a row empty."""
     cells: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for row in metrics_rows(run):
         for name in names:
             if row.get("epoch") and row.get(name):
                 cells[name][int(row["epoch"])].append(float(row[name]))
-    return {name: {epoch: _of_epoch(name, by[epoch]) for epoch in sorted(by)} for name, by in cells.items()}
+
+    def value(name: str, values: list[float]) -> float:
+        return fmean(values) if name.startswith("train/") else values[-1]
+
+    return {name: {epoch: value(name, epochs[epoch]) for epoch in sorted(epochs)} for name, epochs in cells.items()}
 
 
-def _of_epoch(name: str, values: list[float]) -> float:
-    return fmean(values) if name.startswith("train/") else values[-1]
-
-
-@dataclass(frozen=True)
-class PanelRows:
+class PanelRows(NamedTuple):
     """The N examples of a panel, N from 1 to 8.
 
     degraded, clean, restored: (N, 3, H, W), float in [0, 1].
-    flow, predicted_flow: (N, 2, H, W), px; None where the corruption moves nothing or the network predicts no flow.
-    valid: (N, 1, H, W), bool, the pixels that the degraded image can still give back.
+    valid: (N, 1, H, W), bool, the pixels that can be restored from the degraded image.
     captions: N texts.
+    flow, predicted_flow: (N, 2, H, W), px; None if the corruption or the network has no flow.
     """
 
     degraded: Tensor
@@ -121,44 +220,29 @@ class PanelRows:
     flow: Tensor | None = None
     predicted_flow: Tensor | None = None
 
-    def __post_init__(self) -> None:
-        if self.clean.ndim != 4 or self.clean.shape[1] != 3 or not 1 <= len(self.clean) <= 8:
-            raise ValueError(f"clean must have shape (N, 3, H, W) with N from 1 to 8, got {tuple(self.clean.shape)}")
-        for name, channels in (("degraded", 3), ("restored", 3), ("valid", 1), ("flow", 2), ("predicted_flow", 2)):
-            _check_like(name, getattr(self, name), self.clean, channels=channels)
-        if self.valid.dtype != torch.bool:
-            raise TypeError(f"valid must be of type bool, got {self.valid.dtype}")
-        if len(self.captions) != len(self.clean):
-            raise ValueError(f"captions must be {len(self.clean)} texts, got {len(self.captions)}")
-
 
 def save_panel(rows: PanelRows, out: Path) -> None:
-    """Examples as a picture, one a row: clean, corrupted, restored, then true and predicted flow on one scale.
+    """Draw examples, one a row: clean, corrupted, restored, true flow and predicted flow with a common color scale.
 
-    Where there is no flow, the last column is the error |restored - clean|, four times brighter. Pixels that are not
-    valid are hatched from the third column on; values that are not finite are gray.
+    Without a flow, the last column is |restored - clean| times 4. Invalid pixels are hatched from the third column on;
+    values that are not finite are gray.
 
     Args:
-        rows: what to draw.
-        out: the picture to write; the suffix is its format.
+        rows: the examples.
+        out: the picture to write; its suffix selects the format.
     """
-    figure = _panel(rows)
+    figure = draw_panel(rows)
     with replace_file(out) as path:
         figure.savefig(path)
 
 
-def _check_like(name: str, value: Tensor | None, clean: Tensor, *, channels: int) -> None:
-    shape = (clean.shape[0], channels, *clean.shape[2:])
-    if value is not None and value.shape != shape:
-        raise ValueError(f"{name} must have shape {shape}, got {tuple(value.shape)}")
-
-
-def _panel(rows: PanelRows) -> Figure:
+def draw_panel(rows: PanelRows) -> Figure:
+    """Create the figure of `save_panel`."""
     scale = _full_color_px(rows)
-    columns = _columns(rows, scale)
+    columns = _panel_columns(rows, scale)
     lines = 1 + max(caption.count("\n") for caption in rows.captions)
     height, width = columns["clean"].shape[2:]
-    page = Page(len(rows.clean), len(columns), height, width, lines)
+    page = FigureLayout(len(rows.clean), len(columns), height, width, lines)
     figure = page.figure()
     for j, (title, images) in enumerate(columns.items()):
         page.write(figure, title, page.left(j) + page.width / 2, 2 * page.text, ha="center", weight="bold")
@@ -166,30 +250,50 @@ def _panel(rows: PanelRows) -> Figure:
             page.show(figure, image, page.left(j), page.top(i))
     for i, caption in enumerate(rows.captions):
         page.write(figure, caption, page.left(0), page.top(i) - 0.3 * page.text)
-    _draw_key(figure, page, rows, scale)
+    _draw_legend(figure, page, rows, scale)
     return figure
 
 
-def _columns(rows: PanelRows, scale: float) -> dict[str, Tensor]:
-    """Title -> (N, 3, height, width), in the pixels that they are drawn with."""
+def _choose_rows(restored: Restored, pair: Pair) -> PanelRows:
+    """Choose examples evenly, sorted by degradation, so that a mix of effects shows several kinds."""
+    before, after = (psnr(image, pair.clean, pair.valid) for image in (pair.degraded, restored.image))
+    total, count = len(pair.clean), min(_PANEL_ROWS, len(pair.clean))
+    rows = before.argsort(stable=True)[[i * total // count for i in range(count)]]
+
+    def chosen(value: Tensor) -> Tensor:
+        return value[rows].detach().float().cpu()
+
+    return PanelRows(
+        degraded=chosen(pair.degraded),
+        clean=chosen(pair.clean),
+        restored=chosen(restored.image).clamp(0, 1),
+        valid=chosen(pair.valid) > 0,
+        captions=[f"{before[row]:.1f} -> {after[row]:.1f} dB" for row in rows.tolist()],
+        flow=None if restored.flow is None else chosen(pair.flow),
+        predicted_flow=None if restored.flow is None else chosen(restored.flow),
+    )
+
+
+def _panel_columns(rows: PanelRows, scale: float) -> dict[str, Tensor]:
+    """Return title -> (N, 3, height, width), one value for each drawn pixel."""
     derived = {"restored": rows.restored}
     for title, flow in (("true flow", rows.flow), ("predicted flow", rows.predicted_flow)):
         if flow is not None:
             derived[title] = flow_to_rgb(flow, max_px=scale)
     if len(derived) == 1:
         derived["|restored - clean| x 4"] = 4 * (rows.restored - rows.clean).abs()
-    hatched = {title: hatch_invalid(as_drawn(image), rows.valid) for title, image in derived.items()}
-    return {"clean": as_drawn(rows.clean), "corrupted": as_drawn(rows.degraded)} | hatched
+    hatched = {title: hatch_invalid(resize_for_display(image), rows.valid) for title, image in derived.items()}
+    return {"clean": resize_for_display(rows.clean), "corrupted": resize_for_display(rows.degraded)} | hatched
 
 
 def _full_color_px(rows: PanelRows) -> float:
-    """The scale of the true flow, if it moves anything; a stray prediction must not pale the truth."""
-    moving = [flow for flow in (rows.flow, rows.predicted_flow) if flow is not None and flow.any()]
-    return full_color_px(moving[0], rows.valid) if moving else 1.0
+    """Return the color scale of the true flow if it has one, so that a bad prediction cannot make it pale."""
+    flows = [flow for flow in (rows.flow, rows.predicted_flow) if flow is not None and flow.any()]
+    return full_color_px(flows[0], rows.valid) if flows else 1.0
 
 
-def _draw_key(figure: Figure, page: Page, rows: PanelRows, scale: float) -> None:
-    """A stripe below all rows: what hatching means and, where there is flow, the color wheel with its scale."""
+def _draw_legend(figure: Figure, page: FigureLayout, rows: PanelRows, scale: float) -> None:
+    """Explain the hatching and the colors of a flow below the last row."""
     text, y = page.text, page.top(page.rows) - page.text
     if not rows.valid.all():
         stripes = hatch_invalid(torch.zeros(1, 3, page.height, page.width), torch.zeros(1, 1, 1, 1, dtype=torch.bool))

@@ -1,4 +1,4 @@
-"""The two tasks: what a network predicts, how an image comes of it, and what that costs."""
+"""The two tasks: how a prediction of a network restores an image, and the loss of that restoration."""
 
 from abc import ABC, abstractmethod
 from typing import NamedTuple
@@ -12,23 +12,28 @@ from torchrefract.restoration.metrics import masked_mean
 from torchrefract.types import Pair
 from torchrefract.warping.warp import warp
 
-_CELL = 4
+_CELL = 4  # px
 
 
 class Restored(NamedTuple):
-    """A restoration of a batch."""
+    """A restored batch of images.
 
-    image: Tensor  # (B, 3, H, W)
-    flow: Tensor | None = None  # (B, 2, H, W), px, of a task that predicts one
-    transmission: Tensor | None = None  # (B, 1, H, W) in (0, 1), of a task that predicts it
+    image: (B, 3, H, W).
+    flow: (B, 2, H, W), px; None for a task without a flow.
+    transmission: (B, 1, H, W) in (0, 1); None for a task without a transmission.
+    """
+
+    image: Tensor
+    flow: Tensor | None = None
+    transmission: Tensor | None = None
 
 
 class Task(ABC):
-    """What is to be restored.
+    """A kind of restoration.
 
-    name: that of its file in conf/task.
-    channels: how many maps the network has to predict.
-    smooth: whether these may be smooth over the whole frame.
+    name: the name of its file in conf/task.
+    channels: number of maps that the network predicts.
+    smooth: True if the maps may be smooth over the whole frame.
     """
 
     name: str
@@ -37,28 +42,30 @@ class Task(ABC):
 
     @abstractmethod
     def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
-        """The restoration that a prediction stands for.
+        """Restore images by the prediction of a network.
 
         Args:
-            prediction: (B, channels, H, W), or of cells of 4 px, (B, channels, ceil(H / 4), ceil(W / 4)).
+            prediction: (B, channels, H, W), or one value for each cell of 4 x 4 px,
+                (B, channels, ceil(H / 4), ceil(W / 4)).
             degraded: (B, 3, H, W), in [0, 1].
         """
 
     @abstractmethod
     def loss(self, restored: Restored, pair: Pair) -> Tensor:
-        """(), the mean over the batch."""
+        """Compute the loss (), the mean over the batch."""
 
 
 class Undistort(Task):
-    """The flow that undoes a warp is predicted, and the image looked up along it.
+    """Predict the flow that undoes a warp, and warp the degraded image along it.
 
-        flow = limit tanh(prediction) (W, H),  loss = |warp(degraded, flow) - clean|_1 + |flow - true flow|_1,
+        flow = limit tanh(prediction) (W, H)
+        loss = mean |warp(degraded, flow) - clean| + mean |flow - true flow| 2 / (W, H)
 
-    on the valid pixels, the flow in units of half the frame as in [-1, 1]. A prediction of pixels is averaged over
-    cells of 4 px, and that of cells interpolated: a lens is smooth.
+    Both means are over valid pixels. A prediction of pixels is averaged over cells of 4 x 4 px, and the cells are
+    interpolated, because the flow of a lens is smooth.
 
     Args:
-        limit: largest displacement in widths and heights of the frame.
+        limit: largest displacement, as a share of the width and the height of the frame.
     """
 
     name = "undistort"
@@ -69,27 +76,27 @@ class Undistort(Task):
         self.limit = limit
 
     def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
-        """The degraded image looked up along the predicted flow."""
-        smooth = _between_cells(_cells(prediction.float(), degraded), degraded)
-        flow = self.limit * torch.tanh(smooth) * _sizes(smooth)
+        """Warp the degraded image along the predicted flow."""
+        smooth = _interpolate_cells(_average_cells(prediction.float(), degraded), degraded)
+        flow = self.limit * torch.tanh(smooth) * _frame_size(smooth)
         return Restored(warp(degraded, flow, padding="border")[0], flow)
 
     def loss(self, restored: Restored, pair: Pair) -> Tensor:
-        """L1 of the image and of the flow."""
+        """Compute the L1 loss of image and flow."""
         flow = torch.zeros_like(pair.flow) if restored.flow is None else restored.flow
-        flow_error = (flow - pair.flow).abs() * 2 / _sizes(pair.flow)
+        flow_error = (flow - pair.flow).abs() * 2 / _frame_size(pair.flow)
         image_error = masked_mean((restored.image - pair.clean).abs(), pair.valid)
         return (image_error + masked_mean(flow_error, pair.valid)).mean()
 
 
 class Deweather(Task):
-    """The clean image is predicted, as a change of the degraded one, and, if wanted, the transmission of the air.
+    """Predict the change from the degraded to the clean image and, optionally, the transmission of the fog.
 
-        restored = degraded + change,  t = 1 / (1 + exp(-last channel)),
-        loss = |restored - clean|_1 + |t - transmission|_1 on all pixels
+        restored = degraded + change,  t = 1 / (1 + exp(-last channel))
+        loss = mean |restored - clean| + mean |t - transmission|, over all pixels
 
     Args:
-        transmission_head: whether there is a channel for t, and its term in the loss.
+        transmission_head: True adds a channel for t, and its term to the loss.
     """
 
     name = "deweather"
@@ -99,17 +106,17 @@ class Deweather(Task):
         self.channels = 4 if transmission_head else 3
 
     def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
-        """The degraded image plus the predicted change."""
-        found = prediction.float()
-        found = found if _is_dense(found, degraded) else _between_cells(found, degraded)
-        passed = torch.sigmoid(found[:, 3:]) if self.transmission_head else None
-        return Restored(degraded + found[:, :3], transmission=passed)
+        """Add the predicted change to the degraded image."""
+        maps = prediction.float()
+        maps = maps if _is_dense(maps, degraded) else _interpolate_cells(maps, degraded)
+        transmission = torch.sigmoid(maps[:, 3:]) if self.transmission_head else None
+        return Restored(degraded + maps[:, :3], transmission=transmission)
 
     def loss(self, restored: Restored, pair: Pair) -> Tensor:
-        """L1 of the image and, if predicted, of the transmission.
+        """Compute the L1 loss of the image and, with `transmission_head`, of the transmission.
 
         Raises:
-            ValueError: a transmission is predicted, and the pair has none.
+            ValueError: the restoration has a transmission and the pair has none.
         """
         image_error = (restored.image - pair.clean).abs().mean()
         if restored.transmission is None:
@@ -125,22 +132,22 @@ def _is_dense(prediction: Tensor, degraded: Tensor) -> bool:
     return prediction.shape[2:] == degraded.shape[2:]
 
 
-def _cells(prediction: Tensor, degraded: Tensor) -> Tensor:
-    """The means of cells, where the prediction is not of cells already."""
+def _average_cells(prediction: Tensor, degraded: Tensor) -> Tensor:
+    """Average a prediction of pixels over cells; return a prediction of cells unchanged."""
     if not _is_dense(prediction, degraded):
         return prediction
     height, width = degraded.shape[2:]
-    # Whole cells only, or the flow would be stretched along a side that 4 does not divide.
+    # Pad to full cells. Otherwise the flow would be stretched along a side that 4 does not divide.
     return F.avg_pool2d(F.pad(prediction, (0, -width % _CELL, 0, -height % _CELL), mode="replicate"), _CELL)
 
 
-def _between_cells(cells: Tensor, degraded: Tensor) -> Tensor:
-    """The values of pixels, interpolated between the centers of cells."""
+def _interpolate_cells(cells: Tensor, degraded: Tensor) -> Tensor:
+    """Interpolate between the centers of cells to one value for each pixel."""
     height, width = degraded.shape[2:]
-    whole = F.interpolate(cells, size=[_CELL * side for side in cells.shape[2:]], mode="bicubic", antialias=True)
-    return whole[:, :, :height, :width]
+    size = [_CELL * side for side in cells.shape[2:]]
+    return F.interpolate(cells, size=size, mode="bicubic", antialias=True)[:, :, :height, :width]
 
 
-def _sizes(flow: Tensor) -> Tensor:
-    """(1, 2, 1, 1): width and height."""
+def _frame_size(flow: Tensor) -> Tensor:
+    """Return width and height, (1, 2, 1, 1)."""
     return torch.tensor([flow.shape[3], flow.shape[2]], dtype=flow.dtype, device=flow.device).view(1, 2, 1, 1)

@@ -7,6 +7,7 @@ from diffusers import UNet2DModel
 from torch import Tensor
 from torch.testing import assert_close
 
+from torchrefract.restoration.models.coordconv import pixel_coordinates
 from torchrefract.restoration.models.denoiser import Denoiser, conditions
 
 TINY = {"widths": (8, 16), "attention": (False, True), "layers": 1, "groups": 4}
@@ -14,7 +15,7 @@ tiny = partial(Denoiser, **TINY)
 
 
 def published(widths: tuple[int, ...] = (8, 16), **changes) -> UNet2DModel:
-    """A network for pictures as a hub has it, of the kind of google/ddpm-cat-256."""
+    """Return a network for pictures of the kind of google/ddpm-cat-256."""
     options = {
         "sample_size": 16,
         "in_channels": 3,
@@ -50,81 +51,81 @@ def count(denoiser: Denoiser) -> int:
     return sum(parameter.numel() for parameter in denoiser.parameters())
 
 
-def test_the_default_is_the_light_one_and_the_other_configuration_that_of_the_published_network():
+def test_the_default_has_36_million_parameters_and_the_published_configuration_114_million():
     with torch.device("meta"):
         light = Denoiser(3)
         cat = Denoiser(3, widths=(128, 128, 256, 256, 512, 512), attention=(False,) * 4 + (True, False))
     assert 35.0e6 < count(light) < 36.5e6
-    # The published one has 113 673 219, with three channels in; five more of them meet 128 kernels of 3 x 3.
+    # The published network has 113 673 219. Five more input channels add weights to 128 kernels of 3 x 3.
     assert count(cat) == 113_673_219 + 5 * 128 * 9
 
 
-def test_the_conditions_are_the_image_and_where_its_pixels_lie():
+@pytest.mark.quick
+def test_the_conditions_are_the_image_and_the_pixel_coordinates():
     image = torch.rand(2, 3, 4, 5, generator=torch.Generator().manual_seed(0))
-    found = conditions(image)
-    assert_close(found[:, :3], 2 * image - 1)
-    assert_close(found[1, 3], torch.tensor([-0.8, -0.4, 0.0, 0.4, 0.8]).expand(4, 5))
-    assert_close(found[1, 4], torch.tensor([-0.75, -0.25, 0.25, 0.75])[:, None].expand(4, 5))
+    assert_close(conditions(image)[:, :3], 2 * image - 1)
+    assert_close(conditions(image)[:, 3:], pixel_coordinates(image))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (9, 16)])
-def test_a_frame_of_any_size_is_that_of_whole_strides_with_its_border_repeated(size):
+def test_a_frame_of_any_size_is_padded_to_the_stride_by_its_border_pixels(size):
     torch.manual_seed(0)
     denoiser = tiny(2)
     noisy, time, condition = inputs(2, size)
-    found = denoiser(noisy, time, condition)
+    output = denoiser(noisy, time, condition)
     rows, columns = (torch.arange(side + side % 2).clamp(max=side - 1) for side in size)
-    whole = (value[:, :, rows][:, :, :, columns] for value in (noisy, condition))
-    expected = denoiser.network(torch.cat(list(whole), dim=1), time).sample[:, :, : size[0], : size[1]]
-    assert found.shape == noisy.shape
-    assert_close(found, expected)
+    padded = (value[:, :, rows][:, :, :, columns] for value in (noisy, condition))
+    expected = denoiser.network(torch.cat(list(padded), dim=1), time).sample[:, :, : size[0], : size[1]]
+    assert output.shape == noisy.shape
+    assert_close(output, expected)
 
 
-def test_the_noise_found_depends_on_all_that_is_given():
+def test_the_output_depends_on_all_inputs():
     torch.manual_seed(0)
     denoiser = tiny(3)
     noisy, time, condition = inputs(3)
-    found = denoiser(noisy, time, condition)
+    output = denoiser(noisy, time, condition)
     for changed in ((noisy + 1, time, condition), (noisy, time + 200, condition), (noisy, time, condition.flip(3))):
-        assert float((denoiser(*changed) - found).detach().abs().amax()) > 1e-3
+        assert float((denoiser(*changed) - output).detach().abs().amax()) > 1e-3
 
 
 @pytest.mark.parametrize("channels", [3, 2, 4])
-def test_pretrained_weights_find_at_first_what_they_found_on_pictures(folder, channels):
+def test_a_pretrained_network_first_predicts_what_it_predicts_for_pictures(folder, channels):
     denoiser = tiny(channels, pretrained=folder)
     noisy, time, condition = inputs(channels)
     common = min(3, channels)
-    # Of fewer channels the ones that are missing are zeros to the published network.
+    # For the published network, missing channels are zeros.
     picture = torch.zeros(2, 3, 8, 12)
     picture[:, :common] = noisy[:, :common]
     expected = UNet2DModel.from_pretrained(folder, low_cpu_mem_usage=False)(picture, time).sample
-    found = denoiser(noisy, time, condition)
-    assert_close(found[:, :common], expected[:, :common])
-    assert not found[:, common:].any()
+    output = denoiser(noisy, time, condition)
+    assert_close(output[:, :common], expected[:, :common])
+    assert not output[:, common:].any()
 
 
 def test_a_pretrained_encoder_is_frozen_and_a_random_one_is_not(folder):
-    learned = {name for name, value in tiny(2, pretrained=folder).network.named_parameters() if value.requires_grad}
-    everything = {name for name, value in tiny(2).network.named_parameters() if value.requires_grad}
-    assert {name for name in everything - learned if not name.startswith("down_blocks.")} == set()
-    assert not [name for name in learned if name.startswith("down_blocks.")]
-    assert "conv_in.weight" in learned
+    trained, everything = (
+        {name for name, value in denoiser.network.named_parameters() if value.requires_grad}
+        for denoiser in (tiny(2, pretrained=folder), tiny(2))
+    )
+    assert everything - trained == {name for name in everything if name.startswith("down_blocks.")}
 
 
-def test_weights_of_another_network_are_named(tmp_path):
-    published(widths=(8, 12)).save_pretrained(tmp_path)
-    with pytest.raises(ValueError, match=r"pretrained must be a network with block_out_channels = \[8, 16\], got .*12"):
-        tiny(2, pretrained=str(tmp_path))
-
-
-def test_weights_of_another_embedding_of_time_are_named(tmp_path):
-    published(freq_shift=0).save_pretrained(tmp_path)
-    with pytest.raises(ValueError, match=r"pretrained must be a network with freq_shift = 1, got .*, where it is 0"):
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"widths": (8, 12)}, r"block_out_channels = \[8, 16\], got .*, where it is \[8, 12\]"),
+        ({"freq_shift": 0}, r"freq_shift = 1, got .*, where it is 0"),
+    ],
+)
+def test_weights_of_another_network_are_rejected(tmp_path, changes, message):
+    published(**changes).save_pretrained(tmp_path)
+    with pytest.raises(ValueError, match=f"pretrained must be a network with {message}"):
         tiny(2, pretrained=str(tmp_path))
 
 
 @pytest.mark.parametrize("broken", ["nothing", "config", "weights"])
-def test_a_folder_that_holds_no_network_names_the_option_that_avoids_it(folder, tmp_path, broken):
+def test_a_folder_without_a_network_names_the_option_that_avoids_it(folder, tmp_path, broken):
     if broken == "nothing":
         folder = str(tmp_path / "none")
     if broken == "config":
@@ -135,7 +136,7 @@ def test_a_folder_that_holds_no_network_names_the_option_that_avoids_it(folder, 
         tiny(2, pretrained=folder)
 
 
-def test_a_name_on_a_hub_that_cannot_be_reached_names_the_option_that_avoids_it(monkeypatch):
+def test_an_unreachable_hub_names_the_option_that_avoids_it(monkeypatch):
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     with pytest.raises(ValueError, match=r"got nobody/nothing: add model.network.pretrained=null"):
         tiny(2, pretrained="nobody/nothing")
@@ -151,6 +152,6 @@ def test_a_name_on_a_hub_that_cannot_be_reached_names_the_option_that_avoids_it(
         ({"layers": 0}, "layers must be at least 1, got 0"),
     ],
 )
-def test_a_size_that_is_none_is_named(words, message):
+def test_an_invalid_size_is_named(words, message):
     with pytest.raises(ValueError, match=message):
         Denoiser(2, **TINY | words)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrefract._validation import UsageError
 from torchrefract.data.frames import assign_frames, list_files, path_key, select_val_drives
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, as_image, fit, pixels_of, read_pixels
-from torchrefract.videos import VIDEOS, read_video, video_facts
+from torchrefract.data.media import VIDEOS, read_video, video_info
 
 
 class Source(NamedTuple):
@@ -138,7 +138,7 @@ def find_sources(
 
 
 def _find_video_frames(root: Path, paths: Sequence[str], every: int, val_share: float, seed: int) -> Sources:
-    counts = {path: video_facts(root / path)[0] for path in paths}
+    counts = {path: video_info(root / path)[0] for path in paths}
     frames = [(path, index) for path in paths for index in range(0, counts[path], every)]
     if not frames:
         raise UsageError(f"source must be a video with frames, or hold one, got {root} with {', '.join(paths[:3])}")

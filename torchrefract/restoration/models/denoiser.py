@@ -8,33 +8,33 @@ from diffusers import UNet2DModel
 from torch import Tensor, nn
 
 from torchrefract._validation import check_count
-from torchrefract.restoration.models.places import places
+from torchrefract.restoration.models.coordconv import pixel_coordinates
 
-_CONDITIONS = 5  # the image, and the pixel coordinates
-# Of the published network these follow from what is restored, and do not make it another one.
-_FREE = ("in_channels", "out_channels", "sample_size")
+_CONDITION_CHANNELS = 5  # the image and the coordinates of its pixels
+# These options follow from the task. A published network may differ in them.
+_FREE_OPTIONS = ("in_channels", "out_channels", "sample_size")
 
 
 class Denoiser(nn.Module):
-    """What `Diffusion` wants predicted of a noisy target, from it, its level of noise, and what it belongs to.
+    """Predict noise or velocity of a noisy target, given its noise level and the degraded image.
 
-    The network of denoising diffusion models, by default that of 35.7 M parameters with its attention at the coarsest
-    scale, where large frames can afford it. Weights that were trained before on pictures keep what they know: the
-    first channels of the target stand for colors, and what the network has not seen counts for nothing at first. Their
-    encoder is frozen.
+    The network of denoising diffusion models. The default has 35.7 M parameters and attention at the coarsest scale
+    only, which large frames can afford. Pretrained weights keep their function at the start: the first channels of the
+    target take the place of the colors, and the weights of all new channels start at zero. A pretrained encoder is
+    frozen.
 
     Args:
-        channels: of the target.
-        widths: channels at each scale, from the finest; multiples of `groups`.
-        attention: at which scales there is some.
-        layers: blocks at each scale.
-        groups: of the group norms.
-        pretrained: weights to start from, of the same widths, attention, layers and groups: the name of a repository
-            on the hub, such as google/ddpm-cat-256, or a folder that `UNet2DModel.save_pretrained` wrote.
+        channels: number of channels of the target.
+        widths: channels of each scale, from the finest; multiples of `groups`.
+        attention: True for each scale with attention.
+        layers: blocks of each scale.
+        groups: groups of the group norms.
+        pretrained: weights to start from, of the same widths, attention, layers and groups: the name of a repository on
+            the Hugging Face hub, such as google/ddpm-cat-256, or a folder written by `UNet2DModel.save_pretrained`.
 
     Raises:
-        ValueError: widths and attention of different lengths or empty, widths that the groups do not divide, pretrained
-            weights that cannot be had, or are those of another network.
+        ValueError: widths and attention differ in length or are empty; widths are no multiples of groups; the
+            pretrained weights are unavailable or belong to another network.
 
     Source: Ho, Jain, Abbeel, "Denoising diffusion probabilistic models", NeurIPS 2020.
     """
@@ -55,14 +55,14 @@ class Denoiser(nn.Module):
         if any(width % check_count("groups", groups) for width in widths):
             raise ValueError(f"widths must be multiples of groups = {groups}, got {list(widths)}")
         self.network = UNet2DModel(
-            in_channels=channels + _CONDITIONS,
+            in_channels=channels + _CONDITION_CHANNELS,
             out_channels=channels,
             block_out_channels=tuple(widths),
             down_block_types=tuple("AttnDownBlock2D" if at else "DownBlock2D" for at in attention),
             up_block_types=tuple("AttnUpBlock2D" if at else "UpBlock2D" for at in reversed(attention)),
             layers_per_block=check_count("layers", layers),
             norm_num_groups=groups,
-            # As in the published network, where diffusers has other defaults.
+            # The defaults of diffusers differ from the published network here.
             attention_head_dim=None,
             downsample_padding=0,
             flip_sin_to_cos=False,
@@ -71,16 +71,19 @@ class Denoiser(nn.Module):
         )
         self.stride = 2 ** (len(widths) - 1)
         if pretrained is not None:
-            _take_over(self.network, _published(pretrained), pretrained)
+            _copy_weights(self.network, _load_published(pretrained), pretrained)
             self.network.down_blocks.requires_grad_(False)
 
     def forward(self, noisy: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-        """(B, channels, H, W), float32: the noise, or whatever else it was trained to predict.
+        """Predict the noise, or the velocity, of a noisy target of any size.
 
         Args:
-            noisy: (B, channels, H, W), the target with noise, of any size.
-            time: (B,), int64, the step of the noise.
-            condition: (B, 5, H, W), of `conditions`.
+            noisy: (B, channels, H, W).
+            time: (B,), int64, the noise level.
+            condition: (B, 5, H, W), as of `conditions`.
+
+        Returns:
+            (B, channels, H, W), float32.
         """
         height, width = noisy.shape[2:]
         inputs = torch.cat([noisy, condition], dim=1)
@@ -89,12 +92,11 @@ class Denoiser(nn.Module):
 
 
 def conditions(image: Tensor) -> Tensor:
-    """(B, 5, H, W), in [-1, 1]: an image (B, 3, H, W) in [0, 1], and the `places` of its pixels."""
-    return torch.cat([2 * image - 1, places(image)], dim=1)
+    """Stack an image (B, 3, H, W) in [0, 1], mapped to [-1, 1], and its pixel coordinates to (B, 5, H, W)."""
+    return torch.cat([2 * image - 1, pixel_coordinates(image)], dim=1)
 
 
-def _published(name: str) -> UNet2DModel:
-    """The network of a folder or of the hub."""
+def _load_published(name: str) -> UNet2DModel:
     try:
         return UNet2DModel.from_pretrained(name, low_cpu_mem_usage=False)
     except (OSError, ValueError, RuntimeError) as error:
@@ -105,14 +107,14 @@ def _published(name: str) -> UNet2DModel:
         ) from error
 
 
-def _take_over(network: UNet2DModel, published: UNet2DModel, name: str) -> None:
-    """The published weights, in the channels that both networks have; those that are new begin at zero."""
-    for key in sorted(network.config.keys() - {*_FREE}):
-        ours, theirs = (_plain(made.config.get(key)) for made in (network, published))
+def _copy_weights(network: UNet2DModel, published: UNet2DModel, name: str) -> None:
+    """Copy the published weights into the channels that both networks have; set all other weights to zero."""
+    for key in sorted(network.config.keys() - {*_FREE_OPTIONS}):
+        ours, theirs = (_as_list(model.config.get(key)) for model in (network, published))
         if ours != theirs and not key.startswith("_"):
             raise ValueError(f"pretrained must be a network with {key} = {ours}, got {name}, where it is {theirs}")
     weights = published.state_dict()
-    # Of the inputs the target alone is like theirs; the image that comes after it is not.
+    # Only the channels of the target correspond to the published input; the condition follows them.
     weights["conv_in.weight"] = weights["conv_in.weight"][:, : network.config["out_channels"]]
     for key, ours in network.state_dict().items():
         theirs = weights[key]
@@ -120,5 +122,5 @@ def _take_over(network: UNet2DModel, published: UNet2DModel, name: str) -> None:
         ours.zero_()[common] = theirs[common]
 
 
-def _plain(value: object) -> object:
+def _as_list(value: object) -> object:
     return list(value) if isinstance(value, list | tuple) else value

@@ -1,4 +1,4 @@
-"""ImageNet weights of encoders, from the hub or from a folder that lies as the hub's do."""
+"""ImageNet weights of encoders, from the Hugging Face hub or from a folder with the same files."""
 
 import json
 import warnings
@@ -15,14 +15,14 @@ from safetensors.torch import load_file
 
 HUB = "imagenet"
 _CONFIG, _TENSORS = "config.json", "model.safetensors"
-_TIMM = "tu-"  # how segmentation-models-pytorch calls the encoders of timm
+_TIMM = "tu-"  # the prefix of timm's encoders in segmentation-models-pytorch
 _MIT_LICENSE = "NVIDIA Source Code License for SegFormer, non-commercial: for research and evaluation only"
-# What the libraries raise of an encoder that they do not know, and of a file that is damaged or of another one.
-_UNFIT = (SafetensorError, KeyError, RuntimeError, ValueError)
+# The libraries raise these for an unknown encoder and for a damaged or unfitting file.
+_LOAD_ERRORS = (SafetensorError, KeyError, RuntimeError, ValueError)
 
 
 class Weights(NamedTuple):
-    """Where an encoder's weights lie, and what they were trained on."""
+    """The weights file of an encoder and the colors that it was trained on."""
 
     file: Path  # safetensors
     mean: tuple[float, ...]  # of the colors in [0, 1]
@@ -30,15 +30,16 @@ class Weights(NamedTuple):
 
 
 def find_weights(encoder: str, pretrained: str) -> Weights:
-    """The ImageNet weights of an encoder; a warning names their license where it is a non-commercial one.
+    """Locate the ImageNet weights of an encoder; warn of a non-commercial license.
 
     Args:
-        encoder: a name known to segmentation-models-pytorch; "tu-…" is timm's.
-        pretrained: "imagenet", which is fetched from the hub once, or a folder with the config.json and the
-            model.safetensors of the encoder's place on the hub.
+        encoder: a name of segmentation-models-pytorch; "tu-…" selects an encoder of timm.
+        pretrained: "imagenet", which downloads them from the hub once, or a folder with the config.json and the
+            model.safetensors of the encoder's repository on the hub.
 
     Raises:
-        ValueError: a hub that cannot be reached, an encoder that it does not have, no such folder, other files in it.
+        ValueError: the hub cannot be reached or lacks the encoder; the folder is missing, incomplete, or of another
+            encoder.
     """
     folder = _fetch(encoder) if pretrained == HUB else Path(pretrained).expanduser()
     if missing := [name for name in (_CONFIG, _TENSORS) if not (folder / name).is_file()]:
@@ -48,43 +49,44 @@ def find_weights(encoder: str, pretrained: str) -> Weights:
         )
     try:
         config = json.loads((folder / _CONFIG).read_text(encoding="utf-8"))
-        colors = config.get("pretrained_cfg", config)  # timm has them one level down
-        found = Weights(folder / _TENSORS, tuple(map(float, colors["mean"])), tuple(map(float, colors["std"])))
+        colors = config.get("pretrained_cfg", config)  # timm nests them one level deeper
+        weights = Weights(folder / _TENSORS, tuple(map(float, colors["mean"])), tuple(map(float, colors["std"])))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"pretrained must have mean and std in its {_CONFIG}, got {folder}") from error
-    # timm takes what fits of another architecture, and leaves the rest as it was drawn.
+    # timm loads the weights that fit of another architecture and silently keeps random ones for the rest.
     if encoder.startswith(_TIMM) and config.get("architecture") != encoder.removeprefix(_TIMM).partition(".")[0]:
         raise ValueError(f"pretrained must be weights of {encoder}, got {folder} of {config.get('architecture')}")
     if (name := weights_license(encoder)) and ("non-commercial" in name or "-nc" in name):
         warnings.warn(f"the pretrained weights of {encoder} come under this license: {name}", stacklevel=2)
-    return found
+    return weights
 
 
 def load_network(architecture: Callable[..., Any], encoder: str, weights: Weights | None, *, channels: int) -> Any:
-    """A network of segmentation-models-pytorch for three colors, its encoder drawn, or with given weights.
+    """Build a network of segmentation-models-pytorch for three colors; without weights its encoder is random.
 
     Raises:
-        ValueError: an encoder that is not known, or not of this kind; weights of another one, or damaged ones.
+        ValueError: the encoder is unknown or has no features at five scales; the weights are damaged or of another
+            encoder.
     """
-    # timm loads weights while it makes the encoder, for it renames them.
+    # timm renames weights while it builds the encoder, so it must load them itself.
     by_timm = weights is not None and encoder.startswith(_TIMM)
     options = {"pretrained_cfg_overlay": {"file": str(weights.file)}} if weights and by_timm else {}
     try:
         network = architecture(encoder, encoder_weights=by_timm or None, in_channels=3, classes=channels, **options)
         if weights is not None and not by_timm:
             network.encoder.load_state_dict(load_file(weights.file))
-    except _UNFIT as error:
+    except _LOAD_ERRORS as error:
         if weights is not None:
-            raise ValueError(f"pretrained must hold whole weights of {encoder}, got {weights.file}") from error
+            raise ValueError(f"pretrained must hold intact weights of {encoder}, got {weights.file}") from error
         raise ValueError(
-            "encoder must be known to segmentation-models-pytorch, or to timm with tu- in front, and have features "
-            f"at five scales, got {encoder}"
+            "encoder must be a name of segmentation-models-pytorch, or tu- and a name of timm, with features at five "
+            f"scales, got {encoder}"
         ) from error
     return network
 
 
 def weights_license(encoder: str) -> str | None:
-    """The license that the ImageNet weights of an encoder come under, None where the library does not tell."""
+    """Return the license of an encoder's ImageNet weights, or None if the library does not state it."""
     if encoder.startswith(_TIMM):
         config = timm.models.get_pretrained_cfg(encoder.removeprefix(_TIMM))
         return config and config.license
@@ -92,8 +94,8 @@ def weights_license(encoder: str) -> str | None:
 
 
 def _fetch(encoder: str) -> Path:
-    """The folder in the hub's cache."""
-    repository, revision = _place(encoder)
+    """Download the weights unless they are cached; return their folder."""
+    repository, revision = _repository(encoder)
     try:
         files = [hf_hub_download(repository, name, revision=revision) for name in (_CONFIG, _TENSORS)]
     except (OSError, HfHubHTTPError) as error:
@@ -104,8 +106,8 @@ def _fetch(encoder: str) -> Path:
     return Path(files[0]).parent
 
 
-def _place(encoder: str) -> tuple[str, str | None]:
-    """The repository of an encoder's ImageNet weights on the hub, and their version."""
+def _repository(encoder: str) -> tuple[str, str | None]:
+    """Return the repository of an encoder's ImageNet weights on the hub and its revision."""
     if encoder.startswith(_TIMM):
         config = timm.models.get_pretrained_cfg(encoder.removeprefix(_TIMM))
         if config is not None and config.hf_hub_id:

@@ -1,12 +1,12 @@
-"""The residual U-Net baseline."""
+"""The residual U-Net baseline. A file of its own because checkpoints name the class by its module."""
 
 import segmentation_models_pytorch as smp
 
-from torchrefract.restoration.models.coordinates import Located
+from torchrefract.restoration.models.coordconv import CoordConvSegmenter
 
 
-class ResUNet(Located):
-    """A U-Net whose encoder is a residual network; arguments as for `Located`.
+class ResUNet(CoordConvSegmenter):
+    """Predict maps by a U-Net with a residual encoder. See `CoordConvSegmenter` for the arguments.
 
     Source: Ronneberger, Fischer, Brox, "U-Net", MICCAI 2015; He, Zhang, Ren, Sun, "Deep residual learning", CVPR 2016.
     """

@@ -1,26 +1,20 @@
-"""The SegFormer baseline."""
+"""The SegFormer baseline. A file of its own because checkpoints name the class by its module."""
 
 from functools import partial
 
 import segmentation_models_pytorch as smp
 
-from torchrefract.restoration.models.coordinates import Located
+from torchrefract.restoration.models.coordconv import CoordConvSegmenter
 
 
-class SegFormer(Located):
-    """A transformer whose scales are put together at a quarter of the frame; arguments as for `Located`.
+class SegFormer(CoordConvSegmenter):
+    """Predict maps at a quarter of the frame by a transformer. See `CoordConvSegmenter` for the arguments.
 
-    It predicts one value for each cell of 4 px: what is between them is for the task to say.
+    Each value belongs to a cell of 4 x 4 px; the task interpolates between the cells.
 
     Source: Xie, Wang, Yu, Anandkumar, Alvarez, Luo, "SegFormer", NeurIPS 2021.
     """
 
     def __init__(self, channels: int, *, encoder: str = "mit_b1", pretrained: str | None = None, smooth: bool = False):
-        super().__init__(
-            partial(smp.Segformer, upsampling=1),
-            channels,
-            encoder=encoder,
-            pretrained=pretrained,
-            cell=4,
-            smooth=smooth,
-        )
+        architecture = partial(smp.Segformer, upsampling=1)
+        super().__init__(architecture, channels, encoder=encoder, pretrained=pretrained, cell=4, smooth=smooth)

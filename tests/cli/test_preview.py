@@ -1,0 +1,468 @@
+import errno
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import matplotlib.image
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from PIL import Image
+
+import torchrefract as tr
+from torchrefract._io import CONFIG_DIR
+from torchrefract._validation import UsageError
+from torchrefract.cli.command import picture_as_option
+from torchrefract.data.images import fit, read_image
+from torchrefract.data.road_scenes import render_road_scenes
+from torchrefract.effects.base import Effect
+from torchrefract.presets import cape_town_fog, limpopo_sun_glare
+from torchrefract.visualization.animation import Animation
+from torchrefract.visualization.figures import ContactSheetRow, contact_sheet_row
+
+ROOT = Path(__file__).parents[2]
+LENS = ("scene=cheap_dashcam",)  # a lens with its defaults
+FOG = ("scene=cape_town_fog",)
+FLARE = ("scene=limpopo_sun_glare", "seed=3")
+
+
+@pytest.fixture
+def picture(tmp_path) -> Path:
+    """Write frame.png, 24 x 32 px of random 2 x 2 px squares, to the folder in which commands run."""
+    squares = np.random.default_rng(0).integers(0, 256, (12, 16, 3), dtype=np.uint8)
+    Image.fromarray(squares.repeat(2, axis=0).repeat(2, axis=1)).save(tmp_path / "frame.png")
+    return tmp_path / "frame.png"
+
+
+@pytest.fixture
+def frames(tmp_path) -> list[torch.Tensor]:
+    """Write twelve frames (1, 3, 24, 32) to the folder drive; their names sort by number, not by letter."""
+    (tmp_path / "drive").mkdir()
+    values = np.random.default_rng(0).integers(0, 256, (12, 24, 32, 3), dtype=np.uint8)
+    for t, pixels in enumerate(values):
+        Image.fromarray(pixels).save(tmp_path / "drive" / f"frame{t}.png")
+    for name in ("notes.txt", "._frame3.png"):
+        (tmp_path / "drive" / name).touch()
+    return [torch.from_numpy(pixels).movedim(-1, 0)[None] / 255 for pixels in values]
+
+
+def shows(picture: np.ndarray, cell: np.ndarray) -> bool:
+    """Return True if a picture (H, W, 3) contains a cell (h, w, 3), pixel by pixel."""
+    height, width = cell.shape[:2]
+    rows, columns = picture.shape[0] - height + 1, picture.shape[1] - width + 1
+    candidates = np.ones((rows, columns), dtype=bool)
+    # A few pixels exclude nearly all positions.
+    for y in range(0, height, -(-height // 4)):
+        for x in range(0, width, -(-width // 4)):
+            candidates &= (picture[y : y + rows, x : x + columns] == cell[y, x]).all(axis=2)
+    positions = zip(*candidates.nonzero(), strict=True)
+    return any(np.array_equal(picture[y : y + height, x : x + width], cell) for y, x in positions)
+
+
+def sheet_shows(sheet: Path, cell: torch.Tensor | None) -> bool:
+    """Return True if a saved contact sheet contains (3, h, w)."""
+    assert cell is not None
+    pixels = (255 * matplotlib.image.imread(sheet)[..., :3]).round().astype(np.uint8)
+    return shows(pixels, (255 * cell).round().byte().movedim(0, -1).numpy())
+
+
+def row_of(effect: Effect, frame: torch.Tensor, *, seed: int = 0, depth: np.ndarray | None = None) -> ContactSheetRow:
+    meters = None if depth is None else torch.from_numpy(depth.astype(np.float32))[None, None]
+    return contact_sheet_row("", effect, frame=frame, seed=seed, depth=meters)
+
+
+def pictures_of(path: Path) -> list[np.ndarray]:
+    with Image.open(path) as image:
+        pictures = []
+        for t in range(getattr(image, "n_frames", 1)):
+            image.seek(t)
+            pictures.append(np.asarray(image.convert("RGB")))
+    return pictures
+
+
+def flare_at(frame: torch.Tensor, t: int) -> np.ndarray:
+    """Return a frame (1, 3, 24, 32) with the scene's flare at time t as displayed, (240, 320, 3)."""
+    image = limpopo_sun_glare().degrade(frame, seed=3, frame=t).image[0]
+    return (255 * image).round().byte().repeat_interleave(10, 1).repeat_interleave(10, 2).movedim(0, -1).numpy()
+
+
+# --- contact sheets
+
+
+@pytest.mark.quick
+def test_a_picture_becomes_a_contact_sheet(call, picture, tmp_path):
+    outcome = call("preview", "frame.png", *LENS, "seed=3")
+    assert (outcome.code, outcome.err) == (0, "")
+    assert outcome.out == "preview.png: cheap_dashcam on frame.png\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frame.png", "preview.png"]
+    row = row_of(tr.LensDistortion(), read_image(picture)[None], seed=3)
+    for cell in (row.frame, row.corrupted, row.checkerboard, row.restored):
+        assert sheet_shows(tmp_path / "preview.png", cell)
+    other_seed = row_of(tr.LensDistortion(), read_image(picture)[None], seed=4)
+    assert not sheet_shows(tmp_path / "preview.png", other_seed.corrupted)
+
+
+def test_without_a_picture_all_effects_are_drawn_on_a_rendered_scene(call, tmp_path):
+    outcome = call("preview", "size=[24,32]", "out=sheet.png")
+    names = (
+        "LensDistortion, Turbulence, ThinPlateSpline, DivergenceFree, UniformFog, HeterogeneousFog, LensFlare, Compose"
+    )
+    assert outcome.out == f"sheet.png: {names} on a rendered road scene, as no picture was given\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["sheet.png"]
+
+
+def test_fog_has_the_depth_of_the_rendered_scene(call, tmp_path):
+    assert call("preview", *FOG, "size=[24,32]", "seed=7").code == 0
+    frame, depth = render_road_scenes(torch.tensor([7]), 24, 32)
+    row = row_of(cape_town_fog(), frame, seed=7, depth=depth[0, 0].numpy())
+    for cell in (row.frame, row.corrupted, row.map):
+        assert sheet_shows(tmp_path / "preview.png", cell)
+
+
+def test_the_settings_of_an_effect_can_be_changed(call, picture, tmp_path):
+    names = ("LensDistortion", "ThinPlateSpline", "DivergenceFree", "HeterogeneousFog", "LensFlare", "Compose")
+    words = ["effects.Turbulence.amplitude_range=[1,1]", "effects.UniformFog.visibility_range=[9,9]"]
+    outcome = call("preview", "frame.png", *(f"~effects.{name}" for name in names), *words)
+    assert outcome.out == "preview.png: Turbulence, UniformFog on frame.png\n"
+    turbulence = tr.Turbulence(amplitude_range=(1, 1), length_range=(60, 90), aperture_range=(8, 10))
+    for effect in (turbulence, tr.UniformFog(visibility_range=(9, 9), depth=tr.GroundPlaneDepth())):
+        assert sheet_shows(tmp_path / "preview.png", row_of(effect, read_image(picture)[None]).corrupted)
+
+
+def test_a_scene_takes_its_severity(call, picture, tmp_path):
+    assert call("preview", "frame.png", *FOG, "scene.severity=5").code == 0
+    thick, usual = (row_of(cape_town_fog(severity), read_image(picture)[None]) for severity in (5, 3))
+    assert sheet_shows(tmp_path / "preview.png", thick.corrupted)
+    assert not sheet_shows(tmp_path / "preview.png", usual.corrupted)
+
+
+def test_equal_seeds_give_equal_bytes(call, picture, tmp_path):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        assert call("preview", "frame.png", *LENS, f"seed={seed}", f"out={name}.png").code == 0
+    first, second, other = ((tmp_path / f"{name}.png").read_bytes() for name in "abc")
+    assert first == second != other
+
+
+def test_a_picture_is_cropped_and_reduced_before_it_is_degraded(call, picture, tmp_path):
+    assert call("preview", "frame.png", *LENS, "size=[12,8]").code == 0
+    row = row_of(tr.LensDistortion(), read_image(picture)[None, :, ::2, 8:24:2].contiguous())
+    assert sheet_shows(tmp_path / "preview.png", row.frame)
+    assert sheet_shows(tmp_path / "preview.png", row.corrupted)
+
+
+def test_the_suffix_of_out_is_its_format(call, picture, tmp_path):
+    assert call("preview", "frame.png", *LENS, "out=sheet.JPG").code == 0
+    with Image.open(tmp_path / "sheet.JPG") as image:
+        assert image.format == "JPEG"
+
+
+def test_an_installed_package_draws_a_contact_sheet(spawn, picture, tmp_path):
+    shutil.copytree(ROOT / "torchrefract", tmp_path / "torchrefract", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "conf", tmp_path / "torchrefract" / "conf")
+    outcome = spawn("-m", "torchrefract.preview", "frame.png", *LENS, cwd=tmp_path)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frame.png", "preview.png", "torchrefract"]
+
+
+# --- arguments
+
+NAMES = (
+    "my frame.png",
+    "seed=1.png",
+    "a,b.png",
+    "it's.png",
+    'the "road".png',
+    "$HOME ${seed} \\${out}.png",
+    "[1](2){3: 4}.png",
+    "back\\slash.png",
+    "line\nbreak.png",
+    "霧.png",
+    "~effects.png",
+    "+scene=none.png",
+    "null",
+)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_any_name_of_a_file_reaches_the_configuration_unchanged(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    Path(name).touch()
+    (word,) = picture_as_option("preview", [name])
+    with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
+        assert compose("preview", overrides=[word]).image == name
+
+
+def test_a_picture_with_an_odd_name_is_drawn(call, picture, tmp_path):
+    name = "it's ${seed},\n霧 seed=1.png"
+    picture.rename(tmp_path / name)
+    assert call("preview", name, *LENS).out == f"preview.png: cheap_dashcam on {name.replace(chr(10), '?')}\n"
+
+
+@pytest.mark.quick
+def test_only_a_bare_word_is_a_picture_and_there_is_at_most_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["seed=1", "--config-dir", "mine", "-c", "job", "~effects.Compose", "+a=b", "--resolve"]
+    assert picture_as_option("preview", words) == words
+    assert picture_as_option("preview", [*words, "frame.png"]) == [*words, "image='frame.png'"]
+    with pytest.raises(UsageError, match=r"one picture, in quotes .*, got my and frame\.png"):
+        picture_as_option("preview", ["my", "frame.png"])
+
+
+def test_the_configuration_is_shown_without_reading_the_picture(call, tmp_path):
+    outcome = call("preview", "none.png", "--cfg", "job")
+    assert outcome.code == 0
+    assert "image: none.png" in outcome.out.splitlines()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unreadable_picture_is_one_line_of_error(call, picture, tmp_path):
+    picture.write_bytes(picture.read_bytes()[:300])
+    (tmp_path / "notes.txt").write_text("no picture")
+    assert "none.png cannot be opened" in call("preview", "none.png").message
+    assert "frame.png is truncated" in call("preview", "frame.png").message
+    assert call("preview", "notes.txt").message.startswith("notes.txt ")
+    assert not (tmp_path / "preview.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("scene=london", "scene must be one of cape_town_fog, cheap_dashcam, .*, got london"),
+        ("color=red", "color"),
+        ("+effects.Turbulence.color=red", "Turbulence: .*'color'"),
+        ("effects.Turbulence.amplitude_range=[2,1]", "Turbulence: amplitude_range must be"),
+        ("effects.Turbulence._target_=torch.nn.ReLU", "ReLU"),
+        ("+effects.Mine=[1]", "Mine must be an effect of torchrefract, got"),
+        ("effects=null", "effects must be at least one effect with its name, got None"),
+        ("seed=-1", "seed must be a whole number .*, got -1"),
+        ("seed=tomorrow", "seed must be a whole number .*, got tomorrow"),
+        ("size=[640]", r"size must be \(height, width\), got"),
+        ("size=[64,64]", "size: image must be at least size = 64x64"),
+        ("out=sheet.doc", r"out must end in one of \.apng, .*\.gif, .*\.mp4, .*\.png, .*\.webp, got sheet.doc"),
+        ("out=sheet", "out must end in one of .*, got sheet"),
+        ("out=none/sheet.png", "none/sheet.png could not be written: No such file or directory"),
+        ("out=frame.png/sheet.png", "frame.png/sheet.png could not be written: Not a directory"),
+        ("out=folder.png", "out must be a file, got the folder folder.png"),
+        ("frames=0", "frames must be at least 1, got 0"),
+        ("frames=2.5", "frames must be a whole number, got 2.5"),
+        ("fps=0", r"fps must be a number in \[0.1, 50\], got 0"),
+        ("depth=none.png", "none.png cannot be opened"),
+        ("depth=none.npy", "depth must be a file that can be read, got none.npy"),
+        ("depth=frame.png", "depth must be a gray PNG of 16 bits, or a .npy in m, got frame.png"),
+    ],
+)
+def test_a_wrong_argument_is_one_line_of_error_and_writes_nothing(call, picture, tmp_path, monkeypatch, word, message):
+    # Every error is raised before the first effect is drawn.
+    monkeypatch.setattr("torchrefract.cli.preview.contact_sheet_row", None)
+    (tmp_path / "folder.png").mkdir()
+    assert re.search(message, text := call("preview", "frame.png", word).message), text
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["folder.png", "frame.png"]
+
+
+def test_a_contact_sheet_that_cannot_be_drawn_keeps_the_old_file(call, picture, tmp_path):
+    (tmp_path / "preview.png").write_text("old")
+    words = ("+effects.LensDistortion.strict=true", "effects.LensDistortion.k1_range=[-3,-3]")
+    assert "LensDistortion: " in call("preview", "frame.png", *words).message
+    assert (tmp_path / "preview.png").read_text() == "old"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+# --- depth of a picture
+
+
+def meters() -> np.ndarray:
+    """Return depth (12, 16), m, half the sides of the picture, with sky at the top."""
+    depth = np.random.default_rng(1).uniform(5, 120, (12, 16)).round(1)
+    depth[:3] = np.inf
+    return depth
+
+
+def enlarged(depth: np.ndarray, factor: int) -> np.ndarray:
+    return depth.repeat(factor, axis=0).repeat(factor, axis=1)
+
+
+def test_a_depth_array_may_have_any_size_of_the_picture_s_shape(call, picture, tmp_path):
+    frame = read_image(picture)[None]
+    expected = row_of(cape_town_fog(), frame, depth=enlarged(meters(), 2)).corrupted
+    for depth in (meters()[None], enlarged(meters(), 2), enlarged(meters(), 6).astype(np.float32)):
+        np.save(tmp_path / "depth.npy", depth)
+        assert call("preview", "frame.png", *FOG, "depth=depth.npy").out == "preview.png: cape_town_fog on frame.png\n"
+        assert sheet_shows(tmp_path / "preview.png", expected)
+    assert not sheet_shows(tmp_path / "preview.png", row_of(cape_town_fog(), frame).corrupted)
+
+
+@pytest.mark.parametrize(("words", "scale"), [((), 1 / 256), (("depth_scale=0.1",), 0.1)])
+def test_a_depth_picture_counts_in_the_scale_and_its_largest_value_is_infinite(call, picture, tmp_path, words, scale):
+    steps = np.where(np.isinf(meters()), 65535, meters() / scale).round().astype(np.uint16)
+    Image.fromarray(steps).save(tmp_path / "depth.png")
+    outcome = call("preview", "frame.png", *FOG, "depth=depth.png", *words)
+    assert outcome.out == "preview.png: cape_town_fog on frame.png\n"
+    depth = enlarged(np.where(steps == 65535, np.inf, scale * steps), 2)
+    assert sheet_shows(
+        tmp_path / "preview.png", row_of(cape_town_fog(), read_image(picture)[None], depth=depth).corrupted
+    )
+
+
+def test_depth_that_was_not_measured_counts_as_infinite_and_is_reported(call, picture, tmp_path):
+    steps = np.full((24, 32), 256 * 40, np.uint16)
+    steps[:6] = 0
+    Image.fromarray(steps).save(tmp_path / "depth.png")
+    outcome = call("preview", "frame.png", *FOG, "depth=depth.png")
+    assert outcome.out == "preview.png: cape_town_fog on frame.png; 25.0% of its depth is 0, taken as infinite\n"
+    depth = np.where(steps == 0, np.inf, 40.0)
+    assert sheet_shows(
+        tmp_path / "preview.png", row_of(cape_town_fog(), read_image(picture)[None], depth=depth).corrupted
+    )
+
+
+def test_depth_is_cropped_with_its_picture(call, picture, tmp_path):
+    np.save(tmp_path / "depth.npy", meters())
+    assert call("preview", "frame.png", *FOG, "depth=depth.npy", "size=[12,8]").code == 0
+    frame = read_image(picture)[None, :, ::2, 8:24:2].contiguous()
+    assert sheet_shows(tmp_path / "preview.png", row_of(cape_town_fog(), frame, depth=meters()[:, 4:12]).corrupted)
+
+
+@pytest.mark.parametrize(
+    ("name", "depth", "message"),
+    [
+        ("d.npy", meters()[:, :-1], r"of the size of the picture, 24x32 .*, or of its shape, got 12x15"),
+        ("d.npy", meters() - 50, "depth must be at least 0, in m, got -"),
+        ("d.npy", np.where(meters() > 100, np.nan, meters()), "depth must be at least 0, in m, got nan"),
+        ("d.npy", meters() / 1000, "depth must be in m, not normalized"),
+        ("d.npy", np.ones((12, 16), np.uint16), r"depth must be \(height, width\) of floating numbers, in m, got d"),
+        ("d.npy", np.ones((2, 12, 16)), r"depth must be \(height, width\) of floating numbers, in m, got d.npy"),
+        ("d.npy", np.array([{}], dtype=object), "depth must be an array of numbers, got d.npy, which is damaged"),
+        ("d.png", np.zeros((12, 16), np.uint16), "depth must be known in half of the pixels .* d.png with 100.0% at 0"),
+        ("d.png", np.ones((12, 16), np.uint8), "depth must be a gray PNG of 16 bits, or a .npy in m, got d.png"),
+        ("d.png", np.ones((12, 16, 3), np.uint8), "depth must be a gray PNG of 16 bits, or a .npy in m, got d.png"),
+    ],
+)
+def test_a_wrong_or_truncated_depth_is_one_line_of_error(call, picture, tmp_path, name, depth, message):
+    path = tmp_path / name
+    np.save(path, depth, allow_pickle=True) if path.suffix == ".npy" else Image.fromarray(depth).save(path)
+    assert re.search(message, text := call("preview", "frame.png", *FOG, f"depth={name}").message), text
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert re.search("damaged|truncated", call("preview", "frame.png", *FOG, f"depth={name}").message)
+    assert not (tmp_path / "preview.png").exists()
+
+
+def test_depth_needs_a_picture_and_a_scale(call, picture):
+    assert "depth must be that of a picture, image=…" in call("preview", "depth=depth.npy").message
+    assert "depth_scale must be above 0, got 0" in call("preview", "frame.png", "depth=d.png", "depth_scale=0").message
+
+
+# --- animations
+
+
+@pytest.mark.quick
+def test_a_picture_becomes_an_animation(call, picture, tmp_path):
+    outcome = call("preview", "frame.png", *FLARE, "out=flare.apng", "frames=4")
+    assert (outcome.code, outcome.err) == (0, "")
+    assert outcome.out == "flare.apng: limpopo_sun_glare on frame.png, 4 frames\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["flare.apng", "frame.png"]
+    pictures = pictures_of(tmp_path / "flare.apng")
+    assert len(pictures) == 4
+    for t, shown in enumerate(pictures):
+        assert shows(shown, flare_at(read_image(picture)[None], t))
+        assert not shows(shown, flare_at(read_image(picture)[None], t + 1))
+
+
+def test_an_animation_of_a_rendered_scene_has_its_depth(call, tmp_path):
+    assert call("preview", *FOG, "size=[24,32]", "seed=7", "out=fog.apng", "frames=2").code == 0
+    frame, depth = render_road_scenes(torch.tensor([7]), 24, 32)
+    for t, shown in enumerate(pictures_of(tmp_path / "fog.apng")):
+        image = cape_town_fog().degrade(frame, seed=7, depth=depth, frame=t).image[0]
+        large = (255 * image).round().byte().repeat_interleave(10, 1).repeat_interleave(10, 2)
+        assert shows(shown, large.movedim(0, -1).numpy())
+
+
+@pytest.mark.parametrize(("max_frames", "count"), [(3, 3), (100, 12)])
+def test_a_folder_is_played_in_the_order_of_its_numbers(call, frames, tmp_path, max_frames, count):
+    outcome = call("preview", "drive", *FLARE, "out=flare.apng", f"frames={max_frames}")
+    assert outcome.out == f"flare.apng: limpopo_sun_glare on drive, {count} frames\n"
+    pictures = pictures_of(tmp_path / "flare.apng")
+    assert len(pictures) == count
+    assert all(shows(shown, flare_at(frames[t], t)) for t, shown in enumerate(pictures))
+
+
+def test_a_video_is_played_and_its_first_frame_is_that_of_a_contact_sheet(call, frames, tmp_path):
+    path = tmp_path / "a: 100%05d.avi"  # neither a protocol nor a pattern of names
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (32, 24))
+    for frame in frames:
+        writer.write((255 * frame[0]).round().byte().movedim(0, -1).numpy()[..., ::-1])
+    writer.release()
+    video, decoded = cv2.VideoCapture(str(path)), []
+    while (result := video.read())[0]:
+        decoded.append(torch.from_numpy(result[1][..., ::-1].copy()).movedim(-1, 0)[None] / 255)
+    assert call("preview", path.name, *FLARE, "out=flare.apng").out.endswith("12 frames\n")
+    for t, shown in enumerate(pictures_of(tmp_path / "flare.apng")):
+        assert shows(shown, flare_at(decoded[t], t))
+    assert call("preview", path.name, *FLARE, "out=sheet.png").code == 0
+    first = torch.from_numpy(flare_at(decoded[0], 0).copy()).movedim(-1, 0) / 255
+    assert sheet_shows(tmp_path / "sheet.png", first)
+
+
+def test_an_animation_is_read_like_a_video(call, picture, tmp_path):
+    assert call("preview", "frame.png", *FLARE, "out=flare.gif", "frames=3").code == 0
+    assert call("preview", "flare.gif", *FLARE, "out=again.gif").out.endswith("on flare.gif, 3 frames\n")
+
+
+def test_frames_are_cropped_and_reduced(call, frames, tmp_path):
+    assert call("preview", "drive", *LENS, "size=[12,16]", "out=lens.apng", "frames=2").code == 0
+    image = tr.LensDistortion().degrade(fit(frames[1][0], (12, 16)), seed=0).image
+    large = (255 * image).round().byte().repeat_interleave(20, 1).repeat_interleave(20, 2).movedim(0, -1).numpy()
+    assert shows(pictures_of(tmp_path / "lens.apng")[1], large)
+
+
+def test_frames_that_cannot_be_played_are_one_line_of_error(call, frames, picture, tmp_path):
+    for name in ("empty", "mixed"):
+        (tmp_path / name).mkdir()
+    picture.rename(tmp_path / "mixed" / "a.png")
+    Image.new("RGB", (8, 8)).save(tmp_path / "mixed" / "b.png")
+    (tmp_path / "bad.mp4").write_bytes(b"0" * 5000)
+    (tmp_path / "drive" / "frame7.png").write_bytes(b"")
+    for name, message in (
+        ("empty", "image must be a folder that holds .jpg, .jpeg, .png, .webp, .bmp, got empty"),
+        ("mixed", "image must be a folder of frames of one size, 24x32 (height x width), got b.png of 8x8"),
+        ("bad.mp4", "image must be a video with a frame that can be decoded, got bad.mp4"),
+        ("none.mp4", "none.mp4 cannot be opened (No such file or directory)"),
+        ("drive", "drive/frame7.png is empty (0 bytes)"),
+    ):
+        assert call("preview", name, *FLARE, "out=flare.gif").message == message
+    message = call("preview", "drive", *FLARE, "out=flare.gif", "size=[99,99]").message
+    assert "image must be at least size" in message
+    assert not (tmp_path / "flare.gif").exists()
+
+
+def test_a_full_disk_keeps_the_old_animation(call, picture, tmp_path, monkeypatch):
+    def render(self, times):
+        yield next(original(self, times))
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    original = Animation.render
+    monkeypatch.setattr(Animation, "render", render)
+    (tmp_path / "flare.webp").write_text("old")
+    message = call("preview", "frame.png", *FLARE, "out=flare.webp", "frames=3").message
+    assert message == "flare.webp could not be written: No space left on device"
+    assert (tmp_path / "flare.webp").read_text() == "old"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_killed_run_keeps_the_old_animation(picture, tmp_path):
+    (tmp_path / "flare.mp4").write_text("old")
+    words = ("-m", "torchrefract.preview", "frame.png", *FLARE, "out=flare.mp4", "frames=100000")
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen([sys.executable, *words], cwd=tmp_path, env=environment) as run:
+        start = time.monotonic()
+        while not any(path.stat().st_size > 0 for path in tmp_path.glob(".flare-*.mp4")):
+            assert run.poll() is None
+            assert time.monotonic() - start < 120
+            time.sleep(0.1)
+        run.kill()
+    assert (tmp_path / "flare.mp4").read_text() == "old"

@@ -1,0 +1,226 @@
+"""Contact sheets and animations of effects on a picture, a video, a folder of frames or a rendered scene."""
+
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from matplotlib.figure import Figure
+from omegaconf import DictConfig
+from torch import Tensor
+
+from torchrefract._io import replace_file
+from torchrefract._validation import UsageError, check_count, check_number, check_positive, check_size
+from torchrefract.cli.command import check_seed, make, naming, progress
+from torchrefract.data.images import EXTENSIONS, files_in, fit, image_size, read_image
+from torchrefract.data.media import VIDEOS, read_video
+from torchrefract.data.road_scenes import render_road_scenes
+from torchrefract.effects.base import Effect
+from torchrefract.fields.depth import check_depth
+from torchrefract.visualization.animation import FrameSequence, animation_formats, make_animation, save_animation
+from torchrefract.visualization.figures import contact_sheet, contact_sheet_row
+
+_RENDERED_SIZE = (540, 960)  # height and width
+_MAX_FPS = 50.0  # many viewers take the shorter delays that a GIF can hold for no delay
+_MAX_STEPS = 65535  # of a 16-bit depth picture, means farther than measured
+
+
+class _Source(NamedTuple):
+    """Frames to degrade."""
+
+    frames: FrameSequence
+    depth: Tensor | None  # (1, 1, H, W), m
+    name: str
+    note: str  # on the depth
+
+
+def preview(cfg: DictConfig) -> None:
+    """Write a contact sheet of effects on the first frame or, if the format is one of animations, an animation."""
+    seed, effects = check_seed(cfg.seed), _effects(cfg)
+    with naming("fps"):
+        fps = check_number("fps", cfg.fps, low=0.1, high=_MAX_FPS)
+    source = _source(cfg)
+    num_frames = source.frames.num_frames
+    with _writing(str(cfg.out)) as path:
+        if is_animation := path.suffix.lower() in animation_formats():
+            animation = make_animation(effects, source.frames, seed=seed, depth=source.depth)
+            times = progress(range(num_frames), str(cfg.out), count=num_frames)
+            save_animation(animation, path, fps=fps, times=times)
+        else:
+            _save_contact_sheet(effects, source, seed, path)
+    length = f", {num_frames} frames" if is_animation else ""
+    print(f"{cfg.out}: {', '.join(effects)} on {source.name}{length}{source.note}")
+
+
+def _save_contact_sheet(effects: dict[str, Effect], source: _Source, seed: int, path: Path) -> None:
+    _, frame = next(source.frames.read([0]))
+    rows = []
+    for name, effect in effects.items():
+        with naming(name):
+            rows.append(contact_sheet_row(name, effect, frame=frame, depth=source.depth, seed=seed))
+    height, width = frame.shape[2:]
+    contact_sheet(rows, title=f"{source.name}, {width} x {height} px, seed {seed}").savefig(path)
+
+
+def _effects(cfg: DictConfig) -> dict[str, Effect]:
+    """Instantiate the scene or, without one, the effects of the configuration, by name."""
+    if cfg.scene is not None:
+        effects = {str(HydraConfig.get().runtime.choices["scene"]): make(cfg, "scene")}
+    elif isinstance(cfg.effects, DictConfig):
+        effects = {name: make(cfg.effects, name) for name in map(str, cfg.effects)}
+    else:
+        effects = {}
+    if not effects:
+        raise UsageError(f"effects must be at least one effect with its name, got {cfg.effects}")
+    for name, effect in effects.items():
+        if not isinstance(effect, Effect):
+            raise UsageError(f"{name} must be an effect of torchrefract, got {effect}")
+    return effects
+
+
+def _source(cfg: DictConfig) -> _Source:
+    with naming("size"):
+        size = None if cfg.size is None else check_size("size", cfg.size)
+    with naming("frames"):
+        max_frames = check_count("frames", cfg.frames)
+    if cfg.image is None:
+        if cfg.depth is not None:
+            raise UsageError(
+                f"depth must be that of a picture, image=…, as a rendered scene has its own, got {cfg.depth}"
+            )
+        with naming("size"):
+            image, depth = render_road_scenes(torch.tensor([cfg.seed]), *(size or _RENDERED_SIZE))
+        return _Source(_repeat(image, max_frames), depth, "a rendered road scene, as no picture was given", "")
+    path = Path(str(cfg.image))
+    frames, name = _read_frames(path, max_frames), _printable(path.name or path.resolve().name)
+    _, first = next(frames.read([0]))
+    depth, note = (None, "") if cfg.depth is None else _read_depth(cfg, first, size)
+    return _Source(frames if size is None else _resized(frames, size), depth, name, note)
+
+
+def _read_frames(path: Path, max_frames: int) -> FrameSequence:
+    """Read the first frames of a folder or a video; repeat a picture."""
+    if path.is_dir():
+        files = sorted(files_in(path), key=_natural_order)[:max_frames]
+        if not files:
+            raise UsageError(f"image must be a folder that holds {', '.join(EXTENSIONS)}, got {path}")
+        return FrameSequence(len(files), lambda times: _read_folder(files, times))
+    if path.suffix.lower() in VIDEOS:
+        num_frames = sum(1 for _ in read_video(path, range(max_frames)))
+        if num_frames == 0:
+            raise UsageError(f"image must be a video with a frame that can be decoded, got {path}")
+        return FrameSequence(num_frames, lambda times: read_video(path, times))
+    return _repeat(read_image(path)[None].contiguous(), max_frames)
+
+
+def _repeat(image: Tensor, num_frames: int) -> FrameSequence:
+    return FrameSequence(num_frames, lambda times: ((t, image) for t in times))
+
+
+def _natural_order(path: Path) -> list[str | int]:
+    """Return a sort key by which frame 2 comes before frame 10."""
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", path.name))]
+
+
+def _read_folder(files: list[Path], times: Iterable[int]) -> Iterator[tuple[int, Tensor]]:
+    shape = None
+    for t in times:
+        image = read_image(files[t])
+        shape = shape or image.shape
+        if image.shape != shape:
+            raise UsageError(
+                f"image must be a folder of frames of one size, {shape[1]}x{shape[2]} (height x width), "
+                f"got {files[t].name} of {image.shape[1]}x{image.shape[2]}"
+            )
+        yield t, image[None].contiguous()
+
+
+def _resized(frames: FrameSequence, size: tuple[int, int]) -> FrameSequence:
+    """Crop and reduce frames to a size."""
+
+    def read(times: Iterable[int]) -> Iterator[tuple[int, Tensor]]:
+        for t, frame in frames.read(times):
+            with naming("size"):
+                yield t, fit(frame[0], size)[None]
+
+    return FrameSequence(frames.num_frames, read)
+
+
+def _read_depth(cfg: DictConfig, image: Tensor, size: tuple[int, int] | None) -> tuple[Tensor, str]:
+    """Read the depth (1, 1, h, w), m, of an image (1, 3, H, W) that is cropped and reduced to a size, and a note."""
+    with naming("depth_scale"):
+        scale = check_positive("depth_scale", cfg.depth_scale)
+    path = Path(str(cfg.depth))
+    depth, note = (_read_npy(path), "") if path.suffix.lower() == ".npy" else _read_depth_png(path, scale)
+    (height, width), (rows, columns) = image.shape[2:], depth.shape
+    if 2 * abs(rows * width - columns * height) > max(height, width):
+        raise UsageError(
+            f"depth must be of the size of the picture, {height}x{width} (height x width), or of its shape, "
+            f"got {rows}x{columns}"
+        )
+    with naming("depth"):
+        check_depth(depth[None, None])
+    # Crop and reduce a picture of relative coordinates like the image, and sample the depth at the results: an average
+    # over the edge of an object would be a distance at which there is nothing.
+    position = torch.zeros(3, height, width)
+    position[0] = ((torch.arange(height) + 0.5) / height)[:, None]
+    position[1] = (torch.arange(width) + 0.5) / width
+    if size is not None:
+        with naming("size"):
+            position = fit(position, size)
+    y, x = (position[0] * rows).long().clamp(max=rows - 1), (position[1] * columns).long().clamp(max=columns - 1)
+    return depth[y, x][None, None], note
+
+
+def _read_npy(path: Path) -> Tensor:
+    try:
+        value = np.load(path, allow_pickle=False)
+    except OSError as error:
+        raise UsageError(
+            f"depth must be a file that can be read, got {path} ({error.strerror or 'damaged'})"
+        ) from error
+    except (ValueError, EOFError) as error:
+        raise UsageError(f"depth must be an array of numbers, got {path}, which is damaged or not an array") from error
+    if not isinstance(value, np.ndarray) or value.dtype.kind != "f" or value.size == 0 or value.squeeze().ndim != 2:
+        raise UsageError(f"depth must be (height, width) of floating numbers, in m, got {path}")
+    return torch.from_numpy(value.squeeze().astype(np.float32))
+
+
+def _read_depth_png(path: Path, scale: float) -> tuple[Tensor, str]:
+    """Read a 16-bit picture; pixels that were not measured are infinitely far, and the note counts them."""
+    image_size(path)  # raises UnreadableImageError
+    steps = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    if steps is None or steps.dtype != np.uint16 or steps.ndim != 2:
+        raise UsageError(f"depth must be a gray PNG of 16 bits, or a .npy in m, got {path}")
+    missing = float((steps == 0).mean())
+    if missing > 0.5:
+        raise UsageError(f"depth must be known in half of the pixels at least, got {path} with {missing:.1%} at 0")
+    depth = np.where((steps == 0) | (steps == _MAX_STEPS), np.inf, steps * scale).astype(np.float32)
+    return torch.from_numpy(depth), f"; {missing:.1%} of its depth is 0, taken as infinite" if missing else ""
+
+
+def _printable(name: str) -> str:
+    """Shorten the name of a file to one line."""
+    name = "".join(letter if letter.isprintable() else "?" for letter in name)
+    return name if len(name) <= 60 else f"{name[:40]}…{name[-19:]}"
+
+
+@contextmanager
+def _writing(out: str) -> Iterator[Path]:
+    """Yield a temporary path that replaces `out` at the end; raise UsageError at once if it cannot be written."""
+    formats = sorted({*animation_formats(), *(f".{name}" for name in Figure().canvas.get_supported_filetypes())})
+    if Path(out).suffix.lower() not in formats:
+        raise UsageError(f"out must end in one of {', '.join(formats)}, got {out}")
+    if Path(out).is_dir():
+        raise UsageError(f"out must be a file, got the folder {out}")
+    try:
+        with replace_file(Path(out)) as path:
+            path.touch()
+            yield path
+    except OSError as error:
+        raise UsageError(f"{out} could not be written: {error.strerror}") from error

@@ -1,0 +1,208 @@
+"""The commands that apply a trained model: `restore` writes pictures and videos, `export` writes a program."""
+
+import hashlib
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from torchrefract._io import replace_file
+from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
+from torchrefract.cli.command import naming, progress
+from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
+from torchrefract.data.pairs.ledger import claim
+from torchrefract.data.media import (
+    check_output_folder,
+    find_media,
+    is_video,
+    is_complete,
+    convert_video,
+    write_picture,
+    output_name,
+)
+from torchrefract.restoration.checkpoints import load_model
+from torchrefract.restoration.export import FORMATS, export_model
+from torchrefract.restoration.inference import Restorer
+from torchrefract.restoration.module import Restoration
+from torchrefract.restoration.tasks import Undistort
+from torchrefract.data.media import video_info
+
+_T = TypeVar("_T")
+
+
+def restore(cfg: DictConfig) -> None:
+    """Restore all pictures and videos of a folder that are not restored yet; print their number and the rate."""
+    source, out = Path(str(cfg.input)), Path(str(cfg.out))
+    files = find_media(source, deep=True)
+    check_output_folder(out, source, deep=True)
+    job = _make_job(cfg, source if source.is_dir() else source.parent, out)
+    with naming("out"):
+        claim(out, _settings(cfg, job), count=0, about={})
+    todo = [file for file in files if not job.is_done(file)]
+    start = time.perf_counter()
+    failed = dict[Path, str]()
+    num_frames = _restore_pictures([file for file in todo if not is_video(file)], job, failed)
+    num_frames += _restore_videos([file for file in todo if is_video(file)], job, failed)
+    if len(failed) == len(files):
+        raise UsageError(f"input must hold a file that can be restored, got {next(iter(failed.values()))}")
+    rate = num_frames / (time.perf_counter() - start)
+    num_restored, num_existing = len(todo) - len(failed), len(files) - len(todo)
+    print(f"{out}: {num_restored} restored, {num_existing} already existed, {len(failed)} skipped")
+    print(f"{num_frames} frames, {rate:.3g} frames a second on {job.device}")
+
+
+def export(cfg: DictConfig) -> None:
+    """Export the model of a checkpoint; print how much the file differs from the model."""
+    out, loaded = Path(str(cfg.out)), load_model(Path(str(cfg.ckpt_path)))
+    with naming("out"):
+        check_choice("out", out.suffix, FORMATS)
+        out.parent.mkdir(parents=True, exist_ok=True)
+    if not isinstance(loaded.model, Restoration):
+        raise UsageError(
+            f"ckpt_path must be of a model that restores in a single pass, got {cfg.ckpt_path} of {loaded.name}"
+        )
+    height, width = loaded.size if cfg.size is None else _parse_size(str(cfg.size))
+    with naming("interpolation"):
+        errors = export_model(loaded, out, size=(height, width), interpolation=str(cfg.interpolation))
+    differences = ", ".join(f"{name} {error:.1e}" for name, error in errors.items())
+    print(
+        f"{out}: {loaded.name} for {loaded.task}, frames of {height}x{width}, any batch size; "
+        f"largest difference from the model: {differences}"
+    )
+
+
+class _Job(NamedTuple):
+    """The options of a restoration."""
+
+    restorer: Restorer
+    source: Path  # outputs are named by the path of a file relative to this folder
+    out: Path
+    batch: int
+    side_by_side: bool
+    device: torch.device
+
+    def target(self, file: Path) -> Path:
+        """Return the path of the output for a file."""
+        return self.out / output_name(file).relative_to(self.source)
+
+    def is_done(self, file: Path) -> bool:
+        """Return True if the output of a file is complete."""
+        return is_complete(file, self.target(file), num_columns=1 + self.side_by_side)
+
+    def restore(self, images: Sequence[Tensor]) -> Iterator[np.ndarray]:
+        """Restore images (3, H, W) in [0, 1] to pixels (H, W, 3), uint8, RGB."""
+        moved = [image.to(self.device).contiguous() for image in images]
+        for before, after in zip(moved, self.restorer(moved), strict=True):
+            yield pixels_of(torch.cat([before, after], dim=2) if self.side_by_side else after)
+
+
+def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
+    with naming("batch"):
+        batch = check_count("batch", cfg.batch)
+    with naming("side_by_side"):
+        side_by_side = check_flag("side_by_side", cfg.side_by_side)
+    device = _find_device(str(cfg.device))
+    loaded = load_model(Path(str(cfg.ckpt_path)), changes=cfg.model)
+    with naming("size"):
+        size = loaded.size if cfg.size is None else check_size("size", cfg.size)
+    with naming("tile"):
+        side = cfg.tile
+        tile = None if side is None else check_size("tile", (side, side) if isinstance(side, int) else side)
+    if tile is not None and loaded.task == Undistort.name:
+        raise UsageError(f"tile must be null for {loaded.task}, whose model needs the complete frame, got {cfg.tile}")
+    with naming("interpolation"):
+        options = {"tile": tile, "interpolation": cfg.interpolation, "batch": batch}
+        restorer = Restorer(loaded.model.to(device), size=size, **options)
+    return _Job(restorer, source, out, batch, side_by_side, device)
+
+
+def _find_device(name: str) -> torch.device:
+    try:
+        device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # torch asserts in builds without CUDA
+        raise UsageError(f"device must be auto, cpu or another device of this machine, got {name}") from error
+    return device
+
+
+def _settings(cfg: DictConfig, job: _Job) -> dict[str, Any]:
+    """Return everything that decides the output, so that a folder is only continued with the same settings."""
+    with Path(str(cfg.ckpt_path)).open("rb") as stream:
+        checkpoint = hashlib.file_digest(stream, "sha256").hexdigest()
+    return {
+        "checkpoint": checkpoint,
+        "input": str(job.source.resolve()),
+        "size": list(job.restorer.size),
+        "tile": job.restorer.tile and list(job.restorer.tile),
+        "interpolation": job.restorer.interpolation,
+        "side_by_side": job.side_by_side,
+        "model": OmegaConf.to_container(cfg.model),
+    }
+
+
+def _restore_pictures(files: Sequence[Path], job: _Job, failed: dict[Path, str]) -> int:
+    """Restore pictures, note the unreadable ones in `failed`, and return the number restored."""
+    count = 0
+    for chunk in _batches(progress(files, "restoring", count=len(files)), job.batch):
+        images = dict[Path, Tensor]()
+        for file in chunk:
+            try:
+                images[file] = read_image(file)
+            except UnreadableImageError as error:
+                _skip(file, error, failed)
+        for file, pixels in zip(images, job.restore([*images.values()]) if images else (), strict=True):
+            target = job.target(file)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with replace_file(target) as path:
+                write_picture(pixels, path)
+            count += 1
+    return count
+
+
+def _restore_videos(files: Sequence[Path], job: _Job, failed: dict[Path, str]) -> int:
+    """Restore videos, note the unreadable ones in `failed`, and return the number of frames restored."""
+    count = 0
+    for file in files:
+        target = job.target(file)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            count += _restore_video(file, target, job)
+        except UnreadableImageError as error:
+            _skip(file, error, failed)
+    return count
+
+
+def _restore_video(file: Path, target: Path, job: _Job) -> int:
+    num_frames = video_info(file)[0]
+
+    def change(frames: Iterable[Tensor]) -> Iterator[np.ndarray]:
+        for chunk in _batches(progress(frames, f"restoring {file.name}", count=num_frames), job.batch):
+            yield from job.restore([frame[0] for frame in chunk])
+
+    with replace_file(target) as path:
+        return convert_video(file, path, change=change)
+
+
+def _skip(file: Path, error: UnreadableImageError, failed: dict[Path, str]) -> None:
+    failed[file] = str(error)
+    print(f"skipped: {error}", file=sys.stderr)
+
+
+def _batches(items: Iterable[_T], size: int) -> Iterator[list[_T]]:
+    rest = iter(items)
+    while batch := list(islice(rest, size)):
+        yield batch
+
+
+def _parse_size(text: str) -> tuple[int, int]:
+    sides = text.lower().split("x")
+    if len(sides) != 2 or not all(side.isdecimal() and int(side) > 0 for side in sides):
+        raise UsageError(f"size must be HEIGHTxWIDTH, such as 720x1280, got {text}")
+    return int(sides[0]), int(sides[1])

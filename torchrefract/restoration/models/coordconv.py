@@ -1,0 +1,202 @@
+"""What both feed-forward baselines share: pixel coordinates as input channels and a polynomial head for smooth maps."""
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.nn.utils import parametrize
+
+from torchrefract.restoration.models.pretrained import find_weights, load_network
+from torchrefract.warping.grid import pixel_axes
+
+_STRIDE = 32
+_MEAN, _STD = (0.5,) * 3, (0.25,) * 3  # of colors, for an encoder without pretrained weights
+_DEGREE = 5  # a lens with k1 and k2 has terms of degree 3 and 5
+_HIDDEN = 256
+
+
+class CoordConvSegmenter(nn.Module):
+    """Predict maps by a segmentation network that also sees the coordinates of its pixels.
+
+    The last layer starts at zero, so an untrained network predicts zeros. With `smooth`, a `PolynomialFlowHead` adds
+    maps of the whole frame, which start at zero too.
+
+    An encoder with pretrained weights is frozen, together with its running statistics and its dropout. Only the weights
+    that its first layer applies to the coordinates are trained; they start at zero.
+
+    Args:
+        architecture: a model class of segmentation-models-pytorch.
+        channels: number of maps to predict.
+        encoder: a name of segmentation-models-pytorch; "tu-…" selects an encoder of timm.
+        pretrained: None, "imagenet" or a folder, see `find_weights`.
+        cell: side of the square of pixels for which the architecture predicts one value, px.
+        smooth: True adds a `PolynomialFlowHead`, for maps that are smooth over the frame, such as the flow of a lens.
+
+    Raises:
+        ValueError: the encoder is unknown or has no features at five scales; the pretrained weights are unavailable.
+
+    Source: Liu, Lehman, Molino, Petroski Such, Frank, Sergeev, Yosinski, "An intriguing failing of convolutional neural
+    networks and the CoordConv solution", NeurIPS 2018, for the coordinates.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        architecture: Callable[..., Any],
+        channels: int,
+        *,
+        encoder: str,
+        pretrained: str | None,
+        cell: int,
+        smooth: bool,
+    ):
+        super().__init__()
+        weights = None if pretrained is None else find_weights(encoder, pretrained)
+        self.network = load_network(architecture, encoder, weights, channels=channels)
+        self.is_frozen, self.cell = weights is not None, cell
+        self.network.encoder.requires_grad_(not self.is_frozen)
+        _add_coordinate_inputs(self.network.encoder, start_at_zero=self.is_frozen)
+        # The checkpoint holds both, so it can be used without the pretrained weights.
+        mean, std = (_MEAN, _STD) if weights is None else (weights.mean, weights.std)
+        self.register_buffer("mean", torch.tensor(mean).view(1, 3, 1, 1))
+        self.register_buffer("std", torch.tensor(std).view(1, 3, 1, 1))
+        for parameter in self.network.segmentation_head.parameters():
+            nn.init.zeros_(parameter)
+        self.polynomial_head = PolynomialFlowHead(self.network.encoder.out_channels[-1], channels) if smooth else None
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # missing in torch's annotations
+        self.train()
+
+    def train(self, mode: bool = True) -> "CoordConvSegmenter":
+        """Set the training mode; a frozen encoder stays in evaluation mode."""
+        super().train(mode)
+        if self.is_frozen:
+            self.network.encoder.eval()
+        return self
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Predict the maps for images of any size.
+
+        Args:
+            image: (B, 3, H, W), in [0, 1].
+
+        Returns:
+            (B, channels, ceil(H / cell), ceil(W / cell)); with `smooth` float32, even under autocast.
+
+        Raises:
+            ValueError: the image has another shape.
+        """
+        if image.ndim != 4 or image.shape[1] != 3:
+            raise ValueError(f"image must have shape (B, 3, H, W), got {tuple(image.shape)}")
+        height, width = image.shape[2:]
+        inputs = torch.cat([(image - self.mean) / self.std, pixel_coordinates(image)], dim=1)
+        inputs = F.pad(inputs, (0, -width % _STRIDE, 0, -height % _STRIDE), mode="replicate")
+        features = self.network.encoder(inputs.contiguous(memory_format=torch.channels_last))
+        maps = self.network.segmentation_head(self.network.decoder(features))
+        maps = maps[:, :, : -(-height // self.cell), : -(-width // self.cell)]
+        if self.polynomial_head is None:
+            return maps
+        return maps + self.polynomial_head(features[-1], *_cell_axes(image, self.cell))
+
+
+class PolynomialFlowHead(nn.Module):
+    """Predict smooth maps of the whole frame from its coarsest features.
+
+        map(x, y) = sum over i + j <= 5 of c_ij T_i(x) T_j(y),  T_n(x) = cos(n arccos(x))
+
+    with x and y as of `pixel_coordinates`. Two layers compute the 21 coefficients c_ij of each channel from the mean
+    and the maximum of each feature. The coefficients start at zero.
+
+    The flow of a lens is such a map, and every pixel carries a little evidence for it.
+
+    Args:
+        features: number of feature channels.
+        channels: number of maps.
+    """
+
+    def __init__(self, features: int, channels: int):
+        super().__init__()
+        self.channels = channels
+        self.terms = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+        last = nn.Linear(_HIDDEN, channels * len(self.terms))
+        for parameter in last.parameters():
+            nn.init.zeros_(parameter)
+        self.layers = nn.Sequential(nn.Linear(2 * features, _HIDDEN), nn.SiLU(), last)
+
+    def forward(self, features: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        """Evaluate the maps on a grid.
+
+        Args:
+            features: (B, F, h, w).
+            x, y: (W,) and (H,), coordinates of the columns and rows, in [-1, 1].
+
+        Returns:
+            (B, channels, H, W), float32.
+        """
+        flat = features.float().flatten(2)
+        pooled = torch.cat([flat.mean(dim=2), flat.amax(dim=2)], dim=1)
+        basis = torch.stack([_chebyshev(y, j)[:, None] * _chebyshev(x, i) for i, j in self.terms])
+        if torch.is_autocast_enabled(features.device.type):
+            # bfloat16 has 8 bits of mantissa: a flow of 100 px would be off by a quarter of a pixel.
+            with torch.autocast(features.device.type, enabled=False):
+                return self._maps(pooled, basis)
+        return self._maps(pooled, basis)
+
+    def _maps(self, pooled: Tensor, basis: Tensor) -> Tensor:
+        coefficients = self.layers(pooled).unflatten(1, (self.channels, len(self.terms)))
+        return torch.einsum("bct,thw->bchw", coefficients, basis)
+
+
+def pixel_coordinates(image: Tensor) -> Tensor:
+    """Compute the coordinates of the pixel centers in units of half the frame.
+
+        x = (2 column + 1) / W - 1,  y = (2 row + 1) / H - 1
+
+    A convolution alone cannot tell where on the frame it is, and the effect of a lens depends on that.
+
+    Args:
+        image: (B, C, H, W).
+
+    Returns:
+        (B, 2, H, W), x and y in [-1, 1].
+    """
+    batch, _, height, width = image.shape
+    x, y = _cell_axes(image, 1)
+    axes = (x.view(1, 1, 1, width), y.view(1, 1, height, 1))
+    return torch.cat([axis.expand(batch, 1, height, width) for axis in axes], dim=1)
+
+
+def _cell_axes(image: Tensor, cell: int) -> tuple[Tensor, Tensor]:
+    """Return x, (ceil(W / cell),), and y, (ceil(H / cell),), of the centers of cells; the last may exceed 1."""
+    height, width = image.shape[2:]
+    x, y = pixel_axes(-(-height // cell), -(-width // cell), dtype=image.dtype, device=image.device)
+    return cell * (2 * x.flatten() + 1) / width - 1, cell * (2 * y.flatten() + 1) / height - 1
+
+
+def _chebyshev(x: Tensor, degree: int) -> Tensor:
+    return torch.cos(degree * torch.acos(x.float().clamp(-1, 1)))
+
+
+class _CoordinateInputs(nn.Module):
+    """Append the weights of two more input channels to the weight of a convolution."""
+
+    def __init__(self, weight: Tensor, *, start_at_zero: bool):
+        super().__init__()
+        added = torch.zeros_like(weight[:, :2])
+        self.coordinate_weight = nn.Parameter(
+            added if start_at_zero else nn.init.normal_(added, std=float(weight.std()))
+        )
+
+    def forward(self, weight: Tensor) -> Tensor:
+        return torch.cat([weight, self.coordinate_weight], dim=1)
+
+
+def _add_coordinate_inputs(encoder: nn.Module, *, start_at_zero: bool) -> None:
+    """Let the first convolution of an encoder take the two coordinates after the three colors."""
+    stem = next(module for module in encoder.modules() if isinstance(module, nn.Conv2d))
+    inputs = _CoordinateInputs(stem.weight.detach(), start_at_zero=start_at_zero)
+    parametrize.register_parametrization(stem, "weight", inputs, unsafe=True)  # unsafe: the shape changes
+    stem.in_channels = cast(Tensor, stem.weight).shape[1]

@@ -1,0 +1,388 @@
+"""Figures of images in rows and columns, and the contact sheet of effects on one frame.
+
+Figures do not resample images: `resize_for_display` enlarges or reduces them first, and a figure places them on whole
+pixels.
+"""
+
+import math
+import textwrap
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
+
+import torch
+import torch.nn.functional as F
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from torchrefract._tensor import to_float, to_uint8
+from torchrefract.cameras.distortion import POLYNOMIAL12
+from torchrefract.effects.base import Effect
+from torchrefract.effects.compose import Compose
+from torchrefract.effects.defog import remove_fog
+from torchrefract.effects.flare import LensFlare
+from torchrefract.types import Degraded
+from torchrefract.visualization.color import (
+    checkerboard,
+    flow_to_rgb,
+    flow_wheel,
+    full_color_px,
+    hatch_invalid,
+    mark_folded,
+    round_up,
+    transmission_to_rgb,
+)
+from torchrefract.warping.grid import length
+from torchrefract.warping.flow import folded
+from torchrefract.warping.warp import warp
+
+_DPI = 100
+_SMALLEST_SIDE = 320  # px, longer side of a displayed image
+_SHEET_SIDE = 480  # px, largest longer side of an image on a contact sheet
+_COLUMNS = ("frame", "corrupted", "checkerboard", "map", "restored")
+_SQUARES = 20  # of the checkerboard along the longer side
+_PARAMETER_TEXTS: dict[str, Callable[[Tensor], str]] = {
+    "amplitude": lambda value: f"amplitude {value:.2g} px",
+    "length": lambda value: f"length {value:.3g} px",
+    "aperture": lambda value: f"aperture {value:.2g} px",
+    "displacement": lambda value: f"{len(value)} control points, {value.square().mean().sqrt():.2g} px rms in x and y",
+    "coefficients": lambda value: ", ".join(
+        f"{name} {k:.2g}" for name, k in zip(POLYNOMIAL12, value.tolist(), strict=True) if k
+    ),
+    "focal": lambda value: f"focal length {value[0]:.2f} widths",
+    "visibility": lambda value: f"visibility {value:.3g} m",
+    "contrast": lambda value: f"contrast {value:.2g}",
+    "sun": lambda value: f"sun at {value[0]:.2f} widths, {value[1]:.2f} heights",
+    "radius": lambda value: f"radius {value:.2g} diagonals",
+    "strength": lambda value: f"strength {value:.2g}",
+    "center": lambda value: f"center off by ({value[0]:.1g}, {value[1]:.1g}) widths",
+    "wind": lambda value: f"wind ({value[0]:.2g}, {value[1]:.2g}) px/frame",
+    "wind_m": lambda value: f"wind ({', '.join(f'{v:.2g}' for v in value.tolist())}) m/frame",
+}
+_MAP_UNITS = {"extinction": "/m"}
+_NEUTRAL = {"transmission": 1.0, "intensity": 0.0}  # value of a map that changes nothing
+
+
+def resize_for_display(images: Tensor, *, largest: int = 640) -> Tensor:
+    """Bring images to the size of display: repeat the pixels of small ones, reduce large ones by area.
+
+    Args:
+        images: (B, C, H, W), floating; values outside [0, 1] are clamped, values that are not finite turn gray.
+        largest: largest longer side of the result, px, at least 320.
+
+    Returns:
+        (B, C, h, w), float32 in [0, 1], on the CPU.
+    """
+    images = torch.where(images.isfinite(), images, 0.5).detach().float().cpu().clamp(0, 1)
+    height, width = images.shape[2:]
+    side = max(height, width)
+    if side <= largest:
+        factor = min(math.ceil(_SMALLEST_SIDE / side), largest // side)
+        return images.repeat_interleave(factor, dim=2).repeat_interleave(factor, dim=3)
+    scale = largest / side
+    return F.interpolate(images, (max(1, round(height * scale)), max(1, round(width * scale))), mode="area")
+
+
+class FigureLayout(NamedTuple):
+    """Positions of images and texts on a figure, in whole px from the top left."""
+
+    rows: int
+    columns: int
+    height: int  # of an image
+    width: int
+    caption_lines: int  # above each row
+    header_lines: int = 2  # above the first caption
+    footer_lines: int = 4  # below the last row
+    min_column_lines: int = 12  # smallest distance of columns, in lines: a narrow image leaves space for its title
+
+    @property
+    def text(self) -> int:
+        """Height of a line of text; letters fill four fifths of it."""
+        return max(self.height, self.width) // 20
+
+    @property
+    def column_px(self) -> int:
+        """Distance from column to column."""
+        return max(self.width + self.text // 2, self.min_column_lines * self.text)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the figure."""
+        return 2 * self.text + self.columns * self.column_px, self.top(self.rows) + self.footer_lines * self.text
+
+    def left(self, column: int) -> int:
+        """Left side of the images in a column."""
+        return self.text + column * self.column_px + (self.column_px - self.width) // 2
+
+    def top(self, row: int) -> int:
+        """Upper side of the images in a row."""
+        caption = round((1.3 * self.caption_lines + 0.8) * self.text)
+        return self.header_lines * self.text + row * (self.height + caption) + caption
+
+    def figure(self) -> Figure:
+        """Create an empty figure."""
+        return Figure(figsize=(self.size[0] / _DPI, self.size[1] / _DPI), dpi=_DPI, facecolor="white")
+
+    def write(self, figure: Figure, text: str, x: float, y: float, *, ha: str = "left", weight: str = "normal") -> None:
+        """Write a text whose lower edge is at y and whose left end, center or right end (`ha`) is at x."""
+        position, points = (x / self.size[0], 1 - y / self.size[1]), 0.8 * self.text * 72 / _DPI
+        figure.text(*position, text, ha=ha, va="bottom", weight=weight, fontsize=points, parse_math=False)
+
+    def show(self, figure: Figure, image: Tensor, x: int, y: int) -> None:
+        """Place an image (3, h, w) in [0, 1] with its upper left corner at (x, y), pixel by pixel."""
+        (height, width), (total_width, total_height) = image.shape[1:], self.size
+        box = (x / total_width, 1 - (y + height) / total_height, width / total_width, height / total_height)
+        axes = figure.add_axes(box)
+        axes.set_axis_off()
+        axes.imshow(to_uint8(image[None])[0].movedim(0, -1).numpy(), interpolation="nearest", aspect="auto")
+
+    def explain(self, figure: Figure, image: Tensor, text: str, *, x: int, y: int) -> None:
+        """Write a legend: a patch of an image (3, h, w), three lines wide and two high, and a text to its right."""
+        self.show(figure, image[:, : 2 * self.text, : 3 * self.text], x, y)
+        self.write(figure, text, x + 4 * self.text, y + round(1.5 * self.text))
+
+
+class MapScale(NamedTuple):
+    """A map of `Degraded`, and the value of its last color."""
+
+    name: str
+    top: float  # px of a flow in full color, 1/m of an extinction, light of an intensity
+
+
+class ContactSheetRow(NamedTuple):
+    """An effect on a frame; images are (3, h, w), at the size of display."""
+
+    title: str  # name and parameters of the effect
+    scores: str
+    frame: Tensor
+    corrupted: Tensor
+    checkerboard: Tensor
+    map: Tensor | None
+    scales: tuple[MapScale, ...]  # of the map, one for each half if there are two
+    restored: Tensor | None
+
+
+class _Restored(NamedTuple):
+    image: Tensor  # (1, 3, H, W)
+    valid: Tensor  # (1, 1, H, W), bool
+    label: str  # follows its score
+
+
+def contact_sheet_row(
+    name: str, effect: Effect, *, frame: Tensor, seed: int, depth: Tensor | None = None
+) -> ContactSheetRow:
+    """Degrade a frame and a checkerboard by one draw of an effect, and restore the frame.
+
+    The restored image is warp(corrupted, restore_flow), bicubic, or remove_fog(round(255 corrupted) / 255) for fog
+    alone. Invalid pixels are hatched, folded ones of the checkerboard tinted. All is computed at the frame's size.
+
+    Args:
+        name: of the effect.
+        effect: any.
+        frame: (1, 3, H, W), float in [0, 1].
+        seed: of the draw.
+        depth: (1, 1, H, W), m, for effects that depend on it.
+
+    Raises:
+        ValueError: if the effect cannot degrade this frame.
+    """
+    height, width = frame.shape[2:]
+    board = checkerboard(height, width, cell=max(1, round(max(height, width) / _SQUARES)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # The sheet marks the folds that effects warn of.
+        degraded = effect.degrade(frame, seed=seed, depth=depth)
+        degraded_board = effect.apply(board, degraded.params, depth=depth).image
+    scales, restored, folds = map_scales(degraded), _restore(effect, degraded), _folded(degraded)
+    hatched_board = hatch_invalid(_sheet_size(degraded_board), degraded.valid)
+    return ContactSheetRow(
+        title=": ".join(filter(None, (name, describe_params(effect, degraded.params)))),
+        scores=_scores(degraded, frame, restored=restored, folds=folds),
+        frame=_sheet_size(frame)[0],
+        corrupted=_sheet_size(degraded.image)[0],
+        checkerboard=mark_folded(hatched_board, folds)[0],
+        map=map_image(degraded, scales, largest=_SHEET_SIDE) if scales else None,
+        scales=scales,
+        restored=None if restored is None else hatch_invalid(_sheet_size(restored.image), restored.valid)[0],
+    )
+
+
+def contact_sheet(rows: Sequence[ContactSheetRow], *, title: str) -> Figure:
+    """Draw the rows below a title; the scale of each map stands above it.
+
+    Args:
+        rows: at least one, all of one frame.
+        title: one line.
+    """
+    layout = FigureLayout(
+        len(rows), len(_COLUMNS), *rows[0].frame.shape[1:], caption_lines=1, header_lines=4, footer_lines=1
+    )
+    # A letter is about half as wide as a line is high. A caption ends where the legend of the map begins.
+    letters = 2 * _COLUMNS.index("map") * layout.column_px // layout.text
+    captions = [(textwrap.wrap(row.title, letters), textwrap.wrap(row.scores, letters)) for row in rows]
+    layout = layout._replace(caption_lines=max(len(head) + len(tail) for head, tail in captions))
+    figure = layout.figure()
+    layout.write(figure, title, layout.left(0), 2 * layout.text, weight="bold")
+    for j, column in enumerate(_COLUMNS):
+        layout.write(figure, column, layout.left(j) + layout.width / 2, 4 * layout.text, ha="center", weight="bold")
+    for i, (row, (head, tail)) in enumerate(zip(rows, captions, strict=True)):
+        y = layout.top(i) - 0.3 * layout.text
+        layout.write(figure, "\n".join(tail), layout.left(0), y)
+        layout.write(figure, "\n".join(head), layout.left(0), y - 1.3 * len(tail) * layout.text, weight="bold")
+        _draw_row(figure, layout, row, i)
+    _draw_key(figure, layout)
+    return figure
+
+
+def describe_params(effect: Effect, params: Any) -> str:
+    """Describe the parameters of the first sample, "amplitude 2.3 px, length 31 px"; zeros are left out."""
+    if isinstance(effect, Compose):
+        leaves = [
+            f"{type(leaf).__name__} ({describe_params(leaf, leaf_params)})"
+            for leaf, leaf_params, *_ in effect.leaves(params)
+            if leaf_params.applied[0]
+        ]
+        return " + ".join(leaves) or "not applied"
+    if not params.applied[0]:
+        return "not applied"
+    values = {name: value[0] for name, value in zip(params._fields, params, strict=True)}
+    # One field means different things in different effects.
+    if isinstance(effect, LensFlare):
+        values["sun"] = values.pop("center")
+    mode = getattr(effect, "mode", None)
+    if mode == "image":
+        values.pop("contrast")  # used in mode="ray" only
+    elif mode == "ray":
+        values["wind_m"] = values.pop("wind")
+    names = [name for name in _PARAMETER_TEXTS if name in values and values[name].any()]
+    return ", ".join(_PARAMETER_TEXTS[name](values[name]) for name in names)
+
+
+def map_scales(degraded: Degraded) -> tuple[MapScale, ...]:
+    """Choose the maps to show: the flow; else transmission or intensity, and an extinction that varies.
+
+    The scale of a flow is that of its valid pixels, the scale of an intensity or extinction its largest value.
+    """
+    if degraded.has("flow"):
+        return (MapScale("flow", full_color_px(degraded.flow, degraded.valid)),)
+    names = [name for name in _NEUTRAL if degraded.has(name)]
+    if not names:
+        return ()
+    name = next((name for name in names if (getattr(degraded, name) != _NEUTRAL[name]).any()), names[0])
+    if name == "intensity":
+        return (MapScale(name, round_up(degraded.intensity.amax().item())),)
+    k = degraded.extinction if degraded.has("extinction") else torch.zeros(1)
+    varies = k.amax() > 1.001 * k.amin()
+    return (MapScale(name, 1.0), *([MapScale("extinction", round_up(k.amax().item()))] if varies else []))
+
+
+def map_image(degraded: Degraded, scales: Sequence[MapScale], *, largest: int) -> Tensor:
+    """Color the map of the first sample; of two maps, show the left half of the first and the right half of the other.
+
+    Args:
+        degraded: a batch of images.
+        scales: of `map_scales`, at least one.
+        largest: largest longer side of the result, px, at least 320.
+
+    Returns:
+        (3, h, w), in [0, 1]; a flow is hatched where it is invalid.
+    """
+    if scales[0].name == "flow":
+        rgb = flow_to_rgb(degraded.flow[:1], max_px=scales[0].top)
+        return hatch_invalid(resize_for_display(rgb, largest=largest), degraded.valid[:1])[0]
+    maps = (resize_for_display(getattr(degraded, scale.name)[:1] / scale.top, largest=largest) for scale in scales)
+    first, *others = (transmission_to_rgb(value)[0] for value in maps)
+    middle = first.shape[2] // 2
+    return torch.cat([first[..., :middle], others[0][..., middle:]], dim=2) if others else first
+
+
+def draw_legend(figure: Figure, layout: FigureLayout, scales: Sequence[MapScale], *, x: int, y: int) -> None:
+    """Draw the color wheel or the color bars of a map above its upper left corner (x, y)."""
+    text = layout.text
+    if scales and scales[0].name == "flow":
+        size = round(2.6 * text)
+        layout.show(figure, flow_wheel(size), x, y - 3 * text)
+        layout.write(figure, f"full color = {scales[0].top:g} px", x + size + text / 2, y - 1.7 * text)
+        layout.write(figure, "darker = longer", x + size + text / 2, y - 0.4 * text)
+        return
+    bar = transmission_to_rgb(torch.linspace(0, 1, 3 * text).expand(1, 1, text, -1))[0]
+    for i, scale in enumerate(reversed(scales)):
+        line = y - (0.4 + 1.3 * i) * text
+        layout.write(figure, "0", x, line)
+        layout.show(figure, bar, x + text, round(line - 1.1 * text))
+        side = "" if len(scales) == 1 else " (right)" if i == 0 else " (left)"
+        layout.write(figure, f"{scale.top:g}{_MAP_UNITS.get(scale.name, '')} {scale.name}{side}", x + 4.4 * text, line)
+
+
+def draw_invalid_key(figure: Figure, layout: FigureLayout, *, x: int, y: int) -> None:
+    """Draw the legend of hatched pixels."""
+    black = torch.zeros(1, 3, layout.height, layout.width)
+    stripes = hatch_invalid(black, torch.zeros(1, 1, 1, 1, dtype=torch.bool))[0]
+    layout.explain(figure, stripes, "invalid: lost, or outside the frame", x=x, y=y)
+
+
+def _sheet_size(image: Tensor) -> Tensor:
+    return resize_for_display(image, largest=_SHEET_SIDE)
+
+
+def _folded(degraded: Degraded) -> Tensor:
+    """Mark folded pixels, (1, 1, H, W), as `Degraded.folding` counts them."""
+    return folded(degraded.flow, degraded.valid) if degraded.has("flow") else torch.zeros_like(degraded.valid)
+
+
+def _restore(effect: Effect, degraded: Degraded) -> _Restored | None:
+    """Undo the flow or the fog; None for an effect that has neither."""
+    if degraded.has("flow"):
+        image = warp(degraded.image, degraded.restore_flow, interpolation="bicubic")[0]
+        remaining = [text for name, text in (("transmission", "fog"), ("intensity", "flare")) if degraded.has(name)]
+        label = f"restored except {' and '.join(remaining)}" if remaining else "restored"
+        return _Restored(image, degraded.restore_valid, label)
+    if "airlight" not in degraded.params._fields:
+        return None
+    # A float image would be restored exactly, which no image file allows.
+    stored, fog = to_float(to_uint8(degraded.image)), cast(Any, effect)
+    t, airlight = degraded.transmission, degraded.params.airlight
+    return _Restored(*remove_fog(stored, t, airlight, linear_light=fog.air.linear_light), "restored from 8 bits")
+
+
+def _scores(degraded: Degraded, frame: Tensor, *, restored: _Restored | None, folds: Tensor) -> str:
+    """Score the pixels that can be restored or, if nothing can be undone, the valid ones."""
+    valid = degraded.valid if restored is None else restored.valid
+    texts = [f"{valid.float().mean().item():.1%} valid"]
+    if valid.any():
+        texts.append(f"{_psnr(degraded.image, frame, valid):.1f} dB corrupted")
+    if degraded.has("flow"):
+        longest = (length(degraded.flow) * degraded.valid).max().item()
+        texts.insert(0, f"largest displacement {longest:.3g} px")
+    if restored is not None and valid.any():
+        texts[-1] += f", {_psnr(restored.image, frame, valid):.1f} dB {restored.label}"
+    if folds.any():
+        texts.append(f"{100 * folds.float().mean().item():.2g}% folded")
+    return "; ".join(texts)
+
+
+def _psnr(image: Tensor, frame: Tensor, valid: Tensor) -> float:
+    """Compute the peak signal-to-noise ratio on valid pixels, dB."""
+    mse = (image.clamp(0, 1) - frame)[valid.expand_as(frame)].square().mean()
+    return -10 * mse.clamp(min=1e-10).log10().item()
+
+
+def _draw_row(figure: Figure, layout: FigureLayout, row: ContactSheetRow, i: int) -> None:
+    images = (row.frame, row.corrupted, row.checkerboard, row.map, row.restored)
+    for j, image in enumerate(images):
+        if image is not None:
+            layout.show(figure, image, layout.left(j), layout.top(i))
+        else:
+            text = "no flow or fog to undo" if _COLUMNS[j] == "restored" else "no map"
+            layout.write(
+                figure, text, layout.left(j) + layout.width / 2, layout.top(i) + layout.height / 2, ha="center"
+            )
+    draw_legend(figure, layout, row.scales, x=layout.left(_COLUMNS.index("map")), y=layout.top(i))
+
+
+def _draw_key(figure: Figure, layout: FigureLayout) -> None:
+    """Explain hatching and tint below all rows."""
+    y = layout.top(layout.rows) - 2 * layout.text
+    draw_invalid_key(figure, layout, x=layout.left(0), y=y)
+    gray = torch.full((1, 3, layout.height, layout.width), 0.5)
+    tinted = mark_folded(gray, torch.ones(1, 1, 1, 1, dtype=torch.bool))[0]
+    layout.explain(figure, tinted, "folded: shown twice or mirrored", x=layout.left(2), y=y)

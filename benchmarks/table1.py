@@ -28,13 +28,13 @@ from arguments import count
 from slow_timing import seconds
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
+from torchrefract.data.frame_folder import FrameFolder
+from torchrefract.effects.defog import remove_fog
 
 from torchrefract._io import replace_file
 from torchrefract._tensor import to_float, to_uint8
-from torchrefract.data.frame_folder import FrameFolder
 from torchrefract.data.module import make_pair
 from torchrefract.effects.base import Effect
-from torchrefract.effects.defog import remove_fog
 from torchrefract.effects.flare import LensFlare
 from torchrefract.effects.lens import LensDistortion
 from torchrefract.effects.one_of import OneOf

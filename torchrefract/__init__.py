@@ -31,9 +31,8 @@ from torchrefract.labels.maps import warp_depth, warp_mask, warp_optical_flow
 from torchrefract.labels.points import warp_points
 from torchrefract.labels.targets import warp_labels
 from torchrefract.types import Degraded, Folding, Frame, Pair
-from torchrefract.warping.flow import compose_flows
+from torchrefract.warping.flow import compose_flows, folding, jacobian_determinant
 from torchrefract.warping.invert import invert_flow
-from torchrefract.warping.flow import folding, jacobian_determinant
 from torchrefract.warping.warp import warp
 
 __all__ = [

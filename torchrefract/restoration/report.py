@@ -17,12 +17,12 @@ from pytorch_lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from torchrefract._io import replace_file
-from torchrefract.visualization.figures import FigureLayout, resize_for_display
 from torchrefract.restoration.metrics import psnr
 from torchrefract.restoration.module import RestorationModule
 from torchrefract.restoration.tasks import Restored
 from torchrefract.types import Pair
 from torchrefract.visualization.color import flow_to_rgb, flow_wheel, full_color_px, hatch_invalid
+from torchrefract.visualization.figures import FigureLayout, resize_for_display
 
 METRICS, METRICS_BEFORE = "metrics.csv", "metrics_before.csv"
 _PANEL_ROWS = 4

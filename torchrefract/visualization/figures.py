@@ -32,8 +32,8 @@ from torchrefract.visualization.color import (
     round_up,
     transmission_to_rgb,
 )
-from torchrefract.warping.grid import length
 from torchrefract.warping.flow import folded
+from torchrefract.warping.grid import length
 from torchrefract.warping.warp import warp
 
 _DPI = 100

@@ -6,7 +6,7 @@ python benchmarks/effects.py --calls
 """
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -49,7 +49,7 @@ WHAT = (
 )
 PACKAGE = str(Path(tr.__file__).parent)
 ALL = "all four warps"
-OTHER_WARPS: Mapping[str, Callable[..., Any]] = {
+OTHER_WARPS: dict[str, Callable[..., Any]] = {
     "default lenses": tr.LensDistortion,
     "rough turbulence": partial(
         tr.Turbulence, amplitude_range=(1.2, 1.8), length_range=(40.0, 80.0), aperture_range=(4.0, 6.0)
@@ -98,13 +98,13 @@ def candidates(frame: Tensor, backends: Sequence[str]) -> dict[str, Candidate]:
     """Return what is timed on a frame (B, C, H, W), by name; the references come first."""
     chosen: dict[str, Any] = {}
     for backend in backends:
-        for name, make in (WARPS | OTHER_WARPS | {ALL: all_warps}).items():
+        for name, make in {**WARPS, **OTHER_WARPS, ALL: all_warps}.items():
             for tolerance_px in (TOLERANCE_PX, None):
                 chosen[row(name, tolerance_px, backend)] = make(tolerance_px=tolerance_px, backend=backend)
     chosen |= {name: make() for name, make in PHOTOMETRIC.items()}
     timed = references(frame)
     for name in (*WARPS, ALL):
-        flow = (WARPS | {ALL: all_warps})[name](tolerance_px=TOLERANCE_PX).degrade(frame, seed=0).flow
+        flow = {**WARPS, ALL: all_warps}[name](tolerance_px=TOLERANCE_PX).degrade(frame, seed=0).flow
         timed[f"{GRID_SAMPLE} along {name}"] = partial(
             F.grid_sample, frame, sampling_grid(flow), mode="bilinear", align_corners=False
         )

@@ -34,20 +34,19 @@ RESULTS = Path(__file__).parent / "results"
 TOLERANCE_PX = 0.05
 
 MIN_REPEATS = 15
-_SLOW_S = 0.5  # candidates that take longer run in the first _SLOW_REPEATS rounds only
-_SLOW_REPEATS = 3
+_SLOW_S = 0.5  # candidates that take longer run in the first rounds only
 _STRETCH_S = 0.02  # shortest timed stretch, far above the resolution of the clock and the start of a thread
 _MAX_CALLS = 1000
 _REFERENCE_FLOW_PX = 4.0
 
 # Warps whose flow is smooth enough for a lattice; call with `tolerance_px` and other arguments of a warp.
-WARPS: Mapping[str, Callable[..., Any]] = {
+WARPS: dict[str, Callable[..., Any]] = {
     "mild lens": partial(tr.LensDistortion, k1_range=(-0.25, -0.25), k2_range=(0.09, 0.09), focal_range=(0.9, 0.9)),
     "thin-plate spline": tr.ThinPlateSpline,
     "Gaussian turbulence": partial(tr.Turbulence, covariance="gaussian", length_range=(40.0, 60.0)),
     "divergence-free": partial(tr.DivergenceFree, length_range=(40.0, 60.0)),
 }
-PHOTOMETRIC: Mapping[str, Callable[..., Any]] = {
+PHOTOMETRIC: dict[str, Callable[..., Any]] = {
     "uniform fog": tr.UniformFog,
     "heterogeneous fog": tr.HeterogeneousFog,
     "volumetric fog": partial(tr.HeterogeneousFog, mode="ray", depth=tr.GroundPlaneDepth()),
@@ -150,18 +149,20 @@ def measure(
     *,
     references: Sequence[str] = (GRID_SAMPLE,),
     repeats: int = MIN_REPEATS,
+    slow_repeats: int = 3,
     threads: int = 1,
     clock: Callable[[], float] = benchmark.timer,
 ) -> list[Timing]:
     """Time all candidates in turns and return their timings, in order.
 
     Two untimed calls precede each timed stretch of a fast candidate, so that memory and caches are in the state of
-    steady use. A candidate that takes 0.5 s or more runs three times in all.
+    steady use. A candidate that takes 0.5 s or more has few rounds of one call.
 
     Args:
         candidates: functions to call, by name.
         references: names of the candidates to divide by.
         repeats: number of rounds, at least 15.
+        slow_repeats: number of rounds of slow candidates, at least 2.
         threads: number of torch's threads on the CPU.
         clock: returns seconds; the default waits for an accelerator first.
 
@@ -183,7 +184,7 @@ def measure(
             {
                 name: _seconds(name, call, calls[name], 0 if is_slow[name] else 2, clock)
                 for name, call in candidates.items()
-                if i < _SLOW_REPEATS or not is_slow[name]
+                if i < slow_repeats or not is_slow[name]
             }
             for i in range(repeats)
         ]

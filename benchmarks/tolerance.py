@@ -188,8 +188,8 @@ def _composition(dice: random.Random, *size: int) -> Callable[[float | None], An
 def _fog_arguments(dice: random.Random, height: int, width: int) -> dict[str, Any]:
     thin = dice.choice((0.0, dice.random() * 0.2))
     focal, offset = width * log_uniform(dice, 0.4, 2), dice.uniform(-0.1, 0.1)
-    center = {"cx": width * (0.5 + offset), "cy": height * (0.5 - offset)}
-    camera = tr.Camera(width=width, height=height, fx=focal, fy=focal, coefficients=(0.0,) * 4, **center)
+    cx, cy = width * (0.5 + offset), height * (0.5 - offset)
+    camera = tr.Camera(width=width, height=height, fx=focal, fy=focal, cx=cx, cy=cy, coefficients=(0.0,) * 4)
     road = tr.GroundPlaneDepth(
         camera_height=log_uniform(dice, 0.5, 3),
         horizon=dice.uniform(0.2, 0.7),

@@ -289,8 +289,8 @@ def plot(path: Path, rows: Sequence[Row]) -> None:
     for row in rows:
         panels[row.effect][row.setting].append(row)
     figure = Figure(figsize=(10.4, 3.1 * math.ceil(len(panels) / 2)), dpi=110, layout="constrained")
-    all_axes = figure.subplots(math.ceil(len(panels) / 2), 2, squeeze=False, sharey=True).flat
-    for axes in list(all_axes)[len(panels) :]:
+    all_axes = list(figure.subplots(math.ceil(len(panels) / 2), 2, squeeze=False, sharey=True).flat)
+    for axes in all_axes[len(panels) :]:
         axes.set_axis_off()
     for axes, (name, series) in zip(all_axes, panels.items(), strict=False):
         for color, (setting, members) in zip(_COLORS, series.items(), strict=False):

@@ -7,8 +7,8 @@ import torch
 
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io.opencv import read_opencv, write_opencv
-from torchrefract.fields.rectification import camera_flow
 from torchrefract.data.media import video_info
+from torchrefract.fields.rectification import camera_flow
 
 PINHOLE = {"width": 96, "height": 64, "fx": 70.0, "fy": 71.0, "cx": 46.2, "cy": 33.1}
 CAMERAS = {

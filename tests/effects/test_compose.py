@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 from torch.testing import assert_close
+from torchrefract.effects.refraction import WarpEffect
 
 from torchrefract import (
     Compose,
@@ -22,7 +23,6 @@ from torchrefract import (
     warp,
 )
 from torchrefract.effects.base import Effect
-from torchrefract.effects.refraction import WarpEffect
 
 MAPS = ("image", "flow", "valid", "restore_flow", "restore_valid", "restore_residual", "transmission", "intensity")
 LENS: dict[str, Any] = {"k1_range": (-0.3, -0.2), "k2_range": (0.1, 0.2)}

@@ -6,6 +6,10 @@ from typing import Any
 import pytest
 import torch
 from torch.testing import assert_close
+from torchrefract.effects.compose_plan import ComposePlan
+from torchrefract.effects.lattice_warp import LatticeWarp
+from torchrefract.effects.plan import Plan
+from torchrefract.fields.spline import evaluate_spline, fit_spline
 
 from torchrefract import (
     Compose,
@@ -19,10 +23,6 @@ from torchrefract import (
     UniformFog,
 )
 from torchrefract.cameras import Camera
-from torchrefract.effects.compose_plan import ComposePlan
-from torchrefract.effects.lattice_warp import LatticeWarp
-from torchrefract.effects.plan import Plan
-from torchrefract.fields.spline import evaluate_spline, fit_spline
 from torchrefract.warping.lattice import Lattice, LatticeFlow, lagrange_weights
 
 SIZE = (96, 130)

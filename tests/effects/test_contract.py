@@ -15,6 +15,7 @@ from domain import WARNED
 from torch import Tensor, nn
 from torch.testing import assert_close
 from torch.utils.data import DataLoader, Dataset
+from torchrefract.effects.refraction import WarpEffect
 
 import torchrefract
 from torchrefract import (
@@ -32,7 +33,6 @@ from torchrefract import (
     warp,
 )
 from torchrefract.effects.base import Effect
-from torchrefract.effects.refraction import WarpEffect
 
 DTYPES = [torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64]
 MAPS = ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission", "extinction", "intensity")

@@ -9,12 +9,12 @@ import tolerance
 import torch
 from scipy.interpolate import lagrange
 from torch.testing import assert_close
-
-from torchrefract import Compose, DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, UniformFog
 from torchrefract.effects.field_plan import FieldPlan
 from torchrefract.effects.lattice_warp import LatticeWarp
 from torchrefract.effects.plan import MOST_ULPS
 from torchrefract.fields.stream import curl
+
+from torchrefract import Compose, DivergenceFree, LensDistortion, ThinPlateSpline, Turbulence, UniformFog
 from torchrefract.warping.grid import sampler_grid
 from torchrefract.warping.lattice import Lattice, LatticeFlow, StreamFlow, between_nodes
 

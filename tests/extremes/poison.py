@@ -13,10 +13,10 @@ from itertools import islice, product
 
 import torch
 from torch import Tensor
+from torchrefract.effects.refraction import WarpEffect
 
 import torchrefract as tr
 from torchrefract.effects.base import Effect
-from torchrefract.effects.refraction import WarpEffect
 from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS
 
 Case = tuple[str, Callable[[], None]]

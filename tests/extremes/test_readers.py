@@ -29,9 +29,9 @@ from torchrefract.cameras.io.ros import read_ros, write_ros
 from torchrefract.cameras.lens_database import COLUMNS, read_lenses
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import UnreadableImageError, image_size, read_image
+from torchrefract.data.pairs import PairedFolder
 from torchrefract.data.pairs.files import FORMATS, DamagedPairError, PairArrays, encode_pair
 from torchrefract.data.pairs.manifest import PairRow, Stored, read_row
-from torchrefract.data.pairs import PairedFolder
 from torchrefract.restoration.checkpoints import CheckpointError, check_fits, read_checkpoint
 
 SECONDS = 10.0  # for one small file, on a machine that is busy

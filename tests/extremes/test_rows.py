@@ -13,9 +13,9 @@ from domain import DTYPES, WARNED
 from promises import KINDS, LEARNED, MASKED, NOTHING, REFUSED, TOLD
 from torch import Tensor
 from torch.testing import assert_close
+from torchrefract.effects.refraction import WarpEffect
 
 import torchrefract as tr
-from torchrefract.effects.refraction import WarpEffect
 from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

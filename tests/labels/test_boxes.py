@@ -6,7 +6,6 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import LensDistortion, ThinPlateSpline, warp_boxes
-from torchrefract.labels.boxes import warp_outlines
 
 SIZE = (90, 140)
 FRAME = [-0.5, -0.5, SIZE[1] - 0.5, SIZE[0] - 0.5]
@@ -138,16 +137,6 @@ def test_boxes_below_the_limits_are_not_kept():
     ]:
         options: dict[str, Any] = limits
         assert warp_boxes(boxes, flow, **options)[1].tolist() == expected, limits
-
-
-def test_extent_along_rotated_axes_is_that_of_the_rotated_points():
-    corners = torch.tensor([[40.0, 30.0], [60.0, 30.0], [60.0, 50.0], [40.0, 50.0]]).double()[None, None]
-    outlines = warp_outlines(corners, torch.zeros(1, 2, *SIZE, dtype=torch.float64), samples=9)
-    axes = torch.tensor([[1.0, 1.0], [-1.0, 1.0]]).double()[None, None] / 2**0.5
-    low, high = outlines.extent(axes).unclipped
-    # x + y runs from 70 to 110, y - x from -30 to 10.
-    assert_close(low[0, 0] * 2**0.5, torch.tensor([70.0, -30.0]).double(), rtol=0, atol=1e-9)
-    assert_close(high[0, 0] * 2**0.5, torch.tensor([110.0, 10.0]).double(), rtol=0, atol=1e-9)
 
 
 def test_gradients_of_boxes_match_finite_differences(pixels, waves):

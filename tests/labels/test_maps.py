@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchrefract import LensDistortion, Turbulence, warp, warp_depth, warp_mask, warp_optical_flow, warp_points
+from torchrefract import LensDistortion, warp, warp_depth, warp_mask, warp_optical_flow, warp_points
 
 SIZE = (90, 140)
 
@@ -135,22 +135,6 @@ def test_optical_flow_matches_the_path_of_each_point(pixels, interpolation, orac
     halfway = ((clean.frac().abs() - 0.5).abs() < 1e-6).any(dim=-1)[:, None]
     assert both.double().mean() > 0.5
     oracle("optical flow, points", *(torch.where(both & ~halfway, v, 0) for v in (warped, expected)), 0.01, unit="px")
-
-
-def test_optical_flow_aligns_the_two_degraded_frames(pixels):
-    x, y = pixels(*SIZE)
-    frame = torch.stack([torch.sin(x / 7) * torch.cos(y / 9), torch.cos(x / 11 + y / 8)])[None]
-    # The second clean frame shows the content of q at q + expansion(q), an affine map; this is its inverse.
-    inverse = torch.stack([(x + 60 * 0.06 - 1.5) / 1.06 - x, (y + 40 * 0.06 + 0.5) / 1.06 - y])[None]
-    following = warp(frame, inverse, interpolation="bicubic")[0]
-    effect = Turbulence(covariance="gaussian", amplitude_range=(2.0, 2.0), length_range=(30.0, 30.0), tolerance_px=None)
-    one, two = (effect.degrade(image, seed=seed) for seed, image in ((0, frame), (1, following)))
-    warped, valid = warp_optical_flow(expansion(x, y), one.flow, two.restore_flow, restore_valid=two.restore_valid)
-    aligned, aligned_valid = warp(two.image, warped, interpolation="bicubic")
-    mask = (valid & aligned_valid & one.valid).expand_as(frame)
-    assert valid.double().mean() > 0.7
-    assert (two.image - one.image).abs()[mask].mean() > 0.1
-    assert (aligned - one.image).abs()[mask].mean() < 0.006
 
 
 def test_unknown_motion_and_motion_off_the_frame_are_filled():

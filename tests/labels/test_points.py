@@ -5,8 +5,8 @@ from scipy import ndimage
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import LensDistortion, Turbulence, warp_points
-from torchrefract.cameras.brown_conrady import distort_polynomial
+from torchrefract import LensDistortion, warp_points
+from torchrefract.cameras.distortion import distort_polynomial
 
 SIZE = (90, 140)
 
@@ -63,27 +63,6 @@ def test_points_match_the_closed_form_of_a_lens(seed, random_points, oracle):
     oracle("points through a lens, closed form", error, torch.zeros_like(error), 0.02)
     assert (exact - points).norm(dim=1).max() > 5
     assert torch.equal(visible[0], inside(exact, size))
-
-
-def test_points_match_a_newton_solution_of_the_flow_interpolated_by_scipy(random_points, oracle):
-    size = (180, 320)
-    flow = Turbulence().degrade(torch.zeros(1, 1, *size, dtype=torch.float64), seed=1).flow[0]
-    points = random_points(500, size=size)
-
-    def displacement(q: Tensor) -> Tensor:
-        at = q.flip(1).T.numpy()
-        planes = [ndimage.map_coordinates(plane.numpy(), at, order=1, mode="nearest") for plane in flow]
-        return torch.from_numpy(np.stack(planes, axis=1))
-
-    exact = newton(displacement, points)
-    # A solution on the border of a cell can make the Newton steps alternate over it.
-    converged = (exact + displacement(exact) - points).norm(dim=1) < 1e-9
-    warped, visible = warp_points(points[None], flow[None])
-    error = (warped[0] - exact).norm(dim=1)[converged & visible[0]]
-    assert converged.double().mean() > 0.95
-    assert visible.double().mean() > 0.8
-    assert (exact - points).norm(dim=1).max() > 1
-    oracle("points through turbulence, 60 Newton steps", error, torch.zeros_like(error), 0.02)
 
 
 @pytest.mark.quick

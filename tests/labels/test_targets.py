@@ -101,13 +101,6 @@ def test_rotated_boxes_are_flipped_like_in_torchvision(form, flow, flip):
     assert warped.format == boxes.format
 
 
-@pytest.mark.parametrize("form", ROTATED_FORMATS)
-def test_zero_flow_keeps_rotated_boxes(form):
-    boxes = rotated_of(form)
-    warped = warp_labels(boxes, torch.zeros(2, *SIZE))
-    assert_close(warped.as_subclass(Tensor), boxes.as_subclass(Tensor), rtol=0, atol=1e-3)
-
-
 def test_rotated_boxes_are_the_tightest_around_their_warped_outline(wave):
     boxes = rotated_of("XYXYXYXY")
     corners = boxes.as_subclass(Tensor).reshape(-1, 4, 2)

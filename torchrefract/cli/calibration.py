@@ -34,16 +34,16 @@ from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io.opencv import read_opencv, write_opencv
 from torchrefract.cli.command import make, naming, progress
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, pixels_of, read_image
-from torchrefract.fields.rectification import camera_flow
 from torchrefract.data.media import (
     check_output_folder,
-    find_media,
-    is_video,
-    is_complete,
     convert_video,
-    write_picture,
+    find_media,
+    is_complete,
+    is_video,
     output_name,
+    write_picture,
 )
+from torchrefract.fields.rectification import camera_flow
 from torchrefract.warping.warp import warp
 
 _SYNTHETIC = "synthetic"

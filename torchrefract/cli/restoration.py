@@ -17,22 +17,22 @@ from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cli.command import naming, progress
 from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
-from torchrefract.data.pairs.ledger import claim
 from torchrefract.data.media import (
     check_output_folder,
-    find_media,
-    is_video,
-    is_complete,
     convert_video,
-    write_picture,
+    find_media,
+    is_complete,
+    is_video,
     output_name,
+    video_info,
+    write_picture,
 )
+from torchrefract.data.pairs.ledger import claim
 from torchrefract.restoration.checkpoints import load_model
 from torchrefract.restoration.export import FORMATS, export_model
 from torchrefract.restoration.inference import Restorer
 from torchrefract.restoration.module import Restoration
 from torchrefract.restoration.tasks import Undistort
-from torchrefract.data.media import video_info
 
 _T = TypeVar("_T")
 

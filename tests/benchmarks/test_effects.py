@@ -1,0 +1,49 @@
+import json
+import sys
+
+import effects
+import pytest
+import timing
+import torch
+from effects import Calls, count_calls
+from timing import GRID_SAMPLE, Spread, Timing
+
+from torchrefract import LensFlare, warp_mask
+
+
+@pytest.mark.quick
+def test_calls_are_those_inside_the_package():
+    mask, flow = torch.zeros(1, 4, 5), torch.zeros(2, 4, 5)
+    assert count_calls(lambda: torch.zeros(3)) == Calls(0, 0, 0)
+    counted = count_calls(lambda: warp_mask(mask, flow))
+    assert counted.files >= 3  # maps, checks and sampling
+    assert counted.files <= counted.functions <= counted.calls
+    twice = count_calls(lambda: (warp_mask(mask, flow), warp_mask(mask, flow)))
+    assert (twice.files, twice.functions, twice.calls) == (counted.files, counted.functions, 2 * counted.calls)
+    assert sys.getprofile() is None
+
+
+@pytest.mark.quick
+def test_rows_above_their_limit_are_marked():
+    rows = {"mild lens, within 0.05 px": 0.95, "mild lens, within 0.05 px, torch": 0.95, "uniform fog": 0.2}
+    bars = effects.speed_bars([Timing(n, 1, Spread(r, r, r), {GRID_SAMPLE: Spread(r, r, r)}) for n, r in rows.items()])
+    assert [(bar.name, bar.limit, bar.holds) for bar in bars] == [
+        ("mild lens, within 0.05 px", 0.9, False),
+        ("mild lens, within 0.05 px, torch", 1.6, True),
+        ("uniform fog", 0.3, True),
+    ]
+
+
+def test_the_command_times_each_backend(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(timing, "_STRETCH_S", 0.0)
+    monkeypatch.setattr(effects, "WARPS", {"mild lens": timing.WARPS["mild lens"]})
+    monkeypatch.setattr(effects, "OTHER_WARPS", {})
+    monkeypatch.setattr(effects, "PHOTOMETRIC", {"flare": LensFlare})
+    out = tmp_path / "effects.json"
+    monkeypatch.setattr(sys, "argv", ["effects.py", "--size", "24x40", "--threads", "1", "--out", str(out)])
+    effects.main()
+    assert "bar <= 0.9 x bare grid_sample" in capsys.readouterr().out
+    names = [row["name"] for row in json.loads(out.read_text())["timings"]]
+    for suffix in ("", ", torch"):
+        assert {f"mild lens, within 0.05 px{suffix}", f"all four warps, exact{suffix}"} <= set(names)
+    assert "flare" in names

@@ -28,15 +28,14 @@ from arguments import count
 from slow_timing import seconds
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
-from torchrefract.data.frames import FrameFolder
-from torchrefract.effects.defog import remove_fog
-from torchrefract.warping.resample import warp
 
 from torchrefract._io import replace_file
 from torchrefract._tensor import to_float, to_uint8
+from torchrefract.data.frames import FrameFolder
 from torchrefract.data.module import make_pair
 from torchrefract.effects.base import Effect
 from torchrefract.effects.flare import LensFlare
+from torchrefract.effects.fog import remove_fog
 from torchrefract.effects.lens import LensDistortion
 from torchrefract.effects.one_of import OneOf
 from torchrefract.presets import paper_refractive, paper_weather
@@ -45,6 +44,7 @@ from torchrefract.restoration.diffusion import Diffusion
 from torchrefract.restoration.metrics import endpoint_error, masked_mean, psnr, ssim
 from torchrefract.restoration.tasks import Restored
 from torchrefract.types import Frame, Pair
+from torchrefract.warping.warp import warp
 
 TASKS = ("undistort", "deweather")
 ROWS = tuple(f"{model}_{task}" for task in TASKS for model in ("resunet", "segformer", "ddpm"))

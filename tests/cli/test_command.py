@@ -8,10 +8,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from PIL import Image
-from torchrefract.data.frames import FrameFolder
 
 from torchrefract._validation import UsageError
 from torchrefract.cli.command import command, naming, progress, quote_option
+from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint
 

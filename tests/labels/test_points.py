@@ -4,9 +4,9 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 from torch.testing import assert_close
-from torchrefract.cameras.distortion import distort_polynomial
 
 from torchrefract import LensDistortion, warp_points
+from torchrefract.cameras.brown_conrady import distort_polynomial
 
 SIZE = (90, 140)
 

@@ -9,9 +9,9 @@ from pytorch_lightning import Callback, LightningModule
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample
 from torch.testing import assert_close
-from torchrefract.draws import stream
 
 from torchrefract import LensDistortion, Pair, UniformFog
+from torchrefract.random import stream
 from torchrefract.restoration.checkpoints import CheckpointError, check_fits, read_checkpoint
 from torchrefract.restoration.diffusion import (
     SAMPLERS,

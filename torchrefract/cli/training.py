@@ -11,8 +11,7 @@ from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError
 from torchrefract.cli.command import check_seed, make, naming
-from torchrefract.data.module import fingerprint
-from torchrefract.data.module import PairData
+from torchrefract.data.module import PairData, fingerprint
 from torchrefract.restoration.checkpoints import Origin, check_fits, read_checkpoint
 from torchrefract.restoration.models.pretrained import weights_license
 

@@ -20,7 +20,7 @@ from torchrefract.restoration.module import RestorationModule
 from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
 from torchrefract.types import Pair
 from torchrefract.warping.grid import inside
-from torchrefract.warping.resample import warp
+from torchrefract.warping.warp import warp
 
 SAMPLERS = ("ddpm", "ddim", "dpm_solver")
 NUM_LEVELS = 1000  # noise levels of the training

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from torchrefract._validation import check_choice, check_count, check_size
 from torchrefract.restoration.tasks import Restored
-from torchrefract.warping.resample import INTERPOLATIONS, warp
-from torchrefract.warping.resize import resize_flow, resize_image
+from torchrefract.warping.flow import resize_flow, resize_image
+from torchrefract.warping.warp import INTERPOLATIONS, warp
 
 _RADIUS = 1  # px of the small picture, of the windows of `transfer_change`
 _EPSILON = 1e-5  # a window with a smaller variance shows only the rounding to bytes

@@ -16,11 +16,11 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchrefract._tensor import to_float, to_uint8
-from torchrefract.cameras.distortion import POLYNOMIAL12
+from torchrefract.cameras.brown_conrady import POLYNOMIAL12
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
-from torchrefract.effects.defog import remove_fog
 from torchrefract.effects.flare import LensFlare
+from torchrefract.effects.fog import remove_fog
 from torchrefract.types import Degraded
 from torchrefract.visualization.color import (
     checkerboard,
@@ -32,9 +32,9 @@ from torchrefract.visualization.color import (
     round_up,
     transmission_to_rgb,
 )
+from torchrefract.warping.flow import folded
 from torchrefract.warping.grid import length
-from torchrefract.warping.jacobian import folded
-from torchrefract.warping.resample import warp
+from torchrefract.warping.warp import warp
 
 _DPI = 100
 _SMALLEST_SIDE = 320  # px, longer side of a displayed image
@@ -238,7 +238,7 @@ def describe_params(effect: Effect, params: Any) -> str:
     if isinstance(effect, Compose):
         leaves = [
             f"{type(leaf).__name__} ({describe_params(leaf, leaf_params)})"
-            for leaf, leaf_params, *_ in effect.leaves(params)
+            for leaf, leaf_params in effect.effects_with_params(params)
             if leaf_params.applied[0]
         ]
         return " + ".join(leaves) or "not applied"

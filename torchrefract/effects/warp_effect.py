@@ -201,10 +201,10 @@ class WarpEffect(Effect):
         flow = self.planned_flow(params, height, width)
         if flow.is_zero:
             return unchanged(image, params)
-        active = expand_batch(self.active(params, height, width), image.shape[0])
+        active = self.active(params, height, width)  # a flow has B rows, or as many as there are images
         options = SamplingOptions(self.padding, self.interpolation, self.backend)
         return warped(
-            flow.sample(image, active, params, options),
+            flow.sample(image, expand_batch(active, image.shape[0]), params, options),
             params,
             flow=lambda: flow.dense,
             valid=lambda: (flow.exists & inside(flow.dense)) | ~per_sample(expand_batch(active, flow.dense.shape[0])),

@@ -54,8 +54,8 @@ def picture(batch: int = 2) -> torch.Tensor:
 
 @pytest.mark.parametrize("name", tolerance.CONFIGURATIONS)
 def test_random_configurations_stay_within_their_tolerance(name, monkeypatch):
-    monkeypatch.setattr(tolerance, "LARGEST", (240, 320))
-    for seed in range(1000, 1010):
+    monkeypatch.setattr(tolerance, "LARGEST", (160, 240))
+    for seed in range(1000, 1008):
         trial = tolerance.attempt(name, seed)
         assert trial.share <= 1, trial
 
@@ -117,7 +117,7 @@ def test_clips_stay_within_the_tolerance(name):
     assert (coarse - exact).norm(dim=2).amax() <= 0.1
 
 
-@every_warp
+@pytest.mark.parametrize("name", ["lens", "rough turbulence", "divergence-free"])
 def test_one_graph_takes_the_plan_as_a_constant(name):
     effect, image = effect_with(name, 0.1), picture().double()
     assert effect.plan(*SIZE, dtype=torch.float64).stride > 1

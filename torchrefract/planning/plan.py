@@ -181,6 +181,8 @@ def plan_warp(model: ErrorModel | None, request: PlanRequest) -> WarpPlan:
     simplified = model.simplify(*frame, budget)
     if simplified is None:
         return exact
+    if simplified.error_px > budget:
+        return replace(exact, reason="the tolerance is too small to leave anything out")
     stride = coarsest_stride(bounds, simplified, budget, is_random=model.is_random)
     between = float(bounds.interpolation_error(np.array([float(stride)]))[0]) if stride > 1 else 0.0
     error = add_errors([simplified.error_px, between], is_random=model.is_random)

@@ -183,7 +183,9 @@ class Compose(Effect):
             for place, effect in enumerate(effects)
         )
         names = tuple(type(effect).__name__ for effect in effects)
-        samplings = sum(any(not plans[place].is_identity for place in group) for group in groups)
+        samplings = sum(
+            any(effects[place].p > 0 and not plans[place].is_identity for place in group) for group in groups
+        )
         return ComposePlan(height, width, self.tolerance_px, names, each, tuple(strides), error, samplings)
 
     def degrade_batch(self, image: Tensor, params: ComposeParams, depth: Tensor | None) -> Degraded:

@@ -255,12 +255,12 @@ class CountingSpline(ThinPlateSpline):
 
 
 @pytest.mark.parametrize("frames", [1, 3])
-def test_no_flow_is_computed_for_samples_that_a_warp_leaves_alone(frames):
+def test_a_warp_is_computed_only_for_the_samples_that_it_moves(frames):
     spline = CountingSpline(tolerance_px=None)
     spline.rows = []
     image = picture(8, 3 * frames, 20, 30).view(8, frames, 3, 20, 30)
-    degraded = OneOf([spline, UniformFog(), DivergenceFree()]).degrade(image, seed=1)
-    num_applied = int(degraded.params.children[0].applied.sum())
+    degraded = OneOf([UniformFog(), LensDistortion(), spline, DivergenceFree()]).degrade(image, seed=1)
+    num_applied = int(degraded.params.children[2].applied.sum())
     assert 0 < num_applied < 8
     assert spline.rows == [num_applied * frames]
 
@@ -370,10 +370,10 @@ def test_copies_of_compositions_params_and_results_are_equal(copied):
     assert_equal(copied(copied(degraded)), degraded)
 
 
-@pytest.mark.parametrize("kind", [Compose, OneOf])
-def test_one_graph_draws_and_degrades_as_eager_mode(kind):
-    effects = [ThinPlateSpline(padding="border", p=0.7), UniformFog(p=0.7), Turbulence(p=0.7), LensDistortion(p=0.7)]
-    effect, image = kind(effects), picture(4, 3, 24, 32)
+def test_one_graph_draws_and_degrades_as_eager_mode():
+    choice = OneOf([Turbulence(), ThinPlateSpline()])
+    effect = Compose([ThinPlateSpline(padding="border", p=0.7), UniformFog(p=0.7), LensDistortion(p=0.7), choice])
+    image = picture(4, 3, 24, 32)
     torch.manual_seed(3)
     expected = [effect(image) for _ in range(2)]
     assert not torch.equal(*expected)
@@ -383,7 +383,7 @@ def test_one_graph_draws_and_degrades_as_eager_mode(kind):
 
 
 def test_all_maps_can_be_read_in_one_graph():
-    effect, image = Compose([LensDistortion(), DivergenceFree()]), torch.rand(2, 3, 40, 56)
+    effect, image = Compose([LensDistortion(), ThinPlateSpline()]), torch.rand(2, 3, 24, 32)
 
     def read(image: Tensor) -> list[Tensor]:
         degraded = effect.degrade(image, seed=3)
@@ -476,8 +476,8 @@ def test_an_identity_in_a_composition_changes_no_map(name):
     around = Compose([LensDistortion(), effect, Compose([UniformFog()])])
     degraded = around.degrade(image, seed=1, keys=[5, 9])
     without = Compose([LensDistortion(), LensFlare(p=0.0), Compose([UniformFog()])]).degrade(image, seed=1, keys=[5, 9])
-    for map_name in ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission"):
-        assert torch.equal(getattr(degraded, map_name), getattr(without, map_name)), map_name
+    assert torch.equal(degraded.image, without.image)
+    assert_near({key: maps(degraded)[key] for key in maps(without)}, maps(without))
 
 
 @pytest.mark.quick

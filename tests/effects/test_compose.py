@@ -383,7 +383,7 @@ def test_one_graph_draws_and_degrades_as_eager_mode():
 
 
 def test_all_maps_can_be_read_in_one_graph():
-    effect, image = Compose([LensDistortion(), ThinPlateSpline()]), torch.rand(2, 3, 24, 32)
+    effect, image = Compose([LensDistortion(), DivergenceFree()]), torch.rand(2, 3, 40, 56)
 
     def read(image: Tensor) -> list[Tensor]:
         degraded = effect.degrade(image, seed=3)
@@ -475,9 +475,12 @@ def test_an_identity_in_a_composition_changes_no_map(name):
     assert torch.equal(effect(image), image)
     around = Compose([LensDistortion(), effect, Compose([UniformFog()])])
     degraded = around.degrade(image, seed=1, keys=[5, 9])
-    without = Compose([LensDistortion(), LensFlare(p=0.0), Compose([UniformFog()])]).degrade(image, seed=1, keys=[5, 9])
+    flare = LensFlare(p=0.0)  # draws for the same position
+    without = Compose([LensDistortion(), flare, Compose([UniformFog()])]).degrade(image, seed=1, keys=[5, 9])
     assert torch.equal(degraded.image, without.image)
-    assert_near({key: maps(degraded)[key] for key in maps(without)}, maps(without))
+    shared = maps(degraded).keys() & maps(without).keys()
+    assert shared >= {"flow", "valid", "restore_flow", "restore_valid", "transmission"}
+    assert_near(*({key: maps(result)[key] for key in shared} for result in (degraded, without)))
 
 
 @pytest.mark.quick

@@ -1,4 +1,4 @@
-"""What an effect does to the labels beside its image."""
+"""Labels move with the image."""
 
 from typing import Any
 
@@ -15,8 +15,9 @@ transforms = pytest.importorskip("torchvision.transforms.v2", reason="torchvisio
 EFFECTS = [LensDistortion(), Turbulence(), ThinPlateSpline(), Compose([Turbulence(), UniformFog(), LensDistortion()])]
 
 
-def sample(size: tuple[int, int] = (64, 96)) -> tuple[Tensor, dict]:
-    height, width = size
+def sample() -> tuple[Tensor, dict]:
+    """Return an image with boxes, masks and points of two objects."""
+    size = height, width = 64, 96
     mask = torch.zeros(2, height, width, dtype=torch.uint8)
     mask[0, 20:40, 30:50] = 1
     mask[1, 5:15, 60:80] = 1
@@ -31,12 +32,13 @@ def sample(size: tuple[int, int] = (64, 96)) -> tuple[Tensor, dict]:
     return torch.rand(3, height, width), target
 
 
-def acts(effect: Effect, images: Tensor, seed: int) -> list[bool]:
-    """Of each sample, whether it is moved by the draw that torch's seed gives."""
+def moved_samples(effect: Effect, images: Tensor, seed: int) -> list[bool]:
+    """Return for each sample whether the draw of a global seed moves it."""
     torch.manual_seed(seed)
     return (effect.degrade(images).flow != 0).flatten(1).any(dim=1).tolist()
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: type(effect).__name__)
 def test_labels_move_with_the_image(effect: Effect):
     image, target = sample()
@@ -50,13 +52,13 @@ def test_labels_move_with_the_image(effect: Effect):
     assert not torch.equal(moved["points"], target["points"])
     for row, box in zip(moved["masks"], moved["boxes"].as_subclass(Tensor), strict=True):
         y, x = row.nonzero().unbind(1)
-        found = torch.stack([x.min(), y.min(), x.max() + 1, y.max() + 1])
-        assert (found - box).abs().max() < 1.0
+        expected_box = torch.stack([x.min(), y.min(), x.max() + 1, y.max() + 1])
+        assert (expected_box - box).abs().max() < 1.0
     assert moved["labels"].tolist() == [3, 7]
     assert moved["name"] == "frame 1"
 
 
-def test_an_image_of_torchvision_comes_back_as_one():
+def test_a_torchvision_image_stays_one_in_a_pipeline():
     image, target = sample()
     result = LensDistortion()(tv_tensors.Image(image))
     assert type(result) is tv_tensors.Image
@@ -69,7 +71,7 @@ def test_an_image_of_torchvision_comes_back_as_one():
     assert mirrored["boxes"].tolist() == [[46.0, 20.0, 66.0, 40.0], [16.0, 5.0, 36.0, 15.0]]
 
 
-def test_an_effect_that_is_off_leaves_the_labels_as_they_are():
+def test_an_identity_leaves_the_labels_as_they_are():
     image, target = sample()
     for effect in (LensDistortion(p=0.0), Turbulence(amplitude_range=(0, 0)), Compose([ThinPlateSpline()], p=0.0)):
         result, moved = effect(image, target)
@@ -79,24 +81,24 @@ def test_an_effect_that_is_off_leaves_the_labels_as_they_are():
             assert torch.equal(moved[name], target[name]), name
 
 
-def test_labels_of_what_stays_where_it_is_are_not_clipped():
+def test_labels_of_an_image_that_does_not_move_are_not_clipped():
     image = torch.rand(3, 40, 56)
     outside = tv_tensors.BoundingBoxes(
         torch.tensor([[-5.0, -5, 20, 20], [60, 5, 70, 9]]), format="XYXY", canvas_size=(40, 56)
     )  # pyright: ignore[reportCallIssue]  # torchvision's overloads
     second = tv_tensors.Image(torch.rand(3, 40, 56))
     target = {"boxes": outside, "labels": torch.arange(2), "second": second}
-    _, kept = LensDistortion(p=0.0)(image, target)
-    assert torch.equal(kept["boxes"], outside)
-    assert torch.equal(kept["second"], second)
+    _, unmoved = LensDistortion(p=0.0)(image, target)
+    assert torch.equal(unmoved["boxes"], outside)
+    assert torch.equal(unmoved["second"], second)
     _, moved = LensDistortion()(image, target)
     assert moved["labels"].tolist() == [0]
     assert not torch.equal(moved["second"], second)
 
 
-def test_labels_of_a_sample_that_stays_are_not_clipped_beside_one_that_moves():
+def test_labels_of_a_sample_that_does_not_move_are_not_clipped_in_a_mixed_batch():
     effect, images = ThinPlateSpline(amplitude_range=(6.0, 9.0), p=0.5), torch.rand(2, 3, 40, 56)
-    seed = next(seed for seed in range(99) if acts(effect, images, seed) == [True, False])
+    seed = next(seed for seed in range(99) if moved_samples(effect, images, seed) == [True, False])
     size: dict[str, Any] = {"canvas_size": (40, 56)}
     points = torch.tensor([[-3.0, -2.0], [20.0, 10.0]])
     sample = {
@@ -125,16 +127,16 @@ def test_labels_of_a_sample_that_stays_are_not_clipped_beside_one_that_moves():
         assert type(both[name]) is type(batch[name])
 
 
-def test_light_moves_no_label():
+def test_photometric_effects_move_no_label():
     image, target = sample()
     result, moved = UniformFog()(image, target)
     assert moved is target
     assert not torch.equal(result, image)
 
 
-def test_what_cannot_be_moved_raises():
+def test_an_unknown_type_of_label_raises():
     image, target = sample()
-    with pytest.raises(TypeError, match="target must hold what is known how to move, or plain values, got"):
+    with pytest.raises(TypeError, match="target must hold tv_tensors of torchvision or plain values, got"):
         LensDistortion()(image, target | {"camera": nn.Identity()})
-    with pytest.raises(TypeError, match="target must be one, of any nesting, got 2"):
+    with pytest.raises(TypeError, match="target must be a single argument of any nesting, got 2"):
         LensDistortion()(image, target, target)

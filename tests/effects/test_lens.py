@@ -25,24 +25,15 @@ def lenses(coefficients: dict[str, float], focal: float = 0.8, batch: int = 1) -
     )
 
 
-def flows(degraded: Degraded) -> tuple[Tensor, Tensor, Tensor]:
-    """flow, restore_flow and restore_valid, which a lens has."""
-    maps = (degraded.flow, degraded.restore_flow, degraded.restore_valid)
-    assert maps[0] is not None
-    assert maps[1] is not None
-    assert maps[2] is not None
-    return maps[0], maps[1], maps[2]
-
-
 def psnr(image: Tensor, clean: Tensor, valid: Tensor) -> float:
-    """dB, over the valid pixels."""
+    """Return the peak signal-to-noise ratio over the valid pixels, dB."""
     error = (image - clean).square().mean(dim=-3, keepdim=True)[valid].mean()
     return -10 * math.log10(error.item())
 
 
 @pytest.fixture(scope="module")
 def frames(shared_data) -> Tensor:
-    """(3, 3, 360, 640): real frames, one from each of three drives."""
+    """Return real frames of three drives, (3, 3, 360, 640)."""
     names = ["ca_p1_*", "br_es_*", "us_losaltos_*"]
     paths = [sorted((shared_data / "frames" / "val").glob(f"{name}.jpg"))[0] for name in names]
     pictures = [cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB) for path in paths]  # pyright: ignore  # imread may give None
@@ -50,9 +41,9 @@ def frames(shared_data) -> Tensor:
 
 
 @pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
-def test_the_flow_back_restores_real_frames_and_the_negative_flow_does_not(frames, interpolation):
+def test_the_restore_flow_restores_real_frames_and_the_negative_flow_does_not(frames, interpolation):
     d = LensDistortion(interpolation=interpolation).degrade(frames, seed=7, keys=[0, 1, 2])
-    flow, restore_flow, restore_valid = flows(d)
+    flow, restore_flow, restore_valid = d.flow, d.restore_flow, d.restore_valid
     naive = (flow + restore_flow).norm(dim=1, keepdim=True)
     for i, clean in enumerate(frames):
         valid = restore_valid[i]
@@ -61,10 +52,9 @@ def test_the_flow_back_restores_real_frames_and_the_negative_flow_does_not(frame
             for back in (restore_flow, -flow)
         ]
         assert valid.float().mean() > 0.5
-        # What the specification promises: 4.6 dB at an error of 2.3 px, 9.5 dB at 6 px.
+        # An error of 2.3 px costs 4.6 dB, one of 6 px 9.5 dB.
         assert naive[i][valid].max() > 2.3
         assert scores[0] > scores[1] + 4.6, scores
-        # Two look-ups are all that is lost, so bicubic ones lose less.
         do_nothing = psnr(d.image[i], clean, valid)
         assert scores[0] > do_nothing + 4.6, (scores, do_nothing)
 
@@ -73,7 +63,7 @@ def test_bicubic_restores_real_frames_better_than_bilinear(frames):
     scores = {}
     for interpolation in ("bilinear", "bicubic"):
         d = LensDistortion(interpolation=interpolation).degrade(frames, seed=7, keys=[0, 1, 2])
-        _, restore_flow, restore_valid = flows(d)
+        restore_flow, restore_valid = d.restore_flow, d.restore_valid
         back, _ = warp(d.image, restore_flow, interpolation=interpolation)
         scores[interpolation] = psnr(back, frames, restore_valid)
     assert scores["bicubic"] > scores["bilinear"] + 1
@@ -83,15 +73,15 @@ def test_both_flows_undo_each_other(pixels):
     x, y = pixels(60, 90)
     ramp = torch.stack([x, y])[None]
     d = LensDistortion(k1_range=(-0.3, -0.3), k2_range=(0.1, 0.1)).degrade(ramp, seed=7)
-    _, restore_flow, restore_valid = flows(d)
+    restore_flow, restore_valid = d.restore_flow, d.restore_valid
     back, seen = warp(d.image, restore_flow)
     assert restore_valid.double().mean() > 0.8
     assert seen[restore_valid].all()
-    # The ramp's image is the smooth map itself; read bilinearly it errs by (|f_xx| + |f_yy|) / 8, here below 0.01 px.
+    # The degraded ramp is the smooth map itself; bilinear sampling errs by (|f_xx| + |f_yy|) / 8, below 0.01 px.
     assert (back - ramp).abs().amax(dim=1, keepdim=True)[restore_valid].max() < 0.01
 
 
-def test_content_moves_as_the_camera_would_see_it():
+def test_content_moves_as_through_a_real_lens():
     # A point at radius r in widths of the focal length appears at r (1 + k1 r^2 + k2 r^4): a barrel draws it inward.
     image = torch.zeros(1, 1, 101, 101, dtype=torch.float64)
     image[..., 50, 90] = 1
@@ -105,7 +95,7 @@ def test_content_moves_as_the_camera_would_see_it():
     assert expected < 89
 
 
-def test_parameters_are_relative_to_the_width_so_that_a_scene_survives_resizing():
+def test_parameters_are_relative_to_the_width_of_the_frame():
     params = lenses({"k1": -0.25, "k2": 0.08, "p1": 1e-3}).to(torch.float64)
     effect = LensDistortion()
     small = effect.apply(torch.zeros(1, 1, 45, 80, dtype=torch.float64), params).flow
@@ -114,7 +104,7 @@ def test_parameters_are_relative_to_the_width_so_that_a_scene_survives_resizing(
     assert_close(large[..., 1::3, 1::3], 3 * small, rtol=0, atol=1e-9)
 
 
-def test_every_number_is_uniform_in_its_range_and_on_its_own():
+def test_all_numbers_are_uniform_in_their_ranges_and_independent():
     count = 3000
     coefficients: dict[str, Any] = {f"{name}_range": (-1.0 - i, 2.0 + i) for i, name in enumerate(POLYNOMIAL12)}
     effect = LensDistortion(
@@ -135,12 +125,12 @@ def test_every_number_is_uniform_in_its_range_and_on_its_own():
 
 
 @pytest.mark.parametrize("size", [(36, 64), (48, 64), (64, 64)])
-def test_the_default_fleet_folds_nowhere(size):
+def test_default_lenses_fold_nowhere(size):
     degraded = LensDistortion(strict=True).degrade(torch.zeros(300, 1, *size), seed=7)
     assert (degraded.params.coefficients[:, 0] < 0).all()
 
 
-def test_pixels_beyond_a_fold_are_warned_of_once_padded_and_marked():
+def test_pixels_beyond_a_fold_are_padded_and_invalid_after_one_warning():
     effect = LensDistortion(**FOLDING)
     image = torch.ones(3, 1, 36, 64)
     with warnings.catch_warnings(record=True) as caught:
@@ -152,20 +142,20 @@ def test_pixels_beyond_a_fold_are_warned_of_once_padded_and_marked():
     center = first.params.center[0] * 64
     r = torch.hypot(x - center[0], y - center[1]) / (0.7 * 64)
     edge = 2 / 3 / math.sqrt(1.8)
-    # The smaller terms, decentring by a thousandth, blur the edge a little; before it the frame may end.
+    # Decentering by a thousandth moves the edge a little.
     assert not first.valid[0, 0][r > 1.03 * edge].any()
     assert first.valid[0, 0][r < 0.5 * edge].all()
     assert not first.image[0, 0][r > 1.03 * edge].any()
     assert (r > 1.03 * edge).any()
 
 
-def test_strict_refuses_a_lens_that_folds():
+def test_strict_raises_for_a_lens_that_folds():
     with pytest.raises(ValueError, match="must not fold back inside the frame"):
         LensDistortion(**FOLDING, strict=True).degrade(torch.ones(1, 1, 36, 64), seed=7)
 
 
 @pytest.mark.parametrize("around", [lambda lens: Compose([lens]), lambda lens: OneOf([lens, lens])])
-def test_a_fold_is_told_inside_a_composition_too(around):
+def test_a_fold_is_reported_inside_a_composition_too(around):
     image = torch.ones(2, 1, 36, 64)
     with pytest.raises(ValueError, match="must not fold back inside the frame"):
         around(LensDistortion(**FOLDING, strict=True)).degrade(image, seed=7)
@@ -173,7 +163,7 @@ def test_a_fold_is_told_inside_a_composition_too(around):
         around(LensDistortion(**FOLDING)).degrade(image, seed=7)
 
 
-def test_a_fold_behind_a_closed_gate_or_outside_the_frame_is_nobodys_business():
+def test_a_fold_of_a_lens_that_is_not_applied_or_outside_the_frame_is_not_reported():
     image = torch.rand(1, 1, 36, 64)
     LensDistortion(**FOLDING, strict=True, p=0.0).degrade(image, seed=7)
     far: dict[str, Any] = FOLDING | {"focal_range": (3.0, 3.0)}
@@ -216,7 +206,7 @@ def test_infinite_params_raise(field):
         LensDistortion().apply(torch.zeros(1, 1, 8, 9), params._replace(**{field: torch.full((1, 2), math.inf)}))
 
 
-def test_a_vector_of_opencv_is_refused_and_the_model_named():
+def test_coefficients_of_opencv_raise_and_name_the_model():
     params = lenses({"k1": -0.1})._replace(coefficients=torch.zeros(1, 14))
     with pytest.raises(ValueError, match=r"params\.coefficients .*polynomial"):
         LensDistortion().apply(torch.zeros(1, 1, 8, 9), params)
@@ -229,8 +219,8 @@ def test_unknown_options_raise(option):
 
 
 @pytest.mark.parametrize(("padding", "outside"), [("zeros", 0.0), ("border", 1.0), ("reflection", 1.0)])
-def test_the_padding_fills_what_the_lens_sees_beyond_the_frame(padding, outside):
-    # A barrel shows more than the frame holds: its corners look out.
+def test_padding_fills_pixels_that_show_points_outside_the_frame(padding, outside):
+    # The corners of a barrel distortion show points outside the clean frame.
     effect = LensDistortion(padding=padding)
     degraded: Degraded = effect.apply(torch.ones(1, 1, 36, 64), lenses({"k1": -0.2, "k2": 0.05}))
     assert not degraded.valid[0, 0, 0, 0]
@@ -238,10 +228,10 @@ def test_the_padding_fills_what_the_lens_sees_beyond_the_frame(padding, outside)
     assert degraded.image[0, 0, 18, 32] == 1
 
 
-def test_restored_pixels_are_those_that_the_damaged_frame_shows():
-    # A pincushion pushes the corners of the scene out of the frame: no flow brings them back.
+def test_restore_valid_holds_where_the_degraded_frame_shows_the_pixel():
+    # A pincushion distortion moves the corners of the scene out of the frame.
     degraded = LensDistortion().apply(torch.ones(1, 1, 36, 64), lenses({"k1": 0.3}))
-    _, restore_flow, restore_valid = flows(degraded)
+    restore_flow, restore_valid = degraded.restore_flow, degraded.restore_valid
     back, seen = warp(degraded.image, restore_flow)
     assert degraded.valid.all()
     assert torch.equal(restore_valid, seen)
@@ -250,8 +240,8 @@ def test_restored_pixels_are_those_that_the_damaged_frame_shows():
     assert_close(back[restore_valid], torch.ones_like(back[restore_valid]), rtol=0, atol=1e-5)
 
 
-def test_the_draw_counts_for_what_it_says_in_double_precision_too():
+def test_float32_and_float64_draw_the_same_lens():
     image = torch.rand(2, 1, 36, 64)
     single, double = (LensDistortion().degrade(image.to(dtype), seed=7) for dtype in (torch.float32, torch.float64))
     assert_close(single.params.to(torch.float64), double.params, rtol=0, atol=1e-6)
-    assert_close(flows(single)[0].double(), flows(double)[0], rtol=0, atol=1e-3)
+    assert_close(single.flow.double(), double.flow, rtol=0, atol=1e-3)

@@ -79,8 +79,8 @@ def test_the_flow_is_opencvs_map(share, oracle):
     assert ours.sub(torch.stack([x, y])).abs().max() > 20 / share
 
 
-def shown_at(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """(2, N), px: where a camera shows points (2, N) of the plane z = 1, by OpenCV or in closed form."""
+def project(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Project points (2, N) of the plane z = 1 by OpenCV or in closed form -> (2, N), px."""
     matrix, vector, space = (
         np.array(camera.matrix),
         np.array(camera.coefficients),
@@ -104,29 +104,31 @@ def shown_at(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 @every_model
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_each_model_is_looked_up_where_its_camera_shows_the_ray(camera, dtype, oracle):
+def test_the_flow_points_to_where_the_camera_shows_the_ray_of_a_pixel(camera, dtype, oracle):
     made = Rectification(camera, tolerance_px=None).degrade(torch.zeros(1, 1, 27, 48, dtype=dtype), seed=0)
     pixels = np.mgrid[:27, :48][::-1].reshape(2, -1).astype(float)
     rays = (pixels - [[camera.cx], [camera.cy]]) / [[camera.fx], [camera.fy]]
     ours = made.flow[0].double().reshape(2, -1) + torch.from_numpy(pixels)
     bar = 1e-9 if dtype is torch.float64 else 1e-4
-    oracle(f"rectification of each model, {dtype}", ours, torch.from_numpy(shown_at(camera, rays)), bar)
-    # The flow back leads to the ray that the camera shows at the pixel.
+    oracle(f"rectification of each model, {dtype}", ours, torch.from_numpy(project(camera, rays)), bar)
+    # The restore flow points to the ray that the camera shows at the pixel.
     clean = (made.restore_flow[0].double().reshape(2, -1).numpy() + pixels - [[camera.cx], [camera.cy]]) / [
         [camera.fx],
         [camera.fy],
     ]
-    oracle(f"its flow back, {dtype}", torch.from_numpy(shown_at(camera, clean)), torch.from_numpy(pixels), bar)
+    oracle(
+        f"restore flow of each model, {dtype}", torch.from_numpy(project(camera, clean)), torch.from_numpy(pixels), bar
+    )
     assert made.restore_valid.double().mean() > 0.7
 
 
 @pytest.mark.parametrize("name", ["opencv8", "fisheye", "division"])
-def test_of_any_model_one_look_up_keeps_more_than_two(name):
+def test_one_sampling_of_any_model_keeps_more_than_two(name):
     camera = ALL[name].resized(width=480, height=270)
     y, x = torch.meshgrid(torch.arange(270).double(), torch.arange(480).double(), indexing="ij")
 
     def scene(u: Tensor, v: Tensor) -> Tensor:
-        return 0.5 + 0.4 * torch.sin(u / 2.3) * torch.cos(v / 2.9)  # fine, so that a look-up blurs it
+        return 0.5 + 0.4 * torch.sin(u / 2.3) * torch.cos(v / 2.9)  # fine, so that sampling blurs it
 
     raw = scene(x, y)[None, None]
     rectify, lens = Rectification(camera), LensDistortion()
@@ -135,7 +137,7 @@ def test_of_any_model_one_look_up_keeps_more_than_two(name):
     twice = lens.apply(first.image, made.params.children[1]).image
     clean = torch.stack([x, y]) + then.flow[0]
     rays = (clean.reshape(2, -1).numpy() - [[camera.cx], [camera.cy]]) / [[camera.fx], [camera.fy]]
-    u, v = torch.from_numpy(shown_at(camera, rays)).view(2, 270, 480)
+    u, v = torch.from_numpy(project(camera, rays)).view(2, 270, 480)
     seen = made.valid[0, 0] & (u > 2) & (u < 477) & (v > 2) & (v < 267)
     assert seen.double().mean() > 0.5
     once, both = (
@@ -144,9 +146,9 @@ def test_of_any_model_one_look_up_keeps_more_than_two(name):
     assert once > both + 2, (once, both)
 
 
-def test_the_flow_back_undoes_it():
+def test_the_restore_flow_undoes_the_rectification():
     made = Rectification(SMALL).degrade(torch.zeros(2, 1, 27, 48, dtype=torch.float64), seed=0)
-    # Read in closed form at the place that the flow back points to.
+    # Distort the pixel that the restore flow points to, in closed form.
     y, x = torch.meshgrid(torch.arange(27.0).double(), torch.arange(48.0).double(), indexing="ij")
     at = made.restore_flow + torch.stack([x, y])
     u, v = (at[:, 0] - SMALL.cx) / SMALL.fx, (at[:, 1] - SMALL.cy) / SMALL.fy
@@ -164,7 +166,7 @@ def test_the_flow_back_undoes_it():
     assert made.restore_valid.double().mean() > 0.8
 
 
-def test_with_a_lens_behind_it_the_frame_is_looked_up_once():
+def test_a_lens_after_a_rectification_takes_one_sampling():
     raw = smooth(2, 3, 270, 480)
     camera = Camera(width=480, height=270, fx=430.0, fy=425.0, cx=250.0, cy=141.0, coefficients=(-0.281, 0.168, 0, 0))
     effects = [Rectification(camera, tolerance_px=None), LensDistortion(tolerance_px=None)]
@@ -192,8 +194,8 @@ def test_with_a_lens_behind_it_the_frame_is_looked_up_once():
     assert -10 * math.log10(error) > 60
 
 
-def places_by_opencv(params: LensParams) -> np.ndarray:
-    """(2, 720, 1280), px: where the raw frames of DASHCAM have what a lens of k1, k2, p1, p2 shows at each pixel."""
+def positions_by_opencv(params: LensParams) -> np.ndarray:
+    """Return the positions in raw frames of DASHCAM that a lens of k1, k2, p1, p2 shows, (2, 720, 1280), px."""
     k, (fx, fy), (cx, cy) = (value[0].double().numpy() for value in params[1:])
     assert not k[2:6].any()
     assert not k[8:].any()
@@ -209,7 +211,7 @@ def places_by_opencv(params: LensParams) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["ca280_pv_21", "ca280_straight_lines1", "ca280_test5"])
-def test_on_real_frames_one_look_up_keeps_more_than_two(shared_data, name):
+def test_one_sampling_of_real_frames_keeps_more_than_two(shared_data, name):
     # Frames of the camera that DASHCAM is a calibration of, as it delivered them.
     picture = cv2.imread(str(shared_data / "fullres" / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE)
     assert picture is not None
@@ -221,8 +223,8 @@ def test_on_real_frames_one_look_up_keeps_more_than_two(shared_data, name):
     d = scene.degrade(raw, seed=3)
     rectified = rectify.apply(raw, d.params.children[0]).image
     twice = lens.apply(rectified, d.params.children[1]).image
-    # A spline of the fifth degree, read once at the places that OpenCV finds, is as good as the frame can be known.
-    u, v = places_by_opencv(d.params.children[1])
+    # A spline of degree five, sampled once at the positions of OpenCV, is the reference.
+    u, v = positions_by_opencv(d.params.children[1])
     expected = torch.from_numpy(map_coordinates(raw[0, 0].numpy(), [v, u], order=5))
     inside_all = torch.from_numpy((u > 8) & (u < 1271) & (v > 8) & (v < 711)) & d.valid[0, 0]
     assert inside_all.double().mean() > 0.6
@@ -233,7 +235,7 @@ def test_on_real_frames_one_look_up_keeps_more_than_two(shared_data, name):
 
 
 @every_model
-def test_every_sample_is_that_of_a_batch_of_one(camera, on_threads):
+def test_a_sample_does_not_depend_on_batch_or_threads(camera, on_threads):
     image = torch.rand(5, 3, 27, 48)
     effect = Rectification(camera, p=0.5)
     together = effect.degrade(image, seed=5)
@@ -260,7 +262,7 @@ def test_one_graph_under_a_tolerance_gives_the_same_as_eager_mode():
 
 
 @every_model
-def test_gradients_under_a_tolerance_are_near_to_exact_ones(camera):
+def test_gradients_under_a_tolerance_agree_with_exact_ones(camera):
     image, found = smooth(1, 1, 27, 48, dtype=torch.float64), []
     for tolerance in (None, 1e-3):
         effect = Rectification(camera, tolerance_px=tolerance)
@@ -287,7 +289,7 @@ def test_gradients_of_the_camera_are_those_of_finite_differences(camera):
 
 
 @every_model
-def test_gradients_of_the_flow_back_are_those_of_finite_differences(camera):
+def test_gradients_of_the_restore_flow_are_those_of_finite_differences(camera):
     effect, image = Rectification(camera, tolerance_px=None), smooth(1, 1, 9, 16, dtype=torch.float64)
     params = effect.sample(image, seed=0)
 
@@ -300,7 +302,7 @@ def test_gradients_of_the_flow_back_are_those_of_finite_differences(camera):
 
 
 def random_camera(dice: np.random.Generator) -> Camera:
-    """Of any model, wide or narrow, from nearly straight to far from it."""
+    """Draw a camera of any model, wide or narrow, with weak or strong distortion."""
     model = ("polynomial12", "opencv", "opencv", "fisheye", "division")[dice.integers(5)]
     width, height = int(dice.integers(200, 700)), int(dice.integers(120, 500))
     fx, cx, cy = width * dice.uniform(0.5, 1.5), width * dice.uniform(0.45, 0.55), height * dice.uniform(0.45, 0.55)
@@ -315,7 +317,7 @@ def random_camera(dice: np.random.Generator) -> Camera:
     return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=coefficients, model=model)
 
 
-def test_under_a_tolerance_every_camera_stays_within_it():
+def test_random_cameras_stay_within_the_tolerance():
     dice, planned = np.random.default_rng(6), 0
     for _ in range(30):
         camera, tolerance = random_camera(dice), float(10 ** dice.uniform(-3, -0.5))
@@ -347,15 +349,15 @@ def test_a_composition_shares_its_tolerance_with_a_rectification(name):
     assert (found - exact).square().sum(dim=1).sqrt().max() <= plan.error_px <= 0.1
 
 
-def test_the_plan_of_a_camera_is_of_frames_of_its_shape():
+def test_a_plan_needs_the_shape_of_the_frames_of_the_camera():
     effect = Rectification(DASHCAM, tolerance_px=0.05)
     assert effect.plan(720, 1280).stride > 8
-    assert effect.plan(720, 1280).slope < 0.5
+    assert effect.plan(720, 1280).max_gradient < 0.5
     with pytest.raises(ValueError, match="image must have the shape of the camera's frames"):
         effect.plan(720, 720)
 
 
-def test_other_cameras_than_the_one_that_is_known_are_taken_exactly():
+def test_params_of_another_camera_are_computed_exactly():
     effect, exact = Rectification(DASHCAM, tolerance_px=0.1), Rectification(DASHCAM, tolerance_px=None)
     image = torch.rand(1, 1, 72, 128)
     params = exact.sample(image, seed=0)
@@ -365,18 +367,18 @@ def test_other_cameras_than_the_one_that_is_known_are_taken_exactly():
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value))])
-def test_it_is_copied_whole(copied):
+def test_copies_give_equal_images(copied):
     image = smooth(2, 3, 27, 48)
     assert torch.equal(copied(Rectification(SMALL))(image), Rectification(SMALL)(image))
 
 
-def test_a_camera_without_distortion_leaves_the_frame():
+def test_a_camera_without_distortion_returns_the_image():
     image = torch.rand(2, 3, 27, 48)
     still = Camera(width=48, height=27, fx=43.0, fy=42.5, cx=25.0, cy=14.1, coefficients=(0.0,) * 5)
     assert torch.equal(Rectification(still)(image), image)
 
 
-def test_a_model_that_folds_inside_the_frame_is_told():
+def test_a_model_that_folds_inside_the_frame_warns():
     folding = Camera(width=48, height=27, fx=24.0, fy=24.0, cx=23.5, cy=13.0, coefficients=(-0.4, 0.0, 0.0, 0.0))
     with pytest.warns(UserWarning, match="camera: the model folds back inside the frame"):
         made = Rectification(folding).degrade(torch.rand(1, 3, 27, 48), seed=0)
@@ -387,7 +389,7 @@ def test_a_model_that_folds_inside_the_frame_is_told():
     assert torch.equal(made.valid[0, 0][clear], (r2 < 1 / 1.2)[clear])
 
 
-def test_a_fisheye_that_folds_inside_the_frame_is_told():
+def test_a_fisheye_that_folds_inside_the_frame_warns():
     # theta (1 - 0.6 theta^2) falls from theta = 1 / sqrt(1.8) on: at tan(0.745) = 0.922 focal lengths.
     folding = replace(ALL["fisheye"], fx=24.0, fy=24.0, coefficients=(-0.6, 0.0, 0.0, 0.0))
     with pytest.warns(UserWarning, match="camera: the model folds back inside the frame"):
@@ -404,9 +406,9 @@ def test_frames_of_another_shape_raise():
         Rectification(SMALL)(torch.rand(1, 3, 48, 48))
 
 
-def test_what_is_no_camera_raises():
+def test_invalid_cameras_raise():
     with pytest.raises(TypeError, match="camera must be a Camera, got dict"):
-        Rectification({"fx": 1.0})  # pyright: ignore[reportArgumentType]  # the wrong type is the point
+        Rectification({"fx": 1.0})  # pyright: ignore[reportArgumentType]
     # 1 - 2 r^2 is zero at r = 0.707, 1 - 3 r^2 at 0.577; the upper left corner is at 0.67 focal lengths.
     Rectification(Camera(**PINHOLE, coefficients=(0.0,) * 5 + (-2.0, 0.0, 0.0)))
     with pytest.raises(

@@ -87,8 +87,10 @@ def test_one_sampling_shows_the_same_as_one_for_each_warp():
     effect = Compose(four_warps(), **options)
     params = effect.sample(image, seed=3)
     together, repeated = effect.apply(image, params), image
-    for child, own in zip(effect.effects, params.children, strict=True):
-        repeated = Compose([cast(Effect, child)], **options).apply(repeated, params._replace(children=(own,))).image
+    for child, child_params in zip(effect.effects, params.children, strict=True):
+        repeated = (
+            Compose([cast(Effect, child)], **options).apply(repeated, params._replace(children=(child_params,))).image
+        )
     valid = together.valid.expand_as(image)
     assert valid.double().mean() > 0.6
     error = (together.image - repeated)[valid]
@@ -194,8 +196,8 @@ def test_nested_compositions_equal_the_flat_one():
     a, b, c = ThinPlateSpline(), UniformFog(), LensDistortion(**LENS)
     nested, flat = Compose([a, Compose([b, c])]), Compose([a, b, c])
     params = nested.sample(image, seed=5)
-    own = flat.sample(image, seed=5)._replace(children=(params.children[0], *params.children[1].children))
-    assert_equal(nested.apply(image, params), flat.apply(image, own))
+    flat_params = flat.sample(image, seed=5)._replace(children=(params.children[0], *params.children[1].children))
+    assert_equal(nested.apply(image, params), flat.apply(image, flat_params))
 
 
 @pytest.mark.quick

@@ -71,9 +71,9 @@ def test_folding_of_a_composition_is_that_of_the_composed_flow():
 
 @pytest.mark.parametrize("effect", [Turbulence(p=0.0), Compose([LensDistortion()], p=0.0)])
 def test_a_sample_that_is_not_degraded_is_not_folded(effect):
-    found = effect.degrade(torch.rand(2, 3, 9, 8), seed=0).folding
-    assert found.fraction.tolist() == [0, 0]
-    assert found.min_determinant.tolist() == [1, 1]
+    result = effect.degrade(torch.rand(2, 3, 9, 8), seed=0).folding
+    assert result.fraction.tolist() == [0, 0]
+    assert result.min_determinant.tolist() == [1, 1]
 
 
 def test_photometric_effects_have_no_folding():

@@ -40,8 +40,8 @@ def test_nine_hundred_points_give_the_flow_of_scipys_spline(dtype):
     x, y = torch.arange(0, 160, 7), torch.arange(0, 90, 5)
     at = torch.cartesian_prod(x, y)
     expected = RBFInterpolator(points, displacement, kernel="thin_plate_spline")(at.double().numpy())
-    found = degraded.flow[0, :, at[:, 1], at[:, 0]].T.double()
-    assert (found - torch.from_numpy(expected)).abs().max() < (1e-3 if dtype == torch.float32 else 1e-6)
+    displacement = degraded.flow[0, :, at[:, 1], at[:, 0]].T.double()
+    assert (displacement - torch.from_numpy(expected)).abs().max() < (1e-3 if dtype == torch.float32 else 1e-6)
 
 
 def test_control_points_on_pixels_have_finite_gradients():
@@ -134,8 +134,8 @@ def test_parameters_with_gradients_work_without_grad_mode():
     params = effect.sample(image, seed=1)
     trainable = type(params)(*(value.clone().requires_grad_(value.is_floating_point()) for value in params))
     with torch.no_grad():
-        found = effect.apply(image, trainable)
-    assert torch.equal(found.image, effect.apply(image, params).image)
+        degraded = effect.apply(image, trainable)
+    assert torch.equal(degraded.image, effect.apply(image, params).image)
     effect.apply(image, trainable).image.sum().backward()
     assert trainable.displacement.grad.abs().max() > 0
 

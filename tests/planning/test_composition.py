@@ -184,8 +184,8 @@ def test_flows_obey_the_bounds_of_their_error_model(effect):
     assert largest(flow) <= bounds.max_displacement
     limits = (bounds.max_gradient, bounds.max_second_derivative, bounds.max_third_derivative)
     for order, limit in enumerate(limits, start=1):
-        found = max(largest(flow.diff(n=order, dim=dim)) for dim in (2, 3))
-        assert (0.1 * limit if order < 3 else 0) < found <= limit
+        reached = max(largest(flow.diff(n=order, dim=dim)) for dim in (2, 3))
+        assert (0.1 * limit if order < 3 else 0) < reached <= limit
     for px in (3, 6):
         error = 0.0
         for y, x in ((0, 0), (1, 2)):  # the first node

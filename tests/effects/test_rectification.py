@@ -1,6 +1,5 @@
 import math
 import warnings
-from dataclasses import replace
 from typing import Any
 
 import cv2

@@ -1,11 +1,13 @@
 """Flows at the nodes of a coarse lattice, with cubics between the nodes."""
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchrefract._tensor import exact_matmul
+from torchrefract._validation import eager_values
 from torchrefract.ops.cubic import interpolate_nodes, lagrange_basis
 from torchrefract.ops.sampling import grid_sample
 from torchrefract.warping.grid import Points
@@ -123,6 +125,22 @@ class LatticeFlow:
         with torch.autocast(self.nodes.device.type, enabled=False):
             along = exact_matmul(self.nodes, _weight_matrix(x.flatten(), columns).to(self.dtype).mT)
             return exact_matmul(_weight_matrix(y.flatten(), rows).to(self.dtype), along)
+
+
+def lattice_around(points: Points, stride: int) -> Lattice | None:
+    """Return a lattice with nodes around all points.
+
+    None if their positions cannot be read, or if one lies farther outside the frame than the frame is long.
+    """
+    height, width = points.lattice.height, points.lattice.width
+    ends = eager_values(lambda: torch.stack([*points.x.aminmax(), *points.y.aminmax()]), of=points.x)
+    if ends is None:
+        return None
+    left, right, top, bottom = ends
+    outside = max(-left, right - width, -top, bottom - height, 0.0)
+    if not outside < max(height, width):  # nor is NaN
+        return None
+    return Lattice(height, width, stride, margin=2 + math.ceil(outside / stride))
 
 
 def _in_strides(position: Tensor, lattice: Lattice, count: int) -> Tensor:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import exact_matmul
 from torchrefract._validation import eager_values
 from torchrefract.ops.cubic import interpolate_nodes, lagrange_basis
 from torchrefract.ops.sampling import grid_sample
@@ -122,9 +121,8 @@ class LatticeFlow:
             return self.dense()
         rows, columns = self.nodes.shape[2:]
         x, y = _in_strides(points.x, lattice, columns), _in_strides(points.y, lattice, rows)
-        with torch.autocast(self.nodes.device.type, enabled=False):
-            along = exact_matmul(self.nodes, _weight_matrix(x.flatten(), columns).to(self.dtype).mT)
-            return exact_matmul(_weight_matrix(y.flatten(), rows).to(self.dtype), along)
+        # Columns first: there are fewer rows of nodes than of points, and copies of whole rows are faster.
+        return _cubic(_cubic(self.nodes, x.flatten(), dim=3), y.flatten(), dim=2)
 
 
 def lattice_around(points: Points, stride: int) -> Lattice | None:
@@ -153,12 +151,14 @@ def _cell(index: Tensor, count: int) -> Tensor:
     return index.detach().floor().clamp(1, count - 3).long()
 
 
-def _weight_matrix(index: Tensor, count: int) -> Tensor:
-    """Return the cubic weights of `count` nodes at fractional indices (n,), as (n, count)."""
-    cell = _cell(index, count)
-    weights = lagrange_basis(index - cell)
-    neighbors = cell[:, None] + torch.arange(-1, 3, device=index.device)
-    return weights.new_zeros(len(index), count).scatter(1, neighbors, weights)
+def _cubic(nodes: Tensor, index: Tensor, *, dim: int) -> Tensor:
+    """Interpolate nodes along a dimension at fractional indices (n,)."""
+    cell = _cell(index, nodes.shape[dim])
+    weights = lagrange_basis(index - cell).to(nodes.dtype)
+    shape = [1] * nodes.ndim
+    shape[dim] = -1
+    parts = [nodes.index_select(dim, cell + (j - 1)) * weights[:, j].view(shape) for j in range(4)]
+    return parts[0] + parts[1] + parts[2] + parts[3]
 
 
 def _bilinear(nodes: Tensor, x: Tensor, y: Tensor) -> Tensor:

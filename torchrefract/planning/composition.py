@@ -41,7 +41,7 @@ _CLOSED_FORM_SHARE = 0.05  # of the budget of the single flows, for each that dr
 # px between the nodes of a composition, from coarse to fine
 _STRIDES = (16, 12, 10, 8, 6, 5, 4, 3, 2)
 # Shares of the tolerance that the single flows may use; the rest is for the lattice of the composition.
-_SHARES = (0.7, 0.55, 0.4)
+_SHARES = (0.7, 0.5, 0.35, 0.2)
 _MAX_BEND_PX = 4.0  # of phi over one stride, up to which the bound above holds at the border
 
 

@@ -24,7 +24,7 @@ _SAFETY = 1.25
 _MOST_CORNERS, _RANDOM_LENSES = 128, 16
 _LEVELS = np.array([4.0, 16.0, 64.0, 128.0, 256.0])  # px, strides at which errors are measured
 _FINE = 2  # the first levels, whose nodes lie near the frame, give the derivatives
-_CELLS = 5  # along each axis, in which errors are measured
+_CELLS = 7  # along each axis, in which errors are measured
 # Positions in strides from the corner of a cell, on a line through its middle, and weights of the values there: the
 # error of the cubic through the four nodes, and the second and third derivative.
 _LINE = (-1.0, 0.0, 0.5, 1.0, 2.0)

@@ -65,7 +65,8 @@ def flow_at_points(compute: Callable[[Lattice], Tensor], points: Points, plan: W
     if not points.is_displaced and points.lattice == lattice:
         return compute(lattice)
     stride = max(1, plan.stride)
-    wide = Lattice(plan.height, plan.width, stride, margin=math.ceil(_MARGIN_PX / stride))
+    # One node more completes the cubics of the outermost points.
+    wide = Lattice(plan.height, plan.width, stride, margin=math.ceil(_MARGIN_PX / stride) + 1)
     x, y = points.x.clamp(-_MARGIN_PX, plan.width + _MARGIN_PX), points.y.clamp(-_MARGIN_PX, plan.height + _MARGIN_PX)
     return LatticeFlow(compute(wide), wide).at(points._replace(x=x, y=y))
 

@@ -24,7 +24,7 @@ _SAFETY = 1.25
 _MOST_CORNERS, _RANDOM_LENSES = 128, 16
 _LEVELS = np.array([4.0, 16.0, 64.0, 128.0, 256.0])  # px, strides at which errors are measured
 _FINE = 2  # the first levels, whose nodes lie near the frame, give the derivatives
-_CELLS = 5  # along each axis, in which errors are measured
+_CELLS = 7  # along each axis, in which errors are measured
 # Positions in strides from the corner of a cell, on a line through its middle, and weights of the values there: the
 # error of the cubic through the four nodes, and the second and third derivative.
 _LINE = (-1.0, 0.0, 0.5, 1.0, 2.0)
@@ -181,6 +181,13 @@ def cell_lines(height: int, width: int, num_levels: int) -> Tensor:
         corners = torch.from_numpy(np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 1, 2))
         points.append((corners + stride * offsets).reshape(-1, 2))
     return torch.cat(points)
+
+
+def outermost_nodes(height: int, width: int, num_levels: int) -> Tensor:
+    """Return (4, 2), px: the corners of the coarsest lattice, beyond which no node lies."""
+    stride = float(_LEVELS[num_levels - 1])
+    x, y = (torch.tensor([-stride, side - 1 + 2 * stride], dtype=torch.float64) for side in (width, height))
+    return torch.cartesian_prod(x, y)
 
 
 def flow_bounds(flow: Tensor, num_levels: int, stretch: Tensor) -> FlowBounds | None:

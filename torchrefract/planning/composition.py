@@ -173,7 +173,7 @@ def _plan_shares(warps: Sequence[PlannedWarp], request: PlanRequest, budget_px: 
     lattice_share = (1 - num_closed * closed_share) / max(_total(lattices), 1.0)
     plans: list[WarpPlan] = []
     stretch = 1.0
-    for warp in warps:
+    for warp, outside_px in zip(warps, _outside_px(warps, request), strict=True):
         part = closed_share if warp.has_closed_form else lattice_share
         # What a closed form drops has a small share, which need not cover the rounding as well.
         share = replace(request, tolerance_px=part * budget_px / stretch, ulps=0 if warp.has_closed_form else warp.ulps)
@@ -181,11 +181,26 @@ def _plan_shares(warps: Sequence[PlannedWarp], request: PlanRequest, budget_px: 
             plan = _exact_plan(warp, request)
         else:
             plan = plan_warp(warp.model, share)
+            if warp.has_closed_form and plan.bounds is not None and not plan.is_identity:
+                # Bounds hold as far outside the frame as the nodes of the coarsest lattice with a bound lie.
+                reaches = math.isfinite(float(plan.bounds.interpolation_error(np.array([max(outside_px, 1.0)]))[0]))
+                if not reaches:
+                    exact = plan_warp(None, replace(share, tolerance_px=None))
+                    plan = replace(exact, bounds=plan.bounds, reason="later warps lead far outside the frame")
         if warp.has_closed_form and not plan.is_identity:
             plan = replace(plan, node_error_px=plan.node_error_px + replace(request, ulps=warp.ulps).rounding_px)
         plans.append(plan)
         stretch *= 1 + _gradient(plan)
     return plans
+
+
+def _outside_px(warps: Sequence[PlannedWarp], request: PlanRequest) -> list[float]:
+    """Return how far outside the frame each flow may be evaluated, px: as far as the later warps move together."""
+    distances = [0.0]
+    for warp in reversed(warps[1:]):
+        bounds = None if warp.model is None else warp.model.bounds(request.height, request.width)
+        distances.append(distances[-1] + (math.inf if bounds is None else bounds.max_displacement))
+    return distances[::-1]
 
 
 def _own_error(plan: WarpPlan, warp: PlannedWarp) -> float:

@@ -15,7 +15,6 @@ from torchrefract.effects.base import Effect
 from torchrefract.effects.batch import params_per_frame, params_to, per_sample, select_params, where_active
 from torchrefract.effects.photometric_effect import PhotometricEffect
 from torchrefract.effects.warp_effect import (
-    MIN_PIXELS,
     BatchFlow,
     FlowPart,
     SamplingOptions,
@@ -558,10 +557,9 @@ def _needs_gradient(warps: Sequence[tuple[WarpEffect, Any]]) -> bool:
 
 def _planned_samples(effect: WarpEffect, params: Any, request: PlanRequest) -> list[PlannedWarp]:
     """Return the warp as a plan needs it for each sample."""
-    if not effect.has_sample_models or request.height * request.width < MIN_PIXELS or request.tolerance_px is None:
+    dtype = torch.float64 if request.is_double else torch.float32
+    if not effect.has_sample_models or not effect.plan_for_dtype(request.height, request.width, dtype).is_per_sample:
         return list(_planned_warps([effect])) * len(params.applied)
-    if effect.tolerance_px is None:
-        return [_planned_warp(effect, None)] * len(params.applied)
     return [_planned_warp(effect, model) for model in effect.sample_models(params)]
 
 

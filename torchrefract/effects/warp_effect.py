@@ -34,7 +34,7 @@ _MAX_RESIDUAL_PX = (
     0.5  # of a composed inverse; smooth ones are off by far less, those between two sheets of a fold by more
 )
 # A plan of its own for each sample pays off if that of the ranges is finer than this, in frames of this size.
-_FINE_STRIDE, MIN_PIXELS = 4, 1 << 16
+_FINE_STRIDE, _MIN_PIXELS = 4, 1 << 16
 
 
 class SamplingOptions(NamedTuple):
@@ -116,7 +116,7 @@ class WarpEffect(Effect):
         """Return the plan for all parameters in the ranges."""
         request = self.plan_request(height, width, dtype).with_reachable_default()
         plan = plan_warp(self.error_model() if request.tolerance_px else None, request)
-        is_fine = 0 < plan.stride < _FINE_STRIDE and height * width >= MIN_PIXELS
+        is_fine = 0 < plan.stride < _FINE_STRIDE and height * width >= _MIN_PIXELS
         if self.has_sample_models and is_fine and request.tolerance_px is not None:
             plan = replace(plan, is_per_sample=True, error_px=request.tolerance_px)
         return plan

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -155,6 +156,7 @@ class WarpPlan:
         return "\n".join(lines)
 
 
+@lru_cache(maxsize=1024)
 def plan_warp(model: ErrorModel | None, request: PlanRequest) -> WarpPlan:
     """Plan one warp: drop terms, then take the coarsest lattice whose error fits into the tolerance.
 

@@ -227,7 +227,7 @@ def test_a_field_changes_with_constant_strength_and_speed_and_without_a_seam(kin
 
 def test_the_wind_moves_a_field_that_does_not_change():
     wind: dict[str, Any] = {"wind_x_range": (3.0, 3.0), "wind_y_range": (-2.0, -2.0)}
-    forever = {"decorrelation_range": (math.inf, math.inf)}
+    forever: dict[str, Any] = {"decorrelation_range": (math.inf, math.inf)}
     effect = tr.Turbulence(amplitude_range=(1.0, 1.0), length_range=(5.0, 5.0), **wind, **forever)
     for start in (0.0, 1e5):
         flows = flows_at_frames(effect, start + torch.arange(5.0), size=(40, 60), keys=1)[0]

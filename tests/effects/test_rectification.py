@@ -299,7 +299,7 @@ def test_a_camera_without_distortion_returns_the_image():
 # r (1 - 0.4 r^2) falls beyond r^2 = 1 / 1.2, and theta (1 - 0.6 theta^2) beyond theta^2 = 1 / 1.8.
 @pytest.mark.parametrize(("model", "k1", "edge"), [("opencv", -0.4, 1.2**-0.5), ("fisheye", -0.6, math.tan(1.8**-0.5))])
 def test_a_model_that_folds_inside_the_frame_warns(model, k1, edge):
-    pinhole = PINHOLE | {"fx": 24.0, "fy": 24.0}
+    pinhole: dict[str, Any] = PINHOLE | {"fx": 24.0, "fy": 24.0}
     folding = Camera(**pinhole, coefficients=(k1, 0.0, 0.0, 0.0), model=model)
     with pytest.warns(UserWarning, match="camera: the model folds back inside the frame"):
         degraded = Rectification(folding).degrade(torch.rand(1, 3, 27, 48), seed=0)

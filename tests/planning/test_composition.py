@@ -78,7 +78,7 @@ class ConstantError:
     is_random: bool = False
 
     def bounds(self, height: int, width: int) -> FlowBounds:
-        return FlowBounds(10.0, self.gradient, math.inf, math.inf, lambda strides: np.full(np.shape(strides), np.inf))
+        return FlowBounds(10.0, self.gradient, math.inf, math.inf, lambda strides: np.zeros(np.shape(strides)))
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification:
         return Simplification(self.error_px, details="simplified", can_interpolate=False)

@@ -46,7 +46,9 @@ class SamplingOptions(NamedTuple):
 
     def or_else(self, other: "SamplingOptions") -> "SamplingOptions":
         """Take the options of another where these are undecided."""
-        return SamplingOptions(*(a or b for a, b in zip(self, other, strict=True)))
+        return SamplingOptions(
+            self.padding or other.padding, self.interpolation or other.interpolation, self.backend or other.backend
+        )
 
 
 class WarpEffect(Effect):

@@ -175,8 +175,10 @@ def _plan_shares(warps: Sequence[PlannedWarp], request: PlanRequest, budget_px: 
     stretch = 1.0
     for warp, outside_px in zip(warps, _outside_px(warps, request), strict=True):
         part = closed_share if warp.has_closed_form else lattice_share
+        # Rounded down to quarters of octaves, so that compositions with other drawn lenses find the same plans.
+        share_px = 2 ** (math.floor(4 * math.log2(part * budget_px / stretch)) / 4) if stretch < math.inf else 0.0
         # What a closed form drops has a small share, which need not cover the rounding as well.
-        share = replace(request, tolerance_px=part * budget_px / stretch, ulps=0 if warp.has_closed_form else warp.ulps)
+        share = replace(request, tolerance_px=share_px, ulps=0 if warp.has_closed_form else warp.ulps)
         if math.isinf(stretch) or warp.model is None or not share.is_reachable:
             plan = _exact_plan(warp, request)
         else:

@@ -144,7 +144,10 @@ class Body(NamedTuple):
         for z in (-1, 1):
             faces.append(((0, foot + h, z * (length - inset / 2)), (-z * w, 0, 0), (0, h, -z * inset / 2)))
         faces.append(((0, foot + 2 * h, 0), (w, 0, 0), (0, 0, length - inset)))
-        return [self.panel(*face, paint) for face, paint in zip(faces, paints[:1] + paints, strict=True)]
+        return [
+            self.panel(center, right, up, paint)
+            for (center, right, up), paint in zip(faces, paints[:1] + paints, strict=True)
+        ]
 
 
 @cache

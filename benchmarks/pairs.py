@@ -36,9 +36,8 @@ from torchrefract import (
 )
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract.data.pairs.files import FORMATS, decode_pair, encode_pair
-from torchrefract.data.pairs.generator import GenerationConfig, PairGenerator, PairTask
-from torchrefract.data.pairs.sources import SourceReader, find_sources
-from torchrefract.data.pairs.workers import use_one_thread
+from torchrefract.data.pairs.generator import GenerationConfig, PairGenerator, PairTask, SourceReader, find_sources
+from torchrefract.data.pairs.storage import use_one_thread
 from torchrefract.effects.base import Effect
 
 PROTOCOL = {

@@ -17,7 +17,7 @@ from torchrefract.data.road_scenes import render_road_scenes
 
 warnings.simplefilter("ignore", UserWarning)  # The optimizer tries lenses that fold the frame, of which effects warn.
 out, size = sys.argv[1] if len(sys.argv) > 1 else "recover_a_lens.png", (180, 320)
-clean = render_road_scenes(torch.tensor([29]), *size)[0].double()
+clean = render_road_scenes(torch.tensor([2]), *size)[0].double()
 if len(sys.argv) > 2:
     clean = fit(read_image(sys.argv[2]), size)[None].double()
 effect = tr.LensDistortion(p1_range=(0, 0), p2_range=(0, 0), center_x_range=(0, 0), center_y_range=(0, 0))

@@ -9,9 +9,8 @@ from torch.testing import assert_close
 from torch.utils.data import DataLoader
 
 from torchrefract.data.road_scenes import RoadScenes, render_road_scenes
-from torchrefract.data.road_scenes.paint import noise, textured
-from torchrefract.data.road_scenes.render import Camera, band, dashes, render
-from torchrefract.data.road_scenes.scene import Body, Panel, Scene, View, draw_scene
+from torchrefract.data.road_scenes.render import Camera, render
+from torchrefract.data.road_scenes.scene import Body, Panel, Scene, View, draw_scene, noise, textured
 
 
 class Frames(NamedTuple):
@@ -31,8 +30,8 @@ def scene_with(
     c, s = math.cos(pitch), math.sin(pitch)
     view = View(np.array([0, height, 0]), np.array([[1, 0, 0], [0, -c, -s], [0, -s, c]]), 1.0)
     drawn = draw_scene(np.random.default_rng(0))
-    sun = np.array([-1, 1, 0]) / math.sqrt(2)
-    return Scene(drawn.road, view, drawn.light._replace(sun=sun), panels, casters or [])
+    drawn.light.sun = np.array([-1, 1, 0]) / math.sqrt(2)
+    return Scene(drawn.road, view, drawn.light, panels, casters or [])
 
 
 def wall(z: float, color: tuple[float, float, float] = (0.5, 0.5, 0.5), half_width: float = 1.0) -> Panel:
@@ -148,14 +147,6 @@ def test_a_panel_throws_its_shadow_away_from_the_sun():
     assert not dark[distance > 0.2].any()
 
 
-def test_only_the_front_of_a_one_sided_panel_shows():
-    board = textured((0.5,) * 3, 0.0, 0.0)
-    for sign in (1, -1):
-        panel = Body(0.0, 10.0, sign=sign).panel((0, 1, 0), (1, 0, 0), (0, 1, 0), board, is_one_sided=True)
-        _, depth = render(scene_with([panel]), 33, 33)
-        assert np.isclose(depth[16, 16], 10.0) == (sign == 1)
-
-
 def test_noise_is_bounded_continuous_and_periodic():
     x, y = np.random.default_rng(0).uniform(0, 64, (2, 500))
     value = noise(x, y)
@@ -164,14 +155,6 @@ def test_noise_is_bounded_continuous_and_periodic():
     # No slope exceeds 2, the range of the lattice, times 3/2, of the smooth step, along either axis.
     assert np.abs(noise(x + 1e-3, y) - value).max() < 3.1e-3
     assert np.abs(noise(x, y + 1e-3) - value).max() < 3.1e-3
-
-
-def test_road_paint_keeps_its_area_under_every_footprint():
-    position = np.arange(0, 9, 0.01)
-    for footprint in (0.02, 0.7, 5.0, 9.0):
-        assert dashes(position, 9.0, 4.0, np.array(footprint)).mean() == pytest.approx(4 / 9, abs=1e-3)
-        line = band(position - 4.5, 0.14, np.array(min(footprint, 5.0)))
-        assert line.sum() * 0.01 == pytest.approx(0.14, abs=1e-2)
 
 
 @pytest.mark.quick

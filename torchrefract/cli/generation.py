@@ -24,12 +24,9 @@ from torchrefract.cli.command import check_seed, make, naming
 from torchrefract.data.frames import first_names
 from torchrefract.data.pairs.card import HISTOGRAMS, draw_histograms, format_card, summarize
 from torchrefract.data.pairs.files import FORMATS
-from torchrefract.data.pairs.generator import GenerationConfig, PairGenerator, PairTask
-from torchrefract.data.pairs.manifest import Manifest, PairRow, find_manifests, scan_rows
-from torchrefract.data.pairs.output import claim
-from torchrefract.data.pairs.sources import Sources, find_sources
-from torchrefract.data.pairs.storage import FileStorage, PairStorage, TarStorage
-from torchrefract.data.pairs.workers import generate_pairs
+from torchrefract.data.pairs.generator import GenerationConfig, PairGenerator, PairTask, Sources, find_sources
+from torchrefract.data.pairs.manifest import Manifest, PairRow, claim, find_manifests, scan_rows
+from torchrefract.data.pairs.storage import FileStorage, PairStorage, TarStorage, generate_pairs
 from torchrefract.effects.base import Effect
 
 _SAMPLES = 4  # pairs that the estimate of the size on disk rests on

@@ -27,7 +27,7 @@ from torchrefract.data.media import (
     video_info,
     write_picture,
 )
-from torchrefract.data.pairs.output import claim
+from torchrefract.data.pairs.manifest import claim
 from torchrefract.restoration.checkpoints import load_model
 from torchrefract.restoration.export import FORMATS, export_model
 from torchrefract.restoration.inference import Restorer

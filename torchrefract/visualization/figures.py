@@ -341,7 +341,7 @@ def _restore(effect: Effect, degraded: Degraded) -> _Restored | None:
     # A float image would be restored exactly, which no image file allows.
     stored, fog = to_float(to_uint8(degraded.image)), cast(Any, effect)
     t, airlight = degraded.transmission, degraded.params.airlight
-    return _Restored(*remove_fog(stored, t, airlight, linear_light=fog.air.linear_light), "restored from 8 bits")
+    return _Restored(*remove_fog(stored, t, airlight, linear_light=fog.medium.linear_light), "restored from 8 bits")
 
 
 def _scores(degraded: Degraded, frame: Tensor, *, restored: _Restored | None, folds: Tensor) -> str:

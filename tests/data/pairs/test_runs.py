@@ -1,7 +1,6 @@
 """A set ends with the same bytes after a kill, in shards and after a repair."""
 
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -12,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[3]
-COUNT = 30
+COUNT = 16
 
 
 def start(*words: str) -> subprocess.Popen[str]:
@@ -22,17 +21,13 @@ def start(*words: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def finish(run: subprocess.Popen[str]) -> str:
-    out, err = run.communicate(timeout=300)
-    assert run.returncode == 0, out + err
-    return out
-
-
 @pytest.fixture(scope="module")
 def complete(tmp_path_factory, words) -> Path:
     """A set made by one uninterrupted run."""
     out = tmp_path_factory.mktemp("complete") / "out"
-    finish(start(*words(out, f"count={COUNT}")))
+    run = start(*words(out, f"count={COUNT}"))
+    _, err = run.communicate(timeout=300)
+    assert run.returncode == 0, err
     return out
 
 
@@ -75,19 +70,17 @@ def rows_of(out: Path) -> list[str]:
     return sorted(line for path in out.glob("manifest*.jsonl") for line in path.read_text().splitlines())
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_a_killed_run_continues_to_the_same_bytes(tmp_path, words, sums, complete, workers):
-    out, arguments = tmp_path / "out", words(tmp_path / "out", f"count={COUNT}", f"workers={workers}")
-    run = start(*arguments)
+def test_a_killed_run_continues_to_the_same_bytes_with_another_number_of_workers(call, tmp_path, words, sums, complete):
+    out, arguments = tmp_path / "out", words(tmp_path / "out", f"count={COUNT}")
+    run = start(*arguments, "workers=2")
     # Kill it after two pairs, somewhere in a later one.
     wait_for(lambda: run.poll() is not None or len(list(out.rglob("*.png"))) > 8)
-    time.sleep(random.Random(workers).uniform(0, 0.1))
     processes = descendants(run.pid)
     run.send_signal(signal.SIGKILL)
     run.communicate()
     # A worker that outlived the run could write at the same time as the next run.
     wait_for(lambda: not any(is_running(process) for process in processes))
-    assert "exist already" in finish(start(*arguments))
+    assert "exist already" in call("generate", *arguments).out
     assert sums(out) == sums(complete)
 
 
@@ -110,20 +103,20 @@ def test_a_killed_worker_stops_the_run_with_a_message(tmp_path, words):
 
 
 def test_shards_make_the_same_files_in_any_order(call, tmp_path, words, sums, complete):
-    for shard in (2, 0, 1):
-        assert call("generate", *words("out", f"count={COUNT}", "shards=3", f"shard={shard}")).code == 0
+    for shard in (1, 0):
+        assert call("generate", *words("out", f"count={COUNT}", "shards=2", f"shard={shard}")).code == 0
     assert without_manifests(sums(tmp_path / "out")) == without_manifests(sums(complete))
     assert rows_of(tmp_path / "out") == rows_of(complete)
 
 
 def test_shards_make_the_same_tars(call, tmp_path, words, sums):
-    for name, shards in (("one", 1), ("three", 3)):
+    for name, shards in (("one", 1), ("two", 2)):
         for shard in range(shards):
-            options = ("count=11", "tar=2", f"shards={shards}", f"shard={shard}")
+            options = ("count=5", "tar=2", f"shards={shards}", f"shard={shard}")
             assert call("generate", *words(name, *options)).code == 0
-    one, three = sums(tmp_path / "one"), sums(tmp_path / "three")
-    assert without_manifests(one) == without_manifests(three)
-    assert sum(name.startswith("tars/") for name in one) == 6
+    one, two = sums(tmp_path / "one"), sums(tmp_path / "two")
+    assert without_manifests(one) == without_manifests(two)
+    assert sum(name.startswith("tars/") for name in one) == 3
 
 
 def test_the_jobs_of_a_multirun_are_shards(call, tmp_path, words, sums, complete):

@@ -11,7 +11,7 @@ import torch
 from torchrefract.data.images import UnreadableImageError, fit, pixels_of, read_image
 from torchrefract.data.media import read_video, write_video
 from torchrefract.data.pairs.dataset import PairedFolder
-from torchrefract.data.pairs.sources import Source, SourceReader, draw_of, find_sources
+from torchrefract.data.pairs.generator import Source, SourceReader, draw_of, find_sources
 
 OPTIONS = {"size": None, "every": 1, "drive_by": "auto", "val_share": 0.3, "seed": 0}
 FRAMES = 9

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from torchrefract._validation import check_count, check_tensor
+from torchrefract._validation import check_count, check_size, check_tensor
 from torchrefract.data.road_scenes.render import render
 from torchrefract.data.road_scenes.scene import draw_scene
 from torchrefract.types import Frame
@@ -17,9 +17,7 @@ _BITS = (1 << 64) - 1  # negative seeds and keys count modulo 2^64
 
 
 class RoadScenes(Dataset[Frame]):
-    """Rendered road scenes, each with its depth.
-
-    A key and a seed make one scene, at every size; see `render_road_scenes`.
+    """Rendered road scenes with their depth, see `render_road_scenes`.
 
     Args:
         count: number of scenes.
@@ -30,10 +28,9 @@ class RoadScenes(Dataset[Frame]):
 
     def __init__(self, count: int, *, size: Sequence[int] = (64, 112), seed: int = 0, first: int = 0):
         self.count = check_count("count", count)
-        if isinstance(size, str) or not isinstance(size, Sequence) or len(size) != 2:
-            raise ValueError(f"size must be (height, width), got {size!r}")
-        height, width = (check_count("size", side, low=_SMALLEST) for side in size)
-        self.size = (height, width)
+        self.size = check_size("size", size)
+        for side in self.size:
+            check_count("size", side, low=_SMALLEST)
         self.seed = check_count("seed", seed, low=-(2**63))
         self.first = check_count("first", first, low=-(2**63))
 

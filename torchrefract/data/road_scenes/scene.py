@@ -1,58 +1,55 @@
 """Layout of a road scene: road, camera, light and objects, drawn from a random generator.
 
-World axes: x right, y up, z ahead, m. The ground is y = 0. The camera stands at (x, height, 0). Colors are linear.
+World axes: x right, y up, z ahead, m. The ground is y = 0. The camera stands at (x, height, 0). Colors are linear
+albedos.
 """
 
 import math
+from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
-from torchrefract.data.road_scenes import paint
-from torchrefract.data.road_scenes.paint import Array, Color, Paint
+Array = np.ndarray
+Color = Array | tuple[float, ...]
+# u to the right of the middle of a panel and v above its foot, (K,), m -> albedo (K, 3), solid parts (K,), bool.
+Paint = Callable[[Array, Array], tuple[Array, Array]]
 
 _WALLS = ((0.6, 0.56, 0.48), (0.55, 0.42, 0.25), (0.42, 0.2, 0.12), (0.3, 0.42, 0.45), (0.66, 0.64, 0.6))
 _ROOFS = ((0.32, 0.08, 0.05), (0.33, 0.34, 0.35), (0.09, 0.17, 0.11), (0.3, 0.15, 0.08))
 _LEAVES = ((0.08, 0.14, 0.035), (0.12, 0.17, 0.05), (0.14, 0.15, 0.06), (0.06, 0.1, 0.035), (0.2, 0.18, 0.08))
-_CARS = ((0.72, 0.72, 0.7), (0.72, 0.72, 0.7), (0.4, 0.41, 0.42), (0.05, 0.05, 0.055), (0.4, 0.03, 0.03))
-_CARS += ((0.05, 0.1, 0.28), (0.5, 0.38, 0.1), (0.12, 0.2, 0.13))
-# Width, length, heights of the belt line and the roof, length and shift of the cabin, slope of its windows.
-_MODELS = (
-    (1.75, 4.1, 0.95, 1.48, 2.7, -0.3, 1.1),  # hatchback
-    (1.8, 4.6, 0.92, 1.45, 2.6, -0.2, 1.6),  # sedan
-    (1.85, 5.0, 1.0, 1.72, 2.4, 0.3, 0.8),  # pickup
-    (1.8, 4.8, 1.05, 2.05, 4.5, -0.1, 0.35),  # minibus
-    (2.4, 8.0, 1.15, 3.5, 7.9, 0.0, 0.0),  # truck
-)
+_CARS = ((0.72, 0.72, 0.7), (0.4, 0.41, 0.42), (0.05, 0.05, 0.055), (0.4, 0.03, 0.03), (0.05, 0.1, 0.28))
+_BARK, _GLASS, _DARK = (0.16, 0.11, 0.08), (0.07, 0.1, 0.13), (0.02, 0.02, 0.022)
+_WHITE_LAMPS, _RED_LAMPS = (1.6, 1.5, 1.3), (0.75, 0.02, 0.02)
+# Width, length, heights of the belt line and the roof, length of the cabin, distance by which its ends lean in, m.
+_MODELS = ((1.8, 4.4, 0.93, 1.46, 2.7, 0.7), (1.8, 4.8, 1.05, 2.05, 4.5, 0.35))  # car, minibus
+_WHEEL = 0.33  # m, radius
+_TILE = 256  # period of the noise, a power of two
 
 
-class Road(NamedTuple):
-    """A road and its verges.
+class Road:
+    """A road and its verges, drawn from a random generator; lengths in m, curve in 1/m."""
 
-    curve in 1/m, lane (its width), half_width and crossing (z of a pedestrian crossing) in m; green_grass and red_soil
-    in [0, 1]; asphalt: albedo; shift: of the texture of ground and clouds.
-    """
-
-    curve: float
-    lane: float
-    half_width: float
-    is_paved: bool
-    is_town: bool
-    has_solid_line: bool
-    has_edge_lines: bool
-    crossing: float | None
-    green_grass: float
-    red_soil: float
-    asphalt: float
-    shift: tuple[float, float]
+    def __init__(self, random: np.random.Generator):
+        self.is_town = random.random() < 0.4
+        self.is_paved = self.is_town or random.random() < 0.65
+        self.lane = random.uniform(3.0, 3.7)  # width
+        self.half_width = self.lane + random.uniform(0.2, 1.2) * self.is_paved
+        self.curve = random.uniform(-1, 1) ** 3 / 160
+        self.has_solid_line = random.random() < 0.2
+        self.green_grass, self.red_soil = random.random(2)
+        self.asphalt = random.uniform(0.07, 0.2)  # albedo
+        self.shift = random.uniform(0, 256, 2)  # of the texture of ground and clouds
 
     def center(self, z: Array | float) -> Array | float:
         """Return x of the center line: curve z^2 / (2 + z / 300), a parabola that straightens far away."""
         return self.curve * z * z / (2 + z / 300)
 
-    def slope(self, z: Array | float) -> Array | float:
-        """Return dx/dz of the center line."""
-        return self.curve * z * (4 + z / 300) / (2 + z / 300) ** 2
+    def place(self, offset: float, z: float, sign: float = 1.0) -> "Body":
+        """Place a body at an offset from the center line, in the direction of the road."""
+        tangent = self.curve * z * (4 + z / 300) / (2 + z / 300) ** 2
+        return Body(float(self.center(z)) + offset, z, tangent, sign)
 
 
 class View(NamedTuple):
@@ -63,35 +60,38 @@ class View(NamedTuple):
     focal: float
 
 
-class Light(NamedTuple):
-    """The direction to the sun (3,), colors (3,), and the density of clouds."""
+class Light:
+    """The direction to the sun (3,), colors of light (3,) and the density of clouds, drawn from a random generator."""
 
-    sun: Array
-    beam: Array
-    ambient: Array
-    zenith: Array
-    horizon: Array
-    clouds: float
+    def __init__(self, random: np.random.Generator):
+        is_overcast, heading = random.random() < 0.22, random.uniform(-math.pi, math.pi)
+        elevation = 2.5 if is_overcast else random.uniform(0.22, 1)
+        warm, power = np.clip((0.65 - elevation) / 0.4, 0, 1), random.uniform(0.85, 1.25)
+
+        def mix(clear: Color, golden: Color, gray: Color) -> Array:
+            return power * np.array(gray if is_overcast else np.array(clear) * (1 - warm) + np.array(golden) * warm)
+
+        sun = np.array([math.sin(heading), elevation * 1.2, math.cos(heading)])
+        self.sun = sun / np.linalg.norm(sun)
+        self.beam = mix((1.15, 1.08, 0.95), (1.7, 0.98, 0.45), (0.3, 0.3, 0.3))
+        self.ambient = mix((0.3, 0.36, 0.46), (0.3, 0.3, 0.36), (0.58, 0.6, 0.63))
+        self.zenith = mix((0.09, 0.22, 0.56), (0.14, 0.24, 0.45), (0.45, 0.48, 0.53))
+        self.horizon = mix((0.52, 0.66, 0.82), (0.95, 0.68, 0.42), (0.72, 0.74, 0.77))
+        self.clouds = 1.0 if is_overcast else random.uniform(-0.5, 0.55)
 
 
 class Panel(NamedTuple):
-    """A flat rectangle.
-
-    center: (3,). right, up: (3,), from the center to the middle of those edges. paint: see `paint`. is_round: shade it
-    like an ellipsoid. is_one_sided: only the side of the normal shows, as of a closed body.
-    """
+    """A flat rectangle; `right` and `up`, (3,), lead from its center, (3,), to the middle of those edges."""
 
     center: Array
     right: Array
     up: Array
     paint: Paint
-    is_round: bool = False
-    is_one_sided: bool = False
 
     @property
     def normal(self) -> Array:
         """The unit normal up x right."""
-        (a, b, c), (d, e, f) = self.up.tolist(), self.right.tolist()
+        (a, b, c), (d, e, f) = self.up.tolist(), self.right.tolist()  # np.cross takes ten times as long
         normal = b * f - c * e, c * d - a * f, a * e - b * d
         return np.array(normal) / math.hypot(*normal)
 
@@ -119,220 +119,228 @@ class Body(NamedTuple):
     tangent: float = 0.0  # of the angle between local and world z
     sign: float = 1.0  # -1 if the front faces the camera
 
-    def panel(self, center: tuple, right: tuple, up: tuple, paint: Paint, *, is_one_sided: bool = False) -> Panel:
+    def panel(self, center: tuple, right: tuple, up: tuple, paint: Paint) -> Panel:
         """Return a panel given in local coordinates (x, y, z)."""
         cosine = self.sign / math.sqrt(1 + self.tangent**2)
         turn = np.array([[cosine, 0, -cosine * self.tangent], [0, 1, 0], [cosine * self.tangent, 0, cosine]])
         position = np.array(center) @ turn + (self.x, 0, self.z)
-        return Panel(position, np.array(right) @ turn, np.array(up) @ turn, paint, is_one_sided=is_one_sided)
+        return Panel(position, np.array(right) @ turn, np.array(up) @ turn, paint)
 
     def upright(self, half_width: float, height: float, paint: Paint) -> Panel:
         """Return a panel across the body."""
         return self.panel((0, height / 2, 0), (half_width, 0, 0), (0, height / 2, 0), paint)
 
-    def prism(
-        self, size: tuple, side: Paint, rear: Paint, front: Paint, top: Paint, *, foot: float = 0.0, inset: float = 0.0
-    ) -> list[Panel]:
-        """Return a box whose two ends lean in.
+    def box(self, size: tuple, paints: tuple[Paint, ...], *, foot: float = 0.0, inset: float = 0.0) -> list[Panel]:
+        """Return the faces of a box.
 
         Args:
-            size: half width, height, half length, m.
-            side, rear, front, top: paints of the faces.
-            foot: height of the bottom, m.
-            inset: distance by which the upper edges of both ends lean in, m.
+            size: half width, height and half length, m.
+            paints: of both sides, rear, front and top.
+            foot: height of its bottom, m.
+            inset: distance by which the upper edges of rear and front lean in, m.
         """
         w, h, length = size[0], size[1] / 2, size[2]
-        faces: list[tuple] = [((x, foot + h, 0), (0, 0, math.copysign(length, x)), (0, h, 0), side) for x in (-w, w)]
-        for z, end in ((-1, rear), (1, front)):
-            faces.append(((0, foot + h, z * (length - inset / 2)), (-z * w, 0, 0), (0, h, -z * inset / 2), end))
-        if inset < length:
-            faces.append(((0, foot + 2 * h, 0), (w, 0, 0), (0, 0, length - inset), top))
-        return [self.panel(*face, is_one_sided=True) for face in faces]
+        faces: list[tuple] = [((x, foot + h, 0), (0, 0, math.copysign(length, x)), (0, h, 0)) for x in (-w, w)]
+        for z in (-1, 1):
+            faces.append(((0, foot + h, z * (length - inset / 2)), (-z * w, 0, 0), (0, h, -z * inset / 2)))
+        faces.append(((0, foot + 2 * h, 0), (w, 0, 0), (0, 0, length - inset)))
+        return [
+            self.panel(center, right, up, paint)
+            for (center, right, up), paint in zip(faces, paints[:1] + paints, strict=True)
+        ]
+
+
+@cache
+def _noise_tile() -> Array:
+    return np.random.default_rng(0).uniform(-1, 1, _TILE * _TILE).astype(np.float32)
+
+
+def noise(x: Array, y: Array | float) -> Array:
+    """Return smooth value noise in [-1, 1] with unit cells and period 256."""
+    column, row = np.floor(x), np.floor(y)
+    x, y = x - column, y - row
+    x, y = x * x * (3 - 2 * x), y * y * (3 - 2 * y)
+    left, top = column.astype(np.int32) & (_TILE - 1), (row.astype(np.int32) & (_TILE - 1)) * _TILE
+    right, bottom, tile = (left + 1) & (_TILE - 1), (top + _TILE) & (_TILE**2 - 1), _noise_tile()
+    upper, lower = tile[top + left], tile[bottom + left]
+    upper, lower = upper + (tile[top + right] - upper) * x, lower + (tile[bottom + right] - lower) * x
+    return upper + (lower - upper) * y
+
+
+def _shaded(color: Color, shade: Array) -> Array:
+    return np.asarray(color, np.float32) * shade[:, None]
+
+
+def textured(color: Color, seed: float, scale: float) -> Paint:
+    """Paint a solid surface with noise of `scale` cells a meter."""
+    return lambda u, v: (_shaded(color, 1 + 0.2 * noise(u * scale + seed * 256, v * scale)), v >= 0)
+
+
+def _skyline(color: Color, seed: float, height: float, octaves: dict[float, float]) -> Paint:
+    """Paint hills or bush below a skyline of noise; `octaves` has the amplitude of each cell size, both in heights."""
+
+    def paint(u: Array, v: Array) -> tuple[Array, Array]:
+        top = 0.5 + sum(size * noise(u / height / cell + seed * 256, 77 * cell) for cell, size in octaves.items())
+        texture = noise(u * 4 / height + seed * 256, v * 6 / height)
+        return _shaded(color, 1 + 0.3 * texture), v < height * np.clip(top, 0.1, 1)
+
+    return paint
+
+
+def _crown(color: Color, seed: float, half_width: float, half_height: float) -> Paint:
+    """Paint leaves in an ellipse whose rim breaks up."""
+    stretch = 0.6 + 0.4 * half_width / half_height
+
+    def paint(u: Array, v: Array) -> tuple[Array, Array]:
+        depth = np.sqrt(np.clip(1 - (u / half_width) ** 2 - (v / half_height - 1) ** 2, 0, None))
+        x, y = u + seed * 256, v * stretch
+        leaf = noise(x * 2.2, y * 2.2) + 0.7 * noise(x * 7.5, y * 7.5)
+        return _shaded(color, (1.1 + 0.6 * leaf) * (0.65 + 0.35 * v / half_height)), depth > 0.4 + 0.35 * leaf
+
+    return paint
+
+
+def _pole(height: float) -> Paint:
+    """Paint a mast with an arm for wires."""
+
+    def paint(u: Array, v: Array) -> tuple[Array, Array]:
+        return _shaded(_BARK, 1 + 0.25 * noise(u * 9, v)), (np.abs(u) < 0.13) | (np.abs(height - v - 0.6) < 0.09)
+
+    return paint
+
+
+def _wall(color: Color, roof: Color, seed: float, height: float) -> Paint:
+    """Paint a wall with a row of framed windows in each storey, a plinth and the edge of the roof."""
+
+    def paint(u: Array, v: Array) -> tuple[Array, Array]:
+        along, storey = u / (2.4 + seed) + 100.5, np.abs(v % 2.9 - 1.5)
+        middle = np.abs(along - np.floor(along) - 0.5)
+        frame = (middle < 0.29) & (storey < 0.65) & (v < height - 0.6)
+        albedo = _shaded(color, np.where(v < 0.35, 0.6, 1 + 0.08 * noise(u + seed * 256, v)))
+        albedo[frame], albedo[frame & (np.abs(middle - 0.135) < 0.115) & (storey < 0.55)] = (0.62, 0.6, 0.56), _GLASS
+        albedo[v > height - 0.45] = roof
+        return albedo, v >= 0
+
+    return paint
+
+
+def _hull(color: Color, half_width: float, height: float, lamps: Color | None = None) -> Paint:
+    """Paint the lower part of a vehicle: a side with wheels or, with the color of its lamps, an end."""
+
+    def paint(u: Array, v: Array) -> tuple[Array, Array]:
+        albedo = _shaded(color, np.ones_like(u))
+        wheel = np.hypot(np.abs(u) - 0.62 * half_width, v - _WHEEL) if lamps is None else np.full_like(u, np.inf)
+        albedo[(v < 0.42) | (wheel < 0.41)], albedo[wheel < 0.21] = _DARK, (0.3, 0.3, 0.31)
+        if lamps is not None:
+            albedo[(np.abs(np.abs(u) / half_width - 0.8) < 0.15) & (np.abs(v / height - 0.71) < 0.14)] = lamps
+        return albedo, (v > 0.24) | (wheel < _WHEEL)
+
+    return paint
+
+
+def _cabin(color: Color, half_width: float, height: float, inset: float = 0.0) -> Paint:
+    """Paint a trapezoid whose ends lean in by `inset` at the top, with a window."""
+
+    def paint(u: Array, v: Array) -> tuple[Array, Array]:
+        end, albedo = half_width - inset * v / height, _shaded(color, np.ones_like(u))
+        albedo[(np.abs(v / height - 0.48) < 0.38) & (np.abs(u) < end - 0.08)] = _GLASS
+        return albedo, np.abs(u) < end
+
+    return paint
 
 
 def draw_scene(random: np.random.Generator) -> Scene:
     """Draw a scene."""
-    road, light = _draw_road(random), _draw_light(random)
+    road, light = Road(random), Light(random)
     view = _draw_view(random, road)
-    crowns, trunks, crown_shadows = _trees(random, road, view, light)
-    solid = [*_buildings(random, road), *_barriers(random, road), *_poles(random, road), *_vehicles(random, road)]
-    panels = [*_horizon(random), *solid, *trunks, *crowns]
-    return Scene(road, view, light, panels, [*solid, *trunks, *crown_shadows])
-
-
-def _draw_road(random: np.random.Generator) -> Road:
-    is_town = random.random() < 0.4
-    is_paved = is_town or random.random() < 0.65
-    lane = random.uniform(3.0, 3.7)
-    return Road(
-        curve=random.uniform(-1, 1) ** 3 / 160,
-        lane=lane,
-        half_width=lane + random.uniform(0.2, 1.2) * is_paved,
-        is_paved=is_paved,
-        is_town=is_town,
-        has_solid_line=random.random() < 0.2,
-        has_edge_lines=random.random() < 0.75,
-        crossing=random.uniform(9, 30) if is_town and random.random() < 0.3 else None,
-        green_grass=random.random(),
-        red_soil=random.random(),
-        asphalt=random.uniform(0.07, 0.2),
-        shift=(random.uniform(0, 256), random.uniform(0, 256)),
-    )
+    objects = [*_buildings(random, road), *_poles(random, road), *_vehicles(random, road), *_trees(random, road)]
+    return Scene(road, view, light, [*_horizon(random), *objects], objects)
 
 
 def _draw_view(random: np.random.Generator, road: Road) -> View:
     """Draw a dashcam in the left lane."""
-    height = random.uniform(1.2, 1.55) + 0.8 * (random.random() < 0.15)
-    position = random.uniform(-0.5, 0.5) - road.lane / 2, height, 0.0
-    yaw, pitch, roll = random.uniform(-1, 1, 3) * (0.07, 0.06, 0.02)
-    (sy, sp, sr), (cy, cp, cr) = np.sin((yaw, pitch, roll)), np.cos((yaw, pitch, roll))
-    right = (cy * cr - sy * sp * sr, -cp * sr, -sy * cr - cy * sp * sr)
-    down = (-cy * sr - sy * sp * cr, -cp * cr, sy * sr - cy * sp * cr)
-    return View(np.array(position), np.array([right, down, (sy * cp, -sp, cy * cp)]), random.uniform(0.55, 0.85))
-
-
-def _draw_light(random: np.random.Generator) -> Light:
-    is_overcast, heading, elevation = random.random() < 0.22, random.uniform(-math.pi, math.pi), random.uniform(0.22, 1)
-    elevation = 2.5 if is_overcast else elevation
-    sun = np.array([math.sin(heading), elevation * 1.2, math.cos(heading)])
-    warm, power = np.clip((0.65 - elevation) / 0.4, 0, 1), random.uniform(0.85, 1.25)
-
-    def mix(clear: Color, golden: Color, gray: Color) -> Array:
-        return power * np.array(gray if is_overcast else np.array(clear) * (1 - warm) + np.array(golden) * warm)
-
-    return Light(
-        sun=sun / np.linalg.norm(sun),
-        beam=mix((1.15, 1.08, 0.95), (1.7, 0.98, 0.45), (0.3, 0.3, 0.3)),
-        ambient=mix((0.3, 0.36, 0.46), (0.3, 0.3, 0.36), (0.58, 0.6, 0.63)),
-        zenith=mix((0.09, 0.22, 0.56), (0.14, 0.24, 0.45), (0.45, 0.48, 0.53)),
-        horizon=mix((0.52, 0.66, 0.82), (0.95, 0.68, 0.42), (0.72, 0.74, 0.77)),
-        clouds=1.0 if is_overcast else random.uniform(-0.5, 0.55),
+    position = random.uniform(-0.5, 0.5) - road.lane / 2, random.uniform(1.2, 1.7), 0.0
+    (sy, cy), (sp, cp) = (
+        (math.sin(a), math.cos(a)) for a in (random.uniform(-0.07, 0.07), random.uniform(-0.06, 0.06))
     )
-
-
-def _place(road: Road, offset: float, z: float, turn: float = 0.0, sign: float = 1.0) -> Body:
-    """Place a body at an offset from the center line, turned from the direction of the road."""
-    return Body(float(road.center(z)) + offset, z, float(road.slope(z)) + turn, sign)
+    axes = np.array([(cy, 0, -sy), (-sy * sp, -cp, -cy * sp), (sy * cp, -sp, cy * cp)])
+    return View(np.array(position), axes, random.uniform(0.55, 0.85))
 
 
 def _horizon(random: np.random.Generator) -> list[Panel]:
     """Draw mountains, hills, and a line of bush on each side."""
+    mountains, bush = {3.3: 0.5, 1.0: 0.25, 0.22: 0.07}, {3.0: 0.3, 0.5: 0.15}
     panels = []
-    for far, rise, colors in ((7000, 0.07, _WALLS[2:3]), (2300, 0.035, _LEAVES)):
-        z, height = far * random.uniform(0.7, 1.3), far * random.uniform(rise / 6, rise)
-        color = np.array(colors[random.integers(len(colors))]) * 0.4 + 0.09
-        level = 0.75 if random.random() < 0.35 else 1.0
-        ridge = paint.skyline(color, random.random(), height, {3.3: 0.5, 1.0: 0.25, 0.22: 0.07}, level)
-        panels.append(Body(0, z).upright(1.7 * z, height, ridge))
-    for side in (-1, 1):
-        height, color = random.uniform(3, 7), np.array(_LEAVES[random.integers(len(_LEAVES))]) * 0.8
-        bush = paint.skyline(color, random.random(), height, {3.0: 0.3, 0.5: 0.15}, 1.0)
-        panels.append(Body(side * 306.0, random.uniform(110, 320)).upright(300, height, bush))
+    for x, z, half_width, height, color, octaves in (
+        (0, random.uniform(5000, 9000), 15000, random.uniform(80, 490), np.array(_WALLS[2]) * 0.4 + 0.09, mountains),
+        (0, random.uniform(1600, 3000), 5000, random.uniform(13, 80), random.choice(_LEAVES) * 0.4 + 0.09, mountains),
+        (-306, random.uniform(110, 320), 300, random.uniform(3, 7), random.choice(_LEAVES) * 0.8, bush),
+        (306, random.uniform(110, 320), 300, random.uniform(3, 7), random.choice(_LEAVES) * 0.8, bush),
+    ):
+        panels.append(Body(x, z).upright(half_width, height, _skyline(color, random.random(), height, octaves)))
     return panels
 
 
 def _buildings(random: np.random.Generator, road: Road) -> list[Panel]:
-    """Draw houses with gable roofs or flat ones, and apartment blocks farther away."""
+    """Draw houses, and apartment blocks farther away."""
     panels = []
     for i, z in enumerate((17, 24, 40, 47, 68, 75, 150, 220)):
-        is_block, scale = i >= 6, 1 + (i >= 6)
+        is_block = i >= 6
         if random.random() > (0.85 if road.is_town else 0.12):
             continue
-        half_width, half_length = random.uniform(3.5, 5.5) * scale, random.uniform(3, 4.5) * scale
-        is_flat, seed = is_block or random.random() < 0.35, random.random()
-        wall = 2.6 + 2.9 * (random.integers(2, 7) if is_block else random.integers(0, 2) * is_flat)
-        offset, turn = road.half_width + random.uniform(6, 12) + half_width + 25 * is_block, random.uniform(-0.1, 0.1)
-        body = _place(road, (2 * (i % 2) - 1) * offset, z + random.uniform(-4, 4), turn)
-        color, roof = (colors[random.integers(len(colors))] for colors in (_WALLS, _ROOFS))
-        rise, roof = 0.5 if is_flat else random.uniform(1, 2.2), paint.textured(roof, seed, 0.7)
-        side = paint.building(color, seed, wall, (0, 1) if is_flat else (rise, half_length))
-        end = paint.building(color, seed, wall)
-        panels += body.prism((half_width, wall + rise * is_flat, half_length), end, end, end, roof)
-        if not is_flat:
-            size = (half_width, rise, half_length)
-            panels += body.prism((half_width, wall + rise, half_length), side, end, end, roof)[:2]
-            panels += body.prism(size, end, roof, roof, roof, foot=wall, inset=half_length)[2:]
-    return panels
-
-
-def _barriers(random: np.random.Generator, road: Road) -> list[Panel]:
-    """Draw walls in a town, crash barriers and wire fences in the country."""
-    panels, wood = [], (0.25, 0.21, 0.17)
-    kinds = (
-        (0.6 * road.is_town, 4.2, random.uniform(1.4, 2), paint.textured(_WALLS[0], random.random(), 1.0)),
-        (0.3 * (not road.is_town), 3.0, 0.76, paint.barrier((0.42, 0.43, 0.44), (0.59,), 0.32, 2.5)),
-        (0.6 * (not road.is_town), 7.0, 1.26, paint.barrier(wood, (0.21, 0.63, 1.05), 0.026, 3.0)),
-    )
-    for chance, offset, height, board in kinds:
-        for side in (-1, 1):
-            if random.random() < chance:
-                half_length = random.uniform(8, 18)
-                body = _place(road, side * (road.half_width + offset), random.uniform(5, 14) + half_length)
-                panels.append(body.panel((0, height / 2, 0), (0, 0, half_length), (0, height / 2, 0), board))
+        half_width, half_length = random.uniform(3.5, 5.5) * (1 + is_block), random.uniform(3, 4.5) * (1 + is_block)
+        height, seed = 3.1 + 2.9 * (random.integers(2, 7) if is_block else random.integers(0, 2)), random.random()
+        offset = road.half_width + random.uniform(6, 12) + half_width + 25 * is_block
+        body, roof = road.place((2 * (i % 2) - 1) * offset, z + random.uniform(-4, 4)), random.choice(_ROOFS)
+        wall = _wall(random.choice(_WALLS), roof, seed, height)
+        paints = wall, wall, wall, textured(roof, seed, 0.7)
+        panels += body.box((half_width, height, half_length), paints)
     return panels
 
 
 def _poles(random: np.random.Generator, road: Road) -> list[Panel]:
-    """Draw a row of power poles or of street lamps on one side."""
+    """Draw a row of power poles on one side."""
     if random.random() > 0.75:
         return []
-    side, is_lamp, height = random.choice([-1, 1]), random.random() < 0.7 * road.is_town, random.uniform(7.2, 9.6)
-    offset = side * (road.half_width + 2.9 + (not is_lamp) * random.uniform(0.5, 4))
-    board = paint.pole((0.4, 0.41, 0.42) if is_lamp else (0.16, 0.11, 0.08), height, is_lamp)
+    side, height = random.choice([-1, 1]), random.uniform(7.2, 9.6)
+    offset = side * (road.half_width + random.uniform(2.9, 6.9))
     places = random.uniform(9, 24) + random.uniform(24, 45) * np.arange(5)
-    # The arm of a lamp reaches towards the road.
-    return [_place(road, offset, z).upright(-side * (1.1 + 0.5 * is_lamp), height, board) for z in places]
+    return [road.place(offset, z).upright(1.1, height, _pole(height)) for z in places]
 
 
-def _trees(random: np.random.Generator, road: Road, view: View, light: Light) -> tuple[list[Panel], ...]:
-    """Draw trees and bushes: crowns that face the camera, trunks, and crowns that face the sun, for shadows."""
-    crowns, trunks, shadows, is_umbrella = [], [], [], random.random() < 0.5
+def _trees(random: np.random.Generator, road: Road) -> list[Panel]:
+    """Draw trees and bushes, turned to the camera."""
+    panels = []
     for i, near in enumerate((10, 16, 26, 38, 52, 70, 95, 9, 13, 18, 25, 34, 46)):
         is_bush = i >= 7
         if random.random() > 0.75 - 0.3 * road.is_town:
             continue
-        width = random.uniform(1.5, 2.8) * (0.35 if is_bush else 1.4 if is_umbrella else 1.0)
-        height = width * (random.uniform(0.75, 1.2) - 0.45 * (is_umbrella and not is_bush))
-        foot = -0.3 * height if is_bush else random.uniform(1.4, 2.6) + is_umbrella
+        width = random.uniform(1.5, 2.8) * (0.35 if is_bush else 1.0)
+        height = width * random.uniform(0.5, 1.2)
+        foot = -0.3 * height if is_bush else random.uniform(1.4, 3.2)
         offset = random.choice([-1, 1]) * (road.half_width + 1.2 + width + random.random() * random.uniform(2, 16))
         z, seed = near * random.uniform(0.8, 1.25), random.random()
-        x, leaves = float(road.center(z)) + offset, paint.crown(_LEAVES[random.integers(5)], seed, width, height)
-        center = np.array([x, foot + height, z])
-        crowns.append(_facing(center, view.position - center, width, height, leaves))
-        shadows.append(_facing(center, light.sun, width, height, leaves))
+        x, leaves = float(road.center(z)) + offset, _crown(random.choice(_LEAVES), seed, width, height)
+        body = Body(x, z, x / z)
+        panels.append(body.panel((0, foot + height, -0.1), (width, 0, 0), (0, height, 0), leaves))
         if not is_bush:
-            trunks.append(
-                Body(x, z, x / z).upright(0.13, foot + 0.6 * height, paint.textured((0.15, 0.11, 0.08), seed, 5.0))
-            )
-    return crowns, trunks, shadows
-
-
-def _facing(center: Array, direction: Array, half_width: float, half_height: float, board: Paint) -> Panel:
-    """Return a round panel whose normal is a direction."""
-    right = np.cross(direction, (0, 1, 0))
-    up = np.cross(right, direction)
-    right, up = right / np.linalg.norm(right), up / np.linalg.norm(up)
-    return Panel(center, right * half_width, up * half_height, board, is_round=True)
+            panels.append(body.upright(0.13, foot + 0.6 * height, textured(_BARK, seed, 5.0)))
+    return panels
 
 
 def _vehicles(random: np.random.Generator, road: Road) -> list[Panel]:
-    """Draw two vehicles ahead, two oncoming (traffic keeps left) and one parked."""
-    panels, parked = [], road.half_width - road.lane / 2 + 1.3
-    nearest, farthest = np.array((9, 30, 9, 36, 10)), np.array((20, 70, 26, 90, 30))
-    for i, sign in enumerate((1, 1, -1, -1, 1)):
-        width, length, belt, roof, cabin, ahead, slope = _MODELS[random.integers(len(_MODELS))]
-        offset = -sign * (road.lane / 2 + parked * (i == 4)) + random.uniform(-0.25, 0.25)
-        body = _place(road, offset, random.uniform(nearest[i], farthest[i]) + length / 2, sign=sign)
-        color = _CARS[random.integers(len(_CARS))]
-        if random.random() > (0.3 if i == 4 else 0.42):
+    """Draw up to two vehicles ahead and two oncoming; traffic keeps left."""
+    panels = []
+    for sign, nearest, farthest in ((1, 9, 20), (1, 30, 70), (-1, 9, 26), (-1, 36, 90)):
+        width, length, belt, roof, cabin, inset = _MODELS[random.integers(len(_MODELS))]
+        offset, color = random.uniform(-0.25, 0.25) - sign * road.lane / 2, random.choice(_CARS)
+        body = road.place(offset, random.uniform(nearest, farthest) + length / 2, sign=sign)
+        if random.random() > 0.42:
             continue
-        top = paint.textured(color, 0.0, 0.0)
-        rear, front = (paint.hull_end(color, width / 2, belt, is_front) for is_front in (False, True))
-        panels += body.prism((width / 2, belt, length / 2), paint.hull_side(color, length / 2), rear, front, top)
-        height, half_width, inset = roof - belt, width * 0.46, min(slope * (roof - belt), 0.45 * cabin)
-        windows = ((0.1, 0.86), (0.1, 0.86), (0.06, 0.9)) if slope else ((0, 0), (0, 0), (0.05, 0.36))
-        side = paint.cabin(color, cabin / 2, height, inset, windows[0])
-        rear, front = (paint.cabin(color, half_width, math.hypot(height, inset), 0.0, w) for w in windows[1:])
-        body = body._replace(x=body.x + ahead * sign * body.tangent, z=body.z + ahead * sign)
-        panels += body.prism((half_width, height, cabin / 2), side, rear, front, top, foot=belt, inset=inset)
+        top, side = textured(color, 0.0, 0.0), _hull(color, length / 2, belt)
+        rear, front = (_hull(color, width / 2, belt, lamps) for lamps in (_RED_LAMPS, _WHITE_LAMPS))
+        panels += body.box((width / 2, belt, length / 2), (side, rear, front, top))
+        height, half_width = roof - belt, width * 0.46
+        side, end = _cabin(color, cabin / 2, height, inset), _cabin(color, half_width, math.hypot(height, inset))
+        panels += body.box((half_width, height, cabin / 2), (side, end, end, top), foot=belt, inset=inset)
     return panels

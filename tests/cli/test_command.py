@@ -224,32 +224,22 @@ def test_a_frame_that_is_damaged_in_the_middle_is_named_by_the_process_that_read
 # --- checkpoints
 
 
-def save_checkpoint(path: Path, *, task: str, weights: dict[str, torch.Tensor]) -> None:
-    AtomicCheckpointIO().save_checkpoint({"state_dict": weights, "task": task}, path)
-
-
 @pytest.mark.parametrize(
-    ("name", "write", "message"),
+    ("content", "message"),
     [
-        ("train", lambda path: None, "<run>/last.ckpt"),
-        ("eval", lambda path: path.write_bytes(random.Random(0).randbytes(5000)), "damaged"),
-        ("train", lambda path: path.write_bytes(b""), "damaged"),
+        (None, "<run>/last.ckpt"),
+        ({"state_dict": {}, "task": "deweather"}, "a checkpoint of the task undistort, got"),
         (
-            "eval",
-            lambda path: save_checkpoint(path, task="deweather", weights={}),
-            "a checkpoint of the task undistort, got",
-        ),
-        (
-            "train",
-            lambda path: save_checkpoint(path, task="undistort", weights={"network.0.weight": torch.ones(3)}),
+            {"state_dict": {"network.0.weight": torch.ones(3)}, "task": "undistort"},
             "a checkpoint of the model that model= names, got",
         ),
     ],
-    ids=["missing", "noise", "empty", "task", "model"],
+    ids=["missing", "task", "model"],
 )
-def test_an_unusable_checkpoint_is_one_line_of_error(call, small, tmp_path, name, write, message):
-    write(tmp_path / "old.ckpt")
-    text = call(name, "+task=undistort", *small, *NO_EPOCH, "ckpt_path=old.ckpt").message
+def test_an_unusable_checkpoint_is_one_line_of_error(call, small, tmp_path, content, message):
+    if content is not None:
+        AtomicCheckpointIO().save_checkpoint(content, tmp_path / "old.ckpt")
+    text = call("train", "+task=undistort", *small, *NO_EPOCH, "ckpt_path=old.ckpt").message
     assert text.startswith("ckpt_path must be ")
     assert message in text
     assert "old.ckpt" in text

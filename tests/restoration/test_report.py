@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
-from PIL import Image
 from torch import Tensor, nn
 
 from torchrefract import Pair
@@ -262,16 +261,6 @@ def make_pair(batch: int = 6) -> Pair:
     return Pair(clean + 0.1, clean, flow, valid, torch.arange(batch))
 
 
-def finish(run: Path, task: Any, *batches: Pair, rank: int = 0, stage: str = "validate") -> None:
-    """Run the callback after a validation whose restorations are off by 0.01 and whose flows are doubled."""
-    trainer: Any = SimpleNamespace(is_global_zero=rank == 0, callback_metrics=scores())
-    model, callback = Restoration(lambda channels, smooth: nn.Conv2d(3, channels, 1), task), RunSummary(str(run))
-    for number, batch in enumerate(batches):
-        flow = 2 * batch.flow if isinstance(task, Undistort) else None
-        callback.on_validation_batch_end(trainer, model, Restored(batch.clean + 0.01, flow)._asdict(), batch, number)
-    callback.teardown(trainer, model, stage)
-
-
 def test_the_panel_shows_four_examples_by_degradation():
     pair = make_pair()
     offset = torch.tensor([0.01, 0.1, 0.02, 0.2, 0.05, 0.04])
@@ -287,21 +276,14 @@ def test_the_panel_shows_four_examples_by_degradation():
     assert (restored.flow, len(examples.clean)) == (None, 2)
 
 
-def test_a_training_leaves_both_pictures_and_ends_with_the_names_of_its_files(tmp_path, capsys):
-    (tmp_path / "metrics.csv").write_text("epoch,step,train/loss,val/loss\n0,3,,0.3\n0,3,0.5,\n1,7,,0.2\n1,7,0.4,\n")
-    (tmp_path / "folder").mkdir()
-    finish(tmp_path, Undistort(), make_pair(), stage="fit")
-    for name in ("curves.png", "panel.png"):
-        with Image.open(tmp_path / name) as picture:
-            assert min(picture.size) > 300
-            assert np.ptp(np.asarray(picture.convert("L"))) > 128
-    lines = capsys.readouterr().out.splitlines()
-    assert lines == [*summary(scores(), (1080, 1920)), f"{tmp_path}: curves.png, metrics.csv, panel.png"]
-
-
-def test_other_ranks_and_runs_without_validation_write_nothing(tmp_path, capsys):
-    finish(tmp_path, Undistort(), make_pair(), rank=1)
-    finish(tmp_path, Undistort())
+@pytest.mark.parametrize(("rank", "num_batches"), [(1, 1), (0, 0)])
+def test_other_ranks_and_runs_without_validation_write_nothing(tmp_path, capsys, rank, num_batches):
+    trainer: Any = SimpleNamespace(is_global_zero=rank == 0, callback_metrics=scores())
+    model = Restoration(lambda channels, smooth: nn.Conv2d(3, channels, 1), Undistort())
+    callback, pair = RunSummary(str(tmp_path)), make_pair()
+    for number in range(num_batches):
+        callback.on_validation_batch_end(trainer, model, Restored(pair.clean, pair.flow)._asdict(), pair, number)
+    callback.teardown(trainer, model, "validate")
     assert capsys.readouterr().out == ""
     assert list(tmp_path.iterdir()) == []
 

@@ -174,7 +174,7 @@ class Trained(NamedTuple):
 def small() -> tuple[str, ...]:
     """The words that make a training a matter of seconds."""
     data = ("data.train_count=32", "data.val_count=16", "data.batch_size=8", "data.size=[32,64]", "data.workers=0")
-    return (*data, "trainer.max_epochs=3", "model.network.encoder=tu-mobilenetv3_small_050")
+    return (*data, "trainer.max_epochs=2", "model.network.encoder=tu-mobilenetv3_small_050")
 
 
 @pytest.fixture(scope="session")
@@ -193,7 +193,7 @@ def spawn() -> Callable[..., Outcome]:
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory, spawn, small) -> Trained:
-    """A training of three epochs by the command, as a user would start it."""
+    """A training of two epochs by the command, as a user would start it."""
     words = ("+task=undistort", *small)
     outcome = spawn("-m", "torchrefract.train", *words, cwd=tmp_path_factory.mktemp("trained"))
     return Trained(words, outcome, outcome.folder)

@@ -42,8 +42,9 @@ def run_main(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["torchrefract.train", "license=[CC0], by us"])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "")
 
-    def run(main, **options) -> str:
-        command("train", **options)(main)()
+    def run(function, **options) -> str:
+        monkeypatch.setattr("hydra.main", lambda **_: lambda job: lambda: job(None))
+        command("train", lambda _: function(), **options)()
         return capsys.readouterr().err
 
     return run
@@ -124,7 +125,7 @@ def test_an_experiment_chooses_its_task(call):
         ("sede=1", "an option must be one of .*, got sede; did you mean seed"),
         ("data.color=red", "data.color"),
         ("+model.depth=3", "model: .*'depth'"),
-        ("model.network.encoder=tu-nonsense", "model: encoder must be known to .*, got tu-nonsense"),
+        ("model.network.encoder=tu-nonsense", "model: encoder must be a name of .*, got tu-nonsense"),
         ("data.size=[64", r"\[64"),
         ("data.size=[4,4]", "data: size must be at least 8, got 4"),
         ("data.batch_size=33", "data: batch_size must be at most the 32 training frames, got 33"),
@@ -223,32 +224,22 @@ def test_a_frame_that_is_damaged_in_the_middle_is_named_by_the_process_that_read
 # --- checkpoints
 
 
-def save_checkpoint(path: Path, *, task: str, weights: dict[str, torch.Tensor]) -> None:
-    AtomicCheckpointIO().save_checkpoint({"state_dict": weights, "task": task}, path)
-
-
 @pytest.mark.parametrize(
-    ("name", "write", "message"),
+    ("content", "message"),
     [
-        ("train", lambda path: None, "<run>/last.ckpt"),
-        ("eval", lambda path: path.write_bytes(random.Random(0).randbytes(5000)), "damaged"),
-        ("train", lambda path: path.write_bytes(b""), "damaged"),
+        (None, "<run>/last.ckpt"),
+        ({"state_dict": {}, "task": "deweather"}, "a checkpoint of the task undistort, got"),
         (
-            "eval",
-            lambda path: save_checkpoint(path, task="deweather", weights={}),
-            "a checkpoint of the task undistort, got",
-        ),
-        (
-            "train",
-            lambda path: save_checkpoint(path, task="undistort", weights={"network.0.weight": torch.ones(3)}),
+            {"state_dict": {"network.0.weight": torch.ones(3)}, "task": "undistort"},
             "a checkpoint of the model that model= names, got",
         ),
     ],
-    ids=["missing", "noise", "empty", "task", "model"],
+    ids=["missing", "task", "model"],
 )
-def test_an_unusable_checkpoint_is_one_line_of_error(call, small, tmp_path, name, write, message):
-    write(tmp_path / "old.ckpt")
-    text = call(name, "+task=undistort", *small, *NO_EPOCH, "ckpt_path=old.ckpt").message
+def test_an_unusable_checkpoint_is_one_line_of_error(call, small, tmp_path, content, message):
+    if content is not None:
+        AtomicCheckpointIO().save_checkpoint(content, tmp_path / "old.ckpt")
+    text = call("train", "+task=undistort", *small, *NO_EPOCH, "ckpt_path=old.ckpt").message
     assert text.startswith("ckpt_path must be ")
     assert message in text
     assert "old.ckpt" in text
@@ -264,7 +255,7 @@ def test_a_full_disk_stops_the_command_and_keeps_the_last_good_checkpoint(call, 
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(torch, "save", save)
-    outcome = call("train", "+task=undistort", *small, "hydra.run.dir=run")
+    outcome = call("train", "+task=undistort", *small, "trainer.max_epochs=2", "hydra.run.dir=run")
     assert outcome.code == 1
     assert "Traceback" not in outcome.err
     line = outcome.err.splitlines()[-1]

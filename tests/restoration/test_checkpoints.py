@@ -301,7 +301,7 @@ def test_only_models_and_tasks_of_the_package_are_instantiated(write, target, mo
     monkeypatch.setattr("os.system", lambda _: pytest.fail("run"))
     hostile = {"_target_": target}
     for model in (config() | hostile, config(network=hostile), config(metric_size=[{"nested": [hostile]}])):
-        message = load_error(write(config={"model": model}))
+        message = load_error(write(config={"model": model}, state_dict={}))
         assert f"must name models and tasks of torchrefract only, got {write()} with {target!r}" in message
 
 

@@ -18,14 +18,11 @@ from torchrefract.restoration.diffusion import (
     Diffusion,
     FlowTarget,
     ImageTarget,
-    check_steps,
-    noise_levels,
     normal,
     sample,
     target_of,
 )
 from torchrefract.restoration.models.denoiser import Denoiser
-from torchrefract.restoration.module import NotFiniteError
 from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
 
 SIZE = (16, 24)
@@ -150,7 +147,7 @@ def test_levels_are_uniform_over_samples_and_steps(trainer, pairs, loader):
 
 
 def test_training_depends_on_the_seed_alone_and_lowers_the_loss(trainer, pairs, loader, losses):
-    batches, runs = pairs("undistort", 1, size=(32, 32), batch=2) * 40, []
+    batches, runs = pairs("undistort", 1, size=(16, 16), batch=2) * 40, []
     for seed, global_seed in ((0, 1), (0, 2), (1, 1)):
         torch.manual_seed(3)
         model, kept = Diffusion(tiny, Undistort(0.1), seed=seed, lr=5e-3, warmup_steps=5), losses()
@@ -161,7 +158,7 @@ def test_training_depends_on_the_seed_alone_and_lowers_the_loss(trainer, pairs, 
     assert np.mean(runs[0][-10:]) < 0.5 * np.mean(runs[0][:5])
 
 
-@pytest.mark.parametrize(("task", "sampler"), [("undistort", "ddpm"), ("deweather", "ddim"), ("deweather", "ddpm")])
+@pytest.mark.parametrize(("task", "sampler"), [("undistort", "ddpm"), ("deweather", "ddim")])
 def test_a_restoration_depends_on_image_and_key_alone(task, sampler):
     torch.manual_seed(0)
     model = Diffusion(tiny, TASKS[task], sampler=sampler, steps=5).eval()
@@ -299,14 +296,6 @@ def test_mixed_precision_trains_and_restores_without_nan(trainer, pairs, loader,
     assert torch.isfinite(run.callback_metrics["val/epe"])
 
 
-def test_a_nan_loss_stops_the_training_and_names_the_keys(trainer, pairs, loader):
-    model = Diffusion(Linear, Deweather())
-    linear(model).factor.data.fill_(torch.nan)
-    pattern = r"^loss must be finite, got nan in step 0 of epoch 0 for the keys 40, 41, 42, 43$"
-    with pytest.raises(NotFiniteError, match=pattern):
-        trainer(max_epochs=1).fit(model, loader(pairs("deweather", 1, first=40)))
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -327,7 +316,7 @@ def test_an_invalid_option_is_named(options, message):
 
 def test_a_fractional_number_of_steps_is_rejected():
     with pytest.raises(TypeError, match=r"val_steps must be a whole number, got 2\.5"):
-        check_steps("val_steps", 2.5)  # pyright: ignore[reportArgumentType]  # the wrong type is the test
+        Diffusion(Linear, Undistort(), val_steps=2.5)  # pyright: ignore[reportArgumentType]  # the wrong type is the test
 
 
 SHAPE = (3, 2, 5, 7)
@@ -358,7 +347,9 @@ def numpy_ddim(start: np.ndarray, steps: int) -> np.ndarray:
 
 @pytest.mark.quick
 def test_the_variances_of_the_levels_grow_linearly():
-    assert_close(noise_levels().alphas_cumprod.double(), torch.from_numpy(ALPHAS), rtol=1e-4, atol=0)
+    assert_close(
+        Diffusion(Linear, Undistort()).levels.alphas_cumprod.double(), torch.from_numpy(ALPHAS), rtol=1e-4, atol=0
+    )
 
 
 @pytest.mark.parametrize("steps", [1, 3, 7, 50])

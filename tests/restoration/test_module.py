@@ -1,5 +1,4 @@
 import math
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,16 +14,12 @@ from torchrefract import LensDistortion, Pair, UniformFog, presets
 from torchrefract.restoration.checkpoints import read_checkpoint
 from torchrefract.restoration.metrics import endpoint_error, psnr
 from torchrefract.restoration.models.resunet import ResUNet
-from torchrefract.restoration.models.segformer import SegFormer
-from torchrefract.restoration.module import NotFiniteError, Restoration, check_finite, make_schedule
+from torchrefract.restoration.module import NotFiniteError, Restoration
 from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
 
 SIZE = (32, 64)
 BATCH = 4
-SMALL: dict[str, Callable[..., nn.Module]] = {
-    "resunet": partial(ResUNet, encoder="tu-mobilenetv3_small_050"),
-    "segformer": partial(SegFormer, encoder="mit_b0"),  # drops paths at random
-}
+small_unet = partial(ResUNet, encoder="tu-mobilenetv3_small_050")
 
 # Lightning warns of small trainings, and of its own code (LeafSpec).
 pytestmark = pytest.mark.filterwarnings(
@@ -146,8 +141,8 @@ def test_the_learning_rate_warms_up_and_falls_along_a_cosine(trainer, training, 
 
 @pytest.mark.quick
 def test_a_plateau_halves_the_rate_after_more_than_five_epochs_without_a_lower_loss():
-    optimizer = torch.optim.SGD([nn.Parameter(torch.zeros(1))], lr=1.0)
-    scheduler = make_schedule("plateau", optimizer, warmup_steps=5, steps=15)["scheduler"]
+    options = Restoration(Constant, Undistort(), lr=1.0, schedule="plateau").configure_optimizers()
+    optimizer, scheduler = options["optimizer"], options["lr_scheduler"]["scheduler"]
     rates = []
     for loss in [1.0] * 7 + [0.5] * 8:
         rates.append(optimizer.param_groups[0]["lr"])
@@ -157,13 +152,11 @@ def test_a_plateau_halves_the_rate_after_more_than_five_epochs_without_a_lower_l
     assert rates == [1.0] * 7 + [0.5] * 7 + [0.25]
 
 
-@pytest.mark.quick
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_a_loss_that_is_not_finite_names_the_keys_of_its_batch(value):
-    keys = torch.tensor([7, 1 << 40])
-    check_finite(torch.tensor(1.0), keys, step=3, epoch=2)
-    with pytest.raises(NotFiniteError, match=rf"got {value:g} in step 3 of epoch 2 for the keys 7, {1 << 40}$"):
-        check_finite(torch.tensor(value), keys, step=3, epoch=2)
+def test_a_loss_that_is_not_finite_names_the_keys_of_its_batch(trainer, training, loader, value):
+    batch = training[1]._replace(clean=torch.full_like(training[1].clean, value), valid=training[1].valid | True)
+    with pytest.raises(NotFiniteError, match=rf"got {value:g} in step 1 of epoch 0 for the keys 4, 5, 6, 7$"):
+        trainer(max_epochs=1).fit(Restoration(Constant, Undistort()), loader([training[0], batch]))
 
 
 class StoppedError(Exception):
@@ -174,16 +167,6 @@ class Stop(Callback):
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx) -> None:
         if (trainer.current_epoch, batch_idx) == (1, 1):
             raise StoppedError
-
-
-class EpochRates(Callback):
-    """Keep the learning rate of each epoch."""
-
-    def __init__(self):
-        self.values: dict[int, float] = {}
-
-    def on_train_epoch_start(self, trainer, pl_module) -> None:
-        self.values[trainer.current_epoch] = trainer.optimizers[0].param_groups[0]["lr"]
 
 
 class Impatient(Restoration):
@@ -197,16 +180,24 @@ class Impatient(Restoration):
         return options
 
 
+class Dropping(nn.Sequential):
+    """A small network with running statistics and dropout."""
+
+    def __init__(self, channels: int, *, smooth: bool = False):
+        layers = (nn.Conv2d(3, 8, 3, padding=1), nn.BatchNorm2d(8), nn.Dropout(0.5), nn.Conv2d(8, channels, 1))
+        super().__init__(*layers)
+
+
 @pytest.mark.filterwarnings("ignore:.*dirpath has changed")
-@pytest.mark.parametrize(("network", "schedule"), [("resunet", "plateau"), ("segformer", "cosine")])
+@pytest.mark.parametrize("schedule", ["plateau", "cosine"])
 def test_a_resumed_run_ends_with_the_weights_of_an_uninterrupted_one_bit_for_bit(
-    trainer, training, loader, tmp_path, on_threads, network, schedule
+    trainer, training, loader, tmp_path, on_threads, schedule
 ):
     on_threads(1)
 
-    def train(name: str, *callbacks: Callback, ckpt_path: Path | None = None) -> tuple[dict[str, Tensor], dict]:
+    def train(name: str, *callbacks: Callback, ckpt_path: Path | None = None) -> tuple[dict[str, Tensor], list[float]]:
         torch.manual_seed(3)
-        model, rates = Impatient(SMALL[network], Undistort(), lr=1e-2, schedule=schedule), EpochRates()
+        model, rates = Impatient(Dropping, Undistort(), lr=1e-2, schedule=schedule), Rates()
         checkpoint = ModelCheckpoint(tmp_path / name, monitor="val/loss", save_last=True)
         run = trainer(max_epochs=3, callbacks=[rates, checkpoint, *callbacks], enable_checkpointing=True)
         run.fit(model, loader(training[:2]), loader(training[2:]), ckpt_path=ckpt_path, weights_only=True)
@@ -216,33 +207,31 @@ def test_a_resumed_run_ends_with_the_weights_of_an_uninterrupted_one_bit_for_bit
     with pytest.raises(StoppedError):
         train("stopped", Stop())
     resumed_weights, resumed_rates = train("resumed", ckpt_path=tmp_path / "stopped" / "last.ckpt")
-    assert resumed_rates == {epoch: rate for epoch, rate in rates.items() if epoch >= 1}
+    assert resumed_rates == rates[2:]
     if schedule == "plateau":
-        assert list(rates.values()) == [1e-2, 5e-3, 2.5e-3]
+        assert rates == [1e-2, 1e-2, 5e-3, 5e-3, 2.5e-3, 2.5e-3]
     for name, value in weights.items():
         assert torch.equal(value, resumed_weights[name]), name
 
 
-def overfit(network: str, task: Task, pair: Pair, *, steps: int, lr: float) -> Restored:
+def overfit(network: nn.Module, task: Task, pair: Pair, *, steps: int, lr: float) -> Restored:
     """Train a network on a single batch and restore the batch."""
-    torch.manual_seed(0)
-    model = SMALL[network](task.channels, smooth=task.smooth)
-    optimizer = torch.optim.AdamW(model.parameters())
+    optimizer = torch.optim.AdamW(network.parameters())
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, steps)
     for _ in range(steps):
         optimizer.zero_grad()
-        task.loss(task.restore(model(pair.degraded), pair.degraded), pair).backward()
+        task.loss(task.restore(network(pair.degraded), pair.degraded), pair).backward()
         optimizer.step()
         schedule.step()
     with torch.no_grad():
-        return task.restore(model(pair.degraded), pair.degraded)
+        return task.restore(network(pair.degraded), pair.degraded)
 
 
-@pytest.mark.parametrize("network", sorted(SMALL))
-def test_a_network_learns_to_undistort_one_batch_to_half_a_pixel(make_batches, network, on_threads):
+def test_a_network_learns_to_undistort_one_batch_to_half_a_pixel(make_batches, on_threads):
     on_threads(1)  # rounding depends on the number of threads
-    (pair,) = make_batches(presets.cheap_dashcam(severity=5), 1, size=SIZE, batch=2)
-    restored = overfit(network, Undistort(), pair, steps=50, lr=3e-3)
+    torch.manual_seed(0)
+    (pair,) = make_batches(presets.cheap_dashcam(severity=5), 1, size=SIZE, batch=1)
+    restored = overfit(small_unet(2, smooth=True), Undistort(), pair, steps=50, lr=3e-3)
     assert restored.flow is not None
     before, after = (
         endpoint_error(flow, pair.flow, pair.valid, size=SIZE).mean() for flow in (0 * pair.flow, restored.flow)
@@ -252,21 +241,22 @@ def test_a_network_learns_to_undistort_one_batch_to_half_a_pixel(make_batches, n
 
 
 def test_a_network_learns_to_remove_the_fog_of_one_image_to_35_decibels(make_batches):
+    torch.manual_seed(0)
     (pair,) = make_batches(presets.cape_town_fog(), 1, size=SIZE, batch=1)
-    restored = overfit("resunet", Deweather(), pair, steps=240, lr=5e-3)
+    restored = overfit(small_unet(3), Deweather(), pair, steps=240, lr=5e-3)
     before, after = (psnr(image, pair.clean, pair.valid).mean() for image in (pair.degraded, restored.image))
     assert before < 20
     assert after > 35
 
 
-@pytest.mark.parametrize("network", sorted(SMALL))
-def test_mixed_precision_trains_with_finite_float32_weights(trainer, training, loader, network):
-    model, dtypes = Restoration(SMALL[network], Undistort()), []
+def test_mixed_precision_trains_with_finite_float32_weights(trainer, make_batches, loader):
+    batches = make_batches(LensDistortion(), 2, size=SIZE, batch=2)
+    model, dtypes = Restoration(small_unet, Undistort()), []
     model.get_submodule("network.network.segmentation_head").register_forward_hook(
         lambda module, inputs, outputs: dtypes.append(outputs.dtype)
     )
-    run = trainer(max_epochs=2, precision="bf16-mixed")
-    run.fit(model, loader(training[:1]), loader(training[1:2]))
+    run = trainer(max_epochs=1, precision="bf16-mixed")
+    run.fit(model, loader(batches[:1]), loader(batches[1:]))
     assert {*dtypes} == {torch.bfloat16}
     assert all(value.isfinite() for value in run.callback_metrics.values())
     assert all(value.isfinite().all() and value.dtype == torch.float32 for value in model.parameters())

@@ -9,24 +9,21 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
-from PIL import Image
 from torch import Tensor, nn
 
 from torchrefract import Pair
-from torchrefract.restoration import report
 from torchrefract.restoration.module import Restoration
 from torchrefract.restoration.report import (
-    PanelRows,
     RunSummary,
     carry_over,
+    choose_examples,
     draw_panel,
     metrics_rows,
     plot_curves,
-    save_curves,
-    save_panel,
+    save_figure,
     summary,
 )
-from torchrefract.restoration.tasks import Deweather, Restored, Undistort
+from torchrefract.restoration.tasks import Restored, Undistort
 from torchrefract.visualization.color import flow_to_rgb
 
 # CSVLogger writes a row for validation and a row for training in each epoch, most cells empty.
@@ -101,24 +98,20 @@ def test_a_single_epoch_shows_its_baselines_as_lines_over_the_full_width(metrics
 
 
 @pytest.mark.parametrize("text", ["", "epoch,step,val/loss\n0,9,\n", "epoch,step,lr\n0,9,1\n"])
-def test_metrics_without_a_value_are_rejected_and_the_old_picture_stays(metrics, text):
+def test_metrics_without_a_value_are_rejected(metrics, text):
     metrics.write_text(text)
-    out = metrics.with_name("curves.png")
-    out.write_text("old")
     with pytest.raises(ValueError, match="metrics must hold a loss, psnr or epe of an epoch"):
-        save_curves(metrics.parent, out)
-    assert out.read_text() == "old"
+        plot_curves(metrics.parent, epe_unit="px")
 
 
-CAPTION = r"run_$\no$"  # an error if matplotlib parses it as a formula
-
-
-def rows(*, flow: Tensor | None = None, predicted_flow: Tensor | None = None, size: tuple[int, int] = (8, 10)):
-    """Return two examples of random images; the left half of the second is invalid."""
-    degraded, clean, restored = torch.rand(3, 2, 3, *size)
+def examples(*, has_flow: bool = False, size: tuple[int, int] = (8, 10)) -> tuple[Restored, Pair]:
+    """Return two examples of random images and flows; the left half of the second is invalid."""
+    generator = torch.Generator().manual_seed(0)
+    degraded, clean, restored = torch.rand(3, 2, 3, *size, generator=generator)
+    flow, predicted_flow = torch.randn(2, 2, 2, *size, generator=generator)
     valid = torch.ones(2, 1, *size, dtype=torch.bool)
     valid[1, :, :, : size[1] // 2] = False
-    return PanelRows(degraded, clean, restored, valid, ["20 -> 25 dB", CAPTION], flow, predicted_flow)
+    return Restored(restored, predicted_flow if has_flow else None), Pair(degraded, clean, flow, valid, torch.arange(2))
 
 
 def cells(figure: Figure, columns: int) -> list[list[Tensor]]:
@@ -137,41 +130,39 @@ def enlarge(image: Tensor) -> Tensor:
 
 
 def test_a_panel_draws_images_in_their_columns_with_captions():
-    sample = rows()
-    sample.restored[0, :, 0, 0] = math.nan
-    figure = draw_panel(sample)
-    error = (4 * (sample.restored - sample.clean).abs()).clamp(max=1)
-    images = (sample.clean, sample.degraded, sample.restored, error)
-    for column, image in zip(cells(figure, 4), images, strict=True):
-        # A value that is not finite is drawn gray.
-        assert (column[0] - enlarge(image[0].nan_to_num(nan=0.5))).abs().max() <= 0.5 / 255 + 1e-6
+    restored, pair = examples()
+    pair.clean[0] *= 0.8
+    pair.degraded[0], restored.image[0] = pair.clean[0] + 0.1, pair.clean[0] + 0.01  # 20 dB and 40 dB
+    pair.degraded[1, :, 0, 9] = math.nan
+    figure = draw_panel(restored, pair)
+    error = (4 * (restored.image.clamp(0, 1) - pair.clean).abs()).clamp(max=1)
+    for column, image in zip(cells(figure, 4), (pair.clean, pair.degraded, restored.image, error), strict=True):
+        assert (column[0] - enlarge(image[0].clamp(0, 1))).abs().max() <= 0.5 / 255 + 1e-6
+    gray = cells(figure, 4)[1][1][:, :32, -32:]  # a value that is not finite
+    assert (gray - 0.5).abs().max() <= 0.5 / 255 + 1e-6
     assert texts(figure)[:4] == ["clean", "corrupted", "restored", "|restored - clean| x 4"]
-    assert {"20 -> 25 dB", CAPTION, "not valid: lost in the corrupted image"} < set(texts(figure))
-    valid = rows()._replace(valid=torch.ones(2, 1, 8, 10, dtype=torch.bool))
-    assert "not valid: lost in the corrupted image" not in texts(draw_panel(valid))
+    assert {"20.0 -> 40.0 dB", "invalid: lost, or outside the frame"} < set(texts(figure))
+    complete = draw_panel(restored, pair._replace(valid=torch.ones_like(pair.valid)))
+    assert "invalid: lost, or outside the frame" not in texts(complete)
 
 
 def test_both_flows_share_the_scale_of_the_longest_valid_true_flow():
-    flow = torch.randn(2, 2, 8, 10).clamp(-2, 2)
-    flow[0, :, 4, 5] = torch.tensor([22.0, -29.2])  # |flow| = 36.56
-    flow[0, 0, 1, 1] = math.inf
-    flow[1, :, 0, 0] = 500.0  # invalid
-    predicted_flow = 10 * torch.randn(2, 2, 8, 10)
-    figure = draw_panel(rows(flow=flow, predicted_flow=predicted_flow))
+    restored, pair = examples(has_flow=True)
+    assert restored.flow is not None
+    pair.flow[0, :, 4, 5] = torch.tensor([22.0, -29.2])  # |flow| = 36.56
+    pair.flow[0, 0, 1, 1] = math.inf
+    pair.flow[1, :, 0, 0] = 500.0  # invalid
+    figure = draw_panel(restored._replace(flow=10 * restored.flow), pair)
     drawn = cells(figure, 5)
-    for column, shown in ((drawn[3], flow), (drawn[4], predicted_flow)):
+    for column, shown in ((drawn[3], pair.flow), (drawn[4], 10 * restored.flow)):
         expected = enlarge(flow_to_rgb(shown, max_px=37.0)[0])
         assert (column[0] - expected).abs().max() <= 0.5 / 255 + 1e-6
     assert texts(figure)[3:5] == ["true flow", "predicted flow"]
-    assert "full color = 37 px at 10x8" in texts(figure)
-    alone = texts(draw_panel(rows(predicted_flow=torch.full((2, 2, 8, 10), 0.3))))  # |flow| = 0.424
-    assert "true flow" not in alone
-    assert "full color = 0.43 px at 10x8" in alone
+    assert "full color = 37 px" in texts(figure)
 
 
 def test_invalid_pixels_are_hatched_from_the_third_column_on():
-    flow = torch.randn(2, 2, 8, 10)
-    for column, (first, second) in enumerate(cells(draw_panel(rows(flow=flow, predicted_flow=flow)), 5)):
+    for column, (first, second) in enumerate(cells(draw_panel(*examples(has_flow=True)), 5)):
         invalid, valid = second[:, :, :160], second[:, :, 160:]
         is_gray = (invalid == invalid[:1]).all()
         assert is_gray == (column >= 2)
@@ -181,12 +172,12 @@ def test_invalid_pixels_are_hatched_from_the_third_column_on():
             assert len(invalid.unique()) == 2
 
 
-@pytest.mark.parametrize("size", [(37, 53), (720, 1281)])
+@pytest.mark.parametrize("size", [(37, 53), (90, 641)])
 def test_a_saved_panel_holds_its_images_without_resampling(tmp_path, size):
-    sample = rows(size=size)
-    save_panel(sample, tmp_path / "panel.png")
+    figure = draw_panel(*examples(size=size))
+    save_figure(figure, tmp_path / "panel.png")
     page = matplotlib.image.imread(tmp_path / "panel.png")[..., :3]
-    for axes in draw_panel(sample).axes:
+    for axes in figure.axes:
         image = np.asarray(axes.images[0].get_array())
         left, right = (round(x * page.shape[1]) for x in axes.get_position().intervalx)
         bottom, top = (round(y * page.shape[0]) for y in axes.get_position().intervaly)
@@ -196,8 +187,7 @@ def test_a_saved_panel_holds_its_images_without_resampling(tmp_path, size):
 
 @pytest.mark.parametrize("size", [(360, 640), (112, 8), (16, 16)])
 def test_nothing_on_a_panel_overlaps_or_leaves_the_page(size):
-    flow = torch.randn(2, 2, *size)
-    figure = draw_panel(rows(flow=flow, predicted_flow=flow, size=size))
+    figure = draw_panel(*examples(has_flow=True, size=size))
     figure.canvas.draw()
     boxes = [axes.get_window_extent() for axes in figure.axes] + [text.get_window_extent() for text in figure.texts]
     for i, box in enumerate(boxes):
@@ -206,7 +196,7 @@ def test_nothing_on_a_panel_overlaps_or_leaves_the_page(size):
         assert not any(box.padded(-0.5).overlaps(other) for other in boxes[i + 1 :])
 
 
-def test_a_panel_that_cannot_be_saved_keeps_the_old_one(tmp_path, monkeypatch):
+def test_a_figure_that_cannot_be_saved_keeps_the_old_one(tmp_path, monkeypatch):
     def half_a_file(self, path):
         path.write_text("half")
         raise OSError("no space left")
@@ -215,7 +205,7 @@ def test_a_panel_that_cannot_be_saved_keeps_the_old_one(tmp_path, monkeypatch):
     out.write_text("old")
     monkeypatch.setattr(Figure, "savefig", half_a_file)
     with pytest.raises(OSError, match="no space left"):
-        save_panel(rows(), out)
+        save_figure(Figure(), out)
     assert out.read_text() == "old"
     assert list(tmp_path.iterdir()) == [out]
 
@@ -263,60 +253,37 @@ def test_the_table_compares_the_model_with_the_baselines():
     assert words(lines) == ["do nothing 20.50 (+0.00) 0.700", "model 26.00 (+5.50) 0.800"]
 
 
-def make_pair(seed: int = 0, batch: int = 6) -> Pair:
-    generator = torch.Generator().manual_seed(seed)
+def make_pair(batch: int = 6) -> Pair:
+    generator = torch.Generator().manual_seed(0)
     clean = 0.25 + 0.5 * torch.rand(batch, 3, 20, 30, generator=generator)
     flow = torch.randn(batch, 2, 20, 30, generator=generator)
-    return Pair(clean + 0.1, clean, flow, torch.ones(batch, 1, 20, 30, dtype=torch.bool), torch.arange(batch))
+    valid = torch.ones(batch, 1, 20, 30, dtype=torch.bool)
+    return Pair(clean + 0.1, clean, flow, valid, torch.arange(batch))
 
 
-def finish(run: Path, task: Any, *batches: Pair, rank: int = 0, stage: str = "validate") -> None:
-    """Run the callback after a validation whose restorations are off by 0.01 and whose flows are doubled."""
-    trainer: Any = SimpleNamespace(is_global_zero=rank == 0, callback_metrics=scores())
-    model, callback = Restoration(lambda channels, smooth: nn.Conv2d(3, channels, 1), task), RunSummary(str(run))
-    for number, batch in enumerate(batches):
-        flow = 2 * batch.flow if isinstance(task, Undistort) else None
-        callback.on_validation_batch_end(trainer, model, Restored(batch.clean + 0.01, flow)._asdict(), batch, number)
-    callback.teardown(trainer, model, stage)
-
-
-def test_the_panel_shows_four_examples_of_the_first_batch_by_degradation(tmp_path, monkeypatch):
-    panels: list[PanelRows] = []
-    monkeypatch.setattr(report, "save_panel", lambda rows, out: panels.append(rows))
-    first = make_pair()
+def test_the_panel_shows_four_examples_by_degradation():
+    pair = make_pair()
     offset = torch.tensor([0.01, 0.1, 0.02, 0.2, 0.05, 0.04])
-    first = first._replace(degraded=first.clean + offset.view(6, 1, 1, 1))
+    pair = pair._replace(degraded=pair.clean + offset.view(6, 1, 1, 1))
     chosen = [3, 1, 5, 2]  # of 3 1 4 5 2 0
-    finish(tmp_path, Undistort(), first, make_pair(seed=1))
-    finish(tmp_path, Deweather(), make_pair(batch=2))
-    panel, without_flow = panels
-    assert torch.equal(panel.clean, first.clean[chosen])
-    assert torch.equal(panel.degraded, first.degraded[chosen])
-    assert torch.equal(panel.restored, first.clean[chosen] + 0.01)
-    assert panel.flow is not None
-    assert panel.predicted_flow is not None
-    assert torch.equal(panel.flow, first.flow[chosen])
-    assert torch.equal(panel.predicted_flow, 2 * first.flow[chosen])
-    # An offset of 0.1 is 20 dB, one of 0.01 is 40 dB.
-    assert panel.captions == [f"{before} -> 40.0 dB" for before in ("14.0", "20.0", "28.0", "34.0")]
-    assert (without_flow.flow, without_flow.predicted_flow, len(without_flow.clean)) == (None, None, 2)
+    restored, examples = choose_examples(Restored(pair.clean + 0.01, 2 * pair.flow), pair)
+    assert examples.key.tolist() == chosen
+    assert torch.equal(examples.degraded, pair.degraded[chosen])
+    assert torch.equal(restored.image, pair.clean[chosen] + 0.01)
+    assert restored.flow is not None
+    assert torch.equal(restored.flow, 2 * examples.flow)
+    restored, examples = choose_examples(Restored(pair.clean[:2]), Pair(*(value[:2] for value in pair)))
+    assert (restored.flow, len(examples.clean)) == (None, 2)
 
 
-def test_a_training_leaves_both_pictures_and_ends_with_the_names_of_its_files(tmp_path, capsys):
-    (tmp_path / "metrics.csv").write_text("epoch,step,train/loss,val/loss\n0,3,,0.3\n0,3,0.5,\n1,7,,0.2\n1,7,0.4,\n")
-    (tmp_path / "folder").mkdir()
-    finish(tmp_path, Undistort(), make_pair(), stage="fit")
-    for name in ("curves.png", "panel.png"):
-        with Image.open(tmp_path / name) as picture:
-            assert min(picture.size) > 300
-            assert np.ptp(np.asarray(picture.convert("L"))) > 128
-    lines = capsys.readouterr().out.splitlines()
-    assert lines == [*summary(scores(), (1080, 1920)), f"{tmp_path}: curves.png, metrics.csv, panel.png"]
-
-
-def test_other_ranks_and_runs_without_validation_write_nothing(tmp_path, capsys):
-    finish(tmp_path, Undistort(), make_pair(), rank=1)
-    finish(tmp_path, Undistort())
+@pytest.mark.parametrize(("rank", "num_batches"), [(1, 1), (0, 0)])
+def test_other_ranks_and_runs_without_validation_write_nothing(tmp_path, capsys, rank, num_batches):
+    trainer: Any = SimpleNamespace(is_global_zero=rank == 0, callback_metrics=scores())
+    model = Restoration(lambda channels, smooth: nn.Conv2d(3, channels, 1), Undistort())
+    callback, pair = RunSummary(str(tmp_path)), make_pair()
+    for number in range(num_batches):
+        callback.on_validation_batch_end(trainer, model, Restored(pair.clean, pair.flow)._asdict(), pair, number)
+    callback.teardown(trainer, model, "validate")
     assert capsys.readouterr().out == ""
     assert list(tmp_path.iterdir()) == []
 

@@ -1,6 +1,5 @@
 """Shared code of the entry points: one line for an error that the user can fix, a traceback for any other."""
 
-import atexit
 import difflib
 import errno
 import logging
@@ -10,10 +9,10 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import hydra
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, InstantiationException, MissingConfigException
 from hydra.utils import instantiate
@@ -52,41 +51,34 @@ _IGNORED_WARNINGS = (
 )
 
 
-def command(name: str, *, prepare: _Prepare | None = None) -> Callable[[Callable[[], None]], Callable[[], None]]:
-    """Decorate the Hydra main function of `python -m torchrefract.<name>`.
+def command(
+    name: str, function: Callable[[DictConfig], None], *, prepare: _Prepare | None = None
+) -> Callable[[], None]:
+    """Return the main function of `python -m torchrefract.<name>`.
 
     Args:
         name: of the module, and of its file in conf.
+        function: called with the configuration.
         prepare: changes or checks the command-line arguments before Hydra parses them.
     """
 
-    def decorate(main: Callable[[], None]) -> Callable[[], None]:
-        @wraps(main)
-        def run() -> None:
-            logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
-            for message in _IGNORED_WARNINGS:
-                warnings.filterwarnings("ignore", message)
-            # Hydra then raises its errors instead of printing them.
-            os.environ["HYDRA_FULL_ERROR"] = "1"
-            with _one_line_errors(name):
-                if prepare is not None:
-                    sys.argv[1:] = prepare(name, sys.argv[1:])
-                main()
-
-        return run
-
-    return decorate
-
-
-def job(function: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
-    """Decorate the function that Hydra calls: its errors end the program before Hydra adds lines to them."""
-
-    @wraps(function)
-    def run(cfg: DictConfig) -> None:
-        with _one_line_errors():
+    def job(cfg: DictConfig) -> None:
+        with _one_line_errors(name):  # Hydra would add lines to an error that leaves this function
             function(cfg)
 
-    return run
+    job.__module__ = f"torchrefract.{name}"  # Hydra names the job by it
+
+    def main() -> None:
+        logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
+        for message in _IGNORED_WARNINGS:
+            warnings.filterwarnings("ignore", message)
+        os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises its errors instead of printing them
+        with _one_line_errors(name):
+            if prepare is not None:
+                sys.argv[1:] = prepare(name, sys.argv[1:])
+            hydra.main(config_path=CONFIG_DIR, config_name=name, version_base="1.3")(job)()
+
+    return main
 
 
 def require_task(name: str, arguments: list[str]) -> list[str]:
@@ -127,18 +119,12 @@ def picture_as_option(name: str, arguments: list[str]) -> list[str]:
 def quote_option(option: str) -> _Prepare:
     """Return a `prepare` for `command` that takes the value of an option as text: commas and brackets mean nothing."""
 
-    def prepare(name: str, arguments: list[str]) -> list[str]:
-        return [_quote_value(argument) if argument.startswith(f"{option}=") else argument for argument in arguments]
+    def quote(argument: str) -> str:
+        name, _, text = argument.partition("=")
+        is_plain = name == option and text not in ("", "null") and text[0] not in "'\""
+        return f"{option}={_quote(text)}" if is_plain else argument
 
-    return prepare
-
-
-def leave() -> None:
-    """End the program like Python, but without freeing what is in memory: unloading PyTorch takes half a second."""
-    atexit._run_exitfuncs()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(0)
+    return lambda name, arguments: [quote(argument) for argument in arguments]
 
 
 def check_seed(seed: Any) -> int:
@@ -184,18 +170,13 @@ def _is_picture(argument: str) -> bool:
     )
 
 
-def _quote_value(argument: str) -> str:
-    option, _, text = argument.partition("=")
-    return argument if text in ("", "null") or text[0] in "'\"" else f"{option}={_quote(text)}"
-
-
 def _quote(text: str) -> str:
     """Quote a text for Hydra's grammar and OmegaConf's interpolation."""
     return QuotedString(re.sub(r"(\\*)\$\{", r"\1\1\\${", text), Quote.single).with_quotes()
 
 
 @contextmanager
-def _one_line_errors(name: str = "") -> Iterator[None]:
+def _one_line_errors(name: str) -> Iterator[None]:
     """Print an error that the user can fix as one line and end the program; raise any other again."""
     try:
         yield
@@ -216,7 +197,7 @@ def _user_message(error: Exception, name: str) -> str | None:
     if isinstance(error, _FILE_ERRORS):
         return str(error).strip().splitlines()[-1].split("Error: ", 1)[-1]  # a worker prepends its traceback
     if isinstance(error, UsageError | HydraException | OmegaConfBaseException | YAMLError):
-        unknown = _UNKNOWN_OPTION.match(str(error)) if name else None
+        unknown = _UNKNOWN_OPTION.match(str(error))
         return _unknown_option(name, unknown[1]) if unknown else " ".join(str(error).split())
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
         return f"{error.filename or 'a file'} could not be written: {error.strerror}"

@@ -1,4 +1,4 @@
-"""The commands that apply a trained model: `restore` writes pictures and videos, `export` writes a program."""
+"""The commands `train` and `eval`, and those that apply a model: `restore` writes pictures, `export` a program."""
 
 import hashlib
 import sys
@@ -6,16 +6,19 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import torch
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from pytorch_lightning import LightningModule, Trainer, seed_everything
+from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
-from torchrefract.cli.command import naming, progress
+from torchrefract.cli.command import check_seed, make, naming, progress
 from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
 from torchrefract.data.media import (
     check_output_folder,
@@ -27,14 +30,36 @@ from torchrefract.data.media import (
     video_info,
     write_picture,
 )
+from torchrefract.data.module import PairData, fingerprint
 from torchrefract.data.pairs.manifest import claim
-from torchrefract.restoration.checkpoints import load_model
+from torchrefract.restoration.checkpoints import Origin, check_fits, load_model, read_checkpoint
 from torchrefract.restoration.export import FORMATS, export_model
 from torchrefract.restoration.inference import Restorer
+from torchrefract.restoration.models.coordconv import weights_license
 from torchrefract.restoration.module import Restoration
 from torchrefract.restoration.tasks import Undistort
 
 _T = TypeVar("_T")
+
+
+def train(cfg: DictConfig) -> None:
+    """Train the model of a configuration on its data; with `ckpt_path`, resume a stopped run."""
+    data, model, trainer, num_epochs = _make_parts(cfg)
+    limit = trainer.max_epochs
+    if num_epochs and limit is not None and -1 < limit <= num_epochs:
+        raise UsageError(f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}")
+    trainer.callbacks.insert(0, _origin(cfg, data))  # pyright: ignore[reportAttributeAccessIssue]  # a connector sets it
+    _save_config(cfg, trainer)
+    trainer.fit(model, data, ckpt_path=cfg.ckpt_path, weights_only=True)
+
+
+def evaluate(cfg: DictConfig) -> None:
+    """Score a checkpoint on the validation data of a configuration."""
+    if cfg.ckpt_path is None:
+        raise UsageError("ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none")
+    data, model, trainer, _ = _make_parts(cfg)
+    _save_config(cfg, trainer)
+    trainer.validate(model, data, ckpt_path=cfg.ckpt_path, verbose=False, weights_only=True)
 
 
 def restore(cfg: DictConfig) -> None:
@@ -78,6 +103,40 @@ def export(cfg: DictConfig) -> None:
     )
 
 
+def _make_parts(cfg: DictConfig) -> tuple[PairData, LightningModule, Trainer, int]:
+    """Instantiate data, model and trainer, check that they fit together, and count the epochs of `ckpt_path`."""
+    OmegaConf.resolve(cfg)
+    seed_everything(check_seed(cfg.seed), workers=True, verbose=False)
+    path = None if cfg.ckpt_path is None else Path(cfg.ckpt_path)
+    checkpoint = path and read_checkpoint(path, task=str(HydraConfig.get().runtime.choices["task"]))
+    data, model = make(cfg, "data"), make(cfg, "model")
+    try:
+        trainer = make(cfg, "trainer")
+    except MisconfigurationException as error:
+        raise UsageError(f"trainer: {error}") from error
+    with naming("data"):
+        data.check_ranks(trainer.world_size)
+        data.check_pair()
+    if path and checkpoint:
+        check_fits(checkpoint, model, path, config=cfg.model)
+    return data, model, trainer, checkpoint.get("epoch", -1) + 1 if checkpoint else 0
+
+
+def _save_config(cfg: DictConfig, trainer: Trainer) -> None:
+    if trainer.is_global_zero:
+        with naming("run_dir"):
+            Path(cfg.run_dir).mkdir(parents=True, exist_ok=True)
+            with replace_file(Path(cfg.run_dir, "config.yaml")) as temporary:
+                OmegaConf.save(cfg, temporary)
+
+
+def _origin(cfg: DictConfig, data: PairData) -> Origin:
+    source, network = fingerprint(data.train), cfg.model.network
+    weights = weights_license(network.encoder) if "encoder" in network and network.get("pretrained") else None
+    config = cast(dict[str, Any], OmegaConf.to_container(cfg, enum_to_str=True))
+    return Origin(config, data=source, licenses={"data": source["license"], "pretrained weights": weights})
+
+
 class _Job(NamedTuple):
     """The options of a restoration."""
 
@@ -89,11 +148,9 @@ class _Job(NamedTuple):
     device: torch.device
 
     def target(self, file: Path) -> Path:
-        """Return the path of the output for a file."""
         return self.out / output_name(file).relative_to(self.source)
 
     def is_done(self, file: Path) -> bool:
-        """Return True if the output of a file is complete."""
         return is_complete(file, self.target(file), num_columns=1 + self.side_by_side)
 
     def restore(self, images: Sequence[Tensor]) -> Iterator[np.ndarray]:
@@ -113,8 +170,8 @@ def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
     with naming("size"):
         size = loaded.size if cfg.size is None else check_size("size", cfg.size)
     with naming("tile"):
-        side = cfg.tile
-        tile = None if side is None else check_size("tile", (side, side) if isinstance(side, int) else side)
+        sides = (cfg.tile, cfg.tile) if isinstance(cfg.tile, int) else cfg.tile
+        tile = None if sides is None else check_size("tile", sides)
     if tile is not None and loaded.task == Undistort.name:
         raise UsageError(f"tile must be null for {loaded.task}, whose model needs the complete frame, got {cfg.tile}")
     with naming("interpolation"):

@@ -36,7 +36,7 @@ class CheckpointError(UsageError):
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Replace a checkpoint only by a complete one, so that a full disk leaves the last good file."""
+    """Replace a checkpoint only by a complete one, so that a full disk keeps the last good file."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Write the checkpoint to a temporary file, then move it to `path`.
@@ -143,12 +143,12 @@ def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
         raise CheckpointError(
             f"ckpt_path must be an intact checkpoint, got {path}, which is damaged or another kind of file"
         ) from error
-    if not isinstance(checkpoint, dict) or not _has_weights_and_task(checkpoint):
+    weights, name = (checkpoint.get(key) if isinstance(checkpoint, dict) else None for key in ("state_dict", "task"))
+    if not isinstance(weights, dict) or not isinstance(name, str):
         raise CheckpointError(f"ckpt_path must be a checkpoint of torchrefract, got {path}")
-    if task not in (None, checkpoint["task"]):
-        raise CheckpointError(f"ckpt_path must be a checkpoint of the task {task}, got {path} of {checkpoint['task']}")
-    checkpoint["state_dict"] = rename_weights(checkpoint["state_dict"])
-    return checkpoint
+    if task not in (None, name):
+        raise CheckpointError(f"ckpt_path must be a checkpoint of the task {task}, got {path} of {name}")
+    return checkpoint | {"state_dict": rename_weights(weights)}
 
 
 def rename_weights(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -167,19 +167,19 @@ def check_fits(
         path: the checkpoint, for the message.
         config: the configuration of the model, for the message.
     """
-    shapes = {name: value.shape for name, value in model.state_dict().items()}
-    saved = {name: value.shape for name, value in checkpoint["state_dict"].items()}
+    shapes, saved = (
+        {name: value.shape for name, value in weights.items()}
+        for weights in (model.state_dict(), checkpoint["state_dict"])
+    )
     differing = sorted(name for name in shapes.keys() | saved.keys() if shapes.get(name) != saved.get(name))
     if not differing:
         return
-    expected, given = (model_name(part) for part in (config or {}, checkpoint.get("config", {}).get("model", {})))
-    if expected != given and config and "config" in checkpoint:
-        raise CheckpointError(
-            f"ckpt_path must be a checkpoint of {expected}, which model= names, got {path} of {given}"
-        )
-    raise CheckpointError(
-        f"ckpt_path must be a checkpoint of the model that model= names, got {path}, where {differing[0]} differs"
-    )
+    expected, reason = "the model that model= names", f", where {differing[0]} differs"
+    if config and "config" in checkpoint:
+        name, other = model_name(config), model_name(checkpoint["config"]["model"])
+        if name != other:
+            expected, reason = f"{name}, which model= names", f" of {other}"
+    raise CheckpointError(f"ckpt_path must be a checkpoint of {expected}, got {path}{reason}")
 
 
 def model_name(model: Mapping[str, Any]) -> str:
@@ -187,13 +187,6 @@ def model_name(model: Mapping[str, Any]) -> str:
     network = model.get("network", model)
     name = str(network.get("_target_", "a network")).rsplit(".", 1)[-1]
     return f"{name} ({network['encoder']})" if "encoder" in network else name
-
-
-def _has_weights_and_task(checkpoint: dict[Any, Any]) -> bool:
-    weights = checkpoint.get("state_dict")
-    if not isinstance(weights, dict) or not isinstance(checkpoint.get("task"), str):
-        return False
-    return all(isinstance(name, str) and isinstance(value, Tensor) for name, value in weights.items())
 
 
 def _instantiate(config: dict[str, Any], changes: Mapping[str, Any], path: Path) -> LightningModule:

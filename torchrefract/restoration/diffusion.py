@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from diffusers import DDPMScheduler, DPMSolverMultistepScheduler
@@ -27,14 +27,6 @@ NUM_LEVELS = 1000  # noise levels of the training
 _PREDICTIONS = ("v_prediction", "epsilon")
 _NOISE_WEIGHT = 0.8
 _MU = 100.0
-
-
-class _Region(NamedTuple):
-    """A crop of a batch, or the batch itself."""
-
-    pair: Pair
-    condition: Tensor
-    frame_size: Sequence[int]  # height and width of the uncropped frames, px
 
 
 class Diffusion(RestorationModule):
@@ -102,11 +94,11 @@ class Diffusion(RestorationModule):
         self.target = target
         self.prediction = check_choice("prediction", prediction, _PREDICTIONS)
         self.sampler = check_choice("sampler", sampler, SAMPLERS)
-        self.steps, self.val_steps = check_steps("steps", steps), check_steps("val_steps", val_steps)
+        self.steps, self.val_steps = _check_steps("steps", steps), _check_steps("val_steps", val_steps)
         self.crop = None if crop is None else check_count("crop", crop)
         self.ema_decay = check_number("ema_decay", ema_decay, low=0.0, high=1.0)
         self.seed = check_count("seed", seed, low=0)
-        self.levels = noise_levels()
+        self.levels = DDPMScheduler(NUM_LEVELS, beta_schedule="linear")
 
     def forward(self, degraded: Tensor, key: Tensor | None = None) -> Restored:
         """Restore images (B, 3, H, W) in [0, 1]; see `RestorationModule.forward`."""
@@ -115,11 +107,13 @@ class Diffusion(RestorationModule):
     def training_loss(self, batch: Pair) -> tuple[Tensor, None]:
         """Compute the loss at a random level for each sample; each step has its own draws."""
         source = self._stream(batch.key, 1 + self.global_step)
-        return self._loss(self._crop(_whole_region(batch), source.at(0)), source), None
+        pair, condition = self._crop(batch, conditions(batch.degraded), source.at(0))
+        return self._loss(pair, condition, source, size=batch.clean.shape[2:]), None
 
     def validation_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
         """Compute the loss on whole frames with the same draws each time, and the restoration."""
-        loss = self._loss(_whole_region(batch), self._stream(batch.key, 0))
+        source = self._stream(batch.key, 0)
+        loss = self._loss(batch, conditions(batch.degraded), source, size=batch.clean.shape[2:])
         is_training = self.trainer.state.fn == TrainerFn.FITTING
         return loss, self._sample(batch.degraded, batch.key, steps=self.val_steps if is_training else self.steps)
 
@@ -136,11 +130,11 @@ class Diffusion(RestorationModule):
         # The corruption of a batch has the same keys and seeds >= 0, so the complement gives independent numbers.
         return stream(~((self.seed << 32) + step), key, device=self.device)
 
-    def _crop(self, region: _Region, source: Stream) -> _Region:
+    def _crop(self, pair: Pair, condition: Tensor, source: Stream) -> tuple[Pair, Tensor]:
         """Cut a square out of each sample; flows that point out of it become invalid."""
-        height, width = region.frame_size
+        height, width = pair.clean.shape[2:]
         if self.crop is None or (height <= self.crop and width <= self.crop):
-            return region
+            return pair, condition
         size = (min(self.crop, height), min(self.crop, width))
         positions = torch.tensor([height - size[0] + 1, width - size[1] + 1])
         corners = (uniform(source.to(torch.device("cpu")), 2) * positions).long().tolist()
@@ -149,17 +143,16 @@ class Diffusion(RestorationModule):
             rows = zip(value, corners, strict=True)
             return torch.stack([v[:, y : y + size[0], x : x + size[1]] for v, (y, x) in rows])
 
-        degraded, clean, flow, valid = (cut(value) for value in region.pair[:4])
-        pair = region.pair._replace(degraded=degraded, clean=clean, flow=flow, valid=valid & inside(flow))
-        return _Region(pair, cut(region.condition), region.frame_size)
+        degraded, clean, flow, valid = (cut(value) for value in pair[:4])
+        return pair._replace(degraded=degraded, clean=clean, flow=flow, valid=valid & inside(flow)), cut(condition)
 
-    def _loss(self, region: _Region, source: Stream) -> Tensor:
-        pair, size = region.pair, region.frame_size
+    def _loss(self, pair: Pair, condition: Tensor, source: Stream, *, size: Sequence[int]) -> Tensor:
+        """Compute the loss of a pair that was cropped from frames of `size` = (height, width)."""
         target = self.target.encode(pair, size)
         noise = normal(source.at(1), target)
         time = (uniform(source.at(2), 1)[:, 0] * NUM_LEVELS).long()
         noisy = self.levels.add_noise(target, noise, time)  # pyright: ignore[reportArgumentType]  # takes any int tensor
-        predicted_noise, predicted_target = self._predict(noisy, time, region.condition)
+        predicted_noise, predicted_target = self._predict(noisy, time, condition)
         restored = self.target.decode(predicted_target, pair.degraded, size)
         noise_error = masked_mean((predicted_noise - noise).abs(), pair.valid)
         image_error = masked_mean((restored.image - pair.clean).square(), pair.valid)
@@ -284,18 +277,6 @@ def target_of(task: Task) -> Target:
     raise TypeError(f"task must be Undistort or Deweather for a diffusion model, got {type(task).__name__}")
 
 
-def noise_levels() -> DDPMScheduler:
-    """Create the noise levels of the training: 1000 variances that grow linearly from 0.0001 to 0.02."""
-    return DDPMScheduler(NUM_LEVELS, beta_schedule="linear")
-
-
-def check_steps(name: str, steps: int) -> int:
-    """Return `steps` if it is from 1 to 1000."""
-    if check_count(name, steps) > NUM_LEVELS:
-        raise ValueError(f"{name} must be at most the {NUM_LEVELS} noise levels of the training, got {steps}")
-    return steps
-
-
 def normal(source: Stream, like: Tensor) -> Tensor:
     """Draw standard normal noise in the shape (B, C, H, W) of `like`; each sample depends only on its own stream."""
     count = like[0].numel()
@@ -326,7 +307,7 @@ def sample(
     """
     scheduler = _scheduler(check_choice("sampler", name, SAMPLERS))
     # From the highest level down. The spacing of diffusers is uneven, or off by one, if `steps` does not divide 1000.
-    levels = [NUM_LEVELS * (steps - i) // steps - 1 for i in range(check_steps("steps", steps))]
+    levels = [NUM_LEVELS * (steps - i) // steps - 1 for i in range(_check_steps("steps", steps))]
     scheduler.set_timesteps(timesteps=levels)
     # CPU generators draw the same numbers for every device.
     generators = [torch.Generator().manual_seed(word) for word in noise_key(source)[:, 0].tolist()]
@@ -338,13 +319,15 @@ def sample(
     return noisy
 
 
+def _check_steps(name: str, steps: int) -> int:
+    if check_count(name, steps) > NUM_LEVELS:
+        raise ValueError(f"{name} must be at most the {NUM_LEVELS} noise levels of the training, got {steps}")
+    return steps
+
+
 def _scheduler(name: str) -> DDPMScheduler | DPMSolverMultistepScheduler:
     if name == "ddpm":
         return DDPMScheduler(NUM_LEVELS, beta_schedule="linear", prediction_type="sample", clip_sample=False)
     # DDIM is the first-order solver. DDIMScheduler of diffusers requires that the steps divide 1000.
     order = 1 if name == "ddim" else 2
     return DPMSolverMultistepScheduler(NUM_LEVELS, beta_schedule="linear", prediction_type="sample", solver_order=order)
-
-
-def _whole_region(pair: Pair) -> _Region:
-    return _Region(pair, conditions(pair.degraded), pair.clean.shape[2:])

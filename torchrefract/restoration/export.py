@@ -38,7 +38,8 @@ def export_model(loaded: Loaded, out: Path, *, size: tuple[int, int], interpolat
         UsageError: a package is missing, ONNX has no operator for the model, or the file disagrees with the model.
     """
     if out.suffix == ".onnx":
-        _import("onnxscript")  # fail before the trace, which takes longer
+        for package in ("onnxscript", "onnxruntime"):  # fail before the trace, which takes longer
+            _import(package)
     height, width = size
     network = FullSizeModel(loaded.model, size=loaded.size, interpolation=interpolation).eval()
     images = torch.rand(2, 3, height, width, generator=torch.Generator().manual_seed(0))
@@ -46,15 +47,16 @@ def export_model(loaded: Loaded, out: Path, *, size: tuple[int, int], interpolat
     program = trace(network.to(memory_format=torch.contiguous_format), images)  # pyright: ignore[reportCallIssue]  # missing in torch's annotations
     with torch.no_grad():
         expected = network(images)
+    outputs = [*_TOLERANCES][: len(expected)]
     metadata = {
         "model": loaded.name,
         "task": loaded.task,
         "input": f"image, (B, 3, {height}, {width}), RGB in [0, 1]",
-        "outputs": [*_TOLERANCES][: len(expected)],
+        "outputs": outputs,
         "licenses": loaded.licenses,
     }
     with replace_file(out) as path:
-        save_program(program, path, metadata=metadata)
+        save_program(program, path, outputs=outputs, metadata=metadata)
         return _compare(path, images, expected)
 
 
@@ -65,17 +67,18 @@ def trace(network: nn.Module, image: Tensor) -> torch.export.ExportedProgram:
         return torch.export.export(network, (image,), dynamic_shapes=shapes)
 
 
-def save_program(program: torch.export.ExportedProgram, path: Path, *, metadata: Mapping[str, object]) -> None:
-    """Write a program and its metadata, plain values, in the format of the suffix."""
+def save_program(
+    program: torch.export.ExportedProgram, path: Path, *, outputs: Sequence[str], metadata: Mapping[str, object]
+) -> None:
+    """Write a program, the names of its outputs and its metadata in the format of the suffix."""
     text = json.dumps(metadata)
     if path.suffix == ".pt2":
         torch.export.save(program, path, extra_files={METADATA: text})
         return
     logging.getLogger("onnxscript").setLevel(logging.ERROR)  # it warns of operators that it does not optimize
     logging.getLogger("onnx_ir").setLevel(logging.WARNING)
-    outputs = list(metadata["outputs"]) if isinstance(metadata["outputs"], list) else []
     exported = torch.onnx.export(
-        program, dynamo=True, input_names=[_INPUT], output_names=outputs, opset_version=_OPSET, verbose=False
+        program, dynamo=True, input_names=[_INPUT], output_names=[*outputs], opset_version=_OPSET, verbose=False
     )
     if exported is None:
         raise UsageError(f"out must be .pt2 for a model without operators in ONNX, got {path}")
@@ -84,18 +87,12 @@ def save_program(program: torch.export.ExportedProgram, path: Path, *, metadata:
 
 
 def run_program(path: Path, image: Tensor) -> list[Tensor]:
-    """Run an exported file on images; ONNX files by ONNX Runtime or, if it is missing, by ONNX's reference."""
+    """Run an exported file on images (B, C, H, W); ONNX files by ONNX Runtime."""
     if path.suffix == ".pt2":
         with torch.no_grad():
             return list(torch.export.load(path).module()(image))
-    feed = {_INPUT: image.numpy()}
-    try:
-        runtime = _import("onnxruntime")
-    except UsageError:
-        session = _import("onnx.reference").ReferenceEvaluator(str(path))
-    else:
-        session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    return [torch.from_numpy(value) for value in session.run(None, feed)]
+    session = _import("onnxruntime").InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    return [torch.from_numpy(value) for value in session.run(None, {_INPUT: image.numpy()})]
 
 
 def _compare(path: Path, images: Tensor, expected: Sequence[Tensor]) -> dict[str, float]:
@@ -113,7 +110,6 @@ def _import(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        package = name.partition(".")[0]
         raise UsageError(
-            f"out must end in .pt2 if {package} is not installed, got .onnx: pip install onnx onnxscript onnxruntime"
+            f"out must end in .pt2 if {name} is not installed, got .onnx: pip install onnx onnxscript onnxruntime"
         ) from error

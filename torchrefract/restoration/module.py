@@ -1,6 +1,5 @@
 """The training loop that all networks share, and the module of networks that restore in a single pass."""
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -9,7 +8,6 @@ import torch
 from diffusers.optimization import get_cosine_schedule_with_warmup
 from pytorch_lightning import LightningModule
 from torch import Tensor, nn
-from torch.optim import Optimizer
 from torch.optim.lr_scheduler import ReduceLROnPlateau
 
 from torchrefract._validation import UsageError, check_choice, check_count, check_number, check_size
@@ -24,7 +22,7 @@ _NO_FLOWS: tuple[Tensor, ...] = (torch.zeros(0), torch.zeros(0))
 
 
 class NotFiniteError(UsageError):
-    """A loss is NaN or infinite; the message names the step, the epoch and the keys of the batch."""
+    """A loss is NaN or infinite; the message names its batch."""
 
 
 class RestorationModule(LightningModule, ABC):
@@ -39,8 +37,9 @@ class RestorationModule(LightningModule, ABC):
         task: the kind of restoration.
         lr: peak learning rate of AdamW.
         weight_decay: weight decay of AdamW.
-        warmup_steps: steps of linear warm-up of the schedule "cosine".
-        schedule: "cosine" decays the learning rate to zero; "plateau" halves it when val/loss stops falling.
+        warmup_steps: steps of linear warm-up of the schedule "cosine", at most a tenth of all steps.
+        schedule: "cosine" decays the learning rate to zero; "plateau" halves it after more than 5 epochs without a
+            lower val/loss.
         metric_size: (height, width) of the frame whose pixels are the unit of the endpoint error.
     """
 
@@ -90,7 +89,13 @@ class RestorationModule(LightningModule, ABC):
             NotFiniteError: the loss is NaN or infinite.
         """
         loss, restored = self.training_loss(batch)
-        check_finite(loss, batch.key, step=self.global_step, epoch=self.current_epoch)
+        if not loss.isfinite():
+            # The corruption of a frame is drawn from (seed, epoch, key), so the message is enough to repeat the batch.
+            keys = ", ".join(str(key) for key in batch.key.tolist())
+            raise NotFiniteError(
+                f"loss must be finite, got {loss:g} in step {self.global_step} of epoch {self.current_epoch} "
+                f"for the keys {keys}"
+            )
         self._log("train", {"loss": loss} | ({} if restored is None else self._scores(restored, batch)), batch)
         self._add_flows(batch)
         return loss
@@ -110,11 +115,11 @@ class RestorationModule(LightningModule, ABC):
         return restored._asdict()
 
     def on_validation_start(self) -> None:
-        """Add up the flows of all ranks, because the constant baseline needs them now."""
+        """Add up the flows of all ranks for the constant baseline."""
         self._gather_flows()
 
     def on_train_epoch_end(self) -> None:
-        """Add up the flows of all ranks, because the checkpoint holds them."""
+        """Add up the flows of all ranks for the checkpoint."""
         self._gather_flows()
 
     def constant_flow(self, like: Tensor) -> Tensor:
@@ -127,8 +132,12 @@ class RestorationModule(LightningModule, ABC):
     def configure_optimizers(self) -> Any:
         """Create AdamW and its learning rate schedule."""
         optimizer = torch.optim.AdamW(self.parameters(), lr=self.lr, weight_decay=self.weight_decay)
-        steps = int(self.trainer.estimated_stepping_batches)
-        scheduler = make_schedule(self.schedule, optimizer, warmup_steps=self.warmup_steps, steps=steps)
+        if self.schedule == "plateau":
+            scheduler = {"scheduler": ReduceLROnPlateau(optimizer, factor=0.5, patience=5), "monitor": "val/loss"}
+        else:
+            steps = int(self.trainer.estimated_stepping_batches)
+            cosine = get_cosine_schedule_with_warmup(optimizer, min(self.warmup_steps, steps // 10), steps)
+            scheduler = {"scheduler": cosine, "interval": "step"}
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
 
     def on_fit_start(self) -> None:
@@ -208,48 +217,13 @@ class Restoration(RestorationModule):
         return self.task.restore(self.network(degraded), degraded)
 
     def training_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
-        """Compute the loss of the task and the restoration."""
+        """See `RestorationModule.training_loss`."""
         restored = self(batch.degraded)
         return self.task.loss(restored, batch), restored
 
     def validation_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
-        """Compute the loss of the task and the restoration."""
+        """See `RestorationModule.validation_loss`."""
         return self.training_loss(batch)
-
-
-def check_finite(loss: Tensor, keys: Tensor, *, step: int, epoch: int) -> None:
-    """Raise NotFiniteError unless the loss () is finite.
-
-    The corruption of a frame is drawn from (seed, epoch, key), so the message is enough to repeat the batch.
-
-    Args:
-        loss: the loss of a batch.
-        keys: (B,), the keys of the batch.
-        step: the step of the training.
-        epoch: the epoch of the training.
-    """
-    value = float(loss.detach())
-    if not math.isfinite(value):
-        listed = ", ".join(str(key) for key in keys.tolist())
-        raise NotFiniteError(
-            f"loss must be finite, got {value:g} in step {step} of epoch {epoch} for the keys {listed}"
-        )
-
-
-def make_schedule(name: str, optimizer: Optimizer, *, warmup_steps: int, steps: int) -> dict[str, Any]:
-    """Create a learning rate schedule in the form that Lightning expects.
-
-    Args:
-        name: "cosine", a linear warm-up and a cosine down to zero, or "plateau", which halves the rate after more than
-            5 epochs without a lower val/loss.
-        optimizer: the optimizer to schedule.
-        warmup_steps: steps of the warm-up; at most a tenth of all steps are used.
-        steps: steps of the complete training.
-    """
-    if name == "plateau":
-        return {"scheduler": ReduceLROnPlateau(optimizer, factor=0.5, patience=5), "monitor": "val/loss"}
-    cosine = get_cosine_schedule_with_warmup(optimizer, min(warmup_steps, steps // 10), steps)
-    return {"scheduler": cosine, "interval": "step"}
 
 
 def _add(old: tuple[Tensor, ...], new: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

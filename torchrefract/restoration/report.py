@@ -3,12 +3,11 @@
 import csv
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
-import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -21,8 +20,14 @@ from torchrefract.restoration.metrics import psnr
 from torchrefract.restoration.module import RestorationModule
 from torchrefract.restoration.tasks import Restored
 from torchrefract.types import Pair
-from torchrefract.visualization.color import flow_to_rgb, flow_wheel, full_color_px, hatch_invalid
-from torchrefract.visualization.figures import FigureLayout, resize_for_display
+from torchrefract.visualization.color import flow_to_rgb, full_color_px, hatch_invalid
+from torchrefract.visualization.figures import (
+    FigureLayout,
+    MapScale,
+    draw_invalid_key,
+    draw_legend,
+    resize_for_display,
+)
 
 METRICS, METRICS_BEFORE = "metrics.csv", "metrics_before.csv"
 _PANEL_ROWS = 4
@@ -42,7 +47,7 @@ class RunSummary(Callback):
     def __init__(self, run_dir: str, ckpt_path: str | None = None):
         self.run_dir = Path(run_dir)
         self.resumed_run = None if ckpt_path is None else Path(ckpt_path).parent
-        self._rows: PanelRows | None = None
+        self._examples: tuple[Restored, Pair] | None = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Copy the metrics of the run that this one resumes."""
@@ -60,19 +65,25 @@ class RunSummary(Callback):
     ) -> None:
         """Keep examples of the first batch for the panel."""
         if batch_idx == 0:
-            self._rows = _choose_rows(Restored(**outputs), batch)
+            self._examples = choose_examples(Restored(**outputs), batch)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Save the pictures; print the table and the files of the run."""
-        if self._rows is None or not trainer.is_global_zero or not isinstance(pl_module, RestorationModule):
+        if self._examples is None or not trainer.is_global_zero or not isinstance(pl_module, RestorationModule):
             return
         height, width = pl_module.metric_size
         # With fast_dev_run, the logger writes no metrics.
         if stage == "fit" and any(metrics_rows(self.run_dir)):
-            save_curves(self.run_dir, self.run_dir / "curves.png", epe_unit=f"px at {width}x{height}")
-        save_panel(self._rows, self.run_dir / "panel.png")
+            save_figure(plot_curves(self.run_dir, epe_unit=f"px at {width}x{height}"), self.run_dir / "curves.png")
+        save_figure(draw_panel(*self._examples), self.run_dir / "panel.png")
         print("\n".join(summary(trainer.callback_metrics, pl_module.metric_size)))
         print(f"{self.run_dir}: {', '.join(sorted(path.name for path in self.run_dir.iterdir() if path.is_file()))}")
+
+
+def save_figure(figure: Figure, out: Path) -> None:
+    """Write a figure; the file is replaced only by a complete one."""
+    with replace_file(out) as path:
+        figure.savefig(path)
 
 
 def summary(metrics: Mapping[str, Tensor], metric_size: tuple[int, int]) -> list[str]:
@@ -82,18 +93,16 @@ def summary(metrics: Mapping[str, Tensor], metric_size: tuple[int, int]) -> list
     if "epe" in values:
         lines[0] += f"{f'endpoint error (px at {metric_size[1]}x{metric_size[0]})':>40}"
     for name, suffix in _METHODS.items():
-        if f"psnr{suffix}" in values:
-            lines.append(f"{name:<20}" + _format_scores(values, suffix))
+        if f"psnr{suffix}" not in values:
+            continue
+        score = values[f"psnr{suffix}"]
+        line = f"{name:<20}" + f"{score:.2f} ({score - values['psnr_identity']:+.2f})".rjust(18)
+        line += f"{values[f'ssim{suffix}']:8.3f}"
+        if "epe" in values:
+            epe = values[f"epe{suffix}"]
+            line += f"{epe:.2f} ({epe / max(values['epe_identity'], 1e-9):.2f} x do nothing)".rjust(40)
+        lines.append(line)
     return lines
-
-
-def _format_scores(values: dict[str, float], suffix: str) -> str:
-    psnr, ssim = values[f"psnr{suffix}"], values[f"ssim{suffix}"]
-    line = f"{psnr:.2f} ({psnr - values['psnr_identity']:+.2f})".rjust(18) + f"{ssim:8.3f}"
-    if "epe" in values:
-        epe = values[f"epe{suffix}"]
-        line += f"{epe:.2f} ({epe / max(values['epe_identity'], 1e-9):.2f} x do nothing)".rjust(40)
-    return line
 
 
 def metrics_rows(run: Path) -> Iterator[dict[str, str]]:
@@ -137,7 +146,7 @@ _STYLES = (
 )
 
 
-def save_curves(run: Path, out: Path, *, epe_unit: str = "px") -> None:
+def plot_curves(run: Path, *, epe_unit: str) -> Figure:
     """Plot loss, PSNR and endpoint error of a run over its epochs, together with the baselines.
 
     A quantity without columns gets no plot. Training values are means over the rows of an epoch, validation values the
@@ -145,19 +154,11 @@ def save_curves(run: Path, out: Path, *, epe_unit: str = "px") -> None:
 
     Args:
         run: the run folder with the metrics.csv of Lightning's CSVLogger and, after a resume, metrics_before.csv.
-        out: the picture to write; its suffix selects the format.
         epe_unit: the unit of the endpoint error with the image size that it refers to, such as "px at 1920x1080".
 
     Raises:
         ValueError: the metrics hold no value to plot.
     """
-    figure = plot_curves(run, epe_unit=epe_unit)
-    with replace_file(out) as path:
-        figure.savefig(path)
-
-
-def plot_curves(run: Path, *, epe_unit: str) -> Figure:
-    """Create the figure of `save_curves`."""
     units = {"loss": "loss", "psnr": "PSNR (dB)", "epe": f"endpoint error ({epe_unit})"}
     columns = _read_columns(run, [style.column.format(quantity) for quantity in units for style in _STYLES])
     shown = {q: unit for q, unit in units.items() if any(style.column.format(q) in columns for style in _STYLES)}
@@ -203,105 +204,52 @@ def _read_columns(run: Path, names: Sequence[str]) -> _Columns:
     return {name: {epoch: value(name, epochs[epoch]) for epoch in sorted(epochs)} for name, epochs in cells.items()}
 
 
-class PanelRows(NamedTuple):
-    """The N examples of a panel, N from 1 to 8.
-
-    degraded, clean, restored: (N, 3, H, W), float in [0, 1].
-    valid: (N, 1, H, W), bool, the pixels that can be restored from the degraded image.
-    captions: N texts.
-    flow, predicted_flow: (N, 2, H, W), px; None if the corruption or the network has no flow.
-    """
-
-    degraded: Tensor
-    clean: Tensor
-    restored: Tensor
-    valid: Tensor
-    captions: Sequence[str]
-    flow: Tensor | None = None
-    predicted_flow: Tensor | None = None
-
-
-def save_panel(rows: PanelRows, out: Path) -> None:
+def draw_panel(restored: Restored, pair: Pair) -> Figure:
     """Draw examples, one a row: clean, corrupted, restored, true flow and predicted flow with a common color scale.
 
     Without a flow, the last column is |restored - clean| times 4. Invalid pixels are hatched from the third column on;
     values that are not finite are gray.
 
     Args:
-        rows: the examples.
-        out: the picture to write; its suffix selects the format.
+        restored: the restorations of N examples.
+        pair: the examples.
     """
-    figure = draw_panel(rows)
-    with replace_file(out) as path:
-        figure.savefig(path)
-
-
-def draw_panel(rows: PanelRows) -> Figure:
-    """Create the figure of `save_panel`."""
-    scale = _full_color_px(rows)
-    columns = _panel_columns(rows, scale)
-    lines = 1 + max(caption.count("\n") for caption in rows.captions)
+    before, after = (psnr(image, pair.clean, pair.valid) for image in (pair.degraded, restored.image))
+    derived = {"restored": restored.image}
+    # The scale of the true flow, so that a bad prediction cannot make it pale.
+    scale = full_color_px(pair.flow, pair.valid) if restored.flow is not None else 1.0
+    if restored.flow is None:
+        derived["|restored - clean| x 4"] = 4 * (restored.image.clamp(0, 1) - pair.clean).abs()
+    else:
+        derived["true flow"] = flow_to_rgb(pair.flow, max_px=scale)
+        derived["predicted flow"] = flow_to_rgb(restored.flow, max_px=scale)
+    columns = {"clean": resize_for_display(pair.clean), "corrupted": resize_for_display(pair.degraded)}
+    columns |= {title: hatch_invalid(resize_for_display(image), pair.valid) for title, image in derived.items()}
     height, width = columns["clean"].shape[2:]
-    page = FigureLayout(len(rows.clean), len(columns), height, width, lines)
+    page = FigureLayout(len(pair.clean), len(columns), height, width, caption_lines=1)
     figure = page.figure()
     for j, (title, images) in enumerate(columns.items()):
         page.write(figure, title, page.left(j) + page.width / 2, 2 * page.text, ha="center", weight="bold")
         for i, image in enumerate(images):
             page.show(figure, image, page.left(j), page.top(i))
-    for i, caption in enumerate(rows.captions):
-        page.write(figure, caption, page.left(0), page.top(i) - 0.3 * page.text)
-    _draw_legend(figure, page, rows, scale)
+    for i, (degraded, result) in enumerate(zip(before.tolist(), after.tolist(), strict=True)):
+        page.write(figure, f"{degraded:.1f} -> {result:.1f} dB", page.left(0), page.top(i) - 0.3 * page.text)
+    bottom = page.top(page.rows)
+    if not pair.valid.all():
+        draw_invalid_key(figure, page, x=page.left(0), y=bottom)
+    if restored.flow is not None:
+        legend = [MapScale("flow", scale)]
+        draw_legend(figure, page, legend, x=page.left(page.columns - 2), y=bottom + 2 * page.text)
     return figure
 
 
-def _choose_rows(restored: Restored, pair: Pair) -> PanelRows:
-    """Choose examples evenly, sorted by degradation, so that a mix of effects shows several kinds."""
-    before, after = (psnr(image, pair.clean, pair.valid) for image in (pair.degraded, restored.image))
+def choose_examples(restored: Restored, pair: Pair) -> tuple[Restored, Pair]:
+    """Choose up to 4 examples evenly by degradation, so that a mix of effects shows several kinds; on the CPU."""
     total, count = len(pair.clean), min(_PANEL_ROWS, len(pair.clean))
-    rows = before.argsort(stable=True)[[i * total // count for i in range(count)]]
+    order = psnr(pair.degraded, pair.clean, pair.valid).argsort(stable=True)
+    rows = order[[i * total // count for i in range(count)]]
 
-    def chosen(value: Tensor) -> Tensor:
-        return value[rows].detach().float().cpu()
+    def choose(values: Iterable[Tensor | None]) -> list[Any]:
+        return [value if value is None else value[rows].detach().cpu() for value in values]
 
-    return PanelRows(
-        degraded=chosen(pair.degraded),
-        clean=chosen(pair.clean),
-        restored=chosen(restored.image).clamp(0, 1),
-        valid=chosen(pair.valid) > 0,
-        captions=[f"{before[row]:.1f} -> {after[row]:.1f} dB" for row in rows.tolist()],
-        flow=None if restored.flow is None else chosen(pair.flow),
-        predicted_flow=None if restored.flow is None else chosen(restored.flow),
-    )
-
-
-def _panel_columns(rows: PanelRows, scale: float) -> dict[str, Tensor]:
-    """Return title -> (N, 3, height, width), one value for each drawn pixel."""
-    derived = {"restored": rows.restored}
-    for title, flow in (("true flow", rows.flow), ("predicted flow", rows.predicted_flow)):
-        if flow is not None:
-            derived[title] = flow_to_rgb(flow, max_px=scale)
-    if len(derived) == 1:
-        derived["|restored - clean| x 4"] = 4 * (rows.restored - rows.clean).abs()
-    hatched = {title: hatch_invalid(resize_for_display(image), rows.valid) for title, image in derived.items()}
-    return {"clean": resize_for_display(rows.clean), "corrupted": resize_for_display(rows.degraded)} | hatched
-
-
-def _full_color_px(rows: PanelRows) -> float:
-    """Return the color scale of the true flow if it has one, so that a bad prediction cannot make it pale."""
-    flows = [flow for flow in (rows.flow, rows.predicted_flow) if flow is not None and flow.any()]
-    return full_color_px(flows[0], rows.valid) if flows else 1.0
-
-
-def _draw_legend(figure: Figure, page: FigureLayout, rows: PanelRows, scale: float) -> None:
-    """Explain the hatching and the colors of a flow below the last row."""
-    text, y = page.text, page.top(page.rows) - page.text
-    if not rows.valid.all():
-        stripes = hatch_invalid(torch.zeros(1, 3, page.height, page.width), torch.zeros(1, 1, 1, 1, dtype=torch.bool))
-        page.explain(figure, stripes[0], "not valid: lost in the corrupted image", x=page.left(0), y=y + text)
-    if rows.flow is None and rows.predicted_flow is None:
-        return
-    height, width = rows.clean.shape[2:]
-    x = page.left(page.columns - 2)
-    page.show(figure, flow_wheel(4 * text), x, y)
-    for line, below in ((f"full color = {scale:g} px at {width}x{height}", 1.9), ("darker = longer", 3.4)):
-        page.write(figure, line, x + 5 * text, y + below * text)
+    return Restored(*choose(restored)), Pair(*choose(pair[:5]))

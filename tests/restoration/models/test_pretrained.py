@@ -12,8 +12,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from torchrefract.restoration.models.coordconv import CoordConvSegmenter
-from torchrefract.restoration.models.pretrained import find_weights, weights_license
+from torchrefract.restoration.models.coordconv import CoordConvSegmenter, weights_license
 from torchrefract.restoration.models.resunet import ResUNet
 from torchrefract.restoration.models.segformer import SegFormer
 
@@ -130,17 +129,12 @@ def test_an_unreachable_hub_names_the_options_that_avoid_it(offline, encoder):
     assert "where the hub cannot be reached, got imagenet" in str(caught.value)
 
 
-def test_a_non_commercial_license_gives_a_warning(tmp_path):
-    folder = str(write_weights(tmp_path / "weights", "mit_b0"))
+def test_only_a_non_commercial_license_gives_a_warning(tmp_path):
     with pytest.warns(UserWarning, match="weights of mit_b0 come under .* SegFormer, non-commercial"):
-        find_weights("mit_b0", folder)
-
-
-def test_a_free_license_gives_no_warning(tmp_path):
+        SegFormer(2, encoder="mit_b0", pretrained=str(write_weights(tmp_path / "mit", "mit_b0")))
     assert weights_license("tu-resnet10t") == "apache-2.0"
-    find_weights(
-        "tu-resnet10t", str(write_weights(tmp_path / "weights", "tu-resnet10t"))
-    )  # a warning would be an error here
+    # A warning would be an error.
+    ResUNet(2, encoder="tu-resnet10t", pretrained=str(write_weights(tmp_path / "timm", "tu-resnet10t")))
 
 
 def test_a_missing_folder_is_named(tmp_path):

@@ -1,20 +1,35 @@
-"""What both feed-forward baselines share: pixel coordinates as input channels and a polynomial head for smooth maps."""
+"""What both feed-forward baselines share: pixel coordinates as inputs, a polynomial head, and ImageNet weights."""
 
+import json
+import warnings
 from collections.abc import Callable
-from typing import Any, cast
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any, NamedTuple, cast
 
+import segmentation_models_pytorch as smp
+import timm
 import torch
 import torch.nn.functional as F
+from huggingface_hub import hf_hub_download
+from huggingface_hub.errors import HfHubHTTPError
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torchrefract.restoration.models.pretrained import find_weights, load_network
 from torchrefract.warping.grid import pixel_axes
 
 _STRIDE = 32
 _MEAN, _STD = (0.5,) * 3, (0.25,) * 3  # of colors, for an encoder without pretrained weights
 _DEGREE = 5  # a lens with k1 and k2 has terms of degree 3 and 5
 _HIDDEN = 256
+_HUB = "imagenet"
+_CONFIG, _TENSORS = "config.json", "model.safetensors"
+_TIMM = "tu-"  # the prefix of timm's encoders in segmentation-models-pytorch
+_MIT_LICENSE = "NVIDIA Source Code License for SegFormer, non-commercial: for research and evaluation only"
+# The libraries raise these for an unknown encoder and for a damaged or unfitting file.
+_LOAD_ERRORS = (SafetensorError, KeyError, RuntimeError, ValueError)
 
 
 class CoordConvSegmenter(nn.Module):
@@ -30,7 +45,8 @@ class CoordConvSegmenter(nn.Module):
         architecture: a model class of segmentation-models-pytorch.
         channels: number of maps to predict.
         encoder: a name of segmentation-models-pytorch; "tu-…" selects an encoder of timm.
-        pretrained: None, "imagenet" or a folder, see `find_weights`.
+        pretrained: None; "imagenet", which downloads ImageNet weights from the hub once; or a folder with the
+            config.json and the model.safetensors of the encoder's repository on the hub.
         cell: side of the square of pixels for which the architecture predicts one value, px.
         smooth: True adds a `PolynomialFlowHead`, for maps that are smooth over the frame, such as the flow of a lens.
 
@@ -55,8 +71,8 @@ class CoordConvSegmenter(nn.Module):
         smooth: bool,
     ):
         super().__init__()
-        weights = None if pretrained is None else find_weights(encoder, pretrained)
-        self.network = load_network(architecture, encoder, weights, channels=channels)
+        weights = None if pretrained is None else _find_weights(encoder, pretrained)
+        self.network = _load_network(architecture, encoder, weights, channels=channels)
         self.is_frozen, self.cell = weights is not None, cell
         self.network.encoder.requires_grad_(not self.is_frozen)
         _add_coordinate_inputs(self.network.encoder, start_at_zero=self.is_frozen)
@@ -139,15 +155,11 @@ class PolynomialFlowHead(nn.Module):
         flat = features.float().flatten(2)
         pooled = torch.cat([flat.mean(dim=2), flat.amax(dim=2)], dim=1)
         basis = torch.stack([_chebyshev(y, j)[:, None] * _chebyshev(x, i) for i, j in self.terms])
-        if torch.is_autocast_enabled(features.device.type):
-            # bfloat16 has 8 bits of mantissa: a flow of 100 px would be off by a quarter of a pixel.
-            with torch.autocast(features.device.type, enabled=False):
-                return self._maps(pooled, basis)
-        return self._maps(pooled, basis)
-
-    def _maps(self, pooled: Tensor, basis: Tensor) -> Tensor:
-        coefficients = self.layers(pooled).unflatten(1, (self.channels, len(self.terms)))
-        return torch.einsum("bct,thw->bchw", coefficients, basis)
+        device = features.device.type
+        # bfloat16 has 8 bits of mantissa: a flow of 100 px would be off by a quarter of a pixel.
+        with torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext():
+            coefficients = self.layers(pooled).unflatten(1, (self.channels, len(self.terms)))
+            return torch.einsum("bct,thw->bchw", coefficients, basis)
 
 
 def pixel_coordinates(image: Tensor) -> Tensor:
@@ -200,3 +212,84 @@ def _add_coordinate_inputs(encoder: nn.Module, *, start_at_zero: bool) -> None:
     inputs = _CoordinateInputs(stem.weight.detach(), start_at_zero=start_at_zero)
     parametrize.register_parametrization(stem, "weight", inputs, unsafe=True)  # unsafe: the shape changes
     stem.in_channels = cast(Tensor, stem.weight).shape[1]
+
+
+class _Weights(NamedTuple):
+    file: Path  # safetensors
+    mean: tuple[float, ...]  # of the colors in [0, 1]
+    std: tuple[float, ...]
+
+
+def _find_weights(encoder: str, pretrained: str) -> _Weights:
+    """Locate the ImageNet weights of an encoder; warn of a non-commercial license."""
+    folder = _fetch(encoder) if pretrained == _HUB else Path(pretrained).expanduser()
+    if missing := [name for name in (_CONFIG, _TENSORS) if not (folder / name).is_file()]:
+        raise ValueError(
+            f"pretrained must be null, {_HUB}, or a folder with {_CONFIG} and {_TENSORS}, got {pretrained} "
+            f"without {' and '.join(missing)}"
+        )
+    try:
+        config = json.loads((folder / _CONFIG).read_text(encoding="utf-8"))
+        colors = config.get("pretrained_cfg", config)  # timm nests them one level deeper
+        weights = _Weights(folder / _TENSORS, tuple(map(float, colors["mean"])), tuple(map(float, colors["std"])))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ValueError(f"pretrained must have mean and std in its {_CONFIG}, got {folder}") from error
+    # timm loads the weights that fit of another architecture and silently keeps random ones for the rest.
+    if encoder.startswith(_TIMM) and config.get("architecture") != encoder.removeprefix(_TIMM).partition(".")[0]:
+        raise ValueError(f"pretrained must be weights of {encoder}, got {folder} of {config.get('architecture')}")
+    if (name := weights_license(encoder)) and ("non-commercial" in name or "-nc" in name):
+        warnings.warn(f"the pretrained weights of {encoder} come under this license: {name}", stacklevel=2)
+    return weights
+
+
+def _load_network(architecture: Callable[..., Any], encoder: str, weights: _Weights | None, *, channels: int) -> Any:
+    """Build a network for three colors; without weights its encoder is random."""
+    # timm renames weights while it builds the encoder, so it must load them itself.
+    by_timm = weights is not None and encoder.startswith(_TIMM)
+    options = {"pretrained_cfg_overlay": {"file": str(weights.file)}} if weights and by_timm else {}
+    try:
+        network = architecture(encoder, encoder_weights=by_timm or None, in_channels=3, classes=channels, **options)
+        if weights is not None and not by_timm:
+            network.encoder.load_state_dict(load_file(weights.file))
+    except _LOAD_ERRORS as error:
+        if weights is not None:
+            raise ValueError(f"pretrained must hold intact weights of {encoder}, got {weights.file}") from error
+        raise ValueError(
+            "encoder must be a name of segmentation-models-pytorch, or tu- and a name of timm, with features at five "
+            f"scales, got {encoder}"
+        ) from error
+    return network
+
+
+def weights_license(encoder: str) -> str | None:
+    """Return the license of an encoder's ImageNet weights, or None if the library does not state it."""
+    if encoder.startswith(_TIMM):
+        config = timm.models.get_pretrained_cfg(encoder.removeprefix(_TIMM))
+        return config and config.license
+    return _MIT_LICENSE if encoder.startswith("mit_b") else None
+
+
+def _fetch(encoder: str) -> Path:
+    """Return the folder of the weights in the cache of the hub; download them first if they are missing."""
+    repository, revision = _repository(encoder)
+    try:
+        files = [hf_hub_download(repository, name, revision=revision) for name in (_CONFIG, _TENSORS)]
+    except (OSError, HfHubHTTPError) as error:
+        raise ValueError(
+            f"pretrained must be null, or a folder with {_CONFIG} and {_TENSORS} of {repository}, where the hub cannot "
+            f"be reached, got {_HUB}: add model.network.pretrained=null or model.network.pretrained=FOLDER"
+        ) from error
+    return Path(files[0]).parent
+
+
+def _repository(encoder: str) -> tuple[str, str | None]:
+    """Return the repository of an encoder's ImageNet weights on the hub and its revision."""
+    if encoder.startswith(_TIMM):
+        config = timm.models.get_pretrained_cfg(encoder.removeprefix(_TIMM))
+        if config is not None and config.hf_hub_id:
+            return config.hf_hub_id, None
+    elif settings := smp.encoders.encoders.get(encoder, {}).get("pretrained_settings", {}).get(_HUB):
+        return settings["repo_id"], settings["revision"]
+    raise ValueError(
+        f"pretrained must be null or a folder for an encoder without {_HUB} weights, got {_HUB} of {encoder}"
+    )

@@ -24,9 +24,9 @@ from torchrefract.cameras.brown_conrady import (
     implicit,
     undistort_polynomial,
 )
-from torchrefract.cameras.division import distort_division, undistort_division
 from torchrefract.cameras.fisheye import fisheye_angle, fisheye_image, fisheye_ray
 from torchrefract.cameras.radial import (
+    distort_division,
     first_fall,
     first_root,
     growth_of_polynomial,
@@ -34,6 +34,7 @@ from torchrefract.cameras.radial import (
     limit_of_curve,
     radial_factor,
     reach_of,
+    undistort_division,
 )
 from torchrefract.cameras.rational import (
     OPENCV14,

@@ -15,17 +15,23 @@ from torch import Tensor
 
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_choice, check_number
-from torchrefract.cameras.calibration.board_page import board_page
-from torchrefract.cameras.calibration.boards import Board
-from torchrefract.cameras.calibration.detection import Detection, View, detect, has_enough_corners
-from torchrefract.cameras.calibration.diagnosis import describe_other_board, edge_width, explain_failure
+from torchrefract.cameras.calibration.boards import Board, board_page
+from torchrefract.cameras.calibration.detection import (
+    Detection,
+    View,
+    describe_other_board,
+    detect,
+    edge_width,
+    explain_failure,
+    has_enough_corners,
+)
 from torchrefract.cameras.calibration.fit import LENS_MODELS, MIN_VIEWS
-from torchrefract.cameras.calibration.quality import camera_warnings
 from torchrefract.cameras.calibration.report import (
     CAMERA_FILE,
     REPORT_FILE,
     Calibration,
     calibrate_camera,
+    camera_warnings,
     write_failure,
     write_report,
 )

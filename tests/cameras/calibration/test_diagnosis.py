@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from torchrefract.cameras.calibration.boards import Charuco, Chessboard
-from torchrefract.cameras.calibration.detection import detect
-from torchrefract.cameras.calibration.diagnosis import describe_other_board, edge_width, explain_failure
+from torchrefract.cameras.calibration.detection import describe_other_board, detect, edge_width, explain_failure
 from torchrefract.cameras.calibration.synthetic import render_views
 
 

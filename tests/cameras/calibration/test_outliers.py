@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from torchrefract.cameras.calibration.boards import Chessboard
-from torchrefract.cameras.calibration.fit import fit_camera, rms
-from torchrefract.cameras.calibration.outliers import drop_outliers, leave_each_out
+from torchrefract.cameras.calibration.fit import drop_outliers, fit_camera, leave_each_out, rms
 
 BOARD = Chessboard(squares="9x7", square_mm=25)
 OPTIONS = {"model": "opencv5", "size": (800, 600)}

@@ -51,7 +51,8 @@ def fit_spline(points: Tensor, displacement: Tensor, smoothing: Tensor) -> Splin
     smoothing = smoothing[:, None, None] * (scale / scale.detach()).square() / _UNIT**2
     center, scale = center.detach(), _UNIT * scale.detach()
     unit = (points - center) / scale
-    kernel = _kernel(unit, unit.mT) / 2 + smoothing * torch.eye(count, dtype=unit.dtype, device=unit.device)
+    x, y = unit[:, None].unbind(3)
+    kernel = _kernel(unit, x, y) / 2 + smoothing * torch.eye(count, dtype=unit.dtype, device=unit.device)
     plane = torch.cat([torch.ones_like(unit[..., :1]), unit], dim=2)
     corner = unit.new_zeros(unit.shape[0], 3, 3)
     system = torch.cat([torch.cat([kernel, plane], dim=2), torch.cat([plane.mT, corner], dim=2)], dim=1)
@@ -113,18 +114,15 @@ def check_points(points: Tensor) -> None:
 
 def _evaluate(points: Tensor, weights: Tensor, affine: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Compute (B, 2, h, w) at positions x and y, which broadcast to (B, h, w)."""
-    positions = torch.stack(torch.broadcast_tensors(x, y), dim=1)
-    flat = positions.flatten(2)
-    plane = torch.cat([torch.ones_like(flat[:, :1]), flat], dim=1)
-    flow = affine.mT @ plane + weights.mT / 2 @ _kernel(points, flat)
-    return flow.unflatten(2, positions.shape[2:])
+    kernel = _kernel(points[:, :, None], x[:, None], y[:, None])
+    bent = (weights.mT / 2 @ kernel.flatten(2)).unflatten(2, kernel.shape[2:])
+    a, b, c = affine[..., None, None].unbind(1)
+    return a + b * x[:, None] + c * y[:, None] + bent
 
 
-def _kernel(points: Tensor, positions: Tensor) -> Tensor:
-    """Compute 2 U(r) = r^2 ln r^2, (B, P, N), with |p - q|^2 = |p|^2 - 2 p q + |q|^2 as one product of matrices."""
-    left = torch.cat([-2 * points, points.square().sum(dim=2, keepdim=True), torch.ones_like(points[..., :1])], dim=2)
-    right = torch.cat(
-        [positions, torch.ones_like(positions[:, :1]), positions.square().sum(dim=1, keepdim=True)], dim=1
-    )
-    r2 = (left @ right).clamp(min=_TINY)  # which has a logarithm, and a gradient of 0
+def _kernel(points: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Compute 2 U(r) = r^2 ln r^2 of points (B, P, ..., 2) and positions; 0 up to rounding, as its gradient, at 0."""
+    px, py = points[..., None].unbind(-2)
+    # The negligible number has a logarithm.
+    r2 = (x - px).square() + ((y - py).square() + _TINY)
     return r2.log().mul_(r2)

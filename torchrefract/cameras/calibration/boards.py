@@ -97,7 +97,6 @@ class Board:
         return i, j, (i >= 0) & (j >= 0) & (i < columns) & (j < rows)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Chessboard(Board):
     """A chessboard; all of it must be visible, since its squares look alike."""
 

@@ -155,7 +155,7 @@ def _spacings(corners: np.ndarray) -> np.ndarray:
 
 
 def _drop_misfits(board: Board, ids: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Drop corners that do not fit their neighbors, the worst one first, since it misleads the others."""
+    # The worst one is dropped first, since it misleads the others.
     while len(ids) > MIN_CORNERS:
         errors = _misfits(board.corners(ids)[:, :2], corners)
         worst = int(errors.argmax())
@@ -233,10 +233,8 @@ def explain_failure(gray: np.ndarray, view: View, board: Board) -> str:
 
 def describe_other_board(gray: np.ndarray, board: Board) -> str:
     """Describe the board that a picture shows instead of the expected one; empty if it shows none."""
-    return _other_charuco(gray, board if isinstance(board, Charuco) else Charuco()) or _other_chessboard(gray)
-
-
-def _other_chessboard(gray: np.ndarray) -> str:
+    if text := _other_charuco(gray, board if isinstance(board, Charuco) else Charuco()):
+        return text
     has_board, _, cells = cv2.findChessboardCornersSBWithMeta(gray, (3, 3), SEARCH_FLAGS | cv2.CALIB_CB_LARGER)
     if not has_board:
         return ""

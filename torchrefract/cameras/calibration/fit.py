@@ -96,8 +96,7 @@ def fit_camera(
         raise ValueError(f"views must be at least {MIN_VIEWS}, got {len(views)}")
     objects, images = [board.corners(view.ids) for view in views], [view.corners for view in views]
     try:
-        run = _run_fisheye if model == "fisheye" else _run_opencv
-        intrinsics, poses = run(objects, images, model, size, start)
+        intrinsics, poses = _minimize(objects, images, model, size, start)
     except cv2.error as error:
         reason = " ".join(str(error.err or error).split())
         raise ValueError(f"views must be enough for the model {model}, got {len(views)}: {reason}") from error
@@ -173,20 +172,13 @@ def cross_validate(
 
 
 class LeaveOneOut(NamedTuple):
-    """The effect of leaving one view out of the fit; all errors in px rms.
+    """The effect of leaving one view out of the fit; all errors in px rms."""
 
-    name: of the view.
-    error: of the view with the camera fitted to the others.
-    others: of the others without the view.
-    median: of the errors of each of the others.
-    limit: above which the view is an outlier.
-    """
-
-    name: str
-    error: float
-    others: float
-    median: float
-    limit: float
+    name: str  # of the view
+    error: float  # of the view with the camera fitted to the others
+    others: float  # error of the others without the view
+    median: float  # of the errors of each of the others
+    limit: float  # of the error, above which the view is an outlier
 
     @property
     def is_outlier(self) -> bool:
@@ -212,15 +204,21 @@ class Selection(NamedTuple):
 
 
 def leave_each_out(views: Sequence[View], board: Board, fit: Fit, *, size: tuple[int, int]) -> list[LeaveOneOut]:
-    """Leave each view out in turn.
+    """Leave each of at least four views, which `fit` is to, out in turn.
 
-        limit = max(3 m, m + 6 * 1.4826 median |e_j - m|),  m = median e_j,  e_j the rms of the other views
-
-    Args:
-        views, board, size: as for `fit_camera`, with at least four views.
-        fit: to all views.
+    limit = max(3 m, m + 6 * 1.4826 median |e_j - m|),  m = median e_j,  e_j the rms of the other views
     """
-    return [_leave_out(i, views, board, fit, size) for i in range(len(views))]
+    results = []
+    for i, view in enumerate(views):
+        others = [*views[:i], *views[i + 1 :]]
+        other_fit = fit_camera(others, board, model=fit.intrinsics.model, size=size, start=fit.intrinsics)
+        errors = np.array([rms(errors) for errors in other_fit.errors])
+        median = float(np.median(errors))
+        deviation = _MAD_TO_SIGMA * float(np.median(np.abs(errors - median)))
+        error = rms(errors_in_best_pose(view, board, other_fit.intrinsics, fit.poses[i]))
+        limit = max(_RATIO * median, median + _NUM_DEVIATIONS * deviation)
+        results.append(LeaveOneOut(view.name, error, other_fit.rms, median, limit))
+    return results
 
 
 def drop_outliers(
@@ -249,44 +247,24 @@ def drop_outliers(
         kept = [view for view in kept if view.name != worst.name]
 
 
-def _leave_out(i: int, views: Sequence[View], board: Board, fit: Fit, size: tuple[int, int]) -> LeaveOneOut:
-    others = [view for j, view in enumerate(views) if j != i]
-    other_fit = fit_camera(others, board, model=fit.intrinsics.model, size=size, start=fit.intrinsics)
-    errors = np.array([rms(errors) for errors in other_fit.errors])
-    median = float(np.median(errors))
-    deviation = _MAD_TO_SIGMA * float(np.median(np.abs(errors - median)))
-    error = rms(errors_in_best_pose(views[i], board, other_fit.intrinsics, fit.poses[i]))
-    limit = max(_RATIO * median, median + _NUM_DEVIATIONS * deviation)
-    return LeaveOneOut(views[i].name, error, other_fit.rms, median, limit)
-
-
-def _run_opencv(
+def _minimize(
     objects: list[np.ndarray], images: list[np.ndarray], model: str, size: tuple[int, int], start: Intrinsics | None
 ) -> tuple[Intrinsics, list[np.ndarray]]:
-    flags, matrix, vector = _FLAGS[model], np.eye(3), np.zeros(14)
+    """Run OpenCV's calibration, whose fisheye takes float64 and four coefficients."""
+    is_fisheye = model == "fisheye"
+    count = 4 if is_fisheye else int(model.removeprefix("opencv"))
+    matrix, vector = np.eye(3), np.zeros((4 if is_fisheye else 14, 1))
+    flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW if is_fisheye else _FLAGS[model]
     if start is not None:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
-        matrix, vector[: len(start.coefficients)] = start.matrix.copy(), start.coefficients
-    points = [points.astype(np.float32) for points in objects], [points.astype(np.float32) for points in images]
+        matrix, vector[: len(start.coefficients), 0] = start.matrix.copy(), start.coefficients
+    run, dtype = (cv2.fisheye.calibrate, np.float64) if is_fisheye else (cv2.calibrateCamera, np.float32)
+    on_board, in_picture = ([points[None].astype(dtype) for points in group] for group in (objects, images))
     with _on_one_thread():
-        result = cv2.calibrateCamera(*points, size, matrix, vector, flags=flags, criteria=_STOP)
+        result = run(on_board, in_picture, size, matrix, vector, flags=flags, criteria=_STOP)
     _, matrix, vector, rotations, translations = result
-    count = int(model.removeprefix("opencv"))
-    return Intrinsics(model, matrix, vector.ravel()[:count].copy()), _poses(rotations, translations)
-
-
-def _run_fisheye(
-    objects: list[np.ndarray], images: list[np.ndarray], model: str, size: tuple[int, int], start: Intrinsics | None
-) -> tuple[Intrinsics, list[np.ndarray]]:
-    flags, matrix, vector = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW, np.eye(3), np.zeros(4)
-    if start is not None:
-        flags |= cv2.CALIB_USE_INTRINSIC_GUESS
-        matrix, vector = start.matrix.copy(), start.coefficients.copy()
-    on_board, in_picture = ([points[None] for points in group] for group in (objects, images))
-    _, matrix, vector, rotations, translations = cv2.fisheye.calibrate(
-        on_board, in_picture, size, matrix, vector.reshape(4, 1), flags=flags, criteria=_STOP
-    )
-    return Intrinsics(model, matrix, vector.ravel()), _poses(rotations, translations)
+    poses = [np.concatenate([r.ravel(), t.ravel()]) for r, t in zip(rotations, translations, strict=True)]
+    return Intrinsics(model, matrix, vector.ravel()[:count].copy()), poses
 
 
 @contextmanager
@@ -298,10 +276,6 @@ def _on_one_thread() -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(threads)
-
-
-def _poses(rotations: Sequence[np.ndarray], translations: Sequence[np.ndarray]) -> list[np.ndarray]:
-    return [np.concatenate([r.ravel(), t.ravel()]) for r, t in zip(rotations, translations, strict=True)]
 
 
 def _deviations(

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torchrefract._io import replace_file
@@ -50,13 +49,11 @@ class Calibration(NamedTuple):
 def calibrate_camera(
     detections: Sequence[Detection], board: Board, *, model: str, size: tuple[int, int], max_drop_share: float
 ) -> Calibration:
-    """Fit a camera to all usable detections, without views that do not fit the others.
+    """Fit a camera to all usable detections, at least four, without views that do not fit the others.
 
     Args:
-        detections: with at least four that have no problem.
-        board: that was detected.
-        model: of `fit.LENS_MODELS`.
-        size: width and height of the pictures, px.
+        detections, board: as for `detect`.
+        model, size: as for `fit_camera`.
         max_drop_share: of the views that may be dropped.
 
     Raises:
@@ -69,13 +66,7 @@ def calibrate_camera(
 
 
 def write_report(calibration: Calibration, read_gray: Callable[[str], np.ndarray], folder: Path) -> None:
-    """Write report.md, coverage.png and residuals.png.
-
-    Args:
-        calibration: to report.
-        read_gray: returns the picture of a view by its name, (H, W), uint8.
-        folder: to write to.
-    """
+    """Write report.md, coverage.png and residuals.png; `read_gray` returns (H, W), uint8, by the name of a view."""
     figures = _draw_coverage(calibration), _draw_residuals(calibration, read_gray)
     for name, figure in zip(_FIGURES, figures, strict=True):
         with replace_file(folder / name) as path:
@@ -87,12 +78,6 @@ def write_failure(board: Board, detections: Sequence[Detection], problem: str, f
     """Write report.md of a failed calibration, and rename the results of an earlier one.
 
     An earlier camera.yaml becomes camera_before.yaml, so that it is not mistaken for the result of this run.
-
-    Args:
-        board: that was searched.
-        detections: in the pictures.
-        problem: why there is no camera.
-        folder: to write to.
     """
     for name in (CAMERA_FILE, *_FIGURES):
         if (folder / name).is_file():
@@ -210,20 +195,16 @@ def _draw_residuals(calibration: Calibration, read_gray: Callable[[str], np.ndar
     )
     for k, name in enumerate(names):
         axes = figure.add_subplot(rows, _COLUMNS, k + 1)
-        _draw_view(axes, calibration, index[name], read_gray(name), scale)
+        corners, errors = calibration.selection.views[index[name]].corners, calibration.fit.errors[index[name]]
+        gray = read_gray(name)
+        axes.imshow(gray, cmap="gray", vmin=-255, vmax=255)  # pale, so that the arrows stand out
+        options = {"angles": "xy", "scale_units": "xy", "scale": 1 / scale, "color": "#d00000", "width": 0.004}
+        axes.quiver(*corners.T, *errors.T, **options)
+        axes.set_xlim(-0.5, gray.shape[1] - 0.5)
+        axes.set_ylim(gray.shape[0] - 0.5, -0.5)
+        axes.set_axis_off()
+        axes.set_title(f"{name}: {rms(errors):.3f} px", fontsize=10, parse_math=False)
     return figure
-
-
-def _draw_view(axes: Axes, calibration: Calibration, i: int, gray: np.ndarray, scale: float) -> None:
-    view, errors = calibration.selection.views[i], calibration.fit.errors[i]
-    axes.imshow(gray, cmap="gray", vmin=-255, vmax=255)  # pale, so that the arrows stand out
-    axes.quiver(
-        *view.corners.T, *errors.T, angles="xy", scale_units="xy", scale=1 / scale, color="#d00000", width=0.004
-    )
-    axes.set_xlim(-0.5, gray.shape[1] - 0.5)
-    axes.set_ylim(gray.shape[0] - 0.5, -0.5)
-    axes.set_axis_off()
-    axes.set_title(f"{view.name}: {rms(errors):.3f} px", fontsize=10, parse_math=False)
 
 
 def corner_counts(views: Sequence[View], size: tuple[int, int]) -> np.ndarray:

@@ -145,17 +145,6 @@ def test_the_limit_is_the_first_root_of_the_growth():
         assert radius == pytest.approx(first, abs=1e-5), row
 
 
-def test_no_point_exists_beyond_the_fold():
-    c = lens({"k1": -0.3})
-    r_d = torch.linspace(0, 1.2, 400).double()[None]
-    edge = 2 / 3 / math.sqrt(0.9)
-    x, y, exists = undistort_polynomial(0.6 * r_d, 0.8 * r_d, c, limit=limit_of(c))
-    assert x.isfinite().all()
-    assert y.isfinite().all()
-    clear = (r_d - edge).abs() > 1e-5
-    assert torch.equal(exists[clear], (r_d < edge)[clear])
-
-
 def test_a_fold_by_a_tangential_term_is_marked():
     # Without radial terms the map is a parabola in x: x_d = x + 3 p2 x^2 on y = 0, which turns at x = -1 / (6 p2).
     c = lens({"p2": 0.2})

@@ -5,6 +5,8 @@ g(r^2) = 1 + k_1 r^2 + ... + k_n r^2n. A fisheye is the same with the angle to t
 
 The lens is one-to-one from its center up to the radius where dr_d/dr reaches zero: beyond it the image folds back.
 dr_d/dr is, up to a positive factor, a polynomial 1 + a_1 q + ... + a_n q^n in q = r^2, called the growth here.
+
+The division model is radial too, and has closed forms in both directions.
 """
 
 from collections.abc import Callable, Sequence

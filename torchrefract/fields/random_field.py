@@ -11,6 +11,7 @@ Source: Dietrich and Newsam, "Fast and exact simulation of stationary Gaussian p
 the covariance matrix", SIAM J. Sci. Comput. 18 (1997).
 """
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -437,14 +438,11 @@ def _root(values: Tensor) -> Tensor:
 
 def _fast_size(least: int) -> int:
     """Return the smallest even number from `least` on that has no prime factor above 7."""
-    size = max(2, least + least % 2)
-    while not _has_small_factors(size):
-        size += 2
-    return size
+    return next(filter(_has_small_factors, itertools.count(max(2, least + least % 2), 2)))
 
 
 def _fast_size_below(most: int, least: int) -> int:
-    """Return the largest such number up to `most`, or the smallest from `least` on if that is below `least`."""
+    """Return the largest such number up to `most`; if it is below `least`, the smallest one from there on."""
     sizes = range(most - most % 2, max(least, 2) - 1, -2)
     return next(filter(_has_small_factors, sizes), _fast_size(least))
 

@@ -80,19 +80,6 @@ def test_six_radial_terms_are_a_polynomial_up_to_r12():
     assert_close(distort_polynomial(x, y, lens(SIX_TERMS)), (x * g, y * g), rtol=0, atol=1e-14)
 
 
-@pytest.mark.quick
-@pytest.mark.parametrize("name", LENSES)
-def test_undistortion_matches_opencv(name, oracle):
-    x, y = points(0.7)
-    observed = torch.stack([x[0], y[0]], dim=1).numpy()[:, None]
-    expected = cv2.undistortPoints(observed, np.eye(3), opencv_vector(LENSES[name]), criteria=CRITERIA)[:, 0].T
-    c = lens(LENSES[name])
-    x_u, y_u, exists = undistort_polynomial(x, y, c, limit=limit_of(c))
-    assert exists.all()
-    expected = torch.from_numpy(expected.copy())
-    oracle("lens inverse, cv2.undistortPoints, fp64", torch.cat([x_u, y_u]), expected, 1e-6, scale=FOCAL)
-
-
 @pytest.mark.parametrize("values", [*LENSES.values(), SIX_TERMS], ids=[*LENSES, "six terms"])
 @pytest.mark.parametrize(("dtype", "tolerance_px"), [(torch.float64, 1e-9), (torch.float32, 4e-3)])
 def test_undistorted_points_distort_back(values, dtype, tolerance_px, oracle):

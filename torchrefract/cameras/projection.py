@@ -358,6 +358,7 @@ def _check_points(name: str, points: Tensor, size: int, coefficients: Tensor) ->
 def _residual(ray: Sequence[Tensor], points: Tensor, lens: tuple[Any, str, Tensor], scale: Any = 1.0) -> Tensor:
     """Return (B, N), the distance between projected rays and points (B, N, 2) in focal lengths, times `scale`."""
     with torch.no_grad():
-        x_d, y_d, _ = image_of(*ray, *lens)
+        x, y, z = ray
+        x_d, y_d, _ = image_of(x, y, z, *lens)
         error = torch.stack([x_d, y_d], dim=-1) - points
         return (error * scale).square().sum(dim=-1).sqrt()

@@ -36,9 +36,8 @@ from torchrefract._io import replace_file
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract.cameras.calibration.boards import Board, Charuco, Chessboard
 from torchrefract.cameras.calibration.detection import SEARCH_FLAGS, View, detect, has_enough_corners
-from torchrefract.cameras.calibration.fit import Fit, cross_validate, fit_camera, rms
-from torchrefract.cameras.calibration.outliers import drop_outliers
-from torchrefract.cameras.calibration.quality import straightness
+from torchrefract.cameras.calibration.fit import Fit, cross_validate, drop_outliers, fit_camera, rms
+from torchrefract.cameras.calibration.report import straightness
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.conversion import Conversion, convert
 from torchrefract.cameras.lens_database import COLUMNS

@@ -53,17 +53,6 @@ def test_the_flow_matches_the_maps_of_opencv(name, zoom, oracle):
     assert (pinhole.cx, pinhole.cy, pinhole.coefficients) == (46.2, 33.1, (0.0,) * 4)
 
 
-def test_rays_beyond_the_fold_point_outside_the_frame():
-    # It folds where 1 - 3 * 1.2 r^2 = 0: at 0.527 focal lengths from its center.
-    camera = Camera(**PINHOLE, coefficients=(-1.2, 0.0, 0.0, 0.0))
-    flow, exists, _ = camera_flow(camera)
-    y, x = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
-    r2 = ((x - 46.2) / 70).square() + ((y - 33.1) / 71).square()
-    assert torch.equal(exists[0, 0], r2 < 1 / 3.6)
-    u, v = (flow[0] + torch.stack([x, y]))[:, ~exists[0, 0]]
-    assert ((u < -3) | (u > 98) | (v < -3) | (v > 66)).all()
-
-
 @pytest.mark.parametrize("name", ["opencv", "fisheye"])
 def test_rectified_pictures_match_opencv(call, folder, name):
     write_opencv(folder / "cam.yaml", CAMERAS[name])

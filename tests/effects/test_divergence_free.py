@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import DivergenceFree, folding, jacobian_determinant, warp
-from torchrefract.fields.covariance import COVARIANCES
+from torchrefract.fields.random_field import COVARIANCES
 
 GENTLE: dict[str, Any] = {"amplitude_range": (3.0, 3.0), "length_range": (12.0, 20.0)}
 

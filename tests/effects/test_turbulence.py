@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from torchrefract import DivergenceFree, Turbulence, folding
 from torchrefract.fields import random_field
-from torchrefract.fields.covariance import COVARIANCES
+from torchrefract.fields.random_field import COVARIANCES
 
 CALM: dict[str, Any] = {"amplitude_range": (0.3, 0.3), "length_range": (12.0, 12.0), "aperture_range": (2.0, 2.0)}
 

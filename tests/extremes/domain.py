@@ -11,7 +11,7 @@ from torch import Tensor
 
 import torchrefract as tr
 from torchrefract.effects.base import Effect
-from torchrefract.fields.covariance import COVARIANCES
+from torchrefract.fields.random_field import COVARIANCES
 from torchrefract.types import Range
 from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS
 

@@ -10,7 +10,7 @@ from torch import Tensor
 import torchrefract as tr
 from torchrefract.effects.base import Effect
 from torchrefract.fields import torus
-from torchrefract.fields.covariance import COVARIANCES
+from torchrefract.fields.random_field import COVARIANCES
 
 MAPS = ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission", "extinction", "intensity")
 FLOATS = (torch.float32, torch.float64)

@@ -7,9 +7,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import random
-from torchrefract.fields.covariance import COVARIANCES
 from torchrefract.fields.divergence_free import curl, curl_rms, divergence_free_flow
-from torchrefract.fields.random_field import FieldParams, Frequencies, embedding_size, sample_field
+from torchrefract.fields.random_field import COVARIANCES, FieldParams, Frequencies, embedding_size, sample_field
 from torchrefract.warping.lattice import Lattice, pixel_lattice
 
 PRECISION = [(torch.float64, 1e-12), (torch.float32, 1e-4)]

@@ -10,14 +10,17 @@ from torch.testing import assert_close
 
 from torchrefract import random
 from torchrefract.fields import random_field
-from torchrefract.fields.covariance import COVARIANCES, covariance, gaussian_mixture, gradient_rms
 from torchrefract.fields.random_field import (
+    COVARIANCES,
     FieldParams,
     Frequencies,
     Motion,
     amplitudes,
+    covariance,
     embedding_size,
     frequency_noise,
+    gaussian_mixture,
+    gradient_rms,
     sample_field,
     sum_of_waves,
     turn_rates,

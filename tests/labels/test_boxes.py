@@ -47,16 +47,6 @@ def test_boxes_follow_a_shift():
     assert keep.tolist() == [True, True, False]
 
 
-@pytest.mark.parametrize("axis", [0, 1], ids=["x", "y"])
-def test_boxes_follow_flips(flip, random_boxes, axis):
-    boxes = random_boxes(100)
-    expected = boxes.clone()
-    expected[:, axis], expected[:, axis + 2] = (SIZE[1 - axis] - 1 - boxes[:, k] for k in (axis + 2, axis))
-    flow = flip(axis, *SIZE)
-    assert_close(warp_boxes(boxes, flow, clip=False)[0], expected, rtol=0, atol=1e-9)
-    assert_close(warp_boxes(boxes, flow)[0], clipped(expected), rtol=0, atol=1e-9)
-
-
 def mask_bounds(box: Tensor, source: tuple[Tensor, Tensor]) -> Tensor | None:
     """Return the bounds of all output pixels that show the inside of a box, from edge to edge, or None."""
     x, y = source

@@ -94,23 +94,13 @@ def distort_polynomial(x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms 
     return x * g + shift_x, y * g + shift_y
 
 
-def jacobian_polynomial(x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms = ALL_TERMS) -> Jacobian:
-    """Compute the derivatives of `distort_polynomial` with respect to x and y, with its arguments.
-
-    J = g I + 2 dg/d(r^2) (x, y)^T (x, y) + the derivatives of `decentering`
-    """
-    return distort_with_jacobian(x, y, coefficients, terms)[1]
-
-
 def distort_with_jacobian(
     x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms = ALL_TERMS
 ) -> tuple[tuple[Tensor, Tensor], Jacobian]:
-    """Compute `distort_polynomial` and `jacobian_polynomial` together, with their arguments."""
+    """Compute `distort_polynomial` and its derivatives with respect to x and y, with its arguments."""
     k, p, s = _groups(coefficients, terms)
     r2 = x * x + y * y
-    g = radial_factor(r2, k)
-    shift_x, shift_y = decentering(x, y, r2, p, s)
-    return (x * g + shift_x, y * g + shift_y), lens_jacobian(x, y, r2, g, radial_factor_slope(r2, k), p, s)
+    return distort_by_factor(x, y, r2, radial_factor(r2, k), radial_factor_slope(r2, k), p, s)
 
 
 def decentering(x: Tensor, y: Tensor, r2: Tensor, p: Sequence[Tensor], s: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
@@ -126,10 +116,11 @@ def decentering(x: Tensor, y: Tensor, r2: Tensor, p: Sequence[Tensor], s: Sequen
     return shift_x, shift_y
 
 
-def lens_jacobian(
+def distort_by_factor(
     x: Tensor, y: Tensor, r2: Tensor, g: Tensor, slope: Tensor, p: Sequence[Tensor], s: Sequence[Tensor]
-) -> Jacobian:
-    """Compute the derivatives of (x g, y g) + `decentering`, where slope = dg/d(r^2)."""
+) -> tuple[tuple[Tensor, Tensor], Jacobian]:
+    """Compute (x g, y g) + `decentering` and its derivatives g I + 2 slope (x, y)^T (x, y) + ..., slope = dg/d(r^2)."""
+    shift_x, shift_y = decentering(x, y, r2, p, s)
     cross = 2 * slope * x * y
     xx, xy, yx, yy = g + 2 * slope * x * x, cross, cross, g + 2 * slope * y * y
     if p:
@@ -140,7 +131,7 @@ def lens_jacobian(
         s1, s2, s3, s4 = s
         a, b = 2 * s1 + 4 * s2 * r2, 2 * s3 + 4 * s4 * r2
         xx, xy, yx, yy = xx + a * x, xy + a * y, yx + b * x, yy + b * y
-    return Jacobian(xx, xy, yx, yy)
+    return (x * g + shift_x, y * g + shift_y), Jacobian(xx, xy, yx, yy)
 
 
 def undistort_polynomial(

@@ -149,19 +149,19 @@ class Camera:
 
     def distort(self, points: Tensor) -> PointResult:
         """Distort points (N, 2) or (B, N, 2) of the plane z = 1, see `projection.distort`."""
-        return self._apply("points", points, lambda p, c, **_: distort(p, c, model=self.model))
+        return self._apply(distort, points)
 
     def undistort(self, points: Tensor) -> PointResult:
         """Undistort points (N, 2) or (B, N, 2) in focal lengths, see `projection.undistort`."""
-        return self._apply("points", points, lambda p, c, **_: undistort(p, c, model=self.model))
+        return self._apply(undistort, points)
 
     def project(self, points: Tensor) -> PointResult:
         """Project points in space (N, 3) or (B, N, 3) to pixels, see `projection.project`."""
-        return self._apply("points", points, lambda p, c, **pinhole: project(p, c, model=self.model, **pinhole))
+        return self._apply(project, points, has_pinhole=True)
 
     def unproject(self, pixels: Tensor) -> PointResult:
         """Return the rays of unit length of pixels (N, 2) or (B, N, 2), see `projection.unproject`."""
-        return self._apply("pixels", pixels, lambda p, c, **pinhole: unproject(p, c, model=self.model, **pinhole))
+        return self._apply(unproject, pixels, name="pixels", has_pinhole=True)
 
     def tensors(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return coefficients (1, n), focal lengths (1, 2) and center (1, 2), px, with dtype and device of `like`."""
@@ -252,12 +252,15 @@ class Camera:
                 f"r = {corner:.4g} focal lengths, got zero at r = {pole:.4g}"
             )
 
-    def _apply(self, name: str, points: Tensor, function: Callable[..., PointResult]) -> PointResult:
+    def _apply(
+        self, function: Callable[..., PointResult], points: Tensor, *, name: str = "points", has_pinhole: bool = False
+    ) -> PointResult:
         if check_tensor(name, points).ndim not in (2, 3):
             raise ValueError(f"{name} must have shape (N, n) or (B, N, n), got {tuple(points.shape)}")
         batch = points if points.ndim == 3 else points[None]
         coefficients, focal, center = (value.expand(len(batch), -1) for value in self.tensors(points))
-        result = function(batch, coefficients, focal=focal, center=center)
+        pinhole = {"focal": focal, "center": center} if has_pinhole else {}
+        result = function(batch, coefficients, model=self.model, **pinhole)
         return result if points.ndim == 3 else PointResult(*(value[0] for value in result))
 
     def _check_growth(self) -> None:

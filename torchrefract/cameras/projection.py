@@ -10,7 +10,7 @@ z = 1 before distortion; for a fisheye it is an angle in rad.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,9 +24,9 @@ from torchrefract.cameras.brown_conrady import (
     implicit,
     undistort_polynomial,
 )
-from torchrefract.cameras.division import distort_division, undistort_division
 from torchrefract.cameras.fisheye import fisheye_angle, fisheye_image, fisheye_ray
 from torchrefract.cameras.radial import (
+    distort_division,
     first_fall,
     first_root,
     growth_of_polynomial,
@@ -34,6 +34,7 @@ from torchrefract.cameras.radial import (
     limit_of_curve,
     radial_factor,
     reach_of,
+    undistort_division,
 )
 from torchrefract.cameras.rational import (
     OPENCV14,
@@ -87,7 +88,7 @@ def distort(points: Tensor, coefficients: Tensor, *, model: str) -> PointResult:
         TypeError: `points` is not float32 or float64.
     """
     check_coefficients(coefficients, model)
-    points, finite = _replace_non_finite("points", points, 2, coefficients)
+    points, finite = _check_points("points", points, 2, coefficients)
     x, y = points.unbind(-1)
     x_d, y_d, valid = image_of(x, y, torch.ones_like(x), *_lens(coefficients, model))
     return PointResult(torch.stack([x_d, y_d], dim=-1), valid & finite, torch.zeros_like(x_d))
@@ -108,12 +109,12 @@ def undistort(points: Tensor, coefficients: Tensor, *, model: str) -> PointResul
         ValueError, TypeError: as for `distort`.
     """
     check_coefficients(coefficients, model)
-    points, finite = _replace_non_finite("points", points, 2, coefficients)
+    points, finite = _check_points("points", points, 2, coefficients)
     lens = _lens(coefficients, model)
     x_d, y_d = points.unbind(-1)
     ray, valid = ray_of(x_d, y_d, *lens)
     x, y, valid = on_plane(ray, valid & finite)
-    residual = _residual((x, y, torch.ones_like(x)), points, *lens)
+    residual = _residual((x, y, torch.ones_like(x)), points, lens)
     return PointResult(torch.stack([x, y], dim=-1), valid, residual)
 
 
@@ -135,7 +136,7 @@ def project(points: Tensor, coefficients: Tensor, *, focal: Tensor, center: Tens
     """
     check_coefficients(coefficients, model)
     _check_pinhole(focal, center, coefficients)
-    points, finite = _replace_non_finite("points", points, 3, coefficients)
+    points, finite = _check_points("points", points, 3, coefficients)
     x, y, z = points.unbind(-1)
     x_d, y_d, valid = image_of(x, y, z, *_lens(coefficients, model))
     pixels = torch.stack([x_d, y_d], dim=-1) * focal[:, None] + center[:, None]
@@ -157,14 +158,14 @@ def unproject(pixels: Tensor, coefficients: Tensor, *, focal: Tensor, center: Te
     """
     check_coefficients(coefficients, model)
     _check_pinhole(focal, center, coefficients)
-    pixels, finite = _replace_non_finite("pixels", pixels, 2, coefficients)
+    pixels, finite = _check_points("pixels", pixels, 2, coefficients)
     lens = _lens(coefficients, model)
     points = (pixels - center[:, None]) / focal[:, None]
     x_d, y_d = points.unbind(-1)
     ray, valid = ray_of(x_d, y_d, *lens)
     valid = valid & finite
     rays = torch.stack([torch.where(valid, a, axis) for a, axis in zip(ray, (0.0, 0.0, 1.0), strict=True)], dim=-1)
-    residual = _residual(rays.unbind(-1), points, *lens, scale=focal)
+    residual = _residual(rays.unbind(-1), points, lens, focal[:, None])
     return PointResult(rays / rays.square().sum(dim=-1, keepdim=True).sqrt(), valid, residual)
 
 
@@ -216,14 +217,12 @@ def radius_within(coefficients: Tensor, reach: Tensor, model: str) -> Tensor:
         c = columns(coefficients.detach(), model)
         if model == "division":
             return reach
-        if model == "opencv":
-            growth, pole = growth_of_ratio(*ratio(c)), ratio(c)[1]
-            return first_fall(
-                lambda r: torch.minimum(radial_factor(r * r, growth), radial_factor(r * r, pole)) <= 0, reach
-            )[0]
-        growth = growth_of_polynomial(c[: len(RADIAL)])
+        if model == "opencv":  # a pole ends it as well
+            positive = [growth_of_ratio(*ratio(c)), ratio(c)[1]]
+        else:
+            positive = [growth_of_polynomial(c[: len(RADIAL)])]
         end = torch.full_like(reach, math.pi) if model == "fisheye" else reach
-        return first_fall(lambda r: radial_factor(r * r, growth) <= 0, end)[0]
+        return first_fall(lambda r: torch.stack([radial_factor(r * r, k) for k in positive]).amin(dim=0) <= 0, end)[0]
 
 
 def image_of(
@@ -345,7 +344,7 @@ def _check_pinhole(focal: Tensor, center: Tensor, coefficients: Tensor) -> None:
     check_values("center", "be finite", center, torch.isfinite)
 
 
-def _replace_non_finite(name: str, points: Tensor, size: int, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+def _check_points(name: str, points: Tensor, size: int, coefficients: Tensor) -> tuple[Tensor, Tensor]:
     """Return the points with NaN and infinity replaced by 0, and (B, N), bool: the point was finite."""
     check_tensor(name, points)
     if points.dtype not in (torch.float32, torch.float64):
@@ -356,17 +355,10 @@ def _replace_non_finite(name: str, points: Tensor, size: int, coefficients: Tens
     return torch.where(finite[..., None], points, 0.0), finite
 
 
-def _residual(
-    ray: Sequence[Tensor],
-    points: Tensor,
-    c: Sequence[Tensor],
-    model: str,
-    radius: Tensor,
-    scale: Tensor | None = None,
-) -> Tensor:
+def _residual(ray: Sequence[Tensor], points: Tensor, lens: tuple[Any, str, Tensor], scale: Any = 1.0) -> Tensor:
     """Return (B, N), the distance between projected rays and points (B, N, 2) in focal lengths, times `scale`."""
     with torch.no_grad():
         x, y, z = ray
-        x_d, y_d, _ = image_of(x, y, z, c, model, radius)
+        x_d, y_d, _ = image_of(x, y, z, *lens)
         error = torch.stack([x_d, y_d], dim=-1) - points
-        return (error if scale is None else error * scale[:, None]).square().sum(dim=-1).sqrt()
+        return (error * scale).square().sum(dim=-1).sqrt()

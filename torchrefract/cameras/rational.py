@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrefract.cameras.brown_conrady import Jacobian, decentering, lens_jacobian
+from torchrefract.cameras.brown_conrady import Jacobian, distort_by_factor
 from torchrefract.cameras.radial import (
     first_root,
     growth_of_ratio,
@@ -105,11 +105,9 @@ def _ratio(r2: Tensor, c: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
 
 def _lens(x: Tensor, y: Tensor, c: Sequence[Tensor]) -> tuple[Tensor, Tensor, Jacobian]:
     """Distort points by all but the tilt."""
-    p, s = c[2:4], c[8:12]
     r2 = x * x + y * y
-    g, slope = _ratio(r2, c)
-    shift_x, shift_y = decentering(x, y, r2, p, s)
-    return x * g + shift_x, y * g + shift_y, lens_jacobian(x, y, r2, g, slope, p, s)
+    point, jacobian = distort_by_factor(x, y, r2, *_ratio(r2, c), c[2:4], c[8:12])
+    return *point, jacobian
 
 
 def _depth(x: Tensor, y: Tensor, tau_x: Tensor, tau_y: Tensor) -> Tensor:

@@ -15,17 +15,23 @@ from torch import Tensor
 
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_choice, check_number
-from torchrefract.cameras.calibration.board_page import board_page
-from torchrefract.cameras.calibration.boards import Board
-from torchrefract.cameras.calibration.detection import Detection, View, detect, has_enough_corners
-from torchrefract.cameras.calibration.diagnosis import describe_other_board, edge_width, explain_failure
+from torchrefract.cameras.calibration.boards import Board, board_page
+from torchrefract.cameras.calibration.detection import (
+    Detection,
+    View,
+    describe_other_board,
+    detect,
+    edge_width,
+    explain_failure,
+    has_enough_corners,
+)
 from torchrefract.cameras.calibration.fit import LENS_MODELS, MIN_VIEWS
-from torchrefract.cameras.calibration.quality import camera_warnings
 from torchrefract.cameras.calibration.report import (
     CAMERA_FILE,
     REPORT_FILE,
     Calibration,
     calibrate_camera,
+    camera_warnings,
     write_failure,
     write_report,
 )
@@ -124,13 +130,7 @@ def read_gray(path: Path) -> np.ndarray:
 def detect_all(files: Sequence[Path], board: Board, cache: Path) -> Iterator[Detection]:
     """Detect a board in pictures; results of an earlier run for the same board and file are read from the cache.
 
-    Args:
-        files: the pictures.
-        board: to detect.
-        cache: file with a line of JSON for each picture.
-
-    Yields:
-        A detection for each picture.
+    The cache is a file with a line of JSON for each picture.
     """
     key = {"version": _CACHE_VERSION, "opencv": cv2.__version__, "board": board.describe()}
     cached = _read_cache(cache, key)
@@ -169,23 +169,19 @@ def _stamp(file: Path) -> str:
 def _read_cache(path: Path, key: dict[str, Any]) -> dict[tuple[str, str], Detection]:
     """Return cached detections by name and stamp; an incomplete line of an interrupted run is ignored."""
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []
-    documents = [_parse_json(line) for line in lines]
-    if not documents or documents[0] != key:
-        return {}
     cached = {}
-    for d in documents[1:]:
-        if d is not None:
+    for number, line in enumerate(lines):
+        try:
+            d = json.loads(line)
+        except ValueError:
+            continue
+        if number == 0 and d != key:
+            return {}
+        if number > 0:
             corners = np.array(d["corners"], dtype=np.float64).reshape(-1, 2)
             view = View(d["name"], np.array(d["ids"], dtype=int), corners)
             cached[view.name, d["stamp"]] = Detection(view, (d["width"], d["height"]), d["edges"], d["reason"])
     return cached
-
-
-def _parse_json(line: str) -> Any:
-    try:
-        return json.loads(line)
-    except ValueError:
-        return None
 
 
 def _to_json(detection: Detection, stamp: str) -> dict[str, Any]:

@@ -18,9 +18,8 @@ from torchrefract.effects.random_field import (
     warn_if_clipped,
 )
 from torchrefract.effects.warp_effect import WarpEffect
-from torchrefract.fields.covariance import COVARIANCES
 from torchrefract.fields.divergence_free import divergence_free_flow
-from torchrefract.fields.random_field import Frequencies, embedding_size
+from torchrefract.fields.random_field import COVARIANCES, Frequencies, embedding_size
 from torchrefract.fields.turbulence_error import RandomFieldErrorModel
 from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan
 from torchrefract.types import Range

@@ -19,8 +19,7 @@ from torchrefract.effects.random_field import (
     warn_if_clipped,
 )
 from torchrefract.effects.warp_effect import WarpEffect
-from torchrefract.fields.covariance import COVARIANCES, gradient_rms
-from torchrefract.fields.random_field import Frequencies, embedding_size
+from torchrefract.fields.random_field import COVARIANCES, Frequencies, embedding_size, gradient_rms
 from torchrefract.fields.turbulence import turbulence_flow
 from torchrefract.fields.turbulence_error import RandomFieldErrorModel
 from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan

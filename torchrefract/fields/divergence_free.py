@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from torchrefract.fields.covariance import covariance as covariance_at
 from torchrefract.fields.random_field import FieldParams, Frequencies, node_positions, sample_field
+from torchrefract.fields.random_field import covariance as covariance_at
 from torchrefract.warping.flow import compose_flows
 from torchrefract.warping.lattice import Lattice
 

@@ -12,7 +12,6 @@ from torchrefract.cameras.brown_conrady import (
     distort_polynomial,
     distort_with_jacobian,
     implicit,
-    jacobian_polynomial,
     newton_undistort,
     undistort_polynomial,
     used_terms,
@@ -175,7 +174,7 @@ def _is_unfolded(x: Tensor, y: Tensor, determinant: Tensor, limit: RadialLimit) 
 def _with_gradient(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, c: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:
     """Attach the gradient of the exact inverse to a solution (x, y)."""
     with torch.no_grad():
-        jacobian = jacobian_polynomial(x, y, c, terms)
+        jacobian = distort_with_jacobian(x, y, c, terms)[1]
     reached_x, reached_y = distort_polynomial(x, y, c, terms)
     return implicit((x, y), (reached_x - x_d, reached_y - y_d), jacobian)
 

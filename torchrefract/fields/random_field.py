@@ -11,6 +11,7 @@ Source: Dietrich and Newsam, "Fast and exact simulation of stationary Gaussian p
 the covariance matrix", SIAM J. Sci. Comput. 18 (1997).
 """
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -19,15 +20,65 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import exact_matmul
-from torchrefract.fields.covariance import REACH, covariance
 from torchrefract.random import white_noise, white_noise_at
 from torchrefract.warping.lattice import Lattice
 
+# Lengths after which less than 4e-4 is left of each covariance.
+REACH = {"exponential": 8.0, "gaussian": 5.0, "matern32": 6.0, "matern52": 6.0}
+COVARIANCES = tuple(REACH)
+_SMOOTHNESS = {"exponential": 0.5, "matern32": 1.5, "matern52": 2.5}  # nu of the Matern covariances
 _APERTURE_REACH = 6.0  # margin of the domain in apertures: a smoothed field is correlated over sqrt(2) of them
 _MAX_POINTS = 1 << 24  # larger domains need gigabytes
 _ROUNDING = 5e-13  # of the transform, relative to the largest eigenvalue
 _NEGLIGIBLE = 1e-16  # of an amplitude
 _POINTS_AT_ONCE = 1 << 22  # frequencies of all samples that are in memory together
+
+
+def covariance(distance: Tensor, length: Tensor, kind: str) -> Tensor:
+    """Compute C(h), with C(0) = 1, at distances h in px for a correlation length l in px; the two broadcast.
+
+        exponential  exp(-h / l)                       gaussian  exp(-h^2 / (2 l^2))
+        matern32     (1 + a) exp(-a), a = sqrt(3) h / l
+        matern52     (1 + a + a^2 / 3) exp(-a), a = sqrt(5) h / l
+
+    Source: Rasmussen and Williams, "Gaussian processes for machine learning" (2006), section 4.2.
+    """
+    h = distance / length
+    if kind == "gaussian":
+        return torch.exp(-0.5 * h * h)
+    if kind == "exponential":
+        return torch.exp(-h)
+    if kind == "matern32":
+        a = math.sqrt(3) * h
+        return (1 + a) * torch.exp(-a)
+    a = math.sqrt(5) * h
+    return (1 + a + a * a / 3) * torch.exp(-a)
+
+
+def gradient_rms(length: Tensor, *, kind: str, aperture: Tensor | None = None) -> Tensor:
+    """Compute (N,), 1/px: the root mean square difference of neighboring pixels of fields of variance 1.
+
+    sqrt(2 (1 - C(1) / C(0))),  C smoothed by the aperture a twice, for which it is a sum of Gaussians:
+    C(h) = sum w s / (s + 2 a^2) exp(-h^2 / (2 (s + 2 a^2))),  w and s / l^2 from `gaussian_mixture`
+    """
+    weight, scale = gaussian_mixture(kind, length.device)
+    variance = length.double()[:, None].square() * scale
+    spread = variance if aperture is None else variance + 2 * aperture.double()[:, None].square()
+    weight = weight * variance / spread
+    return (-2 * (weight * torch.expm1(-0.5 / spread)).sum(dim=1) / weight.sum(dim=1)).sqrt()
+
+
+def gaussian_mixture(kind: str, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return weights (n,) and squared lengths (n,) in l^2, float64, of the Gaussian covariances that sum to a kind.
+
+    C(h) = sum w exp(-h^2 / (2 s l^2)),  s = t / nu,  w = t^nu exp(-t) over equal steps of ln t, normalized
+    """
+    t = torch.ones(1, dtype=torch.float64, device=device)
+    if kind == "gaussian":
+        return t, t
+    t = torch.arange(-60.0, 5.0, 0.5, dtype=torch.float64, device=device).exp()
+    weight = t ** _SMOOTHNESS[kind] * torch.exp(-t)
+    return weight / weight.sum(), t / _SMOOTHNESS[kind]
 
 
 class FieldParams(NamedTuple):
@@ -115,13 +166,8 @@ def embedding_size(height: int, width: int, *, length: float, kind: str, apertur
 def eigenvalues(frequencies: Frequencies, length: Tensor, *, kind: str) -> Tensor:
     """Compute (N, rows + 1, columns + 1), float64, up to rounding: eigenvalues of a covariance on a periodic domain.
 
-    They are the discrete Fourier transform of the covariance over the distances on the domain, which is even along both
-    axes: the frequencies from 0 on hold all of them.
-
-    Args:
-        frequencies: to compute.
-        length: (N,), px.
-        kind: one of COVARIANCES.
+    They are the discrete Fourier transform of the covariance, for lengths (N,), over the distances on the domain, which
+    is even along both axes: the frequencies from 0 on hold all of them.
     """
     size, length = frequencies.size, length.double()[:, None, None]
     y, x = (torch.arange(n // 2 + 1, dtype=torch.float64, device=length.device) for n in size)
@@ -155,13 +201,6 @@ def amplitudes(
 
     It is the root of the eigenvalue, multiplied by exp(-(k a)^2 / 2) for an aperture a: the field is then smoothed by a
     Gaussian of standard deviation a. Negative eigenvalues count as 0.
-
-    Args:
-        frequencies: to compute.
-        length: (N,), px.
-        kind: one of COVARIANCES.
-        aperture: (N,), px.
-        dtype: of the amplitude.
 
     Returns:
         amplitude: (N, rows + 1, columns + 1).
@@ -210,10 +249,7 @@ def coefficients(
 def sum_of_waves(values: Tensor, frequencies: Frequencies, rows: range, columns: range) -> Tensor:
     """Compute Re and Im of sum_k z_k exp(-2 pi i k . p / size), (N, 2, n, m), at rows and columns of the domain.
 
-    Args:
-        values: (N, 2, Ky, Kx), real and imaginary part of z.
-        frequencies: their frequencies.
-        rows, columns: px; positions beyond the domain continue it periodically.
+    The values z are (N, 2, Ky, Kx), real and imaginary part; positions beyond the domain continue it periodically.
     """
     down, across = (
         _Axis(positions, n, k)
@@ -242,8 +278,7 @@ def sample_field(
         params: of N fields.
         frequencies: of the domain, all or the lowest ones.
         rows, columns: px, where the fields are evaluated.
-        kind: one of COVARIANCES.
-        dtype: float32 or float64.
+        kind, dtype: of the covariance and of the fields.
         transform: changes the coefficients of the waves, (N, 2, Ky, Kx).
 
     Returns:
@@ -251,14 +286,12 @@ def sample_field(
         clipped: (N,), share of the spectrum that is negative and was set to 0.
     """
     parts = []
-    for part in split_params(params, frequencies):
+    for part in _split(params, frequencies):
         values, clipped = coefficients(part, frequencies, kind=kind, dtype=dtype)
         values = values if transform is None else transform(values, frequencies)
         parts.append((sum_of_waves(values, frequencies, rows, columns), clipped))
-    if len(parts) == 1:
-        return parts[0]
     fields, clipped = zip(*parts, strict=True)
-    return torch.cat(fields), torch.cat(clipped)
+    return (fields[0], clipped[0]) if len(parts) == 1 else (torch.cat(fields), torch.cat(clipped))
 
 
 def node_positions(lattice: Lattice) -> tuple[range, range]:
@@ -268,22 +301,16 @@ def node_positions(lattice: Lattice) -> tuple[range, range]:
     return rows, columns
 
 
-def split_params(params: FieldParams, frequencies: Frequencies) -> list[FieldParams]:
+def _split(params: FieldParams, frequencies: Frequencies) -> list[FieldParams]:
     """Split N fields into groups whose noise fits into memory together."""
-    count = len(params.length)
     at_once = max(1, _POINTS_AT_ONCE // math.prod(frequencies.counts))
-    if count <= at_once or torch.compiler.is_compiling():
+    if len(params.length) <= at_once or torch.compiler.is_compiling():
         return [params]
-    groups = [slice(start, start + at_once) for start in range(0, count, at_once)]
-    return [
-        FieldParams(
-            params.length[group],
-            None if params.aperture is None else params.aperture[group],
-            params.key[group],
-            None if params.motion is None else Motion(*(value[group] for value in params.motion)),
-        )
-        for group in groups
-    ]
+    length, aperture, key, motion = params
+    groups = len(length.split(at_once))
+    apertures = [None] * groups if aperture is None else aperture.split(at_once)
+    motions = [None] * groups if motion is None else list(map(Motion, *(part.split(at_once) for part in motion)))
+    return list(map(FieldParams, length.split(at_once), apertures, key.split(at_once), motions))
 
 
 def frequency_noise(key: Tensor, frequencies: Frequencies, *, dtype: torch.dtype) -> Tensor:
@@ -411,14 +438,11 @@ def _root(values: Tensor) -> Tensor:
 
 def _fast_size(least: int) -> int:
     """Return the smallest even number from `least` on that has no prime factor above 7."""
-    size = max(2, least + least % 2)
-    while not _has_small_factors(size):
-        size += 2
-    return size
+    return next(filter(_has_small_factors, itertools.count(max(2, least + least % 2), 2)))
 
 
 def _fast_size_below(most: int, least: int) -> int:
-    """Return the largest such number up to `most`, or the smallest from `least` on if that is below `least`."""
+    """Return the largest such number up to `most`; if it is below `least`, the smallest one from there on."""
     sizes = range(most - most % 2, max(least, 2) - 1, -2)
     return next(filter(_has_small_factors, sizes), _fast_size(least))
 

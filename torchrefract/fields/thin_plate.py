@@ -51,9 +51,8 @@ def fit_spline(points: Tensor, displacement: Tensor, smoothing: Tensor) -> Splin
     smoothing = smoothing[:, None, None] * (scale / scale.detach()).square() / _UNIT**2
     center, scale = center.detach(), _UNIT * scale.detach()
     unit = (points - center) / scale
-    x, y = unit.unbind(2)
-    kernel = _kernel(_square(x[:, None] - x[:, :, None], y[:, None] - y[:, :, None])) / 2
-    kernel = kernel + smoothing * torch.eye(count, dtype=unit.dtype, device=unit.device)
+    x, y = unit[:, None].unbind(3)
+    kernel = _kernel(unit, x, y) / 2 + smoothing * torch.eye(count, dtype=unit.dtype, device=unit.device)
     plane = torch.cat([torch.ones_like(unit[..., :1]), unit], dim=2)
     corner = unit.new_zeros(unit.shape[0], 3, 3)
     system = torch.cat([torch.cat([kernel, plane], dim=2), torch.cat([plane.mT, corner], dim=2)], dim=1)
@@ -74,24 +73,20 @@ def spline_flow(spline: Spline, x: Tensor, y: Tensor, *, dtype: torch.dtype) -> 
     Returns:
         (B, 2, h, w), px.
     """
-    x = ((x.double() - spline.center[:, None, :, :1]) / spline.scale[:, None])[:, 0]
-    y = ((y.double() - spline.center[:, None, :, 1:]) / spline.scale[:, None])[:, 0]
-    values = (*spline[:3], x, y)
-    if torch.compiler.is_compiling():  # one loop over the positions, whose sums need no memory
-        return _evaluate(*values).to(dtype)
+    x, y = (((axis.double()[:, 0] - spline.center[..., i : i + 1]) / spline.scale) for i, axis in enumerate((x, y)))
     height = y.shape[1]
     at_once = max(1, _VALUES_AT_ONCE // max(1, spline.points.shape[1] * x.shape[2] * len(x)))
-    if at_once >= height:
-        return _evaluate(*values).to(dtype)
+    if at_once >= height or torch.compiler.is_compiling():
+        return _evaluate(*spline[:3], x, y).to(dtype)
     # Kernels of all positions would need gigabytes; their gradients compute them again.
-    recompute = requires_grad(values) and why_not_eager(x) is None
-    parts = []
+    recompute = requires_grad((*spline[:3], x, y)) and why_not_eager(x) is None
+    bands = []
     for start in range(0, height, at_once):
         rows = slice(start, start + at_once)
-        part = (*spline[:3], x if x.shape[1] == 1 else x[:, rows], y[:, rows])
-        flow = checkpoint(_evaluate, *part, use_reentrant=False) if recompute else _evaluate(*part)
-        parts.append(flow.to(dtype))
-    return torch.cat(parts, dim=2)
+        values = (*spline[:3], x if x.shape[1] == 1 else x[:, rows], y[:, rows])
+        band = checkpoint(_evaluate, *values, use_reentrant=False) if recompute else _evaluate(*values)
+        bands.append(band.to(dtype))
+    return torch.cat(bands, dim=2)
 
 
 def check_points(points: Tensor) -> None:
@@ -119,18 +114,15 @@ def check_points(points: Tensor) -> None:
 
 def _evaluate(points: Tensor, weights: Tensor, affine: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Compute (B, 2, h, w) at positions x and y, which broadcast to (B, h, w)."""
-    px, py, wu, wv = torch.cat([points, weights / 2], dim=2)[..., None, None].unbind(2)
-    kernel = _kernel(_square(x[:, None] - px, y[:, None] - py))
-    bent = torch.stack([(weight * kernel).sum(dim=1) for weight in (wu, wv)], dim=1)
+    kernel = _kernel(points[:, :, None], x[:, None], y[:, None])
+    bent = (weights.mT / 2 @ kernel.flatten(2)).unflatten(2, kernel.shape[2:])
     a, b, c = affine[..., None, None].unbind(1)
     return a + b * x[:, None] + c * y[:, None] + bent
 
 
-def _square(x: Tensor, y: Tensor) -> Tensor:
-    """Compute the squared distance, plus a negligible number that has a logarithm."""
-    return x.square() + (y.square() + _TINY)
-
-
-def _kernel(r2: Tensor) -> Tensor:
-    """Compute 2 U(r) = r^2 ln r^2 from the squared distance; 0 up to rounding, with a gradient of 0, at r = 0."""
-    return r2 * r2.log()
+def _kernel(points: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Compute 2 U(r) = r^2 ln r^2 of points (B, P, ..., 2) and positions; 0 up to rounding, as its gradient, at 0."""
+    px, py = points[..., None].unbind(-2)
+    # The negligible number has a logarithm.
+    r2 = (x - px).square() + ((y - py).square() + _TINY)
+    return r2.log().mul_(r2)

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor
-from torchrefract.fields.covariance import REACH, gaussian_mixture, gradient_rms
-from torchrefract.fields.random_field import Frequencies, embedding_size
+from torchrefract.fields.random_field import REACH, Frequencies, embedding_size, gaussian_mixture, gradient_rms
 from torchrefract.types import FlowBounds, Range, Simplification
 
 _SIGMAS = 7.0

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._validation import check_count, check_flow, check_positive, check_tensor
+from torchrefract.warping.flow import Jacobian
 from torchrefract.warping.grid import field_dtype
 
 # Smooth flows converge in 6 Newton steps; flows that nearly fold gain little beyond 16.
@@ -94,7 +95,7 @@ def solve_points(points: Tensor, flow: Tensor, steps: int, tolerance_px: float) 
         q, error, sample = _newton(table, p.detach(), _clamp(shifted, flow), node, steps)
         # A point is invalid if its bilinear sample touches an invalid pixel of the flow.
         converged = (_squared_norm(error) <= tolerance_px**2) & (sample.value[:, 2:] > 0.999) & usable
-        upright = _determinant(sample) * orientation > 0
+        upright = _jacobian(sample).determinant * orientation > 0
     if torch.is_grad_enabled() and (p.requires_grad or flow.requires_grad):
         error = sample_linear(flow, q).value - p
         q = q - _newton_step(sample, error - error.detach())
@@ -210,20 +211,16 @@ def _squared_norm(vector: Tensor) -> Tensor:
     return vector[:, :1].square() + vector[:, 1:2].square()
 
 
-def _determinant(sample: LinearSample) -> Tensor:
-    xx, xy, yx, yy = _jacobian(sample)
-    return xx * yy - xy * yx
-
-
-def _jacobian(sample: LinearSample) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the entries of I + slopes, row by row, each (B, 1, N)."""
-    return 1 + sample.slope_x[:, :1], sample.slope_y[:, :1], sample.slope_x[:, 1:2], 1 + sample.slope_y[:, 1:2]
+def _jacobian(sample: LinearSample) -> Jacobian:
+    """Return I + slopes, entries (B, 1, N)."""
+    x, y = sample.slope_x, sample.slope_y
+    return Jacobian(1 + x[:, :1], y[:, :1], x[:, 1:2], 1 + y[:, 1:2])
 
 
 def _newton_step(sample: LinearSample, error: Tensor) -> Tensor:
     """Return (I + slopes)^-1 error in closed form."""
-    xx, xy, yx, yy = _jacobian(sample)
-    determinant = xx * yy - xy * yx
+    jacobian = _jacobian(sample)
+    (xx, xy, yx, yy), determinant = jacobian, jacobian.determinant
     # Near a fold the step length is meaningless: bound it, and let the residual decide.
     determinant = torch.where(determinant >= 0, determinant.clamp(min=1e-3), determinant.clamp(max=-1e-3))
     u, v = error.split(1, dim=1)

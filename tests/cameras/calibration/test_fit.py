@@ -3,7 +3,15 @@ import numpy as np
 import pytest
 
 from torchrefract.cameras.calibration.boards import Chessboard
-from torchrefract.cameras.calibration.fit import Intrinsics, cross_validate, errors_in_best_pose, fit_camera, rms
+from torchrefract.cameras.calibration.fit import (
+    Intrinsics,
+    cross_validate,
+    drop_outliers,
+    errors_in_best_pose,
+    fit_camera,
+    leave_each_out,
+    rms,
+)
 
 BOARD = Chessboard(squares="9x7", square_mm=25)
 SIZE = (800, 600)
@@ -86,3 +94,37 @@ def test_a_fit_is_reproducible_and_restores_the_threads_of_opencv(noisy):
     finally:
         cv2.setNumThreads(before)
     assert len(matrices) == 1
+
+
+def bend(view):
+    """Shift the corners as on a board that sags by 8 px."""
+    x = view.corners[:, 0]
+    t = 2 * (x - x.min()) / (x.max() - x.min()) - 1
+    return view._replace(corners=view.corners + np.stack([0 * x, 8 * (1 - t**2)], axis=1))
+
+
+def test_no_view_of_a_good_set_is_dropped(noisy):
+    selection = drop_outliers(noisy, BOARD, model="opencv5", size=SIZE)
+    assert selection.dropped == {}
+    assert [view.name for view in selection.views] == [view.name for view in noisy]
+    assert [result.others for result in selection.ranking] == sorted(result.others for result in selection.ranking)
+
+
+def test_bent_views_are_dropped_with_a_reason(noisy):
+    mixed = [bend(view) if i in (0, 7) else view for i, view in enumerate(noisy)]
+    selection = drop_outliers(mixed, BOARD, model="opencv5", size=SIZE)
+    assert set(selection.dropped) == {noisy[0].name, noisy[7].name}
+    good = fit_camera([view for i, view in enumerate(noisy) if i not in (0, 7)], BOARD, model="opencv5", size=SIZE)
+    np.testing.assert_allclose(selection.fit.intrinsics.values, good.intrinsics.values, rtol=1e-6)
+    assert all(reason.startswith("its error is ") for reason in selection.dropped.values())
+    assert len(drop_outliers(mixed, BOARD, model="opencv5", size=SIZE, max_share=0.15).dropped) == 1
+    assert drop_outliers(mixed, BOARD, model="opencv5", size=SIZE, max_share=0.0).dropped == {}
+
+
+def test_leaving_a_view_out_is_a_fit_to_the_others(noisy):
+    result = leave_each_out(noisy, BOARD, fit_camera(noisy, BOARD, model="opencv5", size=SIZE), size=SIZE)[3]
+    others = fit_camera(noisy[:3] + noisy[4:], BOARD, model="opencv5", size=SIZE)
+    assert result.name == noisy[3].name
+    assert result.others == pytest.approx(others.rms, rel=1e-5)
+    assert result.median == pytest.approx(float(np.median([rms(errors) for errors in others.errors])), rel=1e-4)
+    assert result.limit >= 3 * result.median

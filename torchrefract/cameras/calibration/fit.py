@@ -1,4 +1,4 @@
-"""Least-squares fit of a camera to views of a board, with standard deviations and cross-validation."""
+"""Least-squares fit of a camera to views of a board, with standard deviations, cross-validation and outliers."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -24,6 +24,9 @@ MIN_VIEWS = 3  # of a fit; cross-validation needs one more
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-10)
 _MAX_RMS = 0.05  # of the width of the frame; a larger error means that the fit failed
 _MAX_POSE_STEPS = 30
+_NUM_DEVIATIONS = 6.0  # standard deviations of the rms of the other views
+_RATIO = 3.0  # to the median rms of the other views
+_MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
 class Intrinsics(NamedTuple):
@@ -93,8 +96,7 @@ def fit_camera(
         raise ValueError(f"views must be at least {MIN_VIEWS}, got {len(views)}")
     objects, images = [board.corners(view.ids) for view in views], [view.corners for view in views]
     try:
-        run = _run_fisheye if model == "fisheye" else _run_opencv
-        intrinsics, poses = run(objects, images, model, size, start)
+        intrinsics, poses = _minimize(objects, images, model, size, start)
     except cv2.error as error:
         reason = " ".join(str(error.err or error).split())
         raise ValueError(f"views must be enough for the model {model}, got {len(views)}: {reason}") from error
@@ -169,33 +171,100 @@ def cross_validate(
     return errors
 
 
-def _run_opencv(
+class LeaveOneOut(NamedTuple):
+    """The effect of leaving one view out of the fit; all errors in px rms."""
+
+    name: str  # of the view
+    error: float  # of the view with the camera fitted to the others
+    others: float  # error of the others without the view
+    median: float  # of the errors of each of the others
+    limit: float  # of the error, above which the view is an outlier
+
+    @property
+    def is_outlier(self) -> bool:
+        """Return True if the view fits the others far worse than they fit each other."""
+        return self.error > self.limit
+
+    def reason(self, before: float) -> str:
+        """Say why the view is dropped; `before` is the rms of the other views in a fit to all of them, px."""
+        return (
+            f"its error is {self.error:.2f} px rms if it is left out of the fit; the others have a median of "
+            f"{self.median:.2f} px, and the limit is {self.limit:.2f} px. Without it the others have "
+            f"{self.others:.2f} px instead of {before:.2f} px"
+        )
+
+
+class Selection(NamedTuple):
+    """The views that fit each other."""
+
+    views: list[View]
+    fit: Fit  # to these views
+    ranking: list[LeaveOneOut]  # of these views, the one that costs the others most first
+    dropped: dict[str, str]  # the reason by the name of each dropped view
+
+
+def leave_each_out(views: Sequence[View], board: Board, fit: Fit, *, size: tuple[int, int]) -> list[LeaveOneOut]:
+    """Leave each of at least four views, which `fit` is to, out in turn.
+
+    limit = max(3 m, m + 6 * 1.4826 median |e_j - m|),  m = median e_j,  e_j the rms of the other views
+    """
+    results = []
+    for i, view in enumerate(views):
+        others = [*views[:i], *views[i + 1 :]]
+        other_fit = fit_camera(others, board, model=fit.intrinsics.model, size=size, start=fit.intrinsics)
+        errors = np.array([rms(errors) for errors in other_fit.errors])
+        median = float(np.median(errors))
+        deviation = _MAD_TO_SIGMA * float(np.median(np.abs(errors - median)))
+        error = rms(errors_in_best_pose(view, board, other_fit.intrinsics, fit.poses[i]))
+        limit = max(_RATIO * median, median + _NUM_DEVIATIONS * deviation)
+        results.append(LeaveOneOut(view.name, error, other_fit.rms, median, limit))
+    return results
+
+
+def drop_outliers(
+    views: Sequence[View], board: Board, *, model: str, size: tuple[int, int], max_share: float = 0.25
+) -> Selection:
+    """Drop views that do not fit the others, one at a time.
+
+    Of all outliers, drops the one whose absence gives the others the smallest rms. Then fits again, until no outlier
+    remains or no more views may be dropped.
+
+    Args:
+        views, board, model, size: as for `fit_camera`, with at least four views.
+        max_share: of the views that may be dropped; at least four views always stay.
+    """
+    kept, dropped = list(views), dict[str, str]()
+    max_dropped = min(int(max_share * len(kept)), len(kept) - MIN_VIEWS - 1)
+    while True:
+        fit = fit_camera(kept, board, model=model, size=size)
+        ranking = sorted(leave_each_out(kept, board, fit, size=size), key=lambda result: result.others)
+        outliers = [result for result in ranking if result.is_outlier]
+        if not outliers or len(dropped) >= max_dropped:
+            return Selection(kept, fit, ranking, dropped)
+        worst = outliers[0]
+        before = [errors for view, errors in zip(kept, fit.errors, strict=True) if view.name != worst.name]
+        dropped[worst.name] = worst.reason(rms(np.concatenate(before)))
+        kept = [view for view in kept if view.name != worst.name]
+
+
+def _minimize(
     objects: list[np.ndarray], images: list[np.ndarray], model: str, size: tuple[int, int], start: Intrinsics | None
 ) -> tuple[Intrinsics, list[np.ndarray]]:
-    flags, matrix, vector = _FLAGS[model], np.eye(3), np.zeros(14)
+    """Run OpenCV's calibration, whose fisheye takes float64 and four coefficients."""
+    is_fisheye = model == "fisheye"
+    count = 4 if is_fisheye else int(model.removeprefix("opencv"))
+    matrix, vector = np.eye(3), np.zeros((4 if is_fisheye else 14, 1))
+    flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW if is_fisheye else _FLAGS[model]
     if start is not None:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
-        matrix, vector[: len(start.coefficients)] = start.matrix.copy(), start.coefficients
-    points = [points.astype(np.float32) for points in objects], [points.astype(np.float32) for points in images]
+        matrix, vector[: len(start.coefficients), 0] = start.matrix.copy(), start.coefficients
+    run, dtype = (cv2.fisheye.calibrate, np.float64) if is_fisheye else (cv2.calibrateCamera, np.float32)
+    on_board, in_picture = ([points[None].astype(dtype) for points in group] for group in (objects, images))
     with _on_one_thread():
-        result = cv2.calibrateCamera(*points, size, matrix, vector, flags=flags, criteria=_STOP)
+        result = run(on_board, in_picture, size, matrix, vector, flags=flags, criteria=_STOP)
     _, matrix, vector, rotations, translations = result
-    count = int(model.removeprefix("opencv"))
-    return Intrinsics(model, matrix, vector.ravel()[:count].copy()), _poses(rotations, translations)
-
-
-def _run_fisheye(
-    objects: list[np.ndarray], images: list[np.ndarray], model: str, size: tuple[int, int], start: Intrinsics | None
-) -> tuple[Intrinsics, list[np.ndarray]]:
-    flags, matrix, vector = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW, np.eye(3), np.zeros(4)
-    if start is not None:
-        flags |= cv2.CALIB_USE_INTRINSIC_GUESS
-        matrix, vector = start.matrix.copy(), start.coefficients.copy()
-    on_board, in_picture = ([points[None] for points in group] for group in (objects, images))
-    _, matrix, vector, rotations, translations = cv2.fisheye.calibrate(
-        on_board, in_picture, size, matrix, vector.reshape(4, 1), flags=flags, criteria=_STOP
-    )
-    return Intrinsics(model, matrix, vector.ravel()), _poses(rotations, translations)
+    poses = [np.concatenate([r.ravel(), t.ravel()]) for r, t in zip(rotations, translations, strict=True)]
+    return Intrinsics(model, matrix, vector.ravel()[:count].copy()), poses
 
 
 @contextmanager
@@ -207,10 +276,6 @@ def _on_one_thread() -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(threads)
-
-
-def _poses(rotations: Sequence[np.ndarray], translations: Sequence[np.ndarray]) -> list[np.ndarray]:
-    return [np.concatenate([r.ravel(), t.ravel()]) for r, t in zip(rotations, translations, strict=True)]
 
 
 def _deviations(

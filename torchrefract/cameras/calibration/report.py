@@ -1,25 +1,17 @@
-"""Report of a calibration in Markdown, with figures of the corners and of the errors."""
+"""Quality of a calibration, and its report in Markdown with figures of the corners and of the errors."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
+import torch
 from matplotlib.figure import Figure
 
 from torchrefract._io import replace_file
 from torchrefract.cameras.calibration.boards import Board
-from torchrefract.cameras.calibration.detection import Detection
-from torchrefract.cameras.calibration.fit import Fit, cross_validate, rms
-from torchrefract.cameras.calibration.outliers import Selection, drop_outliers
-from torchrefract.cameras.calibration.quality import (
-    CELLS,
-    calibration_warnings,
-    corner_counts,
-    straightness,
-    undistort_views,
-)
+from torchrefract.cameras.calibration.detection import Detection, View
+from torchrefract.cameras.calibration.fit import Fit, Selection, cross_validate, drop_outliers, rms
 from torchrefract.cameras.camera import Camera
 
 CAMERA_FILE, REPORT_FILE = "camera.yaml", "report.md"
@@ -28,6 +20,10 @@ _DPI = 100
 _MAX_DRAWN = 12  # views in the figure of errors, those that cost the others most
 _COLUMNS = 4  # of that figure
 _ARROW = 0.05  # of the width of the frame: the length of an arrow for an error as large as the rms
+CELLS = (6, 8)  # rows and columns of the cells that divide the frame
+_NUM_DEVIATIONS = 2.0  # standard deviations within which a coefficient may be zero
+_SIDES = {"left": np.s_[:, 0], "right": np.s_[:, -1], "top": np.s_[0], "bottom": np.s_[-1]}
+_MIN_LINE = 3  # corners of a line; two always lie on one
 
 
 class Calibration(NamedTuple):
@@ -53,13 +49,11 @@ class Calibration(NamedTuple):
 def calibrate_camera(
     detections: Sequence[Detection], board: Board, *, model: str, size: tuple[int, int], max_drop_share: float
 ) -> Calibration:
-    """Fit a camera to all usable detections, without views that do not fit the others.
+    """Fit a camera to all usable detections, at least four, without views that do not fit the others.
 
     Args:
-        detections: with at least four that have no problem.
-        board: that was detected.
-        model: of `fit.LENS_MODELS`.
-        size: width and height of the pictures, px.
+        detections, board: as for `detect`.
+        model, size: as for `fit_camera`.
         max_drop_share: of the views that may be dropped.
 
     Raises:
@@ -72,13 +66,7 @@ def calibrate_camera(
 
 
 def write_report(calibration: Calibration, read_gray: Callable[[str], np.ndarray], folder: Path) -> None:
-    """Write report.md, coverage.png and residuals.png.
-
-    Args:
-        calibration: to report.
-        read_gray: returns the picture of a view by its name, (H, W), uint8.
-        folder: to write to.
-    """
+    """Write report.md, coverage.png and residuals.png; `read_gray` returns (H, W), uint8, by the name of a view."""
     figures = _draw_coverage(calibration), _draw_residuals(calibration, read_gray)
     for name, figure in zip(_FIGURES, figures, strict=True):
         with replace_file(folder / name) as path:
@@ -90,12 +78,6 @@ def write_failure(board: Board, detections: Sequence[Detection], problem: str, f
     """Write report.md of a failed calibration, and rename the results of an earlier one.
 
     An earlier camera.yaml becomes camera_before.yaml, so that it is not mistaken for the result of this run.
-
-    Args:
-        board: that was searched.
-        detections: in the pictures.
-        problem: why there is no camera.
-        folder: to write to.
     """
     for name in (CAMERA_FILE, *_FIGURES):
         if (folder / name).is_file():
@@ -213,17 +195,101 @@ def _draw_residuals(calibration: Calibration, read_gray: Callable[[str], np.ndar
     )
     for k, name in enumerate(names):
         axes = figure.add_subplot(rows, _COLUMNS, k + 1)
-        _draw_view(axes, calibration, index[name], read_gray(name), scale)
+        corners, errors = calibration.selection.views[index[name]].corners, calibration.fit.errors[index[name]]
+        gray = read_gray(name)
+        axes.imshow(gray, cmap="gray", vmin=-255, vmax=255)  # pale, so that the arrows stand out
+        options = {"angles": "xy", "scale_units": "xy", "scale": 1 / scale, "color": "#d00000", "width": 0.004}
+        axes.quiver(*corners.T, *errors.T, **options)
+        axes.set_xlim(-0.5, gray.shape[1] - 0.5)
+        axes.set_ylim(gray.shape[0] - 0.5, -0.5)
+        axes.set_axis_off()
+        axes.set_title(f"{name}: {rms(errors):.3f} px", fontsize=10, parse_math=False)
     return figure
 
 
-def _draw_view(axes: Axes, calibration: Calibration, i: int, gray: np.ndarray, scale: float) -> None:
-    view, errors = calibration.selection.views[i], calibration.fit.errors[i]
-    axes.imshow(gray, cmap="gray", vmin=-255, vmax=255)  # pale, so that the arrows stand out
-    axes.quiver(
-        *view.corners.T, *errors.T, angles="xy", scale_units="xy", scale=1 / scale, color="#d00000", width=0.004
-    )
-    axes.set_xlim(-0.5, gray.shape[1] - 0.5)
-    axes.set_ylim(gray.shape[0] - 0.5, -0.5)
-    axes.set_axis_off()
-    axes.set_title(f"{view.name}: {rms(errors):.3f} px", fontsize=10, parse_math=False)
+def corner_counts(views: Sequence[View], size: tuple[int, int]) -> np.ndarray:
+    """Count the corners in each of 6 x 8 cells of a frame of (width, height) px."""
+    corners = np.concatenate([view.corners for view in views]) + 0.5
+    limits = [(0, size[1]), (0, size[0])]
+    return np.histogram2d(corners[:, 1], corners[:, 0], bins=CELLS, range=limits)[0].astype(int)
+
+
+def calibration_warnings(views: Sequence[View], fit: Fit, camera: Camera) -> list[str]:
+    """Return warnings about a calibration: sides without corners, coefficients near zero, and `camera_warnings`."""
+    counts, messages = corner_counts(views, (camera.width, camera.height)), []
+    empty = [
+        f"{side} ({np.sum(counts[cells] == 0)} of {counts[cells].size} cells)"
+        for side, cells in _SIDES.items()
+        if (counts[cells] == 0).mean() >= 0.5
+    ]
+    if empty:
+        messages.append(
+            f"The frame has few corners at the {', '.join(empty)}: the model is extrapolated there. Add pictures with "
+            "the board near the border."
+        )
+    rows = zip(fit.intrinsics.names[4:], fit.intrinsics.values[4:], fit.deviations[4:], strict=True)
+    vague = [
+        f"{name} = {value:.4g} +- {deviation:.2g}"
+        for name, value, deviation in rows
+        if abs(value) < _NUM_DEVIATIONS * deviation
+    ]
+    if vague:
+        messages.append(
+            f"These coefficients are zero within two standard deviations: {', '.join(vague)}. A lens_model with fewer "
+            "coefficients may be enough."
+        )
+    return [*messages, *camera_warnings(camera)]
+
+
+def camera_warnings(camera: Camera) -> list[str]:
+    """Return warnings about a model that folds back, or has a pole, inside the frame."""
+    messages = []
+    if (share := camera.coverage()) < 1:
+        messages.append(
+            f"The model folds back inside the frame: {1 - share:.1%} of it has no ray. Use a lens_model with fewer "
+            "coefficients, or add pictures with corners near the border."
+        )
+    try:
+        camera.check_pole()
+    except ValueError as error:
+        messages.append(f"The model has a pole inside the frame: {error}. Use a lens_model with fewer coefficients.")
+    return messages
+
+
+def straightness(views: Sequence[View], board: Board) -> float:
+    """Return the distance of corners of one row or column of a board from the line that fits them best, px rms.
+
+        sqrt(sum d^2 / sum (n - 2)),  d the distances of the n corners of a line, over all lines with n >= 3
+
+    A line has two parameters, so that noise of s px in each coordinate gives s.
+
+    Raises:
+        ValueError: no row or column has three corners.
+    """
+    squares, degrees_of_freedom = 0.0, 0
+    for view in views:
+        for line in _lines(view, board):
+            # The smaller singular value is the root of the sum of squared distances from the line.
+            squares += float(np.linalg.svd(line - line.mean(axis=0), compute_uv=False)[1]) ** 2
+            degrees_of_freedom += len(line) - 2
+    if degrees_of_freedom == 0:
+        raise ValueError(f"views must have {_MIN_LINE} corners of one row or column, got {len(views)} views without")
+    return (squares / degrees_of_freedom) ** 0.5
+
+
+def undistort_views(views: Sequence[View], camera: Camera) -> list[View]:
+    """Undistort the corners of views, as the camera's pinhole shows them; corners without a ray are dropped."""
+    focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    undistorted = []
+    for view in views:
+        points, valid, _ = camera.undistort(torch.from_numpy((view.corners - center) / focal))
+        keep = valid.numpy()
+        undistorted.append(View(view.name, view.ids[keep], points.numpy()[keep] * focal + center))
+    return undistorted
+
+
+def _lines(view: View, board: Board) -> list[np.ndarray]:
+    """Return the corners (n, 2) of each row and column that has at least three."""
+    row, column = np.divmod(view.ids, board.num_corners[0])
+    groups = [view.corners[axis == k] for axis in (row, column) for k in np.unique(axis)]
+    return [group for group in groups if len(group) >= _MIN_LINE]

@@ -6,7 +6,6 @@ from typing import Any
 
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import documents
-from torchrefract.cameras.io.yaml_documents import dump_yaml, parse_yaml
 
 _MODELS = {"radtan": "opencv", "equidistant": "fisheye", "none": "opencv"}
 
@@ -21,8 +20,8 @@ def read_kalibr(path: str | Path) -> dict[str, Camera]:
             distortion_model (fov).
     """
     path = Path(path)
-    document = parse_yaml(path, documents.read_text(path))
-    return {str(name): _camera(path, str(name), chain) for name, chain in document.items()}
+    document = documents.parse_yaml(path, documents.read_text(path))
+    return {str(name): _camera(path, str(name), chain) for name, chain in document.values.items()}
 
 
 def write_kalibr(path: str | Path, cameras: Mapping[str, Camera]) -> None:
@@ -35,31 +34,25 @@ def write_kalibr(path: str | Path, cameras: Mapping[str, Camera]) -> None:
     Raises:
         ValueError: a camera has another model or other coefficients.
     """
-    documents.write_text(Path(path), dump_yaml({name: _chain(camera) for name, camera in cameras.items()}))
+    documents.write_text(Path(path), documents.dump_yaml({name: _chain(camera) for name, camera in cameras.items()}))
 
 
 def _camera(path: Path, name: str, chain: Any) -> Camera:
-    if not isinstance(chain, dict):
+    if not isinstance(chain, Mapping):
         raise ValueError(f"path must hold a camera as {name}, got {path} with {documents.abbreviate(chain)}")
-    kind, lens = documents.entry(path, chain, "camera_model"), chain.get("distortion_model", "none")
-    if kind != "pinhole":
-        raise ValueError(
-            f"path must have pinhole as the camera_model of {name}, got {path} with {documents.abbreviate(kind)}"
-        )
-    if not isinstance(lens, str) or lens not in _MODELS:
-        raise ValueError(
-            f"path must have a distortion_model of {', '.join(_MODELS)} for {name}, got {path} with "
-            f"{documents.abbreviate(lens)}"
-        )
-    pinhole = documents.numbers(path, "intrinsics", documents.entry(path, chain, "intrinsics"), count=4)
-    resolution = documents.numbers(path, "resolution", documents.entry(path, chain, "resolution"), count=2)
-    size = [documents.integer(path, "resolution", value) for value in resolution]
-    coefficients = [0.0] * 4
-    if lens != "none":
-        coefficients = documents.numbers(
-            path, "distortion_coeffs", documents.entry(path, chain, "distortion_coeffs"), count=4
-        )
-    return documents.create_camera(path, size, pinhole, coefficients, _MODELS[lens])
+    values = documents.Document(
+        f"{path}, {name},", {**chain, "distortion_model": chain.get("distortion_model", "none")}
+    )
+    values.choice("camera_model", {"pinhole": ""})
+    model = values.choice("distortion_model", _MODELS)
+    width, height = (
+        documents.integer(values.path, "resolution", value) for value in values.numbers("resolution", count=2)
+    )
+    has_lens = values.get("distortion_model") != "none"
+    coefficients = values.numbers("distortion_coeffs", count=4) if has_lens else [0.0] * 4
+    return documents.create_camera(
+        values.path, (width, height), values.numbers("intrinsics", count=4), coefficients, model
+    )
 
 
 def _chain(camera: Camera) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from xml.etree import ElementTree
 
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import documents
-from torchrefract.cameras.io.yaml_documents import parse_yaml
 
 _XML, _YAML = ".xml", (".yml", ".yaml")
 
@@ -23,14 +22,9 @@ def read_opencv(path: str | Path) -> Camera:
         ValueError: the file holds no such camera.
     """
     path = Path(path)
-    document = _from_xml(path) if _is_xml(path) else parse_yaml(path, _plain_yaml(documents.read_text(path)))
-    size = [
-        documents.integer(path, name, documents.entry(path, document, name)) for name in ("image_width", "image_height")
-    ]
-    pinhole = documents.pinhole_of_matrix(path, "camera_matrix", _data(path, document, "camera_matrix"))
-    coefficients = documents.numbers(path, "distortion_coefficients", _data(path, document, "distortion_coefficients"))
-    is_fisheye = documents.integer(path, "fisheye_model", document.get("fisheye_model", 0))
-    return documents.create_camera(path, size, pinhole, coefficients, "fisheye" if is_fisheye else "opencv")
+    document = _parse_xml(path) if _is_xml(path) else _parse_yaml(path)
+    is_fisheye = "fisheye_model" in document.values and document.integer("fisheye_model")
+    return document.camera("fisheye" if is_fisheye else "opencv")
 
 
 def write_opencv(path: str | Path, camera: Camera) -> None:
@@ -61,32 +55,26 @@ def _is_xml(path: Path) -> bool:
     return path.suffix.lower() == _XML
 
 
-def _plain_yaml(text: str) -> str:
+def _parse_yaml(path: Path) -> documents.Document:
     # OpenCV's first line, %YAML:1.0, is not a valid directive of YAML.
+    text = documents.read_text(path)
     first, _, rest = text.partition("\n")
-    return rest if first.startswith("%YAML") else text
+    return documents.parse_yaml(path, rest if first.startswith("%YAML") else text)
 
 
-def _from_xml(path: Path) -> dict[str, Any]:
+def _parse_xml(path: Path) -> documents.Document:
     try:
         root = ElementTree.fromstring(documents.read_text(path))
     except ElementTree.ParseError as error:
         raise ValueError(f"path must hold XML, got {path}: {error}") from error
-    return {node.tag: _from_node(node) for node in root}
+    return documents.Document(path, {node.tag: _value(node) for node in root})
 
 
-def _from_node(node: ElementTree.Element) -> Any:
+def _value(node: ElementTree.Element) -> Any:
     values = {child.tag: (child.text or "").strip() for child in node}
     if "data" in values:
         return values | {"data": values["data"].split()}
     return (node.text or "").strip()
-
-
-def _data(path: Path, document: Any, name: str) -> Any:
-    matrix = documents.entry(path, document, name)
-    if not isinstance(matrix, dict) or "data" not in matrix:
-        raise ValueError(f"path must hold a matrix as {name}, got {path} with {documents.abbreviate(matrix)}")
-    return matrix["data"]
 
 
 def _yaml_text(scalars: dict[str, int], matrices: dict[str, tuple[int, int, list[float]]]) -> str:

@@ -5,7 +5,6 @@ from typing import Any
 
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import documents
-from torchrefract.cameras.io.yaml_documents import dump_yaml, parse_yaml
 
 _MODELS = {"plumb_bob": "opencv", "rational_polynomial": "opencv", "equidistant": "fisheye"}
 
@@ -20,18 +19,8 @@ def read_ros(path: str | Path) -> Camera:
         ValueError: the file holds no such camera, or one with another distortion_model.
     """
     path = Path(path)
-    document = parse_yaml(path, documents.read_text(path))
-    size = [
-        documents.integer(path, name, documents.entry(path, document, name)) for name in ("image_width", "image_height")
-    ]
-    name = documents.entry(path, document, "distortion_model")
-    if not isinstance(name, str) or name not in _MODELS:
-        raise ValueError(
-            f"path must have a distortion_model of {', '.join(_MODELS)}, got {path} with {documents.abbreviate(name)}"
-        )
-    pinhole = documents.pinhole_of_matrix(path, "camera_matrix", _data(path, document, "camera_matrix"))
-    coefficients = documents.numbers(path, "distortion_coefficients", _data(path, document, "distortion_coefficients"))
-    return documents.create_camera(path, size, pinhole, coefficients, _MODELS[name])
+    document = documents.parse_yaml(path, documents.read_text(path))
+    return document.camera(document.choice("distortion_model", _MODELS))
 
 
 def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None:
@@ -62,16 +51,7 @@ def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None
         "rectification_matrix": _matrix(3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
         "projection_matrix": _matrix(3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
     }
-    documents.write_text(Path(path), dump_yaml(document))
-
-
-def _data(path: Path, document: Any, name: str) -> Any:
-    matrix = documents.entry(path, document, name)
-    if not isinstance(matrix, dict):
-        raise ValueError(
-            f"path must hold rows, cols and data as {name}, got {path} with {documents.abbreviate(matrix)}"
-        )
-    return documents.entry(path, matrix, "data")
+    documents.write_text(Path(path), documents.dump_yaml(document))
 
 
 def _matrix(rows: int, columns: int, data: list[float]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import pytest
 from torchrefract.cameras.calibration.boards import Chessboard
 from torchrefract.cameras.calibration.detection import View
 from torchrefract.cameras.calibration.fit import fit_camera
-from torchrefract.cameras.calibration.quality import (
+from torchrefract.cameras.calibration.report import (
     calibration_warnings,
     camera_warnings,
     corner_counts,

@@ -228,7 +228,9 @@ def test_invalid_cameras_and_arguments_raise(camera, options, error, rule):
 
 
 def test_an_invalid_lens_of_a_table_is_named():
-    with pytest.raises(ValueError, match=r"table\[1\] must show rays .* without folding back, got opencv that does so in"):
+    with pytest.raises(
+        ValueError, match=r"table\[1\] must show rays .* without folding back, got opencv that does so in"
+    ):
         LensDistortion.from_lenses([CAR, replace(CAR, coefficients=(-0.6, 0.0, 0.0, 0.0))])
     with pytest.raises(ValueError, match=r"table\[1\] must keep its denominator .* above zero inside the frame"):
         LensDistortion.from_lenses([CAR, replace(CAR, coefficients=POLE)])

@@ -24,7 +24,7 @@ _SIGMAS = 7.0
 _DERIVATIVE_SIGMAS = 4.0  # errors and derivatives are not at their largest in the same place
 _REACH = 8.0  # deviations of the spectrum beyond which nothing is left of it
 # Pixels alias the part of a covariance beyond their own frequencies, before the aperture acts: of the power at k, which
-# falls as k^-3 or faster, at most 0.045 k^3 up to k = 2.2, about where half of all frequencies lie. Beyond 5 / a an
+# falls as k^-3 or faster, at largest 0.045 k^3 up to k = 2.2, about where half of all frequencies lie. Beyond 5 / a an
 # aperture a leaves exp(-25). A Gaussian covariance has nothing there.
 _ALIASED, _HALF_OF_ALL, _SEEN = 0.045, 2.2, 5.0
 # The errors along the two axes of a composed flow, which need not be at right angles, are slightly correlated.
@@ -117,7 +117,7 @@ def _simplify(model: RandomFieldErrorModel, height: int, width: int, budget_px: 
     size = embedding_size(*sides, kind=model.covariance, length=model.length[1], aperture=model.aperture[1])
     frequencies = Frequencies(size, *(math.ceil(cutoff * n / (2 * math.pi)) for n in size))
     count = math.prod(frequencies.counts)
-    has_fewer = all(2 * most + 1 < n for most, n in zip(frequencies[1:], size, strict=True))
+    has_fewer = all(2 * largest + 1 < n for largest, n in zip(frequencies[1:], size, strict=True))
     if model.covariance == "gaussian":
         # The covariance is summed over the ways around the domain only if that is large enough.
         is_cheaper, has_room = count <= _MAX_FREQUENCIES, reach <= min(size)

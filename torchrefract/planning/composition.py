@@ -55,7 +55,7 @@ class PlannedWarp(NamedTuple):
 
 @dataclass(frozen=True)
 class CompositionPlan:
-    """How the composed flow of warps in a row is computed.
+    """The plan of the composed flow of warps in a row.
 
     stride: px between the nodes; 1 computes every pixel.
     plans: of each warp.
@@ -76,7 +76,7 @@ class CompositionPlan:
 
 @dataclass(frozen=True)
 class ComposePlan:
-    """How a `Compose` is computed for frames of one size.
+    """The plan of a `Compose` for frames of one size.
 
     height, width: px, of the frame.
     tolerance_px: largest error of the composed flow; None is exact.
@@ -138,7 +138,7 @@ def plan_composition(warps: tuple[PlannedWarp, ...], request: PlanRequest) -> Co
     plans = _plan_shares(warps, request, request.remaining_px())
     errors = [_own_error(plan, warp) for plan, warp in zip(plans, warps, strict=True)]
     counted = zip(errors, _stretches(plans), plans, strict=True)
-    error = _total([(own * stretch, plan.is_random) for own, stretch, plan in counted if own > 0])
+    error = _total([(error * stretch, plan.is_random) for error, stretch, plan in counted if error > 0])
     return CompositionPlan(1, tuple(plans), error, _composed_gradient(plans))
 
 

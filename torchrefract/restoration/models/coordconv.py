@@ -1,4 +1,4 @@
-"""What both feed-forward baselines share: pixel coordinates as input channels and a polynomial head for smooth maps."""
+"""Parts that both feed-forward baselines share: pixel coordinates as input channels and a polynomial head for smooth maps."""
 
 from collections.abc import Callable
 from typing import Any, cast

@@ -24,7 +24,7 @@ _SIGMAS = 7.0
 _DERIVATIVE_SIGMAS = 4.0  # errors and derivatives are not at their largest in the same place
 _REACH = 8.0  # deviations of the spectrum beyond which nothing is left of it
 # Pixels alias the part of a covariance beyond their own frequencies, before the aperture acts: of the power at k, which
-# falls as k^-3 or faster, at largest 0.045 k^3 up to k = 2.2, about where half of all frequencies lie. Beyond 5 / a an
+# falls as k^-3 or faster, at most 0.045 k^3 up to k = 2.2, about where half of all frequencies lie. Beyond 5 / a an
 # aperture a leaves exp(-25). A Gaussian covariance has nothing there.
 _ALIASED, _HALF_OF_ALL, _SEEN = 0.045, 2.2, 5.0
 # The errors along the two axes of a composed flow, which need not be at right angles, are slightly correlated.

@@ -1,4 +1,4 @@
-"""Parts that both feed-forward baselines share: pixel coordinates as input channels and a polynomial head for smooth maps."""
+"""Parts of both feed-forward baselines: pixel coordinates as input channels and a polynomial head for smooth maps."""
 
 from collections.abc import Callable
 from typing import Any, cast

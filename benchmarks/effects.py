@@ -2,15 +2,14 @@
 
 python benchmarks/effects.py [--size 1080x1920] [--threads 2] [--repeats 15] [--backend auto torch] [--real PATH]
                              [--out benchmarks/results/effects.json]
-python benchmarks/effects.py --calls
+python benchmarks/effects.py --calls [--verbose]
 """
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import torch
@@ -65,6 +64,7 @@ LENS, COMPOSITION = "lens", "composition of four warps and fog"
 # Files, functions and calls of the package that one call may cross.
 CALL_LIMITS = {LENS: (14, 60, 120), COMPOSITION: (24, 150, 500)}
 CALL_SIZE = (256, 256)  # px; the counts hardly depend on it
+NUM_FUNCTIONS = 25  # of each table of functions
 
 
 def main() -> None:
@@ -74,10 +74,11 @@ def main() -> None:
         "--backend", nargs="+", choices=["auto", "torch", "numba"], default=["auto", "torch"], help="auto torch"
     )
     options.add_argument("--calls", action="store_true", help="count Python calls instead")
+    options.add_argument("--verbose", action="store_true", help="with --calls: list the functions with the most calls")
     args = options.parse_args()
     torch.manual_seed(0)
     if args.calls:
-        print(*call_bars(), sep="\n")
+        print(*call_report(num_functions=NUM_FUNCTIONS if args.verbose else 0), sep="\n")
         return
     try:
         frame = frame_of(args.real, args.size)
@@ -127,15 +128,33 @@ def speed_bars(timings: Sequence[Timing]) -> list[Bar]:
 
 @dataclass(frozen=True)
 class Calls:
-    """Files and functions of the package that ran, and how often functions were entered."""
+    """How often each function of the package was entered, by file and qualified name."""
 
-    files: int
-    functions: int
-    calls: int
+    entered: Mapping[tuple[str, str], int]
+
+    @property
+    def files(self) -> int:
+        """Return the number of files whose code ran."""
+        return len({file for file, _ in self.entered})
+
+    @property
+    def functions(self) -> int:
+        """Return the number of functions that ran."""
+        return len(self.entered)
+
+    @property
+    def calls(self) -> int:
+        """Return how often functions were entered."""
+        return sum(self.entered.values())
+
+    def most_called(self, count: int) -> list[str]:
+        """Format the functions with the most calls, one a line."""
+        ranked = sorted(self.entered.items(), key=lambda item: (-item[1], item[0]))
+        return [f"{number:6}  {file}: {function}" for (file, function), number in ranked[:count]]
 
 
 def count_calls(call: Candidate) -> Calls:
-    """Count the files, functions and calls inside torchrefract during one call, by sys.setprofile.
+    """Count the calls inside torchrefract during one call, by sys.setprofile.
 
     Lambdas, comprehensions and generators count as functions, and each resumption of a generator as a call.
     """
@@ -144,7 +163,7 @@ def count_calls(call: Candidate) -> Calls:
     def profile(frame: Any, event: str, _: Any) -> None:
         code = frame.f_code
         if event == "call" and code.co_filename.startswith(PACKAGE):
-            key = code.co_filename, code.co_qualname
+            key = str(Path(code.co_filename).relative_to(PACKAGE)), code.co_qualname
             entered[key] = entered.get(key, 0) + 1
 
     previous = sys.getprofile()
@@ -153,24 +172,28 @@ def count_calls(call: Candidate) -> Calls:
         call()
     finally:
         sys.setprofile(previous)
-    return Calls(len({file for file, _ in entered}), len(entered), sum(entered.values()))
+    return Calls(entered)
 
 
-def call_bars() -> list[Bar]:
-    """Count the calls of a lens and of a composition, warm and on the first call of a new range."""
+def call_report(*, num_functions: int = 0) -> list[Bar | str]:
+    """Count the calls of a lens and of a composition, warm and on the first call of a new range.
+
+    Args:
+        num_functions: how many of the functions with the most calls to list.
+    """
     image = torch.rand(1, 3, *CALL_SIZE)
-    bars = []
+    lines: list[Bar | str] = []
     for name, make in ((LENS, _lens), (COMPOSITION, _composition)):
-        warm = make(0.0)
+        warm, cold = make(0.0), make(1e-3)
         for _ in range(3):
             warm(image)
-        counts = [count_calls(lambda warm=warm: warm(image)) for _ in range(5)]
-        cold = make(1e-3)
-        first = count_calls(lambda cold=cold: cold(image))
-        for state, counted in (("warm", _median(counts)), ("first call of a new range", first)):
+        counts = sorted((count_calls(partial(warm, image)) for _ in range(5)), key=lambda counted: counted.calls)
+        first = count_calls(partial(cold, image))
+        for state, counted in (("warm", counts[len(counts) // 2]), ("first call of a new range", first)):
             for unit, limit in zip(("files", "functions", "calls"), CALL_LIMITS[name], strict=True):
-                bars.append(Bar(f"{name}, {state}", getattr(counted, unit), "<=", limit, unit))
-    return bars
+                lines.append(Bar(f"{name}, {state}", getattr(counted, unit), "<=", limit, unit))
+            lines += counted.most_called(num_functions)
+    return lines
 
 
 def _lens(offset: float) -> Any:
@@ -180,10 +203,6 @@ def _lens(offset: float) -> Any:
 def _composition(offset: float) -> Any:
     lens = tr.LensDistortion(center_x_range=(-0.01 - offset, 0.01))
     return tr.Compose([lens, tr.ThinPlateSpline(), tr.Turbulence(), tr.DivergenceFree(), tr.UniformFog()])
-
-
-def _median(counts: Sequence[Calls]) -> Calls:
-    return Calls(*(round(median(getattr(c, unit) for c in counts)) for unit in ("files", "functions", "calls")))
 
 
 if __name__ == "__main__":

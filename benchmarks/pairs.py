@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from arguments import count, size
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from timing import RESULTS, count, size
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.benchmark import Timer
 from torch.utils.data import DataLoader, Dataset
@@ -256,7 +256,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--maps", choices=FORMATS, default="png", help="format of the maps, png")
     parser.add_argument("--seconds", type=float, default=2.0, help="duration of a measurement of the loader, 2")
     parser.add_argument("--disk", type=Path, help="folder for temporary pairs, the system's default")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "pairs.json", help="the JSON")
+    parser.add_argument("--out", type=Path, default=RESULTS / "pairs.json", help="JSON file to write")
     return parser
 
 

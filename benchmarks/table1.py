@@ -24,8 +24,7 @@ from statistics import median
 from typing import NamedTuple, cast
 
 import torch
-from arguments import count
-from slow_timing import seconds
+from timing import RESULTS, count, seconds
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
@@ -105,7 +104,7 @@ class Line:
 def main() -> None:
     """Train or load the models, score them, print the tables and save them."""
     args = _parser().parse_args()
-    args.out = args.out or Path(__file__).parent / "results" / f"table1_{args.scale}"
+    args.out = args.out or RESULTS / f"table1_{args.scale}"
     torch.set_num_threads(args.threads)
     lines = list[Line]()
     for task in TASKS:
@@ -254,7 +253,7 @@ def _score_model(
             name: score((_call(model, pair.degraded) for pair in chosen), chosen) for name, chosen in batches.items()
         }
         call = partial(_call_and_wait, model, first[0].degraded[:1])
-        milliseconds = 1e3 * median(seconds(call, before=i == 0) for i in range(3))
+        milliseconds = 1e3 * median(seconds(call, warmup=int(i == 0)) for i in range(3))
         name = f"DDPM, {steps} steps" if is_sampled else loaded.name
         line = Line(task, "", "", name, _NO_SCORES, 0, loaded.size, parameters, milliseconds)
         yield from _lines(line, by_effect, _keys(first), groups)

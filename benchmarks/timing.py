@@ -1,7 +1,8 @@
 """Measure, print and save timings: what all benchmarks share.
 
 Candidates take turns in one process. A round runs each of them once, so that a disturbance of the machine affects all
-alike. A ratio is taken within a round; its median and quartiles are over the rounds.
+alike. A ratio is taken within a round; its median and quartiles are over the rounds. `measure` times many short calls,
+`alternate` a few long ones.
 """
 
 import argparse
@@ -177,12 +178,12 @@ def measure(
     previous = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        trials = {name: _seconds(name, call, 1, 1, clock) for name, call in candidates.items()}
+        trials = {name: _named_seconds(name, call, 1, 1, clock) for name, call in candidates.items()}
         is_slow = {name: trials[name] >= _SLOW_S and name not in references for name in candidates}
         calls = {name: max(1, min(_MAX_CALLS, round(_STRETCH_S / max(trials[name], 1e-9)))) for name in candidates}
         rounds = [
             {
-                name: _seconds(name, call, calls[name], 0 if is_slow[name] else 2, clock)
+                name: _named_seconds(name, call, calls[name], 0 if is_slow[name] else 2, clock)
                 for name, call in candidates.items()
                 if i < slow_repeats or not is_slow[name]
             }
@@ -193,15 +194,42 @@ def measure(
     return [_timing(name, calls[name], [r for r in rounds if name in r], references) for name in candidates]
 
 
-def _seconds(name: str, call: Candidate, number: int, warmup: int, clock: Callable[[], float]) -> float:
-    """Return the seconds of one call, as the mean of several after some untimed ones."""
+def alternate(
+    candidates: Mapping[str, Candidate],
+    *,
+    reference: str,
+    rounds: int,
+    clock: Callable[[], float] = benchmark.timer,
+) -> list[Timing]:
+    """Time calls of a second or more, such as training steps: one call of each candidate in turn, once in every round.
+
+    Args:
+        candidates: functions to call, by name; each is called once before the first round.
+        reference: name of the candidate to divide by.
+        rounds: number of rounds.
+        clock: returns seconds; the default waits for an accelerator first.
+    """
+    for call in candidates.values():
+        call()
+    times = [{name: seconds(call, clock=clock) for name, call in candidates.items()} for _ in range(rounds)]
+    return [_timing(name, 1, times, [reference]) for name in candidates]
+
+
+def seconds(
+    call: Candidate, *, number: int = 1, warmup: int = 0, clock: Callable[[], float] = benchmark.timer
+) -> float:
+    """Return the seconds of one call, as the mean of `number` calls after `warmup` untimed ones."""
+    for _ in range(warmup):
+        call()
+    start = clock()
+    for _ in range(number):
+        call()
+    return (clock() - start) / number
+
+
+def _named_seconds(name: str, call: Candidate, number: int, warmup: int, clock: Callable[[], float]) -> float:
     try:
-        for _ in range(warmup):
-            call()
-        start = clock()
-        for _ in range(number):
-            call()
-        return (clock() - start) / number
+        return seconds(call, number=number, warmup=warmup, clock=clock)
     except Exception as error:  # raised again with the name of the candidate
         raise RuntimeError(f"candidate {name!r} failed: {type(error).__name__}: {error}") from error
 
@@ -243,15 +271,15 @@ def _weak_lens(frame: Tensor) -> Tensor:
     return torch.stack([inward * x, inward * y]).expand(batch, -1, -1, -1)
 
 
-def table(timings: Sequence[Timing], conditions: Conditions) -> str:
-    """Format the timings, median and quartiles, below the conditions of the run."""
+def table(timings: Sequence[Timing], conditions: Conditions | None = None) -> str:
+    """Format the timings, median and quartiles, below the conditions of the run if they are given."""
     names = list(timings[0].ratios)
     head = ["candidate", "ms", *(f"x {name}" for name in names)]
     rows = [[t.name, str(t.milliseconds), *(str(t.ratios[name]) for name in names)] for t in timings]
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in (head, *rows)]
     rule = "  ".join("-" * width for width in widths)
-    return "\n".join([_describe(conditions), "", lines[0], rule, *lines[1:]])
+    return "\n".join([*([] if conditions is None else [_describe(conditions), ""]), lines[0], rule, *lines[1:]])
 
 
 def save(
@@ -340,7 +368,7 @@ def _digits(value: float) -> str:
 
 
 def _spread(values: Sequence[float]) -> Spread:
-    lower, median, upper = quantiles(values, n=4, method="inclusive")
+    lower, median, upper = quantiles(values, n=4, method="inclusive") if len(values) > 1 else 3 * list(values)
     return Spread(median, lower, upper)
 
 

@@ -146,6 +146,30 @@ def _lens(dice: random.Random, *_: int) -> Callable[[float | None], Any]:
     return _warp(tr.LensDistortion, ranges)
 
 
+def _rectification(dice: random.Random, height: int, width: int) -> Callable[[float | None], Any]:
+    def coefficient(low: float, high: float) -> float:
+        return dice.choice((-1, 1)) * log_uniform(dice, low, high)
+
+    model = dice.choice(("opencv", "fisheye"))
+    if model == "opencv":
+        k1, k2, p1, p2, k3 = (coefficient(1e-4, high) for high in (0.4, 0.1, 0.01, 0.01, 0.02))
+        coefficients = (k1, k2, p1, p2, k3)
+    else:
+        coefficients = tuple(coefficient(1e-4, high) for high in (0.1, 0.03, 0.01, 0.003))
+    fx = width * log_uniform(dice, 0.4, 4.0)
+    camera = tr.Camera(
+        width=width,
+        height=height,
+        fx=fx,
+        fy=fx * dice.uniform(0.9, 1.1),
+        cx=width * dice.uniform(0.4, 0.6),
+        cy=height * dice.uniform(0.4, 0.6),
+        coefficients=coefficients,
+        model=model,
+    )
+    return lambda tolerance: tr.Rectification(camera, tolerance_px=tolerance)
+
+
 def _thin_plate(dice: random.Random, *_: int) -> Callable[[float | None], Any]:
     smoothing = (0.0, 0.0) if dice.random() < 0.5 else _range(dice, 1e-6, 1.0)
     ranges: dict[str, Any] = {"lattice": (dice.randint(2, 8), dice.randint(2, 8)), "smoothing_range": smoothing}
@@ -244,6 +268,7 @@ def _flare(dice: random.Random, *_: int) -> Callable[[float | None], Any]:
 
 CONFIGURATIONS: dict[str, Configuration] = {
     "LensDistortion": _lens,
+    "Rectification": _rectification,
     "ThinPlateSpline": _thin_plate,
     "Turbulence": _turbulence,
     "rough Turbulence": _rough_turbulence,

@@ -5,21 +5,31 @@ python benchmarks/training.py [--batch 16] [--size 256x256] [--threads 2] [--rep
 """
 
 import argparse
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
 import torch
-from arguments import count, size
-from slow_timing import alternate
-from subjects import effects
-from timing import FEWEST_REPEATS, GRID_SAMPLE, Bar, Candidate, Conditions, Timing, measure, references, table
+from timing import (
+    GRID_SAMPLE,
+    MIN_REPEATS,
+    RESULTS,
+    Bar,
+    Candidate,
+    Conditions,
+    alternate,
+    count,
+    effects,
+    measure,
+    references,
+    save,
+    size,
+    table,
+)
 from torch import Tensor
 
 from torchrefract import presets
-from torchrefract._io import replace_file
 from torchrefract.data.module import make_pair
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
@@ -31,11 +41,11 @@ WHAT = (
     "First table: effect(image) with new draws in every call and the gradient of the image, forward and backward, in "
     "multiples of a bare F.grid_sample of the same batch with the same gradient; warps within 0.05 px. Further tables: "
     "a training step of the ResUNet (forward, loss, backward, AdamW) from pairs made before, and with pairs made on "
-    "the fly (degraded image, restore flow and its validity), in turn; median, least and most of the rounds."
+    "the fly (degraded image, restore flow and its validity), in turn."
 )
 BARE = f"{GRID_SAMPLE}, forward + backward"
 BEFORE, FLY = "step, pairs made before", "step, pairs made on the fly"
-EFFECT_LIMIT, STEP_LIMIT = 1.3, 1.10
+EFFECT_LIMIT, STEP_LIMIT = 1.3, 1.08  # largest multiples of the references
 SEED = 7
 TASKS: Mapping[str, tuple[Callable[[], Task], Callable[[], Effect]]] = {
     "undistort, cheap_dashcam": (Undistort, presets.cheap_dashcam),
@@ -44,7 +54,7 @@ TASKS: Mapping[str, tuple[Callable[[], Task], Callable[[], Effect]]] = {
 
 
 def main() -> None:
-    """Measure, print and save; a limit that is exceeded is printed and does not fail the command."""
+    """Measure, print and save; a limit that does not hold is marked and is no failure of the command."""
     args = _parser().parse_args()
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
@@ -57,12 +67,12 @@ def main() -> None:
     print(table(timings, conditions), "", *bars, "", sep="\n", flush=True)
     steps_by_task = {}
     for name, (task, scene) in TASKS.items():
-        steps = training_steps(Frame(image, keys, depth), task(), scene(), encoder=args.encoder)
-        steps_by_task[name] = alternate(steps, reference=BEFORE, rounds=args.rounds)
+        candidates_of_task = training_steps(Frame(image, keys, depth), task(), scene(), encoder=args.encoder)
+        steps_by_task[name] = alternate(candidates_of_task, reference=BEFORE, rounds=args.rounds)
         bars.append(Bar(name, steps_by_task[name][1].ratios[BEFORE].median, "<=", STEP_LIMIT, f"x the {BEFORE}"))
-        print(table(steps_by_task[name], conditions).partition("\n\n")[2], bars[-1], "", sep="\n", flush=True)
-    _save(args.out, timings, conditions, bars=bars, steps=steps_by_task)
-    print(f"written to {args.out}")
+        print(table(steps_by_task[name]), bars[-1], "", sep="\n", flush=True)
+    steps = {name: [asdict(timing) for timing in timed] for name, timed in steps_by_task.items()}
+    save(args.out, timings, conditions, what=WHAT, bars=bars, steps=steps)
 
 
 def candidates(frames: Tensor, chosen: Mapping[str, Effect]) -> dict[str, Candidate]:
@@ -97,36 +107,15 @@ def training_steps(frames: Frame, task: Task, scene: Effect, *, encoder: str) ->
     return {BEFORE: lambda: step(False), FLY: lambda: step(True)}
 
 
-def _save(
-    path: Path,
-    timings: Sequence[Timing],
-    conditions: Conditions,
-    *,
-    bars: Sequence[Bar],
-    steps: Mapping[str, Sequence[Timing]],
-) -> None:
-    content = {
-        "what": WHAT,
-        "conditions": asdict(conditions),
-        "timings": [asdict(timing) for timing in timings],
-        "steps": {name: [asdict(timing) for timing in timings] for name, timings in steps.items()},
-        "bars": [asdict(bar) | {"holds": bar.holds} for bar in bars],
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replace_file(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--batch", type=count(1), default=16, help="frames at once, 16")
     parser.add_argument("--size", type=size, default=(256, 256), help="height x width of the frames, 256x256")
     parser.add_argument("--threads", type=count(1), default=2, help="threads of torch on the CPU, 2")
-    parser.add_argument("--repeats", type=count(FEWEST_REPEATS), default=FEWEST_REPEATS, help="rounds, 15 or more")
+    parser.add_argument("--repeats", type=count(MIN_REPEATS), default=MIN_REPEATS, help="rounds, 15 or more")
     parser.add_argument("--rounds", type=count(1), default=5, help="of steps, 5")
     parser.add_argument("--encoder", default="tu-resnet34", help="of the ResUNet, tu-resnet34")
-    out = Path(__file__).parent / "results" / "training.json"
-    parser.add_argument("--out", type=Path, default=out, help="the JSON")
+    parser.add_argument("--out", type=Path, default=RESULTS / "training.json", help="JSON file to write")
     return parser
 
 

@@ -24,6 +24,7 @@ from torchrefract.warping.lattice import pixel_lattice
 
 _LARGEST_COEFFICIENT = 100.0
 _FARTHEST = 1e10  # widths
+_FAR_STRIDE = 64  # px; displaced points may lie as far outside the frame as the nodes of such a lattice
 _MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors are another model in another order)"
 
 
@@ -207,7 +208,8 @@ class LensDistortion(WarpEffect):
         lens = lens_in_px(params, height, width)
         if plan.details is not None:
             terms = ALL_TERMS if params.coefficients.requires_grad else plan.details.terms
-            flow = newton_lens_flow(*lens, points, num_steps=plan.details.num_steps, terms=terms)
+            stride = max(points.lattice.stride, _FAR_STRIDE) if points.is_displaced else points.lattice.stride
+            flow = newton_lens_flow(*lens, points, num_steps=plan.details.steps_for(stride), terms=terms)
             return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=flow.device)
         flow, exists = lens_flow(*lens, points)
         if eager_bool(exists.all, of=exists) is False:
@@ -244,7 +246,7 @@ class LensDistortion(WarpEffect):
 
     def _ranges(self) -> LensRanges:
         others = (self.focal_range, self.aspect_range, self.center_x_range, self.center_y_range)
-        return LensRanges(tuple(getattr(self, f"{name}_range") for name in POLYNOMIAL12), *others)
+        return LensRanges(tuple([getattr(self, f"{name}_range") for name in POLYNOMIAL12]), *others)
 
     def _report_fold(self, params: LensParams, height: int, width: int) -> None:
         lens = lens_in_px(params, height, width)

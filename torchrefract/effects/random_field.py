@@ -54,6 +54,8 @@ def field_params(params: Any) -> FieldParams:
 def flow_at_points(compute: Callable[[Lattice], Tensor], points: Points, plan: WarpPlan) -> Tensor:
     """Compute a flow at the nodes of its plan, or interpolate it at other points from nodes with a wider margin.
 
+    Points farther than 32 px outside the frame get the flow of the nearest point within.
+
     Args:
         compute: returns the flow (N, 2, h, w), px, at the nodes of a lattice.
         points: nodes of the plan, or other points.
@@ -63,8 +65,10 @@ def flow_at_points(compute: Callable[[Lattice], Tensor], points: Points, plan: W
     if not points.is_displaced and points.lattice == lattice:
         return compute(lattice)
     stride = max(1, plan.stride)
-    wide = Lattice(plan.height, plan.width, stride, margin=math.ceil(_MARGIN_PX / stride))
-    return LatticeFlow(compute(wide), wide).at(points)
+    # One node more completes the cubics of the outermost points.
+    wide = Lattice(plan.height, plan.width, stride, margin=math.ceil(_MARGIN_PX / stride) + 1)
+    x, y = points.x.clamp(-_MARGIN_PX, plan.width + _MARGIN_PX), points.y.clamp(-_MARGIN_PX, plan.height + _MARGIN_PX)
+    return LatticeFlow(compute(wide), wide).at(points._replace(x=x, y=y))
 
 
 def warn_if_clipped(clipped: Tensor, params: Any, size: tuple[int, int]) -> None:

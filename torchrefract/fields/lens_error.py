@@ -24,7 +24,7 @@ _SAFETY = 1.25
 _MOST_CORNERS, _RANDOM_LENSES = 128, 16
 _LEVELS = np.array([4.0, 16.0, 64.0, 128.0, 256.0])  # px, strides at which errors are measured
 _FINE = 2  # the first levels, whose nodes lie near the frame, give the derivatives
-_CELLS = 5  # along each axis, in which errors are measured
+_CELLS = 7  # along each axis, in which errors are measured
 # Positions in strides from the corner of a cell, on a line through its middle, and weights of the values there: the
 # error of the cubic through the four nodes, and the second and third derivative.
 _LINE = (-1.0, 0.0, 0.5, 1.0, 2.0)
@@ -68,8 +68,13 @@ class LensRanges(NamedTuple):
 class LensDetails(NamedTuple):
     """The choices of a plan for the computation of a lens."""
 
-    num_steps: int  # of Newton's method
+    num_steps: tuple[int, ...]  # of Newton's method, for nodes as far outside the frame as those of each level
     terms: Terms
+
+    def steps_for(self, stride: int) -> int:
+        """Return the number of Newton steps for the nodes of a lattice."""
+        level = min(int(np.searchsorted(_LEVELS, stride)), len(self.num_steps) - 1)
+        return self.num_steps[level]
 
 
 def lens_numbers(coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
@@ -100,19 +105,21 @@ class LensErrorModel:
         measured = _measure(self.boxes, height, width)
         if measured is None:
             return None
-        used = [any(box.coefficients[i] != (0.0, 0.0) for box in self.boxes) for i in range(12)]
+        spans = np.array([box.coefficients for box in self.boxes])  # (boxes, 12, 2)
+        used: list[bool] = spans.any(axis=(0, 2)).tolist()
         dropped = _droppable(used, measured.moved_px, _DROPPED_SHARE * budget_px)
         kept = [i for i in range(12) if used[i] and i not in dropped]
-        steps = next((n for n, error in enumerate(measured.newton_px) if error <= _NEWTON_SHARE * budget_px), None)
-        if steps is None:
+        # A level needs the steps of those before it, whose nodes lie within its own.
+        enough = np.maximum.accumulate(measured.newton_px, axis=1) <= _NEWTON_SHARE * budget_px  # (steps, levels)
+        if not enough[-1].all():
             return None
-        error = sum(measured.moved_px[i] for i in dropped) + measured.newton_px[steps]
+        steps = tuple(enough.argmax(axis=0).tolist())
         return Simplification(
-            error,
-            kept=tuple(POLYNOMIAL12[i] for i in kept),
-            dropped=tuple((POLYNOMIAL12[i], measured.moved_px[i]) for i in dropped),
+            sum([measured.moved_px[i] for i in dropped]) + _NEWTON_SHARE * budget_px,
+            kept=tuple([POLYNOMIAL12[i] for i in kept]),
+            dropped=tuple([(POLYNOMIAL12[i], measured.moved_px[i]) for i in dropped]),
             details=LensDetails(steps, _terms_with(kept)),
-            why=f"cubic polynomials between nodes, {steps} Newton steps",
+            why="cubic polynomials between nodes",
         )
 
     def contains(self, params: Any) -> Tensor:
@@ -129,7 +136,7 @@ class MeasuredErrors(NamedTuple):
     """Errors of the flows of several lenses."""
 
     bounds: FlowBounds
-    newton_px: tuple[float, ...]  # after 0, 1, 2 ... steps
+    newton_px: np.ndarray  # (steps, levels), after 0, 1, 2 ... steps
     moved_px: tuple[float, ...]  # by each of the 12 coefficients alone
 
 
@@ -153,14 +160,13 @@ def _measure(boxes: tuple[LensRanges, ...], height: int, width: int) -> Measured
     if iterates is None:
         return None
     solved_x, solved_y = iterates[-1]
-    newton = [
-        _SAFETY * float(torch.hypot((near_x - solved_x) * focal[:, 0], (near_y - solved_y) * focal[:, 1]).max())
-        for near_x, near_y in iterates
-    ]
+    near = torch.stack([torch.stack(iterate) for iterate in iterates])  # (steps, 2, N, P)
+    missed = torch.hypot(*((near - near[-1]) * focal.movedim(1, 0)).unbind(1))
+    newton = _SAFETY * missed.unflatten(2, (num_levels, -1)).amax(dim=(1, 3)).numpy()
     flow = torch.stack([(solved_x - x) * focal[:, 0], (solved_y - y) * focal[:, 1]])
     stretch = torch.hypot(solved_x, solved_y) / torch.hypot(x, y).clamp(min=1e-9)
     bounds = flow_bounds(flow, num_levels, stretch)
-    return None if bounds is None else MeasuredErrors(bounds, tuple(newton), moved)
+    return None if bounds is None else MeasuredErrors(bounds, newton, moved)
 
 
 def cell_lines(height: int, width: int, num_levels: int) -> Tensor:
@@ -175,6 +181,13 @@ def cell_lines(height: int, width: int, num_levels: int) -> Tensor:
         corners = torch.from_numpy(np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 1, 2))
         points.append((corners + stride * offsets).reshape(-1, 2))
     return torch.cat(points)
+
+
+def outermost_nodes(height: int, width: int, num_levels: int) -> Tensor:
+    """Return (4, 2), px: the corners of the coarsest lattice, beyond which no node lies."""
+    stride = float(_LEVELS[num_levels - 1])
+    x, y = (torch.tensor([-stride, side - 1 + 2 * stride], dtype=torch.float64) for side in (width, height))
+    return torch.cartesian_prod(x, y)
 
 
 def flow_bounds(flow: Tensor, num_levels: int, stretch: Tensor) -> FlowBounds | None:
@@ -309,9 +322,13 @@ def _solve(x: Tensor, y: Tensor, c: Tensor) -> list[tuple[Tensor, Tensor]] | Non
     for point in itertools.islice(newton_iterates(x, y, c, terms=used_terms(c[..., 0])), _MAX_STEPS):
         iterates.append(point)
         # NaN never counts as converged.
-        if len(iterates) > 1 and all((a - b).abs().max() <= limit for a, b in zip(*iterates[-2:], strict=True)):
+        if len(iterates) > 1 and _largest_step(*iterates[-2:]) <= limit:
             return iterates
     return None
+
+
+def _largest_step(last: tuple[Tensor, Tensor], point: tuple[Tensor, Tensor]) -> Tensor:
+    return torch.stack([point[0] - last[0], point[1] - last[1]]).abs().max()
 
 
 def _droppable(used: Sequence[bool], moved_px: Sequence[float], budget_px: float) -> list[int]:
@@ -326,5 +343,5 @@ def _droppable(used: Sequence[bool], moved_px: Sequence[float], budget_px: float
 
 
 def _terms_with(kept: Sequence[int]) -> Terms:
-    radial = max([0, *(i + 1 for i in kept if i < 6)])
-    return Terms(radial, any(i in (6, 7) for i in kept), any(i > 7 for i in kept))
+    radial = [i + 1 for i in kept if i < 6]
+    return Terms(max([0, *radial]), not {6, 7}.isdisjoint(kept), not {8, 9, 10, 11}.isdisjoint(kept))

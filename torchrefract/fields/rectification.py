@@ -14,7 +14,7 @@ from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.projection import columns, image_of, on_plane, radius_within, ray_of
 from torchrefract.fields import lens
 from torchrefract.fields.lens import REACH, border_on_plane, corner_radius, in_bands
-from torchrefract.fields.lens_error import cell_lines, flow_bounds
+from torchrefract.fields.lens_error import cell_lines, flow_bounds, outermost_nodes
 from torchrefract.types import FlowBounds, Simplification
 from torchrefract.warping.grid import Points
 from torchrefract.warping.lattice import pixel_lattice
@@ -141,13 +141,15 @@ class RectificationErrorModel:
 @lru_cache(maxsize=64)
 def _measure(camera: Camera) -> FlowBounds | None:
     for num_levels in (5, 3, 2, 1):
-        points = cell_lines(camera.height, camera.width, num_levels)
+        lines = cell_lines(camera.height, camera.width, num_levels)
+        points = torch.cat([lines, outermost_nodes(camera.height, camera.width, num_levels)])
         c, focal, center = camera.tensors(points)
         x, y = ((points[None, :, i] - center[:, i, None]) / focal[:, i, None] for i in range(2))
         reach = REACH * corner_radius(focal, center, camera.height, camera.width)
         radius = radius_within(c, reach, camera.model)
         x_d, y_d, exists = image_of(x, y, torch.ones_like(x), columns(c, camera.model), camera.model, radius)
         if exists.all():
+            x, y, x_d, y_d = (value[:, : len(lines)] for value in (x, y, x_d, y_d))
             flow = torch.stack([(x_d - x) * focal[:, 0, None], (y_d - y) * focal[:, 1, None]])
             return flow_bounds(flow, num_levels, torch.hypot(x_d, y_d) / torch.hypot(x, y).clamp(min=1e-9))
     return None

@@ -22,7 +22,8 @@ If f'' has kinks there is no G, f' differs by second derivatives alone, and
 
     |r_j| <= F ((1 + L) |u_j| s + B s^2 q_j) B s^2 q_j
 
-Third differences are two of second ones. With two axes, one after the other, the second takes on the error of the first
+The sums over j are largest somewhere in the cell, whatever s is, so that they are constants (`_SUMS`). Third
+differences are two of second ones. With two axes, one after the other, the second takes on the error of the first
 sum |w_j| times, and so it takes on the errors of the nodes.
 """
 
@@ -38,10 +39,10 @@ from torchrefract.planning.plan import ErrorModel, PlanRequest, WarpPlan, plan_w
 from torchrefract.types import FlowBounds
 
 _CLOSED_FORM_SHARE = 0.05  # of the budget of the single flows, for each that drops terms only
-# px between the nodes of a composition, from coarse to fine
-_STRIDES = (16, 12, 10, 8, 6, 5, 4, 3, 2)
+# px between the nodes of a composition, from fine to coarse
+_STRIDES = np.array([2.0, 3, 4, 5, 6, 8, 10, 12, 16])
 # Shares of the tolerance that the single flows may use; the rest is for the lattice of the composition.
-_SHARES = (0.7, 0.55, 0.4)
+_SHARES = (0.7, 0.5, 0.35, 0.2)
 _MAX_BEND_PX = 4.0  # of phi over one stride, up to which the bound above holds at the border
 
 
@@ -124,22 +125,41 @@ def plan_composition(warps: tuple[PlannedWarp, ...], request: PlanRequest) -> Co
         plans = tuple(plan_warp(None, request) for _ in warps)
         return CompositionPlan(1, plans, 0.0, math.inf)
     if len(warps) == 1:
-        plan = plan_warp(warps[0].model, replace(request, ulps=warps[0].ulps))
+        alone = replace(request, ulps=warps[0].ulps)
+        plan = plan_warp(warps[0].model, alone) if alone.is_reachable else _exact_plan(warps[0], request)
         return CompositionPlan(max(plan.stride, 1), (plan,), plan.error_px, _gradient(plan))
     best: CompositionPlan | None = None
     if all(warp.model is not None for warp in warps):
         for share in _SHARES:
             plans = _plan_shares(warps, request, share * request.remaining_px())
-            stride, error = _coarsest_stride(warps, plans, request.tolerance_px, best.stride if best else 1)
-            if stride > 1:
+            errors = _composed_errors(warps, plans)
+            num_fitting = int(np.logical_and.accumulate(errors <= request.tolerance_px).sum())
+            if num_fitting and (best is None or _STRIDES[num_fitting - 1] > best.stride):
+                stride, error = int(_STRIDES[num_fitting - 1]), float(errors[num_fitting - 1])
                 best = CompositionPlan(stride, tuple(plans), error, _composed_gradient(plans))
     if best is not None:
         return best
     plans = _plan_shares(warps, request, request.remaining_px())
+    if _error_at_pixels(warps, plans) > request.tolerance_px:  # the rounding of closed forms has no share
+        plans = [
+            _exact_plan(warp, request) if warp.has_closed_form and not plan.is_identity else plan
+            for warp, plan in zip(warps, plans, strict=True)
+        ]
+    return CompositionPlan(1, tuple(plans), _error_at_pixels(warps, plans), _composed_gradient(plans))
+
+
+def _error_at_pixels(warps: Sequence[PlannedWarp], plans: Sequence[WarpPlan]) -> float:
+    """Bound the error of a composed flow that is computed at every pixel."""
     errors = [_own_error(plan, warp) for plan, warp in zip(plans, warps, strict=True)]
     counted = zip(errors, _stretches(plans), plans, strict=True)
-    error = _total([(error * stretch, plan.is_random) for error, stretch, plan in counted if error > 0])
-    return CompositionPlan(1, tuple(plans), error, _composed_gradient(plans))
+    return _total([(error * stretch, plan.is_random) for error, stretch, plan in counted if error > 0])
+
+
+def _exact_plan(warp: PlannedWarp, request: PlanRequest) -> WarpPlan:
+    """Plan an exact flow whose bounds are known as far as those of the warp."""
+    bounds = None if warp.model is None else warp.model.bounds(request.height, request.width)
+    plan = replace(plan_warp(None, replace(request, tolerance_px=None)), bounds=bounds)
+    return plan if bounds is None else replace(plan, reason="its share of the tolerance is below rounding")
 
 
 def _plan_shares(warps: Sequence[PlannedWarp], request: PlanRequest, budget_px: float) -> list[WarpPlan]:
@@ -153,21 +173,36 @@ def _plan_shares(warps: Sequence[PlannedWarp], request: PlanRequest, budget_px: 
     lattice_share = (1 - num_closed * closed_share) / max(_total(lattices), 1.0)
     plans: list[WarpPlan] = []
     stretch = 1.0
-    for warp in warps:
+    for warp, outside_px in zip(warps, _outside_px(warps, request), strict=True):
         part = closed_share if warp.has_closed_form else lattice_share
+        # Rounded down to quarters of octaves, so that compositions with other drawn lenses find the same plans.
+        share_px = 2 ** (math.floor(4 * math.log2(part * budget_px / stretch)) / 4) if stretch < math.inf else 0.0
         # What a closed form drops has a small share, which need not cover the rounding as well.
-        share = replace(request, tolerance_px=part * budget_px / stretch, ulps=0 if warp.has_closed_form else warp.ulps)
+        share = replace(request, tolerance_px=share_px, ulps=0 if warp.has_closed_form else warp.ulps)
         if math.isinf(stretch) or warp.model is None or not share.is_reachable:
-            bounds = None if warp.model is None else warp.model.bounds(request.height, request.width)
-            plan = replace(plan_warp(None, replace(share, tolerance_px=None)), bounds=bounds)
-            plan = replace(plan, reason="its share of the tolerance is below rounding" if bounds else plan.reason)
+            plan = _exact_plan(warp, request)
         else:
             plan = plan_warp(warp.model, share)
+            if warp.has_closed_form and plan.bounds is not None and not plan.is_identity:
+                # Bounds hold as far outside the frame as the nodes of the coarsest lattice with a bound lie.
+                reaches = math.isfinite(float(plan.bounds.interpolation_error(np.array([max(outside_px, 1.0)]))[0]))
+                if not reaches:
+                    exact = plan_warp(None, replace(share, tolerance_px=None))
+                    plan = replace(exact, bounds=plan.bounds, reason="later warps lead far outside the frame")
         if warp.has_closed_form and not plan.is_identity:
             plan = replace(plan, node_error_px=plan.node_error_px + replace(request, ulps=warp.ulps).rounding_px)
         plans.append(plan)
         stretch *= 1 + _gradient(plan)
     return plans
+
+
+def _outside_px(warps: Sequence[PlannedWarp], request: PlanRequest) -> list[float]:
+    """Return how far outside the frame each flow may be evaluated, px: as far as the later warps move together."""
+    distances = [0.0]
+    for warp in reversed(warps[1:]):
+        bounds = None if warp.model is None else warp.model.bounds(request.height, request.width)
+        distances.append(distances[-1] + (math.inf if bounds is None else bounds.max_displacement))
+    return distances[::-1]
 
 
 def _own_error(plan: WarpPlan, warp: PlannedWarp) -> float:
@@ -191,98 +226,62 @@ def _stretches(plans: Sequence[WarpPlan]) -> list[float]:
     return stretches
 
 
-def _total(errors: Sequence[tuple[float, bool]]) -> float:
-    """Add errors in px; those that are marked as random add as squares."""
-    return sum(error for error, is_random in errors if not is_random) + math.hypot(
-        *(error for error, is_random in errors if is_random)
-    )
+def _total(errors: Sequence[tuple[Any, bool]]) -> Any:
+    """Add errors in px, numbers or arrays; those that are marked as random add as squares."""
+    fixed = sum([error for error, is_random in errors if not is_random])
+    return fixed + np.sqrt(sum([error * error for error, is_random in errors if is_random]))
 
 
-def _coarsest_stride(
-    warps: Sequence[PlannedWarp], plans: Sequence[WarpPlan], tolerance_px: float, least: int
-) -> tuple[int, float]:
-    """Return the largest stride above `least` at which the composed flow stays within the tolerance, and its error."""
-    for stride in _STRIDES:
-        if stride <= least:
-            break
-        error = _composed_error(warps, plans, stride)
-        if error <= tolerance_px:
-            return stride, error
-    return 1, math.inf
-
-
-def _composed_error(warps: Sequence[PlannedWarp], plans: Sequence[WarpPlan], stride: int) -> float:
-    """Bound the error of a composed flow whose nodes are so many px apart; inf if there is no bound."""
-    errors: list[tuple[float, bool]] = []
-    cubic, later = _cubic(stride), _LaterFlows()
+def _composed_errors(warps: Sequence[PlannedWarp], plans: Sequence[WarpPlan]) -> np.ndarray:
+    """Bound the error of a composed flow for each stride of its lattice; inf if there is no bound."""
+    errors: list[tuple[Any, bool]] = []
+    stretch, second, third = 1.0, 0.0, np.zeros_like(_STRIDES)  # of phi
+    s = _STRIDES
     for warp, plan, count in zip(reversed(warps), reversed(plans), reversed(_stretches(plans)), strict=True):
-        if plan.is_identity:
+        if plan.stride == 0:
             errors.append((plan.error_px * count, plan.is_random))
             continue
         bounds = plan.bounds
-        if bounds is None or math.isinf(bounds.max_second_derivative) or later.second * stride**2 > _MAX_BEND_PX:
-            return math.inf
-        between = float(bounds.interpolation_error(np.array([stride * later.stretch]))[0])
+        if bounds is None or math.isinf(bounds.max_second_derivative):
+            return np.full_like(s, np.inf)
         # Flows without a closed form are interpolated bilinearly, here between nodes and if exact between pixels.
-        is_read = later.num_flows > 0 and not warp.has_closed_form
-        bilinear = bounds.max_second_derivative * (stride**2 + 1) / 4 if is_read else 0.0
-        node_error = cubic.amplification**2 * _own_error(plan, warp)
+        is_read = second > 0 and not warp.has_closed_form
+        bilinear = bounds.max_second_derivative * (s**2 + 1) / 4 if is_read else 0.0
+        node_error = _AMPLIFICATION**2 * _own_error(plan, warp)
+        between = bounds.interpolation_error(s * stretch)
         errors.append(((node_error + between + bilinear) * count, plan.is_random))
-        errors.append(((1 + cubic.amplification) * cubic.cross_error(bounds, later, stride) * count, False))
-        later = later.after(bounds, stride)
+        cross = np.where(second * s**2 <= _MAX_BEND_PX, _cross_error(bounds, stretch, second, third), np.inf)
+        errors.append(((1 + _AMPLIFICATION) * cross * count, False))
+        gradient, bend = bounds.max_gradient, bounds.max_second_derivative
+        bent = bend * stretch**2 + gradient * second
+        twisted = 3 * bend * stretch * second + gradient * third + bounds.max_third_derivative * stretch**3
+        third = third + np.minimum(twisted, 2 * bent / s)
+        stretch, second = stretch * (1 + gradient), second + bent
     return _total(errors)
 
 
-class _LaterFlows(NamedTuple):
-    """Bounds of the flows that are evaluated first, together."""
-
-    num_flows: int = 0
-    stretch: float = 1.0  # 1 + the largest gradient
-    second: float = 0.0  # px per px^2
-    third: float = 0.0  # px per px^3
-
-    def after(self, bounds: FlowBounds, stride: int) -> "_LaterFlows":
-        """Add one flow that is evaluated next."""
-        gradient, bend = bounds.max_gradient, bounds.max_second_derivative
-        second = bend * self.stretch**2 + gradient * self.second
-        third = 3 * bend * self.stretch * self.second + gradient * self.third
-        if math.isfinite(bounds.max_third_derivative):
-            third += bounds.max_third_derivative * self.stretch**3
-        else:
-            third = math.inf
-        third = min(third, 2 * second / stride)
-        return _LaterFlows(self.num_flows + 1, self.stretch * (1 + gradient), self.second + second, self.third + third)
+def _cross_error(bounds: FlowBounds, stretch: float, second: float, third: np.ndarray) -> np.ndarray:
+    """Bound sum |w_j r_j| for each stride, with the derivatives of phi."""
+    along, off = stretch * _STRIDES, second * _STRIDES**2
+    rough = bounds.max_second_derivative * (along * off * _SUMS["uq"] + off**2 * _SUMS["qq"])
+    if math.isinf(bounds.max_third_derivative):
+        return rough
+    smooth = stretch * third * _STRIDES**4 / 6 * _SUMS["uuuu"] + off**2 / 2 * _SUMS["qq"]
+    cubes = along**2 * off * _SUMS["uuq"] + 2 * along * off**2 * _SUMS["uqq"] + off**3 * _SUMS["qqq"]
+    return np.minimum(rough, bounds.max_second_derivative * smooth + bounds.max_third_derivative / 2 * cubes)
 
 
-class _Cubic(NamedTuple):
-    """Cubic interpolation at the pixels of a cell, from the four nodes around: arrays (stride, 4)."""
-
-    weight: np.ndarray  # |w_j|
-    distance: np.ndarray  # |u_j|
-    q: np.ndarray
-    amplification: float  # the largest sum of |w_j|
-
-    def cross_error(self, bounds: FlowBounds, later: _LaterFlows, stride: int) -> float:
-        """Return the largest sum |w_j r_j| over the pixels of a cell."""
-        second, third = bounds.max_second_derivative, bounds.max_third_derivative
-        along, off = later.stretch * stride * self.distance, later.second * stride**2 * self.q
-        remainder = second * (along + off) * off
-        if math.isfinite(third):
-            smooth = later.stretch * later.third * stride**4 / 6 * self.distance**4 + off**2 / 2
-            remainder = np.minimum(remainder, second * smooth + third / 2 * (along + off) ** 2 * off)
-        return float((self.weight * remainder).sum(axis=1).max())
-
-
-@lru_cache(maxsize=16)
-def _cubic(stride: int) -> _Cubic:
-    t = np.arange(stride)[:, None] / stride
-    nodes = np.arange(-1, 3)
-    weight = np.ones((stride, 4))
-    for j in range(4):
-        for k in range(4):
-            if k != j:
-                weight[:, j] *= (t[:, 0] - nodes[k]) / (nodes[j] - nodes[k])
-    u = nodes - t
+def _largest_sums() -> dict[str, float]:
+    """Return the largest sums of |w_j| times powers of |u_j| and q_j over the places in a cell."""
+    t = np.linspace(0, 1, 65)[:, None]
+    u = np.arange(-1, 3) - t
+    others = [[k for k in range(4) if k != j] for j in range(4)]
+    weight = np.stack([np.prod(-u[:, k], axis=1) / math.prod(j - i for i in k) for j, k in enumerate(others)], axis=1)
     # The second derivative (1 - t) a + t b, integrated twice from x to a node.
     q = np.abs((1 - t) * u**2 / 2 - u**3 / 6) + np.abs(t * u**2 / 2 + u**3 / 6)
-    return _Cubic(np.abs(weight), np.abs(u), q, float(np.abs(weight).sum(axis=1).max()))
+    powers = {"": 1.0, "uq": abs(u) * q, "qq": q**2, "uuuu": u**4, "uuq": u**2 * q, "uqq": abs(u) * q**2, "qqq": q**3}
+    return {name: float((np.abs(weight) * value).sum(axis=1).max()) for name, value in powers.items()}
+
+
+_SUMS = _largest_sums()
+_AMPLIFICATION = _SUMS[""]  # 5 / 4

@@ -128,7 +128,7 @@ def speed_bars(timings: Sequence[Timing]) -> list[Bar]:
 
 @dataclass(frozen=True)
 class Calls:
-    """How often each function of the package was entered, by file and qualified name."""
+    """The number of calls of each function of the package, by file and qualified name."""
 
     entered: Mapping[tuple[str, str], int]
 

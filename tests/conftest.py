@@ -13,12 +13,12 @@ from torch import Tensor
 
 
 def pytest_addoption(parser) -> None:
-    """How much of the stability contract is tried: a part in minutes, or all of it."""
+    """Add `--extremes`, which selects how many cases of the stability contract run."""
     parser.addoption("--extremes", choices=["part", "full"], default="part", help="full: many cases, large frames")
 
 
 def pytest_configure() -> None:
-    """Of several processes each keeps to one thread, as do those that it starts: none waits for another's threads."""
+    """Use one thread in each process of pytest-xdist and its children, so that they do not compete."""
     if "PYTEST_XDIST_WORKER" in os.environ:
         torch.set_num_threads(1)
         os.environ["OMP_NUM_THREADS"] = "1"
@@ -26,13 +26,13 @@ def pytest_configure() -> None:
 
 @pytest.fixture(scope="session")
 def full_extremes(request) -> bool:
-    """Whether all cases of tests/extremes are asked for."""
+    """Return True if all cases of tests/extremes run."""
     return request.config.getoption("--extremes") == "full"
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real frames and lenses that lies beside the checkout of a developer."""
+    """Return the folder of real frames and lenses next to a developer's checkout, or skip the test."""
     folder = Path(__file__).parents[1].parent / "shared" / "data"
     if not folder.is_dir():
         pytest.skip(f"needs the real frames, and {folder} does not exist")
@@ -41,84 +41,86 @@ def shared_data() -> Path:
 
 @pytest.fixture(autouse=True)
 def fresh_compiler(request) -> Iterator[None]:
-    """All effects share the code of `forward`, and a process compiles the same code for eight kinds of them at most."""
+    """Reset the compiler after tests of graphs: it compiles the shared code of `forward` for eight effects at most."""
     yield
     if "graph" in request.node.name:
         torch.compiler.reset()
 
 
 @pytest.fixture(autouse=True)
-def threads_of_its_own() -> Iterator[None]:
-    """What a test sets, as the benchmarks do, the next one does not find: sums differ with the number of threads."""
+def same_number_of_threads() -> Iterator[None]:
+    """Restore the number of threads, which changes the order of sums, after each test."""
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)
 
 
 class Agreement(NamedTuple):
-    """How far something is from an independent oracle at most, and how far it may be."""
+    """The largest error against an independent reference, and the tolerance."""
 
     error: float
-    bar: float
+    tolerance: float
     unit: str
 
 
 _ORACLES = pytest.StashKey[dict[str, Agreement]]()
 
 
-def keep(config: pytest.Config, what: str, found: Agreement) -> None:
-    """Of all that is told of one oracle, the largest error is kept."""
-    kept = config.stash.setdefault(_ORACLES, {})
-    if what not in kept or found.error > kept[what].error:
-        kept[what] = found
+def record(config: pytest.Config, name: str, agreement: Agreement) -> None:
+    """Keep the largest error against each reference."""
+    recorded = config.stash.setdefault(_ORACLES, {})
+    if name not in recorded or agreement.error > recorded[name].error:
+        recorded[name] = agreement
 
 
 @pytest.fixture
 def oracle(request) -> Callable[..., None]:
-    """Asserts that two tensors agree within a bar, and keeps the largest error for the summary of the run."""
+    """Return a function that compares a tensor with a reference, and records the error for the summary of the run."""
 
-    def agree(what: str, found: Tensor, expected: Tensor, bar: float, *, unit: str = "px", scale: float = 1.0) -> None:
-        assert found.shape == expected.shape
-        assert found.isfinite().all()
-        error = ((found.double() - expected.double()).abs() * scale).amax().item()
-        keep(request.config, what, Agreement(error, bar, unit))
-        assert error <= bar, f"{what}: {error:.2e} {unit}, bar {bar:g}"
+    def agree(
+        name: str, actual: Tensor, expected: Tensor, tolerance: float, *, unit: str = "px", scale: float = 1.0
+    ) -> None:
+        assert actual.shape == expected.shape
+        assert actual.isfinite().all()
+        error = ((actual.double() - expected.double()).abs() * scale).amax().item()
+        record(request.config, name, Agreement(error, tolerance, unit))
+        assert error <= tolerance, f"{name}: {error:.2e} {unit}, tolerance {tolerance:g}"
 
     return agree
 
 
 def pytest_sessionfinish(session) -> None:
-    """One of several processes hands what its oracles said to the one that sums up."""
+    """Send the recorded errors of a process of pytest-xdist to the main process."""
     if hasattr(session.config, "workeroutput"):
-        told = {what: tuple(found) for what, found in session.config.stash.get(_ORACLES, {}).items()}
-        session.config.workeroutput["oracles"] = told
+        recorded = {name: tuple(value) for name, value in session.config.stash.get(_ORACLES, {}).items()}
+        session.config.workeroutput["oracles"] = recorded
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node) -> None:
-    """Collects what the oracles of one process said; one that was killed says nothing."""
-    for what, found in getattr(node, "workeroutput", {}).get("oracles", {}).items():
-        keep(node.config, what, Agreement(*found))
+    """Collect the recorded errors of a process, if it was not killed."""
+    for name, value in getattr(node, "workeroutput", {}).get("oracles", {}).items():
+        record(node.config, name, Agreement(*value))
 
 
 def pytest_terminal_summary(terminalreporter, config) -> None:
-    """What the oracles said, each with its largest error."""
-    kept = config.stash.get(_ORACLES, {})
-    if kept:
-        terminalreporter.section("largest error against each oracle")
-        for what, found in sorted(kept.items()):
-            terminalreporter.write_line(f"{what:74} {found.error:8.1e} {found.unit:3} (bar {found.bar:g})")
+    """Print the largest error against each reference."""
+    recorded = config.stash.get(_ORACLES, {})
+    if recorded:
+        terminalreporter.section("largest error against each reference")
+        for name, value in sorted(recorded.items()):
+            terminalreporter.write_line(f"{name:74} {value.error:8.1e} {value.unit:3} (tolerance {value.tolerance:g})")
 
 
 @pytest.fixture
 def on_threads() -> Callable[[int], None]:
-    """Sets the number of torch's threads, which `threads_of_its_own` sets back."""
+    """Return the function that sets the number of threads; `same_number_of_threads` restores it."""
     return torch.set_num_threads
 
 
 @pytest.fixture
 def waves() -> Callable[..., Tensor]:
-    """A smooth flow (1, 2, H, W), fp64, at the points (x, y): amplitude_px sin(x / length), mixed over both axes."""
+    """Return a function that computes a smooth flow (1, 2, H, W), float64, at points (x, y)."""
 
     def flow(x: Tensor, y: Tensor, amplitude_px: float, length: float, phase: float = 0.3) -> Tensor:
         u = amplitude_px * torch.sin(x / length + phase) * torch.cos(y / length - phase)
@@ -130,7 +132,7 @@ def waves() -> Callable[..., Tensor]:
 
 @pytest.fixture
 def pixels() -> Callable[[int, int], tuple[Tensor, Tensor]]:
-    """The whole coordinates x and y of a frame, each (H, W), fp64."""
+    """Return a function that gives the pixel coordinates x and y of a frame, each (H, W), float64."""
 
     def axes(height: int, width: int) -> tuple[Tensor, Tensor]:
         rows, columns = torch.arange(height).double(), torch.arange(width).double()
@@ -141,7 +143,7 @@ def pixels() -> Callable[[int, int], tuple[Tensor, Tensor]]:
 
 
 class Outcome(NamedTuple):
-    """What a command left behind."""
+    """The exit code and the output of a command."""
 
     code: int
     out: str
@@ -149,7 +151,7 @@ class Outcome(NamedTuple):
 
     @property
     def message(self) -> str:
-        """The one line of an error that the user can mend."""
+        """Return the error message, a single line."""
         assert self.code == 1, self.out + self.err
         (line,) = self.err.splitlines()
         assert line.startswith("error: "), line
@@ -157,13 +159,13 @@ class Outcome(NamedTuple):
 
     @property
     def folder(self) -> Path:
-        """The run folder, as the last line tells it."""
+        """Return the run folder, which the last line names."""
         assert self.code == 0, self.out + self.err
         return Path(self.out.splitlines()[-1].rsplit(": ", 1)[0])
 
 
 class Trained(NamedTuple):
-    """A finished training, and the words that asked for it."""
+    """A finished training and its command line."""
 
     words: tuple[str, ...]
     outcome: Outcome
@@ -172,14 +174,14 @@ class Trained(NamedTuple):
 
 @pytest.fixture(scope="session")
 def small() -> tuple[str, ...]:
-    """The words that make a training a matter of seconds."""
+    """Return arguments of a training that takes seconds."""
     data = ("data.train_count=32", "data.val_count=16", "data.batch_size=8", "data.size=[32,64]", "data.workers=0")
     return (*data, "trainer.max_epochs=2", "model.network.encoder=tu-mobilenetv3_small_050")
 
 
 @pytest.fixture(scope="session")
 def spawn() -> Callable[..., Outcome]:
-    """Runs Python, on one thread, in a process and a folder of its own."""
+    """Return a function that runs Python in a new process, on one thread, in a given folder."""
 
     def run(*words: str, cwd: Path) -> Outcome:
         environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
@@ -193,7 +195,7 @@ def spawn() -> Callable[..., Outcome]:
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory, spawn, small) -> Trained:
-    """A training of two epochs by the command, as a user would start it."""
+    """Run a training of two epochs by its command."""
     words = ("+task=undistort", *small)
     outcome = spawn("-m", "torchrefract.train", *words, cwd=tmp_path_factory.mktemp("trained"))
     return Trained(words, outcome, outcome.folder)
@@ -201,7 +203,7 @@ def trained(tmp_path_factory, spawn, small) -> Trained:
 
 @pytest.fixture(scope="session")
 def known_model(tmp_path_factory) -> Callable[..., Path]:
-    """Writes checkpoints of models that answer the same for every pixel, whatever they see."""
+    """Return a function that writes a checkpoint whose model gives a constant output."""
 
     def write(task: str, answer: tuple[float, ...], *, size: tuple[int, int] = (32, 64)) -> Path:
         checkpoints = importlib.import_module("torchrefract.restoration.checkpoints")
@@ -212,7 +214,7 @@ def known_model(tmp_path_factory) -> Callable[..., Path]:
             "network": network | {"_partial_": True},
         }
         weights = importlib.import_module("hydra.utils").instantiate(model).state_dict()
-        # Its last layer starts at zero.
+        # The last layer is zero but for its bias.
         weights["network.network.segmentation_head.0.bias"][:] = torch.tensor(answer)
         content = {"state_dict": weights, "task": task, "flows": (torch.zeros(0), torch.zeros(0))}
         content |= {"config": {"model": model}, "data": {"size": [*size]}, "licenses": {"data": "CC0"}}
@@ -225,9 +227,9 @@ def known_model(tmp_path_factory) -> Callable[..., Path]:
 
 @pytest.fixture
 def call(monkeypatch, tmp_path, capsys, on_threads) -> Iterator[Callable[..., Outcome]]:
-    """Runs a command in this process, on one thread, in the test's folder: no start to wait for."""
+    """Return a function that runs a command in this process, on one thread, in the folder of the test."""
     for name in ("HYDRA_FULL_ERROR", "PL_GLOBAL_SEED", "PL_SEED_WORKERS"):
-        monkeypatch.setenv(name, "")  # what a command sets goes again
+        monkeypatch.setenv(name, "")  # restored after the test
     monkeypatch.chdir(tmp_path)
     on_threads(1)
     hydra = importlib.import_module("hydra.core.global_hydra").GlobalHydra.instance()

@@ -1,29 +1,26 @@
 import pytest
 from hypothesis import HealthCheck, Phase, settings
 
-from torchrefract.fields import torus
+from torchrefract.fields import random_field
 
 
 def pytest_configure(config) -> None:
-    """The same examples in every run, few of them unless all are asked for."""
-    examples = 2000 if config.getoption("extremes") == "full" else 60
-    # An effect of a wild size may be slow, and its data many; no fixture here changes from case to case.
-    slow = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture]
+    """Use the same hypothesis examples in every run, and more of them with `--extremes=full`."""
     settings.register_profile(
         "extremes",
         derandomize=True,
         deadline=None,
-        max_examples=examples,
+        max_examples=2000 if config.getoption("extremes") == "full" else 40,
         phases=(Phase.explicit, Phase.generate, Phase.shrink),
-        suppress_health_check=slow,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture],
     )
     settings.load_profile("extremes")
 
 
 @pytest.fixture
-def small_tori(full_extremes, monkeypatch) -> None:
-    """The longest correlations would take seconds each: a smaller cap asks the same questions.
+def small_domains(full_extremes, monkeypatch) -> None:
+    """Lower the largest domain of random fields, since the longest correlations would take seconds each.
 
-    The cap that users have is tried by `test_the_longest_correlations_take_the_largest_torus`.
+    `test_the_longest_correlations_take_the_largest_domain` uses the real limit with `--extremes=full`.
     """
-    monkeypatch.setattr(torus, "_MOST_POINTS", 1 << (18 if full_extremes else 12))
+    monkeypatch.setattr(random_field, "_MAX_POINTS", 1 << (18 if full_extremes else 12))

@@ -1,10 +1,11 @@
-"""The whole domain that every effect says it takes, as hypothesis draws it."""
+"""Hypothesis strategies for effects with any valid arguments, and for images."""
 
 import math
 from typing import Any, NamedTuple
 
 import pytest
 import torch
+from helpers import DTYPES, random_image
 from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 from torch import Tensor
@@ -15,19 +16,24 @@ from torchrefract.fields.random_field import COVARIANCES
 from torchrefract.types import Range
 from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS
 
-WARNED = pytest.mark.filterwarnings(
-    "ignore:.*folds back inside the frame:UserWarning",  # of a rectification; test_rectification.py holds it
-    "ignore:.*pixels beyond have no preimage:UserWarning",  # of a lens that folds; test_folding.py holds it
-    "ignore:amplitude is above what the covariance bears:UserWarning",  # of air that folds; test_turbulence.py holds it
-    "ignore:length must be short enough for a torus:UserWarning",  # of a torus cut short; test_turbulence.py holds it
+# Other tests check these warnings of strong effects.
+IGNORE_STRENGTH = pytest.mark.filterwarnings(
+    "ignore:.*folds back inside the frame:UserWarning",
+    "ignore:.*pixels beyond have no preimage:UserWarning",
+    "ignore:Turbulence this strong folds the image:UserWarning",
+    "ignore:length must fit into a periodic domain:UserWarning",
 )
-DTYPES = (torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64)
-_FIELD = {"wind_x_range": (-1e6, 1e6), "wind_y_range": (-1e6, 1e6), "decorrelation_range": (1e-3, math.inf)}
+_MOTION = {"wind_x_range": (-1e6, 1e6), "wind_y_range": (-1e6, 1e6), "decorrelation_range": (1e-3, math.inf)}
 _FOG = {"visibility_range": (1e-6, math.inf), "deviation_range": (-0.999, 0.999)}
 
 
 class Domain(NamedTuple):
-    """An effect, the bounds of its ranges, and the values of its other arguments."""
+    """Valid arguments of an effect.
+
+    kind: the class.
+    ranges: bounds of the arguments that are ranges.
+    others: strategies for the other arguments.
+    """
 
     kind: type[Effect]
     ranges: dict[str, Range]
@@ -35,7 +41,7 @@ class Domain(NamedTuple):
 
 
 def _numbers(low: float, high: float, **options: Any) -> SearchStrategy[float]:
-    """Numbers over many powers of ten, with both ends and zero among them."""
+    """Draw numbers over many powers of ten, with both ends and zero among them."""
     ends = [value for value in (low, high, 0.0) if low <= value <= high]
     near = st.floats(max(low, -3.0), min(high, 3.0)) if max(low, -3.0) <= min(high, 3.0) else st.nothing()
     return st.one_of(near, st.floats(low, high, allow_nan=False, **options), st.sampled_from(ends))
@@ -45,12 +51,12 @@ def _colors(high: float) -> SearchStrategy[float]:
     return st.floats(0.0, high)
 
 
-_WARP = {
+_WARP_OPTIONS = {
     "padding": st.sampled_from(PADDINGS),
     "interpolation": st.sampled_from(INTERPOLATIONS),
     "tolerance_px": st.sampled_from([None, 0.02, 0.5]),
 }
-_AIR = {
+_FOG_OPTIONS = {
     "airlight": st.none() | _colors(1.0),
     "threshold": st.floats(1e-6, 1 - 1e-6),
     "linear_light": st.booleans(),
@@ -78,34 +84,34 @@ DOMAINS = {
             "center_x_range": (-10.0, 10.0),
             "center_y_range": (-10.0, 10.0),
         },
-        _WARP,
+        _WARP_OPTIONS,
     ),
     "turbulence": Domain(
         tr.Turbulence,
-        {"amplitude_range": (0.0, 1e4), "length_range": (1e-3, 1e6), "aperture_range": (0.0, 1e4), **_FIELD},
+        {"amplitude_range": (0.0, 1e4), "length_range": (1e-3, 1e6), "aperture_range": (0.0, 1e4), **_MOTION},
         {
-            **_WARP,
+            **_WARP_OPTIONS,
             "covariance": st.sampled_from(COVARIANCES),
             "normalize": st.sampled_from(["theory", "image"]),
         },
     ),
-    "thin plate": Domain(
+    "thin-plate spline": Domain(
         tr.ThinPlateSpline,
         {"amplitude_range": (0.0, 1e4), "smoothing_range": (0.0, 1e12)},
-        {**_WARP, "lattice": st.tuples(st.integers(2, 6), st.integers(2, 6))},
+        {**_WARP_OPTIONS, "lattice": st.tuples(st.integers(2, 6), st.integers(2, 6))},
     ),
     "divergence-free": Domain(
         tr.DivergenceFree,
-        {"amplitude_range": (0.0, 1e4), "length_range": (1e-3, 1e6), **_FIELD},
+        {"amplitude_range": (0.0, 1e4), "length_range": (1e-3, 1e6), **_MOTION},
         {
-            **_WARP,
+            **_WARP_OPTIONS,
             "covariance": st.sampled_from(COVARIANCES),
             "normalize": st.sampled_from(["theory", "max", "none"]),
             "steps": st.integers(1, 3),
         },
     ),
-    "uniform fog": Domain(tr.UniformFog, _FOG, _AIR),
-    "fog in drifts": Domain(
+    "uniform fog": Domain(tr.UniformFog, _FOG, _FOG_OPTIONS),
+    "heterogeneous fog": Domain(
         tr.HeterogeneousFog,
         {
             **_FOG,
@@ -115,7 +121,7 @@ DOMAINS = {
             "contrast_range": (0.0, 2.0),
         },
         {
-            **_AIR,
+            **_FOG_OPTIONS,
             "mode": st.sampled_from(["image", "ray"]),
             "scale_unit": st.sampled_from(["px", "cells"]),
             "reference_width": st.floats(1.0, 3e3),
@@ -143,14 +149,14 @@ DOMAINS = {
 
 @st.composite
 def ranges(draw: Any, low: float, high: float) -> Range:
-    """A range within bounds."""
+    """Draw a range within bounds."""
     ends = sorted((draw(_numbers(low, high)), draw(_numbers(low, high))))
     return ends[0], ends[1]
 
 
 @st.composite
 def options(draw: Any, name: str) -> dict[str, Any]:
-    """Arguments of an effect, any number of them, anywhere in its domain."""
+    """Draw valid values for up to six arguments of an effect."""
     domain = DOMAINS[name]
     chosen = draw(st.sets(st.sampled_from(sorted([*domain.ranges, *domain.others])), max_size=6))
     given = {key: draw(ranges(*domain.ranges[key])) for key in sorted(chosen) if key in domain.ranges}
@@ -159,10 +165,10 @@ def options(draw: Any, name: str) -> dict[str, Any]:
 
 @st.composite
 def images(draw: Any, *, dtypes: tuple[torch.dtype, ...] = DTYPES, batch: int = 3, side: int = 24) -> Tensor:
-    """Images of any type, size and layout: noise, two levels, or one."""
+    """Draw images of any type, size and layout: noise, two levels, or a single one."""
     shape = (draw(st.integers(0, batch)), draw(st.sampled_from([1, 3, 4])), *draw(sizes(side)))
     dtype = draw(st.sampled_from(dtypes))
-    values = torch.rand(shape, generator=torch.Generator().manual_seed(draw(st.integers(0, 9))), dtype=torch.float64)
+    values = random_image(*shape, dtype=torch.float64, seed=draw(st.integers(0, 9)))
     kind = draw(st.sampled_from(["noise", "binary", "black", "white"]))
     values = {"binary": values.round(), "black": values * 0, "white": values * 0 + 1}.get(kind, values)
     image = (255 * values).round().to(dtype) if dtype is torch.uint8 else values.to(dtype)
@@ -170,13 +176,13 @@ def images(draw: Any, *, dtypes: tuple[torch.dtype, ...] = DTYPES, batch: int = 
 
 
 def sizes(side: int) -> SearchStrategy[tuple[int, int]]:
-    """Of frames, lines and single pixels among them."""
+    """Draw (height, width), px; lines and single pixels are among them."""
     return st.tuples(st.integers(1, side), st.integers(1, side))
 
 
 @st.composite
 def cameras(draw: Any, height: int, width: int) -> tr.Camera | None:
-    """A pinhole for frames of a size, or none."""
+    """Draw a pinhole camera for frames of a size, or None."""
     if draw(st.booleans()):
         return None
     fx, fy = draw(st.floats(1.0, 1e4)), draw(st.floats(1.0, 1e4))
@@ -186,22 +192,22 @@ def cameras(draw: Any, height: int, width: int) -> tr.Camera | None:
 
 @st.composite
 def cases(draw: Any, name: str, *, fixed: dict[str, Any] | None = None, **image: Any) -> tuple[Effect, Tensor]:
-    """An effect anywhere in its domain, and images for it."""
+    """Draw an effect with valid arguments, and images for it."""
     frames, given = draw(images(**image)), draw(options(name))
     if "airlight" in DOMAINS[name].others:
         given["camera"] = draw(cameras(*frames.shape[2:]))
     given |= fixed or {}
-    if name == "flare" and not _reaches(tr.LensFlare(**given), frames):
+    if name == "flare" and not _is_reachable(tr.LensFlare(**given), frames):
         given["tolerance"] = None
     return DOMAINS[name].kind(**given), frames
 
 
-def _reaches(flare: tr.LensFlare, frames: Tensor) -> bool:
-    """Whether the rounding of float32 leaves room for its tolerance; where not, that is refused."""
+def _is_reachable(flare: tr.LensFlare, frames: Tensor) -> bool:
+    """Return False if the rounding of float32 exceeds the tolerance, which raises."""
     try:
-        flare.planned(frames.shape[2], frames.shape[3], torch.float32)
-    except ValueError as refused:  # by a promise of its own; anything else is an error here, too
-        if "tolerance must be at least" not in str(refused):
+        flare.plan(frames.shape[2], frames.shape[3])
+    except ValueError as error:
+        if "tolerance must be at least" not in str(error):
             raise
         return False
     return True

@@ -86,7 +86,7 @@ def falls_before(a: Sequence[float], q_max: float) -> bool:
 
 
 class RadialLimit(NamedTuple):
-    """How far out a radial map can be inverted, with a table of its inverse.
+    """The largest radius up to which a radial map can be inverted, with a table of its inverse.
 
     radius: (B, 1, ...), the largest radius before distortion, on the plane z = 1.
     image_radius: (B, 1, ...), the largest radius after distortion in the table.

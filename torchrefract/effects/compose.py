@@ -192,7 +192,7 @@ class Compose(Effect):
         height, width = image.shape[2:]
         dtype = field_dtype(image.dtype)
         pairs = zip(self.effects_with_params(params), self._leaf_effects(), strict=True)
-        leaves = [_Leaf(effect, own, options) for (effect, own), (_, options) in pairs]
+        leaves = [_Leaf(effect, child, options) for (effect, child), (_, options) in pairs]
         state = _Progress(image, depth, len(params.applied))
         places: list[int] = []
         requests = self._constant_requests(id(self), height, width, dtype)
@@ -305,7 +305,7 @@ class _Segment(NamedTuple):
 
 
 class _Applied(NamedTuple):
-    """What `where_active` reads of parameters."""
+    """The parts of parameters that `where_active` reads."""
 
     applied: Tensor
     nodes: Tensor
@@ -471,8 +471,8 @@ def _valid_after(
     """Return where an image is valid after one more warp."""
 
     def valid() -> Tensor:
-        own = (flow().exists & inside(flow().dense)) | ~per_sample(moves)
-        return own if before is None else own & sees_only_valid(before(), flow().dense)
+        sampled_inside = (flow().exists & inside(flow().dense)) | ~per_sample(moves)
+        return sampled_inside if before is None else sampled_inside & sees_only_valid(before(), flow().dense)
 
     return valid
 

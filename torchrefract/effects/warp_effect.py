@@ -38,7 +38,7 @@ _FINE_STRIDE, _MIN_PIXELS = 4, 1 << 16
 
 
 class SamplingOptions(NamedTuple):
-    """How an image is sampled, as for `warp`; None is undecided."""
+    """Options of sampling an image, as for `warp`; None is undecided."""
 
     padding: str | None = None
     interpolation: str | None = None

@@ -66,7 +66,7 @@ class LensRanges(NamedTuple):
 
 
 class LensDetails(NamedTuple):
-    """What a plan fixes for the computation of a lens."""
+    """The choices of a plan for the computation of a lens."""
 
     num_steps: tuple[int, ...]  # of Newton's method, for nodes as far outside the frame as those of each level
     terms: Terms

@@ -211,13 +211,13 @@ def amplitudes(
         values = torch.where(values.abs() > _ROUNDING * values.amax(dim=(1, 2), keepdim=True), values, 0)
     positive = values.clamp(min=0)
     smooth_y, smooth_x = (
-        _smoothing(torch.arange(most + 1, dtype=torch.float64, device=values.device) / n, aperture)
-        for n, most in zip(frequencies.size, (frequencies.rows, frequencies.columns), strict=True)
+        _smoothing(torch.arange(largest + 1, dtype=torch.float64, device=values.device) / n, aperture)
+        for n, largest in zip(frequencies.size, (frequencies.rows, frequencies.columns), strict=True)
     )
     smooth_y, smooth_x = smooth_y[..., None], smooth_x[..., None, :]
     counts = [
-        _multiplicity(most + 1, values.device, has_middle=2 * most >= n)
-        for n, most in zip(frequencies.size, (frequencies.rows, frequencies.columns), strict=True)
+        _multiplicity(largest + 1, values.device, has_middle=2 * largest >= n)
+        for n, largest in zip(frequencies.size, (frequencies.rows, frequencies.columns), strict=True)
     ]
     weight_y, weight_x = counts[0][:, None] * smooth_y.square(), counts[1] * smooth_x.square()
 
@@ -355,15 +355,15 @@ def _evolve(noise: Tensor, rates: Tensor, frequencies: Frequencies, motion: Moti
 
 def even_transform(values: Tensor, dim: int, count: int) -> Tensor:
     """Transform even, periodic sequences, given and returned by their halves; `count` values from frequency 0 on."""
-    most = values.shape[dim] - 1
+    largest = values.shape[dim] - 1
     if torch.compiler.is_compiling():  # the compiler supports no complex numbers
-        k, p = torch.arange(count, device=values.device)[:, None], torch.arange(most + 1, device=values.device)
-        cosine = ((k * p).remainder(2 * most).to(values.dtype) * (math.pi / most)).cos()
-        matrix = cosine * _multiplicity(most + 1, values.device, has_middle=True)
+        k, p = torch.arange(count, device=values.device)[:, None], torch.arange(largest + 1, device=values.device)
+        cosine = ((k * p).remainder(2 * largest).to(values.dtype) * (math.pi / largest)).cos()
+        matrix = cosine * _multiplicity(largest + 1, values.device, has_middle=True)
         return matrix @ values if dim == 1 else values @ matrix.mT
     if values.shape[0] == 0:  # PyTorch cannot transform empty batches
         return values.narrow(dim, 0, count)
-    mirrored = values.narrow(dim, 1, most - 1).flip(dim)
+    mirrored = values.narrow(dim, 1, largest - 1).flip(dim)
     return torch.fft.rfft(torch.cat([values, mirrored], dim=dim), dim=dim).narrow(dim, 0, count).real
 
 
@@ -441,9 +441,9 @@ def _fast_size(least: int) -> int:
     return next(filter(_has_small_factors, itertools.count(max(2, least + least % 2), 2)))
 
 
-def _fast_size_below(most: int, least: int) -> int:
-    """Return the largest such number up to `most`; if it is below `least`, the smallest one from there on."""
-    sizes = range(most - most % 2, max(least, 2) - 1, -2)
+def _fast_size_below(largest: int, least: int) -> int:
+    """Return the largest such number up to `largest`, or the smallest from `least` on if that is below `least`."""
+    sizes = range(largest - largest % 2, max(least, 2) - 1, -2)
     return next(filter(_has_small_factors, sizes), _fast_size(least))
 
 

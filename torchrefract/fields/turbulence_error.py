@@ -116,7 +116,7 @@ def _simplify(model: RandomFieldErrorModel, height: int, width: int, budget_px: 
     size = embedding_size(*sides, kind=model.covariance, length=model.length[1], aperture=model.aperture[1])
     frequencies = Frequencies(size, *(math.ceil(cutoff * n / (2 * math.pi)) for n in size))
     count = math.prod(frequencies.counts)
-    has_fewer = all(2 * most + 1 < n for most, n in zip(frequencies[1:], size, strict=True))
+    has_fewer = all(2 * largest + 1 < n for largest, n in zip(frequencies[1:], size, strict=True))
     if model.covariance == "gaussian":
         # The covariance is summed over the ways around the domain only if that is large enough.
         is_cheaper, has_room = count <= _MAX_FREQUENCIES, reach <= min(size)

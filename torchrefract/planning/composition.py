@@ -56,7 +56,7 @@ class PlannedWarp(NamedTuple):
 
 @dataclass(frozen=True)
 class CompositionPlan:
-    """How the composed flow of warps in a row is computed.
+    """The plan of the composed flow of warps in a row.
 
     stride: px between the nodes; 1 computes every pixel.
     plans: of each warp.
@@ -77,7 +77,7 @@ class CompositionPlan:
 
 @dataclass(frozen=True)
 class ComposePlan:
-    """How a `Compose` is computed for frames of one size.
+    """The plan of a `Compose` for frames of one size.
 
     height, width: px, of the frame.
     tolerance_px: largest error of the composed flow; None is exact.
@@ -152,7 +152,7 @@ def _error_at_pixels(warps: Sequence[PlannedWarp], plans: Sequence[WarpPlan]) ->
     """Bound the error of a composed flow that is computed at every pixel."""
     errors = [_own_error(plan, warp) for plan, warp in zip(plans, warps, strict=True)]
     counted = zip(errors, _stretches(plans), plans, strict=True)
-    return _total([(own * stretch, plan.is_random) for own, stretch, plan in counted if own > 0])
+    return _total([(error * stretch, plan.is_random) for error, stretch, plan in counted if error > 0])
 
 
 def _exact_plan(warp: PlannedWarp, request: PlanRequest) -> WarpPlan:

@@ -95,7 +95,7 @@ class PlanRequest:
 
 @dataclass(frozen=True)
 class WarpPlan:
-    """How a warp computes its flow for frames of one size.
+    """The computation of the flow of a warp for frames of one size.
 
     height, width: px, of the frame.
     tolerance_px: largest error of the flow that was requested; None is exact.

@@ -17,7 +17,7 @@ _SMALLEST_DETERMINANT = 0.5
 # Steps of all pixels with the gradient of the flow at p, while more than this share of them is unsolved. Afterwards the
 # unsolved pixels are gathered, and the gradient is sampled at p + inverse.
 _SHARED_STEPS, _MANY = 3, 1 / 8
-_BAND_PIXELS = 1 << 14  # whose 20 planes of float32 fit into the cache of one core
+_BAND_PIXELS = 1 << 15  # whose 20 planes of float32 fit into the cache; fixed, so that threads change no result
 
 
 def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> tuple[Tensor, Tensor, Tensor]:
@@ -79,7 +79,7 @@ def _solve(flow: Tensor, steps: int, *, is_eager: bool) -> tuple[Tensor, Tensor,
     height, width = flow.shape[2:]
     gradient = _gradient(flow)
     is_upright = eager_bool(lambda: _determinant(gradient).amin() >= _SMALLEST_DETERMINANT, of=flow)
-    rows = rows_at_once(flow.device, height, each=width, cached=_BAND_PIXELS, shared=True) if is_eager else height
+    rows = rows_at_once(flow.device, height, each=width, cached=_BAND_PIXELS) if is_eager else height
     bands = []
     for start in range(0, height, rows):
         band = flow[:, :, start : start + rows], gradient[:, :, start : start + rows]

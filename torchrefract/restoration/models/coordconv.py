@@ -1,4 +1,4 @@
-"""What both feed-forward baselines share: pixel coordinates as inputs, a polynomial head, and ImageNet weights."""
+"""Parts of both feed-forward baselines: pixel coordinates as inputs, a polynomial head, and ImageNet weights."""
 
 import json
 import warnings

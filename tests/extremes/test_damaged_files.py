@@ -1,3 +1,5 @@
+"""Damaged, hostile and oversized files are read or raise the error of their reader, in little time and memory."""
+
 import io
 import json
 import math
@@ -31,66 +33,25 @@ from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import UnreadableImageError, image_size, read_image
 from torchrefract.data.pairs import PairedFolder
 from torchrefract.data.pairs.files import FORMATS, DamagedPairError, PairArrays, encode_pair
-from torchrefract.data.pairs.manifest import PairRow, Stored, read_row
+from torchrefract.data.pairs.manifest import PairRow, StoredFile, read_row
 from torchrefract.restoration.checkpoints import CheckpointError, check_fits, read_checkpoint
 
-SECONDS = 10.0  # for one small file, on a machine that is busy
-ROOM = 300  # MB
+MAX_SECONDS = 10.0  # for one small file on a busy machine
+MAX_MB = 300
 CAMERA = Camera(width=640, height=480, fx=500, fy=510, cx=320, cy=240, coefficients=(-0.3, 0.1, 0.001, 0.002))
 TRAP = b'!!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path ["trapped"]]'
-# What makes numbers, texts and nests of files break their readers.
+# Fragments that break parsers of numbers, texts and nested documents.
 TOKENS = [
-    *(
-        b"",
-        b"\0",
-        b"\xff",
-        b"\xff\xfe",
-        b"\n",
-        b'"',
-        b"'",
-        b"[",
-        b"]",
-        b"{",
-        b"}",
-        b"<",
-        b">",
-        b"&a ",
-        b"*a",
-        b": ",
-        b"- ",
-    ),
-    *(
-        b"0",
-        b"-1",
-        b"nan",
-        b".nan",
-        b"NaN",
-        b"inf",
-        b".inf",
-        b"1e999",
-        b"1e308",
-        b"-0.0",
-        b"null",
-        b"true",
-        b"1" + b"0" * 400,
-    ),
-    *(
-        b"9" * 5000,
-        b"0x" + b"F" * 5000,
-        b"[" * 600,
-        b"{" * 600,
-        b"<a>" * 600,
-        b"&a [*a]",
-        b"<<: *a",
-        b"? [a]\n: b\n",
-    ),
-    *(b"!!bool x", b'!!int ""', b"!!timestamp a", b"!!float a", b"!!binary a", b"9999-99-99", b"0b_", b"1:30", TRAP),
+    *(b"", b"\0", b"\xff", b"\xff\xfe", b"\n", b"&a ", b"*a", b": ", b"- ", b"&a [*a]", b"<<: *a", b"? [a]\n: b\n"),
+    *b"\" ' [ ] { } < > 0 -1 nan .nan NaN inf .inf 1e999 1e308 -0.0 null true 9999-99-99 0b_ 1:30".split(b" "),
+    *(b"1" + b"0" * 400, b"9" * 5000, b"0x" + b"F" * 5000, b"[" * 600, b"{" * 600, b"<a>" * 600),
+    *(b"!!bool x", b'!!int ""', b"!!timestamp a", b"!!float a", b"!!binary a", TRAP),
     *(struct.pack(">I", 2**32 - 1), struct.pack("<I", 2**31), struct.pack(">HH", 65500, 65500), b"\x80" * 9),
 ]
 
 
 class Reader(NamedTuple):
-    """A whole file, how it is read, and the errors that a reader of such files says it raises."""
+    """An undamaged file, its reader, and the errors that the reader raises for invalid files."""
 
     name: str
     data: bytes
@@ -99,28 +60,28 @@ class Reader(NamedTuple):
 
 
 class Trap:
-    """What a hostile file would hold: a call of its own."""
+    """An object whose unpickling calls a function, as in a hostile file."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Path.touch, (Path("trapped"),)
 
 
 @st.composite
-def damage(draw: st.DrawFn, whole: bytes) -> bytes:
-    """A file with some of its bytes changed, lost, doubled or replaced by what is hard to read."""
-    data = bytearray(whole)
+def damage(draw: st.DrawFn, original: bytes) -> bytes:
+    """Draw a file with changed, missing, repeated or replaced bytes."""
+    data = bytearray(original)
     for _ in range(draw(st.integers(1, 3))):
-        # Heads are small, and most of what can go wrong is in them.
+        # Headers are small, and most errors happen in them.
         start = draw(st.integers(0, len(data)) | st.integers(0, min(64, len(data))))
         end = min(len(data), start + draw(st.sampled_from([0, 1, 4, 30])))
-        how = draw(st.sampled_from(["token", "bytes", "cut", "double", "bit"]))
-        if how == "token":
+        kind = draw(st.sampled_from(["token", "bytes", "cut", "double", "bit"]))
+        if kind == "token":
             data[start:end] = draw(st.sampled_from(TOKENS))
-        elif how == "bytes":
+        elif kind == "bytes":
             data[start:end] = draw(st.binary(min_size=end - start, max_size=end - start))
-        elif how == "cut":
+        elif kind == "cut":
             del data[start:]
-        elif how == "double":
+        elif kind == "double":
             data[end:end] = data[start:end] * draw(st.sampled_from([1, 50]))
         elif start < len(data):
             data[start] ^= 1 << draw(st.integers(0, 7))
@@ -128,73 +89,73 @@ def damage(draw: st.DrawFn, whole: bytes) -> bytes:
 
 
 @contextmanager
-def modest() -> Iterator[None]:
-    """Whatever is done inside takes little time and little memory."""
+def limited_time_and_memory() -> Iterator[None]:
+    """Raise AssertionError if the block takes more than MAX_SECONDS or MAX_MB."""
     status, refs = Path("/proc/self/status"), Path("/proc/self/clear_refs")
     if status.is_file():
-        refs.write_text("5")  # the peak starts anew
+        refs.write_text("5")  # resets the peak
     before, start = _peak(status), time.monotonic()
     yield
-    assert time.monotonic() - start < SECONDS
-    assert _peak(status) - before < ROOM
+    assert time.monotonic() - start < MAX_SECONDS
+    assert _peak(status) - before < MAX_MB
 
 
 def _peak(status: Path) -> float:
-    """The most memory that the process had, MB; 0 where the system does not say."""
+    """Return the peak memory of the process, MB; 0 without /proc."""
     lines = status.read_text().splitlines() if status.is_file() else []
     return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")), 0.0)
 
 
-def hold(reader: Reader, path: Path, data: bytes) -> Any:
-    """What is read of a file, or the error that the reader says it raises; any other one goes through."""
+def read_or_error(reader: Reader, path: Path, data: bytes) -> Any:
+    """Return the content of a file, or the error if it is one of the reader's; other errors propagate."""
     path.write_bytes(data)
-    with modest():
+    with limited_time_and_memory():
         try:
             return reader.read(path)
         except reader.errors as error:
-            found = error
-    assert 0 < len(str(found)) < 2000 + 4 * len(str(path))
-    return found
+            result = error
+    assert 0 < len(str(result)) < 2000 + 4 * len(str(path))
+    return result
 
 
 def fuzz(reader: Reader, path: Path, *, full: bool) -> None:
-    """Read a file in many states of damage."""
-    kept = [HealthCheck.too_slow, HealthCheck.data_too_large]
-    options: Any = {"derandomize": True, "deadline": None, "database": None, "suppress_health_check": kept}
+    """Read many damaged versions of a file."""
+    suppressed = [HealthCheck.too_slow, HealthCheck.data_too_large]
+    options: Any = {"derandomize": True, "deadline": None, "database": None, "suppress_health_check": suppressed}
 
-    @settings(max_examples=3000 if full else 60, **options)
+    @settings(max_examples=3000 if full else 40, **options)
     @given(damage(reader.data))
-    def one(data: bytes) -> None:
-        hold(reader, path, data)
+    def read_one(data: bytes) -> None:
+        read_or_error(reader, path, data)
 
-    one()
+    read_one()
 
 
 @pytest.fixture(autouse=True)
-def nothing_is_run(tmp_path, monkeypatch) -> Iterator[None]:
-    """No file has code of its own run."""
+def no_code_runs(tmp_path, monkeypatch) -> Iterator[None]:
+    """Check that reading runs no code from a file."""
     monkeypatch.chdir(tmp_path)
     yield
     assert not Path("trapped").exists()
 
 
-def pixels(height: int = 24, width: int = 32, kind: type = np.uint8) -> np.ndarray:
-    """Noise, for pictures."""
+def noise(height: int = 24, width: int = 32, kind: type = np.uint8) -> np.ndarray:
+    """Return random pixels."""
     return np.random.default_rng(0).integers(0, np.iinfo(kind).max, (height, width, 3)).astype(kind)
 
 
-def pictures() -> Iterator[Reader]:
-    """Pictures of all formats, and their sizes."""
+def image_readers() -> Iterator[Reader]:
+    """Yield image files of all formats, for `read_image` and `image_size`."""
     errors = (UnreadableImageError,)
     for name, options in {"a.jpg": [], "a.png": [], "a.bmp": [], "a.webp": [cv2.IMWRITE_WEBP_QUALITY, 101]}.items():
-        data = cv2.imencode(name[1:], pixels(), options)[1].tobytes()
+        data = cv2.imencode(name[1:], noise(), options)[1].tobytes()
         yield Reader(name, data, read_image, errors)
         yield Reader(f"size of {name}", data, image_size, errors)
-    yield Reader("16 bits.png", cv2.imencode(".png", pixels(kind=np.uint16))[1].tobytes(), read_image, errors)
+    yield Reader("16 bits.png", cv2.imencode(".png", noise(kind=np.uint16))[1].tobytes(), read_image, errors)
 
 
 def camera_files(folder: Path) -> Iterator[Reader]:
-    """Camera files of all formats, and a table of lenses."""
+    """Yield camera files of all formats, and a lens database."""
     files: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
         "opencv.yaml": (partial(write_opencv, camera=CAMERA), read_opencv),
         "opencv.xml": (partial(write_opencv, camera=CAMERA), read_opencv),
@@ -210,47 +171,47 @@ def camera_files(folder: Path) -> Iterator[Reader]:
 
 TABLE = ",".join(COLUMNS) + '\na,b,c,opencv,640,480,500,500,320,240,"[-0.3, 0.1, 0, 0]",,0.1,1,s,l\n'
 CAMERA_FILES = ("opencv.yaml", "opencv.xml", "ros.yaml", "kalibr.yaml", "cameras.txt", "lenses.csv")
-PICTURES = {reader.name: reader for reader in pictures()}
+IMAGES = {reader.name: reader for reader in image_readers()}
 
 
 @pytest.fixture
 def camera_file(tmp_path) -> Callable[[str], Reader]:
-    """A whole camera file by its name."""
-    found = {reader.name: reader for reader in camera_files(tmp_path)}
-    return found.__getitem__
+    """Return a camera file by its name."""
+    readers = {reader.name: reader for reader in camera_files(tmp_path)}
+    return readers.__getitem__
 
 
-@pytest.mark.parametrize("name", PICTURES)
-def test_a_damaged_picture_is_read_or_named(name, tmp_path, full_extremes):
-    reader = PICTURES[name]
-    assert not isinstance(hold(reader, tmp_path / "whole", reader.data), Exception)
-    fuzz(reader, tmp_path / "picture", full=full_extremes)
+@pytest.mark.parametrize("name", IMAGES)
+def test_a_damaged_image_is_read_or_raises(name, tmp_path, full_extremes):
+    reader = IMAGES[name]
+    assert not isinstance(read_or_error(reader, tmp_path / "undamaged", reader.data), Exception)
+    fuzz(reader, tmp_path / "image", full=full_extremes)
 
 
 def jpeg(height: int, width: int) -> bytes:
-    """A whole file of 24 x 32 pixels that says it has others."""
-    data = bytearray(cv2.imencode(".jpg", pixels())[1].tobytes())
+    """Return a JPEG file of 24 x 32 pixels whose header claims another size."""
+    data = bytearray(cv2.imencode(".jpg", noise())[1].tobytes())
     at = data.index(b"\xff\xc0") + 5
     data[at : at + 4] = struct.pack(">HH", height, width)
     return bytes(data)
 
 
 def chunk(kind: bytes, data: bytes, *, length: int | None = None) -> bytes:
-    """A part of a PNG, maybe one that says it is longer than it is."""
+    """Return a chunk of a PNG, whose header may claim another length."""
     length = len(data) if length is None else length
     return struct.pack(">I", length) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
 def png(height: int, width: int, *, length: int | None = None) -> bytes:
-    """A file that says it has so many pixels, and holds a thousand bytes of them."""
+    """Return a PNG whose header claims a size, with 1000 bytes of pixels."""
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0))
     body = chunk(b"IDAT", zlib.compress(bytes(1000)), length=length)
     return b"\x89PNG\r\n\x1a\n" + head + body + chunk(b"IEND", b"")
 
 
 def bmp(height: int, width: int) -> bytes:
-    """A file of 24 x 32 pixels that says it has others."""
-    data = cv2.imencode(".bmp", pixels())[1].tobytes()
+    """Return a BMP file of 24 x 32 pixels whose header claims another size."""
+    data = cv2.imencode(".bmp", noise())[1].tobytes()
     return data[:18] + struct.pack("<ii", width, height) + data[26:]
 
 
@@ -260,103 +221,102 @@ CLAIMS = {
     "png 30000": png(30_000, 30_000),
     "png 100000": png(100_000, 100_000),
     "png 2^31": png(2**31 - 1, 2**31 - 1),
-    "png of a part of 4 GB": png(24, 32, length=2**32 - 200),
+    "png with a chunk of 4 GB": png(24, 32, length=2**32 - 200),
     "bmp 100000": bmp(100_000, 100_000),
     "bmp -2^31": bmp(-(2**31), 2**31 - 1),
 }
 
 
 @pytest.mark.parametrize("claim", CLAIMS)
-def test_a_picture_that_claims_more_than_it_holds_takes_no_memory(claim, tmp_path):
+def test_an_image_that_claims_a_huge_size_takes_no_memory(claim, tmp_path):
     reader = Reader(claim, CLAIMS[claim], read_image, (UnreadableImageError,))
-    assert isinstance(hold(reader, tmp_path / "picture", reader.data), UnreadableImageError)
+    assert isinstance(read_or_error(reader, tmp_path / "image", reader.data), UnreadableImageError)
 
 
-def test_threads_that_read_pictures_leave_the_log_level_alone(tmp_path):
+def test_threads_that_read_images_keep_the_log_level(tmp_path):
     path = tmp_path / "a.png"
-    path.write_bytes(PICTURES["a.png"].data)
+    path.write_bytes(IMAGES["a.png"].data)
     expected, before = read_image(path), cv2.utils.logging.getLogLevel()
     level = cv2.utils.logging.LOG_LEVEL_WARNING
     cv2.utils.logging.setLogLevel(level)
     try:
         with ThreadPoolExecutor(8) as pool:
-            found = list(pool.map(lambda _: read_image(path), range(400)))
+            images = list(pool.map(lambda _: read_image(path), range(400)))
         assert cv2.utils.logging.getLogLevel() == level
     finally:
         cv2.utils.logging.setLogLevel(before)
-    assert all(torch.equal(image, expected) for image in found)
+    assert all(torch.equal(image, expected) for image in images)
 
 
-def test_a_folder_with_a_damaged_frame_is_read_without_it_or_refused(tmp_path, full_extremes):
+def test_a_folder_with_a_damaged_frame_skips_it_or_raises(tmp_path, full_extremes):
     folder = tmp_path / "frames"
     for i in range(12):
         path = folder / f"drive{i // 6}" / f"{i}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(PICTURES["a.png"].data)
+        path.write_bytes(IMAGES["a.png"].data)
 
     def read(path: Path) -> list[Any]:
         frames = FrameFolder(folder, size=(12, 16))
         assert len(frames) + len(frames.skipped) == 12
         return [frames[i] for i in range(len(frames))]
 
-    reader = Reader("frames", PICTURES["a.png"].data, read, (ValueError, UserWarning))
-    assert len(hold(reader, folder / "drive0" / "0.png", reader.data)) == 12
+    reader = Reader("frames", IMAGES["a.png"].data, read, (ValueError, UserWarning))
+    assert len(read_or_error(reader, folder / "drive0" / "0.png", reader.data)) == 12
     fuzz(reader, folder / "drive0" / "0.png", full=full_extremes)
 
 
 @pytest.mark.parametrize("name", CAMERA_FILES)
-def test_a_damaged_camera_file_is_read_or_named(name, camera_file, tmp_path, full_extremes):
+def test_a_damaged_camera_file_is_read_or_raises(name, camera_file, tmp_path, full_extremes):
     reader = camera_file(name)
-    assert not isinstance(hold(reader, tmp_path / f"whole-{name}", reader.data), Exception)
+    assert not isinstance(read_or_error(reader, tmp_path / f"undamaged-{name}", reader.data), Exception)
     fuzz(reader, tmp_path / f"damaged-{name}", full=full_extremes)
 
 
-# In place of the first 500.0, or of the width; and what is wrong is wrong in every format that has such a thing.
 @pytest.mark.parametrize("token", [token for token in TOKENS if token], ids=range(len(TOKENS) - 1))
 @pytest.mark.parametrize("name", CAMERA_FILES)
-def test_a_number_of_a_camera_that_is_none_is_named(name, token, camera_file, tmp_path):
+def test_an_invalid_value_in_a_camera_file_names_the_file(name, token, camera_file, tmp_path):
     reader, path = camera_file(name), tmp_path / f"damaged-{name}"
     for number in (b"640", b"500", b"radtan", b"plumb_bob", b"opencv"):
         if number in reader.data:
-            found = hold(reader, path, reader.data.replace(number, token, 1))
-            assert not isinstance(found, Exception) or str(path) in str(found)
+            result = read_or_error(reader, path, reader.data.replace(number, token, 1))
+            assert not isinstance(result, Exception) or str(path) in str(result)
 
 
 def bomb(levels: int) -> bytes:
-    """Lists of ten times the one before, by aliases."""
+    """Return YAML whose aliases make each list ten times as long as the one before."""
     lists = [b"a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
     lists += [b"a%d: &a%d [%s]" % (i, i, b", ".join([b"*a%d" % (i - 1)] * 10)) for i in range(1, levels)]
     return b"\n".join(lists) + b"\n"
 
 
 def merge_bomb(levels: int) -> bytes:
-    """Mappings that merge ten times the one before."""
+    """Return YAML whose mappings each merge the one before ten times."""
     maps = [b"a0: &a0 {a: 1, b: 2, c: 3}"]
     maps += [b"a%d: &a%d {<<: [%s]}" % (i, i, b", ".join([b"*a%d" % (i - 1)] * 10)) for i in range(1, levels)]
     return b"\n".join(maps) + b"\n"
 
 
-PLACES = {
+FIELDS = {
     "ros.yaml": [b"640", b"500.0", b"plumb_bob"],
     "kalibr.yaml": [b"640", b"500.0", b"radtan", b"pinhole"],
 }
 
 
-@pytest.mark.parametrize(("name", "place"), [(name, place) for name, places in PLACES.items() for place in places])
-def test_aliases_fill_neither_memory_nor_message(name, place, camera_file, tmp_path):
+@pytest.mark.parametrize(("name", "field"), [(name, field) for name, fields in FIELDS.items() for field in fields])
+def test_yaml_aliases_fill_neither_the_memory_nor_the_message(name, field, camera_file, tmp_path):
     reader = camera_file(name)
-    assert place in reader.data
-    found = hold(reader, tmp_path / "bomb.yaml", bomb(9) + reader.data.replace(place, b"*a8", 1))
-    assert "bomb.yaml" in str(found)
+    assert field in reader.data
+    result = read_or_error(reader, tmp_path / "bomb.yaml", bomb(9) + reader.data.replace(field, b"*a8", 1))
+    assert "bomb.yaml" in str(result)
 
 
-def test_merges_do_not_fill_the_memory(camera_file, tmp_path):
+def test_yaml_merges_do_not_fill_the_memory(camera_file, tmp_path):
     reader = camera_file("ros.yaml")
-    assert "merge key" in str(hold(reader, tmp_path / "bomb.yaml", merge_bomb(9) + reader.data))
+    assert "merge key" in str(read_or_error(reader, tmp_path / "bomb.yaml", merge_bomb(9) + reader.data))
 
 
 @pytest.mark.parametrize("declared", ["entities", "external"])
-def test_entities_of_xml_fill_no_memory_and_open_no_file(declared, tmp_path):
+def test_xml_entities_fill_no_memory_and_open_no_file(declared, tmp_path):
     entities = '<!ENTITY a0 "aaaaaaaaaa">'
     entities += "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 10))
     if declared == "external":
@@ -365,18 +325,18 @@ def test_entities_of_xml_fill_no_memory_and_open_no_file(declared, tmp_path):
     body = "<opencv_storage><image_width>&a9;</image_width></opencv_storage>"
     text = f'<?xml version="1.0"?><!DOCTYPE a [{entities}]>{body}'
     reader = Reader("xml", text.encode(), read_opencv)
-    assert isinstance(hold(reader, tmp_path / "a.xml", reader.data), ValueError)
+    assert isinstance(read_or_error(reader, tmp_path / "a.xml", reader.data), ValueError)
 
 
 ROW = PairRow(
     *(3, "d/3.png", None, "d", "train", "scene", 1, 2, 16, 24),
     effects=[],
     beyond={"flow": 0},
-    files={"clean.png": Stored("pairs/0/3.clean.png", 3, "ab")},
+    files={"clean.png": StoredFile("pairs/0/3.clean.png", 3, "ab")},
 )
 
 
-def test_a_damaged_row_is_read_or_named(tmp_path, full_extremes):
+def test_a_damaged_row_of_a_manifest_is_read_or_raises(tmp_path, full_extremes):
     def read(path: Path) -> PairRow:
         row = read_row(path.read_bytes())
         assert row.as_line()
@@ -384,12 +344,12 @@ def test_a_damaged_row_is_read_or_named(tmp_path, full_extremes):
         return row
 
     reader = Reader("row", ROW.as_line().encode(), read, (DamagedPairError,))
-    assert hold(reader, tmp_path / "row", reader.data) == ROW
+    assert read_or_error(reader, tmp_path / "row", reader.data) == ROW
     fuzz(reader, tmp_path / "row", full=full_extremes)
 
 
 @pytest.mark.parametrize("value", [None, math.inf, 1.5, "x", [1], {}, True, -1, 2**63, 10**400])
-def test_a_row_with_a_value_of_another_type_is_named(value):
+def test_a_row_of_a_manifest_with_a_value_of_another_type_raises(value):
     for name in ("number", "height", "width"):
         with pytest.raises(DamagedPairError, match="a row must"):
             read_row(json.dumps(ROW._asdict() | {name: value, "files": {}}).encode())
@@ -405,12 +365,12 @@ def test_a_row_with_a_value_of_another_type_is_named(value):
 
 
 def pair_set(folder: Path, form: str) -> dict[str, bytes]:
-    """One pair on disk, with its manifest: what is in its files."""
-    dice, size = np.random.default_rng(1), (16, 24)
+    """Write a pair and its manifest, and return the content of its files."""
+    random, size = np.random.default_rng(1), (16, 24)
     maps: dict[str, np.ndarray] = {name: np.ones(size, bool) for name in ("valid", "restore_valid")}
-    maps |= {name: dice.normal(size=(2, *size)).astype(np.float32) for name in ("flow", "restore_flow")}
-    files = encode_pair(PairArrays(pixels(*size), pixels(*size), maps), form)
-    stored = {suffix: Stored(f"pairs/0/3.{suffix}", len(data), "ab") for suffix, data in files.items()}
+    maps |= {name: random.normal(size=(2, *size)).astype(np.float32) for name in ("flow", "restore_flow")}
+    files = encode_pair(PairArrays(noise(*size), noise(*size), maps), form)
+    stored = {suffix: StoredFile(f"pairs/0/3.{suffix}", len(data), "ab") for suffix, data in files.items()}
     for suffix, file in stored.items():
         (folder / file.path).parent.mkdir(parents=True, exist_ok=True)
         (folder / file.path).write_bytes(files[suffix])
@@ -419,7 +379,7 @@ def pair_set(folder: Path, form: str) -> dict[str, bytes]:
 
 
 def first_pair(folder: Path, suffix: str, path: Path) -> Any:
-    """The pair, with other bytes in one of its files, which its row knows of."""
+    """Read the pair after one of its files, and its size in the manifest, changed."""
     manifest = folder / "manifest.jsonl"
     row = read_row(manifest.read_bytes())
     stored = row.files | {suffix: row.files[suffix]._replace(bytes=path.stat().st_size)}
@@ -428,18 +388,18 @@ def first_pair(folder: Path, suffix: str, path: Path) -> Any:
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_a_pair_with_a_damaged_file_is_read_or_named(form, tmp_path, full_extremes):
+def test_a_pair_with_a_damaged_file_is_read_or_raises(form, tmp_path, full_extremes):
     for suffix, data in pair_set(tmp_path, form).items():
         pair_set(tmp_path, form)
         reader = Reader(suffix, data, partial(first_pair, tmp_path, suffix), (DamagedPairError,))
         path = tmp_path / "pairs" / "0" / f"3.{suffix}"
-        assert not isinstance(hold(reader, path, data), Exception)
-        if suffix != "corrupted.png":  # as the clean one
+        assert not isinstance(read_or_error(reader, path, data), Exception)
+        if suffix != "corrupted.png":  # of the format of the clean one
             fuzz(reader, path, full=full_extremes)
 
 
 def npz(shape: tuple[int, ...]) -> bytes:
-    """An archive whose flow says it has a shape."""
+    """Return an archive without data whose flow claims a shape."""
     head = repr({"descr": "<f4", "fortran_order": False, "shape": shape}).encode()
     head += b" " * (64 - (len(head) + 11) % 64) + b"\n"
     stream = io.BytesIO()
@@ -448,49 +408,49 @@ def npz(shape: tuple[int, ...]) -> bytes:
     return stream.getvalue()
 
 
-def packed(count: int) -> bytes:
-    """An archive of so many zeros, which take a thousandth of the room."""
+def compressed_zeros(count: int) -> bytes:
+    """Return a compressed archive of zeros."""
     stream = io.BytesIO()
     np.savez_compressed(stream, restore_flow=np.zeros(count))
     return stream.getvalue()
 
 
 @pytest.mark.parametrize("shape", [(2, 10**6, 10**6), (2, 30_000, 30_000), (2**62, 4), (-1, 3), (10**30,)])
-def test_an_array_that_claims_more_than_it_holds_takes_no_memory(shape, tmp_path):
+def test_an_array_that_claims_a_huge_shape_takes_no_memory(shape, tmp_path):
     pair_set(tmp_path, "npz")
     reader = Reader("npz", npz(shape), partial(first_pair, tmp_path, "maps.npz"), (DamagedPairError,))
-    assert isinstance(hold(reader, tmp_path / "pairs/0/3.maps.npz", reader.data), DamagedPairError)
+    assert isinstance(read_or_error(reader, tmp_path / "pairs/0/3.maps.npz", reader.data), DamagedPairError)
 
 
-def test_zeros_that_are_packed_take_no_memory(tmp_path):
+def test_compressed_zeros_take_no_memory(tmp_path):
     pair_set(tmp_path, "npz")
-    data = packed(20_000_000)
+    data = compressed_zeros(20_000_000)
     assert len(data) < 2**18
     reader = Reader("npz", data, partial(first_pair, tmp_path, "maps.npz"), (DamagedPairError,))
-    assert "claims more" in str(hold(reader, tmp_path / "pairs/0/3.maps.npz", data))
+    assert "claims more" in str(read_or_error(reader, tmp_path / "pairs/0/3.maps.npz", data))
 
 
 def content(**more: Any) -> dict[str, Any]:
-    """What a checkpoint holds."""
+    """Return the content of a checkpoint."""
     return {"state_dict": nn.Linear(8, 8).state_dict(), "task": "undistort", "epoch": 3} | more
 
 
 def read_weights(path: Path) -> dict[str, Any]:
-    """A checkpoint, held against the model that it is of."""
+    """Read a checkpoint and check it against its model."""
     checkpoint = read_checkpoint(path, task="undistort")
     check_fits(checkpoint, nn.Linear(8, 8), path)
     return checkpoint
 
 
 def saved(value: Any) -> bytes:
-    """The bytes of a checkpoint."""
+    """Return the bytes of a saved value."""
     stream = io.BytesIO()
     torch.save(value, stream)
     return stream.getvalue()
 
 
 def resealed(data: bytes, change: Callable[[bytes], bytes]) -> bytes:
-    """An archive whose pickle is changed, with checksums that are right again."""
+    """Change the pickle in an archive, with valid checksums."""
     stream = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(stream, "w") as new:
         for name in old.namelist():
@@ -498,56 +458,56 @@ def resealed(data: bytes, change: Callable[[bytes], bytes]) -> bytes:
     return stream.getvalue()
 
 
-def test_a_damaged_checkpoint_is_read_or_named(tmp_path, full_extremes):
+def test_a_damaged_checkpoint_is_read_or_raises(tmp_path, full_extremes):
     reader = Reader("checkpoint", saved(content()), read_weights, (CheckpointError,))
-    assert not isinstance(hold(reader, tmp_path / "last.ckpt", reader.data), Exception)
+    assert not isinstance(read_or_error(reader, tmp_path / "last.ckpt", reader.data), Exception)
     fuzz(reader, tmp_path / "last.ckpt", full=full_extremes)
 
 
-@pytest.mark.filterwarnings("ignore:Detected pickle protocol:UserWarning")  # torch says so before it refuses
-def test_a_checkpoint_whose_pickle_is_damaged_is_read_or_named(tmp_path, full_extremes):
-    whole = saved(content())
-    with zipfile.ZipFile(io.BytesIO(whole)) as archive:
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol:UserWarning")  # torch warns before it raises
+def test_a_checkpoint_with_a_damaged_pickle_is_read_or_raises(tmp_path, full_extremes):
+    archived = saved(content())
+    with zipfile.ZipFile(io.BytesIO(archived)) as archive:
         (name,) = (name for name in archive.namelist() if name.endswith("data.pkl"))
         inner = archive.read(name)
 
     def read(path: Path) -> Any:
-        path.write_bytes(resealed(whole, lambda _: path.read_bytes()))
+        path.write_bytes(resealed(archived, lambda _: path.read_bytes()))
         return read_weights(path)
 
     fuzz(Reader("pickle", inner, read, (CheckpointError,)), tmp_path / "last.ckpt", full=full_extremes)
 
 
-OTHERS: Mapping[str, Any] = {
-    "a task of two": content(task=torch.ones(2)),
-    "a task of none": content(task=None),
-    "weights in a list": content(state_dict=[1, 2]),
-    "weights that are numbers": content(state_dict={"weight": 1.0, "bias": 2.0}),
-    "weights under numbers": content(state_dict={1: torch.ones(2), "bias": torch.ones(2)}),
-    "lists in lists": content(more=json.loads("[" * 60 + "]" * 60)),
+INVALID_CHECKPOINTS: Mapping[str, Any] = {
+    "task of two values": content(task=torch.ones(2)),
+    "no task": content(task=None),
+    "list of weights": content(state_dict=[1, 2]),
+    "numbers as weights": content(state_dict={"weight": 1.0, "bias": 2.0}),
+    "numbers as names": content(state_dict={1: torch.ones(2), "bias": torch.ones(2)}),
+    "nested lists": content(more=json.loads("[" * 60 + "]" * 60)),
     "huge weights": content(state_dict={"weight": torch.empty(1, 1).expand(10**6, 10**6), "bias": torch.ones(8)}),
 }
 
 
-@pytest.mark.parametrize("name", OTHERS)
-def test_a_checkpoint_of_something_else_is_named(name, tmp_path):
-    reader = Reader(name, saved(OTHERS[name]), read_weights, (CheckpointError,))
-    found = hold(reader, tmp_path / "last.ckpt", reader.data)
-    assert isinstance(found, CheckpointError) or name == "lists in lists"
+@pytest.mark.parametrize("name", INVALID_CHECKPOINTS)
+def test_an_invalid_checkpoint_raises(name, tmp_path):
+    reader = Reader(name, saved(INVALID_CHECKPOINTS[name]), read_weights, (CheckpointError,))
+    result = read_or_error(reader, tmp_path / "last.ckpt", reader.data)
+    assert isinstance(result, CheckpointError) or name == "nested lists"
 
 
-@pytest.mark.filterwarnings("ignore:Detected pickle protocol:UserWarning")  # torch says so before it refuses
-@pytest.mark.parametrize("where", ["pickle", "archive"])
-def test_code_in_a_checkpoint_is_not_run(where, tmp_path):
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol:UserWarning")  # torch warns before it raises
+@pytest.mark.parametrize("container", ["pickle", "archive"])
+def test_code_in_a_checkpoint_does_not_run(container, tmp_path):
     data = pickle.dumps(Trap())
-    data = resealed(saved(content()), lambda _: data) if where == "archive" else data
-    reader = Reader(where, data, read_weights, (CheckpointError,))
-    assert isinstance(hold(reader, tmp_path / "last.ckpt", data), CheckpointError)
+    data = resealed(saved(content()), lambda _: data) if container == "archive" else data
+    reader = Reader(container, data, read_weights, (CheckpointError,))
+    assert isinstance(read_or_error(reader, tmp_path / "last.ckpt", data), CheckpointError)
 
 
 @pytest.mark.parametrize("text", [TRAP, b"a: [", b"a: 'b", b"\0"])
-def test_a_broken_configuration_is_told_in_a_line(text, call, tmp_path):
-    (tmp_path / "own" / "task").mkdir(parents=True)
-    (tmp_path / "own" / "task" / "mine.yaml").write_bytes(b"# @package _global_\n" + text + b"\n")
-    outcome = call("train", "--config-dir", "own", "+task=mine")
+def test_an_invalid_configuration_raises_an_error_of_one_line(text, call, tmp_path):
+    (tmp_path / "configs" / "task").mkdir(parents=True)
+    (tmp_path / "configs" / "task" / "mine.yaml").write_bytes(b"# @package _global_\n" + text + b"\n")
+    outcome = call("train", "--config-dir", "configs", "+task=mine")
     assert "mine.yaml" in outcome.message

@@ -1,0 +1,85 @@
+"""Images, maps and comparisons that the tests of the stability contract share."""
+
+import itertools
+from collections.abc import Iterable, Sequence
+
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+import torchrefract as tr
+
+DTYPES = (torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64)
+MAPS = ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission", "extinction", "intensity")
+FLOW_PX, IMAGE = 1e-4, 1e-5  # between batches, threads and workers; an image as a share of its range
+_ROUNDING = {torch.uint8: 1.0, torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}  # steps of types near 1
+
+
+def random_image(*shape: int, dtype: torch.dtype = torch.float32, device: str = "cpu", seed: int = 0) -> Tensor:
+    """Return uniform noise in [0, 1], or in 0 ... 255 for uint8."""
+    image = torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return ((255 * image).round() if dtype is torch.uint8 else image).to(device, dtype)
+
+
+def maps_of(degraded: tr.Degraded) -> dict[str, Tensor]:
+    """Return the image and all maps that the result has, by name."""
+    return {name: value for name in MAPS if (value := getattr(degraded, name)) is not None}
+
+
+def assert_equal_maps(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
+    """Raise AssertionError unless all maps have equal bits."""
+    assert actual.keys() == expected.keys()
+    for name, value in expected.items():
+        assert torch.equal(actual[name], value), name
+
+
+def assert_close_maps(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
+    """Raise AssertionError unless maps agree as they do between batches, threads and workers.
+
+    Flows agree to 1e-4 px, or to rounding if they are longer than 10 px, and inverse flows where both are valid. Images
+    agree to 1e-5 of their range, and where the flows differ to the change of the image over that distance. One mask
+    pixel in 500 may differ, since masks are thresholds of flows.
+    """
+    assert actual.keys() == expected.keys()
+    shift = 0.0
+    if "flow" in expected:
+        assert_close(actual["flow"], expected["flow"], rtol=1e-5, atol=FLOW_PX)
+        shift = (actual["flow"] - expected["flow"]).abs().amax().item() if actual["flow"].numel() else 0.0
+    for name, value in expected.items():
+        other = actual[name]
+        assert other.shape == value.shape, name
+        if value.dtype is torch.bool:
+            assert (other != value).sum() <= 1 + value.numel() // 500, name
+        elif name == "restore_flow":
+            both = (actual["restore_valid"] & expected["restore_valid"]).expand_as(value)
+            assert_close(other[both], value[both], rtol=1e-5, atol=FLOW_PX)
+        elif name != "flow":
+            assert_close_images(other, value, shift_px=shift)
+
+
+def assert_close_images(actual: Tensor, expected: Tensor, *, shift_px: float = 0.0) -> None:
+    """Raise AssertionError unless images agree to 1e-5 of their range and the rounding of their type."""
+    assert actual.dtype is expected.dtype
+    scale = 255 if actual.dtype is torch.uint8 else 1
+    # Noise changes by at most its range from one pixel to the next, along each axis.
+    tolerance = scale * (IMAGE + 2 * shift_px) + _ROUNDING.get(actual.dtype, 0.0)
+    assert_close(actual.double(), expected.double(), rtol=1e-5, atol=tolerance)
+
+
+def is_in_range(image: Tensor) -> bool:
+    """Return True if an image is in [0, 1], or 0 ... 255, up to the rounding of bilinear weights."""
+    if image.dtype is torch.uint8:
+        return True
+    rounding = 4 * torch.finfo(torch.promote_types(image.dtype, torch.float32)).eps
+    return bool((image >= -rounding).all() and (image <= 1 + rounding).all())
+
+
+def combinations(*lists: Sequence, full: bool) -> Iterable[tuple]:
+    """Return all combinations of the values, or as few of them as use each value at least once."""
+    if full:
+        return itertools.product(*lists)
+    # Each list is shifted against the one before it in every round, so that not only equal indices meet.
+    return [
+        tuple(values[(i + i // len(values) * n) % len(values)] for n, values in enumerate(lists))
+        for i in range(max(map(len, lists)))
+    ]

@@ -24,12 +24,6 @@ def args(tmp_path, monkeypatch) -> Namespace:
     return Namespace(source=tmp_path / "frames", scene="paper_refractive", size=(24, 40), maps="png", count=4)
 
 
-def test_a_pair_takes_longer_than_its_reading_and_encoding(args, on_threads):
-    on_threads(1)
-    seconds = pairs.measure_one_pair(args)
-    assert seconds["generated"] > seconds["read_and_encode"] > 0
-
-
 def test_a_run_is_measured_and_its_files_are_counted(args, tmp_path):
     out = tmp_path / "out"
     run = pairs.measure_run(args, out, 0)

@@ -23,7 +23,14 @@ from torchrefract.effects.warp_effect import (
     warped,
 )
 from torchrefract.planning.composition import ComposePlan, CompositionPlan, PlannedWarp, plan_composition
-from torchrefract.planning.plan import TOLERANCE_PX, ErrorModel, PlanRequest, check_tolerance, lattice_with_stride
+from torchrefract.planning.plan import (
+    TOLERANCE_PX,
+    ErrorModel,
+    PlanRequest,
+    WarpPlan,
+    check_tolerance,
+    lattice_with_stride,
+)
 from torchrefract.types import Degraded
 from torchrefract.warping.flow import compose_flows
 from torchrefract.warping.grid import field_dtype, inside
@@ -175,7 +182,9 @@ class Compose(Effect):
             for place, effect in enumerate(effects)
         )
         names = tuple(type(effect).__name__ for effect in effects)
-        samplings = sum(any(not plans[place].is_identity for place in group) for group in groups)
+        samplings = sum(
+            any(effects[place].p > 0 and not plans[place].is_identity for place in group) for group in groups
+        )
         return ComposePlan(height, width, self.tolerance_px, names, each, tuple(strides), error, samplings)
 
     def degrade_batch(self, image: Tensor, params: ComposeParams, depth: Tensor | None) -> Degraded:
@@ -187,6 +196,15 @@ class Compose(Effect):
         state = _Progress(image, depth, len(params.applied))
         places: list[int] = []
         requests = self._constant_requests(id(self), height, width, dtype)
+
+        def move() -> None:
+            together = tuple(places)
+            state.move(
+                [leaves[place] for place in together],
+                cast(PlanRequest, requests[together[0]]),
+                lambda: self._constant_plan(id(self), together, height, width, dtype),
+            )
+
         for place, leaf in enumerate(leaves):
             if isinstance(leaf.effect, WarpEffect):
                 state.has_warps = True
@@ -195,11 +213,11 @@ class Compose(Effect):
                 continue
             changes_light = requests[place] is None or leaf.effect.may_change(leaf.params)
             if places and changes_light:  # the warps before it come first
-                state.move([leaves[i] for i in places], cast(PlanRequest, requests[places[0]]))
-                places = []
+                move()
+                places.clear()
             state.shade(cast(PhotometricEffect, leaf.effect), leaf.params)
         if places:
-            state.move([leaves[i] for i in places], cast(PlanRequest, requests[places[0]]))
+            move()
         return state.result(params)
 
     def effects_with_params(self, params: ComposeParams) -> Iterator[tuple[Effect, Any]]:
@@ -260,6 +278,16 @@ class Compose(Effect):
     def _constant_requests(self, _: int, height: int, width: int, dtype: torch.dtype) -> tuple[PlanRequest | None, ...]:
         return self._requests(height, width, dtype)
 
+    @assume_constant_result
+    def _constant_plan(
+        self, _: int, places: tuple[int, ...], height: int, width: int, dtype: torch.dtype
+    ) -> tuple[int, tuple[WarpPlan, ...]]:
+        # torch.compile reads the fields of a constant, but not those of the dataclasses in it.
+        effects = [effect for effect, _ in self._leaf_effects()]
+        request = cast(PlanRequest, self._requests(height, width, dtype)[places[0]])
+        plan = plan_composition(_planned_warps([effects[place] for place in places]), request)
+        return plan.stride, plan.plans
+
     def _children(self) -> Iterator[Effect]:
         return cast(Iterator[Effect], iter(self.effects))
 
@@ -295,21 +323,32 @@ class _Progress:
         self.valid: Callable[[], Tensor] | None = None  # None is everywhere
         self.light: dict[str, Callable[[], Tensor]] = {}
 
-    def move(self, leaves: Sequence[_Leaf], request: PlanRequest) -> None:
-        """Sample the images along the composed flow of several warps."""
+    def move(
+        self,
+        leaves: Sequence[_Leaf],
+        request: PlanRequest,
+        plan_all: Callable[[], tuple[int, tuple[WarpPlan, ...]]],
+    ) -> None:
+        """Sample the images along the composed flow of several warps.
+
+        Args:
+            leaves: the warps, in order.
+            request: the frame and the tolerance of the composed flow.
+            plan_all: returns the stride and the plans if all warps move all samples.
+        """
         rows, _, height, width = self.image.shape
         leaves = [leaf._replace(params=params_per_frame(leaf.params, self.frames)) for leaf in leaves]
         warps = [(cast(WarpEffect, leaf.effect), leaf.params) for leaf in leaves]
         active = [effect.active(params, height, width) for effect, params in warps]
-        groups = _group_samples(warps, active, request)
+        groups = _group_samples(warps, active, request, plan_all)
         applied, moved = torch.stack([params.applied for _, params in warps]).any(dim=0), torch.stack(active).any(dim=0)
         parts = []
-        for index, acting, plan in groups:
+        for index, acting, stride, plans in groups:
             chosen = [warps[k] for k in acting]
             if index is not None:
                 chosen = [(effect, select_params(params, index)) for effect, params in chosen]
-            parts.append(FlowPart(index, *_composed_flow(chosen, plan)))
-            if all(warp_plan.stride == 0 for warp_plan in plan.plans) and not _needs_gradient(chosen):
+            parts.append(FlowPart(index, *_composed_flow(chosen, stride, plans)))
+            if all(plan.stride == 0 for plan in plans) and not _needs_gradient(chosen):
                 moved = torch.zeros_like(moved) if index is None else moved.index_fill(0, index, False)
         segment = _Segment(applied, moved, BatchFlow(parts))
         self.image = _sample_segment(self.image, segment, leaves, active)
@@ -317,9 +356,11 @@ class _Progress:
             depth, detached = expand_batch(self.depth, rows), segment._replace(flow=segment.flow.detach())
             self.depth = detached.sample(depth, SamplingOptions("border", "nearest", "auto"))
         self.light = {name: _moved(value, segment) for name, value in self.light.items()}
+        is_exact = request.tolerance_px is None
         for (effect, params), moves in zip(warps, active, strict=True):
-            planned = effect if request.tolerance_px else effect.exact()
-            flow = _remember(lambda planned=planned, params=params: planned.planned_flow(params, height, width))
+            flow = _remember(
+                lambda effect=effect, params=params: effect.planned_flow(params, height, width, is_exact=is_exact)
+            )
             self.warps.append((effect, params, flow, moves))
             self.valid = _valid_after(self.valid, flow, moves)
         self.segments.append(segment)
@@ -473,31 +514,41 @@ def _planned_warp(warp: WarpEffect, model: ErrorModel | None) -> PlannedWarp:
     return PlannedWarp(model, warp.rounding_ulps, warp.has_closed_form)
 
 
+class _Group(NamedTuple):
+    """Samples that the same warps move, by the same plan."""
+
+    samples: Tensor | None  # (n,), their numbers; None for all
+    acting: list[int]  # the numbers of the warps
+    stride: int  # px, of the lattice of the composed flow
+    plans: tuple[WarpPlan, ...]  # of each of the acting warps
+
+
 def _group_samples(
-    warps: Sequence[tuple[WarpEffect, Any]], active: Sequence[Tensor], request: PlanRequest
-) -> list[tuple[Tensor | None, list[int], CompositionPlan]]:
+    warps: Sequence[tuple[WarpEffect, Any]],
+    active: Sequence[Tensor],
+    request: PlanRequest,
+    plan_all: Callable[[], tuple[int, tuple[WarpPlan, ...]]],
+) -> list[_Group]:
     """Group the samples by the warps that move them and by their plan.
 
-    Returns:
-        For each group the numbers of its samples (None for all), the warps that move them, and the plan. If values
-        cannot be read, one group with all warps, whose plan holds for any subset of them.
+    If values cannot be read, there is one group with all warps, whose plan holds for any subset of them.
     """
     flags = None
     if not _needs_gradient(warps):
         flags = eager_values(lambda: torch.stack(list(active), dim=1), of=active[0])
     everything = list(range(len(warps)))
     if flags is None:
-        planned = _planned_warps([effect for effect, _ in warps])
-        return [(None, everything, plan_composition(planned, request))]
+        return [_Group(None, everything, *plan_all())]
     planned = [_planned_samples(effect, params, request) for effect, params in warps]
     groups: dict[Any, tuple[list[int], list[int], CompositionPlan]] = {}
     for i, row in enumerate(flags):
         acting = [k for k in everything if row[k]] or everything[-1:]
         plan = plan_composition(tuple([planned[k][i] for k in acting]), request)
         groups.setdefault((tuple(acting), plan.key), ([], acting, plan))[0].append(i)
-    if len(groups) == 1:
-        return [(None, acting, plan) for _, acting, plan in groups.values()]
-    return [(torch.tensor(rows), acting, plan) for rows, acting, plan in groups.values()]
+    return [
+        _Group(None if len(groups) == 1 else torch.tensor(rows), acting, plan.stride, plan.plans)
+        for rows, acting, plan in groups.values()
+    ]
 
 
 def _needs_gradient(warps: Sequence[tuple[WarpEffect, Any]]) -> bool:
@@ -512,21 +563,23 @@ def _planned_samples(effect: WarpEffect, params: Any, request: PlanRequest) -> l
     return [_planned_warp(effect, model) for model in effect.sample_models(params)]
 
 
-def _composed_flow(warps: Sequence[tuple[WarpEffect, Any]], plan: CompositionPlan) -> tuple[LatticeFlow, Tensor]:
+def _composed_flow(
+    warps: Sequence[tuple[WarpEffect, Any]], stride: int, plans: Sequence[WarpPlan]
+) -> tuple[LatticeFlow, Tensor]:
     """Compute the composed flow of warps at the nodes of one lattice, and where it exists."""
     if len(warps) == 1:
-        return warps[0][0].masked_flow(warps[0][1], plan.plans[0])
-    height, width = plan.plans[0].height, plan.plans[0].width
-    lattice = lattice_with_stride(height, width, plan.stride)
+        return warps[0][0].masked_flow(warps[0][1], plans[0])
+    height, width = plans[0].height, plans[0].width
+    lattice = lattice_with_stride(height, width, stride)
     dtype = flow_dtype(warps[0][1])
     device = warps[0][1].applied.device
     points = lattice.points(dtype=dtype, device=device)
     total: Tensor | None = None
     exists = torch.ones(1, 1, 1, 1, dtype=torch.bool, device=device)
-    for (effect, params), warp_plan in zip(reversed(warps), reversed(plan.plans), strict=True):
-        if warp_plan.stride == 0:
+    for (effect, params), plan in zip(reversed(warps), reversed(plans), strict=True):
+        if plan.stride == 0:
             continue
-        flow, flow_exists = effect.flow(params, points if total is None else points.displaced(total), warp_plan)
+        flow, flow_exists = effect.flow(params, points if total is None else points.displaced(total), plan)
         active = effect.active(params, height, width)
         flow = where_active(flow, 0.0, active, params)
         total = flow if total is None else total + flow
@@ -534,4 +587,4 @@ def _composed_flow(warps: Sequence[tuple[WarpEffect, Any]], plan: CompositionPla
     if total is None:
         rows, columns = lattice.num_nodes
         total = torch.zeros(len(warps[0][1].applied), 2, rows, columns, dtype=dtype, device=device)
-    return LatticeFlow(total, lattice), exists if plan.stride == 1 else exists.new_ones(1, 1, 1, 1)
+    return LatticeFlow(total, lattice), exists if stride == 1 else exists.new_ones(1, 1, 1, 1)

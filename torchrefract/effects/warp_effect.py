@@ -46,7 +46,9 @@ class SamplingOptions(NamedTuple):
 
     def or_else(self, other: "SamplingOptions") -> "SamplingOptions":
         """Take the options of another where these are undecided."""
-        return SamplingOptions(*(a or b for a, b in zip(self, other, strict=True)))
+        return SamplingOptions(
+            self.padding or other.padding, self.interpolation or other.interpolation, self.backend or other.backend
+        )
 
 
 class WarpEffect(Effect):
@@ -163,10 +165,10 @@ class WarpEffect(Effect):
         inverse = expand_batch(inverse, flow.shape[0])
         return where_active(inverse, 0.0, active, params), exists | ~per_sample(active)
 
-    def planned_flow(self, params: Any, height: int, width: int) -> "BatchFlow":
-        """Compute the flow by the plan of the ranges, or by one for each sample."""
+    def planned_flow(self, params: Any, height: int, width: int, *, is_exact: bool = False) -> "BatchFlow":
+        """Compute the flow by the plan of the ranges or by one for each sample, or exactly."""
         dtype = flow_dtype(params)
-        plan = self._constant_plan(id(self), height, width, dtype)
+        plan = self._constant_plan(id(self), height, width, dtype, is_exact)
         if not plan.is_per_sample or requires_grad(params):
             return BatchFlow([self._flow_part(None, params, plan)])
         request = self.plan_request(height, width, dtype)
@@ -201,10 +203,10 @@ class WarpEffect(Effect):
         flow = self.planned_flow(params, height, width)
         if flow.is_zero:
             return unchanged(image, params)
-        active = expand_batch(self.active(params, height, width), image.shape[0])
+        active = self.active(params, height, width)  # a flow has B rows, or as many as there are images
         options = SamplingOptions(self.padding, self.interpolation, self.backend)
         return warped(
-            flow.sample(image, active, params, options),
+            flow.sample(image, expand_batch(active, image.shape[0]), params, options),
             params,
             flow=lambda: flow.dense,
             valid=lambda: (flow.exists & inside(flow.dense)) | ~per_sample(expand_batch(active, flow.dense.shape[0])),
@@ -212,10 +214,10 @@ class WarpEffect(Effect):
         )
 
     @assume_constant_result
-    def _constant_plan(self, _: int, height: int, width: int, dtype: torch.dtype) -> WarpPlan:
+    def _constant_plan(self, _: int, height: int, width: int, dtype: torch.dtype, is_exact: bool) -> WarpPlan:
         # torch.compile takes the plan as a constant. It accepts this of methods only, and tells effects apart by the
         # argument.
-        return self.plan_for_dtype(height, width, dtype)
+        return (self.exact() if is_exact else self).plan_for_dtype(height, width, dtype)
 
 
 class FlowPart(NamedTuple):

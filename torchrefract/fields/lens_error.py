@@ -106,7 +106,7 @@ class LensErrorModel:
         if measured is None:
             return None
         spans = np.array([box.coefficients for box in self.boxes])  # (boxes, 12, 2)
-        used = spans.any(axis=(0, 2)).tolist()
+        used: list[bool] = spans.any(axis=(0, 2)).tolist()
         dropped = _droppable(used, measured.moved_px, _DROPPED_SHARE * budget_px)
         kept = [i for i in range(12) if used[i] and i not in dropped]
         # A level needs the steps of those before it, whose nodes lie within its own.

@@ -125,7 +125,8 @@ def plan_composition(warps: tuple[PlannedWarp, ...], request: PlanRequest) -> Co
         plans = tuple(plan_warp(None, request) for _ in warps)
         return CompositionPlan(1, plans, 0.0, math.inf)
     if len(warps) == 1:
-        plan = plan_warp(warps[0].model, replace(request, ulps=warps[0].ulps))
+        alone = replace(request, ulps=warps[0].ulps)
+        plan = plan_warp(warps[0].model, alone) if alone.is_reachable else _exact_plan(warps[0], request)
         return CompositionPlan(max(plan.stride, 1), (plan,), plan.error_px, _gradient(plan))
     best: CompositionPlan | None = None
     if all(warp.model is not None for warp in warps):
@@ -139,10 +140,26 @@ def plan_composition(warps: tuple[PlannedWarp, ...], request: PlanRequest) -> Co
     if best is not None:
         return best
     plans = _plan_shares(warps, request, request.remaining_px())
+    if _error_at_pixels(warps, plans) > request.tolerance_px:  # the rounding of closed forms has no share
+        plans = [
+            _exact_plan(warp, request) if warp.has_closed_form and not plan.is_identity else plan
+            for warp, plan in zip(warps, plans, strict=True)
+        ]
+    return CompositionPlan(1, tuple(plans), _error_at_pixels(warps, plans), _composed_gradient(plans))
+
+
+def _error_at_pixels(warps: Sequence[PlannedWarp], plans: Sequence[WarpPlan]) -> float:
+    """Bound the error of a composed flow that is computed at every pixel."""
     errors = [_own_error(plan, warp) for plan, warp in zip(plans, warps, strict=True)]
     counted = zip(errors, _stretches(plans), plans, strict=True)
-    error = _total([(own * stretch, plan.is_random) for own, stretch, plan in counted if own > 0])
-    return CompositionPlan(1, tuple(plans), error, _composed_gradient(plans))
+    return _total([(own * stretch, plan.is_random) for own, stretch, plan in counted if own > 0])
+
+
+def _exact_plan(warp: PlannedWarp, request: PlanRequest) -> WarpPlan:
+    """Plan an exact flow whose bounds are known as far as those of the warp."""
+    bounds = None if warp.model is None else warp.model.bounds(request.height, request.width)
+    plan = replace(plan_warp(None, replace(request, tolerance_px=None)), bounds=bounds)
+    return plan if bounds is None else replace(plan, reason="its share of the tolerance is below rounding")
 
 
 def _plan_shares(warps: Sequence[PlannedWarp], request: PlanRequest, budget_px: float) -> list[WarpPlan]:
@@ -158,12 +175,12 @@ def _plan_shares(warps: Sequence[PlannedWarp], request: PlanRequest, budget_px: 
     stretch = 1.0
     for warp, outside_px in zip(warps, _outside_px(warps, request), strict=True):
         part = closed_share if warp.has_closed_form else lattice_share
+        # Rounded down to quarters of octaves, so that compositions with other drawn lenses find the same plans.
+        share_px = 2 ** (math.floor(4 * math.log2(part * budget_px / stretch)) / 4) if stretch < math.inf else 0.0
         # What a closed form drops has a small share, which need not cover the rounding as well.
-        share = replace(request, tolerance_px=part * budget_px / stretch, ulps=0 if warp.has_closed_form else warp.ulps)
+        share = replace(request, tolerance_px=share_px, ulps=0 if warp.has_closed_form else warp.ulps)
         if math.isinf(stretch) or warp.model is None or not share.is_reachable:
-            bounds = None if warp.model is None else warp.model.bounds(request.height, request.width)
-            plan = replace(plan_warp(None, replace(share, tolerance_px=None)), bounds=bounds)
-            plan = replace(plan, reason="its share of the tolerance is below rounding" if bounds else plan.reason)
+            plan = _exact_plan(warp, request)
         else:
             plan = plan_warp(warp.model, share)
             if warp.has_closed_form and plan.bounds is not None and not plan.is_identity:

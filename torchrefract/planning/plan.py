@@ -181,8 +181,8 @@ def plan_warp(model: ErrorModel | None, request: PlanRequest) -> WarpPlan:
         reason = "it moves nothing" if moved == 0 else "it moves less than the tolerance"
         return replace(exact, stride=0, error_px=moved, reason=reason, is_random=model.is_random)
     simplified = model.simplify(*frame, budget)
-    if simplified is None:
-        return exact
+    if simplified is None or simplified.error_px > budget:
+        return exact if simplified is None else replace(exact, reason="the tolerance is too small for fewer terms")
     stride = coarsest_stride(bounds, simplified, budget, is_random=model.is_random)
     between = float(bounds.interpolation_error(np.array([float(stride)]))[0]) if stride > 1 else 0.0
     error = add_errors([simplified.error_px, between], is_random=model.is_random)

@@ -8,7 +8,7 @@ import torch
 from effects import count_calls
 from timing import GRID_SAMPLE, Spread, Timing
 
-from torchrefract import LensFlare, warp_mask
+from torchrefract import LensDistortion, LensFlare, warp_mask
 
 
 @pytest.mark.quick
@@ -40,6 +40,7 @@ def test_the_command_times_each_backend_or_counts_calls(monkeypatch, tmp_path, c
     monkeypatch.setattr(effects, "WARPS", {"mild lens": timing.WARPS["mild lens"]})
     monkeypatch.setattr(effects, "OTHER_WARPS", {})
     monkeypatch.setattr(effects, "PHOTOMETRIC", {"flare": LensFlare})
+    monkeypatch.setattr(effects, "all_warps", LensDistortion)
     out = tmp_path / "effects.json"
     monkeypatch.setattr(sys, "argv", ["effects.py", "--size", "24x40", "--threads", "1", "--out", str(out)])
     effects.main()

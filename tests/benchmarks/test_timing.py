@@ -2,12 +2,8 @@ import json
 from itertools import groupby
 
 import pytest
-import timing
 import torch
-from timing import Bar, Conditions, Spread, Timing, alternate, measure, references, save, table
-from torch.testing import assert_close
-
-from torchrefract import warp
+from timing import Bar, Conditions, Spread, Timing, alternate, measure, save, table
 
 
 class FakeClock:
@@ -74,13 +70,6 @@ def test_invalid_measurements_raise_and_restore_the_number_of_threads(on_threads
         with pytest.raises(error, match=message):
             measure(candidates, threads=1, **options)
     assert torch.get_num_threads() == 2
-
-
-def test_the_bare_sampler_matches_warp_along_a_weak_lens():
-    frame = torch.rand(2, 3, 24, 40)
-    flow = timing._weak_lens(frame)
-    assert_close(flow.norm(dim=1).max().item(), 4.0, atol=1e-4, rtol=0)
-    assert_close(references(frame)[timing.GRID_SAMPLE](), warp(frame, flow, backend="torch")[0])
 
 
 @pytest.mark.quick

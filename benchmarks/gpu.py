@@ -56,7 +56,7 @@ def main() -> None:
         raise SystemExit(1)
     torch.manual_seed(0)
     frames = torch.rand(args.shape).to(args.device)
-    chosen = {name: effect for name, effect in subjects().items() if not args.only or name in args.only}
+    chosen = {name: effect for name, effect in all_effects().items() if not args.only or name in args.only}
     threads = torch.get_num_threads()
     conditions = Conditions.now(frames, threads=threads, repeats=args.repeats)
     print(WHAT, end="\n\n", flush=True)
@@ -74,7 +74,7 @@ def main() -> None:
     save(args.out, timings, conditions, what=WHAT, bars=bars, bytes_per_second=speeds)
 
 
-def subjects() -> dict[str, Any]:
+def all_effects() -> dict[str, Any]:
     """Return the effects by name; warps within a tolerance and exact."""
     return effects() | {f"{name}, exact": make(tolerance_px=None) for name, make in WARPS.items()}
 
@@ -141,7 +141,7 @@ def bytes_per_second(timings: Sequence[Timing], frames: Tensor) -> dict[str, flo
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--shape", type=shape, default=SHAPE, help="batch x channels x height x width, 16x3x1080x1920")
-    parser.add_argument("--only", nargs="+", choices=list(subjects()), help="names of effects; all")
+    parser.add_argument("--only", nargs="+", choices=list(all_effects()), help="names of effects; all")
     parser.add_argument("--eager", action="store_true", help="skip compiled effects, which take minutes to compile")
     parser.add_argument("--repeats", type=count(MIN_REPEATS), default=MIN_REPEATS, help="rounds, 15 or more")
     parser.add_argument("--device", type=torch.device, default=torch.device("cuda"), help="cuda")

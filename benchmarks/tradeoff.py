@@ -20,8 +20,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.transforms import Bbox
 from scipy.ndimage import map_coordinates
 from timing import (
     GRID_SAMPLE,
@@ -62,6 +65,7 @@ STEPS, REFERENCE_STEPS = (1, 2, 4, 8), 16
 MIN_ERROR = 1e-5  # smaller errors are plotted here
 _COLORS = ("#1f77b4", "#d1495b", "#2e8b57", "#8a5fbf", "#c77f1a")
 _BORDER_PX = 12
+_LABEL_PLACES = [(x, y) for y in (4, -11, 15, -22, 26, -33) for x in (4, -26)]  # points, from the marker
 
 
 class Variant(NamedTuple):
@@ -292,13 +296,18 @@ def plot(path: Path, rows: Sequence[Row]) -> None:
     all_axes = list(figure.subplots(math.ceil(len(panels) / 2), 2, squeeze=False, sharey=True).flat)
     for axes in all_axes[len(panels) :]:
         axes.set_axis_off()
+    labels: list[Annotation] = []
     for axes, (name, series) in zip(all_axes, panels.items(), strict=False):
         for color, (setting, members) in zip(_COLORS, series.items(), strict=False):
             front = sorted(_position(row) for row in members if row.is_pareto)
             axes.plot(*zip(*front, strict=True), color=color, linewidth=1.2)
             axes.plot(*zip(*map(_position, members), strict=True), "o", color=color, markersize=5, label=setting)
-            for row in members:
-                axes.annotate(row.value, _position(row), (4, 4), textcoords="offset points", fontsize=8, color=color)
+            labels += [
+                axes.annotate(
+                    row.value, _position(row), _LABEL_PLACES[0], textcoords="offset points", fontsize=8, color=color
+                )
+                for row in members
+            ]
         axes.set(xscale="log", yscale="log", title=name, ylim=(MIN_ERROR / 3, 1000))
         axes.margins(x=0.2)
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -309,7 +318,24 @@ def plot(path: Path, rows: Sequence[Row]) -> None:
         axes.legend(loc="upper right", frameon=False, fontsize=8)
     figure.supxlabel("time, multiples of a bare grid_sample", fontsize=11)
     figure.supylabel("mean error of the image, 1/255", fontsize=11)
+    separate_labels(figure, labels)
     figure.savefig(path)
+
+
+def separate_labels(figure: Figure, labels: Sequence[Annotation]) -> None:
+    """Move each label to the first of several places where it overlaps none before; hide it if there is none."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()  # lays out the panels
+    placed: list[Bbox] = []
+    for label in labels:
+        for place in _LABEL_PLACES:
+            label.xyann = place
+            box = label.get_window_extent(canvas.get_renderer())
+            if not box.count_overlaps(placed):
+                placed.append(box)
+                break
+        else:
+            label.set_visible(False)
 
 
 def _position(row: Row) -> tuple[float, float]:

@@ -5,21 +5,22 @@ import effects
 import pytest
 import timing
 import torch
-from effects import Calls, count_calls
+from effects import count_calls
 from timing import GRID_SAMPLE, Spread, Timing
 
-from torchrefract import LensFlare, warp_mask
+from torchrefract import LensDistortion, LensFlare, warp_mask
 
 
 @pytest.mark.quick
 def test_calls_are_those_inside_the_package():
     mask, flow = torch.zeros(1, 4, 5), torch.zeros(2, 4, 5)
-    assert count_calls(lambda: torch.zeros(3)) == Calls(0, 0, 0)
-    counted = count_calls(lambda: warp_mask(mask, flow))
-    assert counted.files >= 3  # maps, checks and sampling
-    assert counted.files <= counted.functions <= counted.calls
+    assert count_calls(lambda: torch.zeros(3)).calls == 0
+    once = count_calls(lambda: warp_mask(mask, flow))
+    assert 3 <= once.files <= once.functions <= once.calls  # maps, checks and sampling
     twice = count_calls(lambda: (warp_mask(mask, flow), warp_mask(mask, flow)))
-    assert (twice.files, twice.functions, twice.calls) == (counted.files, counted.functions, 2 * counted.calls)
+    assert (twice.files, twice.functions, twice.calls) == (once.files, once.functions, 2 * once.calls)
+    (most,) = twice.most_called(1)
+    assert int(most.split()[0]) == max(twice.entered.values())
     assert sys.getprofile() is None
 
 
@@ -34,16 +35,21 @@ def test_rows_above_their_limit_are_marked():
     ]
 
 
-def test_the_command_times_each_backend(monkeypatch, tmp_path, capsys):
+def test_the_command_times_each_backend_or_counts_calls(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(timing, "_STRETCH_S", 0.0)
     monkeypatch.setattr(effects, "WARPS", {"mild lens": timing.WARPS["mild lens"]})
     monkeypatch.setattr(effects, "OTHER_WARPS", {})
     monkeypatch.setattr(effects, "PHOTOMETRIC", {"flare": LensFlare})
+    monkeypatch.setattr(effects, "all_warps", LensDistortion)
     out = tmp_path / "effects.json"
     monkeypatch.setattr(sys, "argv", ["effects.py", "--size", "24x40", "--threads", "1", "--out", str(out)])
     effects.main()
     assert "bar <= 0.9 x bare grid_sample" in capsys.readouterr().out
-    names = [row["name"] for row in json.loads(out.read_text())["timings"]]
-    for suffix in ("", ", torch"):
-        assert {f"mild lens, within 0.05 px{suffix}", f"all four warps, exact{suffix}"} <= set(names)
-    assert "flare" in names
+    names = {row["name"] for row in json.loads(out.read_text())["timings"]}
+    assert {"mild lens, within 0.05 px", "mild lens, exact, torch", "all four warps, exact", "flare"} <= names
+    monkeypatch.setattr(effects, "CALL_SIZE", (24, 40))
+    monkeypatch.setattr(sys, "argv", ["effects.py", "--calls", "--verbose"])
+    effects.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(line.startswith("composition of four warps and fog, warm: ") for line in lines) == 3
+    assert len(lines) == 4 * (3 + effects.NUM_FUNCTIONS)

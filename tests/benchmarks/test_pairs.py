@@ -24,21 +24,6 @@ def args(tmp_path, monkeypatch) -> Namespace:
     return Namespace(source=tmp_path / "frames", scene="paper_refractive", size=(24, 40), maps="png", count=4)
 
 
-def test_a_pair_takes_longer_than_its_reading_and_encoding(args, on_threads):
-    on_threads(1)
-    seconds = pairs.measure_one_pair(args)
-    assert seconds["generated"] > seconds["read_and_encode"] > 0
-
-
-def test_a_run_is_measured_and_its_files_are_counted(args, tmp_path):
-    out = tmp_path / "out"
-    run = pairs.measure_run(args, out, 0)
-    assert len((out / "manifest.jsonl").read_text().splitlines()) == 4
-    assert run.disk_bytes_per_pair == sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 4
-    assert run.core_share > 0
-    assert run.peak_bytes > 50e6
-
-
 def test_the_peak_memory_is_what_a_call_holds_at_once():
     x = torch.zeros(64, 1024)
     for call, tensors in ((x.clone, 1), (lambda: (x + 1) * 2, 2), (lambda: (x + 1) + (x + 2), 3)):

@@ -4,16 +4,9 @@ import peers
 import pytest
 import torch
 from timing import GRID_SAMPLE, Spread, Timing
-from torch.testing import assert_close
 
 SIZE = (168, 200)
 INNER = (..., slice(20, -20), slice(20, -20))
-
-
-def ramps() -> torch.Tensor:
-    """Return a frame (1, 3, H, W) whose channels are the position, x and y in px, and a constant."""
-    y, x = torch.meshgrid(*(torch.arange(side).float() for side in SIZE), indexing="ij")
-    return torch.stack([x, y, torch.ones_like(x)])[None]
 
 
 def test_a_missing_package_is_reported_with_its_installation(monkeypatch):
@@ -39,22 +32,6 @@ def test_candidates_are_sorted_by_task_and_keep_the_size_of_the_frame(monkeypatc
     assert set(tasks) == set(peers.TASKS)
     for name, call in candidates.items():
         assert tuple(torch.as_tensor(call()).shape) in {(1, 3, height, width), (height, width, 3)}, name
-
-
-def test_all_packages_undistort_the_same_lens():
-    pytest.importorskip("kornia", reason="kornia is in the extra train")
-    cv2 = pytest.importorskip("cv2", reason="OpenCV is in the extra calibration")
-    frame = ramps()
-    pixels = frame[0].movedim(0, -1).contiguous().numpy()  # float32, which OpenCV does not round
-    kornia = torch.as_tensor(peers.kornia(frame)["lens: kornia undistort_image"]())
-    (call,) = peers.opencv(cv2, pixels).values()
-    opencv = torch.as_tensor(call()).movedim(-1, 0)[None]
-    # Rectification samples along the inverse of what LensDistortion samples along.
-    ours = peers.ours(frame, pixels)
-    undistorted = torch.as_tensor(ours["lens: torchrefract Rectification"]())
-    assert (kornia - frame)[INNER].abs().max() > 1
-    assert_close(kornia[INNER], opencv[INNER], atol=2e-3, rtol=0)
-    assert_close(undistorted[INNER], opencv[INNER], atol=0.05, rtol=0)
 
 
 @pytest.mark.quick

@@ -7,16 +7,10 @@ import cv2
 import pytest
 import table1
 import torch
-from table1 import MIX, Scores, constant_flow, corrupt, effects_of, mean_of, score, score_references
-from torch import Tensor, nn
-from torch.testing import assert_close
+from table1 import MIX, Scores, effects_of
 
-from torchrefract import LensDistortion, UniformFog
-from torchrefract.data.frames import FrameFolder
 from torchrefract.data.road_scenes import render_road_scenes
-from torchrefract.restoration.checkpoints import Loaded, load_model
-from torchrefract.restoration.diffusion import Diffusion
-from torchrefract.restoration.tasks import Restored, Undistort
+from torchrefract.restoration.checkpoints import load_model
 from torchrefract.types import Frame
 
 SIZE = (48, 80)
@@ -27,47 +21,6 @@ def frames(count: int = 3) -> list[Frame]:
     keys = torch.arange(count)
     image, _ = render_road_scenes(keys, *SIZE, seed=2)
     return [Frame(image, keys, torch.empty(0))]
-
-
-def test_doing_nothing_is_off_by_the_flow_and_the_true_flow_by_nothing():
-    lens = LensDistortion(k1_range=(-0.3, -0.2))
-    pairs = corrupt(frames(), lens)
-    scores = {name: mean_of(each) for name, each in score_references("undistort", lens, frames(), pairs).items()}
-    (pair,) = pairs
-    # In px of 1920 x 1080, over valid pixels, averaged over frames.
-    lengths = (pair.flow * torch.tensor([1920 / 80, 1080 / 48]).view(1, 2, 1, 1)).norm(dim=1, keepdim=True)
-    means = [length[valid].mean() for length, valid in zip(lengths, pair.valid, strict=True)]
-    assert scores["do nothing"].epe == pytest.approx(torch.stack(means).mean().item(), rel=1e-5)
-    assert scores["the true flow"].epe == 0
-    assert scores["the true flow"].psnr > scores["best constant flow"].psnr > scores["do nothing"].psnr
-
-
-def test_the_constant_flow_of_an_effect_without_randomness_is_its_flow():
-    zero: dict[str, Any] = {f"{name}_range": (0.0, 0.0) for name in ("center_x", "center_y", "p1", "p2", "k2", "k3")}
-    lens = LensDistortion(k1_range=(-0.25, -0.25), focal_range=(1.0, 1.0), aspect_range=(1.0, 1.0), **zero)
-    (pair,) = corrupt(frames(1), lens)
-    valid = pair.valid.expand(1, 2, -1, -1)
-    assert_close(constant_flow(lens, pair.clean)[valid], pair.flow[valid], rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("name", ["uniform fog", "heterogeneous fog", "lens flare"])
-def test_the_true_map_undoes_weather_up_to_rounding_to_8_bits(name):
-    effect, in_mix = effects_of("deweather", SIZE[1])[name]
-    assert in_mix
-    scores = score_references("deweather", effect, frames(), corrupt(frames(), effect))
-    assert mean_of(scores["the true map"]).psnr > mean_of(scores["do nothing"]).psnr + 4
-    assert math.isnan(mean_of(scores["the true map"]).epe)
-
-
-def test_losses_are_those_of_the_training():
-    pairs = corrupt(frames(), LensDistortion(k1_range=(-0.3, -0.2)))
-    (pair,) = pairs
-    restored = Restored(pair.degraded, torch.full_like(pair.flow, 2.0))
-    scores = mean_of(score([restored], pairs))
-    assert scores.loss == pytest.approx(Undistort().loss(restored, pair).item(), rel=1e-5)
-    assert scores.loss == pytest.approx(scores.image_loss + scores.flow_loss, rel=1e-6)
-    only_flow = mean_of(score([restored._replace(image=pair.clean)], pairs))
-    assert (only_flow.image_loss, only_flow.flow_loss) == (0, scores.flow_loss)
 
 
 def test_the_mix_is_the_mean_of_its_effects_for_all_frames_and_for_each_group():
@@ -88,11 +41,6 @@ def test_frames_are_chosen_evenly():
     assert table1._evenly(10, 0) == list(range(10))
     assert table1._evenly(10, 3) == [0, 3, 6]
     assert table1._evenly(2, 5) == [0, 1]
-    lens = LensDistortion(k1_range=(-0.3, -0.2))
-    pairs = [pair for batch in (frames(3), frames(2)) for pair in corrupt(batch, lens)]
-    (chosen,) = table1._subsample(pairs, 3)
-    assert chosen.key.tolist() == [0, 1, 0]  # of 0 1 2 0 1
-    assert_close(chosen.degraded, torch.stack([pairs[0].degraded[0], pairs[0].degraded[1], pairs[1].degraded[0]]))
 
 
 def write_frames(tmp_path: Path) -> Path:
@@ -126,27 +74,6 @@ def test_a_finished_training_is_loaded_and_the_tables_hold_all_methods(tmp_path,
     assert {line.group: line.frames for line in lines} == {"all": 2, "drive2*": 1, "others": 1}
 
 
-def test_a_diffusion_model_is_compared_with_doing_nothing_on_the_same_frames(tmp_path):
-    class Zero(nn.Module):
-        def forward(self, noisy: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-            return torch.zeros_like(noisy)
-
-    args = argparse.Namespace(source=write_frames(tmp_path), steps=[1], **OPTIONS)
-    loaded = Loaded(Diffusion(lambda _: Zero(), Undistort(0.1)), "Zero", "undistort", SIZE, {})
-    lines = list(table1.score_task("undistort", {"ddpm_undistort": loaded}, args))
-    by_method = {line.method: line for line in lines if (line.group, line.effect) == ("all", "wide lens")}
-    every, same, model = (by_method[name] for name in ("do nothing", "do nothing, frames of DDPM", "DDPM, 1 steps"))
-    assert (every.frames, same.frames, model.frames) == (2, 1, 1)
-    assert same.scores.epe != pytest.approx(every.scores.epe, rel=1e-3)
-    first = Frame(*(value[None] for value in FrameFolder(args.source, size=SIZE, split="val")[0]))
-    (pair,) = corrupt([first], effects_of("undistort", SIZE[1])["wide lens"][0])
-    nothing = mean_of(score([Restored(pair.degraded, torch.zeros_like(pair.flow))], [pair]))
-    assert same.scores.epe == pytest.approx(nothing.epe, rel=1e-6)
-    table = table1.format_tables(lines).partition("### undistort: wide lens\n")[2].partition("###")[0]
-    (row,) = (line.split(" | ") for line in table.splitlines() if line.startswith("| DDPM"))
-    assert float(row[7]) == pytest.approx(model.scores.epe / same.scores.epe, abs=0.006)
-
-
 @pytest.mark.quick
 def test_a_stopped_training_is_resumed_and_a_missing_one_is_started(tmp_path, monkeypatch):
     commands = []
@@ -160,10 +87,3 @@ def test_a_stopped_training_is_resumed_and_a_missing_one_is_started(tmp_path, mo
     assert {"+experiment=table1_ddpm_deweather", "scale=small"} < {*first}
     assert not any(word.startswith("ckpt_path=") for word in first)
     assert f"ckpt_path={tmp_path / 'ddpm_deweather_0' / 'last.ckpt'}" in second
-
-
-def test_fog_has_no_flow_and_its_cells_are_empty():
-    references = score_references("deweather", UniformFog(), frames(), corrupt(frames(), UniformFog()))
-    scores = mean_of(references["do nothing"])
-    cells = table1._cells(table1.Line("deweather", "uniform fog", "all", "do nothing", scores, 3, SIZE), scores)
-    assert cells[3] == cells[6] == cells[7] == ""

@@ -1,3 +1,6 @@
+import json
+import sys
+
 import pytest
 import tolerance
 import torch
@@ -13,14 +16,29 @@ def test_a_random_configuration_keeps_its_tolerance(monkeypatch, name):
     assert trial == attempt(name, seed=1)
 
 
+# A strong lens in a narrow frame; a lens at points far outside the frame; lattices whose corners have no ray.
+@pytest.mark.parametrize(("name", "seed"), [("LensDistortion", 9), ("Compose", 60), ("Rectification", 82)])
+def test_configurations_at_the_edge_of_their_error_bounds_keep_their_tolerance(monkeypatch, name, seed):
+    monkeypatch.setattr(tolerance, "LARGEST", (360, 640))
+    assert attempt(name, seed).share <= 1
+
+
 @pytest.mark.quick
-def test_exceeded_tolerances_are_counted():
+def test_exceeded_tolerances_are_counted_and_end_the_command(monkeypatch, tmp_path, capsys):
     trials = [Trial("lens", 64, 64, 0.1, error) for error in (0.02, 0.05, 0.3)]
     assert summary("lens", trials) == (
         "lens: 3 configurations, tolerance EXCEEDED by 1; error / tolerance: largest 3.00, median 0.500"
     )
+    out = tmp_path / "new" / "tolerance.json"
+    monkeypatch.setattr(tolerance, "attempt", lambda name, seed: trials[seed])
+    monkeypatch.setattr(sys, "argv", ["tolerance.py", "--count", "3", "--only", "Compose", "--out", str(out)])
+    with pytest.raises(SystemExit):
+        tolerance.main()
+    assert "EXCEEDED by 1" in capsys.readouterr().out
+    assert [trial["error"] for trial in json.loads(out.read_text())] == [0.02, 0.05, 0.3]
 
 
+@pytest.mark.quick
 def test_pixels_that_rounding_moves_are_compared_with_the_rounded_flow():
     expected = torch.zeros(1, 2, 1, 3).double()
     rounded, flow = torch.zeros(1, 2, 1, 3), torch.zeros(1, 2, 1, 3)

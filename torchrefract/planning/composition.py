@@ -238,6 +238,8 @@ def _composed_errors(warps: Sequence[PlannedWarp], plans: Sequence[WarpPlan]) ->
     stretch, second, third = 1.0, 0.0, np.zeros_like(_STRIDES)  # of phi
     s = _STRIDES
     for warp, plan, count in zip(reversed(warps), reversed(plans), reversed(_stretches(plans)), strict=True):
+        if math.isinf(count):
+            return np.full_like(s, np.inf)
         if plan.stride == 0:
             errors.append((plan.error_px * count, plan.is_random))
             continue

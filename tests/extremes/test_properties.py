@@ -11,7 +11,7 @@ from torch import Tensor
 import torchrefract as tr
 from torchrefract.effects.base import Effect
 from torchrefract.fields import random_field
-from torchrefract.fields.covariance import COVARIANCES
+from torchrefract.fields.random_field import COVARIANCES
 
 FLOATS = (torch.float32, torch.float64)
 small = pytest.mark.usefixtures("small_domains")

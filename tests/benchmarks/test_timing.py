@@ -1,5 +1,6 @@
 import json
 from itertools import groupby
+from typing import Any
 
 import pytest
 import torch
@@ -62,11 +63,12 @@ def test_long_calls_alternate_after_one_untimed_round():
 def test_invalid_measurements_raise_and_restore_the_number_of_threads(on_threads):
     on_threads(2)
     candidates = {"fine": lambda: None, "broken": lambda: 1 / 0}
-    for options, error, message in (
+    cases: tuple[tuple[dict[str, Any], type[Exception], str], ...] = (
         ({"references": ["fine"], "repeats": 14}, ValueError, "repeats must be at least 15, got 14"),
         ({"references": ["other"]}, ValueError, r"references must be among the candidates, got \['other'\]"),
         ({"references": ["fine"]}, RuntimeError, "candidate 'broken' failed: ZeroDivisionError"),
-    ):
+    )
+    for options, error, message in cases:
         with pytest.raises(error, match=message):
             measure(candidates, threads=1, **options)
     assert torch.get_num_threads() == 2

@@ -649,7 +649,7 @@ def test_an_image_of_another_type_raises(case, image):
         ({"seed": torch.tensor(1.5)}, TypeError, "seed must be a whole number, got torch.float32"),
         ({"seed": torch.tensor(True)}, TypeError, "seed must be a whole number, got torch.bool"),
         ({"seed": torch.tensor([1, 2])}, ValueError, r"seed must be one number, got shape \(2,\)"),
-        ({"depth": torch.zeros(2, 1, 9, 8)}, ValueError, "depth must have one channel of the size of the image"),
+        ({"depth": torch.zeros(2, 1, 9, 8)}, ValueError, "depth must have one channel and the size of the image"),
         ({"depth": [1.0]}, TypeError, "depth must be a floating tensor"),
     ],
 )

@@ -234,7 +234,7 @@ def test_an_invalid_lens_of_a_table_is_named():
         LensDistortion.from_lenses([CAR, replace(CAR, coefficients=(-0.6, 0.0, 0.0, 0.0))])
     with pytest.raises(ValueError, match=r"table\[1\] must keep its denominator .* above zero inside the frame"):
         LensDistortion.from_lenses([CAR, replace(CAR, coefficients=POLE)])
-    with pytest.raises(ValueError, match="table must hold a camera at least, got none"):
+    with pytest.raises(ValueError, match="table must hold at least one camera, got none"):
         LensDistortion.from_lenses([])
 
 

@@ -47,7 +47,8 @@ def apply_spline(points: list[list[float]]) -> Any:
 
 def camera(**changed: Any) -> tr.Camera:
     pinhole: dict[str, Any] = {"width": 201, "height": 201, "fx": 199.0, "fy": 199.0, "cx": 100.0, "cy": 100.0}
-    return tr.Camera(**(pinhole | {"coefficients": (0.0,) * 4} | changed))
+    arguments: dict[str, Any] = pinhole | {"coefficients": (0.0,) * 4} | changed
+    return tr.Camera(**arguments)
 
 
 def camera_with_pole() -> tr.Camera:

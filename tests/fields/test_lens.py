@@ -222,11 +222,11 @@ def test_newton_steps_at_nodes_converge_to_the_flow(terms, oracle):
         300 + 100 * torch.rand(5, 2, generator=random),
     )
     points = Lattice(720, 1280, 64, 1).points(dtype=torch.float32, device=torch.device("cpu"))
-    exact, exists = lens_flow(*(value.double() for value in lens), points)
+    exact, exists = lens_flow(lens[0].double(), lens[1].double(), lens[2].double(), points)
     assert exists.all()
     flow = newton_lens_flow(*lens, points, num_steps=6, terms=terms)
     oracle("lens flow at nodes by 6 Newton steps", flow, exact, 1e-3)
-    single = newton_lens_flow(*(value[2:3] for value in lens), points, num_steps=6, terms=terms)
+    single = newton_lens_flow(lens[0][2:3], lens[1][2:3], lens[2][2:3], points, num_steps=6, terms=terms)
     assert_close(single[0], flow[2], rtol=0, atol=1e-4)
     # The first guess alone is worse, and each step improves it.
     errors = [

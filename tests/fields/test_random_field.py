@@ -351,7 +351,8 @@ def test_fields_do_not_depend_on_their_batch_or_its_division(monkeypatch):
     split, clipped = sample_field(params, frequencies, range(9), range(14), **options)
     assert clipped.shape == (3,)
     assert_close(split, together, rtol=0, atol=1e-12)
-    empty = FieldParams(*(value[:0] for value in params[:3]))  # pyright: ignore[reportOptionalSubscript]  # no motion
+    assert params.aperture is not None
+    empty = FieldParams(params.length[:0], params.aperture[:0], params.key[:0])
     assert sample_field(empty, frequencies, range(9), range(14), **options)[0].shape == (0, 2, 9, 14)
 
 
@@ -408,4 +409,5 @@ def test_fields_inside_vmap_are_the_same():
         return sample_field(params, frequencies, range(9), range(14), kind="matern52", dtype=torch.float32)[0][0]
 
     expected, _ = sample_field(params, frequencies, range(9), range(14), kind="matern52", dtype=torch.float32)
-    assert_close(torch.func.vmap(field)(*params[:3]), expected, rtol=0, atol=1e-6)
+    assert params.aperture is not None
+    assert_close(torch.func.vmap(field)(params.length, params.aperture, params.key), expected, rtol=0, atol=1e-6)

@@ -22,7 +22,8 @@ from torchrefract.types import FlowBounds, Range, Simplification
 
 _SAFETY = 1.25
 _MOST_CORNERS, _RANDOM_LENSES = 128, 16
-_LEVELS = np.array([4.0, 16.0, 64.0, 128.0, 256.0])  # px, strides at which errors are measured
+_LEVEL_STRIDES = (4.0, 16.0, 64.0, 128.0, 256.0)  # px, strides at which errors are measured
+_LEVELS = np.array(_LEVEL_STRIDES)
 _FINE = 2  # the first levels, whose nodes lie near the frame, give the derivatives
 _CELLS = 7  # along each axis, in which errors are measured
 # Positions in strides from the corner of a cell, on a line through its middle, and weights of the values there: the
@@ -73,8 +74,8 @@ class LensDetails(NamedTuple):
 
     def steps_for(self, stride: int) -> int:
         """Return the number of Newton steps for the nodes of a lattice."""
-        level = min(int(np.searchsorted(_LEVELS, stride)), len(self.num_steps) - 1)
-        return self.num_steps[level]
+        finer = [level for level in _LEVEL_STRIDES if level < stride]
+        return self.num_steps[min(len(finer), len(self.num_steps) - 1)]
 
 
 def lens_numbers(coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
@@ -106,7 +107,7 @@ class LensErrorModel:
         if measured is None:
             return None
         spans = np.array([box.coefficients for box in self.boxes])  # (boxes, 12, 2)
-        used: list[bool] = spans.any(axis=(0, 2)).tolist()
+        used = [i in np.flatnonzero(spans.any(axis=(0, 2))) for i in range(12)]
         dropped = _droppable(used, measured.moved_px, _DROPPED_SHARE * budget_px)
         kept = [i for i in range(12) if used[i] and i not in dropped]
         # A level needs the steps of those before it, whose nodes lie within its own.

@@ -144,11 +144,15 @@ def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
             f"ckpt_path must be an intact checkpoint, got {path}, which is damaged or another kind of file"
         ) from error
     weights, name = (checkpoint.get(key) if isinstance(checkpoint, dict) else None for key in ("state_dict", "task"))
-    if not isinstance(weights, dict) or not isinstance(name, str):
+    if not isinstance(weights, dict) or not isinstance(name, str) or not _are_weights(weights):
         raise CheckpointError(f"ckpt_path must be a checkpoint of torchrefract, got {path}")
     if task not in (None, name):
         raise CheckpointError(f"ckpt_path must be a checkpoint of the task {task}, got {path} of {name}")
     return checkpoint | {"state_dict": rename_weights(weights)}
+
+
+def _are_weights(weights: Mapping[Any, Any]) -> bool:
+    return all(isinstance(name, str) and isinstance(value, Tensor) for name, value in weights.items())
 
 
 def rename_weights(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:

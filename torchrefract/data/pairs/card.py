@@ -8,9 +8,6 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from torchrefract.cameras.brown_conrady import POLYNOMIAL12
 from torchrefract.data.pairs.manifest import PairRow
@@ -128,6 +125,8 @@ def format_card(summary: Summary, *, settings: Mapping[str, Any], license_text: 
 
 def draw_histograms(summary: Summary) -> bytes | None:
     """Draw a histogram of each parameter that varies; return a PNG, or None if none varies."""
+    from matplotlib.figure import Figure  # noqa: PLC0415  # workers import this module and draw nothing
+
     panels = list(_histogram_panels(summary))
     if not panels:
         return None
@@ -136,7 +135,6 @@ def draw_histograms(summary: Summary) -> bytes | None:
     figure = Figure(figsize=(width, height), dpi=100)
     # Margins in inches keep all panels of the same size.
     figure.subplots_adjust(0.6 / width, 0.5 / height, 1 - 0.15 / width, 1 - 0.3 / height, wspace=0.25, hspace=0.55)
-    FigureCanvasAgg(figure)
     for i, (title, label, values) in enumerate(panels):
         axes = figure.add_subplot(rows, _COLUMNS, i + 1)
         axes.hist(values, bins=min(_MAX_BINS, math.isqrt(len(values)) + 1), color="tab:blue", edgecolor="white")
@@ -144,8 +142,8 @@ def draw_histograms(summary: Summary) -> bytes | None:
         axes.set_xlabel(label, fontsize=8)
         axes.set_ylabel("count" if i % _COLUMNS == 0 else "", fontsize=8)
         axes.tick_params(labelsize=7)
-        axes.xaxis.set_major_locator(MaxNLocator(4))
-        axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+        axes.locator_params(axis="x", nbins=4)
+        axes.locator_params(axis="y", nbins=4, integer=True)
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
     return stream.getvalue()

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from timing import RESULTS, count
+from timing import RESULTS, count, size
 from torch import Tensor
 
 import torchrefract as tr
@@ -56,12 +56,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--count", type=count(1), default=200, help="configurations of each effect, 200")
     parser.add_argument("--seed", type=count(0), default=0, help="seed of the configurations, 0")
+    parser.add_argument("--largest", type=size, default=LARGEST, help="HEIGHTxWIDTH of the largest frames, 1080x1920")
     parser.add_argument("--only", nargs="+", choices=list(CONFIGURATIONS), default=list(CONFIGURATIONS), help="all")
     parser.add_argument("--out", type=Path, default=RESULTS / "tolerance.json", help="JSON file to write")
     args = parser.parse_args()
     trials: list[Trial] = []
     for name in args.only:
-        of_effect = [attempt(name, args.seed + i) for i in range(args.count)]
+        of_effect = [attempt(name, args.seed + i, args.largest) for i in range(args.count)]
         print(summary(name, of_effect), flush=True)
         trials += of_effect
     args.out.parent.mkdir(parents=True, exist_ok=True)
@@ -71,10 +72,10 @@ def main() -> None:
         raise SystemExit(1)
 
 
-def attempt(name: str, seed: int) -> Trial:
-    """Try one random configuration of an effect."""
+def attempt(name: str, seed: int, largest: tuple[int, int] = LARGEST) -> Trial:
+    """Try one random configuration of an effect, in a frame between 64x64 and the largest size."""
     dice = random.Random(f"{name} {seed}")
-    height, width = (round(log_uniform(dice, low, high)) for low, high in zip(SMALLEST, LARGEST, strict=True))
+    height, width = (round(log_uniform(dice, low, high)) for low, high in zip(SMALLEST, largest, strict=True))
     tolerance = dice.choice(TOLERANCES)
     make = CONFIGURATIONS[name](dice, height, width)
     image = torch.rand(2, 1, height, width, generator=torch.Generator().manual_seed(seed))

@@ -1,10 +1,10 @@
-"""Bad lenses, hot air, fog and sun as differentiable layers, and the maps that undo them.
+"""Differentiable image degradations for road cameras, and the maps that undo them.
 
 Every effect is an `nn.Module` from images to images: `LensDistortion`, `Turbulence`, `ThinPlateSpline`,
-`DivergenceFree`, `Rectification`, `UniformFog`, and `Compose` and `OneOf` of them. Beside `effect(image)` there is
-`effect.degrade(image, seed=…, keys=…)`, which returns a `Degraded` with the flow, the flow back, masks and the drawn
-parameters, and `effect.apply(image, params)`, which replays a draw. `warp`, `invert_flow` and `compose_flows` work on
-flows, which are backward and in pixels: out(p) = image(p + flow(p)).
+`DivergenceFree`, `Rectification`, `UniformFog`, `HeterogeneousFog`, `LensFlare`, and `Compose` and `OneOf` of them.
+`effect(image)` degrades an image; `effect.degrade(image, seed=..., keys=...)` returns a `Degraded` with the flow, its
+inverse, masks and the drawn parameters, and `effect.apply(image, params)` repeats a draw. `warp`, `invert_flow` and
+`compose_flows` work on flows, which are backward and in pixels: out(p) = image(p + flow(p)).
 """
 
 from torchrefract.cameras.camera import Camera

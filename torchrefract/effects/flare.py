@@ -56,7 +56,7 @@ class LensFlare(PhotometricEffect):
 
     d is the distance to the center in px. `intensity` is beta m; `valid` are the pixels that do not saturate, where the
     clean image is I - beta color m. With `blend="screen"`, I = 1 - (1 - I_clean) (1 - min(beta color m, 1)), which
-    never saturates, and a pixel is valid where at least 1/255 of its contrast remains. In a clip the sun drifts.
+    never saturates, and a pixel is valid where at least 1/255 of its contrast remains. In a clip the sun moves.
 
     Args:
         center_x_range, center_y_range: of the sun, in widths and heights from the upper left corner of the frame; it
@@ -143,7 +143,7 @@ class LensFlare(PhotometricEffect):
         """Plan frames by the largest light that the ranges add to a pixel; flare does not depend on depth."""
         size = (request.width, request.height)
         radius = max(self.radius_range[1] * math.hypot(*size) * (1 + _ROUNDING), 1e-6)
-        # The sun drifts anywhere in a clip; a still one is some distance from the nearest pixel.
+        # The sun may move anywhere in a clip; a still one is some distance from the nearest pixel.
         distance = math.hypot(
             *(
                 _distance_from_frame(getattr(self, f"center_{axis}_range"), side)

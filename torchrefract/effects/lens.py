@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor
-from torchrefract._validation import check_flag, check_range, check_values, check_within, eager_bool
+from torchrefract._validation import check_flag, check_range, check_values, check_within, eager_bool, eager_values
 from torchrefract.cameras.brown_conrady import ALL_TERMS, POLYNOMIAL12
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import params_to
@@ -250,15 +250,16 @@ class LensDistortion(WarpEffect):
 
     def _report_fold(self, params: LensParams, height: int, width: int) -> None:
         lens = lens_in_px(params, height, width)
-
-        def folds() -> Tensor:
-            return (params.applied & folds_inside(*lens, height=height, width=width)).any()
-
-        if not eager_bool(folds, of=params.applied):
+        folds = eager_values(
+            lambda: params.applied & folds_inside(*lens, height=height, width=width), of=params.applied
+        )
+        if not folds or not any(folds):
             return
         rule = "the lens must not fold back inside the frame (k1, k2 ... and focal_range decide)"
         if self.strict:
-            raise ValueError(f"coefficients: {rule}, got {params.coefficients.tolist()}")
+            sample = folds.index(True)
+            k1, k2 = params.coefficients[sample, :2].tolist()
+            raise ValueError(f"coefficients: {rule}, got k1 = {k1:g} and k2 = {k2:g} in sample {sample}")
         warnings.warn(f"{rule}: pixels beyond have no preimage and are padded, not valid", stacklevel=2)
 
 

@@ -44,7 +44,7 @@ class FrameFolder(Dataset[Frame]):
     """The frames in a folder and its sub-folders, cropped and reduced to one size.
 
     Hidden files are ignored, links are followed, each folder is visited once, and files are sorted. `drive_by` selects
-    how drives are told apart:
+    how drives are distinguished:
 
     - "folder": a drive is a sub-folder, at the first level where the frames are in several folders.
     - "prefix": a drive is `name_prefix` of the file name, in any folder.

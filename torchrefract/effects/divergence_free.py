@@ -14,7 +14,6 @@ from torchrefract.effects.random_field import (
     check_field_params,
     check_field_range,
     field_params,
-    flow_at_points,
     warn_if_clipped,
 )
 from torchrefract.effects.warp_effect import WarpEffect
@@ -24,7 +23,6 @@ from torchrefract.fields.turbulence_error import RandomFieldErrorModel
 from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan
 from torchrefract.types import Range
 from torchrefract.warping.grid import Points
-from torchrefract.warping.lattice import Lattice
 
 
 class DivergenceFreeParams(NamedTuple):
@@ -130,24 +128,20 @@ class DivergenceFree(WarpEffect):
         fields = field_params(params)
         amplitude = expand_batch(params.amplitude, len(fields.length))
 
-        def compute(lattice: Lattice) -> Tensor:
-            flow, clipped = divergence_free_flow(
-                fields,
-                amplitude,
-                covariance=self.covariance,
-                frequencies=frequencies,
-                lattice=lattice,
-                normalize=self.normalize,
-                steps=self.steps,
-            )
-            if frequencies.is_all:
-                warn_if_clipped(clipped, params, frequencies.size)
-            return flow
-
-        flow = flow_at_points(compute, points, plan)
+        flow, clipped = divergence_free_flow(
+            fields,
+            amplitude,
+            covariance=self.covariance,
+            frequencies=frequencies,
+            lattice=points.lattice,
+            normalize=self.normalize,
+            steps=self.steps,
+        )
+        if frequencies.is_all:
+            warn_if_clipped(clipped, params, frequencies.size)
         return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=flow.device)
 
-    def error_model(self, params: DivergenceFreeParams | None = None) -> RandomFieldErrorModel | None:
+    def error_model(self) -> RandomFieldErrorModel | None:
         """Return the error bounds of the ranges for Gaussian psi in one step, normalized by theory; otherwise None."""
         if self.covariance != "gaussian" or self.normalize != "theory" or self.steps > 1:
             return None

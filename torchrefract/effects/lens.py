@@ -15,7 +15,7 @@ from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import params_to
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, newton_lens_flow
-from torchrefract.fields.lens_error import LensErrorModel, LensRanges, lens_numbers
+from torchrefract.fields.lens_error import LensErrorModel, LensRanges
 from torchrefract.fields.lens_source import LensSource, camera_with_covariance, jittered_camera, lenses_from_cameras
 from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan
 from torchrefract.types import Range
@@ -24,7 +24,6 @@ from torchrefract.warping.lattice import pixel_lattice
 
 _LARGEST_COEFFICIENT = 100.0
 _FARTHEST = 1e10  # widths
-_FAR_STRIDE = 64  # px; displaced points may lie as far outside the frame as the nodes of such a lattice
 _MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors are another model in another order)"
 
 
@@ -75,7 +74,6 @@ class LensDistortion(WarpEffect):
     params_type = LensParams
     has_closed_form = True
     rounding_ulps = 16  # Newton's method magnifies the rounding of positions
-    has_sample_models = True
 
     def __init__(
         self,
@@ -208,11 +206,11 @@ class LensDistortion(WarpEffect):
         lens = lens_in_px(params, height, width)
         if plan.details is not None:
             terms = ALL_TERMS if params.coefficients.requires_grad else plan.details.terms
-            stride = max(points.lattice.stride, _FAR_STRIDE) if points.is_displaced else points.lattice.stride
-            flow = newton_lens_flow(*lens, points, num_steps=plan.details.steps_for(stride), terms=terms)
+            num_steps = plan.details.steps_for(points.lattice.stride)
+            flow = newton_lens_flow(*lens, points, num_steps=num_steps, terms=terms)
             return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=flow.device)
         flow, exists = lens_flow(*lens, points)
-        if eager_bool(exists.all, of=exists) is False:
+        if points.lattice.stride == 1 and eager_bool(exists.all, of=exists) is False:
             self._report_fold(params, height, width)
         return flow, exists
 
@@ -222,11 +220,9 @@ class LensDistortion(WarpEffect):
         points = pixel_lattice(height, width).points(dtype=params.focal.dtype, device=params.focal.device)
         return lens_restore_flow(*lens_in_px(params, height, width), points)
 
-    def error_model(self, params: LensParams | None = None) -> LensErrorModel:
-        """Return the error bounds of the ranges or of the source, or those of one lens."""
-        if params is None:
-            return LensErrorModel((self._ranges(),) if self._source is None else self._source.boxes)
-        return LensErrorModel.from_lens(lens_numbers(*(value.detach() for value in params[1:]))[0].tolist())
+    def error_model(self) -> LensErrorModel:
+        """Return the error bounds of the ranges or of the source."""
+        return LensErrorModel((self._ranges(),) if self._source is None else self._source.boxes)
 
     def cameras(self, params: LensParams, *, height: int, width: int) -> list[Camera]:
         """Return the camera of each degraded frame; that of the clean frame is the pinhole with the same numbers.

@@ -1,8 +1,6 @@
 """Code that the effects of random fields share: checks, and the lattice on which a field is computed."""
 
-import math
 import warnings
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -12,13 +10,9 @@ from torchrefract._tensor import expand_batch
 from torchrefract._validation import check_range, check_within, eager_values
 from torchrefract.effects.motion import check_key, check_motion, is_still
 from torchrefract.fields.random_field import FieldParams, Motion
-from torchrefract.planning.plan import WarpPlan, lattice_with_stride
 from torchrefract.types import Range
-from torchrefract.warping.grid import Points
-from torchrefract.warping.lattice import Lattice, LatticeFlow
 
 _MAX_CLIPPED = 1e-3  # of the spectrum; the covariance is off by up to twice as much
-_MARGIN_PX = 32  # around the frame, where earlier warps of a composition may lead
 FIELD_BOUNDS: dict[str, Range] = {"amplitude": (0.0, 1e4), "length": (1e-3, 1e6), "aperture": (0.0, 1e4)}  # px
 
 
@@ -49,26 +43,6 @@ def field_params(params: Any) -> FieldParams:
         motion = Motion(params.frame.reshape(-1), wind, decorrelation)
     aperture = expand_batch(params.aperture, rows) if "aperture" in params._fields else None
     return FieldParams(expand_batch(params.length, rows), aperture, expand_batch(params.key, rows), motion)
-
-
-def flow_at_points(compute: Callable[[Lattice], Tensor], points: Points, plan: WarpPlan) -> Tensor:
-    """Compute a flow at the nodes of its plan, or interpolate it at other points from nodes with a wider margin.
-
-    Points farther than 32 px outside the frame get the flow of the nearest point within.
-
-    Args:
-        compute: returns the flow (N, 2, h, w), px, at the nodes of a lattice.
-        points: nodes of the plan, or other points.
-        plan: gives the stride.
-    """
-    lattice = lattice_with_stride(plan.height, plan.width, plan.stride)
-    if not points.is_displaced and points.lattice == lattice:
-        return compute(lattice)
-    stride = max(1, plan.stride)
-    # One node more completes the cubics of the outermost points.
-    wide = Lattice(plan.height, plan.width, stride, margin=math.ceil(_MARGIN_PX / stride) + 1)
-    x, y = points.x.clamp(-_MARGIN_PX, plan.width + _MARGIN_PX), points.y.clamp(-_MARGIN_PX, plan.height + _MARGIN_PX)
-    return LatticeFlow(compute(wide), wide).at(points._replace(x=x, y=y))
 
 
 def warn_if_clipped(clipped: Tensor, params: Any, size: tuple[int, int]) -> None:

@@ -134,7 +134,7 @@ class Rectification(WarpEffect):
             return lens_flow(*camera, points)
         return rectification_restore_flow(*camera, points, model=self.model)
 
-    def error_model(self, params: RectificationParams | None = None) -> RectificationErrorModel:
+    def error_model(self) -> RectificationErrorModel:
         """Return the error bounds of the camera."""
         return RectificationErrorModel(self.camera, tuple(number for row in self._numbers() for number in row))
 

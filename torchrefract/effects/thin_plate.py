@@ -15,7 +15,6 @@ from torchrefract.fields.thin_plate_error import ThinPlateErrorModel
 from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan
 from torchrefract.types import Range
 from torchrefract.warping.grid import Points
-from torchrefract.warping.lattice import LatticeFlow, lattice_around
 
 _CLOSE = 1e-3  # px, between points that were saved in a smaller type and drawn ones
 
@@ -60,6 +59,7 @@ class ThinPlateSpline(WarpEffect):
     """
 
     params_type = ThinPlateParams
+    has_closed_form = True
 
     def __init__(
         self,
@@ -107,17 +107,10 @@ class ThinPlateSpline(WarpEffect):
     def flow(self, params: ThinPlateParams, points: Points, plan: WarpPlan) -> tuple[Tensor, Tensor]:
         """Evaluate the splines at the points; the flow exists everywhere."""
         spline = fit_spline(params.points, params.displacement, params.smoothing)
-        dtype = params.points.dtype
-        # Many points are cheaper to interpolate from the lattice of the plan.
-        around = lattice_around(points, plan.stride) if points.is_displaced and plan.stride > 1 else None
-        if around is not None:
-            nodes = around.points(dtype=dtype, device=points.x.device)
-            flow = LatticeFlow(spline_flow(spline, nodes.x, nodes.y, dtype=dtype), around).at(points)
-        else:
-            flow = spline_flow(spline, points.x, points.y, dtype=dtype)
+        flow = spline_flow(spline, points.x, points.y, dtype=params.points.dtype)
         return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=flow.device)
 
-    def error_model(self, params: ThinPlateParams | None = None) -> ThinPlateErrorModel:
+    def error_model(self) -> ThinPlateErrorModel:
         """Return the error bounds of the ranges, for the control points of drawn splines."""
         return ThinPlateErrorModel(self.amplitude_range[1], self.lattice, self.smoothing_range)
 

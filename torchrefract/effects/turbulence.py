@@ -15,7 +15,6 @@ from torchrefract.effects.random_field import (
     check_field_params,
     check_field_range,
     field_params,
-    flow_at_points,
     warn_if_clipped,
 )
 from torchrefract.effects.warp_effect import WarpEffect
@@ -25,7 +24,6 @@ from torchrefract.fields.turbulence_error import RandomFieldErrorModel
 from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan
 from torchrefract.types import Range
 from torchrefract.warping.grid import Points
-from torchrefract.warping.lattice import Lattice
 
 # A field folds the image first where a gradient of five standard deviations reaches 1.
 _FOLDING_GRADIENT = 0.2
@@ -138,17 +136,13 @@ class Turbulence(WarpEffect):
         fields = field_params(params)
         amplitude = expand_batch(params.amplitude, len(fields.length))
 
-        def compute(lattice: Lattice) -> Tensor:
-            kind = {"covariance": self.covariance, "normalize": self.normalize}
-            flow, clipped = turbulence_flow(fields, amplitude, frequencies=frequencies, lattice=lattice, **kind)
-            if frequencies.is_all:
-                warn_if_clipped(clipped, params, frequencies.size)
-            return flow
-
-        flow = flow_at_points(compute, points, plan)
+        kind = {"covariance": self.covariance, "normalize": self.normalize}
+        flow, clipped = turbulence_flow(fields, amplitude, frequencies=frequencies, lattice=points.lattice, **kind)
+        if frequencies.is_all:
+            warn_if_clipped(clipped, params, frequencies.size)
         return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=flow.device)
 
-    def error_model(self, params: TurbulenceParams | None = None) -> RandomFieldErrorModel | None:
+    def error_model(self) -> RandomFieldErrorModel | None:
         """Return the error bounds of the ranges; None if fields are normalized by the image."""
         if self.normalize != "theory":
             return None

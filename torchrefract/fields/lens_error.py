@@ -91,11 +91,6 @@ class LensErrorModel:
 
     is_random = False
 
-    @classmethod
-    def from_lens(cls, numbers: Sequence[float]) -> "LensErrorModel":
-        """Build the model of a single lens from its 16 numbers."""
-        return cls((LensRanges.from_numbers([(number, number) for number in numbers]),))
-
     def bounds(self, height: int, width: int) -> FlowBounds | None:
         """Return measured bounds, or None if a lens may fold inside the frame."""
         measured = _measure(self.boxes, height, width)

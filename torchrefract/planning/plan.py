@@ -104,7 +104,7 @@ class WarpPlan:
     reason: what decided the stride.
     kept, dropped: terms that are computed, and those that are not with the largest displacement in px of each.
     is_random: as for `ErrorModel`.
-    is_per_sample: True if each drawn sample gets a plan of its own where its values can be read.
+    is_measured: True if each sample gets the coarsest lattice whose measured error fits, where values can be read.
     details: what the effect needs to compute the flow, from `Simplification.details`.
     bounds: of the flow; None if unknown.
     node_error_px: part of the error that the flow has at the nodes already.
@@ -120,7 +120,7 @@ class WarpPlan:
     kept: tuple[str, ...] = ()
     dropped: tuple[tuple[str, float], ...] = ()
     is_random: bool = False
-    is_per_sample: bool = False
+    is_measured: bool = False
     details: Any = None
     bounds: FlowBounds | None = None
     node_error_px: float = 0.0
@@ -139,8 +139,8 @@ class WarpPlan:
     def summary(self) -> str:
         """Return one line: where the flow is computed, and why."""
         flow = {0: "not computed", 1: "at every pixel"}.get(self.stride, f"every {self.stride} px")
-        per_sample = "; on the CPU by the lens of each sample" if self.is_per_sample else ""
-        return f"{flow} ({self.reason}{per_sample})"
+        measured = "; on the CPU as coarse as measured in each sample" if self.is_measured else ""
+        return f"{flow} ({self.reason}{measured})"
 
     def __str__(self) -> str:
         lines = [

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from torchrefract._validation import eager_values
 from torchrefract.ops.cubic import interpolate_nodes, lagrange_basis
-from torchrefract.ops.sampling import grid_sample
 from torchrefract.warping.grid import Points
 
 
@@ -94,9 +93,7 @@ class LatticeFlow:
     def at(self, points: Points) -> Tensor:
         """Interpolate the flow at points, which may lie anywhere; positions beyond the nodes are clamped.
 
-        Points of a lattice get the cubic polynomials. Displaced points get bilinear interpolation between the cubic
-        values at the nodes of the lattice that they were displaced from, s px apart, with an error of up to
-        s^2 / 8 (|f_xx| + |f_yy|). The result is differentiable with respect to the nodes and the points.
+        There must be four nodes along each axis. The result is differentiable in the nodes and the points.
 
         Args:
             points: of shape (N or 1, 1, h, w), px.
@@ -105,40 +102,25 @@ class LatticeFlow:
             (N, 2, h, w), px.
         """
         lattice = self.lattice
-        if points.is_displaced:
-            step = min(points.lattice.stride, lattice.stride)
-            if step < lattice.stride:
-                margin = lattice.margin * lattice.stride // step
-                finer = Lattice(lattice.height, lattice.width, step, margin)
-                finer_points = finer.points(dtype=self.dtype, device=self.nodes.device)
-                return LatticeFlow(self.at(finer_points), finer).at(points)
-            rows, columns = self.nodes.shape[2:]
-            x, y = _in_strides(points.x, lattice, columns), _in_strides(points.y, lattice, rows)
-            return _bilinear(self.nodes, x, y)
-        if points.lattice == lattice:
+        if points.lattice == lattice and not points.is_displaced:
             return self.nodes
-        if points.lattice == pixel_lattice(lattice.height, lattice.width):
-            return self.dense()
         rows, columns = self.nodes.shape[2:]
         x, y = _in_strides(points.x, lattice, columns), _in_strides(points.y, lattice, rows)
-        # Columns first: there are fewer rows of nodes than of points, and copies of whole rows are faster.
-        return _cubic(_cubic(self.nodes, x.flatten(), dim=3), y.flatten(), dim=2)
+        return _cubic(self.nodes, x, y)
 
 
-def lattice_around(points: Points, stride: int) -> Lattice | None:
-    """Return a lattice with nodes around all points.
+def lattice_around(points: Points, stride: int) -> Lattice:
+    """Return a lattice with nodes around all points that lie less than the longer side outside the frame.
 
-    None if their positions cannot be read, or if one lies farther outside the frame than the frame is long.
+    If their positions cannot be read, the nodes reach a quarter of that side.
     """
     height, width = points.lattice.height, points.lattice.width
+    longest = max(height, width)
     ends = eager_values(lambda: torch.stack([*points.x.aminmax(), *points.y.aminmax()]), of=points.x)
-    if ends is None:
-        return None
-    left, right, top, bottom = ends
+    left, right, top, bottom = ends or (0.0, width + longest / 4, 0.0, 0.0)
     outside = max(-left, right - width, -top, bottom - height, 0.0)
-    if not outside < max(height, width):  # nor is NaN
-        return None
-    return Lattice(height, width, stride, margin=2 + math.ceil(outside / stride))
+    reach = outside if outside < longest else longest  # also if it is NaN
+    return Lattice(height, width, stride, margin=2 + math.ceil(reach / stride))
 
 
 def _in_strides(position: Tensor, lattice: Lattice, count: int) -> Tensor:
@@ -151,20 +133,22 @@ def _cell(index: Tensor, count: int) -> Tensor:
     return index.detach().floor().clamp(1, count - 3).long()
 
 
-def _cubic(nodes: Tensor, index: Tensor, *, dim: int) -> Tensor:
-    """Interpolate nodes along a dimension at fractional indices (n,)."""
-    cell = _cell(index, nodes.shape[dim])
-    weights = lagrange_basis(index - cell).to(nodes.dtype)
-    shape = [1] * nodes.ndim
-    shape[dim] = -1
-    parts = [nodes.index_select(dim, cell + (j - 1)) * weights[:, j].view(shape) for j in range(4)]
-    return parts[0] + parts[1] + parts[2] + parts[3]
-
-
-def _bilinear(nodes: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Interpolate nodes (N, 2, h, w) at fractional indices, each (N or 1, 1, n, m)."""
-    rows, columns = nodes.shape[2:]
-    x, y = torch.broadcast_tensors((2 * x + 1) / columns - 1, (2 * y + 1) / rows - 1)
-    grid = torch.cat([x, y], dim=1).movedim(1, -1)
-    batch = max(len(nodes), len(grid))
-    return grid_sample(nodes.expand(batch, -1, -1, -1), grid, padding="border", interpolation="bilinear")
+def _cubic(nodes: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Interpolate nodes (N, 2, h, w) at fractional indices x and y, which broadcast to (N or 1, 1, n, m)."""
+    batch, _, rows, columns = nodes.shape
+    x, y = x[:, 0], y[:, 0]
+    column, row = _cell(x, columns), _cell(y, rows)
+    weights_x = lagrange_basis(x - column).to(nodes.dtype).unbind(-1)
+    weights_y = lagrange_basis(y - row).to(nodes.dtype).unbind(-1)
+    first = (row - 1) * columns + column - 1  # of the 4 x 4 nodes
+    if batch > 1:
+        first = first + rows * columns * torch.arange(batch, device=nodes.device).view(-1, 1, 1)
+    index, values = first.flatten(), nodes.movedim(0, 1).flatten(1).contiguous()
+    result = torch.zeros((), dtype=nodes.dtype, device=nodes.device)
+    for i in range(4):
+        line = torch.zeros((), dtype=nodes.dtype, device=nodes.device)
+        for j in range(4):
+            node = values.index_select(1, index + (i * columns + j)).view(2, *first.shape)
+            line = torch.addcmul(line, weights_x[j], node)
+        result = torch.addcmul(result, weights_y[i], line)
+    return result.movedim(0, 1)

@@ -1,0 +1,345 @@
+"""Flows of a batch: those of one warp or of several in a row, on lattices as coarse as a tolerance allows.
+
+The composed flow of n warps, the first nearest to the scene, is
+
+    d_1,  d_i = d_(i+1) + f_i(p + d_(i+1)),  d_n = f_n(p)
+
+Cubics between the nodes of a lattice interpolate it. Their error is measured in each sample: the value at a node is
+compared with the cubic through the four neighbors at distances of 1 and 3 strides, as on a lattice of twice the stride.
+That error falls at least by a factor of 4 if the stride is halved, and by 16 where the fourth derivative is bounded.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrefract._tensor import expand_batch
+from torchrefract._validation import eager_bool, requires_grad
+from torchrefract.effects.batch import per_sample, select_params, where_active
+from torchrefract.planning.plan import PlanRequest, WarpPlan, plan_warp
+from torchrefract.warping.grid import Points
+from torchrefract.warping.lattice import Lattice, LatticeFlow, lattice_around, pixel_lattice
+from torchrefract.warping.warp import sample_image
+
+COARSEST = 64  # px, stride of the first lattice that is measured
+_MARGIN = 2  # nodes beyond the frame that a measured lattice has
+_HALVING = 4.0  # the error falls at least so much if the stride is halved
+_SAFETY = 1.25  # of measured stretches, which are largest between the axes of the lattice
+
+
+class SamplingOptions(NamedTuple):
+    """Options of sampling an image, as for `warp`; None is undecided."""
+
+    padding: str | None = None
+    interpolation: str | None = None
+    backend: str | None = None
+
+    def or_else(self, other: "SamplingOptions") -> "SamplingOptions":
+        """Take the options of another where these are undecided."""
+        return SamplingOptions(
+            self.padding or other.padding, self.interpolation or other.interpolation, self.backend or other.backend
+        )
+
+
+class WarpFlow:
+    """The flow of one warp as a function of points, zero for samples that do not move.
+
+    Args:
+        evaluate: computes the flow and where it exists, from params, points and plan, as `WarpEffect.flow`.
+        params: with N or B rows.
+        active: (N,) or (B,), bool.
+        plan: of the warp.
+        has_closed_form: False if the flow is computed at nodes, which then serve all points.
+    """
+
+    def __init__(
+        self,
+        evaluate: Callable[[Any, Points, WarpPlan], tuple[Tensor, Tensor]],
+        params: Any,
+        active: Tensor,
+        plan: WarpPlan,
+        *,
+        has_closed_form: bool,
+    ):
+        self.evaluate, self.params, self.active, self.plan = evaluate, params, active, plan
+        self.has_closed_form = has_closed_form
+        self._field: LatticeFlow | None = None
+
+    def at(self, points: Points) -> tuple[Tensor, Tensor]:
+        """Return the flow (N, 2, h, w), px, and where it exists."""
+        if self.has_closed_form:
+            flow, exists = self.evaluate(self.params, points, self.plan)
+        else:
+            if self._field is None:
+                lattice = lattice_around(points, max(1, self.plan.stride))
+                nodes = lattice.points(dtype=points.x.dtype, device=points.x.device)
+                self._field = LatticeFlow(self.evaluate(self.params, nodes, self.plan)[0], lattice)
+            flow, exists = self._field.at(points), everywhere(self.active.device)
+        return self.masked(flow, exists)
+
+    def masked(self, flow: Tensor, exists: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the flow, zero for samples that do not move, and where it exists."""
+        active = expand_batch(self.active, len(flow))
+        return where_active(flow, 0.0, active, self.params), exists | ~per_sample(active)
+
+    def exact(self) -> "WarpFlow":
+        """Return the flow without a tolerance."""
+        plan = plan_warp(None, PlanRequest(self.plan.height, self.plan.width, None, is_double=False))
+        return WarpFlow(self.evaluate, self.params, self.active, plan, has_closed_form=self.has_closed_form)
+
+    def select(self, rows: Tensor) -> "WarpFlow":
+        """Return the flow of some samples."""
+        params, active = select_params(self.params, rows), self.active[rows]
+        selected = WarpFlow(self.evaluate, params, active, self.plan, has_closed_form=self.has_closed_form)
+        if self._field is not None:
+            nodes = expand_batch(self._field.nodes, len(self.active))[rows]
+            selected._field = self._field.with_nodes(nodes)
+        return selected
+
+
+class ComposedFlow(NamedTuple):
+    """The flow of warps in a row at some points."""
+
+    flow: Tensor  # (N, 2, h, w), px
+    exists: Tensor  # bool, broadcasts to (N, 1, h, w)
+    ends: list[Points]  # after each warp, the last one first
+
+
+def compose_at(warps: Sequence[WarpFlow], points: Points) -> ComposedFlow:
+    """Evaluate the composed flow of warps, the first nearest to the scene, at points."""
+    flow, exists = warps[-1].at(points)
+    ends = [points.displaced(flow)]
+    for warp in reversed(warps[:-1]):
+        moved, moved_exists = warp.at(ends[-1])
+        flow, exists = flow + moved, exists & moved_exists
+        ends.append(points.displaced(flow))
+    return ComposedFlow(flow, exists, ends)
+
+
+class FlowPart(NamedTuple):
+    """The flow of some samples of a batch."""
+
+    samples: Tensor | None  # (n,), their numbers; None for the whole batch
+    flow: LatticeFlow
+    exists: Tensor  # bool, broadcasts to (n, 1, H, W)
+    is_zero: bool = False  # whether the plan computes no flow
+
+    def of_samples(self, samples: Tensor | None) -> "FlowPart":
+        """Return the part with the numbers of a larger batch, from those of its samples (m,)."""
+        if samples is None:
+            return self
+        return self._replace(samples=samples if self.samples is None else samples[self.samples])
+
+
+def flow_at_nodes(warp: WarpFlow, lattice: Lattice) -> FlowPart:
+    """Compute the flow of one warp at the nodes of a lattice, as its plan says."""
+    points = lattice.points(dtype=flow_dtype(warp.params), device=warp.active.device)
+    flow, exists = warp.masked(*warp.evaluate(warp.params, points, warp.plan))
+    return FlowPart(None, LatticeFlow(flow, lattice), exists if lattice.stride == 1 else everywhere(flow.device))
+
+
+def flow_on_measured_lattice(
+    warps: Sequence[WarpFlow], *, stride: int, is_smooth: bool = True, tolerance_px: float
+) -> list[FlowPart]:
+    """Compute a composed flow on the coarsest lattice whose measured error is within a tolerance, sample by sample.
+
+    Args:
+        warps: of N samples, whose values can be read.
+        stride: px, of the coarsest lattice, a power of two.
+        is_smooth: False computes every pixel, after a measurement of how far the warps stretch each other's errors.
+        tolerance_px: of the composed flow.
+    """
+    height, width = warps[0].plan.height, warps[0].plan.width
+    while stride > max(1, min(height, width) // 2):
+        stride //= 2
+    lattice = pixel_lattice(height, width) if stride == 1 else Lattice(height, width, stride, _MARGIN)
+    composed = compose_at(warps, lattice.points(dtype=flow_dtype(warps[0].params), device=warps[0].active.device))
+    if stride == 1:
+        return [FlowPart(None, LatticeFlow(composed.flow, lattice), composed.exists)]
+    lattice_px = lattice_error(composed.flow.detach())
+    stretched_px = _stretched_errors(warps, composed.ends)
+    exists = composed.exists.expand(len(composed.flow), 1, *lattice.num_nodes)
+    exists_inside = exists[..., _MARGIN:-_MARGIN, _MARGIN:-_MARGIN].flatten(1).all(dim=1)
+    lattice_px = torch.where(exists.flatten(1).all(dim=1), lattice_px, torch.inf)
+    rows: dict[str, list[int]] = {"fit": [], "exact": [], "pixels": [], "finer": []}
+    for i, (between, stretched, is_inside) in enumerate(
+        torch.stack([lattice_px, stretched_px, exists_inside.to(lattice_px.dtype)], dim=1).tolist()
+    ):
+        if not stretched <= tolerance_px / 2:
+            rows["exact"].append(i)
+        elif not (is_smooth and is_inside):
+            rows["pixels"].append(i)
+        else:
+            rows["fit" if between / _HALVING + stretched <= tolerance_px else "finer"].append(i)
+    parts: list[FlowPart] = []
+    for choice, chosen in rows.items():
+        if not chosen:
+            continue
+        index = None if len(chosen) == len(lattice_px) else torch.tensor(chosen)
+        some = warps if index is None else [warp.select(index) for warp in warps]
+        if choice == "fit":
+            nodes = composed.flow if index is None else composed.flow[index]
+            parts.append(FlowPart(index, LatticeFlow(nodes, lattice), everywhere(nodes.device)))
+            continue
+        finer = 1
+        if choice == "exact":
+            some = [warp.exact() for warp in some]
+        elif choice == "finer":
+            finer = _next_stride(stride, min(lattice_px[chosen].tolist()), tolerance_px)
+        remaining = flow_on_measured_lattice(some, stride=finer, is_smooth=is_smooth, tolerance_px=tolerance_px)
+        parts += [part.of_samples(index) for part in remaining]
+    return parts
+
+
+def lattice_error(nodes: Tensor) -> Tensor:
+    """Measure how far nodes (N, 2, h, w) lie from the cubics through every other node: (N,), px."""
+    error = torch.zeros(len(nodes), dtype=nodes.dtype, device=nodes.device)
+    for values in (nodes, nodes.mT):
+        near, far = values[..., 2:-4] + values[..., 4:-2], values[..., :-6] + values[..., 6:]
+        missed = values[..., 3:-3] - (9 * near - far) / 16
+        error = error + torch.hypot(*missed.unbind(1)).flatten(1).amax(dim=1)
+    return error
+
+
+def _stretched_errors(warps: Sequence[WarpFlow], ends: Sequence[Points]) -> Tensor:
+    """Add the errors of the warps, each as often as the warps before it stretch distances: (N,), px."""
+    last = ends[-1]
+    fixed = torch.zeros(len(last.x), dtype=last.x.dtype, device=last.x.device)
+    squares = torch.zeros_like(fixed)  # of independent random errors
+    for warp, end in zip(reversed(warps), ends, strict=True):
+        if warp.plan.error_px > 0:
+            error = warp.plan.error_px * (1.0 if end is last else _SAFETY * _largest_stretch(end, last))
+            if warp.plan.is_random:
+                squares = squares + error**2
+            else:
+                fixed = fixed + error
+    return fixed + squares.sqrt()
+
+
+def _largest_stretch(start: Points, end: Points) -> Tensor:
+    """Return (N,), the largest ratio of the distances of neighboring points after and before a map."""
+    ratios = []
+    for dim in (2, 3):
+        before, after = (
+            torch.hypot(points.x.detach().diff(dim=dim), points.y.detach().diff(dim=dim)) for points in (start, end)
+        )
+        ratios.append((after / before.clamp(min=1e-6)).flatten(1).amax(dim=1))
+    return torch.maximum(*ratios)
+
+
+def _next_stride(stride: int, error_px: float, tolerance_px: float) -> int:
+    """Return the coarsest finer stride that can fit, as the error falls at most by 16 if the stride is halved."""
+    finer = stride // 2
+    while finer > 1 and error_px < torch.inf and error_px * (finer / stride) ** 4 / _HALVING > tolerance_px:
+        finer //= 2
+    return finer
+
+
+def zero_flow(params: Any, plan: WarpPlan) -> FlowPart:
+    """Return a flow that moves nothing."""
+    batch, device = len(params.applied), params.applied.device
+    zero = torch.zeros(1, 2, plan.height, plan.width, dtype=flow_dtype(params), device=device)
+    lattice = pixel_lattice(plan.height, plan.width)
+    return FlowPart(None, LatticeFlow(zero.expand(batch, -1, -1, -1), lattice), everywhere(device), is_zero=True)
+
+
+def can_read(params: Any) -> bool:
+    """Return True if the values of parameters can be read without waiting for a device."""
+    return eager_bool(params.applied.any, of=params.applied) is not None
+
+
+class BatchFlow:
+    """Flows of a batch, whose samples may have lattices of their own."""
+
+    def __init__(self, parts: Sequence[FlowPart]):
+        self.parts = parts
+        self._dense: Tensor | None = None
+
+    @property
+    def num_rows(self) -> int:
+        """Return B, or B T for flows that change over a clip."""
+        return sum(len(part.flow.nodes) for part in self.parts)
+
+    @property
+    def is_zero(self) -> bool:
+        """Return True if no flow was computed, because none exceeds the tolerance."""
+        return all(part.is_zero for part in self.parts)
+
+    @property
+    def dense(self) -> Tensor:
+        """Return (N, 2, H, W), px."""
+        # torch.compile cannot trace the lock of functools.cached_property.
+        if self._dense is None:
+            self._dense = self._gather([part.flow.dense() for part in self.parts])
+        return self._dense
+
+    @property
+    def exists(self) -> Tensor:
+        """Return bool, which broadcasts to (N, 1, H, W)."""
+        size = self.parts[0].flow.lattice
+        if len(self.parts) == 1:
+            return self.parts[0].exists
+        return self._gather(
+            [part.exists.expand(len(part.flow.nodes), 1, size.height, size.width) for part in self.parts]
+        )
+
+    def detach(self) -> "BatchFlow":
+        """Return the flows without gradients."""
+        return BatchFlow([part._replace(flow=part.flow.detach()) for part in self.parts])
+
+    def sample(self, image: Tensor, active: Tensor, params: Any, options: SamplingOptions) -> Tensor:
+        """Sample images (N, C, H, W) along the flows; samples that are not active, (N,), stay bit for bit.
+
+        Args:
+            image, active: as above.
+            params: with `applied`; the gradient of applied samples is kept at strength zero.
+            options: all decided.
+        """
+        chosen = options._asdict()
+        if requires_grad(part.flow for part in self.parts):
+            # Samples that do not move need the gradient of their parameters.
+            return where_active(self._sample(image, None, chosen), image, active, params)
+        return self._sample(image, None if eager_bool(active.all, of=active) else active, chosen)
+
+    def _sample(self, image: Tensor, active: Tensor | None, options: dict[str, Any]) -> Tensor:
+        if len(self.parts) == 1:
+            flow = self.parts[0].flow
+            nodes = expand_batch(flow.nodes, image.shape[0])
+            return sample_image(image, flow.with_nodes(nodes), active=active, **options)
+        result = torch.empty_like(image)
+        frames = image.shape[0] // self.num_rows
+        for index, flow, *_ in self.parts:
+            assert index is not None  # of several parts
+            rows = rows_of_samples(index, frames * len(flow.nodes) // len(index))
+            nodes = expand_batch(flow.nodes, len(rows))
+            part = sample_image(
+                image[rows], flow.with_nodes(nodes), active=None if active is None else active[rows], **options
+            )
+            result.index_copy_(0, rows, part)
+        return result
+
+    def _gather(self, values: Sequence[Tensor]) -> Tensor:
+        if len(values) == 1:
+            return values[0]
+        result = values[0].new_empty(sum(map(len, values)), *values[0].shape[1:])
+        for (index, *_), value in zip(self.parts, values, strict=True):
+            assert index is not None
+            result = result.index_copy(0, rows_of_samples(index, len(value) // len(index)), value)
+        return result
+
+
+def flow_dtype(params: Any) -> torch.dtype:
+    """Return the type of the flow that parameters give."""
+    return next(value.dtype for value in params if value.is_floating_point())
+
+
+def rows_of_samples(index: Tensor, frames: int) -> Tensor:
+    """Return (n T,), the rows of some samples, (n,), of T frames each."""
+    return (frames * index[:, None] + torch.arange(frames, device=index.device)).flatten()
+
+
+def everywhere(device: torch.device) -> Tensor:
+    """Return True, (1, 1, 1, 1)."""
+    return torch.ones(1, 1, 1, 1, dtype=torch.bool, device=device)

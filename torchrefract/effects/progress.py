@@ -1,0 +1,224 @@
+"""Images on their way through a composition, with all maps that their result will have."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple, cast
+
+import torch
+from torch import Tensor
+
+from torchrefract._tensor import expand_batch
+from torchrefract._validation import eager_bool
+from torchrefract.effects.base import Effect
+from torchrefract.effects.batch import per_sample
+from torchrefract.effects.batch_flow import BatchFlow, FlowPart, SamplingOptions
+from torchrefract.effects.photometric_effect import PhotometricEffect
+from torchrefract.effects.warp_effect import WarpEffect, warped
+from torchrefract.types import Degraded
+from torchrefract.warping.flow import compose_flows
+from torchrefract.warping.grid import field_dtype, inside
+from torchrefract.warping.warp import sees_only_valid
+
+# How photometric maps of several effects combine.
+_COMBINE: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "transmission": torch.mul,
+    "intensity": torch.add,
+    "extinction": torch.add,
+}
+
+
+class Leaf(NamedTuple):
+    """An effect that is not a composition, with the sampling options of the compositions around it."""
+
+    effect: Effect
+    options: SamplingOptions
+    params: Any = None
+
+
+class _Segment(NamedTuple):
+    """Warps that were sampled together."""
+
+    applied: Tensor  # (N,), bool: one of the warps is applied
+    active: Tensor  # (N,), bool: and moves the sample
+    flow: BatchFlow
+
+    def sample(self, image: Tensor, options: SamplingOptions) -> Tensor:
+        """Sample images (N, C, H, W) along the flow."""
+        return self.flow.sample(image, self.active, _Applied(self.applied, self.flow.parts[0].flow.nodes), options)
+
+
+class _Applied(NamedTuple):
+    """The parts of parameters that `where_active` reads."""
+
+    applied: Tensor
+    nodes: Tensor
+
+
+class Progress:
+    """Images on their way through the effects of a composition, and what their maps are computed from."""
+
+    def __init__(self, image: Tensor, depth: Tensor | None, batch: int):
+        self.image, self.depth = image, depth
+        self.frames = image.shape[0] // max(batch, 1)
+        self.has_warps = False
+        self.segments: list[_Segment] = []
+        self.warps: list[tuple[WarpEffect, Any, Callable[[], BatchFlow], Tensor]] = []  # with params, own flow, active
+        self.valid: Callable[[], Tensor] | None = None  # None is everywhere
+        self.light: dict[str, Callable[[], Tensor]] = {}
+
+    def move(
+        self, leaves: Sequence[Leaf], active: Sequence[Tensor], parts: Sequence[FlowPart], *, is_exact: bool
+    ) -> None:
+        """Sample the images along the composed flow of several warps.
+
+        Args:
+            leaves: the warps, in order, with parameters of N rows.
+            active: (N,), bool, for each warp: the samples that it moves.
+            parts: the composed flow.
+            is_exact: True if the flow was computed without a tolerance.
+        """
+        rows, _, height, width = self.image.shape
+        applied = torch.stack([leaf.params.applied for leaf in leaves]).any(dim=0)
+        moved = torch.stack(list(active)).any(dim=0)
+        for part in parts:
+            if part.is_zero:
+                moved = torch.zeros_like(moved) if part.samples is None else moved.index_fill(0, part.samples, False)
+        segment = _Segment(applied, moved, BatchFlow(parts))
+        self.image = _sample_segment(self.image, segment, leaves, active)
+        if self.depth is not None:
+            depth, detached = expand_batch(self.depth, rows), segment._replace(flow=segment.flow.detach())
+            self.depth = detached.sample(depth, SamplingOptions("border", "nearest", "auto"))
+        self.light = {name: _moved(value, segment) for name, value in self.light.items()}
+        for leaf, moves in zip(leaves, active, strict=True):
+            warp = cast(WarpEffect, leaf.effect)
+            flow = _remember(partial(warp.planned_flow, leaf.params, height, width, is_exact=is_exact))
+            self.warps.append((warp, leaf.params, flow, moves))
+            self.valid = _valid_after(self.valid, flow, moves)
+        self.segments.append(segment)
+
+    def shade(self, effect: PhotometricEffect, params: Any) -> None:
+        """Apply a photometric effect."""
+        shaded = effect.degrade_batch(self.image, params, self.depth)
+        rows, before, valid = self.image.shape[0], dict(self.light), self.valid
+        self.image = shaded.image
+        self.valid = (
+            (lambda: expand_batch(shaded.valid, rows))
+            if valid is None
+            else (lambda: valid() & expand_batch(shaded.valid, rows))
+        )
+
+        def own_map(name: str) -> Callable[[], Tensor] | None:
+            return (lambda: expand_batch(getattr(shaded, name), rows)) if shaded.has(name) else None
+
+        transmission = own_map("transmission")
+        if "intensity" in before and transmission is not None:  # light that was added before is attenuated
+            added = before["intensity"]
+            before["intensity"] = lambda: added() * transmission()
+        self.light = before
+        for name, combine in _COMBINE.items():
+            value = own_map(name)
+            if value is not None:
+                earlier = self.light.get(name)
+                self.light[name] = value if earlier is None else _combined(combine, earlier, value)
+
+    def result(self, params: Any) -> Degraded:
+        """Return the images with all maps."""
+        size, device = self.image.shape, self.image.device
+        valid = self.valid or (lambda: torch.ones(size[0], 1, *size[2:], dtype=torch.bool, device=device))
+        if not self.has_warps:
+            return Degraded(self.image, params, valid=valid, light=self.light)
+        return warped(
+            self.image,
+            params,
+            flow=self._flow,
+            valid=valid,
+            inverse=self._inverse,
+            is_composed=self._is_composed if len(self.warps) > 1 else None,
+            light=self.light,
+        )
+
+    def _flow(self) -> Tensor:
+        """Return (N, 2, H, W), px, the composed flow of all segments."""
+        if not self.segments:
+            rows, _, height, width = self.image.shape
+            return torch.zeros(rows, 2, height, width, dtype=field_dtype(self.image.dtype), device=self.image.device)
+        flow = self.segments[-1].flow.dense
+        for segment in reversed(self.segments[:-1]):
+            flow = torch.where(
+                per_sample(segment.active),
+                compose_flows(segment.flow.dense, flow),
+                flow,
+            )
+        return flow
+
+    def _is_composed(self) -> Tensor:
+        """Return (N,), bool: samples that several warps move."""
+        return torch.stack([moves for _, _, _, moves in self.warps]).sum(dim=0) > 1
+
+    def _inverse(self) -> tuple[Tensor, Tensor]:
+        """Compose the inverse flows of all warps, sample by sample of those that move it."""
+        total: Tensor | None = None
+        valid = moved = torch.empty(0)
+        for effect, params, flow, moves in self.warps:
+            inverse, exists = effect.masked_inverse_flow(params, flow().dense)
+            exists = exists.expand(len(inverse), 1, *inverse.shape[2:])
+            if total is None:
+                total, valid, moved = inverse, exists, moves
+                continue
+            both, alone = per_sample(moved & moves), per_sample(moves)
+            if eager_bool(both.any, of=both) is not False:
+                exists = torch.where(both, valid & sees_only_valid(exists, total), exists)
+                inverse = torch.where(both, compose_flows(inverse, total), inverse)
+            total, valid = torch.where(alone, inverse, total), torch.where(alone, exists, valid)
+            moved = moved | moves
+        if total is None:
+            flow = self._flow()
+            return flow, torch.ones_like(flow[:, :1], dtype=torch.bool)
+        return total, valid
+
+
+def _remember(compute: Callable[[], BatchFlow]) -> Callable[[], BatchFlow]:
+    """Compute a flow when it is first needed, and keep it."""
+    computed: list[BatchFlow] = []
+
+    def flow() -> BatchFlow:
+        if not computed:
+            computed.append(compute())
+        return computed[0]
+
+    return flow
+
+
+def _valid_after(
+    before: Callable[[], Tensor] | None, flow: Callable[[], BatchFlow], moves: Tensor
+) -> Callable[[], Tensor]:
+    """Return where an image is valid after one more warp."""
+
+    def valid() -> Tensor:
+        sampled_inside = (flow().exists & inside(flow().dense)) | ~per_sample(moves)
+        return sampled_inside if before is None else sampled_inside & sees_only_valid(before(), flow().dense)
+
+    return valid
+
+
+def _moved(value: Callable[[], Tensor], segment: _Segment) -> Callable[[], Tensor]:
+    """Move a photometric map along."""
+    return lambda: segment.sample(value(), SamplingOptions("border", "bilinear", "auto"))
+
+
+def _combined(
+    combine: Callable[[Tensor, Tensor], Tensor], first: Callable[[], Tensor], second: Callable[[], Tensor]
+) -> Callable[[], Tensor]:
+    return lambda: combine(first(), second())
+
+
+def _sample_segment(image: Tensor, segment: _Segment, leaves: Sequence[Leaf], active: Sequence[Tensor]) -> Tensor:
+    """Sample the images, each with the options of the last warp that moves it."""
+    result = segment.sample(image, leaves[-1].options)
+    decided = active[-1]
+    for leaf, moves in zip(reversed(leaves[:-1]), reversed(active[:-1]), strict=True):
+        chosen = moves & ~decided
+        if leaf.options != leaves[-1].options and eager_bool(chosen.any, of=chosen) is not False:
+            result = torch.where(per_sample(chosen), segment.sample(image, leaf.options), result)
+        decided = decided | moves
+    return result

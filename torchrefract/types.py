@@ -34,16 +34,12 @@ class FlowBounds:
 
     max_displacement: px.
     max_gradient: px per px; inf if unknown.
-    max_second_derivative: px per px^2, along any line; inf if unknown.
-    max_third_derivative: px per px^3; inf if the second derivative has kinks.
     interpolation_error: from strides, an array in px, to the largest error in px of cubic Lagrange polynomials through
         4 nodes along each axis, wherever the nodes lie; inf if unknown.
     """
 
     max_displacement: float
     max_gradient: float
-    max_second_derivative: float
-    max_third_derivative: float
     interpolation_error: Callable[[np.ndarray], np.ndarray]
 
 

@@ -24,7 +24,7 @@ def flow_on(lattice: Lattice, smoothing: float) -> torch.Tensor:
 
 @pytest.mark.quick
 @pytest.mark.parametrize("smoothing", [0.0, 0.2])
-def test_errors_of_cubics_and_derivatives_are_bounded(smoothing):
+def test_errors_of_cubics_and_gradients_are_bounded(smoothing):
     bounds = ThinPlateErrorModel(1.0, (3, 4), (smoothing, smoothing)).bounds(HEIGHT, WIDTH)
     dense = flow_on(pixel_lattice(HEIGHT, WIDTH), smoothing)
     for stride in (3, 8, 20):
@@ -34,8 +34,6 @@ def test_errors_of_cubics_and_derivatives_are_bounded(smoothing):
         assert 7 * error <= bound < 70 * error
     gradient = (dense[..., 2:] - dense[..., :-2]).square().sum(dim=0).sqrt().max() / 2
     assert 4 * gradient <= bounds.max_gradient < 8 * gradient
-    second = (dense[..., 2:] - 2 * dense[..., 1:-1] + dense[..., :-2]).square().sum(dim=0).sqrt().max()
-    assert 4 * second <= bounds.max_second_derivative * 1.2 < 20 * second
     assert bounds.max_displacement == 14
 
 

@@ -26,14 +26,10 @@ _LEVEL_STRIDES = (4.0, 16.0, 64.0, 128.0, 256.0)  # px, strides at which errors 
 _LEVELS = np.array(_LEVEL_STRIDES)
 _FINE = 2  # the first levels, whose nodes lie near the frame, give the derivatives
 _CELLS = 7  # along each axis, in which errors are measured
-# Positions in strides from the corner of a cell, on a line through its middle, and weights of the values there: the
-# error of the cubic through the four nodes, and the second and third derivative.
+# Positions in strides from the corner of a cell, on a line through its middle, and weights of the values there that
+# give the error of the cubic through the four nodes.
 _LINE = (-1.0, 0.0, 0.5, 1.0, 2.0)
-_ERROR, _SECOND, _THIRD = (
-    (-1 / 16, 9 / 16, -1.0, 9 / 16, -1 / 16),
-    (0.0, 4.0, -8.0, 4.0, 0.0),
-    (-1.0, 3.0, 0.0, -3.0, 1.0),
-)
+_ERROR = (-1 / 16, 9 / 16, -1.0, 9 / 16, -1 / 16)
 _CONVERGED = 1e-7  # step of Newton's method on the plane z = 1; the error is about its square
 _MAX_STEPS = 12
 _MAX_STRETCH = 3.0  # the sampler clamps positions that lie farther out than this, relative to the frame
@@ -206,15 +202,9 @@ def flow_bounds(flow: Tensor, num_levels: int, stretch: Tensor) -> FlowBounds | 
     near, near_strides = lines[:, :, :_FINE], strides[:_FINE, None, None]
     steps = torch.diff(flow.new_tensor(_LINE))
     gradient = (torch.hypot(*torch.diff(near, dim=5)) / (near_strides[..., None] * steps)).max()
-    second, third = (
-        (torch.hypot(*(near @ flow.new_tensor(weights))).sum(dim=3).amax(dim=(0, 2)) / strides[:_FINE] ** order).max()
-        for weights, order in ((_SECOND, 2), (_THIRD, 3))
-    )
     return FlowBounds(
         max_displacement=_SAFETY * float(torch.hypot(*near).max()),
         max_gradient=_SAFETY * float(gradient),
-        max_second_derivative=_SAFETY * float(second),
-        max_third_derivative=_SAFETY * float(third),
         interpolation_error=_between_levels(_LEVELS[:num_levels], errors.numpy()),
     )
 

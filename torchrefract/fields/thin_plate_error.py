@@ -9,7 +9,6 @@ angles the error is smaller.
 """
 
 import itertools
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -27,7 +26,6 @@ _MAX_POINTS = 64  # at which errors are measured
 _LEVELS = np.array([2.0, 16.0, 64.0, 256.0])  # px, strides at which errors are measured
 _INSIDE = (1, 3, 5)  # positions in a cell, sixths
 _PLACES = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (0.25, 0.25))  # of a control point in its cell
-_NEAREST = math.exp(-1)  # px from a control point: ln r there is its mean over the first px
 
 
 @dataclass(frozen=True)
@@ -81,8 +79,6 @@ def _bounds(model: ThinPlateErrorModel, height: int, width: int) -> FlowBounds:
     return FlowBounds(
         _max_displacement(model),
         _GRADIENT_SAFETY * steep * max(map(_gradient, splines)),
-        steep * max(map(_second_derivative, splines)),
-        math.inf,
         interpolation_error,
     )
 
@@ -155,18 +151,6 @@ def _gradient(splines: _UnitSplines) -> float:
     right, left, down, up = np.concatenate([_kernel(at[:, :, None] - splines.points), plane], axis=-1) @ splines.weights
     gradients = np.stack([right - left, down - up]) / 2
     return float(np.sqrt((gradients**2).sum(axis=-1)).max())
-
-
-def _second_derivative(splines: _UnitSplines) -> float:
-    """Measure the deviation of the largest second derivative along a line, for displacements of deviation 1."""
-    largest = 0.0
-    for line in np.array([[1.0, 0.0], [0.0, 1.0], [0.5**0.5, 0.5**0.5], [0.5**0.5, -(0.5**0.5)]]):
-        at = (splines.measured[:, None] + _NEAREST * line - splines.center) / splines.scale
-        step = 0.1 * line / splines.scale
-        values = _kernel((at + np.array([-step, 0 * step, step]))[:, :, None] - splines.points)  # (n, 3, P)
-        second = (values[:, 0] - 2 * values[:, 1] + values[:, 2]) / 0.1**2 @ splines.weights[: len(splines.points)]
-        largest = max(largest, float(np.sqrt((second**2).sum(axis=-1)).max()))
-    return largest
 
 
 def _kernel(offset: np.ndarray) -> np.ndarray:

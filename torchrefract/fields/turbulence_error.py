@@ -89,15 +89,14 @@ def _bounds(model: RandomFieldErrorModel) -> FlowBounds:
             shortest, narrowest = (torch.tensor([ends[0]]) for ends in (model.length, model.aperture))
             gradient = _NARROW_APERTURE * steep
             gradient *= gradient_rms(shortest, kind=model.covariance, aperture=narrowest).item()
-        return FlowBounds(largest, gradient, math.inf, math.inf, lambda strides: np.full(np.shape(strides), np.inf))
-    first, second, third = (steep * _derivative_rms(spectrum, n, is_stream=model.is_stream) for n in (1, 2, 3))
+        return FlowBounds(largest, gradient, lambda strides: np.full(np.shape(strides), np.inf))
 
     def interpolation_error(strides: np.ndarray) -> np.ndarray:
         spacing = np.multiply.outer(np.asarray(strides, dtype=float), spectrum.deviation)
         power = _cubic_error(spacing, is_stream=model.is_stream) @ spectrum.weight
         return _SKEW * spectrum.margin * largest * np.sqrt(power)
 
-    return FlowBounds(largest, first, second, third, interpolation_error)
+    return FlowBounds(largest, steep * _gradient_rms(spectrum, is_stream=model.is_stream), interpolation_error)
 
 
 @lru_cache(maxsize=256)
@@ -150,13 +149,12 @@ def _spectrum(model: RandomFieldErrorModel) -> _Spectrum | None:
     return _Spectrum(weight / weight.sum(), deviation, math.sqrt(1 + aliased))
 
 
-def _derivative_rms(spectrum: _Spectrum, order: int, *, is_stream: bool) -> float:
-    """Return the root mean square of the largest derivative, in 1/px^order, of a flow of variance 1.
+def _gradient_rms(spectrum: _Spectrum, *, is_stream: bool) -> float:
+    """Return the root mean square of the largest derivative, in 1/px, of a flow of variance 1.
 
-    The moments of a Gaussian spectrum of deviation d are (2 n - 1)!! d^(2 n); a component of the curl has those of k^2.
+    A Gaussian spectrum of deviation d has the mean square d^2; that of a component of a curl is 3 d^2.
     """
-    moment = math.prod(range(1, 2 * order + (2 if is_stream else 0), 2))
-    return spectrum.margin * math.sqrt(moment * float(spectrum.weight @ spectrum.deviation ** (2 * order)))
+    return spectrum.margin * math.sqrt((3 if is_stream else 1) * float(spectrum.weight @ spectrum.deviation**2))
 
 
 def _cutoff(spectrum: _Spectrum, error: float, *, is_stream: bool) -> float:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-from torchrefract.planning.plan import ErrorModel, PlanRequest, WarpPlan, plan_warp
+from torchrefract.planning.plan import EXACT_AT_NODES, ErrorModel, PlanRequest, WarpPlan, plan_warp
 
 _FIELD_SHARE = 0.35  # of the tolerance, for the errors of random fields; the rest is for the lattice
 # Shares allow for such a stretch of errors. A sample whose measured stretch is larger is computed exactly.
@@ -114,8 +114,13 @@ def plan_composition(
         bounds = None if warp.model is None else warp.model.bounds(request.height, request.width)
         counted = min(stretch, _ALLOWED_STRETCH) if can_measure else stretch
         share = replace(request, tolerance_px=budget / (parts or 1) / counted, ulps=warp.ulps)
-        is_planned = not warp.has_closed_form and bounds and share.is_reachable
-        plans.append(plan_warp(warp.model, share) if is_planned else replace(exact, bounds=bounds))
+        if warp.has_closed_form or bounds is None:
+            plan = replace(exact, reason=EXACT_AT_NODES if bounds else exact.reason, bounds=bounds)
+        elif share.is_reachable:
+            plan = plan_warp(warp.model, share)
+        else:
+            plan = replace(exact, reason="its share of the tolerance is below rounding", bounds=bounds)
+        plans.append(plan)
         stretch *= 1 + (math.inf if bounds is None else bounds.max_gradient)
     # A warp without a model must be exact, and so is then the composed flow.
     strides = [

@@ -14,6 +14,7 @@ from torchrefract.types import FlowBounds, Simplification
 from torchrefract.warping.lattice import Lattice
 
 TOLERANCE_PX = 0.02  # the default of all warps; an error of this size is invisible
+EXACT_AT_NODES = "exact, at the nodes of the composed flow"  # the reason of warps in closed form
 DEFAULT_ULPS = 4  # units in the last place of the longer side by which float32 flows are off
 _SMALLEST, _LARGEST = 1e-6, 64.0  # px, or levels of 1/255
 _LAST_PLACE = {False: 2.0**-24, True: 2.0**-53}
@@ -138,6 +139,8 @@ class WarpPlan:
 
     def summary(self) -> str:
         """Return one line: where the flow is computed, and why."""
+        if self.reason == EXACT_AT_NODES:
+            return self.reason
         flow = {0: "not computed", 1: "at every pixel"}.get(self.stride, f"every {self.stride} px")
         measured = "; on the CPU as coarse as measured in each sample" if self.is_measured else ""
         return f"{flow} ({self.reason}{measured})"

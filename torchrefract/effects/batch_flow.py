@@ -178,17 +178,17 @@ def flow_on_measured_lattice(
         if not chosen:
             continue
         index = None if len(chosen) == len(lattice_px) else torch.tensor(chosen)
-        some = warps if index is None else [warp.select(index) for warp in warps]
+        selected = warps if index is None else [warp.select(index) for warp in warps]
         if choice == "fit":
             nodes = composed.flow if index is None else composed.flow[index]
             parts.append(FlowPart(index, LatticeFlow(nodes, lattice), everywhere(nodes.device)))
             continue
         finer = 1
         if choice == "exact":
-            some = [warp.exact() for warp in some]
+            selected = [warp.exact() for warp in selected]
         elif choice == "finer":
             finer = _next_stride(stride, min(lattice_px[chosen].tolist()), tolerance_px)
-        remaining = flow_on_measured_lattice(some, stride=finer, is_smooth=is_smooth, tolerance_px=tolerance_px)
+        remaining = flow_on_measured_lattice(selected, stride=finer, is_smooth=is_smooth, tolerance_px=tolerance_px)
         parts += [part.of_samples(index) for part in remaining]
     return parts
 

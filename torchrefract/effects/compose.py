@@ -192,8 +192,8 @@ class Compose(Effect):
             if isinstance(effect, Compose):
                 leaves += effect._leaves(options)
             elif isinstance(effect, WarpEffect):
-                own = SamplingOptions(effect.padding, effect.interpolation, effect.backend)
-                leaves.append(Leaf(effect, options.or_else(own)))
+                of_effect = SamplingOptions(effect.padding, effect.interpolation, effect.backend)
+                leaves.append(Leaf(effect, options.or_else(of_effect)))
             else:
                 leaves.append(Leaf(effect, options))
         return leaves
@@ -274,7 +274,7 @@ class Compose(Effect):
 
 
 class _FlowPlan(NamedTuple):
-    """What a flow needs of a `CompositionPlan`; torch.compile reads the fields of a constant, but no dataclasses."""
+    """The choices of a `CompositionPlan`; torch.compile reads the fields of a constant, but not of dataclasses."""
 
     stride: int
     is_smooth: bool

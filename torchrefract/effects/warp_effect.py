@@ -116,7 +116,12 @@ class WarpEffect(Effect):
         return self.plan_under(request)
 
     def plan_under(self, request: PlanRequest) -> WarpPlan:
-        """Return the plan for a request, which measures the error in each sample if the bounds need a fine lattice."""
+        """Return the plan for a request; an effect without a tolerance stays exact.
+
+        The error is measured in each sample if the bounds need a fine lattice.
+        """
+        if self.tolerance_px is None:
+            request = replace(request, tolerance_px=None)
         plan = plan_warp(self.error_model() if request.tolerance_px else None, request)
         is_fine = 0 < plan.stride < _FINE_STRIDE and request.height * request.width >= _MIN_PIXELS
         if self.has_closed_form and is_fine and request.tolerance_px is not None:

@@ -47,10 +47,9 @@ class RoadScenes(Dataset[Frame]):
 
 
 def render_road_scenes(keys: Tensor, height: int, width: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Render road scenes on the CPU.
+    """Render road scenes on the CPU; a frame depends on its key and the seed alone.
 
-    A frame depends on its key and the seed alone. The color of a pixel is the mean of five rays. Its depth is that of
-    the ray through its center.
+    The color of a pixel is the mean of five rays. Its depth is that of the ray through its center.
 
     Args:
         keys: (B,), int64, B >= 1.

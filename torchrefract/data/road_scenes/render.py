@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from torchrefract.data.road_scenes.scene import Array, Color, Light, Panel, Road, Scene, View, noise
+from torchrefract.data.road_scenes.scene import Array, Color, Light, Panel, Road, Scene, View, noise, scale_color
 
 Window = tuple[slice, slice, slice]  # rays, rows, columns
 
@@ -17,7 +17,6 @@ _OFFSETS = np.array([(0.0, 0.0), (-0.15, -0.4), (0.4, -0.15), (0.15, 0.4), (-0.4
 _NEAR, _FAR = 0.2, 3e4  # m
 _CLOUD_HEIGHT, _CLOUD_SCALE = 900.0, 170.0  # m; size of clouds in multiples of the texture of the ground
 _HAZE = 9000.0  # m, the distance at which contrast is one half
-_CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
 
 
 class Camera:
@@ -51,12 +50,7 @@ class Camera:
 
 
 def render(scene: Scene, height: int, width: int) -> tuple[Array, Array]:
-    """Render a scene.
-
-    Returns:
-        image: (H, W, 3), float32, in [0, 1]; the mean of five rays.
-        depth: (H, W), float32, m along the camera's axis of the ray through the pixel's center; inf for the sky.
-    """
+    """Render an image (H, W, 3) and its depth (H, W), both float32; see `render_road_scenes`."""
     camera = Camera(scene.view, height, width)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         drop = -camera.dot(np.array([0.0, 1.0, 0.0]), camera.frame)
@@ -73,7 +67,7 @@ def render(scene: Scene, height: int, width: int) -> tuple[Array, Array]:
 def _draw_panel(panel: Panel, camera: Camera, light: Light, color: Array, depth: Array) -> None:
     """Draw a panel where it is nearer than `depth`; changes `color` and `depth`."""
     distance = float(panel.normal @ (panel.center - camera.position))
-    window = camera.window(panel.center + _CORNERS @ (panel.right, panel.up))
+    window = camera.window(panel.corners)
     if window is None:
         return
     t = np.float32(distance) / camera.dot(panel.normal, window)
@@ -86,8 +80,7 @@ def _draw_panel(panel: Panel, camera: Camera, light: Light, color: Array, depth:
 
 def _cast_shadow(panel: Panel, camera: Camera, sun: Array, depth: Array, is_shaded: Array) -> None:
     """Mark the rays that meet the ground where the panel hides the sun; changes `is_shaded`."""
-    corners = panel.center + _CORNERS @ (panel.right, panel.up)
-    window = camera.window(corners - np.outer(corners[:, 1], sun / sun[1]))
+    window = camera.window(panel.corners - np.outer(panel.corners[:, 1], sun / sun[1]))
     if window is None:
         return
     ground, start = depth[window], np.float32(panel.normal @ (camera.position - panel.center))
@@ -122,13 +115,9 @@ def _backdrop(scene: Scene, camera: Camera, depth: Array, is_shaded: Array) -> A
     footprint = plane_depth / camera.scale / size * np.maximum(1, 0.5 / np.abs(rise))
     plane = (camera.position[0] + plane_depth * x[0]) / size, plane_depth * z[0] / size
     # Noise of four cell sizes, each faded out where a pixel covers more than about one cell.
-    grain = np.stack(
-        [
-            noise(plane[0] / cell + road.shift[0], plane[1] / cell + road.shift[1]) / (1 + (footprint / cell) ** 2)
-            for cell in (0.035, 0.2, 1.3, 8.0)
-        ]
-    ).astype(np.float32)
-    grain = np.broadcast_to(grain[:, None], (4, *depth.shape))
+    cells = np.array([0.035, 0.2, 1.3, 8.0])[:, None, None]
+    grain = noise(plane[0] / cells + road.shift[0], plane[1] / cells + road.shift[1]) / (1 + (footprint / cells) ** 2)
+    grain = np.broadcast_to(grain[:, None].astype(np.float32), (4, *depth.shape))
     color, is_ground = np.empty((*depth.shape, 3), np.float32), y < 0
     color[~is_ground] = _tone(_sky(light, np.stack([x, y, z])[:, ~is_ground], grain[:, ~is_ground]))
     t = np.minimum(depth[is_ground], _FAR)
@@ -148,12 +137,12 @@ def _ground(road: Road, x: Array, z: Array, grain: Array) -> Array:
     shade, ragged = 0.3 * fine + 0.2 * small, middle + 0.4 * small
     tuft = np.clip(0.62 + coarse + 0.6 * middle + 0.5 * small + 0.3 * fine, 0, 1)
     tuft[distance < road.half_width + 1.1 * road.is_paved + 0.3 * ragged] = 0  # the shoulder is bare
-    albedo = _blend(_times(soil, 1 + shade), _times(grass, 1 + 1.3 * shade + 0.25 * middle), tuft)
+    albedo = _blend(scale_color(soil, 1 + shade), scale_color(grass, 1 + 1.3 * shade + 0.25 * middle), tuft)
     track = np.clip(1 - np.abs(np.abs(distance - road.lane / 2) - 0.8) / 0.5, 0, None)  # of wheels
     surface = (road.asphalt,) * 3 if road.is_paved else _mix((0.42, 0.33, 0.22), (0.44, 0.22, 0.12), road.red_soil)
     tone = 1 + 0.35 * fine + (0.1 + 0.2 * is_gravel) * (small + middle) + (0.32 * is_gravel - 0.14) * track
     is_road = distance < road.half_width + (0.06 + 0.3 * is_gravel) * ragged
-    albedo[is_road] = _times(surface, tone)[is_road]
+    albedo[is_road] = scale_color(surface, tone)[is_road]
     if road.is_paved:
         worn = np.clip(0.85 + 0.2 * fine + 0.2 * small + 0.15 * coarse, 0, 1)
         is_white = (distance < 0.07) & (road.has_solid_line | ((z + road.shift[0]) % 9.0 < 4.0))
@@ -168,10 +157,10 @@ def _sky(light: Light, ray: Array, grain: Array) -> Array:
     rise, toward = ray[1] / length, np.clip(light.sun @ ray / length, 0, 1)
     low = 1 / (1 + 6 * rise)
     sky = _blend(light.zenith, light.horizon, low * low * (1 + rise))
-    sky = sky + _times(light.beam, 0.02 / (1.02 - toward) * (1 - np.clip(light.clouds, 0.2, 0.95)))
+    sky = sky + scale_color(light.beam, 0.02 / (1.02 - toward) * (1 - np.clip(light.clouds, 0.2, 0.95)))
     density = light.clouds + 1.1 * grain[3] + 0.6 * grain[2] + 0.25 * grain[1]
     share = np.clip(density * 1.4, 0, 1) * 0.85 * np.minimum(rise * 14, 1)
-    cloud = _times(light.beam * 0.45 + light.ambient * 0.85, 0.95 - 0.3 * np.clip(density - 0.5, 0, 1))
+    cloud = scale_color(light.beam * 0.45 + light.ambient * 0.85, 0.95 - 0.3 * np.clip(density - 0.5, 0, 1))
     return _blend(sky, cloud, share)
 
 
@@ -186,7 +175,3 @@ def _mix(first: Color, second: Color, share: float) -> Array:
 
 def _blend(under: Array, over: Color, share: Array) -> Array:
     return under + (np.asarray(over, np.float32) - under) * share[..., None]
-
-
-def _times(color: Color, factor: Array) -> Array:
-    return np.asarray(color, np.float32) * factor[..., None]

@@ -36,8 +36,14 @@ from torchrefract import (
 )
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract.data.pairs.files import FORMATS, decode_pair, encode_pair
-from torchrefract.data.pairs.generator import GenerationConfig, PairGenerator, PairTask, SourceReader, find_sources
-from torchrefract.data.pairs.storage import use_one_thread
+from torchrefract.data.pairs.generator import (
+    GenerationConfig,
+    PairGenerator,
+    PairTask,
+    SourceReader,
+    find_sources,
+    use_one_thread,
+)
 from torchrefract.effects.base import Effect
 
 PROTOCOL = {

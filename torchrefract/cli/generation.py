@@ -24,9 +24,16 @@ from torchrefract.cli.command import check_seed, make, naming
 from torchrefract.data.frames import first_names
 from torchrefract.data.pairs.card import HISTOGRAMS, draw_histograms, format_card, summarize
 from torchrefract.data.pairs.files import FORMATS
-from torchrefract.data.pairs.generator import GenerationConfig, PairGenerator, PairTask, Sources, find_sources
+from torchrefract.data.pairs.generator import (
+    GenerationConfig,
+    PairGenerator,
+    PairStorage,
+    PairTask,
+    Sources,
+    find_sources,
+    generate_pairs,
+)
 from torchrefract.data.pairs.manifest import Manifest, PairRow, claim, find_manifests, scan_rows
-from torchrefract.data.pairs.storage import FileStorage, PairStorage, TarStorage, generate_pairs
 from torchrefract.effects.base import Effect
 
 _SAMPLES = 4  # pairs that the estimate of the size on disk rests on
@@ -78,8 +85,7 @@ def generate(cfg: DictConfig) -> None:
         previous = claim(out, options.settings, count=options.num_pairs, about=about).get("made_with", _VERSIONS)
         if previous != _VERSIONS:
             print(f"existing pairs were made with {previous}, new ones are made with {_VERSIONS}: bytes may differ")
-        tar = options.settings["tar"]
-        storage = FileStorage(out) if tar is None else TarStorage(out, tar)
+        storage = PairStorage(out, options.settings["tar"])
         manifest = Manifest(out, *options.shard)
         complete, damaged = manifest.open(
             lambda number: options.shard.holds(number, options.num_pairs, storage.unit), verify=options.verify
@@ -198,7 +204,7 @@ def _check_disk(options: Options, missing: Sequence[int], storage: PairStorage) 
     """Print the estimated size of the missing pairs; raise UsageError if the disk has less space."""
     generator, step = PairGenerator(options.config), max(1, len(missing) // _SAMPLES)
     samples = [generator.generate(options.task(number)) for number in missing[::step][:_SAMPLES]]
-    sizes = [storage.disk_bytes(pair) + len(pair.row.as_line()) for pair in samples if pair.data]
+    sizes = [storage.disk_bytes(pair) for pair in samples if pair.data]
     mean = sum(sizes) / max(1, len(sizes))
     needed, free = mean * len(missing), shutil.disk_usage(storage.out).free
     estimate = f"{len(missing)} pairs take about {_size(needed)} on disk, {_size(mean)} each; {_size(free)} are free"

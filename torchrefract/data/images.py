@@ -49,11 +49,6 @@ def read_image(path: str | Path) -> Tensor:
     Raises:
         UnreadableImageError: the file is missing, damaged or not an image.
     """
-    return as_image(read_pixels(path))
-
-
-def read_pixels(path: str | Path) -> np.ndarray:
-    """Read a file as `read_image` does, without conversion: (H, W, 3), RGB, uint8 or uint16."""
     with opened(path) as stream:
         data = stream.read()
     _check_complete(path, io.BytesIO(data), len(data))
@@ -61,12 +56,7 @@ def read_pixels(path: str | Path) -> np.ndarray:
         raise UnreadableImageError(f"{path} is damaged: its chunks are shorter than they state")
     # OpenCV would allocate any size that a header states; Pillow raises an error for a decompression bomb.
     _header_size(path, io.BytesIO(data))
-    return _decode(path, data)
-
-
-def as_image(pixels: np.ndarray) -> Tensor:
-    """Convert (H, W, 3), uint8 or uint16, into (3, H, W), float32, in [0, 1]."""
-    return to_float(torch.from_numpy(pixels)).permute(2, 0, 1)
+    return to_float(torch.from_numpy(_decode(path, data))).permute(2, 0, 1)
 
 
 def pixels_of(image: Tensor) -> np.ndarray:

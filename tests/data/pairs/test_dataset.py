@@ -164,4 +164,4 @@ def test_pixels_of_a_flow_beyond_512_px_are_marked_as_invalid():
     decoded, mask = decode_flow(encode_flow(flow, valid))
     assert mask.tolist() == [[True, True, False, True, False]]
     assert np.abs(decoded - flow)[:, mask].max() <= 1 / 128
-    assert count_out_of_range(flow, valid) == 2
+    assert count_out_of_range({"flow": flow, "valid": valid}) == {"flow": 2}

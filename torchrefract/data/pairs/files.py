@@ -7,6 +7,7 @@ intensity of 16 bits. npz and safetensors files hold the maps in float32, as the
 import io
 import zipfile
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import cv2
@@ -95,16 +96,15 @@ def decode_pair(files: Mapping[str, Callable[[], bytes]], names: tuple[str, ...]
         if name == _MAPS_STEM:
             maps |= _decode(suffix, read(), _decode_npz if file_format == "npz" else load)
         elif name not in IMAGES and (names is None or name in names):
-            maps[name] = _decode(suffix, read(), _DECODERS[name])
-    clean, corrupted = (_decode(f"{name}.png", files[f"{name}.png"](), decode_image) for name in IMAGES)
+            maps[name] = _decode(suffix, read(), partial(_decode_map, name))
+    clean, corrupted = (_decode(f"{name}.png", files[f"{name}.png"](), _decode_image) for name in IMAGES)
     return PairArrays(clean, corrupted, maps)
 
 
-def count_out_of_range(flow: np.ndarray, valid: np.ndarray) -> int:
-    """Count the valid pixels of a flow (2, H, W) that a PNG cannot hold; `encode_flow` marks them as not valid."""
-    if _in_range(np.array([[flow.min(), flow.max()]])).all():
-        return 0
-    return int((valid & ~_in_range(flow)).sum())
+def count_out_of_range(maps: Mapping[str, np.ndarray]) -> dict[str, int]:
+    """Count the valid pixels that a PNG cannot hold, by flow; `encode_flow` marks them as not valid."""
+    counts = {name: int((maps[mask] & ~_in_range(maps[name])).sum()) for name, mask in FLOWS.items() if name in maps}
+    return {name: count for name, count in counts.items() if count}
 
 
 def encode_flow(flow: np.ndarray, valid: np.ndarray) -> bytes:
@@ -131,8 +131,7 @@ def decode_flow(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(flow.transpose(2, 0, 1)), levels[..., 0] > 0
 
 
-def decode_image(data: bytes) -> np.ndarray:
-    """Decode a PNG of 8 bits into (H, W, 3), uint8, RGB."""
+def _decode_image(data: bytes) -> np.ndarray:
     return np.ascontiguousarray(_decode_png(data, np.uint8, 3)[..., ::-1])
 
 
@@ -151,6 +150,14 @@ def _encode_map(name: str, value: np.ndarray, maps: Mapping[str, np.ndarray]) ->
         limit = f"{_LAST_LEVEL / LIGHTS[name]:.3g}"
         raise ValueError(f"maps must be npz or safetensors for {name} above {limit}, got up to {value.max():.3g}")
     return _encode_png(levels.astype(np.uint16), _MAP_OPTIONS)
+
+
+def _decode_map(name: str, data: bytes) -> np.ndarray:
+    if name in FLOWS:
+        return decode_flow(data)[0]
+    if name in MASKS:
+        return _decode_png(data, np.uint8, 1) > 0
+    return _decode_png(data, np.uint16, 1).astype(np.float32) / LIGHTS[name]
 
 
 def _encode_png(pixels: np.ndarray, options: list[int]) -> bytes:
@@ -189,14 +196,3 @@ def _decode_png(data: bytes, dtype: type, channels: int) -> np.ndarray:
     if pixels is None or pixels.dtype != dtype or pixels.ndim != (3 if channels == 3 else 2):
         raise DamagedPairError(f"it is not a PNG of {channels} channels of {np.dtype(dtype).itemsize * 8} bits")
     return pixels
-
-
-def _light_decoder(name: str) -> Callable[[bytes], np.ndarray]:
-    return lambda data: _decode_png(data, np.uint16, 1).astype(np.float32) / LIGHTS[name]
-
-
-_DECODERS: dict[str, Callable[[bytes], np.ndarray]] = {
-    **{name: lambda data: decode_flow(data)[0] for name in FLOWS},
-    **{name: _light_decoder(name) for name in LIGHTS},
-    **{name: lambda data: _decode_png(data, np.uint8, 1) > 0 for name in MASKS},
-}

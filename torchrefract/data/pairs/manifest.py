@@ -54,7 +54,7 @@ class PairRow(NamedTuple):
     @property
     def name(self) -> str:
         """The beginning of the names of the pair's files."""
-        return pair_name(self.number)
+        return f"{self.number:08d}"
 
     def as_line(self) -> str:
         """Return the row as a line of JSON."""
@@ -68,11 +68,6 @@ class RowLocation(NamedTuple):
     manifest: Path
     offset: int
     length: int
-
-
-def pair_name(number: int) -> str:
-    """Return the beginning of the names of a pair's files."""
-    return f"{number:08d}"
 
 
 def read_row(line: bytes) -> PairRow:

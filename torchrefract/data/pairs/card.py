@@ -81,14 +81,7 @@ def summarize(rows: Iterable[PairRow]) -> Summary:
 
 
 def format_card(summary: Summary, *, settings: Mapping[str, Any], license_text: str, has_histograms: bool) -> str:
-    """Format the card in Markdown.
-
-    Args:
-        summary: of the set.
-        settings: of the set, as in config.json.
-        license_text: license of the frames, as the user states it.
-        has_histograms: True if the file of `HISTOGRAMS` exists.
-    """
+    """Format the card in Markdown, from the settings in config.json and the license of the frames."""
     scene, count = settings["scene"]["name"], summary.splits.total()
     splits = [f"| {name} | {pairs} | {len(summary.drives[name])} |" for name, pairs in sorted(summary.splits.items())]
     effects = [f"| {name} | {pairs} |" for name, pairs in sorted(summary.effects.items())]

@@ -6,9 +6,11 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError
@@ -142,16 +144,13 @@ def scan_rows(
 
 def read_lines(locations: Iterable[RowLocation]) -> Iterator[bytes]:
     """Yield the lines at some locations, each with its line break."""
-    streams = {}
-    try:
-        for location in locations:
-            path = location.manifest
-            stream = streams.get(path) or streams.setdefault(path, path.open("rb"))
-            stream.seek(location.offset)
-            yield stream.read(location.length).rstrip(b"\n") + b"\n"
-    finally:
-        for stream in streams.values():
-            stream.close()
+    with ExitStack() as stack:
+        streams = dict[Path, BinaryIO]()
+        for path, offset, length in locations:
+            if path not in streams:
+                streams[path] = stack.enter_context(path.open("rb"))
+            streams[path].seek(offset)
+            yield streams[path].read(length).rstrip(b"\n") + b"\n"
 
 
 def read_stored(root: Path, file: StoredFile) -> bytes:
@@ -173,10 +172,7 @@ def read_stored(root: Path, file: StoredFile) -> bytes:
 
 
 class Manifest:
-    """The manifest that a shard writes.
-
-    A set of one shard has manifest.jsonl; a set of several has one file for each shard.
-    """
+    """The manifest that a shard writes: manifest.jsonl if there is a single one, otherwise one file for each shard."""
 
     def __init__(self, out: Path, shard: int, shards: int):
         self.out = out
@@ -194,10 +190,9 @@ class Manifest:
             the numbers of complete pairs, and the number of damaged pairs that `verify` has detected.
         """
         rows = scan_rows(find_manifests(self.out), lambda row: is_in_shard(row.number), skip_invalid=True)
-        kept, damaged = [], 0
+        kept, damaged, check = [], 0, partial(self._is_complete, verify=verify)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             while chunk := list(islice(rows, _CHUNK)):
-                check = self._has_checksums if verify else self._has_sizes
                 for (row, location), is_complete in zip(chunk, pool.map(check, [row for row, _ in chunk]), strict=True):
                     if is_complete and not (verify and row.skipped):
                         kept.append((row.number, location))
@@ -222,23 +217,19 @@ class Manifest:
         with replace_file(self.path, alone=True) as temporary, temporary.open("wb") as stream:
             stream.writelines(read_lines(location for _, location in sorted(rows)))
 
-    def _has_sizes(self, row: PairRow) -> bool:
+    def _is_complete(self, row: PairRow, *, verify: bool) -> bool:
+        """Return True if the files of a pair have their sizes and, with `verify`, their checksums."""
         try:
             sizes = {path: (self.out / path).stat().st_size for path in {file.path for file in row.files.values()}}
-        except OSError:
+            for file in row.files.values():
+                end = file.offset + file.bytes
+                if sizes[file.path] < end or (file.offset == 0 and sizes[file.path] > end):  # a tar continues
+                    return False
+                if verify and hashlib.sha256(read_stored(self.out, file)).hexdigest() != file.sha256:
+                    return False
+        except (OSError, DamagedPairError):
             return False
-        # A tar continues after a file.
-        return all(
-            sizes[file.path] >= file.offset + file.bytes if file.offset else sizes[file.path] == file.bytes
-            for file in row.files.values()
-        )
-
-    def _has_checksums(self, row: PairRow) -> bool:
-        try:
-            files = [(read_stored(self.out, file), file.sha256) for file in row.files.values()]
-        except DamagedPairError:
-            return False
-        return self._has_sizes(row) and all(hashlib.sha256(data).hexdigest() == expected for data, expected in files)
+        return True
 
 
 def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[str, Any]) -> dict[str, Any]:
@@ -263,7 +254,12 @@ def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[
     # List the folder before testing for config.json, because another shard may be writing to it.
     others = sorted(file.name for file in out.iterdir() if not file.name.startswith("."))
     if path.is_file():
-        previous = _read(path)
+        try:
+            previous = json.loads(path.read_bytes())
+        except ValueError:
+            previous = None
+        if not isinstance(previous, dict):
+            raise UsageError(f"out must be a folder with a valid {_CONFIG}, got {path}, which is damaged")
         _check_same(previous.get("settings", {}), new, out)
         if count < previous.get("count", 0):
             raise UsageError(f"count must be at least that of the pairs in {out}, {previous['count']}, got {count}")
@@ -274,16 +270,6 @@ def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[
         with replace_file(path) as temporary:
             temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     return previous
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_bytes())
-    except ValueError:
-        document = None
-    if not isinstance(document, dict):
-        raise UsageError(f"out must be a folder with a valid {path.name}, got {path}, which is damaged")
-    return document
 
 
 def _check_same(previous: Any, new: Any, out: Path) -> None:

@@ -1,22 +1,99 @@
-"""Rendering of a road scene: sky and ground in closed form, then panels with a depth buffer.
+"""Rendered dashcam frames of southern African roads, with their true depth: clean frames without files.
 
-Each pixel is sampled by five rays. A ray's direction has length 1 along the camera's axis, so that its parameter is
-the depth. The product of a fixed vector and the direction is linear in the pixel's column and row.
+Sky and ground are drawn in closed form, then panels with a depth buffer. Each pixel is sampled by five rays. A ray's
+direction has length 1 along the camera's axis, so that its parameter is the depth. The product of a fixed vector and
+the direction is linear in the pixel's column and row.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
 
-from torchrefract.data.road_scenes.scene import Array, Color, Light, Panel, Road, Scene, View, noise, scale_color
+from torchrefract._validation import check_count, check_size, check_tensor
+from torchrefract.data.road_scenes.scene import (
+    Array,
+    Color,
+    Light,
+    Panel,
+    Road,
+    Scene,
+    View,
+    draw_scene,
+    noise,
+    scale_color,
+)
+from torchrefract.types import Frame
 
 Window = tuple[slice, slice, slice]  # rays, rows, columns
 
+_SMALLEST = 8  # px a side
+_BITS = (1 << 64) - 1  # negative seeds and keys count modulo 2^64
 # Position of each ray in its pixel, (right, down), px from the center, on distinct rows and columns.
 _OFFSETS = np.array([(0.0, 0.0), (-0.15, -0.4), (0.4, -0.15), (0.15, 0.4), (-0.4, 0.15)])
 _NEAR, _FAR = 0.2, 3e4  # m
 _CLOUD_HEIGHT, _CLOUD_SCALE = 900.0, 170.0  # m; size of clouds in multiples of the texture of the ground
 _HAZE = 9000.0  # m, the distance at which contrast is one half
+
+
+class RoadScenes(Dataset[Frame]):
+    """Rendered road scenes with their depth, see `render_road_scenes`.
+
+    Args:
+        count: number of scenes.
+        size: (height, width), px, each at least 8.
+        seed: any integer of 64 bits.
+        first: key of the first scene; the others follow.
+    """
+
+    def __init__(self, count: int, *, size: Sequence[int] = (64, 112), seed: int = 0, first: int = 0):
+        self.count = check_count("count", count)
+        self.size = check_size("size", size)
+        check_count("size", min(self.size), low=_SMALLEST)
+        self.seed = check_count("seed", seed, low=-(2**63))
+        self.first = check_count("first", first, low=-(2**63))
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> Frame:
+        """Render a frame: image (3, H, W), key () and depth (1, H, W)."""
+        if not -self.count <= index < self.count:
+            raise IndexError(f"index must lie in [{-self.count}, {self.count - 1}], got {index}")
+        key = torch.tensor(self.first + index % self.count)
+        image, depth = render_road_scenes(key[None], *self.size, seed=self.seed)
+        return Frame(image[0], key, depth[0])
+
+
+def render_road_scenes(keys: Tensor, height: int, width: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Render road scenes on the CPU; a frame depends on its key and the seed alone.
+
+    Args:
+        keys: (B,), int64, B >= 1.
+        height, width: px, at least 8. The longer side sets the field of view, so that a scene is alike at all sizes.
+        seed: any integer of 64 bits; scenes of different seeds are independent.
+
+    Returns:
+        image: (B, 3, H, W), float32, in [0, 1], on the device of `keys`; each pixel is the mean of five rays.
+        depth: (B, 1, H, W), float32, m along the camera's axis of the ray through the pixel's center; inf for the sky.
+
+    Raises:
+        ValueError: `keys` has another shape, or a side is below 8.
+        TypeError: `keys` is not an int64 tensor.
+    """
+    if check_tensor("keys", keys).ndim != 1 or len(keys) == 0:
+        raise ValueError(f"keys must have shape (B,) with B >= 1, got {tuple(keys.shape)}")
+    if keys.dtype != torch.int64:
+        raise TypeError(f"keys must be int64, got {keys.dtype}")
+    check_count("height", height, low=_SMALLEST)
+    check_count("width", width, low=_SMALLEST)
+    generators = [np.random.default_rng((seed & _BITS, key & _BITS)) for key in keys.tolist()]
+    images, depths = zip(*(render(draw_scene(random), height, width) for random in generators), strict=True)
+    image = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous()
+    return image.to(keys.device), torch.from_numpy(np.stack(depths)[:, None]).to(keys.device)
 
 
 class Camera:
@@ -40,17 +117,15 @@ class Camera:
         right, down, ahead = self.axes @ (points - self.position).T
         if (ahead < _NEAR).any():  # the projection of a hull that reaches behind the camera has no bounds
             return None if (ahead < _NEAR).all() else self.frame
-        rows, columns = (
-            slice(max(int(place.min() - 1), 0), min(int(place.max() + 2), limit))
-            for place, limit in (
-                (x / ahead * self.scale + n / 2, n) for x, n in zip((down, right), self.size, strict=True)
-            )
-        )
-        return (slice(None), rows, columns) if rows.start < rows.stop and columns.start < columns.stop else None
+        places = np.stack([down, right]) / ahead * self.scale + np.array(self.size)[:, None] / 2
+        first = np.maximum(places.min(axis=1) - 1, 0).astype(int)
+        last = np.minimum(places.max(axis=1) + 2, self.size).astype(int)
+        rows, columns = map(slice, first, last)
+        return (slice(None), rows, columns) if (first < last).all() else None
 
 
 def render(scene: Scene, height: int, width: int) -> tuple[Array, Array]:
-    """Render an image (H, W, 3) and its depth (H, W), both float32; see `render_road_scenes`."""
+    """Render the image (H, W, 3) and the depth (H, W) of a scene, float32."""
     camera = Camera(scene.view, height, width)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         drop = -camera.dot(np.array([0.0, 1.0, 0.0]), camera.frame)

@@ -135,7 +135,10 @@ def fit(image: Tensor, size: Sequence[int]) -> Tensor:
         TypeError: the image is not float32 on the CPU.
     """
     height, width = check_size("size", size)
-    _check_image(image)
+    if check_tensor("image", image).ndim != 3 or image.shape[0] != 3:
+        raise ValueError(f"image must have shape (3, H, W), got {tuple(image.shape)}")
+    if image.dtype != torch.float32 or image.device.type != "cpu":
+        raise TypeError(f"image must be float32 on the CPU, got {image.dtype} on {image.device}")
     H, W = image.shape[1:]
     if height > H or width > W:
         raise ValueError(f"image must be at least size = {height}x{width} (height x width), got {H}x{W}")
@@ -147,14 +150,6 @@ def fit(image: Tensor, size: Sequence[int]) -> Tensor:
     small = cv2.resize(crop, (width, height), interpolation=cv2.INTER_AREA)
     # The weights sum to 1 up to rounding, so a mean may exceed 1.
     return torch.from_numpy(small).permute(2, 0, 1).contiguous().clamp_(0, 1)
-
-
-def _check_image(image: Tensor) -> None:
-    check_tensor("image", image)
-    if image.ndim != 3 or image.shape[0] != 3:
-        raise ValueError(f"image must have shape (3, H, W), got {tuple(image.shape)}")
-    if image.dtype != torch.float32 or image.device.type != "cpu":
-        raise TypeError(f"image must be float32 on the CPU, got {image.dtype} on {image.device}")
 
 
 def _header_size(path: str | Path, stream: BinaryIO) -> tuple[int, int]:

@@ -59,11 +59,7 @@ class PairArrays(NamedTuple):
 
 
 def encode_pair(pair: PairArrays, file_format: str) -> dict[str, bytes]:
-    """Encode a pair.
-
-    Args:
-        pair: the arrays.
-        file_format: of the maps: "png", "npz" or "safetensors".
+    """Encode a pair with its maps in one of `FORMATS`.
 
     Returns:
         the content of each file by the suffix of its name, as "clean.png" and "flow.png".
@@ -74,9 +70,13 @@ def encode_pair(pair: PairArrays, file_format: str) -> dict[str, bytes]:
     files = {f"{name}.png": _encode_png(getattr(pair, name)[..., ::-1], _IMAGE_OPTIONS) for name in IMAGES}
     if file_format != "png":
         # safetensors writes memory in its order, so arrays must be contiguous.
-        arrays = {name: np.ascontiguousarray(pair.maps[name]) for name in sorted(pair.maps)}
-        encoded = _encode_npz(arrays) if file_format == "npz" else save(arrays)
-        return files | {f"{_MAPS_STEM}.{file_format}": encoded}
+        arrays: dict[str, Any] = {name: np.ascontiguousarray(pair.maps[name]) for name in sorted(pair.maps)}
+        stream = io.BytesIO()
+        if file_format == "npz":
+            np.savez(stream, **arrays)  # compression gains little on flows in float32
+        else:
+            stream.write(save(arrays))
+        return files | {f"{_MAPS_STEM}.{file_format}": stream.getvalue()}
     return files | {f"{name}.png": _encode_map(name, value, pair.maps) for name, value in pair.maps.items()}
 
 
@@ -162,13 +162,6 @@ def _decode_map(name: str, data: bytes) -> np.ndarray:
 
 def _encode_png(pixels: np.ndarray, options: list[int]) -> bytes:
     return cv2.imencode(".png", np.ascontiguousarray(pixels), options)[1].tobytes()
-
-
-def _encode_npz(arrays: dict[str, Any]) -> bytes:
-    """Encode without compression, which gains little on flows in float32."""
-    stream = io.BytesIO()
-    np.savez(stream, **arrays)
-    return stream.getvalue()
 
 
 def _decode_npz(data: bytes) -> dict[str, np.ndarray]:

@@ -107,16 +107,11 @@ def find_sources(
 ) -> Sources:
     """List the frames of a folder of images, a video or a folder of videos, with drives and splits.
 
-    Args:
-        source: the folder or the video.
-        size: smallest (height, width) of images, px; None for no limit.
-        every: step between the frames of a video.
-        drive_by, val_share, seed: as for `FrameFolder`. Videos of one folder are a drive each; of several folders, each
-            folder is a drive.
+    Arguments and errors are those of `FrameFolder`; with size None, images may have any size. Each `every`-th frame of
+    a video is listed. Videos of one folder are a drive each; of several folders, each folder is a drive.
 
     Raises:
         UsageError: there are no images or videos, or both.
-        ValueError, OSError: as of `FrameFolder`.
     """
     if not source.exists():
         raise UsageError(f"source must be a folder of images or videos, or a video, got {source}, which does not exist")
@@ -329,11 +324,10 @@ def _add_file(tar: tarfile.TarFile, name: str, data: bytes) -> int:
 def generate_pairs(
     units: Iterable[Sequence[PairTask]], config: GenerationConfig, storage: PairStorage, *, workers: int
 ) -> Iterator[list[PairRow]]:
-    """Generate and write units of pairs; yield the rows of each when it is written, in any order.
+    """Generate and write units of pairs in processes, or in this one with `workers` 0.
 
-    Args:
-        units, config, storage: what to generate, how, and where.
-        workers: number of processes; 0 to generate the pairs in this process.
+    Yields:
+        the rows of each unit when it is written, in any order.
 
     Raises:
         UsageError: a worker was killed.

@@ -115,15 +115,9 @@ def find_manifests(root: Path) -> list[Path]:
 def scan_rows(
     paths: Iterable[Path], keep: Callable[[PairRow], bool], *, skip_invalid: bool = False
 ) -> Iterator[tuple[PairRow, RowLocation]]:
-    """Yield rows and their locations; of a pair that has several rows, the first one.
+    """Yield the rows of manifests that `keep` selects and their locations; of several rows of a pair, the first one.
 
-    Args:
-        paths: the manifest files.
-        keep: returns True for the rows to yield.
-        skip_invalid: True to skip invalid lines, which a kill or a full disk leaves behind.
-
-    Raises:
-        DamagedPairError: a line is invalid, and `skip_invalid` is False.
+    Invalid lines, which a kill or a full disk leaves behind, are skipped, or raise DamagedPairError.
     """
     seen = set[int]()
     for path in paths:
@@ -154,11 +148,7 @@ def read_lines(locations: Iterable[RowLocation]) -> Iterator[bytes]:
 
 
 def read_stored(root: Path, file: StoredFile) -> bytes:
-    """Read a file of a pair.
-
-    Raises:
-        DamagedPairError: the file is missing or too short.
-    """
+    """Read a file of a pair; raises DamagedPairError if it is missing or too short."""
     try:
         with (root / file.path).open("rb") as stream:
             stream.seek(file.offset)
@@ -181,10 +171,8 @@ class Manifest:
     def open(self, is_in_shard: Callable[[int], bool], *, verify: bool) -> tuple[set[int], int]:
         """Write the rows of this shard whose files exist, from all manifests of the folder.
 
-        Args:
-            is_in_shard: returns True for the number of a pair of this shard.
-            verify: True to compare checksums instead of sizes. Files that disagree are then deleted, and frames that
-                were skipped are dropped, to be tried again.
+        With `verify`, checksums are compared too, files that disagree are deleted, and frames that were skipped are
+        dropped, to be tried again.
 
         Returns:
             the numbers of complete pairs, and the number of damaged pairs that `verify` has detected.
@@ -236,7 +224,6 @@ def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[
     """Create an output folder, or check that it has the same settings, and write its config.json.
 
     Args:
-        out: the folder.
         settings: everything that determines the content, of types that JSON has.
         count: number of results; a later run may raise it.
         about: further entries of config.json that do not change the content.

@@ -169,12 +169,9 @@ def test_the_data_set_renders_its_keys():
     batch = list(DataLoader(scenes, batch_size=3))[1]
     assert batch.key.tolist() == [103, 104]
     assert torch.equal(batch.image, image[3:])
-
-
-@pytest.mark.parametrize("index", [5, -6])
-def test_an_index_out_of_range_raises(index):
-    with pytest.raises(IndexError, match=r"index must lie in \[-5, 4\]"):
-        RoadScenes(5)[index]
+    for index in (5, -6):
+        with pytest.raises(IndexError, match=r"index must lie in \[-5, 4\]"):
+            scenes[index]
 
 
 @pytest.mark.parametrize(
@@ -182,7 +179,6 @@ def test_an_index_out_of_range_raises(index):
     [
         ({"count": 0}, ValueError, "count must be at least 1, got 0"),
         ({"count": 1, "size": (64,)}, ValueError, r"size must be \(height, width\)"),
-        ({"count": 1, "size": "64"}, ValueError, r"size must be \(height, width\)"),
         ({"count": 1, "size": (7, 64)}, ValueError, "size must be at least 8, got 7"),
         ({"count": 1, "seed": 0.5}, TypeError, "seed must be a whole number"),
         ({"count": 1, "first": None}, TypeError, "first must be a whole number"),

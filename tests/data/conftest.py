@@ -34,9 +34,10 @@ def frames(tmp_path_factory) -> Path:
 def words(frames) -> Callable[..., tuple[str, ...]]:
     """Return the options of the command for the frames; without workers, unless they are given."""
 
-    def of(out: Path | str, *more: str, scene: str = "paper_refractive") -> tuple[str, ...]:
-        chosen = (f"scene={scene}", "scene.width=192") if scene == "paper_refractive" else (f"scene={scene}",)
-        return (*chosen, f"source={frames}", f"out={out}", "license=CC0", "workers=0", *more)
+    def of(out: Path | str, *more: str, scene: str = "paper_refractive", **others: Any) -> tuple[str, ...]:
+        width = ("scene.width=192",) if scene == "paper_refractive" else ()
+        options = {"source": frames, "out": out, "license": "CC0", "workers": 0} | others
+        return (f"scene={scene}", *width, *(f"{name}={value}" for name, value in options.items()), *more)
 
     return of
 

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -26,10 +27,10 @@ from torchrefract.data.frames import first_names
 from torchrefract.data.pairs.card import HISTOGRAMS, draw_histograms, format_card, summarize
 from torchrefract.data.pairs.files import FORMATS
 from torchrefract.data.pairs.generator import (
-    GenerationConfig,
     PairGenerator,
     PairStorage,
     PairTask,
+    SourceReader,
     Sources,
     find_sources,
     generate_pairs,
@@ -65,7 +66,7 @@ class Shard(NamedTuple):
 class Options(NamedTuple):
     """The parsed configuration."""
 
-    config: GenerationConfig
+    generator: PairGenerator
     sources: Sources
     settings: dict[str, Any]  # everything that determines the content of the files
     num_pairs: int
@@ -98,7 +99,7 @@ def generate(cfg: DictConfig) -> None:
         if units:
             _check_disk(options, [number for unit in units for number in unit], storage)
             tasks = ([options.task(number) for number in unit] for unit in units)
-            rows = generate_pairs(tasks, options.config, storage, workers=min(options.workers, len(units)))
+            rows = generate_pairs(tasks, options.generator, storage, workers=min(options.workers, len(units)))
             for unit in _with_progress(rows, total=sum(map(len, units))):
                 manifest.add(unit)
         manifest.close()
@@ -135,9 +136,10 @@ def _parse(cfg: DictConfig) -> Options:
         raise UsageError("license must be that of the source, in words, got nothing")
     scene: dict[str, Any] = {"name": str(HydraConfig.get().runtime.choices["scene"])}
     scene |= cast(dict[str, Any], OmegaConf.to_container(cfg.scene, resolve=True))
-    config = GenerationConfig(effect, scene["name"], sources.root, plain["size"], cfg.seed, plain["maps"])
+    reader = SourceReader(sources.root, plain["size"])
+    generator = PairGenerator(effect, scene["name"], reader, cfg.seed, plain["maps"])
     settings = {"scene": scene, **plain, "frames": len(sources.frames), "sources": sources.digest()}
-    return Options(config, sources, settings, num_pairs, str(cfg.license), shard, workers, verify)
+    return Options(generator, sources, settings, num_pairs, str(cfg.license), shard, workers, verify)
 
 
 def _checked(cfg: DictConfig, name: str, check: Callable[..., _T], **limits: Any) -> _T:
@@ -184,7 +186,8 @@ def _report(options: Options, complete: set[int], damaged: int) -> None:
 
 def _check_disk(options: Options, missing: Sequence[int], storage: PairStorage) -> None:
     """Print the estimated size of the missing pairs; raise UsageError if the disk has less space."""
-    generator, step = PairGenerator(options.config), max(1, len(missing) // _SAMPLES)
+    # A reader that has opened a video cannot be sent to workers.
+    generator, step = deepcopy(options.generator), max(1, len(missing) // _SAMPLES)
     samples = [generator.generate(options.task(number)) for number in missing[::step][:_SAMPLES]]
     sizes = [storage.disk_bytes(pair) for pair in samples if pair.data]
     mean = sum(sizes) // max(1, len(sizes))

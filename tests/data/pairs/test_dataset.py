@@ -25,45 +25,36 @@ def made(call, words, tmp_path):
 
 
 @pytest.mark.parametrize("maps", ["png", "npz", "safetensors"])
-def test_pairs_from_disk_equal_pairs_on_the_fly(made, frames, batches, maps):
-    out = made(f"maps={maps}")
-    stored = pairs(root=out, batch_size=4, workers=0)
-    live = frame_data(root=frames, effect=presets.paper_refractive(width=192), size=SIZE, batch_size=4, workers=0)
+@pytest.mark.parametrize("scene", ["paper_refractive", "paper_weather"])
+def test_pairs_from_disk_equal_pairs_on_the_fly(made, frames, batches, scene, maps):
+    has_light = scene == "paper_weather"
+    options = {"batch_size": 4, "workers": 0, "transmission": has_light}
+    effect = presets.paper_weather() if has_light else presets.paper_refractive(width=192)
+    stored, live = (
+        pairs(root=made(f"maps={maps}", scene=scene), **options),
+        frame_data(root=frames, effect=effect, size=SIZE, **options),
+    )
     for training in (True, False):
         for disk, fly in zip(batches(stored, training=training), batches(live, training=training), strict=True):
             assert torch.equal(disk.key, fly.key)
             assert torch.equal(disk.valid, fly.valid)
-            assert (disk.flow - fly.flow).abs().max() <= (0.5 / 64 if maps == "png" else 0)
             assert torch.equal(disk.clean, fly.clean)
             assert (disk.degraded - fly.degraded).abs().max() <= 0.5 / 255 + 1e-6
+            assert (disk.flow - fly.flow).abs().max() <= (0.5 / 64 if maps == "png" else 0)
+            if has_light:
+                assert not disk.flow.any()
+                assert disk.valid.all()
+                assert disk.transmission.shape == (4, 1, *SIZE)
+                assert (disk.transmission - fly.transmission).abs().max() <= (0.51 / 65535 if maps == "png" else 0)
 
 
-@pytest.mark.parametrize("maps", ["png", "safetensors"])
-def test_pairs_of_weather_from_disk_have_their_transmission_and_no_flow(made, frames, batches, maps):
-    out = made(f"maps={maps}", scene="paper_weather")
-    stored = pairs(root=out, batch_size=4, workers=0, transmission=True)
-    scene = presets.paper_weather()
-    live = frame_data(root=frames, effect=scene, size=SIZE, batch_size=4, workers=0, transmission=True)
-    for disk, fly in zip(batches(stored, training=True), batches(live, training=True), strict=True):
-        assert disk.transmission.shape == (4, 1, *SIZE)
-        assert not disk.flow.any()
-        assert disk.valid.all()
-        assert (disk.transmission - fly.transmission).abs().max() <= (0.51 / 65535 if maps == "png" else 0)
-
-
-def test_pairs_without_a_required_transmission_raise(made):
-    folder = PairedFolder(made(), transmission=True)
+def test_pairs_without_a_required_map_raise(made):
+    weather, moved = made(scene="paper_weather"), made(out="moved")
     with pytest.raises(ValueError, match="root must hold pairs with a transmission, as of fog, got 0 in "):
-        folder[0]
-
-
-def test_pairs_without_a_required_flow_raise(made):
-    out = made(scene="paper_weather")
-    with pytest.raises(ValueError, match="root must hold pairs with a flow, as of a lens, got 0 in "):
-        PairedFolder(out, flow=True)[0]
+        PairedFolder(moved, transmission=True)[0]
     with pytest.raises(ValueError, match="root must hold pairs with a flow, as of a lens, got "):
-        pairs(root=out, batch_size=4, workers=0, flow=True).check_pair()
-    pairs(root=made(out="moved"), batch_size=4, workers=0, flow=True).check_pair()
+        pairs(root=weather, batch_size=4, workers=0, flow=True).check_pair()
+    pairs(root=moved, batch_size=4, workers=0, flow=True).check_pair()
 
 
 def test_training_from_disk_has_the_losses_of_training_on_the_fly(made, frames, batches):

@@ -43,10 +43,8 @@ def test_a_video_that_ends_early_raises(videos):
 
 
 @pytest.mark.parametrize("size", [None, (40, 60), (20, 30)])
-@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-def test_an_image_is_read_in_its_size(size, kind, tmp_path):
-    levels = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (40, 60, 3), endpoint=True).astype(kind)
-    assert cv2.imwrite(str(tmp_path / "a.png"), levels[..., ::-1])
+def test_an_image_is_cropped_and_reduced_on_request(size, tmp_path):
+    assert cv2.imwrite(str(tmp_path / "a.png"), np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8))
     image = SourceReader(tmp_path, size).read(Source("a.png", ".", "train"))
     assert torch.equal(image, fit(read_image(tmp_path / "a.png"), size or (40, 60)))
     assert image.is_contiguous()
@@ -60,6 +58,8 @@ def test_each_video_is_a_drive_in_one_split(videos):
     splits = {drive: {frame.split for frame in sources.frames if frame.drive == drive} for drive in ("a.mp4", "c.mp4")}
     assert all(len(names) == 1 for names in splits.values())
     assert {frame.split for frame in sources.frames} == {"train", "val"}
+    # Fewer frames are spread over the source.
+    assert [frame.path for frame in sources.limited(6).frames] == ["a.mp4"] * 2 + ["b.mp4"] * 2 + ["c.mp4"] * 2
 
 
 def test_a_repeated_source_has_a_new_key(videos):
@@ -67,11 +67,6 @@ def test_a_repeated_source_has_a_new_key(videos):
     keys = [draw_of(frame, seed=3, repeat=repeat)[1] for repeat in range(3) for frame in sources.frames]
     assert len(set(keys)) == 3 * 3 * FRAMES
     assert {draw_of(frame, seed=3, repeat=0)[0] for frame in sources.frames} == {3 << 32, (3 << 32) + 1}
-
-
-def test_fewer_pairs_than_frames_are_spread_over_the_source(videos):
-    sources = find_sources(videos, **OPTIONS).limited(6)
-    assert [frame.path for frame in sources.frames] == ["a.mp4"] * 2 + ["b.mp4"] * 2 + ["c.mp4"] * 2
 
 
 def test_pairs_of_a_video_hold_its_frames(call, videos, tmp_path):

@@ -68,7 +68,7 @@ class Sources(NamedTuple):
 
 
 class SourceReader:
-    """Reads clean frames. Frames of a video are read fastest in their order.
+    """Reads clean frames. Frames of a video are read fastest in their order. A new reader can be pickled.
 
     Args:
         root: folder of the sources.
@@ -155,17 +155,6 @@ def draw_of(source: Source, *, seed: int, repeat: int) -> tuple[int, int]:
     return (seed << 32) + (source.split != "val"), key
 
 
-class GenerationConfig(NamedTuple):
-    """Everything that a pair depends on, apart from its number and its frame."""
-
-    effect: Effect
-    scene: str  # name of the effect
-    root: Path  # folder of the frames
-    size: tuple[int, int] | None  # (height, width), px, to crop and reduce frames to; None keeps their size
-    seed: int
-    maps: str  # format of the maps: png, npz or safetensors
-
-
 class PairTask(NamedTuple):
     """A pair to generate."""
 
@@ -181,12 +170,14 @@ class GeneratedPair(NamedTuple):
     data: dict[str, bytes]  # content of each file by the suffix of its name; empty if the frame was skipped
 
 
-class PairGenerator:
+class PairGenerator(NamedTuple):
     """Generates pairs on the CPU, one at a time, so that a pair has the same bytes in any order and process."""
 
-    def __init__(self, config: GenerationConfig):
-        self.config = config
-        self._reader = SourceReader(config.root, config.size)
+    effect: Effect
+    scene: str  # name of the effect
+    reader: SourceReader
+    seed: int
+    maps: str  # format of the maps: png, npz or safetensors
 
     def generate(self, task: PairTask) -> GeneratedPair:
         """Generate a pair. An unreadable frame gives a row with the reason and no files.
@@ -194,32 +185,32 @@ class PairGenerator:
         Raises:
             UsageError: the scene, the size or the format of the maps does not suit the frame.
         """
-        config, source = self.config, task.source
-        seed, key = draw_of(source, seed=config.seed, repeat=task.repeat)
+        source = task.source
+        seed, key = draw_of(source, seed=self.seed, repeat=task.repeat)
         origin = (source.path, source.frame, source.drive, source.split)
-        row = PairRow(task.number, *origin, config.scene, seed, key, height=0, width=0, effects=[], beyond={}, files={})
+        row = PairRow(task.number, *origin, self.scene, seed, key, height=0, width=0, effects=[], beyond={}, files={})
         try:
-            image = self._reader.read(source)
+            image = self.reader.read(source)
         except UnreadableImageError as error:
-            return GeneratedPair(row._replace(skipped=str(error).replace(f"{config.root}/", "")), {})
+            return GeneratedPair(row._replace(skipped=str(error).replace(f"{self.reader.root}/", "")), {})
         except ValueError as error:
             raise UsageError(f"size: {error}") from error
         try:
             with warnings.catch_warnings(), torch.no_grad():
                 warnings.simplefilter("ignore", UserWarning)  # of folded pixels, which the masks exclude
-                degraded = config.effect.degrade(image[None], seed=seed, keys=[key])
+                degraded = self.effect.degrade(image[None], seed=seed, keys=[key])
         except (ValueError, TypeError, OSError) as error:
             raise UsageError(f"scene: {error}") from error
         pair = PairArrays(pixels_of(image), pixels_of(degraded.image[0]), _maps(degraded))
         try:
-            data = encode_pair(pair, config.maps)
+            data = encode_pair(pair, self.maps)
         except ValueError as error:
             raise UsageError(f"maps: {error}") from error
         row = row._replace(
             height=image.shape[1],
             width=image.shape[2],
-            effects=_applied_effects(config.effect, degraded.params),
-            beyond=count_out_of_range(pair.maps) if config.maps == "png" else {},
+            effects=_applied_effects(self.effect, degraded.params),
+            beyond=count_out_of_range(pair.maps) if self.maps == "png" else {},
             files={name: StoredFile("", len(x), hashlib.sha256(x).hexdigest()) for name, x in data.items()},
         )
         return GeneratedPair(row, data)
@@ -322,7 +313,7 @@ def _add_file(tar: tarfile.TarFile, name: str, data: bytes) -> int:
 
 
 def generate_pairs(
-    units: Iterable[Sequence[PairTask]], config: GenerationConfig, storage: PairStorage, *, workers: int
+    units: Iterable[Sequence[PairTask]], generator: PairGenerator, storage: PairStorage, *, workers: int
 ) -> Iterator[list[PairRow]]:
     """Generate and write units of pairs in processes, or in this one with `workers` 0.
 
@@ -335,10 +326,9 @@ def generate_pairs(
     """
     if workers == 0:
         use_one_thread()
-        generator = PairGenerator(config)
         yield from (storage.write(unit, generator) for unit in units)
         return
-    pool = ProcessPoolExecutor(workers, mp_context=_context(), initializer=_start, initargs=(config, storage))
+    pool = ProcessPoolExecutor(workers, mp_context=_context(), initializer=_start, initargs=(generator, storage))
     pending = set[Future[list[PairRow]]]()
     try:
         for unit in units:
@@ -379,11 +369,11 @@ class _Worker:
     storage: PairStorage
 
 
-def _start(config: GenerationConfig, storage: PairStorage) -> None:
+def _start(generator: PairGenerator, storage: PairStorage) -> None:
     use_one_thread()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    _Worker.generator, _Worker.storage = PairGenerator(config), storage
+    _Worker.generator, _Worker.storage = generator, storage
 
 
 def _exit_with_parent() -> None:

@@ -100,8 +100,8 @@ def _source(cfg: DictConfig) -> _Source:
     frames, name = _read_frames(path, max_frames), _printable(path.name or path.resolve().name)
     _, first = next(frames.read([0]))
     depth, note = (None, "") if cfg.depth is None else _read_depth(cfg, first, size)
-    fitted = FrameSequence(frames.num_frames, lambda times: ((t, _fit(x, size)) for t, x in frames.read(times)))
-    return _Source(fitted, depth, name, note)
+    resized = FrameSequence(frames.num_frames, lambda times: ((t, _fit(x, size)) for t, x in frames.read(times)))
+    return _Source(resized, depth, name, note)
 
 
 def _read_frames(path: Path, max_frames: int) -> FrameSequence:

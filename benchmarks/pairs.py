@@ -36,8 +36,13 @@ from torchrefract import (
 )
 from torchrefract._io import CONFIG_DIR, replace_file
 from torchrefract.data.pairs.files import FORMATS, decode_pair, encode_pair
-from torchrefract.data.pairs.generator import GenerationConfig, PairGenerator, PairTask, SourceReader, find_sources
-from torchrefract.data.pairs.storage import use_one_thread
+from torchrefract.data.pairs.generator import (
+    PairGenerator,
+    PairTask,
+    SourceReader,
+    find_sources,
+    use_one_thread,
+)
 from torchrefract.effects.base import Effect
 
 PROTOCOL = {
@@ -126,7 +131,7 @@ def measure_one_pair(args: argparse.Namespace) -> dict[str, float]:
     options = {"every": 1, "drive_by": "auto", "val_share": 0.2, "seed": 0}
     sources = find_sources(args.source, size=args.size, **options).limited(_SAMPLES)
     reader, (scene, _) = SourceReader(sources.root, args.size), _scene(args)
-    generator = PairGenerator(GenerationConfig(instantiate(scene), args.scene, sources.root, args.size, 0, args.maps))
+    generator = PairGenerator(instantiate(scene), args.scene, reader, 0, args.maps)
     generated, reference = [], []
     for number, source in enumerate(sources.frames):
         task = PairTask(number, source, 0)

@@ -69,27 +69,17 @@ def test_sixteen_bit_pixels_come_back_exactly(tmp_path):
     assert_close(read_image(tmp_path / "gray.png"), expected, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("suffix", ["png", "bmp"])
-def test_a_gray_image_has_three_equal_channels(tmp_path, suffix):
-    Image.fromarray(PIXELS[..., 0]).save(tmp_path / f"frame.{suffix}")
-    expected = as_tensor(np.repeat(PIXELS[..., :1], 3, axis=2))
-    assert_close(read_image(tmp_path / f"frame.{suffix}"), expected, rtol=0, atol=0)
-
-
 @pytest.mark.parametrize("suffix", ["png", "bmp", "webp"])
-def test_an_alpha_channel_is_ignored(tmp_path, suffix):
-    alpha = np.dstack([PIXELS, PIXELS[..., :1]])
-    Image.fromarray(alpha).save(tmp_path / f"frame.{suffix}", lossless=True, exact=True)  # options of WebP alone
-    assert_close(read_image(tmp_path / f"frame.{suffix}"), as_tensor(PIXELS), rtol=0, atol=0)
-
-
-def test_palettes_and_single_bits_are_read_in_their_colors(tmp_path):
-    palette = Image.fromarray(PIXELS).convert("P", palette=Image.Palette.ADAPTIVE)
-    palette.save(tmp_path / "palette.png")
-    assert_close(read_image(tmp_path / "palette.png"), as_tensor(np.asarray(palette.convert("RGB"))), rtol=0, atol=0)
-    bits = Image.fromarray(PIXELS[..., 0] > 127)
-    bits.save(tmp_path / "bits.png")
-    assert_close(read_image(tmp_path / "bits.png"), as_tensor(np.asarray(bits.convert("RGB"))), rtol=0, atol=0)
+@pytest.mark.parametrize("mode", ["L", "RGBA", "P", "1"])
+def test_images_of_any_mode_are_read_in_their_colors_without_alpha(tmp_path, suffix, mode):
+    image = (
+        Image.fromarray(np.dstack([PIXELS, PIXELS[..., :1]]))
+        if mode == "RGBA"
+        else Image.fromarray(PIXELS).convert(mode)
+    )
+    image.save(tmp_path / f"frame.{suffix}", lossless=True, exact=True)  # options of WebP alone
+    expected = PIXELS if mode == "RGBA" else np.asarray(image.convert("RGB"))
+    assert_close(read_image(tmp_path / f"frame.{suffix}"), as_tensor(expected), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "progressive.jpg", "webp"])
@@ -120,24 +110,16 @@ def test_the_format_follows_from_the_content_and_not_from_the_suffix(tmp_path):
 
 @pytest.mark.parametrize("read", [read_image, image_size])
 @pytest.mark.parametrize("suffix", FORMATS)
-@pytest.mark.parametrize("share", [0.3, 0.999])
-def test_a_truncated_image_raises_and_prints_nothing(tmp_path, capfd, read, suffix, share):
+def test_a_truncated_image_raises_and_prints_nothing(tmp_path, capfd, read, suffix):
     data = encode(SMOOTH, **FORMATS[suffix])
     path = tmp_path / f"frame_12.{suffix}"
-    path.write_bytes(data[: max(16, min(int(share * len(data)), len(data) - 2))])
-    with pytest.raises(UnreadableImageError, match=rf"frame_12\.{suffix} is truncated \(\d+ bytes"):
-        read(path)
+    half = data[: len(data) // 2]
+    zeroed = [half + bytes(len(data) - len(half))] if suffix.endswith(("jpg", "png")) else []  # others have no end
+    for content in (data[: max(16, int(0.3 * len(data)))], data[:-2], *zeroed):
+        path.write_bytes(content)
+        with pytest.raises(UnreadableImageError, match=rf"frame_12\.{suffix} is truncated \(\d+ bytes"):
+            read(path)
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("read", [read_image, image_size])
-@pytest.mark.parametrize("suffix", ["jpg", "progressive.jpg", "png"])
-def test_an_image_with_a_zeroed_second_half_raises(tmp_path, read, suffix):
-    data = encode(SMOOTH, **FORMATS[suffix])
-    half = len(data) // 2
-    (tmp_path / "frame").write_bytes(data[:half] + bytes(len(data) - half))
-    with pytest.raises(UnreadableImageError, match="frame is truncated"):
-        read(tmp_path / "frame")
 
 
 @pytest.mark.parametrize("read", [read_image, image_size])
@@ -161,26 +143,19 @@ def test_bytes_after_the_end_are_ignored(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("read", [read_image, image_size])
-@pytest.mark.parametrize(
-    ("data", "reason"),
-    [
+def test_a_file_that_is_not_an_image_raises_with_the_reason(tmp_path, read):
+    for data, reason in (
+        (None, r"cannot be opened \(No such file"),
         (b"", r"is empty \(0 bytes\)"),
         (b"\xff\xd8", "is not a JPEG, PNG, WebP or BMP image"),
         (b"<html>404</html>", "is not a JPEG"),
         (b"RIFF\x04\0\0\0WAVE", "is not a JPEG"),
         (b"BM\x02\0\0\0", "is truncated"),
-    ],
-)
-def test_a_file_that_is_not_an_image_raises_with_the_reason(tmp_path, read, data, reason):
-    (tmp_path / "frame_7.jpg").write_bytes(data)
-    with pytest.raises(UnreadableImageError, match=rf"frame_7\.jpg {reason}"):
-        read(tmp_path / "frame_7.jpg")
-
-
-@pytest.mark.parametrize("read", [read_image, image_size])
-def test_a_missing_file_raises_with_the_reason(tmp_path, read):
-    with pytest.raises(UnreadableImageError, match=r"gone\.jpg cannot be opened \(No such file"):
-        read(tmp_path / "gone.jpg")
+    ):
+        if data is not None:
+            (tmp_path / "frame_7.jpg").write_bytes(data)
+        with pytest.raises(UnreadableImageError, match=rf"frame_7\.jpg {reason}"):
+            read(tmp_path / "frame_7.jpg")
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
@@ -241,41 +216,23 @@ def test_fit_is_the_area_average_of_the_center(size, crop):
     assert result.is_contiguous()
 
 
-def test_fit_to_the_same_size_copies_the_image():
+def test_fit_copies_an_image_of_the_same_size_and_never_enlarges():
     image = as_tensor(PIXELS)
     fit(image, (36, 50)).zero_()
     assert_close(fit(image, [36, 50]), as_tensor(PIXELS), rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("size", [(37, 50), (36, 51)])
-def test_fit_raises_instead_of_enlarging(size):
-    with pytest.raises(ValueError, match=r"image must be at least size = .* got 36x50"):
-        fit(as_tensor(PIXELS), size)
+    for size in ((37, 50), (36, 51)):
+        with pytest.raises(ValueError, match=r"image must be at least size = .* got 36x50"):
+            fit(image, size)
 
 
 @pytest.mark.parametrize(
     ("image", "size", "error", "message"),
     [
         (torch.zeros(3, 8, 8), (4,), ValueError, r"size must be \(height, width\), got \(4,\)"),
-        (torch.zeros(3, 8, 8), "44", ValueError, r"size must be \(height, width\), got '44'"),
-        (torch.zeros(3, 8, 8), (4, 0), ValueError, "size must be at least 1, got 0"),
-        (torch.zeros(3, 8, 8), (4, 4.0), TypeError, r"size must be a whole number, got 4\.0"),
         (torch.zeros(1, 8, 8), (4, 4), ValueError, r"image must have shape \(3, H, W\), got \(1, 8, 8\)"),
-        (
-            torch.zeros(3, 8, 8, dtype=torch.uint8),
-            (4, 4),
-            TypeError,
-            "image must be float32 on the CPU, got torch.uint8",
-        ),
+        (torch.zeros(3, 8, 8).byte(), (4, 4), TypeError, "image must be float32 on the CPU, got torch.uint8"),
     ],
 )
 def test_fit_raises_for_an_invalid_argument(image, size, error, message):
     with pytest.raises(error, match=message):
         fit(image, size)
-
-
-def test_real_frames_agree_with_pillow(shared_data):
-    path = sorted((shared_data / "frames" / "val").glob("*.jpg"))[0]
-    image = read_image(path)
-    assert image.shape == (3, 360, 640)
-    assert (image - as_tensor(np.asarray(Image.open(path)))).abs().mean() < 1 / 255

@@ -1,5 +1,3 @@
-from types import SimpleNamespace
-
 import pytest
 import torch
 from PIL import Image
@@ -12,13 +10,6 @@ from torchrefract.data.road_scenes import RoadScenes
 
 SIZE = (12, 20)
 COUNT = 10
-
-
-def during(data: PairData, *, epoch: int = 0, training: bool = True, ranks: int = 1, rank: int = 0) -> PairData:
-    """Attach what `PairData` reads of Lightning's trainer at a point of a run."""
-    run = SimpleNamespace(training=training, current_epoch=epoch, world_size=ranks, global_rank=rank)
-    data.trainer = run  # pyright: ignore[reportAttributeAccessIssue]  # only these attributes are read
-    return data
 
 
 def scenes(*, effect: LensDistortion | UniformFog | None = None, batch_size: int = 4, workers: int = 0, seed: int = 0):
@@ -37,15 +28,6 @@ def random_frames(count: int = 2) -> Frame:
     return Frame(torch.rand(count, 3, *SIZE), torch.arange(count), torch.empty(count, 0))
 
 
-def batches(data: PairData) -> list[Pair]:
-    """Return the batches of an epoch of training, or of validation."""
-    assert data.trainer is not None
-    loader = data.train_dataloader() if data.trainer.training else data.val_dataloader()
-    if data.trainer.training:
-        loader.sampler.set_epoch(data.trainer.current_epoch)  # pyright: ignore[reportAttributeAccessIssue]  # it is a DistributedSampler
-    return [data.on_after_batch_transfer(Frame(*batch), 0) for batch in loader]
-
-
 def by_key(pairs: list[Pair]) -> dict[int, Pair]:
     samples = [Pair(*sample) for batch in pairs for sample in zip(*batch, strict=True)]
     result = {int(sample.key): sample for sample in samples}
@@ -60,15 +42,17 @@ def assert_same(pairs: dict[int, Pair], expected: dict[int, Pair]) -> None:
 
 
 @pytest.fixture(scope="module")
-def first_epoch() -> dict[int, Pair]:
-    return by_key(batches(during(scenes(batch_size=1))))
+def first_epoch(batches) -> dict[int, Pair]:
+    return by_key(batches(scenes(batch_size=1)))
 
 
 @pytest.mark.quick
-def test_a_pair_holds_a_frame_and_its_degraded_copy():
+def test_a_pair_holds_a_frame_and_its_degraded_copy_without_gradient():
     frame, effect = random_frames(), LensDistortion()
-    pair = make_pair(frame, effect, seed=3)
     expected = effect.degrade(frame.image, seed=3, keys=frame.key)
+    frame.image.requires_grad_()
+    pair = make_pair(frame, effect, seed=3)
+    assert not pair.degraded.requires_grad
     assert torch.equal(pair.degraded, expected.image)
     assert torch.equal(pair.clean, frame.image)
     assert torch.equal(pair.flow, expected.restore_flow)
@@ -88,17 +72,6 @@ def test_a_pair_has_its_transmission_on_request(scene):
     assert (pair.transmission[unchanged] == 1).all()
 
 
-def test_batches_have_their_transmission_in_training_and_validation():
-    data = road_scenes(
-        effect=UniformFog(), size=SIZE, train_count=4, val_count=4, batch_size=2, workers=0, transmission=True
-    )
-    for training in (True, False):
-        for pair in batches(during(data, training=training)):
-            assert pair.transmission.shape == (2, 1, *SIZE)
-            # The near road at the bottom is clearer than the horizon at the top.
-            assert (pair.transmission[..., -1, :] > pair.transmission[..., 0, :]).all()
-
-
 @pytest.mark.parametrize(
     ("effect", "flow", "message"),
     [
@@ -115,26 +88,17 @@ def test_an_effect_without_a_required_map_raises(effect, flow, message):
     PairData(scenes, scenes, effect=effect, batch_size=2).check_pair()
 
 
-def test_a_warp_has_a_flow_even_if_it_is_not_applied():
-    assert not make_pair(random_frames(), LensDistortion(p=0.0), seed=0, flow=True).flow.any()
+def test_a_pair_of_fog_or_of_a_warp_that_is_not_applied_has_a_flow_of_zeros():
+    for effect, flow in ((UniformFog(), False), (LensDistortion(p=0.0), True)):
+        pair = make_pair(random_frames(), effect, seed=0, flow=flow)
+        assert torch.equal(pair.flow, torch.zeros(2, 2, *SIZE))
+        assert torch.equal(pair.valid, torch.ones(2, 1, *SIZE, dtype=torch.bool))
 
 
-def test_a_pair_of_fog_has_a_flow_of_zeros_that_is_valid_everywhere():
-    pair = make_pair(random_frames(), UniformFog(), seed=0)
-    assert torch.equal(pair.flow, torch.zeros(2, 2, *SIZE))
-    assert torch.equal(pair.valid, torch.ones(2, 1, *SIZE, dtype=torch.bool))
-
-
-def test_a_pair_carries_no_gradient():
-    frame = random_frames()
-    frame.image.requires_grad_()
-    assert not make_pair(frame, LensDistortion(), seed=0).degraded.requires_grad
-
-
-def test_the_depth_of_a_road_scene_reaches_the_fog():
+def test_the_depth_of_a_road_scene_reaches_the_fog(batches):
     # Fog of a fixed density: I = clean t + A (1 - t), t = exp(-k d), where t = 0.05 at the visibility.
     fog = UniformFog(visibility_range=(50.0, 50.0), deviation_range=(0.0, 0.0), airlight=0.8)
-    batch = batches(during(scenes(effect=fog), training=False))[0]
+    batch = batches(scenes(effect=fog), training=False)[0]
     k = -torch.tensor(0.05).log() / 50
     for i in range(len(batch.key)):
         frame = RoadScenes(5, size=SIZE, first=COUNT)[i]
@@ -144,28 +108,29 @@ def test_the_depth_of_a_road_scene_reaches_the_fog():
 
 
 @pytest.mark.parametrize(("batch_size", "workers"), [(5, 0), (4, 2)])
-def test_a_pair_depends_on_seed_epoch_and_key_alone(first_epoch, batch_size, workers):
-    pairs = by_key(batches(during(scenes(batch_size=batch_size, workers=workers))))
+def test_a_pair_depends_on_seed_epoch_and_key_alone(first_epoch, batch_size, workers, batches):
+    pairs = by_key(batches(scenes(batch_size=batch_size, workers=workers)))
     assert len(pairs) == COUNT // batch_size * batch_size
     assert_same(pairs, first_epoch)
 
 
-def test_each_epoch_of_training_has_other_draws_of_the_same_frames(first_epoch):
-    later = by_key(batches(during(scenes(batch_size=1), epoch=1)))
+def test_each_epoch_of_training_has_another_order_and_other_draws_of_the_same_frames(first_epoch, batches):
+    later = by_key(batches(scenes(batch_size=1), epoch=1))
     assert later.keys() == first_epoch.keys()
+    assert list(later) != list(first_epoch)
     for key, pair in later.items():
         assert torch.equal(pair.clean, first_epoch[key].clean)
         assert (pair.flow - first_epoch[key].flow).abs().max() > 1e-3
 
 
-def test_validation_has_the_same_order_and_draws_in_every_epoch():
-    first, later = (batches(during(scenes(), training=False, epoch=epoch)) for epoch in (0, 7))
+def test_validation_has_the_same_order_and_draws_in_every_epoch(batches):
+    first, later = (batches(scenes(), training=False, epoch=epoch) for epoch in (0, 7))
     keys = [key for batch in first for key in batch.key.tolist()]
     assert keys == [key for batch in later for key in batch.key.tolist()] == list(range(COUNT, COUNT + 5))
     assert_same(by_key(later), by_key(first))
 
 
-def test_validation_and_each_epoch_of_each_seed_have_different_draws():
+def test_validation_and_each_epoch_of_each_seed_have_different_draws(during):
     frame = Frame(*next(iter(scenes().train_dataloader())))
     flows = [during(scenes(), training=False).on_after_batch_transfer(frame, 0).flow]
     flows += [
@@ -174,42 +139,35 @@ def test_validation_and_each_epoch_of_each_seed_have_different_draws():
     assert min((a - b).abs().amax(dim=(1, 2, 3)).min() for i, a in enumerate(flows) for b in flows[:i]) > 1e-6
 
 
-def test_another_seed_has_other_scenes_and_draws(first_epoch):
-    for key, pair in by_key(batches(during(scenes(seed=1)))).items():
-        assert not torch.equal(pair.clean, first_epoch[key].clean)
-        assert not torch.equal(pair.flow, first_epoch[key].flow)
-
-
-def test_the_order_of_training_changes_with_the_epoch():
-    first, later = ([batch.key.tolist() for batch in batches(during(scenes(), epoch=epoch))] for epoch in (0, 1))
-    assert first != later
-
-
-def test_two_ranks_share_the_training_frames_and_validate_all(first_epoch):
-    halves = [by_key(batches(during(scenes(batch_size=1), ranks=2, rank=rank))) for rank in (0, 1)]
+def test_two_ranks_share_the_training_frames_and_validate_all(first_epoch, batches):
+    with pytest.raises(
+        ValueError, match="batch_size must be at most the 5 training frames that each of 2 processes has"
+    ):
+        batches(scenes(batch_size=8), ranks=2)
+    halves = [by_key(batches(scenes(batch_size=1), ranks=2, rank=rank)) for rank in (0, 1)]
     assert not halves[0].keys() & halves[1].keys()
     assert (halves[0] | halves[1]).keys() == first_epoch.keys()
     assert_same(halves[0] | halves[1], first_epoch)
-    validated = [during(scenes(), training=False, ranks=2, rank=rank) for rank in (0, 1)]
-    keys = {key for data in validated for batch in batches(data) for key in batch.key.tolist()}
+    validated = [batches(scenes(), training=False, ranks=2, rank=rank) for rank in (0, 1)]
+    keys = {key for part in validated for batch in part for key in batch.key.tolist()}
     assert keys == set(range(COUNT, COUNT + 5))
 
 
-def test_keys_stay_on_the_cpu():
+def test_keys_stay_on_the_cpu(during):
     frame = Frame(*next(iter(during(scenes()).train_dataloader())))
     moved = scenes().transfer_batch_to_device(frame, torch.device("meta"), 0)
     assert moved.image.is_meta  # pyright: ignore[reportAttributeAccessIssue]  # a Frame stays one
     assert torch.equal(moved.key, frame.key)
 
 
-def test_frames_of_a_folder_are_split_by_drive_and_have_no_depth(tmp_path):
+def test_frames_of_a_folder_are_split_by_drive_and_have_no_depth(tmp_path, batches):
     for drive in ("a", "b", "c"):
         for number in range(3):
             path = tmp_path / drive / f"{number}.png"
             path.parent.mkdir(exist_ok=True)
             Image.new("RGB", (40, 24), (80 * "abc".index(drive), 90 * number, 40)).save(path)
     data = frames(root=tmp_path, effect=UniformFog(), size=SIZE, val_share=0.3, batch_size=6, workers=0)
-    splits = [batches(during(data, training=training)) for training in (True, False)]
+    splits = [batches(data, training=training) for training in (True, False)]
     red = [{round(float(x) * 255) for batch in split for x in batch.clean[:, 0].flatten()} for split in splits]
     assert not red[0] & red[1]
     assert red[0] | red[1] == {0, 80, 160}
@@ -245,9 +203,3 @@ def test_an_invalid_option_raises(options, error, message):
     data = RoadScenes(COUNT, size=SIZE)
     with pytest.raises(error, match=message):
         PairData(data, data, effect=UniformFog(), **options)
-
-
-def test_a_batch_larger_than_the_frames_of_a_rank_raises():
-    data = during(scenes(batch_size=8), ranks=2, rank=0)
-    with pytest.raises(ValueError, match="batch_size must be at most"):
-        data.train_dataloader()

@@ -45,14 +45,10 @@ def test_a_frame_depends_on_its_key_and_seed_alone(frames):
     assert torch.equal(depth, frames.depth[[7, 2]])
 
 
-def test_images_lie_in_the_unit_range_and_vary(frames):
+def test_keys_and_seeds_make_different_scenes_in_the_unit_range(frames):
     assert frames.image.dtype == torch.float32
-    assert frames.image.min() >= 0
-    assert frames.image.max() <= 1
+    assert 0 <= frames.image.min() < frames.image.max() <= 1
     assert frames.image.flatten(1).std(dim=1).min() > 0.05
-
-
-def test_keys_and_seeds_make_different_scenes(frames):
     gap = (frames.image[:, None] - frames.image[None]).abs().mean(dim=(2, 3, 4)) + torch.eye(8)
     assert gap.min() > 0.02
     other, _ = render_road_scenes(torch.arange(8), 36, 64, seed=-1)
@@ -169,12 +165,9 @@ def test_the_data_set_renders_its_keys():
     batch = list(DataLoader(scenes, batch_size=3))[1]
     assert batch.key.tolist() == [103, 104]
     assert torch.equal(batch.image, image[3:])
-
-
-@pytest.mark.parametrize("index", [5, -6])
-def test_an_index_out_of_range_raises(index):
-    with pytest.raises(IndexError, match=r"index must lie in \[-5, 4\]"):
-        RoadScenes(5)[index]
+    for index in (5, -6):
+        with pytest.raises(IndexError, match=r"index must lie in \[-5, 4\]"):
+            scenes[index]
 
 
 @pytest.mark.parametrize(
@@ -182,10 +175,8 @@ def test_an_index_out_of_range_raises(index):
     [
         ({"count": 0}, ValueError, "count must be at least 1, got 0"),
         ({"count": 1, "size": (64,)}, ValueError, r"size must be \(height, width\)"),
-        ({"count": 1, "size": "64"}, ValueError, r"size must be \(height, width\)"),
         ({"count": 1, "size": (7, 64)}, ValueError, "size must be at least 8, got 7"),
         ({"count": 1, "seed": 0.5}, TypeError, "seed must be a whole number"),
-        ({"count": 1, "first": None}, TypeError, "first must be a whole number"),
     ],
 )
 def test_invalid_settings_raise(arguments, error, match):

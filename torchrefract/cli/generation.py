@@ -5,10 +5,11 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, cast
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
+from rich.filesize import decimal
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from torchrefract._io import replace_file
@@ -24,10 +26,19 @@ from torchrefract.cli.command import check_seed, make, naming
 from torchrefract.data.frames import first_names
 from torchrefract.data.pairs.card import HISTOGRAMS, draw_histograms, format_card, summarize
 from torchrefract.data.pairs.files import FORMATS
-from torchrefract.data.pairs.generator import GenerationConfig, PairGenerator, PairTask, Sources, find_sources
+from torchrefract.data.pairs.generator import (
+    PairGenerator,
+    PairStorage,
+    PairTask,
+    SourceReader,
+    Sources,
+    find_sources,
+    generate_pairs,
+)
 from torchrefract.data.pairs.manifest import Manifest, PairRow, claim, find_manifests, scan_rows
-from torchrefract.data.pairs.storage import FileStorage, PairStorage, TarStorage, generate_pairs
 from torchrefract.effects.base import Effect
+
+_T = TypeVar("_T")
 
 _SAMPLES = 4  # pairs that the estimate of the size on disk rests on
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -55,7 +66,7 @@ class Shard(NamedTuple):
 class Options(NamedTuple):
     """The parsed configuration."""
 
-    config: GenerationConfig
+    generator: PairGenerator
     sources: Sources
     settings: dict[str, Any]  # everything that determines the content of the files
     num_pairs: int
@@ -78,8 +89,7 @@ def generate(cfg: DictConfig) -> None:
         previous = claim(out, options.settings, count=options.num_pairs, about=about).get("made_with", _VERSIONS)
         if previous != _VERSIONS:
             print(f"existing pairs were made with {previous}, new ones are made with {_VERSIONS}: bytes may differ")
-        tar = options.settings["tar"]
-        storage = FileStorage(out) if tar is None else TarStorage(out, tar)
+        storage = PairStorage(out, options.settings["tar"])
         manifest = Manifest(out, *options.shard)
         complete, damaged = manifest.open(
             lambda number: options.shard.holds(number, options.num_pairs, storage.unit), verify=options.verify
@@ -89,7 +99,7 @@ def generate(cfg: DictConfig) -> None:
         if units:
             _check_disk(options, [number for unit in units for number in unit], storage)
             tasks = ([options.task(number) for number in unit] for unit in units)
-            rows = generate_pairs(tasks, options.config, storage, workers=min(options.workers, len(units)))
+            rows = generate_pairs(tasks, options.generator, storage, workers=min(options.workers, len(units)))
             for unit in _with_progress(rows, total=sum(map(len, units))):
                 manifest.add(unit)
         manifest.close()
@@ -97,63 +107,44 @@ def generate(cfg: DictConfig) -> None:
 
 
 def _parse(cfg: DictConfig) -> Options:
-    config, plain, shard, workers = _config(cfg), _plain_options(cfg), _shard(cfg), _workers(cfg)
-    sources = _sources(cfg, config)
-    with naming("count"):
-        num_pairs = len(sources.frames) if cfg.count is None else check_count("count", cfg.count)
-    sources = sources.limited(num_pairs)
-    if not str(cfg.license or "").strip():
-        raise UsageError("license must be that of the source, in words, got nothing")
-    settings = {"scene": _scene(cfg), **plain, "frames": len(sources.frames), "sources": sources.digest()}
-    return Options(config, sources, settings, num_pairs, str(cfg.license), shard, workers, cfg.verify)
-
-
-def _config(cfg: DictConfig) -> GenerationConfig:
     effect = make(cfg, "scene")
     if not isinstance(effect, Effect):
         raise UsageError(f"scene must be an effect of torchrefract, got {effect}")
-    with naming("size"):
-        size = None if cfg.size is None else check_size("size", cfg.size)
     if check_seed(cfg.seed) >= _SEED_END:
         raise UsageError(f"seed must be below {_SEED_END}, got {cfg.seed}")
-    with naming("maps"):
-        maps = check_choice("maps", str(cfg.maps), FORMATS)
+    plain: dict[str, Any] = {
+        "seed": cfg.seed,
+        "maps": _checked(cfg, "maps", check_choice, choices=FORMATS),
+        "drive_by": _checked(cfg, "drive_by", check_choice, choices=("auto", "folder", "prefix")),
+        "size": None if cfg.size is None else _checked(cfg, "size", check_size),
+        "tar": None if cfg.tar is None else _checked(cfg, "tar", check_count),
+        "every": _checked(cfg, "every", check_count),
+        "val_share": _checked(cfg, "val_share", check_number),
+    }
+    if not 0 < plain["val_share"] < 1:
+        raise UsageError(f"val_share must be between 0 and 1, got {plain['val_share']}")
+    verify, shard, workers = _checked(cfg, "verify", check_flag), _shard(cfg), _workers(cfg)
     source = Path(str(cfg.source)).expanduser()
-    root = source.parent if source.is_file() else source
-    return GenerationConfig(effect, _scene(cfg)["name"], root, size, cfg.seed, maps)
-
-
-def _plain_options(cfg: DictConfig) -> dict[str, Any]:
-    """Check and return the other options that determine the content of the files."""
-    with naming("tar"):
-        tar = None if cfg.tar is None else check_count("tar", cfg.tar)
-    with naming("every"):
-        every = check_count("every", cfg.every)
-    with naming("drive_by"):
-        drive_by = check_choice("drive_by", str(cfg.drive_by), ("auto", "folder", "prefix"))
-    with naming("val_share"):
-        if not 0 < (share := check_number("val_share", cfg.val_share)) < 1:
-            raise UsageError(f"val_share must be between 0 and 1, got {share}")
-    with naming("verify"):
-        check_flag("verify", cfg.verify)
-    size = None if cfg.size is None else list(cfg.size)
-    plain = {"seed": cfg.seed, "maps": str(cfg.maps), "drive_by": drive_by, "size": size}
-    return plain | {"tar": tar, "every": every, "val_share": share}
-
-
-def _scene(cfg: DictConfig) -> dict[str, Any]:
-    name = str(HydraConfig.get().runtime.choices["scene"])
-    scene = OmegaConf.to_container(cfg.scene, resolve=True)
-    return {"name": name, **({str(key): value for key, value in scene.items()} if isinstance(scene, dict) else {})}
-
-
-def _sources(cfg: DictConfig, config: GenerationConfig) -> Sources:
-    source, out = Path(str(cfg.source)).expanduser(), Path(str(cfg.out)).resolve()
-    if out.is_relative_to(source.resolve()):
+    if Path(str(cfg.out)).resolve().is_relative_to(source.resolve()):
         raise UsageError(f"out must lie outside of source, so that pairs do not become sources, got {cfg.out}")
-    options = {"every": cfg.every, "drive_by": str(cfg.drive_by), "val_share": cfg.val_share, "seed": cfg.seed}
     with naming("source"):
-        return find_sources(source, size=config.size, **options)
+        options = {name: plain[name] for name in ("size", "every", "drive_by", "val_share", "seed")}
+        sources = find_sources(source, **options)
+    num_pairs = len(sources.frames) if cfg.count is None else _checked(cfg, "count", check_count)
+    sources = sources.limited(num_pairs)
+    if not str(cfg.license or "").strip():
+        raise UsageError("license must be that of the source, in words, got nothing")
+    scene: dict[str, Any] = {"name": str(HydraConfig.get().runtime.choices["scene"])}
+    scene |= cast(dict[str, Any], OmegaConf.to_container(cfg.scene, resolve=True))
+    reader = SourceReader(sources.root, plain["size"])
+    generator = PairGenerator(effect, scene["name"], reader, cfg.seed, plain["maps"])
+    settings = {"scene": scene, **plain, "frames": len(sources.frames), "sources": sources.digest()}
+    return Options(generator, sources, settings, num_pairs, str(cfg.license), shard, workers, verify)
+
+
+def _checked(cfg: DictConfig, name: str, check: Callable[..., _T], **limits: Any) -> _T:
+    with naming(name):
+        return check(name, cfg[name], **limits)
 
 
 def _shard(cfg: DictConfig) -> Shard:
@@ -171,8 +162,7 @@ def _shard(cfg: DictConfig) -> Shard:
 
 def _workers(cfg: DictConfig) -> int:
     if cfg.workers is not None:
-        with naming("workers"):
-            return check_count("workers", cfg.workers, low=0)
+        return _checked(cfg, "workers", check_count, low=0)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
@@ -196,12 +186,15 @@ def _report(options: Options, complete: set[int], damaged: int) -> None:
 
 def _check_disk(options: Options, missing: Sequence[int], storage: PairStorage) -> None:
     """Print the estimated size of the missing pairs; raise UsageError if the disk has less space."""
-    generator, step = PairGenerator(options.config), max(1, len(missing) // _SAMPLES)
+    # A reader that has opened a video cannot be sent to workers.
+    generator, step = deepcopy(options.generator), max(1, len(missing) // _SAMPLES)
     samples = [generator.generate(options.task(number)) for number in missing[::step][:_SAMPLES]]
-    sizes = [storage.disk_bytes(pair) + len(pair.row.as_line()) for pair in samples if pair.data]
-    mean = sum(sizes) / max(1, len(sizes))
+    sizes = [storage.disk_bytes(pair) for pair in samples if pair.data]
+    mean = sum(sizes) // max(1, len(sizes))
     needed, free = mean * len(missing), shutil.disk_usage(storage.out).free
-    estimate = f"{len(missing)} pairs take about {_size(needed)} on disk, {_size(mean)} each; {_size(free)} are free"
+    estimate = (
+        f"{len(missing)} pairs take about {decimal(needed)} on disk, {decimal(mean)} each; {decimal(free)} are free"
+    )
     if needed > free:
         raise UsageError(
             f"out must have enough space, got too little: {estimate}; choose another disk or a lower count"
@@ -272,11 +265,3 @@ def _disk_errors(out: Path) -> Iterator[None]:
     except KeyboardInterrupt:
         print("stopped; the same command continues")
         raise SystemExit(130) from None
-
-
-def _size(count: float) -> str:
-    for unit in ("kB", "MB", "GB"):
-        count /= 1000
-        if count < 1000 or unit == "GB":
-            break
-    return f"{count:.3g} {unit}"

@@ -100,7 +100,8 @@ def _source(cfg: DictConfig) -> _Source:
     frames, name = _read_frames(path, max_frames), _printable(path.name or path.resolve().name)
     _, first = next(frames.read([0]))
     depth, note = (None, "") if cfg.depth is None else _read_depth(cfg, first, size)
-    return _Source(frames if size is None else _resized(frames, size), depth, name, note)
+    resized = FrameSequence(frames.num_frames, lambda times: ((t, _fit(x, size)) for t, x in frames.read(times)))
+    return _Source(resized, depth, name, note)
 
 
 def _read_frames(path: Path, max_frames: int) -> FrameSequence:
@@ -140,15 +141,9 @@ def _read_folder(files: list[Path], times: Iterable[int]) -> Iterator[tuple[int,
         yield t, image[None].contiguous()
 
 
-def _resized(frames: FrameSequence, size: tuple[int, int]) -> FrameSequence:
-    """Crop and reduce frames to a size."""
-
-    def read(times: Iterable[int]) -> Iterator[tuple[int, Tensor]]:
-        for t, frame in frames.read(times):
-            with naming("size"):
-                yield t, fit(frame[0], size)[None]
-
-    return FrameSequence(frames.num_frames, read)
+def _fit(frame: Tensor, size: tuple[int, int] | None) -> Tensor:
+    with naming("size"):
+        return frame if size is None else fit(frame[0], size)[None]
 
 
 def _read_depth(cfg: DictConfig, image: Tensor, size: tuple[int, int] | None) -> tuple[Tensor, str]:
@@ -167,13 +162,11 @@ def _read_depth(cfg: DictConfig, image: Tensor, size: tuple[int, int] | None) ->
         check_depth(depth[None, None])
     # Crop and reduce a picture of relative coordinates like the image, and sample the depth at the results: an average
     # over the edge of an object would be a distance at which there is nothing.
-    position = torch.zeros(3, height, width)
-    position[0] = ((torch.arange(height) + 0.5) / height)[:, None]
-    position[1] = (torch.arange(width) + 0.5) / width
-    if size is not None:
-        with naming("size"):
-            position = fit(position, size)
-    y, x = (position[0] * rows).long().clamp(max=rows - 1), (position[1] * columns).long().clamp(max=columns - 1)
+    position = torch.zeros(1, 3, height, width)
+    position[0, 0] = ((torch.arange(height) + 0.5) / height)[:, None]
+    position[0, 1] = (torch.arange(width) + 0.5) / width
+    y, x, _ = _fit(position, size)[0]
+    y, x = (y * rows).long().clamp(max=rows - 1), (x * columns).long().clamp(max=columns - 1)
     return depth[y, x][None, None], note
 
 

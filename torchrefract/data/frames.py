@@ -32,12 +32,18 @@ _NUMBERED = re.compile(r"\d[A-Za-z]?$")
 _NUMBER = re.compile(r"[-_.\s\d]*\d[A-Za-z]?")
 
 
-class AssignedFrame(NamedTuple):
-    """A frame with its drive and split."""
+class Source(NamedTuple):
+    """A clean frame with its drive and split."""
 
     path: str  # relative to the root, with forward slashes
     drive: str
     split: str  # train, val, or empty for frames outside of the folders train and val
+    frame: int | None = None  # index in a video
+
+    @property
+    def name(self) -> str:
+        """A name that is unique in the root."""
+        return self.path if self.frame is None else f"{self.path}#{self.frame}"
 
 
 class FrameFolder(Dataset[Frame]):
@@ -88,12 +94,11 @@ class FrameFolder(Dataset[Frame]):
         check_choice("drive_by", drive_by, ("auto", "folder", "prefix"))
         if not 0 < check_number("val_share", val_share) < 1:
             raise ValueError(f"val_share must be a number between 0 and 1, got {val_share}")
-        paths = _find_frames(self.root)
-        drive_of = _select_split(self.root, paths, split=split, drive_by=drive_by, val_share=val_share, seed=seed)
-        readable, self.skipped = _check_frames(self.root, sorted(drive_of), self.size)
-        self.paths = [self.root / path for path in readable]
-        self.drives = sorted({drive_of[path] for path in readable})
-        self.keys = [path_key(path) for path in readable]
+        options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
+        frames, self.skipped = assign_frames(self.root, size=self.size, split=split, **options)
+        self.paths = [self.root / frame.path for frame in frames]
+        self.drives = sorted({frame.drive for frame in frames})
+        self.keys = [path_key(frame.path) for frame in frames]
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -105,27 +110,30 @@ class FrameFolder(Dataset[Frame]):
 
 
 def assign_frames(
-    root: Path, *, size: Sequence[int] | None, drive_by: str = "auto", val_share: float = 0.2, seed: int = 0
-) -> tuple[list[AssignedFrame], list[tuple[Path, str]]]:
-    """Assign all frames of a root to drives and splits, as `FrameFolder` does.
+    root: Path, *, size: tuple[int, int] | None, split: str | None, drive_by: str, val_share: float, seed: int
+) -> tuple[list[Source], list[tuple[Path, str]]]:
+    """Assign the frames of a root to drives and splits.
 
-    All frames of a root with a single drive are for training. Arguments and errors are those of `FrameFolder`; with
-    size None, frames may have any size.
+    Arguments and errors are those of `FrameFolder`. With size None, frames may have any size. With split None, all
+    frames are returned, and those of a root with a single drive are for training.
 
     Returns:
         the readable frames in order, and the unreadable ones with the reasons.
     """
-    options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
     paths = _find_frames(root)
-    drive_of = _select_split(root, paths, split="all", **options)
-    readable, skipped = _check_frames(root, sorted(drive_of), (1, 1) if size is None else check_size("size", size))
-    has_splits = drive_by == "auto" and bool(_split_folders(root))
-    if not has_splits and len(set(drive_of.values())) < 2:
-        return [AssignedFrame(path, drive_of[path], "train") for path in readable], skipped
-    val = _select_split(root, paths, split="val", **options)
-    train = _select_split(root, paths, split="train", **options) if has_splits else drive_of.keys() - val.keys()
-    split_of = {path: "val" if path in val else "train" if path in train else "" for path in readable}
-    return [AssignedFrame(path, drive_of[path], split) for path, split in split_of.items()], skipped
+    if folders := _split_folders(root) if drive_by == "auto" else {}:
+        frames = _assign_by_folder(root, paths, folders)
+    else:
+        drive_of, val = _drives(paths, drive_by), set[str]()
+        if split in ("train", "val") or (split is None and len(set(drive_of.values())) > 1):
+            val = select_val_drives(root, drive_of, val_share=val_share, seed=seed)
+        frames = [Source(path, drive, "val" if drive in val else "train") for path, drive in drive_of.items()]
+    for name in ("train", "val") if folders and split is None else (split,):
+        if name in ("train", "val") and name not in {frame.split for frame in frames}:
+            raise ValueError(f"root must hold frames in its folder for {name}, got none in {root}")
+    frames = sorted(frame for frame in frames if split in (None, "all", frame.split))
+    readable, skipped = _check_frames(root, [frame.path for frame in frames], size or (1, 1))
+    return [frame for frame in frames if frame.path in readable], skipped
 
 
 def name_prefix(stem: str) -> str:
@@ -193,20 +201,6 @@ def _raise_permission_error(error: OSError) -> NoReturn:
     raise error
 
 
-def _select_split(
-    root: Path, paths: list[str], *, split: str, drive_by: str, val_share: float, seed: int
-) -> dict[str, str]:
-    """Return the drive of each frame in a split."""
-    folders = _split_folders(root) if drive_by == "auto" else {}
-    if folders:
-        return _select_split_folder(root, paths, split=split, folders=folders)
-    drive_of = _drives(paths, drive_by)
-    if split == "all":
-        return drive_of
-    val = select_val_drives(root, drive_of, val_share=val_share, seed=seed)
-    return {path: drive for path, drive in drive_of.items() if (drive in val) == (split == "val")}
-
-
 def _split_folders(root: Path) -> dict[str, str]:
     """Return the split of each sub-folder named train or val; empty unless the root has both."""
     splits = {path.name: _SPLITS[path.name.lower()] for path in root.iterdir() if path.name.lower() in _SPLITS}
@@ -214,8 +208,8 @@ def _split_folders(root: Path) -> dict[str, str]:
     return splits if len(set(splits.values())) == 2 else {}
 
 
-def _select_split_folder(root: Path, paths: list[str], *, split: str, folders: dict[str, str]) -> dict[str, str]:
-    """Return the drive of each frame in a split that is a folder; frames outside of both belong to "all" alone."""
+def _assign_by_folder(root: Path, paths: list[str], folders: dict[str, str]) -> list[Source]:
+    """Assign frames to the splits of their folders; frames outside of both belong to "all" alone."""
     groups: dict[str, list[str]] = {"train": [], "val": [], "": []}
     for path in paths:
         groups[folders.get(PurePosixPath(path).parts[0], "")].append(path)
@@ -225,11 +219,7 @@ def _select_split_folder(root: Path, paths: list[str], *, split: str, folders: d
         names = first_names(shared)
         message = f"train and val in {root} both hold frames of {names}, by name; a drive belongs in one of them"
         warnings.warn(message, stacklevel=4)
-    if split == "all":
-        return drives["train"] | drives["val"] | drives[""]
-    if not groups[split]:
-        raise ValueError(f"root must hold frames in its folder for {split}, got none in {root}")
-    return drives[split]
+    return [Source(path, drive, split) for split, group in drives.items() for path, drive in group.items()]
 
 
 def _drives(paths: list[str], drive_by: str, *, skip_levels: int = 0) -> dict[str, str]:
@@ -243,17 +233,7 @@ def _drives(paths: list[str], drive_by: str, *, skip_levels: int = 0) -> dict[st
 
 
 def select_val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: float, seed: int) -> set[str]:
-    """Select the drives of val.
-
-    Args:
-        root: for messages.
-        drive_of: the drive of each frame.
-        val_share: share of the frames in val, between 0 and 1.
-        seed: of the order of drives.
-
-    Raises:
-        ValueError: there are fewer than two drives.
-    """
+    """Select the drives of val from the drive of each frame; raises ValueError if there are fewer than two."""
     frames = Counter(drive_of.values())
     if len(frames) < 2:
         raise ValueError(
@@ -277,7 +257,7 @@ def select_val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: flo
     return (val or {smallest}) if len(val) < len(frames) else val - {smallest}  # each split has at least one drive
 
 
-def _check_frames(root: Path, paths: list[str], size: tuple[int, int]) -> tuple[list[str], list[tuple[Path, str]]]:
+def _check_frames(root: Path, paths: list[str], size: tuple[int, int]) -> tuple[set[str], list[tuple[Path, str]]]:
     """Return the readable paths, and the unreadable ones with the reasons."""
     with ThreadPoolExecutor() as pool:
         results = list(pool.map(_size_or_reason, [root / path for path in paths]))
@@ -290,7 +270,7 @@ def _check_frames(root: Path, paths: list[str], size: tuple[int, int]) -> tuple[
                 f"{examples}; remove them or copy them again"
             )
         message = f"{len(skipped)} of {len(paths)} frames in {root} cannot be read and are skipped: {examples}"
-        warnings.warn(message, stacklevel=3)
+        warnings.warn(message, stacklevel=4)
     sizes = {path: result for path, result in zip(paths, results, strict=True) if not isinstance(result, str)}
     small = [f"{path} of {H}x{W}" for path, (H, W) in sizes.items() if size[0] > H or size[1] > W]
     if small:
@@ -298,7 +278,7 @@ def _check_frames(root: Path, paths: list[str], size: tuple[int, int]) -> tuple[
             f"frames must be at least size = {size[0]}x{size[1]} (height x width), got {first_names(small)} in {root}; "
             "choose a smaller size or remove them"
         )
-    return list(sizes), skipped
+    return set(sizes), skipped
 
 
 def _size_or_reason(path: Path) -> tuple[int, int] | str:

@@ -49,11 +49,6 @@ def read_image(path: str | Path) -> Tensor:
     Raises:
         UnreadableImageError: the file is missing, damaged or not an image.
     """
-    return as_image(read_pixels(path))
-
-
-def read_pixels(path: str | Path) -> np.ndarray:
-    """Read a file as `read_image` does, without conversion: (H, W, 3), RGB, uint8 or uint16."""
     with opened(path) as stream:
         data = stream.read()
     _check_complete(path, io.BytesIO(data), len(data))
@@ -61,12 +56,7 @@ def read_pixels(path: str | Path) -> np.ndarray:
         raise UnreadableImageError(f"{path} is damaged: its chunks are shorter than they state")
     # OpenCV would allocate any size that a header states; Pillow raises an error for a decompression bomb.
     _header_size(path, io.BytesIO(data))
-    return _decode(path, data)
-
-
-def as_image(pixels: np.ndarray) -> Tensor:
-    """Convert (H, W, 3), uint8 or uint16, into (3, H, W), float32, in [0, 1]."""
-    return to_float(torch.from_numpy(pixels)).permute(2, 0, 1)
+    return to_float(torch.from_numpy(_decode(path, data))).permute(2, 0, 1)
 
 
 def pixels_of(image: Tensor) -> np.ndarray:
@@ -145,7 +135,10 @@ def fit(image: Tensor, size: Sequence[int]) -> Tensor:
         TypeError: the image is not float32 on the CPU.
     """
     height, width = check_size("size", size)
-    _check_image(image)
+    if check_tensor("image", image).ndim != 3 or image.shape[0] != 3:
+        raise ValueError(f"image must have shape (3, H, W), got {tuple(image.shape)}")
+    if image.dtype != torch.float32 or image.device.type != "cpu":
+        raise TypeError(f"image must be float32 on the CPU, got {image.dtype} on {image.device}")
     H, W = image.shape[1:]
     if height > H or width > W:
         raise ValueError(f"image must be at least size = {height}x{width} (height x width), got {H}x{W}")
@@ -157,14 +150,6 @@ def fit(image: Tensor, size: Sequence[int]) -> Tensor:
     small = cv2.resize(crop, (width, height), interpolation=cv2.INTER_AREA)
     # The weights sum to 1 up to rounding, so a mean may exceed 1.
     return torch.from_numpy(small).permute(2, 0, 1).contiguous().clamp_(0, 1)
-
-
-def _check_image(image: Tensor) -> None:
-    check_tensor("image", image)
-    if image.ndim != 3 or image.shape[0] != 3:
-        raise ValueError(f"image must have shape (3, H, W), got {tuple(image.shape)}")
-    if image.dtype != torch.float32 or image.device.type != "cpu":
-        raise TypeError(f"image must be float32 on the CPU, got {image.dtype} on {image.device}")
 
 
 def _header_size(path: str | Path, stream: BinaryIO) -> tuple[int, int]:

@@ -29,9 +29,7 @@ _ENCODING = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95], ".jpeg": [cv2.IMWRITE_JPEG_
 def find_media(source: Path, *, deep: bool = False) -> Sequence[Path]:
     """Find the pictures and videos of a folder, or return the one file that `source` names.
 
-    Args:
-        source: a folder, a picture or a video.
-        deep: search the folders below it too.
+    With `deep`, the folders below it are searched too.
 
     Raises:
         UsageError: if `source` does not exist or holds no picture or video, or if two videos would be written under one
@@ -70,12 +68,9 @@ def output_name(file: Path) -> Path:
 
 
 def is_complete(file: Path, target: Path, *, num_columns: int = 1) -> bool:
-    """Return True if the output of a file exists and has its sides (picture) or its number of frames (video).
+    """Return True if the output of a file exists and has its number of frames (video) or its sides (picture).
 
-    Args:
-        file: the input.
-        target: the output.
-        num_columns: pictures side by side in the output.
+    The output of a picture may hold several, side by side.
     """
     if not target.is_file():
         return False
@@ -89,11 +84,7 @@ def is_complete(file: Path, target: Path, *, num_columns: int = 1) -> bool:
 
 
 def write_picture(pixels: np.ndarray, path: Path) -> None:
-    """Write (H, W, 3), uint8, RGB, in the format of the suffix.
-
-    Raises:
-        UsageError: if the format cannot hold the picture.
-    """
+    """Write (H, W, 3), uint8, RGB, in the format of the suffix; raises UsageError if it cannot hold the picture."""
     is_encoded, data = cv2.imencode(path.suffix, pixels[..., ::-1], _ENCODING.get(path.suffix.lower(), []))
     if not is_encoded:
         raise UsageError(f"{path} could not be written as {path.suffix}")
@@ -101,11 +92,7 @@ def write_picture(pixels: np.ndarray, path: Path) -> None:
 
 
 def read_video(path: Path, times: Iterable[int]) -> Iterator[tuple[int, Tensor]]:
-    """Read frames of a video, until it ends.
-
-    Args:
-        path: of the video.
-        times: rising frame numbers.
+    """Read the frames of a video with rising numbers, until it ends.
 
     Yields:
         the frame number, and the frame (1, 3, H, W), float32 in [0, 1], RGB.
@@ -136,16 +123,13 @@ def video_info(path: Path) -> tuple[int, float]:
 
 
 def write_video(pictures: Iterable[np.ndarray], path: Path, *, fps: float, size: tuple[int, int]) -> int:
-    """Write pictures as an MPEG-4 video, one by one.
+    """Write pictures as an MPEG-4 video, one by one; return their number.
 
     Args:
         pictures: (H, W, 3), uint8, RGB, all of one size.
         path: ending in .mp4.
         fps: frames per second.
         size: (width, height), px, both even.
-
-    Returns:
-        the number of frames.
 
     Raises:
         OSError: if the file does not hold all frames, as on a full disk.
@@ -165,15 +149,12 @@ def write_video(pictures: Iterable[np.ndarray], path: Path, *, fps: float, size:
 
 
 def convert_video(source: Path, path: Path, *, change: Callable[[Iterator[Tensor]], Iterable[np.ndarray]]) -> int:
-    """Write the changed frames of a video at its rate.
+    """Write the changed frames of a video at its rate; return their number.
 
     Args:
         source: the video.
         path: of the new video, ending in .mp4.
         change: takes frames (1, 3, H, W) in [0, 1], gives as many pictures (H, W, 3), uint8, RGB, all of one size.
-
-    Returns:
-        the number of frames.
 
     Raises:
         UnreadableImageError: if no frame can be decoded, or a side of the pictures is odd.

@@ -17,9 +17,6 @@ from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.effects.base import Effect
 from torchrefract.types import Frame, Pair
 
-# Validation has the seed of epoch 0, so training begins at 1.
-_FIRST_EPOCH = 1
-
 
 class PairData(LightningDataModule):
     """Pairs of clean and degraded frames for Lightning.
@@ -90,7 +87,8 @@ class PairData(LightningDataModule):
         if isinstance(batch, Pair) or self.effect is None:
             return cast(Pair, batch)
         training = self.trainer is not None and self.trainer.training
-        epoch = _FIRST_EPOCH + self.trainer.current_epoch if training and self.trainer else 0
+        # Validation has the seed of epoch 0, so training begins at 1.
+        epoch = 1 + self.trainer.current_epoch if training and self.trainer else 0
         return make_pair(batch, self.effect, seed=(self.seed << 32) + epoch, **self._maps)
 
     def _loader(self, frames: Dataset[Any], *, training: bool) -> DataLoader[Any]:

@@ -66,10 +66,6 @@ def without_manifests(files: dict[str, str]) -> dict[str, str]:
     return {name: value for name, value in files.items() if not name.startswith("manifest")}
 
 
-def rows_of(out: Path) -> list[str]:
-    return sorted(line for path in out.glob("manifest*.jsonl") for line in path.read_text().splitlines())
-
-
 def test_a_killed_run_continues_to_the_same_bytes_with_another_number_of_workers(call, tmp_path, words, sums, complete):
     out, arguments = tmp_path / "out", words(tmp_path / "out", f"count={COUNT}")
     run = start(*arguments, "workers=2")
@@ -102,11 +98,24 @@ def test_a_killed_worker_stops_the_run_with_a_message(tmp_path, words):
     assert err.startswith("error: workers must fit the memory, got 1 of which one was killed")
 
 
-def test_shards_make_the_same_files_in_any_order(call, tmp_path, words, sums, complete):
-    for shard in (1, 0):
-        assert call("generate", *words("out", f"count={COUNT}", "shards=2", f"shard={shard}")).code == 0
-    assert without_manifests(sums(tmp_path / "out")) == without_manifests(sums(complete))
-    assert rows_of(tmp_path / "out") == rows_of(complete)
+@pytest.mark.parametrize("way", ["jobs", "multirun", "torchrun"])
+def test_shards_make_the_same_files_in_any_order(call, tmp_path, words, sums, complete, monkeypatch, way):
+    out, options = tmp_path / "out", words(tmp_path / "out", f"count={COUNT}")
+    if way == "multirun":
+        assert call("generate", "-m", *options, "shards=2", "shard=0,1").code == 0
+    for shard in (1, 0) if way != "multirun" else ():
+        if way == "torchrun":
+            monkeypatch.setenv("WORLD_SIZE", "2")
+            monkeypatch.setenv("RANK", str(shard))
+        assert call("generate", *options, *(("shards=2", f"shard={shard}") if way == "jobs" else ())).code == 0
+    assert without_manifests(sums(out)) == without_manifests(sums(complete))
+    names = {path.name for path in out.glob("manifest*")}
+    assert names == {"manifest-00000-of-00002.jsonl", "manifest-00001-of-00002.jsonl"}
+    lines, expected = (
+        sorted(line for path in folder.glob("manifest*.jsonl") for line in path.read_text().splitlines())
+        for folder in (out, complete)
+    )
+    assert lines == expected
 
 
 def test_shards_make_the_same_tars(call, tmp_path, words, sums):
@@ -117,22 +126,6 @@ def test_shards_make_the_same_tars(call, tmp_path, words, sums):
     one, two = sums(tmp_path / "one"), sums(tmp_path / "two")
     assert without_manifests(one) == without_manifests(two)
     assert sum(name.startswith("tars/") for name in one) == 3
-
-
-def test_the_jobs_of_a_multirun_are_shards(call, tmp_path, words, sums, complete):
-    assert call("generate", "-m", *words(tmp_path / "out", f"count={COUNT}", "shards=2", "shard=0,1")).code == 0
-    assert without_manifests(sums(tmp_path / "out")) == without_manifests(sums(complete))
-
-
-def test_the_ranks_of_torchrun_are_shards(call, tmp_path, words, sums, complete, monkeypatch):
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    for rank in ("0", "1"):
-        monkeypatch.setenv("RANK", rank)
-        assert call("generate", *words("out", f"count={COUNT}")).code == 0
-    out = tmp_path / "out"
-    assert without_manifests(sums(out)) == without_manifests(sums(complete))
-    names = {path.name for path in out.glob("manifest*")}
-    assert names == {"manifest-00000-of-00002.jsonl", "manifest-00001-of-00002.jsonl"}
 
 
 @pytest.mark.parametrize("tar", ["null", "4"])

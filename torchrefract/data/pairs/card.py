@@ -14,7 +14,7 @@ from torchrefract.data.pairs.manifest import PairRow
 
 HISTOGRAMS = "parameters.png"
 
-_NOT_SHOWN = ("effect", "key", "frame", "wind", "drift", "decorrelation")  # not numbers, or without effect on a frame
+_NOT_SHOWN = {"effect", "key", "frame", "wind", "drift", "decorrelation"}  # not numbers, or without effect on a frame
 _FORMATS = {
     "clean.png": "8 bits, RGB: the clean frame",
     "corrupted.png": "8 bits, RGB: the degraded frame",
@@ -32,15 +32,8 @@ _FORMATS = {
 _FORMATS["maps.safetensors"] = _FORMATS["maps.npz"].replace("NumPy arrays", "tensors")
 _COLUMNS, _MAX_BINS = 4, 30
 _AXES = ("x", "y", "z")
-_UNITS = {
-    "amplitude": "px",
-    "length": "px",
-    "aperture": "px",
-    "displacement": "px",
-    "visibility": "m",
-    "focal": "image widths",
-    "radius": "image diagonals",
-}
+_UNITS = {"amplitude": "px", "length": "px", "aperture": "px", "displacement": "px", "visibility": "m"}
+_UNITS |= {"focal": "image widths", "radius": "image diagonals"}
 
 
 class Summary(NamedTuple):
@@ -76,24 +69,21 @@ def summarize(rows: Iterable[PairRow]) -> Summary:
         files, num_bytes = tuple(row.files), num_bytes + sum(file.bytes for file in row.files.values())
         effects[" + ".join(str(effect["effect"]) for effect in row.effects) or "none"] += 1
         for effect in row.effects:
-            _add_parameters(effect, parameters)
+            for name in effect.keys() - _NOT_SHOWN:
+                numbers = np.array(effect[name], dtype=np.float64).ravel()  # parses the word "inf", too
+                columns = parameters[str(effect["effect"]), name]
+                columns.extend(array("d") for _ in range(len(numbers) - len(columns)))
+                for column, number in zip(columns, numbers, strict=False):
+                    column.append(number)
     return Summary(splits, drives, effects, sizes, len(sources), skipped, beyond, files, num_bytes, parameters)
 
 
 def format_card(summary: Summary, *, settings: Mapping[str, Any], license_text: str, has_histograms: bool) -> str:
-    """Format the card in Markdown.
-
-    Args:
-        summary: of the set.
-        settings: of the set, as in config.json.
-        license_text: license of the frames, as the user states it.
-        has_histograms: True if the file of `HISTOGRAMS` exists.
-    """
+    """Format the card in Markdown, from the settings in config.json and the license of the frames."""
     scene, count = settings["scene"]["name"], summary.splits.total()
     splits = [f"| {name} | {pairs} | {len(summary.drives[name])} |" for name, pairs in sorted(summary.splits.items())]
     effects = [f"| {name} | {pairs} |" for name, pairs in sorted(summary.effects.items())]
     sizes = ", ".join(sorted(summary.sizes))
-    figure = ["## Parameters", "", f"![Histograms of the parameters]({HISTOGRAMS})", ""]
     remarks = [
         f"{pairs} pairs have pixels whose {name} exceeds the range of a 16-bit PNG, 512 px; they are marked as invalid."
         for name, pairs in sorted(summary.beyond.items())
@@ -112,7 +102,7 @@ def format_card(summary: Summary, *, settings: Mapping[str, Any], license_text: 
         *("| split | pairs | drives |", "| --- | --- | --- |", *splits, ""),
         *("| effect | pairs |", "| --- | --- |", *effects, ""),
         *(line for remark in remarks for line in (remark, "")),
-        *(figure if has_histograms else []),
+        *(["## Parameters", "", f"![Histograms of the parameters]({HISTOGRAMS})", ""] if has_histograms else []),
         *("## Files", "", "Flows are in pixels, u to the right and v down. Pixel centers are integers.", ""),
         *(f"- `{suffix}`: {_FORMATS[suffix]}" for suffix in summary.files),
         "",
@@ -147,17 +137,6 @@ def draw_histograms(summary: Summary) -> bytes | None:
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
     return stream.getvalue()
-
-
-def _add_parameters(effect: Mapping[str, Any], parameters: dict[tuple[str, str], list["array[float]"]]) -> None:
-    for name, value in effect.items():
-        if name in _NOT_SHOWN:
-            continue
-        numbers = np.array(value, dtype=np.float64).ravel()  # parses the word "inf", too
-        columns = parameters[str(effect["effect"]), name]
-        columns.extend(array("d") for _ in range(len(numbers) - len(columns)))
-        for column, number in zip(columns, numbers, strict=False):
-            column.append(number)
 
 
 def _histogram_panels(summary: Summary) -> Iterable[tuple[str, str, np.ndarray]]:

@@ -12,15 +12,7 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 from torchrefract._tensor import to_float
 from torchrefract._validation import check_choice, check_count, check_flag
 from torchrefract.data.pairs.files import DamagedPairError, decode_pair
-from torchrefract.data.pairs.manifest import (
-    PairRow,
-    RowLocation,
-    find_manifests,
-    read_lines,
-    read_row,
-    read_stored,
-    scan_rows,
-)
+from torchrefract.data.pairs.manifest import PairRow, find_manifests, read_row, read_stored, scan_rows
 from torchrefract.types import Pair
 
 _SPLITS = ("all", "train", "val")
@@ -82,13 +74,10 @@ class PairedFolder(Dataset[Pair]):
                 f"pair {row.number} in {self.root} must be whole, got {error}; torchrefract.generate with "
                 "verify=true makes it again"
             ) from error
-        required = (
-            (self.transmission, _TRANSMISSION, "transmission, as of fog"),
-            (self.flow, _FLOW, "flow, as of a lens"),
-        )
-        for is_required, name, description in required:
-            if is_required and name not in arrays.maps:
-                raise ValueError(f"root must hold pairs with a {description}, got {row.number} in {self.root}")
+        if self.transmission and _TRANSMISSION not in arrays.maps:
+            raise ValueError(f"root must hold pairs with a transmission, as of fog, got {row.number} in {self.root}")
+        if self.flow and _FLOW not in arrays.maps:
+            raise ValueError(f"root must hold pairs with a flow, as of a lens, got {row.number} in {self.root}")
         size = arrays.clean.shape[:2]
         flow = arrays.maps.get(_FLOW, np.zeros((2, *size), np.float32))
         valid = arrays.maps[_VALID] if _FLOW in arrays.maps else np.ones(size, dtype=bool)
@@ -104,8 +93,9 @@ class PairedFolder(Dataset[Pair]):
     def row(self, index: int) -> PairRow:
         """Read the manifest's row of a pair."""
         number, offset, length = self._locations[index].tolist()
-        (line,) = read_lines([RowLocation(self._manifests[number], offset, length)])
-        return read_row(line)
+        with self._manifests[number].open("rb") as stream:
+            stream.seek(offset)
+            return read_row(stream.read(length))
 
     def rows(self) -> Iterator[PairRow]:
         """Read all rows of the split, in the order of the manifest."""

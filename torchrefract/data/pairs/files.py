@@ -7,6 +7,7 @@ intensity of 16 bits. npz and safetensors files hold the maps in float32, as the
 import io
 import zipfile
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import cv2
@@ -58,11 +59,7 @@ class PairArrays(NamedTuple):
 
 
 def encode_pair(pair: PairArrays, file_format: str) -> dict[str, bytes]:
-    """Encode a pair.
-
-    Args:
-        pair: the arrays.
-        file_format: of the maps: "png", "npz" or "safetensors".
+    """Encode a pair with its maps in one of `FORMATS`.
 
     Returns:
         the content of each file by the suffix of its name, as "clean.png" and "flow.png".
@@ -73,9 +70,13 @@ def encode_pair(pair: PairArrays, file_format: str) -> dict[str, bytes]:
     files = {f"{name}.png": _encode_png(getattr(pair, name)[..., ::-1], _IMAGE_OPTIONS) for name in IMAGES}
     if file_format != "png":
         # safetensors writes memory in its order, so arrays must be contiguous.
-        arrays = {name: np.ascontiguousarray(pair.maps[name]) for name in sorted(pair.maps)}
-        encoded = _encode_npz(arrays) if file_format == "npz" else save(arrays)
-        return files | {f"{_MAPS_STEM}.{file_format}": encoded}
+        arrays: dict[str, Any] = {name: np.ascontiguousarray(pair.maps[name]) for name in sorted(pair.maps)}
+        stream = io.BytesIO()
+        if file_format == "npz":
+            np.savez(stream, **arrays)  # compression gains little on flows in float32
+        else:
+            stream.write(save(arrays))
+        return files | {f"{_MAPS_STEM}.{file_format}": stream.getvalue()}
     return files | {f"{name}.png": _encode_map(name, value, pair.maps) for name, value in pair.maps.items()}
 
 
@@ -95,16 +96,15 @@ def decode_pair(files: Mapping[str, Callable[[], bytes]], names: tuple[str, ...]
         if name == _MAPS_STEM:
             maps |= _decode(suffix, read(), _decode_npz if file_format == "npz" else load)
         elif name not in IMAGES and (names is None or name in names):
-            maps[name] = _decode(suffix, read(), _DECODERS[name])
-    clean, corrupted = (_decode(f"{name}.png", files[f"{name}.png"](), decode_image) for name in IMAGES)
+            maps[name] = _decode(suffix, read(), partial(_decode_map, name))
+    clean, corrupted = (_decode(f"{name}.png", files[f"{name}.png"](), _decode_image) for name in IMAGES)
     return PairArrays(clean, corrupted, maps)
 
 
-def count_out_of_range(flow: np.ndarray, valid: np.ndarray) -> int:
-    """Count the valid pixels of a flow (2, H, W) that a PNG cannot hold; `encode_flow` marks them as not valid."""
-    if _in_range(np.array([[flow.min(), flow.max()]])).all():
-        return 0
-    return int((valid & ~_in_range(flow)).sum())
+def count_out_of_range(maps: Mapping[str, np.ndarray]) -> dict[str, int]:
+    """Count the valid pixels that a PNG cannot hold, by flow; `encode_flow` marks them as not valid."""
+    counts = {name: int((maps[mask] & ~_in_range(maps[name])).sum()) for name, mask in FLOWS.items() if name in maps}
+    return {name: count for name, count in counts.items() if count}
 
 
 def encode_flow(flow: np.ndarray, valid: np.ndarray) -> bytes:
@@ -131,8 +131,7 @@ def decode_flow(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(flow.transpose(2, 0, 1)), levels[..., 0] > 0
 
 
-def decode_image(data: bytes) -> np.ndarray:
-    """Decode a PNG of 8 bits into (H, W, 3), uint8, RGB."""
+def _decode_image(data: bytes) -> np.ndarray:
     return np.ascontiguousarray(_decode_png(data, np.uint8, 3)[..., ::-1])
 
 
@@ -153,15 +152,16 @@ def _encode_map(name: str, value: np.ndarray, maps: Mapping[str, np.ndarray]) ->
     return _encode_png(levels.astype(np.uint16), _MAP_OPTIONS)
 
 
+def _decode_map(name: str, data: bytes) -> np.ndarray:
+    if name in FLOWS:
+        return decode_flow(data)[0]
+    if name in MASKS:
+        return _decode_png(data, np.uint8, 1) > 0
+    return _decode_png(data, np.uint16, 1).astype(np.float32) / LIGHTS[name]
+
+
 def _encode_png(pixels: np.ndarray, options: list[int]) -> bytes:
     return cv2.imencode(".png", np.ascontiguousarray(pixels), options)[1].tobytes()
-
-
-def _encode_npz(arrays: dict[str, Any]) -> bytes:
-    """Encode without compression, which gains little on flows in float32."""
-    stream = io.BytesIO()
-    np.savez(stream, **arrays)
-    return stream.getvalue()
 
 
 def _decode_npz(data: bytes) -> dict[str, np.ndarray]:
@@ -189,14 +189,3 @@ def _decode_png(data: bytes, dtype: type, channels: int) -> np.ndarray:
     if pixels is None or pixels.dtype != dtype or pixels.ndim != (3 if channels == 3 else 2):
         raise DamagedPairError(f"it is not a PNG of {channels} channels of {np.dtype(dtype).itemsize * 8} bits")
     return pixels
-
-
-def _light_decoder(name: str) -> Callable[[bytes], np.ndarray]:
-    return lambda data: _decode_png(data, np.uint16, 1).astype(np.float32) / LIGHTS[name]
-
-
-_DECODERS: dict[str, Callable[[bytes], np.ndarray]] = {
-    **{name: lambda data: decode_flow(data)[0] for name in FLOWS},
-    **{name: _light_decoder(name) for name in LIGHTS},
-    **{name: lambda data: _decode_png(data, np.uint8, 1) > 0 for name in MASKS},
-}

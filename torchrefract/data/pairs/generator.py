@@ -1,20 +1,36 @@
-"""Generation of one pair: list clean frames, read one, degrade it by its own draw, encode the files."""
+"""Generation of pairs: list clean frames, read one, degrade it by its own draw, encode and write it, in processes.
+
+A pair or a tar is always complete. Files are written under a hidden name and then renamed. They are not flushed to
+disk one by one, which would take longer than everything else. A kill loses nothing. After a power cut, a file may be
+short, which the next run detects by its size, or hold zeros, which verify=true detects.
+"""
 
 import hashlib
+import io
+import json
 import math
+import multiprocessing
+import os
+import signal
+import tarfile
+import threading
 import warnings
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.context import BaseContext
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchrefract._io import replace_file
 from torchrefract._validation import UsageError
-from torchrefract.data.frames import assign_frames, list_files, path_key, select_val_drives
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, as_image, fit, pixels_of, read_pixels
+from torchrefract.data.frames import Source, assign_frames, list_files, path_key, select_val_drives
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, pixels_of, read_image
 from torchrefract.data.media import VIDEOS, read_video, video_info
 from torchrefract.data.pairs.files import FLOWS, LIGHTS, PairArrays, count_out_of_range, encode_pair
 from torchrefract.data.pairs.manifest import PairRow, StoredFile
@@ -22,19 +38,9 @@ from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
 from torchrefract.types import Degraded
 
-
-class Source(NamedTuple):
-    """A clean frame."""
-
-    path: str  # relative to the root, with forward slashes
-    drive: str
-    split: str  # train, val, or empty for frames outside of the folders train and val
-    frame: int | None = None  # index in a video
-
-    @property
-    def name(self) -> str:
-        """A name that is unique in the root."""
-        return self.path if self.frame is None else f"{self.path}#{self.frame}"
+_PAIRS_PER_FOLDER = 1000
+_DISK_BLOCK, _TAR_BLOCK = 4096, 512  # bytes
+_QUEUED_UNITS = 2  # for each worker, so that none waits
 
 
 class Sources(NamedTuple):
@@ -62,7 +68,7 @@ class Sources(NamedTuple):
 
 
 class SourceReader:
-    """Reads clean frames. Frames of a video are read fastest in their order.
+    """Reads clean frames. Frames of a video are read fastest in their order. A new reader can be pickled.
 
     Args:
         root: folder of the sources.
@@ -71,44 +77,29 @@ class SourceReader:
 
     def __init__(self, root: Path, size: tuple[int, int] | None):
         self.root, self.size = root, size
-        self._next_index = 0
-        self._video: tuple[str, int, Iterator[tuple[int, Tensor]]] | None = None  # path, last index, further frames
+        self._video, self._index = "", -1  # path and frame that were read last
+        self._frames: Iterator[tuple[int, Tensor]] = iter(())
 
-    def read(self, source: Source) -> tuple[Tensor, np.ndarray]:
-        """Read a frame.
-
-        Returns:
-            image: (3, H, W), float32, in [0, 1].
-            pixels: (H, W, 3), uint8, the image rounded to 8 bits.
+    def read(self, source: Source) -> Tensor:
+        """Read a frame (3, H, W), float32, in [0, 1].
 
         Raises:
             UnreadableImageError: the file is damaged, or the video ends before the frame.
         """
-        if source.frame is not None:
-            image = self._fit(self._read_video(source.path, source.frame))
-            return image, pixels_of(image)
-        pixels = read_pixels(self.root / source.path)
-        image = self._fit(as_image(pixels))
-        is_unchanged = pixels.dtype == np.uint8 and pixels.shape[:2] == image.shape[1:]
-        return image, pixels if is_unchanged else pixels_of(image)
-
-    def _fit(self, image: Tensor) -> Tensor:
+        path = self.root / source.path
+        image = read_image(path) if source.frame is None else self._read_video(source.path, source.frame)
         return image.contiguous() if self.size is None else fit(image, self.size)
 
     def _read_video(self, path: str, index: int) -> Tensor:
-        if self._video is None or self._video[0] != path or self._video[1] >= index:
-            self._video = (path, -1, read_video(self.root / path, self._indices()))
-        frames, self._next_index = self._video[2], index
-        self._video = (path, index, frames)
-        frame = next(frames, None)
+        if path != self._video or index <= self._index:
+            # Each further frame is the one that `_index` names by then.
+            self._frames = read_video(self.root / path, iter(lambda: self._index, None))
+        self._video, self._index = path, index
+        frame = next(self._frames, None)
         if frame is None:
-            self._video = None
+            self._video = ""
             raise UnreadableImageError(f"{self.root / path} ends before its frame {index}")
         return frame[1][0]
-
-    def _indices(self) -> Iterator[int]:
-        while True:
-            yield self._next_index
 
 
 def find_sources(
@@ -116,16 +107,11 @@ def find_sources(
 ) -> Sources:
     """List the frames of a folder of images, a video or a folder of videos, with drives and splits.
 
-    Args:
-        source: the folder or the video.
-        size: smallest (height, width) of images, px; None for no limit.
-        every: step between the frames of a video.
-        drive_by, val_share, seed: as for `FrameFolder`. Videos of one folder are a drive each; of several folders, each
-            folder is a drive.
+    Arguments and errors are those of `FrameFolder`; with size None, images may have any size. Each `every`-th frame of
+    a video is listed. Videos of one folder are a drive each; of several folders, each folder is a drive.
 
     Raises:
         UsageError: there are no images or videos, or both.
-        ValueError, OSError: as of `FrameFolder`.
     """
     if not source.exists():
         raise UsageError(f"source must be a folder of images or videos, or a video, got {source}, which does not exist")
@@ -136,10 +122,10 @@ def find_sources(
     files = sorted(path.relative_to(source).as_posix() for path in list_files(source))
     videos = [file for file in files if file.lower().endswith(VIDEOS)]
     if not videos:
-        frames, skipped = assign_frames(source, size=size, drive_by=drive_by, val_share=val_share, seed=seed)
+        options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
+        frames, skipped = assign_frames(source, size=size, split=None, **options)
         has_one_drive = len({(frame.drive, frame.split) for frame in frames}) < 2
-        names = [path.relative_to(source).as_posix() for path, _ in skipped]
-        return Sources(source, [Source(*frame) for frame in frames], names, has_one_drive)
+        return Sources(source, frames, [path.relative_to(source).as_posix() for path, _ in skipped], has_one_drive)
     if images := [file for file in files if file.lower().endswith(EXTENSIONS)]:
         both = f"{images[0]} and {videos[0]}"
         raise UsageError(f"source must hold images or videos, got both in {source}, such as {both}")
@@ -161,38 +147,12 @@ def _find_video_frames(root: Path, paths: Sequence[str], every: int, val_share: 
 
 
 def draw_of(source: Source, *, seed: int, repeat: int) -> tuple[int, int]:
-    """Return the seed and the key of the draw for a source.
+    """Return the seed and the key of the draw for a source that was used `repeat` times before, in a set of a seed.
 
     At repeat 0 they are those of the first epoch of `PairData` with the same seed, and of its validation.
-
-    Args:
-        source: the frame.
-        seed: of the set.
-        repeat: how many times the source was used before.
     """
     key = path_key(source.name if repeat == 0 else f"{source.name}\0{repeat}")
     return (seed << 32) + (source.split != "val"), key
-
-
-@dataclass(frozen=True)
-class GenerationConfig:
-    """Everything that a pair depends on, apart from its number and its frame.
-
-    Args:
-        effect: degrades the frames.
-        scene: name of the effect.
-        root: folder of the frames.
-        size: (height, width), px, to crop and reduce frames to; None keeps their size.
-        seed: of the draws.
-        maps: format of the maps: "png", "npz" or "safetensors".
-    """
-
-    effect: Effect
-    scene: str
-    root: Path
-    size: tuple[int, int] | None
-    seed: int
-    maps: str
 
 
 class PairTask(NamedTuple):
@@ -210,12 +170,14 @@ class GeneratedPair(NamedTuple):
     data: dict[str, bytes]  # content of each file by the suffix of its name; empty if the frame was skipped
 
 
-class PairGenerator:
+class PairGenerator(NamedTuple):
     """Generates pairs on the CPU, one at a time, so that a pair has the same bytes in any order and process."""
 
-    def __init__(self, config: GenerationConfig):
-        self.config = config
-        self._reader = SourceReader(config.root, config.size)
+    effect: Effect
+    scene: str  # name of the effect
+    reader: SourceReader
+    seed: int
+    maps: str  # format of the maps: png, npz or safetensors
 
     def generate(self, task: PairTask) -> GeneratedPair:
         """Generate a pair. An unreadable frame gives a row with the reason and no files.
@@ -223,43 +185,38 @@ class PairGenerator:
         Raises:
             UsageError: the scene, the size or the format of the maps does not suit the frame.
         """
-        config = self.config
+        source = task.source
+        seed, key = draw_of(source, seed=self.seed, repeat=task.repeat)
+        origin = (source.path, source.frame, source.drive, source.split)
+        row = PairRow(task.number, *origin, self.scene, seed, key, height=0, width=0, effects=[], beyond={}, files={})
         try:
-            image, pixels = self._reader.read(task.source)
+            image = self.reader.read(source)
         except UnreadableImageError as error:
-            return GeneratedPair(self._row(task, (0, 0), skipped=str(error).replace(f"{config.root}/", "")), {})
+            return GeneratedPair(row._replace(skipped=str(error).replace(f"{self.reader.root}/", "")), {})
         except ValueError as error:
             raise UsageError(f"size: {error}") from error
-        seed, key = draw_of(task.source, seed=config.seed, repeat=task.repeat)
         try:
             with warnings.catch_warnings(), torch.no_grad():
                 warnings.simplefilter("ignore", UserWarning)  # of folded pixels, which the masks exclude
-                degraded = config.effect.degrade(image[None], seed=seed, keys=[key])
+                degraded = self.effect.degrade(image[None], seed=seed, keys=[key])
         except (ValueError, TypeError, OSError) as error:
             raise UsageError(f"scene: {error}") from error
-        pair = PairArrays(pixels, pixels_of(degraded.image[0]), _maps(degraded))
+        pair = PairArrays(pixels_of(image), pixels_of(degraded.image[0]), _maps(degraded))
         try:
-            data = encode_pair(pair, config.maps)
+            data = encode_pair(pair, self.maps)
         except ValueError as error:
             raise UsageError(f"maps: {error}") from error
-        row = self._row(
-            task,
-            (image.shape[1], image.shape[2]),
-            effects=applied_effects(config.effect, degraded.params),
-            beyond=_count_out_of_range(pair) if config.maps == "png" else {},
+        row = row._replace(
+            height=image.shape[1],
+            width=image.shape[2],
+            effects=_applied_effects(self.effect, degraded.params),
+            beyond=count_out_of_range(pair.maps) if self.maps == "png" else {},
             files={name: StoredFile("", len(x), hashlib.sha256(x).hexdigest()) for name, x in data.items()},
         )
         return GeneratedPair(row, data)
 
-    def _row(self, task: PairTask, size: tuple[int, int], **rest: Any) -> PairRow:
-        seed, key = draw_of(task.source, seed=self.config.seed, repeat=task.repeat)
-        source, (height, width) = task.source, size
-        origin = (source.path, source.frame, source.drive, source.split)
-        empty: dict[str, Any] = {"effects": [], "beyond": {}, "files": {}}
-        return PairRow(task.number, *origin, self.config.scene, seed, key, height, width, **(empty | rest))
 
-
-def applied_effects(effect: Effect, params: Any) -> list[dict[str, Any]]:
+def _applied_effects(effect: Effect, params: Any) -> list[dict[str, Any]]:
     """Return the name and the parameters of each effect that was applied to the first sample, in order."""
     leaves = effect.effects_with_params(params) if isinstance(effect, Compose) else [(effect, params)]
     return [
@@ -285,7 +242,147 @@ def _maps(degraded: Degraded) -> dict[str, np.ndarray]:
     return maps | {name: getattr(degraded, name)[0, 0].float().numpy() for name in LIGHTS if degraded.has(name)}
 
 
-def _count_out_of_range(pair: PairArrays) -> dict[str, int]:
-    maps = pair.maps
-    counts = {name: count_out_of_range(maps[name], maps[mask]) for name, mask in FLOWS.items() if name in maps}
-    return {name: count for name, count in counts.items() if count}
+class PairStorage(NamedTuple):
+    """Writes units of pairs, each completely or not at all.
+
+    Without `tar`, a unit is a pair of files, as pairs/00012/00012345.clean.png. Otherwise it is a tar of that many
+    pairs in WebDataset's layout, as tars/00000012.tar, in which each pair has its row of the manifest as a further file
+    with the suffix json.
+    """
+
+    out: Path  # the folder of the set
+    tar: int | None
+
+    @property
+    def unit(self) -> int:
+        """The number of pairs in a unit."""
+        return self.tar or 1
+
+    def write(self, tasks: Sequence[PairTask], generator: PairGenerator) -> list[PairRow]:
+        """Generate and write the pairs of a unit; return their rows."""
+        if self.tar is None:
+            return [self._write_files(generator.generate(task)) for task in tasks]
+        path = f"tars/{tasks[0].number // self.tar:08d}.tar"
+        target = self.out / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with (
+            replace_file(target, alone=True) as temporary,
+            tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar,
+        ):
+            return [_add_pair(tar, generator.generate(task), path) for task in tasks]
+
+    def disk_bytes(self, pair: GeneratedPair) -> int:
+        """Return the size of a pair on disk, with its row: files fill blocks, and those of a tar have a header."""
+        sizes, block, header = [len(data) for data in pair.data.values()], _DISK_BLOCK, 0
+        if self.tar is not None:
+            sizes.append(len(_row_without_files(pair.row)))
+            block = header = _TAR_BLOCK
+        return sum(header + math.ceil(size / block) * block for size in sizes) + len(pair.row.as_line())
+
+    def _write_files(self, pair: GeneratedPair) -> PairRow:
+        folder, files = f"pairs/{pair.row.number // _PAIRS_PER_FOLDER:05d}", {}
+        for suffix, data in pair.data.items():
+            files[suffix] = file = pair.row.files[suffix]._replace(path=f"{folder}/{pair.row.name}.{suffix}")
+            (self.out / folder).mkdir(parents=True, exist_ok=True)
+            with replace_file(self.out / file.path, alone=True) as temporary:
+                temporary.write_bytes(data)
+        return pair.row._replace(files=files)
+
+
+def _row_without_files(row: PairRow) -> bytes:
+    document = row._asdict()
+    del document["files"]
+    return json.dumps(document).encode()
+
+
+def _add_pair(tar: tarfile.TarFile, pair: GeneratedPair, path: str) -> PairRow:
+    row, files = pair.row, {}
+    for suffix, data in pair.data.items():
+        files[suffix] = row.files[suffix]._replace(path=path, offset=_add_file(tar, f"{row.name}.{suffix}", data))
+    if files:
+        _add_file(tar, f"{row.name}.json", _row_without_files(row))
+    return row._replace(files=files)
+
+
+def _add_file(tar: tarfile.TarFile, name: str, data: bytes) -> int:
+    """Add a file without time and owner, so that its bytes are reproducible; return the offset of its content."""
+    start, info = tar.offset, tarfile.TarInfo(name)
+    info.size = len(data)
+    tar.addfile(info, io.BytesIO(data))
+    return start + _TAR_BLOCK
+
+
+def generate_pairs(
+    units: Iterable[Sequence[PairTask]], generator: PairGenerator, storage: PairStorage, *, workers: int
+) -> Iterator[list[PairRow]]:
+    """Generate and write units of pairs in processes, or in this one with `workers` 0.
+
+    Yields:
+        the rows of each unit when it is written, in any order.
+
+    Raises:
+        UsageError: a worker was killed.
+        Exception: any error of a worker, after the others have finished their units.
+    """
+    if workers == 0:
+        use_one_thread()
+        yield from (storage.write(unit, generator) for unit in units)
+        return
+    pool = ProcessPoolExecutor(workers, mp_context=_context(), initializer=_start, initargs=(generator, storage))
+    pending = set[Future[list[PairRow]]]()
+    try:
+        for unit in units:
+            pending.add(pool.submit(_write, unit))
+            if len(pending) >= _QUEUED_UNITS * workers:
+                done, pending = wait(pending, return_when=FIRST_COMPLETED)
+                yield from (future.result() for future in done)
+        while pending:
+            done, pending = wait(pending, return_when=FIRST_COMPLETED)
+            yield from (future.result() for future in done)
+    except BrokenProcessPool as error:
+        raise UsageError(
+            f"workers must fit the memory, got {workers} of which one was killed; pairs that are written stay, and the "
+            "same command continues"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def use_one_thread() -> None:
+    """Limit PyTorch and OpenCV to one thread in this process."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+
+
+def _context() -> BaseContext:
+    """Choose the start method of workers: forking this process, which has threads, could hang."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    multiprocessing.set_forkserver_preload([__name__])  # imported once, not in each worker
+    return multiprocessing.get_context("forkserver")
+
+
+class _Worker:
+    """The state of a worker process between units."""
+
+    generator: PairGenerator
+    storage: PairStorage
+
+
+def _start(generator: PairGenerator, storage: PairStorage) -> None:
+    use_one_thread()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    _Worker.generator, _Worker.storage = generator, storage
+
+
+def _exit_with_parent() -> None:
+    """Exit if the parent is killed; otherwise the worker could write at the same time as the next run."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _write(unit: Sequence[PairTask]) -> list[PairRow]:
+    return _Worker.storage.write(unit, _Worker.generator)

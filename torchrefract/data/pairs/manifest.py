@@ -6,9 +6,11 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError
@@ -54,7 +56,7 @@ class PairRow(NamedTuple):
     @property
     def name(self) -> str:
         """The beginning of the names of the pair's files."""
-        return pair_name(self.number)
+        return f"{self.number:08d}"
 
     def as_line(self) -> str:
         """Return the row as a line of JSON."""
@@ -68,11 +70,6 @@ class RowLocation(NamedTuple):
     manifest: Path
     offset: int
     length: int
-
-
-def pair_name(number: int) -> str:
-    """Return the beginning of the names of a pair's files."""
-    return f"{number:08d}"
 
 
 def read_row(line: bytes) -> PairRow:
@@ -118,15 +115,9 @@ def find_manifests(root: Path) -> list[Path]:
 def scan_rows(
     paths: Iterable[Path], keep: Callable[[PairRow], bool], *, skip_invalid: bool = False
 ) -> Iterator[tuple[PairRow, RowLocation]]:
-    """Yield rows and their locations; of a pair that has several rows, the first one.
+    """Yield the rows of manifests that `keep` selects and their locations; of several rows of a pair, the first one.
 
-    Args:
-        paths: the manifest files.
-        keep: returns True for the rows to yield.
-        skip_invalid: True to skip invalid lines, which a kill or a full disk leaves behind.
-
-    Raises:
-        DamagedPairError: a line is invalid, and `skip_invalid` is False.
+    Invalid lines, which a kill or a full disk leaves behind, are skipped, or raise DamagedPairError.
     """
     seen = set[int]()
     for path in paths:
@@ -147,24 +138,17 @@ def scan_rows(
 
 def read_lines(locations: Iterable[RowLocation]) -> Iterator[bytes]:
     """Yield the lines at some locations, each with its line break."""
-    streams = {}
-    try:
-        for location in locations:
-            path = location.manifest
-            stream = streams.get(path) or streams.setdefault(path, path.open("rb"))
-            stream.seek(location.offset)
-            yield stream.read(location.length).rstrip(b"\n") + b"\n"
-    finally:
-        for stream in streams.values():
-            stream.close()
+    with ExitStack() as stack:
+        streams = dict[Path, BinaryIO]()
+        for path, offset, length in locations:
+            if path not in streams:
+                streams[path] = stack.enter_context(path.open("rb"))
+            streams[path].seek(offset)
+            yield streams[path].read(length).rstrip(b"\n") + b"\n"
 
 
 def read_stored(root: Path, file: StoredFile) -> bytes:
-    """Read a file of a pair.
-
-    Raises:
-        DamagedPairError: the file is missing or too short.
-    """
+    """Read a file of a pair; raises DamagedPairError if it is missing or too short."""
     try:
         with (root / file.path).open("rb") as stream:
             stream.seek(file.offset)
@@ -178,10 +162,7 @@ def read_stored(root: Path, file: StoredFile) -> bytes:
 
 
 class Manifest:
-    """The manifest that a shard writes.
-
-    A set of one shard has manifest.jsonl; a set of several has one file for each shard.
-    """
+    """The manifest that a shard writes: manifest.jsonl if there is a single one, otherwise one file for each shard."""
 
     def __init__(self, out: Path, shard: int, shards: int):
         self.out = out
@@ -190,19 +171,16 @@ class Manifest:
     def open(self, is_in_shard: Callable[[int], bool], *, verify: bool) -> tuple[set[int], int]:
         """Write the rows of this shard whose files exist, from all manifests of the folder.
 
-        Args:
-            is_in_shard: returns True for the number of a pair of this shard.
-            verify: True to compare checksums instead of sizes. Files that disagree are then deleted, and frames that
-                were skipped are dropped, to be tried again.
+        With `verify`, checksums are compared too, files that disagree are deleted, and frames that were skipped are
+        dropped, to be tried again.
 
         Returns:
             the numbers of complete pairs, and the number of damaged pairs that `verify` has detected.
         """
         rows = scan_rows(find_manifests(self.out), lambda row: is_in_shard(row.number), skip_invalid=True)
-        kept, damaged = [], 0
+        kept, damaged, check = [], 0, partial(self._is_complete, verify=verify)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             while chunk := list(islice(rows, _CHUNK)):
-                check = self._has_checksums if verify else self._has_sizes
                 for (row, location), is_complete in zip(chunk, pool.map(check, [row for row, _ in chunk]), strict=True):
                     if is_complete and not (verify and row.skipped):
                         kept.append((row.number, location))
@@ -227,30 +205,25 @@ class Manifest:
         with replace_file(self.path, alone=True) as temporary, temporary.open("wb") as stream:
             stream.writelines(read_lines(location for _, location in sorted(rows)))
 
-    def _has_sizes(self, row: PairRow) -> bool:
+    def _is_complete(self, row: PairRow, *, verify: bool) -> bool:
+        """Return True if the files of a pair have their sizes and, with `verify`, their checksums."""
         try:
             sizes = {path: (self.out / path).stat().st_size for path in {file.path for file in row.files.values()}}
-        except OSError:
+            for file in row.files.values():
+                end = file.offset + file.bytes
+                if sizes[file.path] < end or (file.offset == 0 and sizes[file.path] > end):  # a tar continues
+                    return False
+                if verify and hashlib.sha256(read_stored(self.out, file)).hexdigest() != file.sha256:
+                    return False
+        except (OSError, DamagedPairError):
             return False
-        # A tar continues after a file.
-        return all(
-            sizes[file.path] >= file.offset + file.bytes if file.offset else sizes[file.path] == file.bytes
-            for file in row.files.values()
-        )
-
-    def _has_checksums(self, row: PairRow) -> bool:
-        try:
-            files = [(read_stored(self.out, file), file.sha256) for file in row.files.values()]
-        except DamagedPairError:
-            return False
-        return self._has_sizes(row) and all(hashlib.sha256(data).hexdigest() == expected for data, expected in files)
+        return True
 
 
 def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[str, Any]) -> dict[str, Any]:
     """Create an output folder, or check that it has the same settings, and write its config.json.
 
     Args:
-        out: the folder.
         settings: everything that determines the content, of types that JSON has.
         count: number of results; a later run may raise it.
         about: further entries of config.json that do not change the content.
@@ -268,7 +241,12 @@ def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[
     # List the folder before testing for config.json, because another shard may be writing to it.
     others = sorted(file.name for file in out.iterdir() if not file.name.startswith("."))
     if path.is_file():
-        previous = _read(path)
+        try:
+            previous = json.loads(path.read_bytes())
+        except ValueError:
+            previous = None
+        if not isinstance(previous, dict):
+            raise UsageError(f"out must be a folder with a valid {_CONFIG}, got {path}, which is damaged")
         _check_same(previous.get("settings", {}), new, out)
         if count < previous.get("count", 0):
             raise UsageError(f"count must be at least that of the pairs in {out}, {previous['count']}, got {count}")
@@ -279,16 +257,6 @@ def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[
         with replace_file(path) as temporary:
             temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     return previous
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_bytes())
-    except ValueError:
-        document = None
-    if not isinstance(document, dict):
-        raise UsageError(f"out must be a folder with a valid {path.name}, got {path}, which is damaged")
-    return document
 
 
 def _check_same(previous: Any, new: Any, out: Path) -> None:

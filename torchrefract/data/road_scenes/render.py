@@ -1,23 +1,99 @@
-"""Rendering of a road scene: sky and ground in closed form, then panels with a depth buffer.
+"""Rendered dashcam frames of southern African roads, with their true depth: clean frames without files.
 
-Each pixel is sampled by five rays. A ray's direction has length 1 along the camera's axis, so that its parameter is
-the depth. The product of a fixed vector and the direction is linear in the pixel's column and row.
+Sky and ground are drawn in closed form, then panels with a depth buffer. Each pixel is sampled by five rays. A ray's
+direction has length 1 along the camera's axis, so that its parameter is the depth. The product of a fixed vector and
+the direction is linear in the pixel's column and row.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
 
-from torchrefract.data.road_scenes.scene import Array, Color, Light, Panel, Road, Scene, View, noise
+from torchrefract._validation import check_count, check_size, check_tensor
+from torchrefract.data.road_scenes.scene import (
+    Array,
+    Color,
+    Light,
+    Panel,
+    Road,
+    Scene,
+    View,
+    draw_scene,
+    noise,
+    scale_color,
+)
+from torchrefract.types import Frame
 
 Window = tuple[slice, slice, slice]  # rays, rows, columns
 
+_SMALLEST = 8  # px a side
+_BITS = (1 << 64) - 1  # negative seeds and keys count modulo 2^64
 # Position of each ray in its pixel, (right, down), px from the center, on distinct rows and columns.
 _OFFSETS = np.array([(0.0, 0.0), (-0.15, -0.4), (0.4, -0.15), (0.15, 0.4), (-0.4, 0.15)])
 _NEAR, _FAR = 0.2, 3e4  # m
 _CLOUD_HEIGHT, _CLOUD_SCALE = 900.0, 170.0  # m; size of clouds in multiples of the texture of the ground
 _HAZE = 9000.0  # m, the distance at which contrast is one half
-_CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+
+
+class RoadScenes(Dataset[Frame]):
+    """Rendered road scenes with their depth, see `render_road_scenes`.
+
+    Args:
+        count: number of scenes.
+        size: (height, width), px, each at least 8.
+        seed: any integer of 64 bits.
+        first: key of the first scene; the others follow.
+    """
+
+    def __init__(self, count: int, *, size: Sequence[int] = (64, 112), seed: int = 0, first: int = 0):
+        self.count = check_count("count", count)
+        self.size = check_size("size", size)
+        check_count("size", min(self.size), low=_SMALLEST)
+        self.seed = check_count("seed", seed, low=-(2**63))
+        self.first = check_count("first", first, low=-(2**63))
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> Frame:
+        """Render a frame: image (3, H, W), key () and depth (1, H, W)."""
+        if not -self.count <= index < self.count:
+            raise IndexError(f"index must lie in [{-self.count}, {self.count - 1}], got {index}")
+        key = torch.tensor(self.first + index % self.count)
+        image, depth = render_road_scenes(key[None], *self.size, seed=self.seed)
+        return Frame(image[0], key, depth[0])
+
+
+def render_road_scenes(keys: Tensor, height: int, width: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Render road scenes on the CPU; a frame depends on its key and the seed alone.
+
+    Args:
+        keys: (B,), int64, B >= 1.
+        height, width: px, at least 8. The longer side sets the field of view, so that a scene is alike at all sizes.
+        seed: any integer of 64 bits; scenes of different seeds are independent.
+
+    Returns:
+        image: (B, 3, H, W), float32, in [0, 1], on the device of `keys`; each pixel is the mean of five rays.
+        depth: (B, 1, H, W), float32, m along the camera's axis of the ray through the pixel's center; inf for the sky.
+
+    Raises:
+        ValueError: `keys` has another shape, or a side is below 8.
+        TypeError: `keys` is not an int64 tensor.
+    """
+    if check_tensor("keys", keys).ndim != 1 or len(keys) == 0:
+        raise ValueError(f"keys must have shape (B,) with B >= 1, got {tuple(keys.shape)}")
+    if keys.dtype != torch.int64:
+        raise TypeError(f"keys must be int64, got {keys.dtype}")
+    check_count("height", height, low=_SMALLEST)
+    check_count("width", width, low=_SMALLEST)
+    generators = [np.random.default_rng((seed & _BITS, key & _BITS)) for key in keys.tolist()]
+    images, depths = zip(*(render(draw_scene(random), height, width) for random in generators), strict=True)
+    image = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous()
+    return image.to(keys.device), torch.from_numpy(np.stack(depths)[:, None]).to(keys.device)
 
 
 class Camera:
@@ -41,22 +117,15 @@ class Camera:
         right, down, ahead = self.axes @ (points - self.position).T
         if (ahead < _NEAR).any():  # the projection of a hull that reaches behind the camera has no bounds
             return None if (ahead < _NEAR).all() else self.frame
-        rows, columns = (
-            slice(max(int(place.min() - 1), 0), min(int(place.max() + 2), limit))
-            for place, limit in (
-                (x / ahead * self.scale + n / 2, n) for x, n in zip((down, right), self.size, strict=True)
-            )
-        )
-        return (slice(None), rows, columns) if rows.start < rows.stop and columns.start < columns.stop else None
+        places = np.stack([down, right]) / ahead * self.scale + np.array(self.size)[:, None] / 2
+        first = np.maximum(places.min(axis=1) - 1, 0).astype(int)
+        last = np.minimum(places.max(axis=1) + 2, self.size).astype(int)
+        rows, columns = map(slice, first, last)
+        return (slice(None), rows, columns) if (first < last).all() else None
 
 
 def render(scene: Scene, height: int, width: int) -> tuple[Array, Array]:
-    """Render a scene.
-
-    Returns:
-        image: (H, W, 3), float32, in [0, 1]; the mean of five rays.
-        depth: (H, W), float32, m along the camera's axis of the ray through the pixel's center; inf for the sky.
-    """
+    """Render the image (H, W, 3) and the depth (H, W) of a scene, float32."""
     camera = Camera(scene.view, height, width)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         drop = -camera.dot(np.array([0.0, 1.0, 0.0]), camera.frame)
@@ -73,7 +142,7 @@ def render(scene: Scene, height: int, width: int) -> tuple[Array, Array]:
 def _draw_panel(panel: Panel, camera: Camera, light: Light, color: Array, depth: Array) -> None:
     """Draw a panel where it is nearer than `depth`; changes `color` and `depth`."""
     distance = float(panel.normal @ (panel.center - camera.position))
-    window = camera.window(panel.center + _CORNERS @ (panel.right, panel.up))
+    window = camera.window(panel.corners)
     if window is None:
         return
     t = np.float32(distance) / camera.dot(panel.normal, window)
@@ -86,8 +155,7 @@ def _draw_panel(panel: Panel, camera: Camera, light: Light, color: Array, depth:
 
 def _cast_shadow(panel: Panel, camera: Camera, sun: Array, depth: Array, is_shaded: Array) -> None:
     """Mark the rays that meet the ground where the panel hides the sun; changes `is_shaded`."""
-    corners = panel.center + _CORNERS @ (panel.right, panel.up)
-    window = camera.window(corners - np.outer(corners[:, 1], sun / sun[1]))
+    window = camera.window(panel.corners - np.outer(panel.corners[:, 1], sun / sun[1]))
     if window is None:
         return
     ground, start = depth[window], np.float32(panel.normal @ (camera.position - panel.center))
@@ -122,13 +190,9 @@ def _backdrop(scene: Scene, camera: Camera, depth: Array, is_shaded: Array) -> A
     footprint = plane_depth / camera.scale / size * np.maximum(1, 0.5 / np.abs(rise))
     plane = (camera.position[0] + plane_depth * x[0]) / size, plane_depth * z[0] / size
     # Noise of four cell sizes, each faded out where a pixel covers more than about one cell.
-    grain = np.stack(
-        [
-            noise(plane[0] / cell + road.shift[0], plane[1] / cell + road.shift[1]) / (1 + (footprint / cell) ** 2)
-            for cell in (0.035, 0.2, 1.3, 8.0)
-        ]
-    ).astype(np.float32)
-    grain = np.broadcast_to(grain[:, None], (4, *depth.shape))
+    cells = np.array([0.035, 0.2, 1.3, 8.0])[:, None, None]
+    grain = noise(plane[0] / cells + road.shift[0], plane[1] / cells + road.shift[1]) / (1 + (footprint / cells) ** 2)
+    grain = np.broadcast_to(grain[:, None].astype(np.float32), (4, *depth.shape))
     color, is_ground = np.empty((*depth.shape, 3), np.float32), y < 0
     color[~is_ground] = _tone(_sky(light, np.stack([x, y, z])[:, ~is_ground], grain[:, ~is_ground]))
     t = np.minimum(depth[is_ground], _FAR)
@@ -148,12 +212,12 @@ def _ground(road: Road, x: Array, z: Array, grain: Array) -> Array:
     shade, ragged = 0.3 * fine + 0.2 * small, middle + 0.4 * small
     tuft = np.clip(0.62 + coarse + 0.6 * middle + 0.5 * small + 0.3 * fine, 0, 1)
     tuft[distance < road.half_width + 1.1 * road.is_paved + 0.3 * ragged] = 0  # the shoulder is bare
-    albedo = _blend(_times(soil, 1 + shade), _times(grass, 1 + 1.3 * shade + 0.25 * middle), tuft)
+    albedo = _blend(scale_color(soil, 1 + shade), scale_color(grass, 1 + 1.3 * shade + 0.25 * middle), tuft)
     track = np.clip(1 - np.abs(np.abs(distance - road.lane / 2) - 0.8) / 0.5, 0, None)  # of wheels
     surface = (road.asphalt,) * 3 if road.is_paved else _mix((0.42, 0.33, 0.22), (0.44, 0.22, 0.12), road.red_soil)
     tone = 1 + 0.35 * fine + (0.1 + 0.2 * is_gravel) * (small + middle) + (0.32 * is_gravel - 0.14) * track
     is_road = distance < road.half_width + (0.06 + 0.3 * is_gravel) * ragged
-    albedo[is_road] = _times(surface, tone)[is_road]
+    albedo[is_road] = scale_color(surface, tone)[is_road]
     if road.is_paved:
         worn = np.clip(0.85 + 0.2 * fine + 0.2 * small + 0.15 * coarse, 0, 1)
         is_white = (distance < 0.07) & (road.has_solid_line | ((z + road.shift[0]) % 9.0 < 4.0))
@@ -168,10 +232,10 @@ def _sky(light: Light, ray: Array, grain: Array) -> Array:
     rise, toward = ray[1] / length, np.clip(light.sun @ ray / length, 0, 1)
     low = 1 / (1 + 6 * rise)
     sky = _blend(light.zenith, light.horizon, low * low * (1 + rise))
-    sky = sky + _times(light.beam, 0.02 / (1.02 - toward) * (1 - np.clip(light.clouds, 0.2, 0.95)))
+    sky = sky + scale_color(light.beam, 0.02 / (1.02 - toward) * (1 - np.clip(light.clouds, 0.2, 0.95)))
     density = light.clouds + 1.1 * grain[3] + 0.6 * grain[2] + 0.25 * grain[1]
     share = np.clip(density * 1.4, 0, 1) * 0.85 * np.minimum(rise * 14, 1)
-    cloud = _times(light.beam * 0.45 + light.ambient * 0.85, 0.95 - 0.3 * np.clip(density - 0.5, 0, 1))
+    cloud = scale_color(light.beam * 0.45 + light.ambient * 0.85, 0.95 - 0.3 * np.clip(density - 0.5, 0, 1))
     return _blend(sky, cloud, share)
 
 
@@ -186,7 +250,3 @@ def _mix(first: Color, second: Color, share: float) -> Array:
 
 def _blend(under: Array, over: Color, share: Array) -> Array:
     return under + (np.asarray(over, np.float32) - under) * share[..., None]
-
-
-def _times(color: Color, factor: Array) -> Array:
-    return np.asarray(color, np.float32) * factor[..., None]

@@ -6,15 +6,15 @@ albedos.
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 Array = np.ndarray
 Color = Array | tuple[float, ...]
-# u to the right of the middle of a panel and v above its foot, (K,), m -> albedo (K, 3), solid parts (K,), bool.
-Paint = Callable[[Array, Array], tuple[Array, Array]]
+Painted = tuple[Array, Array]  # albedo (K, 3), solid parts (K,), bool
+Paint = Callable[[Array, Array], Painted]  # of u to the right of the middle of a panel and v above its foot, (K,), m
 
 _WALLS = ((0.6, 0.56, 0.48), (0.55, 0.42, 0.25), (0.42, 0.2, 0.12), (0.3, 0.42, 0.45), (0.66, 0.64, 0.6))
 _ROOFS = ((0.32, 0.08, 0.05), (0.33, 0.34, 0.35), (0.09, 0.17, 0.11), (0.3, 0.15, 0.08))
@@ -25,7 +25,9 @@ _WHITE_LAMPS, _RED_LAMPS = (1.6, 1.5, 1.3), (0.75, 0.02, 0.02)
 # Width, length, heights of the belt line and the roof, length of the cabin, distance by which its ends lean in, m.
 _MODELS = ((1.8, 4.4, 0.93, 1.46, 2.7, 0.7), (1.8, 4.8, 1.05, 2.05, 4.5, 0.35))  # car, minibus
 _WHEEL = 0.33  # m, radius
+_CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
 _TILE = 256  # period of the noise, a power of two
+_NOISE = np.random.default_rng(0).uniform(-1, 1, _TILE * _TILE).astype(np.float32)
 
 
 class Road:
@@ -96,6 +98,11 @@ class Panel(NamedTuple):
         return np.array(normal) / math.hypot(*normal)
 
     @property
+    def corners(self) -> Array:
+        """The corners, (4, 3)."""
+        return self.center + _CORNERS @ (self.right, self.up)
+
+    @property
     def inverse_axes(self) -> tuple[Array, Array]:
         """Vectors whose products with a point relative to the center are its coordinates, in [-1, 1] on the panel."""
         return self.right / (self.right @ self.right), self.up / (self.up @ self.up)
@@ -131,28 +138,21 @@ class Body(NamedTuple):
         return self.panel((0, height / 2, 0), (half_width, 0, 0), (0, height / 2, 0), paint)
 
     def box(self, size: tuple, paints: tuple[Paint, ...], *, foot: float = 0.0, inset: float = 0.0) -> list[Panel]:
-        """Return the faces of a box.
+        """Return the faces of a box of (half width, height, half length) whose rear and front lean in by `inset`.
 
         Args:
-            size: half width, height and half length, m.
+            size: m, as are `foot`, the height of the bottom, and `inset`.
             paints: of both sides, rear, front and top.
-            foot: height of its bottom, m.
-            inset: distance by which the upper edges of rear and front lean in, m.
         """
-        w, h, length = size[0], size[1] / 2, size[2]
-        faces: list[tuple] = [((x, foot + h, 0), (0, 0, math.copysign(length, x)), (0, h, 0)) for x in (-w, w)]
-        for z in (-1, 1):
-            faces.append(((0, foot + h, z * (length - inset / 2)), (-z * w, 0, 0), (0, h, -z * inset / 2)))
-        faces.append(((0, foot + 2 * h, 0), (w, 0, 0), (0, 0, length - inset)))
-        return [
-            self.panel(center, right, up, paint)
-            for (center, right, up), paint in zip(faces, paints[:1] + paints, strict=True)
-        ]
-
-
-@cache
-def _noise_tile() -> Array:
-    return np.random.default_rng(0).uniform(-1, 1, _TILE * _TILE).astype(np.float32)
+        w, h, length, lean = size[0], size[1] / 2, size[2], inset / 2
+        faces: tuple[tuple, ...] = (
+            ((-w, foot + h, 0), (0, 0, -length), (0, h, 0)),
+            ((w, foot + h, 0), (0, 0, length), (0, h, 0)),
+            ((0, foot + h, lean - length), (w, 0, 0), (0, h, lean)),
+            ((0, foot + h, length - lean), (-w, 0, 0), (0, h, -lean)),
+            ((0, foot + 2 * h, 0), (w, 0, 0), (0, 0, length - inset)),
+        )
+        return [self.panel(*face, paint) for face, paint in zip(faces, paints[:1] + paints, strict=True)]
 
 
 def noise(x: Array, y: Array | float) -> Array:
@@ -161,92 +161,68 @@ def noise(x: Array, y: Array | float) -> Array:
     x, y = x - column, y - row
     x, y = x * x * (3 - 2 * x), y * y * (3 - 2 * y)
     left, top = column.astype(np.int32) & (_TILE - 1), (row.astype(np.int32) & (_TILE - 1)) * _TILE
-    right, bottom, tile = (left + 1) & (_TILE - 1), (top + _TILE) & (_TILE**2 - 1), _noise_tile()
-    upper, lower = tile[top + left], tile[bottom + left]
-    upper, lower = upper + (tile[top + right] - upper) * x, lower + (tile[bottom + right] - lower) * x
+    right, bottom = (left + 1) & (_TILE - 1), (top + _TILE) & (_TILE**2 - 1)
+    upper, lower = _NOISE[top + left], _NOISE[bottom + left]
+    upper, lower = upper + (_NOISE[top + right] - upper) * x, lower + (_NOISE[bottom + right] - lower) * x
     return upper + (lower - upper) * y
 
 
-def _shaded(color: Color, shade: Array) -> Array:
-    return np.asarray(color, np.float32) * shade[:, None]
+def scale_color(color: Color, factor: Array) -> Array:
+    """Multiply a color (3,) or colors (K, 3) by factors (K,)."""
+    return np.asarray(color, np.float32) * factor[..., None]
 
 
 def textured(color: Color, seed: float, scale: float) -> Paint:
     """Paint a solid surface with noise of `scale` cells a meter."""
-    return lambda u, v: (_shaded(color, 1 + 0.2 * noise(u * scale + seed * 256, v * scale)), v >= 0)
+    return lambda u, v: (scale_color(color, 1 + 0.2 * noise(u * scale + seed * 256, v * scale)), v >= 0)
 
 
-def _skyline(color: Color, seed: float, height: float, octaves: dict[float, float]) -> Paint:
+def _skyline(color: Color, seed: float, height: float, octaves: dict[float, float], u: Array, v: Array) -> Painted:
     """Paint hills or bush below a skyline of noise; `octaves` has the amplitude of each cell size, both in heights."""
-
-    def paint(u: Array, v: Array) -> tuple[Array, Array]:
-        top = 0.5 + sum(size * noise(u / height / cell + seed * 256, 77 * cell) for cell, size in octaves.items())
-        texture = noise(u * 4 / height + seed * 256, v * 6 / height)
-        return _shaded(color, 1 + 0.3 * texture), v < height * np.clip(top, 0.1, 1)
-
-    return paint
+    top = 0.5 + sum(size * noise(u / height / cell + seed * 256, 77 * cell) for cell, size in octaves.items())
+    texture = noise(u * 4 / height + seed * 256, v * 6 / height)
+    return scale_color(color, 1 + 0.3 * texture), v < height * np.clip(top, 0.1, 1)
 
 
-def _crown(color: Color, seed: float, half_width: float, half_height: float) -> Paint:
+def _crown(color: Color, seed: float, half_width: float, half_height: float, u: Array, v: Array) -> Painted:
     """Paint leaves in an ellipse whose rim breaks up."""
-    stretch = 0.6 + 0.4 * half_width / half_height
-
-    def paint(u: Array, v: Array) -> tuple[Array, Array]:
-        depth = np.sqrt(np.clip(1 - (u / half_width) ** 2 - (v / half_height - 1) ** 2, 0, None))
-        x, y = u + seed * 256, v * stretch
-        leaf = noise(x * 2.2, y * 2.2) + 0.7 * noise(x * 7.5, y * 7.5)
-        return _shaded(color, (1.1 + 0.6 * leaf) * (0.65 + 0.35 * v / half_height)), depth > 0.4 + 0.35 * leaf
-
-    return paint
+    depth = np.sqrt(np.clip(1 - (u / half_width) ** 2 - (v / half_height - 1) ** 2, 0, None))
+    x, y = u + seed * 256, v * (0.6 + 0.4 * half_width / half_height)
+    leaf = noise(x * 2.2, y * 2.2) + 0.7 * noise(x * 7.5, y * 7.5)
+    return scale_color(color, (1.1 + 0.6 * leaf) * (0.65 + 0.35 * v / half_height)), depth > 0.4 + 0.35 * leaf
 
 
-def _pole(height: float) -> Paint:
+def _pole(height: float, u: Array, v: Array) -> Painted:
     """Paint a mast with an arm for wires."""
-
-    def paint(u: Array, v: Array) -> tuple[Array, Array]:
-        return _shaded(_BARK, 1 + 0.25 * noise(u * 9, v)), (np.abs(u) < 0.13) | (np.abs(height - v - 0.6) < 0.09)
-
-    return paint
+    return scale_color(_BARK, 1 + 0.25 * noise(u * 9, v)), (np.abs(u) < 0.13) | (np.abs(height - v - 0.6) < 0.09)
 
 
-def _wall(color: Color, roof: Color, seed: float, height: float) -> Paint:
+def _wall(color: Color, roof: Color, seed: float, height: float, u: Array, v: Array) -> Painted:
     """Paint a wall with a row of framed windows in each storey, a plinth and the edge of the roof."""
-
-    def paint(u: Array, v: Array) -> tuple[Array, Array]:
-        along, storey = u / (2.4 + seed) + 100.5, np.abs(v % 2.9 - 1.5)
-        middle = np.abs(along - np.floor(along) - 0.5)
-        frame = (middle < 0.29) & (storey < 0.65) & (v < height - 0.6)
-        albedo = _shaded(color, np.where(v < 0.35, 0.6, 1 + 0.08 * noise(u + seed * 256, v)))
-        albedo[frame], albedo[frame & (np.abs(middle - 0.135) < 0.115) & (storey < 0.55)] = (0.62, 0.6, 0.56), _GLASS
-        albedo[v > height - 0.45] = roof
-        return albedo, v >= 0
-
-    return paint
+    along, storey = u / (2.4 + seed) + 100.5, np.abs(v % 2.9 - 1.5)
+    middle = np.abs(along - np.floor(along) - 0.5)
+    frame = (middle < 0.29) & (storey < 0.65) & (v < height - 0.6)
+    albedo = scale_color(color, np.where(v < 0.35, 0.6, 1 + 0.08 * noise(u + seed * 256, v)))
+    albedo[frame], albedo[frame & (np.abs(middle - 0.135) < 0.115) & (storey < 0.55)] = (0.62, 0.6, 0.56), _GLASS
+    albedo[v > height - 0.45] = roof
+    return albedo, v >= 0
 
 
-def _hull(color: Color, half_width: float, height: float, lamps: Color | None = None) -> Paint:
+def _hull(color: Color, half_width: float, height: float, lamps: Color | None, u: Array, v: Array) -> Painted:
     """Paint the lower part of a vehicle: a side with wheels or, with the color of its lamps, an end."""
-
-    def paint(u: Array, v: Array) -> tuple[Array, Array]:
-        albedo = _shaded(color, np.ones_like(u))
-        wheel = np.hypot(np.abs(u) - 0.62 * half_width, v - _WHEEL) if lamps is None else np.full_like(u, np.inf)
-        albedo[(v < 0.42) | (wheel < 0.41)], albedo[wheel < 0.21] = _DARK, (0.3, 0.3, 0.31)
-        if lamps is not None:
-            albedo[(np.abs(np.abs(u) / half_width - 0.8) < 0.15) & (np.abs(v / height - 0.71) < 0.14)] = lamps
-        return albedo, (v > 0.24) | (wheel < _WHEEL)
-
-    return paint
+    albedo = scale_color(color, np.ones_like(u))
+    wheel = np.hypot(np.abs(u) - 0.62 * half_width, v - _WHEEL) if lamps is None else np.full_like(u, np.inf)
+    albedo[(v < 0.42) | (wheel < 0.41)], albedo[wheel < 0.21] = _DARK, (0.3, 0.3, 0.31)
+    if lamps is not None:
+        albedo[(np.abs(np.abs(u) / half_width - 0.8) < 0.15) & (np.abs(v / height - 0.71) < 0.14)] = lamps
+    return albedo, (v > 0.24) | (wheel < _WHEEL)
 
 
-def _cabin(color: Color, half_width: float, height: float, inset: float = 0.0) -> Paint:
+def _cabin(color: Color, half_width: float, height: float, inset: float, u: Array, v: Array) -> Painted:
     """Paint a trapezoid whose ends lean in by `inset` at the top, with a window."""
-
-    def paint(u: Array, v: Array) -> tuple[Array, Array]:
-        end, albedo = half_width - inset * v / height, _shaded(color, np.ones_like(u))
-        albedo[(np.abs(v / height - 0.48) < 0.38) & (np.abs(u) < end - 0.08)] = _GLASS
-        return albedo, np.abs(u) < end
-
-    return paint
+    end, albedo = half_width - inset * v / height, scale_color(color, np.ones_like(u))
+    albedo[(np.abs(v / height - 0.48) < 0.38) & (np.abs(u) < end - 0.08)] = _GLASS
+    return albedo, np.abs(u) < end
 
 
 def draw_scene(random: np.random.Generator) -> Scene:
@@ -277,7 +253,9 @@ def _horizon(random: np.random.Generator) -> list[Panel]:
         (-306, random.uniform(110, 320), 300, random.uniform(3, 7), random.choice(_LEAVES) * 0.8, bush),
         (306, random.uniform(110, 320), 300, random.uniform(3, 7), random.choice(_LEAVES) * 0.8, bush),
     ):
-        panels.append(Body(x, z).upright(half_width, height, _skyline(color, random.random(), height, octaves)))
+        panels.append(
+            Body(x, z).upright(half_width, height, partial(_skyline, color, random.random(), height, octaves))
+        )
     return panels
 
 
@@ -292,7 +270,7 @@ def _buildings(random: np.random.Generator, road: Road) -> list[Panel]:
         height, seed = 3.1 + 2.9 * (random.integers(2, 7) if is_block else random.integers(0, 2)), random.random()
         offset = road.half_width + random.uniform(6, 12) + half_width + 25 * is_block
         body, roof = road.place((2 * (i % 2) - 1) * offset, z + random.uniform(-4, 4)), random.choice(_ROOFS)
-        wall = _wall(random.choice(_WALLS), roof, seed, height)
+        wall = partial(_wall, random.choice(_WALLS), roof, seed, height)
         paints = wall, wall, wall, textured(roof, seed, 0.7)
         panels += body.box((half_width, height, half_length), paints)
     return panels
@@ -305,7 +283,7 @@ def _poles(random: np.random.Generator, road: Road) -> list[Panel]:
     side, height = random.choice([-1, 1]), random.uniform(7.2, 9.6)
     offset = side * (road.half_width + random.uniform(2.9, 6.9))
     places = random.uniform(9, 24) + random.uniform(24, 45) * np.arange(5)
-    return [road.place(offset, z).upright(1.1, height, _pole(height)) for z in places]
+    return [road.place(offset, z).upright(1.1, height, partial(_pole, height)) for z in places]
 
 
 def _trees(random: np.random.Generator, road: Road) -> list[Panel]:
@@ -320,7 +298,7 @@ def _trees(random: np.random.Generator, road: Road) -> list[Panel]:
         foot = -0.3 * height if is_bush else random.uniform(1.4, 3.2)
         offset = random.choice([-1, 1]) * (road.half_width + 1.2 + width + random.random() * random.uniform(2, 16))
         z, seed = near * random.uniform(0.8, 1.25), random.random()
-        x, leaves = float(road.center(z)) + offset, _crown(random.choice(_LEAVES), seed, width, height)
+        x, leaves = float(road.center(z)) + offset, partial(_crown, random.choice(_LEAVES), seed, width, height)
         body = Body(x, z, x / z)
         panels.append(body.panel((0, foot + height, -0.1), (width, 0, 0), (0, height, 0), leaves))
         if not is_bush:
@@ -337,10 +315,11 @@ def _vehicles(random: np.random.Generator, road: Road) -> list[Panel]:
         body = road.place(offset, random.uniform(nearest, farthest) + length / 2, sign=sign)
         if random.random() > 0.42:
             continue
-        top, side = textured(color, 0.0, 0.0), _hull(color, length / 2, belt)
-        rear, front = (_hull(color, width / 2, belt, lamps) for lamps in (_RED_LAMPS, _WHITE_LAMPS))
+        top, side = textured(color, 0.0, 0.0), partial(_hull, color, length / 2, belt, None)
+        rear, front = (partial(_hull, color, width / 2, belt, lamps) for lamps in (_RED_LAMPS, _WHITE_LAMPS))
         panels += body.box((width / 2, belt, length / 2), (side, rear, front, top))
         height, half_width = roof - belt, width * 0.46
-        side, end = _cabin(color, cabin / 2, height, inset), _cabin(color, half_width, math.hypot(height, inset))
+        side = partial(_cabin, color, cabin / 2, height, inset)
+        end = partial(_cabin, color, half_width, math.hypot(height, inset), 0.0)
         panels += body.box((half_width, height, cabin / 2), (side, end, end, top), foot=belt, inset=inset)
     return panels

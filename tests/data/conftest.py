@@ -2,11 +2,15 @@ import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
+
+from torchrefract import Pair
+from torchrefract.data.module import PairData
 
 SIZE = (32, 48)
 
@@ -30,9 +34,10 @@ def frames(tmp_path_factory) -> Path:
 def words(frames) -> Callable[..., tuple[str, ...]]:
     """Return the options of the command for the frames; without workers, unless they are given."""
 
-    def of(out: Path | str, *more: str, scene: str = "paper_refractive") -> tuple[str, ...]:
-        chosen = (f"scene={scene}", "scene.width=192") if scene == "paper_refractive" else (f"scene={scene}",)
-        return (*chosen, f"source={frames}", f"out={out}", "license=CC0", "workers=0", *more)
+    def of(out: Path | str, *more: str, scene: str = "paper_refractive", **others: Any) -> tuple[str, ...]:
+        width = ("scene.width=192",) if scene == "paper_refractive" else ()
+        options = {"source": frames, "out": out, "license": "CC0", "workers": 0} | others
+        return (f"scene={scene}", *width, *(f"{name}={value}" for name, value in options.items()), *more)
 
     return of
 
@@ -52,3 +57,29 @@ def sums() -> Callable[[Path], dict[str, str]]:
 def rows() -> Callable[[Path], list[Any]]:
     """Return the rows of a manifest as JSON documents."""
     return lambda out: [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="session")
+def during() -> Callable[..., PairData]:
+    """Return a function that attaches what `PairData` reads of Lightning's trainer at a point of a run."""
+
+    def attach(data: PairData, *, epoch: int = 0, training: bool = True, ranks: int = 1, rank: int = 0) -> PairData:
+        run = SimpleNamespace(training=training, current_epoch=epoch, world_size=ranks, global_rank=rank)
+        data.trainer = run  # pyright: ignore[reportAttributeAccessIssue]  # only these attributes are read
+        return data
+
+    return attach
+
+
+@pytest.fixture(scope="session")
+def batches(during) -> Callable[..., list[Pair]]:
+    """Return a function that gives the batches of an epoch of training, or of validation."""
+
+    def of(data: PairData, *, epoch: int = 0, training: bool = True, **ranks: int) -> list[Pair]:
+        during(data, epoch=epoch, training=training, **ranks)
+        loader: Any = data.train_dataloader() if training else data.val_dataloader()
+        if training:
+            loader.sampler.set_epoch(epoch)
+        return [data.on_after_batch_transfer(batch, 0) for batch in loader]
+
+    return of

@@ -33,7 +33,7 @@ from torchrefract import presets
 from torchrefract.data.module import make_pair
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
-from torchrefract.restoration.models.resunet import ResUNet
+from torchrefract.restoration.models.coordconv import ResUNet
 from torchrefract.restoration.tasks import Deweather, Task, Undistort
 from torchrefract.types import Frame
 

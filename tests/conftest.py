@@ -207,11 +207,11 @@ def known_model(tmp_path_factory) -> Callable[..., Path]:
 
     def write(task: str, answer: tuple[float, ...], *, size: tuple[int, int] = (32, 64)) -> Path:
         checkpoints = importlib.import_module("torchrefract.restoration.checkpoints")
-        network = {"_target_": "torchrefract.restoration.models.resunet.ResUNet", "encoder": "tu-mobilenetv3_small_050"}
+        network = {"_target_": "torchrefract.restoration.models.coordconv.ResUNet", "_partial_": True}
         model = {
             "_target_": "torchrefract.restoration.module.Restoration",
             "task": {"_target_": f"torchrefract.restoration.tasks.{task.capitalize()}"},
-            "network": network | {"_partial_": True},
+            "network": network | {"encoder": "tu-mobilenetv3_small_050"},
         }
         weights = importlib.import_module("hydra.utils").instantiate(model).state_dict()
         # The last layer is zero but for its bias.

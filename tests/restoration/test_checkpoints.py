@@ -184,7 +184,7 @@ def test_weights_fit_their_model_and_no_other(other):
 
 
 def network(name: str, encoder: str) -> dict[str, Any]:
-    return {"network": {"_target_": f"torchrefract.restoration.models.{name.lower()}.{name}", "encoder": encoder}}
+    return {"network": {"_target_": f"torchrefract.restoration.models.coordconv.{name}", "encoder": encoder}}
 
 
 def test_weights_of_another_network_are_rejected_by_both_names():
@@ -217,7 +217,7 @@ def test_weights_of_older_checkpoints_get_their_new_names():
 def config(**changes: Any) -> dict[str, Any]:
     """Return the configuration of a model."""
     network = {
-        "_target_": "torchrefract.restoration.models.resunet.ResUNet",
+        "_target_": "torchrefract.restoration.models.coordconv.ResUNet",
         "_partial_": True,
         "encoder": "tu-mobilenetv3_small_050",
     }

@@ -1,10 +1,7 @@
 """Checkpoints: written atomically, verified before use, and sufficient to rebuild their model safely."""
 
-import pickle
-import struct
 import zipfile
-import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, NamedTuple
@@ -14,7 +11,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from pytorch_lightning import Callback, LightningModule, Trainer
+from pytorch_lightning import LightningModule
 from pytorch_lightning.plugins.io import TorchCheckpointIO
 from torch import Tensor, nn
 
@@ -24,11 +21,8 @@ from torchrefract.restoration.tasks import Task
 
 _PACKAGE = "torchrefract."
 _ALLOWED = (nn.Module, Task)  # the classes that a checkpoint may instantiate
-# Parts of the names of weights in older checkpoints, and the parts that replaced them.
-_RENAMED = {"whole": "polynomial_head", "place": "coordinate_weight"}
-# zipfile and torch.load raise these for files that are damaged or no archives.
-_READ_ERRORS = (zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, EOFError, LookupError, OSError, RuntimeError)
-_READ_ERRORS += (struct.error, ValueError, TypeError, AttributeError, ArithmeticError, AssertionError)
+# Parts of the names of weights and classes in older checkpoints, and the parts that replaced them.
+_RENAMED = {"whole": "polynomial_head", "place": "coordinate_weight", "resunet": "coordconv", "segformer": "coordconv"}
 
 
 class CheckpointError(UsageError):
@@ -57,23 +51,6 @@ class AtomicCheckpointIO(TorchCheckpointIO):
                 f"{path} could not be written ({reason}){previous}: free disk space or choose another hydra.run.dir, "
                 "and resume with ckpt_path="
             ) from error
-
-
-class Origin(Callback):
-    """Add to each checkpoint its origin, in plain values that load with `weights_only=True`.
-
-    Args:
-        config: the resolved configuration of the run.
-        data: the training data, as of `torchrefract.data.module`.
-        licenses: by source of the model, the license, or None if it is unknown.
-    """
-
-    def __init__(self, config: Mapping[str, Any], *, data: Mapping[str, Any], licenses: Mapping[str, str | None]):
-        self.origin = {"config": dict(config), "data": dict(data), "licenses": dict(licenses)}
-
-    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Add configuration, data and licenses."""
-        checkpoint.update(self.origin)
 
 
 class Loaded(NamedTuple):
@@ -139,25 +116,26 @@ def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
             if (damaged := archive.testzip()) is not None:
                 raise zipfile.BadZipFile(damaged)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except _READ_ERRORS as error:
+    except Exception as error:  # zipfile and torch.load raise many types for a damaged file
         raise CheckpointError(
             f"ckpt_path must be an intact checkpoint, got {path}, which is damaged or another kind of file"
         ) from error
     weights, name = (checkpoint.get(key) if isinstance(checkpoint, dict) else None for key in ("state_dict", "task"))
-    if not isinstance(weights, dict) or not isinstance(name, str) or not _are_weights(weights):
+    is_ours = isinstance(weights, dict) and isinstance(name, str)
+    if not (is_ours and all(isinstance(key, str) and isinstance(value, Tensor) for key, value in weights.items())):
         raise CheckpointError(f"ckpt_path must be a checkpoint of torchrefract, got {path}")
     if task not in (None, name):
         raise CheckpointError(f"ckpt_path must be a checkpoint of the task {task}, got {path} of {name}")
     return checkpoint | {"state_dict": rename_weights(weights)}
 
 
-def _are_weights(weights: Mapping[Any, Any]) -> bool:
-    return all(isinstance(name, str) and isinstance(value, Tensor) for name, value in weights.items())
-
-
 def rename_weights(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Give weights of an older version the names of this one."""
-    return {".".join(_RENAMED.get(part, part) for part in name.split(".")): weights[name] for name in weights}
+    return {_new_name(name): value for name, value in weights.items()}
+
+
+def _new_name(name: str) -> str:
+    return ".".join(_RENAMED.get(part, part) for part in name.split("."))
 
 
 def check_fits(
@@ -196,10 +174,8 @@ def model_name(model: Mapping[str, Any]) -> str:
 def _instantiate(config: dict[str, Any], changes: Mapping[str, Any], path: Path) -> LightningModule:
     """Instantiate the configuration of a model after checking that it can do nothing else."""
     try:
-        plain = OmegaConf.to_container(OmegaConf.merge(config, dict(changes)), resolve=False)
-        for node in _mappings(plain):
-            _check_node(node, path)
-        model = instantiate(plain)
+        merged = OmegaConf.to_container(OmegaConf.merge(config, dict(changes)), resolve=False)
+        model = instantiate(_safe(merged, path))
     except (InstantiationException, OmegaConfBaseException, ValueError, TypeError) as error:
         reason = error.__cause__ or error
         raise CheckpointError(f"ckpt_path must be of a model that can be built, got {path}: {reason}") from error
@@ -208,30 +184,29 @@ def _instantiate(config: dict[str, Any], changes: Mapping[str, Any], path: Path)
     return model
 
 
-def _mappings(value: Any) -> Iterator[dict[Any, Any]]:
-    """Yield all mappings in nested plain values."""
-    if isinstance(value, dict):
-        yield value
-    for child in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
-        yield from _mappings(child)
-
-
-def _check_node(node: dict[Any, Any], path: Path) -> None:
-    """Raise CheckpointError if a mapping could run foreign code or read other files; drop its pretrained weights."""
-    if any(isinstance(value, str) and "${" in value for value in node.values()):
+def _safe(value: Any, path: Path) -> Any:
+    """Drop pretrained weights from a configuration; raise CheckpointError if it could run code or read files."""
+    if isinstance(value, str) and "${" in value:
         raise CheckpointError(f"ckpt_path must hold a resolved configuration, got {path} with ${{…}} in it")
-    if node.get("pretrained") is not None:
-        node["pretrained"] = None
-    target = node.get("_target_")
-    if "_target_" in node and not _is_allowed(target):
-        raise CheckpointError(f"ckpt_path must name models and tasks of torchrefract only, got {path} with {target!r}")
+    if isinstance(value, list):
+        return [_safe(child, path) for child in value]
+    if not isinstance(value, dict):
+        return value
+    safe = {key: None if key == "pretrained" else _safe(child, path) for key, child in value.items()}
+    if "_target_" in value:
+        if not _is_allowed(target := value["_target_"]):
+            raise CheckpointError(
+                f"ckpt_path must name models and tasks of torchrefract only, got {path} with {target!r}"
+            )
+        safe["_target_"] = _new_name(target)
+    return safe
 
 
 def _is_allowed(target: Any) -> bool:
     if not isinstance(target, str) or not target.startswith(_PACKAGE):
         return False
     try:
-        value = resolve_name(target)
+        value = resolve_name(_new_name(target))
     except (ImportError, ValueError, AttributeError):
         return False
     # Our modules have classes of other packages as attributes, so the module that defines the class decides.

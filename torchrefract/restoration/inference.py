@@ -58,12 +58,12 @@ class Restorer:
             return [image.clamp(0, 1) for image in tiled]
         small = torch.cat([resize_image(image[None], self.size) for image in images])
         restored = self.model(small)
-        results = []
-        for i, image in enumerate(images):
-            one = Restored(restored.image[i : i + 1], None if restored.flow is None else restored.flow[i : i + 1])
-            options = {"small": small[i : i + 1], "interpolation": self.interpolation}
-            results.append(at_full_size(one, image[None], **options).image[0])
-        return results
+        flows = [None] * len(images) if restored.flow is None else restored.flow.split(1)
+        parts = zip(images, small.split(1), map(Restored, restored.image.split(1), flows), strict=True)
+        return [
+            at_full_size(one, image[None], small=before, interpolation=self.interpolation).image[0]
+            for image, before, one in parts
+        ]
 
     def _restore_tile(self, tiles: Tensor) -> Tensor:
         restored = self.model(tiles)
@@ -75,13 +75,7 @@ class Restorer:
 
 
 class FullSizeModel(nn.Module):
-    """Restore a batch of images at their own size in one module, for `torch.export`.
-
-    Args:
-        model: maps images (B, 3, H, W) in [0, 1] to `Restored`.
-        size: (height, width) of the frames that the model was trained on, px.
-        interpolation: interpolation of the warp.
-    """
+    """Restore a batch of images at their own size in one module, for `torch.export`; see `Restorer`."""
 
     def __init__(self, model: nn.Module, *, size: Sequence[int], interpolation: str = "bicubic"):
         super().__init__()

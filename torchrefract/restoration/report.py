@@ -2,8 +2,7 @@
 
 import csv
 import math
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -32,8 +31,6 @@ from torchrefract.visualization.figures import (
 METRICS, METRICS_BEFORE = "metrics.csv", "metrics_before.csv"
 _PANEL_ROWS = 4
 _METHODS = {"do nothing": "_identity", "best constant flow": "_constant", "model": ""}
-
-_Columns = dict[str, dict[int, float]]  # name -> epoch -> value
 
 
 class RunSummary(Callback):
@@ -160,14 +157,18 @@ def plot_curves(run: Path, *, epe_unit: str) -> Figure:
         ValueError: the metrics hold no value to plot.
     """
     units = {"loss": "loss", "psnr": "PSNR (dB)", "epe": f"endpoint error ({epe_unit})"}
-    columns = _read_columns(run, [style.column.format(quantity) for quantity in units for style in _STYLES])
-    shown = {q: unit for q, unit in units.items() if any(style.column.format(q) in columns for style in _STYLES)}
+    rows = [row for row in metrics_rows(run) if row.get("epoch")]
+    curves = {
+        quantity: [(style, _read_column(rows, style.column.format(quantity))) for style in _STYLES]
+        for quantity in units
+    }
+    shown = {quantity: unit for quantity, unit in units.items() if any(column for _, column in curves[quantity])}
     if not shown:
         raise ValueError(f"metrics must hold a loss, psnr or epe of an epoch, got none in {run}")
     figure = Figure(figsize=(4.8 * len(shown), 4.4), dpi=120, layout=ConstrainedLayoutEngine(w_pad=0.12))
     for axes, (quantity, unit) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
-        for style in _STYLES:
-            if column := columns.get(style.column.format(quantity)):
+        for style, column in curves[quantity]:
+            if column:
                 _plot_curve(axes, column, style)
         axes.set_xlabel("epoch")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
@@ -190,18 +191,13 @@ def _plot_curve(axes: Axes, column: dict[int, float], style: _Style) -> None:
     axes.plot(epochs, values, style.line, color=style.color, marker=marker, markersize=3, linewidth=1.6, label=label)
 
 
-def _read_columns(run: Path, names: Sequence[str]) -> _Columns:
-    """Read the columns `names` that have a value; a logger leaves most cells of a row empty."""
-    cells: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in metrics_rows(run):
-        for name in names:
-            if row.get("epoch") and row.get(name):
-                cells[name][int(row["epoch"])].append(float(row[name]))
-
-    def value(name: str, values: list[float]) -> float:
-        return fmean(values) if name.startswith("train/") else values[-1]
-
-    return {name: {epoch: value(name, epochs[epoch]) for epoch in sorted(epochs)} for name, epochs in cells.items()}
+def _read_column(rows: list[dict[str, str]], name: str) -> dict[int, float]:
+    """Return the values of a column by epoch; a logger leaves most cells of a row empty."""
+    cells: dict[int, list[float]] = {}
+    for row in rows:
+        if row.get(name):
+            cells.setdefault(int(row["epoch"]), []).append(float(row[name]))
+    return {epoch: fmean(cells[epoch]) if name.startswith("train/") else cells[epoch][-1] for epoch in sorted(cells)}
 
 
 def draw_panel(restored: Restored, pair: Pair) -> Figure:
@@ -227,20 +223,19 @@ def draw_panel(restored: Restored, pair: Pair) -> Figure:
     columns |= {title: hatch_invalid(resize_for_display(image), pair.valid) for title, image in derived.items()}
     height, width = columns["clean"].shape[2:]
     page = FigureLayout(len(pair.clean), len(columns), height, width, caption_lines=1)
-    figure = page.figure()
     for j, (title, images) in enumerate(columns.items()):
-        page.write(figure, title, page.left(j) + page.width / 2, 2 * page.text, ha="center", weight="bold")
+        page.write(title, page.left(j) + page.width / 2, 2 * page.text, ha="center", weight="bold")
         for i, image in enumerate(images):
-            page.show(figure, image, page.left(j), page.top(i))
+            page.show(image, page.left(j), page.top(i))
     for i, (degraded, result) in enumerate(zip(before.tolist(), after.tolist(), strict=True)):
-        page.write(figure, f"{degraded:.1f} -> {result:.1f} dB", page.left(0), page.top(i) - 0.3 * page.text)
+        page.write(f"{degraded:.1f} -> {result:.1f} dB", page.left(0), page.top(i) - 0.3 * page.text)
     bottom = page.top(page.rows)
     if not pair.valid.all():
-        draw_invalid_key(figure, page, x=page.left(0), y=bottom)
+        draw_invalid_key(page, x=page.left(0), y=bottom)
     if restored.flow is not None:
-        legend = [MapScale("flow", scale)]
-        draw_legend(figure, page, legend, x=page.left(page.columns - 2), y=bottom + 2 * page.text)
-    return figure
+        x, y = page.left(page.columns - 2), bottom + 2 * page.text
+        draw_legend(page, [MapScale("flow", scale)], x=x, y=y)
+    return page.figure
 
 
 def choose_examples(restored: Restored, pair: Pair) -> tuple[Restored, Pair]:

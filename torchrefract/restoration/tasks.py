@@ -108,7 +108,8 @@ class Deweather(Task):
     def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
         """Add the predicted change to the degraded image."""
         maps = prediction.float()
-        maps = maps if _is_dense(maps, degraded) else _interpolate_cells(maps, degraded)
+        if maps.shape[2:] != degraded.shape[2:]:
+            maps = _interpolate_cells(maps, degraded)
         transmission = torch.sigmoid(maps[:, 3:]) if self.transmission_head else None
         return Restored(degraded + maps[:, :3], transmission=transmission)
 
@@ -128,15 +129,11 @@ class Deweather(Task):
         return image_error + (restored.transmission - pair.transmission).abs().mean()
 
 
-def _is_dense(prediction: Tensor, degraded: Tensor) -> bool:
-    return prediction.shape[2:] == degraded.shape[2:]
-
-
 def _average_cells(prediction: Tensor, degraded: Tensor) -> Tensor:
     """Average a prediction of pixels over cells; return a prediction of cells unchanged."""
-    if not _is_dense(prediction, degraded):
-        return prediction
     height, width = degraded.shape[2:]
+    if prediction.shape[2:] != (height, width):
+        return prediction
     # Pad to full cells. Otherwise the flow would be stretched along a side that 4 does not divide.
     return F.avg_pool2d(F.pad(prediction, (0, -width % _CELL, 0, -height % _CELL), mode="replicate"), _CELL)
 

@@ -3,7 +3,7 @@
 import textwrap
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -186,21 +186,21 @@ def _draw_background(panels: Sequence[Panel], height: int, width: int) -> tuple[
     across = 1 if len(panels) <= _MAX_STACKED else 2
     layout = FigureLayout(-(-len(panels) // across), 2 * across, height, width, 2, header_lines=0)
     # The legend of a map takes 17 lines from its left side.
-    layout = layout._replace(min_column_lines=33 - width // layout.text)
+    layout = replace(layout, min_column_lines=33 - width // layout.text)
     letters = round(1.9 * layout.column_px / layout.text)
     captions = [
         textwrap.wrap(panel.caption, letters, max_lines=_MAX_CAPTION_LINES, placeholder=" …") for panel in panels
     ]
-    layout = layout._replace(caption_lines=max(2, *map(len, captions)))
-    figure, bottom = layout.figure(), layout.top(layout.rows - 1) + height + layout.text
+    layout = replace(layout, caption_lines=max(2, *map(len, captions)))
+    bottom = layout.top(layout.rows - 1) + height + layout.text
     for i, (panel, caption) in enumerate(zip(panels, captions, strict=True)):
         column, y = 2 * (i % across), layout.top(i // across)
-        layout.write(figure, "\n".join(caption), layout.left(column), y - 0.3 * layout.text, weight="bold")
-        draw_legend(figure, layout, panel.scales, x=layout.left(column + 1), y=y)
+        layout.write("\n".join(caption), layout.left(column), y - 0.3 * layout.text, weight="bold")
+        draw_legend(layout, panel.scales, x=layout.left(column + 1), y=y)
     if any(scale.name == "flow" for panel in panels for scale in panel.scales):
-        draw_invalid_key(figure, layout, x=layout.left(0), y=bottom)
+        draw_invalid_key(layout, x=layout.left(0), y=bottom)
         bottom += 3 * layout.text
-    canvas = FigureCanvasAgg(figure)
+    canvas = FigureCanvasAgg(layout.figure)
     canvas.draw()
     drawn = np.asarray(canvas.buffer_rgba())[:bottom, :, :3]
     # Video codecs need even sides.

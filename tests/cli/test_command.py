@@ -179,32 +179,6 @@ def test_a_missing_folder_of_frames_is_one_line_of_error(call, tmp_path):
         assert reason in message
 
 
-def test_frames_smaller_than_the_crop_are_named(call, tmp_path):
-    write_frames(tmp_path / "frames", 6, size=(32, 16))
-    message = call("train", "+task=undistort", *FOLDER[:3], *NO_EPOCH).message
-    assert "frames must be at least size = 32x64" in message
-    assert re.search(r"drive./00.\.png of 16x32", message)
-
-
-def test_a_few_unreadable_frames_are_reported_and_skipped(call, tmp_path):
-    paths = write_frames(tmp_path / "frames", 44)
-    paths[4].write_bytes(b"")
-    paths[7].write_bytes(paths[7].read_bytes()[:900])
-    with pytest.warns(UserWarning, match="skipped") as caught:
-        assert call("train", *DEWEATHER, "trainer.max_epochs=0").code == 0
-    text = " ".join(str(warning.message) for warning in caught)
-    for part in ("1 of 22 frames", "drive0/004.png is empty (0 bytes)", "drive1/007.png is truncated (900 bytes"):
-        assert part in text
-
-
-def test_many_unreadable_frames_stop_the_command(call, tmp_path):
-    for path in write_frames(tmp_path / "frames", 20)[:6]:
-        path.write_bytes(b"")
-    message = call("train", *DEWEATHER, "trainer.max_epochs=0").message
-    assert message.startswith("data: root must hold readable frames, got 3 of 10")
-    assert re.search(r"drive./00.\.png is empty \(0 bytes\)", message)
-
-
 @pytest.mark.parametrize(("workers", "num_readable"), [(0, 0), (2, 1)])
 def test_a_frame_that_is_damaged_in_the_middle_is_named_by_the_process_that_reads_it(
     call, tmp_path, workers, num_readable

@@ -4,7 +4,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import matplotlib.image
 import numpy as np
 import pytest
 import torch
@@ -20,7 +19,6 @@ from torchrefract.restoration.report import (
     draw_panel,
     metrics_rows,
     plot_curves,
-    save_figure,
     summary,
 )
 from torchrefract.restoration.tasks import Restored, Undistort
@@ -172,19 +170,6 @@ def test_invalid_pixels_are_hatched_from_the_third_column_on():
             assert len(invalid.unique()) == 2
 
 
-@pytest.mark.parametrize("size", [(37, 53), (90, 641)])
-def test_a_saved_panel_holds_its_images_without_resampling(tmp_path, size):
-    figure = draw_panel(*examples(size=size))
-    save_figure(figure, tmp_path / "panel.png")
-    page = matplotlib.image.imread(tmp_path / "panel.png")[..., :3]
-    for axes in figure.axes:
-        image = np.asarray(axes.images[0].get_array())
-        left, right = (round(x * page.shape[1]) for x in axes.get_position().intervalx)
-        bottom, top = (round(y * page.shape[0]) for y in axes.get_position().intervaly)
-        saved = page[page.shape[0] - top : page.shape[0] - bottom, left:right]
-        np.testing.assert_allclose(saved, image / 255, atol=1e-6)
-
-
 @pytest.mark.parametrize("size", [(360, 640), (112, 8), (16, 16)])
 def test_nothing_on_a_panel_overlaps_or_leaves_the_page(size):
     figure = draw_panel(*examples(has_flow=True, size=size))
@@ -194,20 +179,6 @@ def test_nothing_on_a_panel_overlaps_or_leaves_the_page(size):
         assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
         assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1
         assert not any(box.padded(-0.5).overlaps(other) for other in boxes[i + 1 :])
-
-
-def test_a_figure_that_cannot_be_saved_keeps_the_old_one(tmp_path, monkeypatch):
-    def half_a_file(self, path):
-        path.write_text("half")
-        raise OSError("no space left")
-
-    out = tmp_path / "panel.png"
-    out.write_text("old")
-    monkeypatch.setattr(Figure, "savefig", half_a_file)
-    with pytest.raises(OSError, match="no space left"):
-        save_figure(Figure(), out)
-    assert out.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [out]
 
 
 SCORES = {

@@ -33,11 +33,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """Replace a checkpoint only by a complete one, so that a full disk keeps the last good file."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Write the checkpoint to a temporary file, then move it to `path`.
-
-        Raises:
-            CheckpointError: the file cannot be written.
-        """
+        """Write the checkpoint to a temporary file, then move it to `path`; raise CheckpointError if that fails."""
         path = Path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -54,20 +50,13 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 class Loaded(NamedTuple):
-    """A model and the facts about it that its checkpoint holds.
+    """A model and the facts about it that its checkpoint holds."""
 
-    model: in evaluation mode; maps images (B, 3, H, W) in [0, 1] to `Restored`.
-    name: as of `model_name`.
-    task: the name of its task.
-    size: (height, width) of the frames that it was trained on, px.
-    licenses: by source of the model, the license, or None if it is unknown.
-    """
-
-    model: LightningModule
-    name: str
-    task: str
-    size: tuple[int, int]
-    licenses: dict[str, Any]
+    model: LightningModule  # in evaluation mode; maps images (B, 3, H, W) in [0, 1] to `Restored`
+    name: str  # as of `model_name`
+    task: str  # the name of its task
+    size: tuple[int, int]  # height and width of the frames that it was trained on, px
+    licenses: dict[str, Any]  # by source of the model, the license, or None if it is unknown
 
 
 def load_model(path: Path, *, changes: Mapping[str, Any] | None = None) -> Loaded:
@@ -99,11 +88,7 @@ def load_model(path: Path, *, changes: Mapping[str, Any] | None = None) -> Loade
 
 
 def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
-    """Read a checkpoint without running code from it.
-
-    Args:
-        path: the checkpoint.
-        task: the task that it must be of; None accepts any.
+    """Read a checkpoint without running code from it; its task must be `task`, if that is given.
 
     Raises:
         CheckpointError: the file is missing, damaged, no checkpoint of torchrefract, or of another task.
@@ -121,8 +106,11 @@ def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
             f"ckpt_path must be an intact checkpoint, got {path}, which is damaged or another kind of file"
         ) from error
     weights, name = (checkpoint.get(key) if isinstance(checkpoint, dict) else None for key in ("state_dict", "task"))
-    is_ours = isinstance(weights, dict) and isinstance(name, str)
-    if not (is_ours and all(isinstance(key, str) and isinstance(value, Tensor) for key, value in weights.items())):
+    if not (
+        isinstance(name, str)
+        and isinstance(weights, dict)
+        and all(isinstance(key, str) and isinstance(value, Tensor) for key, value in weights.items())
+    ):
         raise CheckpointError(f"ckpt_path must be a checkpoint of torchrefract, got {path}")
     if task not in (None, name):
         raise CheckpointError(f"ckpt_path must be a checkpoint of the task {task}, got {path} of {name}")
@@ -143,11 +131,7 @@ def check_fits(
 ) -> None:
     """Raise CheckpointError unless the weights of a checkpoint have the names and shapes of a model's.
 
-    Args:
-        checkpoint: as of `read_checkpoint`.
-        model: the model.
-        path: the checkpoint, for the message.
-        config: the configuration of the model, for the message.
+    The message names the path and, if the model's configuration is given, both models.
     """
     shapes, saved = (
         {name: value.shape for name, value in weights.items()}

@@ -291,7 +291,7 @@ def sample(
     Source: Ho et al. as for `Diffusion`; Song, Meng, Ermon, "Denoising diffusion implicit models", ICLR 2021; Lu et
     al., "DPM-Solver++", 2022.
     """
-    options = {"beta_schedule": "linear", "prediction_type": "sample"}
+    options: dict[str, Any] = {"beta_schedule": "linear", "prediction_type": "sample"}
     if check_choice("sampler", name, SAMPLERS) == "ddpm":
         scheduler = DDPMScheduler(NUM_LEVELS, clip_sample=False, **options)
     else:

@@ -108,11 +108,8 @@ def transfer_change(image: Tensor, small: Tensor, restored: Tensor) -> Tensor:
     that the small copy lacks.
 
     Args:
-        image: (B, C, H, W).
+        image: (B, C, H, W); the result has its shape.
         small, restored: (B, C, h, w).
-
-    Returns:
-        (B, C, H, W).
 
     Source: He, Sun, Tang, "Guided image filtering", IEEE TPAMI 35 (2013), for a.
     """
@@ -126,7 +123,7 @@ def transfer_change(image: Tensor, small: Tensor, restored: Tensor) -> Tensor:
 
 
 def restore_tiles(restore: Callable[[Tensor], Tensor], image: Tensor, *, tile: tuple[int, int], batch: int) -> Tensor:
-    """Restore a picture tile by tile, and blend the tiles where they overlap.
+    """Restore a picture (C, H, W) tile by tile, and blend the tiles where they overlap.
 
         out(p) = sum_i w(p - o_i) restored_i(p - o_i) / sum_i w(p - o_i),  w(x, y) = sin^2(pi x / w) sin^2(pi y / h)
 
@@ -135,12 +132,8 @@ def restore_tiles(restore: Callable[[Tensor], Tensor], image: Tensor, *, tile: t
 
     Args:
         restore: restores images (B, C, h, w).
-        image: (C, H, W).
-        tile: (h, w), px; at most the size of the picture is used.
-        batch: number of tiles that are restored together.
-
-    Returns:
-        (C, H, W).
+        image: the picture; the result has its shape.
+        tile, batch: as for `Restorer`; at most the size of the picture is used.
     """
     height, width = (min(side, full) for side, full in zip(tile, image.shape[1:], strict=True))
     corners = list(product(_tile_starts(image.shape[1], height), _tile_starts(image.shape[2], width)))

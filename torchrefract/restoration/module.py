@@ -97,7 +97,9 @@ class RestorationModule(LightningModule, ABC):
                 f"for the keys {keys}"
             )
         self._log("train", {"loss": loss} | ({} if restored is None else self._scores(restored, batch)), batch)
-        self._add_flows(batch)
+        weight = batch.valid.double()
+        flows = torch.cat([batch.flow.double() * weight, weight], dim=1).sum(dim=0)
+        self.new_flows = _add(self.new_flows, flows)
         return loss
 
     def validation_step(self, batch: Pair, _: int) -> dict[str, Any]:
@@ -116,11 +118,13 @@ class RestorationModule(LightningModule, ABC):
 
     def on_validation_start(self) -> None:
         """Add up the flows of all ranks for the constant baseline."""
-        self._gather_flows()
+        if len(self.new_flows):
+            of_all_ranks = self.trainer.strategy.reduce(self.new_flows.to(self.device), reduce_op="sum")
+            self.flows, self.new_flows = _add(self.flows, of_all_ranks), torch.zeros(0)
 
     def on_train_epoch_end(self) -> None:
-        """Add up the flows of all ranks for the checkpoint."""
-        self._gather_flows()
+        """Add up the flows of an epoch without a validation for the checkpoint."""
+        self.on_validation_start()
 
     def constant_flow(self, like: Tensor) -> Tensor:
         """Return the mean valid flow of the training set in the shape of `like`; 0 without a valid flow."""
@@ -176,15 +180,6 @@ class RestorationModule(LightningModule, ABC):
     def _log(self, split: str, scores: dict[str, Tensor], batch: Pair, suffix: str = "") -> None:
         values = {f"{split}/{name}{suffix}": value.mean() for name, value in scores.items()}
         self.log_dict(values, on_step=False, on_epoch=True, batch_size=len(batch.clean), sync_dist=True)
-
-    def _add_flows(self, pair: Pair) -> None:
-        weight = pair.valid.double()
-        self.new_flows = _add(self.new_flows, torch.cat([pair.flow.double() * weight, weight], dim=1).sum(dim=0))
-
-    def _gather_flows(self) -> None:
-        if len(self.new_flows):
-            of_all_ranks = self.trainer.strategy.reduce(self.new_flows.to(self.device), reduce_op="sum")
-            self.flows, self.new_flows = _add(self.flows, of_all_ranks), torch.zeros(0)
 
 
 class Restoration(RestorationModule):

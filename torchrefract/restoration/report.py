@@ -3,6 +3,7 @@
 import csv
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -158,18 +159,14 @@ def plot_curves(run: Path, *, epe_unit: str) -> Figure:
     """
     units = {"loss": "loss", "psnr": "PSNR (dB)", "epe": f"endpoint error ({epe_unit})"}
     rows = [row for row in metrics_rows(run) if row.get("epoch")]
-    curves = {
-        quantity: [(style, _read_column(rows, style.column.format(quantity))) for style in _STYLES]
-        for quantity in units
-    }
-    shown = {quantity: unit for quantity, unit in units.items() if any(column for _, column in curves[quantity])}
+    shown = {quantity: curves for quantity in units if (curves := _read_curves(rows, quantity))}
     if not shown:
         raise ValueError(f"metrics must hold a loss, psnr or epe of an epoch, got none in {run}")
     figure = Figure(figsize=(4.8 * len(shown), 4.4), dpi=120, layout=ConstrainedLayoutEngine(w_pad=0.12))
-    for axes, (quantity, unit) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
-        for style, column in curves[quantity]:
-            if column:
-                _plot_curve(axes, column, style)
+    for axes, (quantity, curves) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
+        for style, values in curves.items():
+            _plot_curve(axes, values, style)
+        unit = units[quantity]
         axes.set_xlabel("epoch")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         axes.grid(color="#e4e4e4", linewidth=0.8)
@@ -180,8 +177,22 @@ def plot_curves(run: Path, *, epe_unit: str) -> Figure:
     return figure
 
 
-def _plot_curve(axes: Axes, column: dict[int, float], style: _Style) -> None:
-    epochs, values = list(column), list(column.values())
+def _read_curves(rows: list[dict[str, str]], quantity: str) -> dict[_Style, dict[int, float]]:
+    """Return the curves of a quantity that have values, by epoch; a logger leaves most cells of a row empty."""
+    curves = {}
+    for style in _STYLES:
+        name, cells = style.column.format(quantity), dict[int, list[float]]()
+        for row in rows:
+            if row.get(name):
+                cells.setdefault(int(row["epoch"]), []).append(float(row[name]))
+        if cells:
+            mean_or_last = fmean if name.startswith("train/") else itemgetter(-1)
+            curves[style] = {epoch: mean_or_last(cells[epoch]) for epoch in sorted(cells)}
+    return curves
+
+
+def _plot_curve(axes: Axes, curve: dict[int, float], style: _Style) -> None:
+    epochs, values = list(curve), list(curve.values())
     label = f"{style.label} ({values[-1]:.4g})"
     if style.line == "--" and len(values) == 1:  # a dashed line with one point would be invisible
         axes.axhline(values[0], color=style.color, linestyle=style.line, label=label)
@@ -191,24 +202,11 @@ def _plot_curve(axes: Axes, column: dict[int, float], style: _Style) -> None:
     axes.plot(epochs, values, style.line, color=style.color, marker=marker, markersize=3, linewidth=1.6, label=label)
 
 
-def _read_column(rows: list[dict[str, str]], name: str) -> dict[int, float]:
-    """Return the values of a column by epoch; a logger leaves most cells of a row empty."""
-    cells: dict[int, list[float]] = {}
-    for row in rows:
-        if row.get(name):
-            cells.setdefault(int(row["epoch"]), []).append(float(row[name]))
-    return {epoch: fmean(cells[epoch]) if name.startswith("train/") else cells[epoch][-1] for epoch in sorted(cells)}
-
-
 def draw_panel(restored: Restored, pair: Pair) -> Figure:
     """Draw examples, one a row: clean, corrupted, restored, true flow and predicted flow with a common color scale.
 
     Without a flow, the last column is |restored - clean| times 4. Invalid pixels are hatched from the third column on;
     values that are not finite are gray.
-
-    Args:
-        restored: the restorations of N examples.
-        pair: the examples.
     """
     before, after = (psnr(image, pair.clean, pair.valid) for image in (pair.degraded, restored.image))
     derived = {"restored": restored.image}

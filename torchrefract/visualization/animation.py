@@ -108,13 +108,12 @@ def make_animation(
         height, width = resize_for_display(frame, largest=_largest_side(len(effects))).shape[2:]
         for name, effect in effects.items():
             degraded = _degrade(name, effect, frame, seed, depth, t)
-            scales = map_scales(degraded)
-            if name not in panels:
-                panels[name] = Panel(name, effect, f"{name}: {describe_params(effect, degraded.params)}", scales)
-            else:
-                panels[name] = _with_larger_scales(panels[name], dict(scales))
-    layout, background = _draw_background(list(panels.values()), height, width)
-    return Animation(list(panels.values()), frames, layout, background, seed, depth)
+            scales, caption = map_scales(degraded), f"{name}: {describe_params(effect, degraded.params)}"
+            panel, tops = panels.setdefault(name, Panel(name, effect, caption, scales)), dict(scales)
+            larger = (scale._replace(top=max(scale.top, tops.get(scale.name, scale.top))) for scale in panel.scales)
+            panels[name] = panel._replace(scales=tuple(larger))
+    layout, background = _draw_background([*panels.values()], height, width)
+    return Animation([*panels.values()], frames, layout, background, seed, depth)
 
 
 def animation_formats() -> list[str]:
@@ -163,8 +162,7 @@ def _largest_side(num_effects: int) -> int:
 
 def _sample_times(num_frames: int) -> list[int]:
     """Return a few frame numbers, spread evenly from the first to the last."""
-    steps = max(1, min(num_frames, _NUM_SAMPLED) - 1)
-    return sorted({i * (num_frames - 1) // steps for i in range(steps + 1)})
+    return np.unique(np.linspace(0, num_frames - 1, _NUM_SAMPLED, dtype=int)).tolist()
 
 
 def _degrade(name: str, effect: Effect, frame: Tensor, seed: int, depth: Tensor | None, t: int) -> Degraded:
@@ -174,11 +172,6 @@ def _degrade(name: str, effect: Effect, frame: Tensor, seed: int, depth: Tensor 
             return effect.degrade(frame, seed=seed, depth=depth, frame=t)
         except (ValueError, TypeError) as error:
             raise UsageError(f"{name}: {error}") from error
-
-
-def _with_larger_scales(panel: Panel, tops: Mapping[str, float]) -> Panel:
-    """Return the panel with scales that hold for both of two frames."""
-    return panel._replace(scales=tuple(MapScale(name, max(top, tops.get(name, top))) for name, top in panel.scales))
 
 
 def _draw_background(panels: Sequence[Panel], height: int, width: int) -> tuple[FigureLayout, np.ndarray]:

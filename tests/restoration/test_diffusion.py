@@ -302,6 +302,7 @@ def test_mixed_precision_trains_and_restores_without_nan(trainer, pairs, loader,
         ({"steps": 0}, "steps must be at least 1, got 0"),
         ({"steps": 1001}, "steps must be at most the 1000 noise levels of the training, got 1001"),
         ({"val_steps": 0}, "val_steps must be at least 1, got 0"),
+        ({"val_steps": 2.5}, r"val_steps must be a whole number, got 2\.5"),
         ({"sampler": "euler"}, "sampler must be one of ddpm, ddim, dpm_solver, got 'euler'"),
         ({"prediction": "flow"}, "prediction must be one of v_prediction, epsilon, got 'flow'"),
         ({"crop": 0}, "crop must be at least 1, got 0"),
@@ -310,13 +311,8 @@ def test_mixed_precision_trains_and_restores_without_nan(trainer, pairs, loader,
     ],
 )
 def test_an_invalid_option_is_named(options, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, TypeError), match=message):
         Diffusion(Linear, Undistort(), **options)
-
-
-def test_a_fractional_number_of_steps_is_rejected():
-    with pytest.raises(TypeError, match=r"val_steps must be a whole number, got 2\.5"):
-        Diffusion(Linear, Undistort(), val_steps=2.5)  # pyright: ignore[reportArgumentType]  # the wrong type is the test
 
 
 SHAPE = (3, 2, 5, 7)
@@ -343,13 +339,6 @@ def numpy_ddim(start: np.ndarray, steps: int) -> np.ndarray:
         noise = (noisy - np.sqrt(a) * target) / np.sqrt(1 - a)
         noisy = np.sqrt(a_after) * target + np.sqrt(1 - a_after) * noise
     return noisy
-
-
-@pytest.mark.quick
-def test_the_variances_of_the_levels_grow_linearly():
-    assert_close(
-        Diffusion(Linear, Undistort()).levels.alphas_cumprod.double(), torch.from_numpy(ALPHAS), rtol=1e-4, atol=0
-    )
 
 
 @pytest.mark.parametrize("steps", [1, 3, 7, 50])
@@ -434,25 +423,6 @@ def test_a_target_beyond_the_limit_decodes_to_the_limit():
     flow = FlowTarget(0.25).decode(target, torch.rand(1, 3, *FRAME), FRAME).flow
     assert flow is not None
     assert_close(flow[0, :, 0, 0], torch.tensor([2.5, -1.5]))
-
-
-def test_an_encoded_flow_decodes_to_the_flow_and_the_warped_image():
-    flow = torch.rand(1, 2, *FRAME, generator=torch.Generator().manual_seed(1)) * 2 - 1
-    pair, target = flow_pair(flow), FlowTarget(0.25)
-    restored = target.decode(target.encode(pair, FRAME), pair.degraded, FRAME)
-    assert restored.flow is not None
-    assert_close(restored.flow, flow)
-    expected = torch.from_numpy(numpy_warp(pair.degraded, flow.double().numpy()))
-    assert_close(restored.image, expected.float())
-
-
-def test_an_encoded_image_decodes_to_the_image():
-    pair, target = flow_pair(torch.zeros(1, 2, *FRAME)), ImageTarget()
-    encoded = target.encode(pair, FRAME)
-    assert_close(encoded, pair.clean * 2 - 1)
-    restored = target.decode(encoded, pair.degraded, FRAME)
-    assert restored.flow is None
-    assert_close(restored.image, pair.clean)
 
 
 def test_a_checkpoint_holds_the_companding_of_its_flows():

@@ -102,14 +102,15 @@ def test_metrics_without_a_value_are_rejected(metrics, text):
         plot_curves(metrics.parent, epe_unit="px")
 
 
-def examples(*, has_flow: bool = False, size: tuple[int, int] = (8, 10)) -> tuple[Restored, Pair]:
-    """Return two examples of random images and flows; the left half of the second is invalid."""
+def examples(*, has_flow: bool = False, size: tuple[int, int] = (8, 10), count: int = 2) -> tuple[Restored, Pair]:
+    """Return examples of random images and flows; the left half of the second is invalid."""
     generator = torch.Generator().manual_seed(0)
-    degraded, clean, restored = torch.rand(3, 2, 3, *size, generator=generator)
-    flow, predicted_flow = torch.randn(2, 2, 2, *size, generator=generator)
-    valid = torch.ones(2, 1, *size, dtype=torch.bool)
+    degraded, clean, restored = torch.rand(3, count, 3, *size, generator=generator)
+    flow, predicted_flow = torch.randn(2, count, 2, *size, generator=generator)
+    valid = torch.ones(count, 1, *size, dtype=torch.bool)
     valid[1, :, :, : size[1] // 2] = False
-    return Restored(restored, predicted_flow if has_flow else None), Pair(degraded, clean, flow, valid, torch.arange(2))
+    pair = Pair(degraded, clean, flow, valid, torch.arange(count))
+    return Restored(restored, predicted_flow if has_flow else None), pair
 
 
 def cells(figure: Figure, columns: int) -> list[list[Tensor]]:
@@ -224,36 +225,27 @@ def test_the_table_compares_the_model_with_the_baselines():
     assert words(lines) == ["do nothing 20.50 (+0.00) 0.700", "model 26.00 (+5.50) 0.800"]
 
 
-def make_pair(batch: int = 6) -> Pair:
-    generator = torch.Generator().manual_seed(0)
-    clean = 0.25 + 0.5 * torch.rand(batch, 3, 20, 30, generator=generator)
-    flow = torch.randn(batch, 2, 20, 30, generator=generator)
-    valid = torch.ones(batch, 1, 20, 30, dtype=torch.bool)
-    return Pair(clean + 0.1, clean, flow, valid, torch.arange(batch))
-
-
 def test_the_panel_shows_four_examples_by_degradation():
-    pair = make_pair()
+    restored, pair = examples(has_flow=True, count=6)
     offset = torch.tensor([0.01, 0.1, 0.02, 0.2, 0.05, 0.04])
+    pair.clean.mul_(0.8)
     pair = pair._replace(degraded=pair.clean + offset.view(6, 1, 1, 1))
     chosen = [3, 1, 5, 2]  # of 3 1 4 5 2 0
-    restored, examples = choose_examples(Restored(pair.clean + 0.01, 2 * pair.flow), pair)
-    assert examples.key.tolist() == chosen
-    assert torch.equal(examples.degraded, pair.degraded[chosen])
-    assert torch.equal(restored.image, pair.clean[chosen] + 0.01)
-    assert restored.flow is not None
-    assert torch.equal(restored.flow, 2 * examples.flow)
-    restored, examples = choose_examples(Restored(pair.clean[:2]), Pair(*(value[:2] for value in pair)))
-    assert (restored.flow, len(examples.clean)) == (None, 2)
+    chosen_restored, chosen_pair = choose_examples(restored, pair)
+    for value, every in zip((*chosen_restored[:2], *chosen_pair[:5]), (*restored[:2], *pair[:5]), strict=True):
+        assert value is not None
+        assert torch.equal(value, every[chosen])
+    restored, pair = choose_examples(*examples())
+    assert (restored.flow, len(pair.clean)) == (None, 2)
 
 
 @pytest.mark.parametrize(("rank", "num_batches"), [(1, 1), (0, 0)])
 def test_other_ranks_and_runs_without_validation_write_nothing(tmp_path, capsys, rank, num_batches):
     trainer: Any = SimpleNamespace(is_global_zero=rank == 0, callback_metrics=scores())
     model = Restoration(lambda channels, smooth: nn.Conv2d(3, channels, 1), Undistort())
-    callback, pair = RunSummary(str(tmp_path)), make_pair()
+    callback, (restored, pair) = RunSummary(str(tmp_path)), examples(has_flow=True)
     for number in range(num_batches):
-        callback.on_validation_batch_end(trainer, model, Restored(pair.clean, pair.flow)._asdict(), pair, number)
+        callback.on_validation_batch_end(trainer, model, restored._asdict(), pair, number)
     callback.teardown(trainer, model, "validate")
     assert capsys.readouterr().out == ""
     assert list(tmp_path.iterdir()) == []

@@ -198,25 +198,11 @@ def test_a_frame_that_is_damaged_in_the_middle_is_named_by_the_process_that_read
 # --- checkpoints
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (None, "<run>/last.ckpt"),
-        ({"state_dict": {}, "task": "deweather"}, "a checkpoint of the task undistort, got"),
-        (
-            {"state_dict": {"network.0.weight": torch.ones(3)}, "task": "undistort"},
-            "a checkpoint of the model that model= names, got",
-        ),
-    ],
-    ids=["missing", "task", "model"],
-)
-def test_an_unusable_checkpoint_is_one_line_of_error(call, small, tmp_path, content, message):
-    if content is not None:
-        AtomicCheckpointIO().save_checkpoint(content, tmp_path / "old.ckpt")
+def test_a_checkpoint_of_another_model_is_one_line_of_error(call, small, tmp_path):
+    content = {"state_dict": {"network.0.weight": torch.ones(3)}, "task": "undistort"}
+    AtomicCheckpointIO().save_checkpoint(content, tmp_path / "old.ckpt")
     text = call("train", "+task=undistort", *small, *NO_EPOCH, "ckpt_path=old.ckpt").message
-    assert text.startswith("ckpt_path must be ")
-    assert message in text
-    assert "old.ckpt" in text
+    assert text.startswith("ckpt_path must be a checkpoint of the model that model= names, got old.ckpt")
 
 
 def test_a_full_disk_stops_the_command_and_keeps_the_last_good_checkpoint(call, small, tmp_path, monkeypatch):

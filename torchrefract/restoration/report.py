@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -129,19 +129,12 @@ def _epoch_of(row: dict[str, str]) -> float:
     return int(row["epoch"]) if is_complete else math.inf
 
 
-class _Style(NamedTuple):
-    column: str
-    label: str
-    color: str
-    line: str
-
-
-_STYLES = (
-    _Style("train/{}", "training", "#7fb2dd", "-"),
-    _Style("val/{}", "validation", "#08306b", "-"),
-    _Style("val/{}_identity", "do nothing", "#6b6b6b", "--"),
-    _Style("val/{}_constant", "best constant flow", "#d95f02", "--"),
-)
+_STYLES = {  # column -> label, color and line of its curve; without markers, a point between gaps would be invisible
+    "train/{}": ("training", "#7fb2dd", "-o"),
+    "val/{}": ("validation", "#08306b", "-o"),
+    "val/{}_identity": ("do nothing", "#6b6b6b", "--"),
+    "val/{}_constant": ("best constant flow", "#d95f02", "--"),
+}
 
 
 def plot_curves(run: Path, *, epe_unit: str) -> Figure:
@@ -164,8 +157,8 @@ def plot_curves(run: Path, *, epe_unit: str) -> Figure:
         raise ValueError(f"metrics must hold a loss, psnr or epe of an epoch, got none in {run}")
     figure = Figure(figsize=(4.8 * len(shown), 4.4), dpi=120, layout=ConstrainedLayoutEngine(w_pad=0.12))
     for axes, (quantity, curves) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
-        for style, values in curves.items():
-            _plot_curve(axes, values, style)
+        for column, curve in curves.items():
+            _plot_curve(axes, curve, *_STYLES[column])
         unit = units[quantity]
         axes.set_xlabel("epoch")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
@@ -177,29 +170,27 @@ def plot_curves(run: Path, *, epe_unit: str) -> Figure:
     return figure
 
 
-def _read_curves(rows: list[dict[str, str]], quantity: str) -> dict[_Style, dict[int, float]]:
+def _read_curves(rows: list[dict[str, str]], quantity: str) -> dict[str, dict[int, float]]:
     """Return the curves of a quantity that have values, by epoch; a logger leaves most cells of a row empty."""
     curves = {}
-    for style in _STYLES:
-        name, cells = style.column.format(quantity), dict[int, list[float]]()
+    for column in _STYLES:
+        name, cells = column.format(quantity), dict[int, list[float]]()
         for row in rows:
             if row.get(name):
                 cells.setdefault(int(row["epoch"]), []).append(float(row[name]))
         if cells:
             mean_or_last = fmean if name.startswith("train/") else itemgetter(-1)
-            curves[style] = {epoch: mean_or_last(cells[epoch]) for epoch in sorted(cells)}
+            curves[column] = {epoch: mean_or_last(cells[epoch]) for epoch in sorted(cells)}
     return curves
 
 
-def _plot_curve(axes: Axes, curve: dict[int, float], style: _Style) -> None:
+def _plot_curve(axes: Axes, curve: dict[int, float], label: str, color: str, line: str) -> None:
     epochs, values = list(curve), list(curve.values())
-    label = f"{style.label} ({values[-1]:.4g})"
-    if style.line == "--" and len(values) == 1:  # a dashed line with one point would be invisible
-        axes.axhline(values[0], color=style.color, linestyle=style.line, label=label)
-        return
-    # Without markers, a single point between gaps would be invisible.
-    marker = "" if style.line == "--" else "o"
-    axes.plot(epochs, values, style.line, color=style.color, marker=marker, markersize=3, linewidth=1.6, label=label)
+    label = f"{label} ({values[-1]:.4g})"
+    if line == "--" and len(values) == 1:  # a dashed line with one point would be invisible
+        axes.axhline(values[0], color=color, linestyle=line, label=label)
+    else:
+        axes.plot(epochs, values, line, color=color, markersize=3, linewidth=1.6, label=label)
 
 
 def draw_panel(restored: Restored, pair: Pair) -> Figure:

@@ -16,29 +16,19 @@ _CELL = 4  # px
 
 
 class Restored(NamedTuple):
-    """A restored batch of images.
+    """A restored batch of images; maps that the task does not predict are None."""
 
-    image: (B, 3, H, W).
-    flow: (B, 2, H, W), px; None for a task without a flow.
-    transmission: (B, 1, H, W) in (0, 1); None for a task without a transmission.
-    """
-
-    image: Tensor
-    flow: Tensor | None = None
-    transmission: Tensor | None = None
+    image: Tensor  # (B, 3, H, W)
+    flow: Tensor | None = None  # (B, 2, H, W), px
+    transmission: Tensor | None = None  # (B, 1, H, W), in (0, 1)
 
 
 class Task(ABC):
-    """A kind of restoration.
+    """A kind of restoration."""
 
-    name: the name of its file in conf/task.
-    channels: number of maps that the network predicts.
-    smooth: True if the maps may be smooth over the whole frame.
-    """
-
-    name: str
-    channels: int
-    smooth = False
+    name: str  # of its file in conf/task
+    channels: int  # number of maps that the network predicts
+    smooth = False  # True if the maps may be smooth over the whole frame
 
     @abstractmethod
     def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:

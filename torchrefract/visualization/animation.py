@@ -55,15 +55,12 @@ class Panel(NamedTuple):
 
 @dataclass(frozen=True)
 class Animation:
-    """Effects on a sequence of frames; each degraded frame stands left of its map.
-
-    background: (height, width, 3), uint8, both even: texts and legends, which do not change.
-    """
+    """Effects on a sequence of frames; each degraded frame stands left of its map."""
 
     panels: Sequence[Panel]
     frames: FrameSequence
     layout: FigureLayout
-    background: np.ndarray
+    background: np.ndarray  # (height, width, 3), uint8, both even: texts and legends, which do not change
     seed: int
     depth: Tensor | None
 

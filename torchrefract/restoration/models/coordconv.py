@@ -165,15 +165,7 @@ class PolynomialFlowHead(nn.Module):
         self.layers = nn.Sequential(nn.Linear(2 * features, _HIDDEN), nn.SiLU(), last)
 
     def forward(self, features: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """Evaluate the maps on a grid.
-
-        Args:
-            features: (B, F, h, w).
-            x, y: (W,) and (H,), coordinates of the columns and rows, in [-1, 1].
-
-        Returns:
-            (B, channels, H, W), float32.
-        """
+        """Evaluate the maps (B, channels, H, W), float32, from features (B, F, h, w) at x (W,) and y (H,)."""
         flat = features.float().flatten(2)
         pooled = torch.cat([flat.mean(dim=2), flat.amax(dim=2)], dim=1)
         basis = torch.stack([_chebyshev(y, j)[:, None] * _chebyshev(x, i) for i, j in self.terms])
@@ -185,17 +177,11 @@ class PolynomialFlowHead(nn.Module):
 
 
 def pixel_coordinates(image: Tensor) -> Tensor:
-    """Compute the coordinates of the pixel centers in units of half the frame.
+    """Return x and y of the pixels of an image (B, C, H, W) as (B, 2, H, W), in [-1, 1].
 
         x = (2 column + 1) / W - 1,  y = (2 row + 1) / H - 1
 
     A convolution alone cannot tell where on the frame it is, and the effect of a lens depends on that.
-
-    Args:
-        image: (B, C, H, W).
-
-    Returns:
-        (B, 2, H, W), x and y in [-1, 1].
     """
     x, y = _cell_axes(image, 1)
     axes = torch.meshgrid(x, y, indexing="xy")

@@ -76,15 +76,12 @@ class Denoiser(nn.Module):
             self.network.down_blocks.requires_grad_(False)
 
     def forward(self, noisy: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-        """Predict the noise, or the velocity, of a noisy target of any size.
+        """Predict the noise, or the velocity, of a noisy target of any size; float32.
 
         Args:
-            noisy: (B, channels, H, W).
+            noisy: (B, channels, H, W); the result has the same shape.
             time: (B,), int64, the noise level.
             condition: (B, 5, H, W), as of `conditions`.
-
-        Returns:
-            (B, channels, H, W), float32.
         """
         height, width = noisy.shape[2:]
         inputs = torch.cat([noisy, condition], dim=1)

@@ -1,5 +1,6 @@
 import importlib
 import logging
+import math
 import os
 import subprocess
 import sys
@@ -223,6 +224,19 @@ def known_model(tmp_path_factory) -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture(scope="session")
+def shifted(known_model) -> Path:
+    """Return a model whose flow points 1/16 of the width to the right and 1/32 of the height up."""
+    limit = 0.25  # of Undistort, in widths and heights
+    return known_model("undistort", (math.atanh(1 / 16 / limit), math.atanh(-1 / 32 / limit)))
+
+
+@pytest.fixture(scope="session")
+def brighter(known_model) -> Path:
+    """Return a model that adds 0.2 to red and subtracts 0.1 from blue."""
+    return known_model("deweather", (0.2, 0.0, -0.1))
 
 
 @pytest.fixture

@@ -234,6 +234,7 @@ def test_the_panel_shows_four_examples_by_degradation():
     chosen_restored, chosen_pair = choose_examples(restored, pair)
     for value, every in zip((*chosen_restored[:2], *chosen_pair[:5]), (*restored[:2], *pair[:5]), strict=True):
         assert value is not None
+        assert every is not None
         assert torch.equal(value, every[chosen])
     restored, pair = choose_examples(*examples())
     assert (restored.flow, len(pair.clean)) == (None, 2)

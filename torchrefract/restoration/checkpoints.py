@@ -1,5 +1,6 @@
 """Checkpoints: written atomically, verified before use, and sufficient to rebuild their model safely."""
 
+import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,8 +22,9 @@ from torchrefract.restoration.tasks import Task
 
 _PACKAGE = "torchrefract."
 _ALLOWED = (nn.Module, Task)  # the classes that a checkpoint may instantiate
-# Parts of the names of weights and classes in older checkpoints, and the parts that replaced them.
-_RENAMED = {"whole": "polynomial_head", "place": "coordinate_weight", "resunet": "coordconv", "segformer": "coordconv"}
+# Parts of the names of weights in older checkpoints, and the parts that replaced them.
+_RENAMED = {"whole": "polynomial_head", "place": "coordinate_weight"}
+_MOVED = re.compile(r"(?<=\.models\.)(resunet|segformer)(?=\.)")  # modules of older checkpoints, now in coordconv
 
 
 class CheckpointError(UsageError):
@@ -119,11 +121,7 @@ def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
 
 def rename_weights(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Give weights of an older version the names of this one."""
-    return {_new_name(name): value for name, value in weights.items()}
-
-
-def _new_name(name: str) -> str:
-    return ".".join(_RENAMED.get(part, part) for part in name.split("."))
+    return {".".join(_RENAMED.get(part, part) for part in name.split(".")): weights[name] for name in weights}
 
 
 def check_fits(
@@ -177,12 +175,10 @@ def _safe(value: Any, path: Path) -> Any:
     if not isinstance(value, dict):
         return value
     safe = {key: None if key == "pretrained" else _safe(child, path) for key, child in value.items()}
-    if "_target_" in value:
-        if not _is_allowed(target := value["_target_"]):
-            raise CheckpointError(
-                f"ckpt_path must name models and tasks of torchrefract only, got {path} with {target!r}"
-            )
-        safe["_target_"] = _new_name(target)
+    if isinstance(target := safe.get("_target_"), str):
+        safe["_target_"] = target = _MOVED.sub("coordconv", target)
+    if "_target_" in safe and not _is_allowed(target):
+        raise CheckpointError(f"ckpt_path must name models and tasks of torchrefract only, got {path} with {target!r}")
     return safe
 
 
@@ -190,7 +186,7 @@ def _is_allowed(target: Any) -> bool:
     if not isinstance(target, str) or not target.startswith(_PACKAGE):
         return False
     try:
-        value = resolve_name(_new_name(target))
+        value = resolve_name(target)
     except (ImportError, ValueError, AttributeError):
         return False
     # Our modules have classes of other packages as attributes, so the module that defines the class decides.

@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
+from timing import write_json
 from torch import Tensor
 
 from torchrefract._io import replace_file
@@ -349,9 +350,7 @@ def main() -> None:
     args = parser.parse_args()
     results = args.run(args)
     if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        with replace_file(args.out) as temporary:
-            temporary.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+        write_json(args.out, results)
 
 
 if __name__ == "__main__":

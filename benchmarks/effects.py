@@ -69,7 +69,7 @@ NUM_FUNCTIONS = 25  # of each table of functions
 
 def main() -> None:
     """Measure, print and save; a limit that does not hold is marked and is no failure of the command."""
-    options = parser(__doc__, out=RESULTS / "effects.json")
+    options = parser(__doc__, out=RESULTS / "effects.json", has_real=True)
     options.add_argument(
         "--backend", nargs="+", choices=["auto", "torch", "numba"], default=["auto", "torch"], help="auto torch"
     )

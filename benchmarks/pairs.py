@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from timing import RESULTS, count, size
+from timing import RESULTS, count, size, write_json
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.benchmark import Timer
 from torch.utils.data import DataLoader, Dataset
@@ -34,7 +34,7 @@ from torchrefract import (
     Turbulence,
     UniformFog,
 )
-from torchrefract._io import CONFIG_DIR, replace_file
+from torchrefract._io import CONFIG_DIR
 from torchrefract.data.pairs.files import FORMATS, decode_pair, encode_pair
 from torchrefract.data.pairs.generator import (
     PairGenerator,
@@ -89,12 +89,8 @@ def main() -> None:
     }
     for name, text in PROTOCOL.items():
         print(name, text, json.dumps(results[name], indent=2), sep="\n", end="\n\n")
-    args.out.parent.mkdir(parents=True, exist_ok=True)
     conditions = {"cores": os.cpu_count(), "torch": torch.__version__, "size": args.size, "scene": args.scene}
-    with replace_file(args.out) as path:
-        content = {"protocol": PROTOCOL, "conditions": conditions, **results}
-        path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    print(f"written to {args.out}")
+    write_json(args.out, {"protocol": PROTOCOL, "conditions": conditions, **results})
 
 
 def make_effects() -> dict[str, Effect]:

@@ -69,7 +69,7 @@ _TAPS = 17  # of the approximate blur, which is nearly a box of this width
 
 def main() -> None:
     """Measure, print and save."""
-    options = parser(__doc__, out=RESULTS / "peers.json")
+    options = parser(__doc__, out=RESULTS / "peers.json", has_real=True)
     args = options.parse_args()
     torch.manual_seed(0)
     try:

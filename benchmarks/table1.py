@@ -12,7 +12,6 @@ start with each prefix of `--groups`, and for the remaining frames.
 """
 
 import argparse
-import json
 import math
 import subprocess
 import sys
@@ -24,11 +23,10 @@ from statistics import median
 from typing import NamedTuple, cast
 
 import torch
-from timing import RESULTS, count, seconds
+from timing import RESULTS, count, seconds, write_json
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
-from torchrefract._io import replace_file
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.module import make_pair
@@ -112,11 +110,9 @@ def main() -> None:
         lines += score_task(task, {row: load_model(train(row, args)) for row in rows}, args)
     text = format_tables(lines)
     print(text)
-    args.out.mkdir(parents=True, exist_ok=True)
-    for name, content in (("table.md", text), ("table.json", json.dumps([asdict(line) for line in lines], indent=2))):
-        with replace_file(args.out / name) as path:
-            path.write_text(content + "\n", encoding="utf-8")
-    print(f"written to {args.out}; each row has its curves.png and panel.png")
+    write_json(args.out / "table.json", [asdict(line) for line in lines])
+    (args.out / "table.md").write_text(text + "\n", encoding="utf-8")
+    print("each row has its curves.png and panel.png")
 
 
 def train(row: str, args: argparse.Namespace) -> Path:
@@ -242,7 +238,7 @@ def _score_model(
     task: str, loaded: Loaded, pairs: dict[str, list[Pair]], groups: dict[str, set[int]], args: argparse.Namespace
 ) -> Iterator[Line]:
     model = loaded.model.to(args.device)
-    parameters = sum(parameter.numel() for parameter in model.network.parameters())  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]  # of every RestorationModule
+    parameters = sum(parameter.numel() for parameter in model.get_submodule("network").parameters())
     is_sampled = isinstance(model, Diffusion)
     batches = {name: _subsample(every, args.sampled if is_sampled else 0) for name, every in pairs.items()}
     first = next(iter(batches.values()))

@@ -25,6 +25,7 @@ from torch import Tensor
 from torch.utils import benchmark
 
 import torchrefract as tr
+from torchrefract._io import replace_file
 from torchrefract.data.images import fit, read_image
 
 Candidate = Callable[[], object]
@@ -307,24 +308,36 @@ def save(
         "bars": [asdict(bar) | {"holds": bar.holds} for bar in bars],
         **more,
     }
+    write_json(path, content)
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write a JSON file, whose folder is created, and print its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    with replace_file(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     print(f"written to {path}")
 
 
-def parser(description: str | None, *, out: Path) -> argparse.ArgumentParser:
+def parser(
+    description: str | None, *, out: Path, frame_size: tuple[int, int] = (1080, 1920), has_real: bool = False
+) -> argparse.ArgumentParser:
     """Return a parser with the options that the benchmarks share.
 
     Args:
         description: docstring of the script; its first line is the help text.
-        out: default path of the JSON file.
+        out: default path of the file or folder that is written.
+        frame_size: default height and width of the frames, px.
+        has_real: True adds the option of `frame_of`.
     """
     options = argparse.ArgumentParser(description=(description or "").splitlines()[0])
-    options.add_argument("--size", type=size, default=(1080, 1920), help="height x width of the frame, 1080x1920")
+    size_help = "height x width of the frames, {}x{}".format(*frame_size)
+    options.add_argument("--size", type=size, default=frame_size, help=size_help)
     options.add_argument("--threads", type=count(1), default=2, help="threads of torch on the CPU, 2")
     options.add_argument("--repeats", type=count(MIN_REPEATS), default=MIN_REPEATS, help="rounds, 15 or more")
-    options.add_argument("--real", type=Path, help="picture to use as the frame; the default is noise")
-    options.add_argument("--out", type=Path, default=out, help=f"JSON file to write, {out.name}")
+    options.add_argument("--out", type=Path, default=out, help=f"where to write, {out.name}")
+    if has_real:
+        options.add_argument("--real", type=Path, help="picture to use as the frame; the default is noise")
     return options
 
 

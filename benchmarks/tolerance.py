@@ -10,7 +10,6 @@ above its tolerance ends the command with exit code 1.
 """
 
 import argparse
-import json
 import math
 import random
 import statistics
@@ -21,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from timing import RESULTS, count, size
+from timing import RESULTS, count, size, write_json
 from torch import Tensor
 
 import torchrefract as tr
@@ -65,9 +64,7 @@ def main() -> None:
         of_effect = [attempt(name, args.seed + i, args.largest) for i in range(args.count)]
         print(summary(name, of_effect), flush=True)
         trials += of_effect
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps([asdict(trial) for trial in trials], indent=2) + "\n", encoding="utf-8")
-    print(f"written to {args.out}")
+    write_json(args.out, [asdict(trial) for trial in trials])
     if any(trial.share > 1 for trial in trials):
         raise SystemExit(1)
 

@@ -7,8 +7,6 @@ Writes tradeoff.json and tradeoff.png and prints a Markdown table. `--frames syn
 uses one small frame.
 """
 
-import argparse
-import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -28,7 +26,6 @@ from matplotlib.transforms import Bbox
 from scipy.ndimage import map_coordinates
 from timing import (
     GRID_SAMPLE,
-    MIN_REPEATS,
     PHOTOMETRIC,
     RESULTS,
     TOLERANCE_PX,
@@ -38,8 +35,9 @@ from timing import (
     all_warps,
     count,
     measure,
+    parser,
     references,
-    size,
+    write_json,
 )
 from torch import Tensor
 
@@ -104,12 +102,15 @@ class Errors(NamedTuple):
 
 def main() -> None:
     """Measure, print, plot and save."""
-    parser = _parser()
-    args = parser.parse_args()
+    options = parser(__doc__, out=RESULTS)
+    options.add_argument("--frames", default=str(FRAMES), help=f"folder of pictures, or {SYNTHETIC!r}")
+    options.add_argument("--count", type=count(1), default=2, help="number of frames, 2")
+    options.add_argument("--quick", action="store_true", help="one frame of {}x{} px".format(*QUICK_SIZE))
+    args = options.parse_args()
     try:
         frames = read_frames(args.frames, QUICK_SIZE if args.quick else args.size, 1 if args.quick else args.count)
     except (ValueError, OSError) as error:
-        parser.error(str(error))
+        options.error(str(error))
     conditions = Conditions.now(frames[0], threads=args.threads, repeats=args.repeats)
     print(WHAT, end="\n\n", flush=True)
     rows = []
@@ -118,11 +119,9 @@ def main() -> None:
         with torch.no_grad():
             rows += evaluate(name, variants, frames, repeats=args.repeats, threads=args.threads)
     print("", *table(rows), "", sep="\n")
-    args.out.mkdir(parents=True, exist_ok=True)
     content = {"what": WHAT, "conditions": asdict(conditions), "frames": len(frames), "rows": list(map(asdict, rows))}
-    (args.out / "tradeoff.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_json(args.out / "tradeoff.json", content)
     plot(args.out / "tradeoff.png", rows)
-    print(f"written to {args.out}")
 
 
 def settings() -> dict[str, list[Variant]]:
@@ -340,18 +339,6 @@ def separate_labels(figure: Figure, labels: Sequence[Annotation]) -> None:
 
 def _position(row: Row) -> tuple[float, float]:
     return row.ratio, max(row.mean_levels, MIN_ERROR)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--frames", default=str(FRAMES), help=f"folder of pictures, or {SYNTHETIC!r}")
-    parser.add_argument("--count", type=count(1), default=2, help="number of frames, 2")
-    parser.add_argument("--size", type=size, default=(1080, 1920), help="height x width of the frames, 1080x1920")
-    parser.add_argument("--threads", type=count(1), default=2, help="threads of torch on the CPU, 2")
-    parser.add_argument("--repeats", type=count(MIN_REPEATS), default=MIN_REPEATS, help="rounds, 15 or more")
-    parser.add_argument("--quick", action="store_true", help="one frame of {}x{} px".format(*QUICK_SIZE))
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder to write to")
-    return parser
 
 
 if __name__ == "__main__":

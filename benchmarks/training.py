@@ -4,16 +4,13 @@ python benchmarks/training.py [--batch 16] [--size 256x256] [--threads 2] [--rep
                               [--encoder tu-resnet34] [--out benchmarks/results/training.json]
 """
 
-import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 
 import torch
 from timing import (
     GRID_SAMPLE,
-    MIN_REPEATS,
     RESULTS,
     Bar,
     Candidate,
@@ -22,9 +19,9 @@ from timing import (
     count,
     effects,
     measure,
+    parser,
     references,
     save,
-    size,
     table,
 )
 from torch import Tensor
@@ -33,7 +30,7 @@ from torchrefract import presets
 from torchrefract.data.module import make_pair
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
-from torchrefract.restoration.models.resunet import ResUNet
+from torchrefract.restoration.models.coordconv import ResUNet
 from torchrefract.restoration.tasks import Deweather, Task, Undistort
 from torchrefract.types import Frame
 
@@ -55,7 +52,11 @@ TASKS: Mapping[str, tuple[Callable[[], Task], Callable[[], Effect]]] = {
 
 def main() -> None:
     """Measure, print and save; a limit that does not hold is marked and is no failure of the command."""
-    args = _parser().parse_args()
+    options = parser(__doc__, out=RESULTS / "training.json", frame_size=(256, 256))
+    options.add_argument("--batch", type=count(1), default=16, help="frames at once, 16")
+    options.add_argument("--rounds", type=count(1), default=5, help="of steps, 5")
+    options.add_argument("--encoder", default="tu-resnet34", help="of the ResUNet, tu-resnet34")
+    args = options.parse_args()
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
     keys = torch.arange(args.batch)
@@ -105,18 +106,6 @@ def training_steps(frames: Frame, task: Task, scene: Effect, *, encoder: str) ->
         return loss
 
     return {BEFORE: lambda: step(False), FLY: lambda: step(True)}
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--batch", type=count(1), default=16, help="frames at once, 16")
-    parser.add_argument("--size", type=size, default=(256, 256), help="height x width of the frames, 256x256")
-    parser.add_argument("--threads", type=count(1), default=2, help="threads of torch on the CPU, 2")
-    parser.add_argument("--repeats", type=count(MIN_REPEATS), default=MIN_REPEATS, help="rounds, 15 or more")
-    parser.add_argument("--rounds", type=count(1), default=5, help="of steps, 5")
-    parser.add_argument("--encoder", default="tu-resnet34", help="of the ResUNet, tu-resnet34")
-    parser.add_argument("--out", type=Path, default=RESULTS / "training.json", help="JSON file to write")
-    return parser
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 import importlib
 import logging
+import math
 import os
 import subprocess
 import sys
@@ -207,11 +208,11 @@ def known_model(tmp_path_factory) -> Callable[..., Path]:
 
     def write(task: str, answer: tuple[float, ...], *, size: tuple[int, int] = (32, 64)) -> Path:
         checkpoints = importlib.import_module("torchrefract.restoration.checkpoints")
-        network = {"_target_": "torchrefract.restoration.models.resunet.ResUNet", "encoder": "tu-mobilenetv3_small_050"}
+        network = {"_target_": "torchrefract.restoration.models.coordconv.ResUNet", "_partial_": True}
         model = {
             "_target_": "torchrefract.restoration.module.Restoration",
             "task": {"_target_": f"torchrefract.restoration.tasks.{task.capitalize()}"},
-            "network": network | {"_partial_": True},
+            "network": network | {"encoder": "tu-mobilenetv3_small_050"},
         }
         weights = importlib.import_module("hydra.utils").instantiate(model).state_dict()
         # The last layer is zero but for its bias.
@@ -223,6 +224,19 @@ def known_model(tmp_path_factory) -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture(scope="session")
+def shifted(known_model) -> Path:
+    """Return a model whose flow points 1/16 of the width to the right and 1/32 of the height up."""
+    limit = 0.25  # of Undistort, in widths and heights
+    return known_model("undistort", (math.atanh(1 / 16 / limit), math.atanh(-1 / 32 / limit)))
+
+
+@pytest.fixture(scope="session")
+def brighter(known_model) -> Path:
+    """Return a model that adds 0.2 to red and subtracts 0.1 from blue."""
+    return known_model("deweather", (0.2, 0.0, -0.1))
 
 
 @pytest.fixture

@@ -46,19 +46,10 @@ def test_conf_holds_only_yaml():
         assert isinstance(OmegaConf.load(path), DictConfig), path
 
 
-@pytest.mark.parametrize(("task", "trainer"), [("undistort", "gpu"), ("deweather", "ddp"), ("deweather", "cpu")])
-def test_every_task_composes_with_every_trainer(tmp_path, task, trainer):
-    cfg = compose_training(tmp_path, f"+task={task}", f"trainer={trainer}")
-    assert cfg.task._target_ == f"torchrefract.restoration.tasks.{task.capitalize()}"
-    assert cfg.model.task == cfg.task
-    assert cfg.data.effect == cfg.scene
-    assert cfg.trainer.logger.save_dir == str(tmp_path)
-    assert not OmegaConf.missing_keys(cfg)
-
-
 @pytest.mark.parametrize("task", options("task"))
 def test_every_task_builds_its_data_and_its_model(tmp_path, task):
     cfg = compose_training(tmp_path, f"+task={task}", "seed=5")
+    assert not OmegaConf.missing_keys(cfg)
     data, model = instantiate(cfg.data), instantiate(cfg.model)
     assert isinstance(data, PairData)
     assert isinstance(model, Restoration)
@@ -68,7 +59,11 @@ def test_every_task_builds_its_data_and_its_model(tmp_path, task):
     assert repr(data.effect) == repr(getattr(presets, cfg.scene._target_.rsplit(".", 1)[1])())
 
 
-@pytest.mark.parametrize(("name", "millions"), [("ddpm", 35.75), ("ddpm_cat256", 113.68)])
+# google/ddpm-cat-256 has 113 673 219 weights, for 3 channels in and out. Here 7 go in and 2 come out (3 x 3 kernels).
+CAT256 = 113_673_219 + 4 * 128 * 9 - (128 * 9 + 1)
+
+
+@pytest.mark.parametrize(("name", "millions"), [("ddpm", 35.75), ("ddpm_cat256", CAT256 / 1e6)])
 def test_a_diffusion_model_has_its_size_and_the_defaults_of_its_class(tmp_path, name, millions):
     cfg = compose_training(tmp_path, "+task=undistort", f"model={name}", "seed=5")
     with torch.device("meta"):

@@ -1,5 +1,4 @@
 import json
-import math
 import sys
 from pathlib import Path
 
@@ -19,18 +18,6 @@ MODEL_SIZE = (32, 64)  # of the training, and of the frames if no size is given
 
 def images(batch: int, size: tuple[int, int] = SIZE) -> Tensor:
     return torch.rand(batch, 3, *size, generator=torch.Generator().manual_seed(batch))
-
-
-@pytest.fixture(scope="module")
-def shifted(known_model) -> Path:
-    """Return a model whose flow points 1/16 of the width to the right and 1/32 of the height up."""
-    return known_model("undistort", (math.atanh(1 / 4), math.atanh(-1 / 8)))
-
-
-@pytest.fixture(scope="module")
-def brighter(known_model) -> Path:
-    """Return a model that adds 0.2 to red and subtracts 0.1 from blue."""
-    return known_model("deweather", (0.2, 0.0, -0.1))
 
 
 def expected(task: str, image: Tensor) -> list[Tensor]:

@@ -30,13 +30,6 @@ def test_the_peak_memory_is_what_a_call_holds_at_once():
         assert pairs.peak_bytes(call) == pytest.approx(tensors * x.nbytes, rel=1e-3)
 
 
-@pytest.mark.quick
-@pytest.mark.parametrize("power", [0.0, 0.7, 2.0])
-def test_the_slope_is_the_power(power):
-    sizes = [64, 256, 5000]
-    assert pairs.slope(sizes, [0.3 * size**power for size in sizes]) == pytest.approx(power, abs=1e-9)
-
-
 def test_the_command_writes_all_measurements(args, tmp_path, monkeypatch):
     monkeypatch.setattr(pairs, "make_effects", lambda: {"fog": UniformFog()})
     monkeypatch.setattr(pairs, "measure_run", lambda *_: pairs.Run(1, 2.0, 1.0, 10, 20.0))

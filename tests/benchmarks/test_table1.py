@@ -11,16 +11,9 @@ from table1 import MIX, Scores, effects_of
 
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.restoration.checkpoints import load_model
-from torchrefract.types import Frame
 
 SIZE = (48, 80)
 OPTIONS: dict[str, Any] = {"device": torch.device("cpu"), "groups": ["drive2"], "frames": 0, "sampled": 1}
-
-
-def frames(count: int = 3) -> list[Frame]:
-    keys = torch.arange(count)
-    image, _ = render_road_scenes(keys, *SIZE, seed=2)
-    return [Frame(image, keys, torch.empty(0))]
 
 
 def test_the_mix_is_the_mean_of_its_effects_for_all_frames_and_for_each_group():

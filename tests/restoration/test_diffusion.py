@@ -14,7 +14,6 @@ from torchrefract import LensDistortion, Pair, UniformFog
 from torchrefract.random import stream
 from torchrefract.restoration.checkpoints import CheckpointError, check_fits, read_checkpoint
 from torchrefract.restoration.diffusion import (
-    SAMPLERS,
     Diffusion,
     FlowTarget,
     ImageTarget,
@@ -23,7 +22,7 @@ from torchrefract.restoration.diffusion import (
     target_of,
 )
 from torchrefract.restoration.models.denoiser import Denoiser
-from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
+from torchrefract.restoration.tasks import Deweather, Undistort
 
 SIZE = (16, 24)
 ALPHAS = np.cumprod(1 - np.linspace(1e-4, 0.02, 1000))  # a of the docstring, by level
@@ -158,7 +157,9 @@ def test_training_depends_on_the_seed_alone_and_lowers_the_loss(trainer, pairs, 
     assert np.mean(runs[0][-10:]) < 0.5 * np.mean(runs[0][:5])
 
 
-@pytest.mark.parametrize(("task", "sampler"), [("undistort", "ddpm"), ("deweather", "ddim")])
+@pytest.mark.parametrize(
+    ("task", "sampler"), [("undistort", "ddpm"), ("deweather", "ddim"), ("undistort", "dpm_solver")]
+)
 def test_a_restoration_depends_on_image_and_key_alone(task, sampler):
     torch.manual_seed(0)
     model = Diffusion(tiny, TASKS[task], sampler=sampler, steps=5).eval()
@@ -302,6 +303,7 @@ def test_mixed_precision_trains_and_restores_without_nan(trainer, pairs, loader,
         ({"steps": 0}, "steps must be at least 1, got 0"),
         ({"steps": 1001}, "steps must be at most the 1000 noise levels of the training, got 1001"),
         ({"val_steps": 0}, "val_steps must be at least 1, got 0"),
+        ({"val_steps": 2.5}, r"val_steps must be a whole number, got 2\.5"),
         ({"sampler": "euler"}, "sampler must be one of ddpm, ddim, dpm_solver, got 'euler'"),
         ({"prediction": "flow"}, "prediction must be one of v_prediction, epsilon, got 'flow'"),
         ({"crop": 0}, "crop must be at least 1, got 0"),
@@ -310,13 +312,8 @@ def test_mixed_precision_trains_and_restores_without_nan(trainer, pairs, loader,
     ],
 )
 def test_an_invalid_option_is_named(options, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, TypeError), match=message):
         Diffusion(Linear, Undistort(), **options)
-
-
-def test_a_fractional_number_of_steps_is_rejected():
-    with pytest.raises(TypeError, match=r"val_steps must be a whole number, got 2\.5"):
-        Diffusion(Linear, Undistort(), val_steps=2.5)  # pyright: ignore[reportArgumentType]  # the wrong type is the test
 
 
 SHAPE = (3, 2, 5, 7)
@@ -327,10 +324,8 @@ def predict(noisy: Tensor, time: Tensor) -> Tensor:
     return torch.tanh(0.4 * noisy + 0.3 - time.view(-1, 1, 1, 1) / 2000)
 
 
-def run_sampler(name: str, steps: int, *keys: int, start: Tensor | None = None) -> Tensor:
-    source = stream(7, torch.tensor(keys))
-    start = normal(source.at(0), torch.empty(len(keys), *SHAPE[1:])) if start is None else start
-    return sample(start, predict, source.at(1), name=name, steps=steps)
+def run_sampler(name: str, steps: int, start: Tensor) -> Tensor:
+    return sample(start, predict, stream(7, torch.tensor([1, 2, 3])), name=name, steps=steps)
 
 
 def numpy_ddim(start: np.ndarray, steps: int) -> np.ndarray:
@@ -345,17 +340,10 @@ def numpy_ddim(start: np.ndarray, steps: int) -> np.ndarray:
     return noisy
 
 
-@pytest.mark.quick
-def test_the_variances_of_the_levels_grow_linearly():
-    assert_close(
-        Diffusion(Linear, Undistort()).levels.alphas_cumprod.double(), torch.from_numpy(ALPHAS), rtol=1e-4, atol=0
-    )
-
-
 @pytest.mark.parametrize("steps", [1, 3, 7, 50])
 def test_ddim_follows_its_formula_whether_or_not_the_steps_divide_the_levels(steps):
     start = torch.randn(SHAPE, generator=torch.Generator().manual_seed(steps))
-    result = run_sampler("ddim", steps, 1, 2, 3, start=start)
+    result = run_sampler("ddim", steps, start)
     assert_close(result.double(), torch.from_numpy(numpy_ddim(start.numpy(), steps)), rtol=0, atol=2e-4)
 
 
@@ -363,7 +351,7 @@ def test_the_solver_converges_with_its_steps_and_faster_than_ddim():
     start = torch.randn(SHAPE, generator=torch.Generator().manual_seed(0))
     limit = torch.from_numpy(numpy_ddim(start.numpy(), 1000)).float()
     coarse, fine, ddim = (
-        float((run_sampler(name, steps, 1, 2, 3, start=start) - limit).abs().max())
+        float((run_sampler(name, steps, start) - limit).abs().max())
         for name, steps in (("dpm_solver", 10), ("dpm_solver", 100), ("ddim", 100))
     )
     assert fine < coarse / 2
@@ -385,14 +373,6 @@ def test_a_step_of_ddpm_has_the_mean_and_variance_of_its_posterior():
     assert float(inputs[1].mean()) == pytest.approx(mean, abs=4 * np.sqrt(variance) / 200)
     assert float(inputs[1].var()) == pytest.approx(variance, rel=0.04)
     assert_close(result, torch.zeros(1, 1, 200, 200), rtol=0, atol=1e-6)  # the last step removes all noise
-
-
-@pytest.mark.parametrize("name", SAMPLERS)
-def test_a_sample_depends_on_its_key_alone(name):
-    together = run_sampler(name, 6, 11, 12, 13)
-    for i, key in enumerate((11, 12, 13)):
-        assert torch.equal(run_sampler(name, 6, key), together[i : i + 1])
-    assert not torch.equal(together[0], together[1])
 
 
 def test_the_noise_is_standard_normal_and_depends_on_the_key_alone():
@@ -436,25 +416,6 @@ def test_a_target_beyond_the_limit_decodes_to_the_limit():
     assert_close(flow[0, :, 0, 0], torch.tensor([2.5, -1.5]))
 
 
-def test_an_encoded_flow_decodes_to_the_flow_and_the_warped_image():
-    flow = torch.rand(1, 2, *FRAME, generator=torch.Generator().manual_seed(1)) * 2 - 1
-    pair, target = flow_pair(flow), FlowTarget(0.25)
-    restored = target.decode(target.encode(pair, FRAME), pair.degraded, FRAME)
-    assert restored.flow is not None
-    assert_close(restored.flow, flow)
-    expected = torch.from_numpy(numpy_warp(pair.degraded, flow.double().numpy()))
-    assert_close(restored.image, expected.float())
-
-
-def test_an_encoded_image_decodes_to_the_image():
-    pair, target = flow_pair(torch.zeros(1, 2, *FRAME)), ImageTarget()
-    encoded = target.encode(pair, FRAME)
-    assert_close(encoded, pair.clean * 2 - 1)
-    restored = target.decode(encoded, pair.degraded, FRAME)
-    assert restored.flow is None
-    assert_close(restored.image, pair.clean)
-
-
 def test_a_checkpoint_holds_the_companding_of_its_flows():
     model = Diffusion(lambda _: nn.Identity(), Undistort(0.25))
     state = model.state_dict()
@@ -466,22 +427,12 @@ def test_a_checkpoint_holds_the_companding_of_its_flows():
     assert_close(encoded, torch.tensor([compand(0.5 / (0.25 * side), 255) for side in (10, 6)]))
 
 
-class OtherTask(Task):
-    name, channels = "other", 1
-
-    def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
-        return Restored(degraded)
-
-    def loss(self, restored: Restored, pair: Pair) -> Tensor:
-        return restored.image.mean()
-
-
 def test_the_target_follows_from_the_task():
     flow = target_of(Undistort(0.1))
     assert isinstance(flow, FlowTarget)
     assert (flow.limit, flow.channels) == (0.1, 2)
     assert isinstance(target_of(Deweather()), ImageTarget)
-    with pytest.raises(TypeError, match="task must be Undistort or Deweather for a diffusion model, got OtherTask"):
-        target_of(OtherTask())
+    with pytest.raises(TypeError, match="task must be Undistort or Deweather for a diffusion model, got NoneType"):
+        target_of(None)  # pyright: ignore[reportArgumentType]  # the wrong type is the test
     with pytest.raises(ValueError, match=r"task.transmission_head must be false for a diffusion model, got true"):
         target_of(Deweather(transmission_head=True))

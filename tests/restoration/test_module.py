@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from torchrefract import LensDistortion, Pair, UniformFog, presets
 from torchrefract.restoration.checkpoints import read_checkpoint
 from torchrefract.restoration.metrics import endpoint_error, psnr
-from torchrefract.restoration.models.resunet import ResUNet
+from torchrefract.restoration.models.coordconv import ResUNet
 from torchrefract.restoration.module import NotFiniteError, Restoration
 from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
 

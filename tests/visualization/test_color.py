@@ -33,10 +33,6 @@ def mask(size: tuple[int, int], *positions: tuple[int, int]) -> torch.Tensor:
     return value
 
 
-def test_no_motion_is_white():
-    assert_close(flow_to_rgb(torch.zeros(2, 2, 3, 4)), torch.ones(2, 3, 3, 4))
-
-
 @pytest.mark.parametrize(
     ("u", "v", "rgb"),
     [

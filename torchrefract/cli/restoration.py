@@ -6,13 +6,13 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from pytorch_lightning import LightningModule, Trainer, seed_everything
+from pytorch_lightning import Trainer, seed_everything
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
@@ -32,11 +32,11 @@ from torchrefract.data.media import (
 )
 from torchrefract.data.module import PairData, fingerprint
 from torchrefract.data.pairs.manifest import claim
-from torchrefract.restoration.checkpoints import Origin, check_fits, load_model, read_checkpoint
+from torchrefract.restoration.checkpoints import check_fits, load_model, read_checkpoint
 from torchrefract.restoration.export import FORMATS, export_model
 from torchrefract.restoration.inference import Restorer
 from torchrefract.restoration.models.coordconv import weights_license
-from torchrefract.restoration.module import Restoration
+from torchrefract.restoration.module import Restoration, RestorationModule
 from torchrefract.restoration.tasks import Undistort
 
 _T = TypeVar("_T")
@@ -48,7 +48,7 @@ def train(cfg: DictConfig) -> None:
     limit = trainer.max_epochs
     if num_epochs and limit is not None and -1 < limit <= num_epochs:
         raise UsageError(f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}")
-    trainer.callbacks.insert(0, _origin(cfg, data))  # pyright: ignore[reportAttributeAccessIssue]  # a connector sets it
+    model.origin = _origin(cfg, data)
     _save_config(cfg, trainer)
     trainer.fit(model, data, ckpt_path=cfg.ckpt_path, weights_only=True)
 
@@ -74,7 +74,7 @@ def restore(cfg: DictConfig) -> None:
     start = time.perf_counter()
     failed = dict[Path, str]()
     num_frames = _restore_pictures([file for file in todo if not is_video(file)], job, failed)
-    num_frames += _restore_videos([file for file in todo if is_video(file)], job, failed)
+    num_frames += sum(_restore_video(file, job, failed) for file in todo if is_video(file))
     if len(failed) == len(files):
         raise UsageError(f"input must hold a file that can be restored, got {next(iter(failed.values()))}")
     rate = num_frames / (time.perf_counter() - start)
@@ -103,7 +103,7 @@ def export(cfg: DictConfig) -> None:
     )
 
 
-def _make_parts(cfg: DictConfig) -> tuple[PairData, LightningModule, Trainer, int]:
+def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, int]:
     """Instantiate data, model and trainer, check that they fit together, and count the epochs of `ckpt_path`."""
     OmegaConf.resolve(cfg)
     seed_everything(check_seed(cfg.seed), workers=True, verbose=False)
@@ -130,11 +130,12 @@ def _save_config(cfg: DictConfig, trainer: Trainer) -> None:
                 OmegaConf.save(cfg, temporary)
 
 
-def _origin(cfg: DictConfig, data: PairData) -> Origin:
+def _origin(cfg: DictConfig, data: PairData) -> dict[str, Any]:
+    """Return what a checkpoint holds of its origin: configuration, training data, and licenses by source."""
     source, network = fingerprint(data.train), cfg.model.network
     weights = weights_license(network.encoder) if "encoder" in network and network.get("pretrained") else None
-    config = cast(dict[str, Any], OmegaConf.to_container(cfg, enum_to_str=True))
-    return Origin(config, data=source, licenses={"data": source["license"], "pretrained weights": weights})
+    licenses = {"data": source["license"], "pretrained weights": weights}
+    return {"config": OmegaConf.to_container(cfg, enum_to_str=True), "data": source, "licenses": licenses}
 
 
 class _Job(NamedTuple):
@@ -223,28 +224,22 @@ def _restore_pictures(files: Sequence[Path], job: _Job, failed: dict[Path, str])
     return count
 
 
-def _restore_videos(files: Sequence[Path], job: _Job, failed: dict[Path, str]) -> int:
-    """Restore videos, note the unreadable ones in `failed`, and return the number of frames restored."""
-    count = 0
-    for file in files:
-        target = job.target(file)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            count += _restore_video(file, target, job)
-        except UnreadableImageError as error:
-            _skip(file, error, failed)
-    return count
-
-
-def _restore_video(file: Path, target: Path, job: _Job) -> int:
-    num_frames = video_info(file)[0]
+def _restore_video(file: Path, job: _Job, failed: dict[Path, str]) -> int:
+    """Restore a video and return the number of its frames; note an unreadable one in `failed` and return 0."""
 
     def change(frames: Iterable[Tensor]) -> Iterator[np.ndarray]:
+        num_frames = video_info(file)[0]
         for chunk in _batches(progress(frames, f"restoring {file.name}", count=num_frames), job.batch):
             yield from job.restore([frame[0] for frame in chunk])
 
-    with replace_file(target) as path:
-        return convert_video(file, path, change=change)
+    target = job.target(file)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with replace_file(target) as path:
+            return convert_video(file, path, change=change)
+    except UnreadableImageError as error:
+        _skip(file, error, failed)
+        return 0
 
 
 def _skip(file: Path, error: UnreadableImageError, failed: dict[Path, str]) -> None:

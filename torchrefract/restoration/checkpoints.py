@@ -1,10 +1,8 @@
 """Checkpoints: written atomically, verified before use, and sufficient to rebuild their model safely."""
 
-import pickle
-import struct
+import re
 import zipfile
-import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, NamedTuple
@@ -14,7 +12,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from pytorch_lightning import Callback, LightningModule, Trainer
+from pytorch_lightning import LightningModule
 from pytorch_lightning.plugins.io import TorchCheckpointIO
 from torch import Tensor, nn
 
@@ -26,9 +24,7 @@ _PACKAGE = "torchrefract."
 _ALLOWED = (nn.Module, Task)  # the classes that a checkpoint may instantiate
 # Parts of the names of weights in older checkpoints, and the parts that replaced them.
 _RENAMED = {"whole": "polynomial_head", "place": "coordinate_weight"}
-# zipfile and torch.load raise these for files that are damaged or no archives.
-_READ_ERRORS = (zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, EOFError, LookupError, OSError, RuntimeError)
-_READ_ERRORS += (struct.error, ValueError, TypeError, AttributeError, ArithmeticError, AssertionError)
+_MOVED = re.compile(r"(?<=\.models\.)(resunet|segformer)(?=\.)")  # modules of older checkpoints, now in coordconv
 
 
 class CheckpointError(UsageError):
@@ -39,11 +35,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """Replace a checkpoint only by a complete one, so that a full disk keeps the last good file."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Write the checkpoint to a temporary file, then move it to `path`.
-
-        Raises:
-            CheckpointError: the file cannot be written.
-        """
+        """Write the checkpoint to a temporary file, then move it to `path`; raise CheckpointError if that fails."""
         path = Path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -59,38 +51,14 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             ) from error
 
 
-class Origin(Callback):
-    """Add to each checkpoint its origin, in plain values that load with `weights_only=True`.
-
-    Args:
-        config: the resolved configuration of the run.
-        data: the training data, as of `torchrefract.data.module`.
-        licenses: by source of the model, the license, or None if it is unknown.
-    """
-
-    def __init__(self, config: Mapping[str, Any], *, data: Mapping[str, Any], licenses: Mapping[str, str | None]):
-        self.origin = {"config": dict(config), "data": dict(data), "licenses": dict(licenses)}
-
-    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Add configuration, data and licenses."""
-        checkpoint.update(self.origin)
-
-
 class Loaded(NamedTuple):
-    """A model and the facts about it that its checkpoint holds.
+    """A model and the facts about it that its checkpoint holds."""
 
-    model: in evaluation mode; maps images (B, 3, H, W) in [0, 1] to `Restored`.
-    name: as of `model_name`.
-    task: the name of its task.
-    size: (height, width) of the frames that it was trained on, px.
-    licenses: by source of the model, the license, or None if it is unknown.
-    """
-
-    model: LightningModule
-    name: str
-    task: str
-    size: tuple[int, int]
-    licenses: dict[str, Any]
+    model: LightningModule  # in evaluation mode; maps images (B, 3, H, W) in [0, 1] to `Restored`
+    name: str  # as of `model_name`
+    task: str  # the name of its task
+    size: tuple[int, int]  # height and width of the frames that it was trained on, px
+    licenses: dict[str, Any]  # by source of the model, the license, or None if it is unknown
 
 
 def load_model(path: Path, *, changes: Mapping[str, Any] | None = None) -> Loaded:
@@ -122,11 +90,7 @@ def load_model(path: Path, *, changes: Mapping[str, Any] | None = None) -> Loade
 
 
 def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
-    """Read a checkpoint without running code from it.
-
-    Args:
-        path: the checkpoint.
-        task: the task that it must be of; None accepts any.
+    """Read a checkpoint without running code from it; its task must be `task`, if that is given.
 
     Raises:
         CheckpointError: the file is missing, damaged, no checkpoint of torchrefract, or of another task.
@@ -139,20 +103,20 @@ def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
             if (damaged := archive.testzip()) is not None:
                 raise zipfile.BadZipFile(damaged)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except _READ_ERRORS as error:
+    except Exception as error:  # zipfile and torch.load raise many types for a damaged file
         raise CheckpointError(
             f"ckpt_path must be an intact checkpoint, got {path}, which is damaged or another kind of file"
         ) from error
     weights, name = (checkpoint.get(key) if isinstance(checkpoint, dict) else None for key in ("state_dict", "task"))
-    if not isinstance(weights, dict) or not isinstance(name, str) or not _are_weights(weights):
+    if not (
+        isinstance(name, str)
+        and isinstance(weights, dict)
+        and all(isinstance(key, str) and isinstance(value, Tensor) for key, value in weights.items())
+    ):
         raise CheckpointError(f"ckpt_path must be a checkpoint of torchrefract, got {path}")
     if task not in (None, name):
         raise CheckpointError(f"ckpt_path must be a checkpoint of the task {task}, got {path} of {name}")
     return checkpoint | {"state_dict": rename_weights(weights)}
-
-
-def _are_weights(weights: Mapping[Any, Any]) -> bool:
-    return all(isinstance(name, str) and isinstance(value, Tensor) for name, value in weights.items())
 
 
 def rename_weights(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -165,11 +129,7 @@ def check_fits(
 ) -> None:
     """Raise CheckpointError unless the weights of a checkpoint have the names and shapes of a model's.
 
-    Args:
-        checkpoint: as of `read_checkpoint`.
-        model: the model.
-        path: the checkpoint, for the message.
-        config: the configuration of the model, for the message.
+    The message names the path and, if the model's configuration is given, both models.
     """
     shapes, saved = (
         {name: value.shape for name, value in weights.items()}
@@ -196,10 +156,8 @@ def model_name(model: Mapping[str, Any]) -> str:
 def _instantiate(config: dict[str, Any], changes: Mapping[str, Any], path: Path) -> LightningModule:
     """Instantiate the configuration of a model after checking that it can do nothing else."""
     try:
-        plain = OmegaConf.to_container(OmegaConf.merge(config, dict(changes)), resolve=False)
-        for node in _mappings(plain):
-            _check_node(node, path)
-        model = instantiate(plain)
+        merged = OmegaConf.to_container(OmegaConf.merge(config, dict(changes)), resolve=False)
+        model = instantiate(_safe(merged, path))
     except (InstantiationException, OmegaConfBaseException, ValueError, TypeError) as error:
         reason = error.__cause__ or error
         raise CheckpointError(f"ckpt_path must be of a model that can be built, got {path}: {reason}") from error
@@ -208,23 +166,20 @@ def _instantiate(config: dict[str, Any], changes: Mapping[str, Any], path: Path)
     return model
 
 
-def _mappings(value: Any) -> Iterator[dict[Any, Any]]:
-    """Yield all mappings in nested plain values."""
-    if isinstance(value, dict):
-        yield value
-    for child in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
-        yield from _mappings(child)
-
-
-def _check_node(node: dict[Any, Any], path: Path) -> None:
-    """Raise CheckpointError if a mapping could run foreign code or read other files; drop its pretrained weights."""
-    if any(isinstance(value, str) and "${" in value for value in node.values()):
+def _safe(value: Any, path: Path) -> Any:
+    """Drop pretrained weights from a configuration; raise CheckpointError if it could run code or read files."""
+    if isinstance(value, str) and "${" in value:
         raise CheckpointError(f"ckpt_path must hold a resolved configuration, got {path} with ${{…}} in it")
-    if node.get("pretrained") is not None:
-        node["pretrained"] = None
-    target = node.get("_target_")
-    if "_target_" in node and not _is_allowed(target):
+    if isinstance(value, list):
+        return [_safe(child, path) for child in value]
+    if not isinstance(value, dict):
+        return value
+    safe = {key: None if key == "pretrained" else _safe(child, path) for key, child in value.items()}
+    if isinstance(target := safe.get("_target_"), str):
+        safe["_target_"] = target = _MOVED.sub("coordconv", target)
+    if "_target_" in safe and not _is_allowed(target):
         raise CheckpointError(f"ckpt_path must name models and tasks of torchrefract only, got {path} with {target!r}")
+    return safe
 
 
 def _is_allowed(target: Any) -> bool:

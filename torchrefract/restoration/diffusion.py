@@ -188,24 +188,17 @@ class Diffusion(RestorationModule):
 
 
 class Target(nn.Module, ABC):
-    """Represent a restoration by maps in about [-1, 1].
-
-    Buffers that `decode` needs are in the state dict, so that weights of another representation do not fit.
-    """
+    """Represent a restoration by maps in about [-1, 1]. Buffers of `decode` make other weights unfit to load."""
 
     channels: int
 
     @abstractmethod
     def encode(self, pair: Pair, size: Sequence[int]) -> Tensor:
-        """Encode the true restoration of a pair that was cropped from frames of `size` = (height, width).
-
-        Returns:
-            (B, channels, H, W), in [-1, 1].
-        """
+        """Encode the restoration of a pair cropped from frames of `size` = (height, width) to (B, channels, H, W)."""
 
     @abstractmethod
     def decode(self, target: Tensor, degraded: Tensor, size: Sequence[int]) -> Restored:
-        """Restore images (B, 3, H, W) that were cropped from frames of `size` by their target."""
+        """Restore images (B, 3, H, W) that were cropped from frames of `size` by their target; inverts `encode`."""
 
 
 class FlowTarget(Target):
@@ -287,25 +280,23 @@ def normal(source: Stream, like: Tensor) -> Tensor:
 def sample(
     start: Tensor, predict_target: Callable[[Tensor, Tensor], Tensor], source: Stream, *, name: str, steps: int
 ) -> Tensor:
-    """Sample a target, starting from noise.
-
-    "ddpm" adds fresh noise after each step and needs many steps. "ddim" and "dpm_solver" follow the mean path, the
-    latter by second-order steps, of which it needs fewer.
+    """Sample a target from noise. "ddpm" adds noise after each step, "dpm_solver" takes steps of second order.
 
     Args:
-        start: (B, C, H, W), standard normal.
+        start: (B, C, H, W), standard normal; the target has the same shape.
         predict_target: predicts the target from a noisy one and its level (B,).
-        source: stream of the fresh noise.
-        name: one of SAMPLERS.
-        steps: from 1 to 1000.
+        source: stream of the noise of "ddpm".
+        name, steps: as for `Diffusion`.
 
-    Returns:
-        (B, C, H, W).
-
-    Source: Ho, Jain, Abbeel, "Denoising diffusion probabilistic models", NeurIPS 2020; Song, Meng, Ermon, "Denoising
-    diffusion implicit models", ICLR 2021; Lu et al., "DPM-Solver++", 2022.
+    Source: Ho et al. as for `Diffusion`; Song, Meng, Ermon, "Denoising diffusion implicit models", ICLR 2021; Lu et
+    al., "DPM-Solver++", 2022.
     """
-    scheduler = _scheduler(check_choice("sampler", name, SAMPLERS))
+    options: dict[str, Any] = {"beta_schedule": "linear", "prediction_type": "sample"}
+    if check_choice("sampler", name, SAMPLERS) == "ddpm":
+        scheduler = DDPMScheduler(NUM_LEVELS, clip_sample=False, **options)
+    else:
+        # DDIM is the first-order solver. DDIMScheduler of diffusers requires that the steps divide 1000.
+        scheduler = DPMSolverMultistepScheduler(NUM_LEVELS, solver_order=1 if name == "ddim" else 2, **options)
     # From the highest level down. The spacing of diffusers is uneven, or off by one, if `steps` does not divide 1000.
     levels = [NUM_LEVELS * (steps - i) // steps - 1 for i in range(_check_steps("steps", steps))]
     scheduler.set_timesteps(timesteps=levels)
@@ -323,11 +314,3 @@ def _check_steps(name: str, steps: int) -> int:
     if check_count(name, steps) > NUM_LEVELS:
         raise ValueError(f"{name} must be at most the {NUM_LEVELS} noise levels of the training, got {steps}")
     return steps
-
-
-def _scheduler(name: str) -> DDPMScheduler | DPMSolverMultistepScheduler:
-    if name == "ddpm":
-        return DDPMScheduler(NUM_LEVELS, beta_schedule="linear", prediction_type="sample", clip_sample=False)
-    # DDIM is the first-order solver. DDIMScheduler of diffusers requires that the steps divide 1000.
-    order = 1 if name == "ddim" else 2
-    return DPMSolverMultistepScheduler(NUM_LEVELS, beta_schedule="linear", prediction_type="sample", solver_order=order)

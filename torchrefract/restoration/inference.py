@@ -58,12 +58,12 @@ class Restorer:
             return [image.clamp(0, 1) for image in tiled]
         small = torch.cat([resize_image(image[None], self.size) for image in images])
         restored = self.model(small)
-        results = []
-        for i, image in enumerate(images):
-            one = Restored(restored.image[i : i + 1], None if restored.flow is None else restored.flow[i : i + 1])
-            options = {"small": small[i : i + 1], "interpolation": self.interpolation}
-            results.append(at_full_size(one, image[None], **options).image[0])
-        return results
+        flows = [None] * len(images) if restored.flow is None else restored.flow.split(1)
+        parts = zip(images, small.split(1), map(Restored, restored.image.split(1), flows), strict=True)
+        return [
+            at_full_size(one, image[None], small=before, interpolation=self.interpolation).image[0]
+            for image, before, one in parts
+        ]
 
     def _restore_tile(self, tiles: Tensor) -> Tensor:
         restored = self.model(tiles)
@@ -75,13 +75,7 @@ class Restorer:
 
 
 class FullSizeModel(nn.Module):
-    """Restore a batch of images at their own size in one module, for `torch.export`.
-
-    Args:
-        model: maps images (B, 3, H, W) in [0, 1] to `Restored`.
-        size: (height, width) of the frames that the model was trained on, px.
-        interpolation: interpolation of the warp.
-    """
+    """Restore a batch of images at their own size in one module, for `torch.export`; see `Restorer`."""
 
     def __init__(self, model: nn.Module, *, size: Sequence[int], interpolation: str = "bicubic"):
         super().__init__()
@@ -114,11 +108,8 @@ def transfer_change(image: Tensor, small: Tensor, restored: Tensor) -> Tensor:
     that the small copy lacks.
 
     Args:
-        image: (B, C, H, W).
+        image: (B, C, H, W); the result has its shape.
         small, restored: (B, C, h, w).
-
-    Returns:
-        (B, C, H, W).
 
     Source: He, Sun, Tang, "Guided image filtering", IEEE TPAMI 35 (2013), for a.
     """
@@ -132,7 +123,7 @@ def transfer_change(image: Tensor, small: Tensor, restored: Tensor) -> Tensor:
 
 
 def restore_tiles(restore: Callable[[Tensor], Tensor], image: Tensor, *, tile: tuple[int, int], batch: int) -> Tensor:
-    """Restore a picture tile by tile, and blend the tiles where they overlap.
+    """Restore a picture (C, H, W) tile by tile, and blend the tiles where they overlap.
 
         out(p) = sum_i w(p - o_i) restored_i(p - o_i) / sum_i w(p - o_i),  w(x, y) = sin^2(pi x / w) sin^2(pi y / h)
 
@@ -141,12 +132,8 @@ def restore_tiles(restore: Callable[[Tensor], Tensor], image: Tensor, *, tile: t
 
     Args:
         restore: restores images (B, C, h, w).
-        image: (C, H, W).
-        tile: (h, w), px; at most the size of the picture is used.
-        batch: number of tiles that are restored together.
-
-    Returns:
-        (C, H, W).
+        image: the picture; the result has its shape.
+        tile, batch: as for `Restorer`; at most the size of the picture is used.
     """
     height, width = (min(side, full) for side, full in zip(tile, image.shape[1:], strict=True))
     corners = list(product(_tile_starts(image.shape[1], height), _tile_starts(image.shape[2], width)))

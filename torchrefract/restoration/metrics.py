@@ -10,7 +10,7 @@ def masked_mean(value: Tensor, valid: Tensor) -> Tensor:
 
     Args:
         value: (B, C, H, W).
-        valid: (B, 1, H, W), bool.
+        valid: (B, 1, H, W), bool; the same for all scores.
 
     Returns:
         (B,); 0 for an image without a valid pixel.
@@ -21,32 +21,18 @@ def masked_mean(value: Tensor, valid: Tensor) -> Tensor:
 
 
 def psnr(restored: Tensor, clean: Tensor, valid: Tensor) -> Tensor:
-    """Compute the peak signal-to-noise ratio of each image.
+    """Compute the peak signal-to-noise ratio (B,), dB, of images (B, C, H, W) in [0, 1].
 
-        psnr = 10 log10(1 / mean (clamp(restored, 0, 1) - clean)^2), at most 100 dB
-
-    Args:
-        restored, clean: (B, C, H, W), in [0, 1].
-        valid: (B, 1, H, W), bool.
-
-    Returns:
-        (B,), dB.
+    psnr = 10 log10(1 / mean (clamp(restored, 0, 1) - clean)^2), at most 100 dB
     """
     error = masked_mean((restored.clamp(0, 1) - clean).square(), valid)
     return -10 * torch.log10(error.clamp(min=1e-10))
 
 
 def ssim(restored: Tensor, clean: Tensor, valid: Tensor) -> Tensor:
-    """Compute the structural similarity of each image with an 11 x 11 Gaussian window.
+    """Compute the structural similarity (B,), at most 1, of images (B, C, H, W) in [0, 1].
 
-    Invalid pixels inside a window count as clean ones.
-
-    Args:
-        restored, clean: (B, C, H, W), in [0, 1].
-        valid: (B, 1, H, W), bool.
-
-    Returns:
-        (B,), at most 1.
+    The window is an 11 x 11 Gaussian. Invalid pixels inside a window count as clean ones.
 
     Source: Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment", IEEE TIP 13 (2004).
     """
@@ -54,15 +40,12 @@ def ssim(restored: Tensor, clean: Tensor, valid: Tensor) -> Tensor:
 
 
 def endpoint_error(flow: Tensor, target: Tensor, valid: Tensor, *, size: tuple[int, int]) -> Tensor:
-    """Compute the mean length of `flow - target` of each image, in pixels of a frame of another size.
+    """Compute the mean length (B,) of `flow - target`, each (B, 2, H, W), px.
 
     Args:
-        flow, target: (B, 2, H, W), px of a frame of (H, W).
-        valid: (B, 1, H, W), bool.
+        flow, target: px of a frame of (H, W).
+        valid: as for `masked_mean`.
         size: (height, width) of the frame whose pixels are the unit of the result.
-
-    Returns:
-        (B,), px.
     """
     scale = [size[1] / flow.shape[3], size[0] / flow.shape[2]]
     difference = (flow - target) * torch.tensor(scale, dtype=flow.dtype, device=flow.device).view(1, 2, 1, 1)

@@ -18,7 +18,6 @@ from torchrefract.types import Pair
 from torchrefract.warping.warp import warp
 
 SCHEDULES = ("cosine", "plateau")
-_NO_FLOWS: tuple[Tensor, ...] = (torch.zeros(0), torch.zeros(0))
 
 
 class NotFiniteError(UsageError):
@@ -61,9 +60,10 @@ class RestorationModule(LightningModule, ABC):
         self.warmup_steps = check_count("warmup_steps", warmup_steps, low=0)
         self.schedule = check_choice("schedule", schedule, SCHEDULES)
         self.metric_size = check_size("metric_size", metric_size)
-        # For the constant baseline: the sum of the valid flows (2, H, W) and their number (1, H, W), over all ranks,
-        # and those of this rank that are not yet added.
-        self.flows, self.new_flows = _NO_FLOWS, _NO_FLOWS
+        # For the constant baseline: the sum of the valid flows and their number, (3, H, W), over all ranks, and those
+        # of this rank that are not yet added.
+        self.flows, self.new_flows = torch.zeros(0), torch.zeros(0)
+        self.origin: dict[str, Any] = {}  # config, data and licenses in plain values, which checkpoints hold
 
     @abstractmethod
     def forward(self, degraded: Tensor, key: Tensor | None = None) -> Restored:
@@ -97,7 +97,9 @@ class RestorationModule(LightningModule, ABC):
                 f"for the keys {keys}"
             )
         self._log("train", {"loss": loss} | ({} if restored is None else self._scores(restored, batch)), batch)
-        self._add_flows(batch)
+        weight = batch.valid.double()
+        flows = torch.cat([batch.flow.double() * weight, weight], dim=1).sum(dim=0)
+        self.new_flows = _add(self.new_flows, flows)
         return loss
 
     def validation_step(self, batch: Pair, _: int) -> dict[str, Any]:
@@ -116,18 +118,19 @@ class RestorationModule(LightningModule, ABC):
 
     def on_validation_start(self) -> None:
         """Add up the flows of all ranks for the constant baseline."""
-        self._gather_flows()
+        if len(self.new_flows):
+            of_all_ranks = self.trainer.strategy.reduce(self.new_flows.to(self.device), reduce_op="sum")
+            self.flows, self.new_flows = _add(self.flows, of_all_ranks), torch.zeros(0)
 
     def on_train_epoch_end(self) -> None:
-        """Add up the flows of all ranks for the checkpoint."""
-        self._gather_flows()
+        """Add up the flows of an epoch without a validation for the checkpoint."""
+        self.on_validation_start()
 
     def constant_flow(self, like: Tensor) -> Tensor:
         """Return the mean valid flow of the training set in the shape of `like`; 0 without a valid flow."""
-        flow_sum, count = self.flows
-        if flow_sum.shape != like.shape[1:]:
+        if self.flows.shape[1:] != like.shape[2:]:
             return torch.zeros_like(like)
-        return (flow_sum / count.clamp(min=1)).to(like).expand_as(like)
+        return (self.flows[:2] / self.flows[2:].clamp(min=1)).to(like).expand_as(like)
 
     def configure_optimizers(self) -> Any:
         """Create AdamW and its learning rate schedule."""
@@ -160,14 +163,13 @@ class RestorationModule(LightningModule, ABC):
             scheduler.step()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the task and the sums of the flows to a checkpoint."""
-        checkpoint["task"] = self.task.name
-        checkpoint["flows"] = self.flows
+        """Add the task, the sums of the flows and the origin to a checkpoint."""
+        checkpoint.update(self.origin, task=self.task.name, flows=(self.flows[:2], self.flows[2:]))
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Restore the sums of the flows; rename weights of an older version."""
         checkpoint["state_dict"] = rename_weights(checkpoint["state_dict"])
-        self.flows = checkpoint["flows"]
+        self.flows = torch.cat(checkpoint["flows"])
 
     def _scores(self, restored: Restored, pair: Pair) -> dict[str, Tensor]:
         scores = {"psnr": psnr(restored.image.detach(), pair.clean, pair.valid)}
@@ -178,15 +180,6 @@ class RestorationModule(LightningModule, ABC):
     def _log(self, split: str, scores: dict[str, Tensor], batch: Pair, suffix: str = "") -> None:
         values = {f"{split}/{name}{suffix}": value.mean() for name, value in scores.items()}
         self.log_dict(values, on_step=False, on_epoch=True, batch_size=len(batch.clean), sync_dist=True)
-
-    def _add_flows(self, pair: Pair) -> None:
-        weight = pair.valid.double()
-        self.new_flows = _add(self.new_flows, ((pair.flow.double() * weight).sum(dim=0), weight.sum(dim=0)))
-
-    def _gather_flows(self) -> None:
-        if len(self.new_flows[0]):
-            ranks = (self.trainer.strategy.reduce(value.to(self.device), reduce_op="sum") for value in self.new_flows)
-            self.flows, self.new_flows = _add(self.flows, tuple(ranks)), _NO_FLOWS
 
 
 class Restoration(RestorationModule):
@@ -217,16 +210,12 @@ class Restoration(RestorationModule):
         return self.task.restore(self.network(degraded), degraded)
 
     def training_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
-        """See `RestorationModule.training_loss`."""
         restored = self(batch.degraded)
         return self.task.loss(restored, batch), restored
 
     def validation_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
-        """See `RestorationModule.validation_loss`."""
         return self.training_loss(batch)
 
 
-def _add(old: tuple[Tensor, ...], new: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    if old[0].shape != new[0].shape:
-        return new
-    return tuple(a.to(b.device) + b for a, b in zip(old, new, strict=True))
+def _add(old: Tensor, new: Tensor) -> Tensor:
+    return old.to(new.device) + new if old.shape == new.shape else new

@@ -2,11 +2,11 @@
 
 import csv
 import math
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
+from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -32,8 +32,6 @@ from torchrefract.visualization.figures import (
 METRICS, METRICS_BEFORE = "metrics.csv", "metrics_before.csv"
 _PANEL_ROWS = 4
 _METHODS = {"do nothing": "_identity", "best constant flow": "_constant", "model": ""}
-
-_Columns = dict[str, dict[int, float]]  # name -> epoch -> value
 
 
 class RunSummary(Callback):
@@ -131,19 +129,12 @@ def _epoch_of(row: dict[str, str]) -> float:
     return int(row["epoch"]) if is_complete else math.inf
 
 
-class _Style(NamedTuple):
-    column: str
-    label: str
-    color: str
-    line: str
-
-
-_STYLES = (
-    _Style("train/{}", "training", "#7fb2dd", "-"),
-    _Style("val/{}", "validation", "#08306b", "-"),
-    _Style("val/{}_identity", "do nothing", "#6b6b6b", "--"),
-    _Style("val/{}_constant", "best constant flow", "#d95f02", "--"),
-)
+_STYLES = {  # column -> label, color and line of its curve; without markers, a point between gaps would be invisible
+    "train/{}": ("training", "#7fb2dd", "-o"),
+    "val/{}": ("validation", "#08306b", "-o"),
+    "val/{}_identity": ("do nothing", "#6b6b6b", "--"),
+    "val/{}_constant": ("best constant flow", "#d95f02", "--"),
+}
 
 
 def plot_curves(run: Path, *, epe_unit: str) -> Figure:
@@ -160,15 +151,15 @@ def plot_curves(run: Path, *, epe_unit: str) -> Figure:
         ValueError: the metrics hold no value to plot.
     """
     units = {"loss": "loss", "psnr": "PSNR (dB)", "epe": f"endpoint error ({epe_unit})"}
-    columns = _read_columns(run, [style.column.format(quantity) for quantity in units for style in _STYLES])
-    shown = {q: unit for q, unit in units.items() if any(style.column.format(q) in columns for style in _STYLES)}
+    rows = [row for row in metrics_rows(run) if row.get("epoch")]
+    shown = {quantity: curves for quantity in units if (curves := _read_curves(rows, quantity))}
     if not shown:
         raise ValueError(f"metrics must hold a loss, psnr or epe of an epoch, got none in {run}")
     figure = Figure(figsize=(4.8 * len(shown), 4.4), dpi=120, layout=ConstrainedLayoutEngine(w_pad=0.12))
-    for axes, (quantity, unit) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
-        for style in _STYLES:
-            if column := columns.get(style.column.format(quantity)):
-                _plot_curve(axes, column, style)
+    for axes, (quantity, curves) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
+        for column, curve in curves.items():
+            _plot_curve(axes, curve, *_STYLES[column])
+        unit = units[quantity]
         axes.set_xlabel("epoch")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         axes.grid(color="#e4e4e4", linewidth=0.8)
@@ -179,29 +170,27 @@ def plot_curves(run: Path, *, epe_unit: str) -> Figure:
     return figure
 
 
-def _plot_curve(axes: Axes, column: dict[int, float], style: _Style) -> None:
-    epochs, values = list(column), list(column.values())
-    label = f"{style.label} ({values[-1]:.4g})"
-    if style.line == "--" and len(values) == 1:  # a dashed line with one point would be invisible
-        axes.axhline(values[0], color=style.color, linestyle=style.line, label=label)
-        return
-    # Without markers, a single point between gaps would be invisible.
-    marker = "" if style.line == "--" else "o"
-    axes.plot(epochs, values, style.line, color=style.color, marker=marker, markersize=3, linewidth=1.6, label=label)
+def _read_curves(rows: list[dict[str, str]], quantity: str) -> dict[str, dict[int, float]]:
+    """Return the curves of a quantity that have values, by epoch; a logger leaves most cells of a row empty."""
+    curves = {}
+    for column in _STYLES:
+        name, cells = column.format(quantity), dict[int, list[float]]()
+        for row in rows:
+            if row.get(name):
+                cells.setdefault(int(row["epoch"]), []).append(float(row[name]))
+        if cells:
+            mean_or_last = fmean if name.startswith("train/") else itemgetter(-1)
+            curves[column] = {epoch: mean_or_last(cells[epoch]) for epoch in sorted(cells)}
+    return curves
 
 
-def _read_columns(run: Path, names: Sequence[str]) -> _Columns:
-    """Read the columns `names` that have a value; a logger leaves most cells of a row empty."""
-    cells: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in metrics_rows(run):
-        for name in names:
-            if row.get("epoch") and row.get(name):
-                cells[name][int(row["epoch"])].append(float(row[name]))
-
-    def value(name: str, values: list[float]) -> float:
-        return fmean(values) if name.startswith("train/") else values[-1]
-
-    return {name: {epoch: value(name, epochs[epoch]) for epoch in sorted(epochs)} for name, epochs in cells.items()}
+def _plot_curve(axes: Axes, curve: dict[int, float], label: str, color: str, line: str) -> None:
+    epochs, values = list(curve), list(curve.values())
+    label = f"{label} ({values[-1]:.4g})"
+    if line == "--" and len(values) == 1:  # a dashed line with one point would be invisible
+        axes.axhline(values[0], color=color, linestyle=line, label=label)
+    else:
+        axes.plot(epochs, values, line, color=color, markersize=3, linewidth=1.6, label=label)
 
 
 def draw_panel(restored: Restored, pair: Pair) -> Figure:
@@ -209,10 +198,6 @@ def draw_panel(restored: Restored, pair: Pair) -> Figure:
 
     Without a flow, the last column is |restored - clean| times 4. Invalid pixels are hatched from the third column on;
     values that are not finite are gray.
-
-    Args:
-        restored: the restorations of N examples.
-        pair: the examples.
     """
     before, after = (psnr(image, pair.clean, pair.valid) for image in (pair.degraded, restored.image))
     derived = {"restored": restored.image}
@@ -227,20 +212,19 @@ def draw_panel(restored: Restored, pair: Pair) -> Figure:
     columns |= {title: hatch_invalid(resize_for_display(image), pair.valid) for title, image in derived.items()}
     height, width = columns["clean"].shape[2:]
     page = FigureLayout(len(pair.clean), len(columns), height, width, caption_lines=1)
-    figure = page.figure()
     for j, (title, images) in enumerate(columns.items()):
-        page.write(figure, title, page.left(j) + page.width / 2, 2 * page.text, ha="center", weight="bold")
+        page.write(title, page.left(j) + page.width / 2, 2 * page.text, ha="center", weight="bold")
         for i, image in enumerate(images):
-            page.show(figure, image, page.left(j), page.top(i))
+            page.show(image, page.left(j), page.top(i))
     for i, (degraded, result) in enumerate(zip(before.tolist(), after.tolist(), strict=True)):
-        page.write(figure, f"{degraded:.1f} -> {result:.1f} dB", page.left(0), page.top(i) - 0.3 * page.text)
+        page.write(f"{degraded:.1f} -> {result:.1f} dB", page.left(0), page.top(i) - 0.3 * page.text)
     bottom = page.top(page.rows)
     if not pair.valid.all():
-        draw_invalid_key(figure, page, x=page.left(0), y=bottom)
+        draw_invalid_key(page, x=page.left(0), y=bottom)
     if restored.flow is not None:
-        legend = [MapScale("flow", scale)]
-        draw_legend(figure, page, legend, x=page.left(page.columns - 2), y=bottom + 2 * page.text)
-    return figure
+        x, y = page.left(page.columns - 2), bottom + 2 * page.text
+        draw_legend(page, [MapScale("flow", scale)], x=x, y=y)
+    return page.figure
 
 
 def choose_examples(restored: Restored, pair: Pair) -> tuple[Restored, Pair]:

@@ -16,29 +16,19 @@ _CELL = 4  # px
 
 
 class Restored(NamedTuple):
-    """A restored batch of images.
+    """A restored batch of images; maps that the task does not predict are None."""
 
-    image: (B, 3, H, W).
-    flow: (B, 2, H, W), px; None for a task without a flow.
-    transmission: (B, 1, H, W) in (0, 1); None for a task without a transmission.
-    """
-
-    image: Tensor
-    flow: Tensor | None = None
-    transmission: Tensor | None = None
+    image: Tensor  # (B, 3, H, W)
+    flow: Tensor | None = None  # (B, 2, H, W), px
+    transmission: Tensor | None = None  # (B, 1, H, W), in (0, 1)
 
 
 class Task(ABC):
-    """A kind of restoration.
+    """A kind of restoration."""
 
-    name: the name of its file in conf/task.
-    channels: number of maps that the network predicts.
-    smooth: True if the maps may be smooth over the whole frame.
-    """
-
-    name: str
-    channels: int
-    smooth = False
+    name: str  # of its file in conf/task
+    channels: int  # number of maps that the network predicts
+    smooth = False  # True if the maps may be smooth over the whole frame
 
     @abstractmethod
     def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
@@ -108,7 +98,8 @@ class Deweather(Task):
     def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
         """Add the predicted change to the degraded image."""
         maps = prediction.float()
-        maps = maps if _is_dense(maps, degraded) else _interpolate_cells(maps, degraded)
+        if maps.shape[2:] != degraded.shape[2:]:
+            maps = _interpolate_cells(maps, degraded)
         transmission = torch.sigmoid(maps[:, 3:]) if self.transmission_head else None
         return Restored(degraded + maps[:, :3], transmission=transmission)
 
@@ -128,15 +119,11 @@ class Deweather(Task):
         return image_error + (restored.transmission - pair.transmission).abs().mean()
 
 
-def _is_dense(prediction: Tensor, degraded: Tensor) -> bool:
-    return prediction.shape[2:] == degraded.shape[2:]
-
-
 def _average_cells(prediction: Tensor, degraded: Tensor) -> Tensor:
     """Average a prediction of pixels over cells; return a prediction of cells unchanged."""
-    if not _is_dense(prediction, degraded):
-        return prediction
     height, width = degraded.shape[2:]
+    if prediction.shape[2:] != (height, width):
+        return prediction
     # Pad to full cells. Otherwise the flow would be stretched along a side that 4 does not divide.
     return F.avg_pool2d(F.pad(prediction, (0, -width % _CELL, 0, -height % _CELL), mode="replicate"), _CELL)
 

@@ -3,7 +3,7 @@
 import textwrap
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,15 +55,12 @@ class Panel(NamedTuple):
 
 @dataclass(frozen=True)
 class Animation:
-    """Effects on a sequence of frames; each degraded frame stands left of its map.
-
-    background: (height, width, 3), uint8, both even: texts and legends, which do not change.
-    """
+    """Effects on a sequence of frames; each degraded frame stands left of its map."""
 
     panels: Sequence[Panel]
     frames: FrameSequence
     layout: FigureLayout
-    background: np.ndarray
+    background: np.ndarray  # (height, width, 3), uint8, both even: texts and legends, which do not change
     seed: int
     depth: Tensor | None
 
@@ -108,13 +105,12 @@ def make_animation(
         height, width = resize_for_display(frame, largest=_largest_side(len(effects))).shape[2:]
         for name, effect in effects.items():
             degraded = _degrade(name, effect, frame, seed, depth, t)
-            scales = map_scales(degraded)
-            if name not in panels:
-                panels[name] = Panel(name, effect, f"{name}: {describe_params(effect, degraded.params)}", scales)
-            else:
-                panels[name] = _with_larger_scales(panels[name], dict(scales))
-    layout, background = _draw_background(list(panels.values()), height, width)
-    return Animation(list(panels.values()), frames, layout, background, seed, depth)
+            scales, caption = map_scales(degraded), f"{name}: {describe_params(effect, degraded.params)}"
+            panel, tops = panels.setdefault(name, Panel(name, effect, caption, scales)), dict(scales)
+            larger = (scale._replace(top=max(scale.top, tops.get(scale.name, scale.top))) for scale in panel.scales)
+            panels[name] = panel._replace(scales=tuple(larger))
+    layout, background = _draw_background([*panels.values()], height, width)
+    return Animation([*panels.values()], frames, layout, background, seed, depth)
 
 
 def animation_formats() -> list[str]:
@@ -163,8 +159,7 @@ def _largest_side(num_effects: int) -> int:
 
 def _sample_times(num_frames: int) -> list[int]:
     """Return a few frame numbers, spread evenly from the first to the last."""
-    steps = max(1, min(num_frames, _NUM_SAMPLED) - 1)
-    return sorted({i * (num_frames - 1) // steps for i in range(steps + 1)})
+    return np.unique(np.linspace(0, num_frames - 1, _NUM_SAMPLED, dtype=int)).tolist()
 
 
 def _degrade(name: str, effect: Effect, frame: Tensor, seed: int, depth: Tensor | None, t: int) -> Degraded:
@@ -176,31 +171,26 @@ def _degrade(name: str, effect: Effect, frame: Tensor, seed: int, depth: Tensor 
             raise UsageError(f"{name}: {error}") from error
 
 
-def _with_larger_scales(panel: Panel, tops: Mapping[str, float]) -> Panel:
-    """Return the panel with scales that hold for both of two frames."""
-    return panel._replace(scales=tuple(MapScale(name, max(top, tops.get(name, top))) for name, top in panel.scales))
-
-
 def _draw_background(panels: Sequence[Panel], height: int, width: int) -> tuple[FigureLayout, np.ndarray]:
     """Lay out images of (height, width), and draw captions and legends."""
     across = 1 if len(panels) <= _MAX_STACKED else 2
     layout = FigureLayout(-(-len(panels) // across), 2 * across, height, width, 2, header_lines=0)
     # The legend of a map takes 17 lines from its left side.
-    layout = layout._replace(min_column_lines=33 - width // layout.text)
+    layout = replace(layout, min_column_lines=33 - width // layout.text)
     letters = round(1.9 * layout.column_px / layout.text)
     captions = [
         textwrap.wrap(panel.caption, letters, max_lines=_MAX_CAPTION_LINES, placeholder=" …") for panel in panels
     ]
-    layout = layout._replace(caption_lines=max(2, *map(len, captions)))
-    figure, bottom = layout.figure(), layout.top(layout.rows - 1) + height + layout.text
+    layout = replace(layout, caption_lines=max(2, *map(len, captions)))
+    bottom = layout.top(layout.rows - 1) + height + layout.text
     for i, (panel, caption) in enumerate(zip(panels, captions, strict=True)):
         column, y = 2 * (i % across), layout.top(i // across)
-        layout.write(figure, "\n".join(caption), layout.left(column), y - 0.3 * layout.text, weight="bold")
-        draw_legend(figure, layout, panel.scales, x=layout.left(column + 1), y=y)
+        layout.write("\n".join(caption), layout.left(column), y - 0.3 * layout.text, weight="bold")
+        draw_legend(layout, panel.scales, x=layout.left(column + 1), y=y)
     if any(scale.name == "flow" for panel in panels for scale in panel.scales):
-        draw_invalid_key(figure, layout, x=layout.left(0), y=bottom)
+        draw_invalid_key(layout, x=layout.left(0), y=bottom)
         bottom += 3 * layout.text
-    canvas = FigureCanvasAgg(figure)
+    canvas = FigureCanvasAgg(layout.figure)
     canvas.draw()
     drawn = np.asarray(canvas.buffer_rgba())[:bottom, :, :3]
     # Video codecs need even sides.

@@ -73,11 +73,7 @@ def flow_to_rgb(flow: Tensor, *, max_px: float | None = None) -> Tensor:
 def flow_wheel(size: int) -> Tensor:
     """Draw the legend of `flow_to_rgb`: each pixel has the color of the flow that points to it from the center.
 
-    Args:
-        size: side of the picture and diameter of the disc, px.
-
-    Returns:
-        (3, size, size), in [0, 1], float32; white outside the disc.
+    Returns (3, size, size), in [0, 1], float32; white outside the disc, whose diameter is the size, px.
 
         rgb(u, v) = flow_to_rgb((u, v), max_px=1),  u = (2 column + 1) / size - 1,  v = (2 row + 1) / size - 1
     """
@@ -88,14 +84,11 @@ def flow_wheel(size: int) -> Tensor:
 
 
 def full_color_px(flow: Tensor, valid: Tensor) -> float:
-    """Choose a round `max_px` for `flow_to_rgb`: the largest valid magnitude, rounded up to two digits.
+    """Choose a round `max_px` for `flow_to_rgb`: the largest finite magnitude of valid pixels, rounded up; else 1.
 
     Args:
-        flow: (B, 2, H, W), px; magnitudes that are not finite are ignored.
+        flow: (B, 2, H, W), px.
         valid: (B, 1, H, W), bool.
-
-    Returns:
-        px; 1 if no valid pixel moves.
     """
     check_flow("flow", flow)
     _check_mask("valid", valid, flow)
@@ -105,12 +98,9 @@ def full_color_px(flow: Tensor, valid: Tensor) -> float:
 
 
 def round_up(value: float) -> float:
-    """Round a number of a legend up to two digits; 0 becomes 1.
+    """Round a finite number of at least 0 up to two digits; 0 becomes 1.
 
-    Args:
-        value: finite, at least 0.
-
-        digits = 1 - floor(log10(value)),  result = ceil(value 10^digits) / 10^digits
+    digits = 1 - floor(log10(value)),  result = ceil(value 10^digits) / 10^digits
     """
     if not 0 <= value < math.inf:
         raise ValueError(f"value must be a finite number of at least 0, got {value}")
@@ -146,8 +136,7 @@ def checkerboard(height: int, width: int, *, cell: int = 32) -> Tensor:
     """Draw a black and white checkerboard, white at the top left, whose straight lines show what a flow bends.
 
     Args:
-        height: px.
-        width: px.
+        height, width: of the image, px.
         cell: side of a square, px.
 
     Returns:
@@ -192,11 +181,8 @@ def mark_folded(image: Tensor, folded: Tensor) -> Tensor:
     reduced picture.
 
     Args:
-        image: (B, 3, H, W), floating, in [0, 1], at the size of display.
+        image: as for `hatch_invalid`, and so is the result.
         folded: (B, 1, h, w), bool, of any size, such as `jacobian_determinant(flow) <= 0`.
-
-    Returns:
-        (B, 3, H, W), of the type of the image.
 
         out = 0.25 image + 0.75 (1, 0, 1)
     """

@@ -8,6 +8,8 @@ import math
 import textwrap
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -39,7 +41,7 @@ from torchrefract.warping.warp import warp
 _DPI = 100
 _SMALLEST_SIDE = 320  # px, longer side of a displayed image
 _SHEET_SIDE = 480  # px, largest longer side of an image on a contact sheet
-_COLUMNS = ("frame", "corrupted", "checkerboard", "map", "restored")
+_COLUMNS = ("frame", "corrupted", "checkerboard", "map", "restored")  # fields of ContactSheetRow
 _SQUARES = 20  # of the checkerboard along the longer side
 _PARAMETER_TEXTS: dict[str, Callable[[Tensor], str]] = {
     "amplitude": lambda value: f"amplitude {value:.2g} px",
@@ -83,8 +85,12 @@ def resize_for_display(images: Tensor, *, largest: int = 640) -> Tensor:
     return F.interpolate(images, (max(1, round(height * scale)), max(1, round(width * scale))), mode="area")
 
 
-class FigureLayout(NamedTuple):
-    """Positions of images and texts on a figure, in whole px from the top left."""
+_sheet_size = partial(resize_for_display, largest=_SHEET_SIDE)
+
+
+@dataclass(frozen=True)
+class FigureLayout:
+    """A figure and the positions of its images and texts, in whole px from the top left."""
 
     rows: int
     columns: int
@@ -119,27 +125,28 @@ class FigureLayout(NamedTuple):
         caption = round((1.3 * self.caption_lines + 0.8) * self.text)
         return self.header_lines * self.text + row * (self.height + caption) + caption
 
+    @cached_property
     def figure(self) -> Figure:
-        """Create an empty figure."""
+        """The figure, which is empty at first."""
         return Figure(figsize=(self.size[0] / _DPI, self.size[1] / _DPI), dpi=_DPI, facecolor="white")
 
-    def write(self, figure: Figure, text: str, x: float, y: float, *, ha: str = "left", weight: str = "normal") -> None:
+    def write(self, text: str, x: float, y: float, *, ha: str = "left", weight: str = "normal") -> None:
         """Write a text whose lower edge is at y and whose left end, center or right end (`ha`) is at x."""
         position, points = (x / self.size[0], 1 - y / self.size[1]), 0.8 * self.text * 72 / _DPI
-        figure.text(*position, text, ha=ha, va="bottom", weight=weight, fontsize=points, parse_math=False)
+        self.figure.text(*position, text, ha=ha, va="bottom", weight=weight, fontsize=points, parse_math=False)
 
-    def show(self, figure: Figure, image: Tensor, x: int, y: int) -> None:
+    def show(self, image: Tensor, x: int, y: int) -> None:
         """Place an image (3, h, w) in [0, 1] with its upper left corner at (x, y), pixel by pixel."""
         (height, width), (total_width, total_height) = image.shape[1:], self.size
         box = (x / total_width, 1 - (y + height) / total_height, width / total_width, height / total_height)
-        axes = figure.add_axes(box)
+        axes = self.figure.add_axes(box)
         axes.set_axis_off()
         axes.imshow(to_uint8(image[None])[0].movedim(0, -1).numpy(), interpolation="nearest", aspect="auto")
 
-    def explain(self, figure: Figure, image: Tensor, text: str, *, x: int, y: int) -> None:
+    def explain(self, image: Tensor, text: str, *, x: int, y: int) -> None:
         """Write a legend: a patch of an image (3, h, w), three lines wide and two high, and a text to its right."""
-        self.show(figure, image[:, : 2 * self.text, : 3 * self.text], x, y)
-        self.write(figure, text, x + 4 * self.text, y + round(1.5 * self.text))
+        self.show(image[:, : 2 * self.text, : 3 * self.text], x, y)
+        self.write(text, x + 4 * self.text, y + round(1.5 * self.text))
 
 
 class MapScale(NamedTuple):
@@ -192,7 +199,8 @@ def contact_sheet_row(
         warnings.simplefilter("ignore", UserWarning)  # The sheet marks the folds that effects warn of.
         degraded = effect.degrade(frame, seed=seed, depth=depth)
         degraded_board = effect.apply(board, degraded.params, depth=depth).image
-    scales, restored, folds = map_scales(degraded), _restore(effect, degraded), _folded(degraded)
+    scales, restored = map_scales(degraded), _restore(effect, degraded)
+    folds = folded(degraded.flow, degraded.valid) if degraded.has("flow") else torch.zeros_like(degraded.valid)
     hatched_board = hatch_invalid(_sheet_size(degraded_board), degraded.valid)
     return ContactSheetRow(
         title=": ".join(filter(None, (name, describe_params(effect, degraded.params)))),
@@ -219,18 +227,21 @@ def contact_sheet(rows: Sequence[ContactSheetRow], *, title: str) -> Figure:
     # A letter is about half as wide as a line is high. A caption ends where the legend of the map begins.
     letters = 2 * _COLUMNS.index("map") * layout.column_px // layout.text
     captions = [(textwrap.wrap(row.title, letters), textwrap.wrap(row.scores, letters)) for row in rows]
-    layout = layout._replace(caption_lines=max(len(head) + len(tail) for head, tail in captions))
-    figure = layout.figure()
-    layout.write(figure, title, layout.left(0), 2 * layout.text, weight="bold")
+    layout = replace(layout, caption_lines=max(len(head) + len(tail) for head, tail in captions))
+    layout.write(title, layout.left(0), 2 * layout.text, weight="bold")
     for j, column in enumerate(_COLUMNS):
-        layout.write(figure, column, layout.left(j) + layout.width / 2, 4 * layout.text, ha="center", weight="bold")
+        layout.write(column, layout.left(j) + layout.width / 2, 4 * layout.text, ha="center", weight="bold")
     for i, (row, (head, tail)) in enumerate(zip(rows, captions, strict=True)):
         y = layout.top(i) - 0.3 * layout.text
-        layout.write(figure, "\n".join(tail), layout.left(0), y)
-        layout.write(figure, "\n".join(head), layout.left(0), y - 1.3 * len(tail) * layout.text, weight="bold")
-        _draw_row(figure, layout, row, i)
-    _draw_key(figure, layout)
-    return figure
+        layout.write("\n".join(tail), layout.left(0), y)
+        layout.write("\n".join(head), layout.left(0), y - 1.3 * len(tail) * layout.text, weight="bold")
+        _draw_row(layout, row, i)
+    y = layout.top(layout.rows) - 2 * layout.text
+    draw_invalid_key(layout, x=layout.left(0), y=y)
+    gray = torch.full((1, 3, layout.height, layout.width), 0.5)
+    tinted = mark_folded(gray, torch.ones(1, 1, 1, 1, dtype=torch.bool))[0]
+    layout.explain(tinted, "folded: shown twice or mirrored", x=layout.left(2), y=y)
+    return layout.figure
 
 
 def describe_params(effect: Effect, params: Any) -> str:
@@ -295,38 +306,29 @@ def map_image(degraded: Degraded, scales: Sequence[MapScale], *, largest: int) -
     return torch.cat([first[..., :middle], others[0][..., middle:]], dim=2) if others else first
 
 
-def draw_legend(figure: Figure, layout: FigureLayout, scales: Sequence[MapScale], *, x: int, y: int) -> None:
+def draw_legend(layout: FigureLayout, scales: Sequence[MapScale], *, x: int, y: int) -> None:
     """Draw the color wheel or the color bars of a map above its upper left corner (x, y)."""
     text = layout.text
     if scales and scales[0].name == "flow":
         size = round(2.6 * text)
-        layout.show(figure, flow_wheel(size), x, y - 3 * text)
-        layout.write(figure, f"full color = {scales[0].top:g} px", x + size + text / 2, y - 1.7 * text)
-        layout.write(figure, "darker = longer", x + size + text / 2, y - 0.4 * text)
+        layout.show(flow_wheel(size), x, y - 3 * text)
+        layout.write(f"full color = {scales[0].top:g} px", x + size + text / 2, y - 1.7 * text)
+        layout.write("darker = longer", x + size + text / 2, y - 0.4 * text)
         return
     bar = transmission_to_rgb(torch.linspace(0, 1, 3 * text).expand(1, 1, text, -1))[0]
     for i, scale in enumerate(reversed(scales)):
         line = y - (0.4 + 1.3 * i) * text
-        layout.write(figure, "0", x, line)
-        layout.show(figure, bar, x + text, round(line - 1.1 * text))
+        layout.write("0", x, line)
+        layout.show(bar, x + text, round(line - 1.1 * text))
         side = "" if len(scales) == 1 else " (right)" if i == 0 else " (left)"
-        layout.write(figure, f"{scale.top:g}{_MAP_UNITS.get(scale.name, '')} {scale.name}{side}", x + 4.4 * text, line)
+        layout.write(f"{scale.top:g}{_MAP_UNITS.get(scale.name, '')} {scale.name}{side}", x + 4.4 * text, line)
 
 
-def draw_invalid_key(figure: Figure, layout: FigureLayout, *, x: int, y: int) -> None:
+def draw_invalid_key(layout: FigureLayout, *, x: int, y: int) -> None:
     """Draw the legend of hatched pixels."""
     black = torch.zeros(1, 3, layout.height, layout.width)
     stripes = hatch_invalid(black, torch.zeros(1, 1, 1, 1, dtype=torch.bool))[0]
-    layout.explain(figure, stripes, "invalid: lost, or outside the frame", x=x, y=y)
-
-
-def _sheet_size(image: Tensor) -> Tensor:
-    return resize_for_display(image, largest=_SHEET_SIDE)
-
-
-def _folded(degraded: Degraded) -> Tensor:
-    """Mark folded pixels, (1, 1, H, W), as `Degraded.folding` counts them."""
-    return folded(degraded.flow, degraded.valid) if degraded.has("flow") else torch.zeros_like(degraded.valid)
+    layout.explain(stripes, "invalid: lost, or outside the frame", x=x, y=y)
 
 
 def _restore(effect: Effect, degraded: Degraded) -> _Restored | None:
@@ -366,23 +368,12 @@ def _psnr(image: Tensor, frame: Tensor, valid: Tensor) -> float:
     return -10 * mse.clamp(min=1e-10).log10().item()
 
 
-def _draw_row(figure: Figure, layout: FigureLayout, row: ContactSheetRow, i: int) -> None:
-    images = (row.frame, row.corrupted, row.checkerboard, row.map, row.restored)
-    for j, image in enumerate(images):
-        if image is not None:
-            layout.show(figure, image, layout.left(j), layout.top(i))
+def _draw_row(layout: FigureLayout, row: ContactSheetRow, i: int) -> None:
+    for j, column in enumerate(_COLUMNS):
+        x, y = layout.left(j), layout.top(i)
+        if (image := getattr(row, column)) is not None:
+            layout.show(image, x, y)
         else:
-            text = "no flow or fog to undo" if _COLUMNS[j] == "restored" else "no map"
-            layout.write(
-                figure, text, layout.left(j) + layout.width / 2, layout.top(i) + layout.height / 2, ha="center"
-            )
-    draw_legend(figure, layout, row.scales, x=layout.left(_COLUMNS.index("map")), y=layout.top(i))
-
-
-def _draw_key(figure: Figure, layout: FigureLayout) -> None:
-    """Explain hatching and tint below all rows."""
-    y = layout.top(layout.rows) - 2 * layout.text
-    draw_invalid_key(figure, layout, x=layout.left(0), y=y)
-    gray = torch.full((1, 3, layout.height, layout.width), 0.5)
-    tinted = mark_folded(gray, torch.ones(1, 1, 1, 1, dtype=torch.bool))[0]
-    layout.explain(figure, tinted, "folded: shown twice or mirrored", x=layout.left(2), y=y)
+            text = "no flow or fog to undo" if column == "restored" else "no map"
+            layout.write(text, x + layout.width / 2, y + layout.height / 2, ha="center")
+    draw_legend(layout, row.scales, x=layout.left(_COLUMNS.index("map")), y=layout.top(i))

@@ -6,9 +6,7 @@ import torch
 from numpy.polynomial import Chebyshev
 from torch.testing import assert_close
 
-from torchrefract.restoration.models.coordconv import CoordConvSegmenter, pixel_coordinates
-from torchrefract.restoration.models.resunet import ResUNet
-from torchrefract.restoration.models.segformer import SegFormer
+from torchrefract.restoration.models.coordconv import CoordConvSegmenter, ResUNet, SegFormer, pixel_coordinates
 
 SMALL: dict[str, Callable[..., CoordConvSegmenter]] = {
     "resunet": partial(ResUNet, encoder="tu-resnet10t"),

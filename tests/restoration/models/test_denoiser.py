@@ -47,19 +47,6 @@ def inputs(channels: int, size: tuple[int, int] = (8, 12)) -> tuple[Tensor, Tens
     return torch.randn(2, channels, *size, generator=generator), torch.tensor([3, 700]), conditions(image)
 
 
-def count(denoiser: Denoiser) -> int:
-    return sum(parameter.numel() for parameter in denoiser.parameters())
-
-
-def test_the_default_has_36_million_parameters_and_the_published_configuration_114_million():
-    with torch.device("meta"):
-        light = Denoiser(3)
-        cat = Denoiser(3, widths=(128, 128, 256, 256, 512, 512), attention=(False,) * 4 + (True, False))
-    assert 35.0e6 < count(light) < 36.5e6
-    # The published network has 113 673 219. Five more input channels add weights to 128 kernels of 3 x 3.
-    assert count(cat) == 113_673_219 + 5 * 128 * 9
-
-
 @pytest.mark.quick
 def test_the_conditions_are_the_image_and_the_pixel_coordinates():
     image = torch.rand(2, 3, 4, 5, generator=torch.Generator().manual_seed(0))
@@ -78,15 +65,6 @@ def test_a_frame_of_any_size_is_padded_to_the_stride_by_its_border_pixels(size):
     expected = denoiser.network(torch.cat(list(padded), dim=1), time).sample[:, :, : size[0], : size[1]]
     assert output.shape == noisy.shape
     assert_close(output, expected)
-
-
-def test_the_output_depends_on_all_inputs():
-    torch.manual_seed(0)
-    denoiser = tiny(3)
-    noisy, time, condition = inputs(3)
-    output = denoiser(noisy, time, condition)
-    for changed in ((noisy + 1, time, condition), (noisy, time + 200, condition), (noisy, time, condition.flip(3))):
-        assert float((denoiser(*changed) - output).detach().abs().amax()) > 1e-3
 
 
 @pytest.mark.parametrize("channels", [3, 2, 4])

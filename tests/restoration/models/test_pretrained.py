@@ -12,9 +12,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from torchrefract.restoration.models.coordconv import CoordConvSegmenter, weights_license
-from torchrefract.restoration.models.resunet import ResUNet
-from torchrefract.restoration.models.segformer import SegFormer
+from torchrefract.restoration.models.coordconv import CoordConvSegmenter, ResUNet, SegFormer, weights_license
 
 COLORS = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
 KINDS: dict[str, Callable[..., CoordConvSegmenter]] = {

@@ -1,11 +1,12 @@
-"""Parts of both feed-forward baselines: pixel coordinates as inputs, a polynomial head, and ImageNet weights."""
+"""The feed-forward baselines: segmentation networks with pixel coordinates as inputs and a polynomial head."""
 
 import json
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import segmentation_models_pytorch as smp
 import timm
@@ -21,7 +22,7 @@ from torch.nn.utils import parametrize
 from torchrefract.warping.grid import pixel_axes
 
 _STRIDE = 32
-_MEAN, _STD = (0.5,) * 3, (0.25,) * 3  # of colors, for an encoder without pretrained weights
+_MEAN, _STD = [0.5] * 3, [0.25] * 3  # of colors, for an encoder without pretrained weights
 _DEGREE = 5  # a lens with k1 and k2 has terms of degree 3 and 5
 _HIDDEN = 256
 _HUB = "imagenet"
@@ -71,13 +72,12 @@ class CoordConvSegmenter(nn.Module):
         smooth: bool,
     ):
         super().__init__()
-        weights = None if pretrained is None else _find_weights(encoder, pretrained)
-        self.network = _load_network(architecture, encoder, weights, channels=channels)
-        self.is_frozen, self.cell = weights is not None, cell
+        file, mean, std = (None, _MEAN, _STD) if pretrained is None else _find_weights(encoder, pretrained)
+        self.network = _load_network(architecture, encoder, file, channels=channels)
+        self.is_frozen, self.cell = file is not None, cell
         self.network.encoder.requires_grad_(not self.is_frozen)
         _add_coordinate_inputs(self.network.encoder, start_at_zero=self.is_frozen)
         # The checkpoint holds both, so it can be used without the pretrained weights.
-        mean, std = (_MEAN, _STD) if weights is None else (weights.mean, weights.std)
         self.register_buffer("mean", torch.tensor(mean).view(1, 3, 1, 1))
         self.register_buffer("std", torch.tensor(std).view(1, 3, 1, 1))
         for parameter in self.network.segmentation_head.parameters():
@@ -118,15 +118,37 @@ class CoordConvSegmenter(nn.Module):
         return maps + self.polynomial_head(features[-1], *_cell_axes(image, self.cell))
 
 
+class ResUNet(CoordConvSegmenter):
+    """Predict maps by a U-Net with a residual encoder. See `CoordConvSegmenter` for the arguments.
+
+    Source: Ronneberger, Fischer, Brox, "U-Net", MICCAI 2015; He, Zhang, Ren, Sun, "Deep residual learning", CVPR 2016.
+    """
+
+    def __init__(
+        self, channels: int, *, encoder: str = "tu-resnet34", pretrained: str | None = None, smooth: bool = False
+    ):
+        super().__init__(smp.Unet, channels, encoder=encoder, pretrained=pretrained, cell=1, smooth=smooth)
+
+
+class SegFormer(CoordConvSegmenter):
+    """Predict maps by a transformer, a value for each cell of 4 x 4 px. See `CoordConvSegmenter` for the arguments.
+
+    Source: Xie, Wang, Yu, Anandkumar, Alvarez, Luo, "SegFormer", NeurIPS 2021.
+    """
+
+    def __init__(self, channels: int, *, encoder: str = "mit_b1", pretrained: str | None = None, smooth: bool = False):
+        architecture = partial(smp.Segformer, upsampling=1)
+        super().__init__(architecture, channels, encoder=encoder, pretrained=pretrained, cell=4, smooth=smooth)
+
+
 class PolynomialFlowHead(nn.Module):
     """Predict smooth maps of the whole frame from its coarsest features.
 
         map(x, y) = sum over i + j <= 5 of c_ij T_i(x) T_j(y),  T_n(x) = cos(n arccos(x))
 
     with x and y as of `pixel_coordinates`. Two layers compute the 21 coefficients c_ij of each channel from the mean
-    and the maximum of each feature. The coefficients start at zero.
-
-    The flow of a lens is such a map, and every pixel carries a little evidence for it.
+    and the maximum of each feature. The coefficients start at zero. The flow of a lens is such a map, and every pixel
+    carries a little evidence for it.
 
     Args:
         features: number of feature channels.
@@ -143,15 +165,7 @@ class PolynomialFlowHead(nn.Module):
         self.layers = nn.Sequential(nn.Linear(2 * features, _HIDDEN), nn.SiLU(), last)
 
     def forward(self, features: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """Evaluate the maps on a grid.
-
-        Args:
-            features: (B, F, h, w).
-            x, y: (W,) and (H,), coordinates of the columns and rows, in [-1, 1].
-
-        Returns:
-            (B, channels, H, W), float32.
-        """
+        """Evaluate the maps (B, channels, H, W), float32, from features (B, F, h, w) at x (W,) and y (H,)."""
         flat = features.float().flatten(2)
         pooled = torch.cat([flat.mean(dim=2), flat.amax(dim=2)], dim=1)
         basis = torch.stack([_chebyshev(y, j)[:, None] * _chebyshev(x, i) for i, j in self.terms])
@@ -163,22 +177,15 @@ class PolynomialFlowHead(nn.Module):
 
 
 def pixel_coordinates(image: Tensor) -> Tensor:
-    """Compute the coordinates of the pixel centers in units of half the frame.
+    """Return x and y of the pixels of an image (B, C, H, W) as (B, 2, H, W), in [-1, 1].
 
         x = (2 column + 1) / W - 1,  y = (2 row + 1) / H - 1
 
     A convolution alone cannot tell where on the frame it is, and the effect of a lens depends on that.
-
-    Args:
-        image: (B, C, H, W).
-
-    Returns:
-        (B, 2, H, W), x and y in [-1, 1].
     """
-    batch, _, height, width = image.shape
     x, y = _cell_axes(image, 1)
-    axes = (x.view(1, 1, 1, width), y.view(1, 1, height, 1))
-    return torch.cat([axis.expand(batch, 1, height, width) for axis in axes], dim=1)
+    axes = torch.meshgrid(x, y, indexing="xy")
+    return torch.stack(axes).expand(image.shape[0], -1, -1, -1)
 
 
 def _cell_axes(image: Tensor, cell: int) -> tuple[Tensor, Tensor]:
@@ -214,14 +221,8 @@ def _add_coordinate_inputs(encoder: nn.Module, *, start_at_zero: bool) -> None:
     stem.in_channels = cast(Tensor, stem.weight).shape[1]
 
 
-class _Weights(NamedTuple):
-    file: Path  # safetensors
-    mean: tuple[float, ...]  # of the colors in [0, 1]
-    std: tuple[float, ...]
-
-
-def _find_weights(encoder: str, pretrained: str) -> _Weights:
-    """Locate the ImageNet weights of an encoder; warn of a non-commercial license."""
+def _find_weights(encoder: str, pretrained: str) -> tuple[Path, list[float], list[float]]:
+    """Return the ImageNet weights of an encoder, and mean and std of their colors; warn of a non-commercial license."""
     folder = _fetch(encoder) if pretrained == _HUB else Path(pretrained).expanduser()
     if missing := [name for name in (_CONFIG, _TENSORS) if not (folder / name).is_file()]:
         raise ValueError(
@@ -231,7 +232,7 @@ def _find_weights(encoder: str, pretrained: str) -> _Weights:
     try:
         config = json.loads((folder / _CONFIG).read_text(encoding="utf-8"))
         colors = config.get("pretrained_cfg", config)  # timm nests them one level deeper
-        weights = _Weights(folder / _TENSORS, tuple(map(float, colors["mean"])), tuple(map(float, colors["std"])))
+        mean, std = ([float(value) for value in colors[name]] for name in ("mean", "std"))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"pretrained must have mean and std in its {_CONFIG}, got {folder}") from error
     # timm loads the weights that fit of another architecture and silently keeps random ones for the rest.
@@ -239,21 +240,21 @@ def _find_weights(encoder: str, pretrained: str) -> _Weights:
         raise ValueError(f"pretrained must be weights of {encoder}, got {folder} of {config.get('architecture')}")
     if (name := weights_license(encoder)) and ("non-commercial" in name or "-nc" in name):
         warnings.warn(f"the pretrained weights of {encoder} come under this license: {name}", stacklevel=2)
-    return weights
+    return folder / _TENSORS, mean, std
 
 
-def _load_network(architecture: Callable[..., Any], encoder: str, weights: _Weights | None, *, channels: int) -> Any:
+def _load_network(architecture: Callable[..., Any], encoder: str, weights: Path | None, *, channels: int) -> Any:
     """Build a network for three colors; without weights its encoder is random."""
     # timm renames weights while it builds the encoder, so it must load them itself.
     by_timm = weights is not None and encoder.startswith(_TIMM)
-    options = {"pretrained_cfg_overlay": {"file": str(weights.file)}} if weights and by_timm else {}
+    options = {"pretrained_cfg_overlay": {"file": str(weights)}} if by_timm else {}
     try:
         network = architecture(encoder, encoder_weights=by_timm or None, in_channels=3, classes=channels, **options)
         if weights is not None and not by_timm:
-            network.encoder.load_state_dict(load_file(weights.file))
+            network.encoder.load_state_dict(load_file(weights))
     except _LOAD_ERRORS as error:
         if weights is not None:
-            raise ValueError(f"pretrained must hold intact weights of {encoder}, got {weights.file}") from error
+            raise ValueError(f"pretrained must hold intact weights of {encoder}, got {weights}") from error
         raise ValueError(
             "encoder must be a name of segmentation-models-pytorch, or tu- and a name of timm, with features at five "
             f"scales, got {encoder}"
@@ -271,7 +272,16 @@ def weights_license(encoder: str) -> str | None:
 
 def _fetch(encoder: str) -> Path:
     """Return the folder of the weights in the cache of the hub; download them first if they are missing."""
-    repository, revision = _repository(encoder)
+    if encoder.startswith(_TIMM):
+        config = timm.models.get_pretrained_cfg(encoder.removeprefix(_TIMM))
+        repository, revision = config and config.hf_hub_id, None
+    else:
+        settings = smp.encoders.encoders.get(encoder, {}).get("pretrained_settings", {}).get(_HUB, {})
+        repository, revision = settings.get("repo_id"), settings.get("revision")
+    if not repository:
+        raise ValueError(
+            f"pretrained must be null or a folder for an encoder without {_HUB} weights, got {_HUB} of {encoder}"
+        )
     try:
         files = [hf_hub_download(repository, name, revision=revision) for name in (_CONFIG, _TENSORS)]
     except (OSError, HfHubHTTPError) as error:
@@ -280,16 +290,3 @@ def _fetch(encoder: str) -> Path:
             f"be reached, got {_HUB}: add model.network.pretrained=null or model.network.pretrained=FOLDER"
         ) from error
     return Path(files[0]).parent
-
-
-def _repository(encoder: str) -> tuple[str, str | None]:
-    """Return the repository of an encoder's ImageNet weights on the hub and its revision."""
-    if encoder.startswith(_TIMM):
-        config = timm.models.get_pretrained_cfg(encoder.removeprefix(_TIMM))
-        if config is not None and config.hf_hub_id:
-            return config.hf_hub_id, None
-    elif settings := smp.encoders.encoders.get(encoder, {}).get("pretrained_settings", {}).get(_HUB):
-        return settings["repo_id"], settings["revision"]
-    raise ValueError(
-        f"pretrained must be null or a folder for an encoder without {_HUB} weights, got {_HUB} of {encoder}"
-    )

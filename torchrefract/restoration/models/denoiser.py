@@ -1,5 +1,6 @@
 """The U-Net of the diffusion baseline."""
 
+import json
 from collections.abc import Sequence
 
 import torch
@@ -75,15 +76,12 @@ class Denoiser(nn.Module):
             self.network.down_blocks.requires_grad_(False)
 
     def forward(self, noisy: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-        """Predict the noise, or the velocity, of a noisy target of any size.
+        """Predict the noise, or the velocity, of a noisy target of any size; float32.
 
         Args:
-            noisy: (B, channels, H, W).
+            noisy: (B, channels, H, W); the result has the same shape.
             time: (B,), int64, the noise level.
             condition: (B, 5, H, W), as of `conditions`.
-
-        Returns:
-            (B, channels, H, W), float32.
         """
         height, width = noisy.shape[2:]
         inputs = torch.cat([noisy, condition], dim=1)
@@ -109,18 +107,15 @@ def _load_published(name: str) -> UNet2DModel:
 
 def _copy_weights(network: UNet2DModel, published: UNet2DModel, name: str) -> None:
     """Copy the published weights into the channels that both networks have; set all other weights to zero."""
-    for key in sorted(network.config.keys() - {*_FREE_OPTIONS}):
-        ours, theirs = (_as_list(model.config.get(key)) for model in (network, published))
-        if ours != theirs and not key.startswith("_"):
-            raise ValueError(f"pretrained must be a network with {key} = {ours}, got {name}, where it is {theirs}")
+    ours, theirs = (json.loads(model.to_json_string()) for model in (network, published))
+    for key in sorted(ours.keys() - {*_FREE_OPTIONS}):
+        if ours[key] != theirs.get(key) and not key.startswith("_"):
+            raise ValueError(
+                f"pretrained must be a network with {key} = {ours[key]}, got {name}, where it is {theirs.get(key)}"
+            )
     weights = published.state_dict()
     # Only the channels of the target correspond to the published input; the condition follows them.
     weights["conv_in.weight"] = weights["conv_in.weight"][:, : network.config["out_channels"]]
-    for key, ours in network.state_dict().items():
-        theirs = weights[key]
-        common = tuple(slice(min(sizes)) for sizes in zip(ours.shape, theirs.shape, strict=True))
-        ours.zero_()[common] = theirs[common]
-
-
-def _as_list(value: object) -> object:
-    return list(value) if isinstance(value, list | tuple) else value
+    for key, weight in network.state_dict().items():
+        common = tuple(slice(min(sizes)) for sizes in zip(weight.shape, weights[key].shape, strict=True))
+        weight.zero_()[common] = weights[key][common]

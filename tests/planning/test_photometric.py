@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import Compose, GroundPlaneDepth, HeterogeneousFog, LensFlare, LinearDepth, UniformFog
-from torchrefract.effects.depth import DepthProvider
+from torchrefract.fields.depth import DepthProvider
 from torchrefract.fields.perlin import draw_octave, perlin_noise
 from torchrefract.planning.photometric import (
     FogErrorModel,

@@ -23,9 +23,8 @@ from torchrefract._validation import (
 )
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import BatchShape, check_image, from_batch, params_to, per_sample, to_batch
-from torchrefract.effects.depth import DepthProvider, LinearDepth
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
-from torchrefract.fields.depth import check_depth, check_floating, ray_distance
+from torchrefract.fields.depth import DepthProvider, LinearDepth, check_depth, check_floating, ray_distance
 from torchrefract.fields.fog import blend_fog, extinction, transmission, unblend_fog
 from torchrefract.planning.photometric import (
     FogErrorModel,

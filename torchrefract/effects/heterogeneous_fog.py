@@ -20,7 +20,6 @@ from torchrefract._validation import (
 )
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import params_to, per_sample
-from torchrefract.effects.depth import DepthProvider
 from torchrefract.effects.fog import (
     check_deviation_range,
     check_fog_params,
@@ -38,6 +37,7 @@ from torchrefract.effects.motion import (
     motion_ranges,
 )
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
+from torchrefract.fields.depth import DepthProvider
 from torchrefract.fields.fog_volume import ExtinctionField, mean_extinction_along_rays
 from torchrefract.fields.heterogeneous_fog import (
     image_noise,

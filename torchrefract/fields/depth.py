@@ -1,6 +1,8 @@
 """Depth in meters: of a flat road, along rays, converted from other units, and checked."""
 
 import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -13,24 +15,44 @@ _NUM_CHECKED = 128 * 128  # values of a sample by which `check_depth` judges it
 _MIN_UPPER_HALF = 128  # values of its upper half; fewer are not judged
 
 
-def linear_depth(height: int, max_depth: float, *, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return d(y) = (1 - (y + 1/2) / H) max_depth in m, (1, 1, H, 1), from the far top row to the near bottom row."""
-    margin = max_depth / (2 * height)
-    return torch.linspace(max_depth - margin, margin, height, dtype=dtype, device=device).view(1, 1, height, 1)
+class DepthProvider(ABC):
+    """The depth of a frame of any size if no depth map is passed in; derive your own provider from it."""
+
+    @abstractmethod
+    def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+        """Return the depth along the axis of the camera in m, inf for the sky.
+
+        Args:
+            height, width: px, of the frame.
+            dtype, device: of the result.
+
+        Returns:
+            (1, 1, H, W), or (1, 1, H, 1) if all pixels of a row have one depth.
+        """
 
 
-def ground_plane_depth(
-    height: int,
-    *,
-    camera_height: float,
-    focal_px: float,
-    horizon: float,
-    spread: float = 0.0,
-    far: float,
-    dtype: torch.dtype,
-    device: torch.device,
-) -> Tensor:
-    """Return the depth of a flat road along the axis of the camera; `far` at the horizon and above it.
+@dataclass(frozen=True, kw_only=True)
+class LinearDepth(DepthProvider):
+    """The ramp over the rows of the paper: d(y) = (1 - (y + 1/2) / H) max_depth.
+
+    max_depth: m, at the top edge of the frame, in [0, 1e12].
+    """
+
+    max_depth: float = 160.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "max_depth", check_number("max_depth", self.max_depth, low=0.0, high=_FARTHEST))
+
+    def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+        """Return (1, 1, H, 1), m."""
+        margin = self.max_depth / (2 * height)
+        rows = torch.linspace(self.max_depth - margin, margin, height, dtype=dtype, device=device)
+        return rows.view(1, 1, height, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundPlaneDepth(DepthProvider):
+    """A flat road below the horizon: its depth along the axis of the camera, not along the ray of each pixel.
 
         z(y) = min(h sqrt(f^2 + (c_y - y_h)^2) / b, far),  y_h = horizon H - 1/2,  c_y = (H - 1) / 2
         b = max(y - y_h, 0),  or with s = spread H > 0 its mean (y - y_h) Phi(u) + s phi(u),  u = (y - y_h) / s
@@ -38,26 +60,38 @@ def ground_plane_depth(
     The camera is a pinhole that looks down by theta, tan(theta) = (c_y - y_h) / f, so sqrt(...) is f / cos(theta). A
     spread averages inverse depth over normally distributed horizons.
 
-    Args:
-        height: px, of the frame, whose middle is the principal point.
-        camera_height: m, h, above the road.
-        focal_px: f.
-        horizon: its position, 0 at the top edge of the frame and 1 at its bottom edge.
-        spread: standard deviation of the horizon, at least 0.
-        far: m, the largest depth; may be inf.
-
-    Returns:
-        (1, 1, H, 1), m.
+    camera_height: m, h, above the road.
+    focal: f, focal length of the pinhole, widths of the frame.
+    horizon: its position, 0 at the top edge of the frame and 1 at its bottom edge, in [-10, 10].
+    spread: standard deviation of an uncertain horizon, in heights of the frame, in [0, 10]; depth then grows smoothly
+        across the horizon instead of jumping there.
+    far: m, the largest depth, which is that of the sky; may be inf.
     """
-    y_h = horizon * height - 0.5
-    # Close to the horizon float32 would lose the digits of the difference.
-    rows_below = torch.arange(height, dtype=torch.float64, device=device) - y_h
-    z = camera_height * math.hypot(focal_px, (height - 1) / 2 - y_h) / _mean_positive(rows_below, spread * height)
-    return z.clamp(max=far).to(dtype).view(1, 1, height, 1)
+
+    camera_height: float = 1.3
+    focal: float = 0.9
+    horizon: float = 0.5
+    spread: float = 0.0
+    far: float = 200.0
+
+    def __post_init__(self) -> None:
+        for name in ("camera_height", "focal"):
+            object.__setattr__(self, name, check_positive(name, getattr(self, name)))
+        for name, low, high in (("horizon", -10.0, 10.0), ("spread", 0.0, 10.0), ("far", 1e-6, math.inf)):
+            object.__setattr__(self, name, check_number(name, getattr(self, name), low=low, high=high))
+
+    def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+        """Return (1, 1, H, 1), m."""
+        y_h = self.horizon * height - 0.5
+        # Close to the horizon float32 would lose the digits of the difference.
+        below = torch.arange(height, dtype=torch.float64, device=device) - y_h
+        distance = self.camera_height * math.hypot(self.focal * width, (height - 1) / 2 - y_h)
+        z = distance / _mean_positive(below, self.spread * height)
+        return z.clamp(max=self.far).to(dtype).view(1, 1, height, 1)
 
 
 def _mean_positive(value: Tensor, deviation: float) -> Tensor:
-    """The mean of max(X, 0) for a normal X with this mean and standard deviation."""
+    """Compute the mean of max(X, 0) for a normal X with this mean and standard deviation."""
     if deviation == 0:
         return value.clamp(min=0)
     u = value / deviation

@@ -18,6 +18,7 @@ from torchrefract.fields.fog_volume import (
     mean_extinction_along_rays,
     noise_on_planes,
 )
+from torchrefract.fields.random_field import Motion
 
 SCALES, WEIGHTS, REACH = (10.0, 20.0, 40.0, 80.0), (0.4, 0.3, 0.2, 0.1), 400.0
 # A frame of 16:9 with a field of view of 88 degrees.
@@ -54,10 +55,16 @@ def distances(samples: int, height: int, width: int, dtype: torch.dtype = torch.
     return 500 * torch.rand(samples, 1, height, width, generator=generator, dtype=dtype) ** 2
 
 
+def field_of(key: Tensor, parameters: dict[str, Any]) -> ExtinctionField:
+    motion = Motion(*(parameters[name] for name in Motion._fields))
+    return ExtinctionField(key, parameters["weights"], parameters["contrast"], motion)
+
+
 def mean_extinction(key: Tensor, distance: Tensor, **options: Any) -> Tensor:
     options = {"scales": SCALES, "reach": REACH} | SMALL | options
-    field = ExtinctionField(key, *(options.pop(name) for name in ExtinctionField._fields[1:]))
-    return mean_extinction_along_rays(field, distance, **options)
+    field = field_of(key, options)
+    names = ("height", "width", "focal", "center", "scales", "reach")
+    return mean_extinction_along_rays(field, distance, **{name: options[name] for name in names})
 
 
 def mean_up_to(distance: float, key: Tensor | None = None, **options: Any) -> Tensor:
@@ -71,7 +78,7 @@ def extinction_at_camera(parameters: dict[str, Any]) -> Tensor:
     """Return q at the camera, (N,)."""
     key = keys(len(parameters["frame"]))
     options: dict[str, Any] = {"scales": SCALES, "reach": 1e-3, "dtype": torch.float64}
-    return 1 + extinction_on_planes(ExtinctionField(key, **parameters), ONE_RAY, **options)[:, 0, 0, 0]
+    return 1 + extinction_on_planes(field_of(key, parameters), ONE_RAY, **options)[:, 0, 0, 0]
 
 
 def correlation_of(first: Tensor, second: Tensor) -> float:

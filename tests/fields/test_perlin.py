@@ -12,6 +12,7 @@ from torch.testing import assert_close
 
 from torchrefract import random
 from torchrefract.fields.perlin import Octave, draw_octave, perlin_noise
+from torchrefract.fields.random_field import Motion
 
 PERIODS = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 WEIGHTS = (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)
@@ -35,15 +36,10 @@ def octaves_of(
     dtype: torch.dtype = torch.float64,
 ) -> list[Octave]:
     """Draw the octaves of a frame; numbers hold for all samples."""
-    motion: Any = {
-        "frame": torch.as_tensor(frame, dtype=torch.float64).expand(len(key)),
-        "wind": torch.as_tensor(wind, dtype=torch.float64).expand(len(key), 2),
-        "decorrelation": torch.as_tensor(decorrelation, dtype=torch.float64).expand(len(key)),
-    }
-    return [
-        draw_octave(key, i, period=period, height=height, width=width, **motion, dtype=dtype)
-        for i, period in enumerate(periods)
-    ]
+    frame, wind, decorrelation = (torch.as_tensor(v, dtype=torch.float64) for v in (frame, wind, decorrelation))
+    motion = Motion(frame.expand(len(key)), wind.expand(len(key), 2), decorrelation.expand(len(key)))
+    options: Any = {"height": height, "width": width, "motion": motion, "dtype": dtype}
+    return [draw_octave(key, i, period=period, **options) for i, period in enumerate(periods)]
 
 
 def weights_of(count: int, periods: tuple[float, ...], dtype: torch.dtype = torch.float64) -> Tensor:
@@ -235,8 +231,8 @@ def test_gradients_of_the_motion_match_finite_differences():
 
 
 def moving_noise(key: Tensor, frame: Tensor, wind: Tensor, decorrelation: Tensor) -> Tensor:
-    motion: Any = {"frame": frame, "wind": wind, "decorrelation": decorrelation, "dtype": torch.float32}
-    octaves = [draw_octave(key, i, period=p, height=80, width=140, **motion) for i, p in enumerate((2.5, 30.0))]
+    options: Any = {"motion": Motion(frame, wind, decorrelation), "dtype": torch.float32}
+    octaves = [draw_octave(key, i, period=p, height=80, width=140, **options) for i, p in enumerate((2.5, 30.0))]
     return perlin_noise(octaves, weights_of(len(key), (2.5, 30.0), torch.float32))
 
 

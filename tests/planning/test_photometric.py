@@ -9,6 +9,7 @@ from torch.testing import assert_close
 from torchrefract import Compose, GroundPlaneDepth, HeterogeneousFog, LensFlare, LinearDepth, UniformFog
 from torchrefract.fields.depth import DepthProvider
 from torchrefract.fields.perlin import draw_octave, perlin_noise
+from torchrefract.fields.random_field import Motion
 from torchrefract.planning.photometric import (
     FogErrorModel,
     PhotometricPlan,
@@ -159,12 +160,8 @@ def test_one_graph_takes_the_plan_as_a_constant():
 def test_the_mean_of_noise_over_a_frame_has_the_variance_of_its_bound(period):
     count = 400
     key = torch.randint(1 << 32, (count, 4), generator=torch.Generator().manual_seed(1))
-    motion: dict[str, Any] = {
-        "frame": torch.zeros(count),
-        "wind": torch.zeros(count, 2),
-        "decorrelation": torch.full((count,), math.inf),
-    }
-    octave = draw_octave(key, 0, period=period, height=60, width=90, **motion, dtype=torch.float64)
+    still = Motion(torch.zeros(count), torch.zeros(count, 2), torch.full((count,), math.inf))
+    octave = draw_octave(key, 0, period=period, height=60, width=90, motion=still, dtype=torch.float64)
     variance = perlin_noise([octave], torch.ones(count, 1).double()).mean(dim=(1, 2, 3)).var().item()
     # The bound is that of the worst phase; the sampled variance of 400 has a deviation of 7 %.
     assert 0.1 * noise_mean_variance(period, 60, 90) <= variance <= 1.2 * noise_mean_variance(period, 60, 90)

@@ -18,9 +18,9 @@ from torchrefract._validation import (
     color_per_channel,
     finite_or,
 )
-from torchrefract.effects.batch import params_to, per_sample
-from torchrefract.effects.motion import check_frame
+from torchrefract.effects.batch import check_shapes, params_to, per_sample
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
+from torchrefract.effects.random_field import check_frame
 from torchrefract.fields.flare import add_light, flare_axes, screen_light
 from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, in_ranges, plan_flare
 from torchrefract.types import Range
@@ -120,11 +120,8 @@ class LensFlare(PhotometricEffect):
 
     def validate(self, params: FlareParams, image: Tensor) -> None:
         """Raise ValueError for invalid parameters."""
-        batch, channels = image.shape[:2]
-        sizes = {"center": (batch, 2), "drift": (batch, 2), "color": (batch, channels), "radius": (batch,)}
-        for name, size in (sizes | {"strength": (batch,)}).items():
-            if getattr(params, name).shape != size:
-                raise ValueError(f"params.{name} must have shape {size}, got {tuple(getattr(params, name).shape)}")
+        rows = {"center": (2,), "drift": (2,), "color": (image.shape[1],), "radius": (), "strength": ()}
+        check_shapes(params, rows)
         check_frame(params)
         for name in ("center", "drift"):
             check_values(f"params.{name}", "be finite", getattr(params, name), torch.isfinite)

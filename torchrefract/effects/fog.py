@@ -22,7 +22,15 @@ from torchrefract._validation import (
     finite_or,
 )
 from torchrefract.cameras.camera import Camera
-from torchrefract.effects.batch import BatchShape, check_image, from_batch, params_to, per_sample, to_batch
+from torchrefract.effects.batch import (
+    BatchShape,
+    check_image,
+    check_shapes,
+    from_batch,
+    params_to,
+    per_sample,
+    to_batch,
+)
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.fields.depth import DepthProvider, LinearDepth, check_depth, check_floating, ray_distance
 from torchrefract.fields.fog import blend_fog, extinction, transmission, unblend_fog
@@ -62,7 +70,7 @@ class FogParams(NamedTuple):
         return self.visibility == torch.inf
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)  # depth providers may have no hash
 class FogMedium:
     """The light of the fog and the distance through it, without its density; fields as arguments of `UniformFog`."""
 
@@ -71,18 +79,6 @@ class FogMedium:
     depth: DepthProvider
     camera: Camera | None
     linear_light: bool
-
-    def __post_init__(self) -> None:
-        check_number("threshold", self.threshold, low=1e-6, high=1 - 1e-6)
-        if not isinstance(self.depth, DepthProvider):
-            raise TypeError(f"depth must be a depth provider such as LinearDepth(), got {type(self.depth).__name__}")
-        if self.camera is not None and not isinstance(self.camera, Camera):
-            raise TypeError(f"camera must be a Camera, got {type(self.camera).__name__}")
-        check_flag("linear_light", self.linear_light)
-
-    def __hash__(self) -> int:
-        # Depth providers may have no hash.
-        return hash((self.airlight, self.threshold, self.camera, self.linear_light))
 
     @property
     def colors(self) -> tuple[float, ...]:
@@ -134,13 +130,7 @@ class FogMedium:
         return scale / far * (1 + thin) * (1 - _ROUNDING), scale / near * (1 + dense) * (1 + _ROUNDING)
 
     def error_model(self, extinction_range: Range, height: int, width: int, *, has_depth: bool) -> FogErrorModel:
-        """Return error bounds of uniform fog for a range of mean extinctions in 1/m.
-
-        Args:
-            extinction_range: 1/m.
-            height, width: px, of the frame.
-            has_depth: the depth is passed in, so that the distance has no bound.
-        """
+        """Return error bounds of uniform fog; `has_depth` if the depth is passed in, so that it has no bound."""
         largest = extinction_range[1]
         farthest = math.inf if has_depth else _farthest(self, height, width)
         thickness = largest * min(farthest, 1e12) if largest > 0 else 0.0
@@ -196,9 +186,18 @@ def make_medium(
     linear_light: bool,
 ) -> FogMedium:
     """Make a medium from arguments as `UniformFog` takes them."""
-    color = None if airlight is None else check_color("airlight", airlight, high=1.0)
     depth = LinearDepth() if depth is None else depth
-    return FogMedium(airlight=color, threshold=threshold, depth=depth, camera=camera, linear_light=linear_light)
+    if not isinstance(depth, DepthProvider):
+        raise TypeError(f"depth must be a depth provider such as LinearDepth(), got {type(depth).__name__}")
+    if camera is not None and not isinstance(camera, Camera):
+        raise TypeError(f"camera must be a Camera, got {type(camera).__name__}")
+    return FogMedium(
+        airlight=None if airlight is None else check_color("airlight", airlight, high=1.0),
+        threshold=check_number("threshold", threshold, low=1e-6, high=1 - 1e-6),
+        depth=depth,
+        camera=camera,
+        linear_light=check_flag("linear_light", linear_light),
+    )
 
 
 class UniformFog(PhotometricEffect):
@@ -254,10 +253,7 @@ class UniformFog(PhotometricEffect):
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> FogParams:
         """Draw V and the deviation uniformly in their ranges."""
-        ranges = [visibility_to_uniform(self.visibility_range), self.deviation_range]
-        applied, values = self.draw_in_ranges(stream, ranges, image)
-        visibility = visibility_from_uniform(values[:, 0], self.visibility_range)
-        return FogParams(applied, visibility, values[:, 1], self.medium.airlight_of(image, values.dtype))
+        return draw_fog(self, stream, image)[0]
 
     def validate(self, params: FogParams, image: Tensor) -> None:
         """Raise ValueError for invalid parameters."""
@@ -281,16 +277,18 @@ class UniformFog(PhotometricEffect):
         return self.medium.blend(image, params, self.medium.distance(image, depth), k, is_visible=is_visible)
 
 
-def visibility_to_uniform(visibility_range: Range) -> Range:
-    """Return the range of the uniform number from which `visibility_from_uniform` makes V."""
-    near, far = visibility_range
+def draw_fog(
+    effect: Any, stream: random.Stream, image: Tensor, ranges: Sequence[Range] = ()
+) -> tuple[FogParams, Tensor]:
+    """Draw the parameters that all fogs have, and a uniform value in each of n more ranges, (B, n)."""
+    near, far = effect.visibility_range
     # An infinite end has no uniform draw, so 1 / V is drawn.
-    return (1 / far, 1 / near) if far > _ENDLESS else visibility_range
-
-
-def visibility_from_uniform(value: Tensor, visibility_range: Range) -> Tensor:
-    """Return V in m, (B,), of uniform numbers."""
-    return 1 / value if visibility_range[1] > _ENDLESS else value
+    is_inverse = far > _ENDLESS
+    first = (1 / far, 1 / near) if is_inverse else (near, far)
+    applied, values = effect.draw_in_ranges(stream, [first, effect.deviation_range, *ranges], image)
+    visibility = 1 / values[:, 0] if is_inverse else values[:, 0]
+    airlight = effect.medium.airlight_of(image, values.dtype)
+    return FogParams(applied, visibility, values[:, 1], airlight), values[:, 2:]
 
 
 def check_visibility_range(value: Range) -> Range:
@@ -305,13 +303,7 @@ def check_deviation_range(value: Range) -> Range:
 
 def check_fog_params(params: Any, image: Tensor) -> None:
     """Raise ValueError for an invalid visibility, deviation or airlight."""
-    if params.airlight.shape != image.shape[:2]:
-        raise ValueError(
-            f"params.airlight must have shape {tuple(image.shape[:2])}, got {tuple(params.airlight.shape)}"
-        )
-    for name in ("visibility", "deviation"):
-        if getattr(params, name).ndim != 1:
-            raise ValueError(f"params.{name} must have shape (B,), got {tuple(getattr(params, name).shape)}")
+    check_shapes(params, {"visibility": (), "deviation": (), "airlight": (image.shape[1],)})
     check_values("params.visibility", "be above 0", params.visibility, lambda v: v > 0)
     check_values("params.deviation", "be above -1", params.deviation, lambda v: (v > -1) & v.isfinite())
     check_within("params.airlight", params.airlight, 0.0, 1.0)

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrefract._tensor import as_device_tensor, cat_bands, exact_matmul, rows_at_once
 from torchrefract._validation import finite_or
 from torchrefract.fields.perlin import fade_out
+from torchrefract.fields.random_field import Motion
 from torchrefract.random import lattice_noise
 
 # Variance of the noise over all gradients and places in a cell. Each of the 8 nodes adds a third of the mean of
@@ -67,18 +68,15 @@ class ExtinctionField(NamedTuple):
     key: (N, 4), int64, of `noise_key`.
     weights: (N, octaves), w_i, not all 0.
     contrast: (N,), c, the standard deviation of ln q.
-    frame: (N,), t.
-    wind: (N, 3), m per frame, to the right, down and ahead, as seen by the camera.
-    decorrelation: (N,), frames, above 0, after which q in the wind has the correlation 1 / e with itself, so that that
-        of g is exp(-t^2 ln(1 / r) / decorrelation^2), r = ln(1 + (exp(c^2) - 1) / e) / c^2; may be inf.
+    motion: wind: (N, 3), m per frame, to the right, down and ahead, as seen by the camera; decorrelation: (N,), frames,
+        after which q in the wind has the correlation 1 / e with itself, so that that of g is
+        exp(-t^2 ln(1 / r) / decorrelation^2), r = ln(1 + (exp(c^2) - 1) / e) / c^2.
     """
 
     key: Tensor
     weights: Tensor
     contrast: Tensor
-    frame: Tensor
-    wind: Tensor
-    decorrelation: Tensor
+    motion: Motion
 
 
 class View(NamedTuple):
@@ -160,7 +158,7 @@ def extinction_on_planes(
     )
     sparse = ((apart_m / period[:, None] - _SPARSE) / (_SPARSEST - _SPARSE)).clamp(0, 1)
     damping = (1 - sparse * sparse * (3 - 2 * sparse)) * deviation_of_mean(length_m / period[:, None])
-    weights, frame = field.weights.double(), field.frame.double()
+    weights, frame = field.weights.double(), field.motion.frame.double()
     contrast = finite_or(field.contrast.double(), 0.0).clamp(0, _MAX_CONTRAST)
     deviation = weights * (contrast / (VARIANCE * weights.square().sum(dim=1)).sqrt())[:, None]
     amplitude = deviation[:, :, None] * damping
@@ -171,8 +169,8 @@ def extinction_on_planes(
         periods=scales,
         planes=[sum(value < _SPARSEST * scale for value in apart) for scale in scales],
         amplitude=amplitude.to(dtype),
-        moved=field.wind.double() * frame[:, None],
-        turns=frame / field.decorrelation.double() * log_field_pace(contrast.square()),
+        moved=field.motion.wind.double() * frame[:, None],
+        turns=frame / field.motion.decorrelation.double() * log_field_pace(contrast.square()),
     )
     half_variance = VARIANCE / 2 * amplitude.square().sum(dim=1)
     return torch.expm1(noise - half_variance.to(dtype)[:, :, None, None])

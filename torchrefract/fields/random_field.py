@@ -100,7 +100,7 @@ class Motion(NamedTuple):
     """Time and change of N random fields.
 
     frame: (N,), number of the frame t.
-    wind: (N, 2), px per frame, to the right and down.
+    wind: (N, 2), px per frame, to the right and down; of fog in space (N, 3), m per frame.
     decorrelation: (N,), frames, above 0; inf for a field that is only moved by the wind.
     """
 

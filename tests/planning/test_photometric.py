@@ -1,12 +1,13 @@
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import Compose, GroundPlaneDepth, HeterogeneousFog, LensFlare, LinearDepth, UniformFog
+from torchrefract import Compose, GroundPlaneDepth, HeterogeneousFog, LensFlare, LinearDepth, UniformFog, random
+from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.fields.depth import DepthProvider
 from torchrefract.fields.perlin import draw_octave, perlin_noise
 from torchrefract.fields.random_field import Motion
@@ -107,6 +108,40 @@ def test_heterogeneous_fog_without_octaves_is_uniform_fog():
     params = effect.sample(picture(), seed=2)
     uniform = UniformFog().apply(picture(), UniformFog.params_type(*params[:4]))
     assert torch.equal(effect.apply(picture(), params).image, uniform.image)
+
+
+class DimmingParams(NamedTuple):
+    applied: Tensor
+    share: Tensor
+    is_identity = property(lambda self: self.share == 1)
+
+
+class Dimming(PhotometricEffect):
+    params_type, maps = DimmingParams, ("transmission",)
+
+    def sample_params(self, stream: random.Stream, image: Tensor) -> DimmingParams:
+        applied, values = self.draw_in_ranges(stream, [(0.4, 0.6)], image)
+        return DimmingParams(applied, values[:, 0])
+
+    def validate(self, params: Any, image: Tensor) -> None:
+        pass
+
+    def render(self, image: Tensor, params: Any, depth: Tensor | None) -> Rendered:
+        t = params.share.view(-1, 1, 1, 1)
+        return Rendered(image * t, lambda: t > 0, transmission=t)
+
+
+def test_an_effect_without_error_bounds_is_computed_in_full():
+    effect = Dimming(tolerance=1.0, p=0.5)
+    plan = effect.plan(*SIZE)
+    assert "no error bound is known for this effect" in str(plan)
+    assert (plan.error, plan.is_identity) == (0, False)
+    degraded = effect.degrade(picture(8), seed=1)
+    params = degraded.params
+    expected = torch.where(params.applied, params.share, 1).view(-1, 1, 1, 1)
+    assert 0 < params.applied.sum() < 8
+    assert torch.equal(degraded.image, picture(8) * expected)
+    assert torch.equal(degraded.transmission, expected.expand(-1, 1, *SIZE))
 
 
 @pytest.mark.parametrize("kind", [UniformFog, HeterogeneousFog])

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -70,13 +70,13 @@ class FogParams(NamedTuple):
         return self.visibility == torch.inf
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)  # depth providers may have no hash
+@dataclass(frozen=True, kw_only=True)
 class FogMedium:
     """The light of the fog and the distance through it, without its density; fields as arguments of `UniformFog`."""
 
     airlight: tuple[float, ...] | None
     threshold: float
-    depth: DepthProvider
+    depth: DepthProvider = field(hash=False)  # providers may have no hash
     camera: Camera | None
     linear_light: bool
 

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor, cat_bands, exact_matmul, rows_at_once
+from torchrefract._tensor import as_device_tensor, exact_matmul
 from torchrefract._validation import finite_or
 from torchrefract.fields.perlin import fade_out
 from torchrefract.fields.random_field import Motion
@@ -35,7 +35,6 @@ _FINER = 2  # cells of the image lattice per cell between rays; pixels are inter
 # An octave fades out where rays are so many of its periods apart, or planes `_LONGER` times as many.
 _SPARSE, _SPARSEST = 0.4, 0.8
 _LONGER = 5.0
-_CACHED_PIXELS = 1 << 15
 _MAX_CONTRAST = 30.0  # above it the exponentials leave float32
 
 
@@ -375,7 +374,7 @@ def _interpolate_rows(view: View, volume: Tensor, distance: Tensor, reach: float
 
 
 def _interpolate_pixels(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:
-    """m for distances (N or 1, 1, H, W)."""
+    """Compute m for distances (N or 1, 1, H, W)."""
     volume = exact_matmul(volume, _cubic_weights(view.across, volume).T)
     rows, columns = volume.shape[2:]
     # The slices lie below one another in one image, and the next slice of each is a second channel.
@@ -384,19 +383,8 @@ def _interpolate_pixels(view: View, volume: Tensor, distance: Tensor, reach: flo
         ((2 * (torch.arange(n, dtype=torch.float64, device=volume.device) + 0.5) * (_FINER / view.cell) + 1) / size - 1)
         for n, size in ((view.width, columns), (view.height, rows * _SLICES))
     )
-    x, y = x.to(volume.dtype), y.to(volume.dtype)[:, None]
-    # A few rows at a time stay in the cache.
-    size = rows_at_once(volume.device, view.height, each=view.width, cached=_CACHED_PIXELS)
-    bands = (
-        _interpolate_band(pairs, band, x, middle, reach)
-        for band, middle in zip(distance.split(size, dim=2), y.split(size), strict=True)
-    )
-    return cat_bands(bands, dim=2, length=view.height)
-
-
-def _interpolate_band(pairs: Tensor, distance: Tensor, x: Tensor, y: Tensor, reach: float) -> Tensor:
     first, part, share = _slice_of(distance, reach)
-    y = first[:, 0] * (2 / _SLICES) + y
-    grid = torch.stack([x.expand_as(y), y], dim=3).expand(len(pairs), -1, -1, -1)
+    y = first[:, 0] * (2 / _SLICES) + y.to(volume.dtype)[:, None]
+    grid = torch.stack([x.to(volume.dtype).expand_as(y), y], dim=3).expand(len(pairs), -1, -1, -1)
     below, above = F.grid_sample(pairs, grid, align_corners=False).split(1, dim=1)
     return (torch.lerp(below, above, part) * share + 1).relu()

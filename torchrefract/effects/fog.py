@@ -148,32 +148,25 @@ class FogMedium:
         return in_ranges(k[:, None], [extinction_range]) & in_ranges(params.airlight, colors)
 
     def blend(self, image: Tensor, params: Any, distance: Tensor, k: Tensor, *, is_visible: bool) -> Rendered:
-        """Blend images (N, C, H, W) with fog of the extinction k, (N or B, 1, H or 1, W or 1), in 1/m.
+        """Blend images with fog, or return them as they are and maps.
 
         Args:
-            image: clean.
+            image: (N, C, H, W), clean.
             params: with B rows; gives the airlight.
             distance: (N, B or 1, 1, H, 1 or W), m.
-            k: 1/m.
-            is_visible: False returns the image as it is, and maps.
+            k: (N or B, 1, H or 1, W or 1), extinction, 1/m.
+            is_visible: False returns the image as it is.
         """
-        rows = max(k.shape[0], distance.shape[0])
-        if distance.shape[0] > 1:
-            distance = expand_batch(distance, rows)
+        rows, batch = max(len(k), len(distance)), len(image)
 
         def through() -> Tensor:
-            return transmission(distance, k if k.shape[0] == 1 else expand_batch(k, rows))
+            return transmission(expand_batch(distance, rows), expand_batch(k, rows))
 
         if not is_visible:
             return Rendered(image, lambda: through() >= _MIN_TRANSMISSION, transmission=through, extinction=k)
-        t, batch = through(), image.shape[0]
-        airlight = finite_or(params.airlight.to(field_dtype(image.dtype)), 0.0)[:, :, None, None]
-        blended = blend_fog(
-            image,
-            t if t.shape[0] == 1 else expand_batch(t, batch),
-            expand_batch(airlight, batch),
-            linear_light=self.linear_light,
-        )
+        t, airlight = through(), finite_or(params.airlight.to(field_dtype(image.dtype)), 0.0)[:, :, None, None]
+        airlight = expand_batch(airlight, batch)
+        blended = blend_fog(image, expand_batch(t, batch), airlight, linear_light=self.linear_light)
         return Rendered(blended, lambda: t >= _MIN_TRANSMISSION, transmission=t, extinction=k)
 
 

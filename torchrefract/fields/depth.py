@@ -125,7 +125,10 @@ def ray_distance(
         ValueError: an invalid shape, a focal length that is not above 0, an intrinsic that is not finite.
         TypeError: depth is not a floating tensor.
     """
-    _check_rows("depth", depth, width)
+    if check_floating("depth", depth).ndim != 4 or depth.shape[1] != 1:
+        raise ValueError(f"depth must have shape (B, 1, H, W) or (B, 1, H, 1), got {tuple(depth.shape)}")
+    if width is not None and depth.shape[3] not in (1, width):
+        raise ValueError(f"depth must be 1 or {width} px wide, as the frame, got {tuple(depth.shape)}")
     z = depth.to(field_dtype(depth.dtype))
     columns, rows = pixel_axes(z.shape[2], width or z.shape[3], dtype=z.dtype, device=z.device)
     x = (columns - _intrinsic("cx", cx, z)) / _focal("fx", fx, z)
@@ -187,16 +190,7 @@ def depth_from_inverse(value: Tensor, *, near: float, far: float) -> Tensor:
 
     Monocular networks such as MiDaS predict such maps, up to a scale to [0, 1].
 
-    Args:
-        value: in [0, 1], of any shape.
-        near, far: m, 0 < near < far; far may be inf.
-
-    Returns:
-        Depth in m, of the same shape, float32, or float64 for a float64 map.
-
-    Raises:
-        ValueError: a value outside [0, 1] or NaN (on the CPU); a near or far out of range.
-        TypeError: value is not a floating tensor.
+    Args, Returns, Raises: as for `depth_from_normalized`, but 0 < near < far, and far may be inf.
 
     Source: Ranftl et al., "Towards Robust Monocular Depth Estimation", IEEE TPAMI 44 (2022).
     """
@@ -216,9 +210,6 @@ def check_depth(depth: Tensor, *, name: str = "depth") -> None:
     Args:
         depth: (B, 1, H, W) or (B, T, 1, H, W), m, inf for the sky.
         name: of the argument, for the message.
-
-    Raises:
-        ValueError: an invalid depth.
     """
     lowest = eager_values(lambda: depth.detach().amin(), of=depth) if depth.numel() else None
     if lowest is None:
@@ -240,13 +231,6 @@ def check_floating(name: str, value: Tensor) -> Tensor:
     if not check_tensor(name, value).is_floating_point():
         raise TypeError(f"{name} must be of a floating type, got {value.dtype}")
     return value
-
-
-def _check_rows(name: str, depth: Tensor, width: int | None) -> None:
-    if check_floating(name, depth).ndim != 4 or depth.shape[1] != 1:
-        raise ValueError(f"{name} must have shape (B, 1, H, W) or (B, 1, H, 1), got {tuple(depth.shape)}")
-    if width is not None and depth.shape[3] not in (1, width):
-        raise ValueError(f"{name} must be 1 or {width} px wide, as the frame, got {tuple(depth.shape)}")
 
 
 def _focal(name: str, value: float | Tensor, like: Tensor) -> float | Tensor:

@@ -358,7 +358,7 @@ def _positions(pixels: int, cell: float, cells: int, like: Tensor) -> tuple[Tens
 
 
 def _interpolate_rows(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:
-    """m for distances (N or 1, 1, H, 1): each row of pixels reads one slice, so that matrix products serve."""
+    """Compute m for distances (N or 1, 1, H, 1): each row of pixels reads one slice, so that matrix products serve."""
     first, part, share = (value.flatten(1) for value in _slice_of(distance, reach))
     y, dy = _positions(view.height, view.cell, view.down, volume)
     batch, slices, rows = volume.shape[:3]

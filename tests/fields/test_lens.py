@@ -184,6 +184,13 @@ def test_flow_gradients_match_finite_differences(field, size):
     assert torch.autograd.gradcheck(lambda c, f, p: field(c, f, p, points=pixel_points(4, 6))[0], inputs)
 
 
+some_terms = pytest.mark.parametrize(
+    "terms",
+    [ALL_TERMS, Terms(6, False, False), Terms(2, False, False), Terms(3, True, False), Terms(0, False, True)],
+    ids=str,
+)
+
+
 def random_lenses(terms: Terms, scale: float) -> tuple[Tensor, Tensor, Tensor]:
     """Draw the coefficients, focal lengths and centers of five lenses that have only `terms`."""
     random = torch.Generator().manual_seed(0)
@@ -198,11 +205,7 @@ def random_lenses(terms: Terms, scale: float) -> tuple[Tensor, Tensor, Tensor]:
     )
 
 
-@pytest.mark.parametrize(
-    "terms",
-    [ALL_TERMS, Terms(6, False, False), Terms(2, False, False), Terms(3, True, False), Terms(0, False, True)],
-    ids=str,
-)
+@some_terms
 def test_newton_steps_at_nodes_converge_to_the_flow(terms, oracle):
     lens = random_lenses(terms, scale=0.02)
     points = Lattice(720, 1280, 64, 1).points(dtype=torch.float32, device=torch.device("cpu"))
@@ -220,11 +223,7 @@ def test_newton_steps_at_nodes_converge_to_the_flow(terms, oracle):
     assert errors[0] >= errors[1] >= errors[2] - 1e-4
 
 
-@pytest.mark.parametrize(
-    "terms",
-    [ALL_TERMS, Terms(6, False, False), Terms(2, False, False), Terms(3, True, False), Terms(0, False, True)],
-    ids=str,
-)
+@some_terms
 @pytest.mark.parametrize("steps", [0, 1, 4])
 def test_newton_steps_at_nodes_of_strong_lenses_round_little(terms, steps, oracle):
     # Some of these lenses fold, so there is no inverse to compare with: the same steps in float64 are the oracle.

@@ -50,8 +50,7 @@ class Rays(NamedTuple):
 
     def slopes(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return x / z, (columns,), and y / z, (rows,), float64."""
-        j = torch.arange(self.columns, dtype=torch.float64, device=device)
-        i = torch.arange(self.rows, dtype=torch.float64, device=device)
+        j, i = (torch.arange(n, dtype=torch.float64, device=device) for n in (self.columns, self.rows))
         return self.left + self.step_x * j, self.top + self.step_y * i
 
     def box(self, depth: float) -> list[tuple[float, float]]:
@@ -241,18 +240,16 @@ def noise_on_planes(
     device, dtype = key.device, amplitude.dtype
     boxes = [rays.box(depths[count - 1] / period) for count, period in zip(planes, periods, strict=True)]
     nodes = [[math.ceil(high - low) + 2 for low, high in box] for box in boxes]
-    low = as_device_tensor([[end[0] for end in box] for box in boxes], dtype=torch.float64, device=device)
-    number = torch.arange(1, len(periods) + 1, device=device)[:, None]
-    phase = key[:, None, :3].double() * 2.0**-32 + number * as_device_tensor(
-        _PHASES, dtype=torch.float64, device=device
+    lowest = [[low for low, _ in box] for box in boxes]
+    low, period, phase, depth = (
+        as_device_tensor(values, dtype=torch.float64, device=device) for values in (lowest, periods, _PHASES, depths)
     )
-    period = as_device_tensor(periods, dtype=torch.float64, device=device)[:, None]
-    origin = phase.frac() - moved.double()[:, None] / period
+    phase = key[:, None, :3].double() * 2.0**-32 + torch.arange(1, len(periods) + 1, device=device)[:, None] * phase
+    origin = phase.frac() - moved.double()[:, None] / period[:, None]
     # From the first node on, float32 suffices for positions, however far the wind has carried the noise.
     first = (origin.detach() + low).floor()
     gradients = _gradients(key, first.long(), nodes, turns, dtype=dtype)
     x, y = rays.slopes(device)
-    depth = as_device_tensor(depths, dtype=torch.float64, device=device)
     total = amplitude.new_zeros(len(key), len(depths), rays.rows, rays.columns)
     for i, count in enumerate(planes):
         z = depth[:count] / periods[i]
@@ -273,7 +270,7 @@ def noise_on_planes(
 
 
 def _weights(position: Tensor, nodes: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """(..., nodes, places): h and h p of every node at positions (..., places)."""
+    """Compute (..., nodes, places): h and h p of every node at positions (..., places)."""
     node = torch.arange(nodes, dtype=position.dtype, device=position.device)[:, None]
     distance = (position.unsqueeze(-2) - node).to(dtype)
     hat = fade_out(distance)

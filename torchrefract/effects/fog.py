@@ -238,8 +238,7 @@ class UniformFog(PhotometricEffect):
         p: float = 1.0,
     ):
         super().__init__(tolerance=tolerance, p=p)
-        self.visibility_range = check_visibility_range(visibility_range)
-        self.deviation_range = check_deviation_range(deviation_range)
+        self.visibility_range, self.deviation_range = check_fog_ranges(visibility_range, deviation_range)
         self.medium = make_medium(
             airlight=airlight, threshold=threshold, depth=depth, camera=camera, linear_light=linear_light
         )
@@ -284,14 +283,10 @@ def draw_fog(
     return FogParams(applied, visibility, values[:, 1], airlight), values[:, 2:]
 
 
-def check_visibility_range(value: Range) -> Range:
-    """Return a valid range of V in m."""
-    return check_range("visibility_range", value, low=1e-6, high=torch.inf)
-
-
-def check_deviation_range(value: Range) -> Range:
-    """Return a valid range of the relative deviation of the extinction."""
-    return check_range("deviation_range", value, low=-0.999, high=0.999)
+def check_fog_ranges(visibility_range: Range, deviation_range: Range) -> tuple[Range, Range]:
+    """Return valid ranges of V in m and of the relative deviation of the extinction."""
+    visibility_range = check_range("visibility_range", visibility_range, low=1e-6, high=torch.inf)
+    return visibility_range, check_range("deviation_range", deviation_range, low=-0.999, high=0.999)
 
 
 def check_fog_params(params: Any, image: Tensor) -> None:

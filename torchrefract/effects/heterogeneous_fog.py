@@ -10,27 +10,13 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor, expand_batch
-from torchrefract._validation import (
-    check_choice,
-    check_number,
-    check_positive,
-    check_range,
-    check_values,
-    check_within,
-)
+from torchrefract._validation import check_choice, check_number, check_positive, check_range, check_values, check_within
 from torchrefract.cameras.camera import Camera
-from torchrefract.effects.batch import check_shapes, params_to, per_sample
-from torchrefract.effects.fog import (
-    check_deviation_range,
-    check_fog_params,
-    check_visibility_range,
-    draw_fog,
-    make_medium,
-)
+from torchrefract.effects.batch import check_shapes, frame_mean, params_to, per_sample
+from torchrefract.effects.fog import check_fog_params, check_fog_ranges, draw_fog, make_medium
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.effects.random_field import (
     check_decorrelation,
-    check_key,
     check_motion,
     check_wind,
     drawn_motion,
@@ -39,12 +25,7 @@ from torchrefract.effects.random_field import (
 )
 from torchrefract.fields.depth import DepthProvider
 from torchrefract.fields.fog_volume import ExtinctionField, mean_extinction_along_rays
-from torchrefract.fields.heterogeneous_fog import (
-    image_noise,
-    normalize_weights,
-    periods_in_frame,
-    scale_to_mean,
-)
+from torchrefract.fields.heterogeneous_fog import image_noise, normalize_weights, periods_in_frame
 from torchrefract.planning.photometric import (
     PhotometricPlan,
     PhotometricRequest,
@@ -160,8 +141,7 @@ class HeterogeneousFog(PhotometricEffect):
     ):
         super().__init__(tolerance=tolerance, p=p)
         self.mode = check_choice("mode", mode, ("image", "ray"))
-        self.visibility_range = check_visibility_range(visibility_range)
-        self.deviation_range = check_deviation_range(deviation_range)
+        self.visibility_range, self.deviation_range = check_fog_ranges(visibility_range, deviation_range)
         self.medium = make_medium(
             airlight=airlight, threshold=threshold, depth=depth, camera=camera, linear_light=linear_light
         )
@@ -195,7 +175,6 @@ class HeterogeneousFog(PhotometricEffect):
     def validate(self, params: HeterogeneousFogParams, image: Tensor) -> None:
         """Raise ValueError for invalid parameters."""
         check_fog_params(params, image)
-        check_key(params)
         check_motion(params, axes=3)
         check_shapes(params, {"weights": (len(self.scales),), "contrast": ()})
         check_values("params.weights", "be at least 0 and finite", params.weights, lambda v: v.isfinite() & (v >= 0))
@@ -253,12 +232,13 @@ class HeterogeneousFog(PhotometricEffect):
             octaves = range(len(self.scales)) if plan.octaves is None else plan.octaves
             periods, stretch = self._periods(height, width), self.normalize == "image"
             q = image_noise(key, weights, octaves=octaves, periods=periods, motion=motion, stretch=stretch, **size)
-            return scale_to_mean(q, k, mean=None if self.mean == "image" else 0.5)
-        focal, center = self.medium.pinhole(height, width)
-        field = ExtinctionField(key, weights, contrast.to(k.dtype), motion)
-        view = {"focal": focal, "center": center, "scales": self.scales, "reach": self.reach}
-        q = mean_extinction_along_rays(field, distance, **size, **view)
-        return scale_to_mean(q, k, mean=None if self.mean == "image" else 1.0)
+        else:
+            focal, center = self.medium.pinhole(height, width)
+            field = ExtinctionField(key, weights, contrast.to(k.dtype), motion)
+            view = {"focal": focal, "center": center, "scales": self.scales, "reach": self.reach}
+            q = mean_extinction_along_rays(field, distance, **size, **view)
+        of_all_fogs = 0.5 if self.mode == "image" else 1.0
+        return q * (k / (frame_mean(q) if self.mean == "image" else of_all_fogs))
 
     def _unit_weights(self) -> tuple[float, ...]:
         return tuple(weight / sum(self.weights) for weight in self.weights)
@@ -272,7 +252,7 @@ class HeterogeneousFog(PhotometricEffect):
 def _check_scales(
     scales: Sequence[float] | None, weights: Sequence[float] | None, *, mode: str
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Valid scales and as many weights; None are the defaults of the mode."""
+    """Return valid scales and as many weights; None are the defaults of the mode."""
     defaults = (_PAPER_SCALES, _PAPER_WEIGHTS) if mode == "image" else (_ROAD_SCALES, _ROAD_WEIGHTS)
     if scales is None:
         scales, weights = defaults[0], defaults[1] if weights is None else weights

@@ -49,7 +49,9 @@ def drawn_motion(values: Tensor) -> dict[str, Tensor]:
 
 
 def check_motion(params: Any, *, axes: int) -> None:
-    """Raise ValueError unless `wind` is (B, axes), `decorrelation` (B,) and `frame` (B, T), with values in range."""
+    """Raise ValueError for an invalid `key`, (B, 4), `wind`, (B, axes), `decorrelation`, (B,), or `frame`, (B, T)."""
+    if params.key.shape[1:] != (4,) or params.key.dtype is not torch.int64:
+        raise ValueError(f"params.key must be (B, 4) of int64, got {tuple(params.key.shape)} of {params.key.dtype}")
     check_shapes(params, {"wind": (axes,), "decorrelation": ()})
     check_frame(params)
     check_within("params.wind", params.wind, -_FASTEST, _FASTEST)
@@ -63,12 +65,6 @@ def check_frame(params: Any) -> None:
     check_within("params.frame", params.frame, -LATEST_FRAME, LATEST_FRAME)
 
 
-def check_key(params: Any) -> None:
-    """Raise ValueError unless `key` is (B, 4), int64."""
-    if params.key.shape[1:] != (4,) or params.key.dtype is not torch.int64:
-        raise ValueError(f"params.key must be (B, 4) of int64, got {tuple(params.key.shape)} of {params.key.dtype}")
-
-
 def check_field_range(name: str, value: Range) -> Range:
     """Check the range of one of `FIELD_BOUNDS`."""
     low, high = FIELD_BOUNDS[name]
@@ -79,7 +75,6 @@ def check_field_params(params: Any) -> None:
     """Raise ValueError for an invalid `amplitude`, `length`, `aperture`, `key` or motion."""
     bounds = {name: ends for name, ends in FIELD_BOUNDS.items() if name in params._fields}
     check_shapes(params, dict.fromkeys(bounds, ()))
-    check_key(params)
     check_motion(params, axes=2)
     for name, ends in bounds.items():
         check_within(f"params.{name}", getattr(params, name), *ends)

@@ -52,17 +52,6 @@ def image_noise(
     return (chosen[..., None, None] * torch.cat(stretched, dim=1)).sum(dim=1, keepdim=True)
 
 
-def scale_to_mean(q: Tensor, k: Tensor, *, mean: float | None) -> Tensor:
-    """Return k q / <q>, with <q> the mean over each frame, or `mean` if it is given.
-
-    Args:
-        q: (N, 1, H, W).
-        k: (N, 1, 1, 1), 1/m, the mean extinction.
-        mean: <q>.
-    """
-    return q * (k / (q.mean(dim=(2, 3), keepdim=True) if mean is None else mean))
-
-
 def stretch_to_unit(noise: Tensor) -> Tensor:
     """Map the smallest value of each frame (N, 1, H, W) to 0 and the largest to 1; constant frames become 1/2."""
     low, high = noise.detach().amin(dim=(2, 3), keepdim=True), noise.detach().amax(dim=(2, 3), keepdim=True)

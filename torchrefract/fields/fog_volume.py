@@ -114,8 +114,7 @@ def mean_extinction_along_rays(
         field: of N samples.
         distance: (N or 1, 1, H, 1 or W), m, d along the ray, at least 0, may be inf; gives the type.
         height, width: px, of the frame.
-        focal: px, fx and fy of a pinhole camera.
-        center: px, cx and cy, its principal point.
+        focal, center: px, fx and fy of a pinhole camera, and cx and cy of its principal point.
         scales: m, the periods of the octaves.
         reach: m; beyond it the fog is uniform.
 
@@ -178,9 +177,6 @@ def log_field_pace(variance: Tensor) -> Tensor:
     """Return by how much slower a Gaussian field decorrelates than its exponential, to a correlation of 1 / e.
 
     The exponentials of two Gaussians of variance v and correlation r are correlated by (exp(v r) - 1) / (exp(v) - 1).
-
-    Args:
-        variance: v, of any shape.
     """
     share, is_small = math.exp(-1), variance < 1e-4
     safe = torch.where(is_small, 1.0, variance)
@@ -193,10 +189,7 @@ def log_field_pace(variance: Tensor) -> Tensor:
 def deviation_of_mean(length: Tensor) -> Tensor:
     """Return the standard deviation of the mean of the noise over a length along an axis, over that of the noise.
 
-        (1 + (length / 0.851)^2)^(-1/4),  within 2.5 %; 0.851 is twice the integral of the correlation
-
-    Args:
-        length: periods, of any shape.
+    (1 + (length / 0.851)^2)^(-1/4),  within 2.5 %; 0.851 periods are twice the integral of the correlation
     """
     return (1 + (length / 0.851).square()).pow(-0.25)
 

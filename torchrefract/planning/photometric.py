@@ -269,11 +269,7 @@ def noise_mean_variance(period: float, height: int, width: int) -> float:
     """Return the largest variance over all phases of the mean of 2-D Perlin noise over a frame.
 
     The mean is a sum over nodes of g_x A(x) H(y) + g_y H(x) A(y) with unit vectors g of random direction, where H and A
-    are the means along an axis of h(p) and p h(p).
-
-    Args:
-        period: px.
-        height, width: px.
+    are the means along an axis of h(p) and p h(p). All sizes are in px.
     """
     (hy, ay), (hx, ax) = (_squared_sums(period, size) for size in (height, width))
     return float(((ay[:, None] * hx + hy[:, None] * ax) / 2).max())

@@ -137,8 +137,8 @@ class LensFlare(PhotometricEffect):
         size = (request.width, request.height)
         radius = max(self.radius_range[1] * math.hypot(*size) * (1 + _ROUNDING), 1e-6)
         # The sun may move anywhere in a clip; a still one is some distance from the nearest pixel.
-        centers, drifts = ([getattr(self, f"{name}_{axis}_range") for axis in "xy"] for name in ("center", "drift"))
-        is_still = drifts == [(0.0, 0.0)] * 2
+        centers, speeds = ([getattr(self, f"{name}_{axis}_range") for axis in "xy"] for name in ("center", "drift"))
+        is_still = speeds == [(0.0, 0.0)] * 2
         distance = math.hypot(*map(_distance_from_frame, centers, size)) if is_still else 0.0
         light = self.strength_range[1] * max(self.color) * (1 + _ROUNDING)
         light *= math.exp(-0.5 * (distance / radius) ** 2) if self.radius_range[1] > 0 else 0.0

@@ -350,8 +350,8 @@ def _evolve(noise: Tensor, rates: Tensor, frequencies: Frequencies, motion: Moti
     )
     shift = 2 * math.pi * (motion.frame.double()[:, None] * motion.wind.double())[:, :, None]
     # Whole turns are subtracted in float64, so that late frames are as exact as the first.
-    drifts = shift[:, :1] * kx, shift[:, 1:].mT * ky[:, None]
-    drift = sum(angle.remainder(2 * math.pi).to(noise.dtype) for angle in drifts)
+    angles = shift[:, :1] * kx, shift[:, 1:].mT * ky[:, None]
+    drift = sum(angle.remainder(2 * math.pi).to(noise.dtype) for angle in angles)
     phase = (math.sqrt(2) * motion.frame / motion.decorrelation)[:, None, None].to(noise.dtype) * rates + drift
     cos, sin = phase.cos(), phase.sin()
     real, imaginary = noise.unbind(1)

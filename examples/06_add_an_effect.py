@@ -10,7 +10,6 @@ from torchrefract._validation import check_range, check_values
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.batch import params_to, per_sample
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
-from torchrefract.planning.photometric import exact_plan, in_ranges
 
 
 def vignetting(strength: torch.Tensor, *, height: int, width: int) -> torch.Tensor:
@@ -40,12 +39,6 @@ class Vignetting(PhotometricEffect):
 
     def validate(self, params, image):
         check_values("params.strength", "lie in [0, 1]", params.strength, lambda s: (s >= 0) & (s <= 1))
-
-    def params_in_range(self, params):
-        return in_ranges(params.strength[:, None], [self.strength_range])
-
-    def make_plan(self, request, *, has_depth):
-        return exact_plan(request.height, request.width)  # nothing to leave out
 
     def render(self, image, params, depth):
         strength = params.strength.repeat_interleave(len(image) // len(params.strength))  # for the frames of clips

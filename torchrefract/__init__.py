@@ -9,7 +9,6 @@ inverse, masks and the drawn parameters, and `effect.apply(image, params)` repea
 
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.compose import Compose, ComposeParams
-from torchrefract.effects.depth import DepthProvider, GroundPlaneDepth, LinearDepth
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams
 from torchrefract.effects.flare import FlareParams, LensFlare
 from torchrefract.effects.fog import FogParams, UniformFog, remove_fog
@@ -20,6 +19,9 @@ from torchrefract.effects.rectification import Rectification, RectificationParam
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence, TurbulenceParams
 from torchrefract.fields.depth import (
+    DepthProvider,
+    GroundPlaneDepth,
+    LinearDepth,
     check_depth,
     depth_from_disparity,
     depth_from_inverse,

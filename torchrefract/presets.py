@@ -11,7 +11,6 @@ from typing import TypeVar
 
 from torchrefract._validation import check_positive
 from torchrefract.effects.compose import Compose
-from torchrefract.effects.depth import GroundPlaneDepth
 from torchrefract.effects.divergence_free import DivergenceFree
 from torchrefract.effects.flare import LensFlare
 from torchrefract.effects.fog import UniformFog
@@ -20,6 +19,7 @@ from torchrefract.effects.lens import LensDistortion
 from torchrefract.effects.one_of import OneOf
 from torchrefract.effects.thin_plate import ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence
+from torchrefract.fields.depth import GroundPlaneDepth
 from torchrefract.types import Range
 
 SEVERITIES = (1, 2, 3, 4, 5)

@@ -183,7 +183,7 @@ def test_an_airlight_for_other_channels_raises():
     with pytest.raises(ValueError, match="airlight must have 1 number or 4, one for each channel"):
         UniformFog(airlight=(0.1, 0.2, 0.3)).degrade(picture(1, 4, 2, 2), seed=7)
     image = picture(1, 4, 2, 2)
-    with pytest.raises(ValueError, match=r"params\.airlight must have shape \(1, 4\), got \(1, 3\)"):
+    with pytest.raises(ValueError, match=r"params\.airlight must have shape \(B, 4\), got \(1, 3\)"):
         UniformFog().apply(image, fog_params(image, 10.0))
 
 

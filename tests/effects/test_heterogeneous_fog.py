@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from torchrefract import Camera, GroundPlaneDepth, HeterogeneousFog, LinearDepth, UniformFog, remove_fog
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.fields.perlin import draw_octave, perlin_noise
+from torchrefract.fields.random_field import Motion
 
 SIZE = (36, 64)
 PAPER = {"scales": (4, 8, 16, 32, 64, 128), "weights": (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)}
@@ -39,17 +40,12 @@ def test_image_and_maps_are_the_closed_form(unit, width):
     image = picture(3, 3, *SIZE)
     d = effect.degrade(image, seed=4)
     periods = [SIZE[1] / s if unit == "cells" else s * SIZE[1] / width for s in PAPER["scales"]]
-    motionless: dict[str, Any] = {
-        "frame": torch.zeros(3),
-        "wind": torch.zeros(3, 2),
-        "decorrelation": torch.full((3,), math.inf),
-    }
+    still = Motion(torch.zeros(3), torch.zeros(3, 2), torch.full((3,), math.inf))
     q = torch.zeros(3, 1, *SIZE, dtype=torch.float64)
     for i, (period, weight) in enumerate(zip(periods, PAPER["weights"], strict=True)):
-        options: dict[str, Any] = {"period": period, "height": SIZE[0], "width": SIZE[1], "dtype": torch.float64}
-        noise = perlin_noise(
-            [draw_octave(d.params.key, i, **options, **motionless)], torch.ones(3, 1, dtype=torch.float64)
-        )
+        options: dict[str, Any] = {"height": SIZE[0], "width": SIZE[1], "motion": still, "dtype": torch.float64}
+        octave = draw_octave(d.params.key, i, period=period, **options)
+        noise = perlin_noise([octave], torch.ones(3, 1, dtype=torch.float64))
         q += weight * (noise / math.sqrt(0.5) + 1) / 2
     q /= sum(PAPER["weights"])
     k = mean_extinction(d.params)[:, None, None, None] * q / q.mean(dim=(2, 3), keepdim=True)

@@ -1,3 +1,4 @@
+import dataclasses
 import math
 from typing import Any
 
@@ -10,16 +11,16 @@ from torch.testing import assert_close
 
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.fields.depth import (
+    DepthProvider,
+    GroundPlaneDepth,
+    LinearDepth,
     check_depth,
     depth_from_disparity,
     depth_from_inverse,
     depth_from_normalized,
-    ground_plane_depth,
-    linear_depth,
     ray_distance,
 )
 
-OPTIONS = {"dtype": torch.float64, "device": torch.device("cpu")}
 INTRINSICS: dict[str, Any] = {"fx": 11.0, "fy": 9.0, "cx": 4.3, "cy": 2.9}
 
 
@@ -35,37 +36,77 @@ def real_depths(shared_data) -> list[Tensor]:
     return [torch.from_numpy(np.where(p == 65535, np.inf, p / 256))[None, None] for p in pictures]
 
 
+def depth_of(provider: DepthProvider, height: int, width: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    return provider(height, width, dtype=dtype, device=torch.device("cpu"))
+
+
 @pytest.mark.quick
-def test_linear_depth_runs_from_the_far_top_row_to_the_near_bottom_row():
-    depth = linear_depth(4, 160.0, **OPTIONS)
-    assert depth.flatten().tolist() == [140.0, 100.0, 60.0, 20.0]
-    assert depth.shape == (1, 1, 4, 1)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_linear_depth_falls_row_by_row(dtype):
+    expected = torch.tensor([160 * (1 - (y + 0.5) / 7) for y in range(7)], dtype=dtype).view(1, 1, 7, 1)
+    assert_close(depth_of(LinearDepth(), 7, 3, dtype), expected)
+    assert_close(depth_of(LinearDepth(max_depth=40), 7, 3, dtype), expected / 4)
+    assert not depth_of(LinearDepth(max_depth=0.0), 7, 3, dtype).any()
 
 
-@pytest.mark.parametrize("height", [1, 90])
-@pytest.mark.parametrize("pitch", [-0.2, 0.0, 0.7])
-@pytest.mark.parametrize("far", [60.0, math.inf])
-def test_the_ground_plane_is_where_the_rays_of_a_pitched_camera_meet_it(height, pitch, far):
-    focal, above, middle = 1.7 * height, 1.3, (height - 1) / 2
-    # The camera's axes down and ahead, in the world's (down, ahead).
-    down = np.array([math.cos(pitch), -math.sin(pitch)])
-    ahead = np.array([math.sin(pitch), math.cos(pitch)])
-    level = np.array([0.0, 1.0])
-    row = middle + focal * (level @ down) / (level @ ahead)
-    expected = np.full(height, far)
-    for y in range(height):
-        fall = ((y - middle) / focal * down + ahead)[0]
-        if fall > 0:  # the ray has 1 m ahead of the camera for each unit of its length
-            expected[y] = min(above / fall, far)
-    options = {"camera_height": above, "focal_px": focal, "horizon": (row + 0.5) / height, "far": far}
-    depth = ground_plane_depth(height, **options, **OPTIONS)
-    assert_close(depth, torch.from_numpy(expected).view(1, 1, height, 1), rtol=1e-9, atol=0)
-    single = ground_plane_depth(height, **options, dtype=torch.float32, device=torch.device("cpu"))
-    assert torch.equal(single, depth.float())
+@pytest.mark.parametrize("size", [(90, 160), (160, 90), (1, 1)])
+def test_a_point_of_the_road_projects_to_the_row_of_its_depth(size):
+    road, (height, width) = GroundPlaneDepth(camera_height=1.4, focal=0.8, horizon=0.3, far=math.inf), size
+    focal, middle = 0.8 * width, (height - 1) / 2
+    pitch = math.atan((middle - (0.3 * height - 0.5)) / focal)
+    for y, z in enumerate(depth_of(road, height, width).flatten().tolist()):
+        if z == math.inf:
+            assert (y + 0.5) / height <= 0.3
+            continue
+        # A point of depth z, 1.4 m below the camera, in the camera's axes: ahead m on the ground, z along the axis.
+        ahead = (z - 1.4 * math.sin(pitch)) / math.cos(pitch)
+        down = 1.4 * math.cos(pitch) - ahead * math.sin(pitch)
+        assert middle + focal * down / z == pytest.approx(y, abs=1e-9)
+
+
+def test_a_horizon_above_the_frame_leaves_no_sky_and_one_below_no_road():
+    assert depth_of(GroundPlaneDepth(horizon=-0.2), 20, 30).amax() < 200
+    assert (depth_of(GroundPlaneDepth(horizon=1.0), 20, 30) == 200).all()
+
+
+@pytest.mark.parametrize("height", [1, 720])
+@pytest.mark.parametrize("horizon", [-10.0, 0.5, 10.0])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_depth_is_positive_and_at_most_far(height, horizon, dtype):
+    depth = depth_of(GroundPlaneDepth(horizon=horizon, far=50.0), height, 33, dtype)
+    assert (depth > 0).all()
+    assert (depth <= 50).all()
+
+
+def test_providers_are_plain_values():
+    assert GroundPlaneDepth(far=200) == GroundPlaneDepth()
+    assert repr(LinearDepth(max_depth=3)) == "LinearDepth(max_depth=3.0)"
+    assert len({LinearDepth(), LinearDepth(max_depth=160), GroundPlaneDepth()}) == 2
+    assert dataclasses.replace(GroundPlaneDepth(), horizon=0.5).horizon == 0.5
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "error"),
+    [
+        (LinearDepth, {"max_depth": -1.0}, ValueError),
+        (LinearDepth, {"max_depth": math.inf}, ValueError),
+        (LinearDepth, {"max_depth": "far"}, TypeError),
+        (GroundPlaneDepth, {"camera_height": 0.0}, ValueError),
+        (GroundPlaneDepth, {"focal": -0.9}, ValueError),
+        (GroundPlaneDepth, {"focal": math.inf}, ValueError),
+        (GroundPlaneDepth, {"horizon": math.nan}, ValueError),
+        (GroundPlaneDepth, {"horizon": 450.0}, ValueError),
+        (GroundPlaneDepth, {"far": 0.0}, ValueError),
+        (GroundPlaneDepth, {"far": math.nan}, ValueError),
+    ],
+)
+def test_arguments_out_of_range_raise(kind, options: dict[str, Any], error):
+    with pytest.raises(error, match=f"{next(iter(options))} must"):
+        kind(**options)
 
 
 def test_the_row_of_the_horizon_is_as_far_as_the_sky():
-    depth = ground_plane_depth(10, camera_height=2.0, focal_px=8.0, horizon=0.45, far=math.inf, **OPTIONS).flatten()
+    depth = depth_of(GroundPlaneDepth(camera_height=2.0, focal=0.8, horizon=0.45, far=math.inf), 10, 10).flatten()
     assert depth[:5].isinf().all()
     assert depth[5:].tolist() == pytest.approx([2 * math.hypot(8, 0.5) / rows for rows in range(1, 6)])
 
@@ -253,7 +294,7 @@ def test_one_graph_vmap_and_meta_tensors_are_not_read():
             depth / 90, near=1, far=9
         )
         depth = depth_from_disparity(depth, focal_px=9.0, baseline=0.5)
-        road = ground_plane_depth(6, camera_height=1.3, focal_px=9.0, horizon=0.2, far=50.0, **OPTIONS)
+        road = GroundPlaneDepth(focal=1.0, horizon=0.2, far=50.0)(6, 9, dtype=depth.dtype, device=torch.device("cpu"))
         return ray_distance(torch.minimum(depth, road), fx=fx, fy=9.0, cx=4.0, cy=2.0)
 
     together = distance(depth, focal)
@@ -266,8 +307,8 @@ def test_one_graph_vmap_and_meta_tensors_are_not_read():
 
 
 def test_a_spread_averages_inverse_depth_over_horizons():
-    options = {"camera_height": 1.4, "focal_px": 40.0, "far": math.inf, **OPTIONS}
-    result = ground_plane_depth(24, horizon=0.4, spread=0.15, **options).flatten()
+    road = GroundPlaneDepth(camera_height=1.4, focal=1.0, horizon=0.4, far=math.inf)
+    result = depth_of(dataclasses.replace(road, spread=0.15), 24, 40).flatten()
     y_h, s = 0.4 * 24 - 0.5, 0.15 * 24
     distance = 1.4 * math.hypot(40.0, 11.5 - y_h)
     shifts = np.linspace(-9, 9, 200_001)
@@ -275,7 +316,7 @@ def test_a_spread_averages_inverse_depth_over_horizons():
     share /= share.sum()
     inverse = [(share * np.maximum(y - y_h - s * shifts, 0)).sum() / distance for y in range(24)]
     assert_close(1 / result, torch.tensor(inverse, dtype=torch.float64), rtol=1e-6, atol=1e-12)
-    sharp = ground_plane_depth(24, horizon=0.4, **options).flatten()
+    sharp = depth_of(road, 24, 40).flatten()
     assert_close(result[-1:], sharp[-1:], rtol=1e-4, atol=0)
     assert (result[:9].isfinite() & sharp[:9].isinf()).all()
     assert (result.diff() < 0).all()

@@ -82,20 +82,6 @@ def test_the_rms_of_the_flow_is_the_theoretical_one(kind, length):
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("length", [20.0, 1e3])
-def test_the_theoretical_rms_tends_to_that_of_the_derivative(length):
-    lengths = torch.tensor([length], dtype=torch.float64)
-    derivatives = {"gaussian": 1.0, "matern52": math.sqrt(5 / 3), "matern32": math.sqrt(3)}
-    for kind, derivative in derivatives.items():
-        # Var psi' = -C''(0); the next term of a Matern 3/2 is of the third power of the distance.
-        assert_close(length * curl_rms(lengths, kind), lengths.new_tensor([derivative]), rtol=2.5 / length, atol=0)
-    # (1 - exp(-2 / l)) / 2 -> 1 / l: this field has no derivative.
-    assert_close(curl_rms(lengths, "exponential"), lengths.rsqrt(), rtol=1 / length, atol=0)
-    for kind in COVARIANCES:  # white noise
-        assert curl_rms(torch.tensor([0.1]), kind).item() == pytest.approx(math.sqrt(0.5), rel=1e-6)
-
-
-@pytest.mark.quick
 @pytest.mark.parametrize("stride", [2, 3, 6])
 def test_flows_of_low_frequencies_at_nodes_are_those_at_the_pixels(stride):
     size = embedding_size(62, 82, length=9.0, kind="gaussian")

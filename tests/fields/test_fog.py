@@ -28,11 +28,6 @@ def test_the_threshold_arrives_from_the_distance_of_the_visibility(visibility, t
     assert transmission(v, extinction(v, threshold)).item() == pytest.approx(threshold, rel=1e-12)
 
 
-def test_the_transmission_through_two_layers_is_the_product():
-    near, far, k = (torch.tensor(value).double() for value in (13.0, 29.0, 0.03))
-    assert_close(transmission(near + far, k), transmission(near, k) * transmission(far, k))
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(
     ("depth", "k", "t"),

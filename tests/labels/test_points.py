@@ -143,13 +143,6 @@ def test_gradients_of_points_match_finite_differences(pixels, waves):
     assert torch.autograd.gradcheck(call, [points, flow], fast_mode=True)
 
 
-def test_points_have_no_gradient_unless_an_argument_requires_one(random_points):
-    points, flow = random_points(1, 3), torch.zeros(1, 2, *SIZE, dtype=torch.float64)
-    assert not warp_points(points, flow)[0].requires_grad
-    with torch.no_grad():
-        assert not warp_points(points, flow.requires_grad_())[0].requires_grad
-
-
 def test_a_batch_of_points_equals_its_samples(pixels, waves, random_points):
     flow = torch.cat([waves(*pixels(*SIZE), 8.0, 40.0), torch.full((1, 2, *SIZE), 3.0)]).float()
     points = random_points(2, 37).float()

@@ -1,14 +1,16 @@
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import Compose, GroundPlaneDepth, HeterogeneousFog, LensFlare, LinearDepth, UniformFog
-from torchrefract.effects.depth import DepthProvider
+from torchrefract import Compose, GroundPlaneDepth, HeterogeneousFog, LensFlare, LinearDepth, UniformFog, random
+from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
+from torchrefract.fields.depth import DepthProvider
 from torchrefract.fields.perlin import draw_octave, perlin_noise
+from torchrefract.fields.random_field import Motion
 from torchrefract.planning.photometric import (
     FogErrorModel,
     PhotometricPlan,
@@ -108,6 +110,40 @@ def test_heterogeneous_fog_without_octaves_is_uniform_fog():
     assert torch.equal(effect.apply(picture(), params).image, uniform.image)
 
 
+class DimmingParams(NamedTuple):
+    applied: Tensor
+    share: Tensor
+    is_identity = property(lambda self: self.share == 1)
+
+
+class Dimming(PhotometricEffect):
+    params_type, maps = DimmingParams, ("transmission",)
+
+    def sample_params(self, stream: random.Stream, image: Tensor) -> DimmingParams:
+        applied, values = self.draw_in_ranges(stream, [(0.4, 0.6)], image)
+        return DimmingParams(applied, values[:, 0])
+
+    def validate(self, params: Any, image: Tensor) -> None:
+        pass
+
+    def render(self, image: Tensor, params: Any, depth: Tensor | None) -> Rendered:
+        t = params.share.view(-1, 1, 1, 1)
+        return Rendered(image * t, lambda: t > 0, transmission=t)
+
+
+def test_an_effect_without_error_bounds_is_computed_in_full():
+    effect = Dimming(tolerance=1.0, p=0.5)
+    plan = effect.plan(*SIZE)
+    assert "no error bound is known for this effect" in str(plan)
+    assert (plan.error, plan.is_identity) == (0, False)
+    degraded = effect.degrade(picture(8), seed=1)
+    params = degraded.params
+    expected = torch.where(params.applied, params.share, 1).view(-1, 1, 1, 1)
+    assert 0 < params.applied.sum() < 8
+    assert torch.equal(degraded.image, picture(8) * expected)
+    assert torch.equal(degraded.transmission, expected.expand(-1, 1, *SIZE))
+
+
 @pytest.mark.parametrize("kind", [UniformFog, HeterogeneousFog])
 def test_thin_fog_is_computed_for_a_depth_that_is_passed_in(kind):
     effect, depth = kind(visibility_range=(1e6, 1e6), tolerance=1.0), torch.full((2, 1, *SIZE), 1e6)
@@ -159,12 +195,8 @@ def test_one_graph_takes_the_plan_as_a_constant():
 def test_the_mean_of_noise_over_a_frame_has_the_variance_of_its_bound(period):
     count = 400
     key = torch.randint(1 << 32, (count, 4), generator=torch.Generator().manual_seed(1))
-    motion: dict[str, Any] = {
-        "frame": torch.zeros(count),
-        "wind": torch.zeros(count, 2),
-        "decorrelation": torch.full((count,), math.inf),
-    }
-    octave = draw_octave(key, 0, period=period, height=60, width=90, **motion, dtype=torch.float64)
+    still = Motion(torch.zeros(count), torch.zeros(count, 2), torch.full((count,), math.inf))
+    octave = draw_octave(key, 0, period=period, height=60, width=90, motion=still, dtype=torch.float64)
     variance = perlin_noise([octave], torch.ones(count, 1).double()).mean(dim=(1, 2, 3)).var().item()
     # The bound is that of the worst phase; the sampled variance of 400 has a deviation of 7 %.
     assert 0.1 * noise_mean_variance(period, 60, 90) <= variance <= 1.2 * noise_mean_variance(period, 60, 90)

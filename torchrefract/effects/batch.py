@@ -4,6 +4,7 @@ N is B for images, and B T for the frames of B clips, which follow one another. 
 of a clip keeps B rows until it meets one that is not.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -171,6 +172,14 @@ def params_per_frame(params: Any, frames: int) -> Any:
         repeated = map_params(params, lambda value: value.repeat_interleave(frames, dim=0))
         return repeated._replace(frame=frame)
     return map_params(params, lambda value: value.repeat_interleave(frames, dim=0))
+
+
+def check_shapes(params: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise ValueError unless these fields of the parameters have rows of the given shapes."""
+    for name, row in shapes.items():
+        shape = getattr(params, name).shape
+        if shape[1:] != row:
+            raise ValueError(f"params.{name} must have shape {('B', *row)}, got {tuple(shape)}".replace("'B'", "B"))
 
 
 def select_params(params: Any, index: Tensor) -> Any:

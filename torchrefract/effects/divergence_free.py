@@ -9,11 +9,14 @@ from torchrefract import random
 from torchrefract._tensor import expand_batch
 from torchrefract._validation import check_choice, check_count
 from torchrefract.effects.batch import params_to
-from torchrefract.effects.motion import check_decorrelation, check_wind, drawn_motion, motion_ranges
 from torchrefract.effects.random_field import (
+    check_decorrelation,
     check_field_params,
     check_field_range,
+    check_wind,
+    drawn_motion,
     field_params,
+    motion_ranges,
     warn_if_clipped,
 )
 from torchrefract.effects.warp_effect import WarpEffect

@@ -18,9 +18,9 @@ from torchrefract._validation import (
     color_per_channel,
     finite_or,
 )
-from torchrefract.effects.batch import params_to, per_sample
-from torchrefract.effects.motion import check_frame
+from torchrefract.effects.batch import check_shapes, params_to, per_sample
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
+from torchrefract.effects.random_field import check_frame
 from torchrefract.fields.flare import add_light, flare_axes, screen_light
 from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, in_ranges, plan_flare
 from torchrefract.types import Range
@@ -96,13 +96,9 @@ class LensFlare(PhotometricEffect):
         p: float = 1.0,
     ):
         super().__init__(tolerance=tolerance, p=p)
-        for name, value in {
-            "center_x_range": center_x_range,
-            "center_y_range": center_y_range,
-            "drift_x_range": drift_x_range,
-            "drift_y_range": drift_y_range,
-        }.items():
-            setattr(self, name, check_range(name, value, low=-_FARTHEST, high=_FARTHEST))
+        places = {"center_x": center_x_range, "center_y": center_y_range}
+        for name, value in {**places, "drift_x": drift_x_range, "drift_y": drift_y_range}.items():
+            setattr(self, f"{name}_range", check_range(f"{name}_range", value, low=-_FARTHEST, high=_FARTHEST))
         self.radius_range = check_range("radius_range", radius_range, low=0.0, high=_FARTHEST)
         self.strength_range = check_range("strength_range", strength_range, low=0.0, high=1e3)
         self.color = check_color("color", color, high=1e3)
@@ -120,11 +116,8 @@ class LensFlare(PhotometricEffect):
 
     def validate(self, params: FlareParams, image: Tensor) -> None:
         """Raise ValueError for invalid parameters."""
-        batch, channels = image.shape[:2]
-        sizes = {"center": (batch, 2), "drift": (batch, 2), "color": (batch, channels), "radius": (batch,)}
-        for name, size in (sizes | {"strength": (batch,)}).items():
-            if getattr(params, name).shape != size:
-                raise ValueError(f"params.{name} must have shape {size}, got {tuple(getattr(params, name).shape)}")
+        rows = {"center": (2,), "drift": (2,), "color": (image.shape[1],), "radius": (), "strength": ()}
+        check_shapes(params, rows)
         check_frame(params)
         for name in ("center", "drift"):
             check_values(f"params.{name}", "be finite", getattr(params, name), torch.isfinite)
@@ -144,14 +137,9 @@ class LensFlare(PhotometricEffect):
         size = (request.width, request.height)
         radius = max(self.radius_range[1] * math.hypot(*size) * (1 + _ROUNDING), 1e-6)
         # The sun may move anywhere in a clip; a still one is some distance from the nearest pixel.
-        distance = math.hypot(
-            *(
-                _distance_from_frame(getattr(self, f"center_{axis}_range"), side)
-                for axis, side in zip("xy", size, strict=True)
-            )
-        )
-        if any(getattr(self, f"drift_{axis}_range") != (0.0, 0.0) for axis in "xy"):
-            distance = 0.0
+        centers, speeds = ([getattr(self, f"{name}_{axis}_range") for axis in "xy"] for name in ("center", "drift"))
+        is_still = speeds == [(0.0, 0.0)] * 2
+        distance = math.hypot(*map(_distance_from_frame, centers, size)) if is_still else 0.0
         light = self.strength_range[1] * max(self.color) * (1 + _ROUNDING)
         light *= math.exp(-0.5 * (distance / radius) ** 2) if self.radius_range[1] > 0 else 0.0
         return plan_flare(light, request, is_bounded=self.clip or self.blend == "screen")
@@ -164,10 +152,12 @@ class LensFlare(PhotometricEffect):
         # Invalid values, which cannot be read on an accelerator, make no light.
         center = finite_or(place.to(dtype), _FARTHEST).reshape(-1, 2)
         center = center * as_device_tensor((width, height), dtype=dtype, device=center.device) - 0.5
-        radius = expand_batch(finite_or(params.radius.to(dtype), 0.0), rows) * math.hypot(width, height)
-        along_x, along_y = flare_axes(center, radius, height=height, width=width)
-        along_y = along_y * per_sample(expand_batch(finite_or(params.strength.to(dtype), 0.0), rows))
-        color = expand_batch(finite_or(params.color.to(dtype), 0.0), rows)[:, :, None, None]
+        radius, strength, color = (
+            expand_batch(finite_or(value.to(dtype), 0.0), rows)
+            for value in (params.radius, params.strength, params.color)
+        )
+        along_x, along_y = flare_axes(center, radius * math.hypot(width, height), height=height, width=width)
+        along_y, color = along_y * per_sample(strength), color[:, :, None, None]
 
         def is_valid() -> Tensor:
             if self.blend == "screen":

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -22,10 +22,17 @@ from torchrefract._validation import (
     finite_or,
 )
 from torchrefract.cameras.camera import Camera
-from torchrefract.effects.batch import BatchShape, check_image, from_batch, params_to, per_sample, to_batch
-from torchrefract.effects.depth import DepthProvider, LinearDepth
+from torchrefract.effects.batch import (
+    BatchShape,
+    check_image,
+    check_shapes,
+    from_batch,
+    params_to,
+    per_sample,
+    to_batch,
+)
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
-from torchrefract.fields.depth import check_depth, check_floating, ray_distance
+from torchrefract.fields.depth import DepthProvider, LinearDepth, check_depth, check_floating, ray_distance
 from torchrefract.fields.fog import blend_fog, extinction, transmission, unblend_fog
 from torchrefract.planning.photometric import (
     FogErrorModel,
@@ -69,21 +76,9 @@ class FogMedium:
 
     airlight: tuple[float, ...] | None
     threshold: float
-    depth: DepthProvider
+    depth: DepthProvider = field(hash=False)  # providers may have no hash
     camera: Camera | None
     linear_light: bool
-
-    def __post_init__(self) -> None:
-        check_number("threshold", self.threshold, low=1e-6, high=1 - 1e-6)
-        if not isinstance(self.depth, DepthProvider):
-            raise TypeError(f"depth must be a depth provider such as LinearDepth(), got {type(self.depth).__name__}")
-        if self.camera is not None and not isinstance(self.camera, Camera):
-            raise TypeError(f"camera must be a Camera, got {type(self.camera).__name__}")
-        check_flag("linear_light", self.linear_light)
-
-    def __hash__(self) -> int:
-        # Depth providers may have no hash.
-        return hash((self.airlight, self.threshold, self.camera, self.linear_light))
 
     @property
     def colors(self) -> tuple[float, ...]:
@@ -135,13 +130,7 @@ class FogMedium:
         return scale / far * (1 + thin) * (1 - _ROUNDING), scale / near * (1 + dense) * (1 + _ROUNDING)
 
     def error_model(self, extinction_range: Range, height: int, width: int, *, has_depth: bool) -> FogErrorModel:
-        """Return error bounds of uniform fog for a range of mean extinctions in 1/m.
-
-        Args:
-            extinction_range: 1/m.
-            height, width: px, of the frame.
-            has_depth: the depth is passed in, so that the distance has no bound.
-        """
+        """Return error bounds of uniform fog; `has_depth` if the depth is passed in, so that it has no bound."""
         largest = extinction_range[1]
         farthest = math.inf if has_depth else _farthest(self, height, width)
         thickness = largest * min(farthest, 1e12) if largest > 0 else 0.0
@@ -159,32 +148,25 @@ class FogMedium:
         return in_ranges(k[:, None], [extinction_range]) & in_ranges(params.airlight, colors)
 
     def blend(self, image: Tensor, params: Any, distance: Tensor, k: Tensor, *, is_visible: bool) -> Rendered:
-        """Blend images (N, C, H, W) with fog of the extinction k, (N or B, 1, H or 1, W or 1), in 1/m.
+        """Blend images with fog, or return them as they are and maps.
 
         Args:
-            image: clean.
+            image: (N, C, H, W), clean.
             params: with B rows; gives the airlight.
             distance: (N, B or 1, 1, H, 1 or W), m.
-            k: 1/m.
-            is_visible: False returns the image as it is, and maps.
+            k: (N or B, 1, H or 1, W or 1), extinction, 1/m.
+            is_visible: False returns the image as it is.
         """
-        rows = max(k.shape[0], distance.shape[0])
-        if distance.shape[0] > 1:
-            distance = expand_batch(distance, rows)
+        rows, batch = max(len(k), len(distance)), len(image)
 
         def through() -> Tensor:
-            return transmission(distance, k if k.shape[0] == 1 else expand_batch(k, rows))
+            return transmission(expand_batch(distance, rows), expand_batch(k, rows))
 
         if not is_visible:
             return Rendered(image, lambda: through() >= _MIN_TRANSMISSION, transmission=through, extinction=k)
-        t, batch = through(), image.shape[0]
-        airlight = finite_or(params.airlight.to(field_dtype(image.dtype)), 0.0)[:, :, None, None]
-        blended = blend_fog(
-            image,
-            t if t.shape[0] == 1 else expand_batch(t, batch),
-            expand_batch(airlight, batch),
-            linear_light=self.linear_light,
-        )
+        t, airlight = through(), finite_or(params.airlight.to(field_dtype(image.dtype)), 0.0)[:, :, None, None]
+        airlight = expand_batch(airlight, batch)
+        blended = blend_fog(image, expand_batch(t, batch), airlight, linear_light=self.linear_light)
         return Rendered(blended, lambda: t >= _MIN_TRANSMISSION, transmission=t, extinction=k)
 
 
@@ -197,9 +179,18 @@ def make_medium(
     linear_light: bool,
 ) -> FogMedium:
     """Make a medium from arguments as `UniformFog` takes them."""
-    color = None if airlight is None else check_color("airlight", airlight, high=1.0)
     depth = LinearDepth() if depth is None else depth
-    return FogMedium(airlight=color, threshold=threshold, depth=depth, camera=camera, linear_light=linear_light)
+    if not isinstance(depth, DepthProvider):
+        raise TypeError(f"depth must be a depth provider such as LinearDepth(), got {type(depth).__name__}")
+    if camera is not None and not isinstance(camera, Camera):
+        raise TypeError(f"camera must be a Camera, got {type(camera).__name__}")
+    return FogMedium(
+        airlight=None if airlight is None else check_color("airlight", airlight, high=1.0),
+        threshold=check_number("threshold", threshold, low=1e-6, high=1 - 1e-6),
+        depth=depth,
+        camera=camera,
+        linear_light=check_flag("linear_light", linear_light),
+    )
 
 
 class UniformFog(PhotometricEffect):
@@ -247,18 +238,14 @@ class UniformFog(PhotometricEffect):
         p: float = 1.0,
     ):
         super().__init__(tolerance=tolerance, p=p)
-        self.visibility_range = check_visibility_range(visibility_range)
-        self.deviation_range = check_deviation_range(deviation_range)
+        self.visibility_range, self.deviation_range = check_fog_ranges(visibility_range, deviation_range)
         self.medium = make_medium(
             airlight=airlight, threshold=threshold, depth=depth, camera=camera, linear_light=linear_light
         )
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> FogParams:
         """Draw V and the deviation uniformly in their ranges."""
-        ranges = [visibility_to_uniform(self.visibility_range), self.deviation_range]
-        applied, values = self.draw_in_ranges(stream, ranges, image)
-        visibility = visibility_from_uniform(values[:, 0], self.visibility_range)
-        return FogParams(applied, visibility, values[:, 1], self.medium.airlight_of(image, values.dtype))
+        return draw_fog(self, stream, image)[0]
 
     def validate(self, params: FogParams, image: Tensor) -> None:
         """Raise ValueError for invalid parameters."""
@@ -282,37 +269,29 @@ class UniformFog(PhotometricEffect):
         return self.medium.blend(image, params, self.medium.distance(image, depth), k, is_visible=is_visible)
 
 
-def visibility_to_uniform(visibility_range: Range) -> Range:
-    """Return the range of the uniform number from which `visibility_from_uniform` makes V."""
-    near, far = visibility_range
+def draw_fog(
+    effect: Any, stream: random.Stream, image: Tensor, ranges: Sequence[Range] = ()
+) -> tuple[FogParams, Tensor]:
+    """Draw the parameters that all fogs have, and a uniform value in each of n more ranges, (B, n)."""
+    near, far = effect.visibility_range
     # An infinite end has no uniform draw, so 1 / V is drawn.
-    return (1 / far, 1 / near) if far > _ENDLESS else visibility_range
+    is_inverse = far > _ENDLESS
+    first = (1 / far, 1 / near) if is_inverse else (near, far)
+    applied, values = effect.draw_in_ranges(stream, [first, effect.deviation_range, *ranges], image)
+    visibility = 1 / values[:, 0] if is_inverse else values[:, 0]
+    airlight = effect.medium.airlight_of(image, values.dtype)
+    return FogParams(applied, visibility, values[:, 1], airlight), values[:, 2:]
 
 
-def visibility_from_uniform(value: Tensor, visibility_range: Range) -> Tensor:
-    """Return V in m, (B,), of uniform numbers."""
-    return 1 / value if visibility_range[1] > _ENDLESS else value
-
-
-def check_visibility_range(value: Range) -> Range:
-    """Return a valid range of V in m."""
-    return check_range("visibility_range", value, low=1e-6, high=torch.inf)
-
-
-def check_deviation_range(value: Range) -> Range:
-    """Return a valid range of the relative deviation of the extinction."""
-    return check_range("deviation_range", value, low=-0.999, high=0.999)
+def check_fog_ranges(visibility_range: Range, deviation_range: Range) -> tuple[Range, Range]:
+    """Return valid ranges of V in m and of the relative deviation of the extinction."""
+    visibility_range = check_range("visibility_range", visibility_range, low=1e-6, high=torch.inf)
+    return visibility_range, check_range("deviation_range", deviation_range, low=-0.999, high=0.999)
 
 
 def check_fog_params(params: Any, image: Tensor) -> None:
     """Raise ValueError for an invalid visibility, deviation or airlight."""
-    if params.airlight.shape != image.shape[:2]:
-        raise ValueError(
-            f"params.airlight must have shape {tuple(image.shape[:2])}, got {tuple(params.airlight.shape)}"
-        )
-    for name in ("visibility", "deviation"):
-        if getattr(params, name).ndim != 1:
-            raise ValueError(f"params.{name} must have shape (B,), got {tuple(getattr(params, name).shape)}")
+    check_shapes(params, {"visibility": (), "deviation": (), "airlight": (image.shape[1],)})
     check_values("params.visibility", "be above 0", params.visibility, lambda v: v > 0)
     check_values("params.deviation", "be above -1", params.deviation, lambda v: (v > -1) & v.isfinite())
     check_within("params.airlight", params.airlight, 0.0, 1.0)

@@ -10,41 +10,22 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor, expand_batch
-from torchrefract._validation import (
-    check_choice,
-    check_number,
-    check_positive,
-    check_range,
-    check_values,
-    check_within,
-)
+from torchrefract._validation import check_choice, check_number, check_positive, check_range, check_values, check_within
 from torchrefract.cameras.camera import Camera
-from torchrefract.effects.batch import params_to, per_sample
-from torchrefract.effects.depth import DepthProvider
-from torchrefract.effects.fog import (
-    check_deviation_range,
-    check_fog_params,
-    check_visibility_range,
-    make_medium,
-    visibility_from_uniform,
-    visibility_to_uniform,
-)
-from torchrefract.effects.motion import (
+from torchrefract.effects.batch import check_shapes, frame_mean, params_to, per_sample
+from torchrefract.effects.fog import check_fog_params, check_fog_ranges, draw_fog, make_medium
+from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
+from torchrefract.effects.random_field import (
     check_decorrelation,
     check_motion,
     check_wind,
-    clamp_motion,
     drawn_motion,
+    motion_of,
     motion_ranges,
 )
-from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
+from torchrefract.fields.depth import DepthProvider
 from torchrefract.fields.fog_volume import ExtinctionField, mean_extinction_along_rays
-from torchrefract.fields.heterogeneous_fog import (
-    image_noise,
-    normalize_weights,
-    periods_in_frame,
-    scale_to_mean,
-)
+from torchrefract.fields.heterogeneous_fog import image_noise, normalize_weights, periods_in_frame
 from torchrefract.planning.photometric import (
     PhotometricPlan,
     PhotometricRequest,
@@ -160,8 +141,7 @@ class HeterogeneousFog(PhotometricEffect):
     ):
         super().__init__(tolerance=tolerance, p=p)
         self.mode = check_choice("mode", mode, ("image", "ray"))
-        self.visibility_range = check_visibility_range(visibility_range)
-        self.deviation_range = check_deviation_range(deviation_range)
+        self.visibility_range, self.deviation_range = check_fog_ranges(visibility_range, deviation_range)
         self.medium = make_medium(
             airlight=airlight, threshold=threshold, depth=depth, camera=camera, linear_light=linear_light
         )
@@ -183,36 +163,24 @@ class HeterogeneousFog(PhotometricEffect):
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> HeterogeneousFogParams:
         """Draw all parameters uniformly in their ranges, and the key of the noise."""
-        winds = (self.wind_x_range, self.wind_y_range, self.wind_z_range)
-        ranges = [visibility_to_uniform(self.visibility_range), self.deviation_range, self.contrast_range]
-        ranges += motion_ranges(*winds, decorrelation=self.decorrelation_range)
-        applied, values = self.draw_in_ranges(stream, ranges, image)
-        weights = as_device_tensor([self.weights] * image.shape[0], dtype=values.dtype, device=values.device)
-        return HeterogeneousFogParams(
-            applied,
-            visibility_from_uniform(values[:, 0], self.visibility_range),
-            values[:, 1],
-            self.medium.airlight_of(image, values.dtype),
-            weights.view(-1, len(self.scales)),
-            values[:, 2],
-            **drawn_motion(values[:, 3:]),
-            key=random.noise_key(stream),
+        motion = motion_ranges(
+            self.wind_x_range, self.wind_y_range, self.wind_z_range, decorrelation=self.decorrelation_range
         )
+        fog, values = draw_fog(self, stream, image, [self.contrast_range, *motion])
+        weights = as_device_tensor([self.weights] * image.shape[0], dtype=values.dtype, device=values.device)
+        weights = weights.view(-1, len(self.scales))
+        motion = drawn_motion(values[:, 1:])
+        return HeterogeneousFogParams(*fog, weights, values[:, 0], **motion, key=random.noise_key(stream))
 
     def validate(self, params: HeterogeneousFogParams, image: Tensor) -> None:
         """Raise ValueError for invalid parameters."""
         check_fog_params(params, image)
-        if params.key.shape[1:] != (4,) or params.key.dtype is not torch.int64:
-            raise ValueError(f"params.key must be (B, 4) of int64, got {tuple(params.key.shape)} of {params.key.dtype}")
         check_motion(params, axes=3)
-        if params.weights.shape[1:] != (len(self.scales),):
-            raise ValueError(f"params.weights must be (B, {len(self.scales)}), got {tuple(params.weights.shape)}")
+        check_shapes(params, {"weights": (len(self.scales),), "contrast": ()})
         check_values("params.weights", "be at least 0 and finite", params.weights, lambda v: v.isfinite() & (v >= 0))
         sums = params.weights.sum(dim=1)
         check_values("params.weights", "have a sum above 0", sums, lambda v: v > 0)
         check_values("params.weights", "have a finite sum", sums, torch.isfinite)
-        if params.contrast.ndim != 1:
-            raise ValueError(f"params.contrast must have shape (B,), got {tuple(params.contrast.shape)}")
         check_within("params.contrast", params.contrast, *_CONTRASTS)
 
     def params_in_range(self, params: HeterogeneousFogParams) -> Tensor:
@@ -254,39 +222,23 @@ class HeterogeneousFog(PhotometricEffect):
     def _extinction(
         self, k: Tensor, params: HeterogeneousFogParams, distance: Tensor, image: Tensor, plan: PhotometricPlan
     ) -> Tensor:
-        """(N, 1, H, W): k q / <q>, 1/m, of the mean extinction k, (N, 1, 1, 1)."""
+        """Compute (N, 1, H, W): k q / <q>, 1/m, of the mean extinction k, (N, 1, 1, 1)."""
         rows, _, height, width = image.shape
-        dtype = field_dtype(image.dtype)
-        names = ("key", "weights", "contrast", "wind", "decorrelation")
-        key, weights, contrast, wind, decorrelation = (expand_batch(getattr(params, name), rows) for name in names)
-        weights = normalize_weights(weights.to(dtype))
-        frame, wind, decorrelation = clamp_motion(params.frame.reshape(-1), wind, decorrelation)
+        size = {"height": height, "width": width}
+        key, weights, contrast = (expand_batch(v, rows) for v in (params.key, params.weights, params.contrast))
+        weights, motion = normalize_weights(weights.to(k.dtype)), motion_of(params)
         if self.mode == "image":
-            q = image_noise(
-                key,
-                weights,
-                octaves=range(len(self.scales)) if plan.octaves is None else plan.octaves,
-                periods=self._periods(height, width),
-                height=height,
-                width=width,
-                frame=frame,
-                wind=wind[:, :2] * (width / self.reference_width),
-                decorrelation=decorrelation,
-                stretch=self.normalize == "image",
-            )
-            return scale_to_mean(q, k, mean=None if self.mean == "image" else 0.5)
-        focal, center = self.medium.pinhole(height, width)
-        q = mean_extinction_along_rays(
-            ExtinctionField(key, weights, contrast.to(dtype), frame, wind, decorrelation),
-            distance,
-            height=height,
-            width=width,
-            focal=focal,
-            center=center,
-            scales=self.scales,
-            reach=self.reach,
-        )
-        return scale_to_mean(q, k, mean=None if self.mean == "image" else 1.0)
+            motion = motion._replace(wind=motion.wind[:, :2] * (width / self.reference_width))
+            octaves = range(len(self.scales)) if plan.octaves is None else plan.octaves
+            periods, stretch = self._periods(height, width), self.normalize == "image"
+            q = image_noise(key, weights, octaves=octaves, periods=periods, motion=motion, stretch=stretch, **size)
+        else:
+            focal, center = self.medium.pinhole(height, width)
+            field = ExtinctionField(key, weights, contrast.to(k.dtype), motion)
+            view = {"focal": focal, "center": center, "scales": self.scales, "reach": self.reach}
+            q = mean_extinction_along_rays(field, distance, **size, **view)
+        of_all_fogs = 0.5 if self.mode == "image" else 1.0
+        return q * (k / (frame_mean(q) if self.mean == "image" else of_all_fogs))
 
     def _unit_weights(self) -> tuple[float, ...]:
         return tuple(weight / sum(self.weights) for weight in self.weights)
@@ -300,7 +252,7 @@ class HeterogeneousFog(PhotometricEffect):
 def _check_scales(
     scales: Sequence[float] | None, weights: Sequence[float] | None, *, mode: str
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Valid scales and as many weights; None are the defaults of the mode."""
+    """Return valid scales and as many weights; None are the defaults of the mode."""
     defaults = (_PAPER_SCALES, _PAPER_WEIGHTS) if mode == "image" else (_ROAD_SCALES, _ROAD_WEIGHTS)
     if scales is None:
         scales, weights = defaults[0], defaults[1] if weights is None else weights

@@ -1,9 +1,9 @@
 """The base class of effects that change light and move nothing."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from copy import copy
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -39,8 +39,8 @@ class Rendered(NamedTuple):
 class PhotometricEffect(Effect):
     """An effect that changes light and moves nothing.
 
-    Subclasses implement `sample_params`, `validate`, `render`, `make_plan` and `params_in_range`. Their parameters are
-    a NamedTuple with `applied` and a property `is_identity`, both (B,), bool.
+    Subclasses implement `sample_params`, `validate` and `render`, and where an error bound is known `make_plan` and
+    `params_in_range`. Their parameters are a NamedTuple with `applied` and a property `is_identity`, both (B,), bool.
 
     Args:
         tolerance: largest error of the image in levels of 1/255, for images in [0, 1] and all parameters in the ranges
@@ -59,13 +59,16 @@ class PhotometricEffect(Effect):
     def render(self, image: Tensor, params: Any, depth: Tensor | None) -> Rendered:
         """Degrade images (N, C, H, W), floating, with valid parameters of B samples, all of them."""
 
-    @abstractmethod
     def make_plan(self, request: PhotometricRequest, *, has_depth: bool) -> PhotometricPlan:
-        """Plan frames from the ranges, for the depth of the effect or, with `has_depth`, for any depth."""
+        """Plan frames from the ranges, for the depth of the effect or, with `has_depth`, for any depth.
 
-    @abstractmethod
+        By default all of the effect is computed.
+        """
+        return exact_plan(request, "no error bound is known for this effect")
+
     def params_in_range(self, params: Any) -> Tensor:
-        """Return (), bool: all parameters lie in the ranges of the effect, up to rounding."""
+        """Return (), bool: the plan of the ranges holds for these parameters, as the default plan always does."""
+        return torch.ones((), dtype=torch.bool)
 
     def plan_for_dtype(
         self, height: int, width: int, dtype: torch.dtype, *, has_depth: bool = False
@@ -78,7 +81,7 @@ class PhotometricEffect(Effect):
         """Return the plan for a batch; the exact one without a tolerance or if parameters require gradients."""
         height, width = image.shape[2:]
         if self.tolerance is None or requires_grad(params):
-            return exact_plan(height, width)
+            return exact_plan(PhotometricRequest(height, width, None, False))
         return self._constant_plan(id(self), height, width, field_dtype(image.dtype), depth is not None)
 
     def for_params(self, params: Any, height: int, width: int) -> "PhotometricEffect":
@@ -97,43 +100,63 @@ class PhotometricEffect(Effect):
         """Degrade images (N, C, H, W), floating, with valid parameters of B samples."""
         active = params.applied & ~params.is_identity
         if not self.may_change(params):
-            valid = active.new_ones(()).expand(_map_shape(image))
-            return Degraded(image, params, valid=valid, light=unchanged_maps(self.maps, image))
-        index, batch = _active_samples(active, params), len(active)
+            return self._unchanged(image, params)
+        index = _active_samples(active, params)
+        if index is not None:
+            return self._degrade_samples(image, params, depth, index)
         if eager_bool(active.any, of=active) is False:
             depth = None  # its values do not matter, so they are not checked either
-        if index is None:
-            rendered = self.render(image, params, depth)
-        else:
-            part = None if depth is None else _select(depth, index, batch)
-            rendered = self.render(_select(image, index, batch), select_params(params, index), part)
-        height, width = image.shape[2:]
+        rendered = self.render(image, params, depth)
 
-        def map_of_all(value: Tensor, unchanged: float | bool) -> Tensor:
-            if index is not None:
-                value = _insert(value, index, unchanged, batch)
-            elif eager_bool(active.all, of=active) is not True:
-                rows = max(value.shape[0], batch)
+        def masked_map(value: Map, unchanged: float | bool) -> Tensor:
+            value = value() if callable(value) else value
+            if eager_bool(active.all, of=active) is not True:
+                rows = max(value.shape[0], len(active))
                 value = torch.where(per_sample(expand_batch(active, rows)), expand_batch(value, rows), unchanged)
-            return value.expand(-1, 1, height, width)
+            return value.expand(-1, 1, *image.shape[2:])
 
-        def lazy_map(name: str) -> Map | None:
-            value = cast(Map | None, getattr(rendered, name))
-            if value is None:
-                return None
-            return lambda: map_of_all(value() if callable(value) else value, _UNCHANGED[name])
+        def lazy_map(name: str) -> Map:
+            return lambda: masked_map(getattr(rendered, name), _UNCHANGED[name])
 
-        if rendered.image is image:
-            result = image
-        elif index is not None:
-            result = _insert(rendered.image, index, image, batch)
-        else:
-            result = where_active(rendered.image, image, active, params)
+        is_same = rendered.image is image
         return Degraded(
-            result,
+            image if is_same else where_active(rendered.image, image, active, params),
             params,
-            valid=lambda: map_of_all(rendered.valid(), True),
-            light={name: value for name in _UNCHANGED if (value := lazy_map(name)) is not None},
+            valid=lambda: masked_map(rendered.valid, True),
+            light={name: lazy_map(name) for name in self.maps},
+        )
+
+    def _unchanged(self, image: Tensor, params: Any) -> Degraded:
+        def constant(value: float | bool, dtype: torch.dtype) -> Map:
+            shape = (image.shape[0], 1, *image.shape[2:])
+            return lambda: torch.full((), value, dtype=dtype, device=image.device).expand(shape)
+
+        light = {name: constant(_UNCHANGED[name], field_dtype(image.dtype)) for name in self.maps}
+        return Degraded(image, params, valid=constant(True, torch.bool), light=light)
+
+    def _degrade_samples(self, image: Tensor, params: Any, depth: Tensor | None, index: Tensor) -> Degraded:
+        """Degrade some samples of a batch, (n,), and leave the others."""
+        batch = len(params.applied)
+        part, part_depth = (None if v is None else v[_rows_of(index, len(v) // batch)] for v in (image, depth))
+        assert part is not None
+        degraded = self.degrade_batch(part, select_params(params, index), part_depth)
+
+        def with_others(value: Tensor, others: Tensor | float) -> Tensor:
+            frames = max(1, len(value) // len(index))
+            value = expand_batch(value, frames * len(index))
+            if not isinstance(others, Tensor):
+                others = value.new_full((batch * frames, *value.shape[1:]), others)
+            return others.index_copy(0, _rows_of(index, frames), value)
+
+        def lazy_map(name: str) -> Map:
+            return lambda: with_others(getattr(degraded, name), _UNCHANGED[name])
+
+        is_same = degraded.image is part
+        return Degraded(
+            image if is_same else with_others(degraded.image, image),
+            params,
+            valid=lambda: with_others(degraded.valid, True),
+            light={name: lazy_map(name) for name in self.maps},
         )
 
     @assume_constant_result
@@ -143,44 +166,14 @@ class PhotometricEffect(Effect):
         return self.plan_for_dtype(height, width, dtype, has_depth=has_depth)
 
 
-def unchanged_maps(names: Iterable[str], image: Tensor) -> dict[str, Map]:
-    """Return lazy maps with the values that they have where an effect changes nothing."""
-    shape, dtype, device = _map_shape(image), field_dtype(image.dtype), image.device
-
-    def constant(value: float) -> Map:
-        return lambda: torch.full((), value, dtype=dtype, device=device).expand(shape)
-
-    return {name: constant(_UNCHANGED[name]) for name in names}
-
-
-def _map_shape(image: Tensor) -> tuple[int, ...]:
-    return (image.shape[0], 1, *image.shape[2:])
-
-
 def _active_samples(active: Tensor, params: Any) -> Tensor | None:
-    """(n,): the indices of the active samples, so that only these are computed.
-
-    None if all or none are active, if that cannot be read without waiting, or if parameters require gradients.
-    """
+    """Return (n,), the indices of the active samples; None for all, none, gradients, or values unread."""
     flags = None if requires_grad(params) else eager_values(lambda: active)
     if flags is None or all(flags) or not any(flags):
         return None
     return torch.tensor([i for i, flag in enumerate(flags) if flag])
 
 
-def _select(value: Tensor, index: Tensor, batch: int) -> Tensor:
-    """The rows of some samples; (N, ...) has the frames of the B clips one after the other."""
-    return value[_row_numbers(index, value.shape[0] // batch)]
-
-
-def _insert(value: Tensor, index: Tensor, unchanged: Tensor | float, batch: int) -> Tensor:
-    """Put the rows of some samples into a batch whose other rows are `unchanged`."""
-    value = expand_batch(value, max(len(index), value.shape[0]))
-    frames = value.shape[0] // len(index)
-    if not isinstance(unchanged, Tensor):
-        unchanged = value.new_full((batch * frames, *value.shape[1:]), unchanged)
-    return unchanged.index_copy(0, _row_numbers(index, frames), value)
-
-
-def _row_numbers(index: Tensor, frames: int) -> Tensor:
+def _rows_of(index: Tensor, frames: int) -> Tensor:
+    """Return (n frames,): the rows of some samples; the frames of each clip follow one another."""
     return (frames * index[:, None] + torch.arange(frames)).flatten()

@@ -1,4 +1,4 @@
-"""Code that the effects of random fields share: checks, and the lattice on which a field is computed."""
+"""Code that random fields share: checks and draws of parameters that move and change over a clip."""
 
 import warnings
 from typing import Any
@@ -7,13 +7,62 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import check_range, check_within, eager_values
-from torchrefract.effects.motion import check_key, check_motion, is_still
+from torchrefract._validation import (
+    check_range,
+    check_values,
+    check_within,
+    eager_bool,
+    eager_values,
+    finite_or,
+    requires_grad,
+)
+from torchrefract.effects.batch import LATEST_FRAME, check_shapes
 from torchrefract.fields.random_field import FieldParams, Motion
 from torchrefract.types import Range
 
 _MAX_CLIPPED = 1e-3  # of the spectrum; the covariance is off by up to twice as much
+_FASTEST = 1e6  # px or m per frame
+_SHORTEST = 1e-3  # frames
 FIELD_BOUNDS: dict[str, Range] = {"amplitude": (0.0, 1e4), "length": (1e-3, 1e6), "aperture": (0.0, 1e4)}  # px
+
+
+def check_wind(name: str, value: Range) -> Range:
+    """Check the range of one component of a wind."""
+    return check_range(name, value, low=-_FASTEST, high=_FASTEST)
+
+
+def check_decorrelation(value: Range) -> Range:
+    """Check the range of a decorrelation time; inf is a field that the wind moves without changing it."""
+    return check_range("decorrelation_range", value, low=_SHORTEST, high=torch.inf)
+
+
+def motion_ranges(*winds: Range, decorrelation: Range) -> list[Range]:
+    """Return the ranges of the uniform numbers that `drawn_motion` takes: the wind, and 1 / decorrelation."""
+    # An infinite end has no uniform draw, its inverse has.
+    return [*winds, (1 / decorrelation[1], 1 / decorrelation[0])]
+
+
+def drawn_motion(values: Tensor) -> dict[str, Tensor]:
+    """Return `wind`, (B, axes), `decorrelation`, (B,), and `frame`, (B, 1), 0, from (B, axes + 1) uniform numbers."""
+    wind, rate = values[:, :-1], values[:, -1]
+    return {"wind": wind, "decorrelation": 1 / rate, "frame": torch.zeros_like(values[:, :1])}
+
+
+def check_motion(params: Any, *, axes: int) -> None:
+    """Raise ValueError for an invalid `key`, (B, 4), `wind`, (B, axes), `decorrelation`, (B,), or `frame`, (B, T)."""
+    if params.key.shape[1:] != (4,) or params.key.dtype is not torch.int64:
+        raise ValueError(f"params.key must be (B, 4) of int64, got {tuple(params.key.shape)} of {params.key.dtype}")
+    check_shapes(params, {"wind": (axes,), "decorrelation": ()})
+    check_frame(params)
+    check_within("params.wind", params.wind, -_FASTEST, _FASTEST)
+    check_values("params.decorrelation", "be above 0", params.decorrelation, lambda v: v > 0)
+
+
+def check_frame(params: Any) -> None:
+    """Raise ValueError unless `frame` is (B, T), with numbers that clips may have."""
+    if params.frame.ndim != 2:
+        raise ValueError(f"params.frame must have shape (B, T), got {tuple(params.frame.shape)}")
+    check_within("params.frame", params.frame, -LATEST_FRAME, LATEST_FRAME)
 
 
 def check_field_range(name: str, value: Range) -> Range:
@@ -25,24 +74,37 @@ def check_field_range(name: str, value: Range) -> Range:
 def check_field_params(params: Any) -> None:
     """Raise ValueError for an invalid `amplitude`, `length`, `aperture`, `key` or motion."""
     bounds = {name: ends for name, ends in FIELD_BOUNDS.items() if name in params._fields}
-    for name in bounds:
-        if getattr(params, name).ndim != 1:
-            raise ValueError(f"params.{name} must have shape (B,), got {tuple(getattr(params, name).shape)}")
-    check_key(params)
+    check_shapes(params, dict.fromkeys(bounds, ()))
     check_motion(params, axes=2)
     for name, ends in bounds.items():
         check_within(f"params.{name}", getattr(params, name), *ends)
 
 
+def motion_of(params: Any) -> Motion:
+    """Return the motion of each frame, N = B T rows, within its bounds; values that are not finite move nothing."""
+    rows = params.frame.numel()
+    wind, decorrelation = (expand_batch(value, rows) for value in (params.wind, params.decorrelation))
+    return Motion(
+        finite_or(params.frame.reshape(-1), 0.0).clamp(-LATEST_FRAME, LATEST_FRAME),
+        finite_or(wind, 0.0).clamp(-_FASTEST, _FASTEST),
+        torch.where(decorrelation > 0, decorrelation.clamp(min=_SHORTEST), torch.inf),
+    )
+
+
 def field_params(params: Any) -> FieldParams:
     """Return sizes, noise and motion of each frame, N = B T rows."""
     rows = params.frame.numel()
-    motion = None
-    if not is_still(params):
-        wind, decorrelation = (expand_batch(value, rows) for value in (params.wind, params.decorrelation))
-        motion = Motion(params.frame.reshape(-1), wind, decorrelation)
     aperture = expand_batch(params.aperture, rows) if "aperture" in params._fields else None
+    motion = None if _is_still(params) else motion_of(params)
     return FieldParams(expand_batch(params.length, rows), aperture, expand_batch(params.key, rows), motion)
+
+
+def _is_still(params: Any) -> bool:
+    """Return True if all samples are at frame 0 and no gradient of time is needed, as far as values can be read."""
+    moving = (params.frame, params.wind, params.decorrelation)
+    if params.frame.shape[1] > 1 or requires_grad(moving):
+        return False
+    return eager_bool((params.frame == 0).all, of=params.frame) is True
 
 
 def warn_if_clipped(clipped: Tensor, params: Any, size: tuple[int, int]) -> None:

@@ -107,10 +107,9 @@ class Rectification(WarpEffect):
         """Raise ValueError for invalid cameras."""
         if self.model == "polynomial12":
             check_lens(params, image.shape[0])
-        else:
-            count = len(self.camera.coefficients)
-            model = f"of the model {self.model}"
-            check_lens(params, image.shape[0], count=count, model=model, bound=_LARGEST_COEFFICIENT)
+            return
+        model, count = f"of the model {self.model}", len(self.camera.coefficients)
+        check_lens(params, image.shape[0], count=count, model=model, bound=_LARGEST_COEFFICIENT)
 
     def flow(self, params: RectificationParams, points: Points, plan: WarpPlan) -> tuple[Tensor, Tensor]:
         """Distort the points, in closed form."""
@@ -121,8 +120,16 @@ class Rectification(WarpEffect):
             flow, exists = lens_restore_flow(*camera, points)
         else:
             flow, exists = rectification_flow(*camera, points, model=self.model)
-        if points.lattice.stride == 1 and eager_bool(exists.all, of=exists) is False:
-            self._report_fold(params, height, width)
+
+        def folds() -> Tensor:
+            is_missing = is_border_missing(*camera, model=self.model, height=height, width=width)
+            return (params.applied & is_missing).any()
+
+        is_suspect = points.lattice.stride == 1 and eager_bool(exists.all, of=exists) is False
+        if is_suspect and eager_bool(folds, of=params.applied):
+            warnings.warn(
+                "camera: the model folds back inside the frame: pixels beyond are padded, not valid", stacklevel=2
+            )
         return flow, exists
 
     def inverse_flow(self, params: RectificationParams, flow: Tensor) -> tuple[Tensor, Tensor]:
@@ -147,13 +154,3 @@ class Rectification(WarpEffect):
             (camera.fx / width, camera.fy / width),
             ((camera.cx - middle[0]) / width, (camera.cy - middle[1]) / width),
         )
-
-    def _report_fold(self, params: RectificationParams, height: int, width: int) -> None:
-        def folds() -> Tensor:
-            camera = lens_in_px(params, height, width)
-            return (params.applied & is_border_missing(*camera, model=self.model, height=height, width=width)).any()
-
-        if eager_bool(folds, of=params.applied):
-            warnings.warn(
-                "camera: the model folds back inside the frame: pixels beyond are padded, not valid", stacklevel=3
-            )

@@ -1,6 +1,8 @@
 """Depth in meters: of a flat road, along rays, converted from other units, and checked."""
 
 import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -13,24 +15,44 @@ _NUM_CHECKED = 128 * 128  # values of a sample by which `check_depth` judges it
 _MIN_UPPER_HALF = 128  # values of its upper half; fewer are not judged
 
 
-def linear_depth(height: int, max_depth: float, *, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return d(y) = (1 - (y + 1/2) / H) max_depth in m, (1, 1, H, 1), from the far top row to the near bottom row."""
-    margin = max_depth / (2 * height)
-    return torch.linspace(max_depth - margin, margin, height, dtype=dtype, device=device).view(1, 1, height, 1)
+class DepthProvider(ABC):
+    """The depth of a frame of any size if no depth map is passed in; derive your own provider from it."""
+
+    @abstractmethod
+    def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+        """Return the depth along the axis of the camera in m, inf for the sky.
+
+        Args:
+            height, width: px, of the frame.
+            dtype, device: of the result.
+
+        Returns:
+            (1, 1, H, W), or (1, 1, H, 1) if all pixels of a row have one depth.
+        """
 
 
-def ground_plane_depth(
-    height: int,
-    *,
-    camera_height: float,
-    focal_px: float,
-    horizon: float,
-    spread: float = 0.0,
-    far: float,
-    dtype: torch.dtype,
-    device: torch.device,
-) -> Tensor:
-    """Return the depth of a flat road along the axis of the camera; `far` at the horizon and above it.
+@dataclass(frozen=True, kw_only=True)
+class LinearDepth(DepthProvider):
+    """The ramp over the rows of the paper: d(y) = (1 - (y + 1/2) / H) max_depth.
+
+    max_depth: m, at the top edge of the frame, in [0, 1e12].
+    """
+
+    max_depth: float = 160.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "max_depth", check_number("max_depth", self.max_depth, low=0.0, high=_FARTHEST))
+
+    def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+        """Return (1, 1, H, 1), m."""
+        margin = self.max_depth / (2 * height)
+        rows = torch.linspace(self.max_depth - margin, margin, height, dtype=dtype, device=device)
+        return rows.view(1, 1, height, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundPlaneDepth(DepthProvider):
+    """A flat road below the horizon: its depth along the axis of the camera, not along the ray of each pixel.
 
         z(y) = min(h sqrt(f^2 + (c_y - y_h)^2) / b, far),  y_h = horizon H - 1/2,  c_y = (H - 1) / 2
         b = max(y - y_h, 0),  or with s = spread H > 0 its mean (y - y_h) Phi(u) + s phi(u),  u = (y - y_h) / s
@@ -38,26 +60,38 @@ def ground_plane_depth(
     The camera is a pinhole that looks down by theta, tan(theta) = (c_y - y_h) / f, so sqrt(...) is f / cos(theta). A
     spread averages inverse depth over normally distributed horizons.
 
-    Args:
-        height: px, of the frame, whose middle is the principal point.
-        camera_height: m, h, above the road.
-        focal_px: f.
-        horizon: its position, 0 at the top edge of the frame and 1 at its bottom edge.
-        spread: standard deviation of the horizon, at least 0.
-        far: m, the largest depth; may be inf.
-
-    Returns:
-        (1, 1, H, 1), m.
+    camera_height: m, h, above the road.
+    focal: f, focal length of the pinhole, widths of the frame.
+    horizon: its position, 0 at the top edge of the frame and 1 at its bottom edge, in [-10, 10].
+    spread: standard deviation of an uncertain horizon, in heights of the frame, in [0, 10]; depth then grows smoothly
+        across the horizon instead of jumping there.
+    far: m, the largest depth, which is that of the sky; may be inf.
     """
-    y_h = horizon * height - 0.5
-    # Close to the horizon float32 would lose the digits of the difference.
-    rows_below = torch.arange(height, dtype=torch.float64, device=device) - y_h
-    z = camera_height * math.hypot(focal_px, (height - 1) / 2 - y_h) / _mean_positive(rows_below, spread * height)
-    return z.clamp(max=far).to(dtype).view(1, 1, height, 1)
+
+    camera_height: float = 1.3
+    focal: float = 0.9
+    horizon: float = 0.5
+    spread: float = 0.0
+    far: float = 200.0
+
+    def __post_init__(self) -> None:
+        for name in ("camera_height", "focal"):
+            object.__setattr__(self, name, check_positive(name, getattr(self, name)))
+        for name, low, high in (("horizon", -10.0, 10.0), ("spread", 0.0, 10.0), ("far", 1e-6, math.inf)):
+            object.__setattr__(self, name, check_number(name, getattr(self, name), low=low, high=high))
+
+    def __call__(self, height: int, width: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
+        """Return (1, 1, H, 1), m."""
+        y_h = self.horizon * height - 0.5
+        # Close to the horizon float32 would lose the digits of the difference.
+        below = torch.arange(height, dtype=torch.float64, device=device) - y_h
+        distance = self.camera_height * math.hypot(self.focal * width, (height - 1) / 2 - y_h)
+        z = distance / _mean_positive(below, self.spread * height)
+        return z.clamp(max=self.far).to(dtype).view(1, 1, height, 1)
 
 
 def _mean_positive(value: Tensor, deviation: float) -> Tensor:
-    """The mean of max(X, 0) for a normal X with this mean and standard deviation."""
+    """Compute the mean of max(X, 0) for a normal X with this mean and standard deviation."""
     if deviation == 0:
         return value.clamp(min=0)
     u = value / deviation
@@ -91,7 +125,10 @@ def ray_distance(
         ValueError: an invalid shape, a focal length that is not above 0, an intrinsic that is not finite.
         TypeError: depth is not a floating tensor.
     """
-    _check_rows("depth", depth, width)
+    if check_floating("depth", depth).ndim != 4 or depth.shape[1] != 1:
+        raise ValueError(f"depth must have shape (B, 1, H, W) or (B, 1, H, 1), got {tuple(depth.shape)}")
+    if width is not None and depth.shape[3] not in (1, width):
+        raise ValueError(f"depth must be 1 or {width} px wide, as the frame, got {tuple(depth.shape)}")
     z = depth.to(field_dtype(depth.dtype))
     columns, rows = pixel_axes(z.shape[2], width or z.shape[3], dtype=z.dtype, device=z.device)
     x = (columns - _intrinsic("cx", cx, z)) / _focal("fx", fx, z)
@@ -153,16 +190,7 @@ def depth_from_inverse(value: Tensor, *, near: float, far: float) -> Tensor:
 
     Monocular networks such as MiDaS predict such maps, up to a scale to [0, 1].
 
-    Args:
-        value: in [0, 1], of any shape.
-        near, far: m, 0 < near < far; far may be inf.
-
-    Returns:
-        Depth in m, of the same shape, float32, or float64 for a float64 map.
-
-    Raises:
-        ValueError: a value outside [0, 1] or NaN (on the CPU); a near or far out of range.
-        TypeError: value is not a floating tensor.
+    Args, Returns, Raises: as for `depth_from_normalized`, but 0 < near < far, and far may be inf.
 
     Source: Ranftl et al., "Towards Robust Monocular Depth Estimation", IEEE TPAMI 44 (2022).
     """
@@ -182,9 +210,6 @@ def check_depth(depth: Tensor, *, name: str = "depth") -> None:
     Args:
         depth: (B, 1, H, W) or (B, T, 1, H, W), m, inf for the sky.
         name: of the argument, for the message.
-
-    Raises:
-        ValueError: an invalid depth.
     """
     lowest = eager_values(lambda: depth.detach().amin(), of=depth) if depth.numel() else None
     if lowest is None:
@@ -206,13 +231,6 @@ def check_floating(name: str, value: Tensor) -> Tensor:
     if not check_tensor(name, value).is_floating_point():
         raise TypeError(f"{name} must be of a floating type, got {value.dtype}")
     return value
-
-
-def _check_rows(name: str, depth: Tensor, width: int | None) -> None:
-    if check_floating(name, depth).ndim != 4 or depth.shape[1] != 1:
-        raise ValueError(f"{name} must have shape (B, 1, H, W) or (B, 1, H, 1), got {tuple(depth.shape)}")
-    if width is not None and depth.shape[3] not in (1, width):
-        raise ValueError(f"{name} must be 1 or {width} px wide, as the frame, got {tuple(depth.shape)}")
 
 
 def _focal(name: str, value: float | Tensor, like: Tensor) -> float | Tensor:

@@ -85,11 +85,7 @@ def curl(psi: Tensor) -> Tensor:
 def curl_rms(length: Tensor, kind: str) -> Tensor:
     """Compute (N,), 1/px: the root mean square of each component of `curl` over all fields psi of variance 1.
 
-        sqrt((C(0) - C(2)) / 2),  the variance of a central difference
-
-    Args:
-        length: (N,), px, correlation length of psi.
-        kind: of its covariance.
+    sqrt((C(0) - C(2)) / 2),  the root of the variance of a central difference; C for lengths (N,), px
     """
     two = torch.full_like(length, 2.0, dtype=torch.float64)
     return ((1 - covariance_at(two, length.double(), kind)) / 2).sqrt().to(length.dtype)

@@ -12,9 +12,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor, cat_bands, exact_matmul, rows_at_once
+from torchrefract._tensor import as_device_tensor, exact_matmul
 from torchrefract._validation import finite_or
 from torchrefract.fields.perlin import fade_out
+from torchrefract.fields.random_field import Motion
 from torchrefract.random import lattice_noise
 
 # Variance of the noise over all gradients and places in a cell. Each of the 8 nodes adds a third of the mean of
@@ -34,7 +35,6 @@ _FINER = 2  # cells of the image lattice per cell between rays; pixels are inter
 # An octave fades out where rays are so many of its periods apart, or planes `_LONGER` times as many.
 _SPARSE, _SPARSEST = 0.4, 0.8
 _LONGER = 5.0
-_CACHED_PIXELS = 1 << 15
 _MAX_CONTRAST = 30.0  # above it the exponentials leave float32
 
 
@@ -50,8 +50,7 @@ class Rays(NamedTuple):
 
     def slopes(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return x / z, (columns,), and y / z, (rows,), float64."""
-        j = torch.arange(self.columns, dtype=torch.float64, device=device)
-        i = torch.arange(self.rows, dtype=torch.float64, device=device)
+        j, i = (torch.arange(n, dtype=torch.float64, device=device) for n in (self.columns, self.rows))
         return self.left + self.step_x * j, self.top + self.step_y * i
 
     def box(self, depth: float) -> list[tuple[float, float]]:
@@ -67,18 +66,15 @@ class ExtinctionField(NamedTuple):
     key: (N, 4), int64, of `noise_key`.
     weights: (N, octaves), w_i, not all 0.
     contrast: (N,), c, the standard deviation of ln q.
-    frame: (N,), t.
-    wind: (N, 3), m per frame, to the right, down and ahead, as seen by the camera.
-    decorrelation: (N,), frames, above 0, after which q in the wind has the correlation 1 / e with itself, so that that
-        of g is exp(-t^2 ln(1 / r) / decorrelation^2), r = ln(1 + (exp(c^2) - 1) / e) / c^2; may be inf.
+    motion: wind: (N, 3), m per frame, to the right, down and ahead, as seen by the camera; decorrelation: (N,), frames,
+        after which q in the wind has the correlation 1 / e with itself, so that that of g is
+        exp(-t^2 ln(1 / r) / decorrelation^2), r = ln(1 + (exp(c^2) - 1) / e) / c^2.
     """
 
     key: Tensor
     weights: Tensor
     contrast: Tensor
-    frame: Tensor
-    wind: Tensor
-    decorrelation: Tensor
+    motion: Motion
 
 
 class View(NamedTuple):
@@ -118,8 +114,7 @@ def mean_extinction_along_rays(
         field: of N samples.
         distance: (N or 1, 1, H, 1 or W), m, d along the ray, at least 0, may be inf; gives the type.
         height, width: px, of the frame.
-        focal: px, fx and fy of a pinhole camera.
-        center: px, cx and cy, its principal point.
+        focal, center: px, fx and fy of a pinhole camera, and cx and cy of its principal point.
         scales: m, the periods of the octaves.
         reach: m; beyond it the fog is uniform.
 
@@ -160,7 +155,7 @@ def extinction_on_planes(
     )
     sparse = ((apart_m / period[:, None] - _SPARSE) / (_SPARSEST - _SPARSE)).clamp(0, 1)
     damping = (1 - sparse * sparse * (3 - 2 * sparse)) * deviation_of_mean(length_m / period[:, None])
-    weights, frame = field.weights.double(), field.frame.double()
+    weights, frame = field.weights.double(), field.motion.frame.double()
     contrast = finite_or(field.contrast.double(), 0.0).clamp(0, _MAX_CONTRAST)
     deviation = weights * (contrast / (VARIANCE * weights.square().sum(dim=1)).sqrt())[:, None]
     amplitude = deviation[:, :, None] * damping
@@ -171,8 +166,8 @@ def extinction_on_planes(
         periods=scales,
         planes=[sum(value < _SPARSEST * scale for value in apart) for scale in scales],
         amplitude=amplitude.to(dtype),
-        moved=field.wind.double() * frame[:, None],
-        turns=frame / field.decorrelation.double() * log_field_pace(contrast.square()),
+        moved=field.motion.wind.double() * frame[:, None],
+        turns=frame / field.motion.decorrelation.double() * log_field_pace(contrast.square()),
     )
     half_variance = VARIANCE / 2 * amplitude.square().sum(dim=1)
     return torch.expm1(noise - half_variance.to(dtype)[:, :, None, None])
@@ -182,9 +177,6 @@ def log_field_pace(variance: Tensor) -> Tensor:
     """Return by how much slower a Gaussian field decorrelates than its exponential, to a correlation of 1 / e.
 
     The exponentials of two Gaussians of variance v and correlation r are correlated by (exp(v r) - 1) / (exp(v) - 1).
-
-    Args:
-        variance: v, of any shape.
     """
     share, is_small = math.exp(-1), variance < 1e-4
     safe = torch.where(is_small, 1.0, variance)
@@ -197,10 +189,7 @@ def log_field_pace(variance: Tensor) -> Tensor:
 def deviation_of_mean(length: Tensor) -> Tensor:
     """Return the standard deviation of the mean of the noise over a length along an axis, over that of the noise.
 
-        (1 + (length / 0.851)^2)^(-1/4),  within 2.5 %; 0.851 is twice the integral of the correlation
-
-    Args:
-        length: periods, of any shape.
+    (1 + (length / 0.851)^2)^(-1/4),  within 2.5 %; 0.851 periods are twice the integral of the correlation
     """
     return (1 + (length / 0.851).square()).pow(-0.25)
 
@@ -244,18 +233,16 @@ def noise_on_planes(
     device, dtype = key.device, amplitude.dtype
     boxes = [rays.box(depths[count - 1] / period) for count, period in zip(planes, periods, strict=True)]
     nodes = [[math.ceil(high - low) + 2 for low, high in box] for box in boxes]
-    low = as_device_tensor([[end[0] for end in box] for box in boxes], dtype=torch.float64, device=device)
-    number = torch.arange(1, len(periods) + 1, device=device)[:, None]
-    phase = key[:, None, :3].double() * 2.0**-32 + number * as_device_tensor(
-        _PHASES, dtype=torch.float64, device=device
+    lowest = [[low for low, _ in box] for box in boxes]
+    low, period, phase, depth = (
+        as_device_tensor(values, dtype=torch.float64, device=device) for values in (lowest, periods, _PHASES, depths)
     )
-    period = as_device_tensor(periods, dtype=torch.float64, device=device)[:, None]
-    origin = phase.frac() - moved.double()[:, None] / period
+    phase = key[:, None, :3].double() * 2.0**-32 + torch.arange(1, len(periods) + 1, device=device)[:, None] * phase
+    origin = phase.frac() - moved.double()[:, None] / period[:, None]
     # From the first node on, float32 suffices for positions, however far the wind has carried the noise.
     first = (origin.detach() + low).floor()
     gradients = _gradients(key, first.long(), nodes, turns, dtype=dtype)
     x, y = rays.slopes(device)
-    depth = as_device_tensor(depths, dtype=torch.float64, device=device)
     total = amplitude.new_zeros(len(key), len(depths), rays.rows, rays.columns)
     for i, count in enumerate(planes):
         z = depth[:count] / periods[i]
@@ -276,7 +263,7 @@ def noise_on_planes(
 
 
 def _weights(position: Tensor, nodes: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """(..., nodes, places): h and h p of every node at positions (..., places)."""
+    """Compute (..., nodes, places): h and h p of every node at positions (..., places)."""
     node = torch.arange(nodes, dtype=position.dtype, device=position.device)[:, None]
     distance = (position.unsqueeze(-2) - node).to(dtype)
     hat = fade_out(distance)
@@ -361,7 +348,7 @@ def _positions(pixels: int, cell: float, cells: int, like: Tensor) -> tuple[Tens
 
 
 def _interpolate_rows(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:
-    """m for distances (N or 1, 1, H, 1): each row of pixels reads one slice, so that matrix products serve."""
+    """Compute m for distances (N or 1, 1, H, 1): each row of pixels reads one slice, so that matrix products serve."""
     first, part, share = (value.flatten(1) for value in _slice_of(distance, reach))
     y, dy = _positions(view.height, view.cell, view.down, volume)
     batch, slices, rows = volume.shape[:3]
@@ -377,7 +364,7 @@ def _interpolate_rows(view: View, volume: Tensor, distance: Tensor, reach: float
 
 
 def _interpolate_pixels(view: View, volume: Tensor, distance: Tensor, reach: float) -> Tensor:
-    """m for distances (N or 1, 1, H, W)."""
+    """Compute m for distances (N or 1, 1, H, W)."""
     volume = exact_matmul(volume, _cubic_weights(view.across, volume).T)
     rows, columns = volume.shape[2:]
     # The slices lie below one another in one image, and the next slice of each is a second channel.
@@ -386,19 +373,8 @@ def _interpolate_pixels(view: View, volume: Tensor, distance: Tensor, reach: flo
         ((2 * (torch.arange(n, dtype=torch.float64, device=volume.device) + 0.5) * (_FINER / view.cell) + 1) / size - 1)
         for n, size in ((view.width, columns), (view.height, rows * _SLICES))
     )
-    x, y = x.to(volume.dtype), y.to(volume.dtype)[:, None]
-    # A few rows at a time stay in the cache.
-    size = rows_at_once(volume.device, view.height, each=view.width, cached=_CACHED_PIXELS)
-    bands = (
-        _interpolate_band(pairs, band, x, middle, reach)
-        for band, middle in zip(distance.split(size, dim=2), y.split(size), strict=True)
-    )
-    return cat_bands(bands, dim=2, length=view.height)
-
-
-def _interpolate_band(pairs: Tensor, distance: Tensor, x: Tensor, y: Tensor, reach: float) -> Tensor:
     first, part, share = _slice_of(distance, reach)
-    y = first[:, 0] * (2 / _SLICES) + y
-    grid = torch.stack([x.expand_as(y), y], dim=3).expand(len(pairs), -1, -1, -1)
+    y = first[:, 0] * (2 / _SLICES) + y.to(volume.dtype)[:, None]
+    grid = torch.stack([x.to(volume.dtype).expand_as(y), y], dim=3).expand(len(pairs), -1, -1, -1)
     below, above = F.grid_sample(pairs, grid, align_corners=False).split(1, dim=1)
     return (torch.lerp(below, above, part) * share + 1).relu()

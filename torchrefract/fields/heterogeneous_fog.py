@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchrefract._validation import finite_or
 from torchrefract.fields.perlin import draw_octave, perlin_noise
+from torchrefract.fields.random_field import Motion
 
 _MAX_NODES = 1 << 24  # more nodes would take gigabytes
 
@@ -19,9 +20,7 @@ def image_noise(
     periods: Sequence[float],
     height: int,
     width: int,
-    frame: Tensor,
-    wind: Tensor,
-    decorrelation: Tensor,
+    motion: Motion,
     stretch: bool,
 ) -> Tensor:
     """Mix Perlin noises in the image plane, each mapped to [0, 1].
@@ -36,48 +35,21 @@ def image_noise(
         octaves: the indices of the octaves that are computed, at least one.
         periods: px, K of them.
         height, width: px, of the frame.
-        frame: (N,).
-        wind: (N, 2), px per frame.
-        decorrelation: (N,), frames.
+        motion: of the N fogs, with a wind in px per frame.
         stretch: map the extremes of each noise in the frame to 0 and 1, without gradients of these.
 
     Returns:
         (N, 1, H, W), q.
     """
-    drawn = [
-        draw_octave(
-            key,
-            i,
-            period=periods[i],
-            height=height,
-            width=width,
-            frame=frame,
-            wind=wind,
-            decorrelation=decorrelation,
-            dtype=weights.dtype,
-        )
-        for i in octaves
-    ]
+    frame = {"height": height, "width": width, "motion": motion, "dtype": weights.dtype}
+    drawn = [draw_octave(key, i, period=periods[i], **frame) for i in octaves]
     # A list as an index would make a device wait.
     chosen = torch.stack([weights[:, i] for i in octaves], dim=1)
     if not stretch:
         return perlin_noise(drawn, chosen * 0.5**0.5).add_(0.5)
     one = torch.ones_like(chosen[:, :1])
-    q = 0.0
-    for octave, weight in zip(drawn, chosen.unbind(1), strict=True):
-        q = q + weight.view(-1, 1, 1, 1) * stretch_to_unit(perlin_noise([octave], one))
-    return torch.as_tensor(q)
-
-
-def scale_to_mean(q: Tensor, k: Tensor, *, mean: float | None) -> Tensor:
-    """Return k q / <q>, with <q> the mean over each frame, or `mean` if it is given.
-
-    Args:
-        q: (N, 1, H, W).
-        k: (N, 1, 1, 1), 1/m, the mean extinction.
-        mean: <q>.
-    """
-    return q * (k / (q.mean(dim=(2, 3), keepdim=True) if mean is None else mean))
+    stretched = [stretch_to_unit(perlin_noise([octave], one)) for octave in drawn]
+    return (chosen[..., None, None] * torch.cat(stretched, dim=1)).sum(dim=1, keepdim=True)
 
 
 def stretch_to_unit(noise: Tensor) -> Tensor:

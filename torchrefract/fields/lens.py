@@ -1,12 +1,10 @@
 """The flow of a lens, and the flow that undoes it."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor, rows_at_once
-from torchrefract._validation import eager_bool
+from torchrefract._tensor import as_device_tensor
+from torchrefract._validation import eager_bool, requires_grad
 from torchrefract.cameras.brown_conrady import (
     Terms,
     distort_polynomial,
@@ -22,7 +20,6 @@ from torchrefract.warping.grid import Points
 # Preimages are searched up to this many half-diagonals of the frame from the center.
 REACH = 4.0
 _BORDER_POINTS = 17  # on each side of the frame, where folds begin
-_CACHED = 1 << 16  # positions whose intermediate values fit into the cache of a core
 
 
 def lens_flow(coefficients: Tensor, focal: Tensor, center: Tensor, points: Points) -> tuple[Tensor, Tensor]:
@@ -45,14 +42,11 @@ def lens_flow(coefficients: Tensor, focal: Tensor, center: Tensor, points: Point
     """
     c, terms = coefficients[:, :, None, None, None], used_terms(coefficients)
     limit = frame_limit(coefficients, focal, center, height=points.lattice.height, width=points.lattice.width)
-
-    def flow(x_d: Tensor, y_d: Tensor) -> tuple[Tensor, Tensor]:
-        x, y, exists = undistort_polynomial(x_d.detach(), y_d.detach(), c.detach(), limit=limit, terms=terms)
-        if torch.is_grad_enabled() and (c.requires_grad or x_d.requires_grad):
-            x, y = _with_gradient(*_replace_missing(x, y, exists), x_d, y_d, c, terms)
-        return _to_flow(x - x_d, y - y_d, exists, x_d, y_d, focal), exists
-
-    return in_bands(flow, *on_plane(points, focal, center))
+    x_d, y_d = on_plane(points, focal, center)
+    x, y, exists = undistort_polynomial(x_d.detach(), y_d.detach(), c.detach(), limit=limit, terms=terms)
+    if requires_grad((c, x_d)):
+        x, y = _with_gradient(*_replace_missing(x, y, exists), x_d, y_d, c, terms)
+    return _to_flow(x - x_d, y - y_d, exists, x_d, y_d, focal), exists
 
 
 def lens_restore_flow(coefficients: Tensor, focal: Tensor, center: Tensor, points: Points) -> tuple[Tensor, Tensor]:
@@ -64,21 +58,17 @@ def lens_restore_flow(coefficients: Tensor, focal: Tensor, center: Tensor, point
     """
     c, terms = coefficients[:, :, None, None, None], used_terms(coefficients)
     limit = frame_limit(coefficients, focal, center, height=points.lattice.height, width=points.lattice.width)
-
-    def flow(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        x, y = (axis.contiguous() for axis in torch.broadcast_tensors(x, y))
-        with torch.no_grad():
-            if terms.bent:
-                (x_d, y_d), jacobian = distort_with_jacobian(x, y, c, terms)
-                exists = _is_unfolded(x, y, jacobian.determinant, limit)
-            else:
-                x_d, y_d = distort_polynomial(x, y, c, terms)
-                exists = x * x + y * y <= limit.radius.square()
-        if torch.is_grad_enabled() and (c.requires_grad or x.requires_grad):
-            x_d, y_d = distort_polynomial(*_replace_missing(x, y, exists), c, terms)
-        return _to_flow(x_d - x, y_d - y, exists, x, y, focal), exists
-
-    return in_bands(flow, *on_plane(points, focal, center))
+    x, y = (axis.contiguous() for axis in torch.broadcast_tensors(*on_plane(points, focal, center)))
+    with torch.no_grad():
+        is_shown = x * x + y * y <= limit.radius.square()
+        if terms.bent:
+            (x_d, y_d), jacobian = distort_with_jacobian(x, y, c, terms)
+            exists = is_shown & (jacobian.determinant > 0) & (jacobian.determinant < torch.inf)
+        else:
+            (x_d, y_d), exists = distort_polynomial(x, y, c, terms), is_shown
+    if requires_grad((c, x)):
+        x_d, y_d = distort_polynomial(*_replace_missing(x, y, exists), c, terms)
+    return _to_flow(x_d - x, y_d - y, exists, x, y, focal), exists
 
 
 def newton_lens_flow(
@@ -95,14 +85,11 @@ def newton_lens_flow(
         (B, 2, h, w), px.
     """
     c = coefficients[:, :, None, None, None]
-
-    def flow(x_d: Tensor, y_d: Tensor) -> tuple[Tensor, Tensor]:
-        x, y = newton_undistort(x_d.detach(), y_d.detach(), c.detach(), steps=num_steps, terms=terms)
-        if torch.is_grad_enabled() and (c.requires_grad or x_d.requires_grad):
-            x, y = _with_gradient(x, y, x_d, y_d, c, terms)
-        return torch.cat([x - x_d, y - y_d], dim=1) * focal[:, :, None, None], x_d
-
-    return in_bands(flow, *on_plane(points, focal, center))[0]
+    x_d, y_d = on_plane(points, focal, center)
+    x, y = newton_undistort(x_d.detach(), y_d.detach(), c.detach(), steps=num_steps, terms=terms)
+    if requires_grad((c, x_d)):
+        x, y = _with_gradient(x, y, x_d, y_d, c, terms)
+    return torch.cat([x - x_d, y - y_d], dim=1) * focal[:, :, None, None]
 
 
 def frame_limit(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> RadialLimit:
@@ -146,29 +133,9 @@ def on_plane(points: Points, focal: Tensor, center: Tensor) -> tuple[Tensor, Ten
     return x, y
 
 
-def in_bands(
-    function: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], x: Tensor, y: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Apply a function of positions to bands of rows whose intermediate values fit into the cache of a core."""
-    height, width = y.shape[2], x.shape[3]
-    rows = rows_at_once(x.device, height, each=max(x.shape[0], y.shape[0]) * width, cached=_CACHED)
-    bands_y = y.split(rows, dim=2)
-    bands_x = x.split(rows, dim=2) if x.shape[2] == height else [x] * len(bands_y)
-    results = [function(band_x, band_y) for band_x, band_y in zip(bands_x, bands_y, strict=True)]
-    if len(results) == 1:
-        return results[0]
-    first, second = zip(*results, strict=True)
-    return torch.cat(first, dim=2), torch.cat(second, dim=2)
-
-
 def _replace_missing(x: Tensor, y: Tensor, exists: Tensor) -> tuple[Tensor, Tensor]:
     # Zero times an infinite slope is NaN, so that points without a solution must not reach the backward pass.
     return torch.where(exists, x, 0), torch.where(exists, y, 0)
-
-
-def _is_unfolded(x: Tensor, y: Tensor, determinant: Tensor, limit: RadialLimit) -> Tensor:
-    """Return (B, 1, h, w), bool: the points that the lens shows and does not fold over."""
-    return (x * x + y * y <= limit.radius.square()) & (determinant > 0) & (determinant < torch.inf)
 
 
 def _with_gradient(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, c: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:

@@ -73,8 +73,7 @@ def lenses_from_cameras(table: Sequence[Camera] | None, *, residual_px: float) -
         residual_px: largest distance in px between a camera of another model and its polynomial.
 
     Raises:
-        TypeError: an element is not a camera.
-        ValueError: an empty table; a camera too far from a polynomial, or that folds back inside its frame.
+        ValueError, TypeError: an empty table; as for `as_polynomial`.
     """
     residual_px = check_number("residual_px", residual_px, low=0.0)
     if table is None:
@@ -90,9 +89,8 @@ def jittered_camera(camera: Camera, *, jitter: float, residual_px: float) -> Len
     """Vary each number of a camera independently.
 
     Args:
-        camera: of any model.
+        camera, residual_px: as for `as_polynomial`.
         jitter: largest relative change of each number, in [0, 0.99].
-        residual_px: as for `lenses_from_cameras`.
     """
     jitter = check_number("jitter", jitter, low=0.0, high=0.99)
     lens = _numbers(as_polynomial("camera", camera, check_number("residual_px", residual_px, low=0.0)))

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchrefract._tensor import exact_matmul
 from torchrefract._validation import eager_bool, requires_grad
+from torchrefract.fields.random_field import Motion
 from torchrefract.random import lattice_noise
 
 # Multiples of the golden ratio stay apart modulo 1, so that octaves share no lines of nodes.
@@ -41,9 +42,7 @@ def draw_octave(
     period: float,
     height: int,
     width: int,
-    frame: Tensor,
-    wind: Tensor,
-    decorrelation: Tensor,
+    motion: Motion,
     dtype: torch.dtype,
 ) -> Octave:
     """Draw one octave for one frame of each clip.
@@ -60,15 +59,13 @@ def draw_octave(
         index: of the octave; octaves of different indices are independent.
         period: px between two nodes, above 0.
         height, width: px, of the frame.
-        frame: (N,), t.
-        wind: (N, 2), px per frame, to the right and down.
-        decorrelation: (N,), frames, above 0; inf for gradients that do not turn.
+        motion: time t, wind in px per frame and decorrelation; inf for gradients that do not turn.
         dtype: of the gradients.
 
     Source: Perlin and Neyret, "Flow noise", SIGGRAPH 2001 technical sketches, for the turning gradients.
     """
     phase = (2.0**-32 * key[:, :2].double() + _GOLDEN_RATIO * (index + 1)).frac()
-    start = (0.5 - wind.double() * frame.double()[:, None]) / period + phase
+    start = (0.5 - motion.wind.double() * motion.frame.double()[:, None]) / period + phase
     first = start.detach().floor()
     step = 1 / period
     axes, nodes = [], [torch.full((len(key), 1), index, device=key.device)]
@@ -83,7 +80,7 @@ def draw_octave(
             nodes.append(node[:, None] + torch.stack([before, before + 1], dim=2).long().flatten(1))
             position = position - before + 2 * pixel
         axes.append(position)
-    angle = 2 * math.pi * _turns(key, nodes, frame=frame, decorrelation=decorrelation, dtype=dtype).mT
+    angle = 2 * math.pi * _turns(key, nodes, motion, dtype).mT
     return Octave(torch.stack([angle.cos(), angle.sin()], dim=1), axes[0], axes[1], min(step, 2.0))
 
 
@@ -169,8 +166,9 @@ def _blocks(position: Tensor, nodes: int, step: float, dtype: torch.dtype) -> tu
     return first.long(), (position[:, :, None] - node[..., None]).to(dtype)
 
 
-def _turns(key: Tensor, nodes: Sequence[Tensor], *, frame: Tensor, decorrelation: Tensor, dtype: torch.dtype) -> Tensor:
-    """(N, n, m): the angles of the gradients over 2 pi."""
+def _turns(key: Tensor, nodes: Sequence[Tensor], motion: Motion, dtype: torch.dtype) -> Tensor:
+    """Compute (N, n, m): the angles of the gradients over 2 pi."""
+    frame, decorrelation = motion.frame, motion.decorrelation
     if not requires_grad((frame, decorrelation)) and eager_bool((frame / decorrelation == 0).all, of=frame):
         return lattice_noise(key, nodes, 1)[:, 0, 0].to(dtype)
     start, speed = lattice_noise(key, nodes, 2)[:, :, 0].unbind(1)

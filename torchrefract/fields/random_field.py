@@ -48,11 +48,8 @@ def covariance(distance: Tensor, length: Tensor, kind: str) -> Tensor:
         return torch.exp(-0.5 * h * h)
     if kind == "exponential":
         return torch.exp(-h)
-    if kind == "matern32":
-        a = math.sqrt(3) * h
-        return (1 + a) * torch.exp(-a)
-    a = math.sqrt(5) * h
-    return (1 + a + a * a / 3) * torch.exp(-a)
+    a = math.sqrt(3 if kind == "matern32" else 5) * h
+    return (1 + a if kind == "matern32" else 1 + a + a * a / 3) * torch.exp(-a)
 
 
 def gradient_rms(length: Tensor, *, kind: str, aperture: Tensor | None = None) -> Tensor:
@@ -100,7 +97,7 @@ class Motion(NamedTuple):
     """Time and change of N random fields.
 
     frame: (N,), number of the frame t.
-    wind: (N, 2), px per frame, to the right and down.
+    wind: (N, 2), px per frame, to the right and down; of fog in space (N, 3), m per frame.
     decorrelation: (N,), frames, above 0; inf for a field that is only moved by the wind.
     """
 
@@ -125,9 +122,14 @@ class Frequencies(NamedTuple):
         return cls(size, size[0] // 2, size[1] // 2)
 
     @property
+    def axes(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Return the size of the domain and the highest frequency along y and along x."""
+        return (self.size[0], self.rows), (self.size[1], self.columns)
+
+    @property
     def is_all(self) -> bool:
         """Return True if no frequency is missing."""
-        return 2 * self.rows >= self.size[0] and 2 * self.columns >= self.size[1]
+        return all(2 * highest >= n for n, highest in self.axes)
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -136,10 +138,9 @@ class Frequencies(NamedTuple):
 
     def numbers(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return the periods (Ky,) and (Kx,), int64: 0 ... N - 1 of all, or those from -rows and -columns on."""
-        if self.is_all:
-            return torch.arange(self.size[0], device=device), torch.arange(self.size[1], device=device)
-        rows = torch.arange(-self.rows, self.rows + 1, device=device)
-        return rows, torch.arange(-self.columns, self.columns + 1, device=device)
+        first = (0, 0) if self.is_all else (-self.rows, -self.columns)
+        y, x = (torch.arange(low, low + n, device=device) for low, n in zip(first, self.counts, strict=True))
+        return y, x
 
 
 def embedding_size(height: int, width: int, *, length: float, kind: str, aperture: float = 0.0) -> tuple[int, int]:
@@ -181,11 +182,7 @@ def eigenvalues(frequencies: Frequencies, length: Tensor, *, kind: str) -> Tenso
             + is_summed * (covariance(n - t, length, kind) + covariance(n + t, length, kind))
             for t, n in ((y, size[0]), (x, size[1]))
         )
-        rows, columns = (
-            even_transform(rows, 1, frequencies.rows + 1),
-            even_transform(columns, 2, frequencies.columns + 1),
-        )
-        return rows * columns
+        return even_transform(rows, 1, frequencies.rows + 1) * even_transform(columns, 2, frequencies.columns + 1)
     values = covariance((x * x + y * y).sqrt(), length, kind)
     if kind != "exponential":
         far_x2, far_y2 = (size[1] - x).square(), (size[0] - y).square()
@@ -211,15 +208,14 @@ def amplitudes(
         values = torch.where(values.abs() > _ROUNDING * values.amax(dim=(1, 2), keepdim=True), values, 0)
     positive = values.clamp(min=0)
     smooth_y, smooth_x = (
-        _smoothing(torch.arange(largest + 1, dtype=torch.float64, device=values.device) / n, aperture)
-        for n, largest in zip(frequencies.size, (frequencies.rows, frequencies.columns), strict=True)
+        _smoothing(torch.arange(highest + 1, dtype=torch.float64, device=values.device) / n, aperture)
+        for n, highest in frequencies.axes
+    )
+    count_y, count_x = (
+        _multiplicity(highest + 1, values.device, has_middle=2 * highest >= n) for n, highest in frequencies.axes
     )
     smooth_y, smooth_x = smooth_y[..., None], smooth_x[..., None, :]
-    counts = [
-        _multiplicity(largest + 1, values.device, has_middle=2 * largest >= n)
-        for n, largest in zip(frequencies.size, (frequencies.rows, frequencies.columns), strict=True)
-    ]
-    weight_y, weight_x = counts[0][:, None] * smooth_y.square(), counts[1] * smooth_x.square()
+    weight_y, weight_x = count_y[:, None] * smooth_y.square(), count_x * smooth_x.square()
 
     def total(eigenvalues: Tensor) -> Tensor:
         return ((eigenvalues * weight_x).sum(dim=2, keepdim=True) * weight_y).sum(dim=1, keepdim=True)
@@ -242,24 +238,31 @@ def coefficients(
         torch.minimum(k.remainder(n), (-k).remainder(n))
         for k, n in zip(frequencies.numbers(noise.device), frequencies.size, strict=True)
     )
-    amplitude = quarter.index_select(2, kx).index_select(1, ky)
-    return noise * amplitude[:, None], clipped
+    return noise * quarter.index_select(2, kx).index_select(1, ky)[:, None], clipped
 
 
 def sum_of_waves(values: Tensor, frequencies: Frequencies, rows: range, columns: range) -> Tensor:
     """Compute Re and Im of sum_k z_k exp(-2 pi i k . p / size), (N, 2, n, m), at rows and columns of the domain.
 
     The values z are (N, 2, Ky, Kx), real and imaginary part; positions beyond the domain continue it periodically.
+    All frequencies are summed at adjacent pixels by FFT, others by products of matrices.
     """
-    down, across = (
-        _Axis(positions, n, k)
-        for positions, n, k in zip((rows, columns), frequencies.size, frequencies.numbers(values.device), strict=True)
-    )
-    # The compiler supports no complex numbers.
-    if torch.compiler.is_compiling() or not (down.has_transform and across.has_transform):
-        return down.by_products(across.by_products(values.mT).mT)
-    spectrum = across.by_transform(torch.complex(values[:, 0], values[:, 1]), 2)
-    return torch.view_as_real(down.by_transform(spectrum, 1)).movedim(-1, 1)
+    size, spans = frequencies.size, (rows, columns)
+    # The compiler supports no complex numbers, and PyTorch cannot transform empty batches.
+    if frequencies.is_all and rows.step == columns.step == 1 and len(values) and not torch.compiler.is_compiling():
+        spectrum = torch.complex(values[:, 0], values[:, 1])
+        for dim in (2, 1):
+            index = torch.arange(spans[dim - 1].start, spans[dim - 1].stop, device=values.device)
+            spectrum = torch.fft.fft(spectrum, dim=dim).index_select(dim, index.remainder(size[dim - 1]))
+        return torch.view_as_real(spectrum).movedim(-1, 1)
+    for span, n, periods in list(zip(spans, size, frequencies.numbers(values.device), strict=True))[::-1]:
+        positions = torch.arange(span.start, span.stop, span.step, device=values.device)
+        # Whole turns are subtracted from integers, exactly.
+        angle = (positions[:, None] * periods).remainder(n).to(values.dtype) * (2 * math.pi / n)
+        real, imaginary = values.mT.unbind(1)
+        pairs = torch.stack([torch.cat([real, imaginary], dim=1), torch.cat([imaginary, -real], dim=1)], dim=1)
+        values = exact_matmul(torch.cat([angle.cos(), angle.sin()], dim=1), pairs)
+    return values
 
 
 def sample_field(
@@ -291,7 +294,7 @@ def sample_field(
         values = values if transform is None else transform(values, frequencies)
         parts.append((sum_of_waves(values, frequencies, rows, columns), clipped))
     fields, clipped = zip(*parts, strict=True)
-    return (fields[0], clipped[0]) if len(parts) == 1 else (torch.cat(fields), torch.cat(clipped))
+    return torch.cat(fields), torch.cat(clipped)
 
 
 def node_positions(lattice: Lattice) -> tuple[range, range]:
@@ -303,14 +306,16 @@ def node_positions(lattice: Lattice) -> tuple[range, range]:
 
 def _split(params: FieldParams, frequencies: Frequencies) -> list[FieldParams]:
     """Split N fields into groups whose noise fits into memory together."""
-    at_once = max(1, _POINTS_AT_ONCE // math.prod(frequencies.counts))
-    if len(params.length) <= at_once or torch.compiler.is_compiling():
+    count, at_once = len(params.length), max(1, _POINTS_AT_ONCE // math.prod(frequencies.counts))
+    if count <= at_once or torch.compiler.is_compiling():
         return [params]
-    length, aperture, key, motion = params
-    groups = len(length.split(at_once))
-    apertures = [None] * groups if aperture is None else aperture.split(at_once)
-    motions = [None] * groups if motion is None else list(map(Motion, *(part.split(at_once) for part in motion)))
-    return list(map(FieldParams, length.split(at_once), apertures, key.split(at_once), motions))
+
+    def group(rows: slice) -> FieldParams:
+        aperture = None if params.aperture is None else params.aperture[rows]
+        motion = params.motion and Motion(*(value[rows] for value in params.motion))
+        return FieldParams(params.length[rows], aperture, params.key[rows], motion)
+
+    return [group(slice(first, first + at_once)) for first in range(0, count, at_once)]
 
 
 def frequency_noise(key: Tensor, frequencies: Frequencies, *, dtype: torch.dtype) -> Tensor:
@@ -345,8 +350,8 @@ def _evolve(noise: Tensor, rates: Tensor, frequencies: Frequencies, motion: Moti
     )
     shift = 2 * math.pi * (motion.frame.double()[:, None] * motion.wind.double())[:, :, None]
     # Whole turns are subtracted in float64, so that late frames are as exact as the first.
-    drift_x, drift_y = shift[:, :1] * kx, shift[:, 1:].mT * ky[:, None]
-    drift = drift_x.remainder(2 * math.pi).to(noise.dtype) + drift_y.remainder(2 * math.pi).to(noise.dtype)
+    angles = shift[:, :1] * kx, shift[:, 1:].mT * ky[:, None]
+    drift = sum(angle.remainder(2 * math.pi).to(noise.dtype) for angle in angles)
     phase = (math.sqrt(2) * motion.frame / motion.decorrelation)[:, None, None].to(noise.dtype) * rates + drift
     cos, sin = phase.cos(), phase.sin()
     real, imaginary = noise.unbind(1)
@@ -365,45 +370,6 @@ def even_transform(values: Tensor, dim: int, count: int) -> Tensor:
         return values.narrow(dim, 0, count)
     mirrored = values.narrow(dim, 1, largest - 1).flip(dim)
     return torch.fft.rfft(torch.cat([values, mirrored], dim=dim), dim=dim).narrow(dim, 0, count).real
-
-
-class _Axis(NamedTuple):
-    """Positions along one axis of a domain, px, its size, and the periods (K,) of its frequencies."""
-
-    positions: range
-    size: int
-    periods: Tensor
-
-    @property
-    def has_transform(self) -> bool:
-        """Return True if an FFT of size / step frequencies, which holds all of them, gives the values."""
-        step = self.positions.step
-        return self.size % step == 0 and self.positions.start % step == 0 and self.size // step >= len(self.periods)
-
-    def by_transform(self, values: Tensor, dim: int) -> Tensor:
-        """Transform complex values along an axis by FFT."""
-        length, count = self.size // self.positions.step, len(self.periods)
-        if count < self.size:  # the frequencies below 0 come last
-            shape = list(values.shape)
-            shape[dim] = length - count
-            below, others = values.split([count // 2, count - count // 2], dim=dim)
-            values = torch.cat([others, values.new_zeros(shape), below], dim=dim)
-        if values.shape[0]:  # PyTorch cannot transform empty batches
-            values = torch.fft.fft(values, dim=dim)
-        first, needed = self.positions.start // self.positions.step % length, len(self.positions)
-        if first + needed <= length:
-            return values.narrow(dim, first, needed)
-        return values.index_select(dim, (first + torch.arange(needed, device=values.device)).remainder(length))
-
-    def by_products(self, values: Tensor) -> Tensor:
-        """Transform values (N, 2, K, m), real and imaginary part, along K by a product of real matrices."""
-        span = self.positions
-        positions = torch.arange(span.start, span.stop, span.step, device=values.device)
-        # Whole turns are subtracted from integers, exactly.
-        angle = (positions[:, None] * self.periods).remainder(self.size).to(values.dtype) * (2 * math.pi / self.size)
-        real, imaginary = values.unbind(1)
-        pairs = torch.stack([torch.cat([real, imaginary], dim=1), torch.cat([imaginary, -real], dim=1)], dim=1)
-        return exact_matmul(torch.cat([angle.cos(), angle.sin()], dim=1), pairs)
 
 
 def _indices(frequencies: Frequencies, device: torch.device) -> Tensor:

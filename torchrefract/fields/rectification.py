@@ -1,6 +1,5 @@
 """The flow that shows frames of a camera of any model as a pinhole would have taken them, and the flow back."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -13,7 +12,7 @@ from torchrefract._validation import check_positive
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.projection import columns, image_of, on_plane, radius_within, ray_of
 from torchrefract.fields import lens
-from torchrefract.fields.lens import REACH, border_on_plane, corner_radius, in_bands
+from torchrefract.fields.lens import REACH, border_on_plane, corner_radius
 from torchrefract.fields.lens_error import cell_lines, flow_bounds, outermost_nodes
 from torchrefract.types import FlowBounds, Simplification
 from torchrefract.warping.grid import Points
@@ -45,15 +44,10 @@ def rectification_flow(
         flow: (B, 2, h, w), px.
         exists: (B, 1, h, w), bool: the camera shows that ray, on the sheet that holds the center.
     """
-    c = columns(coefficients, model)
-    radius = radius_within(coefficients, REACH / zoom * _corner(focal, center, points), model)
-
-    def displacement(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        x, y = x / zoom, y / zoom
-        x_d, y_d, exists = image_of(x, y, torch.ones_like(x), c, model, radius)
-        return x_d - zoom * x, y_d - zoom * y, exists
-
-    return _flow(displacement, focal, center, points)
+    x, y = (axis / zoom for axis in _on_plane(points, focal, center))
+    reach = REACH / zoom * _corner(focal, center, points)
+    x_d, y_d, exists = _project(coefficients, x, y, model, reach)
+    return _to_flow(x_d - zoom * x, y_d - zoom * y, exists, zoom * x, zoom * y, focal, points)
 
 
 def rectification_restore_flow(
@@ -65,15 +59,10 @@ def rectification_restore_flow(
 
     Args, Returns: as there; `exists` is False where the camera shows no ray, or one that no pinhole shows.
     """
-    c = columns(coefficients, model)
+    x_d, y_d = _on_plane(points, focal, center)
     radius = radius_within(coefficients, REACH * _corner(focal, center, points), model)
-
-    def displacement(x_d: Tensor, y_d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        x, y, exists = on_plane(*ray_of(x_d, y_d, c, model, radius))
-        return x - x_d, y - y_d, exists
-
-    # The inverse reads a table that covers all of its points, so they are not computed in bands.
-    return _flow(displacement, focal, center, points, in_one=True)
+    x, y, exists = on_plane(*ray_of(x_d, y_d, columns(coefficients, model), model, radius))
+    return _to_flow(x - x_d, y - y_d, exists, x_d, y_d, focal, points)
 
 
 def is_border_missing(
@@ -82,8 +71,7 @@ def is_border_missing(
     """Return (B,), bool: the camera does not show part of the border of the pinhole's frame."""
     x, y = (axis.detach().flatten(1) for axis in border_on_plane(focal, center, height, width))
     reach = REACH * corner_radius(focal.detach(), center.detach(), height, width)
-    radius = radius_within(coefficients, reach, model)
-    return ~image_of(x, y, torch.ones_like(x), columns(coefficients, model), model, radius)[2].all(dim=1)
+    return ~_project(coefficients, x, y, model, reach)[2].all(dim=1)
 
 
 def camera_flow(camera: Camera, *, zoom: float = 1.0) -> tuple[Tensor, Tensor, Camera]:
@@ -146,8 +134,7 @@ def _measure(camera: Camera) -> FlowBounds | None:
         c, focal, center = camera.tensors(points)
         x, y = ((points[None, :, i] - center[:, i, None]) / focal[:, i, None] for i in range(2))
         reach = REACH * corner_radius(focal, center, camera.height, camera.width)
-        radius = radius_within(c, reach, camera.model)
-        x_d, y_d, exists = image_of(x, y, torch.ones_like(x), columns(c, camera.model), camera.model, radius)
+        x_d, y_d, exists = _project(c, x, y, camera.model, reach)
         if exists.all():
             x, y, x_d, y_d = (value[:, : len(lines)] for value in (x, y, x_d, y_d))
             flow = torch.stack([(x_d - x) * focal[:, 0, None], (y_d - y) * focal[:, 1, None]])
@@ -159,29 +146,32 @@ def _corner(focal: Tensor, center: Tensor, points: Points) -> Tensor:
     return corner_radius(focal.detach(), center.detach(), points.lattice.height, points.lattice.width)
 
 
-def _flow(
-    displacement: Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]],
-    focal: Tensor,
-    center: Tensor,
-    points: Points,
-    *,
-    in_one: bool = False,
+def _on_plane(points: Points, focal: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
+    """Return x and y of the points on the plane z = 1, (B, h w)."""
+    x, y = (axis.flatten(1) for axis in torch.broadcast_tensors(*lens.on_plane(points, focal, center)))
+    return x, y
+
+
+def _project(coefficients: Tensor, x: Tensor, y: Tensor, model: str, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Distort points (B, N) on the plane z = 1 within a radius (B,), and tell which the camera shows."""
+    radius = radius_within(coefficients, reach, model)
+    return image_of(x, y, torch.ones_like(x), columns(coefficients, model), model, radius)
+
+
+def _to_flow(
+    u: Tensor, v: Tensor, exists: Tensor, x: Tensor, y: Tensor, focal: Tensor, points: Points
 ) -> tuple[Tensor, Tensor]:
-    """Compute f (u, v) from a function of x and y, (B, N), on the plane z = 1, that returns u, v and `exists`."""
+    """Return f (u, v), (B, 2, h, w), and `exists`, of points (x, y) on the plane z = 1, all (B, h w)."""
+    # Points without a ray are sent outward, farther than any frame: padded, never extrapolated.
     far = _FAR * max(points.lattice.height, points.lattice.width)
-
-    def flow(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        shape = torch.broadcast_shapes(x.shape, y.shape)
-        flat_x, flat_y = (value.expand(shape).flatten(1) for value in (x, y))
-        u, v, exists = displacement(flat_x, flat_y)
-        # Points without a ray are sent outward, farther than any frame: padded, never extrapolated.
-        with torch.no_grad():
-            outward = far / (flat_x * flat_x + flat_y * flat_y).sqrt().clamp(min=1e-9)
-        u, v = (
+    with torch.no_grad():
+        outward = far / (x * x + y * y).sqrt().clamp(min=1e-9)
+    flow = torch.stack(
+        [
             torch.where(exists, part * focal[:, i, None], (outward * axis).detach())
-            for i, (part, axis) in enumerate(((u, flat_x), (v, flat_y)))
-        )
-        return torch.stack([u, v], dim=1).view(shape[0], 2, *shape[2:]), exists.view(shape)
-
-    x, y = lens.on_plane(points, focal, center)
-    return flow(x, y) if in_one else in_bands(flow, x, y)
+            for i, (part, axis) in enumerate(((u, x), (v, y)))
+        ],
+        dim=1,
+    )
+    size = torch.broadcast_shapes(points.x.shape, points.y.shape)[2:]
+    return flow.unflatten(2, size), exists.view(-1, 1, *size)

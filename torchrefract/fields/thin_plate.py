@@ -93,22 +93,16 @@ def check_points(points: Tensor) -> None:
     """Raise ValueError if no spline interpolates control points (B, N, 2); nothing is checked on accelerators."""
     if points.shape[1] < 3:
         raise ValueError(f"points must be at least 3 to a sample, got {points.shape[1]}")
-    if points.device.type != "cpu":
+    if points.device.type != "cpu" or torch.compiler.is_compiling():
         return
     check_values("points", "be finite", points, torch.isfinite)
     centered = (points - points.mean(dim=1, keepdim=True)).detach().double()
     extent = centered.norm(dim=2).amax(dim=1)
-
-    def are_apart() -> Tensor:
-        diagonal = extent[:, None, None] * torch.eye(points.shape[1], device=points.device)
-        return ((torch.cdist(centered, centered) + diagonal).amin(dim=(1, 2)) > _NEAREST * extent).all()
-
-    def span_plane() -> Tensor:
-        return (torch.linalg.svdvals(centered.nan_to_num(0.0, 0.0, 0.0))[:, 1] > _FLATTEST * extent).all()
-
-    if eager_bool(are_apart, of=centered) is False:
+    apart = torch.cdist(centered, centered) + extent[:, None, None] * torch.eye(points.shape[1])
+    if eager_bool((apart.amin(dim=(1, 2)) > _NEAREST * extent).all, of=centered) is False:
         raise ValueError("points must differ from one another, got two equal ones")
-    if eager_bool(span_plane, of=centered) is False:
+    widths = torch.linalg.svdvals(centered.nan_to_num(0.0, 0.0, 0.0))
+    if eager_bool((widths[:, 1] > _FLATTEST * extent).all, of=centered) is False:
         raise ValueError("points must not lie on one line, got a sample with collinear points")
 
 

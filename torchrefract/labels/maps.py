@@ -48,7 +48,7 @@ def warp_depth(
 
     Args:
         depth: (B, 1, H, W) or (1, H, W), m, floating; inf is the sky, NaN is unknown.
-        flow: (B, 2, H, W) or (1, 2, H, W), px; (2, H, W) for an unbatched depth map.
+        flow: as for `warp_mask`.
         fill: value of invalid pixels, m, finite.
         interpolation: "nearest", or "bilinear", which mixes the distances on both sides of an edge.
 
@@ -57,8 +57,7 @@ def warp_depth(
         valid: bool, of the same shape: the nearest input pixel lies in the frame, and no depth used is NaN.
 
     Raises:
-        ValueError: if shapes do not fit, the interpolation is unknown, or `fill` is not finite.
-        TypeError: if an argument is not a floating tensor.
+        ValueError, TypeError: as for `warp_mask`; an unknown interpolation, a `fill` that is not finite.
     """
     check_tensor("depth", depth)
     check_tensor("flow", flow)
@@ -97,13 +96,11 @@ def warp_optical_flow(
     Args:
         optical_flow: (B, 2, H, W) or (2, H, W), px, floating, from the first clean frame to the second; NaN and inf are
             unknown.
-        flow: flow of the first frame, (B, 2, H, W) or (1, 2, H, W), px; (2, H, W) for an unbatched optical flow.
-        restore_flow: restore flow of the second frame, with the same shapes.
+        flow, restore_flow: as for `warp_mask`; of the first frame, and the restore flow of the second.
         restore_valid: validity of `restore_flow`, (B, 1, H, W) or (1, 1, H, W), bool; (1, H, W) for an unbatched
             optical flow. None means valid everywhere.
-        fill: value of invalid pixels, px, finite.
-        interpolation: interpolation of the optical flow, "nearest", or "bilinear", which mixes the motion on both sides
-            of an edge. `restore_flow` is always interpolated bilinearly.
+        fill, interpolation: of the optical flow, as for `warp_depth`, in px; `restore_flow` is always interpolated
+            bilinearly.
 
     Returns:
         warped: the optical flow between the degraded frames, of the same shape and dtype, without NaN.
@@ -111,8 +108,7 @@ def warp_optical_flow(
             second degraded frame shows where it leads.
 
     Raises:
-        ValueError: if shapes do not fit, the interpolation is unknown, or `fill` is not finite.
-        TypeError: if an argument is not a tensor, the optical flow is not floating, or the mask is not bool.
+        ValueError, TypeError: as for `warp_depth`; a mask that is not bool.
     """
     flows = {"optical_flow": optical_flow, "flow": flow, "restore_flow": restore_flow}
     for name, value in flows.items():
@@ -147,8 +143,7 @@ def _flow_for(value: Tensor, flow: Tensor) -> Tensor:
 
 def _validity(restore_valid: Tensor, restore_flow: Tensor) -> Tensor:
     """Check a mask and return it as (B, 1, H, W) in the dtype of the flow."""
-    check_tensor("restore_valid", restore_valid)
-    if restore_valid.dtype is not torch.bool:
+    if check_tensor("restore_valid", restore_valid).dtype is not torch.bool:
         raise TypeError(f"restore_valid must be bool, got {restore_valid.dtype}")
     batch, _, *size = restore_flow.shape
     if restore_valid.shape not in ((batch, 1, *size), (1, 1, *size)):

@@ -157,15 +157,14 @@ def _nearest_node(table: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
     content, valid = torch.stack([nodes[:, 0] + x, nodes[:, 1] + y[:, None]], dim=1), nodes[:, 2:] > 0.5
     # Invalid nodes get a distance larger than any valid one, whose square is still finite.
     targets = torch.where(valid, content, 4 * _LARGEST_PX).flatten(2)
-    index = torch.cat([_nearest_target(targets, chunk) for chunk in p.split(_CHUNK, dim=2)], dim=1)
+    # Products of matrices would round away differences between large coordinates.
+    distances = (
+        torch.cdist(chunk, targets.mT, compute_mode="donot_use_mm_for_euclid_dist")
+        for chunk in p.mT.split(_CHUNK, dim=1)
+    )
+    index = torch.cat([distance.argmin(dim=2) for distance in distances], dim=1)
     node = torch.stack([x[index % x.shape[0]], y[index // x.shape[0]]], dim=1)
     return node, _orientation(content, valid)
-
-
-def _nearest_target(targets: Tensor, p: Tensor) -> Tensor:
-    """Return the index of the target (B, 2, K) nearest to each of the points (B, 2, N): (B, N)."""
-    difference = targets[:, :, None] - p[..., None]
-    return (difference[:, 0].square() + difference[:, 1].square()).argmin(dim=-1)
 
 
 def pixel_subset(table: Tensor, dim: int, count: int) -> Tensor:

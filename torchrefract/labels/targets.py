@@ -173,12 +173,11 @@ def _restore_unmoved(leaf: Any, warped: _Warped, is_zero: Tensor) -> _Warped:
 def _warp_leaf(leaf: Any, flow: Tensor, options: _Options) -> _Warped:
     """Warp one leaf of a sample; flow is (2, H, W), or (B, 2, H, W) for leaves with a leading dimension B."""
     if is_tv_tensor(leaf, "Image") or is_tv_tensor(leaf, "Video"):
-        maps = _as_batch(leaf, flow)
-        image, _ = warp(maps, _batched(flow), padding=options.padding, interpolation=options.interpolation)
-        return _Warped(wrap_like(image.reshape(leaf.shape), leaf))
+        sampling = {"padding": options.padding, "interpolation": options.interpolation}
+        return _Warped(wrap_like(warp(_as_batch(leaf, flow), _batched(flow), **sampling)[0].reshape(leaf.shape), leaf))
     if is_tv_tensor(leaf, "Mask"):
-        maps, soft = _as_batch(leaf, flow), options.soft_masks and leaf.is_floating_point()
-        mask = warp_mask(maps, _batched(flow), fill=options.mask_fill, soft=soft)
+        soft = options.soft_masks and leaf.is_floating_point()
+        mask = warp_mask(_as_batch(leaf, flow), _batched(flow), fill=options.mask_fill, soft=soft)
         return _Warped(wrap_like(mask.reshape(leaf.shape), leaf))
     if is_tv_tensor(leaf, "KeyPoints"):
         return _warp_keypoints(leaf, flow)
@@ -299,9 +298,8 @@ def _default_labels(entries: dict[str, Any], siblings: dict[str, int]) -> list[i
 
 def _select(value: Any, keep: Tensor) -> Any:
     """Return the rows to keep."""
-    if type(value) in (Tensor, torch.nn.Parameter):
-        return value[keep.to(value.device)]
-    return wrap_like(value.as_subclass(Tensor)[keep.to(value.device)], value)
+    rows = value.as_subclass(Tensor)[keep.to(value.device)]
+    return rows if type(value) in (Tensor, torch.nn.Parameter) else wrap_like(rows, value)
 
 
 def _clear_visibility(values: list[Any], leaves: list[Any], siblings: dict[str, int], visible: Tensor) -> None:
@@ -336,8 +334,8 @@ def _as_batch(leaf: Any, flow: Tensor) -> Tensor:
         size = f"{tuple(flow.shape[-2:])}, got {tuple(plain.shape)}"
         raise ValueError(f"{type(leaf).__name__} must have the size of the flow, {size}")
     _check_batch(plain, flow)
-    channels = math.prod(plain.shape[:-2]) // (flow.shape[0] if flow.ndim == 4 else 1)
-    return plain.reshape(_batched(flow).shape[0], channels, *plain.shape[-2:])
+    batch = _batched(flow).shape[0]
+    return plain.reshape(batch, math.prod(plain.shape[:-2]) // batch, *plain.shape[-2:])
 
 
 def _check_batch(plain: Tensor, flow: Tensor) -> None:

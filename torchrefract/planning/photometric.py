@@ -21,7 +21,6 @@ from torchrefract.types import Range
 LEVELS = 255.0
 _SIGMAS = 7.0  # of random bounds
 _ROUNDING_ULPS = 16
-_LAST_PLACE = {False: 2.0**-24, True: 2.0**-53}
 _STEEPEST_SRGB = 12.92  # slope of the curve from linear light to stored values in the dark
 _MIN_MEAN = 0.1  # a mean extinction over the frame that may be smaller has no useful bound
 _PHASES = 12
@@ -55,13 +54,13 @@ class PhotometricRequest:
         """
         if self.tolerance is None:
             return 0.0
-        rounding = LEVELS * _ROUNDING_ULPS * _LAST_PLACE[self.is_double] * scale
+        rounding = LEVELS * _ROUNDING_ULPS * 2.0 ** (-53 if self.is_double else -24) * scale
         rounding *= _STEEPEST_SRGB if linear_light else 1.0
         if self.tolerance < 2 * rounding:
+            kind = f"{'float64' if self.is_double else 'float32'}{' in linear light' if linear_light else ''}"
             raise ValueError(
-                f"tolerance must be at least {2 * rounding:.2g} levels of 1/255 for images in "
-                f"{'float64' if self.is_double else 'float32'}{' in linear light' if linear_light else ''} "
-                f"(None is exact), got {self.tolerance:g}"
+                f"tolerance must be at least {2 * rounding:.2g} levels of 1/255 for images in {kind} (None is exact), "
+                f"got {self.tolerance:g}"
             )
         return self.tolerance - rounding
 
@@ -140,7 +139,7 @@ class FogErrorModel:
 @lru_cache(maxsize=64)
 def plan_uniform_fog(model: FogErrorModel, request: PhotometricRequest) -> PhotometricPlan:
     """Plan uniform fog: all of it or, if it is too thin, nothing."""
-    return _without_fog(model, request, largest_ratio=1.0) or _exact(request, "the fog can be seen")
+    return _without_fog(model, request, largest_ratio=1.0) or exact_plan(request, "the fog can be seen")
 
 
 @lru_cache(maxsize=64)
@@ -159,7 +158,7 @@ def plan_image_fog(model: FogErrorModel, request: PhotometricRequest) -> Photome
     lowest = 0.5 - _NOISE_BOUND * min(_NOISE_BOUND, _deviation_of_mean(model, octaves, request))
     if (plan := _without_fog(model, request, largest_ratio=1 / lowest if lowest > 0 else math.inf)) is not None:
         return plan
-    exact = _exact(request, "no octave is too faint", kept=tuple(names), octaves=octaves)
+    exact = exact_plan(request, "no octave is too faint", kept=tuple(names), octaves=octaves)
     if request.tolerance is None or lowest < _MIN_MEAN:
         return exact
     remaining = request.remaining(linear_light=model.linear_light)
@@ -173,18 +172,13 @@ def plan_image_fog(model: FogErrorModel, request: PhotometricRequest) -> Photome
         return model.levels(-math.expm1(-largest * weight / 2) + mean / smallest * y * math.exp(-y))
 
     faintest = sorted(octaves, key=lambda i: model.weights[i])
-    dropped: list[int] = []
-    for octave in faintest:
-        if error_without([*dropped, octave]) > remaining:
-            break
-        dropped.append(octave)
-    if not dropped:
+    count = next((n for n in octaves if error_without(faintest[: n + 1]) > remaining), len(octaves))
+    if count == 0:
         return exact
+    dropped = faintest[:count]
     kept = tuple(i for i in octaves if i not in dropped)
-    return PhotometricPlan(
-        request.height,
-        request.width,
-        request.tolerance,
+    return _plan(
+        request,
         error_without(dropped),
         "octaves that are too faint are left out",
         kept=tuple(names[i] for i in kept),
@@ -206,14 +200,13 @@ def plan_volumetric_fog(model: FogErrorModel, request: PhotometricRequest) -> Ph
     if (plan := _without_fog(model, request, largest_ratio=math.exp(high))) is not None:
         return plan
     if request.tolerance is None:
-        return _exact(request, "the fog can be seen")
+        return exact_plan(request, "the fog can be seen")
     x = np.geomspace(1e-6, 1, 200) * min(model.thickness, 1e5)
     changes = [np.abs(np.exp(-x * math.exp(end)) - np.exp(-x)).max() for end in (low, high)]
     error = 1.05 * model.levels(float(max(changes)))
     if error > request.remaining(linear_light=model.linear_light):
-        return _exact(request, "its contrast can be seen")
-    frame = (request.height, request.width, request.tolerance)
-    return PhotometricPlan(*frame, error, "its contrast is too faint", dropped=(("contrast", error),), octaves=())
+        return exact_plan(request, "its contrast can be seen")
+    return _plan(request, error, "its contrast is too faint", dropped=(("contrast", error),), octaves=())
 
 
 def plan_flare(light: float, request: PhotometricRequest, *, is_bounded: bool) -> PhotometricPlan:
@@ -226,17 +219,16 @@ def plan_flare(light: float, request: PhotometricRequest, *, is_bounded: bool) -
     """
     budget = request.remaining(scale=1.0 if is_bounded else max(1.0, light))
     plan = _identity_if_unseen(LEVELS * light, budget, request, name="flare", reason="it is too faint")
-    return plan or _exact(request, "the flare can be seen")
+    return plan or exact_plan(request, "the flare can be seen")
 
 
-def exact_plan(height: int, width: int) -> PhotometricPlan:
-    """Return the plan without a tolerance."""
-    return PhotometricPlan(height, width, None, 0.0, "no tolerance")
+def exact_plan(request: PhotometricRequest, reason: str = "", **terms: Any) -> PhotometricPlan:
+    """Return the plan that leaves nothing out, and why; without a tolerance that is the reason."""
+    return _plan(request, 0.0, "no tolerance" if request.tolerance is None else reason, **terms)
 
 
-def _exact(request: PhotometricRequest, reason: str, **terms: Any) -> PhotometricPlan:
-    reason = "no tolerance" if request.tolerance is None else reason
-    return PhotometricPlan(request.height, request.width, request.tolerance, 0.0, reason, **terms)
+def _plan(request: PhotometricRequest, error: float, reason: str, **terms: Any) -> PhotometricPlan:
+    return PhotometricPlan(request.height, request.width, request.tolerance, error, reason, **terms)
 
 
 def _without_fog(model: FogErrorModel, request: PhotometricRequest, *, largest_ratio: float) -> PhotometricPlan | None:
@@ -251,10 +243,9 @@ def _identity_if_unseen(
 ) -> PhotometricPlan | None:
     if change > budget:
         return None
-    frame = (request.height, request.width, request.tolerance)
     if change == 0:
-        return PhotometricPlan(*frame, 0.0, "its strength is 0", is_identity=True)
-    return PhotometricPlan(*frame, change, reason, is_identity=True, dropped=((name, change),))
+        return _plan(request, 0.0, "its strength is 0", is_identity=True)
+    return _plan(request, change, reason, is_identity=True, dropped=((name, change),))
 
 
 def _deviation_of_mean(model: FogErrorModel, octaves: Sequence[int], request: PhotometricRequest) -> float:
@@ -278,11 +269,7 @@ def noise_mean_variance(period: float, height: int, width: int) -> float:
     """Return the largest variance over all phases of the mean of 2-D Perlin noise over a frame.
 
     The mean is a sum over nodes of g_x A(x) H(y) + g_y H(x) A(y) with unit vectors g of random direction, where H and A
-    are the means along an axis of h(p) and p h(p).
-
-    Args:
-        period: px.
-        height, width: px.
+    are the means along an axis of h(p) and p h(p). All sizes are in px.
     """
     (hy, ay), (hx, ax) = (_squared_sums(period, size) for size in (height, width))
     return float(((ay[:, None] * hx + hy[:, None] * ax) / 2).max())

@@ -14,7 +14,6 @@ from torchrefract.effects.flare import FlareParams, LensFlare
 from torchrefract.effects.fog import FogParams, UniformFog, remove_fog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog, HeterogeneousFogParams
 from torchrefract.effects.lens import LensDistortion, LensParams
-from torchrefract.effects.one_of import OneOf
 from torchrefract.effects.rectification import Rectification, RectificationParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence, TurbulenceParams

@@ -10,13 +10,12 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from torchrefract._validation import check_positive
-from torchrefract.effects.compose import Compose
+from torchrefract.effects.compose import Compose, OneOf
 from torchrefract.effects.divergence_free import DivergenceFree
 from torchrefract.effects.flare import LensFlare
 from torchrefract.effects.fog import UniformFog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog
 from torchrefract.effects.lens import LensDistortion
-from torchrefract.effects.one_of import OneOf
 from torchrefract.effects.thin_plate import ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence
 from torchrefract.fields.depth import GroundPlaneDepth

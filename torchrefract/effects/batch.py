@@ -187,6 +187,11 @@ def select_params(params: Any, index: Tensor) -> Any:
     return map_params(params, lambda value: value[index])
 
 
+def rows_of_samples(index: Tensor, frames: int) -> Tensor:
+    """Return (n T,), the rows of some samples, (n,), of T frames each."""
+    return (frames * index[:, None] + torch.arange(frames, device=index.device)).flatten()
+
+
 def per_sample(flags: Tensor) -> Tensor:
     """View (N,) as (N, 1, 1, 1)."""
     return flags.view(-1, 1, 1, 1)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchrefract._tensor import expand_batch
 from torchrefract._validation import eager_bool, requires_grad
-from torchrefract.effects.batch import per_sample, select_params, where_active
+from torchrefract.effects.batch import per_sample, rows_of_samples, select_params, where_active
 from torchrefract.planning.plan import PlanRequest, WarpPlan, plan_warp
 from torchrefract.warping.grid import Points
 from torchrefract.warping.lattice import Lattice, LatticeFlow, lattice_around, pixel_lattice
@@ -333,11 +333,6 @@ class BatchFlow:
 def flow_dtype(params: Any) -> torch.dtype:
     """Return the type of the flow that parameters give."""
     return next(value.dtype for value in params if value.is_floating_point())
-
-
-def rows_of_samples(index: Tensor, frames: int) -> Tensor:
-    """Return (n T,), the rows of some samples, (n,), of T frames each."""
-    return (frames * index[:, None] + torch.arange(frames, device=index.device)).flatten()
 
 
 def everywhere(device: torch.device) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrefract._tensor import assume_constant_result, expand_batch
 from torchrefract._validation import eager_bool, eager_values, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.batch import per_sample, select_params, where_active
+from torchrefract.effects.batch import per_sample, rows_of_samples, select_params, where_active
 from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, exact_plan
 from torchrefract.planning.plan import check_tolerance
 from torchrefract.types import Degraded, Map
@@ -137,7 +137,7 @@ class PhotometricEffect(Effect):
     def _degrade_samples(self, image: Tensor, params: Any, depth: Tensor | None, index: Tensor) -> Degraded:
         """Degrade some samples of a batch, (n,), and leave the others."""
         batch = len(params.applied)
-        part, part_depth = (None if v is None else v[_rows_of(index, len(v) // batch)] for v in (image, depth))
+        part, part_depth = (None if v is None else v[rows_of_samples(index, len(v) // batch)] for v in (image, depth))
         assert part is not None
         degraded = self.degrade_batch(part, select_params(params, index), part_depth)
 
@@ -146,7 +146,7 @@ class PhotometricEffect(Effect):
             value = expand_batch(value, frames * len(index))
             if not isinstance(others, Tensor):
                 others = value.new_full((batch * frames, *value.shape[1:]), others)
-            return others.index_copy(0, _rows_of(index, frames), value)
+            return others.index_copy(0, rows_of_samples(index, frames), value)
 
         def lazy_map(name: str) -> Map:
             return lambda: with_others(getattr(degraded, name), _UNCHANGED[name])
@@ -172,8 +172,3 @@ def _active_samples(active: Tensor, params: Any) -> Tensor | None:
     if flags is None or all(flags) or not any(flags):
         return None
     return torch.tensor([i for i, flag in enumerate(flags) if flag])
-
-
-def _rows_of(index: Tensor, frames: int) -> Tensor:
-    """Return (n frames,): the rows of some samples; the frames of each clip follow one another."""
-    return (frames * index[:, None] + torch.arange(frames)).flatten()

@@ -31,10 +31,10 @@ from torchrefract._tensor import to_float, to_uint8
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.module import make_pair
 from torchrefract.effects.base import Effect
+from torchrefract.effects.compose import OneOf
 from torchrefract.effects.flare import LensFlare
 from torchrefract.effects.fog import remove_fog
 from torchrefract.effects.lens import LensDistortion
-from torchrefract.effects.one_of import OneOf
 from torchrefract.presets import paper_refractive, paper_weather
 from torchrefract.restoration.checkpoints import Loaded, load_model
 from torchrefract.restoration.diffusion import Diffusion

@@ -8,7 +8,7 @@ inverse, masks and the drawn parameters, and `effect.apply(image, params)` repea
 """
 
 from torchrefract.cameras.camera import Camera
-from torchrefract.effects.compose import Compose, ComposeParams
+from torchrefract.effects.compose import Compose, ComposeParams, OneOf
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams
 from torchrefract.effects.flare import FlareParams, LensFlare
 from torchrefract.effects.fog import FogParams, UniformFog, remove_fog

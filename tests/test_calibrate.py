@@ -12,7 +12,7 @@ from torchrefract.cameras.calibration.boards import Charuco
 from torchrefract.cameras.calibration.fit import Intrinsics
 from torchrefract.cameras.calibration.synthetic import CAMERA, render_views
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io.opencv import read_opencv
+from torchrefract.cameras.io import read_opencv
 from torchrefract.cli import calibration
 
 SMALL = Camera(width=640, height=400, fx=380.0, fy=381.0, cx=322.3, cy=196.6, coefficients=(-0.25, 0.08, 0.003, -0.002))

@@ -7,10 +7,16 @@ import numpy as np
 import pytest
 import yaml
 
-from torchrefract.cameras.io.colmap import read_colmap, write_colmap
-from torchrefract.cameras.io.kalibr import read_kalibr, write_kalibr
-from torchrefract.cameras.io.opencv import read_opencv, write_opencv
-from torchrefract.cameras.io.ros import read_ros, write_ros
+from torchrefract.cameras.io import (
+    read_colmap,
+    read_kalibr,
+    read_opencv,
+    read_ros,
+    write_colmap,
+    write_kalibr,
+    write_opencv,
+    write_ros,
+)
 
 VECTORS = {
     "4": ((-0.3, 0.1, 0.002, 1e-17), "opencv"),
@@ -271,7 +277,7 @@ def check(reader: Callable[[Path], Any], path: Path, text: str, rule: str) -> No
         (OPENCV, "just words", "path must hold a mapping of names to values"),
         ("image_width: 64\n", "", "path must hold image_width, got .* with image_height"),
         ("64", "64.5", "path must hold a whole number as image_width, got .* with 64.5"),
-        ("64", "wide", "path must hold numbers as image_width, got .* with .'wide'"),
+        ("64", "wide", "path must hold numbers as image_width, got .* with 'wide'"),
         ("camera_matrix:", "camera_matrix: 7\nother:", "path must hold a matrix as camera_matrix"),
         ("5., 0., 3.", "5., x, 3.", "path must hold numbers as camera_matrix"),
         ("5., 0., 3.", "5., 0., 1., 3.", "path must hold 9 numbers as camera_matrix, got .* with 10"),
@@ -316,7 +322,7 @@ def test_an_invalid_ros_file_is_named(old, new, rule, tmp_path):
         ("246.0]", "246.0, 1.0]", "path must hold 4 numbers as intrinsics"),
         ("0.0001]", "]", "path must hold 4 numbers as distortion_coeffs, got .* with 3"),
         ("  intrinsics: [461.6, 460.1, 362.6, 246.0]\n", "", "path must hold intrinsics, got .* with cam_overlaps"),
-        ("cam0:\n", "units: px\ncam0:\n", "path must hold a camera as units, got .* with 'px'"),
+        ("cam0:\n", "units: px\ncam0:\n", "path must hold a mapping of names to values, got .*, units, with str"),
     ],
 )
 def test_an_invalid_kalibr_chain_is_named(old, new, rule, tmp_path):

@@ -24,10 +24,16 @@ from hypothesis import strategies as st
 from torch import nn
 
 from torchrefract import Camera
-from torchrefract.cameras.io.colmap import read_colmap, write_colmap
-from torchrefract.cameras.io.kalibr import read_kalibr, write_kalibr
-from torchrefract.cameras.io.opencv import read_opencv, write_opencv
-from torchrefract.cameras.io.ros import read_ros, write_ros
+from torchrefract.cameras.io import (
+    read_colmap,
+    read_kalibr,
+    read_opencv,
+    read_ros,
+    write_colmap,
+    write_kalibr,
+    write_opencv,
+    write_ros,
+)
 from torchrefract.cameras.lens_database import COLUMNS, read_lenses
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import UnreadableImageError, image_size, read_image

@@ -37,7 +37,7 @@ from torchrefract.cameras.calibration.report import (
 )
 from torchrefract.cameras.calibration.synthetic import CAMERA, NUM_VIEWS, render_views
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io.opencv import read_opencv, write_opencv
+from torchrefract.cameras.io import read_opencv, write_opencv
 from torchrefract.cli.command import make, naming, progress
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, pixels_of, read_image
 from torchrefract.data.media import (

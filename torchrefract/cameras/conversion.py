@@ -80,17 +80,10 @@ def _fit(camera: Camera, to: str, count: int, min_z: float) -> tuple[float, ...]
 
 
 def least_squares(error: Callable[[Tensor], Tensor], start: Tensor, *, rows: int) -> Tensor:
-    """Minimize the sum of squares of a function by the Levenberg-Marquardt method.
+    """Minimize the sum of squares of a function by the Levenberg-Marquardt method, from parameters (n,), float64.
 
-    Each step solves (J^T J + damping diag(J^T J)) step = -J^T error as a linear least-squares problem.
-
-    Args:
-        error: maps parameters (rows, n), one copy for each row, to values (rows, k); row i depends on copy i only.
-        start: (n,), float64.
-        rows: number of rows.
-
-    Returns:
-        (n,), the parameters.
+    Each step solves (J^T J + damping diag(J^T J)) step = -J^T error as a linear least-squares problem. `error` maps
+    parameters (rows, n), one copy for each row, to values (rows, k); row i depends on copy i only.
 
     Source: Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", SIAM J. 11 (1963).
     """

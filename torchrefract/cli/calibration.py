@@ -104,7 +104,7 @@ def calibrate(cfg: DictConfig) -> None:
     except (UsageError, ValueError) as error:
         write_failure(board, detections, str(error), out)
         raise UsageError(f"{error} ({out / REPORT_FILE} lists all pictures)") from error
-    write_opencv(out / CAMERA_FILE, calibration.camera)
+    write_opencv(out / CAMERA_FILE, calibration.fit.camera)
     write_report(calibration, lambda name: read_gray(paths[name]), out)
     _print_summary(calibration, out)
 
@@ -240,12 +240,12 @@ def _rendered(board: Board, folder: Path) -> list[Path]:
 
 
 def _print_summary(calibration: Calibration, out: Path) -> None:
-    for name, reason in calibration.selection.dropped.items():
+    for name, reason in calibration.dropped.items():
         print(f"{name} dropped: {reason}")
-    for message in camera_warnings(calibration.camera):
+    for message in camera_warnings(calibration.fit.camera):
         print(f"warning: {message}", file=sys.stderr)
     print(
-        f"{out / CAMERA_FILE}: {calibration.fit.intrinsics.model} from {len(calibration.selection.views)} views in "
+        f"{out / CAMERA_FILE}: {calibration.fit.model} from {len(calibration.views)} views in "
         f"{len(calibration.detections)} pictures, error {calibration.fit.rms:.3f} px rms, of held-out views "
         f"{calibration.held_out_rms:.3f} px rms; see {out / REPORT_FILE}"
     )

@@ -4,7 +4,6 @@ import pytest
 
 from torchrefract.cameras.calibration.boards import Chessboard
 from torchrefract.cameras.calibration.fit import (
-    Intrinsics,
     cross_validate,
     drop_outliers,
     errors_in_best_pose,
@@ -12,6 +11,7 @@ from torchrefract.cameras.calibration.fit import (
     leave_each_out,
     rms,
 )
+from torchrefract.cameras.camera import Camera
 
 BOARD = Chessboard(squares="9x7", square_mm=25)
 SIZE = (800, 600)
@@ -36,11 +36,11 @@ def test_exact_corners_give_the_exact_camera(model, projected):
     views = projected(BOARD, MATRIX, np.array(VECTORS[model]), fisheye=model == "fisheye")
     fit = fit_camera(views, BOARD, model=model, size=SIZE)
     assert fit.rms < 1e-3  # corners go to OpenCV as float32
-    np.testing.assert_allclose(fit.intrinsics.values[:4], MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]], rtol=1e-4)
+    np.testing.assert_allclose(fit.values[:4], MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]], rtol=1e-4)
     if model != "opencv8":  # its coefficients are strongly correlated
-        np.testing.assert_allclose(fit.intrinsics.values[4:], VECTORS[model], atol=1e-3)
-    assert fit.intrinsics.names[:5] == ("fx", "fy", "cx", "cy", "k1")
-    assert len(fit.intrinsics.names) == len(fit.intrinsics.values) == 4 + len(VECTORS[model])
+        np.testing.assert_allclose(fit.values[4:], VECTORS[model], atol=1e-3)
+    assert fit.names[:5] == ("fx", "fy", "cx", "cy", "k1")
+    assert len(fit.names) == len(fit.values) == 4 + len(VECTORS[model])
 
 
 def test_errors_and_deviations_match_opencv(noisy):
@@ -57,8 +57,8 @@ def test_deviations_of_a_fisheye_match_its_errors(projected):
     exact = np.concatenate([MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]], VECTORS["fisheye"]])
     views = projected(BOARD, MATRIX, np.array(VECTORS["fisheye"]), noise=0.2, fisheye=True)
     fit = fit_camera(views, BOARD, model="fisheye", size=SIZE)
-    assert (np.abs(fit.intrinsics.values - exact) < 4 * fit.deviations).all()
-    assert (np.abs(fit.intrinsics.values - exact) > 0.01 * fit.deviations).sum() >= 6
+    assert (np.abs(fit.values - exact) < 4 * fit.deviations).all()
+    assert (np.abs(fit.values - exact) > 0.01 * fit.deviations).sum() >= 6
 
 
 def test_the_best_pose_matches_opencv(noisy):
@@ -68,13 +68,13 @@ def test_the_best_pose_matches_opencv(noisy):
     turn, move = cv2.solvePnPRefineLM(corners, view.corners, MATRIX, vector, turn, move)
     theirs = view.corners - cv2.projectPoints(corners, turn, move, MATRIX, vector)[0].reshape(-1, 2)
     start = np.concatenate([turn.ravel() + 0.05, move.ravel() + 5])
-    errors = errors_in_best_pose(view, BOARD, Intrinsics("opencv5", MATRIX, vector), start)
+    errors = errors_in_best_pose(view, BOARD, Camera.from_opencv(MATRIX, vector, width=800, height=600), start)
     np.testing.assert_allclose(errors, theirs, atol=1e-3)
 
 
 def test_errors_of_held_out_views_are_larger_than_those_of_the_fit(noisy):
     fit = fit_camera(noisy, BOARD, model="opencv5", size=SIZE)
-    held_out = cross_validate(noisy, BOARD, fit, size=SIZE, folds=3)
+    held_out = cross_validate(noisy, BOARD, fit, folds=3)
     assert [len(errors) for errors in held_out] == [len(view.ids) for view in noisy]
     assert fit.rms < rms(np.concatenate(held_out)) < 1.3 * 0.3 * np.sqrt(2)
     assert fit.rms == pytest.approx(0.3 * np.sqrt(2), rel=0.1)
@@ -89,11 +89,11 @@ def test_a_fit_is_reproducible_and_restores_the_threads_of_opencv(noisy):
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
     try:
-        matrices = {fit_camera(noisy, BOARD, model="opencv5", size=SIZE).intrinsics.matrix.tobytes() for _ in range(8)}
+        cameras = {fit_camera(noisy, BOARD, model="opencv5", size=SIZE).camera for _ in range(8)}
         assert cv2.getNumThreads() == 2
     finally:
         cv2.setNumThreads(before)
-    assert len(matrices) == 1
+    assert len(cameras) == 1
 
 
 def bend(view):
@@ -115,14 +115,14 @@ def test_bent_views_are_dropped_with_a_reason(noisy):
     selection = drop_outliers(mixed, BOARD, model="opencv5", size=SIZE)
     assert set(selection.dropped) == {noisy[0].name, noisy[7].name}
     good = fit_camera([view for i, view in enumerate(noisy) if i not in (0, 7)], BOARD, model="opencv5", size=SIZE)
-    np.testing.assert_allclose(selection.fit.intrinsics.values, good.intrinsics.values, rtol=1e-6)
+    np.testing.assert_allclose(selection.fit.values, good.values, rtol=1e-6)
     assert all(reason.startswith("its error is ") for reason in selection.dropped.values())
     assert len(drop_outliers(mixed, BOARD, model="opencv5", size=SIZE, max_share=0.15).dropped) == 1
     assert drop_outliers(mixed, BOARD, model="opencv5", size=SIZE, max_share=0.0).dropped == {}
 
 
 def test_leaving_a_view_out_is_a_fit_to_the_others(noisy):
-    result = leave_each_out(noisy, BOARD, fit_camera(noisy, BOARD, model="opencv5", size=SIZE), size=SIZE)[3]
+    result = leave_each_out(noisy, BOARD, fit_camera(noisy, BOARD, model="opencv5", size=SIZE))[3]
     others = fit_camera(noisy[:3] + noisy[4:], BOARD, model="opencv5", size=SIZE)
     assert result.name == noisy[3].name
     assert result.others == pytest.approx(others.rms, rel=1e-5)

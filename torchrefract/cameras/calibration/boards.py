@@ -14,15 +14,9 @@ from torchrefract._validation import check_choice, check_positive
 DICTIONARIES = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
 # Each of these begins with the markers of the smaller dictionaries of its kind.
 LARGEST_DICTIONARIES = (
-    "DICT_4X4_1000",
-    "DICT_5X5_1000",
-    "DICT_6X6_1000",
-    "DICT_7X7_1000",
+    *(f"DICT_{cells}_1000" for cells in ("4X4", "5X5", "6X6", "7X7")),
     "DICT_ARUCO_ORIGINAL",
-    "DICT_APRILTAG_16h5",
-    "DICT_APRILTAG_25h9",
-    "DICT_APRILTAG_36h10",
-    "DICT_APRILTAG_36h11",
+    *(f"DICT_APRILTAG_{kind}" for kind in ("16h5", "25h9", "36h10", "36h11")),
 )
 _MIN_SQUARES, _MAX_SQUARES = 3, 100  # along a side
 _MM_PER_INCH = 25.4

@@ -56,15 +56,8 @@ def detect(gray: np.ndarray, board: Board, *, name: str = "") -> View:
     Drops corners that the refinement moves far, that lie at the border of the picture, or that do not fit their
     neighbors. Drops corners of a ChArUco board where black and white do not cross, such as behind a finger. Keeps the
     corners unrefined if many would move far, or if refined corners of a chessboard fit their neighbors worse, as on an
-    overexposed board whose black squares do not touch.
-
-    Args:
-        gray: (H, W), uint8.
-        board: to search.
-        name: of the view.
-
-    Returns:
-        The view, without corners if no board was found.
+    overexposed board whose black squares do not touch. The picture is (H, W), uint8. A view without corners means that
+    no board was found.
     """
     if isinstance(board, Charuco):
         ids, corners = _find_charuco(gray, board)
@@ -97,17 +90,14 @@ def candidates(option: str | bool) -> tuple[bool, ...]:
 def _find_charuco(gray: np.ndarray, board: Charuco) -> tuple[np.ndarray, np.ndarray]:
     best = np.empty(0, dtype=int), np.empty((0, 2))
     parameters = cv2.aruco.CharucoParameters()
-    # One marker next to a corner is enough, so that corners near the border of the picture count.
-    parameters.minMarkers = 1
+    parameters.minMarkers = 1  # next to a corner, so that corners near the border of the picture count
     # On boards with an odd number of rows both patterns are equal.
     legacies = candidates(board.legacy) if board.num_squares[1] % 2 == 0 else (False,)
-    for inverted in candidates(board.inverted):
-        picture = 255 - gray if inverted else gray
-        for legacy in legacies:
-            detector = cv2.aruco.CharucoDetector(board.to_opencv(legacy=legacy), parameters)
-            corners, ids, _, _ = detector.detectBoard(picture)
-            if ids is not None and len(ids) > len(best[0]):
-                best = ids.ravel(), corners.reshape(-1, 2)
+    for inverted, legacy in itertools.product(candidates(board.inverted), legacies):
+        detector = cv2.aruco.CharucoDetector(board.to_opencv(legacy=legacy), parameters)
+        corners, ids, _, _ = detector.detectBoard(255 - gray if inverted else gray)
+        if ids is not None and len(ids) > len(best[0]):
+            best = ids.ravel(), corners.reshape(-1, 2)
     return best
 
 
@@ -141,9 +131,10 @@ def _is_as_smooth(
     board: Board, refined: tuple[np.ndarray, np.ndarray], original: tuple[np.ndarray, np.ndarray]
 ) -> bool:
     """Return True if refined corners fit their neighbors nearly as well as the original ones."""
-    (ids, corners), before = refined, original[1][np.isin(original[0], refined[0])]
-    plane = board.corners(ids)[:, :2]
-    error, refined_error = (np.square(_misfits(plane, c) * _spacings(c)).mean() for c in (before, corners))
+    before = original[1][np.isin(original[0], refined[0])]
+    error, refined_error = (
+        np.square(_misfits(board, refined[0], c) * _spacings(c)).mean() for c in (before, refined[1])
+    )
     return bool(error >= _SMOOTHNESS**2 * refined_error)
 
 
@@ -156,47 +147,42 @@ def _spacings(corners: np.ndarray) -> np.ndarray:
 
 def _drop_misfits(board: Board, ids: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     # The worst one is dropped first, since it misleads the others.
-    while len(ids) > MIN_CORNERS:
-        errors = _misfits(board.corners(ids)[:, :2], corners)
+    while len(ids) > MIN_CORNERS and (errors := _misfits(board, ids, corners)).max() > _MAX_MISFIT:
         worst = int(errors.argmax())
-        if errors[worst] <= _MAX_MISFIT:
-            break
         ids, corners = np.delete(ids, worst), np.delete(corners, worst, axis=0)
     return ids, corners
 
 
-def _misfits(plane: np.ndarray, corners: np.ndarray) -> np.ndarray:
+def _misfits(board: Board, ids: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Return (N,), squares, the distance of each corner from its place by the homography of its neighbors."""
-    spacings, errors = _spacings(corners), np.zeros(len(corners))
-    for k, matrix in enumerate(_homographies(plane, corners)):
-        if matrix is not None:
-            expected = cv2.perspectiveTransform(plane[None, k : k + 1], matrix).reshape(2)
-            errors[k] = np.hypot(*(expected - corners[k])) / spacings[k]
-    return errors
+    errors = np.zeros(len(corners))
+    for k, point, matrix in _homographies(board, ids, corners):
+        errors[k] = np.hypot(*(cv2.perspectiveTransform(point[None, None], matrix).reshape(2) - corners[k]))
+    return errors / _spacings(corners)
 
 
-def _homographies(plane: np.ndarray, corners: np.ndarray) -> Iterator[np.ndarray | None]:
-    """Yield the homography from board to picture by the neighbors of each corner; None if these are collinear."""
+def _homographies(board: Board, ids: np.ndarray, corners: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Yield corners on the board with the homography to the picture by their neighbors, unless these are collinear."""
+    plane = board.corners(ids)[:, :2]
     distances = np.linalg.norm(plane[:, None] - plane[None], axis=2)
-    for k in range(len(corners)):
+    for k, point in enumerate(plane):
         others = np.argsort(distances[k], kind="stable")[1 : _NUM_NEIGHBORS + 1]
         is_line = np.linalg.matrix_rank(plane[others] - plane[others].mean(axis=0)) < 2
-        yield None if is_line or len(others) < 4 else cv2.findHomography(plane[others], corners[others], 0)[0]
+        if len(others) >= 4 and not is_line:
+            yield k, point, cv2.findHomography(plane[others], corners[others], 0)[0]
 
 
 def _drop_covered(
     gray: np.ndarray, board: Board, ids: np.ndarray, corners: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drop corners where two opposite squares are not clearly darker than the two others."""
-    plane, contrasts = board.corners(ids)[:, :2], np.full(len(ids), np.nan)
-    signs = np.array([(-1, -1), (1, 1), (-1, 1), (1, -1)])
-    for k, matrix in enumerate(_homographies(plane, corners)):
-        if matrix is not None:
-            points = np.vstack([plane[k], plane[k] + _PROBE * board.square_mm * signs])
-            pixels = cv2.perspectiveTransform(points[None], matrix).reshape(-1, 2)
-            x, y = (pixels[1:] - pixels[0] + corners[k]).astype(np.float32).T
-            values = cv2.remap(gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float).ravel()
-            contrasts[k] = max(values[:2].min() - values[2:].max(), values[2:].min() - values[:2].max())
+    contrasts = np.full(len(ids), np.nan)
+    steps = _PROBE * board.square_mm * np.array([(0, 0), (-1, -1), (1, 1), (-1, 1), (1, -1)])
+    for k, point, matrix in _homographies(board, ids, corners):
+        pixels = cv2.perspectiveTransform((point + steps)[None], matrix).reshape(-1, 2)
+        x, y = (pixels[1:] - pixels[0] + corners[k]).astype(np.float32).T
+        values = cv2.remap(gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float).ravel()
+        contrasts[k] = max(values[:2].min() - values[2:].max(), values[2:].min() - values[:2].max())
     if np.isnan(contrasts).all():
         return ids, corners
     keep = np.isnan(contrasts) | (contrasts > _MIN_CONTRAST * np.nanmedian(contrasts))
@@ -243,14 +229,17 @@ def describe_other_board(gray: np.ndarray, board: Board) -> str:
 
 
 def _other_charuco(gray: np.ndarray, board: Charuco) -> str:
-    searches = [_find_markers(picture, name) for picture in (gray, 255 - gray) for name in LARGEST_DICTIONARIES]
-    best = max(searches, key=lambda search: len(search.corners))
-    if len(best.corners) < _MIN_MARKERS:
+    best: _Markers | None = None
+    for picture, color in ((gray, ""), (255 - gray, ", black and white exchanged")):
+        for name in LARGEST_DICTIONARIES:
+            corners, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(name)).detectMarkers(picture)
+            if len(corners) >= (_MIN_MARKERS if best is None else len(best.corners) + 1):
+                best = _Markers(picture, color, name, ids, corners)
+    if best is None:
         return ""
     low, high = int(best.ids.min()), int(best.ids.max())
     name = _smallest_dictionary(best.dictionary, high, preferred=board.dictionary)
-    color = "" if best.picture is gray else ", black and white exchanged"
-    text = f"{len(best.ids)} markers of {name}{color}, from number {low} to {high}"
+    text = f"{len(best.ids)} markers of {name}{best.color}, from number {low} to {high}"
     squares, count = _find_squares(best, replace(board, squares="3x3", dictionary=name))
     return f"{text}, with {count} corners as on a board of squares={squares}" if count >= MIN_CORNERS else text
 
@@ -259,24 +248,19 @@ class _Markers(NamedTuple):
     """The markers of a dictionary in a picture."""
 
     picture: np.ndarray
+    color: str
     dictionary: str
     ids: np.ndarray
     corners: Sequence[np.ndarray]
 
 
-def _find_markers(picture: np.ndarray, dictionary: str) -> _Markers:
-    corners, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(dictionary)).detectMarkers(picture)
-    return _Markers(picture, dictionary, np.empty((0, 1), dtype=np.int32) if ids is None else ids, corners)
-
-
 def _smallest_dictionary(dictionary: str, highest: int, *, preferred: str) -> str:
     """Return the preferred dictionary, or the smallest one of this kind, that has a marker with this number."""
-    kind = dictionary.rpartition("_")[0]
-    if not kind.startswith(("DICT_4X4", "DICT_5X5", "DICT_6X6", "DICT_7X7")):
+    kind, _, size = dictionary.rpartition("_")
+    if size != "1000":
         return dictionary
-    if preferred.rpartition("_")[0] == kind and highest < int(preferred.rpartition("_")[2]):
-        return preferred
-    return next(f"{kind}_{count}" for count in (50, 100, 250, 1000) if highest < count)
+    sizes = [preferred.rpartition("_")[2]] if preferred.rpartition("_")[0] == kind else []
+    return next(f"{kind}_{count}" for count in (*sizes, 50, 100, 250, 1000) if highest < int(count))
 
 
 def _find_squares(markers: _Markers, board: Charuco) -> tuple[str, int]:

@@ -11,17 +11,9 @@ from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import check_choice, check_count, check_number, check_positive, check_tensor
+from torchrefract.cameras import projection
 from torchrefract.cameras.brown_conrady import POLYNOMIAL12
-from torchrefract.cameras.projection import (
-    COEFFICIENTS,
-    MODELS,
-    PointResult,
-    distort,
-    project,
-    undistort,
-    unproject,
-    valid_radius,
-)
+from torchrefract.cameras.projection import COEFFICIENTS, MODELS, PointResult
 from torchrefract.cameras.radial import falls_before, first_root, growth
 from torchrefract.cameras.rational import RationalLens
 
@@ -112,7 +104,7 @@ class Camera:
     @property
     def valid_radius(self) -> float:
         """Return the radius on the plane z = 1 up to which the lens is one-to-one; the angle in rad for a fisheye."""
-        return valid_radius(torch.tensor([self.coefficients], dtype=torch.float64), model=self.model).item()
+        return projection.valid_radius(torch.tensor([self.coefficients], dtype=torch.float64), model=self.model).item()
 
     @property
     def is_pinhole(self) -> bool:
@@ -130,7 +122,7 @@ class Camera:
         """Return the coefficients in the order of "polynomial12".
 
         Raises:
-            ValueError: `is_polynomial` is false.
+            ValueError: `is_polynomial` is False.
         """
         if not self.is_polynomial:
             raise ValueError(
@@ -145,19 +137,19 @@ class Camera:
 
     def distort(self, points: Tensor) -> PointResult:
         """Distort points (N, 2) or (B, N, 2) of the plane z = 1, see `projection.distort`."""
-        return self._apply(distort, points)
+        return self._apply(projection.distort, points)
 
     def undistort(self, points: Tensor) -> PointResult:
         """Undistort points (N, 2) or (B, N, 2) in focal lengths, see `projection.undistort`."""
-        return self._apply(undistort, points)
+        return self._apply(projection.undistort, points)
 
     def project(self, points: Tensor) -> PointResult:
         """Project points in space (N, 3) or (B, N, 3) to pixels, see `projection.project`."""
-        return self._apply(project, points, has_pinhole=True)
+        return self._apply(projection.project, points, has_pinhole=True)
 
     def unproject(self, pixels: Tensor) -> PointResult:
         """Return the rays of unit length of pixels (N, 2) or (B, N, 2), see `projection.unproject`."""
-        return self._apply(unproject, pixels, name="pixels", has_pinhole=True)
+        return self._apply(projection.unproject, pixels, name="pixels", has_pinhole=True)
 
     def tensors(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return coefficients (1, n), focal lengths (1, 2) and center (1, 2), px, with dtype and device of `like`."""
@@ -209,8 +201,7 @@ class Camera:
     def flipped(self, direction: str) -> "Camera":
         """Return the camera of the same frames mirrored left to right ("horizontal") or top to bottom ("vertical").
 
-        cx' = W - 1 - cx, and the coefficients of terms that are odd in x change their sign: p2, s1, s2, tau_y.
-        Likewise cy with p1, s3, s4 and tau_x.
+        cx' = W - 1 - cx, and the coefficients of terms that are odd in x change their sign; likewise cy.
         """
         odd = _ODD[check_choice("direction", direction, DIRECTIONS)]
         pairs = zip(COEFFICIENTS[self.model], self.coefficients, strict=False)

@@ -25,14 +25,9 @@ def fisheye_image(
 
         (x_d, y_d) = theta_d (x, y) / r,  theta = atan2(r, z),  r^2 = x^2 + y^2
 
-    Args:
-        x, y, z: (B, N), rays of any length.
-        k: k1 ... k4, each (B, 1).
-        max_angle: (B,), rad, up to which theta_d grows, see `fisheye_angle`.
-
-    Returns:
-        x_d, y_d: (B, N), in focal lengths; 0 where `valid` is false.
-        valid: (B, N), bool: the angle of the ray is at most `max_angle`, and the ray does not point straight back.
+    The rays (x, y, z), (B, N) each, may have any length. k are k1 ... k4, each (B, 1). `max_angle`, (B,), rad, is that
+    of `fisheye_angle`. Returns x_d and y_d in focal lengths, 0 where the last result, valid, is False: beyond
+    `max_angle`, or if the ray points straight back.
     """
     with torch.no_grad():
         r2 = x * x + y * y

@@ -5,7 +5,8 @@ the format cannot hold the camera; readers of the path find the old file or the 
 """
 
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -64,26 +65,25 @@ def write_opencv(path: str | Path, camera: Camera) -> None:
         path: ending in .xml, .yml or .yaml.
         camera: of the model "opencv" or "fisheye".
     """
-    path = Path(path)
-    _check_opencv_model(camera)
-    scalars = {"image_width": camera.width, "image_height": camera.height}
-    scalars["fisheye_model"] = int(camera.model == "fisheye")
-    matrices = {"camera_matrix": (3, 3, _matrix_values(camera))}
-    matrices["distortion_coefficients"] = (len(camera.coefficients), 1, list(camera.coefficients))
+    path, coefficients = Path(path), _fit_coefficients(camera, (len(camera.coefficients),))
+    is_fisheye = int(camera.model == "fisheye")
+    scalars = {"image_width": camera.width, "image_height": camera.height, "fisheye_model": is_fisheye}
+    matrices = {"camera_matrix": _matrix(3, chain(*camera.matrix))}
+    matrices["distortion_coefficients"] = _matrix(len(coefficients), coefficients)
     if _is_xml(path):
         lines = ['<?xml version="1.0"?>', "<opencv_storage>"]
         lines += [f"<{name}>{value}</{name}>" for name, value in scalars.items()]
-        for name, (rows, columns, values) in matrices.items():
-            content = (
-                f"<rows>{rows}</rows><cols>{columns}</cols><dt>d</dt><data>{' '.join(map(_digits, values))}</data>"
-            )
+        for name, matrix in matrices.items():
+            data = " ".join(f"{value:.17e}" for value in matrix["data"])
+            content = f"<rows>{matrix['rows']}</rows><cols>{matrix['cols']}</cols><dt>d</dt><data>{data}</data>"
             lines.append(f'<{name} type_id="opencv-matrix">{content}</{name}>')
         lines.append("</opencv_storage>")
     else:
         lines = ["%YAML:1.0", "---", *(f"{name}: {value}" for name, value in scalars.items())]
-        for name, (rows, columns, values) in matrices.items():
-            lines += [f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d"]
-            lines.append(f"   data: [ {', '.join(map(_digits, values))} ]")
+        for name, matrix in matrices.items():
+            data = ", ".join(f"{value:.17e}" for value in matrix["data"])
+            lines += [f"{name}: !!opencv-matrix", f"   rows: {matrix['rows']}", f"   cols: {matrix['cols']}"]
+            lines += ["   dt: d", f"   data: [ {data} ]"]
     _write(path, "\n".join(lines) + "\n")
 
 
@@ -105,20 +105,15 @@ def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None
         camera: "fisheye", or "opencv" without prism and tilt.
         name: of the camera.
     """
-    _check_opencv_model(camera)
-    coefficients, model = camera.coefficients, "equidistant"
-    if camera.model == "opencv":
-        is_short = not any(coefficients[5:])
-        coefficients = _fit_length(camera, 5 if is_short else 8)
-        model = "plumb_bob" if is_short else "rational_polynomial"
+    coefficients = _fit_coefficients(camera, (5, 8))
     (fx, _, cx), (_, fy, cy), _ = camera.matrix
     document = {
         "image_width": camera.width,
         "image_height": camera.height,
         "camera_name": name,
-        "camera_matrix": _matrix(3, _matrix_values(camera)),
-        "distortion_model": model,
-        "distortion_coefficients": _matrix(1, list(coefficients)),
+        "camera_matrix": _matrix(3, chain(*camera.matrix)),
+        "distortion_model": {4: "equidistant", 5: "plumb_bob", 8: "rational_polynomial"}[len(coefficients)],
+        "distortion_coefficients": _matrix(1, coefficients),
         "rectification_matrix": _matrix(3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
         "projection_matrix": _matrix(3, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
     }
@@ -142,17 +137,16 @@ def write_kalibr(path: str | Path, cameras: Mapping[str, Camera]) -> None:
         path: to write.
         cameras: by their names, such as cam0; "fisheye", or "opencv" with k1, k2, p1, p2 only.
     """
-    chains = {}
-    for name, camera in cameras.items():
-        _check_opencv_model(camera)
-        is_radtan = camera.model == "opencv"
-        chains[name] = {
+    chains = {
+        name: {
             "camera_model": "pinhole",
             "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
-            "distortion_model": "radtan" if is_radtan else "equidistant",
-            "distortion_coeffs": list(_fit_length(camera, 4) if is_radtan else camera.coefficients),
+            "distortion_model": "radtan" if camera.model == "opencv" else "equidistant",
+            "distortion_coeffs": list(_fit_coefficients(camera, (4,))),
             "resolution": [camera.width, camera.height],
         }
+        for name, camera in cameras.items()
+    }
     _write(path, _dump_yaml(chains))
 
 
@@ -178,15 +172,9 @@ def write_colmap(path: str | Path, cameras: Mapping[int, Camera]) -> None:
     """
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", f"# Number of cameras: {len(cameras)}"]
     for number, camera in cameras.items():
-        _check_opencv_model(camera)
-        if camera.model == "fisheye":
-            model, coefficients = "OPENCV_FISHEYE", camera.coefficients
-        elif not any(camera.coefficients):
-            model, coefficients = "PINHOLE", ()
-        elif not any(camera.coefficients[4:]):
-            model, coefficients = "OPENCV", _fit_length(camera, 4)
-        else:
-            model, coefficients = "FULL_OPENCV", _fit_length(camera, 8)
+        coefficients = _fit_coefficients(camera, (0, 4, 8))
+        model = {0: "PINHOLE", 4: "OPENCV", 8: "FULL_OPENCV"}[len(coefficients)]
+        model = "OPENCV_FISHEYE" if camera.model == "fisheye" else model
         pinhole = (camera.fx, camera.fy, camera.cx + _COLMAP_OFFSET, camera.cy + _COLMAP_OFFSET)
         values = " ".join(map(repr, (*pinhole, *coefficients)))
         lines.append(f"{number} {model} {camera.width} {camera.height} {values}")
@@ -294,32 +282,25 @@ def _xml_value(node: ElementTree.Element) -> Any:
     return (node.text or "").strip()
 
 
-def _matrix_values(camera: Camera) -> list[float]:
-    return [value for row in camera.matrix for value in row]
-
-
-def _matrix(rows: int, data: list[float]) -> dict[str, Any]:
+def _matrix(rows: int, values: Iterable[float]) -> dict[str, Any]:
+    data = list(values)
     return {"rows": rows, "cols": len(data) // rows, "data": data}
 
 
-def _digits(value: float) -> str:
-    return f"{value:.17e}"
-
-
-def _fit_length(camera: Camera, count: int) -> tuple[float, ...]:
-    """Return OpenCV's coefficients truncated or padded with zeros; raise ValueError if others would be dropped."""
-    first, rest = camera.coefficients[:count], camera.coefficients[count:]
-    if any(rest):
-        raise ValueError(f"camera must have at most {count} coefficients for this file, got {camera.coefficients}")
-    return (*first, *(0.0,) * (count - len(first)))
-
-
-def _check_opencv_model(camera: Camera) -> None:
+def _fit_coefficients(camera: Camera, counts: Sequence[int]) -> tuple[float, ...]:
+    """Return those of a fisheye, or those of OpenCV with zeros in the first of the lengths `counts` that holds them."""
     if camera.model not in ("opencv", "fisheye"):
         raise ValueError(
             "camera must be of the model opencv or fisheye for this file (convert(camera, to=...) finds the nearest), "
             f"got {camera.model}"
         )
+    values = camera.coefficients
+    if camera.model == "fisheye":
+        return values
+    for count in counts:
+        if not any(values[count:]):
+            return (*values[:count], *(0.0,) * (count - len(values)))
+    raise ValueError(f"camera must have at most {counts[-1]} coefficients for this file, got {values}")
 
 
 def _is_xml(path: Path) -> bool:

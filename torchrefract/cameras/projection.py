@@ -85,8 +85,7 @@ def undistort(points: Tensor, coefficients: Tensor, *, model: str) -> PointResul
         Points (B, N, 2) on the plane z = 1. Rays of a fisheye at 90 degrees or more to its axis are not valid: they do
         not meet the plane.
 
-    Raises:
-        ValueError, TypeError: as for `distort`.
+    Raises: as for `distort`.
     """
     points, finite, lens = _check_points("points", points, 2, coefficients, model)
     x_d, y_d = points.unbind(-1)
@@ -109,8 +108,7 @@ def project(points: Tensor, coefficients: Tensor, *, focal: Tensor, center: Tens
     Returns:
         Pixels (B, N, 2), which may lie outside the frame; pixel centers are whole numbers.
 
-    Raises:
-        ValueError, TypeError: as for `distort`; a focal length is not positive.
+    Raises: as for `distort`, and ValueError for a focal length that is not positive.
     """
     points, finite, lens = _check_points("points", points, 3, coefficients, model)
     _check_pinhole(focal, center, len(coefficients))
@@ -130,8 +128,7 @@ def unproject(pixels: Tensor, coefficients: Tensor, *, focal: Tensor, center: Te
     Returns:
         Rays (B, N, 3), x right, y down, z forward.
 
-    Raises:
-        ValueError, TypeError: as for `project`.
+    Raises: as for `project`.
     """
     pixels, finite, lens = _check_points("pixels", pixels, 2, coefficients, model)
     _check_pinhole(focal, center, len(coefficients))
@@ -147,12 +144,8 @@ def unproject(pixels: Tensor, coefficients: Tensor, *, focal: Tensor, center: Te
 def valid_radius(coefficients: Tensor, *, model: str) -> Tensor:
     """Return the radius up to which the radial part of lenses is one-to-one, the first root of its growth.
 
-    Args:
-        coefficients, model: as for `distort`.
-
-    Returns:
-        (B,), float64, on the plane z = 1 before distortion, inf if the lens never folds; for a fisheye the angle in
-        rad, at most pi.
+    Args and Raises are as for `distort`. Returns (B,), float64, on the plane z = 1 before distortion, inf if the lens
+    never folds; for a fisheye the angle in rad, at most pi.
     """
     _check_coefficients(coefficients, model)
     return _exact_radius(coefficients, model)
@@ -187,12 +180,7 @@ def radius_within(coefficients: Tensor, reach: Tensor, model: str) -> Tensor:
 def image_of(
     x: Tensor, y: Tensor, z: Tensor, c: Sequence[Tensor], model: str, radius: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Project rays (x, y, z) of any length to the image.
-
-    Returns:
-        x_d, y_d: (B, N), in focal lengths; 0 where `valid` is false.
-        valid: (B, N), bool.
-    """
+    """Project rays (x, y, z) of any length to x_d, y_d, in focal lengths; return 0 where the last, valid, is False."""
     if model == "fisheye":
         return fisheye_image(x, y, z, c, radius)
     with torch.no_grad():
@@ -234,10 +222,7 @@ def on_plane(ray: tuple[Tensor, Tensor, Tensor], valid: Tensor) -> tuple[Tensor,
 
 
 def image_of_rays(x: Tensor, y: Tensor, z: Tensor, coefficients: Tensor, model: str) -> tuple[Tensor, Tensor]:
-    """Evaluate a model's formula for rays (B, N) with z > 0, also beyond the fold, to fit models by.
-
-    Returns x_d and y_d, (B, N), in focal lengths.
-    """
+    """Evaluate x_d and y_d by a model's formula for rays (B, N) with z > 0, also beyond the fold, to fit models by."""
     c = columns(coefficients, model)
     if model == "fisheye":
         return fisheye_image(x, y, z, c, fisheye_angle(coefficients).to(coefficients.dtype))[:2]
@@ -269,11 +254,7 @@ def _check_coefficients(coefficients: Tensor, model: str) -> None:
 def _check_points(
     name: str, points: Tensor, size: int, coefficients: Tensor, model: str
 ) -> tuple[Tensor, Tensor, tuple[tuple[Tensor, ...], str, Tensor]]:
-    """Check shapes and values.
-
-    Returns the points with NaN and infinity replaced by 0, (B, N), bool: the point was finite, and the last three
-    arguments of `image_of` and `ray_of`.
-    """
+    """Return finite points, where they were finite before, and the last three arguments of `image_of`."""
     _check_coefficients(coefficients, model)
     check_tensor(name, points)
     if points.dtype not in (torch.float32, torch.float64):

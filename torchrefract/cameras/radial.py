@@ -86,14 +86,9 @@ def falls_before(a: Sequence[float], q_max: float) -> bool:
 
 
 def first_fall(falls: Callable[[Tensor], Tensor], reach: Tensor) -> Tensor:
-    """Search the radius where a radial map stops growing, on a lattice that is refined twice.
+    """Search the radius (B,) up to `reach` (B,) where a radial map stops growing, on a lattice that is refined twice.
 
-    Args:
-        falls: maps radii (B, n) to (B, n), bool: the map does not grow there.
-        reach: (B,), the largest radius to search.
-
-    Returns:
-        (B,), just before the first fall; `reach` if there is none.
+    `falls` maps radii (B, n) to (B, n), bool: the map does not grow there. Returns `reach` if it never falls.
     """
     has_fall = falls(reach[:, None] * _steps(reach)).any(dim=1)
     radius, width = torch.zeros_like(reach), reach
@@ -129,8 +124,6 @@ class RadialLimit(NamedTuple):
 def radial_limit(coefficients: Tensor, reach: Tensor, image_reach: Tensor) -> RadialLimit:
     """Compute how far out the radial terms of the Brown-Conrady polynomial can be inverted.
 
-    The fold is searched on a lattice of radii that is refined twice.
-
     Args:
         coefficients: (B, 12, ...), with one dimension for each dimension of the points.
         reach: (B,), the largest radius on the plane z = 1 to search.
@@ -146,12 +139,9 @@ def radial_limit(coefficients: Tensor, reach: Tensor, image_reach: Tensor) -> Ra
 def invert_radius(
     r_d: Tensor, radius: Tensor, numerator: Sequence[Tensor], denominator: Sequence[Tensor] = ()
 ) -> Tensor:
-    """Solve r g(r^2) = r_d for r by a table and Newton's method, without gradient.
+    """Solve r g(r^2) = r_d for r (B, N) by a table and Newton's method, without gradient.
 
-    Args:
-        r_d: (B, N), radii after distortion.
-        radius: (B,), up to which the map grows, inf if it always does.
-        numerator, denominator: each coefficient (B, 1).
+    `radius` (B,), up to which the map grows, is inf if it always does. Each coefficient is (B, 1).
     """
     with torch.no_grad():
         zero = r_d.new_zeros(r_d.shape[0], 1)
@@ -209,13 +199,8 @@ def undistort_division(x_d: Tensor, y_d: Tensor, k: Tensor) -> tuple[Tensor, Ten
 
         x = x_d / (1 + k r_d^2),  y = y_d / (1 + k r_d^2)
 
-    Args:
-        x_d, y_d: (B, N), in focal lengths.
-        k: (B, 1).
-
-    Returns:
-        x, y: (B, N), on the plane z = 1; 0 where no point exists.
-        exists: (B, N), bool: 1 + k r_d^2 and 1 - k r_d^2, to which dr / dr_d is proportional, are above zero.
+    k is (B, 1), all else (B, N). The last result is True where the point exists: 1 + k r_d^2 and 1 - k r_d^2, to which
+    dr / dr_d is proportional, are above zero. Elsewhere x and y are 0.
 
     Source: Fitzgibbon, "Simultaneous linear estimation of multiple view geometry and lens distortion", CVPR 2001.
     """
@@ -231,7 +216,7 @@ def distort_division(x: Tensor, y: Tensor, k: Tensor) -> tuple[Tensor, Tensor, T
 
         x_d = 2 x / (1 + sqrt(1 - 4 k r^2)),  y_d = 2 y / (1 + sqrt(1 - 4 k r^2))
 
-    Args, Returns: as there with both planes exchanged; `exists` where 1 - 4 k r^2 is above zero.
+    The shapes are as there; a point exists where 1 - 4 k r^2 is above zero.
     """
     with torch.no_grad():
         exists = 4 * k * (x * x + y * y) < 1

@@ -132,9 +132,7 @@ def _is_as_smooth(
 ) -> bool:
     """Return True if refined corners fit their neighbors nearly as well as the original ones."""
     before = original[1][np.isin(original[0], refined[0])]
-    error, refined_error = (
-        np.square(_misfits(board, refined[0], c) * _spacings(c)).mean() for c in (before, refined[1])
-    )
+    error, refined_error = (np.square(_misfits(board, refined[0], c)).mean() for c in (before, refined[1]))
     return bool(error >= _SMOOTHNESS**2 * refined_error)
 
 
@@ -147,18 +145,21 @@ def _spacings(corners: np.ndarray) -> np.ndarray:
 
 def _drop_misfits(board: Board, ids: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     # The worst one is dropped first, since it misleads the others.
-    while len(ids) > MIN_CORNERS and (errors := _misfits(board, ids, corners)).max() > _MAX_MISFIT:
+    while len(ids) > MIN_CORNERS:
+        errors = _misfits(board, ids, corners) / _spacings(corners).clip(min=1e-6)
         worst = int(errors.argmax())
+        if errors[worst] <= _MAX_MISFIT:
+            break
         ids, corners = np.delete(ids, worst), np.delete(corners, worst, axis=0)
     return ids, corners
 
 
 def _misfits(board: Board, ids: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return (N,), squares, the distance of each corner from its place by the homography of its neighbors."""
+    """Return (N,), px, the distance of each corner from its place by the homography of its neighbors."""
     errors = np.zeros(len(corners))
     for k, point, matrix in _homographies(board, ids, corners):
         errors[k] = np.hypot(*(cv2.perspectiveTransform(point[None, None], matrix).reshape(2) - corners[k]))
-    return errors / _spacings(corners)
+    return errors
 
 
 def _homographies(board: Board, ids: np.ndarray, corners: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:

@@ -99,12 +99,9 @@ def fit_camera(
 
 
 def project(camera: Camera, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project points (N, 3), mm, of a board in a pose.
+    """Project points (N, 3), mm, of a board in a pose to pixels (N, 2).
 
-    Returns:
-        pixels: (N, 2), px.
-        pose_slopes: (2 N, 6), derivatives with respect to the pose.
-        camera_slopes: (2 N, n), derivatives with respect to fx, fy, cx, cy and the coefficients.
+    Returns their derivatives too: with respect to the pose (2 N, 6), and to fx, fy, cx, cy, coefficients (2 N, n).
     """
     arguments = points.reshape(-1, 1, 3), pose[:3], pose[3:], np.array(camera.matrix), np.array(camera.coefficients)
     if camera.model == "fisheye":
@@ -249,10 +246,7 @@ def _minimize(
 
 
 def _deviations(slopes: Sequence[Sequence[np.ndarray]], errors: np.ndarray) -> np.ndarray:
-    """Return the standard deviations of `Fit.values` from the slopes of `project` in each view.
-
-    The poses are eliminated by the Schur complement.
-    """
+    """Return the deviations of a fit from the slopes of its views; the Schur complement eliminates the poses."""
     normal = np.zeros((1, 1))
     for pose_slopes, camera_slopes in slopes:
         shared = pose_slopes.T @ camera_slopes

@@ -71,13 +71,7 @@ def calibrate_camera(
 ) -> Calibration:
     """Fit a camera to all usable detections, at least four, without views that do not fit the others.
 
-    Args:
-        detections, board: as for `detect`.
-        model, size: as for `fit_camera`.
-        max_drop_share: of the views that may be dropped.
-
-    Raises:
-        ValueError: no camera fits the views.
+    The other arguments are those of `drop_outliers`. Raises ValueError if no camera fits the views.
     """
     views = [detection.view for detection in detections if not detection.problem]
     selection = drop_outliers(views, board, model=model, size=size, max_share=max_drop_share)

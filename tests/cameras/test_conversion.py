@@ -84,13 +84,14 @@ def test_least_squares_match_scipy():
     t = torch.linspace(0, 3, 40, dtype=torch.float64)
     target = 2.5 * torch.exp(-1.3 * t) + 0.4 + 0.05 * torch.sin(9 * t)
 
-    def error(p: torch.Tensor) -> torch.Tensor:
-        return (p[:, 0] * torch.exp(-p[:, 1] * t) + p[:, 2] - target)[:, None]
+    def function(p: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        decay = torch.exp(-p[1] * t)
+        return p[0] * decay + p[2] - target, torch.stack([decay, -p[0] * t * decay, torch.ones_like(t)], dim=1)
 
     def numpy_error(p: np.ndarray) -> np.ndarray:
         return p[0] * np.exp(-p[1] * t.numpy()) + p[2] - target.numpy()
 
-    parameters = least_squares(error, torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64), rows=40)
+    parameters = least_squares(function, torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64))
     theirs = scipy_least_squares(numpy_error, [1.0, 0.5, 0.0], xtol=1e-14, ftol=1e-14)
     assert parameters.tolist() == pytest.approx(theirs.x.tolist(), abs=1e-5)
 

@@ -78,12 +78,11 @@ class Camera:
 
     @staticmethod
     def from_opencv(matrix: Any, coefficients: Any, *, width: int, height: int) -> "Camera":
-        """Create a camera from the results of `cv2.calibrateCamera`.
+        """Create a camera of frames of width x height px from the results of `cv2.calibrateCamera`.
 
         Args:
             matrix: (3, 3), an array or nested lists.
             coefficients: 4, 5, 8, 12 or 14 numbers, an array of any shape or nested lists.
-            width, height: px, of the frames.
 
         Raises:
             ValueError: the matrix is not 3 x 3 or has skew; see also `Camera`.

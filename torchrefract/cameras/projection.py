@@ -1,11 +1,9 @@
 """Points and rays through the lenses of a batch of cameras, differentiable, with validity and residual.
 
-`distort`, `undistort`, `project`, `unproject` and `valid_radius` are public and check shapes; `Camera` offers them as
-methods for one camera. The functions below them choose the formula of the lens model; they take x and y, (B, N), and
-the coefficients as `columns` returns them, and check nothing.
-
-Every model is used from the center of the image up to the radius where it folds back. That radius is on the plane
-z = 1 before distortion; for a fisheye it is an angle in rad.
+`distort`, `undistort`, `project`, `unproject` and `valid_radius` check their arguments. The functions below them choose
+the formula of the lens model; they take x and y, (B, N), and the coefficients as `columns` returns them, and check
+nothing. Every model is used from the center of the image up to the radius where it folds back, on the plane z = 1
+before distortion; for a fisheye it is an angle in rad.
 """
 
 import math
@@ -42,15 +40,12 @@ _MAX_RADIUS = 1e6  # on the plane z = 1; no lens shows points beyond it
 class PointResult(NamedTuple):
     """Points or rays after a lens.
 
-    points: (B, N, 2), or rays (B, N, 3). Where `valid` is false they are the center or the axis, without gradient.
-    valid: (B, N), bool: the model has an answer before the lens folds back.
-    residual: (B, N), the distance between the input and the answer put through the model; zero for closed forms.
-        In px if the input is in px, otherwise in focal lengths.
+    The residual is zero for closed forms. It is in px if the input is in px, otherwise in focal lengths.
     """
 
-    points: Tensor
-    valid: Tensor
-    residual: Tensor
+    points: Tensor  # (B, N, 2), or rays (B, N, 3); the center or the axis, without gradient, if not valid
+    valid: Tensor  # (B, N), bool: the model has an answer before the lens folds back
+    residual: Tensor  # (B, N), the distance between the input and the answer put through the model
 
 
 def distort(points: Tensor, coefficients: Tensor, *, model: str) -> PointResult:

@@ -109,11 +109,7 @@ def calibrate(cfg: DictConfig) -> None:
 
 
 def find_pictures(folder: str | Path) -> list[Path]:
-    """Return the pictures of a folder, sorted by name.
-
-    Raises:
-        UsageError: the folder does not exist or holds no pictures.
-    """
+    """Return the pictures of a folder, sorted by name; raise UsageError if it does not exist or holds none."""
     if not (folder := Path(folder)).is_dir():
         raise UsageError(f"images must be an existing folder of pictures, got {folder}")
     if not (files := files_in(folder)):
@@ -127,10 +123,7 @@ def read_gray(path: Path) -> np.ndarray:
 
 
 def detect_all(files: Sequence[Path], board: Board, cache: Path) -> Iterator[Detection]:
-    """Detect a board in pictures; results of an earlier run for the same board and file are read from the cache.
-
-    The cache is a file with a line of JSON for each picture.
-    """
+    """Detect a board in pictures that the cache, a file of JSON lines, does not hold for this board and file."""
     key = f"{_CACHE_VERSION}, OpenCV {cv2.__version__}, {board.describe()}"
     cached = _read_cache(cache)
     with cache.open("a", encoding="utf-8") as stream:

@@ -39,7 +39,7 @@ def test_a_pixel_is_the_mean_over_its_area(monkeypatch):
 
 
 def test_the_board_moves_over_the_frame(small_board, small_camera, monkeypatch):
-    monkeypatch.setattr(synthetic, "_render", lambda *_: np.zeros((small_camera.height, small_camera.width)))
+    monkeypatch.setattr(synthetic, "_shade", lambda _board, points, _pose: np.zeros(points.shape[:-1]))
     middles = []
     for _, _, pose in render_views(small_board, small_camera, count=6):
         width, height = small_board.size_mm

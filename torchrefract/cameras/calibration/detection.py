@@ -4,7 +4,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -36,6 +36,10 @@ class View(NamedTuple):
     ids: np.ndarray  # (N,), int, of `Board.corners`
     corners: np.ndarray  # (N, 2), float64, px
 
+    def only(self, mask: np.ndarray) -> "View":
+        """Return the view with the corners of a mask (N,), bool."""
+        return View(self.name, self.ids[mask], self.corners[mask])
+
 
 class Detection(NamedTuple):
     """The result of the search for a board in a picture."""
@@ -59,21 +63,17 @@ def detect(gray: np.ndarray, board: Board, *, name: str = "") -> View:
     overexposed board whose black squares do not touch. The picture is (H, W), uint8. A view without corners means that
     no board was found.
     """
-    if isinstance(board, Charuco):
-        ids, corners = _find_charuco(gray, board)
-        clearance = (board.square_mm - board.marker_mm) / board.square_mm / 2
-    else:
-        ids, corners = _find_chessboard(gray, board)
-        clearance = 0.5
-    if len(ids):
-        refined = _refine(gray, ids, corners, _WINDOW_SHARE * clearance)
-        # Corners of ChArUco boards are interpolated from markers, so that they are smooth even where they are wrong.
-        if isinstance(board, Charuco) or _is_as_smooth(board, refined, (ids, corners)):
-            ids, corners = refined
-        ids, corners = _drop_misfits(board, ids, corners)
-        if isinstance(board, Charuco):  # a chessboard is always visible as a whole
-            ids, corners = _drop_covered(gray, board, ids, corners)
-    return View(name, ids, corners.astype(np.float64).reshape(-1, 2))
+    is_charuco = isinstance(board, Charuco)
+    clearance = (board.square_mm - board.marker_mm) / board.square_mm / 2 if is_charuco else 0.5
+    ids, corners = _find_charuco(gray, board) if is_charuco else _find_chessboard(gray, board)
+    view = View(name, np.asarray(ids, dtype=int).ravel(), np.asarray(corners, dtype=np.float64).reshape(-1, 2))
+    if len(view.ids) == 0:
+        return view
+    refined = _refine(gray, view, _WINDOW_SHARE * clearance)
+    # Corners of ChArUco boards are interpolated from markers, so that they are smooth even where they are wrong.
+    view = refined if is_charuco or _is_as_smooth(board, refined, view) else view
+    view = _drop_misfits(board, view)
+    return _drop_covered(gray, board, view) if is_charuco else view  # a chessboard is always visible as a whole
 
 
 def has_enough_corners(view: View, board: Board) -> bool:
@@ -87,8 +87,9 @@ def candidates(option: str | bool) -> tuple[bool, ...]:
     return (False, True) if option == "auto" else (bool(option),)
 
 
-def _find_charuco(gray: np.ndarray, board: Charuco) -> tuple[np.ndarray, np.ndarray]:
-    best = np.empty(0, dtype=int), np.empty((0, 2))
+def _find_charuco(gray: np.ndarray, board: Charuco) -> tuple[Any, Any]:
+    """Return ids and corners as OpenCV has them, or two empty tuples."""
+    best: tuple[Any, Any] = (), ()
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = 1  # next to a corner, so that corners near the border of the picture count
     # On boards with an odd number of rows both patterns are equal.
@@ -97,42 +98,37 @@ def _find_charuco(gray: np.ndarray, board: Charuco) -> tuple[np.ndarray, np.ndar
         detector = cv2.aruco.CharucoDetector(board.to_opencv(legacy=legacy), parameters)
         corners, ids, _, _ = detector.detectBoard(255 - gray if inverted else gray)
         if ids is not None and len(ids) > len(best[0]):
-            best = ids.ravel(), corners.reshape(-1, 2)
+            best = ids, corners
     return best
 
 
-def _find_chessboard(gray: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
+def _find_chessboard(gray: np.ndarray, board: Board) -> tuple[Any, Any]:
     has_board, corners = cv2.findChessboardCornersSB(gray, board.num_corners, flags=SEARCH_FLAGS)
     if not has_board:
         has_board, corners = cv2.findChessboardCorners(gray, board.num_corners)
-    if not has_board:
-        return np.empty(0, dtype=int), np.empty((0, 2))
-    return np.arange(len(corners)), corners.reshape(-1, 2)
+    return (range(len(corners)), corners) if has_board else ((), ())
 
 
-def _refine(gray: np.ndarray, ids: np.ndarray, corners: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+def _refine(gray: np.ndarray, view: View, share: float) -> View:
     """Refine corners in windows with half sides of `share` times the distance to the next corner."""
     height, width = gray.shape
-    refined, is_near, is_inside = corners.copy(), [], []
-    for k, spacing in enumerate(_spacings(corners)):
+    refined, is_near, is_inside = view.corners.copy(), [], []
+    for k, spacing in enumerate(_spacings(view.corners)):
         smallest = min(_MIN_WINDOW_PX, max(2, int(_MIN_WINDOW_SQUARES * spacing)))
         half = int(np.clip(share * spacing, smallest, _MAX_WINDOW_PX))
-        start = corners[k].astype(np.float32).reshape(1, 1, 2)
-        x, y = refined[k] = cv2.cornerSubPix(gray, start.copy(), (half, half), (-1, -1), _STOP).reshape(2)
-        is_near.append(np.hypot(*(refined[k] - corners[k])) <= max(1.0, _MAX_MOVE * spacing))
+        start = view.corners[k].astype(np.float32).reshape(1, 1, 2)
+        x, y = refined[k] = cv2.cornerSubPix(gray, start, (half, half), (-1, -1), _STOP).reshape(2)
+        is_near.append(np.hypot(*(refined[k] - view.corners[k])) <= max(1.0, _MAX_MOVE * spacing))
         is_inside.append(min(x, y, width - 1 - x, height - 1 - y) > half + 1)
     if np.mean(is_near) < _MIN_REFINED:
-        return ids, corners
-    keep = np.logical_and(is_near, is_inside)
-    return ids[keep], refined[keep]
+        return view
+    return view._replace(corners=refined).only(np.logical_and(is_near, is_inside))
 
 
-def _is_as_smooth(
-    board: Board, refined: tuple[np.ndarray, np.ndarray], original: tuple[np.ndarray, np.ndarray]
-) -> bool:
+def _is_as_smooth(board: Board, refined: View, original: View) -> bool:
     """Return True if refined corners fit their neighbors nearly as well as the original ones."""
-    before = original[1][np.isin(original[0], refined[0])]
-    error, refined_error = (np.square(_misfits(board, refined[0], c)).mean() for c in (before, refined[1]))
+    views = original.only(np.isin(original.ids, refined.ids)), refined
+    error, refined_error = (np.square(_misfits(board, view)).mean() for view in views)
     return bool(error >= _SMOOTHNESS**2 * refined_error)
 
 
@@ -143,51 +139,47 @@ def _spacings(corners: np.ndarray) -> np.ndarray:
     return distances.min(axis=1) if len(corners) > 1 else np.zeros(len(corners))
 
 
-def _drop_misfits(board: Board, ids: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _drop_misfits(board: Board, view: View) -> View:
     # The worst one is dropped first, since it misleads the others.
-    while len(ids) > MIN_CORNERS:
-        errors = _misfits(board, ids, corners) / _spacings(corners).clip(min=1e-6)
-        worst = int(errors.argmax())
-        if errors[worst] <= _MAX_MISFIT:
+    while len(view.ids) > MIN_CORNERS:
+        errors = _misfits(board, view) / _spacings(view.corners).clip(min=1e-6)
+        if errors.max() <= _MAX_MISFIT:
             break
-        ids, corners = np.delete(ids, worst), np.delete(corners, worst, axis=0)
-    return ids, corners
+        view = view.only(np.arange(len(errors)) != errors.argmax())
+    return view
 
 
-def _misfits(board: Board, ids: np.ndarray, corners: np.ndarray) -> np.ndarray:
+def _misfits(board: Board, view: View) -> np.ndarray:
     """Return (N,), px, the distance of each corner from its place by the homography of its neighbors."""
-    errors = np.zeros(len(corners))
-    for k, point, matrix in _homographies(board, ids, corners):
-        errors[k] = np.hypot(*(cv2.perspectiveTransform(point[None, None], matrix).reshape(2) - corners[k]))
+    errors = np.zeros(len(view.ids))
+    for k, point, matrix in _homographies(board, view):
+        errors[k] = np.hypot(*(cv2.perspectiveTransform(point[None, None], matrix).reshape(2) - view.corners[k]))
     return errors
 
 
-def _homographies(board: Board, ids: np.ndarray, corners: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+def _homographies(board: Board, view: View) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Yield corners on the board with the homography to the picture by their neighbors, unless these are collinear."""
-    plane = board.corners(ids)[:, :2]
+    plane = board.corners(view.ids)[:, :2]
     distances = np.linalg.norm(plane[:, None] - plane[None], axis=2)
     for k, point in enumerate(plane):
         others = np.argsort(distances[k], kind="stable")[1 : _NUM_NEIGHBORS + 1]
         is_line = np.linalg.matrix_rank(plane[others] - plane[others].mean(axis=0)) < 2
         if len(others) >= 4 and not is_line:
-            yield k, point, cv2.findHomography(plane[others], corners[others], 0)[0]
+            yield k, point, cv2.findHomography(plane[others], view.corners[others], 0)[0]
 
 
-def _drop_covered(
-    gray: np.ndarray, board: Board, ids: np.ndarray, corners: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _drop_covered(gray: np.ndarray, board: Board, view: View) -> View:
     """Drop corners where two opposite squares are not clearly darker than the two others."""
-    contrasts = np.full(len(ids), np.nan)
+    contrasts = np.full(len(view.ids), np.nan)
     steps = _PROBE * board.square_mm * np.array([(0, 0), (-1, -1), (1, 1), (-1, 1), (1, -1)])
-    for k, point, matrix in _homographies(board, ids, corners):
+    for k, point, matrix in _homographies(board, view):
         pixels = cv2.perspectiveTransform((point + steps)[None], matrix).reshape(-1, 2)
-        x, y = (pixels[1:] - pixels[0] + corners[k]).astype(np.float32).T
+        x, y = (pixels[1:] - pixels[0] + view.corners[k]).astype(np.float32).T
         values = cv2.remap(gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float).ravel()
         contrasts[k] = max(values[:2].min() - values[2:].max(), values[2:].min() - values[:2].max())
     if np.isnan(contrasts).all():
-        return ids, corners
-    keep = np.isnan(contrasts) | (contrasts > _MIN_CONTRAST * np.nanmedian(contrasts))
-    return ids[keep], corners[keep]
+        return view
+    return view.only(np.isnan(contrasts) | (contrasts > _MIN_CONTRAST * np.nanmedian(contrasts)))
 
 
 def edge_width(gray: np.ndarray) -> float:

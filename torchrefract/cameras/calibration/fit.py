@@ -5,10 +5,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import torch
+from torch import Tensor
 
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.detection import View
 from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.conversion import least_squares
 from torchrefract.cameras.projection import COEFFICIENTS
 
 _FLAGS = {
@@ -22,7 +25,6 @@ LENS_MODELS = (*_FLAGS, "fisheye")
 MIN_VIEWS = 3  # of a fit; cross-validation needs one more
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-10)
 _MAX_RMS = 0.05  # of the width of the frame; a larger error means that the fit failed
-_MAX_POSE_STEPS = 30
 _NUM_DEVIATIONS = 6.0  # standard deviations of the rms of the other views
 _RATIO = 3.0  # to the median rms of the other views
 _MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
@@ -116,21 +118,14 @@ def errors_in_best_pose(view: View, board: Board, camera: Camera, pose: np.ndarr
 
     Only the pose is fitted, by the Levenberg-Marquardt method from `pose`: six parameters for 2 N values.
     """
-    points, damping = board.corners(view.ids), 1e-3
-    pixels, slopes, _ = project(camera, pose, points)
-    errors = view.corners - pixels
-    for _ in range(_MAX_POSE_STEPS):
-        normal = slopes.T @ slopes
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slopes.T @ errors.ravel())
-        pixels, new_slopes, _ = project(camera, pose + step, points)
-        new_errors = view.corners - pixels
-        if (new_errors**2).sum() <= (errors**2).sum():
-            pose, errors, slopes, damping = pose + step, new_errors, new_slopes, damping / 10
-        else:
-            damping *= 10
-        if np.abs(step).max() < 1e-9:
-            break
-    return errors
+    points = board.corners(view.ids)
+
+    def function(pose: Tensor) -> tuple[Tensor, Tensor]:
+        pixels, slopes, _ = project(camera, pose.numpy(), points)
+        return torch.from_numpy((pixels - view.corners).ravel()), torch.from_numpy(slopes)
+
+    best = least_squares(function, torch.from_numpy(pose))
+    return view.corners - project(camera, best.numpy(), points)[0]
 
 
 def cross_validate(views: Sequence[View], board: Board, fit: Fit, *, folds: int = 5) -> list[np.ndarray]:

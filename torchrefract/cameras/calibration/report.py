@@ -121,6 +121,12 @@ def _report(calibration: Calibration) -> str:
         "corners off straight lines, rectified": straightness(undistort_views(views, camera), board),
     }
     parameters = zip(fit.names, fit.values, fit.deviations, strict=True)
+    results = {view.name: (str(len(view.ids)), rms(e)) for view, e in zip(views, fit.errors, strict=True)}
+    view_rows = []
+    for one in calibration.ranking:
+        num_corners, error = results[one.name]
+        numbers = (f"{value:.3f}" for value in (error, one.error, one.limit, one.others))
+        view_rows.append((one.name, num_corners, *numbers))
     text = _REPORT.format(
         board=board.describe(),
         model=fit.model,
@@ -134,23 +140,11 @@ def _report(calibration: Calibration) -> str:
             [(name, f"{value:.6g}", f"{deviation:.2g}") for name, value, deviation in parameters],
         ),
         warnings="\n".join(f"- {message}" for message in calibration_warnings(views, fit)),
-        views=_table(
-            ("view", "corners", "error", "held-out error", "limit", "others without it"), _view_rows(calibration)
-        ),
+        views=_table(("view", "corners", "error", "held-out error", "limit", "others without it"), view_rows),
     )
     unused = [(name, f"dropped: {reason}") for name, reason in calibration.dropped.items()]
     unused += [(d.view.name, d.problem) for d in calibration.detections if d.problem]
     return f"{text}\n\n## Pictures not used\n\n{_table(('picture', 'reason'), unused)}" if unused else text
-
-
-def _view_rows(calibration: Calibration) -> list[tuple[str, ...]]:
-    fits = {v.name: (len(v.ids), rms(e)) for v, e in zip(calibration.views, calibration.fit.errors, strict=True)}
-    rows = []
-    for result in calibration.ranking:
-        num_corners, error = fits[result.name]
-        numbers = (f"{value:.3f}" for value in (error, result.error, result.limit, result.others))
-        rows.append((result.name, str(num_corners), *numbers))
-    return rows
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -257,10 +251,12 @@ def straightness(views: Sequence[View], board: Board) -> float:
     """
     squares, degrees_of_freedom = 0.0, 0
     for view in views:
-        for line in _lines(view, board):
-            # The smaller singular value is the root of the sum of squared distances from the line.
-            squares += float(np.linalg.svd(line - line.mean(axis=0), compute_uv=False)[1]) ** 2
-            degrees_of_freedom += len(line) - 2
+        for axis in np.divmod(view.ids, board.num_corners[0]):  # rows, then columns
+            for line in (view.corners[axis == k] for k in np.unique(axis)):
+                if len(line) >= _MIN_LINE:
+                    # The smaller singular value is the root of the sum of squared distances from the line.
+                    squares += float(np.linalg.svd(line - line.mean(axis=0), compute_uv=False)[1]) ** 2
+                    degrees_of_freedom += len(line) - 2
     if degrees_of_freedom == 0:
         raise ValueError(f"views must have {_MIN_LINE} corners of one row or column, got {len(views)} views without")
     return (squares / degrees_of_freedom) ** 0.5
@@ -272,13 +268,5 @@ def undistort_views(views: Sequence[View], camera: Camera) -> list[View]:
     undistorted = []
     for view in views:
         points, valid, _ = camera.undistort(torch.from_numpy((view.corners - center) / focal))
-        keep = valid.numpy()
-        undistorted.append(View(view.name, view.ids[keep], points.numpy()[keep] * focal + center))
+        undistorted.append(view._replace(corners=points.numpy() * focal + center).only(valid.numpy()))
     return undistorted
-
-
-def _lines(view: View, board: Board) -> list[np.ndarray]:
-    """Return the corners (n, 2) of each row and column that has at least three."""
-    row, column = np.divmod(view.ids, board.num_corners[0])
-    groups = [view.corners[axis == k] for axis in (row, column) for k in np.unique(axis)]
-    return [group for group in groups if len(group) >= _MIN_LINE]

@@ -27,25 +27,23 @@ def render_views(
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Render pictures of a board with a white margin of one square in front of a gray wall.
 
-    A pixel is the mean of 6 x 6 rays, with noise, rounded to 8 bits.
-
-    Args:
-        board: to render; "auto" patterns are rendered as False.
-        camera: that takes the pictures.
-        count: number of pictures; the board moves over the frame in rows.
-        seed: of the poses and of the noise.
+    A pixel is the mean of 6 x 6 rays, with noise, rounded to 8 bits. The board moves over the frame in rows; "auto"
+    patterns are rendered as False. `seed` is that of the poses and of the noise.
 
     Yields:
-        name: of the picture.
-        picture: (H, W), uint8.
-        pose: (6,), of the board, rotation vector and translation, mm.
+        The name of the picture; the picture (H, W), uint8; the pose of the board (6,), rotation vector and translation,
+        mm.
     """
     generator = np.random.default_rng(seed)
     pixels = np.stack(np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), axis=-1)
     rays = on_plane(camera, pixels)
     for number in range(count):
         pose = _pose(board, camera, number, count, generator)
-        shade = _render(board, rays, pose) + generator.normal(0, _NOISE, (camera.height, camera.width))
+        shade = _shade(board, rays, pose)
+        contrast = cv2.dilate(shade, np.ones((3, 3))) - cv2.erode(shade, np.ones((3, 3)))
+        edges = contrast > 0  # all rays of any other pixel meet one color
+        shade[edges] = _shade(board, subpixel_points(rays, edges), pose).mean(axis=-1)
+        shade += generator.normal(0, _NOISE, shade.shape)
         yield f"view_{number:02d}.png", shade.round().clip(0, 255).astype(np.uint8), pose
 
 
@@ -84,14 +82,6 @@ def _pose(board: Board, camera: Camera, number: int, count: int, generator: np.r
     middle = rotation @ (width / 2, height / 2, 0)
     position = distance * np.array([x, y, 1]) / np.sqrt(x * x + y * y + 1)
     return np.concatenate([cv2.Rodrigues(rotation)[0].ravel(), position - middle])
-
-
-def _render(board: Board, rays: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    shade = _shade(board, rays, pose)
-    contrast = cv2.dilate(shade, np.ones((3, 3))) - cv2.erode(shade, np.ones((3, 3)))
-    edges = contrast > 0  # all rays of any other pixel meet one color
-    shade[edges] = _shade(board, subpixel_points(rays, edges), pose).mean(axis=-1)
-    return shade
 
 
 def _shade(board: Board, points: np.ndarray, pose: np.ndarray) -> np.ndarray:

@@ -83,19 +83,14 @@ def distort_with_jacobian(
 
 
 def distort_by_factor(
-    x: Tensor,
-    y: Tensor,
-    numerator: Sequence[Tensor],
-    denominator: Sequence[Tensor],
-    p: Sequence[Tensor],
-    s: Sequence[Tensor],
+    x: Tensor, y: Tensor, k: Sequence[Tensor], denominator: Sequence[Tensor], p: Sequence[Tensor], s: Sequence[Tensor]
 ) -> tuple[Point, Jacobian]:
-    """Compute the polynomial with a ratio as its factor g (see `radial.py`), and its derivatives.
+    """Compute the polynomial with the ratio of k and the denominator (see `radial.py`) as g, and its derivatives.
 
     The derivatives of (x g, y g) are g I + 2 dg/d(r^2) (x, y)^T (x, y). p (p1, p2) and s (s1 ... s4) may be empty.
     """
     r2 = x * x + y * y
-    g, slope = factor_and_slope(r2, numerator, denominator)
+    g, slope = factor_and_slope(r2, k, denominator)
     shift_x, shift_y = _decentering(x, y, r2, p, s)
     cross = 2 * slope * x * y
     xx, xy, yx, yy = g + 2 * slope * x * x, cross, cross, g + 2 * slope * y * y

@@ -38,16 +38,8 @@ from torchrefract.cameras.calibration.synthetic import CAMERA, NUM_VIEWS, render
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_opencv, write_opencv
 from torchrefract.cli.command import make, naming, progress
+from torchrefract.data import media
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, pixels_of, read_image
-from torchrefract.data.media import (
-    check_output_folder,
-    convert_video,
-    find_media,
-    is_complete,
-    is_video,
-    output_name,
-    write_picture,
-)
 from torchrefract.fields.rectification import camera_flow
 from torchrefract.warping.warp import warp
 
@@ -230,10 +222,10 @@ def rectify(cfg: DictConfig) -> None:
     with naming("camera"):
         camera = read_opencv(str(cfg.camera))
         _, exists, pinhole = camera_flow(camera, zoom=zoom)
-    files = find_media(source)
+    files = media.find_media(source)
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
-    check_output_folder(out, source)
+    media.check_output_folder(out, source)
     for path, content in ((out / "lens.yaml", camera), (out / CAMERA_FILE, pinhole)):
         _write_camera(path, content)
     if not exists.all():
@@ -252,15 +244,15 @@ def rectify(cfg: DictConfig) -> None:
 
     num_written, skipped = 0, dict[Path, str]()
     for file in progress(files, "rectifying", count=len(files)):
-        target = out / output_name(file).name
+        target = out / media.output_name(file).name
         try:
-            if is_complete(file, target):
+            if media.is_complete(file, target):
                 continue
             with replace_file(target) as path:
-                if is_video(file):
-                    convert_video(file, path, change=partial(map, rectify_frame))
+                if media.is_video(file):
+                    media.convert_video(file, path, change=partial(map, rectify_frame))
                 else:
-                    write_picture(rectify_frame(read_image(file)[None].contiguous()), path)
+                    media.write_picture(rectify_frame(read_image(file)[None].contiguous()), path)
             num_written += 1
         except ValueError as error:
             skipped[file] = str(error) if isinstance(error, UnreadableImageError) else f"{file}: {error}"

@@ -107,12 +107,12 @@ def measure_board(name: str, entry: Mapping[str, Any], folder: Path) -> BoardRow
         return [view for view in views if has_enough_corners(view, board)]
 
     def held_out(views: Sequence[View], fit: Fit) -> float:
-        return rms(np.concatenate(cross_validate(views, board, fit, size=size)))
+        return rms(np.concatenate(cross_validate(views, board, fit)))
 
     views, opencv_views = usable(detect), usable(opencv_detect)
     selection = drop_outliers(views, board, model=LENS_MODEL, size=size)
     opencv_fit = fit_camera(opencv_views, board, model=LENS_MODEL, size=size)
-    camera, published = selection.fit.intrinsics.camera(size), entry.get("published")
+    camera, published = selection.fit.camera, entry.get("published")
     lines, rectified_lines = _line_errors(selection.views, pictures, board, camera)
     return BoardRow(
         name, len(pictures), len(selection.views), sum(len(view.ids) for view in selection.views),

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from torchrefract.cameras.calibration.boards import Charuco
-from torchrefract.cameras.calibration.fit import Intrinsics
 from torchrefract.cameras.calibration.synthetic import CAMERA, render_views
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io.opencv import read_opencv
+from torchrefract.cameras.io import read_opencv
 from torchrefract.cli import calibration
 
 SMALL = Camera(width=640, height=400, fx=380.0, fy=381.0, cx=322.3, cy=196.6, coefficients=(-0.25, 0.08, 0.003, -0.002))
@@ -68,9 +67,7 @@ def test_unusable_pictures_are_reported_with_a_reason(call, pictures, tmp_path, 
     cv2.imwrite(str(pictures / "odd.png"), cv2.resize(gray, (320, 200)))
     (pictures / "empty.png").touch()
     (pictures / "dead.png").symlink_to("gone.png")
-    # The lens turns at r = 0.456, and the corner of the frame is at 0.99 focal lengths.
-    folding = replace(SMALL, coefficients=(-1.6, 0.0, 0.0, 0.0))
-    monkeypatch.setattr(Intrinsics, "camera", lambda *_: folding)
+    monkeypatch.setattr(Camera, "coverage", lambda _: 0.75)
     outcome = call("calibrate", *OPTIONS)
     assert outcome.code == 0
     report = read_report(tmp_path)
@@ -79,7 +76,7 @@ def test_unusable_pictures_are_reported_with_a_reason(call, pictures, tmp_path, 
     assert "| odd.png | 320 x 200 px, other pictures have 640 x 400 px |" in report
     assert "| empty.png | unreadable: pictures/empty.png is empty (0 bytes) |" in report
     assert "| dead.png | unreadable: pictures/dead.png cannot be opened (No such file or directory) |" in report
-    line = f"The model folds back inside the frame: {1 - folding.coverage():.1%} of it has no ray."
+    line = "The model folds back inside the frame: 25.0% of it has no ray."
     assert outcome.err.startswith(f"warning: {line}")
     assert f"- {line}" in report
 
@@ -139,7 +136,9 @@ def test_a_failed_fit_keeps_the_detections(call, pictures, tmp_path, monkeypatch
     assert message.startswith("views must be enough for the model opencv4, got 6 that fit no camera")
     assert "The calibration failed: views must be enough for the model opencv4" in read_report(tmp_path)
     lines = (tmp_path / "calibration" / "detections.jsonl").read_text().splitlines()[1:]
-    assert min(len(json.loads(line)["ids"]) for line in lines) >= 6
+    for line in lines:
+        _, ((_, ids, _), *_) = json.loads(line)
+        assert len(ids) >= 6
 
 
 def test_pictures_of_many_sizes_are_rejected(call, pictures):

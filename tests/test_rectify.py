@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io.opencv import read_opencv, write_opencv
+from torchrefract.cameras.io import read_opencv, write_opencv
 from torchrefract.data.media import video_info
 from torchrefract.fields.rectification import camera_flow
 

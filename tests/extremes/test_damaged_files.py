@@ -24,10 +24,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from torchrefract import Camera
-from torchrefract.cameras.io.colmap import read_colmap, write_colmap
-from torchrefract.cameras.io.kalibr import read_kalibr, write_kalibr
-from torchrefract.cameras.io.opencv import read_opencv, write_opencv
-from torchrefract.cameras.io.ros import read_ros, write_ros
+from torchrefract.cameras import io as camera_io
 from torchrefract.cameras.lens_database import COLUMNS, read_lenses
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import UnreadableImageError, image_size, read_image
@@ -157,11 +154,11 @@ def image_readers() -> Iterator[Reader]:
 def camera_files(folder: Path) -> Iterator[Reader]:
     """Yield camera files of all formats, and a lens database."""
     files: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
-        "opencv.yaml": (partial(write_opencv, camera=CAMERA), read_opencv),
-        "opencv.xml": (partial(write_opencv, camera=CAMERA), read_opencv),
-        "ros.yaml": (partial(write_ros, camera=CAMERA), read_ros),
-        "kalibr.yaml": (partial(write_kalibr, cameras={"cam0": CAMERA}), read_kalibr),
-        "cameras.txt": (partial(write_colmap, cameras={1: CAMERA}), read_colmap),
+        "opencv.yaml": (partial(camera_io.write_opencv, camera=CAMERA), camera_io.read_opencv),
+        "opencv.xml": (partial(camera_io.write_opencv, camera=CAMERA), camera_io.read_opencv),
+        "ros.yaml": (partial(camera_io.write_ros, camera=CAMERA), camera_io.read_ros),
+        "kalibr.yaml": (partial(camera_io.write_kalibr, cameras={"cam0": CAMERA}), camera_io.read_kalibr),
+        "cameras.txt": (partial(camera_io.write_colmap, cameras={1: CAMERA}), camera_io.read_colmap),
         "lenses.csv": (lambda path: path.write_text(TABLE), read_lenses),
     }
     for name, (write, read) in files.items():
@@ -324,7 +321,7 @@ def test_xml_entities_fill_no_memory_and_open_no_file(declared, tmp_path):
         entities = f'<!ENTITY a9 SYSTEM "file://{tmp_path}/secret">'
     body = "<opencv_storage><image_width>&a9;</image_width></opencv_storage>"
     text = f'<?xml version="1.0"?><!DOCTYPE a [{entities}]>{body}'
-    reader = Reader("xml", text.encode(), read_opencv)
+    reader = Reader("xml", text.encode(), camera_io.read_opencv)
     assert isinstance(read_or_error(reader, tmp_path / "a.xml", reader.data), ValueError)
 
 

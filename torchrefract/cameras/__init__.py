@@ -1,8 +1,8 @@
 """Cameras: a pinhole and one of four lens models, with points, rays, conversion and a database of real lenses.
 
 `Camera` is one camera in plain numbers. `distort`, `undistort`, `project` and `unproject` take a batch of cameras as
-tensors, with gradients. `convert` fits another lens model to a camera. `read_lenses` reads real lenses. The modules of
-`torchrefract.cameras.io` read and write the files of OpenCV, ROS, Kalibr and COLMAP.
+tensors, with gradients. `convert` fits another lens model to a camera. `read_lenses` reads real lenses.
+`torchrefract.cameras.io` reads and writes the files of OpenCV, ROS, Kalibr and COLMAP.
 """
 
 from torchrefract.cameras.camera import Camera

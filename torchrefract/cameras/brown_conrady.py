@@ -2,10 +2,11 @@
 
 The model maps a point (x, y) of the plane z = 1 to the point where the lens shows it, in focal lengths from the
 principal point. All functions take x and y as separate tensors of any shapes (B, ...) that broadcast with coefficients
-(B, 12, ...), in the order of `POLYNOMIAL12`. To add a radial term, extend `RADIAL` in `radial.py`.
+(B, 12, ...), k1 ... k6, p1, p2, s1 ... s4, and compute only the given `terms`. To add a radial term, extend `RADIAL` in
+`radial.py`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from typing import NamedTuple
 
@@ -13,36 +14,23 @@ import torch
 from torch import Tensor
 
 from torchrefract._validation import eager_values
-from torchrefract.cameras.radial import (
-    RADIAL,
-    RadialLimit,
-    newton_radius,
-    radial_factor,
-    radial_factor_slope,
-)
+from torchrefract.cameras.radial import RADIAL, RadialLimit, factor_and_slope, newton_radius, radial_factor
 from torchrefract.warping.flow import Jacobian
 
-TANGENTIAL = ("p1", "p2")
-PRISM = ("s1", "s2", "s3", "s4")
-POLYNOMIAL12 = (*RADIAL, *TANGENTIAL, *PRISM)
-_SIZES = (len(RADIAL), len(TANGENTIAL), len(PRISM))
-
+POLYNOMIAL12 = (*RADIAL, "p1", "p2", "s1", "s2", "s3", "s4")
+MAX_RESIDUAL = {torch.float32: 2e-6, torch.float64: 1e-12}  # of an inverted point, relative to 1 + r_d
 _MIN_RADIAL_FACTOR = 0.1  # in the first guess of Newton's method
 _NEWTON_STEPS = {torch.float32: 3, torch.float64: 5}
-_RESIDUALS = {torch.float32: 2e-6, torch.float64: 1e-12}  # of an inverted point, relative to 1 + r_d
+
+Point = tuple[Tensor, Tensor]  # x and y
 
 
 class Terms(NamedTuple):
-    """The terms of the polynomial to compute; the coefficients of all others count as zero.
+    """The terms of the polynomial to compute; the coefficients of all others count as zero."""
 
-    radial: number of radial terms, k1 and on.
-    tangential: p1 and p2.
-    prism: s1 ... s4.
-    """
-
-    radial: int = len(RADIAL)
-    tangential: bool = True
-    prism: bool = True
+    radial: int = len(RADIAL)  # number of radial terms, k1 and on
+    tangential: bool = True  # p1 and p2
+    prism: bool = True  # s1 ... s4
 
     @property
     def bent(self) -> bool:
@@ -69,58 +57,41 @@ def used_terms(coefficients: Tensor) -> Terms:
     return Terms(order, any(tangential), any(prism))
 
 
-def distort_polynomial(x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms = ALL_TERMS) -> tuple[Tensor, Tensor]:
-    """Distort points by the extended Brown-Conrady model.
+def distort_polynomial(x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms = ALL_TERMS) -> Point:
+    """Distort points (x, y) of the plane z = 1 by the extended Brown-Conrady model, to focal lengths.
 
         x_d = x g + 2 p1 x y + p2 (r^2 + 2 x^2) + s1 r^2 + s2 r^4
         y_d = y g + p1 (r^2 + 2 y^2) + 2 p2 x y + s3 r^2 + s4 r^4,  g = 1 + sum k_i r^2i,  i = 1 ... 6
 
     It equals OpenCV's model if k4 = k5 = k6 = 0; OpenCV's coefficients of those names form a denominator.
 
-    Args:
-        x, y: (B, ...), on the plane z = 1.
-        coefficients: (B, 12, ...), k1 ... k6, p1, p2, s1 ... s4.
-        terms: the terms to compute.
-
-    Returns:
-        x_d, y_d: (B, ...), in focal lengths.
-
     Source: Brown, "Close-range camera calibration", Photogrammetric Engineering 37 (1971), with thin-prism terms.
     """
     k, p, s = _groups(coefficients, terms)
     r2 = x * x + y * y
     g = radial_factor(r2, k)
-    shift_x, shift_y = decentering(x, y, r2, p, s)
+    shift_x, shift_y = _decentering(x, y, r2, p, s)
     return x * g + shift_x, y * g + shift_y
 
 
 def distort_with_jacobian(
     x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms = ALL_TERMS
-) -> tuple[tuple[Tensor, Tensor], Jacobian]:
-    """Compute `distort_polynomial` and its derivatives with respect to x and y, with its arguments."""
+) -> tuple[Point, Jacobian]:
+    """Compute `distort_polynomial` and its derivatives with respect to x and y."""
     k, p, s = _groups(coefficients, terms)
-    r2 = x * x + y * y
-    return distort_by_factor(x, y, r2, radial_factor(r2, k), radial_factor_slope(r2, k), p, s)
-
-
-def decentering(x: Tensor, y: Tensor, r2: Tensor, p: Sequence[Tensor], s: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Compute the shift of points by tangential (p1, p2) and thin-prism (s1 ... s4) terms; either may be empty."""
-    shift_x = shift_y = torch.zeros_like(r2)
-    if p:
-        p1, p2 = p
-        shift_x = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        shift_y = 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-    if s:
-        s1, s2, s3, s4 = s
-        shift_x, shift_y = shift_x + r2 * (s1 + s2 * r2), shift_y + r2 * (s3 + s4 * r2)
-    return shift_x, shift_y
+    return distort_by_factor(x, y, k, (), p, s)
 
 
 def distort_by_factor(
-    x: Tensor, y: Tensor, r2: Tensor, g: Tensor, slope: Tensor, p: Sequence[Tensor], s: Sequence[Tensor]
-) -> tuple[tuple[Tensor, Tensor], Jacobian]:
-    """Compute (x g, y g) + `decentering` and its derivatives g I + 2 slope (x, y)^T (x, y) + ..., slope = dg/d(r^2)."""
-    shift_x, shift_y = decentering(x, y, r2, p, s)
+    x: Tensor, y: Tensor, k: Sequence[Tensor], denominator: Sequence[Tensor], p: Sequence[Tensor], s: Sequence[Tensor]
+) -> tuple[Point, Jacobian]:
+    """Compute the polynomial with the ratio of k and the denominator (see `radial.py`) as g, and its derivatives.
+
+    The derivatives of (x g, y g) are g I + 2 dg/d(r^2) (x, y)^T (x, y). p (p1, p2) and s (s1 ... s4) may be empty.
+    """
+    r2 = x * x + y * y
+    g, slope = factor_and_slope(r2, k, denominator)
+    shift_x, shift_y = _decentering(x, y, r2, p, s)
     cross = 2 * slope * x * y
     xx, xy, yx, yy = g + 2 * slope * x * x, cross, cross, g + 2 * slope * y * y
     if p:
@@ -134,19 +105,26 @@ def distort_by_factor(
     return (x * g + shift_x, y * g + shift_y), Jacobian(xx, xy, yx, yy)
 
 
+def _decentering(x: Tensor, y: Tensor, r2: Tensor, p: Sequence[Tensor], s: Sequence[Tensor]) -> Point:
+    shift_x = shift_y = torch.zeros_like(r2)
+    if p:
+        p1, p2 = p
+        shift_x = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        shift_y = 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+    if s:
+        s1, s2, s3, s4 = s
+        shift_x, shift_y = shift_x + r2 * (s1 + s2 * r2), shift_y + r2 * (s3 + s4 * r2)
+    return shift_x, shift_y
+
+
 def undistort_polynomial(
     x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, limit: RadialLimit, terms: Terms = ALL_TERMS
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Invert `distort_polynomial` by Newton's method, without gradient.
 
     Newton's method starts from the inverse of the radial terms, which a table gives to 1e-6. It runs along the radius
-    if there are only radial terms, otherwise in the plane (3 steps in float32, 5 in float64).
-
-    Args:
-        x_d, y_d: (B, ...), in focal lengths.
-        coefficients: (B, 12, ...), k1 ... k6, p1, p2, s1 ... s4.
-        limit: of the same coefficients, by `radial_limit`.
-        terms: the terms to compute.
+    if there are only radial terms, otherwise in the plane (3 steps in float32, 5 in float64). The limit is of the same
+    coefficients, by `radial_limit`.
 
     Returns:
         x, y: (B, ...), on the plane z = 1, finite everywhere.
@@ -158,74 +136,62 @@ def undistort_polynomial(
         r_d = (x_d * x_d + y_d * y_d).sqrt()
         r = limit.inverse(r_d)
         if not terms.bent:
-            r = newton_radius(r_d, r, limit, lambda r2: (radial_factor(r2, k), radial_factor_slope(r2, k)))
+            r = newton_radius(r_d, r, limit, k)
         scale = r / r_d.clamp(min=torch.finfo(r_d.dtype).tiny)
         x, y = scale * x_d, scale * y_d
         if terms.bent:
-            for _ in range(_NEWTON_STEPS[x.dtype]):
-                x, y = _newton_step(x, y, x_d, y_d, coefficients, terms)
+            steps = newton((x, y), (x_d, y_d), lambda x, y: distort_with_jacobian(x, y, coefficients, terms))
+            x, y = next(islice(steps, _NEWTON_STEPS[x.dtype], None))
         (back_x, back_y), jacobian = distort_with_jacobian(x, y, coefficients, terms)
         residual = torch.maximum((back_x - x_d).abs(), (back_y - y_d).abs())
-        exists = (residual <= _RESIDUALS[r_d.dtype] * (1 + r_d)) & (x * x + y * y <= limit.radius.square())
+        exists = (residual <= MAX_RESIDUAL[r_d.dtype] * (1 + r_d)) & (x * x + y * y <= limit.radius.square())
         if terms.bent:  # radial terms alone keep the orientation up to the limit
             exists = exists & (jacobian.determinant >= 0)
         return x.nan_to_num(0, 0, 0), y.nan_to_num(0, 0, 0), exists
 
 
-def newton_undistort(
-    x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, steps: int, terms: Terms = ALL_TERMS
-) -> tuple[Tensor, Tensor]:
-    """Invert `distort_polynomial` by a fixed number of Newton steps in the plane, without gradient.
+def newton_undistort(x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, steps: int, terms: Terms = ALL_TERMS) -> Point:
+    """Invert `distort_polynomial` by a fixed number of Newton steps in the plane, 0 or more, without gradient.
 
     Converges for lenses that do not fold near the points; checks nothing.
-
-    Args:
-        x_d, y_d: (B, ...), in focal lengths.
-        coefficients: (B, 12, ...), k1 ... k6, p1, p2, s1 ... s4.
-        steps: number of steps, 0 or more.
-        terms: the terms to compute.
     """
     with torch.no_grad():
         return next(islice(newton_iterates(x_d, y_d, coefficients, terms=terms), steps, None))
 
 
-def newton_iterates(
-    x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, terms: Terms = ALL_TERMS
-) -> Iterator[tuple[Tensor, Tensor]]:
+def newton_iterates(x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, terms: Terms = ALL_TERMS) -> Iterator[Point]:
     """Yield the iterates of `newton_undistort` after 0, 1, 2 ... steps, without end.
 
     The first guess divides the distorted point by the radial factor at that point.
     """
     g = radial_factor(x_d * x_d + y_d * y_d, _groups(coefficients, terms)[0]).clamp(min=_MIN_RADIAL_FACTOR)
-    x, y = x_d / g, y_d / g
+    start = x_d / g, y_d / g
+    return newton(start, (x_d, y_d), lambda x, y: distort_with_jacobian(x, y, coefficients, terms))
+
+
+def newton(
+    point: Point, target: Point, function: Callable[[Tensor, Tensor], tuple[Point, Jacobian]]
+) -> Iterator[Point]:
+    """Yield the iterates of Newton's method for function(point) = target in the plane, without end."""
     while True:
-        yield x, y
-        x, y = _newton_step(x, y, x_d, y_d, coefficients, terms)
+        yield point
+        (x, y), jacobian = function(*point)
+        step_x, step_y = jacobian.solve(x - target[0], y - target[1])
+        point = point[0] - step_x, point[1] - step_y
 
 
-def implicit(point: tuple[Tensor, Tensor], error: tuple[Tensor, Tensor], jacobian: Jacobian) -> tuple[Tensor, Tensor]:
+def implicit(point: Point, error: Point, jacobian: Jacobian) -> Point:
     """Attach the gradient of the exact inverse to a solved point, by one Newton step of length zero.
 
-    Args:
-        point: x and y, solved without gradient.
-        error: distort(point) minus the target, with gradient.
-        jacobian: of the model at the point, without gradient.
+    The error is distort(point) minus the target, with gradient; point and Jacobian have none.
     """
     step_x, step_y = jacobian.solve(error[0] - error[0].detach(), error[1] - error[1].detach())
     return point[0] - step_x, point[1] - step_y
 
 
-def _newton_step(
-    x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, coefficients: Tensor, terms: Terms
-) -> tuple[Tensor, Tensor]:
-    (back_x, back_y), jacobian = distort_with_jacobian(x, y, coefficients, terms)
-    step_x, step_y = jacobian.solve(back_x - x_d, back_y - y_d)
-    return x - step_x, y - step_y
-
-
 def _split(values: Sequence) -> tuple[Sequence, Sequence, Sequence]:
-    first, second, _ = _SIZES
-    return values[:first], values[first : first + second], values[first + second :]
+    n = len(RADIAL)
+    return values[:n], values[n : n + 2], values[n + 2 :]
 
 
 def _groups(coefficients: Tensor, terms: Terms) -> tuple[Sequence[Tensor], Sequence[Tensor], Sequence[Tensor]]:

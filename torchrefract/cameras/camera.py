@@ -1,28 +1,21 @@
 """A camera: a pinhole behind a lens."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import check_choice, check_count, check_number, check_positive, check_tensor
-from torchrefract.cameras.brown_conrady import POLYNOMIAL12, RADIAL
-from torchrefract.cameras.projection import (
-    COEFFICIENTS,
-    MODELS,
-    PointResult,
-    distort,
-    project,
-    undistort,
-    unproject,
-    valid_radius,
-)
-from torchrefract.cameras.radial import falls_before, first_root, growth_of_polynomial, growth_of_ratio
-from torchrefract.cameras.rational import ratio
+from torchrefract.cameras import projection
+from torchrefract.cameras.brown_conrady import POLYNOMIAL12
+from torchrefract.cameras.projection import COEFFICIENTS, MODELS, PointResult
+from torchrefract.cameras.radial import falls_before, first_root, growth
+from torchrefract.cameras.rational import RationalLens
 
 _GRID = 129  # points along each side of the frame at which `coverage` looks for a ray
 DIRECTIONS = ("horizontal", "vertical")
@@ -85,23 +78,22 @@ class Camera:
 
     @staticmethod
     def from_opencv(matrix: Any, coefficients: Any, *, width: int, height: int) -> "Camera":
-        """Create a camera from the results of `cv2.calibrateCamera`.
+        """Create a camera of frames of width x height px from the results of `cv2.calibrateCamera`.
 
         Args:
             matrix: (3, 3), an array or nested lists.
             coefficients: 4, 5, 8, 12 or 14 numbers, an array of any shape or nested lists.
-            width, height: px, of the frames.
 
         Raises:
             ValueError: the matrix is not 3 x 3 or has skew; see also `Camera`.
         """
-        rows = [[float(value) for value in row] for row in matrix]
-        if [len(row) for row in rows] != [3, 3, 3]:
-            raise ValueError(f"matrix must be 3 x 3, got {len(rows)} rows of {[len(row) for row in rows]}")
-        (fx, skew, cx), (_, fy, cy), _ = rows
+        rows, numbers = np.asarray(matrix, dtype=float), np.asarray(coefficients, dtype=float).ravel()
+        if rows.shape != (3, 3):
+            raise ValueError(f"matrix must be 3 x 3, got {rows.shape}")
+        (fx, skew, cx), (_, fy, cy), _ = rows.tolist()
         if skew != 0:
             raise ValueError(f"matrix must have no skew, got {skew:g}")
-        return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=tuple(_flat(coefficients)))
+        return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=tuple(numbers.tolist()))
 
     @property
     def matrix(self) -> tuple[tuple[float, float, float], ...]:
@@ -111,7 +103,7 @@ class Camera:
     @property
     def valid_radius(self) -> float:
         """Return the radius on the plane z = 1 up to which the lens is one-to-one; the angle in rad for a fisheye."""
-        return valid_radius(torch.tensor([self.coefficients], dtype=torch.float64), model=self.model).item()
+        return projection.valid_radius(torch.tensor([self.coefficients], dtype=torch.float64), model=self.model).item()
 
     @property
     def is_pinhole(self) -> bool:
@@ -129,18 +121,13 @@ class Camera:
         """Return the coefficients in the order of "polynomial12".
 
         Raises:
-            ValueError: `is_polynomial` is false: the model is "fisheye" or "division", or OpenCV's denominator (k4,
-                k5, k6) or tilt (tau_x, tau_y) is not zero.
+            ValueError: `is_polynomial` is False.
         """
-        if self.model not in ("polynomial12", "opencv"):
-            raise ValueError(
-                f"model must be polynomial12, or opencv without denominator and tilt (convert(camera, "
-                f'to="polynomial12") finds the nearest polynomial), got {self.model}'
-            )
         if not self.is_polynomial:
             raise ValueError(
-                "coefficients must have k4, k5, k6, tau_x and tau_y of zero, since OpenCV's denominator and tilt are "
-                f'not polynomials (convert(camera, to="polynomial12") finds the nearest), got {self.coefficients}'
+                "model must be polynomial12, or opencv without denominator and tilt: k4, k5, k6, tau_x and tau_y of "
+                'zero (convert(camera, to="polynomial12") finds the nearest polynomial), got '
+                f"{self.model} with {self.coefficients}"
             )
         if self.model == "polynomial12":
             return self.coefficients
@@ -149,19 +136,19 @@ class Camera:
 
     def distort(self, points: Tensor) -> PointResult:
         """Distort points (N, 2) or (B, N, 2) of the plane z = 1, see `projection.distort`."""
-        return self._apply(distort, points)
+        return self._apply(projection.distort, points)
 
     def undistort(self, points: Tensor) -> PointResult:
         """Undistort points (N, 2) or (B, N, 2) in focal lengths, see `projection.undistort`."""
-        return self._apply(undistort, points)
+        return self._apply(projection.undistort, points)
 
     def project(self, points: Tensor) -> PointResult:
         """Project points in space (N, 3) or (B, N, 3) to pixels, see `projection.project`."""
-        return self._apply(project, points, has_pinhole=True)
+        return self._apply(projection.project, points, has_pinhole=True)
 
     def unproject(self, pixels: Tensor) -> PointResult:
         """Return the rays of unit length of pixels (N, 2) or (B, N, 2), see `projection.unproject`."""
-        return self._apply(unproject, pixels, name="pixels", has_pinhole=True)
+        return self._apply(projection.unproject, pixels, name="pixels", has_pinhole=True)
 
     def tensors(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return coefficients (1, n), focal lengths (1, 2) and center (1, 2), px, with dtype and device of `like`."""
@@ -213,8 +200,7 @@ class Camera:
     def flipped(self, direction: str) -> "Camera":
         """Return the camera of the same frames mirrored left to right ("horizontal") or top to bottom ("vertical").
 
-        cx' = W - 1 - cx, and the coefficients of terms that are odd in x change their sign: p2, s1, s2, tau_y.
-        Likewise cy with p1, s3, s4 and tau_x.
+        cx' = W - 1 - cx, and the coefficients of terms that are odd in x change their sign; likewise cy.
         """
         odd = _ODD[check_choice("direction", direction, DIRECTIONS)]
         pairs = zip(COEFFICIENTS[self.model], self.coefficients, strict=False)
@@ -266,21 +252,12 @@ class Camera:
     def _check_growth(self) -> None:
         """Raise ValueError if the lens folds back within a pixel; with Python numbers, so that compilers can trace."""
         c = self.coefficients
-        if self.model == "opencv":
-            numerator, denominator = ratio((*c, *(0.0,) * 4))
-            growths = [growth_of_ratio(numerator, denominator), denominator]
-        elif self.model == "division":
+        if self.model == "division":
             growths = [c, [-value for value in c]]
+        elif self.model == "fisheye":
+            growths = [growth(c)]
         else:
-            growths = [growth_of_polynomial(c[: len(RADIAL)])]
-        if any(falls_before(growth, 1 / min(self.fx, self.fy) ** 2) for growth in growths):
+            lens = RationalLens.of((*c, *(0.0,) * 4) if self.model == "opencv" else c, self.model)
+            growths = [growth(lens.numerator, lens.denominator), lens.denominator]
+        if any(falls_before(a, 1 / min(self.fx, self.fy) ** 2) for a in growths):
             raise ValueError(f"coefficients must leave at least one pixel that does not fold back, got {c}")
-
-
-def _flat(values: Any) -> Sequence[float]:
-    """Return the numbers of an array or of nested lists, in order."""
-    if hasattr(values, "tolist"):
-        values = values.tolist()
-    if isinstance(values, int | float):
-        return [float(values)]
-    return [number for value in values for number in _flat(value)]

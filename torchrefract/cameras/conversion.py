@@ -20,17 +20,12 @@ _DEFAULT_COUNTS = {"polynomial12": 12, "opencv": 8, "fisheye": 4, "division": 1}
 
 
 class Conversion(NamedTuple):
-    """A converted camera and its distance from the original.
+    """A converted camera and its distance from the original."""
 
-    camera: with the pinhole of the original.
-    max_px, rms_px: distance between the pixels where both show the same ray, over the covered part of the frame.
-    covered: share of the frame whose rays lie within `most_angle_deg` and are shown by both cameras.
-    """
-
-    camera: Camera
-    max_px: float
-    rms_px: float
-    covered: float
+    camera: Camera  # with the pinhole of the original
+    max_px: float  # distance between the pixels where both show the same ray, over the covered part of the frame
+    rms_px: float  # of the same distances
+    covered: float  # share of the frame whose rays lie within `most_angle_deg` and are shown by both cameras
 
 
 def convert(camera: Camera, *, to: str, count: int | None = None, most_angle_deg: float = 80.0) -> Conversion:
@@ -76,45 +71,43 @@ def _fit(camera: Camera, to: str, count: int, min_z: float) -> tuple[float, ...]
         points = torch.cat(image_of_rays(x, y, z, coefficients, to), dim=1)
         return points * focal + center - target
 
-    return tuple(least_squares(error, torch.zeros(count, dtype=torch.float64), rows=len(target)).tolist())
+    start = torch.zeros(count, dtype=torch.float64)
+    return tuple(least_squares(lambda c: _linearize(error, c, len(target)), start).tolist())
 
 
-def least_squares(error: Callable[[Tensor], Tensor], start: Tensor, *, rows: int) -> Tensor:
-    """Minimize the sum of squares of a function by the Levenberg-Marquardt method.
+def least_squares(function: Callable[[Tensor], tuple[Tensor, Tensor]], start: Tensor) -> Tensor:
+    """Minimize a sum of squares by the Levenberg-Marquardt method, from parameters (n,), float64.
 
-    Each step solves (J^T J + damping diag(J^T J)) step = -J^T error as a linear least-squares problem.
-
-    Args:
-        error: maps parameters (rows, n), one copy for each row, to values (rows, k); row i depends on copy i only.
-        start: (n,), float64.
-        rows: number of rows.
-
-    Returns:
-        (n,), the parameters.
+    Each step solves (J^T J + damping diag(J^T J)) step = -J^T values as a linear least-squares problem. The function
+    maps parameters to values (m,) and their derivatives J (m, n).
 
     Source: Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", SIAM J. 11 (1963).
     """
     parameters, damping = start, 1e-3
-    value, jacobian = _linearize(error, parameters, rows)
+    values, jacobian = function(start)
     for _ in range(_MAX_STEPS):
-        before = value.square().sum()
+        before = values.square().sum()
         while damping < _MAX_DAMPING:
-            candidate = parameters + _step(jacobian, value, damping)
+            candidate = parameters + _step(jacobian, values, damping)
+            new_values, new_jacobian = function(candidate)
             # A step past a pole gives NaN, which compares as false.
-            if error(candidate.expand(rows, -1)).square().sum() < before:
+            if new_values.square().sum() < before:
                 break
             damping *= 10
         else:
             return parameters
         parameters, damping = candidate, max(damping / 10, _MIN_DAMPING)
-        value, jacobian = _linearize(error, parameters, rows)
-        if before - value.square().sum() <= _CONVERGED * before:
+        values, jacobian = new_values, new_jacobian
+        if before - values.square().sum() <= _CONVERGED * before:
             break
     return parameters
 
 
 def _linearize(error: Callable[[Tensor], Tensor], parameters: Tensor, rows: int) -> tuple[Tensor, Tensor]:
-    """Return the values (rows k,) and their derivatives (rows k, n), by one backward pass for each of the k columns."""
+    """Return the values (rows k,) of a function and their derivatives (rows k, n), by k backward passes.
+
+    `error` maps parameters (rows, n), one copy for each row, to values (rows, k); row i depends on copy i only.
+    """
     with torch.enable_grad():
         copies = parameters.detach().expand(rows, -1).clone().requires_grad_()
         columns = error(copies).unbind(1)
@@ -122,11 +115,11 @@ def _linearize(error: Callable[[Tensor], Tensor], parameters: Tensor, rows: int)
     return torch.cat(columns).detach(), torch.cat(slopes)
 
 
-def _step(jacobian: Tensor, value: Tensor, damping: float) -> Tensor:
+def _step(jacobian: Tensor, values: Tensor, damping: float) -> Tensor:
     # Columns hold r^3 up to r^13: scaled to equal length, so that the problem is well conditioned.
     scale = jacobian.square().sum(dim=0).sqrt().clamp(min=1e-12)
     damped = math.sqrt(damping) * torch.eye(len(scale), dtype=scale.dtype)
-    right = torch.cat([-value, value.new_zeros(len(scale))])
+    right = torch.cat([-values, values.new_zeros(len(scale))])
     step = torch.linalg.lstsq(torch.cat([jacobian / scale, damped]), right[:, None], driver="gelsd").solution
     return step[:, 0] / scale
 

@@ -15,24 +15,15 @@ _PACKAGED = Path(__file__).with_name("lenses.csv")
 
 
 class Lens(NamedTuple):
-    """A row of the database.
+    """A row of the database."""
 
-    name: unique name of the row.
-    title: camera and lens.
-    camera: as published.
-    polynomial: the camera converted to "polynomial12"; None if no polynomial comes close.
-    residual_px: largest distance between the two over the frame, px, or of the closest polynomial if it is None.
-    source: repository and file that the numbers come from.
-    licence: stated by the source.
-    """
-
-    name: str
-    title: str
-    camera: Camera
-    polynomial: Camera | None
-    residual_px: float
-    source: str
-    licence: str
+    name: str  # unique
+    title: str  # camera and lens
+    camera: Camera  # as published
+    polynomial: Camera | None  # the camera converted to "polynomial12"; None if no polynomial comes close
+    residual_px: float  # largest distance between the two over the frame, or of the closest polynomial if it is None
+    source: str  # repository and file that the numbers come from
+    licence: str  # stated by the source
 
 
 def read_lenses(path: str | Path | None = None) -> tuple[Lens, ...]:

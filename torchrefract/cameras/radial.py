@@ -1,12 +1,13 @@
 """Radial factors of lens models: their values, how far out they can be inverted, and their inverse.
 
-A radially symmetric lens maps the radius r to r_d = r g(r^2). For the polynomial models
-g(r^2) = 1 + k_1 r^2 + ... + k_n r^2n. A fisheye is the same with the angle to the axis in place of r.
+A radially symmetric lens maps the radius r to r_d = r g(r^2) with a ratio of polynomials g = N / D,
+N = 1 + n_1 r^2 + n_2 r^4 + ..., D likewise. The Brown-Conrady polynomial has no denominator, so D = 1. A fisheye is
+the same with the angle to the axis in place of r. The division model is radial too, with closed forms both ways.
 
 The lens is one-to-one from its center up to the radius where dr_d/dr reaches zero: beyond it the image folds back.
 dr_d/dr is, up to a positive factor, a polynomial 1 + a_1 q + ... + a_n q^n in q = r^2, called the growth here.
 
-The division model is radial too, and has closed forms in both directions.
+Coefficients of a polynomial are a sequence without the leading 1: `numerator`, and `denominator`, which may be empty.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,29 +22,33 @@ _MAX_IMAGE_RADIUS = 1e3  # focal lengths; farther points are outside every lens 
 _DOUBLINGS = 12  # of the radius after distortion, to bracket the radius before it
 
 
-def radial_factor(r2: Tensor, k: Sequence[Tensor]) -> Tensor:
-    """Evaluate g = 1 + sum k_i r^2i by Horner's rule; `k` may be empty."""
+def radial_factor(r2: Tensor, numerator: Sequence[Tensor], denominator: Sequence[Tensor] = ()) -> Tensor:
+    """Evaluate g at r^2 by Horner's rule."""
     value = torch.zeros_like(r2)
-    for coefficient in reversed(k):
+    for coefficient in reversed(numerator):
         value = (value + coefficient) * r2
-    return 1 + value
+    return (1 + value) / radial_factor(r2, denominator) if denominator else 1 + value
 
 
-def radial_factor_slope(r2: Tensor, k: Sequence[Tensor]) -> Tensor:
-    """Evaluate dg/d(r^2) = sum i k_i r^(2i - 2)."""
+def factor_and_slope(
+    r2: Tensor, numerator: Sequence[Tensor], denominator: Sequence[Tensor] = ()
+) -> tuple[Tensor, Tensor]:
+    """Evaluate g and dg/d(r^2) at r^2."""
+    g, slope = radial_factor(r2, numerator, denominator), _slope(r2, numerator)
+    if denominator:
+        slope = (slope - g * _slope(r2, denominator)) / radial_factor(r2, denominator)
+    return g, slope
+
+
+def _slope(r2: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
     value = torch.zeros_like(r2)
-    for i, coefficient in reversed(list(enumerate(k, start=1))):
+    for i, coefficient in reversed(list(enumerate(coefficients, start=1))):
         value = value * r2 + i * coefficient
     return value
 
 
-def growth_of_polynomial(k: Sequence[Any]) -> list[Any]:
-    """Return a_1 ... a_n of d/dr [r (1 + sum k_i r^2i)] = 1 + sum (2 i + 1) k_i q^i."""
-    return [(2 * i + 1) * value for i, value in enumerate(k, start=1)]
-
-
-def growth_of_ratio(numerator: Sequence[Any], denominator: Sequence[Any]) -> list[Any]:
-    """Return a_1 ... a_n of the growth of r N / D with N = 1 + sum n_i q^i and D = 1 + sum d_i q^i.
+def growth(numerator: Sequence[Any], denominator: Sequence[Any] = ()) -> list[Any]:
+    """Return a_1 ... a_n of the growth of r N / D, of numbers or tensors.
 
     d/dr [r N / D] = [N D + 2 q (N' D - N D')] / D^2, so that n_i d_j (1 + 2 (i - j)) belongs to q^(i + j).
     """
@@ -59,13 +64,8 @@ def first_root(a: Tensor) -> Tensor:
     """Return the smallest positive root of 1 + a_1 q + ... + a_n q^n, or inf if there is none.
 
     With z = 1 / q it is the largest positive root of z^n + a_1 z^(n - 1) + ... + a_n, an eigenvalue of a companion
-    matrix. A root where the polynomial touches zero without crossing it counts.
-
-    Args:
-        a: (B, n), float64.
-
-    Returns:
-        (B,), float64, without gradient.
+    matrix. A root where the polynomial touches zero without crossing it counts. Takes (B, n) and returns (B,), both
+    float64, without gradient.
     """
     with torch.no_grad():
         batch, n = a.shape
@@ -85,27 +85,35 @@ def falls_before(a: Sequence[float], q_max: float) -> bool:
     return any(1 + sum(value * q**i for i, value in enumerate(a, start=1)) <= 0 for q in points)
 
 
+def first_fall(falls: Callable[[Tensor], Tensor], reach: Tensor) -> Tensor:
+    """Search the radius (B,) up to `reach` (B,) where a radial map stops growing, on a lattice that is refined twice.
+
+    `falls` maps radii (B, n) to (B, n), bool: the map does not grow there. Returns `reach` if it never falls.
+    """
+    has_fall = falls(reach[:, None] * _steps(reach)).any(dim=1)
+    radius, width = torch.zeros_like(reach), reach
+    for _ in range(3):
+        first = falls(radius[:, None] + width[:, None] * _steps(reach)).long().argmax(dim=1)
+        width = width / _NODES
+        radius = torch.where(has_fall, radius + (first - 1).clamp(min=0) * width, reach)
+    return radius
+
+
 class RadialLimit(NamedTuple):
     """The largest radius up to which a radial map can be inverted, with a table of its inverse.
 
     radius: (B, 1, ...), the largest radius before distortion, on the plane z = 1.
     image_radius: (B, 1, ...), the largest radius after distortion in the table.
-    folds: (B,), bool: the map stops growing at `radius`; False if it was not searched farther.
     table: (B, 2049), the radius before distortion at r_d = image_radius (1 - (1 - i / 2048)^2). Near a fold the inverse
         behaves like a square root, and on these nodes it is smooth.
     """
 
     radius: Tensor
     image_radius: Tensor
-    folds: Tensor
     table: Tensor
 
     def inverse(self, r_d: Tensor) -> Tensor:
-        """Interpolate the radius before distortion in the table, to about 1e-6; beyond the table it is `radius`.
-
-        Args:
-            r_d: (B, ...), the radius after distortion.
-        """
+        """Interpolate the radius before distortion at (B, ...), to about 1e-6; beyond the table it is `radius`."""
         position = _NODES * (1 - (1 - r_d / self.image_radius).clamp(min=0).sqrt())
         node = position.long().clamp(0, _NODES - 1)
         index = node.flatten(1)
@@ -116,8 +124,6 @@ class RadialLimit(NamedTuple):
 def radial_limit(coefficients: Tensor, reach: Tensor, image_reach: Tensor) -> RadialLimit:
     """Compute how far out the radial terms of the Brown-Conrady polynomial can be inverted.
 
-    The fold is searched on a lattice of radii that is refined twice.
-
     Args:
         coefficients: (B, 12, ...), with one dimension for each dimension of the points.
         reach: (B,), the largest radius on the plane z = 1 to search.
@@ -125,94 +131,63 @@ def radial_limit(coefficients: Tensor, reach: Tensor, image_reach: Tensor) -> Ra
     """
     with torch.no_grad():
         k = coefficients.flatten(1)[:, : len(RADIAL), None].unbind(1)
-        growth = growth_of_polynomial(k)
-        radius, folds = first_fall(lambda r: radial_factor(r * r, growth) <= 0, reach)
-        shape = (-1,) + (1,) * (coefficients.ndim - 2)
-        return _tabulate(radius, folds, image_reach, lambda r: r * radial_factor(r * r, k), shape)
+        radius = first_fall(lambda r: radial_factor(r * r, growth(k)) <= 0, reach)
+        limit, shape = _tabulate(radius, image_reach, k, ()), (-1,) + (1,) * (coefficients.ndim - 2)
+        return RadialLimit(radius.view(shape), limit.image_radius.view(shape), limit.table)
 
 
-def first_fall(falls: Callable[[Tensor], Tensor], reach: Tensor) -> tuple[Tensor, Tensor]:
-    """Search the radius where a radial map stops growing, on a lattice that is refined twice.
+def invert_radius(
+    r_d: Tensor, radius: Tensor, numerator: Sequence[Tensor], denominator: Sequence[Tensor] = ()
+) -> Tensor:
+    """Solve r g(r^2) = r_d for r (B, N) by a table and Newton's method, without gradient.
 
-    Args:
-        falls: maps radii (B, n) to (B, n), bool: the map does not grow there.
-        reach: (B,), the largest radius to search.
-
-    Returns:
-        radius: (B,), just before the first fall; `reach` if there is none.
-        has_fall: (B,), bool.
-    """
-    has_fall = falls(reach[:, None] * _steps(reach)).any(dim=1)
-    radius, width = torch.zeros_like(reach), reach
-    for _ in range(3):
-        first = falls(radius[:, None] + width[:, None] * _steps(reach)).long().argmax(dim=1)
-        width = width / _NODES
-        radius = torch.where(has_fall, radius + (first - 1).clamp(min=0) * width, reach)
-    return radius, has_fall
-
-
-def limit_of_curve(radius: Tensor, image_reach: Tensor, curve: Callable[[Tensor], Tensor]) -> RadialLimit:
-    """Compute the limit of any radial map that grows up to a given radius.
-
-    Args:
-        radius: (B,), inf if the map always grows.
-        image_reach: (B,), the largest radius after distortion that will be inverted.
-        curve: maps radii (B, n) before distortion to radii after it.
-
-    Returns:
-        The limit; `radius` and `image_radius` have shape (B, 1).
+    `radius` (B,), up to which the map grows, is inf if it always does. Each coefficient is (B, 1).
     """
     with torch.no_grad():
+        zero = r_d.new_zeros(r_d.shape[0], 1)
+        image_reach = torch.cat([zero, r_d], dim=1).clamp(max=_MAX_IMAGE_RADIUS).amax(dim=1)
+        image_reach = 1.1 * image_reach.clamp(min=1e-3)
         # A radius far beyond the points would make the table coarse: bracket what they need by doubling.
         powers = 2.0 ** torch.arange(_DOUBLINGS + 1, dtype=radius.dtype, device=radius.device)
         radii = torch.minimum(image_reach[:, None] * powers, radius[:, None])
-        first = (curve(radii) < image_reach[:, None]).sum(dim=1, keepdim=True).clamp(max=_DOUBLINGS)
-        reach = radii.gather(1, first)[:, 0]
-        limit = _tabulate(reach, reach == radius, image_reach, curve, (-1, 1))
-        return limit._replace(radius=radius[:, None])
-
-
-def reach_of(r_d: Tensor) -> Tensor:
-    """Return (B,), the radius after distortion that a table for radii (B, N) must cover."""
-    zero = r_d.new_zeros(r_d.shape[0], 1)
-    return 1.1 * torch.cat([zero, r_d], dim=1).clamp(max=_MAX_IMAGE_RADIUS).amax(dim=1).clamp(min=1e-3)
+        reached = radii * radial_factor(radii * radii, numerator, denominator)
+        first = (reached < image_reach[:, None]).sum(dim=1, keepdim=True).clamp(max=_DOUBLINGS)
+        limit = _tabulate(radii.gather(1, first)[:, 0], image_reach, numerator, denominator)
+        limit = limit._replace(radius=radius[:, None])
+        return newton_radius(r_d, limit.inverse(r_d), limit, numerator, denominator)
 
 
 def newton_radius(
-    r_d: Tensor, start: Tensor, limit: RadialLimit, factor_and_slope: Callable[[Tensor], tuple[Tensor, Tensor]]
+    r_d: Tensor, start: Tensor, limit: RadialLimit, numerator: Sequence[Tensor], denominator: Sequence[Tensor] = ()
 ) -> Tensor:
-    """Solve r g(r^2) = r_d for r by Newton's method from a start with an error of about 1e-6.
-
-    Takes 2 steps in float32 and 3 in float64.
-
-    Args:
-        r_d, start: (B, ...).
-        limit: of the map.
-        factor_and_slope: maps r^2 to g and dg/d(r^2).
-    """
+    """Solve r g(r^2) = r_d for r (B, ...) by 2 Newton steps in float32, 3 in float64, from a start that is 1e-6 off."""
     r = start
     for _ in range(3 if r.dtype is torch.float64 else 2):
         r2 = r * r
-        g, slope = factor_and_slope(r2)
-        growth = (g + 2 * r2 * slope).clamp(min=torch.finfo(r.dtype).eps)
-        r = torch.minimum((r - (r * g - r_d) / growth).clamp(min=0), limit.radius)
+        g, slope = factor_and_slope(r2, numerator, denominator)
+        derivative = (g + 2 * r2 * slope).clamp(min=torch.finfo(r.dtype).eps)
+        r = torch.minimum((r - (r * g - r_d) / derivative).clamp(min=0), limit.radius)
     return r
 
 
 def _tabulate(
-    radius: Tensor, folds: Tensor, image_reach: Tensor, curve: Callable[[Tensor], Tensor], shape: tuple[int, ...]
+    radius: Tensor, image_reach: Tensor, numerator: Sequence[Tensor], denominator: Sequence[Tensor]
 ) -> RadialLimit:
+    """Return the limit (B, 1) of a map that grows up to `radius`, with a table that ends where it covers the reach."""
+
+    def curve(r: Tensor) -> Tensor:
+        return r * radial_factor(r * r, numerator, denominator)
+
     r = radius[:, None] * _steps(radius)
-    # The table ends where `image_reach` is covered: a shorter table is finer.
     last = (curve(r) < image_reach[:, None]).sum(dim=1, keepdim=True).clamp(max=_NODES)
-    r = r.gather(1, last) * _steps(radius)
+    r = r.gather(1, last) * _steps(radius)  # a shorter table is finer
     r_d = curve(r)
     nodes = r_d[:, -1:] * (1 - (1 - _steps(radius)).square())
     node = torch.searchsorted(r_d.contiguous(), nodes.contiguous()).clamp(1, _NODES)
     low, high = r_d.gather(1, node - 1), r_d.gather(1, node)
     weight = ((nodes - low) / (high - low).clamp(min=torch.finfo(r.dtype).tiny)).clamp(0, 1)
     table = torch.lerp(r.gather(1, node - 1), r.gather(1, node), weight)
-    return RadialLimit(radius.view(shape), r_d[:, -1].view(shape), folds, table)
+    return RadialLimit(radius[:, None], r_d[:, -1:], table)
 
 
 def _steps(like: Tensor) -> Tensor:
@@ -224,13 +199,8 @@ def undistort_division(x_d: Tensor, y_d: Tensor, k: Tensor) -> tuple[Tensor, Ten
 
         x = x_d / (1 + k r_d^2),  y = y_d / (1 + k r_d^2)
 
-    Args:
-        x_d, y_d: (B, N), in focal lengths.
-        k: (B, 1).
-
-    Returns:
-        x, y: (B, N), on the plane z = 1; 0 where no point exists.
-        exists: (B, N), bool: 1 + k r_d^2 and 1 - k r_d^2, to which dr / dr_d is proportional, are above zero.
+    k is (B, 1), all else (B, N). The last result is True where the point exists: 1 + k r_d^2 and 1 - k r_d^2, to which
+    dr / dr_d is proportional, are above zero. Elsewhere x and y are 0.
 
     Source: Fitzgibbon, "Simultaneous linear estimation of multiple view geometry and lens distortion", CVPR 2001.
     """
@@ -246,13 +216,7 @@ def distort_division(x: Tensor, y: Tensor, k: Tensor) -> tuple[Tensor, Tensor, T
 
         x_d = 2 x / (1 + sqrt(1 - 4 k r^2)),  y_d = 2 y / (1 + sqrt(1 - 4 k r^2))
 
-    Args:
-        x, y: (B, N), on the plane z = 1.
-        k: (B, 1).
-
-    Returns:
-        x_d, y_d: (B, N), in focal lengths; 0 where no point exists.
-        exists: (B, N), bool: 1 - 4 k r^2 is above zero.
+    The shapes are as there; a point exists where 1 - 4 k r^2 is above zero.
     """
     with torch.no_grad():
         exists = 4 * k * (x * x + y * y) < 1

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -37,25 +36,17 @@ from torchrefract.cameras.calibration.report import (
 )
 from torchrefract.cameras.calibration.synthetic import CAMERA, NUM_VIEWS, render_views
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io.opencv import read_opencv, write_opencv
+from torchrefract.cameras.io import read_opencv, write_opencv
 from torchrefract.cli.command import make, naming, progress
+from torchrefract.data import media
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, pixels_of, read_image
-from torchrefract.data.media import (
-    check_output_folder,
-    convert_video,
-    find_media,
-    is_complete,
-    is_video,
-    output_name,
-    write_picture,
-)
 from torchrefract.fields.rectification import camera_flow
 from torchrefract.warping.warp import warp
 
 _SYNTHETIC = "synthetic"
 _MIN_USABLE = MIN_VIEWS + 1  # views, so that each can be left out of the fit
 _MAX_REASONS = 300  # characters
-_CACHE_VERSION = 2  # of detections.jsonl; files of other versions are ignored
+_CACHE_VERSION = 3  # of detections.jsonl; lines of other versions are ignored
 _MIN_SAME_SIZE = 0.75  # share of the pictures
 _NUM_DIAGNOSED = 3  # pictures in which another board is searched if the expected one is missing
 _BOARD_FORMATS = (".pdf", ".png")
@@ -98,23 +89,19 @@ def calibrate(cfg: DictConfig) -> None:
     paths = {file.name: file for file in files}
     try:
         size = _common_size(detections)
-        detections = [_check_size(detection, size) for detection in detections]
+        detections = [_reject_other_size(detection, size) for detection in detections]
         _check_count(detections, paths, board)
         calibration = calibrate_camera(detections, board, model=model, size=size, max_drop_share=max_drop_share)
     except (UsageError, ValueError) as error:
         write_failure(board, detections, str(error), out)
         raise UsageError(f"{error} ({out / REPORT_FILE} lists all pictures)") from error
-    write_opencv(out / CAMERA_FILE, calibration.camera)
+    write_opencv(out / CAMERA_FILE, calibration.fit.camera)
     write_report(calibration, lambda name: read_gray(paths[name]), out)
     _print_summary(calibration, out)
 
 
 def find_pictures(folder: str | Path) -> list[Path]:
-    """Return the pictures of a folder, sorted by name.
-
-    Raises:
-        UsageError: the folder does not exist or holds no pictures.
-    """
+    """Return the pictures of a folder, sorted by name; raise UsageError if it does not exist or holds none."""
     if not (folder := Path(folder)).is_dir():
         raise UsageError(f"images must be an existing folder of pictures, got {folder}")
     if not (files := files_in(folder)):
@@ -128,23 +115,32 @@ def read_gray(path: Path) -> np.ndarray:
 
 
 def detect_all(files: Sequence[Path], board: Board, cache: Path) -> Iterator[Detection]:
-    """Detect a board in pictures; results of an earlier run for the same board and file are read from the cache.
-
-    The cache is a file with a line of JSON for each picture.
-    """
-    key = {"version": _CACHE_VERSION, "opencv": cv2.__version__, "board": board.describe()}
-    cached = _read_cache(cache, key)
-    with replace_file(cache) as path:
-        lines = [key, *(_to_json(detection, stamp) for (_, stamp), detection in cached.items())]
-        path.write_text("".join(f"{json.dumps(line)}\n" for line in lines), encoding="utf-8")
+    """Detect a board in pictures that the cache, a file of JSON lines, does not hold for this board and file."""
+    key = f"{_CACHE_VERSION}, OpenCV {cv2.__version__}, {board.describe()}"
+    cached = _read_cache(cache)
     with cache.open("a", encoding="utf-8") as stream:
         for file in files:
-            stamp = _stamp(file)
+            stat = file.stat() if file.exists() else None
+            stamp = f"{key}, {stat.st_size} {stat.st_mtime_ns}" if stat else key
             if (detection := cached.get((file.name, stamp))) is None:
                 detection = _detect_in_file(file, board)
-                stream.write(json.dumps(_to_json(detection, stamp)) + "\n")
+                # The line before may be incomplete, if its run was interrupted.
+                stream.write("\n" + json.dumps([stamp, detection], default=np.ndarray.tolist))
                 stream.flush()
             yield detection
+
+
+def _read_cache(path: Path) -> dict[tuple[str, str], Detection]:
+    """Return cached detections by name and stamp; an incomplete line of an interrupted run is ignored."""
+    cached = {}
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
+        try:
+            stamp, ((name, ids, corners), size, edge_width_px, problem) = json.loads(line)
+        except (ValueError, TypeError):
+            continue
+        view = View(name, np.array(ids, dtype=int), np.array(corners, dtype=np.float64).reshape(-1, 2))
+        cached[name, stamp] = Detection(view, (size[0], size[1]), edge_width_px, problem)
+    return cached
 
 
 def _detect_in_file(file: Path, board: Board) -> Detection:
@@ -155,39 +151,6 @@ def _detect_in_file(file: Path, board: Board) -> Detection:
     view = detect(gray, board, name=file.name)
     problem = "" if has_enough_corners(view, board) else explain_failure(gray, view, board)
     return Detection(view, (gray.shape[1], gray.shape[0]), edge_width(gray), problem)
-
-
-def _stamp(file: Path) -> str:
-    """Return a text that changes when the file changes; empty if the file is missing."""
-    try:
-        stat = file.stat()
-    except OSError:
-        return ""
-    return f"{stat.st_size} {stat.st_mtime_ns}"
-
-
-def _read_cache(path: Path, key: dict[str, Any]) -> dict[tuple[str, str], Detection]:
-    """Return cached detections by name and stamp; an incomplete line of an interrupted run is ignored."""
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []
-    cached = {}
-    for number, line in enumerate(lines):
-        try:
-            d = json.loads(line)
-        except ValueError:
-            continue
-        if number == 0 and d != key:
-            return {}
-        if number > 0:
-            corners = np.array(d["corners"], dtype=np.float64).reshape(-1, 2)
-            view = View(d["name"], np.array(d["ids"], dtype=int), corners)
-            cached[view.name, d["stamp"]] = Detection(view, (d["width"], d["height"]), d["edges"], d["reason"])
-    return cached
-
-
-def _to_json(detection: Detection, stamp: str) -> dict[str, Any]:
-    view, (width, height) = detection.view, detection.size
-    facts = {"width": width, "height": height, "edges": detection.edge_width_px, "reason": detection.problem}
-    return {"name": view.name, "stamp": stamp, **facts, "ids": view.ids.tolist(), "corners": view.corners.tolist()}
 
 
 def _common_size(detections: Sequence[Detection]) -> tuple[int, int]:
@@ -203,7 +166,7 @@ def _common_size(detections: Sequence[Detection]) -> tuple[int, int]:
     return size
 
 
-def _check_size(detection: Detection, size: tuple[int, int]) -> Detection:
+def _reject_other_size(detection: Detection, size: tuple[int, int]) -> Detection:
     if detection.problem or detection.size == size:
         return detection
     width, height = detection.size
@@ -240,12 +203,12 @@ def _rendered(board: Board, folder: Path) -> list[Path]:
 
 
 def _print_summary(calibration: Calibration, out: Path) -> None:
-    for name, reason in calibration.selection.dropped.items():
+    for name, reason in calibration.dropped.items():
         print(f"{name} dropped: {reason}")
-    for message in camera_warnings(calibration.camera):
+    for message in camera_warnings(calibration.fit.camera):
         print(f"warning: {message}", file=sys.stderr)
     print(
-        f"{out / CAMERA_FILE}: {calibration.fit.intrinsics.model} from {len(calibration.selection.views)} views in "
+        f"{out / CAMERA_FILE}: {calibration.fit.model} from {len(calibration.views)} views in "
         f"{len(calibration.detections)} pictures, error {calibration.fit.rms:.3f} px rms, of held-out views "
         f"{calibration.held_out_rms:.3f} px rms; see {out / REPORT_FILE}"
     )
@@ -257,21 +220,40 @@ def rectify(cfg: DictConfig) -> None:
     with naming("zoom"):
         zoom = check_number("zoom", cfg.zoom, low=0.05, high=20.0)
     with naming("camera"):
-        rectifier = _Rectifier(read_opencv(str(cfg.camera)), zoom)
-    files = find_media(source)
+        camera = read_opencv(str(cfg.camera))
+        _, exists, pinhole = camera_flow(camera, zoom=zoom)
+    files = media.find_media(source)
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
-    check_output_folder(out, source)
-    _write_cameras(out, rectifier)
-    if rectifier.black_share:
+    media.check_output_folder(out, source)
+    for path, content in ((out / "lens.yaml", camera), (out / CAMERA_FILE, pinhole)):
+        _write_camera(path, content)
+    if not exists.all():
+        share = 1 - exists.double().mean().item()
         print(
-            f"warning: the camera's model folds back inside the frame: {rectifier.black_share:.1%} of it stays black",
-            file=sys.stderr,
+            f"warning: the camera's model folds back inside the frame: {share:.1%} of it stays black", file=sys.stderr
         )
+
+    @lru_cache(maxsize=2)
+    def flow(height: int, width: int) -> Tensor:
+        return camera_flow(camera.resized(width=width, height=height), zoom=zoom)[0]
+
+    def rectify_frame(frame: Tensor) -> np.ndarray:
+        """Rectify a frame (1, 3, H, W) in [0, 1] to (H, W, 3), uint8, RGB."""
+        return pixels_of(warp(frame, flow(*frame.shape[2:]), interpolation="bicubic")[0][0])
+
     num_written, skipped = 0, dict[Path, str]()
     for file in progress(files, "rectifying", count=len(files)):
+        target = out / media.output_name(file).name
         try:
-            num_written += _rectify_file(file, rectifier, out)
+            if media.is_complete(file, target):
+                continue
+            with replace_file(target) as path:
+                if media.is_video(file):
+                    media.convert_video(file, path, change=partial(map, rectify_frame))
+                else:
+                    media.write_picture(rectify_frame(read_image(file)[None].contiguous()), path)
+            num_written += 1
         except ValueError as error:
             skipped[file] = str(error) if isinstance(error, UnreadableImageError) else f"{file}: {error}"
             print(f"skipped: {skipped[file]}", file=sys.stderr)
@@ -284,46 +266,14 @@ def rectify(cfg: DictConfig) -> None:
     )
 
 
-class _Rectifier:
-    """Removal of a camera's distortion from frames, with a flow for each of the last two frame sizes."""
-
-    def __init__(self, camera: Camera, zoom: float):
-        self.camera, self.zoom = camera, zoom
-        _, exists, self.pinhole = camera_flow(camera, zoom=zoom)
-        self.black_share = 1 - exists.double().mean().item()  # of the frame
-        self._flow = lru_cache(maxsize=2)(self._compute_flow)
-
-    def _compute_flow(self, height: int, width: int) -> Tensor:
-        return camera_flow(self.camera.resized(width=width, height=height), zoom=self.zoom)[0]
-
-    def __call__(self, frame: Tensor) -> np.ndarray:
-        """Rectify a frame (1, 3, H, W) in [0, 1] to (H, W, 3), uint8, RGB."""
-        image = warp(frame, self._flow(*frame.shape[2:]), interpolation="bicubic")[0]
-        return pixels_of(image[0])
-
-
-def _write_cameras(out: Path, rectifier: _Rectifier) -> None:
-    """Write the original camera and the one of the results; raise UsageError if the folder has different ones."""
-    for path, camera in ((out / "lens.yaml", rectifier.camera), (out / CAMERA_FILE, rectifier.pinhole)):
-        if path.is_file():
-            with naming("out"):
-                existing = read_opencv(path)
-            if existing != camera:
-                raise UsageError(
-                    f"out must be a folder of the same camera and zoom, got {out} with another {path.name}"
-                )
-        else:
-            write_opencv(path, camera)
-
-
-def _rectify_file(file: Path, rectifier: _Rectifier, out: Path) -> bool:
-    """Rectify a picture or video; return False if its result exists already."""
-    target = out / output_name(file).name
-    if is_complete(file, target):
-        return False
-    with replace_file(target) as path:
-        if is_video(file):
-            convert_video(file, path, change=partial(map, rectifier))
-        else:
-            write_picture(rectifier(read_image(file)[None].contiguous()), path)
-    return True
+def _write_camera(path: Path, camera: Camera) -> None:
+    """Write a camera unless the file holds it already; raise UsageError if it holds another one."""
+    if not path.is_file():
+        write_opencv(path, camera)
+        return
+    with naming("out"):
+        existing = read_opencv(path)
+    if existing != camera:
+        raise UsageError(
+            f"out must be a folder of the same camera and zoom, got {path.parent} with another {path.name}"
+        )

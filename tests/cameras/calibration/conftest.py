@@ -34,16 +34,15 @@ def rendered(small_board, small_camera) -> list[tuple[str, np.ndarray, np.ndarra
 def projected() -> Callable[..., list[View]]:
     """Return a function that projects a board by OpenCV in nine poses, with noise of so many px."""
 
-    def project(
-        board: Board, matrix: np.ndarray, vector: np.ndarray, *, noise: float = 0.0, fisheye: bool = False
-    ) -> list[View]:
+    def project(board: Board, camera: Camera, *, noise: float = 0.0) -> list[View]:
         generator, views = np.random.default_rng(0), []
         width, height = board.size_mm
         corners = board.corners().reshape(-1, 1, 3)
         for k, (x, y) in enumerate(itertools.product((-0.5, 0.0, 0.5), (-0.25, 0.1, 0.3))):
             turn = generator.uniform(-0.5, 0.5, 3)
             move = np.array([x, y, 1.0]) * 1.3 * width - cv2.Rodrigues(turn)[0] @ (width / 2, height / 2, 0)
-            points = (cv2.fisheye if fisheye else cv2).projectPoints(corners, turn, move, matrix, vector)[0]
+            lens = np.array(camera.matrix), np.array(camera.coefficients)
+            points = (cv2.fisheye if camera.model == "fisheye" else cv2).projectPoints(corners, turn, move, *lens)[0]
             pixels = points.reshape(-1, 2)
             views.append(View(f"{k}.png", np.arange(len(pixels)), pixels + generator.normal(0, noise, pixels.shape)))
         return views

@@ -92,7 +92,7 @@ def test_refined_chessboard_corners_are_used_if_they_are_as_smooth(chessboard, m
     board, gray, _ = chessboard
     original = cv2.findChessboardCornersSB(gray, board.num_corners, flags=detection.SEARCH_FLAGS)[1].reshape(-1, 2)
     refined = original + np.random.default_rng(0).normal(0, noise, original.shape)
-    monkeypatch.setattr(detection, "_refine", lambda *_: (np.arange(30), refined))
+    monkeypatch.setattr(detection, "_refine", lambda *_: View("", np.arange(30), refined))
     np.testing.assert_allclose(detect(gray, board).corners, refined if uses_refined else original, atol=1e-6)
 
 

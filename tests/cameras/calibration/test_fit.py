@@ -1,10 +1,11 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from torchrefract.cameras.calibration.boards import Chessboard
 from torchrefract.cameras.calibration.fit import (
-    Intrinsics,
     cross_validate,
     drop_outliers,
     errors_in_best_pose,
@@ -12,35 +13,36 @@ from torchrefract.cameras.calibration.fit import (
     leave_each_out,
     rms,
 )
+from torchrefract.cameras.camera import Camera
 
 BOARD = Chessboard(squares="9x7", square_mm=25)
 SIZE = (800, 600)
-MATRIX = np.array([[700.0, 0, 405.0], [0, 702.0, 297.0], [0, 0, 1]])
-VECTORS = {
-    "opencv4": (-0.2, 0.06, 0.002, -0.001),
-    "opencv5": (-0.2, 0.06, 0.002, -0.001, 0.01),
-    "opencv8": (0.3, 0.05, 0.002, -0.001, 0.01, 0.5, 0.1, 0.02),
-    "fisheye": (-0.03, 0.01, -0.005, 0.001),
+PINHOLE = Camera(width=800, height=600, fx=700.0, fy=702.0, cx=405.0, cy=297.0, coefficients=(0.0,) * 4)
+CAMERAS = {
+    "opencv4": replace(PINHOLE, coefficients=(-0.2, 0.06, 0.002, -0.001)),
+    "opencv5": replace(PINHOLE, coefficients=(-0.2, 0.06, 0.002, -0.001, 0.01)),
+    "opencv8": replace(PINHOLE, coefficients=(0.3, 0.05, 0.002, -0.001, 0.01, 0.5, 0.1, 0.02)),
+    "fisheye": replace(PINHOLE, coefficients=(-0.03, 0.01, -0.005, 0.001), model="fisheye"),
 }
 
 
 @pytest.fixture(scope="module")
 def noisy(projected):
     """Return views of opencv5 with noise of 0.3 px in x and in y."""
-    return projected(BOARD, MATRIX, np.array(VECTORS["opencv5"]), noise=0.3)
+    return projected(BOARD, CAMERAS["opencv5"], noise=0.3)
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("model", VECTORS)
+@pytest.mark.parametrize("model", CAMERAS)
 def test_exact_corners_give_the_exact_camera(model, projected):
-    views = projected(BOARD, MATRIX, np.array(VECTORS[model]), fisheye=model == "fisheye")
-    fit = fit_camera(views, BOARD, model=model, size=SIZE)
+    fit = fit_camera(projected(BOARD, CAMERAS[model]), BOARD, model=model, size=SIZE)
     assert fit.rms < 1e-3  # corners go to OpenCV as float32
-    np.testing.assert_allclose(fit.intrinsics.values[:4], MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]], rtol=1e-4)
+    np.testing.assert_allclose(fit.values[:4], (700, 702, 405, 297), rtol=1e-4)
     if model != "opencv8":  # its coefficients are strongly correlated
-        np.testing.assert_allclose(fit.intrinsics.values[4:], VECTORS[model], atol=1e-3)
-    assert fit.intrinsics.names[:5] == ("fx", "fy", "cx", "cy", "k1")
-    assert len(fit.intrinsics.names) == len(fit.intrinsics.values) == 4 + len(VECTORS[model])
+        np.testing.assert_allclose(fit.values[4:], CAMERAS[model].coefficients, atol=1e-3)
+    assert fit.names[:5] == ("fx", "fy", "cx", "cy", "k1")
+    assert len(fit.names) == len(fit.values) == 4 + len(CAMERAS[model].coefficients)
+    assert fit.camera.model == CAMERAS[model].model
 
 
 def test_errors_and_deviations_match_opencv(noisy):
@@ -54,27 +56,27 @@ def test_errors_and_deviations_match_opencv(noisy):
 
 
 def test_deviations_of_a_fisheye_match_its_errors(projected):
-    exact = np.concatenate([MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]], VECTORS["fisheye"]])
-    views = projected(BOARD, MATRIX, np.array(VECTORS["fisheye"]), noise=0.2, fisheye=True)
+    exact = (700, 702, 405, 297, *CAMERAS["fisheye"].coefficients)
+    views = projected(BOARD, CAMERAS["fisheye"], noise=0.2)
     fit = fit_camera(views, BOARD, model="fisheye", size=SIZE)
-    assert (np.abs(fit.intrinsics.values - exact) < 4 * fit.deviations).all()
-    assert (np.abs(fit.intrinsics.values - exact) > 0.01 * fit.deviations).sum() >= 6
+    assert (np.abs(fit.values - exact) < 4 * fit.deviations).all()
+    assert (np.abs(fit.values - exact) > 0.01 * fit.deviations).sum() >= 6
 
 
 def test_the_best_pose_matches_opencv(noisy):
-    vector, view = np.array(VECTORS["opencv5"]), noisy[0]
-    corners = BOARD.corners(view.ids)
-    _, turn, move = cv2.solvePnP(corners, view.corners, MATRIX, vector)
-    turn, move = cv2.solvePnPRefineLM(corners, view.corners, MATRIX, vector, turn, move)
-    theirs = view.corners - cv2.projectPoints(corners, turn, move, MATRIX, vector)[0].reshape(-1, 2)
+    camera, view = CAMERAS["opencv5"], noisy[0]
+    corners, lens = BOARD.corners(view.ids), (np.array(camera.matrix), np.array(camera.coefficients))
+    _, turn, move = cv2.solvePnP(corners, view.corners, *lens)
+    turn, move = cv2.solvePnPRefineLM(corners, view.corners, *lens, turn, move)
+    theirs = view.corners - cv2.projectPoints(corners, turn, move, *lens)[0].reshape(-1, 2)
     start = np.concatenate([turn.ravel() + 0.05, move.ravel() + 5])
-    errors = errors_in_best_pose(view, BOARD, Intrinsics("opencv5", MATRIX, vector), start)
+    errors = errors_in_best_pose(view, BOARD, camera, start)
     np.testing.assert_allclose(errors, theirs, atol=1e-3)
 
 
 def test_errors_of_held_out_views_are_larger_than_those_of_the_fit(noisy):
     fit = fit_camera(noisy, BOARD, model="opencv5", size=SIZE)
-    held_out = cross_validate(noisy, BOARD, fit, size=SIZE, folds=3)
+    held_out = cross_validate(noisy, BOARD, fit, folds=3)
     assert [len(errors) for errors in held_out] == [len(view.ids) for view in noisy]
     assert fit.rms < rms(np.concatenate(held_out)) < 1.3 * 0.3 * np.sqrt(2)
     assert fit.rms == pytest.approx(0.3 * np.sqrt(2), rel=0.1)
@@ -89,11 +91,11 @@ def test_a_fit_is_reproducible_and_restores_the_threads_of_opencv(noisy):
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
     try:
-        matrices = {fit_camera(noisy, BOARD, model="opencv5", size=SIZE).intrinsics.matrix.tobytes() for _ in range(8)}
+        cameras = {fit_camera(noisy, BOARD, model="opencv5", size=SIZE).camera for _ in range(8)}
         assert cv2.getNumThreads() == 2
     finally:
         cv2.setNumThreads(before)
-    assert len(matrices) == 1
+    assert len(cameras) == 1
 
 
 def bend(view):
@@ -115,14 +117,14 @@ def test_bent_views_are_dropped_with_a_reason(noisy):
     selection = drop_outliers(mixed, BOARD, model="opencv5", size=SIZE)
     assert set(selection.dropped) == {noisy[0].name, noisy[7].name}
     good = fit_camera([view for i, view in enumerate(noisy) if i not in (0, 7)], BOARD, model="opencv5", size=SIZE)
-    np.testing.assert_allclose(selection.fit.intrinsics.values, good.intrinsics.values, rtol=1e-6)
+    np.testing.assert_allclose(selection.fit.values, good.values, rtol=1e-6)
     assert all(reason.startswith("its error is ") for reason in selection.dropped.values())
     assert len(drop_outliers(mixed, BOARD, model="opencv5", size=SIZE, max_share=0.15).dropped) == 1
     assert drop_outliers(mixed, BOARD, model="opencv5", size=SIZE, max_share=0.0).dropped == {}
 
 
 def test_leaving_a_view_out_is_a_fit_to_the_others(noisy):
-    result = leave_each_out(noisy, BOARD, fit_camera(noisy, BOARD, model="opencv5", size=SIZE), size=SIZE)[3]
+    result = leave_each_out(noisy, BOARD, fit_camera(noisy, BOARD, model="opencv5", size=SIZE))[3]
     others = fit_camera(noisy[:3] + noisy[4:], BOARD, model="opencv5", size=SIZE)
     assert result.name == noisy[3].name
     assert result.others == pytest.approx(others.rms, rel=1e-5)

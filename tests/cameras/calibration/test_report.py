@@ -16,8 +16,8 @@ from torchrefract.cameras.calibration.report import (
 from torchrefract.cameras.camera import Camera
 
 BOARD = Chessboard(squares="9x7", square_mm=25)
-MATRIX = np.array([[700.0, 0, 405.0], [0, 702.0, 297.0], [0, 0, 1]])
-CAMERA = Camera.from_opencv(MATRIX, [-0.2, 0.06, 0.002, -0.001], width=800, height=600)
+PINHOLE = Camera(width=800, height=600, fx=700.0, fy=702.0, cx=405.0, cy=297.0, coefficients=(0.0,) * 4)
+CAMERA = replace(PINHOLE, coefficients=(-0.2, 0.06, 0.002, -0.001))
 
 
 def test_corners_are_counted_in_cells_of_the_frame():
@@ -29,21 +29,22 @@ def test_corners_are_counted_in_cells_of_the_frame():
 
 
 def test_vague_coefficients_folds_and_empty_sides_are_warned_of(projected):
-    views = projected(BOARD, MATRIX, np.array(CAMERA.coefficients), noise=0.2)
+    views = projected(BOARD, CAMERA, noise=0.2)
     fit = fit_camera(views, BOARD, model="opencv14", size=(800, 600))
-    text = " ".join(calibration_warnings(views, fit, replace(CAMERA, coefficients=(-0.9, 0.0, 0.0, 0.0))))
+    folding = replace(CAMERA, coefficients=(-0.9, *(0.0,) * 13))
+    text = " ".join(calibration_warnings(views, fit._replace(camera=folding)))
     assert "zero within two standard deviations: " in text
     assert "tau_x" in text
     assert "The model folds back inside the frame: " in text
     middle = [view._replace(corners=400 + 0.2 * (view.corners - 400)) for view in views]
-    assert any("left (6 of 6 cells)" in message for message in calibration_warnings(middle, fit, CAMERA))
+    assert any("left (6 of 6 cells)" in message for message in calibration_warnings(middle, fit))
 
 
 def test_a_good_calibration_has_no_warnings(projected):
-    fit = fit_camera(projected(BOARD, MATRIX, np.array(CAMERA.coefficients)), BOARD, model="opencv4", size=(800, 600))
+    fit = fit_camera(projected(BOARD, CAMERA), BOARD, model="opencv4", size=(800, 600))
     x, y = np.meshgrid(np.arange(10, 800, 20.0), np.arange(10, 600, 20.0))
     everywhere = View("", np.arange(x.size), np.stack([x.ravel(), y.ravel()], axis=1))
-    assert calibration_warnings([everywhere], fit, CAMERA) == []
+    assert calibration_warnings([everywhere], fit) == []
 
 
 def test_a_pole_is_warned_of():
@@ -52,8 +53,8 @@ def test_a_pole_is_warned_of():
 
 
 def test_straightness_is_the_noise_of_a_pinhole(projected):
-    assert straightness(projected(BOARD, MATRIX, np.zeros(4)), BOARD) < 1e-9
-    assert straightness(projected(BOARD, MATRIX, np.zeros(4), noise=0.3), BOARD) == pytest.approx(0.3, rel=0.05)
+    assert straightness(projected(BOARD, PINHOLE), BOARD) < 1e-9
+    assert straightness(projected(BOARD, PINHOLE, noise=0.3), BOARD) == pytest.approx(0.3, rel=0.05)
 
 
 def test_one_corner_off_its_line_counts_by_its_distance():
@@ -63,7 +64,7 @@ def test_one_corner_off_its_line_counts_by_its_distance():
 
 
 def test_undistorted_corners_lie_on_straight_lines(projected):
-    views = projected(BOARD, MATRIX, np.array(CAMERA.coefficients))
+    views = projected(BOARD, CAMERA)
     assert straightness(views, BOARD) > 0.5
     assert straightness(undistort_views(views, CAMERA), BOARD) < 1e-6
 

@@ -14,15 +14,9 @@ from torchrefract._validation import check_choice, check_positive
 DICTIONARIES = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
 # Each of these begins with the markers of the smaller dictionaries of its kind.
 LARGEST_DICTIONARIES = (
-    "DICT_4X4_1000",
-    "DICT_5X5_1000",
-    "DICT_6X6_1000",
-    "DICT_7X7_1000",
+    *(f"DICT_{cells}_1000" for cells in ("4X4", "5X5", "6X6", "7X7")),
     "DICT_ARUCO_ORIGINAL",
-    "DICT_APRILTAG_16h5",
-    "DICT_APRILTAG_25h9",
-    "DICT_APRILTAG_36h10",
-    "DICT_APRILTAG_36h11",
+    *(f"DICT_APRILTAG_{kind}" for kind in ("16h5", "25h9", "36h10", "36h11")),
 )
 _MIN_SQUARES, _MAX_SQUARES = 3, 100  # along a side
 _MM_PER_INCH = 25.4
@@ -40,22 +34,26 @@ class Board:
     Args:
         squares: columns x rows of squares, such as "11x8", at least 3 of each.
         square_mm: side of a square.
-
-    Raises:
-        ValueError: an argument is out of range.
     """
 
     squares: str = "11x8"
     square_mm: float = 22.0
 
     def __post_init__(self) -> None:
-        _parse_squares(self.squares)
+        _ = self.num_squares
         check_positive("square_mm", self.square_mm)
 
     @cached_property
     def num_squares(self) -> tuple[int, int]:
         """Return the numbers of columns and rows of squares."""
-        return _parse_squares(self.squares)
+        columns, _, rows = str(self.squares).lower().partition("x")
+        if not (columns.isdecimal() and rows.isdecimal()):
+            raise ValueError(f"squares must be columns x rows, such as 11x8, got {self.squares!r}")
+        if not all(_MIN_SQUARES <= int(n) <= _MAX_SQUARES for n in (columns, rows)):
+            raise ValueError(
+                f"squares must be from {_MIN_SQUARES} to {_MAX_SQUARES} in columns and rows, got {self.squares}"
+            )
+        return int(columns), int(rows)
 
     @property
     def num_corners(self) -> tuple[int, int]:
@@ -112,9 +110,6 @@ class Charuco(Board):
         legacy: True for the pattern of OpenCV up to version 4.6, which differs on boards with an even number of rows;
             "auto" detects either.
         inverted: True if black and white are exchanged; "auto" detects either.
-
-    Raises:
-        ValueError: an argument is out of range, or the dictionary has too few markers.
     """
 
     marker_mm: float = 14.0
@@ -130,18 +125,12 @@ class Charuco(Board):
         for name in ("legacy", "inverted"):
             if getattr(self, name) not in ("auto", True, False):
                 raise ValueError(f"{name} must be auto, true or false, got {getattr(self, name)!r}")
-        available = len(marker_dictionary(self.dictionary).bytesList)
-        if self.num_markers > available:
+        available, (columns, rows) = len(marker_dictionary(self.dictionary).bytesList), self.num_squares
+        if columns * rows // 2 > available:
             raise ValueError(
-                f"dictionary must hold the {self.num_markers} markers of a board of {self.squares} squares, "
+                f"dictionary must hold the {columns * rows // 2} markers of a board of {self.squares} squares, "
                 f"got {self.dictionary} with {available}"
             )
-
-    @property
-    def num_markers(self) -> int:
-        """Return the number of markers."""
-        columns, rows = self.num_squares
-        return columns * rows // 2
 
     def to_opencv(self, *, legacy: bool) -> "cv2.aruco.CharucoBoard":
         """Create OpenCV's board, in mm."""
@@ -182,7 +171,6 @@ class Charuco(Board):
         return ~black if self.inverted is True else black
 
     def color_edges(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return sorted x and y, mm, from border to border, such that each cell between them has one color."""
         side = self._marker_cells.shape[2]
         margin = (self.square_mm - self.marker_mm) / 2
         cells = margin + np.arange(side + 1) * self.marker_mm / side
@@ -191,7 +179,6 @@ class Charuco(Board):
         return np.union1d(square_x, x), np.union1d(square_y, y)
 
     def describe(self) -> str:
-        """Return the options of the commands that define this board."""
         return (
             f"board=charuco squares={self.squares} square_mm={self.square_mm:g} marker_mm={self.marker_mm:g} "
             f"dictionary={self.dictionary} legacy={str(self.legacy).lower()} inverted={str(self.inverted).lower()}"
@@ -203,23 +190,11 @@ def marker_dictionary(name: str) -> "cv2.aruco.Dictionary":
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def _parse_squares(squares: str) -> tuple[int, int]:
-    columns, _, rows = str(squares).lower().partition("x")
-    if not (columns.isdecimal() and rows.isdecimal()):
-        raise ValueError(f"squares must be columns x rows, such as 11x8, got {squares!r}")
-    if not all(_MIN_SQUARES <= int(n) <= _MAX_SQUARES for n in (columns, rows)):
-        raise ValueError(f"squares must be from {_MIN_SQUARES} to {_MAX_SQUARES} in columns and rows, got {squares}")
-    return int(columns), int(rows)
-
-
 def board_page(board: Board, *, margin_mm: float) -> Figure:
     """Draw a board with a margin and, below it, a ruler and the definition of the board.
 
-    A PDF of the figure has true scale; a PNG has dpi / 25.4 px for each mm.
-
-    Args:
-        board: to draw; "auto" patterns are drawn as False.
-        margin_mm: around the board, white, or black for an inverted board.
+    A PDF of the figure has true scale; a PNG has dpi / 25.4 px for each mm. "auto" patterns are drawn as False. The
+    margin is white, or black for an inverted board.
     """
     (width, height), margin = board.size_mm, float(margin_mm)
     page = width + 2 * margin, height + 2 * margin + _CAPTION_MM
@@ -229,22 +204,15 @@ def board_page(board: Board, *, margin_mm: float) -> Figure:
     axes.set_ylim(page[1] - margin, -margin)
     axes.set_axis_off()
     axes.add_patch(PathPatch(_black_outline(board, margin), facecolor="black", lw=0, snap=False))
-    _draw_caption(figure, board, margin, page)
-    return figure
-
-
-def _draw_caption(figure: Figure, board: Board, margin: float, page: tuple[float, float]) -> None:
-    """Draw the ruler and two lines of text; they start at the left edge of the board."""
-    axes, top = figure.axes[0], page[1] - _CAPTION_MM
-    length = min(_RULER_MM, 10 * (board.size_mm[0] // 10))
-    y = top + 2 - margin
-    axes.plot([0, length], [y, y], color="black", lw=0.6)
+    # The ruler and two lines of text start at the left edge of the board.
+    length, top = min(_RULER_MM, 10 * (width // 10)), height + margin + 2
+    axes.plot([0, length], [top, top], color="black", lw=0.6)
     for x in (0.0, length):
-        axes.plot([x, x], [y - 1, y + 1], color="black", lw=0.6)
+        axes.plot([x, x], [top - 1, top + 1], color="black", lw=0.6)
     lines = (f"this line is {length:g} mm long if printed at true scale (100 %)", board.describe())
-    for text, offset in zip(lines, (6.5, 10.0), strict=True):
-        place = margin / page[0], 1 - (top + offset) / page[1]
-        figure.text(*place, text, fontsize=_FONT_MM / _MM_PER_INCH * 72, parse_math=False)
+    for text, y in zip(lines, (5.5, 2.0), strict=True):
+        figure.text(margin / page[0], y / page[1], text, fontsize=_FONT_MM / _MM_PER_INCH * 72, parse_math=False)
+    return figure
 
 
 def _black_outline(board: Board, margin: float) -> Path:

@@ -4,7 +4,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -36,6 +36,10 @@ class View(NamedTuple):
     ids: np.ndarray  # (N,), int, of `Board.corners`
     corners: np.ndarray  # (N, 2), float64, px
 
+    def only(self, mask: np.ndarray) -> "View":
+        """Return the view with the corners of a mask (N,), bool."""
+        return View(self.name, self.ids[mask], self.corners[mask])
+
 
 class Detection(NamedTuple):
     """The result of the search for a board in a picture."""
@@ -56,31 +60,20 @@ def detect(gray: np.ndarray, board: Board, *, name: str = "") -> View:
     Drops corners that the refinement moves far, that lie at the border of the picture, or that do not fit their
     neighbors. Drops corners of a ChArUco board where black and white do not cross, such as behind a finger. Keeps the
     corners unrefined if many would move far, or if refined corners of a chessboard fit their neighbors worse, as on an
-    overexposed board whose black squares do not touch.
-
-    Args:
-        gray: (H, W), uint8.
-        board: to search.
-        name: of the view.
-
-    Returns:
-        The view, without corners if no board was found.
+    overexposed board whose black squares do not touch. The picture is (H, W), uint8. A view without corners means that
+    no board was found.
     """
-    if isinstance(board, Charuco):
-        ids, corners = _find_charuco(gray, board)
-        clearance = (board.square_mm - board.marker_mm) / board.square_mm / 2
-    else:
-        ids, corners = _find_chessboard(gray, board)
-        clearance = 0.5
-    if len(ids):
-        refined = _refine(gray, ids, corners, _WINDOW_SHARE * clearance)
-        # Corners of ChArUco boards are interpolated from markers, so that they are smooth even where they are wrong.
-        if isinstance(board, Charuco) or _is_as_smooth(board, refined, (ids, corners)):
-            ids, corners = refined
-        ids, corners = _drop_misfits(board, ids, corners)
-        if isinstance(board, Charuco):  # a chessboard is always visible as a whole
-            ids, corners = _drop_covered(gray, board, ids, corners)
-    return View(name, ids, corners.astype(np.float64).reshape(-1, 2))
+    is_charuco = isinstance(board, Charuco)
+    clearance = (board.square_mm - board.marker_mm) / board.square_mm / 2 if is_charuco else 0.5
+    ids, corners = _find_charuco(gray, board) if is_charuco else _find_chessboard(gray, board)
+    view = View(name, np.asarray(ids, dtype=int).ravel(), np.asarray(corners, dtype=np.float64).reshape(-1, 2))
+    if len(view.ids) == 0:
+        return view
+    refined = _refine(gray, view, _WINDOW_SHARE * clearance)
+    # Corners of ChArUco boards are interpolated from markers, so that they are smooth even where they are wrong.
+    view = refined if is_charuco or _is_as_smooth(board, refined, view) else view
+    view = _drop_misfits(board, view)
+    return _drop_covered(gray, board, view) if is_charuco else view  # a chessboard is always visible as a whole
 
 
 def has_enough_corners(view: View, board: Board) -> bool:
@@ -94,56 +87,48 @@ def candidates(option: str | bool) -> tuple[bool, ...]:
     return (False, True) if option == "auto" else (bool(option),)
 
 
-def _find_charuco(gray: np.ndarray, board: Charuco) -> tuple[np.ndarray, np.ndarray]:
-    best = np.empty(0, dtype=int), np.empty((0, 2))
+def _find_charuco(gray: np.ndarray, board: Charuco) -> tuple[Any, Any]:
+    """Return ids and corners as OpenCV has them, or two empty tuples."""
+    best: tuple[Any, Any] = (), ()
     parameters = cv2.aruco.CharucoParameters()
-    # One marker next to a corner is enough, so that corners near the border of the picture count.
-    parameters.minMarkers = 1
+    parameters.minMarkers = 1  # next to a corner, so that corners near the border of the picture count
     # On boards with an odd number of rows both patterns are equal.
     legacies = candidates(board.legacy) if board.num_squares[1] % 2 == 0 else (False,)
-    for inverted in candidates(board.inverted):
-        picture = 255 - gray if inverted else gray
-        for legacy in legacies:
-            detector = cv2.aruco.CharucoDetector(board.to_opencv(legacy=legacy), parameters)
-            corners, ids, _, _ = detector.detectBoard(picture)
-            if ids is not None and len(ids) > len(best[0]):
-                best = ids.ravel(), corners.reshape(-1, 2)
+    for inverted, legacy in itertools.product(candidates(board.inverted), legacies):
+        detector = cv2.aruco.CharucoDetector(board.to_opencv(legacy=legacy), parameters)
+        corners, ids, _, _ = detector.detectBoard(255 - gray if inverted else gray)
+        if ids is not None and len(ids) > len(best[0]):
+            best = ids, corners
     return best
 
 
-def _find_chessboard(gray: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
+def _find_chessboard(gray: np.ndarray, board: Board) -> tuple[Any, Any]:
     has_board, corners = cv2.findChessboardCornersSB(gray, board.num_corners, flags=SEARCH_FLAGS)
     if not has_board:
         has_board, corners = cv2.findChessboardCorners(gray, board.num_corners)
-    if not has_board:
-        return np.empty(0, dtype=int), np.empty((0, 2))
-    return np.arange(len(corners)), corners.reshape(-1, 2)
+    return (range(len(corners)), corners) if has_board else ((), ())
 
 
-def _refine(gray: np.ndarray, ids: np.ndarray, corners: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+def _refine(gray: np.ndarray, view: View, share: float) -> View:
     """Refine corners in windows with half sides of `share` times the distance to the next corner."""
     height, width = gray.shape
-    refined, is_near, is_inside = corners.copy(), [], []
-    for k, spacing in enumerate(_spacings(corners)):
+    refined, is_near, is_inside = view.corners.copy(), [], []
+    for k, spacing in enumerate(_spacings(view.corners)):
         smallest = min(_MIN_WINDOW_PX, max(2, int(_MIN_WINDOW_SQUARES * spacing)))
         half = int(np.clip(share * spacing, smallest, _MAX_WINDOW_PX))
-        start = corners[k].astype(np.float32).reshape(1, 1, 2)
-        x, y = refined[k] = cv2.cornerSubPix(gray, start.copy(), (half, half), (-1, -1), _STOP).reshape(2)
-        is_near.append(np.hypot(*(refined[k] - corners[k])) <= max(1.0, _MAX_MOVE * spacing))
+        start = view.corners[k].astype(np.float32).reshape(1, 1, 2)
+        x, y = refined[k] = cv2.cornerSubPix(gray, start, (half, half), (-1, -1), _STOP).reshape(2)
+        is_near.append(np.hypot(*(refined[k] - view.corners[k])) <= max(1.0, _MAX_MOVE * spacing))
         is_inside.append(min(x, y, width - 1 - x, height - 1 - y) > half + 1)
     if np.mean(is_near) < _MIN_REFINED:
-        return ids, corners
-    keep = np.logical_and(is_near, is_inside)
-    return ids[keep], refined[keep]
+        return view
+    return view._replace(corners=refined).only(np.logical_and(is_near, is_inside))
 
 
-def _is_as_smooth(
-    board: Board, refined: tuple[np.ndarray, np.ndarray], original: tuple[np.ndarray, np.ndarray]
-) -> bool:
+def _is_as_smooth(board: Board, refined: View, original: View) -> bool:
     """Return True if refined corners fit their neighbors nearly as well as the original ones."""
-    (ids, corners), before = refined, original[1][np.isin(original[0], refined[0])]
-    plane = board.corners(ids)[:, :2]
-    error, refined_error = (np.square(_misfits(plane, c) * _spacings(c)).mean() for c in (before, corners))
+    views = original.only(np.isin(original.ids, refined.ids)), refined
+    error, refined_error = (np.square(_misfits(board, view)).mean() for view in views)
     return bool(error >= _SMOOTHNESS**2 * refined_error)
 
 
@@ -154,53 +139,47 @@ def _spacings(corners: np.ndarray) -> np.ndarray:
     return distances.min(axis=1) if len(corners) > 1 else np.zeros(len(corners))
 
 
-def _drop_misfits(board: Board, ids: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _drop_misfits(board: Board, view: View) -> View:
     # The worst one is dropped first, since it misleads the others.
-    while len(ids) > MIN_CORNERS:
-        errors = _misfits(board.corners(ids)[:, :2], corners)
-        worst = int(errors.argmax())
-        if errors[worst] <= _MAX_MISFIT:
+    while len(view.ids) > MIN_CORNERS:
+        errors = _misfits(board, view) / _spacings(view.corners).clip(min=1e-6)
+        if errors.max() <= _MAX_MISFIT:
             break
-        ids, corners = np.delete(ids, worst), np.delete(corners, worst, axis=0)
-    return ids, corners
+        view = view.only(np.arange(len(errors)) != errors.argmax())
+    return view
 
 
-def _misfits(plane: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return (N,), squares, the distance of each corner from its place by the homography of its neighbors."""
-    spacings, errors = _spacings(corners), np.zeros(len(corners))
-    for k, matrix in enumerate(_homographies(plane, corners)):
-        if matrix is not None:
-            expected = cv2.perspectiveTransform(plane[None, k : k + 1], matrix).reshape(2)
-            errors[k] = np.hypot(*(expected - corners[k])) / spacings[k]
+def _misfits(board: Board, view: View) -> np.ndarray:
+    """Return (N,), px, the distance of each corner from its place by the homography of its neighbors."""
+    errors = np.zeros(len(view.ids))
+    for k, point, matrix in _homographies(board, view):
+        errors[k] = np.hypot(*(cv2.perspectiveTransform(point[None, None], matrix).reshape(2) - view.corners[k]))
     return errors
 
 
-def _homographies(plane: np.ndarray, corners: np.ndarray) -> Iterator[np.ndarray | None]:
-    """Yield the homography from board to picture by the neighbors of each corner; None if these are collinear."""
+def _homographies(board: Board, view: View) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Yield corners on the board with the homography to the picture by their neighbors, unless these are collinear."""
+    plane = board.corners(view.ids)[:, :2]
     distances = np.linalg.norm(plane[:, None] - plane[None], axis=2)
-    for k in range(len(corners)):
+    for k, point in enumerate(plane):
         others = np.argsort(distances[k], kind="stable")[1 : _NUM_NEIGHBORS + 1]
         is_line = np.linalg.matrix_rank(plane[others] - plane[others].mean(axis=0)) < 2
-        yield None if is_line or len(others) < 4 else cv2.findHomography(plane[others], corners[others], 0)[0]
+        if len(others) >= 4 and not is_line:
+            yield k, point, cv2.findHomography(plane[others], view.corners[others], 0)[0]
 
 
-def _drop_covered(
-    gray: np.ndarray, board: Board, ids: np.ndarray, corners: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _drop_covered(gray: np.ndarray, board: Board, view: View) -> View:
     """Drop corners where two opposite squares are not clearly darker than the two others."""
-    plane, contrasts = board.corners(ids)[:, :2], np.full(len(ids), np.nan)
-    signs = np.array([(-1, -1), (1, 1), (-1, 1), (1, -1)])
-    for k, matrix in enumerate(_homographies(plane, corners)):
-        if matrix is not None:
-            points = np.vstack([plane[k], plane[k] + _PROBE * board.square_mm * signs])
-            pixels = cv2.perspectiveTransform(points[None], matrix).reshape(-1, 2)
-            x, y = (pixels[1:] - pixels[0] + corners[k]).astype(np.float32).T
-            values = cv2.remap(gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float).ravel()
-            contrasts[k] = max(values[:2].min() - values[2:].max(), values[2:].min() - values[:2].max())
+    contrasts = np.full(len(view.ids), np.nan)
+    steps = _PROBE * board.square_mm * np.array([(0, 0), (-1, -1), (1, 1), (-1, 1), (1, -1)])
+    for k, point, matrix in _homographies(board, view):
+        pixels = cv2.perspectiveTransform((point + steps)[None], matrix).reshape(-1, 2)
+        x, y = (pixels[1:] - pixels[0] + view.corners[k]).astype(np.float32).T
+        values = cv2.remap(gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float).ravel()
+        contrasts[k] = max(values[:2].min() - values[2:].max(), values[2:].min() - values[:2].max())
     if np.isnan(contrasts).all():
-        return ids, corners
-    keep = np.isnan(contrasts) | (contrasts > _MIN_CONTRAST * np.nanmedian(contrasts))
-    return ids[keep], corners[keep]
+        return view
+    return view.only(np.isnan(contrasts) | (contrasts > _MIN_CONTRAST * np.nanmedian(contrasts)))
 
 
 def edge_width(gray: np.ndarray) -> float:
@@ -243,14 +222,17 @@ def describe_other_board(gray: np.ndarray, board: Board) -> str:
 
 
 def _other_charuco(gray: np.ndarray, board: Charuco) -> str:
-    searches = [_find_markers(picture, name) for picture in (gray, 255 - gray) for name in LARGEST_DICTIONARIES]
-    best = max(searches, key=lambda search: len(search.corners))
-    if len(best.corners) < _MIN_MARKERS:
+    best: _Markers | None = None
+    for picture, color in ((gray, ""), (255 - gray, ", black and white exchanged")):
+        for name in LARGEST_DICTIONARIES:
+            corners, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(name)).detectMarkers(picture)
+            if len(corners) >= (_MIN_MARKERS if best is None else len(best.corners) + 1):
+                best = _Markers(picture, color, name, ids, corners)
+    if best is None:
         return ""
     low, high = int(best.ids.min()), int(best.ids.max())
     name = _smallest_dictionary(best.dictionary, high, preferred=board.dictionary)
-    color = "" if best.picture is gray else ", black and white exchanged"
-    text = f"{len(best.ids)} markers of {name}{color}, from number {low} to {high}"
+    text = f"{len(best.ids)} markers of {name}{best.color}, from number {low} to {high}"
     squares, count = _find_squares(best, replace(board, squares="3x3", dictionary=name))
     return f"{text}, with {count} corners as on a board of squares={squares}" if count >= MIN_CORNERS else text
 
@@ -259,24 +241,19 @@ class _Markers(NamedTuple):
     """The markers of a dictionary in a picture."""
 
     picture: np.ndarray
+    color: str
     dictionary: str
     ids: np.ndarray
     corners: Sequence[np.ndarray]
 
 
-def _find_markers(picture: np.ndarray, dictionary: str) -> _Markers:
-    corners, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(dictionary)).detectMarkers(picture)
-    return _Markers(picture, dictionary, np.empty((0, 1), dtype=np.int32) if ids is None else ids, corners)
-
-
 def _smallest_dictionary(dictionary: str, highest: int, *, preferred: str) -> str:
     """Return the preferred dictionary, or the smallest one of this kind, that has a marker with this number."""
-    kind = dictionary.rpartition("_")[0]
-    if not kind.startswith(("DICT_4X4", "DICT_5X5", "DICT_6X6", "DICT_7X7")):
+    kind, _, size = dictionary.rpartition("_")
+    if size != "1000":
         return dictionary
-    if preferred.rpartition("_")[0] == kind and highest < int(preferred.rpartition("_")[2]):
-        return preferred
-    return next(f"{kind}_{count}" for count in (50, 100, 250, 1000) if highest < count)
+    sizes = [preferred.rpartition("_")[2]] if preferred.rpartition("_")[0] == kind else []
+    return next(f"{kind}_{count}" for count in (*sizes, 50, 100, 250, 1000) if highest < int(count))
 
 
 def _find_squares(markers: _Markers, board: Charuco) -> tuple[str, int]:

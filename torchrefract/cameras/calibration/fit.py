@@ -1,15 +1,17 @@
 """Least-squares fit of a camera to views of a board, with standard deviations, cross-validation and outliers."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+import torch
+from torch import Tensor
 
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.detection import View
 from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.conversion import least_squares
 from torchrefract.cameras.projection import COEFFICIENTS
 
 _FLAGS = {
@@ -23,45 +25,30 @@ LENS_MODELS = (*_FLAGS, "fisheye")
 MIN_VIEWS = 3  # of a fit; cross-validation needs one more
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-10)
 _MAX_RMS = 0.05  # of the width of the frame; a larger error means that the fit failed
-_MAX_POSE_STEPS = 30
 _NUM_DEVIATIONS = 6.0  # standard deviations of the rms of the other views
 _RATIO = 3.0  # to the median rms of the other views
 _MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
-class Intrinsics(NamedTuple):
-    """The fitted parameters of a camera."""
+class Fit(NamedTuple):
+    """A fitted camera, the poses of the board, and the errors that remain."""
 
     model: str  # of `LENS_MODELS`
-    matrix: np.ndarray  # (3, 3), px
-    coefficients: np.ndarray  # (n,), in OpenCV's order, or k1 ... k4 of its fisheye
+    camera: Camera
+    deviations: np.ndarray  # standard deviations of `values`
+    poses: list[np.ndarray]  # for each view (6,), rotation vector and translation, mm
+    errors: list[np.ndarray]  # for each view (N, 2), px, detected minus projected corners
 
     @property
     def values(self) -> np.ndarray:
         """Return fx, fy, cx, cy and the coefficients."""
-        return np.concatenate([self.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], self.coefficients])
+        camera = self.camera
+        return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.coefficients])
 
     @property
     def names(self) -> tuple[str, ...]:
         """Return the names of `values`."""
-        kind = "fisheye" if self.model == "fisheye" else "opencv"
-        return ("fx", "fy", "cx", "cy", *COEFFICIENTS[kind][: len(self.coefficients)])
-
-    def camera(self, size: tuple[int, int]) -> Camera:
-        """Create the camera of frames of (width, height) px."""
-        fx, fy, cx, cy, *coefficients = self.values.tolist()
-        pinhole = {"width": size[0], "height": size[1], "fx": fx, "fy": fy, "cx": cx, "cy": cy}
-        model = "fisheye" if self.model == "fisheye" else "opencv"
-        return Camera(**pinhole, coefficients=tuple(coefficients), model=model)
-
-
-class Fit(NamedTuple):
-    """A fitted camera, the poses of the board, and the errors that remain."""
-
-    intrinsics: Intrinsics
-    deviations: np.ndarray  # standard deviations of `intrinsics.values`
-    poses: list[np.ndarray]  # for each view (6,), rotation vector and translation, mm
-    errors: list[np.ndarray]  # for each view (N, 2), px, detected minus projected corners
+        return ("fx", "fy", "cx", "cy", *COEFFICIENTS[self.camera.model][: len(self.camera.coefficients)])
 
     @property
     def rms(self) -> float:
@@ -75,7 +62,7 @@ def rms(errors: np.ndarray) -> float:
 
 
 def fit_camera(
-    views: Sequence[View], board: Board, *, model: str, size: tuple[int, int], start: Intrinsics | None = None
+    views: Sequence[View], board: Board, *, model: str, size: tuple[int, int], start: Camera | None = None
 ) -> Fit:
     """Fit a camera to views of a board by OpenCV's calibration.
 
@@ -96,16 +83,16 @@ def fit_camera(
         raise ValueError(f"views must be at least {MIN_VIEWS}, got {len(views)}")
     objects, images = [board.corners(view.ids) for view in views], [view.corners for view in views]
     try:
-        intrinsics, poses = _minimize(objects, images, model, size, start)
-    except cv2.error as error:
-        reason = " ".join(str(error.err or error).split())
-        raise ValueError(f"views must be enough for the model {model}, got {len(views)}: {reason}") from error
-    if not np.isfinite(intrinsics.values).all():
-        raise ValueError(f"views must be enough for the model {model}, got {len(views)} that fit no camera")
-    errors = [
-        image - project(intrinsics, pose, points)[0] for points, pose, image in zip(objects, poses, images, strict=True)
-    ]
-    fit = Fit(intrinsics, _deviations(intrinsics, poses, objects, errors), poses, errors)
+        camera, poses = _minimize(objects, images, model, size, start)
+    except (cv2.error, ValueError) as error:
+        reason = " ".join(str(getattr(error, "err", None) or error).split())
+        raise ValueError(
+            f"views must be enough for the model {model}, got {len(views)} that fit no camera: {reason}"
+        ) from error
+    projected = [project(camera, pose, points) for points, pose in zip(objects, poses, strict=True)]
+    errors = [image - pixels for image, (pixels, _, _) in zip(images, projected, strict=True)]
+    deviations = _deviations([slopes for _, *slopes in projected], np.concatenate(errors))
+    fit = Fit(model, camera, deviations, poses, errors)
     if fit.rms > _MAX_RMS * size[0]:
         raise ValueError(
             f"views must be of one camera of the model {model}, got {len(views)} that leave {fit.rms:.1f} px rms"
@@ -113,62 +100,52 @@ def fit_camera(
     return fit
 
 
-def project(intrinsics: Intrinsics, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project points (N, 3), mm, of a board in a pose.
+def project(camera: Camera, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Project points (N, 3), mm, of a board in a pose to pixels (N, 2).
 
-    Returns:
-        pixels: (N, 2), px.
-        pose_slopes: (2 N, 6), derivatives with respect to the pose.
-        intrinsic_slopes: (2 N, n), derivatives with respect to `intrinsics.values`.
+    Returns their derivatives too: with respect to the pose (2 N, 6), and to fx, fy, cx, cy, coefficients (2 N, n).
     """
-    points, rotation, translation = points.reshape(-1, 1, 3).astype(np.float64), pose[:3], pose[3:]
-    lens = intrinsics.matrix, intrinsics.coefficients
-    if intrinsics.model == "fisheye":
-        pixels, slopes = cv2.fisheye.projectPoints(points, rotation, translation, *lens)
+    arguments = points.reshape(-1, 1, 3), pose[:3], pose[3:], np.array(camera.matrix), np.array(camera.coefficients)
+    if camera.model == "fisheye":
+        pixels, slopes = cv2.fisheye.projectPoints(*arguments)
         return pixels.reshape(-1, 2), slopes[:, 8:14], slopes[:, :8]
-    pixels, slopes = cv2.projectPoints(points, rotation, translation, *lens)
+    pixels, slopes = cv2.projectPoints(*arguments)
     return pixels.reshape(-1, 2), slopes[:, :6], slopes[:, 6:]
 
 
-def errors_in_best_pose(view: View, board: Board, intrinsics: Intrinsics, pose: np.ndarray) -> np.ndarray:
+def errors_in_best_pose(view: View, board: Board, camera: Camera, pose: np.ndarray) -> np.ndarray:
     """Return the errors (N, 2), px, of a view that the camera was not fitted to.
 
     Only the pose is fitted, by the Levenberg-Marquardt method from `pose`: six parameters for 2 N values.
     """
-    points, damping = board.corners(view.ids), 1e-3
-    pixels, slopes, _ = project(intrinsics, pose, points)
-    errors = view.corners - pixels
-    for _ in range(_MAX_POSE_STEPS):
-        normal = slopes.T @ slopes
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slopes.T @ errors.ravel())
-        pixels, new_slopes, _ = project(intrinsics, pose + step, points)
-        new_errors = view.corners - pixels
-        if (new_errors**2).sum() <= (errors**2).sum():
-            pose, errors, slopes, damping = pose + step, new_errors, new_slopes, damping / 10
-        else:
-            damping *= 10
-        if np.abs(step).max() < 1e-9:
-            break
-    return errors
+    points = board.corners(view.ids)
+
+    def function(pose: Tensor) -> tuple[Tensor, Tensor]:
+        pixels, slopes, _ = project(camera, pose.numpy(), points)
+        return torch.from_numpy((pixels - view.corners).ravel()), torch.from_numpy(slopes)
+
+    best = least_squares(function, torch.from_numpy(pose))
+    return view.corners - project(camera, best.numpy(), points)[0]
 
 
-def cross_validate(
-    views: Sequence[View], board: Board, fit: Fit, *, size: tuple[int, int], folds: int = 5
-) -> list[np.ndarray]:
-    """Return for each view its errors (N, 2), px, with a camera fitted to the views of the other folds.
+def cross_validate(views: Sequence[View], board: Board, fit: Fit, *, folds: int = 5) -> list[np.ndarray]:
+    """Return for each of at least four views its errors (N, 2), px, with a camera fitted to the views of other folds.
 
-    Args:
-        views, board, size: as for `fit_camera`, with at least four views.
-        fit: to all views.
-        folds: number of folds, at most one for each view; view i is in fold i mod folds.
+    `fit` is to all views. View i is in fold i mod folds.
     """
     errors, folds = [np.empty((0, 2))] * len(views), min(folds, len(views))
     for fold in range(folds):
-        others = [view for i, view in enumerate(views) if i % folds != fold]
-        other_fit = fit_camera(others, board, model=fit.intrinsics.model, size=size, start=fit.intrinsics)
-        for i in range(fold, len(views), folds):
-            errors[i] = errors_in_best_pose(views[i], board, other_fit.intrinsics, fit.poses[i])
+        held_out = range(fold, len(views), folds)
+        camera = _fit_without(held_out, views, board, fit).camera
+        for i in held_out:
+            errors[i] = errors_in_best_pose(views[i], board, camera, fit.poses[i])
     return errors
+
+
+def _fit_without(held_out: Collection[int], views: Sequence[View], board: Board, fit: Fit) -> Fit:
+    others = [view for i, view in enumerate(views) if i not in held_out]
+    size = fit.camera.width, fit.camera.height
+    return fit_camera(others, board, model=fit.model, size=size, start=fit.camera)
 
 
 class LeaveOneOut(NamedTuple):
@@ -180,19 +157,6 @@ class LeaveOneOut(NamedTuple):
     median: float  # of the errors of each of the others
     limit: float  # of the error, above which the view is an outlier
 
-    @property
-    def is_outlier(self) -> bool:
-        """Return True if the view fits the others far worse than they fit each other."""
-        return self.error > self.limit
-
-    def reason(self, before: float) -> str:
-        """Say why the view is dropped; `before` is the rms of the other views in a fit to all of them, px."""
-        return (
-            f"its error is {self.error:.2f} px rms if it is left out of the fit; the others have a median of "
-            f"{self.median:.2f} px, and the limit is {self.limit:.2f} px. Without it the others have "
-            f"{self.others:.2f} px instead of {before:.2f} px"
-        )
-
 
 class Selection(NamedTuple):
     """The views that fit each other."""
@@ -203,19 +167,18 @@ class Selection(NamedTuple):
     dropped: dict[str, str]  # the reason by the name of each dropped view
 
 
-def leave_each_out(views: Sequence[View], board: Board, fit: Fit, *, size: tuple[int, int]) -> list[LeaveOneOut]:
+def leave_each_out(views: Sequence[View], board: Board, fit: Fit) -> list[LeaveOneOut]:
     """Leave each of at least four views, which `fit` is to, out in turn.
 
     limit = max(3 m, m + 6 * 1.4826 median |e_j - m|),  m = median e_j,  e_j the rms of the other views
     """
     results = []
     for i, view in enumerate(views):
-        others = [*views[:i], *views[i + 1 :]]
-        other_fit = fit_camera(others, board, model=fit.intrinsics.model, size=size, start=fit.intrinsics)
+        other_fit = _fit_without([i], views, board, fit)
         errors = np.array([rms(errors) for errors in other_fit.errors])
         median = float(np.median(errors))
         deviation = _MAD_TO_SIGMA * float(np.median(np.abs(errors - median)))
-        error = rms(errors_in_best_pose(view, board, other_fit.intrinsics, fit.poses[i]))
+        error = rms(errors_in_best_pose(view, board, other_fit.camera, fit.poses[i]))
         limit = max(_RATIO * median, median + _NUM_DEVIATIONS * deviation)
         results.append(LeaveOneOut(view.name, error, other_fit.rms, median, limit))
     return results
@@ -237,60 +200,55 @@ def drop_outliers(
     max_dropped = min(int(max_share * len(kept)), len(kept) - MIN_VIEWS - 1)
     while True:
         fit = fit_camera(kept, board, model=model, size=size)
-        ranking = sorted(leave_each_out(kept, board, fit, size=size), key=lambda result: result.others)
-        outliers = [result for result in ranking if result.is_outlier]
+        ranking = sorted(leave_each_out(kept, board, fit), key=lambda result: result.others)
+        outliers = [result for result in ranking if result.error > result.limit]
         if not outliers or len(dropped) >= max_dropped:
             return Selection(kept, fit, ranking, dropped)
         worst = outliers[0]
-        before = [errors for view, errors in zip(kept, fit.errors, strict=True) if view.name != worst.name]
-        dropped[worst.name] = worst.reason(rms(np.concatenate(before)))
+        others = [errors for view, errors in zip(kept, fit.errors, strict=True) if view.name != worst.name]
+        dropped[worst.name] = (
+            f"its error is {worst.error:.2f} px rms if it is left out of the fit; the others have a median of "
+            f"{worst.median:.2f} px, and the limit is {worst.limit:.2f} px. Without it the others have "
+            f"{worst.others:.2f} px instead of {rms(np.concatenate(others)):.2f} px"
+        )
         kept = [view for view in kept if view.name != worst.name]
 
 
 def _minimize(
-    objects: list[np.ndarray], images: list[np.ndarray], model: str, size: tuple[int, int], start: Intrinsics | None
-) -> tuple[Intrinsics, list[np.ndarray]]:
-    """Run OpenCV's calibration, whose fisheye takes float64 and four coefficients."""
+    objects: list[np.ndarray], images: list[np.ndarray], model: str, size: tuple[int, int], start: Camera | None
+) -> tuple[Camera, list[np.ndarray]]:
+    """Run OpenCV's calibration, whose fisheye takes float64 and four coefficients; return the camera and the poses."""
     is_fisheye = model == "fisheye"
     count = 4 if is_fisheye else int(model.removeprefix("opencv"))
     matrix, vector = np.eye(3), np.zeros((4 if is_fisheye else 14, 1))
     flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW if is_fisheye else _FLAGS[model]
     if start is not None:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
-        matrix, vector[: len(start.coefficients), 0] = start.matrix.copy(), start.coefficients
+        matrix, vector[:count, 0] = np.array(start.matrix), start.coefficients
     run, dtype = (cv2.fisheye.calibrate, np.float64) if is_fisheye else (cv2.calibrateCamera, np.float32)
     on_board, in_picture = ([points[None].astype(dtype) for points in group] for group in (objects, images))
-    with _on_one_thread():
-        result = run(on_board, in_picture, size, matrix, vector, flags=flags, criteria=_STOP)
-    _, matrix, vector, rotations, translations = result
-    poses = [np.concatenate([r.ravel(), t.ravel()]) for r, t in zip(rotations, translations, strict=True)]
-    return Intrinsics(model, matrix, vector.ravel()[:count].copy()), poses
-
-
-@contextmanager
-def _on_one_thread() -> Iterator[None]:
-    """Run OpenCV on one thread: on several, it sums over the views in a different order in each run."""
     threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
+    cv2.setNumThreads(1)  # on several, OpenCV sums over the views in a different order in each run
     try:
-        yield
+        result = run(on_board, in_picture, size, matrix, vector, flags=flags, criteria=_STOP)
     finally:
         cv2.setNumThreads(threads)
+    _, matrix, vector, rotations, translations = result
+    poses = [np.concatenate([r.ravel(), t.ravel()]) for r, t in zip(rotations, translations, strict=True)]
+    pinhole = dict(zip(("fx", "fy", "cx", "cy"), matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True))
+    coefficients, kind = tuple(vector.ravel()[:count].tolist()), "fisheye" if is_fisheye else "opencv"
+    return Camera(width=size[0], height=size[1], **pinhole, coefficients=coefficients, model=kind), poses
 
 
-def _deviations(
-    intrinsics: Intrinsics, poses: list[np.ndarray], objects: list[np.ndarray], errors: list[np.ndarray]
-) -> np.ndarray:
-    """Return the standard deviations of `intrinsics.values`, with the poses eliminated by the Schur complement."""
-    count = len(intrinsics.values)
-    normal = np.zeros((count, count))
-    for pose, points in zip(poses, objects, strict=True):
-        _, pose_slopes, slopes = project(intrinsics, pose, points)
-        shared = pose_slopes.T @ slopes
-        normal += slopes.T @ slopes - shared.T @ np.linalg.solve(pose_slopes.T @ pose_slopes, shared)
-    residual = np.concatenate(errors)
-    degrees_of_freedom = max(1, residual.size - count - 6 * len(poses))
+def _deviations(slopes: Sequence[Sequence[np.ndarray]], errors: np.ndarray) -> np.ndarray:
+    """Return the deviations of a fit from the slopes of its views; the Schur complement eliminates the poses."""
+    normal = np.zeros((1, 1))
+    for pose_slopes, camera_slopes in slopes:
+        shared = pose_slopes.T @ camera_slopes
+        normal = normal + camera_slopes.T @ camera_slopes
+        normal -= shared.T @ np.linalg.solve(pose_slopes.T @ pose_slopes, shared)
+    degrees_of_freedom = max(1, errors.size - len(normal) - 6 * len(slopes))
     # Correlated coefficients make the matrix nearly singular; scaled to a unit diagonal it can be inverted.
     scale = np.sqrt(np.diag(normal).clip(min=np.finfo(float).tiny))
     inverse = np.linalg.pinv(normal / np.outer(scale, scale), hermitian=True)
-    return np.sqrt(np.diag(inverse).clip(min=0) * (residual**2).sum() / degrees_of_freedom) / scale
+    return np.sqrt(np.diag(inverse).clip(min=0) * (errors**2).sum() / degrees_of_freedom) / scale

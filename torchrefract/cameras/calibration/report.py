@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from torchrefract._io import replace_file
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.detection import Detection, View
-from torchrefract.cameras.calibration.fit import Fit, Selection, cross_validate, drop_outliers, rms
+from torchrefract.cameras.calibration.fit import Fit, LeaveOneOut, cross_validate, drop_outliers, rms
 from torchrefract.cameras.camera import Camera
 
 CAMERA_FILE, REPORT_FILE = "camera.yaml", "report.md"
@@ -24,6 +24,34 @@ CELLS = (6, 8)  # rows and columns of the cells that divide the frame
 _NUM_DEVIATIONS = 2.0  # standard deviations within which a coefficient may be zero
 _SIDES = {"left": np.s_[:, 0], "right": np.s_[:, -1], "top": np.s_[0], "bottom": np.s_[-1]}
 _MIN_LINE = 3  # corners of a line; two always lie on one
+_REPORT = """\
+# Calibration
+
+Board: `{board}`
+Lens model: {model}, frames of {camera.width} x {camera.height} px
+Used: {num_views} views of {num_pictures} pictures, {num_corners} corners
+
+{errors}
+
+Errors are distances in the picture, over all corners. A held-out view is not used to fit the camera; only
+its pose is fitted.
+
+## Camera
+
+{parameters}
+
+{warnings}
+
+![Corners in the frame](coverage.png)
+
+## Views
+
+Each view was left out of the fit in turn. The view that costs the others most comes first. A view is an
+outlier if its held-out error is above its limit. All errors are in px rms.
+
+{views}
+
+![Reprojection errors](residuals.png)"""
 
 
 class Calibration(NamedTuple):
@@ -31,19 +59,11 @@ class Calibration(NamedTuple):
 
     board: Board
     detections: Sequence[Detection]
-    selection: Selection
-    held_out_errors: Sequence[np.ndarray]  # for each view (N, 2), px, by `cross_validate`
-    camera: Camera
-
-    @property
-    def fit(self) -> Fit:
-        """Return the fit of camera and poses."""
-        return self.selection.fit
-
-    @property
-    def held_out_rms(self) -> float:
-        """Return the rms error of views that the camera was not fitted to, px."""
-        return rms(np.concatenate(self.held_out_errors))
+    views: list[View]  # that fit each other
+    fit: Fit  # to these views
+    ranking: list[LeaveOneOut]  # of these views, the one that costs the others most first
+    dropped: dict[str, str]  # the reason by the name of each dropped view
+    held_out_rms: float  # error of views that the camera was not fitted to, px, by `cross_validate`
 
 
 def calibrate_camera(
@@ -51,18 +71,12 @@ def calibrate_camera(
 ) -> Calibration:
     """Fit a camera to all usable detections, at least four, without views that do not fit the others.
 
-    Args:
-        detections, board: as for `detect`.
-        model, size: as for `fit_camera`.
-        max_drop_share: of the views that may be dropped.
-
-    Raises:
-        ValueError: no camera fits the views.
+    The other arguments are those of `drop_outliers`. Raises ValueError if no camera fits the views.
     """
     views = [detection.view for detection in detections if not detection.problem]
     selection = drop_outliers(views, board, model=model, size=size, max_share=max_drop_share)
-    held_out = cross_validate(selection.views, board, selection.fit, size=size)
-    return Calibration(board, detections, selection, held_out, selection.fit.intrinsics.camera(size))
+    held_out = cross_validate(selection.views, board, selection.fit)
+    return Calibration(board, detections, *selection, rms(np.concatenate(held_out)))
 
 
 def write_report(calibration: Calibration, read_gray: Callable[[str], np.ndarray], folder: Path) -> None:
@@ -82,92 +96,64 @@ def write_failure(board: Board, detections: Sequence[Detection], problem: str, f
     for name in (CAMERA_FILE, *_FIGURES):
         if (folder / name).is_file():
             (folder / name).replace(_earlier(folder / name))
-    lines = ["# Calibration", "", f"The calibration failed: {problem}", "", f"Board: `{board.describe()}`", ""]
+    text = f"# Calibration\n\nThe calibration failed: {problem}\n\nBoard: `{board.describe()}`\n\n"
     if _earlier(folder / CAMERA_FILE).is_file():
-        lines += [f"`{_earlier(folder / CAMERA_FILE).name}` is the camera of an earlier calibration.", ""]
+        text += f"`{_earlier(folder / CAMERA_FILE).name}` is the camera of an earlier calibration.\n\n"
     rows = [(d.view.name, str(len(d.view.ids)), d.problem) for d in detections]
-    _write(folder / REPORT_FILE, [*lines, *_table(("picture", "corners", "problem"), rows)])
+    _write(folder / REPORT_FILE, text + _table(("picture", "corners", "problem"), rows))
 
 
 def _earlier(path: Path) -> Path:
     return path.with_name(f"{path.stem}_before{path.suffix}")
 
 
-def _write(path: Path, lines: Sequence[str]) -> None:
+def _write(path: Path, text: str) -> None:
     with replace_file(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        temporary.write_text(text + "\n", encoding="utf-8")
 
 
-def _report(calibration: Calibration) -> list[str]:
-    fit, views, camera = calibration.fit, calibration.selection.views, calibration.camera
-    num_corners = sum(len(view.ids) for view in views)
-    parameters = zip(fit.intrinsics.names, fit.intrinsics.values, fit.deviations, strict=True)
-    lines = [
-        "# Calibration",
-        "",
-        f"Board: `{calibration.board.describe()}`",
-        f"Lens model: {fit.intrinsics.model}, frames of {camera.width} x {camera.height} px",
-        f"Used: {len(views)} views of {len(calibration.detections)} pictures, {num_corners} corners",
-        "",
-        *_table(("error", "px rms"), _error_rows(calibration)),
-        "",
-        "Errors are distances in the picture, over all corners. A held-out view is not used to fit the camera; only",
-        "its pose is fitted.",
-        "",
-        "## Camera",
-        "",
-        *_table(
+def _report(calibration: Calibration) -> str:
+    fit, views, camera, board = calibration.fit, calibration.views, calibration.fit.camera, calibration.board
+    errors = {
+        "reprojection error": fit.rms,
+        "reprojection error of held-out views": calibration.held_out_rms,
+        "corners off straight lines, in the pictures": straightness(views, board),
+        "corners off straight lines, rectified": straightness(undistort_views(views, camera), board),
+    }
+    parameters = zip(fit.names, fit.values, fit.deviations, strict=True)
+    results = {view.name: (str(len(view.ids)), rms(e)) for view, e in zip(views, fit.errors, strict=True)}
+    view_rows = []
+    for one in calibration.ranking:
+        num_corners, error = results[one.name]
+        numbers = (f"{value:.3f}" for value in (error, one.error, one.limit, one.others))
+        view_rows.append((one.name, num_corners, *numbers))
+    text = _REPORT.format(
+        board=board.describe(),
+        model=fit.model,
+        camera=camera,
+        num_views=len(views),
+        num_pictures=len(calibration.detections),
+        num_corners=sum(len(view.ids) for view in views),
+        errors=_table(("error", "px rms"), [(name, f"{value:.4f}") for name, value in errors.items()]),
+        parameters=_table(
             ("parameter", "value", "standard deviation"),
             [(name, f"{value:.6g}", f"{deviation:.2g}") for name, value, deviation in parameters],
         ),
-        "",
-        *[f"- {message}" for message in calibration_warnings(views, fit, camera)],
-        "",
-        "![Corners in the frame](coverage.png)",
-        "",
-        "## Views",
-        "",
-        "Each view was left out of the fit in turn. The view that costs the others most comes first. A view is an",
-        "outlier if its held-out error is above its limit. All errors are in px rms.",
-        "",
-        *_table(("view", "corners", "error", "held-out error", "limit", "others without it"), _view_rows(calibration)),
-        "",
-        "![Reprojection errors](residuals.png)",
-    ]
-    unused = [(name, f"dropped: {reason}") for name, reason in calibration.selection.dropped.items()]
+        warnings="\n".join(f"- {message}" for message in calibration_warnings(views, fit)),
+        views=_table(("view", "corners", "error", "held-out error", "limit", "others without it"), view_rows),
+    )
+    unused = [(name, f"dropped: {reason}") for name, reason in calibration.dropped.items()]
     unused += [(d.view.name, d.problem) for d in calibration.detections if d.problem]
-    return [*lines, "", "## Pictures not used", "", *_table(("picture", "reason"), unused)] if unused else lines
+    return f"{text}\n\n## Pictures not used\n\n{_table(('picture', 'reason'), unused)}" if unused else text
 
 
-def _error_rows(calibration: Calibration) -> list[tuple[str, str]]:
-    views, board = calibration.selection.views, calibration.board
-    values = {
-        "reprojection error": calibration.fit.rms,
-        "reprojection error of held-out views": calibration.held_out_rms,
-        "corners off straight lines, in the pictures": straightness(views, board),
-        "corners off straight lines, rectified": straightness(undistort_views(views, calibration.camera), board),
-    }
-    return [(name, f"{value:.4f}") for name, value in values.items()]
-
-
-def _view_rows(calibration: Calibration) -> list[tuple[str, ...]]:
-    views, ranking = calibration.selection.views, calibration.selection.ranking
-    fits = {view.name: (len(view.ids), rms(e)) for view, e in zip(views, calibration.fit.errors, strict=True)}
-    rows = []
-    for result in ranking:
-        num_corners, error = fits[result.name]
-        numbers = (f"{value:.3f}" for value in (error, result.error, result.limit, result.others))
-        rows.append((result.name, str(num_corners), *numbers))
-    return rows
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)]
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows))
 
 
 def _draw_coverage(calibration: Calibration) -> Figure:
     """Draw all corners, over the number of corners in each cell of the frame."""
-    camera, views = calibration.camera, calibration.selection.views
+    camera, views = calibration.fit.camera, calibration.views
     figure = Figure(figsize=(9.6, 9.6 * camera.height / camera.width + 0.9), dpi=_DPI, layout="constrained")
     axes = figure.add_subplot()
     counts, (rows, columns) = corner_counts(views, (camera.width, camera.height)), CELLS
@@ -185,17 +171,14 @@ def _draw_coverage(calibration: Calibration) -> Figure:
 
 def _draw_residuals(calibration: Calibration, read_gray: Callable[[str], np.ndarray]) -> Figure:
     """Draw the views that cost the others most, each with the errors of its corners."""
-    names = [result.name for result in calibration.selection.ranking[:_MAX_DRAWN]]
-    index = {view.name: i for i, view in enumerate(calibration.selection.views)}
-    rows, aspect = -(-len(names) // _COLUMNS), calibration.camera.height / calibration.camera.width
+    names, fit = [result.name for result in calibration.ranking[:_MAX_DRAWN]], calibration.fit
+    results = {view.name: (view.corners, e) for view, e in zip(calibration.views, fit.errors, strict=True)}
+    rows, aspect = -(-len(names) // _COLUMNS), fit.camera.height / fit.camera.width
     figure = Figure(figsize=(16, rows * (4 * aspect + 0.4) + 0.6), dpi=_DPI, layout="constrained")
-    scale = _ARROW * calibration.camera.width / max(calibration.fit.rms, 1e-6)
-    figure.suptitle(
-        f"detected minus projected corners, {scale:.0f} times enlarged; rms of all {calibration.fit.rms:.3f} px"
-    )
+    scale = _ARROW * fit.camera.width / max(fit.rms, 1e-6)
+    figure.suptitle(f"detected minus projected corners, {scale:.0f} times enlarged; rms of all {fit.rms:.3f} px")
     for k, name in enumerate(names):
-        axes = figure.add_subplot(rows, _COLUMNS, k + 1)
-        corners, errors = calibration.selection.views[index[name]].corners, calibration.fit.errors[index[name]]
+        axes, (corners, errors) = figure.add_subplot(rows, _COLUMNS, k + 1), results[name]
         gray = read_gray(name)
         axes.imshow(gray, cmap="gray", vmin=-255, vmax=255)  # pale, so that the arrows stand out
         options = {"angles": "xy", "scale_units": "xy", "scale": 1 / scale, "color": "#d00000", "width": 0.004}
@@ -214,9 +197,9 @@ def corner_counts(views: Sequence[View], size: tuple[int, int]) -> np.ndarray:
     return np.histogram2d(corners[:, 1], corners[:, 0], bins=CELLS, range=limits)[0].astype(int)
 
 
-def calibration_warnings(views: Sequence[View], fit: Fit, camera: Camera) -> list[str]:
+def calibration_warnings(views: Sequence[View], fit: Fit) -> list[str]:
     """Return warnings about a calibration: sides without corners, coefficients near zero, and `camera_warnings`."""
-    counts, messages = corner_counts(views, (camera.width, camera.height)), []
+    counts, messages = corner_counts(views, (fit.camera.width, fit.camera.height)), []
     empty = [
         f"{side} ({np.sum(counts[cells] == 0)} of {counts[cells].size} cells)"
         for side, cells in _SIDES.items()
@@ -227,7 +210,7 @@ def calibration_warnings(views: Sequence[View], fit: Fit, camera: Camera) -> lis
             f"The frame has few corners at the {', '.join(empty)}: the model is extrapolated there. Add pictures with "
             "the board near the border."
         )
-    rows = zip(fit.intrinsics.names[4:], fit.intrinsics.values[4:], fit.deviations[4:], strict=True)
+    rows = zip(fit.names[4:], fit.values[4:], fit.deviations[4:], strict=True)
     vague = [
         f"{name} = {value:.4g} +- {deviation:.2g}"
         for name, value, deviation in rows
@@ -238,7 +221,7 @@ def calibration_warnings(views: Sequence[View], fit: Fit, camera: Camera) -> lis
             f"These coefficients are zero within two standard deviations: {', '.join(vague)}. A lens_model with fewer "
             "coefficients may be enough."
         )
-    return [*messages, *camera_warnings(camera)]
+    return [*messages, *camera_warnings(fit.camera)]
 
 
 def camera_warnings(camera: Camera) -> list[str]:
@@ -268,10 +251,12 @@ def straightness(views: Sequence[View], board: Board) -> float:
     """
     squares, degrees_of_freedom = 0.0, 0
     for view in views:
-        for line in _lines(view, board):
-            # The smaller singular value is the root of the sum of squared distances from the line.
-            squares += float(np.linalg.svd(line - line.mean(axis=0), compute_uv=False)[1]) ** 2
-            degrees_of_freedom += len(line) - 2
+        for axis in np.divmod(view.ids, board.num_corners[0]):  # rows, then columns
+            for line in (view.corners[axis == k] for k in np.unique(axis)):
+                if len(line) >= _MIN_LINE:
+                    # The smaller singular value is the root of the sum of squared distances from the line.
+                    squares += float(np.linalg.svd(line - line.mean(axis=0), compute_uv=False)[1]) ** 2
+                    degrees_of_freedom += len(line) - 2
     if degrees_of_freedom == 0:
         raise ValueError(f"views must have {_MIN_LINE} corners of one row or column, got {len(views)} views without")
     return (squares / degrees_of_freedom) ** 0.5
@@ -283,13 +268,5 @@ def undistort_views(views: Sequence[View], camera: Camera) -> list[View]:
     undistorted = []
     for view in views:
         points, valid, _ = camera.undistort(torch.from_numpy((view.corners - center) / focal))
-        keep = valid.numpy()
-        undistorted.append(View(view.name, view.ids[keep], points.numpy()[keep] * focal + center))
+        undistorted.append(view._replace(corners=points.numpy() * focal + center).only(valid.numpy()))
     return undistorted
-
-
-def _lines(view: View, board: Board) -> list[np.ndarray]:
-    """Return the corners (n, 2) of each row and column that has at least three."""
-    row, column = np.divmod(view.ids, board.num_corners[0])
-    groups = [view.corners[axis == k] for axis in (row, column) for k in np.unique(axis)]
-    return [group for group in groups if len(group) >= _MIN_LINE]

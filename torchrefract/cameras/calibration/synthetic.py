@@ -1,7 +1,6 @@
 """Rendered pictures of a board as a known camera takes them, to test a calibration."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,54 +22,44 @@ _BLACK, _WHITE, _WALL = 25.0, 225.0, 130.0  # of 255
 _NOISE = 1.0  # of 255, standard deviation
 
 
-class Rays(NamedTuple):
-    """The points where the rays of a camera meet the plane z = 1; NaN where there is none."""
-
-    centers: np.ndarray  # (H, W, 2), of pixel centers
-    slopes: np.ndarray  # (2, H, W, 2), per px to the right and per px down
-
-    def subpixel_points(self, mask: np.ndarray) -> np.ndarray:
-        """Return (N, n^2, 2), n x n points in each pixel of a mask, linearized with an error below 1e-3 px."""
-        steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
-        right, down = (offsets.reshape(-1, 1) for offsets in np.meshgrid(steps, steps))
-        center, slopes = self.centers[mask][:, None], self.slopes[:, mask][:, :, None]
-        return center + right * slopes[0] + down * slopes[1]
-
-
 def render_views(
     board: Board, camera: Camera = CAMERA, *, count: int = NUM_VIEWS, seed: int = 0
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Render pictures of a board with a white margin of one square in front of a gray wall.
 
-    A pixel is the mean of 6 x 6 rays, with noise, rounded to 8 bits.
-
-    Args:
-        board: to render; "auto" patterns are rendered as False.
-        camera: that takes the pictures.
-        count: number of pictures; the board moves over the frame in rows.
-        seed: of the poses and of the noise.
+    A pixel is the mean of 6 x 6 rays, with noise, rounded to 8 bits. The board moves over the frame in rows; "auto"
+    patterns are rendered as False. `seed` is that of the poses and of the noise.
 
     Yields:
-        name: of the picture.
-        picture: (H, W), uint8.
-        pose: (6,), of the board, rotation vector and translation, mm.
+        The name of the picture; the picture (H, W), uint8; the pose of the board (6,), rotation vector and translation,
+        mm.
     """
-    rays, generator = camera_rays(camera), np.random.default_rng(seed)
+    generator = np.random.default_rng(seed)
+    pixels = np.stack(np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), axis=-1)
+    rays = on_plane(camera, pixels)
     for number in range(count):
         pose = _pose(board, camera, number, count, generator)
-        shade = _render(board, rays, pose) + generator.normal(0, _NOISE, (camera.height, camera.width))
+        shade = _shade(board, rays, pose)
+        contrast = cv2.dilate(shade, np.ones((3, 3))) - cv2.erode(shade, np.ones((3, 3)))
+        edges = contrast > 0  # all rays of any other pixel meet one color
+        shade[edges] = _shade(board, subpixel_points(rays, edges), pose).mean(axis=-1)
+        shade += generator.normal(0, _NOISE, shade.shape)
         yield f"view_{number:02d}.png", shade.round().clip(0, 255).astype(np.uint8), pose
 
 
-def camera_rays(camera: Camera) -> Rays:
-    """Compute the rays of all pixels of a camera."""
-    pixels = np.stack(np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), axis=-1)
-    centers = _on_plane(camera, pixels)
-    return Rays(centers, np.stack([np.gradient(centers, axis=1), np.gradient(centers, axis=0)]))
+def subpixel_points(rays: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return (N, n^2, 2), n x n points in each pixel of a mask (H, W), linearized with an error below 1e-3 px.
+
+    `rays` are the points (H, W, 2) where the rays of pixels meet the plane z = 1.
+    """
+    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+    right, down = (offsets.reshape(-1, 1) for offsets in np.meshgrid(steps, steps))
+    slopes = (np.gradient(rays, axis=axis)[mask][:, None] for axis in (1, 0))
+    return rays[mask][:, None] + right * next(slopes) + down * next(slopes)
 
 
-def _on_plane(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Return where the rays of pixels (..., 2) meet the plane z = 1."""
+def on_plane(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Return where the rays of pixels (..., 2) meet the plane z = 1; NaN where there is none."""
     rays, valid, _ = camera.unproject(torch.from_numpy(pixels.reshape(-1, 2)))
     in_front = valid & (rays[:, 2] > 0)
     points = torch.where(in_front[:, None], rays[:, :2] / torch.where(in_front, rays[:, 2], 1.0)[:, None], torch.nan)
@@ -82,27 +71,17 @@ def _pose(board: Board, camera: Camera, number: int, count: int, generator: np.r
     columns = int(np.ceil(np.sqrt(1.5 * count)))
     raster = (np.array([number % columns, number // columns]) + 0.5) / (columns, np.ceil(count / columns))
     width_range, margin = _CHARUCO_LAYOUT if isinstance(board, Charuco) else _CHESSBOARD_LAYOUT
-    x, y = _on_plane(camera, (margin + (1 - 2 * margin) * raster) * (camera.width - 1, camera.height - 1))
-    rotation = _facing(x, y) @ cv2.Rodrigues(generator.uniform(-1, 1, 3) * (_MAX_TILT, _MAX_TILT, _MAX_TURN))[0]
+    x, y = on_plane(camera, (margin + (1 - 2 * margin) * raster) * (camera.width - 1, camera.height - 1))
+    # The smallest rotation that turns the axis of the camera toward (x, y).
+    facing = np.arctan(np.hypot(x, y)) * np.array([-y, x, 0]) / max(np.hypot(x, y), 1e-9)
+    rotation = (
+        cv2.Rodrigues(facing)[0] @ cv2.Rodrigues(generator.uniform(-1, 1, 3) * (_MAX_TILT, _MAX_TILT, _MAX_TURN))[0]
+    )
     width, height = board.size_mm
     distance = width * camera.fx / camera.width / generator.uniform(*width_range)
     middle = rotation @ (width / 2, height / 2, 0)
     position = distance * np.array([x, y, 1]) / np.sqrt(x * x + y * y + 1)
     return np.concatenate([cv2.Rodrigues(rotation)[0].ravel(), position - middle])
-
-
-def _facing(x: float, y: float) -> np.ndarray:
-    """Return the smallest rotation that turns the axis of a camera toward (x, y) on the plane z = 1."""
-    angle = np.arctan(np.hypot(x, y))
-    return cv2.Rodrigues(angle * np.array([-y, x, 0]) / max(np.hypot(x, y), 1e-9))[0]
-
-
-def _render(board: Board, rays: Rays, pose: np.ndarray) -> np.ndarray:
-    shade = _shade(board, rays.centers, pose)
-    contrast = cv2.dilate(shade, np.ones((3, 3))) - cv2.erode(shade, np.ones((3, 3)))
-    edges = contrast > 0  # all rays of any other pixel meet one color
-    shade[edges] = _shade(board, rays.subpixel_points(edges), pose).mean(axis=-1)
-    return shade
 
 
 def _shade(board: Board, points: np.ndarray, pose: np.ndarray) -> np.ndarray:

@@ -1,1 +1,0 @@
-"""Readers and writers of camera files: `opencv`, `ros`, `kalibr` and `colmap`; YAML needs the `calibration` extra."""

@@ -122,14 +122,9 @@ class Frequencies(NamedTuple):
         return cls(size, size[0] // 2, size[1] // 2)
 
     @property
-    def axes(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """Return the size of the domain and the highest frequency along y and along x."""
-        return (self.size[0], self.rows), (self.size[1], self.columns)
-
-    @property
     def is_all(self) -> bool:
         """Return True if no frequency is missing."""
-        return all(2 * highest >= n for n, highest in self.axes)
+        return 2 * self.rows >= self.size[0] and 2 * self.columns >= self.size[1]
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -207,13 +202,13 @@ def amplitudes(
     if kind != "exponential":  # eigenvalues below rounding would have roots with arbitrary gradients
         values = torch.where(values.abs() > _ROUNDING * values.amax(dim=(1, 2), keepdim=True), values, 0)
     positive = values.clamp(min=0)
+    # torch.compile cannot iterate over what a property of a constant returns.
+    axes = ((frequencies.size[0], frequencies.rows), (frequencies.size[1], frequencies.columns))
     smooth_y, smooth_x = (
         _smoothing(torch.arange(highest + 1, dtype=torch.float64, device=values.device) / n, aperture)
-        for n, highest in frequencies.axes
+        for n, highest in axes
     )
-    count_y, count_x = (
-        _multiplicity(highest + 1, values.device, has_middle=2 * highest >= n) for n, highest in frequencies.axes
-    )
+    count_y, count_x = (_multiplicity(highest + 1, values.device, has_middle=2 * highest >= n) for n, highest in axes)
     smooth_y, smooth_x = smooth_y[..., None], smooth_x[..., None, :]
     weight_y, weight_x = count_y[:, None] * smooth_y.square(), count_x * smooth_x.square()
 

@@ -143,12 +143,6 @@ def test_check_values_names_the_first_wrong_value():
         check_values("depth", "be above 0, in m", torch.tensor([1.0, -2.5, -3.0]), positive)
 
 
-def test_values_on_a_device_are_not_check_and_add():
-    on_meta = torch.empty(3, device="meta")
-    check_values("depth", "be above 0, in m", on_meta, positive)
-    assert eager_bool((on_meta > 0).all) is None
-
-
 def test_values_on_a_device_are_not_computed():
     on_meta, computed = torch.empty(3, device="meta"), list[torch.Tensor]()
 

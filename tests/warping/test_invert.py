@@ -136,25 +136,6 @@ def test_valid_pixels_of_a_folding_map_have_a_positive_determinant(pixels):
     assert inverse.isfinite().all()
 
 
-@pytest.mark.parametrize("poison", [torch.nan, torch.inf, -torch.inf])
-def test_pixels_that_sample_an_invalid_flow_are_not_valid(poison):
-    flow = torch.full((1, 2, 20, 40), 5.0, dtype=torch.float64)
-    flow[:, 1] = 0
-    flow[:, :, 8:12, 20:25] = poison
-    inverse, valid, residual = invert_flow(flow, steps=20)
-    expected = torch.ones(1, 1, 20, 40, dtype=torch.bool)
-    expected[..., :5] = False  # off the frame
-    expected[..., 8:12, 25:30] = False  # q - 5 lies in the hole
-    assert inverse.isfinite().all()
-    assert residual.isfinite().all()
-    solved = valid & expected
-    assert not (valid & ~expected).any()
-    assert_close(inverse.where(solved, 0)[:, 0], (-5.0 * solved[:, 0]).double(), rtol=0, atol=1e-9)
-    # The flow is invalid in the hole, but its inverse there samples valid pixels, so either answer is right.
-    expected[..., 8:12, 20:25] = False
-    assert (valid | ~expected).all()
-
-
 @pytest.mark.parametrize("amplitude_px", [1e3, 1e6, 1e9, 1e11, 9e11])
 def test_inverse_and_residual_of_huge_flows_are_finite(amplitude_px):
     source = torch.Generator().manual_seed(0)
@@ -189,12 +170,6 @@ def test_a_sample_does_not_depend_on_its_batch(pixels, waves):
     for i, sample in enumerate(flow.split(1)):
         for value, alone in zip(together, invert_flow(sample), strict=True):
             assert torch.equal(value[i : i + 1], alone)
-
-
-def test_gradients_through_an_affine_flow_are_those_of_finite_differences(pixels):
-    x, y = pixels(5, 6)
-    flow = torch.stack([0.1 * x - 0.05 * y + 0.23, 0.08 * y + 0.04 * x - 0.31])[None].requires_grad_()
-    assert torch.autograd.gradcheck(lambda f: invert_flow(f, steps=30)[0][..., 1:-1, 1:-1], [flow])
 
 
 def test_gradients_through_a_curved_flow_are_those_of_finite_differences(pixels, waves):

@@ -269,15 +269,6 @@ def test_neighbors_in_white_noise_do_not_correlate(lag):
             assert abs(correlation(a[lag:].abs(), b[:-lag].abs())) < LIMIT
 
 
-def test_the_power_spectrum_of_white_noise_is_flat():
-    side = 512
-    numbers = random.white_noise(noise_keys(samples=4), side * side).view(-1, side, side)
-    power = torch.fft.rfft2(numbers, norm="ortho").abs().square()[:, :, 1:-1].double()
-    # The power of white noise follows the exponential law, so of n values the largest exceeds t with n exp(-t).
-    assert power.max() < math.log(power.numel() / ALARM)
-    assert stats.kstest(power.flatten().numpy()[::7], "expon").pvalue > ALARM
-
-
 def test_white_noise_of_samples_lanes_and_seeds_is_independent():
     base = random.stream(5, torch.arange(4))
     key = torch.cat([random.noise_key(source) for source in (base, base.at(1), random.stream(6, torch.arange(1)))])

@@ -199,17 +199,6 @@ def test_seed_key_and_place_each_change_the_parameters(case):
     assert rows.unique(dim=0).shape[0] == 8
 
 
-@pytest.mark.quick
-def test_torch_manual_seed_repeats_the_results(case):
-    effect, image = case.strong(), random_image(2, 3, 9, 11)
-    torch.manual_seed(3)
-    first, second = effect(image), effect(image)
-    torch.manual_seed(3)
-    assert torch.equal(effect(image), first)
-    assert torch.equal(effect(image), second)
-    assert not torch.equal(first, second)
-
-
 def test_a_seed_leaves_the_global_generators_unchanged(case):
     before = torch.get_rng_state(), random.getstate(), repr(np.random.get_state())
     case.strong().degrade(random_image(2, 3, 9, 11), seed=7)
@@ -298,13 +287,6 @@ def test_shape_type_and_layout_stay_and_the_result_is_that_of_float32(case, dtyp
         assert_close(result, expected.double(), rtol=0, atol=2e-4)
     else:
         assert torch.equal(result, expected.round().to(dtype) if dtype is torch.uint8 else expected.to(dtype))
-
-
-def test_maps_of_an_unbatched_image_are_unbatched(case):
-    effect, image = case.strong(), random_image(3, 20, 30)
-    unbatched = maps_of(effect.degrade(image, seed=7, keys=[5]))
-    batched = maps_of(effect.degrade(image[None], seed=7, keys=[5]))
-    assert_close_maps(unbatched, {name: value[0] for name, value in batched.items()})
 
 
 def test_channels_are_degraded_independently(case):

@@ -61,17 +61,6 @@ def test_the_image_is_the_closed_form(center):
     assert screen.valid.all()
 
 
-def test_subtracting_the_intensity_restores_valid_pixels():
-    image = picture(2, 3, *SIZE)
-    effect = LensFlare(color=(1.0, 0.8, 0.5))
-    d = effect.degrade(image, seed=3)
-    assert 0.1 < d.valid.double().mean() < 0.9
-    restored = d.image - d.intensity * d.params.color[..., None, None]
-    assert_close(torch.where(d.valid, restored, image), image, rtol=0, atol=1e-12)
-    saturated = ~d.valid.expand_as(image) & (d.image == 1)
-    assert (restored < image - 1e-6)[saturated].any()
-
-
 def test_screened_pixels_without_contrast_are_invalid():
     image = picture(1, 3, *SIZE)
     d = LensFlare(blend="screen").apply(image, flare_params(image, strength=3.0))
@@ -138,12 +127,9 @@ def test_arguments_out_of_range_raise(options: dict[str, Any], rule: str):
         LensFlare(**options)
 
 
-def test_an_invalid_flag_raises():
+def test_a_color_for_other_channels_and_an_invalid_flag_raise():
     with pytest.raises(TypeError, match="clip must be True or False, got 1"):
         LensFlare(clip=1)  # pyright: ignore[reportArgumentType]  # the invalid argument
-
-
-def test_a_color_for_other_channels_raises():
     with pytest.raises(ValueError, match="color must have 1 number or 4, one for each channel"):
         LensFlare(color=(1.0, 0.9, 0.8)).degrade(picture(1, 4, 2, 2), seed=7)
 

@@ -107,13 +107,6 @@ def test_the_sky_is_infinitely_far(linear_light):
     assert torch.equal(clear.image, image)
 
 
-def test_an_unbatched_image_takes_an_unbatched_depth():
-    image, depth = picture(3, 4, 5), 100 * picture(1, 4, 5)
-    alone = UniformFog().degrade(image, seed=7, depth=depth)
-    batched = UniformFog().degrade(image[None], seed=7, depth=depth[None])
-    assert torch.equal(alone.image, batched.image[0])
-
-
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_a_half_precision_depth_is_converted_to_float32(dtype):
     image, depth = picture(1, 3, 4, 5, dtype=torch.float32), (100 * picture(1, 1, 4, 5)).to(dtype)

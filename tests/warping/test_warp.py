@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import warp
-from torchrefract.warping.grid import inside, pixel_axes
 from torchrefract.warping.lattice import Lattice, LatticeFlow
 from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS, sample_image, sees_only_valid
 
@@ -313,18 +312,6 @@ def smooth_flow(seed: int, size: tuple[int, int], px: float) -> Tensor:
     """Return a flow (2, 2, H, W) with displacements of about `px`."""
     nodes = torch.randn(2, 2, 4, 5, generator=torch.Generator().manual_seed(seed))
     return px * F.interpolate(nodes, size=size, mode="bilinear")
-
-
-@pytest.mark.quick
-@pytest.mark.parametrize("size", [(1, 1), (3, 40), (37, 53)])
-@pytest.mark.parametrize("px", [0.0, 2.0, 400.0])
-def test_inside_compares_positions_with_the_frame(size, px):
-    height, width = size
-    flow = smooth_flow(0, size, px)
-    x, y = pixel_axes(height, width, dtype=torch.float64, device=flow.device)
-    u, v = flow.double().split(1, dim=1)
-    expected = (x + u >= -1e-3) & (x + u <= width - 1 + 1e-3) & (y + v >= -1e-3) & (y + v <= height - 1 + 1e-3)
-    assert torch.equal(inside(flow), expected)
 
 
 @pytest.mark.quick

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
+from domain import IGNORE_STRENGTH
 from helpers import DTYPES, assert_close_maps, assert_equal_maps, maps_of, random_image
 from torch import Tensor, nn
 from torch.testing import assert_close
@@ -382,6 +383,21 @@ def test_params_of_a_smaller_type_than_the_flow_are_converted(case, dtype):
     result, expected = effect.apply(image, rounded), effect.apply(image, rounded.to(image.dtype))
     assert_equal_maps(maps_of(result), maps_of(expected))
     assert {value.dtype for value in maps_of(result).values() if value.is_floating_point()} == {image.dtype}
+
+
+@pytest.mark.parametrize("value", [1e5, -1e5, 1e10, -1e10, 1e20, 3e38, -3e38, 1e-10, 1e-38])
+@IGNORE_STRENGTH
+def test_extreme_params_raise_or_give_finite_maps(case, value):
+    effect, image = case.strong(), random_image(2, 3, 24, 32)
+    params = effect.sample(image, seed=1)
+    for name in case.fields:
+        try:
+            result = effect.apply(image, params._replace(**{name: torch.full_like(getattr(params, name), value)}))
+        except ValueError as error:
+            if name not in str(error):
+                raise
+        else:
+            assert all(shown.isfinite().all() for shown in maps_of(result).values()), name
 
 
 def test_gradients_of_params_and_image_match_finite_differences(case):

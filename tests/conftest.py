@@ -56,27 +56,9 @@ def same_number_of_threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-class Agreement(NamedTuple):
-    """The largest error against an independent reference, and the tolerance."""
-
-    error: float
-    tolerance: float
-    unit: str
-
-
-_ORACLES = pytest.StashKey[dict[str, Agreement]]()
-
-
-def record(config: pytest.Config, name: str, agreement: Agreement) -> None:
-    """Keep the largest error against each reference."""
-    recorded = config.stash.setdefault(_ORACLES, {})
-    if name not in recorded or agreement.error > recorded[name].error:
-        recorded[name] = agreement
-
-
 @pytest.fixture
-def oracle(request) -> Callable[..., None]:
-    """Return a function that compares a tensor with a reference, and records the error for the summary of the run."""
+def oracle() -> Callable[..., None]:
+    """Return a function that compares a tensor with that of an independent reference."""
 
     def agree(
         name: str, actual: Tensor, expected: Tensor, tolerance: float, *, unit: str = "px", scale: float = 1.0
@@ -84,33 +66,9 @@ def oracle(request) -> Callable[..., None]:
         assert actual.shape == expected.shape
         assert actual.isfinite().all()
         error = ((actual.double() - expected.double()).abs() * scale).amax().item()
-        record(request.config, name, Agreement(error, tolerance, unit))
         assert error <= tolerance, f"{name}: {error:.2e} {unit}, tolerance {tolerance:g}"
 
     return agree
-
-
-def pytest_sessionfinish(session) -> None:
-    """Send the recorded errors of a process of pytest-xdist to the main process."""
-    if hasattr(session.config, "workeroutput"):
-        recorded = {name: tuple(value) for name, value in session.config.stash.get(_ORACLES, {}).items()}
-        session.config.workeroutput["oracles"] = recorded
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_testnodedown(node) -> None:
-    """Collect the recorded errors of a process, if it was not killed."""
-    for name, value in getattr(node, "workeroutput", {}).get("oracles", {}).items():
-        record(node.config, name, Agreement(*value))
-
-
-def pytest_terminal_summary(terminalreporter, config) -> None:
-    """Print the largest error against each reference."""
-    recorded = config.stash.get(_ORACLES, {})
-    if recorded:
-        terminalreporter.section("largest error against each reference")
-        for name, value in sorted(recorded.items()):
-            terminalreporter.write_line(f"{name:74} {value.error:8.1e} {value.unit:3} (tolerance {value.tolerance:g})")
 
 
 @pytest.fixture

@@ -42,17 +42,12 @@ def test_the_package_imports_torch_and_numpy_only(spawn, tmp_path):
     assert (outcome.out.strip(), outcome.err) == ("[]", "")
 
 
-def test_commands_without_a_model_do_not_import_the_training_stack(spawn, tmp_path):
-    modules = ", ".join(
-        f"torchrefract.{name}" for name in ("calibrate", "generate", "make_board", "preview", "rectify")
-    )
-    outcome = spawn("-c", IMPORT.format(module=modules, names=LEARNING), cwd=tmp_path)
-    assert (outcome.code, outcome.out.strip()) == (0, "[]"), outcome.err
-
-
-def test_workers_that_generate_pairs_do_not_import_matplotlib(spawn, tmp_path):
-    outcome = spawn("-c", IMPORT.format(module="torchrefract.generate", names=("matplotlib",)), cwd=tmp_path)
-    assert (outcome.code, outcome.out.strip()) == (0, "[]"), outcome.err
+def test_commands_without_a_model_import_neither_the_training_stack_nor_workers_matplotlib(spawn, tmp_path):
+    # Workers that generate pairs import the module of their command.
+    workers = IMPORT.format(module="torchrefract.generate", names=(*LEARNING, "matplotlib"))
+    modules = ", ".join(f"torchrefract.{name}" for name in WITHOUT_MODELS)
+    outcome = spawn("-c", f"{workers}; {IMPORT.format(module=modules, names=LEARNING)}", cwd=tmp_path)
+    assert (outcome.code, outcome.out.split()) == (0, ["[]", "[]"]), outcome.err
 
 
 def test_constant_results_are_marked_as_torch_marks_them():

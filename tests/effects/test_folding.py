@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from torchrefract import Compose, DivergenceFree, LensDistortion, Turbulence, UniformFog, folding, jacobian_determinant
+from torchrefract import Compose, DivergenceFree, LensDistortion, Turbulence, UniformFog, folding
 
 
 def turbulence(amplitude: float) -> Turbulence:
@@ -16,30 +16,6 @@ def turbulence(amplitude: float) -> Turbulence:
 def degrade(effect, *shape):
     with pytest.warns(UserWarning, match="fold"):
         return effect.degrade(torch.rand(shape), seed=7)
-
-
-def test_folding_counts_folded_pixels_of_each_sample():
-    degraded = degrade(turbulence(2.0), 3, 1, 40, 50)
-    determinant = jacobian_determinant(degraded.flow)
-    for i in range(3):
-        counted = torch.zeros(40, 50, dtype=torch.bool)
-        for y in range(40):
-            for x in range(50):
-                near = degraded.valid[i, 0, max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
-                counted[y, x] = bool(near.all())
-        values = determinant[i, 0]
-        assert degraded.folding.min_determinant[i] == values[counted].min()
-        assert degraded.folding.fraction[i].item() == pytest.approx((values[counted] <= 0).sum().item() / 2000)
-    assert (degraded.folding.fraction > 0.02).all()
-
-
-def test_folded_pixels_are_not_valid_in_the_restore_flow():
-    degraded = degrade(turbulence(2.0), 1, 1, 40, 50)
-    calm = turbulence(0.05).degrade(torch.rand(1, 1, 40, 50), seed=7)
-    assert calm.folding.fraction == 0
-    assert calm.restore_valid.double().mean() > 0.9
-    assert degraded.restore_valid.double().mean() < 0.6
-    assert degraded.restore_residual[degraded.restore_valid].max() <= 0.05
 
 
 def test_compositions_do_not_interpolate_between_sheets_of_a_fold():

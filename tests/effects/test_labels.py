@@ -10,7 +10,6 @@ from torchrefract import Compose, LensDistortion, ThinPlateSpline, Turbulence, U
 from torchrefract.effects.base import Effect
 
 tv_tensors = pytest.importorskip("torchvision.tv_tensors", reason="torchvision is in the extra test")
-transforms = pytest.importorskip("torchvision.transforms.v2", reason="torchvision is in the extra test")
 
 EFFECTS = [LensDistortion(), Turbulence(), ThinPlateSpline(), Compose([Turbulence(), UniformFog(), LensDistortion()])]
 
@@ -56,29 +55,6 @@ def test_labels_move_with_the_image(effect: Effect):
         assert (expected_box - box).abs().max() < 1.0
     assert moved["labels"].tolist() == [3, 7]
     assert moved["name"] == "frame 1"
-
-
-def test_a_torchvision_image_stays_one_in_a_pipeline():
-    image, target = sample()
-    result = LensDistortion()(tv_tensors.Image(image))
-    assert type(result) is tv_tensors.Image
-    pipeline = transforms.Compose([LensDistortion(), transforms.RandomHorizontalFlip(p=1.0), UniformFog()])
-    flipped, moved = pipeline(tv_tensors.Image(image), target)
-    assert type(flipped) is tv_tensors.Image
-    assert moved["boxes"].canvas_size == (64, 96)
-    plain = transforms.Compose([LensDistortion(p=0.0), transforms.RandomHorizontalFlip(p=1.0)])
-    _, mirrored = plain(tv_tensors.Image(image), target)
-    assert mirrored["boxes"].tolist() == [[46.0, 20.0, 66.0, 40.0], [16.0, 5.0, 36.0, 15.0]]
-
-
-def test_an_identity_leaves_the_labels_as_they_are():
-    image, target = sample()
-    for effect in (LensDistortion(p=0.0), Turbulence(amplitude_range=(0, 0)), Compose([ThinPlateSpline()], p=0.0)):
-        result, moved = effect(image, target)
-        assert torch.equal(result, image)
-        assert moved.keys() == target.keys()
-        for name in ("boxes", "masks", "points", "labels"):
-            assert torch.equal(moved[name], target[name]), name
 
 
 def test_labels_of_an_image_that_does_not_move_are_not_clipped():

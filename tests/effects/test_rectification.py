@@ -1,5 +1,4 @@
 import math
-import warnings
 from typing import Any
 
 import cv2
@@ -15,8 +14,6 @@ from torchrefract import (
     LensDistortion,
     Rectification,
     RectificationParams,
-    compose_flows,
-    warp,
 )
 
 # A car's camera, from a calibration with 20 chessboards.
@@ -116,9 +113,8 @@ def test_the_flow_points_to_where_the_camera_shows_the_ray_of_a_pixel(camera, dt
     assert degraded.restore_valid.double().mean() > 0.7
 
 
-@pytest.mark.parametrize("name", ["opencv8", "fisheye"])
-def test_one_sampling_of_any_model_keeps_more_than_two(name):
-    camera = ALL[name].resized(width=480, height=270)
+def test_one_sampling_with_a_lens_keeps_more_than_two():
+    camera = ALL["fisheye"].resized(width=480, height=270)
     y, x = torch.meshgrid(torch.arange(270).double(), torch.arange(480).double(), indexing="ij")
 
     def scene(u: Tensor, v: Tensor) -> Tensor:
@@ -140,45 +136,7 @@ def test_one_sampling_of_any_model_keeps_more_than_two(name):
     assert once > both + 2, (once, both)
 
 
-def test_a_lens_after_a_rectification_takes_one_sampling():
-    raw = smooth(2, 3, 270, 480)
-    camera = Camera(width=480, height=270, fx=430.0, fy=425.0, cx=250.0, cy=141.0, coefficients=(-0.281, 0.168, 0, 0))
-    effects = [Rectification(camera, tolerance_px=None), LensDistortion(tolerance_px=None)]
-    rectify, lens = effects
-    d = Compose(effects, tolerance_px=None).degrade(raw, seed=3)
-    first, second = rectify.apply(raw, d.params.children[0]), lens.apply(raw, d.params.children[1])
-    # Bilinear interpolation of a smooth flow is off by up to 2e-3 px, away from the border of the first one.
-    difference = (d.flow - compose_flows(first.flow, second.flow)).abs()[..., 40:-40, 40:-40]
-    assert difference.max() < 2e-3
-    assert_close(d.image, warp(raw, d.flow)[0], rtol=0, atol=1e-5)
-    # The flow from the degraded frame to the rectified one; the degraded frame shows nothing beyond the raw one.
-    back = second.restore_flow
-    restored, _ = warp(d.image, back, interpolation="bicubic")
-    good = second.restore_valid & (warp(d.valid.float(), back)[0] > 0.999) & first.valid
-    error = (restored - first.image).square()[good.expand_as(raw)].mean().item()
-    assert good.double().mean() > 0.6
-    assert -10 * math.log10(error) > 60
-    # The restore flow of the composition leads to the raw frame.
-    restored, _ = warp(d.image, d.restore_flow, interpolation="bicubic")
-    error = (restored - raw).square()[d.restore_valid.expand_as(raw)].mean().item()
-    assert -10 * math.log10(error) > 60
-
-
-@every_model
-def test_a_sample_does_not_depend_on_batch_or_threads(camera, on_threads):
-    image = torch.rand(5, 3, 27, 48)
-    effect = Rectification(camera, p=0.5)
-    together = effect.degrade(image, seed=5)
-    assert 0 < together.params.applied.sum() < 5
-    for i in range(5):
-        on_threads(1 + i % 3)
-        alone = effect.degrade(image[i], seed=5, keys=[i])
-        for name, atol in {"image": 1e-5, "flow": 1e-4, "restore_flow": 1e-4}.items():
-            assert_close(getattr(alone, name), getattr(together, name)[i], rtol=0, atol=atol)
-    assert torch.equal(together.image[~together.params.applied], image[~together.params.applied])
-
-
-@pytest.mark.parametrize(("name", "tolerance_px"), [("opencv14", None), ("fisheye", None), ("opencv8", 0.05)])
+@pytest.mark.parametrize(("name", "tolerance_px"), [("opencv14", None), ("fisheye", 0.05)])
 def test_one_graph_gives_the_same_as_eager_mode(name, tolerance_px):
     effect, image = Rectification(ALL[name], tolerance_px=tolerance_px), smooth(2, 3, 27, 48)
     assert (effect.plan(27, 48).stride > 1) == (tolerance_px is not None)
@@ -187,80 +145,20 @@ def test_one_graph_gives_the_same_as_eager_mode(name, tolerance_px):
 
 
 @every_model
-def test_gradients_under_a_tolerance_agree_with_exact_ones(camera):
-    image, gradients = smooth(1, 1, 27, 48, dtype=torch.float64), []
-    for tolerance in (None, 1e-3):
-        effect = Rectification(camera, tolerance_px=tolerance)
-        params = effect.sample(image, seed=0)
-        values = [value.requires_grad_() for value in params[1:]]
-        degraded = effect.apply(image, RectificationParams(params.applied, *values))
-        gradients.append(torch.autograd.grad((degraded.image * image.flip(3)).sum(), values))
-    assert effect.plan(27, 48).stride > 1
-    for exact, near in zip(*gradients, strict=True):
-        assert_close(near, exact, rtol=0, atol=0.01 * exact.abs().max().item())
-    assert not torch.equal(gradients[0][0], gradients[1][0])
-
-
-@every_model
 def test_gradients_of_the_camera_are_those_of_finite_differences(camera):
-    effect, image = Rectification(camera, tolerance_px=None), smooth(1, 1, 27, 48, dtype=torch.float64)
+    effect, image = Rectification(camera, tolerance_px=None), smooth(1, 1, 9, 16, dtype=torch.float64)
     params = effect.sample(image, seed=0)
 
-    def rectified(coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
-        return effect.apply(image, RectificationParams(params.applied, coefficients, focal, center)).image
+    def rectified(coefficients: Tensor, focal: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
+        degraded = effect.apply(image, RectificationParams(params.applied, coefficients, focal, center))
+        return degraded.image, degraded.restore_flow
 
     values = [value.clone().requires_grad_() for value in params[1:]]
     assert torch.autograd.gradcheck(rectified, values, fast_mode=True)
 
 
-@every_model
-def test_gradients_of_the_restore_flow_are_those_of_finite_differences(camera):
-    effect, image = Rectification(camera, tolerance_px=None), smooth(1, 1, 9, 16, dtype=torch.float64)
-    params = effect.sample(image, seed=0)
-
-    def back(coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
-        return effect.apply(image, RectificationParams(params.applied, coefficients, focal, center)).restore_flow
-
-    values = [value.clone().requires_grad_() for value in params[1:]]
-    assert torch.autograd.gradcheck(back, values, fast_mode=True)
-
-
-def random_camera(dice: np.random.Generator) -> Camera:
-    """Draw a camera of any model, wide or narrow, with weak or strong distortion."""
-    model = ("polynomial12", "opencv", "opencv", "fisheye", "division")[dice.integers(5)]
-    width, height = int(dice.integers(200, 700)), int(dice.integers(120, 500))
-    fx, cx, cy = width * dice.uniform(0.5, 1.5), width * dice.uniform(0.45, 0.55), height * dice.uniform(0.45, 0.55)
-    radial, small = dice.uniform(-0.3, 0.3, 6) / 3.0 ** np.arange(6), dice.normal(0, 2e-3, 6)
-    numbers = {
-        "polynomial12": [*radial, *small],
-        "opencv": [*radial[:2], *small[:2], radial[2], *dice.uniform(-0.2, 0.6, 3) / [1, 3, 9], *small[2:], 0.02, 0.01],
-        "fisheye": radial[:4] / 3,
-        "division": radial[:1] / 2,
-    }[model]
-    coefficients, fy = tuple(map(float, numbers)), fx * dice.uniform(0.98, 1.02)
-    return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=coefficients, model=model)
-
-
-def test_random_cameras_stay_within_the_tolerance():
-    dice, planned = np.random.default_rng(6), 0
-    for _ in range(30):
-        camera, tolerance = random_camera(dice), float(10 ** dice.uniform(-3, -0.5))
-        image = torch.zeros(1, 1, camera.height, camera.width)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "camera: the model folds back")  # random cameras may; others test it
-            near = Rectification(camera, tolerance_px=tolerance).degrade(image, seed=0)
-            exact = Rectification(camera, tolerance_px=None).degrade(image.double(), seed=0)
-        plan = Rectification(camera, tolerance_px=tolerance).plan(camera.height, camera.width)
-        planned += plan.stride > 1
-        if plan.stride > 1:
-            assert exact.valid is not None
-            assert (near.flow - exact.flow).square().sum(dim=1).sqrt().max() <= plan.error_px <= tolerance
-    assert planned >= 20  # the others fold, or bend too much
-
-
-@pytest.mark.parametrize("name", ["opencv8", "fisheye"])
-def test_a_composition_shares_its_tolerance_with_a_rectification(name):
-    camera = ALL[name].resized(width=480, height=270)
+def test_a_composition_shares_its_tolerance_with_a_rectification():
+    camera = ALL["opencv8"].resized(width=480, height=270)
     parts = [
         [Rectification(camera, tolerance_px=t), LensDistortion(k1_range=(-0.25, -0.2), tolerance_px=t)]
         for t in (1.0, None)
@@ -279,15 +177,6 @@ def test_a_plan_needs_the_shape_of_the_frames_of_the_camera():
     assert effect.plan(720, 1280).max_gradient < 0.5
     with pytest.raises(ValueError, match="image must have the shape of the camera's frames"):
         effect.plan(720, 720)
-
-
-def test_params_of_another_camera_are_computed_exactly():
-    effect, exact = Rectification(DASHCAM, tolerance_px=0.1), Rectification(DASHCAM, tolerance_px=None)
-    image = torch.rand(1, 1, 72, 128)
-    params = exact.sample(image, seed=0)
-    other = params._replace(coefficients=params.coefficients * 1.01)
-    assert not torch.equal(effect.apply(image, params).flow, exact.apply(image, params).flow)
-    assert torch.equal(effect.apply(image, other).flow, exact.apply(image, other).flow)
 
 
 def test_a_camera_without_distortion_returns_the_image():

@@ -24,13 +24,6 @@ def test_the_amplitude_is_the_standard_deviation_of_each_component(covariance, a
     assert flow.mean(dim=(0, 2, 3)).abs().max() < 0.01
 
 
-def test_fields_of_samples_and_components_are_uncorrelated():
-    flow = Turbulence(**CALM).degrade(torch.zeros(3, 1, 192, 256), seed=1).flow.flatten(2)
-    fields = torch.cat([flow[:, 0], flow[:, 1]])
-    correlation = torch.corrcoef(fields) - torch.eye(6)
-    assert correlation.abs().max() < 0.2  # some 340 patches of a length each way in each field
-
-
 def test_each_field_normalized_by_the_image_has_the_amplitude():
     effect = Turbulence(**CALM, normalize="image")
     flow = effect.degrade(torch.zeros(3, 1, 64, 96), seed=1).flow
@@ -86,9 +79,6 @@ def test_an_amplitude_that_folds_warns_and_folded_pixels_are_not_valid(length):
 @pytest.mark.parametrize(
     ("options", "rule"),
     [
-        ({"length_range": (0.0, 1.0)}, "length_range must be"),
-        ({"length_range": (math.nan, 1.0)}, "length_range must not be NaN"),
-        ({"amplitude_range": (-1.0, 1.0)}, "amplitude_range must be"),
         ({"aperture_range": (-1.0, 1.0)}, "aperture_range must be"),
         ({"covariance": "spherical"}, "covariance must be one of exponential, gaussian, matern32, matern52"),
         ({"normalize": "max"}, "normalize must be one of theory, image"),
@@ -103,7 +93,6 @@ def test_wrong_arguments_raise(options, rule):
     ("field", "value", "rule"),
     [
         ("length", 0.0, r"params.length must lie in \[0.001, 1e\+06\]"),
-        ("length", -1.0, r"params.length must lie in \[0.001, 1e\+06\]"),
         ("length", 1e10, r"params.length must lie in \[0.001, 1e\+06\]"),
         ("length", math.nan, "params.length must not be NaN"),
         ("amplitude", -1.0, r"params.amplitude must lie in \[0, 10000\]"),

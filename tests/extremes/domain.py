@@ -47,17 +47,13 @@ def _numbers(low: float, high: float, **options: Any) -> SearchStrategy[float]:
     return st.one_of(near, st.floats(low, high, allow_nan=False, **options), st.sampled_from(ends))
 
 
-def _colors(high: float) -> SearchStrategy[float]:
-    return st.floats(0.0, high)
-
-
 _WARP_OPTIONS = {
     "padding": st.sampled_from(PADDINGS),
     "interpolation": st.sampled_from(INTERPOLATIONS),
     "tolerance_px": st.sampled_from([None, 0.02, 0.5]),
 }
 _FOG_OPTIONS = {
-    "airlight": st.none() | _colors(1.0),
+    "airlight": st.none() | st.floats(0.0, 1.0),
     "threshold": st.floats(1e-6, 1 - 1e-6),
     "linear_light": st.booleans(),
     "tolerance": st.sampled_from([None, 0.5]),
@@ -115,9 +111,7 @@ DOMAINS = {
         tr.HeterogeneousFog,
         {
             **_FOG,
-            "wind_x_range": (-1e6, 1e6),
-            "wind_y_range": (-1e6, 1e6),
-            "decorrelation_range": (1e-3, math.inf),
+            **_MOTION,
             "contrast_range": (0.0, 2.0),
         },
         {
@@ -138,7 +132,7 @@ DOMAINS = {
             "strength_range": (0.0, 1e3),
         },
         {
-            "color": _colors(1e3),
+            "color": st.floats(0.0, 1e3),
             "blend": st.sampled_from(["add", "screen"]),
             "clip": st.booleans(),
             "tolerance": st.sampled_from([None, 0.5]),

@@ -1,17 +1,34 @@
 """Images, maps and comparisons that the tests of the stability contract share."""
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
 from torch.testing import assert_close
 
 import torchrefract as tr
+from torchrefract.effects.base import Effect
 
 DTYPES = (torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 MAPS = ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission", "extinction", "intensity")
 FLOW_PX, IMAGE = 1e-4, 1e-5  # between batches, threads and workers; an image as a share of its range
+SIZE = (32, 48)  # of the frames that the rectification takes
+_CAMERA = tr.Camera(width=48, height=32, fx=40, fy=40, cx=23, cy=16, coefficients=(-0.2, 0.05, 0.001, 0.002))
+EFFECTS: dict[str, Callable[[], Effect]] = {
+    "lens": tr.LensDistortion,
+    "turbulence": tr.Turbulence,
+    "thin-plate spline": tr.ThinPlateSpline,
+    "divergence-free": tr.DivergenceFree,
+    "uniform fog": tr.UniformFog,
+    "heterogeneous fog": tr.HeterogeneousFog,
+    "volumetric fog": partial(tr.HeterogeneousFog, mode="ray"),
+    "flare": tr.LensFlare,
+    "compose": lambda: tr.Compose([tr.Turbulence(), tr.LensDistortion(), tr.UniformFog()]),
+    "one of": lambda: tr.OneOf([tr.DivergenceFree(), tr.ThinPlateSpline(), tr.LensFlare()]),
+    "rectification": partial(tr.Rectification, _CAMERA),
+}
 _ROUNDING = {torch.uint8: 1.0, torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}  # steps of types near 1
 
 

@@ -50,7 +50,7 @@ TOKENS = [
 class Reader(NamedTuple):
     """An undamaged file, its reader, and the errors that the reader raises for invalid files."""
 
-    name: str
+    path: Path
     data: bytes
     read: Callable[[Path], Any]
     errors: tuple[type[Exception], ...] = (ValueError,)
@@ -103,19 +103,19 @@ def _peak(status: Path) -> float:
     return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")), 0.0)
 
 
-def read_or_error(reader: Reader, path: Path, data: bytes) -> Any:
+def read_or_error(reader: Reader, data: bytes) -> Any:
     """Return the content of a file, or the error if it is one of the reader's; other errors propagate."""
-    path.write_bytes(data)
+    reader.path.write_bytes(data)
     with limited_time_and_memory():
         try:
-            return reader.read(path)
+            return reader.read(reader.path)
         except reader.errors as error:
             result = error
-    assert 0 < len(str(result)) < 2000 + 4 * len(str(path))
+    assert 0 < len(str(result)) < 2000 + 4 * len(str(reader.path))
     return result
 
 
-def fuzz(reader: Reader, path: Path, *, full: bool) -> None:
+def fuzz(reader: Reader, *, full: bool) -> None:
     """Read many damaged versions of a file."""
     suppressed = [HealthCheck.too_slow, HealthCheck.data_too_large]
     options: Any = {"derandomize": True, "deadline": None, "database": None, "suppress_health_check": suppressed}
@@ -123,7 +123,7 @@ def fuzz(reader: Reader, path: Path, *, full: bool) -> None:
     @settings(max_examples=3000 if full else 40, **options)
     @given(damage(reader.data))
     def read_one(data: bytes) -> None:
-        read_or_error(reader, path, data)
+        read_or_error(reader, data)
 
     read_one()
 
@@ -141,14 +141,32 @@ def noise(height: int = 24, width: int = 32, kind: type = np.uint8) -> np.ndarra
     return np.random.default_rng(0).integers(0, np.iinfo(kind).max, (height, width, 3)).astype(kind)
 
 
-def image_readers() -> Iterator[Reader]:
+PNG = cv2.imencode(".png", noise())[1].tobytes()
+
+
+def images(folder: Path) -> Iterator[Reader]:
     """Yield image files of all formats, for `read_image` and `image_size`."""
     errors = (UnreadableImageError,)
-    for name, options in {"a.jpg": [], "a.png": [], "a.bmp": [], "a.webp": [cv2.IMWRITE_WEBP_QUALITY, 101]}.items():
-        data = cv2.imencode(name[1:], noise(), options)[1].tobytes()
-        yield Reader(name, data, read_image, errors)
-        yield Reader(f"size of {name}", data, image_size, errors)
-    yield Reader("16 bits.png", cv2.imencode(".png", noise(kind=np.uint16))[1].tobytes(), read_image, errors)
+    for kind, options in {".jpg": [], ".png": [], ".bmp": [], ".webp": [cv2.IMWRITE_WEBP_QUALITY, 101]}.items():
+        data = cv2.imencode(kind, noise(), options)[1].tobytes()
+        yield Reader(folder / "image", data, read_image, errors)
+        yield Reader(folder / "image", data, image_size, errors)
+    yield Reader(folder / "image", cv2.imencode(".png", noise(kind=np.uint16))[1].tobytes(), read_image, errors)
+
+
+def frames(folder: Path) -> Iterator[Reader]:
+    """Yield a frame among others of two drives."""
+    paths = [folder / f"drive{i // 6}" / f"{i}.png" for i in range(12)]
+    for path in paths:
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(PNG)
+
+    def read(_: Path) -> list[Any]:
+        folder_frames = FrameFolder(folder, size=(12, 16))
+        assert len(folder_frames) + len(folder_frames.skipped) == 12
+        return [folder_frames[i] for i in range(len(folder_frames))]
+
+    yield Reader(paths[0], PNG, read, (ValueError, UserWarning))
 
 
 def camera_files(folder: Path) -> Iterator[Reader]:
@@ -163,26 +181,18 @@ def camera_files(folder: Path) -> Iterator[Reader]:
     }
     for name, (write, read) in files.items():
         write(folder / name)
-        yield Reader(name, (folder / name).read_bytes(), read)
+        yield Reader(folder / name, (folder / name).read_bytes(), read)
 
 
 TABLE = ",".join(COLUMNS) + '\na,b,c,opencv,640,480,500,500,320,240,"[-0.3, 0.1, 0, 0]",,0.1,1,s,l\n'
 CAMERA_FILES = ("opencv.yaml", "opencv.xml", "ros.yaml", "kalibr.yaml", "cameras.txt", "lenses.csv")
-IMAGES = {reader.name: reader for reader in image_readers()}
 
 
 @pytest.fixture
 def camera_file(tmp_path) -> Callable[[str], Reader]:
     """Return a camera file by its name."""
-    readers = {reader.name: reader for reader in camera_files(tmp_path)}
+    readers = {reader.path.name: reader for reader in camera_files(tmp_path)}
     return readers.__getitem__
-
-
-@pytest.mark.parametrize("name", IMAGES)
-def test_a_damaged_image_is_read_or_raises(name, tmp_path, full_extremes):
-    reader = IMAGES[name]
-    assert not isinstance(read_or_error(reader, tmp_path / "undamaged", reader.data), Exception)
-    fuzz(reader, tmp_path / "image", full=full_extremes)
 
 
 def jpeg(height: int, width: int) -> bytes:
@@ -226,57 +236,33 @@ CLAIMS = {
 
 @pytest.mark.parametrize("claim", CLAIMS)
 def test_an_image_that_claims_a_huge_size_takes_no_memory(claim, tmp_path):
-    reader = Reader(claim, CLAIMS[claim], read_image, (UnreadableImageError,))
-    assert isinstance(read_or_error(reader, tmp_path / "image", reader.data), UnreadableImageError)
+    reader = Reader(tmp_path / "image", CLAIMS[claim], read_image, (UnreadableImageError,))
+    assert isinstance(read_or_error(reader, reader.data), UnreadableImageError)
 
 
 def test_threads_that_read_images_keep_the_log_level(tmp_path):
     path = tmp_path / "a.png"
-    path.write_bytes(IMAGES["a.png"].data)
+    path.write_bytes(PNG)
     expected, before = read_image(path), cv2.utils.logging.getLogLevel()
     level = cv2.utils.logging.LOG_LEVEL_WARNING
     cv2.utils.logging.setLogLevel(level)
     try:
         with ThreadPoolExecutor(8) as pool:
-            images = list(pool.map(lambda _: read_image(path), range(400)))
+            results = list(pool.map(lambda _: read_image(path), range(400)))
         assert cv2.utils.logging.getLogLevel() == level
     finally:
         cv2.utils.logging.setLogLevel(before)
-    assert all(torch.equal(image, expected) for image in images)
-
-
-def test_a_folder_with_a_damaged_frame_skips_it_or_raises(tmp_path, full_extremes):
-    folder = tmp_path / "frames"
-    for i in range(12):
-        path = folder / f"drive{i // 6}" / f"{i}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(IMAGES["a.png"].data)
-
-    def read(path: Path) -> list[Any]:
-        frames = FrameFolder(folder, size=(12, 16))
-        assert len(frames) + len(frames.skipped) == 12
-        return [frames[i] for i in range(len(frames))]
-
-    reader = Reader("frames", IMAGES["a.png"].data, read, (ValueError, UserWarning))
-    assert len(read_or_error(reader, folder / "drive0" / "0.png", reader.data)) == 12
-    fuzz(reader, folder / "drive0" / "0.png", full=full_extremes)
-
-
-@pytest.mark.parametrize("name", CAMERA_FILES)
-def test_a_damaged_camera_file_is_read_or_raises(name, camera_file, tmp_path, full_extremes):
-    reader = camera_file(name)
-    assert not isinstance(read_or_error(reader, tmp_path / f"undamaged-{name}", reader.data), Exception)
-    fuzz(reader, tmp_path / f"damaged-{name}", full=full_extremes)
+    assert all(torch.equal(image, expected) for image in results)
 
 
 @pytest.mark.parametrize("token", [token for token in TOKENS if token], ids=range(len(TOKENS) - 1))
 @pytest.mark.parametrize("name", CAMERA_FILES)
-def test_an_invalid_value_in_a_camera_file_names_the_file(name, token, camera_file, tmp_path):
-    reader, path = camera_file(name), tmp_path / f"damaged-{name}"
+def test_an_invalid_value_in_a_camera_file_names_the_file(name, token, camera_file):
+    reader = camera_file(name)
     for number in (b"640", b"500", b"radtan", b"plumb_bob", b"opencv"):
         if number in reader.data:
-            result = read_or_error(reader, path, reader.data.replace(number, token, 1))
-            assert not isinstance(result, Exception) or str(path) in str(result)
+            result = read_or_error(reader, reader.data.replace(number, token, 1))
+            assert not isinstance(result, Exception) or str(reader.path) in str(result)
 
 
 def bomb(levels: int) -> bytes:
@@ -293,23 +279,17 @@ def merge_bomb(levels: int) -> bytes:
     return b"\n".join(maps) + b"\n"
 
 
-FIELDS = {
-    "ros.yaml": [b"640", b"500.0", b"plumb_bob"],
-    "kalibr.yaml": [b"640", b"500.0", b"radtan", b"pinhole"],
-}
+@pytest.mark.parametrize("field", [b"640", b"500.0", b"plumb_bob", b"radtan", b"pinhole"])
+def test_yaml_aliases_fill_neither_the_memory_nor_the_message(field, camera_file):
+    for reader in (camera_file("ros.yaml"), camera_file("kalibr.yaml")):
+        if field in reader.data:
+            result = read_or_error(reader, bomb(9) + reader.data.replace(field, b"*a8", 1))
+            assert reader.path.name in str(result)
 
 
-@pytest.mark.parametrize(("name", "field"), [(name, field) for name, fields in FIELDS.items() for field in fields])
-def test_yaml_aliases_fill_neither_the_memory_nor_the_message(name, field, camera_file, tmp_path):
-    reader = camera_file(name)
-    assert field in reader.data
-    result = read_or_error(reader, tmp_path / "bomb.yaml", bomb(9) + reader.data.replace(field, b"*a8", 1))
-    assert "bomb.yaml" in str(result)
-
-
-def test_yaml_merges_do_not_fill_the_memory(camera_file, tmp_path):
+def test_yaml_merges_do_not_fill_the_memory(camera_file):
     reader = camera_file("ros.yaml")
-    assert "merge key" in str(read_or_error(reader, tmp_path / "bomb.yaml", merge_bomb(9) + reader.data))
+    assert "merge key" in str(read_or_error(reader, merge_bomb(9) + reader.data))
 
 
 @pytest.mark.parametrize("declared", ["entities", "external"])
@@ -321,8 +301,8 @@ def test_xml_entities_fill_no_memory_and_open_no_file(declared, tmp_path):
         entities = f'<!ENTITY a9 SYSTEM "file://{tmp_path}/secret">'
     body = "<opencv_storage><image_width>&a9;</image_width></opencv_storage>"
     text = f'<?xml version="1.0"?><!DOCTYPE a [{entities}]>{body}'
-    reader = Reader("xml", text.encode(), camera_io.read_opencv)
-    assert isinstance(read_or_error(reader, tmp_path / "a.xml", reader.data), ValueError)
+    reader = Reader(tmp_path / "a.xml", text.encode(), camera_io.read_opencv)
+    assert isinstance(read_or_error(reader, reader.data), ValueError)
 
 
 ROW = PairRow(
@@ -333,16 +313,16 @@ ROW = PairRow(
 )
 
 
-def test_a_damaged_row_of_a_manifest_is_read_or_raises(tmp_path, full_extremes):
+def manifest_row(folder: Path) -> Iterator[Reader]:
+    """Yield a row of a manifest in a file of its own."""
+
     def read(path: Path) -> PairRow:
         row = read_row(path.read_bytes())
         assert row.as_line()
         assert all(file.bytes >= 0 and file.path.startswith(("pairs/", "tars/")) for file in row.files.values())
         return row
 
-    reader = Reader("row", ROW.as_line().encode(), read, (DamagedPairError,))
-    assert read_or_error(reader, tmp_path / "row", reader.data) == ROW
-    fuzz(reader, tmp_path / "row", full=full_extremes)
+    yield Reader(folder / "row", ROW.as_line().encode(), read, (DamagedPairError,))
 
 
 @pytest.mark.parametrize("value", [None, math.inf, 1.5, "x", [1], {}, True, -1, 2**63, 10**400])
@@ -384,15 +364,14 @@ def first_pair(folder: Path, suffix: str, path: Path) -> Any:
     return PairedFolder(folder)[0]
 
 
-@pytest.mark.parametrize("form", FORMATS)
-def test_a_pair_with_a_damaged_file_is_read_or_raises(form, tmp_path, full_extremes):
-    for suffix, data in pair_set(tmp_path, form).items():
-        pair_set(tmp_path, form)
-        reader = Reader(suffix, data, partial(first_pair, tmp_path, suffix), (DamagedPairError,))
-        path = tmp_path / "pairs" / "0" / f"3.{suffix}"
-        assert not isinstance(read_or_error(reader, path, data), Exception)
-        if suffix != "corrupted.png":  # of the format of the clean one
-            fuzz(reader, path, full=full_extremes)
+def pair_files(folder: Path) -> Iterator[Reader]:
+    """Yield the files of a pair in each format; the corrupted image has the format of the clean one."""
+    for form in FORMATS:
+        for suffix, data in pair_set(folder, form).items():
+            if suffix != "corrupted.png":
+                pair_set(folder, form)
+                path = folder / "pairs" / "0" / f"3.{suffix}"
+                yield Reader(path, data, partial(first_pair, folder, suffix), (DamagedPairError,))
 
 
 def npz(shape: tuple[int, ...]) -> bytes:
@@ -412,19 +391,15 @@ def compressed_zeros(count: int) -> bytes:
     return stream.getvalue()
 
 
-@pytest.mark.parametrize("shape", [(2, 10**6, 10**6), (2, 30_000, 30_000), (2**62, 4), (-1, 3), (10**30,)])
+@pytest.mark.parametrize("shape", [(2, 10**6, 10**6), (2, 30_000, 30_000), (2**62, 4), (-1, 3), (10**30,), "zeros"])
 def test_an_array_that_claims_a_huge_shape_takes_no_memory(shape, tmp_path):
     pair_set(tmp_path, "npz")
-    reader = Reader("npz", npz(shape), partial(first_pair, tmp_path, "maps.npz"), (DamagedPairError,))
-    assert isinstance(read_or_error(reader, tmp_path / "pairs/0/3.maps.npz", reader.data), DamagedPairError)
-
-
-def test_compressed_zeros_take_no_memory(tmp_path):
-    pair_set(tmp_path, "npz")
-    data = compressed_zeros(20_000_000)
+    data = compressed_zeros(20_000_000) if shape == "zeros" else npz(shape)
     assert len(data) < 2**18
-    reader = Reader("npz", data, partial(first_pair, tmp_path, "maps.npz"), (DamagedPairError,))
-    assert "claims more" in str(read_or_error(reader, tmp_path / "pairs/0/3.maps.npz", data))
+    read = partial(first_pair, tmp_path, "maps.npz")
+    result = read_or_error(Reader(tmp_path / "pairs/0/3.maps.npz", data, read, (DamagedPairError,)), data)
+    assert isinstance(result, DamagedPairError)
+    assert shape != "zeros" or "claims more" in str(result)
 
 
 def content(**more: Any) -> dict[str, Any]:
@@ -455,15 +430,10 @@ def resealed(data: bytes, change: Callable[[bytes], bytes]) -> bytes:
     return stream.getvalue()
 
 
-def test_a_damaged_checkpoint_is_read_or_raises(tmp_path, full_extremes):
-    reader = Reader("checkpoint", saved(content()), read_weights, (CheckpointError,))
-    assert not isinstance(read_or_error(reader, tmp_path / "last.ckpt", reader.data), Exception)
-    fuzz(reader, tmp_path / "last.ckpt", full=full_extremes)
-
-
-@pytest.mark.filterwarnings("ignore:Detected pickle protocol:UserWarning")  # torch warns before it raises
-def test_a_checkpoint_with_a_damaged_pickle_is_read_or_raises(tmp_path, full_extremes):
-    archived = saved(content())
+def checkpoints(folder: Path) -> Iterator[Reader]:
+    """Yield a checkpoint, and the pickle in its archive."""
+    path, archived = folder / "last.ckpt", saved(content())
+    yield Reader(path, archived, read_weights, (CheckpointError,))
     with zipfile.ZipFile(io.BytesIO(archived)) as archive:
         (name,) = (name for name in archive.namelist() if name.endswith("data.pkl"))
         inner = archive.read(name)
@@ -472,7 +442,19 @@ def test_a_checkpoint_with_a_damaged_pickle_is_read_or_raises(tmp_path, full_ext
         path.write_bytes(resealed(archived, lambda _: path.read_bytes()))
         return read_weights(path)
 
-    fuzz(Reader("pickle", inner, read, (CheckpointError,)), tmp_path / "last.ckpt", full=full_extremes)
+    yield Reader(path, inner, read, (CheckpointError,))
+
+
+FILES = (images, frames, camera_files, manifest_row, pair_files, checkpoints)
+
+
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol:UserWarning")  # torch warns before it raises
+@pytest.mark.parametrize("files", FILES)
+def test_a_damaged_file_is_read_or_raises(files, tmp_path, full_extremes):
+    for reader in files(tmp_path):
+        assert not isinstance(read_or_error(reader, reader.data), Exception), reader.path
+        fuzz(reader, full=full_extremes)
+        reader.path.write_bytes(reader.data)
 
 
 INVALID_CHECKPOINTS: Mapping[str, Any] = {
@@ -488,8 +470,8 @@ INVALID_CHECKPOINTS: Mapping[str, Any] = {
 
 @pytest.mark.parametrize("name", INVALID_CHECKPOINTS)
 def test_an_invalid_checkpoint_raises(name, tmp_path):
-    reader = Reader(name, saved(INVALID_CHECKPOINTS[name]), read_weights, (CheckpointError,))
-    result = read_or_error(reader, tmp_path / "last.ckpt", reader.data)
+    reader = Reader(tmp_path / "last.ckpt", saved(INVALID_CHECKPOINTS[name]), read_weights, (CheckpointError,))
+    result = read_or_error(reader, reader.data)
     assert isinstance(result, CheckpointError) or name == "nested lists"
 
 
@@ -498,8 +480,8 @@ def test_an_invalid_checkpoint_raises(name, tmp_path):
 def test_code_in_a_checkpoint_does_not_run(container, tmp_path):
     data = pickle.dumps(Trap())
     data = resealed(saved(content()), lambda _: data) if container == "archive" else data
-    reader = Reader(container, data, read_weights, (CheckpointError,))
-    assert isinstance(read_or_error(reader, tmp_path / "last.ckpt", data), CheckpointError)
+    reader = Reader(tmp_path / "last.ckpt", data, read_weights, (CheckpointError,))
+    assert isinstance(read_or_error(reader, data), CheckpointError)
 
 
 @pytest.mark.parametrize("text", [TRAP, b"a: [", b"a: 'b", b"\0"])

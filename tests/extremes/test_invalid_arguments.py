@@ -10,29 +10,12 @@ import torch
 
 import torchrefract as tr
 
-EFFECTS = {
-    "lens": tr.LensDistortion,
-    "turbulence": tr.Turbulence,
-    "thin-plate spline": tr.ThinPlateSpline,
-    "divergence-free": tr.DivergenceFree,
-    "uniform fog": tr.UniformFog,
-    "heterogeneous fog": tr.HeterogeneousFog,
-    "flare": tr.LensFlare,
-}
 GRAY = torch.full((1, 3, 8, 9), 0.5)
-Call = Callable[[], Any]
-
-
-def check(call: Call, argument: str) -> None:
-    """Raise AssertionError unless a call raises an error that names the argument, the rule and the value."""
-    with pytest.raises(ValueError, match=rf"^{re.escape(argument)}\b.* must .+, got .+"):
-        call()
-
-
-def calls(cases: dict[str, Call]) -> Any:
-    """Parametrize a test by calls; each name starts with the argument that the error names."""
-    values = [pytest.param(call, name.split()[0], id=name) for name, call in cases.items()]
-    return pytest.mark.parametrize(("call", "argument"), values)
+EFFECTS = (
+    *(tr.LensDistortion, tr.Turbulence, tr.ThinPlateSpline, tr.DivergenceFree),
+    *(tr.UniformFog, tr.HeterogeneousFog, tr.LensFlare),
+)
+FOLDING: dict[str, Any] = {"k1_range": (-0.6, -0.6), "focal_range": (0.5, 0.5), "strict": True}
 
 
 def apply_lens(**changed: Any) -> Any:
@@ -40,7 +23,7 @@ def apply_lens(**changed: Any) -> Any:
     return effect.apply(GRAY, effect.sample(GRAY, seed=0)._replace(**changed))
 
 
-def apply_spline(points: list[list[float]]) -> Any:
+def apply_spline(*points: tuple[float, float]) -> Any:
     effect, values = tr.ThinPlateSpline(), torch.tensor([points])
     return effect.apply(GRAY, effect.sample(GRAY, seed=0)._replace(points=values, displacement=values))
 
@@ -60,146 +43,73 @@ def fog(depth: torch.Tensor) -> Any:
     return tr.UniformFog().degrade(GRAY, seed=0, depth=depth)
 
 
-def heterogeneous_fog(scale: float, **options: Any) -> Any:
-    return tr.HeterogeneousFog(scales=[scale], weights=[1.0], **options).degrade(GRAY, seed=0)
+def noise(*scales: float, **options: Any) -> Any:
+    return tr.HeterogeneousFog(**{"scales": scales, "weights": [1.0] * len(scales)} | options)
+
+
+# Calls; each name starts with the argument that the error names.
+CALLS: dict[str, Callable[[], Any]] = {
+    **{f"p of {kind.__name__}": lambda kind=kind: kind(p=1.5) for kind in EFFECTS},
+    # A strength below 0.
+    "amplitude_range of turbulence": lambda: tr.Turbulence(amplitude_range=(-1.0, 0.0)),
+    "amplitude_range of a thin-plate spline": lambda: tr.ThinPlateSpline(amplitude_range=(-1.0, 0.0)),
+    "amplitude_range of divergence-free warps": lambda: tr.DivergenceFree(amplitude_range=(-1.0, 0.0)),
+    "contrast_range of fog": lambda: tr.HeterogeneousFog(contrast_range=(-0.1, 0.1)),
+    "radius_range of flare": lambda: tr.LensFlare(radius_range=(-0.1, 0.2)),
+    "strength_range of flare": lambda: tr.LensFlare(strength_range=(-0.1, 0.2)),
+    # A lens out of bounds, or one that folds.
+    "k1_range = -1e3": lambda: tr.LensDistortion(k1_range=(-1e3, 0.0)),
+    "k1_range = 1e30": lambda: tr.LensDistortion(k1_range=(0.0, 1e30)),
+    "focal_range = 0": lambda: tr.LensDistortion(focal_range=(0.0, 1.0)),
+    "focal_range < 0": lambda: tr.LensDistortion(focal_range=(-1.0, 1.0)),
+    "params.focal = 0": lambda: apply_lens(focal=torch.zeros(1, 2)),
+    "params.coefficients = -1e3": lambda: apply_lens(coefficients=torch.full((1, 12), -1e3)),
+    "params.coefficients = 1e30": lambda: apply_lens(coefficients=torch.full((1, 12), 1e30)),
+    "fx of a camera": lambda: camera(fx=0.0),
+    "coefficients of a camera": lambda: camera(coefficients=(-1e30, 0.0, 0.0, 0.0)),
+    "coefficients of a strict lens": lambda: tr.LensDistortion(**FOLDING).degrade(torch.rand(1, 3, 18, 32), seed=0),
+    # A denominator of 0 inside the frame.
+    "camera to rectify": lambda: tr.Rectification(camera_with_pole()),
+    "camera as a lens": lambda: tr.LensDistortion.from_camera(camera_with_pole()),
+    "camera to cover a frame": lambda: camera_with_pole().check_covers(),
+    # A length that is not positive.
+    **{f"length_range of {low}": lambda low=low: tr.Turbulence(length_range=(low, 1.0)) for low in (0, -1, math.nan)},
+    # Points that define no spline.
+    "points of which two are equal": lambda: apply_spline((0.0, 0.0), (9.0, 0.0), (9.0, 0.0), (4.0, 4.0)),
+    "points on a line": lambda: apply_spline((0.0, 0.0), (3.0, 1.0), (6.0, 2.0), (9.0, 3.0)),
+    "points, two of them": lambda: apply_spline((0.0, 0.0), (9.0, 0.0)),
+    "points at infinity": lambda: apply_spline((0.0, 0.0), (9.0, math.inf), (4.0, 4.0)),
+    # A visibility that is not positive, and an invalid depth.
+    "visibility_range = 0": lambda: tr.UniformFog(visibility_range=(0.0, 9.0)),
+    "visibility_range < 0": lambda: tr.HeterogeneousFog(visibility_range=(-1.0, 9.0)),
+    "depth < 0": lambda: fog(torch.full((1, 1, 8, 9), -1.0)),
+    "depth NaN": lambda: fog(torch.full((1, 1, 8, 9), math.nan)),
+    "depth of another shape": lambda: fog(torch.ones(1, 1, 9, 8)),
+    "max_depth < 0": lambda: tr.LinearDepth(max_depth=-1.0),
+    "max_depth = 1e308": lambda: tr.LinearDepth(max_depth=1e308),
+    # Invalid scales and weights, and scales that need too many nodes.
+    "scales = 0": lambda: noise(4.0, 0.0),
+    "scales < 0": lambda: noise(-4.0),
+    "scales empty": noise,
+    "weights < 0": lambda: noise(4.0, weights=[-1.0]),
+    "weights all 0": lambda: noise(4.0, weights=[0.0]),
+    "scales of 1e-6": lambda: noise(1e-6).degrade(GRAY, seed=0),
+    "scales of 1e-320": lambda: noise(1e-320).degrade(GRAY, seed=0),
+    "scales of a million cells": lambda: noise(1e6, scale_unit="cells").degrade(GRAY, seed=0),
+    "effects of an empty composition": lambda: tr.Compose([]),
+}
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("name", EFFECTS)
-def test_a_probability_outside_0_to_1_raises(name):
-    check(lambda: EFFECTS[name](p=1.5), "p")
+@pytest.mark.parametrize("name", CALLS)
+def test_an_invalid_argument_raises(name):
+    argument = re.escape(name.split()[0].strip(","))
+    with pytest.raises(ValueError, match=rf"^{argument}\b.* must .+, got .+"):
+        CALLS[name]()
 
 
-@calls(
-    {
-        "amplitude_range of turbulence": lambda: tr.Turbulence(amplitude_range=(-1.0, 0.0)),
-        "amplitude_range of a thin-plate spline": lambda: tr.ThinPlateSpline(amplitude_range=(-1.0, 0.0)),
-        "amplitude_range of divergence-free warps": lambda: tr.DivergenceFree(amplitude_range=(-1.0, 0.0)),
-        "strength_range of flare": lambda: tr.LensFlare(strength_range=(-0.5, 0.5)),
-        "contrast_range of fog": lambda: tr.HeterogeneousFog(contrast_range=(-0.1, 0.1)),
-    }
-)
-def test_a_negative_strength_raises(call, argument):
-    check(call, argument)
-
-
-@calls(
-    {
-        "k1_range = -1e3": lambda: tr.LensDistortion(k1_range=(-1e3, 0.0)),
-        "k1_range = 1e30": lambda: tr.LensDistortion(k1_range=(0.0, 1e30)),
-        "focal_range = 0": lambda: tr.LensDistortion(focal_range=(0.0, 1.0)),
-        "focal_range < 0": lambda: tr.LensDistortion(focal_range=(-1.0, 1.0)),
-        "params.focal = 0": lambda: apply_lens(focal=torch.zeros(1, 2)),
-        "params.coefficients = -1e3": lambda: apply_lens(coefficients=torch.full((1, 12), -1e3)),
-        "params.coefficients = 1e30": lambda: apply_lens(coefficients=torch.full((1, 12), 1e30)),
-        "fx of a camera": lambda: camera(fx=0.0),
-        "coefficients of a camera": lambda: camera(coefficients=(-1e30, 0.0, 0.0, 0.0)),
-    }
-)
-def test_a_lens_out_of_bounds_raises(call, argument):
-    check(call, argument)
-
-
-def test_a_strict_lens_that_folds_inside_the_frame_raises():
-    options: dict[str, Any] = {"k1_range": (-0.6, -0.6), "focal_range": (0.5, 0.5), "strict": True}
-    check(lambda: tr.LensDistortion(**options).degrade(torch.rand(1, 3, 18, 32), seed=0), "coefficients")
-
-
-@calls(
-    {
-        "camera to rectify": lambda: tr.Rectification(camera_with_pole()),
-        "camera as a lens": lambda: tr.LensDistortion.from_camera(camera_with_pole()),
-        "camera to cover a frame": lambda: camera_with_pole().check_covers(),
-    }
-)
-def test_a_camera_with_a_pole_inside_the_frame_raises(call, argument):
-    check(call, argument)
-
-
-@calls(
-    {
-        "params.coefficients of 14": lambda: apply_lens(coefficients=torch.zeros(1, 14)),
-        "coefficients of 14": lambda: camera(coefficients=(0.0,) * 14, model="polynomial12"),
-    }
-)
-def test_opencv_s_14_coefficients_as_a_polynomial_raise(call, argument):
-    check(call, argument)
-
-
-@pytest.mark.parametrize("low", [0.0, -1.0, math.nan])
-def test_a_length_that_is_not_positive_raises(low):
-    check(lambda: tr.Turbulence(length_range=(low, 1.0)), "length_range")
-
-
-@pytest.mark.parametrize(
-    "points",
-    [
-        pytest.param([[0.0, 0.0], [9.0, 0.0], [9.0, 0.0], [4.0, 4.0]], id="two equal points"),
-        pytest.param([[0.0, 0.0], [3.0, 1.0], [6.0, 2.0], [9.0, 3.0]], id="points on a line"),
-        pytest.param([[0.0, 0.0], [9.0, 0.0]], id="two points"),
-        pytest.param([[0.0, 0.0], [9.0, math.inf], [4.0, 4.0]], id="a point at infinity"),
-    ],
-)
-def test_control_points_that_define_no_spline_raise(points):
-    check(lambda: apply_spline(points), "points")
-
-
-@calls(
-    {
-        "visibility_range = 0": lambda: tr.UniformFog(visibility_range=(0.0, 9.0)),
-        "visibility_range < 0": lambda: tr.HeterogeneousFog(visibility_range=(-1.0, 9.0)),
-    }
-)
-def test_a_visibility_that_is_not_positive_raises(call, argument):
-    check(call, argument)
-
-
-@calls(
-    {
-        "depth < 0": lambda: fog(torch.full((1, 1, 8, 9), -1.0)),
-        "depth NaN": lambda: fog(torch.full((1, 1, 8, 9), math.nan)),
-        "depth of another shape": lambda: fog(torch.ones(1, 1, 9, 8)),
-        "max_depth < 0": lambda: tr.LinearDepth(max_depth=-1.0),
-        "max_depth = 1e308": lambda: tr.LinearDepth(max_depth=1e308),
-    }
-)
-def test_an_invalid_depth_raises(call, argument):
-    check(call, argument)
-
-
-@calls(
-    {
-        "scales = 0": lambda: tr.HeterogeneousFog(scales=[0.0], weights=[1.0]),
-        "scales < 0": lambda: tr.HeterogeneousFog(scales=[-4.0], weights=[1.0]),
-        "scales empty": lambda: tr.HeterogeneousFog(scales=[], weights=[]),
-        "weights < 0": lambda: tr.HeterogeneousFog(scales=[4.0], weights=[-1.0]),
-        "weights all 0": lambda: tr.HeterogeneousFog(scales=[4.0], weights=[0.0]),
-    }
-)
-def test_invalid_scales_and_weights_raise(call, argument):
-    check(call, argument)
-
-
-@calls(
-    {
-        "scales of 1e-6": lambda: heterogeneous_fog(1e-6),
-        "scales of 1e-320": lambda: heterogeneous_fog(1e-320),
-        "scales of a million cells": lambda: heterogeneous_fog(1e6, scale_unit="cells"),
-    }
-)
-def test_scales_that_need_too_many_nodes_raise(call, argument):
-    check(call, argument)
-
-
-@calls(
-    {
-        "radius_range < 0": lambda: tr.LensFlare(radius_range=(-0.1, 0.2)),
-        "strength_range < 0": lambda: tr.LensFlare(strength_range=(-0.1, 0.2)),
-    }
-)
-def test_a_negative_flare_raises(call, argument):
-    check(call, argument)
-
-
-def test_a_composition_without_effects_raises():
-    check(lambda: tr.Compose([]), "effects")
+def test_opencv_s_14_coefficients_as_a_polynomial_raise():
+    with pytest.raises(ValueError, match=r"^params\.coefficients must .*polynomial.*, got "):
+        apply_lens(coefficients=torch.zeros(1, 14))
+    with pytest.raises(ValueError, match=r"^coefficients must .*polynomial12.*, got "):
+        camera(coefficients=(0.0,) * 14, model="polynomial12")

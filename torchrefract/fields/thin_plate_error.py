@@ -9,6 +9,7 @@ angles the error is smaller.
 """
 
 import itertools
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ from torchrefract.types import FlowBounds, Range, Simplification
 
 _SIGMAS = 7.0  # the two components of the error are longer with a probability of exp(-_SIGMAS^2 / 2), 2e-11
 _DERIVATIVE_SIGMAS = 4.0  # errors and derivatives are not at their largest in the same place
+_MOST_POINTS = 100  # of a spline whose bounds are measured
 _SAFETY, _GRADIENT_SAFETY = 1.25, 1.05
 _MAX_POINTS = 64  # at which errors are measured
 _LEVELS = np.array([2.0, 16.0, 64.0, 256.0])  # px, strides at which errors are measured
@@ -43,9 +45,12 @@ class ThinPlateErrorModel:
 
     is_random = True
 
-    def bounds(self, height: int, width: int) -> FlowBounds:
-        """Return bounds of the displacement, and measured ones of its derivatives and of the error of cubics."""
-        return _bounds(self, height, width)
+    def bounds(self, height: int, width: int) -> FlowBounds | None:
+        """Return bounds of the displacement, and measured ones of its gradient and of the error of cubics.
+
+        None for many control points, since measuring their splines takes longer than the lattice saves.
+        """
+        return None if math.prod(self.lattice) > _MOST_POINTS else _bounds(self, height, width)
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification:
         """Leave out nothing; a flow that is longer than the frame is computed at every pixel."""

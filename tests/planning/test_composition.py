@@ -22,14 +22,14 @@ from torchrefract import (
     Turbulence,
     UniformFog,
 )
-from torchrefract.effects.batch_flow import WarpFlow, flow_on_measured_lattice, lattice_error
+from torchrefract.effects.batch_flow import WarpFlow, errors_at_nodes, flow_on_measured_lattice, lattice_error
 from torchrefract.effects.thin_plate import ThinPlateParams
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.planning.composition import CompositionPlan, PlannedWarp, plan_composition
 from torchrefract.planning.plan import PlanRequest, WarpPlan
 from torchrefract.types import FlowBounds, Simplification
 from torchrefract.warping.grid import Points
-from torchrefract.warping.lattice import Lattice, LatticeFlow
+from torchrefract.warping.lattice import Lattice, LatticeFlow, pixel_lattice
 
 SIZE = (96, 130)
 CAMERA = Camera(width=320, height=240, fx=290.0, fy=290.0, cx=160.0, cy=120.0, coefficients=(-0.2, 0.05, 1e-3, 0.0))
@@ -135,8 +135,30 @@ def test_the_error_of_every_other_node_is_that_of_the_remainder():
     nodes = torch.zeros(2, 2, 9, 21, dtype=torch.float64)
     nodes[1, 0] = x**4
     # The cubic through -3, -1, 1 and 3 is off at 0 by 9 / 24 of the fourth derivative, and likewise elsewhere.
-    assert_close(lattice_error(nodes), torch.tensor([0.0, 9.0]).double(), rtol=0, atol=1e-9)
-    assert_close(lattice_error(nodes.mT), lattice_error(nodes))
+    expected = torch.tensor([0.0, 9.0]).double().view(2, 1, 1, 1).expand(2, 1, 9, 21)
+    assert_close(errors_at_nodes(nodes), expected, rtol=0, atol=1e-9)
+    assert_close(errors_at_nodes(nodes.mT), expected.mT, rtol=0, atol=1e-9)
+
+
+def kink(x: Tensor, y: Tensor, at: float) -> Tensor:
+    """Return the kernel r^2 ln r of a thin-plate spline with a control point at (80 + at, 80 - at / 2)."""
+    square = (x - 80 - at) ** 2 + (y - 80 + at / 2) ** 2 + 1e-30
+    return square * square.log() / 2
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("function", ["kink", "wave"])
+@pytest.mark.parametrize("at", range(8))
+def test_the_estimated_error_of_a_lattice_is_above_the_true_one(function, at):
+    def flow(points: Points) -> Tensor:
+        x, y = torch.broadcast_tensors(points.x, points.y)
+        values = kink(x, y, at) if function == "kink" else torch.sin(x / 9 + y / 12 + at)
+        return torch.cat([values, 0 * values], dim=1)
+
+    lattice, pixels = Lattice(160, 160, 8, 2), pixel_lattice(160, 160)
+    nodes, dense = (flow(each.points(dtype=torch.float64, device=torch.device("cpu"))) for each in (lattice, pixels))
+    true = distance(LatticeFlow(nodes, lattice).dense(), dense)
+    assert true < lattice_error(nodes).item() < (15 if function == "kink" else 3) * true
 
 
 def planned(effects: list[WarpEffect], px: float, size: tuple[int, int] = (540, 960)) -> CompositionPlan:

@@ -176,7 +176,7 @@ def test_the_lattice_of_a_composition_gets_coarser_with_the_tolerance():
         (part,) = flow_on_measured_lattice(warps, stride=64, tolerance_px=px)
         strides.append(part.flow.lattice.stride)
         text = str(Compose(four_warps(64.0), tolerance_px=px).plan(540, 960))
-        assert f"composed flow  every {plan.stride} px, or finer" in text
+        assert f"composed flow  every {plan.stride} px or finer" in text
     assert strides == sorted(strides)
     assert strides[0] < strides[2] < strides[3] <= 64
 
@@ -341,6 +341,14 @@ def test_one_of_several_effects_is_within_the_tolerance(seed):
     degraded = effect.degrade(image, seed=seed)
     exact = exact_flow(effects(None), image, degraded.params)
     assert 1e-4 < distance(degraded.flow, exact) <= effect.plan(*SIZE).error_px <= 0.1
+
+
+def test_the_lattice_of_a_sample_does_not_depend_on_its_batch():
+    effect = Compose(four_warps(64.0), tolerance_px=0.05)
+    image = torch.zeros(6, 1, 120, 160)
+    together = effect.degrade(image, seed=4).flow
+    alone = torch.cat([effect.degrade(image[:1], seed=4, keys=[key]).flow for key in range(6)])
+    assert distance(together, alone) <= 1e-4
 
 
 def test_gradients_agree_with_those_of_the_exact_composition_within_the_tolerance():

@@ -167,32 +167,31 @@ def flow_on_measured_lattice(
     exists = composed.exists.expand(len(composed.flow), 1, *lattice.num_nodes)
     exists_inside = exists[..., _MARGIN:-_MARGIN, _MARGIN:-_MARGIN].flatten(1).all(dim=1)
     lattice_px = torch.where(exists.flatten(1).all(dim=1), lattice_px, torch.inf)
-    rows: dict[str, list[int]] = {"fit": [], "exact": [], "pixels": [], "finer": []}
-    for i, (between, stretched, is_inside) in enumerate(
-        torch.stack([lattice_px, stretched_px, exists_inside.to(lattice_px.dtype)], dim=1).tolist()
-    ):
+    values = torch.stack([lattice_px, stretched_px, exists_inside.to(lattice_px.dtype)], dim=1).tolist()
+    rows: dict[tuple[bool, int], list[int]] = {}  # by whether they must be exact, and by their next stride
+    for i, (between, stretched, is_inside) in enumerate(values):
         if not stretched <= tolerance_px / 2:
-            rows["exact"].append(i)
+            choice = True, 1
         elif not (is_smooth and is_inside):
-            rows["pixels"].append(i)
+            choice = False, 1
         else:
-            rows["fit" if between + stretched <= tolerance_px else "finer"].append(i)
+            fits = between + stretched <= tolerance_px
+            choice = False, stride if fits else _next_stride(stride, between, tolerance_px)
+        rows.setdefault(choice, []).append(i)
     parts: list[FlowPart] = []
-    for choice, chosen in rows.items():
-        if not chosen:
-            continue
-        index = None if len(chosen) == len(lattice_px) else torch.tensor(chosen)
-        selected = warps if index is None else [warp.select(index) for warp in warps]
-        if choice == "fit":
+    for (is_exact, next_stride), chosen in rows.items():
+        index = None if len(chosen) == len(values) else torch.tensor(chosen)
+        if next_stride == stride:
             nodes = composed.flow if index is None else composed.flow[index]
             parts.append(FlowPart(index, LatticeFlow(nodes, lattice), everywhere(nodes.device)))
             continue
-        finer = 1
-        if choice == "exact":
-            selected = [warp.exact() for warp in selected]
-        elif choice == "finer":
-            finer = _next_stride(stride, min(lattice_px[chosen].tolist()), tolerance_px)
-        remaining = flow_on_measured_lattice(selected, stride=finer, is_smooth=is_smooth, tolerance_px=tolerance_px)
+        selected = warps if index is None else [warp.select(index) for warp in warps]
+        remaining = flow_on_measured_lattice(
+            [warp.exact() for warp in selected] if is_exact else selected,
+            stride=next_stride,
+            is_smooth=is_smooth,
+            tolerance_px=tolerance_px,
+        )
         parts += [part.of_samples(index) for part in remaining]
     return parts
 

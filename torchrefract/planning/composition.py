@@ -49,7 +49,7 @@ class CompositionPlan:
         """Return one line: where the composed flow is computed."""
         if self.stride == 1 or not self.is_smooth:
             return "at every pixel"
-        return f"every {self.stride} px, or finer where the error that is measured in a sample needs it"
+        return f"every {self.stride} px or finer, as measured in each sample; at every pixel off the CPU"
 
 
 @dataclass(frozen=True)

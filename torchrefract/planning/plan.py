@@ -142,7 +142,7 @@ class WarpPlan:
         if self.reason == EXACT_AT_NODES:
             return self.reason
         flow = {0: "not computed", 1: "at every pixel"}.get(self.stride, f"every {self.stride} px")
-        measured = "; on the CPU as coarse as measured in each sample" if self.is_measured else ""
+        measured = "; on the CPU as coarse as each sample allows, which is measured" if self.is_measured else ""
         return f"{flow} ({self.reason}{measured})"
 
     def __str__(self) -> str:

@@ -23,7 +23,7 @@ from torchrefract._validation import eager_bool, requires_grad
 from torchrefract.effects.batch import per_sample, rows_of_samples, select_params, where_active
 from torchrefract.planning.plan import PlanRequest, WarpPlan, plan_warp
 from torchrefract.warping.grid import Points
-from torchrefract.warping.lattice import Lattice, LatticeFlow, lattice_around, pixel_lattice
+from torchrefract.warping.lattice import Lattice, LatticeFlow, lattice_around, pixel_lattice, within_reach
 from torchrefract.warping.warp import sample_image
 
 COARSEST = 64  # px, stride of the first lattice that is measured
@@ -76,6 +76,7 @@ class WarpFlow:
         if self.has_closed_form:
             flow, exists = self.evaluate(self.params, points, self.plan)
         else:
+            points = within_reach(points)
             if self._field is None:
                 lattice = lattice_around(points, max(1, self.plan.stride))
                 nodes = lattice.points(dtype=points.x.dtype, device=points.x.device)

@@ -109,10 +109,17 @@ class LatticeFlow:
         return _cubic(self.nodes, x, y)
 
 
-def lattice_around(points: Points, stride: int) -> Lattice:
-    """Return a lattice with nodes around all points that lie less than the longer side outside the frame.
+def within_reach(points: Points) -> Points:
+    """Move points that lie farther outside the frame than its longer side to that distance."""
+    height, width = points.lattice.height, points.lattice.width
+    reach = max(height, width)
+    return points._replace(x=points.x.clamp(-reach, width + reach), y=points.y.clamp(-reach, height + reach))
 
-    If their positions cannot be read, the nodes reach a quarter of that side.
+
+def lattice_around(points: Points, stride: int) -> Lattice:
+    """Return a lattice with nodes around all points that `within_reach` returns.
+
+    If their positions cannot be read, the nodes reach a quarter of the longer side.
     """
     height, width = points.lattice.height, points.lattice.width
     longest = max(height, width)

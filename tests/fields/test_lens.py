@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from scipy.optimize import brentq
 from torch import Tensor
 from torch.testing import assert_close
@@ -27,6 +28,12 @@ def camera(names: dict[str, float], focal: tuple[float, float], center: tuple[fl
 
 def pixel_points(height: int, width: int, dtype: torch.dtype = torch.float64) -> Points:
     return pixel_lattice(height, width).points(dtype=dtype, device=torch.device("cpu"))
+
+
+def pixels_of(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Return x and y of the pixels, (H, W)."""
+    y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    return x, y
 
 
 def small_camera(names: dict[str, float], height: int = 36, width: int = 64) -> Camera:
@@ -98,6 +105,26 @@ def test_single_precision_is_off_by_less_than_2_thousandths_of_a_pixel_at_4k(ora
     # Preimages are searched up to four times the farthest corner.
     reach = frame_limit(torch.zeros_like(at[0]), *at[1:], height=height, width=width).radius.item()
     assert reach == pytest.approx(4 * math.hypot(1925, 1089) / 3000)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("seed", range(6))
+def test_strong_prisms_are_solved_in_single_precision_as_in_double(seed):
+    dice = torch.Generator().manual_seed(seed)
+    size = {"k1": 0.05, "p1": 0.02, "p2": 0.005, "s2": 0.02, "s4": 0.03}
+    numbers = 2 * torch.rand(len(size), generator=dice) - 1
+    names = {name: most * number for (name, most), number in zip(size.items(), numbers.tolist(), strict=True)}
+    at = camera(names, (50.0, 55.0), (33.0, 109.0))  # the corners lie at 2.2 focal lengths
+    double, exists = lens_flow(*at, points=pixel_points(223, 68))
+    single, single_exists = lens_flow(*(t.float() for t in at), points=pixel_points(223, 68, torch.float32))
+    differ = exists ^ single_exists
+    assert differ.double().mean() < 5e-4  # pixels whose preimage lies at a fold
+    near_fold = F.max_pool2d(differ.double(), 3, stride=1, padding=1) > 0
+    assert (single - double).abs()[(exists & single_exists & ~near_fold).expand(-1, 2, -1, -1)].max() < 0.02
+    flow = double.where(exists, torch.nan)
+    x, y = (torch.stack(pixels_of(223, 68)) + flow[0]).unbind(0)
+    back = by_opencv(x.nan_to_num(33.0), y.nan_to_num(109.0), names, at)
+    assert (back - torch.stack(pixels_of(223, 68))).abs()[exists[0].expand(2, -1, -1)].max() < 1e-6
 
 
 @pytest.mark.quick

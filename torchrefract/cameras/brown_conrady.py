@@ -13,14 +13,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._validation import eager_values
+from torchrefract._validation import eager_bool, eager_values
 from torchrefract.cameras.radial import RADIAL, RadialLimit, factor_and_slope, newton_radius, radial_factor
 from torchrefract.warping.flow import Jacobian
 
 POLYNOMIAL12 = (*RADIAL, "p1", "p2", "s1", "s2", "s3", "s4")
 MAX_RESIDUAL = {torch.float32: 2e-6, torch.float64: 1e-12}  # of an inverted point, relative to 1 + r_d
 _MIN_RADIAL_FACTOR = 0.1  # in the first guess of Newton's method
-_NEWTON_STEPS = {torch.float32: 3, torch.float64: 5}
+_MAX_NEWTON_STEPS = 12  # in the plane; strong prisms need more than the usual 3
+_SMALL_STEP = {torch.float32: 1e-4, torch.float64: 1e-7}  # after which the error is about its square
 
 Point = tuple[Tensor, Tensor]  # x and y
 
@@ -123,8 +124,7 @@ def undistort_polynomial(
     """Invert `distort_polynomial` by Newton's method, without gradient.
 
     Newton's method starts from the inverse of the radial terms, which a table gives to 1e-6. It runs along the radius
-    if there are only radial terms, otherwise in the plane (3 steps in float32, 5 in float64). The limit is of the same
-    coefficients, by `radial_limit`.
+    if there are only radial terms, otherwise in the plane. The limit is of the same coefficients, by `radial_limit`.
 
     Returns:
         x, y: (B, ...), on the plane z = 1, finite everywhere.
@@ -141,7 +141,7 @@ def undistort_polynomial(
         x, y = scale * x_d, scale * y_d
         if terms.bent:
             steps = newton((x, y), (x_d, y_d), lambda x, y: distort_with_jacobian(x, y, coefficients, terms))
-            x, y = next(islice(steps, _NEWTON_STEPS[x.dtype], None))
+            x, y = converge(steps)
         (back_x, back_y), jacobian = distort_with_jacobian(x, y, coefficients, terms)
         residual = torch.maximum((back_x - x_d).abs(), (back_y - y_d).abs())
         exists = (residual <= MAX_RESIDUAL[r_d.dtype] * (1 + r_d)) & (x * x + y * y <= limit.radius.square())
@@ -178,6 +178,17 @@ def newton(
         (x, y), jacobian = function(*point)
         step_x, step_y = jacobian.solve(x - target[0], y - target[1])
         point = point[0] - step_x, point[1] - step_y
+
+
+def converge(iterates: Iterator[Point]) -> Point:
+    """Return the first iterate that a small step leads to, as far as values can be read, or the one after 12 steps."""
+    x, y = next(iterates)
+    for new_x, new_y in islice(iterates, _MAX_NEWTON_STEPS):
+        step = torch.maximum((new_x - x).abs(), (new_y - y).abs())
+        x, y = new_x, new_y
+        if eager_bool((step <= _SMALL_STEP[step.dtype]).all, of=step):
+            break
+    return x, y
 
 
 def implicit(point: Point, error: Point, jacobian: Jacobian) -> Point:

@@ -4,18 +4,16 @@ The Brown-Conrady polynomial is its special case without denominator and tilt. A
 """
 
 from collections.abc import Sequence
-from itertools import islice
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchrefract.cameras.brown_conrady import MAX_RESIDUAL, Jacobian, Point, distort_by_factor, newton
+from torchrefract.cameras.brown_conrady import MAX_RESIDUAL, Jacobian, Point, converge, distort_by_factor, newton
 from torchrefract.cameras.radial import RADIAL, first_root, growth, invert_radius
 
 OPENCV14 = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 OPENCV_COUNTS = (4, 5, 8, 12, 14)  # lengths that OpenCV accepts
-_NEWTON_STEPS = 8  # in the plane; strong decentering needs more than the usual 5
 
 
 class RationalLens(NamedTuple):
@@ -62,7 +60,7 @@ class RationalLens(NamedTuple):
         """Invert `distort` up to a radius (B,) by Newton's method, without gradient.
 
         Inverts the tilt in closed form, then the radial ratio by a table and Newton steps along the radius, then the
-        whole lens by 8 Newton steps in the plane.
+        whole lens by Newton steps in the plane.
 
         Returns:
             x, y: (B, N), on the plane z = 1, finite everywhere.
@@ -77,7 +75,7 @@ class RationalLens(NamedTuple):
             r = invert_radius(r_l, radius, self.numerator, self.denominator)
             scale = r / r_l.clamp(min=torch.finfo(r.dtype).tiny)
             steps = newton((scale * x_l, scale * y_l), (x_l, y_l), self._distort_before_tilt)
-            x, y = (value.nan_to_num(0, 0, 0) for value in next(islice(steps, _NEWTON_STEPS, None)))
+            x, y = (value.nan_to_num(0, 0, 0) for value in converge(steps))
             back_x, back_y = self.distort(x, y)[0]
             residual = torch.maximum((back_x - x_d).abs(), (back_y - y_d).abs())
             limit = MAX_RESIDUAL[x.dtype] * (1 + (x_d * x_d + y_d * y_d).sqrt())

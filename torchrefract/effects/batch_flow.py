@@ -77,8 +77,8 @@ class WarpFlow:
             flow, exists = self.evaluate(self.params, points, self.plan)
         else:
             points = within_reach(points)
-            if self._field is None:
-                lattice = lattice_around(points, max(1, self.plan.stride))
+            lattice = lattice_around(points, max(1, self.plan.stride))
+            if self._field is None or lattice.margin > self._field.lattice.margin:
                 nodes = lattice.points(dtype=points.x.dtype, device=points.x.device)
                 self._field = LatticeFlow(self.evaluate(self.params, nodes, self.plan)[0], lattice)
             flow, exists = self._field.at(points), everywhere(self.active.device)

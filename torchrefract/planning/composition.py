@@ -109,10 +109,11 @@ def plan_composition(
     # Independent random errors add as squares.
     parts = math.sqrt(len(fields)) if all(warp.model and warp.model.is_random for warp in fields) else len(fields)
     plans: list[WarpPlan] = []
-    stretch = 1.0
+    stretch, rough_stretch = 1.0, 1.0
     for warp in warps:
         bounds = None if warp.model is None else warp.model.bounds(request.height, request.width)
-        counted = min(stretch, _ALLOWED_STRETCH) if can_measure else stretch
+        # A lattice cannot measure how far fields stretch that are too rough for one.
+        counted = min(stretch, _ALLOWED_STRETCH * rough_stretch) if can_measure else stretch
         share = replace(request, tolerance_px=budget / (parts or 1) / counted, ulps=warp.ulps)
         if warp.has_closed_form or bounds is None:
             plan = replace(exact, reason=EXACT_AT_NODES if bounds else exact.reason, bounds=bounds)
@@ -121,7 +122,10 @@ def plan_composition(
         else:
             plan = replace(exact, reason="its share of the tolerance is below rounding", bounds=bounds)
         plans.append(plan)
-        stretch *= 1 + (math.inf if bounds is None else bounds.max_gradient)
+        factor = 1 + (math.inf if bounds is None else bounds.max_gradient)
+        stretch *= factor
+        if plan.stride == 1 and not warp.has_closed_form:
+            rough_stretch *= factor
     # A warp without a model must be exact, and so is then the composed flow.
     strides = [
         plan.stride

@@ -4,7 +4,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -46,7 +46,7 @@ from torchrefract.warping.warp import warp
 _SYNTHETIC = "synthetic"
 _MIN_USABLE = MIN_VIEWS + 1  # views, so that each can be left out of the fit
 _MAX_REASONS = 300  # characters
-_CACHE_VERSION = 3  # of detections.jsonl; lines of other versions are ignored
+_CACHE_VERSION = 4  # of detections.jsonl; lines of other versions are ignored
 _MIN_SAME_SIZE = 0.75  # share of the pictures
 _NUM_DIAGNOSED = 3  # pictures in which another board is searched if the expected one is missing
 _BOARD_FORMATS = (".pdf", ".png")
@@ -84,6 +84,8 @@ def calibrate(cfg: DictConfig) -> None:
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
     files = _rendered(board, out / "rendered") if str(cfg.images) == _SYNTHETIC else find_pictures(str(cfg.images))
+    if turned := media.describe_turned(files):
+        print(turned)
     search = detect_all(files, board, out / "detections.jsonl")
     detections = list(progress(search, "detecting the board", count=len(files)))
     paths = {file.name: file for file in files}
@@ -97,6 +99,9 @@ def calibrate(cfg: DictConfig) -> None:
         raise UsageError(f"{error} ({out / REPORT_FILE} lists all pictures)") from error
     write_opencv(out / CAMERA_FILE, calibration.fit.camera)
     write_report(calibration, lambda name: read_gray(paths[name]), out)
+    if turned:
+        with (out / REPORT_FILE).open("a", encoding="utf-8") as stream:
+            stream.write(f"\n\n{turned}.\n")
     _print_summary(calibration, out)
 
 
@@ -110,8 +115,8 @@ def find_pictures(folder: str | Path) -> list[Path]:
 
 
 def read_gray(path: Path) -> np.ndarray:
-    """Read a picture (H, W), uint8, converted to gray by OpenCV."""
-    return cv2.cvtColor(pixels_of(read_image(path)), cv2.COLOR_RGB2GRAY)
+    """Read a picture (H, W), uint8, as it is stored, in the frame of the sensor; OpenCV converts it to gray."""
+    return cv2.cvtColor(pixels_of(read_image(path, upright=False)), cv2.COLOR_RGB2GRAY)
 
 
 def detect_all(files: Sequence[Path], board: Board, cache: Path) -> Iterator[Detection]:
@@ -234,13 +239,20 @@ def rectify(cfg: DictConfig) -> None:
             f"warning: the camera's model folds back inside the frame: {share:.1%} of it stays black", file=sys.stderr
         )
 
+    for message in (media.describe_turned(files), *media.describe_losses(files, upright=False)):
+        if message:
+            print(f"warning: {message}", file=sys.stderr)
+
     @lru_cache(maxsize=2)
     def flow(height: int, width: int) -> Tensor:
         return camera_flow(camera.resized(width=width, height=height), zoom=zoom)[0]
 
-    def rectify_frame(frame: Tensor) -> np.ndarray:
-        """Rectify a frame (1, 3, H, W) in [0, 1] to (H, W, 3), uint8, RGB."""
-        return pixels_of(warp(frame, flow(*frame.shape[2:]), interpolation="bicubic")[0][0])
+    def rectify_frame(frame: Tensor) -> Tensor:
+        """Rectify a frame (1, 3, H, W) in [0, 1] to (3, H, W)."""
+        return warp(frame, flow(*frame.shape[2:]), interpolation="bicubic")[0][0]
+
+    def rectify_frames(frames: Iterator[Tensor]) -> Iterator[np.ndarray]:
+        return (pixels_of(rectify_frame(frame)) for frame in frames)
 
     num_written, skipped = 0, dict[Path, str]()
     for file in progress(files, "rectifying", count=len(files)):
@@ -250,9 +262,10 @@ def rectify(cfg: DictConfig) -> None:
                 continue
             with replace_file(target) as path:
                 if media.is_video(file):
-                    media.convert_video(file, path, change=partial(map, rectify_frame))
+                    media.convert_video(file, path, change=rectify_frames, upright=False)
                 else:
-                    media.write_picture(rectify_frame(read_image(file)[None].contiguous()), path)
+                    frame = read_image(file, upright=False)[None].contiguous()
+                    media.write_picture(rectify_frame(frame), path, source=file, upright=False)
             num_written += 1
         except ValueError as error:
             skipped[file] = str(error) if isinstance(error, UnreadableImageError) else f"{file}: {error}"

@@ -23,6 +23,7 @@ from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
 from torchrefract.data.media import (
     check_output_folder,
     convert_video,
+    describe_losses,
     find_media,
     is_complete,
     is_video,
@@ -71,6 +72,8 @@ def restore(cfg: DictConfig) -> None:
     with naming("out"):
         claim(out, _settings(cfg, job), count=0, about={})
     todo = [file for file in files if not job.is_done(file)]
+    for loss in describe_losses(todo, upright=True):
+        print(f"warning: {loss}", file=sys.stderr)
     start = time.perf_counter()
     failed = dict[Path, str]()
     num_frames = _restore_pictures([file for file in todo if not is_video(file)], job, failed)
@@ -154,11 +157,11 @@ class _Job(NamedTuple):
     def is_done(self, file: Path) -> bool:
         return is_complete(file, self.target(file), num_columns=1 + self.side_by_side)
 
-    def restore(self, images: Sequence[Tensor]) -> Iterator[np.ndarray]:
-        """Restore images (3, H, W) in [0, 1] to pixels (H, W, 3), uint8, RGB."""
+    def restore(self, images: Sequence[Tensor]) -> Iterator[Tensor]:
+        """Restore images (3, H, W) in [0, 1]; `side_by_side` puts the image to the left of its restoration."""
         moved = [image.to(self.device).contiguous() for image in images]
         for before, after in zip(moved, self.restorer(moved), strict=True):
-            yield pixels_of(torch.cat([before, after], dim=2) if self.side_by_side else after)
+            yield torch.cat([before, after], dim=2) if self.side_by_side else after
 
 
 def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
@@ -215,11 +218,11 @@ def _restore_pictures(files: Sequence[Path], job: _Job, failed: dict[Path, str])
                 images[file] = read_image(file)
             except UnreadableImageError as error:
                 _skip(file, error, failed)
-        for file, pixels in zip(images, job.restore([*images.values()]) if images else (), strict=True):
+        for file, image in zip(images, job.restore([*images.values()]) if images else (), strict=True):
             target = job.target(file)
             target.parent.mkdir(parents=True, exist_ok=True)
             with replace_file(target) as path:
-                write_picture(pixels, path)
+                write_picture(image, path, source=file)
             count += 1
     return count
 
@@ -230,7 +233,7 @@ def _restore_video(file: Path, job: _Job, failed: dict[Path, str]) -> int:
     def change(frames: Iterable[Tensor]) -> Iterator[np.ndarray]:
         num_frames = video_info(file)[0]
         for chunk in _batches(progress(frames, f"restoring {file.name}", count=num_frames), job.batch):
-            yield from job.restore([frame[0] for frame in chunk])
+            yield from map(pixels_of, job.restore([frame[0] for frame in chunk]))
 
     target = job.target(file)
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import cv2
 import numpy as np
@@ -30,7 +30,9 @@ _PNG_END = b"IEND\xaeB`\x82"
 _JPEG_END = b"\xff\xd9"
 _START_OF_SCAN = 0xDA
 _BARE_MARKERS = (0x01, *range(0xD0, 0xD8))  # TEM and RST0 to RST7 have no length
+_PNG_DEPTH = 24  # position of the bits of a channel
 _ORIENTATION = 0x0112
+_EXIF_PREFIX = b"Exif\0\0"
 _TRANSPOSED = (5, 6, 7, 8)  # EXIF orientations that swap height and width
 _LOG_LOCK = Lock()
 _log_levels: list[int] = []  # OpenCV's previous log level, once for each thread that has silenced it
@@ -40,8 +42,25 @@ class UnreadableImageError(ValueError):
     """Raised for a file that is not a complete image."""
 
 
-def read_image(path: str | Path) -> Tensor:
-    """Read a JPEG, PNG, WebP or BMP file, rotated by its EXIF orientation, without its alpha channel.
+class ImageHeader(NamedTuple):
+    """What the header of an image file states."""
+
+    size: tuple[int, int]  # (H, W) as stored, which is the frame of the sensor
+    orientation: int  # of EXIF, 1 to 8: how a viewer turns the stored pixels; 1 is upright
+    bits: int  # of a channel
+    num_frames: int
+    has_alpha: bool
+    exif: bytes  # in the form of TIFF; empty without EXIF
+    profile: bytes  # ICC profile; empty without one
+
+
+def read_image(path: str | Path, *, upright: bool = True) -> Tensor:
+    """Read a JPEG, PNG, WebP or BMP file without its alpha channel.
+
+    Args:
+        path: of the file.
+        upright: True turns the image by its EXIF orientation, as a viewer does. False keeps the stored pixels, which
+            lie in the frame of the sensor, where the geometry of a camera holds.
 
     Returns:
         (3, H, W), float32, in [0, 1], RGB: 8-bit values / 255 or 16-bit values / 65535; in memory, channels last.
@@ -55,22 +74,46 @@ def read_image(path: str | Path) -> Tensor:
     if data.startswith(_PNG) and not has_complete_png_chunks(data):
         raise UnreadableImageError(f"{path} is damaged: its chunks are shorter than they state")
     # OpenCV would allocate any size that a header states; Pillow raises an error for a decompression bomb.
-    _header_size(path, io.BytesIO(data))
-    return to_float(torch.from_numpy(_decode(path, data))).permute(2, 0, 1)
+    _read_header(path, io.BytesIO(data))
+    return to_float(torch.from_numpy(_decode(path, data, upright=upright))).permute(2, 0, 1)
 
 
-def pixels_of(image: Tensor) -> np.ndarray:
-    """Convert an image (3, H, W) into (H, W, 3), uint8: round(255 v) of each value v, clipped to [0, 1].
+def upright_exif(header: ImageHeader) -> bytes:
+    """Return the EXIF data of a header with orientation 1, for pixels that are turned upright."""
+    data = bytearray(header.exif)
+    order = "little" if data.startswith(b"II") else "big"
+    start = int.from_bytes(data[4:8], order) + 2
+    for entry in range(start, start + 12 * int.from_bytes(data[start - 2 : start], order), 12):
+        if int.from_bytes(data[entry : entry + 2], order) == _ORIENTATION:
+            data[entry + 8 : entry + 10] = (1).to_bytes(2, order)
+    return bytes(data)
 
-    It inverts `read_image` of an image of 8 bits exactly.
+
+def pixels_of(image: Tensor, *, bits: int = 8) -> np.ndarray:
+    """Convert an image (3, H, W) into (H, W, 3), uint8 or uint16: round(v (2^bits - 1)) of values v clipped to [0, 1].
+
+    It inverts `read_image` of an image of 8 or 16 `bits` exactly.
     """
+    if bits == 16:
+        values = image.detach().cpu().permute(1, 2, 0).double().clamp(0, 1)
+        return (values * 65535).round().numpy().astype(np.uint16)
     levels = to_uint8(image.detach().cpu()[None])[0]
     # OpenCV interleaves planes faster than a strided copy.
     return last.numpy() if (last := levels.permute(1, 2, 0)).is_contiguous() else cv2.merge([*levels.numpy()])
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Return (H, W) of an image from the header and the end of its file, without decoding pixels.
+    """Return (H, W) of an upright image from the header and the end of its file, without decoding pixels.
+
+    Errors are those of `image_header`.
+    """
+    header = image_header(path)
+    height, width = header.size
+    return (width, height) if header.orientation in _TRANSPOSED else (height, width)
+
+
+def image_header(path: str | Path) -> ImageHeader:
+    """Read the header of an image, without decoding pixels, and check the end of its file.
 
     Raises:
         UnreadableImageError: the file is empty, truncated or not an image. Damage in between is detected by
@@ -78,7 +121,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
     """
     with opened(path) as stream:
         _check_complete(path, stream, os.fstat(stream.fileno()).st_size)
-        return _header_size(path, stream)
+        return _read_header(path, stream)
 
 
 @contextmanager
@@ -152,22 +195,30 @@ def fit(image: Tensor, size: Sequence[int]) -> Tensor:
     return torch.from_numpy(small).permute(2, 0, 1).contiguous().clamp_(0, 1)
 
 
-def _header_size(path: str | Path, stream: BinaryIO) -> tuple[int, int]:
+def _read_header(path: str | Path, stream: BinaryIO) -> ImageHeader:
     try:
         with Image.open(stream) as header:
             width, height = header.size
+            info = header.info
             # Without the first test, Pillow decodes a whole PNG to search for EXIF data behind its pixels.
-            is_transposed = "exif" in header.info and header.getexif().get(_ORIENTATION) in _TRANSPOSED
+            orientation = header.getexif().get(_ORIENTATION, 1) if "exif" in info else 1
+            num_frames, has_alpha = getattr(header, "n_frames", 1), header.has_transparency_data
+        stream.seek(0)
+        head = stream.read(_PNG_DEPTH + 1)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise UnreadableImageError(f"{path} has a damaged header ({error})") from error
-    return (width, height) if is_transposed else (height, width)
+    bits = max(8, head[_PNG_DEPTH]) if head.startswith(_PNG) else 8
+    orientation = orientation if orientation in range(1, 9) else 1  # as viewers treat invalid values
+    exif = info.get("exif", b"").removeprefix(_EXIF_PREFIX)
+    return ImageHeader((height, width), orientation, bits, num_frames, has_alpha, exif, info.get("icc_profile") or b"")
 
 
-def _decode(path: str | Path, data: bytes) -> np.ndarray:
+def _decode(path: str | Path, data: bytes, *, upright: bool) -> np.ndarray:
     # From a file instead of memory, OpenCV would fill the missing rows of a truncated JPEG with gray.
+    mode = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
     try:
         with _silent_opencv():
-            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
     except cv2.error as error:
         raise UnreadableImageError(f"{path} cannot be decoded ({error.err})") from error
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image, features
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from torchrefract._validation import UsageError
 from torchrefract.data.images import pixels_of
-from torchrefract.data.media import write_video
+from torchrefract.data.media import can_write_videos, write_video
 from torchrefract.effects.base import Effect
 from torchrefract.types import Degraded
 from torchrefract.visualization.figures import (
@@ -114,8 +113,8 @@ def make_animation(
 
 
 def animation_formats() -> list[str]:
-    """Return the suffixes of files that the installed Pillow and OpenCV can write."""
-    available = {".webp": features.check("webp"), ".mp4": cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG)}
+    """Return the suffixes of files that the installed Pillow and PyAV can write."""
+    available = {".webp": features.check("webp"), ".mp4": can_write_videos()}
     return [suffix for suffix in (".gif", ".webp", ".apng", ".mp4") if available.get(suffix, True)]
 
 

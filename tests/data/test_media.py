@@ -1,0 +1,344 @@
+"""Videos keep their times, sound and orientation; pictures their orientation, bits and color profile."""
+
+import io
+import resource
+import warnings
+from collections.abc import Sequence
+from fractions import Fraction
+from itertools import product
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image, ImageCms, ImageOps
+
+from torchrefract.data.images import UnreadableImageError, image_header, read_image
+from torchrefract.data.media import (
+    convert_video,
+    describe_losses,
+    describe_turned,
+    is_complete,
+    read_video,
+    video_info,
+    write_picture,
+    write_video,
+)
+
+ONE = 1 << 16  # of the fixed-point numbers of a display matrix
+TURNS = [(a, b, 0, c, d, 0, 0, 0, 1 << 14) for a, b, c, d in (
+    *((x * ONE, 0, 0, y * ONE) for x, y in product((1, -1), repeat=2)),
+    *((0, x * ONE, y * ONE, 0) for x, y in product((1, -1), repeat=2)),
+)]  # fmt: skip  # rows of a table
+TIMES_MS = [0, 40, 80, 120, 1400, 1440, 1480, 2600]  # a phone in the dark
+
+
+def page(k: int = 0, *, height: int = 32, width: int = 48) -> np.ndarray:
+    """Return (H, W, 3), uint8, smooth, and different in all its corners."""
+    y, x = np.mgrid[:height, :width]
+    return np.dstack([3 * x + 20, 5 * y + 20, 100 + x + y + 10 * k]).clip(0, 255).astype(np.uint8)
+
+
+def write(
+    path: Path,
+    pages: Sequence[np.ndarray],
+    *,
+    times: Sequence[int] = (),
+    unit: Fraction = Fraction(1, 1000),
+    codec: str = "libx264",
+    pix_fmt: str = "yuv420p",
+    sound: str = "",
+    matrix: tuple[int, ...] = TURNS[0],
+    space: int = 2,
+) -> None:
+    """Write a video of pages at times, with a sine as its sound."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25)
+        stream.height, stream.width = pages[0].shape[:2]
+        stream.pix_fmt, stream.colorspace = pix_fmt, space
+        stream.codec_context.time_base = stream.time_base = unit
+        if matrix != TURNS[0]:
+            stream.set_display_matrix(matrix)
+        if sound:
+            track = container.add_stream(sound, rate=48000, layout="mono")
+        for pixels, t in zip(pages, times or range(len(pages)), strict=True):
+            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+            frame = frame.reformat(format=pix_fmt, dst_colorspace=space if space != 2 else 5)
+            frame.pts, frame.time_base = t, unit
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+        for start in range(0, 48000 if sound else 0, 960):
+            wave = (9000 * np.sin(np.arange(start, start + 960) / 17)).astype(np.int16)[None]
+            frame = av.AudioFrame.from_ndarray(wave, format="s16", layout="mono")
+            frame.sample_rate, frame.pts = 48000, start
+            for resampled in av.AudioResampler(track.codec_context.format, "mono", 48000).resample(frame):
+                container.mux(track.encode(resampled))
+        if sound:
+            container.mux(track.encode(None))
+
+
+def times_of(path: Path) -> list[float]:
+    with av.open(str(path)) as container:
+        return [frame.time for frame in container.decode(video=0)]
+
+
+def samples_of(path: Path) -> tuple[float, np.ndarray]:
+    """Return the time of the first sample, and all samples."""
+    with av.open(str(path)) as container:
+        frames = list(container.decode(audio=0))
+    return frames[0].time, np.concatenate([frame.to_ndarray() for frame in frames], axis=1)
+
+
+def equal(new: np.ndarray, samples: np.ndarray) -> bool:
+    return np.array_equal(new[:, : samples.shape[1]], samples)
+
+
+def as_pixels(frame: torch.Tensor) -> np.ndarray:
+    return (255 * frame[0]).movedim(0, -1).numpy()
+
+
+def unchanged(frames):
+    return (as_pixels(frame).round().astype(np.uint8) for frame in frames)
+
+
+def turned(pixels: np.ndarray, matrix: tuple[int, ...]) -> np.ndarray:
+    """Move each pixel by the display matrix of ISO 14496-12: x' = a x + c y, y' = b x + d y."""
+    a, b, c, d = (int(np.sign(matrix[i])) for i in (0, 1, 3, 4))
+    y, x = np.mgrid[: pixels.shape[0], : pixels.shape[1]]
+    right, down = a * x + c * y, b * x + d * y
+    right, down = right - right.min(), down - down.min()
+    result = np.zeros((down.max() + 1, right.max() + 1, 3), pixels.dtype)
+    result[down, right] = pixels
+    return result
+
+
+@pytest.mark.parametrize("matrix", TURNS)
+def test_a_turned_video_is_read_as_displayed_or_as_stored_and_stays_upright(tmp_path, matrix):
+    write(tmp_path / "a.mp4", [page(k) for k in range(3)], times=(0, 40, 80), matrix=matrix)
+    stored, displayed = (
+        as_pixels(next(read_video(tmp_path / "a.mp4", [1], upright=upright))[1]) for upright in (False, True)
+    )
+    assert np.abs(stored - page(1)).mean() < 4  # of the codec
+    np.testing.assert_array_equal(displayed, turned(stored, matrix))
+    assert bool(describe_turned([tmp_path / "a.mp4"])) == (matrix != TURNS[0])
+    for upright in (False, True):
+        convert_video(tmp_path / "a.mp4", tmp_path / "b.mp4", change=unchanged, upright=upright)
+        again = [as_pixels(next(read_video(tmp_path / "b.mp4", [1], upright=is_up))[1]) for is_up in (False, True)]
+        assert np.abs(again[1] - displayed).mean() < 3
+        assert np.abs(again[0] - (displayed if upright else stored)).mean() < 3
+
+
+@pytest.mark.parametrize("quarter", [0, 90, 180, 270])
+def test_opencv_shows_a_converted_video_as_the_original(tmp_path, quarter):
+    c, s = {0: (1, 0), 90: (0, 1), 180: (-1, 0), 270: (0, -1)}[quarter]
+    write(tmp_path / "a.mp4", [page()], matrix=(c * ONE, s * ONE, 0, -s * ONE, c * ONE, 0, 0, 0, 1 << 14))
+    expected = cv2.VideoCapture(str(tmp_path / "a.mp4")).read()[1][..., ::-1].astype(float)
+    ours = as_pixels(next(read_video(tmp_path / "a.mp4", [0]))[1])
+    assert np.abs(ours - expected).mean() < 2
+    convert_video(tmp_path / "a.mp4", tmp_path / "b.mp4", change=unchanged, upright=False)
+    result = cv2.VideoCapture(str(tmp_path / "b.mp4")).read()[1][..., ::-1].astype(float)
+    assert np.abs(result - expected).mean() < 3
+
+
+@pytest.mark.parametrize(
+    ("suffix", "codec", "unit", "times", "sound"),
+    [
+        (".mp4", "libx264", Fraction(1, 1000), TIMES_MS, "aac"),
+        (".mov", "libx264", Fraction(1, 90000), [90 * t + 3 for t in TIMES_MS], "aac"),
+        (".mov", "mpeg4", Fraction(1, 600), [600 * t // 1000 for t in TIMES_MS], "pcm_s16le"),
+        (".mkv", "libx264", Fraction(1, 1000), [t + 700 for t in TIMES_MS], "flac"),
+        (".mkv", "libx264", Fraction(1, 1000), TIMES_MS, "libopus"),
+        (".mp4", "libx264", Fraction(1001, 30000), list(range(8)), "libmp3lame"),
+        (".avi", "mjpeg", Fraction(1, 25), list(range(8)), "libmp3lame"),
+    ],
+)
+def test_a_converted_video_keeps_times_and_sound(tmp_path, suffix, codec, unit, times, sound):
+    source, target = tmp_path / f"a{suffix}", tmp_path / "b.mp4"
+    pages = [page(k) for k in range(8)]
+    write(source, pages, times=times, unit=unit, codec=codec, sound=sound,
+          pix_fmt="yuvj420p" if codec == "mjpeg" else "yuv420p")  # fmt: skip  # options in one place
+    assert describe_losses([source], upright=True) == []
+    assert convert_video(source, target, change=unchanged) == 8
+    assert times_of(source) == pytest.approx([float(t * unit) for t in times], abs=1e-3)
+    assert times_of(target) == pytest.approx(times_of(source), abs=1e-3)
+    (start, samples), (new_start, new_samples) = samples_of(source), samples_of(target)
+    # MKV rounds the start of compressed sound to 1 ms, and MP4 does not trim its end.
+    shift = next(k for k in range(-48, 49) if equal(new_samples[:, max(0, k) :], samples[:, max(0, -k) :]))
+    assert shift == 0 or suffix == ".mkv"
+    assert new_start == pytest.approx(start, abs=1e-3)
+    assert is_complete(source, target)
+    for (_, frame), (_, original) in zip(read_video(target, range(8)), read_video(source, range(8)), strict=True):
+        assert np.abs(as_pixels(frame) - as_pixels(original)).mean() < 3
+
+
+@pytest.mark.parametrize(("space", "pix_fmt"), [(1, "yuv420p"), (5, "yuv420p"), (9, "yuv420p"), (2, "yuvj420p")])
+def test_colors_are_read_by_the_matrix_and_range_of_the_video_and_kept(tmp_path, space, pix_fmt):
+    flat = np.full((32, 48, 3), (200, 60, 30), np.uint8)
+    write(tmp_path / "a.mp4", [flat], space=space, pix_fmt=pix_fmt)
+    convert_video(tmp_path / "a.mp4", tmp_path / "b.mp4", change=unchanged)
+    for name in ("a.mp4", "b.mp4"):
+        _, frame = next(read_video(tmp_path / name, [0]))
+        assert np.abs(as_pixels(frame) - flat).max() < 3, name
+    with av.open(str(tmp_path / "b.mp4")) as container:
+        assert next(container.decode(video=0)).colorspace == space
+
+
+def test_pixels_that_are_not_square_keep_their_shape(tmp_path):
+    write(tmp_path / "a.mp4", [page()], matrix=TURNS[-1])
+    with av.open(str(tmp_path / "a.mp4")) as source, av.open(str(tmp_path / "wide.mp4"), "w") as wide:
+        stream = wide.add_stream_from_template(source.streams.video[0])
+        stream.sample_aspect_ratio = stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+        stream.set_display_matrix(TURNS[-1])
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                wide.mux(packet)
+    for upright, ratio in ((False, Fraction(4, 3)), (True, Fraction(3, 4))):
+        convert_video(tmp_path / "wide.mp4", tmp_path / "b.mp4", change=unchanged, upright=upright)
+        with av.open(str(tmp_path / "b.mp4")) as container:
+            assert container.streams.video[0].sample_aspect_ratio == ratio
+
+
+def test_what_a_video_loses_is_described(tmp_path):
+    write(tmp_path / "law.mov", [page()], sound="pcm_mulaw")
+    write(tmp_path / "deep.mkv", [page()], pix_fmt="yuv420p10le", sound="flac")
+    write(tmp_path / "clear.mov", [page()], codec="qtrle", pix_fmt="argb")
+    with av.open(str(tmp_path / "law.mov")) as source, av.open(str(tmp_path / "notes.mkv"), "w") as target:
+        stream = target.add_stream_from_template(source.streams.video[0])
+        target.add_attachment("notes.txt", "text/plain", b"notes")
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                target.mux(packet)
+    files = [tmp_path / name for name in ("law.mov", "deep.mkv", "clear.mov", "notes.mkv")]
+    assert describe_losses(files, upright=True) == [
+        "the sound is not kept, since MP4 cannot hold pcm_mulaw: law.mov",
+        "10 bits a channel are written as 8: deep.mkv",
+        "transparency is not kept: clear.mov",
+        "a stream of type attachment is not kept: notes.mkv",
+    ]
+    for file in files:
+        assert convert_video(file, tmp_path / "b.mp4", change=unchanged) == 1
+
+
+def test_frames_after_damage_are_kept_and_the_damage_is_warned_of(tmp_path):
+    write(tmp_path / "a.avi", [page(k) for k in range(6)], codec="png", pix_fmt="rgb24", unit=Fraction(1, 25))
+    data = bytearray((tmp_path / "a.avi").read_bytes())
+    second = data.index(b"\x89PNG", data.index(b"\x89PNG") + 1)
+    data[second : second + 60] = bytes(60)
+    (tmp_path / "a.avi").write_bytes(data)
+    with pytest.warns(UserWarning, match=r"a\.avi has 1 damaged frames, which are left out"):
+        num_frames = convert_video(tmp_path / "a.avi", tmp_path / "b.mp4", change=unchanged)
+    assert num_frames == 5
+    assert times_of(tmp_path / "b.mp4") == pytest.approx([0, 0.08, 0.12, 0.16, 0.2], abs=1e-3)
+
+
+def test_frames_that_change_their_size_raise(tmp_path):
+    for name, size in (("a", (32, 48)), ("b", (48, 64))):
+        write(tmp_path / f"{name}.mkv", [page(height=size[0], width=size[1])], codec="mjpeg", pix_fmt="yuvj420p")
+    with av.open(str(tmp_path / "both.mkv"), "w") as target:
+        for k, name in enumerate("ab"):
+            with av.open(str(tmp_path / f"{name}.mkv")) as source:
+                stream = target.streams.video[0] if k else target.add_stream_from_template(source.streams.video[0])
+                packet = next(source.demux(video=0))
+                packet.stream, packet.pts, packet.dts = stream, 40 * k, 40 * k
+                target.mux(packet)
+    with pytest.raises(UnreadableImageError, match=r"both\.mkv changes the size of its frames"):
+        convert_video(tmp_path / "both.mkv", tmp_path / "c.mp4", change=unchanged)
+
+
+def test_a_full_disk_raises(tmp_path):
+    pages = [np.random.default_rng(k).integers(0, 256, (64, 96, 3), np.uint8) for k in range(40)]
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            write_video(pages, tmp_path / "a.mp4", fps=10, size=(96, 64))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_video_without_a_number_of_frames_in_its_header_is_counted(tmp_path):
+    write(tmp_path / "a.mkv", [page(k) for k in range(8)], times=TIMES_MS)
+    assert video_info(tmp_path / "a.mkv")[0] == 8
+    assert write_video([page()] * 5, tmp_path / "b.mp4", fps=29.97, size=(48, 32)) == 5
+    assert video_info(tmp_path / "b.mp4") == (5, pytest.approx(29.97, rel=1e-6))
+
+
+def load(path: Path) -> Image.Image:
+    return Image.open(io.BytesIO(path.read_bytes()))
+
+
+def tagged(path: Path, orientation: int, **options) -> np.ndarray:
+    """Write a picture with an orientation, a maker and a color profile; return its stored pixels."""
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0112] = "maker", orientation
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    Image.fromarray(page()).save(path, exif=exif, icc_profile=profile, **options)
+    return np.asarray(load(path))
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_picture_is_read_as_displayed_or_as_stored_and_stays_upright(tmp_path, suffix, orientation):
+    source, target = tmp_path / f"a.{suffix}", tmp_path / f"b.{suffix}"
+    stored = tagged(source, orientation, quality=98)
+    displayed = np.asarray(ImageOps.exif_transpose(load(source)))
+    for upright, expected in ((False, stored), (True, displayed)):
+        image = read_image(source, upright=upright)
+        assert np.abs(as_pixels(image[None]) - expected).mean() < 2
+        write_picture(image, target, source=source, upright=upright)
+        with load(target) as written:
+            assert written.getexif().get(0x0112) == (1 if upright else orientation)
+            assert written.getexif()[0x010F] == "maker"
+            assert written.info["icc_profile"] == load(source).info["icc_profile"]
+            assert np.abs(np.asarray(ImageOps.exif_transpose(written)).astype(float) - displayed).mean() < 4
+        assert is_complete(source, target)
+    assert bool(describe_turned([source])) == (orientation != 1)
+
+
+def test_sixteen_bits_are_kept(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 65536, (6, 8, 3)).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "a.png"), pixels)
+    assert describe_losses([tmp_path / "a.png"], upright=True) == []
+    write_picture(read_image(tmp_path / "a.png"), tmp_path / "b.png", source=tmp_path / "a.png")
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "b.png"), cv2.IMREAD_UNCHANGED), pixels)
+
+
+def test_what_a_picture_loses_is_described(tmp_path):
+    pages = [Image.fromarray(page(k)) for k in range(3)]
+    for name in ("moving.png", "moving.webp"):
+        pages[0].save(tmp_path / name, save_all=True, append_images=pages[1:], duration=100)
+    pages[0].convert("RGBA").save(tmp_path / "clear.png")
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((6, 8), np.uint16))
+    (tmp_path / "a.png").rename(tmp_path / "deep.jpg")
+    tagged(tmp_path / "a.jpg", 6)
+    (tmp_path / "a.jpg").rename(tmp_path / "turned.bmp")
+    names = ("moving.png", "moving.webp", "clear.png", "deep.jpg", "turned.bmp")
+    assert describe_losses([tmp_path / name for name in names], upright=False) == [
+        "the first of several frames is kept: moving.png, moving.webp",
+        "transparency is not kept: clear.png",
+        "16 bits a channel are written as 8, since .jpg holds no more: deep.jpg",
+        "the orientation is not kept, since .bmp cannot hold it: turned.bmp",
+    ]
+
+
+def test_an_invalid_color_profile_is_warned_of(tmp_path):
+    source = tmp_path / "a.png"
+    Image.fromarray(page()).save(source, icc_profile=bytes(16) + b"RGB " + bytes(200))
+    assert image_header(source).profile
+    with pytest.warns(UserWarning, match=r"a\.png has an invalid color profile, which is not kept"):
+        write_picture(read_image(source), tmp_path / "b.png", source=source)
+    assert np.array_equal(np.asarray(load(tmp_path / "b.png")), page())
+
+
+@pytest.mark.parametrize("kind", [b"GRAY", b"CMYK"])
+def test_a_profile_of_other_channels_is_not_written(tmp_path, kind):
+    source = tmp_path / "a.jpg"
+    Image.fromarray(page()).save(source, icc_profile=bytes(16) + kind + bytes(200))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write_picture(read_image(source), tmp_path / "b.jpg", source=source)
+    assert "icc_profile" not in load(tmp_path / "b.jpg").info

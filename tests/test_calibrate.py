@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from torchrefract.cameras.calibration.boards import Charuco
 from torchrefract.cameras.calibration.synthetic import CAMERA, render_views
@@ -79,6 +80,24 @@ def test_unusable_pictures_are_reported_with_a_reason(call, pictures, tmp_path, 
     line = "The model folds back inside the frame: 25.0% of it has no ray."
     assert outcome.err.startswith(f"warning: {line}")
     assert f"- {line}" in report
+
+
+def test_pictures_are_calibrated_as_stored_whatever_their_exif_orientation(call, pictures, tmp_path):
+    for k, path in enumerate(sorted(pictures.iterdir())):
+        exif = Image.Exif()
+        exif[0x0112] = (1, 3, 6)[k % 3]
+        gray = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+        Image.fromarray(gray).save(path, exif=exif)
+    outcome = call("calibrate", *OPTIONS)
+    camera = read_opencv(tmp_path / "calibration" / "camera.yaml")
+    assert (camera.width, camera.height) == (640, 400)
+    for name in ("fx", "fy", "cx", "cy"):
+        assert getattr(camera, name) == pytest.approx(getattr(SMALL, name), rel=5e-3)
+    line = (
+        "4 of 6 files have a tag that turns them for display (EXIF orientation, or rotation of a video): view_01.png, "
+    )
+    assert outcome.out.startswith(line)
+    assert line in read_report(tmp_path)
 
 
 def test_a_bent_view_is_dropped_and_reported(call, pictures, tmp_path):

@@ -16,6 +16,7 @@ from torchrefract._tensor import assume_constant_result
 ROOT = Path(__file__).parents[1]
 HEAVY = (
     "PIL",
+    "av",
     "cv2",
     "diffusers",
     "hydra",

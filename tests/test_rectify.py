@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_opencv, write_opencv
@@ -109,6 +110,27 @@ def test_a_video_is_rectified_frame_by_frame(call, folder):
     theirs = cv2.remap(waves().astype(np.float32), *maps(CAMERAS["opencv"], 1.0), cv2.INTER_CUBIC)
     assert np.abs(frame - theirs)[4:-4, 4:-4].mean() < 12  # two codecs in between
     assert "0 rectified, 1 already existed" in call("rectify", "input=clip.avi", "camera=cam.yaml", "out=out").out
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_a_picture_is_rectified_as_stored_and_shown_upright(call, folder, orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(waves()[..., ::-1]).save(folder / "phone.png", exif=exif)
+    outcome = call("rectify", "input=phone.png", "camera=cam.yaml", "out=out")
+    assert outcome.err.startswith("warning: 1 of 1 files have a tag that turns them for display (EXIF orientation, or")
+    theirs = cv2.remap(waves().astype(np.float32), *maps(CAMERAS["opencv"], 1.0), cv2.INTER_CUBIC).clip(0, 255)
+    with Image.open(folder / "out" / "phone.png") as result:
+        assert result.getexif()[0x0112] == orientation
+        assert np.abs(np.asarray(result)[..., ::-1] - theirs)[4:-4, 4:-4].mean() < 1
+    assert "0 rectified, 1 already existed" in call("rectify", "input=phone.png", "camera=cam.yaml", "out=out").out
+
+
+def test_losses_are_described_before_the_first_file_is_written(call, folder):
+    pages = [Image.fromarray(np.roll(waves(), k, axis=1)) for k in range(2)]
+    pages[0].save(folder / "raw" / "0.png", save_all=True, append_images=pages[1:])
+    outcome = call("rectify", "input=raw", "camera=cam.yaml", "out=out")
+    assert outcome.err == "warning: the first of several frames is kept: 0.png\n"
 
 
 def test_a_fold_inside_the_frame_is_warned_of(call, folder):

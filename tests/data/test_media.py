@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from itertools import product
 from pathlib import Path
+from typing import Any, Literal
 
 import av
 import cv2
@@ -35,6 +36,14 @@ TURNS = [(a, b, 0, c, d, 0, 0, 0, 1 << 14) for a, b, c, d in (
 TIMES_MS = [0, 40, 80, 120, 1400, 1440, 1480, 2600]  # a phone in the dark
 
 
+def media_file(path: Path, mode: Literal["r", "w"] = "r") -> Any:
+    return av.open(str(path), mode)
+
+
+def shown_by_opencv(path: Path) -> np.ndarray:
+    return np.asarray(cv2.VideoCapture(str(path)).read()[1])[..., ::-1].astype(float)
+
+
 def page(k: int = 0, *, height: int = 32, width: int = 48) -> np.ndarray:
     """Return (H, W, 3), uint8, smooth, and different in all its corners."""
     y, x = np.mgrid[:height, :width]
@@ -54,13 +63,14 @@ def write(
     space: int = 2,
 ) -> None:
     """Write a video of pages at times, with a sine as its sound."""
-    with av.open(str(path), "w") as container:
+    with media_file(path, "w") as container:
         stream = container.add_stream(codec, rate=25)
         stream.height, stream.width = pages[0].shape[:2]
         stream.pix_fmt, stream.colorspace = pix_fmt, space
         stream.codec_context.time_base = stream.time_base = unit
         if matrix != TURNS[0]:
             stream.set_display_matrix(matrix)
+        track: Any = None
         if sound:
             track = container.add_stream(sound, rate=48000, layout="mono")
         for pixels, t in zip(pages, times or range(len(pages)), strict=True):
@@ -69,24 +79,24 @@ def write(
             frame.pts, frame.time_base = t, unit
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-        for start in range(0, 48000 if sound else 0, 960):
+        for start in range(0, 48000 if track else 0, 960):
             wave = (9000 * np.sin(np.arange(start, start + 960) / 17)).astype(np.int16)[None]
             frame = av.AudioFrame.from_ndarray(wave, format="s16", layout="mono")
             frame.sample_rate, frame.pts = 48000, start
             for resampled in av.AudioResampler(track.codec_context.format, "mono", 48000).resample(frame):
                 container.mux(track.encode(resampled))
-        if sound:
+        if track:
             container.mux(track.encode(None))
 
 
 def times_of(path: Path) -> list[float]:
-    with av.open(str(path)) as container:
+    with media_file(path) as container:
         return [frame.time for frame in container.decode(video=0)]
 
 
 def samples_of(path: Path) -> tuple[float, np.ndarray]:
     """Return the time of the first sample, and all samples."""
-    with av.open(str(path)) as container:
+    with media_file(path) as container:
         frames = list(container.decode(audio=0))
     return frames[0].time, np.concatenate([frame.to_ndarray() for frame in frames], axis=1)
 
@@ -134,11 +144,11 @@ def test_a_turned_video_is_read_as_displayed_or_as_stored_and_stays_upright(tmp_
 def test_opencv_shows_a_converted_video_as_the_original(tmp_path, quarter):
     c, s = {0: (1, 0), 90: (0, 1), 180: (-1, 0), 270: (0, -1)}[quarter]
     write(tmp_path / "a.mp4", [page()], matrix=(c * ONE, s * ONE, 0, -s * ONE, c * ONE, 0, 0, 0, 1 << 14))
-    expected = cv2.VideoCapture(str(tmp_path / "a.mp4")).read()[1][..., ::-1].astype(float)
+    expected = shown_by_opencv(tmp_path / "a.mp4")
     ours = as_pixels(next(read_video(tmp_path / "a.mp4", [0]))[1])
     assert np.abs(ours - expected).mean() < 2
     convert_video(tmp_path / "a.mp4", tmp_path / "b.mp4", change=unchanged, upright=False)
-    result = cv2.VideoCapture(str(tmp_path / "b.mp4")).read()[1][..., ::-1].astype(float)
+    result = shown_by_opencv(tmp_path / "b.mp4")
     assert np.abs(result - expected).mean() < 3
 
 
@@ -182,13 +192,13 @@ def test_colors_are_read_by_the_matrix_and_range_of_the_video_and_kept(tmp_path,
     for name in ("a.mp4", "b.mp4"):
         _, frame = next(read_video(tmp_path / name, [0]))
         assert np.abs(as_pixels(frame) - flat).max() < 3, name
-    with av.open(str(tmp_path / "b.mp4")) as container:
+    with media_file(tmp_path / "b.mp4") as container:
         assert next(container.decode(video=0)).colorspace == space
 
 
 def test_pixels_that_are_not_square_keep_their_shape(tmp_path):
     write(tmp_path / "a.mp4", [page()], matrix=TURNS[-1])
-    with av.open(str(tmp_path / "a.mp4")) as source, av.open(str(tmp_path / "wide.mp4"), "w") as wide:
+    with media_file(tmp_path / "a.mp4") as source, media_file(tmp_path / "wide.mp4", "w") as wide:
         stream = wide.add_stream_from_template(source.streams.video[0])
         stream.sample_aspect_ratio = stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
         stream.set_display_matrix(TURNS[-1])
@@ -198,7 +208,7 @@ def test_pixels_that_are_not_square_keep_their_shape(tmp_path):
                 wide.mux(packet)
     for upright, ratio in ((False, Fraction(4, 3)), (True, Fraction(3, 4))):
         convert_video(tmp_path / "wide.mp4", tmp_path / "b.mp4", change=unchanged, upright=upright)
-        with av.open(str(tmp_path / "b.mp4")) as container:
+        with media_file(tmp_path / "b.mp4") as container:
             assert container.streams.video[0].sample_aspect_ratio == ratio
 
 
@@ -206,7 +216,7 @@ def test_what_a_video_loses_is_described(tmp_path):
     write(tmp_path / "law.mov", [page()], sound="pcm_mulaw")
     write(tmp_path / "deep.mkv", [page()], pix_fmt="yuv420p10le", sound="flac")
     write(tmp_path / "clear.mov", [page()], codec="qtrle", pix_fmt="argb")
-    with av.open(str(tmp_path / "law.mov")) as source, av.open(str(tmp_path / "notes.mkv"), "w") as target:
+    with media_file(tmp_path / "law.mov") as source, media_file(tmp_path / "notes.mkv", "w") as target:
         stream = target.add_stream_from_template(source.streams.video[0])
         target.add_attachment("notes.txt", "text/plain", b"notes")
         for packet in source.demux(video=0):
@@ -240,9 +250,9 @@ def test_frames_after_damage_are_kept_and_the_damage_is_warned_of(tmp_path):
 def test_frames_that_change_their_size_raise(tmp_path):
     for name, size in (("a", (32, 48)), ("b", (48, 64))):
         write(tmp_path / f"{name}.mkv", [page(height=size[0], width=size[1])], codec="mjpeg", pix_fmt="yuvj420p")
-    with av.open(str(tmp_path / "both.mkv"), "w") as target:
+    with media_file(tmp_path / "both.mkv", "w") as target:
         for k, name in enumerate("ab"):
-            with av.open(str(tmp_path / f"{name}.mkv")) as source:
+            with media_file(tmp_path / f"{name}.mkv") as source:
                 stream = target.streams.video[0] if k else target.add_stream_from_template(source.streams.video[0])
                 packet = next(source.demux(video=0))
                 packet.stream, packet.pts, packet.dts = stream, 40 * k, 40 * k

@@ -43,7 +43,7 @@ class UnreadableImageError(ValueError):
 
 
 class ImageHeader(NamedTuple):
-    """What the header of an image file states."""
+    """Size, orientation and form of an image, by the header of its file."""
 
     size: tuple[int, int]  # (H, W) as stored, which is the frame of the sensor
     orientation: int  # of EXIF, 1 to 8: how a viewer turns the stored pixels; 1 is upright

@@ -16,7 +16,7 @@ from functools import lru_cache
 from heapq import merge
 from itertools import chain, count, repeat
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import av
 import cv2
@@ -384,7 +384,7 @@ def _mux(container: OutputContainer, stream: av.VideoStream, packets: Iterable[P
 
 def _tensor_of(frame: av.VideoFrame, *, upright: bool) -> Tensor:
     """Convert a frame into (1, 3, H, W), float32 in [0, 1], RGB."""
-    options = {"src_colorspace": _matrix_of(frame.colorspace), "src_color_range": frame.color_range}
+    options: Any = {"src_colorspace": _matrix_of(frame.colorspace), "src_color_range": frame.color_range}
     pixels = frame.to_ndarray(format="rgb24", interpolation=_CONVERSION, **options)
     if upright:
         pixels = _turn(pixels, _display_matrix(frame))

@@ -15,6 +15,7 @@ from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
 from torchrefract.cli.command import picture_as_option
 from torchrefract.data.images import fit, read_image
+from torchrefract.data.media import read_video
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
 from torchrefract.presets import cape_town_fog, limpopo_sun_glare
@@ -373,9 +374,7 @@ def test_a_video_is_played_and_its_first_frame_is_that_of_a_contact_sheet(call, 
     for frame in frames:
         writer.write((255 * frame[0]).round().byte().movedim(0, -1).numpy()[..., ::-1])
     writer.release()
-    video, decoded = cv2.VideoCapture(str(path)), []
-    while (result := video.read())[0]:
-        decoded.append(torch.from_numpy(result[1][..., ::-1].copy()).movedim(-1, 0)[None] / 255)
+    decoded = [frame for _, frame in read_video(path, range(12))]
     assert call("preview", path.name, *FLARE, "out=flare.apng").out.endswith("12 frames\n")
     for t, shown in enumerate(pictures_of(tmp_path / "flare.apng")):
         assert shows(shown, flare_at(decoded[t], t))

@@ -272,6 +272,16 @@ def test_a_full_disk_raises(tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+def test_the_delays_of_a_gif_are_kept_up_to_the_last_one(tmp_path):
+    images = [Image.fromarray(page(k)) for k in (0, 5, 9)]
+    images[0].save(tmp_path / "a.gif", save_all=True, append_images=images[1:], duration=[50, 700, 90])
+    convert_video(tmp_path / "a.gif", tmp_path / "b.mp4", change=unchanged)
+    assert times_of(tmp_path / "b.mp4") == pytest.approx([0, 0.05, 0.75], abs=1e-3)
+    with media_file(tmp_path / "b.mp4") as container:
+        assert container.duration == pytest.approx(840_000, abs=1000)  # microseconds
+    assert is_complete(tmp_path / "a.gif", tmp_path / "b.mp4")
+
+
 def test_a_video_without_a_number_of_frames_in_its_header_is_counted(tmp_path):
     write(tmp_path / "a.mkv", [page(k) for k in range(8)], times=TIMES_MS)
     assert video_info(tmp_path / "a.mkv")[0] == 8

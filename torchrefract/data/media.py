@@ -22,6 +22,7 @@ import av
 import cv2
 import numpy as np
 import torch
+from av.codec.context import Flags
 from av.container import InputContainer, OutputContainer
 from av.packet import Packet
 from av.stream import Stream
@@ -345,6 +346,7 @@ def _add_video(
     stream.pix_fmt = "yuv420p"
     stream.color_range = ColorRange.MPEG
     stream.codec_context.time_base = stream.time_base = time_base
+    stream.codec_context.flags |= Flags.frame_duration  # otherwise the last frame lasts as long as the mean one
     return stream
 
 

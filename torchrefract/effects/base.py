@@ -1,8 +1,10 @@
 """The base class of all effects: parameters drawn by key, then a deterministic and differentiable degradation."""
 
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, cast
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor, nn
@@ -36,6 +38,8 @@ from torchrefract.labels.targets import is_tv_tensor, warp_moved_labels, wrap_li
 from torchrefract.types import Degraded, Range
 from torchrefract.warping.grid import field_dtype
 
+# Shapes and types of images whose values were checked, by effect: a call stores nothing on the module.
+_CHECKED_SHAPES: WeakKeyDictionary[nn.Module, set[Any]] = WeakKeyDictionary()
 _MAX_CHECKED_SHAPES = 64
 
 
@@ -88,7 +92,10 @@ class Effect(nn.Module, ABC):
             degraded, flow = self._degrade_like(image)
             return degraded, *self._move_labels(target, flow, (image, *target))
         if isinstance(image, Tensor):
-            return self._degrade_like(image)[0]
+            degraded, flow = self._degrade_like(image)
+            if flow is not None:
+                _check_kornia_keys()
+            return degraded
         leaves, spec = pytree.tree_flatten(image)
         place = _find_image(leaves)
         degraded, flow = self._degrade_like(leaves[place])
@@ -149,7 +156,8 @@ class Effect(nn.Module, ABC):
             frame: number of the image in its clip, or of the first frame of a clip, in [-1e9, 1e9]; a number or (B,).
 
         Raises:
-            ValueError, TypeError: an invalid argument.
+            ValueError, TypeError: an invalid argument; a floating image that clearly is not in [0, 1], see
+                `check_image_values`.
         """
         shape = check_image(image)
         self._check_values(image)
@@ -184,7 +192,6 @@ class Effect(nn.Module, ABC):
         if params is None and callable(image) and not isinstance(image, Tensor):
             return super().apply(cast(Callable[[nn.Module], None], image))
         shape = check_image(image)
-        self._check_values(image)
         self.check_params(params, first_frames(image, shape))
         params = promote_params(params, field_dtype(image.dtype))
         if frame is not None:
@@ -265,10 +272,10 @@ class Effect(nn.Module, ABC):
         )
 
     def _check_values(self, image: Tensor) -> None:
-        """Check the range of the first image of each shape."""
-        if torch.compiler.is_compiling() or not image.is_floating_point():
+        """Check the range of the first image of each shape, but not of one that a network with gradients computed."""
+        if torch.compiler.is_compiling() or not image.is_floating_point() or image.requires_grad:
             return
-        checked: set[Any] = self.__dict__.setdefault("_checked_shapes", set())
+        checked = _CHECKED_SHAPES.setdefault(self, set())
         kind = (image.shape, image.dtype)
         if kind not in checked:
             check_image_values(image)
@@ -304,6 +311,24 @@ class Effect(nn.Module, ABC):
             result = self.degrade_batch(batch, params, depth)
         result.image = from_batch(result.image, image, batch)
         return result if image.ndim == 4 and not shape.is_clip else result.map(shape.restore)
+
+
+def _check_kornia_keys() -> None:
+    """Raise TypeError inside a container of kornia that passes labels, which it would not move."""
+    operations = sys.modules.get("kornia.augmentation.container.ops")
+    if operations is None or torch.compiler.is_compiling():
+        return
+    # A container calls foreign modules with the image alone; its data keys are in its own frame only.
+    frame = sys._getframe(1)
+    while frame is not None:
+        keys = frame.f_locals.get("_data_keys", ()) if frame.f_globals is vars(operations) else ()
+        names = [key.name.lower() for key in keys if key.name not in ("IMAGE", "INPUT", "CLASS", "LABEL")]
+        if names:
+            raise TypeError(
+                f"data_keys must be ['input'] for an effect as it is, got {names} too, which kornia would not move; "
+                "pass torchrefract.adapters.kornia.KorniaEffect(effect) to the container"
+            )
+        frame = frame.f_back
 
 
 def _find_image(leaves: list[Any]) -> int:

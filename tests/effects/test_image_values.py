@@ -66,7 +66,7 @@ def test_values_are_read_once_for_each_effect_and_shape(monkeypatch):
 @pytest.mark.parametrize(
     ("image", "error", "message"),
     [
-        (torch.zeros(48, 60, 3, dtype=torch.uint8), ValueError, "channels before its height and width, got .* movedim"),
+        (torch.zeros(48, 60, 3, dtype=torch.uint8), ValueError, "channels before its height and width, got .*; use image.movedim"),
         (torch.zeros(2, 48, 60, 4), ValueError, "image must have its channels before its height and width"),
         (torch.zeros(48, 60, 1), ValueError, "image must have its channels before its height and width"),
         (
@@ -74,7 +74,7 @@ def test_values_are_read_once_for_each_effect_and_shape(monkeypatch):
             TypeError,
             r"image must be a tensor, got numpy\.ndarray; convert it by",
         ),
-        (torch.zeros(3, 48, 60, dtype=torch.uint16), TypeError, "got torch.uint16; divide it by"),
+        (torch.zeros(3, 48, 60, dtype=torch.uint16), TypeError, r"got torch\.uint16; divide it by"),
         ([1, 2], TypeError, "image must be a tensor, or a sample with an Image"),
     ],
 )

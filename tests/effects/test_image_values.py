@@ -66,7 +66,11 @@ def test_values_are_read_once_for_each_effect_and_shape(monkeypatch):
 @pytest.mark.parametrize(
     ("image", "error", "message"),
     [
-        (torch.zeros(48, 60, 3, dtype=torch.uint8), ValueError, "channels before its height and width, got .*; use image.movedim"),
+        (
+            torch.zeros(48, 60, 3, dtype=torch.uint8),
+            ValueError,
+            "channels before its height and width, got .*; use image.movedim",
+        ),
         (torch.zeros(2, 48, 60, 4), ValueError, "image must have its channels before its height and width"),
         (torch.zeros(48, 60, 1), ValueError, "image must have its channels before its height and width"),
         (

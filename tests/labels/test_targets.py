@@ -427,6 +427,7 @@ SMALL = tv.KeyPoints(torch.zeros(1, 2), canvas_size=(5, 5))
         ({"Masks": [torch.zeros(SIZE)]}, {}, TypeError, r"target\['Masks'\]\[0\] must be a Mask of torchvision"),
         ({"keypoints": np.zeros((2, 17, 3))}, {}, TypeError, r"must be a KeyPoints .* got a plain ndarray"),
         ({"segmentation": [[1.0, 2.0, 3.0, 4.0]]}, {}, TypeError, "must be a Mask of torchvision"),
+        ({"segmentation": {"counts": b"1", "size": [36, 64]}}, {}, TypeError, "must be a Mask of torchvision"),
         ({"classes": torch.zeros(1, *SIZE)}, {}, TypeError, r"target\['classes'\] must be of a torchvision type"),
         ({"depth": np.zeros((*SIZE, 1))}, {}, TypeError, r"got a plain ndarray \(36, 64, 1\); pass tv_tensors.Mask"),
         ({"p": tv.KeyPoints(torch.zeros(1, 2), canvas_size=SIZE), "visible": torch.ones(2)}, {}, ValueError, "visible"),

@@ -185,22 +185,30 @@ def _is_plain_value(value: Any) -> bool:
     return isinstance(value, _PLAIN) and not isinstance(value, Tensor)
 
 
-def _name(path: Any) -> str:
-    """Return the last key or field name of a path in lower case; "" if it has neither."""
+def _names(path: Any) -> list[str]:
+    """Return the keys and field names of a path in lower case."""
     names = [getattr(key, "key", getattr(key, "name", None)) for key in path]
-    return next((str(name).lower() for name in reversed(names) if name is not None), "")
+    return [str(name).lower() for name in names if name is not None]
+
+
+def _name(path: Any) -> str:
+    """Return the last key or field name of a path; "" if it has neither."""
+    return next(reversed(_names(path)), "")
 
 
 def _check_moves(path: Any, leaf: Any, flow: Tensor) -> None:
     """Raise TypeError for a plain value that holds positions in the image, by its name or by its size."""
-    if isinstance(leaf, list | tuple) and leaf:
-        shape = None
-    elif type(leaf) in (Tensor, torch.nn.Parameter, np.ndarray) and leaf.ndim > 0:
+    shape = None
+    if isinstance(leaf, Tensor | np.ndarray):
         shape = tuple(leaf.shape)
-    else:
+        if not shape or type(leaf) not in (Tensor, torch.nn.Parameter, np.ndarray):
+            return
+    elif not isinstance(leaf, list | tuple) or not leaf:
         return
     place, got = f"target{pytree.keystr(path)}", f"a plain {type(leaf).__name__}"
-    kind, size = _TYPES_BY_NAME.get(_name(path)), tuple(flow.shape[-2:])
+    is_run_length = "segmentation" in _names(path)  # of COCO, a dict of counts and a size
+    kind = "Mask" if is_run_length else _TYPES_BY_NAME.get(_name(path))
+    size = tuple(flow.shape[-2:])
     if kind is not None:
         options = {"BoundingBoxes": f", format=..., canvas_size={size}", "KeyPoints": f", canvas_size={size}"}
         remedy = f"tv_tensors.{kind}(...{options.get(kind, '')})"

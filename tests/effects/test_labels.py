@@ -1,15 +1,18 @@
 """Labels move with the image."""
 
+from copy import copy
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.utils import _pytree as pytree
 
 from torchrefract import Compose, LensDistortion, ThinPlateSpline, Turbulence, UniformFog, warp_points
 from torchrefract.effects.base import Effect
 
 tv_tensors = pytest.importorskip("torchvision.tv_tensors", reason="torchvision is in the extra test")
+v2 = pytest.importorskip("torchvision.transforms.v2", reason="torchvision is in the extra test")
 
 EFFECTS = [LensDistortion(), Turbulence(), ThinPlateSpline(), Compose([Turbulence(), UniformFog(), LensDistortion()])]
 
@@ -86,7 +89,7 @@ def test_labels_of_a_sample_that_does_not_move_are_not_clipped_in_a_mixed_batch(
     torch.manual_seed(seed)
     _, (moved, stayed) = effect(images, [sample, sample])
     assert moved["labels"].tolist() == [0]
-    assert moved["visible"].tolist() == [0, 1]
+    assert moved["visible"].tolist() == [0]
     for name, value in sample.items():
         assert torch.equal(stayed[name], value), name
     batch = {
@@ -114,5 +117,77 @@ def test_an_unknown_type_of_label_raises():
     image, target = sample()
     with pytest.raises(TypeError, match="target must hold tv_tensors of torchvision or plain values, got"):
         LensDistortion()(image, target | {"camera": nn.Identity()})
-    with pytest.raises(TypeError, match="target must be a single argument of any nesting, got 2"):
-        LensDistortion()(image, target, target)
+
+
+def border_sample() -> dict[str, Any]:
+    """Return a sample of two boxes, of which the one in the corner leaves the frame under PINCUSHION."""
+    size: dict[str, Any] = {"canvas_size": (64, 80)}
+    boxes = torch.tensor([[0.0, 0, 3, 3], [30, 30, 50, 50]])
+    return {
+        "image": tv_tensors.Image(torch.rand(3, 64, 80)),
+        "boxes": tv_tensors.BoundingBoxes(boxes, format="XYXY", **size),
+        "labels": torch.tensor([1, 2]),
+        "keypoints": tv_tensors.KeyPoints(torch.rand(2, 17, 2) * 20 + 30, **size),
+    }
+
+
+PINCUSHION = LensDistortion(k1_range=(0.4, 0.4), k2_range=(0, 0), focal_range=(0.7, 0.7))
+
+
+def test_samples_have_the_forms_of_torchvision_s_transforms():
+    sample = border_sample()
+    image, boxes, labels, keypoints = sample.values()
+    torch.manual_seed(2)
+    expected_image, expected = PINCUSHION(image, sample | {"image": None})
+    assert expected["labels"].tolist() == [2]
+    transform = v2.Compose([v2.Identity(), PINCUSHION])
+    for inputs in ((image, boxes, labels, keypoints), (sample,), ((image, {"a": boxes, "b": (labels, [keypoints])}),)):
+        torch.manual_seed(2)
+        outputs = transform(*inputs)
+        leaves = pytree.tree_leaves(outputs)
+        assert pytree.tree_structure(outputs) == pytree.tree_structure(inputs if len(inputs) > 1 else inputs[0])
+        for leaf, value in zip(leaves, (expected_image, *list(expected.values())[1:]), strict=True):
+            assert type(leaf) is type(value)
+            assert torch.equal(leaf, value)
+    torch.manual_seed(2)
+    plain = PINCUSHION({"name": "a", "picture": image.as_subclass(Tensor), "boxes": boxes, "labels": labels})
+    assert torch.equal(plain["picture"], expected_image)
+    assert plain["labels"].tolist() == [2]
+
+
+def test_a_batch_takes_a_list_for_each_kind_of_label():
+    sample = border_sample()
+    images = torch.rand(2, 3, 64, 80)
+    _, boxes, labels = PINCUSHION(images, [sample["boxes"]] * 2, [sample["labels"]] * 2)
+    assert [len(one) for one in boxes] == [1, 1]
+    assert [one.tolist() for one in labels] == [[2], [2]]
+    with pytest.raises(TypeError, match="target must be lists of 2 entries, one for each image, got Tensor"):
+        PINCUSHION(images, [sample["boxes"]] * 2, sample["labels"])
+
+
+def test_the_labels_getter_of_an_effect_takes_its_arguments():
+    sample, effect = border_sample(), copy(PINCUSHION)
+    target = {key: sample[key] for key in ("boxes", "labels")} | {"ids": torch.arange(2)}
+    effect.labels_getter = lambda inputs: inputs[1]["labels"]
+    _, moved = effect(sample["image"], target)
+    assert (moved["labels"].tolist(), moved["ids"].tolist()) == ([2], [0, 1])
+    effect.labels_getter = lambda inputs: inputs["labels"]
+    assert effect(sample | {"ids": torch.arange(2)})["ids"].tolist() == [0, 1]
+    effect.labels_getter = "ids"
+    with pytest.raises(ValueError, match="labels_getter must be 'default', a function or None, got 'ids'"):
+        effect(sample["image"], target)
+
+
+def test_a_sample_without_one_image_raises():
+    sample = border_sample()
+    with pytest.raises(ValueError, match="image must be the only Image or Video of a sample, got 2"):
+        PINCUSHION(sample | {"right": sample["image"]})
+    with pytest.raises(TypeError, match="image must be a tensor, or a sample with an Image of torchvision in it"):
+        PINCUSHION({"boxes": sample["boxes"]})
+    with pytest.raises(TypeError, match=r"image must be a tensor, got numpy\.ndarray; convert it by"):
+        PINCUSHION({"image": sample["image"].numpy(), "labels": sample["labels"]})
+
+
+def test_plain_positions_raise_even_if_the_effect_does_not_apply():
+    with pytest.raises(TypeError, match=r"target\['boxes'\] must be a BoundingBoxes of torchvision to move with the"):
+        LensDistortion(p=0.0)(torch.rand(3, 40, 56), {"boxes": torch.zeros(2, 4)})

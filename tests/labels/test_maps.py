@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 
@@ -30,9 +31,17 @@ def test_masks_take_the_nearest_class_and_the_fill_outside(pixels, waves, dtype)
 
 
 @pytest.mark.quick
-def test_class_ids_above_float32_precision_are_exact():
-    mask = torch.full((1, 4, 5), 2**40 + 1)
-    assert torch.equal(warp_mask(mask, torch.zeros(2, 4, 5)), mask)
+@pytest.mark.parametrize("bits", [8, 16, 32, 64])
+@pytest.mark.parametrize("sign", ["int", "uint"])
+def test_ids_of_every_integer_type_keep_every_bit(bits, sign):
+    dtype = getattr(torch, f"{sign}{bits}")
+    largest = torch.iinfo(dtype).max
+    ids = np.arange(largest - 20, largest, dtype=f"{sign}{bits}").reshape(1, 4, 5)
+    warped = warp_mask(torch.from_numpy(ids), torch.tensor([2.0, 1.0]).view(2, 1, 1).expand(2, 4, 5), fill=largest)
+    expected = np.full_like(ids, largest)
+    expected[:, :3, :3] = ids[:, 1:, 2:]
+    assert warped.dtype is dtype
+    assert np.array_equal(warped.numpy(), expected)
 
 
 @pytest.mark.quick

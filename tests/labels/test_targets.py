@@ -234,15 +234,51 @@ def test_invisible_rotated_boxes_are_dropped_or_get_zero_area(form):
     assert (degenerate[1] - degenerate[1, :1]).abs().max() > 1
 
 
+def test_all_rows_of_dropped_boxes_are_removed():
+    sample = detection()
+    rows = {
+        "area": torch.tensor([300.0, 60.0, 150.0]),
+        "iscrowd": torch.tensor([[0], [1], [0]]),
+        "points": tv.KeyPoints(torch.rand(3, 17, 2, generator=generator()) * 20, canvas_size=SIZE),
+        "scores": np.array([0.9, 0.8, 0.7]),
+        "names": ["car", "dog", "sign"],
+        "polygons": [[1, 2], [3], [4, 5, 6]],
+    }
+    of_image = {"image_id": torch.tensor([7, 7, 7]), "orig_size": (3, 36, 64), "camera_matrix": torch.eye(3)}
+    other = {"semantic": tv.Mask(torch.zeros(SIZE)), "image": tv.Image(torch.rand(3, *SIZE)), "ids": torch.arange(4)}
+    warped = warp_labels(sample | rows | of_image | other, SHIFT)
+    for key, value in (rows | {key: sample[key] for key in ("boxes", "labels", "masks")}).items():
+        assert len(warped[key]) == 2, key
+        assert type(warped[key]) is type(value)
+    assert warped["area"].tolist() == [300, 150]
+    assert warped["iscrowd"].tolist() == [[0], [0]]
+    assert warped["scores"].tolist() == [0.9, 0.7]
+    assert warped["names"] == ["car", "sign"]
+    assert warped["polygons"] == [[1, 2], [4, 5, 6]]
+    assert all(warped[key] is value for key, value in of_image.items())
+    assert warped["image"].shape == (3, *SIZE)
+    assert warped["ids"] is other["ids"]
+
+
+def test_several_sets_of_boxes_take_the_rows_of_their_own_dict():
+    far, near = boxes_of([[1.0, 1.0, 9.0, 9.0], [30.0, 5.0, 50.0, 20.0]]), boxes_of([[30.0, 5.0, 50.0, 20.0]] * 2)
+    sample = {"car": {"boxes": far, "labels": torch.arange(2)}, "sign": {"boxes": near, "labels": torch.arange(2)}}
+    warped = warp_labels(sample, SHIFT)
+    assert warped["car"]["labels"].tolist() == [1]
+    assert warped["sign"]["labels"].tolist() == [0, 1]
+    assert warp_labels({"ann": {"boxes": far}, "labels": torch.arange(2)}, SHIFT)["labels"].tolist() == [1]
+
+
 def test_labels_getter_selects_the_tensors_to_filter():
-    sample = detection() | {"iscrowd": torch.tensor([0, 1, 2])}
+    sample = detection() | {"iscrowd": torch.tensor([0, 1, 2]), "ids": torch.arange(3)}
     warped = warp_labels(sample, SHIFT, labels_getter=lambda s: (s["labels"], s["iscrowd"]))
     assert (warped["labels"].tolist(), warped["iscrowd"].tolist()) == ([7, 9], [0, 2])
+    assert warped["ids"] is sample["ids"]
     warped = warp_labels(sample, SHIFT, labels_getter=None)
     assert (len(warped["boxes"]), len(warped["labels"]), len(warped["masks"])) == (2, 3, 2)
     warped = warp_labels({"boxes": sample["boxes"], "my_Label": sample["labels"]}, SHIFT)
     assert warped["my_Label"].tolist() == [7, 9]
-    warped = warp_labels([sample["boxes"], sample["labels"]], SHIFT, labels_getter=lambda s: s[1])
+    warped = warp_labels([sample["boxes"], sample["labels"]], SHIFT)
     assert warped[1].tolist() == [7, 9]
     assert len(warp_labels(sample["boxes"], SHIFT)) == 2
 
@@ -372,10 +408,28 @@ SMALL = tv.KeyPoints(torch.zeros(1, 2), canvas_size=(5, 5))
         (tv.Mask(torch.zeros(5, 5)), {}, ValueError, "Mask must have the size of the flow"),
         (tv.Mask(torch.zeros(SIZE)), {"mask_fill": torch.inf}, ValueError, "fill must be"),
         (SMALL, {}, ValueError, r"KeyPoints must have the canvas size of the flow, \(36, 64\), got \(5, 5\)"),
-        ([BOXES, torch.arange(1)], {}, ValueError, "target must hold boxes in a dict with their labels"),
+        (
+            {"a": BOXES, "b": BOXES, "labels": torch.arange(1)},
+            {},
+            ValueError,
+            "target must hold each BoundingBoxes in a",
+        ),
         ({"boxes": BOXES, "labels": torch.arange(2)}, {}, ValueError, "labels must have one row for each of the 1"),
-        ({"boxes": BOXES, "labels": "car"}, {}, TypeError, "labels must be a tensor if drop=True, got str"),
-        ([{"boxes": BOXES, "Label": ()}], {}, TypeError, "label must be a tensor if drop=True, got tuple"),
+        ({"boxes": BOXES, "labels": "car"}, {}, ValueError, "labels must have one row .* got 'car'"),
+        ([{"boxes": BOXES, "Label": ()}], {}, ValueError, r"labels must have one row .* got \(\)"),
+        ({"boxes": torch.zeros(1, 4)}, {}, TypeError, r"target\['boxes'\] must be a BoundingBoxes of torchvision"),
+        (
+            [{"bbox": [1.0, 2.0, 3.0, 4.0]}],
+            {},
+            TypeError,
+            r"target\[0\]\['bbox'\] must be a Bounding.* got a plain list",
+        ),
+        ({"Masks": [torch.zeros(SIZE)]}, {}, TypeError, r"target\['Masks'\]\[0\] must be a Mask of torchvision"),
+        ({"keypoints": np.zeros((2, 17, 3))}, {}, TypeError, r"must be a KeyPoints .* got a plain ndarray"),
+        ({"segmentation": [[1.0, 2.0, 3.0, 4.0]]}, {}, TypeError, "must be a Mask of torchvision"),
+        ({"segmentation": {"counts": b"1", "size": [36, 64]}}, {}, TypeError, "must be a Mask of torchvision"),
+        ({"classes": torch.zeros(1, *SIZE)}, {}, TypeError, r"target\['classes'\] must be of a torchvision type"),
+        ({"depth": np.zeros((*SIZE, 1))}, {}, TypeError, r"got a plain ndarray \(36, 64, 1\); pass tv_tensors.Mask"),
         ({"p": tv.KeyPoints(torch.zeros(1, 2), canvas_size=SIZE), "visible": torch.ones(2)}, {}, ValueError, "visible"),
         ([1, 2, 3], {"flow": SHIFT[None]}, ValueError, "target must have one sample for each of the 1 flows, got 3"),
         ({"boxes": BOXES}, {"flow": SHIFT[None]}, ValueError, "target must be a list of samples if it holds"),

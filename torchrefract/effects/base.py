@@ -1,11 +1,14 @@
 """The base class of all effects: parameters drawn by key, then a deterministic and differentiable degradation."""
 
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, cast
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor, nn
+from torch.utils import _pytree as pytree
 
 from torchrefract import random
 from torchrefract._validation import (
@@ -22,9 +25,11 @@ from torchrefract.effects.batch import (
     check_depth_fits,
     check_frames,
     check_image,
+    check_image_values,
     first_frames,
     frame_numbers,
     from_batch,
+    is_foreign_image,
     params_at_frames,
     promote_params,
     to_batch,
@@ -32,6 +37,10 @@ from torchrefract.effects.batch import (
 from torchrefract.labels.targets import is_tv_tensor, warp_moved_labels, wrap_like
 from torchrefract.types import Degraded, Range
 from torchrefract.warping.grid import field_dtype
+
+# Shapes and types of images whose values were checked, by effect: a call stores nothing on the module.
+_CHECKED_SHAPES: WeakKeyDictionary[nn.Module, set[Any]] = WeakKeyDictionary()
+_MAX_CHECKED_SHAPES = 64
 
 
 class Effect(nn.Module, ABC):
@@ -49,38 +58,83 @@ class Effect(nn.Module, ABC):
 
     Args:
         p: probability that a sample is degraded, in [0, 1].
+
+    Attributes:
+        labels_getter: what `effect(image, target)` removes together with boxes that leave the frame, see `warp_labels`;
+            set it to a function of the arguments, as for `SanitizeBoundingBoxes` of torchvision, (image, target) or one
+            sample. Of a batch, the function takes the target of each image.
     """
 
     params_type: type[Any]
+    labels_getter: str | Callable[[Any], Any] | None = "default"
 
     def __init__(self, *, p: float = 1.0):
         super().__init__()
         self.p = check_number("p", p, low=0.0, high=1.0)
 
-    def forward(self, image: Tensor, *target: Any) -> Any:
-        """Degrade an image by a draw that the global torch generator seeds, and move a target along.
+    def forward(self, image: Any, *target: Any) -> Any:
+        """Degrade an image by a draw that the global torch generator seeds, and move its labels along.
+
+        `effect(image)`, `effect(image, target)`, `effect(image, boxes, labels)` and one sample, a dict, list or tuple
+        with the image in it, work as in torchvision's transforms. The image of a sample is its torchvision `Image` or
+        `Video` or, if it has neither, its first plain tensor.
 
         Args:
-            image: as for the class.
-            target: at most one, any nesting of torchvision tv_tensors and plain values; see `warp_labels` for what
-                moves and what raises. Photometric effects leave it as it is.
+            image: as for the class, or a sample.
+            target: any nesting of torchvision tv_tensors and plain values; see `warp_labels` for what moves and what
+                raises, and `labels_getter` for what is removed together with boxes. A batch of images takes a list of
+                targets. Photometric effects leave labels as they are.
 
         Returns:
-            The degraded image, or (image, target) if a target is passed.
+            What was passed, in the same nesting, with the degraded image and the moved labels.
         """
-        if len(target) > 1:
-            raise TypeError(f"target must be a single argument of any nesting, got {len(target)}")
+        if target:
+            degraded, flow = self._degrade_like(image)
+            return degraded, *self._move_labels(target, flow, (image, *target))
+        if isinstance(image, Tensor):
+            degraded, flow = self._degrade_like(image)
+            if flow is not None:
+                _check_kornia_keys()
+            return degraded
+        leaves, spec = pytree.tree_flatten(image)
+        place = _find_image(leaves)
+        degraded, flow = self._degrade_like(leaves[place])
+        marker = torch.empty(())  # stands for the image, which is not a label
+        (moved,) = self._move_labels(
+            (pytree.tree_unflatten([*leaves[:place], marker, *leaves[place + 1 :]], spec),), flow, image
+        )
+        return pytree.tree_map(lambda leaf: degraded if leaf is marker else leaf, moved)
+
+    def _degrade_like(self, image: Any) -> tuple[Tensor, Tensor | None]:
+        """Return the degraded image in the torchvision type of the image, and the flow of a warp."""
         degraded = self.degrade(image)
         is_tv = is_tv_tensor(image, "Image") or is_tv_tensor(image, "Video")
-        result = wrap_like(degraded.image, image) if is_tv else degraded.image
-        if not target:
-            return result
-        flow = degraded.flow
+        return wrap_like(degraded.image, image) if is_tv else degraded.image, degraded.flow
+
+    def _move_labels(self, targets: tuple[Any, ...], flow: Tensor | None, inputs: Any) -> tuple[Any, ...]:
+        """Return the targets of an image, or of a batch of images, that moved along its flow."""
         if flow is None:
-            return result, target[0]
+            return targets
         if flow.ndim == 5:
             raise TypeError("target must be None for a batch of clips: warp_labels moves the target of each clip")
-        return result, warp_moved_labels(target[0], flow)
+        getter = self.labels_getter
+        if flow.ndim == 3:
+            of_inputs = (lambda _: getter(inputs)) if callable(getter) else getter
+            return (
+                (warp_moved_labels(targets[0], flow, of_inputs),)
+                if len(targets) == 1
+                else warp_moved_labels(targets, flow, of_inputs)
+            )
+        if len(targets) == 1:
+            return (warp_moved_labels(targets[0], flow, getter),)
+        # Labels of a batch are lists, one entry for each image, as the targets are.
+        for target in targets:
+            if type(target) not in (list, tuple) or len(target) != flow.shape[0]:
+                raise TypeError(
+                    f"target must be lists of {flow.shape[0]} entries, one for each image, got {type(target).__name__}"
+                )
+        moved = warp_moved_labels(list(zip(*targets, strict=True)), flow, getter)
+        return tuple(map(list, zip(*moved, strict=True)))
 
     def degrade(
         self,
@@ -102,9 +156,11 @@ class Effect(nn.Module, ABC):
             frame: number of the image in its clip, or of the first frame of a clip, in [-1e9, 1e9]; a number or (B,).
 
         Raises:
-            ValueError, TypeError: an invalid argument.
+            ValueError, TypeError: an invalid argument; a floating image that clearly is not in [0, 1], see
+                `check_image_values`.
         """
         shape = check_image(image)
+        self._check_values(image)
         params = self._draw(image, shape, seed, keys, 0, frame)
         return self._degrade(image, shape, params, depth)
 
@@ -215,6 +271,18 @@ class Effect(nn.Module, ABC):
             f"{name}={value}" for name, value in vars(self).items() if name[0] != "_" and name != "training"
         )
 
+    def _check_values(self, image: Tensor) -> None:
+        """Check the range of the first image of each shape, but not of one that a network with gradients computed."""
+        if torch.compiler.is_compiling() or not image.is_floating_point() or image.requires_grad:
+            return
+        checked = _CHECKED_SHAPES.setdefault(self, set())
+        kind = (image.shape, image.dtype)
+        if kind not in checked:
+            check_image_values(image)
+            if len(checked) >= _MAX_CHECKED_SHAPES:
+                checked.clear()
+            checked.add(kind)
+
     def _draw(
         self,
         image: Tensor,
@@ -243,6 +311,38 @@ class Effect(nn.Module, ABC):
             result = self.degrade_batch(batch, params, depth)
         result.image = from_batch(result.image, image, batch)
         return result if image.ndim == 4 and not shape.is_clip else result.map(shape.restore)
+
+
+def _check_kornia_keys() -> None:
+    """Raise TypeError inside a container of kornia that passes labels, which it would not move."""
+    operations = sys.modules.get("kornia.augmentation.container.ops")
+    if operations is None or torch.compiler.is_compiling():
+        return
+    # A container calls foreign modules with the image alone; its data keys are in its own frame only.
+    frame = sys._getframe(1)
+    while frame is not None:
+        keys = frame.f_locals.get("_data_keys", ()) if frame.f_globals is vars(operations) else ()
+        names = [key.name.lower() for key in keys if key.name not in ("IMAGE", "INPUT", "CLASS", "LABEL")]
+        if names:
+            raise TypeError(
+                f"data_keys must be ['input'] for an effect as it is, got {names} too, which kornia would not move; "
+                "pass torchrefract.adapters.kornia.KorniaEffect(effect) to the container"
+            )
+        frame = frame.f_back
+
+
+def _find_image(leaves: list[Any]) -> int:
+    """Return the index of the image among the leaves of a sample."""
+    images = [k for k, leaf in enumerate(leaves) if is_tv_tensor(leaf, "Image") or is_tv_tensor(leaf, "Video")]
+    if len(images) > 1:
+        raise ValueError(
+            f"image must be the only Image or Video of a sample, got {len(images)}; pass it as the first argument"
+        )
+    # `check_image` raises for pictures of Pillow and arrays, which torchvision would take for the image too.
+    plain = [k for k, leaf in enumerate(leaves) if type(leaf) in (Tensor, nn.Parameter) or is_foreign_image(leaf)]
+    if not images + plain:
+        raise TypeError("image must be a tensor, or a sample with an Image of torchvision in it, got none")
+    return (images + plain)[0]
 
 
 def _check_seed(seed: int | Tensor) -> int | Tensor:

@@ -4,17 +4,22 @@ N is B for images, and B T for the frames of B clips, which follow one another. 
 of a clip keeps B rows until it meets one that is not.
 """
 
+import sys
 from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchrefract._tensor import expand_batch, is_channels_last, to_float, to_uint8
-from torchrefract._validation import check_tensor, check_within, eager_bool, requires_grad
+from torchrefract._validation import check_tensor, check_within, eager_bool, requires_grad, why_not_eager
 from torchrefract.labels.targets import is_tv_tensor
 from torchrefract.warping.grid import field_dtype
 
+_MOST_CHANNELS_OF_NARROW_IMAGES = 16  # with a width of 1, 3 or 4; above it, the height of an image (H, W, C) is likely
+_CHECKED_PIXELS = 16  # a side, of the values of an image
+_LIMITS = ((1, 1.5, 0.25), (-1, 0.25, 0.05))  # sign, limit, and the largest share of pixels beyond it
 LATEST_FRAME = 1e9  # of a clip, in both directions; float64 still resolves the drift of a field there
 
 
@@ -46,13 +51,25 @@ def check_image(image: Tensor) -> BatchShape:
         ValueError: another number of dimensions; no channel, no pixel or no frame.
         TypeError: neither floating nor uint8.
     """
+    if is_foreign_image(image):
+        raise TypeError(
+            f"image must be a tensor, got {type(image).__module__}.{type(image).__name__}; convert it by "
+            "v2.functional.to_image of torchvision, or place v2.ToImage() before the effect"
+        )
     check_tensor("image", image)
     if image.ndim not in (3, 4, 5) or 0 in image.shape[-3:]:
         raise ValueError(
             f"image must have shape (B, C, H, W), (C, H, W) or, for clips, (B, T, C, H, W), got {tuple(image.shape)}"
         )
+    if image.shape[-3] > _MOST_CHANNELS_OF_NARROW_IMAGES and image.shape[-1] in (1, 3, 4):
+        raise ValueError(
+            f"image must have its channels before its height and width, got {tuple(image.shape)}; "
+            "use image.movedim(-1, -3) if the channels are last"
+        )
     if not image.is_floating_point() and image.dtype is not torch.uint8:
-        raise TypeError(f"image must be floating in [0, 1] or uint8, got {image.dtype}")
+        raise TypeError(
+            f"image must be floating in [0, 1] or uint8, got {image.dtype}; divide it by its largest possible value"
+        )
     leading = tuple(image.shape[:-3])
     if len(leading) == 1 and not is_tv_tensor(image, "Video"):
         return BatchShape(leading[0], 1, leading)
@@ -60,6 +77,37 @@ def check_image(image: Tensor) -> BatchShape:
     if frames == 0:
         raise ValueError(f"image must have at least one frame in a clip, got {tuple(image.shape)}")
     return BatchShape(batch, frames, leading)
+
+
+def is_foreign_image(value: Any) -> bool:
+    """Return True for a picture of Pillow and for a NumPy array of at least two dimensions."""
+    if isinstance(value, np.ndarray):
+        return value.ndim >= 2
+    picture = getattr(sys.modules.get("PIL.Image"), "Image", None)
+    return picture is not None and isinstance(value, picture)
+
+
+def check_image_values(image: Tensor) -> None:
+    """Raise ValueError for a floating image in 0...255, or after normalization, from a few of its pixels.
+
+    An image may exceed [0, 1], as after bicubic interpolation or with highlights. The check fails if a quarter of the
+    pixels lie above 1.5 or 5 % lie below -0.25; pixels of 0, as of a frame, do not count. It reads nothing where that
+    waits for a device or breaks a graph.
+    """
+    if why_not_eager(image) is not None:
+        return
+    height, width = image.shape[-2:]
+    pixels = image.detach()[..., :: -(-height // _CHECKED_PIXELS), :: -(-width // _CHECKED_PIXELS)]
+    pixels = pixels[pixels.isfinite() & (pixels != 0)]
+    if pixels.numel() == 0:
+        return
+    is_high, is_low = ((sign * pixels > limit).float().mean() > share for sign, limit, share in _LIMITS)
+    if is_high or is_low:
+        low, high = (value.item() for value in pixels.aminmax())
+        raise ValueError(
+            f"image must lie in [0, 1] if it is floating, got values from {low:.3g} to {high:.3g}; divide 0...255 by "
+            "255 or pass uint8, and place effects before Normalize"
+        )
 
 
 def check_depth_fits(depth: Any, image: Tensor, shape: BatchShape) -> Tensor:

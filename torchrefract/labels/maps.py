@@ -16,7 +16,7 @@ def warp_mask(mask: Tensor, flow: Tensor, *, fill: float = 0, soft: bool = False
     """Warp a segmentation mask along a backward flow: each pixel takes the class of the nearest input pixel.
 
     Args:
-        mask: (B, C, H, W) or (C, H, W), integers up to 2^53, bool or floating.
+        mask: (B, C, H, W) or (C, H, W), an integer type, bool or floating; integers keep every bit.
         flow: (B, 2, H, W) or (1, 2, H, W), px; (2, H, W) for an unbatched mask.
         fill: value of pixels whose nearest input pixel lies outside the frame; the dtype of the mask must hold it.
         soft: interpolate bilinearly instead, for probabilities in a floating mask.
@@ -156,7 +156,19 @@ def _warp_map(value: Tensor, flow: Tensor, interpolation: str) -> tuple[Tensor, 
     flow = _flow_for(value, flow)
     ones = torch.ones_like(flow[:, :1])
     in_frame = sample_image(ones, flow, padding="zeros", interpolation="nearest") > 0.5
+    if not value.is_floating_point() and value.dtype.itemsize >= 4:
+        return _nearest_integers(value, flow), in_frame
     return sample_image(value, flow, padding="border", interpolation=interpolation), in_frame
+
+
+def _nearest_integers(value: Tensor, flow: Tensor) -> Tensor:
+    """Sample integers of 32 or 64 bits, which the sampler's floating types cannot hold, by the indices of pixels."""
+    height, width = value.shape[2:]
+    index = torch.arange(height * width, dtype=torch.float64, device=value.device).view(1, 1, height, width)
+    index = index.expand(flow.shape[0], -1, -1, -1)
+    index = sample_image(index, flow, padding="border", interpolation="nearest").long().flatten(2)
+    bits = value.view(torch.int32 if value.dtype.itemsize == 4 else torch.int64)  # gather supports no unsigned types
+    return bits.flatten(2).gather(2, index.expand(-1, value.shape[1], -1)).view(value.shape).view(value.dtype)
 
 
 def _check_map(name: str, value: Tensor, flow: Tensor, *, flow_name: str = "flow") -> None:

@@ -8,7 +8,7 @@ import numbers
 import os
 import sys
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -27,7 +27,16 @@ _PLAIN = (
     *(enum.Enum, os.PathLike, datetime.date, datetime.time, datetime.timedelta),
 )
 _SAMPLES_PER_EDGE = 64
+_LARGEST_MATRIX = 8  # rows; a tensor of the size of a smaller frame may be a matrix of a camera
 _VISIBILITY_KEYS = ("visible", "visibility")
+# Names of positions in the image, which would stay behind as plain values.
+_TYPES_BY_NAME = {
+    **dict.fromkeys(("box", "boxes", "bbox", "bboxes", "bounding_box", "bounding_boxes"), "BoundingBoxes"),
+    **dict.fromkeys(("mask", "masks", "segmentation", "segmentations"), "Mask"),
+    **dict.fromkeys(("keypoint", "keypoints"), "KeyPoints"),
+}
+# Parts of names of values that describe the image or the camera, never one box.
+_OF_IMAGE = ("image", "img", "orig", "camera", "intrinsic", "extrinsic", "calib")
 
 
 class _Options(NamedTuple):
@@ -69,12 +78,16 @@ def warp_labels(
     edge of the first pixel and keypoints from its center, as in torchvision's flips and clamps. Integer boxes and
     keypoints are rounded.
 
-    With `drop`, boxes below the limits are removed as by `SanitizeBoundingBoxes`, together with their rows of the
-    labels and of the instance masks, (N, H, W), in the same dict. This reads values, so it waits for an accelerator.
-    Without `drop`, these boxes stay and have zero area. A rotated box becomes the smallest box around its warped
-    outline that has the direction of the warped top and bottom edges. An invisible keypoint gets its position off the
-    canvas, or (-1, -1) if it has none. A plain tensor "visible" or "visibility" in the same dict, with one entry for
-    each keypoint, is set to zero for invisible keypoints.
+    With `drop`, boxes below the limits are removed as by `SanitizeBoundingBoxes`, together with their rows of every
+    tensor, array and list that has as many rows as there are boxes, as labels, areas, keypoints and instance masks,
+    (N, H, W). They lie anywhere in the sample or, if it holds several `BoundingBoxes`, in the dict, list or tuple of
+    the boxes. Images stay as they are, and so do sizes and values whose name says that they belong to the image or to
+    the camera, as "image_id". `labels_getter` replaces this rule. Dropping reads values, so it waits for an
+    accelerator. Without `drop`, these boxes stay and have zero area.
+
+    A rotated box becomes the smallest box around its warped outline that has the direction of the warped top and bottom
+    edges. An invisible keypoint gets its position off the canvas, or (-1, -1) if it has none. A plain tensor "visible"
+    or "visibility" in the same dict, with one entry for each keypoint, is set to zero for invisible keypoints.
 
     Args:
         target: nested dicts, lists, tuples and named tuples.
@@ -82,9 +95,8 @@ def warp_labels(
             samples, or any other target whose tensors have a leading dimension B (not for boxes).
         min_area, min_visibility, clip: see `warp_boxes`.
         drop: remove boxes that `warp_boxes` does not keep, instead of giving them zero area.
-        labels_getter: tensors to filter together with the boxes. "default" takes the tensor under the key "labels", or
-            under a key that contains "label", in the dict of the boxes; a function takes the sample and returns one
-            tensor or several; None filters only boxes and instance masks.
+        labels_getter: what to filter together with the boxes and the instance masks: "default" takes all that have
+            one row for each box; a function takes the sample and returns one tensor or several; None takes nothing.
         soft_masks: interpolate floating masks bilinearly.
         mask_fill: value of masks outside the frame.
         padding, interpolation: of images and videos, see `warp`.
@@ -93,9 +105,9 @@ def warp_labels(
         The warped target, in the same nesting.
 
     Raises:
-        TypeError: if the target holds an unsupported type, or labels of boxes to drop are not a tensor.
-        ValueError: if shapes do not fit, an option is out of range, or boxes to drop are not in a dict, so that their
-            labels are unknown (a target that is a single `BoundingBoxes` has none).
+        TypeError: if the target holds an unsupported type, or a plain value under a name such as boxes, bbox, masks or
+            keypoints, or of the size of the frame, which would not move.
+        ValueError: if shapes do not fit, an option is out of range, or it is not clear which rows belong to a box.
     """
     check_tensor("flow", flow)
     if flow.ndim not in (3, 4) or flow.shape[-3] != 2:
@@ -105,15 +117,21 @@ def warp_labels(
     check_flag("soft_masks", soft_masks)
     check_choice("padding", padding, PADDINGS)
     check_choice("interpolation", interpolation, INTERPOLATIONS)
-    if labels_getter is not None and labels_getter != "default" and not callable(labels_getter):
-        raise ValueError(f"labels_getter must be 'default', a function or None, got {labels_getter!r}")
+    check_labels_getter(labels_getter)
     limits = (min_area, min_visibility, clip, drop, labels_getter)
     return _warp_target(target, flow, _Options(*limits, soft_masks, mask_fill, padding, interpolation))
 
 
-def warp_moved_labels(target: Any, flow: Tensor) -> Any:
+def warp_moved_labels(target: Any, flow: Tensor, labels_getter: Any = "default") -> Any:
     """Warp labels like `warp_labels`, but return samples whose flow is zero unchanged: neither clipped nor dropped."""
-    return _warp_target(target, flow, _Options(keep_unmoved=True))
+    return _warp_target(target, flow, _Options(keep_unmoved=True, labels_getter=check_labels_getter(labels_getter)))
+
+
+def check_labels_getter(labels_getter: Any) -> Any:
+    """Return `labels_getter` if it is "default", a function or None."""
+    if labels_getter is not None and labels_getter != "default" and not callable(labels_getter):
+        raise ValueError(f"labels_getter must be 'default', a function or None, got {labels_getter!r}")
+    return labels_getter
 
 
 def is_tv_tensor(value: Any, name: str) -> bool:
@@ -136,25 +154,70 @@ def _warp_target(target: Any, flow: Tensor, options: _Options) -> Any:
 
 
 def _warp_sample(sample: Any, flow: Tensor, options: _Options) -> Any:
+    pairs, spec = pytree.tree_flatten_with_path(sample, is_leaf=_is_plain_list)
+    paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]
+    for path, leaf in pairs:
+        _check_moves(path, leaf, flow)
     is_zero = (flow == 0).flatten(-3).all(dim=-1) if options.keep_unmoved else None
     if is_zero is not None and eager_bool(is_zero.all, of=is_zero):
         return sample
-    pairs, spec = pytree.tree_flatten_with_path(sample)
-    paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]
     warped = [_warp_leaf(leaf, flow, options) for leaf in leaves]
     if is_zero is not None and eager_bool(is_zero.any, of=is_zero) is not False:
         warped = [_restore_unmoved(leaf, one, is_zero) for leaf, one in zip(leaves, warped, strict=True)]
     values = [one.value for one in warped]
+    boxes = [i for i, leaf in enumerate(leaves) if is_tv_tensor(leaf, "BoundingBoxes")]
     for i, one in enumerate(warped):
-        if one.flags is None:
-            continue
-        siblings = _siblings(paths, i)
-        if not is_tv_tensor(leaves[i], "BoundingBoxes"):
-            _clear_visibility(values, leaves, siblings, one.flags)
-        elif options.drop:
-            for k in _rows_of_boxes(sample, paths, leaves, siblings, i, options.labels_getter):
-                values[k] = _select(values[k], one.flags)
+        if one.flags is not None and i not in boxes:
+            _clear_visibility(values, leaves, _siblings(paths, i), one.flags)
+    for i in boxes if options.drop else []:
+        flags = cast(Tensor, warped[i].flags)
+        for k in _rows_of_boxes(sample, paths, leaves, boxes, i, options.labels_getter):
+            values[k] = _select(values[k], flags)
     return pytree.tree_unflatten(values, spec)
+
+
+def _is_plain_list(node: Any) -> bool:
+    """Return True for a list or tuple, of any depth, that holds plain values only."""
+    return type(node) in (list, tuple) and all(_is_plain_value(value) or _is_plain_list(value) for value in node)
+
+
+def _is_plain_value(value: Any) -> bool:
+    return isinstance(value, _PLAIN) and not isinstance(value, Tensor)
+
+
+def _names(path: Any) -> list[str]:
+    """Return the keys and field names of a path in lower case."""
+    names = [getattr(key, "key", getattr(key, "name", None)) for key in path]
+    return [str(name).lower() for name in names if name is not None]
+
+
+def _name(path: Any) -> str:
+    """Return the last key or field name of a path; "" if it has neither."""
+    return next(reversed(_names(path)), "")
+
+
+def _check_moves(path: Any, leaf: Any, flow: Tensor) -> None:
+    """Raise TypeError for a plain value that holds positions in the image, by its name or by its size."""
+    shape = None
+    if isinstance(leaf, Tensor | np.ndarray):
+        shape = tuple(leaf.shape)
+        if not shape or type(leaf) not in (Tensor, torch.nn.Parameter, np.ndarray):
+            return
+    elif not isinstance(leaf, list | tuple) or not leaf:
+        return
+    place, got = f"target{pytree.keystr(path)}", f"a plain {type(leaf).__name__}"
+    is_run_length = "segmentation" in _names(path)  # of COCO, a dict of counts and a size
+    kind = "Mask" if is_run_length else _TYPES_BY_NAME.get(_name(path))
+    size = tuple(flow.shape[-2:])
+    if kind is not None:
+        options = {"BoundingBoxes": f", format=..., canvas_size={size}", "KeyPoints": f", canvas_size={size}"}
+        remedy = f"tv_tensors.{kind}(...{options.get(kind, '')})"
+        raise TypeError(f"{place} must be a {kind} of torchvision to move with the image, got {got}; pass {remedy}")
+    if shape is not None and min(size) > _LARGEST_MATRIX and size in (shape[-2:], shape[:2]):
+        remedy = "tv_tensors.Mask(...), or Image(...) for values to interpolate"
+        raise TypeError(
+            f"{place} must be of a torchvision type to move with the image, got {got} {shape}; pass {remedy}"
+        )
 
 
 def _restore_unmoved(leaf: Any, warped: _Warped, is_zero: Tensor) -> _Warped:
@@ -183,7 +246,7 @@ def _warp_leaf(leaf: Any, flow: Tensor, options: _Options) -> _Warped:
         return _warp_keypoints(leaf, flow)
     if is_tv_tensor(leaf, "BoundingBoxes"):
         return _warp_bounding_boxes(leaf, flow, options)
-    if type(leaf) in (Tensor, torch.nn.Parameter) or (isinstance(leaf, _PLAIN) and not isinstance(leaf, Tensor)):
+    if type(leaf) in (Tensor, torch.nn.Parameter) or _is_plain_value(leaf) or _is_plain_list(leaf):
         return _Warped(leaf)
     kind = f"{type(leaf).__module__}.{type(leaf).__qualname__}"
     raise TypeError(f"target must hold tv_tensors of torchvision or plain values, got {kind}")
@@ -264,40 +327,61 @@ def _siblings(paths: list[Any], i: int) -> dict[str, int]:
 
 
 def _rows_of_boxes(
-    sample: Any, paths: list[Any], leaves: list[Any], siblings: dict[str, int], i: int, labels_getter: Any
+    sample: Any, paths: list[Any], leaves: list[Any], boxes: list[int], i: int, labels_getter: Any
 ) -> list[int]:
     """Return the indices of the boxes i and of all leaves that have one row for each box."""
-    count = leaves[i].shape[0]
-    masks = [k for k in siblings.values() if is_tv_tensor(leaves[k], "Mask") and leaves[k].ndim > 2]
-    rows = [i, *(k for k in masks if leaves[k].shape[0] == count)]
-    if labels_getter is None or (labels_getter == "default" and leaves[i] is sample):
-        return rows
+    count, parent = leaves[i].shape[0], paths[i][:-1]
+    near = [k for k, path in enumerate(paths) if len(boxes) == 1 or path[: len(parent)] == parent]
+    rows = [k for k in near if k not in boxes and _num_rows(leaves[k]) == count]
+    rows = [k for k in rows if not is_tv_tensor(leaves[k], "Mask") or leaves[k].ndim > 2]
     if callable(labels_getter):
         labels = labels_getter(sample)
         labels = [] if labels is None else labels if isinstance(labels, list | tuple) else [labels]
-        rows += [k for k, leaf in enumerate(leaves) if any(leaf is label for label in labels)]
-    elif not siblings:
-        raise ValueError("target must hold boxes in a dict with their labels if drop=True, got boxes outside a dict")
-    else:
-        entries = pytree.key_get(sample, paths[i][:-1])
-        rows += _default_labels({str(key).lower(): value for key, value in entries.items()}, siblings)
-    for k in rows:
-        if leaves[k].shape[:1] != (count,):
-            raise ValueError(f"labels must have one row for each of the {count} boxes, got {tuple(leaves[k].shape)}")
-    return sorted(set(rows))
+        chosen = [k for k, leaf in enumerate(leaves) if any(leaf is label for label in labels)]
+        for k in chosen:
+            _check_rows(leaves[k], count)
+        return sorted({i, *chosen, *(k for k in rows if is_tv_tensor(leaves[k], "Mask"))})
+    if labels_getter is None:
+        return [i, *(k for k in rows if is_tv_tensor(leaves[k], "Mask"))]
+    rows = [k for k in rows if not _is_of_image(leaves[k], _name(paths[k]))]
+    rivals = [k for k in boxes if k != i and leaves[k].shape[0] == count and paths[k][:-1] == parent]
+    if rivals and rows:
+        raise ValueError(
+            f"target must hold each BoundingBoxes in a dict with its labels if drop=True, got {1 + len(rivals)} of "
+            f"{count} boxes in one; nest them, or pass labels_getter"
+        )
+    if len(boxes) == 1:
+        labels = [k for k in near if _name(paths[k]) == "labels"] or [k for k in near if "label" in _name(paths[k])][:1]
+        for k in labels:
+            _check_rows(leaves[k], count)
+    return [i, *rows]
 
 
-def _default_labels(entries: dict[str, Any], siblings: dict[str, int]) -> list[int]:
-    """Return the index of the labels by torchvision's rule: the key "labels", or the first that contains "label"."""
-    keys = ["labels"] if "labels" in entries else [key for key in entries if "label" in key][:1]
-    for key in keys:
-        if not isinstance(entries[key], Tensor):
-            raise TypeError(f"{key} must be a tensor if drop=True, got {type(entries[key]).__name__}")
-    return [siblings[key] for key in keys]
+def _num_rows(leaf: Any) -> int | None:
+    """Return the length of a tensor, array or list along its first dimension; None for other values and images."""
+    if is_tv_tensor(leaf, "Image") or is_tv_tensor(leaf, "Video"):
+        return None
+    if isinstance(leaf, Tensor | np.ndarray):
+        return leaf.shape[0] if leaf.ndim else None
+    return len(leaf) if type(leaf) in (list, tuple) else None
+
+
+def _is_of_image(leaf: Any, name: str) -> bool:
+    return name in ("size", "shape") or any(part in name for part in _OF_IMAGE)
+
+
+def _check_rows(labels: Any, count: int) -> None:
+    if _num_rows(labels) != count:
+        got = tuple(labels.shape) if hasattr(labels, "shape") else repr(labels)
+        raise ValueError(f"labels must have one row for each of the {count} boxes, got {got}")
 
 
 def _select(value: Any, keep: Tensor) -> Any:
     """Return the rows to keep."""
+    if isinstance(value, list | tuple):
+        return type(value)(row for row, kept in zip(value, keep.tolist(), strict=True) if kept)
+    if isinstance(value, np.ndarray):
+        return value[keep.cpu().numpy()]
     rows = value.as_subclass(Tensor)[keep.to(value.device)]
     return rows if type(value) in (Tensor, torch.nn.Parameter) else wrap_like(rows, value)
 

@@ -1,0 +1,100 @@
+"""Effects as augmentations of kornia, whose containers move masks, boxes and keypoints along."""
+
+from typing import Any
+
+import torch
+from kornia.augmentation import RigidAffineAugmentationBase2D
+from kornia.constants import Resample
+from kornia.geometry.boxes import Boxes
+from kornia.geometry.keypoints import Keypoints
+from torch import Tensor
+
+from torchrefract import random
+from torchrefract.effects.base import Effect
+from torchrefract.labels.boxes import warp_boxes
+from torchrefract.labels.maps import warp_mask
+from torchrefract.labels.points import warp_points
+
+
+class KorniaEffect(RigidAffineAugmentationBase2D):
+    """Make an effect an augmentation for `kornia.augmentation.AugmentationSequential` with any `data_keys`.
+
+    Masks take the nearest pixel, as kornia's do, or are interpolated if they are floating and `extra_args` ask for it.
+    Boxes become the smallest boxes around their warped outlines, and a box that leaves the frame becomes zeros, as by
+    kornia's `filter_boxes_by_area`, since a batch cannot drop one. Keypoints without a position in the degraded image
+    become (-1, -1). Class labels stay. `params` replay a draw; it has no inverse, and its matrix is the identity.
+
+    Args:
+        effect: the effect; its own `p` decides which samples it degrades.
+        same_on_batch: draw once for all samples of a batch.
+        keepdim: see kornia.
+    """
+
+    def __init__(self, effect: Effect, *, same_on_batch: bool = False, keepdim: bool = False):
+        super().__init__(p=1.0, same_on_batch=same_on_batch, keepdim=keepdim)
+        self.effect = effect
+        self.flags = {"resample": Resample.NEAREST}  # of masks; `extra_args` of a container replace it
+
+    def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
+        """Draw the seed and the keys of the samples, which determine the parameters of the effect."""
+        keys = torch.zeros(batch_shape[0], dtype=torch.int64) if self.same_on_batch else torch.arange(batch_shape[0])
+        return {"seed": torch.as_tensor(random.call_seed()), "keys": keys}
+
+    def compute_transformation(self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any]) -> Tensor:
+        """Return identities, (B, 3, 3): no matrix describes an effect."""
+        return self.identity_matrix(input)
+
+    def apply_transform(
+        self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Tensor:
+        """Degrade images, (B, C, H, W)."""
+        return self.effect.degrade(input, seed=params["seed"], keys=params["keys"]).image
+
+    def apply_transform_mask(
+        self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Tensor:
+        """Warp masks, (B, C, H, W)."""
+        flow = self._flow(params, input)
+        soft = Resample.get(flags.get("resample", Resample.NEAREST)) is not Resample.NEAREST
+        return input if flow is None else warp_mask(input, flow, soft=soft and input.is_floating_point())
+
+    def apply_transform_box(
+        self, input: Boxes, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Boxes:
+        """Warp boxes."""
+        flow = self._flow(params, input.data)
+        if flow is None or input.data.shape[1] == 0:
+            return input
+        # Corners in kornia are the centers of pixels that still belong to the box.
+        low, high = input.data.amin(dim=2) - 0.5, input.data.amax(dim=2) + 0.5
+        corners, keep = warp_boxes(torch.cat([low, high], dim=-1), flow)
+        x1, y1, x2, y2 = corners.unbind(-1)
+        x1, y1, x2, y2 = x1 + 0.5, y1 + 0.5, x2 - 0.5, y2 - 0.5
+        quadrilaterals = torch.stack([x1, y1, x2, y1, x2, y2, x1, y2], dim=-1).unflatten(-1, (4, 2))
+        boxes = input.clone()
+        boxes._data = torch.where(keep[..., None, None], quadrilaterals, 0).to(input.data.dtype)
+        boxes._valid = boxes._valid & keep
+        return boxes
+
+    def apply_transform_keypoint(
+        self, input: Keypoints, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Keypoints:
+        """Warp keypoints, (B, N, 2)."""
+        flow = self._flow(params, input.data)
+        if flow is None:
+            return input
+        points, valid = warp_points(input.data, flow)
+        return Keypoints(torch.where(valid[..., None], points, -1.0), raise_if_not_floating_point=False)
+
+    def _unchanged(self, input: Any, *args: Any, **kwargs: Any) -> Any:
+        """Return labels as they are: kornia asks for them even though every sample is passed to the effect."""
+        return input
+
+    apply_non_transform_mask = apply_non_transform_box = apply_non_transform_keypoint = _unchanged
+
+    def _flow(self, params: dict[str, Tensor], like: Tensor) -> Tensor | None:
+        """Return the flow of the draw, (B, 2, H, W), on the device of a label; None for a photometric effect."""
+        shape = [params["keys"].shape[0], *params["forward_input_shape"].tolist()[1:]]
+        dtype = like.dtype if like.dtype is torch.float64 else torch.float32
+        image = torch.zeros(shape, dtype=dtype, device=like.device)
+        return self.effect.degrade(image, seed=params["seed"], keys=params["keys"]).flow

@@ -182,6 +182,8 @@ def why_not_eager(value: Tensor) -> str | None:
         return "under torch.jit.trace"
     if value.device.type != "cpu":
         return f"on {value.device.type}"
+    if type(value).__torch_dispatch__ is not Tensor.__torch_dispatch__:  # as of a FakeTensor, which has no memory
+        return f"of the type {type(value).__name__}"
     if forward_ad.unpack_dual(value).tangent is not None:
         return "with forward-mode gradients"
     try:

@@ -62,6 +62,14 @@ def check_image(image: Tensor) -> BatchShape:
     return BatchShape(batch, frames, leading)
 
 
+def fix_frame_size(image: Tensor) -> Tensor:
+    """Return the image with a frame size in numbers: torch.compile makes symbols of sizes, and a plan needs numbers."""
+    if not torch.compiler.is_compiling():
+        return image
+    height, width = [len(range(side)) for side in image.shape[-2:]]  # `int` would keep the symbol
+    return image.view(*image.shape[:-2], height, width)
+
+
 def check_depth_fits(depth: Any, image: Tensor, shape: BatchShape) -> Tensor:
     """Return the depth as (N, 1, H, W), or (B, 1, H, W) if it is the same in all frames of a clip.
 

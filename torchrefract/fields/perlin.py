@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import exact_matmul
+from torchrefract._tensor import exact_matmul, without_autocast
 from torchrefract._validation import eager_bool, requires_grad
 from torchrefract.fields.random_field import Motion
 from torchrefract.random import lattice_noise
@@ -107,7 +107,7 @@ def perlin_noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
     indices: list[Tensor] = []
     factors: list[Tensor] = []
     row = 0
-    with torch.autocast(weights.device.type, enabled=False):  # it would round the products of matrices
+    with without_autocast(weights.device):  # it would round the products of matrices
         for octave, weight in zip(octaves, weights.unbind(1), strict=True):
             nodes = octave.gradient.shape[2]
             tables.append(_interpolate_rows(octave, weights.dtype).flatten(1, 2))

@@ -182,15 +182,15 @@ def why_not_eager(value: Tensor) -> str | None:
         return "under torch.jit.trace"
     if value.device.type != "cpu":
         return f"on {value.device.type}"
-    if type(value).__torch_dispatch__ is not Tensor.__torch_dispatch__:  # as of a FakeTensor, which has no memory
-        return f"of the type {type(value).__name__}"
     if forward_ad.unpack_dual(value).tangent is not None:
         return "with forward-mode gradients"
     try:
         value.detach().data_ptr()
     except RuntimeError:
         return "inside torch.func"
-    return None
+    # A FakeTensor, for one, has a shape and no memory.
+    is_plain = type(value).__torch_dispatch__ is Tensor.__torch_dispatch__
+    return None if is_plain else f"of the type {type(value).__name__}"
 
 
 def _check_real(name: str, value: float) -> float:

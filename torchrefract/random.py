@@ -140,7 +140,8 @@ def white_noise(key: Tensor, count: int) -> Tensor:
         return white_noise_at(key, torch.arange(count, device=key.device))
     band = max(1, _BAND // max(1, len(key)))
     bands = (
-        white_noise_at(key, torch.arange(start, min(start + band, count), device=key.device)) for start in range(0, max(1, count), band)
+        white_noise_at(key, torch.arange(start, min(start + band, count), device=key.device))
+        for start in range(0, max(1, count), band)
     )
     return cat_bands(bands, dim=2, length=count)
 

@@ -103,7 +103,9 @@ class Camera:
     @property
     def valid_radius(self) -> float:
         """Return the radius on the plane z = 1 up to which the lens is one-to-one; the angle in rad for a fisheye."""
-        return projection.valid_radius(torch.tensor([self.coefficients], dtype=torch.float64, device="cpu"), model=self.model).item()
+        return projection.valid_radius(
+            torch.tensor([self.coefficients], dtype=torch.float64, device="cpu"), model=self.model
+        ).item()
 
     @property
     def is_pinhole(self) -> bool:
@@ -158,7 +160,9 @@ class Camera:
 
     def grid(self, count: int) -> Tensor:
         """Return pixels (count^2, 2), float64, on a regular grid over the frame, from border to border."""
-        u, v = (torch.linspace(0, size - 1, count, dtype=torch.float64, device="cpu") for size in (self.width, self.height))
+        u, v = (
+            torch.linspace(0, size - 1, count, dtype=torch.float64, device="cpu") for size in (self.width, self.height)
+        )
         return torch.cartesian_prod(u, v)
 
     def resized(self, *, width: int, height: int) -> "Camera":

@@ -149,8 +149,9 @@ def params_to(params: Any, *args: Any, **kwargs: Any) -> Any:
     """Move the parameters as by `Tensor.to`; flags and keys keep their type."""
 
     def move(value: Tensor) -> Tensor:
-        target = (value if value.is_floating_point() else torch.empty(0, device=value.device)).to(*args, **kwargs)
-        return target if value.is_floating_point() else value.to(target.device)
+        if value.is_floating_point():
+            return value.to(*args, **kwargs)
+        return value.to(torch.empty(0, dtype=torch.float32, device=value.device).to(*args, **kwargs).device)
 
     return map_params(params, move)
 

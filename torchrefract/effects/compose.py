@@ -370,7 +370,10 @@ def _group_samples(active: Sequence[Tensor]) -> list[tuple[Tensor | None, list[i
     for i, row in enumerate(torch.stack(list(active), dim=1).tolist()):
         acting = tuple([k for k, moves in enumerate(row) if moves])
         groups.setdefault(acting or (len(active) - 1,), []).append(i)
-    return [(None if len(groups) == 1 else torch.tensor(rows, device="cpu"), list(acting)) for acting, rows in groups.items()]
+    return [
+        (None if len(groups) == 1 else torch.tensor(rows, device="cpu"), list(acting))
+        for acting, rows in groups.items()
+    ]
 
 
 def _composed_flow(

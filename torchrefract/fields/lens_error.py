@@ -178,7 +178,9 @@ def cell_lines(height: int, width: int, num_levels: int) -> Tensor:
 def outermost_nodes(height: int, width: int, num_levels: int) -> Tensor:
     """Return (4, 2), px: the corners of the coarsest lattice, beyond which no node lies."""
     stride = float(_LEVELS[num_levels - 1])
-    x, y = (torch.tensor([-stride, side - 1 + 2 * stride], dtype=torch.float64, device="cpu") for side in (width, height))
+    x, y = (
+        torch.tensor([-stride, side - 1 + 2 * stride], dtype=torch.float64, device="cpu") for side in (width, height)
+    )
     return torch.cartesian_prod(x, y)
 
 

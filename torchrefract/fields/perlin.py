@@ -68,7 +68,7 @@ def draw_octave(
     start = (0.5 - motion.wind.double() * motion.frame.double()[:, None]) / period + phase
     first = start.detach().floor()
     step = 1 / period
-    axes, nodes = [], [torch.full((len(key), 1), index, device=key.device)]
+    axes, nodes = [], [torch.full((len(key), 1), index, dtype=torch.int64, device=key.device)]
     for size, offset, node in zip((width, height), (start - first).unbind(1), first.long().unbind(1), strict=True):
         pixel = torch.arange(size, dtype=torch.float64, device=key.device)
         position = offset[:, None] + step * pixel

@@ -3,7 +3,13 @@
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor, assume_constant_result, cached_constant, exact_matmul, without_autocast
+from torchrefract._tensor import (
+    as_device_tensor,
+    assume_constant_result,
+    cached_constant,
+    exact_matmul,
+    without_autocast,
+)
 
 
 def lagrange_weights(stride: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:

@@ -87,7 +87,9 @@ class PairedFolder(Dataset[Pair]):
             torch.from_numpy(flow),
             torch.from_numpy(valid)[None],
             torch.tensor(row.key, device="cpu"),
-            torch.from_numpy(arrays.maps[_TRANSMISSION])[None] if self.transmission else torch.empty(0, dtype=torch.float32, device="cpu"),
+            torch.from_numpy(arrays.maps[_TRANSMISSION])[None]
+            if self.transmission
+            else torch.empty(0, dtype=torch.float32, device="cpu"),
         )
 
     def row(self, index: int) -> PairRow:

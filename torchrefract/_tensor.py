@@ -1,6 +1,8 @@
 """Small operations on tensors that several packages share."""
 
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache, wraps
 from itertools import chain
 from typing import Any, TypeVar, cast
@@ -14,7 +16,7 @@ _CACHED_VALUES = 1 << 17  # float32 values that fit into the cache of one core
 
 def as_device_tensor(values: Any, *, dtype: torch.dtype | None = None, device: torch.device) -> Tensor:
     """Create a tensor from numbers or nested lists without waiting for the device, as `torch.tensor` would."""
-    return torch.tensor(values, dtype=dtype).to(device, non_blocking=True)
+    return torch.tensor(values, dtype=dtype, device="cpu").to(device, non_blocking=True)
 
 
 def assume_constant_result(function: _F) -> _F:
@@ -24,6 +26,28 @@ def assume_constant_result(function: _F) -> _F:
     """
     vars(function)["_dynamo_marked_constant"] = True
     return function
+
+
+def cached_constant(*, maxsize: int) -> Callable[[_F], _F]:
+    """Cache a function of hashable arguments whose result depends on nothing else, as that of a plan.
+
+    A thread of its own computes it. What PyTorch keeps for each thread does not reach it: FakeTensorMode, the tracing
+    of an export, a default device, inference mode.
+    """
+
+    def decorate(function: _F) -> _F:
+        def compute(*args: Any, **kwargs: Any) -> Any:
+            with ThreadPoolExecutor(max_workers=1) as pool:
+                return pool.submit(function, *args, **kwargs).result()
+
+        return cast(_F, wraps(function)(lru_cache(maxsize=maxsize)(compute)))
+
+    return decorate
+
+
+def without_autocast(device: torch.device) -> AbstractContextManager[Any]:
+    """Return a context without autocast, which the device `meta` does not have."""
+    return nullcontext() if device.type == "meta" else torch.autocast(device.type, enabled=False)
 
 
 def cached(function: _F) -> _F:

@@ -184,11 +184,17 @@ def why_not_eager(value: Tensor) -> str | None:
         return f"on {value.device.type}"
     if forward_ad.unpack_dual(value).tangent is not None:
         return "with forward-mode gradients"
+    return None if _has_memory(value) else "inside torch.func, or without memory as a FakeTensor"
+
+
+def _has_memory(value: Tensor) -> bool:
+    if type(value).__torch_dispatch__ is not Tensor.__torch_dispatch__:  # pyright: ignore[reportAttributeAccessIssue]  # torch names it so
+        return False
     try:
         value.detach().data_ptr()
     except RuntimeError:
-        return "inside torch.func"
-    return None
+        return False
+    return True
 
 
 def _check_real(name: str, value: float) -> float:

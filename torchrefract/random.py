@@ -140,7 +140,8 @@ def white_noise(key: Tensor, count: int) -> Tensor:
         return white_noise_at(key, torch.arange(count, device=key.device))
     band = max(1, _BAND // max(1, len(key)))
     bands = (
-        white_noise_at(key, torch.arange(start, min(start + band, count))) for start in range(0, max(1, count), band)
+        white_noise_at(key, torch.arange(start, min(start + band, count), device=key.device))
+        for start in range(0, max(1, count), band)
     )
     return cat_bands(bands, dim=2, length=count)
 
@@ -276,7 +277,7 @@ def _to_uniform(word: Tensor) -> Tensor:
 
 
 def _new_seed() -> Tensor:
-    return torch.randint(-(2**63), 2**63 - 1, (), dtype=torch.int64)
+    return torch.randint(-(2**63), 2**63 - 1, (), dtype=torch.int64, device="cpu")
 
 
 @torch.library.custom_op("torchrefract::call_seed", mutates_args=(), tags=(torch.Tag.nondeterministic_seeded,))
@@ -287,4 +288,4 @@ def _call_seed() -> Tensor:
 
 @_call_seed.register_fake
 def _() -> Tensor:
-    return torch.empty((), dtype=torch.int64)
+    return torch.empty((), dtype=torch.int64, device="cpu")

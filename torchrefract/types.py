@@ -97,7 +97,7 @@ class Pair(NamedTuple):
     flow: Tensor
     valid: Tensor
     key: Tensor
-    transmission: Tensor = torch.empty(0)
+    transmission: Tensor = torch.empty(0, dtype=torch.float32, device="cpu")
 
 
 class Degraded:

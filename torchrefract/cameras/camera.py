@@ -103,7 +103,9 @@ class Camera:
     @property
     def valid_radius(self) -> float:
         """Return the radius on the plane z = 1 up to which the lens is one-to-one; the angle in rad for a fisheye."""
-        return projection.valid_radius(torch.tensor([self.coefficients], dtype=torch.float64), model=self.model).item()
+        return projection.valid_radius(
+            torch.tensor([self.coefficients], dtype=torch.float64, device="cpu"), model=self.model
+        ).item()
 
     @property
     def is_pinhole(self) -> bool:
@@ -158,7 +160,9 @@ class Camera:
 
     def grid(self, count: int) -> Tensor:
         """Return pixels (count^2, 2), float64, on a regular grid over the frame, from border to border."""
-        u, v = (torch.linspace(0, size - 1, count, dtype=torch.float64) for size in (self.width, self.height))
+        u, v = (
+            torch.linspace(0, size - 1, count, dtype=torch.float64, device="cpu") for size in (self.width, self.height)
+        )
         return torch.cartesian_prod(u, v)
 
     def resized(self, *, width: int, height: int) -> "Camera":
@@ -231,7 +235,7 @@ class Camera:
             return
         sides = ((self.cx, self.width, self.fx), (self.cy, self.height, self.fy))
         corner = math.hypot(*(max(abs(center), abs(size - 1 - center)) / focal for center, size, focal in sides))
-        pole = first_root(torch.tensor([self.coefficients[5:8]], dtype=torch.float64)).sqrt().item()
+        pole = first_root(torch.tensor([self.coefficients[5:8]], dtype=torch.float64, device="cpu")).sqrt().item()
         if pole <= corner:
             raise ValueError(
                 f"{name} must keep its denominator 1 + k4 r^2 + k5 r^4 + k6 r^6 above zero inside the frame, up to "

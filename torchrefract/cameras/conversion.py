@@ -71,7 +71,7 @@ def _fit(camera: Camera, to: str, count: int, min_z: float) -> tuple[float, ...]
         points = torch.cat(image_of_rays(x, y, z, coefficients, to), dim=1)
         return points * focal + center - target
 
-    start = torch.zeros(count, dtype=torch.float64)
+    start = torch.zeros(count, dtype=torch.float64, device="cpu")
     return tuple(least_squares(lambda c: _linearize(error, c, len(target)), start).tolist())
 
 
@@ -118,7 +118,7 @@ def _linearize(error: Callable[[Tensor], Tensor], parameters: Tensor, rows: int)
 def _step(jacobian: Tensor, values: Tensor, damping: float) -> Tensor:
     # Columns hold r^3 up to r^13: scaled to equal length, so that the problem is well conditioned.
     scale = jacobian.square().sum(dim=0).sqrt().clamp(min=1e-12)
-    damped = math.sqrt(damping) * torch.eye(len(scale), dtype=scale.dtype)
+    damped = math.sqrt(damping) * torch.eye(len(scale), dtype=scale.dtype, device=scale.device)
     right = torch.cat([-values, values.new_zeros(len(scale))])
     step = torch.linalg.lstsq(torch.cat([jacobian / scale, damped]), right[:, None], driver="gelsd").solution
     return step[:, 0] / scale

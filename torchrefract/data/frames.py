@@ -106,7 +106,11 @@ class FrameFolder(Dataset[Frame]):
     def __getitem__(self, index: int) -> Frame:
         """Read a frame: image (3, h, w), key () and an empty depth (0,)."""
         image = read_image(self.paths[index])
-        return Frame(fit(image, self.size), torch.tensor(self.keys[index]), torch.empty(0))
+        return Frame(
+            fit(image, self.size),
+            torch.tensor(self.keys[index], device="cpu"),
+            torch.empty(0, dtype=torch.float32, device="cpu"),
+        )
 
 
 def assign_frames(

@@ -27,6 +27,7 @@ from torchrefract.effects.batch import (
     check_image,
     check_image_values,
     first_frames,
+    fix_frame_size,
     frame_numbers,
     from_batch,
     is_foreign_image,
@@ -71,6 +72,12 @@ class Effect(nn.Module, ABC):
     def __init__(self, *, p: float = 1.0):
         super().__init__()
         self.p = check_number("p", p, low=0.0, high=1.0)
+
+    def __init_subclass__(cls, **kwargs: Any):
+        """Let `torch.load` read saved parameters with its default `weights_only=True`."""
+        super().__init_subclass__(**kwargs)
+        if "params_type" in vars(cls):
+            torch.serialization.add_safe_globals([cls.params_type])
 
     def forward(self, image: Any, *target: Any) -> Any:
         """Degrade an image by a draw that the global torch generator seeds, and move its labels along.
@@ -161,6 +168,7 @@ class Effect(nn.Module, ABC):
         """
         shape = check_image(image)
         self._check_values(image)
+        image = fix_frame_size(image)
         params = self._draw(image, shape, seed, keys, 0, frame)
         return self._degrade(image, shape, params, depth)
 
@@ -174,7 +182,8 @@ class Effect(nn.Module, ABC):
         frame: float | Tensor = 0,
     ) -> Any:
         """Draw parameters for an image, a NamedTuple of tensors; `place` is the position in a pipeline."""
-        return self._draw(image, check_image(image), seed, keys, place, frame)
+        shape, image = check_image(image), fix_frame_size(image)
+        return self._draw(image, shape, seed, keys, place, frame)
 
     def apply(  # pyright: ignore[reportIncompatibleMethodOverride]  # nn.Module uses this name; both uses work
         self, image: Any, params: Any = None, *, depth: Tensor | None = None, frame: float | Tensor | None = None
@@ -191,7 +200,7 @@ class Effect(nn.Module, ABC):
         """
         if params is None and callable(image) and not isinstance(image, Tensor):
             return super().apply(cast(Callable[[nn.Module], None], image))
-        shape = check_image(image)
+        shape, image = check_image(image), fix_frame_size(image)
         self.check_params(params, first_frames(image, shape))
         params = promote_params(params, field_dtype(image.dtype))
         if frame is not None:
@@ -303,7 +312,7 @@ class Effect(nn.Module, ABC):
         batch = to_batch(image, keep_uint8=self.keeps_uint8)
         check_frames(params, shape)
         depth = None if depth is None else check_depth_fits(depth, image, shape)
-        if torch.is_autocast_enabled(image.device.type):
+        if image.device.type != "meta" and torch.is_autocast_enabled(image.device.type):
             # Autocast would compute matrix products in half, and positions need float32.
             with torch.autocast(image.device.type, enabled=False):
                 result = self.degrade_batch(batch, params, depth)
@@ -360,7 +369,8 @@ def _check_keys(keys: Tensor | Sequence[int] | None, batch: int) -> Tensor | ran
         return range(batch)
     # An empty list has no type of its own.
     dtype = None if isinstance(keys, Tensor) or len(keys) else torch.int64
-    keys = torch.as_tensor(keys, dtype=dtype)
+    device = keys.device if isinstance(keys, Tensor) else "cpu"
+    keys = torch.as_tensor(keys, dtype=dtype, device=device)
     if not is_whole(keys):
         raise TypeError(f"keys must be whole numbers, got {keys.dtype}")
     if keys.reshape(-1).shape[0] != batch or keys.ndim > 1:

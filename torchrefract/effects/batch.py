@@ -110,6 +110,14 @@ def check_image_values(image: Tensor) -> None:
         )
 
 
+def fix_frame_size(image: Tensor) -> Tensor:
+    """Return the image with a frame size in numbers: torch.compile makes symbols of sizes, and a plan needs numbers."""
+    if not torch.compiler.is_compiling():
+        return image
+    height, width = [len(range(side)) for side in image.shape[-2:]]  # `int` would keep the symbol
+    return image.view(*image.shape[:-2], height, width)
+
+
 def check_depth_fits(depth: Any, image: Tensor, shape: BatchShape) -> Tensor:
     """Return the depth as (N, 1, H, W), or (B, 1, H, W) if it is the same in all frames of a clip.
 
@@ -189,8 +197,9 @@ def params_to(params: Any, *args: Any, **kwargs: Any) -> Any:
     """Move the parameters as by `Tensor.to`; flags and keys keep their type."""
 
     def move(value: Tensor) -> Tensor:
-        target = (value if value.is_floating_point() else torch.empty(0, device=value.device)).to(*args, **kwargs)
-        return target if value.is_floating_point() else value.to(target.device)
+        if value.is_floating_point():
+            return value.to(*args, **kwargs)
+        return value.to(torch.empty(0, dtype=torch.float32, device=value.device).to(*args, **kwargs).device)
 
     return map_params(params, move)
 

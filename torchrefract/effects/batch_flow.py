@@ -181,7 +181,7 @@ def flow_on_measured_lattice(
         rows.setdefault(choice, []).append(i)
     parts: list[FlowPart] = []
     for (is_exact, next_stride), chosen in rows.items():
-        index = None if len(chosen) == len(values) else torch.tensor(chosen)
+        index = None if len(chosen) == len(values) else torch.tensor(chosen, device="cpu")
         if next_stride == stride:
             nodes = composed.flow if index is None else composed.flow[index]
             parts.append(FlowPart(index, LatticeFlow(nodes, lattice), everywhere(nodes.device)))

@@ -308,7 +308,7 @@ class OneOf(Compose):
         """Draw whether the composition is applied, and for each sample which effect is."""
         values = random.uniform(stream, 2)
         applied, choice = values[:, 0] < self.p, values[:, 1] * sum(self.weights)
-        ends = as_device_tensor(self.weights, device=choice.device).cumsum(dim=0)[:-1]
+        ends = as_device_tensor(self.weights, dtype=choice.dtype, device=choice.device).cumsum(dim=0)[:-1]
         chosen = torch.bucketize(choice, ends, right=True)
         return applied, [applied & (chosen == i) for i in range(len(self.effects))]
 
@@ -370,7 +370,10 @@ def _group_samples(active: Sequence[Tensor]) -> list[tuple[Tensor | None, list[i
     for i, row in enumerate(torch.stack(list(active), dim=1).tolist()):
         acting = tuple([k for k, moves in enumerate(row) if moves])
         groups.setdefault(acting or (len(active) - 1,), []).append(i)
-    return [(None if len(groups) == 1 else torch.tensor(rows), list(acting)) for acting, rows in groups.items()]
+    return [
+        (None if len(groups) == 1 else torch.tensor(rows, device="cpu"), list(acting))
+        for acting, rows in groups.items()
+    ]
 
 
 def _composed_flow(

@@ -3,14 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import as_device_tensor, expand_batch
+from torchrefract._tensor import as_device_tensor, cached_constant, expand_batch
 from torchrefract._validation import (
     check_color,
     check_flag,
@@ -297,10 +296,10 @@ def check_fog_params(params: Any, image: Tensor) -> None:
     check_within("params.airlight", params.airlight, 0.0, 1.0)
 
 
-@lru_cache(maxsize=64)
+@cached_constant(maxsize=64)
 def _farthest(medium: FogMedium, height: int, width: int) -> float:
     """The largest distance in m by the depth provider."""
-    return medium.distance(torch.empty(1, 1, height, width, dtype=torch.float64), None).amax().item()
+    return medium.distance(torch.empty(1, 1, height, width, dtype=torch.float64, device="cpu"), None).amax().item()
 
 
 def remove_fog(

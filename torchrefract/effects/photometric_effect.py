@@ -68,7 +68,7 @@ class PhotometricEffect(Effect):
 
     def params_in_range(self, params: Any) -> Tensor:
         """Return (), bool: the plan of the ranges holds for these parameters, as the default plan always does."""
-        return torch.ones((), dtype=torch.bool)
+        return torch.ones((), dtype=torch.bool, device=params.applied.device)
 
     def plan_for_dtype(
         self, height: int, width: int, dtype: torch.dtype, *, has_depth: bool = False
@@ -171,4 +171,4 @@ def _active_samples(active: Tensor, params: Any) -> Tensor | None:
     flags = None if requires_grad(params) else eager_values(lambda: active)
     if flags is None or all(flags) or not any(flags):
         return None
-    return torch.tensor([i for i, flag in enumerate(flags) if flag])
+    return torch.tensor([i for i, flag in enumerate(flags) if flag], device="cpu")

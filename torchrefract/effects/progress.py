@@ -158,7 +158,7 @@ class Progress:
     def _inverse(self) -> tuple[Tensor, Tensor]:
         """Compose the inverse flows of all warps, sample by sample of those that move it."""
         total: Tensor | None = None
-        valid = moved = torch.empty(0)
+        valid = moved = torch.empty(0, dtype=torch.bool, device=self.image.device)
         for effect, params, flow, moves in self.warps:
             inverse, exists = effect.masked_inverse_flow(params, flow().dense)
             exists = exists.expand(len(inverse), 1, *inverse.shape[2:])

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor, exact_matmul
+from torchrefract._tensor import as_device_tensor, exact_matmul, without_autocast
 from torchrefract._validation import finite_or
 from torchrefract.fields.perlin import fade_out
 from torchrefract.fields.random_field import Motion
@@ -124,7 +124,7 @@ def mean_extinction_along_rays(
     Source: Wronski, "Volumetric fog", SIGGRAPH 2014, for volumes of rays and slices.
     """
     view = make_view(height, width, focal, center)
-    with torch.autocast(distance.device.type, enabled=False):  # it would round the products of matrices
+    with without_autocast(distance.device):  # it would round the products of matrices
         excess = extinction_on_planes(field, view.rays, scales=scales, reach=reach, dtype=distance.dtype)
         volume = _means_up_to_slices(view.rays, excess)
         volume = exact_matmul(_cubic_weights(view.down, volume), volume)
@@ -319,7 +319,8 @@ def _quadrature(like: Tensor) -> Tensor:
     k = torch.arange(_PLANES + 2, dtype=torch.float64, device=like.device)
     end = k[:-1, None]
     lag = end - k
-    weight = (lag >= 1).double() + (lag == 1) / 24 + (lag == 0) / 2 - (lag == -1) / 24 + (lag >= 0) * (k == 1) / 12
+    after, at, before = ((lag == step).double() for step in (1, 0, -1))
+    weight = (lag >= 1).double() + after / 24 + at / 2 - before / 24 + ((lag >= 0) & (k == 1)).double() / 12
     return torch.where(end == 0, (k == 0).double(), 2 * k / end.clamp(min=1).square() * weight).to(like.dtype)
 
 

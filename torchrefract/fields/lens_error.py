@@ -163,7 +163,7 @@ def _measure(boxes: tuple[LensRanges, ...], height: int, width: int) -> Measured
 
 def cell_lines(height: int, width: int, num_levels: int) -> Tensor:
     """Return (P, 2), px: for each level and for cells all over the frame, the positions `_LINE` along x and along y."""
-    line = torch.tensor(_LINE, dtype=torch.float64)
+    line = torch.tensor(_LINE, dtype=torch.float64, device="cpu")
     middle = torch.full_like(line, 0.5)
     offsets = torch.stack([torch.stack([line, middle], dim=1), torch.stack([middle, line], dim=1)])  # (2, 5, 2)
     points = []
@@ -178,7 +178,9 @@ def cell_lines(height: int, width: int, num_levels: int) -> Tensor:
 def outermost_nodes(height: int, width: int, num_levels: int) -> Tensor:
     """Return (4, 2), px: the corners of the coarsest lattice, beyond which no node lies."""
     stride = float(_LEVELS[num_levels - 1])
-    x, y = (torch.tensor([-stride, side - 1 + 2 * stride], dtype=torch.float64) for side in (width, height))
+    x, y = (
+        torch.tensor([-stride, side - 1 + 2 * stride], dtype=torch.float64, device="cpu") for side in (width, height)
+    )
     return torch.cartesian_prod(x, y)
 
 
@@ -277,7 +279,7 @@ def _radii(ranges: LensRanges, height: int, width: int) -> np.ndarray:
 def _sample_lenses(boxes: Sequence[LensRanges], height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return coefficients (N, 12, 1), and in px focal lengths and centers (N, 2, 1), of lenses in the boxes."""
     values = torch.from_numpy(np.concatenate([_corners_and_draws(box) for box in boxes]))[:, :, None]
-    middle = torch.tensor([[width - 1], [height - 1]], dtype=torch.float64) / 2
+    middle = torch.tensor([[width - 1], [height - 1]], dtype=torch.float64, device="cpu") / 2
     focal = width * torch.cat([values[:, 12:13], values[:, 12:13] * values[:, 13:14]], dim=1)
     return values[:, :12], focal, middle + width * values[:, 14:]
 

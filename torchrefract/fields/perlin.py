@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import exact_matmul
+from torchrefract._tensor import exact_matmul, without_autocast
 from torchrefract._validation import eager_bool, requires_grad
 from torchrefract.fields.random_field import Motion
 from torchrefract.random import lattice_noise
@@ -68,7 +68,7 @@ def draw_octave(
     start = (0.5 - motion.wind.double() * motion.frame.double()[:, None]) / period + phase
     first = start.detach().floor()
     step = 1 / period
-    axes, nodes = [], [torch.full((len(key), 1), index, device=key.device)]
+    axes, nodes = [], [torch.full((len(key), 1), index, dtype=torch.int64, device=key.device)]
     for size, offset, node in zip((width, height), (start - first).unbind(1), first.long().unbind(1), strict=True):
         pixel = torch.arange(size, dtype=torch.float64, device=key.device)
         position = offset[:, None] + step * pixel
@@ -107,7 +107,7 @@ def perlin_noise(octaves: Sequence[Octave], weights: Tensor) -> Tensor:
     indices: list[Tensor] = []
     factors: list[Tensor] = []
     row = 0
-    with torch.autocast(weights.device.type, enabled=False):  # it would round the products of matrices
+    with without_autocast(weights.device):  # it would round the products of matrices
         for octave, weight in zip(octaves, weights.unbind(1), strict=True):
             nodes = octave.gradient.shape[2]
             tables.append(_interpolate_rows(octave, weights.dtype).flatten(1, 2))

@@ -98,7 +98,9 @@ def check_points(points: Tensor) -> None:
     check_values("points", "be finite", points, torch.isfinite)
     centered = (points - points.mean(dim=1, keepdim=True)).detach().double()
     extent = centered.norm(dim=2).amax(dim=1)
-    apart = torch.cdist(centered, centered) + extent[:, None, None] * torch.eye(points.shape[1])
+    apart = torch.cdist(centered, centered) + extent[:, None, None] * torch.eye(
+        points.shape[1], dtype=extent.dtype, device=extent.device
+    )
     if eager_bool((apart.amin(dim=(1, 2)) > _NEAREST * extent).all, of=centered) is False:
         raise ValueError("points must differ from one another, got two equal ones")
     widths = torch.linalg.svdvals(centered.nan_to_num(0.0, 0.0, 0.0))

@@ -86,7 +86,9 @@ def _bounds(model: RandomFieldErrorModel) -> FlowBounds:
     if spectrum is None:
         gradient = math.inf
         if not model.is_stream:
-            shortest, narrowest = (torch.tensor([ends[0]]) for ends in (model.length, model.aperture))
+            shortest, narrowest = (
+                torch.tensor([ends[0]], dtype=torch.float64, device="cpu") for ends in (model.length, model.aperture)
+            )
             gradient = _NARROW_APERTURE * steep
             gradient *= gradient_rms(shortest, kind=model.covariance, aperture=narrowest).item()
         return FlowBounds(largest, gradient, lambda strides: np.full(np.shape(strides), np.inf))

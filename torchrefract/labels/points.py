@@ -122,7 +122,8 @@ def _newton(table: Tensor, p: Tensor, start: Tensor, node: Tensor, steps: int) -
 
 def _merit(error: Tensor, sample: LinearSample) -> Tensor:
     """Return the squared residual; invalid flow, which is stored as zero, is worse than any residual."""
-    return _squared_norm(error) + torch.where(sample.value[:, 2:] > 0.999, 0, 4 * _LARGEST_PX**2)
+    squared = _squared_norm(error)
+    return torch.where(sample.value[:, 2:] > 0.999, squared, squared + 4 * _LARGEST_PX**2)
 
 
 def sample_linear(table: Tensor, points: Tensor) -> LinearSample:

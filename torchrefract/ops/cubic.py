@@ -1,11 +1,15 @@
 """Interpolate values between the nodes of a lattice by cubic Lagrange polynomials."""
 
-from functools import lru_cache
-
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor, assume_constant_result, exact_matmul
+from torchrefract._tensor import (
+    as_device_tensor,
+    assume_constant_result,
+    cached_constant,
+    exact_matmul,
+    without_autocast,
+)
 
 
 def lagrange_weights(stride: int, *, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -54,7 +58,7 @@ def interpolate_nodes(nodes: Tensor, *, stride: int, margin: int, height: int, w
     rows, columns = -(-height // stride) + 3, -(-width // stride) + 3
     nodes = nodes[..., margin - 1 : margin - 1 + rows, margin - 1 : margin - 1 + columns]
     weights = lagrange_weights(stride, dtype=nodes.dtype, device=nodes.device)
-    with torch.autocast(nodes.device.type, enabled=False):  # half types would round positions to several px
+    with without_autocast(nodes.device):  # half types would round positions to several px
         lines = exact_matmul(nodes.unfold(3, 4, 1), weights.mT).flatten(3)[..., :width]
         # One product a cell: with a matrix on the left, matmul would copy the lines to fold them into one matrix.
         return exact_matmul(weights[None], lines.unfold(2, 4, 1).mT).flatten(2, 3)[:, :, :height]
@@ -65,7 +69,6 @@ def _constant_weights(stride: int) -> list[list[float]]:
     return _cached_weights(stride)  # called indirectly, since torch.compile warns of caches that it traces
 
 
-@lru_cache(maxsize=64)
+@cached_constant(maxsize=64)
 def _cached_weights(stride: int) -> list[list[float]]:
-    with torch.inference_mode(False):
-        return lagrange_basis(torch.arange(stride, dtype=torch.float64) / stride).tolist()
+    return lagrange_basis(torch.arange(stride, dtype=torch.float64, device="cpu") / stride).tolist()

@@ -101,9 +101,9 @@ def _sample(
     batch, channels, height, width = image.shape
     # Not `empty_like`, which gives an image of one pixel other strides.
     layout = torch.channels_last if is_channels_last(image) else torch.contiguous_format
-    out = torch.empty(image.shape, dtype=image.dtype, memory_format=layout)
+    out = torch.empty(image.shape, dtype=image.dtype, device="cpu", memory_format=layout)
     table = flow.new_zeros(4, 1) if weights is None else weights.to(flow.dtype).mT.contiguous()
-    mask = torch.ones(batch, dtype=torch.bool) if active is None else active.expand(batch).contiguous()
+    mask = torch.ones(batch, dtype=torch.bool, device="cpu") if active is None else active.expand(batch).contiguous()
     arguments = (
         _elements(image),
         (channels, height, width),

@@ -8,9 +8,9 @@ depends on the sample: its error is measured (`torchrefract.effects.batch_flow`)
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, NamedTuple
 
+from torchrefract._tensor import cached_constant
 from torchrefract.planning.plan import EXACT_AT_NODES, ErrorModel, PlanRequest, WarpPlan, plan_warp
 
 _FIELD_SHARE = 0.35  # of the tolerance, for the errors of random fields; the rest is for the lattice
@@ -87,7 +87,7 @@ class ComposePlan:
         return "\n".join(lines)
 
 
-@lru_cache(maxsize=256)
+@cached_constant(maxsize=256)
 def plan_composition(
     warps: tuple[PlannedWarp, ...], request: PlanRequest, *, can_measure: bool = True
 ) -> CompositionPlan:

@@ -7,14 +7,13 @@ of t moves a pixel by at most max(A, 1 - A) e; in linear light by at most the sl
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor
+from torchrefract._tensor import as_device_tensor, cached_constant
 from torchrefract.fields.fog_volume import VARIANCE
 from torchrefract.types import Range
 
@@ -136,13 +135,13 @@ class FogErrorModel:
         return LEVELS * max(error, _STEEPEST_SRGB * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055)
 
 
-@lru_cache(maxsize=64)
+@cached_constant(maxsize=64)
 def plan_uniform_fog(model: FogErrorModel, request: PhotometricRequest) -> PhotometricPlan:
     """Plan uniform fog: all of it or, if it is too thin, nothing."""
     return _without_fog(model, request, largest_ratio=1.0) or exact_plan(request, "the fog can be seen")
 
 
-@lru_cache(maxsize=64)
+@cached_constant(maxsize=64)
 def plan_image_fog(model: FogErrorModel, request: PhotometricRequest) -> PhotometricPlan:
     """Plan fog with noise in the image: drop the octaves of the least weight, in order.
 
@@ -187,7 +186,7 @@ def plan_image_fog(model: FogErrorModel, request: PhotometricRequest) -> Photome
     )
 
 
-@lru_cache(maxsize=64)
+@cached_constant(maxsize=64)
 def plan_volumetric_fog(model: FogErrorModel, request: PhotometricRequest) -> PhotometricPlan:
     """Plan volumetric fog: all of it, uniform fog if its contrast is too faint, or nothing.
 

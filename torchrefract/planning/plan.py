@@ -3,12 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
 from torch import Tensor
 
+from torchrefract._tensor import cached_constant
 from torchrefract._validation import check_number
 from torchrefract.types import FlowBounds, Simplification
 from torchrefract.warping.lattice import Lattice
@@ -159,7 +159,7 @@ class WarpPlan:
         return "\n".join(lines)
 
 
-@lru_cache(maxsize=1024)
+@cached_constant(maxsize=1024)
 def plan_warp(model: ErrorModel | None, request: PlanRequest) -> WarpPlan:
     """Plan one warp: drop terms, then take the coarsest lattice whose error fits into the tolerance.
 

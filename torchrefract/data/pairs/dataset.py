@@ -86,8 +86,10 @@ class PairedFolder(Dataset[Pair]):
             _image(arrays.clean),
             torch.from_numpy(flow),
             torch.from_numpy(valid)[None],
-            torch.tensor(row.key),
-            torch.from_numpy(arrays.maps[_TRANSMISSION])[None] if self.transmission else torch.empty(0),
+            torch.tensor(row.key, device="cpu"),
+            torch.from_numpy(arrays.maps[_TRANSMISSION])[None]
+            if self.transmission
+            else torch.empty(0, dtype=torch.float32, device="cpu"),
         )
 
     def row(self, index: int) -> PairRow:

@@ -63,7 +63,7 @@ class RoadScenes(Dataset[Frame]):
         """Render a frame: image (3, H, W), key () and depth (1, H, W)."""
         if not -self.count <= index < self.count:
             raise IndexError(f"index must lie in [{-self.count}, {self.count - 1}], got {index}")
-        key = torch.tensor(self.first + index % self.count)
+        key = torch.tensor(self.first + index % self.count, device="cpu")
         image, depth = render_road_scenes(key[None], *self.size, seed=self.seed)
         return Frame(image[0], key, depth[0])
 

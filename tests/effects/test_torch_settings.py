@@ -1,0 +1,179 @@
+"""Effects under PyTorch's settings and tools: default types and devices, meta and fake tensors, graphs, saved files."""
+
+import ast
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+from helpers import EFFECTS, SIZE, assert_equal_maps, maps_of, random_image
+from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.testing import assert_close
+
+import torchrefract as tr
+from torchrefract import random
+from torchrefract._tensor import cached_constant
+from torchrefract.effects.base import Effect
+from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
+
+SOURCES = Path(tr.__file__).parent
+PACKAGES = ("effects", "fields", "planning", "labels", "cameras", "warping", "ops")
+FLOATS = {"empty", "eye", "full", "linspace", "ones", "rand", "randn", "zeros"}
+FACTORIES = {*FLOATS, "arange", "as_tensor", "randint", "randperm", "tensor"}
+
+
+@pytest.fixture(params=EFFECTS)
+def effect(request) -> Effect:
+    return EFFECTS[request.param]()
+
+
+@pytest.fixture
+def default_dtype(request) -> Iterator[torch.dtype]:
+    before = torch.get_default_dtype()
+    yield request.param
+    torch.set_default_dtype(before)
+
+
+@pytest.mark.quick
+def test_every_new_tensor_names_its_device_and_floats_their_type():
+    calls = []
+    for path in [*SOURCES.glob("*.py"), *(path for name in PACKAGES for path in (SOURCES / name).rglob("*.py"))]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+                module, name = ast.unparse(node.func.value), node.func.attr
+                if module == "torch" and name in FACTORIES:
+                    calls.append((path.name, node.lineno, name, {word.arg for word in node.keywords}))
+    assert len(calls) > 50
+    for name, line, factory, words in calls:
+        expected = {"device", "dtype"} if factory in FLOATS else {"device"}
+        assert expected <= words, (name, line, factory)
+
+
+@pytest.mark.parametrize("default_dtype", [torch.bfloat16, torch.float64], indirect=True)
+def test_the_default_type_changes_no_bit(effect, default_dtype):
+    image = random_image(2, 3, *SIZE)
+    expected = maps_of(effect.degrade(image, seed=7, frame=2))
+    torch.set_default_dtype(default_dtype)
+    assert_equal_maps(maps_of(effect.degrade(image, seed=7, frame=2)), expected)
+
+
+@pytest.mark.parametrize("default_dtype", [torch.bfloat16, torch.float64], indirect=True)
+def test_the_default_type_changes_no_bit_of_moved_labels(default_dtype):
+    flow = tr.LensDistortion().degrade(random_image(1, 3, *SIZE), seed=7).flow
+    points, boxes = 30 * random_image(1, 9, 2), torch.tensor([[3.0, 4.0, 20.0, 25.0]])
+    expected = (*tr.warp_points(points, flow), *tr.warp_boxes(boxes, flow[0]), *tr.invert_flow(flow))
+    torch.set_default_dtype(default_dtype)
+    actual = (*tr.warp_points(points, flow), *tr.warp_boxes(boxes, flow[0]), *tr.invert_flow(flow))
+    for value, other in zip(actual, expected, strict=True):
+        assert value.dtype is other.dtype
+        assert torch.equal(value, other)
+
+
+def test_the_default_device_changes_nothing(effect):
+    image = random_image(2, 3, *SIZE)
+    torch.manual_seed(3)
+    expected = [maps_of(effect.degrade(image, seed=7, keys=[5, 9])), {"image": effect(image)}]
+    torch.manual_seed(3)
+    with torch.device("meta"):
+        actual = [maps_of(effect.degrade(image, seed=7, keys=[5, 9])), {"image": effect(image)}]
+    for value, other in zip(actual, expected, strict=True):
+        assert_equal_maps(value, other)
+
+
+@pytest.mark.parametrize("kind", ["meta", "fake"])
+def test_images_without_values_give_shapes(effect, kind):
+    image = random_image(2, 3, *SIZE)
+    expected = maps_of(effect.degrade(image, seed=7))
+    with torch.device("meta") if kind == "meta" else FakeTensorMode():
+        image = torch.empty(2, 3, *SIZE, dtype=torch.float32)
+        actual = maps_of(effect.degrade(image, seed=7))
+        assert effect(image).shape == image.shape
+    assert actual.keys() == expected.keys()
+    for name, value in actual.items():
+        assert (value.shape, value.dtype, value.device) == (expected[name].shape, expected[name].dtype, image.device)
+
+
+@pytest.mark.quick
+def test_a_cached_constant_does_not_depend_on_who_computes_it_first():
+    @cached_constant(maxsize=4)
+    def total(count: int) -> float:
+        return torch.arange(count, dtype=torch.float64).sum().item()
+
+    with FakeTensorMode(), torch.device("meta"), torch.inference_mode():
+        assert total(4) == 6.0
+    assert total(4) == 6.0
+
+
+@pytest.mark.parametrize(
+    "make",
+    [tr.ThinPlateSpline, lambda: tr.Compose([tr.LensFlare(), tr.ThinPlateSpline()])],
+    ids=["warp", "compose"],
+)
+def test_a_graph_takes_another_frame_size_and_batch(make):
+    effect = make()
+    compiled = torch.compile(effect, fullgraph=True, backend="eager")
+    for shape in ((2, 3, 24, 32), (3, 3, 20, 28)):
+        image = random_image(*shape)
+        torch.manual_seed(3)
+        expected = effect(image)
+        torch.manual_seed(3)
+        assert_close(compiled(image), expected, rtol=0, atol=2e-4)
+
+
+def test_a_model_with_an_effect_is_exported_as_a_graph_that_draws():
+    model, image = nn.Sequential(nn.Conv2d(3, 3, 1), tr.ThinPlateSpline()).train(), random_image(2, 3, 24, 32)
+    exported = torch.export.export(model, (image,)).module()
+    torch.manual_seed(3)
+    expected = model(image)
+    torch.manual_seed(3)
+    first = exported(image)
+    assert_close(first, expected, rtol=0, atol=2e-4)
+    assert (exported(image) - first).abs().max() > 0.01
+
+
+def saved_and_loaded(value: Any) -> Any:
+    file = io.BytesIO()
+    torch.save(value, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+@pytest.mark.quick
+def test_saved_params_are_loaded_with_weights_only(effect):
+    image = random_image(2, 3, *SIZE)
+    degraded = effect.degrade(image, seed=7)
+    params = saved_and_loaded({"params": degraded.params})["params"]
+    assert type(params) is type(degraded.params)
+    assert torch.equal(effect.apply(image, params).image, degraded.image)
+
+
+class DimmerParams(NamedTuple):
+    """Parameters of an effect that is defined outside of the package."""
+
+    applied: Tensor
+    share: Tensor
+
+    @property
+    def is_identity(self) -> Tensor:
+        return self.share == 1
+
+
+class Dimmer(PhotometricEffect):
+    params_type, maps = DimmerParams, ()
+
+    def sample_params(self, stream: random.Stream, image: Tensor) -> DimmerParams:
+        return DimmerParams(*self.draw_in_ranges(stream, [(0.2, 0.8)], image))
+
+    def validate(self, params: DimmerParams, image: Tensor) -> None:
+        return None
+
+    def render(self, image: Tensor, params: DimmerParams, depth: Tensor | None) -> Rendered:
+        return Rendered(image * params.share.view(-1, 1, 1, 1), lambda: params.applied.view(-1, 1, 1, 1))
+
+
+def test_saved_params_of_an_effect_of_another_package_are_loaded_with_weights_only():
+    params = Dimmer().sample(random_image(2, 3, *SIZE), seed=7)
+    assert_close(saved_and_loaded(params), params, rtol=0, atol=0)

@@ -3,8 +3,8 @@
 import re
 import zipfile
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 import torch
@@ -160,6 +160,8 @@ def _instantiate(config: dict[str, Any], changes: Mapping[str, Any], path: Path)
         model = instantiate(_safe(merged, path))
     except (InstantiationException, OmegaConfBaseException, ValueError, TypeError) as error:
         reason = error.__cause__ or error
+        if isinstance(reason, ModuleNotFoundError):
+            raise reason from None  # a missing library is not a fault of the checkpoint
         raise CheckpointError(f"ckpt_path must be of a model that can be built, got {path}: {reason}") from error
     if not isinstance(model, LightningModule):
         raise CheckpointError(f"ckpt_path must be of a model, got {path} of {type(model).__name__}")
@@ -185,8 +187,13 @@ def _safe(value: Any, path: Path) -> Any:
 def _is_allowed(target: Any) -> bool:
     if not isinstance(target, str) or not target.startswith(_PACKAGE):
         return False
+    module, _, name = target.rpartition(".")
     try:
-        value = resolve_name(target)
+        value = getattr(import_module(module), name)
+    except ModuleNotFoundError as error:
+        if error.name is None or f"{error.name}.".startswith(_PACKAGE):
+            return False
+        raise  # a missing library is not a fault of the checkpoint
     except (ImportError, ValueError, AttributeError):
         return False
     # Our modules have classes of other packages as attributes, so the module that defines the class decides.

@@ -98,7 +98,10 @@ def prepare_arguments(name: str, arguments: list[str]) -> list[str]:
     if name == "preview":
         arguments = picture_as_option(name, arguments)
     if name == "eval":
-        arguments = task_of_checkpoint(arguments)
+        # Only this command needs the training stack here.
+        from torchrefract.cli.evaluation import add_choices  # noqa: PLC0415
+
+        arguments = add_choices(arguments)
     if name in ("train", "eval"):
         arguments = require_task(name, arguments)
     overrides, options = list[str](), list[str]()
@@ -137,6 +140,8 @@ def require_task(name: str, arguments: list[str]) -> list[str]:
     """
     if any(argument in _INFORMATION_OPTIONS for argument in arguments):
         return arguments
+    if name == "eval" and not any(argument.startswith("ckpt_path=") for argument in arguments):
+        raise UsageError("ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none")
     example = f"python -m torchrefract.{name}"
     for argument in arguments:
         if argument.startswith("task="):
@@ -162,18 +167,6 @@ def picture_as_option(name: str, arguments: list[str]) -> list[str]:
         names = " and ".join(arguments[i] for i in pictures)
         raise UsageError(f"{name} must have one picture, in quotes if its name has spaces, got {names}")
     return [f"image={_quote(argument)}" if i in pictures else argument for i, argument in enumerate(arguments)]
-
-
-def task_of_checkpoint(arguments: list[str]) -> list[str]:
-    """Add the task of the checkpoint that `ckpt_path=` names, unless the arguments choose a task."""
-    path = next((argument.partition("=")[2] for argument in arguments if argument.startswith("ckpt_path=")), "")
-    path = path if _exists(path) else path.strip("'\"")
-    if not os.path.isfile(path) or any(argument.startswith(("task=", *_TASK_OPTIONS)) for argument in arguments):
-        return arguments
-    # Only `eval` needs the training stack here.
-    from torchrefract.restoration.checkpoints import read_checkpoint  # noqa: PLC0415
-
-    return [*arguments, f"+task={read_checkpoint(Path(path))['task']}"]
 
 
 def check_seed(seed: Any) -> int:
@@ -277,7 +270,8 @@ def _one_line_errors(name: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if (message := _user_message(error, name)) is None:
+        is_missing = isinstance(error, ModuleNotFoundError)
+        if (message := missing_library(error, name) if is_missing else _user_message(error, name)) is None:
             raise
         print(f"error: {message}", file=sys.stderr)
         raise SystemExit(1) from error
@@ -288,8 +282,6 @@ def _user_message(error: Exception, name: str) -> str | None:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, option = error.missing_cfg_file.rpartition("/")
         return f"{group} must be one of {', '.join(error.options or [])}, got {option}"
-    if isinstance(error, ModuleNotFoundError):
-        return missing_library(error, name)
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key} must be given, as in {error.full_key}=…, got nothing"
     if isinstance(error, _FILE_ERRORS):

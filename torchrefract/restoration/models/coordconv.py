@@ -76,8 +76,8 @@ class CoordConvSegmenter(nn.Module):
         super().__init__()
         if not _ENCODER.fullmatch(encoder):
             raise ValueError(
-                "encoder must be a name of segmentation-models-pytorch or tu- and a name of timm, without a source such "
-                f"as hf-hub: or a path, got {encoder}; add model.network.encoder=tu-NAME, and for its weights "
+                "encoder must be a name of segmentation-models-pytorch or tu- and a name of timm, without a source "
+                f"such as hf-hub: or a path, got {encoder}; add model.network.encoder=tu-NAME, and for its weights "
                 "model.network.pretrained=FOLDER"
             )
         file, mean, std = (None, _MEAN, _STD) if pretrained is None else _find_weights(encoder, pretrained)

@@ -183,9 +183,13 @@ def test_a_picture_with_an_odd_name_is_drawn(call, picture, tmp_path):
 @pytest.mark.quick
 def test_only_a_bare_word_is_a_picture_and_there_is_at_most_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = ["seed=1", "--config-dir", "mine", "-c", "job", "~effects.Compose", "+a=b", "--resolve"]
-    assert prepare_arguments("preview", words) == words
-    assert prepare_arguments("preview", [*words, "frame.png"]) == [*words, "image='frame.png'"]
+    overrides, options = ["seed=1", "~effects.Compose", "+a=b"], ["--config-dir", "mine", "-c", "job", "--resolve"]
+    assert prepare_arguments("preview", overrides + options) == overrides + options
+    assert prepare_arguments("preview", [*options, "frame.png", *overrides]) == [
+        "image='frame.png'",
+        *overrides,
+        *options,
+    ]
     with pytest.raises(UsageError, match=r"one picture, in quotes .*, got my and frame\.png"):
         prepare_arguments("preview", ["my", "frame.png"])
 

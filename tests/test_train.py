@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from torchrefract.data.pairs import PairedFolder
-from torchrefract.restoration.checkpoints import read_checkpoint
+from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint
 from torchrefract.restoration.module import Restoration
 
 FILES = ["best.ckpt", "config.yaml", "curves.png", "last.ckpt", "metrics.csv", "panel.png"]
@@ -58,7 +58,7 @@ def test_a_run_prints_a_comparison_with_the_baselines_and_nothing_of_the_librari
     )
     assert model.split()[:3] == ["model", f"{psnr:.2f}", f"({psnr - nothing_psnr:+.2f})"]
     assert f"{epe:.2f} ({epe / nothing_epe:.2f} x do nothing)" in model
-    assert trained.outcome.err == ""
+    assert trained.outcome.err == "torchrefract: loading …\n"
     for word in ("Traceback", "Warning", "Tip:"):
         assert word not in trained.outcome.out
 
@@ -187,6 +187,37 @@ def test_a_diffusion_model_trains_and_its_evaluation_by_the_moving_average_repea
     evaluated = call("eval", "+task=undistort", *DDPM, f"ckpt_path={path}", "hydra.run.dir=again", "model.steps=3")
     assert evaluated.code == 0, evaluated.err
     assert model_line(evaluated.out) == model_line(trained.out)
+
+
+def test_an_evaluation_scores_by_default_what_the_checkpoint_was_validated_on_and_says_so(call, trained, tmp_path):
+    checkpoint = trained.folder / "best.ckpt"
+    score = model_line(trained.outcome.out)
+    for words in ((), ("+task=undistort", "seed=0"), ("-m", "data.batch_size=4", "hydra.sweep.dir=sweep")):
+        outcome = call("eval", *words, f"ckpt_path={checkpoint}")
+        assert outcome.code == 0, outcome.err
+        (line,) = (line for line in outcome.out.splitlines() if line.startswith("scoring "))
+        assert line == (
+            f"scoring {checkpoint} on 16 validation frames of RoadScenes, 32x64 px, cheap_dashcam of severity 3; "
+            "as in its own validation"
+        )
+        assert model_line(outcome.out) == score
+    outcome = call("eval", f"ckpt_path={checkpoint}", "data.val_count=8", "scene.severity=5")
+    assert "on 8 validation frames of RoadScenes, 32x64 px, cheap_dashcam of severity 5; " in outcome.out
+    assert "; unlike its own validation in data.effect.severity, data.val_count\n" in outcome.out
+    outcome = call("eval", f"ckpt_path={checkpoint}", "scene=paper_refractive")
+    assert "32x64 px, paper_refractive of severity 3; unlike its own validation in data.effect._target_" in outcome.out
+
+
+def test_an_evaluation_runs_no_code_that_a_checkpoint_names(call, known_model, tmp_path):
+    path = known_model("undistort", (0.0, 0.0))
+    content = read_checkpoint(path)
+    for target in ("os.mkdir", "torchrefract.data.media.os.mkdir", "torchrefract._io.replace_file"):
+        data = {"_target_": "torchrefract.data.module.road_scenes", "effect": {"_target_": target, "path": "made"}}
+        AtomicCheckpointIO().save_checkpoint(content | {"config": content["config"] | {"data": data}}, path)
+        message = call("eval", f"ckpt_path={path}", "hydra.run.dir=run").message
+        assert message.startswith("ckpt_path must name models and tasks of torchrefract only, got ")
+        assert message.endswith(repr(target))
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_an_evaluation_repeats_the_scores_of_the_training_and_leaves_its_folder_alone(call, trained, tmp_path):

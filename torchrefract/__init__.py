@@ -1,11 +1,27 @@
 """Differentiable image degradations for road cameras, and the maps that undo them.
 
-Every effect is an `nn.Module` from images to images: `LensDistortion`, `Turbulence`, `ThinPlateSpline`,
-`DivergenceFree`, `Rectification`, `UniformFog`, `HeterogeneousFog`, `LensFlare`, and `Compose` and `OneOf` of them.
+Effects, each an `nn.Module` from images to images; in parentheses what they show:
+    LensDistortion (a lens), Turbulence (heat haze), ThinPlateSpline and DivergenceFree (smooth random warps),
+    Rectification (removes the lens of a calibrated camera), UniformFog, HeterogeneousFog, LensFlare,
+    Compose (several effects in order), OneOf (one of several, at random)
+
+Presets, in `torchrefract.presets`, are effects with the parameters of a place and a severity of 1 to 5:
+    cheap_dashcam, cape_town_fog, limpopo_sun_glare, highveld_heat_haze, unpaved_road, and paper_refractive and
+    paper_weather, which draw one of several effects for each image
+
 `effect(image)` degrades an image; `effect.degrade(image, seed=..., keys=...)` returns a `Degraded` with the flow, its
 inverse, masks and the drawn parameters, and `effect.apply(image, params)` repeats a draw. `warp`, `invert_flow` and
 `compose_flows` work on flows, which are backward and in pixels: out(p) = image(p + flow(p)).
+
+Commands, each with a `--help`: python -m torchrefract.preview, generate, train, eval, restore, export, calibrate,
+rectify, make_board.
 """
+
+import sys as _sys
+
+if _sys.argv[:1] == ["-m"] and _sys.stderr is not None:
+    # Python has this argv while `python -m torchrefract.<command>` imports the package, and torch takes seconds.
+    print("torchrefract: loading …", file=_sys.stderr, flush=True)
 
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.compose import Compose, ComposeParams, OneOf
@@ -35,6 +51,8 @@ from torchrefract.types import Degraded, Folding, Frame, Pair
 from torchrefract.warping.flow import compose_flows, folding, jacobian_determinant
 from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.warp import warp
+
+__version__ = "0.2.0"
 
 __all__ = [
     "Camera",

@@ -1,9 +1,31 @@
-"""Score a checkpoint: `python -m torchrefract.eval +task=undistort ckpt_path=<run>/best.ckpt`."""
+"""Score a checkpoint: `python -m torchrefract.eval ckpt_path=<run>/best.ckpt`.
 
-from torchrefract.cli.command import command, require_task
-from torchrefract.cli.restoration import evaluate
+By default, the model, the validation frames and their degradation are those of the checkpoint, so the scores are those
+of its training. Options change single values; the first line says what is scored.
 
-main = command("eval", evaluate, prepare=require_task)
+Options:
+    ckpt_path=FILE          a checkpoint of `train`, required
+    data=frames             other frames: road_scenes (rendered), frames (a folder) or pairs (of `generate`)
+    data.root=DIR           folder of the frames or pairs
+    data.size=[64,112]      [height, width] to which frames are cropped and reduced, px
+    scene=NAME              another degradation: cheap_dashcam, cape_town_fog, paper_refractive, paper_weather, ...
+    scene.severity=3        1 to 5
+    model.steps=50          of a diffusion model
+    data.batch_size=16      frames in a step; data.workers=2 processes load them
+    trainer=gpu             hardware: cpu, gpu or ddp
+    hydra.run.dir=DIR       folder of metrics.csv and panel.png
+
+Examples:
+    python -m torchrefract.eval ckpt_path=runs/undistort/2026-01-01_10-00-00/best.ckpt
+    python -m torchrefract.eval ckpt_path=best.ckpt data.root=other_frames trainer=gpu
+
+Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
+`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
+"""
+
+from torchrefract.cli.entry import command
+
+main = command("eval", __doc__, "restoration:evaluate")
 
 if __name__ == "__main__":
     main()

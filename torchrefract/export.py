@@ -1,9 +1,24 @@
-"""Export a model for other programs: `python -m torchrefract.export ckpt_path=<run>/best.ckpt out=model.onnx`."""
+"""Export a model for other programs: `python -m torchrefract.export ckpt_path=<run>/best.ckpt out=model.onnx`.
 
-from torchrefract.cli.command import command
-from torchrefract.cli.restoration import export
+The file takes frames of one size and any batch size. The command compares it with the model and prints the difference.
 
-main = command("export", export)
+Options:
+    ckpt_path=FILE          a checkpoint of `train`, required
+    out=model.onnx          or .pt2, a program of torch.export
+    size=720x1280           HEIGHTxWIDTH of the frames that the file accepts, px; default: that of the training
+    interpolation=bicubic   of the warp along a predicted flow; or bilinear
+
+Examples:
+    python -m torchrefract.export ckpt_path=best.ckpt size=720x1280
+    python -m torchrefract.export ckpt_path=best.ckpt out=model.pt2 interpolation=bilinear
+
+Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
+`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
+"""
+
+from torchrefract.cli.entry import command
+
+main = command("export", __doc__, "restoration:export")
 
 if __name__ == "__main__":
     main()

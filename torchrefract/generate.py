@@ -1,9 +1,31 @@
-"""Write pairs to disk: `python -m torchrefract.generate scene=paper_weather source=DIR out=DIR license="CC BY 4.0"`."""
+"""Write pairs to disk: `python -m torchrefract.generate scene=NAME source=DIR out=DIR license="CC BY 4.0"`.
 
-from torchrefract.cli.command import command, quote_option
-from torchrefract.cli.generation import generate
+A pair is a clean and a degraded frame with the maps that undo the degradation. The same command continues an
+interrupted set; README.md in the output folder describes the complete set.
 
-main = command("generate", generate, prepare=quote_option("license"))
+Options:
+    scene=NAME              degradation, required: cheap_dashcam, cape_town_fog, paper_refractive, paper_weather, ...
+    source=PATH             folder of images or of videos, or a video, required
+    out=DIR                 folder of the pairs, required
+    license=TEXT            of the source, stated in the README of the set, required
+    count=N                 number of pairs; default: one for each frame
+    size=[720,1280]         [height, width] to which frames are cropped and reduced, px
+    maps=png                format of the maps; npz and safetensors have full precision
+    tar=N                   pairs in a tar of WebDataset's layout; default: files
+    val_share=0.2           share of the frames in the validation split
+    workers=N               processes; default: one for each core
+
+Examples:
+    python -m torchrefract.generate scene=paper_refractive source=frames out=pairs license="CC BY 4.0"
+    python -m torchrefract.generate scene=cape_town_fog source=drive.mp4 out=fog count=16000 tar=1000 license=CC0
+
+Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
+`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
+"""
+
+from torchrefract.cli.entry import command
+
+main = command("generate", __doc__, "generation:generate")
 
 if __name__ == "__main__":
     main()

@@ -1,9 +1,31 @@
-"""Draw effects on a picture, a video or a folder of frames: `python -m torchrefract.preview image.jpg`."""
+"""Draw effects on a picture, a video or a folder of frames: `python -m torchrefract.preview image.jpg`.
 
-from torchrefract.cli.command import command, picture_as_option
-from torchrefract.cli.preview import preview
+A contact sheet shows each effect, its map and the restored picture; the suffix of an animation gives an animation.
+Without a picture, the effects are drawn on a rendered road scene. The first run compiles for about a minute.
 
-main = command("preview", preview, prepare=picture_as_option)
+Options:
+    image=FILE              picture, video or folder of frames; may be given without `image=`
+    out=preview.png         .gif, .webp, .apng and .mp4 are animations, other formats contact sheets
+    scene=NAME              a scene in place of all effects: cheap_dashcam, cape_town_fog, paper_weather, ...
+    scene.severity=3        1 to 5
+    depth=FILE              depth of the picture: 16-bit PNG, or .npy in m
+    depth_scale=0.00390625  m per step of the PNG
+    size=[540,960]          [height, width] to which the picture is cropped and reduced, px
+    frames=48               largest number of frames of an animation
+    fps=12                  frames per second of an animation
+    seed=0                  of the draws
+
+Examples:
+    python -m torchrefract.preview image.jpg scene=cape_town_fog scene.severity=5
+    python -m torchrefract.preview drive.mp4 scene=highveld_heat_haze out=haze.gif
+
+Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
+`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
+"""
+
+from torchrefract.cli.entry import command
+
+main = command("preview", __doc__, "preview:preview")
 
 if __name__ == "__main__":
     main()

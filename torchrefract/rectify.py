@@ -1,9 +1,24 @@
-"""Remove lens distortion from pictures or videos: `python -m torchrefract.rectify input=DIR camera=camera.yaml`."""
+"""Remove lens distortion from pictures or videos: `python -m torchrefract.rectify input=DIR camera=camera.yaml`.
 
-from torchrefract.cli.calibration import rectify
-from torchrefract.cli.command import command
+Writes the rectified files, lens.yaml of the input, and camera.yaml of the results. Files that exist already are kept.
 
-main = command("rectify", rectify)
+Options:
+    input=PATH              folder of pictures and videos, a picture or a video, required
+    camera=FILE             camera.yaml of `calibrate`, or another camera file, required
+    out=rectified           output folder
+    zoom=1.0                factor of the focal length; below 1 the rectified frames show more
+
+Examples:
+    python -m torchrefract.rectify input=drive.mp4 camera=calibration/camera.yaml
+    python -m torchrefract.rectify input=pictures camera=camera.yaml out=wide zoom=0.8
+
+Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
+`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
+"""
+
+from torchrefract.cli.entry import command
+
+main = command("rectify", __doc__, "calibration:rectify")
 
 if __name__ == "__main__":
     main()

@@ -1,9 +1,30 @@
-"""Restore pictures and videos: `python -m torchrefract.restore ckpt_path=<run>/best.ckpt input=DIR out=DIR`."""
+"""Restore pictures and videos: `python -m torchrefract.restore ckpt_path=<run>/best.ckpt input=DIR out=DIR`.
 
-from torchrefract.cli.command import command
-from torchrefract.cli.restoration import restore
+Files that are restored already are kept, so the same command continues an interrupted run.
 
-main = command("restore", restore)
+Options:
+    ckpt_path=FILE          a checkpoint of `train`, required
+    input=PATH              a picture, a video, or a folder of them with its subfolders, required
+    out=restored            output folder; names and subfolders are those of the input
+    size=[720,1280]         [height, width] to which frames are resized for the model; default: that of its training
+    tile=512                px or [height, width]; the model sees tiles of a frame instead of the resized frame
+    interpolation=bicubic   of the warp along a predicted flow; or bilinear
+    side_by_side=false      true writes the input to the left of the restoration
+    batch=4                 pictures, frames or tiles that are restored together
+    device=auto             cpu, cuda, or auto, which prefers cuda
+    +model.steps=50         changes a value of the model, here of a diffusion model
+
+Examples:
+    python -m torchrefract.restore ckpt_path=best.ckpt input=drive.mp4 side_by_side=true
+    python -m torchrefract.restore ckpt_path=best.ckpt input=frames out=clear device=cuda batch=16
+
+Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
+`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
+"""
+
+from torchrefract.cli.entry import command
+
+main = command("restore", __doc__, "restoration:restore")
 
 if __name__ == "__main__":
     main()

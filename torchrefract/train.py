@@ -1,9 +1,31 @@
-"""Train a restoration: `python -m torchrefract.train +task=undistort`."""
+"""Train a model that restores images: `python -m torchrefract.train +task=undistort`.
 
-from torchrefract.cli.command import command, require_task
-from torchrefract.cli.restoration import train
+Frames are degraded on the fly by a scene. The run folder receives best.ckpt, last.ckpt, config.yaml, metrics.csv and
+pictures; the last lines compare the model with doing nothing.
 
-main = command("train", train, prepare=require_task)
+Options:
+    +task=undistort         what to learn, required unless an experiment is given: undistort or deweather
+    data=road_scenes        clean frames: road_scenes (rendered), frames (a folder) or pairs (of `generate`)
+    data.root=DIR           folder of the frames or pairs
+    data.size=[64,112]      [height, width] to which frames are cropped and reduced, px
+    scene=NAME              degradation: cheap_dashcam, cape_town_fog, paper_refractive, paper_weather, ...
+    model=resunet           network: resunet, segformer, ddpm or ddpm_cat256
+    trainer=cpu             hardware: cpu, gpu or ddp; trainer.max_epochs=6 sets the length
+    data.batch_size=16      frames in a step; data.workers=2 processes load them
+    ckpt_path=FILE          last.ckpt of a stopped run, which is resumed
+    hydra.run.dir=DIR       run folder; seed=0 sets weights, order and degradations
+
+Examples:
+    python -m torchrefract.train +task=undistort data=frames data.root=frames trainer=gpu
+    python -m torchrefract.train +experiment=table1_segformer_deweather scale=small data.root=frames
+
+Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
+`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
+"""
+
+from torchrefract.cli.entry import command
+
+main = command("train", __doc__, "restoration:train")
 
 if __name__ == "__main__":
     main()

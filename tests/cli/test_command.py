@@ -1,16 +1,21 @@
 import errno
 import random
 import re
+import shlex
 import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from PIL import Image
 
+from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
-from torchrefract.cli.command import command, naming, progress, quote_option
+from torchrefract.cli.command import naming, prepare_arguments, progress, quote_text, run
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint
@@ -38,16 +43,16 @@ def write_frames(root: Path, count: int, *, size: tuple[int, int] = (64, 32)) ->
 
 @pytest.fixture
 def run_main(monkeypatch, capsys):
-    """Run a main function as a command; return what it wrote to stderr."""
-    monkeypatch.setattr(sys, "argv", ["torchrefract.train", "license=[CC0], by us"])
+    """Run a function as a command; return what it wrote to stderr."""
+    monkeypatch.setattr(sys, "argv", ["torchrefract.train", "+task=undistort"])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "")
 
-    def run(function, **options) -> str:
-        monkeypatch.setattr("hydra.main", lambda **_: lambda job: lambda: job(None))
-        command("train", lambda _: function(), **options)()
+    def run_function(function) -> str:
+        monkeypatch.setattr("hydra.main", lambda **_: lambda job: function)
+        run("train", lambda _: None)
         return capsys.readouterr().err
 
-    return run
+    return run_function
 
 
 @pytest.mark.quick
@@ -82,27 +87,152 @@ def test_naming_adds_the_part_to_errors_of_values_only():
 
 
 @pytest.mark.quick
-def test_the_value_of_a_quoted_option_reaches_hydra_as_text(run_main):
-    run_main(lambda: None, prepare=quote_option("license"))
-    assert sys.argv[1:] == ["license='[CC0], by us'"]
-    assert quote_option("license")("generate", ["license=null", "license='a'"]) == ["license=null", "license='a'"]
-
-
-@pytest.mark.quick
-def test_progress_hands_on_its_items_and_is_silent_outside_a_terminal(capsys):
+def test_progress_hands_on_its_items_and_prints_a_line_outside_a_terminal_only_if_they_take_long(capsys, monkeypatch):
     assert list(progress(range(3), "working", count=3)) == [0, 1, 2]
     assert capsys.readouterr() == ("", "")
+    monkeypatch.setattr("torchrefract.cli.command._MESSAGE_INTERVAL", 0.02)
+    for item in progress(range(2), "working", count=2):
+        if item == 1:
+            time.sleep(0.2)
+    assert capsys.readouterr().err.startswith("working: 1 of 2, 0 s\n")
 
 
 # --- arguments
 
 
-@pytest.mark.parametrize("name", ["train", "eval"])
-def test_a_command_without_a_task_lists_the_tasks(call, name):
-    message = call(name).message
+ODD_NAMES = (
+    "Größe",
+    "clip (1)",
+    "epoch=1-step=20",
+    "it#5%",
+    "a@b, [c] {d}: e",
+    "'quoted'",
+    '"',
+    "back\\slash\\",
+    "a${seed}b",
+    "line\nbreak",
+    "null",
+    "霧~ $HOME `x` 1e3",
+)
+# The options of each command that take the name of a file, and the arguments that it needs.
+FILE_OPTIONS = {
+    "preview": (("image", "depth"), ()),
+    "generate": (("source",), ("scene=paper_weather", "out=o", "license=l")),
+    "calibrate": (("images", "out"), ()),
+    "rectify": (("input", "camera"), ("camera=c", "input=i")),
+    "restore": (("ckpt_path", "input", "out"), ("ckpt_path=a", "input=b")),
+    "export": (("ckpt_path",), ()),
+    "make_board": (("out",), ()),
+    "train": (("data.root", "ckpt_path", "run_dir", "hydra.run.dir"), ("+task=undistort", "data=frames")),
+}
+
+
+@pytest.mark.parametrize("name", FILE_OPTIONS)
+def test_any_name_of_a_file_reaches_the_configuration_of_each_command(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    options, required = FILE_OPTIONS[name]
+    with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
+        for file in ODD_NAMES:
+            path = tmp_path / "x" / file
+            path.mkdir(parents=True, exist_ok=True)
+            for option in options:
+                words = [word for word in required if not word.startswith(f"{option}=")]
+                words = prepare_arguments(name, [f"{option}={path}", *words])
+                cfg = compose(name, words, return_hydra_config=True)
+                assert OmegaConf.select(cfg, option) == str(path)
+
+
+@pytest.mark.quick
+def test_a_value_that_is_text_is_quoted_unless_it_is_quoted_or_an_interpolation(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for word, expected in (
+        ("license=[CC0], by us", "license='[CC0], by us'"),
+        ("license=null", "license=null"),
+        ("license='a'", "license='a'"),
+        ("license=a ${b}", "license='a \\${b}'"),
+        ("+ckpt_path=a=1.ckpt", "+ckpt_path='a=1.ckpt'"),
+        ("out=runs/${seed}", "out='runs/${seed}'"),
+        ("seed=1,2", "seed=1,2"),
+        ("data.size=[3,4]", "data.size=[3,4]"),
+    ):
+        assert prepare_arguments("restore", [word]) == [expected]
+
+
+@pytest.mark.quick
+def test_a_multirun_splits_names_of_files_at_commas_and_its_option_may_stand_anywhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("a, b").touch()
+    words = ["input=ä,b=c", "-m", "out=choice(x,y)", "ckpt_path=a, b", "license=l, m", "--package", "p", "size=null"]
+    assert prepare_arguments("restore", words) == [
+        *("input='ä','b=c'", "out=choice(x,y)", "ckpt_path='a, b'", "license='l, m'", "size=null"),
+        *("-m", "--package", "p"),
+    ]
+
+
+def test_names_of_files_are_the_values_of_a_multirun(call, tmp_path):
+    words = ("out=ä=1.pdf,b#2.pdf", "-m", "square_mm=20")
+    outcome = call("make_board", *words)
+    assert outcome.code == 0, outcome.err
+    assert {path.name for path in tmp_path.iterdir()} >= {"ä=1.pdf", "b#2.pdf"}
+
+
+COMMANDS = ("train", "eval", "preview", "generate", "restore", "export", "calibrate", "rectify", "make_board")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.quick
+def test_a_help_page_says_what_a_command_does_with_options_that_exist_and_two_examples(call, name, tmp_path):
+    outcome = call(name, "seed=1", "--help")
+    assert (outcome.code, outcome.err, list(tmp_path.iterdir())) == (0, "", [])
+    assert len(outcome.out.splitlines()) < 32
+    _, options, examples = re.split(r"\n(?:Options|Examples):\n", outcome.out)
+    words = [
+        [word for word in shlex.split(line.strip()) if word not in ("python", "-m", f"torchrefract.{name}")]
+        for line in examples.splitlines()
+        if line.startswith("    python -m ")
+    ]
+    assert len(words) == 2
+    named = re.findall(r"^    ([+\w.]+)=", options, re.MULTILINE)
+    assert 3 <= len(named) <= 10
+    choices = {"train": ["data=frames", "scene=cape_town_fog"], "preview": ["scene=cape_town_fog"]}
+    choices["eval"] = ["+task=undistort", "data=frames", "scene=cape_town_fog", "model=ddpm"]
+    with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
+        for example in words:
+            compose(name, [*example, *choices["eval"]] if name == "eval" else prepare_arguments(name, example))
+        required = [word for word in words[0] if "=" in word and word.partition("=")[0] not in ("data", "scene")]
+        if name == "generate":
+            required += ["scene=cape_town_fog"]
+        cfg: Any = compose(
+            name, [quote_text(word) for word in required] + choices.get(name, []), return_hydra_config=True
+        )
+    for option in named:
+        parent, _, key = option.lstrip("+").rpartition(".")
+        assert key in [*(OmegaConf.select(cfg, parent) if parent else cfg)] or option == "+model.steps", option
+
+
+def test_a_command_without_a_task_lists_the_tasks(call):
+    message = call("train").message
     assert message.startswith("+task must be one of deweather, undistort: ")
-    assert f"python -m torchrefract.{name} +task=" in message
-    assert "undistort" in call(name, "--help").out
+    assert "python -m torchrefract.train +task=" in message
+
+
+def test_an_evaluation_without_a_checkpoint_names_the_option(call):
+    assert call("eval").message.startswith("ckpt_path must be the path of a checkpoint: add ckpt_path=")
+    assert call("eval", "ckpt_path=a=1.ckpt").message.endswith(
+        "must be a checkpoint file, such as <run>/last.ckpt, got a=1.ckpt"
+    )
+
+
+def test_a_run_that_fails_leaves_no_empty_folder_but_those_that_existed(call, tmp_path):
+    frames = ("data=frames", "data.root=none")
+    (tmp_path / "kept").mkdir()
+    for words in ((), ("hydra.run.dir=new/run",), ("run_dir=other",), ("hydra.run.dir=kept",)):
+        assert call("train", "+task=undistort", *frames, *words).code == 1
+    assert call("train", "-m", "+task=undistort", *frames, "seed=1,2").code == 1
+    assert call("calibrate", "images=none", "out=a/camera").code == 1
+    assert call("rectify", "input=none", "camera=none", "out=a/rectified").code == 1
+    assert call("generate", "scene=paper_weather", "source=none", "out=a/pairs", "license=CC0").code == 1
+    assert [path.name for path in tmp_path.rglob("*")] == ["kept"]
 
 
 def test_a_task_without_its_plus_is_one_line_of_error(call):

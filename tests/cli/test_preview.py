@@ -13,7 +13,7 @@ from PIL import Image
 import torchrefract as tr
 from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
-from torchrefract.cli.command import picture_as_option
+from torchrefract.cli.command import prepare_arguments
 from torchrefract.data.images import fit, read_image
 from torchrefract.data.media import read_video
 from torchrefract.data.road_scenes import render_road_scenes
@@ -170,7 +170,7 @@ NAMES = (
 def test_any_name_of_a_file_reaches_the_configuration_unchanged(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     Path(name).touch()
-    (word,) = picture_as_option("preview", [name])
+    (word,) = prepare_arguments("preview", [name])
     with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
         assert compose("preview", overrides=[word]).image == name
 
@@ -184,11 +184,15 @@ def test_a_picture_with_an_odd_name_is_drawn(call, picture, tmp_path):
 @pytest.mark.quick
 def test_only_a_bare_word_is_a_picture_and_there_is_at_most_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = ["seed=1", "--config-dir", "mine", "-c", "job", "~effects.Compose", "+a=b", "--resolve"]
-    assert picture_as_option("preview", words) == words
-    assert picture_as_option("preview", [*words, "frame.png"]) == [*words, "image='frame.png'"]
+    overrides, options = ["seed=1", "~effects.Compose", "+a=b"], ["--config-dir", "mine", "-c", "job", "--resolve"]
+    assert prepare_arguments("preview", overrides + options) == overrides + options
+    assert prepare_arguments("preview", [*options, "frame.png", *overrides]) == [
+        "image='frame.png'",
+        *overrides,
+        *options,
+    ]
     with pytest.raises(UsageError, match=r"one picture, in quotes .*, got my and frame\.png"):
-        picture_as_option("preview", ["my", "frame.png"])
+        prepare_arguments("preview", ["my", "frame.png"])
 
 
 def test_the_configuration_is_shown_without_reading_the_picture(call, tmp_path):

@@ -1,6 +1,7 @@
 import errno
 import random
 import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -312,3 +313,20 @@ def test_loading_ignores_pretrained_weights(write):
 )
 def test_a_checkpoint_that_rebuilds_no_model_says_why(write, changes, message):
     assert message in load_error(write(**changes))
+
+
+@pytest.mark.parametrize("encoder", ["tu-hf-hub:timm/resnet18.a1_in1k", "tu-hf_hub:a/b", "tu-local-dir:/x", "a/b"])
+def test_an_encoder_of_the_hub_is_rejected_without_network(write, encoder, monkeypatch):
+    monkeypatch.setattr("socket.getaddrinfo", lambda *_, **__: pytest.fail("reached the network"))
+    message = load_error(write(config={"model": config(network=config()["network"] | {"encoder": encoder})}))
+    assert "encoder must be a name of segmentation-models-pytorch or tu- and a name of timm, without" in message
+    assert f"got {encoder}; add model.network.encoder=tu-NAME" in message
+
+
+def test_a_missing_library_is_not_a_fault_of_the_checkpoint(write, monkeypatch):
+    path = write()
+    monkeypatch.setitem(sys.modules, "diffusers", None)
+    monkeypatch.setitem(sys.modules, "diffusers.optimization", None)
+    monkeypatch.delitem(sys.modules, "torchrefract.restoration.module")
+    with pytest.raises(ModuleNotFoundError, match="diffusers"):
+        load_model(path)

@@ -6,13 +6,16 @@ import logging
 import os
 import re
 import sys
+import threading
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, InstantiationException, MissingConfigException
 from hydra.utils import instantiate
@@ -24,15 +27,24 @@ from yaml import YAMLError
 
 from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
+from torchrefract.cli.entry import missing_library
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.pairs.files import DamagedPairError
 
 _T = TypeVar("_T")
-_Prepare = Callable[[str, list[str]], list[str]]  # (command, arguments) -> arguments
 
 _NUM_SEEDS = 2**32  # NumPy's limit
+_MESSAGE_INTERVAL = 10.0  # seconds between two lines of progress outside a terminal
 _FILE_ERRORS = (UnreadableImageError, DamagedPairError)  # their messages name the file
-_INFORMATION_OPTIONS = ("--help", "-h", "--hydra-help", "--info", "--shell-completion", "-sc")
+_INFORMATION_OPTIONS = ("--hydra-help", "--info", "--shell-completion", "-sc")
+_MULTIRUN = ("-m", "--multirun")
+# Options whose value is text, mostly the path of a file: Hydra's syntax in it means nothing.
+_TEXT_OPTION = re.compile(
+    r"(\+{0,2}(?:image|images|input|source|depth|camera|out|ckpt_path|license|run_dir|data\.root|hydra\.run\.dir"
+    r"|hydra\.sweep\.dir|hydra\.sweep\.subdir|model\.network\.pretrained))=(.*)",
+    re.DOTALL,
+)
+_SWEEP = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)")
 _TASK_OPTIONS = ("+task=", "++task=", "+experiment=", "++experiment=")  # an experiment chooses its task
 # Options of Hydra whose value is the next argument.
 _OPTIONS_WITH_VALUE = ("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--cfg", "-c")
@@ -51,34 +63,73 @@ _IGNORED_WARNINGS = (
 )
 
 
-def command(
-    name: str, function: Callable[[DictConfig], None], *, prepare: _Prepare | None = None
-) -> Callable[[], None]:
-    """Return the main function of `python -m torchrefract.<name>`.
+def run(name: str, function: Callable[[DictConfig], None]) -> None:
+    """Run a command with the configuration that the command line gives.
 
     Args:
         name: of the module, and of its file in conf.
         function: called with the configuration.
-        prepare: changes or checks the command-line arguments before Hydra parses them.
     """
 
     def job(cfg: DictConfig) -> None:
-        with _one_line_errors(name):  # Hydra would add lines to an error that leaves this function
+        with _one_line_errors(name), _no_empty_folder(cfg, existing):  # Hydra would add lines to an error
             function(cfg)
 
     job.__module__ = f"torchrefract.{name}"  # Hydra names the job by it
+    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
+    for message in _IGNORED_WARNINGS:
+        warnings.filterwarnings("ignore", message)
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises its errors instead of printing them
+    values = (argument.partition("=")[2].strip("'\"") for argument in sys.argv[1:])
+    # Hydra creates the folder of a run before it calls the job.
+    existing = _existing_folders([*filter(None, values), *Path("runs").glob("*"), "runs"])
+    with _one_line_errors(name):
+        sys.argv[1:] = prepare_arguments(name, sys.argv[1:])
+        hydra.main(config_path=CONFIG_DIR, config_name=name, version_base="1.3")(job)()
 
-    def main() -> None:
-        logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
-        for message in _IGNORED_WARNINGS:
-            warnings.filterwarnings("ignore", message)
-        os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises its errors instead of printing them
-        with _one_line_errors(name):
-            if prepare is not None:
-                sys.argv[1:] = prepare(name, sys.argv[1:])
-            hydra.main(config_path=CONFIG_DIR, config_name=name, version_base="1.3")(job)()
 
-    return main
+def prepare_arguments(name: str, arguments: list[str]) -> list[str]:
+    """Quote file names for Hydra's grammar, and move options such as `-m` behind the overrides.
+
+    Raises:
+        UsageError: if the arguments lack a task, or name several pictures.
+    """
+    is_multirun = any(argument in _MULTIRUN for argument in arguments)
+    if name == "preview":
+        arguments = picture_as_option(name, arguments)
+    if name == "eval":
+        # Only this command needs the training stack here.
+        from torchrefract.cli.evaluation import add_choices  # noqa: PLC0415
+
+        arguments = add_choices(arguments)
+    if name in ("train", "eval"):
+        arguments = require_task(name, arguments)
+    overrides, options = list[str](), list[str]()
+    for i, argument in enumerate(arguments):
+        is_value = i > 0 and arguments[i - 1] in _OPTIONS_WITH_VALUE
+        (options if is_value or argument.startswith("-") else overrides).append(argument)
+    return [quote_text(override, is_multirun=is_multirun) for override in overrides] + options
+
+
+def quote_text(override: str, *, is_multirun: bool = False) -> str:
+    """Quote the value of an option that is text, mostly a file name; return other overrides unchanged.
+
+    Quotes around a value, and the interpolation of a path that does not exist, keep their meaning in Hydra. With
+    `is_multirun`, commas separate the values of a sweep unless a file has them in its name.
+    """
+    if not (match := _TEXT_OPTION.fullmatch(override)):
+        return override
+    option, text = match.groups()
+    is_path = option.lstrip("+") != "license"
+    exists = is_path and _exists(text)
+    is_quoted = len(text) > 1 and text[0] == text[-1] and text[0] in "'\""
+    if text in ("", "null", "???") or (is_quoted and not exists):
+        return override
+    if is_multirun and is_path and not exists:
+        if _SWEEP.fullmatch(text):
+            return override
+        return f"{option}=" + ",".join(_quote(part, is_literal=_exists(part)) for part in text.split(","))
+    return f"{option}={_quote(text, is_literal=exists or not is_path)}"
 
 
 def require_task(name: str, arguments: list[str]) -> list[str]:
@@ -89,6 +140,8 @@ def require_task(name: str, arguments: list[str]) -> list[str]:
     """
     if any(argument in _INFORMATION_OPTIONS for argument in arguments):
         return arguments
+    if name == "eval" and not any(argument.startswith("ckpt_path=") for argument in arguments):
+        raise UsageError("ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none")
     example = f"python -m torchrefract.{name}"
     for argument in arguments:
         if argument.startswith("task="):
@@ -114,17 +167,6 @@ def picture_as_option(name: str, arguments: list[str]) -> list[str]:
         names = " and ".join(arguments[i] for i in pictures)
         raise UsageError(f"{name} must have one picture, in quotes if its name has spaces, got {names}")
     return [f"image={_quote(argument)}" if i in pictures else argument for i, argument in enumerate(arguments)]
-
-
-def quote_option(option: str) -> _Prepare:
-    """Return a `prepare` for `command` that takes the value of an option as text: commas and brackets mean nothing."""
-
-    def quote(argument: str) -> str:
-        name, _, text = argument.partition("=")
-        is_plain = name == option and text not in ("", "null") and text[0] not in "'\""
-        return f"{option}={_quote(text)}" if is_plain else argument
-
-    return lambda name, arguments: [quote(argument) for argument in arguments]
 
 
 def check_seed(seed: Any) -> int:
@@ -157,10 +199,26 @@ def naming(part: str) -> Iterator[None]:
         raise UsageError(f"{part}: {error}") from error
 
 
-def progress(items: Iterable[_T], name: str, *, count: int) -> Iterable[_T]:
-    """Return `count` items that show a progress bar with a name while they are taken, in a terminal only."""
+def progress(items: Iterable[_T], name: str, *, count: int) -> Iterator[_T]:
+    """Yield `count` items; show a progress bar in a terminal, and print a line each ten seconds elsewhere."""
     console = Console(stderr=True)
-    return track(items, name, total=count, console=console, transient=True, disable=not console.is_terminal)
+    if console.is_terminal:
+        yield from track(items, name, total=count, console=console, transient=True)
+        return
+    done, finished = 0, threading.Event()
+
+    def report() -> None:
+        start = time.monotonic()
+        while not finished.wait(_MESSAGE_INTERVAL):
+            print(f"{name}: {done} of {count}, {time.monotonic() - start:.0f} s", file=sys.stderr, flush=True)
+
+    threading.Thread(target=report, daemon=True).start()
+    try:
+        for item in items:
+            yield item
+            done += 1
+    finally:
+        finished.set()
 
 
 def _is_picture(argument: str) -> bool:
@@ -170,9 +228,40 @@ def _is_picture(argument: str) -> bool:
     )
 
 
-def _quote(text: str) -> str:
-    """Quote a text for Hydra's grammar and OmegaConf's interpolation."""
-    return QuotedString(re.sub(r"(\\*)\$\{", r"\1\1\\${", text), Quote.single).with_quotes()
+def _quote(text: str, *, is_literal: bool = True) -> str:
+    """Quote a text for Hydra's grammar and, if it is literal, for OmegaConf's interpolation."""
+    literal = re.sub(r"(\\*)\$\{", r"\1\1\\${", text) if is_literal else text
+    return QuotedString(literal, Quote.single).with_quotes()
+
+
+def _exists(path: str) -> bool:
+    """Return True if a path, or the folder of a path with an interpolation in it, exists."""
+    folder = os.path.dirname(path)
+    return os.path.exists(path) or ("${" in folder and os.path.isdir(folder))
+
+
+def _existing_folders(paths: Iterable[str | Path]) -> set[Path]:
+    """Return the paths, and the folders that they lie in, that exist as folders."""
+    resolved = [Path(path).resolve() for path in paths]
+    return {folder for path in resolved for folder in (path, *path.parents) if folder.is_dir()}
+
+
+@contextmanager
+def _no_empty_folder(cfg: DictConfig, existing: set[Path]) -> Iterator[None]:
+    """Delete the output folders of a run that fails if they are empty and did not exist before."""
+    outputs = [str(path) for key in ("out", "run_dir") if (path := OmegaConf.select(cfg, key))]
+    outputs = [path for path in outputs if path != HydraConfig.get().runtime.output_dir]
+    existing = existing | _existing_folders([Path.cwd(), *outputs])
+    try:
+        yield
+    except BaseException:
+        for path in (HydraConfig.get().runtime.output_dir, *outputs):
+            folder = Path(path).resolve()
+            with suppress(OSError):  # not empty, or missing
+                while folder not in existing:
+                    folder.rmdir()
+                    folder = folder.parent
+        raise
 
 
 @contextmanager
@@ -181,7 +270,8 @@ def _one_line_errors(name: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if (message := _user_message(error, name)) is None:
+        is_missing = isinstance(error, ModuleNotFoundError)
+        if (message := missing_library(error, name) if is_missing else _user_message(error, name)) is None:
             raise
         print(f"error: {message}", file=sys.stderr)
         raise SystemExit(1) from error

@@ -60,7 +60,8 @@ def preview(cfg: DictConfig) -> None:
 def _save_contact_sheet(effects: dict[str, Effect], source: _Source, seed: int, path: Path) -> None:
     _, frame = next(source.frames.read([0]))
     rows = []
-    for name, effect in effects.items():
+    items = progress(effects.items(), "drawing the effects; a first run compiles for a minute", count=len(effects))
+    for name, effect in items:
         with naming(name):
             rows.append(contact_sheet_row(name, effect, frame=frame, depth=source.depth, seed=seed))
     height, width = frame.shape[2:]

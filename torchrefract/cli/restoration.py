@@ -19,6 +19,7 @@ from torch import Tensor
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cli.command import check_seed, make, naming, progress
+from torchrefract.cli.evaluation import describe_validation, use_validation_config
 from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
 from torchrefract.data.media import (
     check_output_folder,
@@ -55,11 +56,16 @@ def train(cfg: DictConfig) -> None:
 
 
 def evaluate(cfg: DictConfig) -> None:
-    """Score a checkpoint on the validation data of a configuration."""
+    """Score a checkpoint, by default on the data that it was validated on."""
     if cfg.ckpt_path is None:
         raise UsageError("ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none")
+    path = Path(str(cfg.ckpt_path))
+    checkpoint = read_checkpoint(path, task=str(HydraConfig.get().runtime.choices["task"]))
+    changed = use_validation_config(cfg, checkpoint, list(HydraConfig.get().overrides.task), path)
     data, model, trainer, _ = _make_parts(cfg)
     _save_config(cfg, trainer)
+    if trainer.is_global_zero:
+        print(f"scoring {path} on {describe_validation(data.val, cfg, changed)}", flush=True)
     trainer.validate(model, data, ckpt_path=cfg.ckpt_path, verbose=False, weights_only=True)
 
 

@@ -2,9 +2,9 @@
 
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from importlib import import_module
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 import torch
@@ -157,40 +157,62 @@ def _instantiate(config: dict[str, Any], changes: Mapping[str, Any], path: Path)
     """Instantiate the configuration of a model after checking that it can do nothing else."""
     try:
         merged = OmegaConf.to_container(OmegaConf.merge(config, dict(changes)), resolve=False)
-        model = instantiate(_safe(merged, path))
+        model = instantiate(safe_config(merged, path))
     except (InstantiationException, OmegaConfBaseException, ValueError, TypeError) as error:
         reason = error.__cause__ or error
+        if isinstance(reason, ModuleNotFoundError):
+            raise reason from None  # a missing library is not a fault of the checkpoint
         raise CheckpointError(f"ckpt_path must be of a model that can be built, got {path}: {reason}") from error
     if not isinstance(model, LightningModule):
         raise CheckpointError(f"ckpt_path must be of a model, got {path} of {type(model).__name__}")
     return model
 
 
-def _safe(value: Any, path: Path) -> Any:
-    """Drop pretrained weights from a configuration; raise CheckpointError if it could run code or read files."""
+def safe_config(value: Any, path: Path, *, is_allowed: Callable[[Any], bool] | None = None) -> Any:
+    """Drop pretrained weights from a configuration; raise CheckpointError if it could run code or read files.
+
+    Args:
+        value: the configuration, or a part of it.
+        path: of the checkpoint, for messages.
+        is_allowed: returns True for other classes and functions of torchrefract that may be instantiated.
+    """
     if isinstance(value, str) and "${" in value:
         raise CheckpointError(f"ckpt_path must hold a resolved configuration, got {path} with ${{…}} in it")
     if isinstance(value, list):
-        return [_safe(child, path) for child in value]
+        return [safe_config(child, path, is_allowed=is_allowed) for child in value]
     if not isinstance(value, dict):
         return value
-    safe = {key: None if key == "pretrained" else _safe(child, path) for key, child in value.items()}
+    safe = {
+        key: None if key == "pretrained" else safe_config(child, path, is_allowed=is_allowed)
+        for key, child in value.items()
+    }
     if isinstance(target := safe.get("_target_"), str):
         safe["_target_"] = target = _MOVED.sub("coordconv", target)
-    if "_target_" in safe and not _is_allowed(target):
-        raise CheckpointError(f"ckpt_path must name models and tasks of torchrefract only, got {path} with {target!r}")
+    if "_target_" in safe:
+        named = _resolve(target)
+        is_model = isinstance(named, type) and issubclass(named, _ALLOWED)
+        if named is None or not (is_model or (is_allowed and is_allowed(named))):
+            raise CheckpointError(
+                f"ckpt_path must name models and tasks of torchrefract only, got {path} with {target!r}"
+            )
     return safe
 
 
-def _is_allowed(target: Any) -> bool:
+def _resolve(target: Any) -> Any:
+    """Import what a target names; return None if torchrefract does not define it."""
     if not isinstance(target, str) or not target.startswith(_PACKAGE):
-        return False
+        return None
+    module, _, name = target.rpartition(".")
     try:
-        value = resolve_name(target)
+        value = getattr(import_module(module), name)
+    except ModuleNotFoundError as error:
+        if error.name is None or f"{error.name}.".startswith(_PACKAGE):
+            return None
+        raise  # a missing library is not a fault of the checkpoint
     except (ImportError, ValueError, AttributeError):
-        return False
-    # Our modules have classes of other packages as attributes, so the module that defines the class decides.
-    return isinstance(value, type) and issubclass(value, _ALLOWED) and value.__module__.startswith(_PACKAGE)
+        return None
+    # Our modules have attributes of other packages, so the module that defines the value decides.
+    return value if str(getattr(value, "__module__", "")).startswith(_PACKAGE) else None
 
 
 def _frame_size(size: Any, path: Path) -> tuple[int, int]:

@@ -1,6 +1,7 @@
 """The feed-forward baselines: segmentation networks with pixel coordinates as inputs and a polynomial head."""
 
 import json
+import re
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -27,6 +28,7 @@ _DEGREE = 5  # a lens with k1 and k2 has terms of degree 3 and 5
 _HIDDEN = 256
 _HUB = "imagenet"
 _CONFIG, _TENSORS = "config.json", "model.safetensors"
+_ENCODER = re.compile(r"[\w.\-]+")  # with a colon, timm reads an encoder from the hub or from a folder
 _TIMM = "tu-"  # the prefix of timm's encoders in segmentation-models-pytorch
 _MIT_LICENSE = "NVIDIA Source Code License for SegFormer, non-commercial: for research and evaluation only"
 # The libraries raise these for an unknown encoder and for a damaged or unfitting file.
@@ -72,6 +74,12 @@ class CoordConvSegmenter(nn.Module):
         smooth: bool,
     ):
         super().__init__()
+        if not _ENCODER.fullmatch(encoder):
+            raise ValueError(
+                "encoder must be a name of segmentation-models-pytorch or tu- and a name of timm, without a source "
+                f"such as hf-hub: or a path, got {encoder}; add model.network.encoder=tu-NAME, and for its weights "
+                "model.network.pretrained=FOLDER"
+            )
         file, mean, std = (None, _MEAN, _STD) if pretrained is None else _find_weights(encoder, pretrained)
         self.network = _load_network(architecture, encoder, file, channels=channels)
         self.is_frozen, self.cell = file is not None, cell

@@ -1,0 +1,44 @@
+"""Main functions of the commands. This module imports only the standard library: a bare wheel lacks all others."""
+
+import importlib
+import sys
+from collections.abc import Callable
+
+_HELP = ("--help", "-h")
+_CAMERA_COMMANDS = ("calibrate", "rectify", "make_board")  # their libraries are in the extra "calibration"
+
+
+def command(name: str, page: str | None, function: str) -> Callable[[], None]:
+    """Return the main function of `python -m torchrefract.<name>`.
+
+    Args:
+        name: of the module, and of its file in conf.
+        page: the help page, which `--help` prints.
+        function: as "module:name", with the module in torchrefract.cli. It is called with the configuration.
+    """
+
+    def main() -> None:
+        if any(argument in _HELP for argument in sys.argv[1:]):
+            print((page or "").strip())
+            return
+        module, _, attribute = function.partition(":")
+        try:
+            run = importlib.import_module("torchrefract.cli.command").run
+            job = getattr(importlib.import_module(f"torchrefract.cli.{module}"), attribute)
+        except ModuleNotFoundError as error:
+            if (message := missing_library(error, name)) is None:
+                raise
+            print(f"error: {message}", file=sys.stderr)
+            raise SystemExit(1) from error
+        run(name, job)
+
+    return main
+
+
+def missing_library(error: ModuleNotFoundError, name: str) -> str | None:
+    """Return the error message of a command if a library is not installed; None if the module is of torchrefract."""
+    library = (error.name or "").partition(".")[0]
+    if library in ("", "torchrefract"):
+        return None
+    extra = "calibration" if name in _CAMERA_COMMANDS else "export" if library.startswith("onnx") else "train"
+    return f"{name} needs {library}, which is not installed: pip install 'torchrefract[{extra}]'"

@@ -1,0 +1,130 @@
+"""Default options of `eval`: the configuration with which a checkpoint was validated."""
+
+from collections.abc import Iterator, Sequence
+from inspect import isfunction
+from pathlib import Path
+from typing import Any, cast
+
+from omegaconf import DictConfig, OmegaConf
+from torch.utils.data import Dataset
+
+from torchrefract._io import CONFIG_DIR
+from torchrefract.data.module import fingerprint
+from torchrefract.effects.base import Effect
+from torchrefract.fields.depth import DepthProvider
+from torchrefract.restoration.checkpoints import read_checkpoint, safe_config
+
+_PARTS = ("scene", "task", "data", "model")
+_MODULES = ("torchrefract.presets", "torchrefract.data.module")  # a checkpoint may name their functions
+_NOT_COMPARED = ("workers", "batch_size", "pretrained")  # they change no score
+
+
+def add_choices(arguments: list[str]) -> list[str]:
+    """Add the task, data, model and scene of the checkpoint that `ckpt_path=` names, unless the arguments choose them.
+
+    Hydra needs the choices to know which options exist; `use_validation_config` then sets their values.
+    """
+    given = {key: value for key, _, value in (argument.lstrip("+").partition("=") for argument in arguments)}
+    text = given.get("ckpt_path", "")
+    path = Path(text if Path(text).is_file() else text.strip("'\""))
+    if not text or "experiment" in given or ("task" in given and not path.is_file()):
+        return arguments
+    checkpoint = read_checkpoint(path)
+    config = checkpoint.get("config") or {}
+    choices = {"+task": checkpoint["task"]}
+    choices |= {group: _choice(group, config.get(group)) for group in ("data", "model", "scene")}
+    added = [f"{group}={name}" for group, name in choices.items() if name and group.lstrip("+") not in given]
+    return arguments + added
+
+
+def use_validation_config(
+    cfg: DictConfig, checkpoint: dict[str, Any], overrides: Sequence[str], path: Path
+) -> list[str] | None:
+    """Replace the values in `cfg` that no override sets by those with which a checkpoint was validated.
+
+    An experiment sets all values.
+
+    Args:
+        cfg: the configuration, which changes.
+        checkpoint: of `read_checkpoint`.
+        overrides: of the command line.
+        path: of the checkpoint, for messages.
+
+    Returns:
+        The names of the values that differ from the checkpoint's; None if the checkpoint has no configuration.
+
+    Raises:
+        CheckpointError: the configuration of the checkpoint could run code of another package.
+    """
+    OmegaConf.resolve(cfg)
+    stored = checkpoint.get("config")
+    if not (isinstance(stored, dict) and all(isinstance(stored.get(part), dict) for part in ("data", "model"))):
+        return None
+    keys = [override.lstrip("+~").partition("=")[0] for override in overrides]
+    if "experiment" not in keys:
+        for part in _PARTS:
+            if (chosen := cfg.get(part)) is not None and part in keys and _kind(chosen) != _kind(stored.get(part)):
+                continue
+            values = OmegaConf.create({part: safe_config(stored.get(part), path, is_allowed=_is_allowed)})
+            for key in (key for key in keys if key.startswith(f"{part}.")):
+                OmegaConf.update(values, key, OmegaConf.select(cfg, key), force_add=True)
+            OmegaConf.update(cfg, part, values[part], merge=False, force_add=True)
+        limit = (stored.get("trainer") or {}).get("limit_val_batches")
+        if "trainer.limit_val_batches" not in keys and isinstance(limit, int | float):
+            cfg.trainer.limit_val_batches = limit
+        if "seed" not in keys and isinstance(stored.get("seed"), int):
+            cfg.seed = stored["seed"]
+        if "data.seed" not in keys and ("seed" in keys or _kind(cfg.data) != _kind(stored["data"])):
+            cfg.data.seed = cfg.seed
+        if "effect" in cfg.data:
+            cfg.data.effect = cfg.scene
+        cfg.model.task = cfg.task
+    before, after = (dict(_flatten(values)) for values in (stored, cast(Any, OmegaConf.to_container(cfg))))
+    return sorted(key for key in before.keys() | after.keys() if before.get(key) != after.get(key))
+
+
+def describe_validation(frames: Dataset[Any], cfg: DictConfig, changed: list[str] | None) -> str:
+    """State in a line on what a checkpoint is scored, and how that differs from its own validation."""
+    facts, limit, effect = fingerprint(frames), cfg.trainer.limit_val_batches, cfg.data.get("effect")
+    scene = "degraded on disk" if effect is None else str(effect.get("_target_")).rpartition(".")[2]
+    severity = f" of severity {effect.severity}" if effect is not None and "severity" in effect else ""
+    height, width = facts["size"]
+    text = f"{facts['frames']} validation frames of {facts['source']}{f' {root}' if (root := facts['root']) else ''}"
+    text += f", {height}x{width} px, {scene}{severity}" + ("" if limit is None else f", limit_val_batches {limit}")
+    if changed is None:
+        return f"{text}; the checkpoint does not say what it was validated on"
+    return f"{text}; " + (
+        f"unlike its own validation in {', '.join(changed)}" if changed else "as in its own validation"
+    )
+
+
+def _choice(group: str, config: Any) -> str | None:
+    """Return the file in a group of conf that makes a part of a configuration, or None."""
+    files = sorted(Path(CONFIG_DIR, group).glob("*.yaml"))
+    return next((file.stem for file in files if _kind(OmegaConf.load(file)) == _kind(config)), None)
+
+
+def _kind(config: Any) -> tuple[Any, Any] | None:
+    """Return what a part of a configuration makes: its target and that of its network."""
+    if not isinstance(config, dict | DictConfig):
+        return None
+    network = config.get("network")
+    return config.get("_target_"), network.get("_target_") if isinstance(network, dict | DictConfig) else None
+
+
+def _is_allowed(value: Any) -> bool:
+    is_class = isinstance(value, type) and issubclass(value, Effect | DepthProvider)
+    return is_class or (isfunction(value) and value.__module__ in _MODULES and not value.__name__.startswith("_"))
+
+
+def _flatten(config: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the name and the value of what changes a score."""
+    parts = ("data", "model") if not prefix else config
+    for key in parts:
+        name, value = f"{prefix}{key}", config[key]
+        if isinstance(value, dict):
+            yield from _flatten(value, f"{name}.")
+        elif key not in _NOT_COMPARED:
+            yield name, value
+    if not prefix:
+        yield "trainer.limit_val_batches", (config.get("trainer") or {}).get("limit_val_batches")

@@ -8,6 +8,8 @@ from typing import Any, TypeVar, cast
 import torch
 from torch import Tensor
 
+from torchrefract._validation import requires_grad
+
 _F = TypeVar("_F", bound=Callable[..., Any])
 _CACHED_VALUES = 1 << 17  # float32 values that fit into the cache of one core
 
@@ -66,7 +68,7 @@ def cat_bands(bands: Iterable[Tensor], *, dim: int, length: int) -> Tensor:
     first = next(iterator)
     if first.shape[dim] == length:
         return first
-    if first.requires_grad and torch.is_grad_enabled():
+    if requires_grad((first,)):
         return torch.cat([first, *iterator], dim=dim)
     shape = list(first.shape)
     shape[dim] = length

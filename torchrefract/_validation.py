@@ -170,8 +170,20 @@ def finite_or(value: Tensor, default: float) -> Tensor:
 
 
 def requires_grad(values: Iterable[Any]) -> bool:
-    """Return True if gradients are enabled and one of the values, tensors or objects alike, requires one."""
-    return torch.is_grad_enabled() and any([value.requires_grad for value in values])  # a list takes less time
+    """Return True if a derivative with respect to one of the tensors may be asked for, in reverse or forward mode.
+
+    Inside torch.func it is always True, since a tensor does not show the transforms outside of the innermost one.
+    """
+    if torch._C._are_functorch_transforms_active():
+        return True
+    values = list(values)
+    if torch.is_grad_enabled() and any([value.requires_grad for value in values]):  # a list takes less time
+        return True
+    return any([isinstance(value, Tensor) and _has_tangent(value) for value in values])
+
+
+def _has_tangent(value: Tensor) -> bool:
+    return forward_ad.unpack_dual(value).tangent is not None
 
 
 def why_not_eager(value: Tensor) -> str | None:
@@ -182,12 +194,14 @@ def why_not_eager(value: Tensor) -> str | None:
         return "under torch.jit.trace"
     if value.device.type != "cpu":
         return f"on {value.device.type}"
-    if forward_ad.unpack_dual(value).tangent is not None:
+    if torch._C._are_functorch_transforms_active():
+        return "inside torch.func"
+    if _has_tangent(value):
         return "with forward-mode gradients"
     try:
         value.detach().data_ptr()
     except RuntimeError:
-        return "inside torch.func"
+        return f"as a {type(value).__name__}"
     return None
 
 

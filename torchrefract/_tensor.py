@@ -8,8 +8,6 @@ from typing import Any, TypeVar, cast
 import torch
 from torch import Tensor
 
-from torchrefract._validation import requires_grad
-
 _F = TypeVar("_F", bound=Callable[..., Any])
 _CACHED_VALUES = 1 << 17  # float32 values that fit into the cache of one core
 
@@ -68,7 +66,7 @@ def cat_bands(bands: Iterable[Tensor], *, dim: int, length: int) -> Tensor:
     first = next(iterator)
     if first.shape[dim] == length:
         return first
-    if requires_grad((first,)):
+    if torch._C._are_functorch_transforms_active() or (first.requires_grad and torch.is_grad_enabled()):
         return torch.cat([first, *iterator], dim=dim)
     shape = list(first.shape)
     shape[dim] = length
@@ -113,7 +111,9 @@ def is_channels_last(image: Tensor) -> bool:
 
 
 def has_memory_format(image: Tensor) -> bool:
-    """Return False inside `torch.vmap`, where a sample has no memory format."""
+    """Return False inside of torch.func, where samples and tangents of a batch have no memory format."""
+    if torch._C._are_functorch_transforms_active():
+        return False
     try:
         image.is_contiguous(memory_format=torch.channels_last)
     except RuntimeError:

@@ -188,21 +188,18 @@ def _has_tangent(value: Tensor) -> bool:
 
 def why_not_eager(value: Tensor) -> str | None:
     """Say why the memory of a tensor cannot be read outside of PyTorch; None if it can."""
-    if torch.compiler.is_compiling():
-        return "under torch.compile"
-    if torch.jit.is_tracing():
-        return "under torch.jit.trace"
+    if torch.compiler.is_compiling() or torch.jit.is_tracing():
+        return "under torch.compile" if torch.compiler.is_compiling() else "under torch.jit.trace"
     if value.device.type != "cpu":
         return f"on {value.device.type}"
-    if torch._C._are_functorch_transforms_active():
-        return "inside torch.func"
-    if _has_tangent(value):
+    is_in_func = torch._C._are_functorch_transforms_active()
+    if not is_in_func and _has_tangent(value):
         return "with forward-mode gradients"
     try:
         value.detach().data_ptr()
     except RuntimeError:
         return f"as a {type(value).__name__}"
-    return None
+    return "inside torch.func" if is_in_func else None
 
 
 def _check_real(name: str, value: float) -> float:

@@ -144,7 +144,6 @@ def _replace_missing(x: Tensor, y: Tensor, exists: Tensor) -> tuple[Tensor, Tens
 
 def _with_gradient(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, c: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:
     """Attach the gradient of the exact inverse to a solution (x, y)."""
-
     x, y = implicit((x, y), (x_d, y_d, c), partial(_distortion_error, terms=terms))
     return x, y
 

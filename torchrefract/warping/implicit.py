@@ -5,7 +5,7 @@ solver, so solvers run without gradient, and `implicit` attaches the derivative 
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -53,7 +53,7 @@ class _Implicit(torch.autograd.Function):
         def error(*inputs: Tensor) -> tuple[Solution, Jacobian | Slope]:
             return ctx.equation(*solution, *inputs)
 
-        _, pull_back, jacobian = torch.func.vjp(error, *inputs, has_aux=True)
+        _, pull_back, jacobian = cast(Any, torch.func.vjp(error, *inputs, has_aux=True))
         weights = _solve(jacobian, gradient, is_transposed=True)
         return None, None, *[None] * ctx.count, *(-value for value in pull_back(weights))
 
@@ -79,13 +79,14 @@ class _Implicit(torch.autograd.Function):
             return tuple(-value for value in _solve(jacobian, push_forward(tuple(moved))))
 
     @staticmethod
-    def vmap(info: Any, in_dims: Any, equation: Equation, count: int, *values: Tensor) -> Any:
+    def vmap(info: Any, in_dims: Any, *arguments: Any) -> Any:
+        equation, count, *values = arguments
         dims = [dim if i >= count or dim is not None else 0 for i, dim in enumerate(in_dims[2:])]
-        values = tuple(
+        values = [
             value.expand(info.batch_size, *value.shape) if in_dims[2 + i] is None and i < count else value
             for i, value in enumerate(values)
-        )
-        values = tuple(value if dim is None else value.movedim(dim, 0) for value, dim in zip(values, dims, strict=True))
+        ]
+        values = [value if dim is None else value.movedim(dim, 0) for value, dim in zip(values, dims, strict=True)]
         batched = torch.func.vmap(equation, in_dims=tuple(None if dim is None else 0 for dim in dims))
         return _Implicit.apply(batched, count, *values), (0,) * count
 

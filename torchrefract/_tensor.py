@@ -90,7 +90,7 @@ def cat_bands(bands: Iterable[Tensor], *, dim: int, length: int) -> Tensor:
     first = next(iterator)
     if first.shape[dim] == length:
         return first
-    if first.requires_grad and torch.is_grad_enabled():
+    if torch._C._are_functorch_transforms_active() or (first.requires_grad and torch.is_grad_enabled()):
         return torch.cat([first, *iterator], dim=dim)
     shape = list(first.shape)
     shape[dim] = length
@@ -135,7 +135,9 @@ def is_channels_last(image: Tensor) -> bool:
 
 
 def has_memory_format(image: Tensor) -> bool:
-    """Return False inside `torch.vmap`, where a sample has no memory format."""
+    """Return False inside of torch.func, where samples and tangents of a batch have no memory format."""
+    if torch._C._are_functorch_transforms_active():
+        return False
     try:
         image.is_contiguous(memory_format=torch.channels_last)
     except RuntimeError:

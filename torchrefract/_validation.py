@@ -170,21 +170,34 @@ def finite_or(value: Tensor, default: float) -> Tensor:
 
 
 def requires_grad(values: Iterable[Any]) -> bool:
-    """Return True if gradients are enabled and one of the values, tensors or objects alike, requires one."""
-    return torch.is_grad_enabled() and any([value.requires_grad for value in values])  # a list takes less time
+    """Return True if a derivative with respect to one of the tensors may be asked for, in reverse or forward mode.
+
+    Inside torch.func it is always True, since a tensor does not show the transforms outside of the innermost one.
+    """
+    if torch._C._are_functorch_transforms_active():
+        return True
+    values = list(values)
+    if torch.is_grad_enabled() and any([value.requires_grad for value in values]):  # a list takes less time
+        return True
+    return any([isinstance(value, Tensor) and _has_tangent(value) for value in values])
+
+
+def _has_tangent(value: Tensor) -> bool:
+    return forward_ad.unpack_dual(value).tangent is not None
 
 
 def why_not_eager(value: Tensor) -> str | None:
     """Say why the memory of a tensor cannot be read outside of PyTorch; None if it can."""
-    if torch.compiler.is_compiling():
-        return "under torch.compile"
-    if torch.jit.is_tracing():
-        return "under torch.jit.trace"
+    if torch.compiler.is_compiling() or torch.jit.is_tracing():
+        return "under torch.compile" if torch.compiler.is_compiling() else "under torch.jit.trace"
     if value.device.type != "cpu":
         return f"on {value.device.type}"
-    if forward_ad.unpack_dual(value).tangent is not None:
+    is_in_func = torch._C._are_functorch_transforms_active()
+    if not is_in_func and _has_tangent(value):
         return "with forward-mode gradients"
-    return None if _has_memory(value) else "inside torch.func, or without memory as a FakeTensor"
+    if not _has_memory(value):
+        return "without memory of its own, as a FakeTensor"
+    return "inside torch.func" if is_in_func else None
 
 
 def _has_memory(value: Tensor) -> bool:

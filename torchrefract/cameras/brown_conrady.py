@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._validation import eager_bool, eager_values
+from torchrefract._validation import eager_bool, eager_values, requires_grad
 from torchrefract.cameras.radial import RADIAL, RadialLimit, factor_and_slope, newton_radius, radial_factor
 from torchrefract.warping.flow import Jacobian
 
@@ -49,7 +49,7 @@ def used_terms(coefficients: Tensor) -> Terms:
 
     Returns all terms if the coefficients (B, 12) require a gradient, or if reading them would wait for a device.
     """
-    values = None if coefficients.requires_grad else eager_values(lambda: coefficients)
+    values = None if requires_grad((coefficients,)) else eager_values(lambda: coefficients)
     if values is None:
         return ALL_TERMS
     is_used = [any(column) for column in zip(*values, strict=True)]
@@ -191,15 +191,6 @@ def converge(iterates: Iterator[Point]) -> Point:
         if eager_bool((step <= _SMALL_STEP[step.dtype]).all, of=step):
             break
     return x, y
-
-
-def implicit(point: Point, error: Point, jacobian: Jacobian) -> Point:
-    """Attach the gradient of the exact inverse to a solved point, by one Newton step of length zero.
-
-    The error is distort(point) minus the target, with gradient; point and Jacobian have none.
-    """
-    step_x, step_y = jacobian.solve(error[0] - error[0].detach(), error[1] - error[1].detach())
-    return point[0] - step_x, point[1] - step_y
 
 
 def _split(values: Sequence) -> tuple[Sequence, Sequence, Sequence]:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchrefract.cameras.brown_conrady import MAX_RESIDUAL
 from torchrefract.cameras.radial import first_root, growth, invert_radius, radial_factor
+from torchrefract.warping.implicit import Slope, Solution, implicit
 
 _AXIS = 1e-14  # squared sine of the angle to the axis below which a fisheye is computed as a pinhole
 
@@ -51,14 +52,12 @@ def fisheye_ray(
     target = torch.where(off_axis, theta_d, 0.0)
     with torch.no_grad():
         fixed = [value.detach() for value in k]
-        theta = invert_radius(target, max_angle, fixed)
-        slope = radial_factor(theta * theta, growth(fixed)).clamp(min=torch.finfo(theta.dtype).eps)
+        theta = invert_radius(target.detach(), max_angle, fixed)
         residual = (_distort_angle(theta, fixed) - theta_d).abs()
         valid = ~off_axis | (residual <= MAX_RESIDUAL[theta.dtype] * (1 + theta_d))
-    error = _distort_angle(theta, k) - target
-    theta = theta - (error - error.detach()) / slope  # a step of length zero, with the gradient of the exact inverse
+    (theta,) = implicit((theta,), (target, *k), _angle_error)
     scale = torch.where(off_axis, theta.sin() / theta_d, 1.0)
-    return (scale * x_d, scale * y_d, torch.where(off_axis, theta.cos(), 1.0)), valid
+    return (scale * x_d, scale * y_d, torch.where(off_axis, theta.cos(), 1 - (x_d * x_d + y_d * y_d) / 2)), valid
 
 
 def fisheye_angle(k: Tensor) -> Tensor:
@@ -69,3 +68,7 @@ def fisheye_angle(k: Tensor) -> Tensor:
 
 def _distort_angle(theta: Tensor, k: Sequence[Tensor]) -> Tensor:
     return theta * radial_factor(theta * theta, k)
+
+
+def _angle_error(theta: Tensor, target: Tensor, *k: Tensor) -> tuple[Solution, Slope]:
+    return (_distort_angle(theta, k) - target,), Slope(radial_factor(theta * theta, growth(k)))

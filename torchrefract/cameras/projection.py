@@ -8,13 +8,14 @@ before distortion; for a fisheye it is an angle in rad.
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrefract._validation import check_choice, check_tensor, check_values
-from torchrefract.cameras.brown_conrady import POLYNOMIAL12, implicit
+from torchrefract.cameras.brown_conrady import POLYNOMIAL12, Point
 from torchrefract.cameras.fisheye import fisheye_angle, fisheye_image, fisheye_ray
 from torchrefract.cameras.radial import (
     distort_division,
@@ -25,6 +26,8 @@ from torchrefract.cameras.radial import (
     undistort_division,
 )
 from torchrefract.cameras.rational import OPENCV14, OPENCV_COUNTS, RationalLens
+from torchrefract.warping.flow import Jacobian
+from torchrefract.warping.implicit import implicit
 
 # Names of the coefficients of each model, and how many of them a camera may have.
 COEFFICIENTS = {
@@ -203,10 +206,13 @@ def ray_of(
         fixed = RationalLens.of([value.detach() for value in c], model)
         x, y, exists = fixed.undistort(x_d.detach(), y_d.detach(), radius)
         x, y = torch.where(exists, x, 0.0), torch.where(exists, y, 0.0)
-        jacobian = fixed.distort(x, y)[1]
-    back_x, back_y = RationalLens.of(c, model).distort(x, y)[0]
-    x, y = implicit((x, y), (back_x - x_d, back_y - y_d), jacobian)
+    x, y = implicit((x, y), (x_d, y_d, *c), partial(_distortion_error, model=model))
     return (x, y, torch.ones_like(x)), exists
+
+
+def _distortion_error(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, *c: Tensor, model: str) -> tuple[Point, Jacobian]:
+    (back_x, back_y), jacobian = RationalLens.of(c, model).distort(x, y)
+    return (back_x - x_d, back_y - y_d), jacobian
 
 
 def on_plane(ray: tuple[Tensor, Tensor, Tensor], valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -275,4 +281,4 @@ def _residual(ray: Sequence[Tensor], points: Tensor, lens: tuple[Any, str, Tenso
         x, y, z = ray
         x_d, y_d, _ = image_of(x, y, z, *lens)
         error = torch.stack([x_d, y_d], dim=-1) - points
-        return (error * scale).square().sum(dim=-1).sqrt()
+        return (error * scale).detach().square().sum(dim=-1).sqrt()

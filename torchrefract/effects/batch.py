@@ -266,7 +266,7 @@ class _SwapGradient(torch.autograd.Function):
 
     @staticmethod
     def forward(value: Tensor, differentiable: Tensor) -> Tensor:
-        return value.view_as(value)
+        return value.clone()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
@@ -275,6 +275,14 @@ class _SwapGradient(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]  # two inputs, two gradients
         return None, gradient
+
+
+class _SwapGradientForward(_SwapGradient):
+    """Add the forward mode, which torch.compile does not trace."""
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, tangent: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]  # two inputs, two tangents
+        return tangent
 
 
 def where_active(changed: Tensor, unchanged: Tensor | float, active: Tensor, params: Any) -> Tensor:
@@ -297,4 +305,5 @@ def where_active(changed: Tensor, unchanged: Tensor | float, active: Tensor, par
     if not requires_grad(value for value in params if isinstance(value, Tensor)):
         return value
     differentiable = torch.where(expand_batch(params.applied, rows).view(shape), changed, unchanged)
-    return cast(Tensor, _SwapGradient.apply(value.detach(), differentiable))
+    swap = _SwapGradient if torch.compiler.is_compiling() else _SwapGradientForward
+    return cast(Tensor, swap.apply(value.detach(), differentiable))

@@ -315,7 +315,7 @@ class BatchFlow:
             options: all decided.
         """
         chosen = options._asdict()
-        if requires_grad(part.flow for part in self.parts):
+        if requires_grad(part.flow.nodes for part in self.parts):
             # Samples that do not move need the gradient of their parameters.
             return where_active(self._sample(image, None, chosen), image, active, params)
         return self._sample(image, None if eager_bool(active.all, of=active) else active, chosen)
@@ -334,7 +334,8 @@ class BatchFlow:
             part = sample_image(
                 image[rows], flow.with_nodes(nodes), active=None if active is None else active[rows], **options
             )
-            result.index_copy_(0, rows, part)
+            # Forward-mode gradients cannot be written into a tensor without any.
+            result = (result.index_copy if requires_grad((part,)) else result.index_copy_)(0, rows, part)
         return result
 
     def _gather(self, values: Sequence[Tensor]) -> Tensor:

@@ -9,7 +9,15 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor
-from torchrefract._validation import check_flag, check_range, check_values, check_within, eager_bool, eager_values
+from torchrefract._validation import (
+    check_flag,
+    check_range,
+    check_values,
+    check_within,
+    eager_bool,
+    eager_values,
+    requires_grad,
+)
 from torchrefract.cameras.brown_conrady import ALL_TERMS, POLYNOMIAL12
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import params_to
@@ -205,7 +213,7 @@ class LensDistortion(WarpEffect):
         height, width = points.lattice.height, points.lattice.width
         lens = lens_in_px(params, height, width)
         if plan.details is not None:
-            terms = ALL_TERMS if params.coefficients.requires_grad else plan.details.terms
+            terms = ALL_TERMS if requires_grad((params.coefficients,)) else plan.details.terms
             num_steps = plan.details.steps_for(points.lattice.stride)
             flow = newton_lens_flow(*lens, points, num_steps=num_steps, terms=terms)
             return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=flow.device)

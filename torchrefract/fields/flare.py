@@ -4,6 +4,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchrefract._validation import requires_grad
+
 _MIN_RADIUS = 1e-6  # px
 
 
@@ -40,7 +42,7 @@ def add_light(image: Tensor, along_x: Tensor, along_y: Tensor, *, clip: bool) ->
     result = torch.addcmul(image, along_y, along_x)
     if not clip:
         return result
-    if result.requires_grad or torch.compiler.is_compiling():
+    if requires_grad((result,)) or torch.compiler.is_compiling():
         return result.clamp(0, 1)
     return F.hardtanh(result, 0.0, 1.0, inplace=True)  # a clamp in place that torch.vmap supports
 

@@ -1,21 +1,25 @@
 """The flow of a lens, and the flow that undoes it."""
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import eager_bool, requires_grad
 from torchrefract.cameras.brown_conrady import (
+    Point,
     Terms,
     distort_polynomial,
     distort_with_jacobian,
-    implicit,
     newton_undistort,
     undistort_polynomial,
     used_terms,
 )
 from torchrefract.cameras.radial import RadialLimit, radial_limit
+from torchrefract.warping.flow import Jacobian
 from torchrefract.warping.grid import Points
+from torchrefract.warping.implicit import implicit
 
 # Preimages are searched up to this many half-diagonals of the frame from the center.
 REACH = 4.0
@@ -140,10 +144,15 @@ def _replace_missing(x: Tensor, y: Tensor, exists: Tensor) -> tuple[Tensor, Tens
 
 def _with_gradient(x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, c: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:
     """Attach the gradient of the exact inverse to a solution (x, y)."""
-    with torch.no_grad():
-        jacobian = distort_with_jacobian(x, y, c, terms)[1]
-    reached_x, reached_y = distort_polynomial(x, y, c, terms)
-    return implicit((x, y), (reached_x - x_d, reached_y - y_d), jacobian)
+    x, y = implicit((x, y), (x_d, y_d, c), partial(_distortion_error, terms=terms))
+    return x, y
+
+
+def _distortion_error(
+    x: Tensor, y: Tensor, x_d: Tensor, y_d: Tensor, c: Tensor, *, terms: Terms
+) -> tuple[Point, Jacobian]:
+    (reached_x, reached_y), jacobian = distort_with_jacobian(x, y, c, terms)
+    return (reached_x - x_d, reached_y - y_d), jacobian
 
 
 def _to_flow(u: Tensor, v: Tensor, exists: Tensor, x: Tensor, y: Tensor, focal: Tensor) -> Tensor:

@@ -13,10 +13,10 @@ from torchrefract.labels.points import (
     frame_bounds,
     in_frame,
     pixel_subset,
-    sample_linear,
     solve_points,
 )
 from torchrefract.warping.grid import field_dtype
+from torchrefract.warping.implicit import sample_linear
 
 # Probes along each side of the frame: they find the part of a box whose outline the frame does not show.
 _NUM_PROBES = 49

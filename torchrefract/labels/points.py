@@ -5,17 +5,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._validation import check_count, check_flow, check_positive, check_tensor
+from torchrefract._validation import check_count, check_flow, check_positive, check_tensor, requires_grad
 from torchrefract.warping.flow import Jacobian
 from torchrefract.warping.grid import field_dtype
+from torchrefract.warping.implicit import LinearSample, implicit, sample_linear
 
 # Smooth flows converge in 6 Newton steps; flows that nearly fold gain little beyond 16.
 STEPS = 16
 TOLERANCE_PX = 0.01
 # Nodes along each side of the lattice from which the search starts.
 _NUM_NODES = 17
-# Outside the frame the flow continues along its secant over this many border pixels: the slope of one pixel is noise.
-_SECANT_PX = 16
 # Larger coordinates count as invalid; the square of this still fits into float32.
 _LARGEST_PX = 1e7
 # Rounding error of float32 coordinates, px.
@@ -73,14 +72,6 @@ class PointSolution(NamedTuple):
     upright: Tensor  # (B, N), bool: the local orientation is that of most of the frame
 
 
-class LinearSample(NamedTuple):
-    """Bilinear samples of a map and their derivatives, each (B, C, N)."""
-
-    value: Tensor
-    slope_x: Tensor
-    slope_y: Tensor
-
-
 def solve_points(points: Tensor, flow: Tensor, steps: int, tolerance_px: float) -> PointSolution:
     """Solve q + flow(q) = p for points (B, N, 2) and a flow (B or 1, 2, H, W), without checks."""
     dtype = field_dtype(torch.promote_types(points.dtype, flow.dtype))
@@ -95,10 +86,10 @@ def solve_points(points: Tensor, flow: Tensor, steps: int, tolerance_px: float) 
         q, error, sample = _newton(table, p.detach(), _clamp(shifted, flow), node, steps)
         # A point is invalid if its bilinear sample touches an invalid pixel of the flow.
         converged = (_squared_norm(error) <= tolerance_px**2) & (sample.value[:, 2:] > 0.999) & usable
-        upright = _jacobian(sample).determinant * orientation > 0
-    if torch.is_grad_enabled() and (p.requires_grad or flow.requires_grad):
-        error = sample_linear(flow, q).value - p
-        q = q - _newton_step(sample, error - error.detach())
+        upright = sample.jacobian.determinant * orientation > 0
+    if requires_grad((p, flow)):
+        # A point without a solution keeps the best attempt, which has no derivative.
+        q = torch.where(converged, torch.cat(implicit(q.split(1, dim=1), (p, flow), _error), dim=1), q)
     return PointSolution(q.movedim(1, -1), converged[:, 0], upright[:, 0])
 
 
@@ -124,31 +115,6 @@ def _merit(error: Tensor, sample: LinearSample) -> Tensor:
     """Return the squared residual; invalid flow, which is stored as zero, is worse than any residual."""
     squared = _squared_norm(error)
     return torch.where(sample.value[:, 2:] > 0.999, squared, squared + 4 * _LARGEST_PX**2)
-
-
-def sample_linear(table: Tensor, points: Tensor) -> LinearSample:
-    """Sample a map (B, C, H, W) bilinearly at the points (B, 2, N)."""
-    height, width = table.shape[2:]
-    left, right, span_x = _interval(points[:, :1], width)
-    top, bottom, span_y = _interval(points[:, 1:], height)
-    tx, ty = (points[:, :1] - left) / span_x, (points[:, 1:] - top) / span_y
-    flat = table.flatten(2)
-    a, b, c, d = (
-        flat.gather(2, (row * width + column).expand(-1, table.shape[1], -1))
-        for row in (top, bottom)
-        for column in (left, right)
-    )
-    upper, lower = a + tx * (b - a), c + tx * (d - c)
-    value = upper + ty * (lower - upper)
-    return LinearSample(value, ((b - a) + ty * ((d - c) - (b - a))) / span_x, (lower - upper) / span_y)
-
-
-def _interval(position: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the pixels on both sides and their distance; outside the frame, those of the secant at its border."""
-    outside = (position < 0) | (position > size - 1)
-    span = torch.where(outside, min(_SECANT_PX, max(size - 1, 1)), 1)
-    low = torch.minimum(position.floor().long().clamp(min=0), size - 1 - span).clamp(min=0)
-    return low, (low + span).clamp(max=size - 1), span
 
 
 def _nearest_node(table: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
@@ -207,19 +173,20 @@ def _clamp(points: Tensor, flow: Tensor) -> Tensor:
     return points.clamp(-reach, reach)
 
 
+def _error(x: Tensor, y: Tensor, p: Tensor, flow: Tensor) -> tuple[tuple[Tensor, Tensor], Jacobian]:
+    q = torch.cat([x, y], dim=1)
+    sample = sample_linear(flow, q)
+    u, v = (q + sample.value - p).split(1, dim=1)
+    return (u, v), sample.jacobian
+
+
 def _squared_norm(vector: Tensor) -> Tensor:
     return vector[:, :1].square() + vector[:, 1:2].square()
 
 
-def _jacobian(sample: LinearSample) -> Jacobian:
-    """Return I + slopes, entries (B, 1, N)."""
-    x, y = sample.slope_x, sample.slope_y
-    return Jacobian(1 + x[:, :1], y[:, :1], x[:, 1:2], 1 + y[:, 1:2])
-
-
 def _newton_step(sample: LinearSample, error: Tensor) -> Tensor:
     """Return (I + slopes)^-1 error in closed form."""
-    jacobian = _jacobian(sample)
+    jacobian = sample.jacobian
     (xx, xy, yx, yy), determinant = jacobian, jacobian.determinant
     # Near a fold the step length is meaningless: bound it, and let the residual decide.
     determinant = torch.where(determinant >= 0, determinant.clamp(min=1e-3), determinant.clamp(max=-1e-3))

@@ -4,12 +4,14 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import rows_at_once
-from torchrefract._validation import check_count, check_flow, check_positive, eager_bool, eager_values
+from torchrefract._validation import check_count, check_flow, check_positive, eager_bool, eager_values, requires_grad
 from torchrefract.ops.sampling import grid_sample, sample, sampling_dtype
+from torchrefract.warping.flow import Jacobian
 from torchrefract.warping.grid import field_dtype, inside, pixel_axes
+from torchrefract.warping.implicit import implicit, sample_linear
 
 # Px: a pixel with a smaller residual takes no further step.
-_SOLVED_PX = {torch.float32: 1e-3, torch.float64: 1e-9}
+_SOLVED_PX = {torch.float32: 1e-3, torch.float64: 1e-11}
 # Px: flow beyond it is invalid; its square is still finite.
 _LARGEST_FLOW = 1e12
 # Pixels of a smaller Jacobian determinant are near a fold, and their first steps ignore the gradient of the flow.
@@ -27,13 +29,13 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
         inverse <- inverse - (I + grad flow)^-1 (inverse + flow),  flow sampled at p + inverse
 
     The first steps, up to 4, use the gradient of the flow at p, the later ones that at p + inverse. The flow is sampled
-    bilinearly, its gradient are central differences. The gradient with respect to `flow` is that of one Newton step at
-    the solution (implicit function theorem).
+    bilinearly, its gradient are central differences. Derivatives with respect to `flow`, of any order and in
+    any mode, are those of the exact inverse (implicit function theorem); pixels that are not solved have none.
 
     Args:
         flow: (B, 2, H, W), px.
         steps: largest number of Newton steps after the first one, at least 1. A pixel takes no further step once its
-            residual is within 1e-3 px (1e-9 px in float64).
+            residual is within 1e-3 px (1e-11 px in float64).
         tolerance_px: largest residual of a valid pixel, px.
 
     Returns:
@@ -66,12 +68,11 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
         if has_holes:
             # The inverse is unknown where it samples a hole of the flow.
             valid = valid & is_finite & (_sample(is_finite.to(flow.dtype), solution) > 0.999)
-    if not (flow.requires_grad and torch.is_grad_enabled()):
-        return solution, valid, residual
-    moved = _sample(flow, solution)
-    gradient = _cell_gradient(flow.detach(), solution)
-    matrix = _inverse_jacobian(gradient, _determinant(gradient))
-    return _newton_step(solution, moved - moved.detach(), matrix), valid, residual
+    if requires_grad((flow,)):
+        # A pixel without a solution keeps the last iterate, which has no derivative.
+        inverse = torch.cat(implicit(solution.split(1, dim=1), (flow,), _error), dim=1)
+        solution = torch.where(residual <= tolerance_px, inverse, solution)
+    return solution, valid, residual
 
 
 def _solve(flow: Tensor, steps: int, *, is_eager: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -209,18 +210,19 @@ def _gradient(flow: Tensor) -> Tensor:
     return torch.cat(differences, dim=1)
 
 
-def _cell_gradient(flow: Tensor, at: Tensor) -> Tensor:
-    """Return the gradient of the bilinear interpolant itself at p + at(p), (B, 4, H, W)."""
+def _error(u: Tensor, v: Tensor, flow: Tensor) -> tuple[tuple[Tensor, Tensor], Jacobian]:
+    """Return inverse + flow(p + inverse) of the inverse (u, v), and its derivatives with respect to u and v."""
     height, width = flow.shape[2:]
     axes = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
-    differences = []
-    for channel, axis in enumerate(axes):
-        low = at.clone()
-        low[:, channel : channel + 1] = (axis + at[:, channel : channel + 1]).floor() - axis
-        high = low.clone()
-        high[:, channel] += 1
-        differences.append(_sample(flow, high) - _sample(flow, low))
-    return torch.cat(differences, dim=1)
+    points = torch.cat([axes[0] + u, axes[1] + v], dim=1).flatten(2)
+    size = points.new_tensor([[width - 1], [height - 1]])
+    inner = points.maximum(torch.zeros_like(size)).minimum(size)
+    sample = sample_linear(flow, inner)
+    # Beyond the border the flow is constant.
+    is_inner_x, is_inner_y = (inner == points).split(1, dim=1)
+    sample = sample._replace(slope_x=sample.slope_x * is_inner_x, slope_y=sample.slope_y * is_inner_y)
+    moved_u, moved_v = sample.value.unflatten(2, (height, width)).split(1, dim=1)
+    return (u + moved_u, v + moved_v), Jacobian(*(value.view_as(u) for value in sample.jacobian))
 
 
 def _sample_at(field: Tensor, x: Tensor, y: Tensor, shift: Tensor) -> Tensor:

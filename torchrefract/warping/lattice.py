@@ -64,11 +64,6 @@ class LatticeFlow:
         """Return the type of the nodes."""
         return self.nodes.dtype
 
-    @property
-    def requires_grad(self) -> bool:
-        """Return True if the nodes require a gradient."""
-        return self.nodes.requires_grad
-
     def detach(self) -> "LatticeFlow":
         """Return the flow without its gradient."""
         return self.with_nodes(self.nodes.detach())

@@ -41,7 +41,7 @@ def test_a_covariance_is_read_back_and_varies_a_lens(ending, tmp_path, make_came
     assert np.array_equal(covariance, root @ root.T)
     assert io.read_opencv(path) == camera
     effect = LensDistortion.from_camera(io.read_opencv(path), covariance=covariance)
-    drawn = effect.sample(2, 48, 64, seed=0).coefficients
+    drawn = effect.sample(torch.zeros(2, 3, 48, 64), seed=0).coefficients
     assert not torch.equal(drawn[0], drawn[1])
     io.write_opencv(path, camera)
     assert io.read_covariance(path) is None

@@ -183,7 +183,7 @@ def _report(calibration: Calibration) -> str:
 
 
 def corner_deviations(fit: Fit) -> np.ndarray:
-    """Return the standard deviations of the rectified position in the four corners, px, row by row; NaN without a ray."""
+    """Return the standard deviations of the rectified position in the four corners, px; NaN without a ray."""
     right, bottom = fit.camera.width - 1.0, fit.camera.height - 1.0
     pixels = np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
     return rectified_deviation(fit.camera, fit.covariance, pixels)

@@ -36,8 +36,8 @@ def rectified_deviation(camera: Camera, covariance: np.ndarray, pixels: np.ndarr
     for axis in (axes * np.sqrt(values.clip(min=0))).T:
         if not axis.any():
             continue
-        (ahead, _), (behind, _) = (_rectify(with_values(camera, start + s * _STEP * axis), pixels) for s in (1, -1))
-        variance += (((ahead - behind) / (2 * _STEP)) ** 2).sum(axis=1)
+        (ahead, _), (before, _) = (_rectify(with_values(camera, start + s * _STEP * axis), pixels) for s in (1, -1))
+        variance += (((ahead - before) / (2 * _STEP)) ** 2).sum(axis=1)
     return np.where(is_shown, np.sqrt(variance), np.nan)
 
 
@@ -59,7 +59,8 @@ class Crop(NamedTuple):
     def of(self, pixels: np.ndarray, frame_width: int) -> np.ndarray:
         """Return this part of a frame (H, W, ...) in any resolution; its sides are even, which videos need."""
         scale = pixels.shape[1] / frame_width
-        left, top, width, height = (round(value * scale / 2) * 2 for value in self)
+        left, top = round(self.left * scale), round(self.top * scale)
+        width, height = (int(side * scale) // 2 * 2 for side in (self.width, self.height))
         return pixels[top : top + height, left : left + width]
 
 

@@ -201,7 +201,7 @@ def test_edge_rays_of_real_pictures_are_near_the_published_camera(name, marker_m
 
 def test_real_pictures_give_the_camera_of_opencv(call, shared_data, tmp_path):
     folder = shared_data / "charuco" / "opencv_tutorial"
-    options = ("squares=5x7", "marker_mm=10", "dictionary=DICT_6X6_250", "out=out")
+    options = ("squares=5x7", "marker_mm=11", "dictionary=DICT_6X6_250", "lens_model=opencv5", "out=out")
     assert call("calibrate", f"images={folder}", *options).code == 0
     reference = json.loads((folder.parent / "reference.json").read_text())["opencv_tutorial"]
     camera = read_opencv(tmp_path / "out" / "camera.yaml")

@@ -12,7 +12,7 @@ from PIL import Image
 from torchrefract.cameras.calibration.boards import Charuco
 from torchrefract.cameras.calibration.synthetic import CAMERA, render_views
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io import read_opencv
+from torchrefract.cameras.io import read_covariance, read_opencv
 from torchrefract.cli import calibration
 
 SMALL = Camera(width=640, height=400, fx=380.0, fy=381.0, cx=322.3, cy=196.6, coefficients=(-0.25, 0.08, 0.003, -0.002))
@@ -58,7 +58,20 @@ def test_the_camera_of_rendered_pictures_is_recovered(call, tmp_path, monkeypatc
     assert (camera.width, camera.height, camera.model) == (CAMERA.width, CAMERA.height, "opencv")
     assert "14 views of 14 pictures" in read_report(tmp_path)
     written = {path.name for path in (tmp_path / "calibration").iterdir()}
-    assert written == {"camera.yaml", "report.md", "coverage.png", "residuals.png", "detections.jsonl", "rendered"}
+    assert written == {
+        "camera.yaml",
+        "report.md",
+        "coverage.png",
+        "residuals.png",
+        "uncertainty.png",
+        "detections.jsonl",
+        "rendered",
+    }
+
+
+def test_markers_of_another_size_than_stated_are_an_error(call, pictures):
+    message = call("calibrate", *OPTIONS, "marker_mm=12").message
+    assert re.match(r"marker_mm must be the side of the markers, about (19|20)\S* mm in the pictures", message)
 
 
 def test_unusable_pictures_are_reported_with_a_reason(call, pictures, tmp_path, monkeypatch):
@@ -173,7 +186,7 @@ def test_pictures_of_many_sizes_are_rejected(call, pictures):
     [
         (("images=none",), "images must be an existing folder of pictures, got none"),
         (("images=.",), "images must be a folder that holds .jpg, .jpeg, .png, .webp, .bmp, got ."),
-        (("lens_model=opencv7",), "lens_model: lens_model must be one of opencv4, opencv5, .*, fisheye, got 'opencv7'"),
+        (("lens_model=opencv7",), "lens_model: lens_model must be one of auto, opencv0, .*, fisheye, got 'opencv7'"),
         (("drop_share=2",), "drop_share: drop_share must be a number in .*, got 2"),
         (("dictionary=DICT",), "board: dictionary must be one of DICT_.*, got 'DICT'"),
         (
@@ -186,9 +199,28 @@ def test_invalid_options_are_one_line_of_error(call, options, message):
     assert re.search(message, call("calibrate", *options).message)
 
 
+@pytest.mark.parametrize(("name", "marker_mm"), [("caliscope_cam0", 40.5), ("caliscope_cam1", 40.5)])
+def test_edge_rays_of_real_pictures_are_near_the_published_camera(name, marker_mm, call, shared_data, tmp_path):
+    board = ("squares=4x5", "square_mm=54", f"marker_mm={marker_mm}", "dictionary=DICT_4X4_1000")
+    folder = shared_data / "charuco" / name
+    assert call("calibrate", f"images={folder}", *board, "out=out").code == 0
+    camera = read_opencv(tmp_path / "out" / "camera.yaml")
+    numbers = json.loads((folder.parent / "reference.json").read_text())[name]["published"]
+    pinhole = {key: numbers[key] for key in ("fx", "fy", "cx", "cy")}
+    published = Camera(width=1280, height=720, **pinhole, coefficients=tuple(numbers["dist_k1k2p1p2k3"]))
+    grid = published.grid(17)
+    pixels = camera.project(published.unproject(grid).points)
+    assert pixels.valid.all()
+    assert (pixels.points - grid).norm(dim=1).max() < 100
+    assert camera.coverage() == 1
+    covariance = read_covariance(tmp_path / "out" / "camera.yaml")
+    assert covariance is not None
+    assert covariance.shape == (4 + len(camera.coefficients),) * 2
+
+
 def test_real_pictures_give_the_camera_of_opencv(call, shared_data, tmp_path):
     folder = shared_data / "charuco" / "opencv_tutorial"
-    options = ("squares=5x7", "marker_mm=10", "dictionary=DICT_6X6_250", "out=out")
+    options = ("squares=5x7", "marker_mm=11", "dictionary=DICT_6X6_250", "lens_model=opencv5", "out=out")
     assert call("calibrate", f"images={folder}", *options).code == 0
     reference = json.loads((folder.parent / "reference.json").read_text())["opencv_tutorial"]
     camera = read_opencv(tmp_path / "out" / "camera.yaml")

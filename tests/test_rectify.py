@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import cv2
@@ -52,6 +53,27 @@ def test_the_flow_matches_the_maps_of_opencv(name, zoom, oracle):
     assert exists.all()
     assert (pinhole.fx, pinhole.fy) == (zoom * 70.0, zoom * 71.0)
     assert (pinhole.cx, pinhole.cy, pinhole.coefficients) == (46.2, 33.1, (0.0,) * 4)
+
+
+def test_an_uncertain_camera_is_warned_of_and_crop_keeps_the_certain_part(call, folder):
+    covariance = np.diag([0.0] * 4 + [0.3**2, 0.0, 0.0, 0.0])
+    write_opencv(folder / "cam.yaml", CAMERAS["opencv"], covariance=covariance)
+    outcome = call("rectify", "input=raw", "camera=cam.yaml")
+    match = re.search(r"up to (\d+\.\d) px; in the middle (\d+) x (\d+) px it is at most 2 px", outcome.err)
+    assert match is not None
+    assert float(match[1]) > 2
+    assert call("rectify", "input=raw", "camera=cam.yaml", "crop=true", "out=cropped").err == ""
+    picture = cv2.imread(str(folder / "cropped" / "0.png"))
+    assert picture.shape == (int(match[3]), int(match[2]), 3)
+    left, top = (96 - int(match[2])) // 2, (64 - int(match[3])) // 2
+    expected = cv2.imread(str(folder / "rectified" / "0.png"))[top:, left:][: picture.shape[0], : picture.shape[1]]
+    np.testing.assert_array_equal(picture, expected)
+    assert read_opencv(folder / "cropped" / "camera.yaml").cx == 46.2 - left
+
+
+def test_crop_needs_a_covariance(call, folder):
+    message = call("rectify", "input=raw", "camera=cam.yaml", "crop=true").message
+    assert message == "crop must be false for a camera file without a covariance, got true with cam.yaml"
 
 
 @pytest.mark.parametrize("name", ["opencv", "fisheye"])

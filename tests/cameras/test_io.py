@@ -1,9 +1,10 @@
 import cv2
 import numpy as np
 import pytest
+import torch
 import yaml
 
-from torchrefract import Camera
+from torchrefract import Camera, LensDistortion
 from torchrefract.cameras import io
 
 VECTORS = {
@@ -29,6 +30,23 @@ def test_written_files_are_read_back_and_by_opencv(name, ending, tmp_path, make_
     assert np.array_equal(storage.getNode("camera_matrix").mat(), np.array(camera.matrix))
     assert np.array_equal(storage.getNode("distortion_coefficients").mat().ravel(), camera.coefficients)
     storage.release()
+
+
+@pytest.mark.parametrize("ending", [".yml", ".xml"])
+def test_a_covariance_is_read_back_and_varies_a_lens(ending, tmp_path, make_camera):
+    camera, path = make_camera(*VECTORS["4"]), tmp_path / f"camera{ending}"
+    root = np.tril(np.linspace(-1, 1, 64).reshape(8, 8)) * 1e-3
+    io.write_opencv(path, camera, covariance=root @ root.T)
+    covariance = io.read_covariance(path)
+    assert np.array_equal(covariance, root @ root.T)
+    assert io.read_opencv(path) == camera
+    effect = LensDistortion.from_camera(io.read_opencv(path), covariance=covariance)
+    drawn = effect.sample(torch.zeros(2, 3, 48, 64), seed=0).coefficients
+    assert not torch.equal(drawn[0], drawn[1])
+    io.write_opencv(path, camera)
+    assert io.read_covariance(path) is None
+    with pytest.raises(ValueError, match=r"covariance must have shape \(8, 8\), got \(9, 9\)"):
+        io.write_opencv(path, camera, covariance=np.eye(9))
 
 
 @pytest.mark.parametrize("ending", [".yaml", ".xml"])

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
+
 from torchrefract._io import replace_file
 from torchrefract.cameras.camera import Camera
 
@@ -43,33 +45,53 @@ def read_opencv(path: str | Path) -> Camera:
     Args:
         path: ending in .xml, .yml or .yaml.
     """
-    path = Path(path)
+    document = _read_storage(Path(path))
+    is_fisheye = "fisheye_model" in document.values and document.integers("fisheye_model") != [0]
+    return document.camera("fisheye" if is_fisheye else "opencv")
+
+
+def read_covariance(path: str | Path) -> np.ndarray | None:
+    """Read the covariance (4 + n, 4 + n) of fx, fy, cx, cy and n coefficients from a file of `write_opencv`.
+
+    Returns None if the file has none. `LensDistortion.from_camera` takes the result.
+    """
+    document = _read_storage(Path(path))
+    if "covariance" not in document.values:
+        return None
+    size = 4 + len(document.numbers("distortion_coefficients", is_matrix=True))
+    return np.array(document.numbers("covariance", count=size * size, is_matrix=True)).reshape(size, size)
+
+
+def _read_storage(path: Path) -> "_Document":
     if _is_xml(path):
         try:
             root = ElementTree.fromstring(_read(path))
         except ElementTree.ParseError as error:
             raise ValueError(f"path must hold XML, got {path}: {error}") from error
-        document = _Document(path, {node.tag: _xml_value(node) for node in root})
-    else:
-        text = _read(path)
-        # OpenCV's first line, %YAML:1.0, is not a valid directive of YAML.
-        document = _parse_yaml(path, text.partition("\n")[2] if text.startswith("%YAML") else text)
-    is_fisheye = "fisheye_model" in document.values and document.integers("fisheye_model") != [0]
-    return document.camera("fisheye" if is_fisheye else "opencv")
+        return _Document(path, {node.tag: _xml_value(node) for node in root})
+    text = _read(path)
+    # OpenCV's first line, %YAML:1.0, is not a valid directive of YAML.
+    return _parse_yaml(path, text.partition("\n")[2] if text.startswith("%YAML") else text)
 
 
-def write_opencv(path: str | Path, camera: Camera) -> None:
+def write_opencv(path: str | Path, camera: Camera, *, covariance: np.ndarray | None = None) -> None:
     """Write a file that `read_opencv` and `cv2.FileStorage` read.
 
     Args:
         path: ending in .xml, .yml or .yaml.
         camera: of the model "opencv" or "fisheye".
+        covariance: (4 + n, 4 + n), of fx, fy, cx, cy and the n coefficients; None writes none.
     """
     path, coefficients = Path(path), _fit_coefficients(camera, (len(camera.coefficients),))
     is_fisheye = int(camera.model == "fisheye")
     scalars = {"image_width": camera.width, "image_height": camera.height, "fisheye_model": is_fisheye}
     matrices = {"camera_matrix": _matrix(3, chain(*camera.matrix))}
     matrices["distortion_coefficients"] = _matrix(len(coefficients), coefficients)
+    if covariance is not None:
+        size = 4 + len(coefficients)
+        if np.shape(covariance) != (size, size):
+            raise ValueError(f"covariance must have shape ({size}, {size}), got {np.shape(covariance)}")
+        matrices["covariance"] = _matrix(size, np.asarray(covariance, dtype=float).ravel().tolist())
     if _is_xml(path):
         lines = ['<?xml version="1.0"?>', "<opencv_storage>"]
         lines += [f"<{name}>{value}</{name}>" for name, value in scalars.items()]

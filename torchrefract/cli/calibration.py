@@ -14,7 +14,8 @@ from torch import Tensor
 
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_choice, check_number
-from torchrefract.cameras.calibration.boards import Board, board_page
+from torchrefract.cameras.calibration.boards import Board, Charuco, board_page
+from torchrefract.cameras.calibration.choice import AUTO
 from torchrefract.cameras.calibration.detection import (
     Detection,
     View,
@@ -23,6 +24,7 @@ from torchrefract.cameras.calibration.detection import (
     edge_width,
     explain_failure,
     has_enough_corners,
+    measure_marker,
 )
 from torchrefract.cameras.calibration.fit import LENS_MODELS, MIN_VIEWS
 from torchrefract.cameras.calibration.report import (
@@ -31,12 +33,14 @@ from torchrefract.cameras.calibration.report import (
     Calibration,
     calibrate_camera,
     camera_warnings,
+    describe_corners,
     write_failure,
     write_report,
 )
 from torchrefract.cameras.calibration.synthetic import CAMERA, NUM_VIEWS, render_views
+from torchrefract.cameras.calibration.uncertainty import MAX_DEVIATION_PX, Crop, certain_part
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io import read_opencv, write_opencv
+from torchrefract.cameras.io import read_covariance, read_opencv, write_opencv
 from torchrefract.cli.command import make, naming, progress
 from torchrefract.data import media
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, pixels_of, read_image
@@ -48,6 +52,7 @@ _MIN_USABLE = MIN_VIEWS + 1  # views, so that each can be left out of the fit
 _MAX_REASONS = 300  # characters
 _CACHE_VERSION = 4  # of detections.jsonl; lines of other versions are ignored
 _MIN_SAME_SIZE = 0.75  # share of the pictures
+_MAX_MARKER_ERROR = 0.15  # of the side of a marker; blur shrinks it by some percent
 _NUM_DIAGNOSED = 3  # pictures in which another board is searched if the expected one is missing
 _BOARD_FORMATS = (".pdf", ".png")
 
@@ -77,7 +82,7 @@ def calibrate(cfg: DictConfig) -> None:
     """
     board = make(cfg, "board")
     with naming("lens_model"):
-        model = check_choice("lens_model", str(cfg.lens_model), LENS_MODELS)
+        model = check_choice("lens_model", str(cfg.lens_model), (AUTO, *LENS_MODELS))
     with naming("drop_share"):
         max_drop_share = check_number("drop_share", cfg.drop_share, low=0.0, high=0.9)
     out = Path(str(cfg.out))
@@ -93,11 +98,12 @@ def calibrate(cfg: DictConfig) -> None:
         size = _common_size(detections)
         detections = [_reject_other_size(detection, size) for detection in detections]
         _check_count(detections, paths, board)
+        _check_marker(detections, paths, board)
         calibration = calibrate_camera(detections, board, model=model, size=size, max_drop_share=max_drop_share)
     except (UsageError, ValueError) as error:
         write_failure(board, detections, str(error), out)
         raise UsageError(f"{error} ({out / REPORT_FILE} lists all pictures)") from error
-    write_opencv(out / CAMERA_FILE, calibration.fit.camera)
+    write_opencv(out / CAMERA_FILE, calibration.fit.camera, covariance=calibration.fit.covariance)
     write_report(calibration, lambda name: read_gray(paths[name]), out)
     if turned:
         with (out / REPORT_FILE).open("a", encoding="utf-8") as stream:
@@ -194,6 +200,20 @@ def _check_count(detections: Sequence[Detection], paths: dict[str, Path], board:
     raise UsageError(". ".join(parts))
 
 
+def _check_marker(detections: Sequence[Detection], paths: dict[str, Path], board: Board) -> None:
+    """Raise UsageError if the markers of a ChArUco board have another size in the pictures, relative to the squares."""
+    if not isinstance(board, Charuco):
+        return
+    views = sorted((d.view for d in detections if not d.problem), key=lambda view: -len(view.ids))[:_NUM_DIAGNOSED]
+    sides = [measure_marker(read_gray(paths[view.name]), view, board) for view in views]
+    side = float(np.nanmedian(sides)) if np.isfinite(sides).any() else board.marker_mm
+    if abs(side / board.marker_mm - 1) > _MAX_MARKER_ERROR:
+        raise UsageError(
+            f"marker_mm must be the side of the markers, about {side:.3g} mm in the pictures if square_mm = "
+            f"{board.square_mm:g} is right, got {board.marker_mm:g}"
+        )
+
+
 def _rendered(board: Board, folder: Path) -> list[Path]:
     """Return pictures of the board by a known camera; they are rendered unless the folder holds them already."""
     marker, content = folder / "rendered.txt", f"{board.describe()}\n{CAMERA}\n"
@@ -215,7 +235,8 @@ def _print_summary(calibration: Calibration, out: Path) -> None:
     print(
         f"{out / CAMERA_FILE}: {calibration.fit.model} from {len(calibration.views)} views in "
         f"{len(calibration.detections)} pictures, error {calibration.fit.rms:.3f} px rms, of held-out views "
-        f"{calibration.held_out_rms:.3f} px rms; see {out / REPORT_FILE}"
+        f"{calibration.held_out_rms:.3f} px rms; standard deviation of rectified corners, px: "
+        f"{describe_corners(calibration.fit)}; see {out / REPORT_FILE}"
     )
 
 
@@ -226,7 +247,9 @@ def rectify(cfg: DictConfig) -> None:
         zoom = check_number("zoom", cfg.zoom, low=0.05, high=20.0)
     with naming("camera"):
         camera = read_opencv(str(cfg.camera))
+        covariance = read_covariance(str(cfg.camera))
         _, exists, pinhole = camera_flow(camera, zoom=zoom)
+    part, pinhole = _part_to_keep(cfg, camera, covariance, pinhole)
     files = media.find_media(source)
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
@@ -249,7 +272,8 @@ def rectify(cfg: DictConfig) -> None:
 
     def rectify_frame(frame: Tensor) -> Tensor:
         """Rectify a frame (1, 3, H, W) in [0, 1] to (3, H, W)."""
-        return warp(frame, flow(*frame.shape[2:]), interpolation="bicubic")[0][0]
+        result = warp(frame, flow(*frame.shape[2:]), interpolation="bicubic")[0][0]
+        return result if part is None else part.of(result, camera.width)
 
     def rectify_frames(frames: Iterator[Tensor]) -> Iterator[np.ndarray]:
         return (pixels_of(rectify_frame(frame)) for frame in frames)
@@ -277,6 +301,25 @@ def rectify(cfg: DictConfig) -> None:
         f"{out}: {num_written} rectified, {num_existing} already existed, {len(skipped)} skipped; camera of the "
         f"results: {out}/{CAMERA_FILE}"
     )
+
+
+def _part_to_keep(
+    cfg: DictConfig, camera: Camera, covariance: np.ndarray | None, pinhole: Camera
+) -> tuple[Crop | None, Camera]:
+    """Return the part of rectified frames that is certain enough, None for all, and its camera; warn of the rest."""
+    if covariance is not None:
+        deviation, crop = certain_part(camera, covariance, pinhole)
+        if deviation > MAX_DEVIATION_PX and not cfg.crop:
+            print(
+                f"warning: the rectified position has a standard deviation of up to {deviation:.1f} px; in the middle "
+                f"{crop.width} x {crop.height} px it is at most {MAX_DEVIATION_PX:g} px: crop=true keeps these only",
+                file=sys.stderr,
+            )
+        elif cfg.crop and deviation > MAX_DEVIATION_PX:
+            return crop, pinhole.cropped(**crop._asdict())
+    elif cfg.crop:
+        raise UsageError(f"crop must be false for a camera file without a covariance, got true with {cfg.camera}")
+    return None, pinhole
 
 
 def _write_camera(path: Path, camera: Camera) -> None:

@@ -1,6 +1,7 @@
 """Calibration of a camera from pictures of a board.
 
 `boards` defines boards and draws them to print. `detection` finds corners and explains why a picture has none. `fit`
-estimates the camera and drops views that do not fit. `report` says how far to trust the result. `synthetic` renders
-pictures of a board through a known camera.
+estimates the camera and drops views that do not fit. `choice` chooses the lens model. `uncertainty` computes the
+standard deviation of rectified pictures. `report` says how far to trust the result. `synthetic` renders pictures of a
+board through a known camera.
 """

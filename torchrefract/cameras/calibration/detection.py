@@ -269,3 +269,25 @@ def _find_squares(markers: _Markers, board: Charuco) -> tuple[str, int]:
             if ids is not None and len(ids) > num_corners:
                 squares, num_corners = candidate.squares, len(ids)
     return squares, num_corners
+
+
+def measure_marker(gray: np.ndarray, view: View, board: Charuco) -> float:
+    """Return the median side of the markers in a picture, mm; NaN if no marker has four corners of a view around it.
+
+    A homography of the nearest corners of the view maps a marker to the board. Blur shrinks the side by a few percent.
+    """
+    sides = []
+    for inverted in candidates(board.inverted):
+        picture = 255 - gray if inverted else gray
+        markers, _, _ = cv2.aruco.ArucoDetector(marker_dictionary(board.dictionary)).detectMarkers(picture)
+        for marker in markers:
+            nearest = np.argsort(np.linalg.norm(view.corners - marker[0].mean(axis=0), axis=1))[:_NUM_NEIGHBORS]
+            plane = board.corners(view.ids[nearest])[:, :2]
+            if len(nearest) < 4 or np.linalg.matrix_rank(plane - plane.mean(axis=0)) < 2:
+                continue
+            matrix, _ = cv2.findHomography(view.corners[nearest], plane, 0)
+            if matrix is not None:
+                x, y = cv2.perspectiveTransform(marker.astype(float), matrix)[0].T
+                # The area by the shoelace formula is half of the difference.
+                sides.append(abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))) ** 0.5 / 2**0.5)
+    return float(np.median(sides)) if sides else np.nan

@@ -1,6 +1,8 @@
 """Least-squares fit of a camera to views of a board, with standard deviations, cross-validation and outliers."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -12,18 +14,32 @@ from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.detection import View
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.conversion import least_squares
+from torchrefract.cameras.lens_database import read_lenses
 from torchrefract.cameras.projection import COEFFICIENTS
 
+_RADIAL_ONLY = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
+_RATIONAL, _PRISM = cv2.CALIB_RATIONAL_MODEL, cv2.CALIB_THIN_PRISM_MODEL
+_FISHEYE = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
 _FLAGS = {
+    "opencv0": _RADIAL_ONLY | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2,
+    "opencv1": _RADIAL_ONLY | cv2.CALIB_FIX_K2,
+    "opencv2": _RADIAL_ONLY,
     "opencv4": cv2.CALIB_FIX_K3,
     "opencv5": 0,
-    "opencv8": cv2.CALIB_RATIONAL_MODEL,
-    "opencv12": cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL,
-    "opencv14": cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL,
+    "opencv8": _RATIONAL,
+    "opencv12": _RATIONAL | _PRISM,
+    "opencv14": _RATIONAL | _PRISM | cv2.CALIB_TILTED_MODEL,
+    "fisheye1": _FISHEYE | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_K4,
+    "fisheye2": _FISHEYE | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_K4,
+    "fisheye": _FISHEYE,
 }
-LENS_MODELS = (*_FLAGS, "fisheye")
+LENS_MODELS = tuple(_FLAGS)
+PRIORS = ("none", "published", "centered")
+_CENTERED_PX = 1e-3  # standard deviation of a principal point that is fixed in the middle
 MIN_VIEWS = 3  # of a fit; cross-validation needs one more
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-10)
+_ONE_SIGMA = 0.683  # share of a normal distribution within its standard deviation
+_MAX_STEPS, _CONVERGED, _MAX_DAMPING = 50, 1e-9, 1e9  # of the fit under a prior
 _MAX_RMS = 0.05  # of the width of the frame; a larger error means that the fit failed
 _NUM_DEVIATIONS = 6.0  # standard deviations of the rms of the other views
 _RATIO = 3.0  # to the median rms of the other views
@@ -35,15 +51,20 @@ class Fit(NamedTuple):
 
     model: str  # of `LENS_MODELS`
     camera: Camera
-    deviations: np.ndarray  # standard deviations of `values`
+    covariance: np.ndarray  # (n, n), of `values`; zero for coefficients that the model fixes at zero
     poses: list[np.ndarray]  # for each view (6,), rotation vector and translation, mm
     errors: list[np.ndarray]  # for each view (N, 2), px, detected minus projected corners
+    prior: str = "none"  # of `PRIORS`
 
     @property
     def values(self) -> np.ndarray:
         """Return fx, fy, cx, cy and the coefficients."""
-        camera = self.camera
-        return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.coefficients])
+        return camera_values(self.camera)
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """Return the standard deviations of `values`."""
+        return np.sqrt(np.diag(self.covariance))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -56,25 +77,50 @@ class Fit(NamedTuple):
         return rms(np.concatenate(self.errors))
 
 
+def camera_values(camera: Camera) -> np.ndarray:
+    """Return fx, fy, cx, cy and the coefficients."""
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.coefficients])
+
+
+def with_values(camera: Camera, values: np.ndarray) -> Camera:
+    """Return the camera with other values than `camera_values`."""
+    fx, fy, cx, cy, *coefficients = values.tolist()
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=tuple(coefficients))
+
+
+def num_coefficients(model: str) -> int:
+    """Return the number of coefficients that a model of `LENS_MODELS` fits."""
+    return int(model.removeprefix("opencv").removeprefix("fisheye") or 4)
+
+
 def rms(errors: np.ndarray) -> float:
     """Return sqrt(mean |error|^2) of errors (N, 2), px."""
     return float(np.sqrt((errors**2).sum(axis=1).mean())) if len(errors) else 0.0
 
 
 def fit_camera(
-    views: Sequence[View], board: Board, *, model: str, size: tuple[int, int], start: Camera | None = None
+    views: Sequence[View],
+    board: Board,
+    *,
+    model: str,
+    size: tuple[int, int],
+    prior: str = "none",
+    start: Fit | None = None,
 ) -> Fit:
     """Fit a camera to views of a board by OpenCV's calibration.
 
         camera, poses = argmin sum |detected - projected corner|^2
-        deviation^2 = diag((J^T J)^-1) sum |error|^2 / (2 N - parameters),  J with respect to all parameters and poses
+        covariance = (J^T J)^-1 sum |error|^2 / (2 N - parameters),  J with respect to all parameters and poses
 
     Args:
         views: at least three.
         board: that the views show.
-        model: of `LENS_MODELS`; the number is the count of OpenCV's coefficients, where 4 means k3 = 0.
+        model: of `LENS_MODELS`; the number counts the coefficients that are fitted, the others are zero.
         size: width and height of the pictures, px.
-        start: initial parameters; None starts from homographies.
+        prior: of `PRIORS`. All but "none" add sum (value - mean)^2 / deviation^2, in units of the variance of the
+            errors, and minimize again by the Levenberg-Marquardt method. The mean is the middle of the frame, and zero.
+            "published": with the deviations of `prior_deviations`. "centered": the principal point is the middle.
+        start: an earlier fit of the same model to the same views, to start from; None starts from homographies.
 
     Raises:
         ValueError: there are too few views, or no camera fits them.
@@ -83,16 +129,25 @@ def fit_camera(
         raise ValueError(f"views must be at least {MIN_VIEWS}, got {len(views)}")
     objects, images = [board.corners(view.ids) for view in views], [view.corners for view in views]
     try:
-        camera, poses = _minimize(objects, images, model, size, start)
+        if start is None or prior == "none":
+            camera, poses = _minimize(objects, images, model, size, start.camera if start else None)
+        else:
+            camera, poses = start.camera, start.poses
     except (cv2.error, ValueError) as error:
         reason = " ".join(str(getattr(error, "err", None) or error).split())
         raise ValueError(
             f"views must be enough for the model {model}, got {len(views)} that fit no camera: {reason}"
         ) from error
-    projected = [project(camera, pose, points) for points, pose in zip(objects, poses, strict=True)]
-    errors = [image - pixels for image, (pixels, _, _) in zip(images, projected, strict=True)]
-    deviations = _deviations([slopes for _, *slopes in projected], np.concatenate(errors))
-    fit = Fit(model, camera, deviations, poses, errors)
+    num_fitted = 4 + num_coefficients(model)
+    precision = np.zeros(num_fitted)
+    if prior != "none":
+        precision = prior_deviations(camera, prior)[:num_fitted] ** -2.0
+        camera, poses = _refine(objects, images, camera, poses, precision)
+    errors, normal, *_ = _linearize(objects, images, camera, poses, num_fitted)
+    variance = _variance(errors, num_fitted)
+    covariance = np.zeros((4 + len(camera.coefficients),) * 2)
+    covariance[:num_fitted, :num_fitted] = variance * _inverse(normal + np.diag(variance * precision))
+    fit = Fit(model, camera, covariance, poses, errors, prior)
     if fit.rms > _MAX_RMS * size[0]:
         raise ValueError(
             f"views must be of one camera of the model {model}, got {len(views)} that leave {fit.rms:.1f} px rms"
@@ -145,7 +200,8 @@ def cross_validate(views: Sequence[View], board: Board, fit: Fit, *, folds: int 
 def _fit_without(held_out: Collection[int], views: Sequence[View], board: Board, fit: Fit) -> Fit:
     others = [view for i, view in enumerate(views) if i not in held_out]
     size = fit.camera.width, fit.camera.height
-    return fit_camera(others, board, model=fit.model, size=size, start=fit.camera)
+    start = fit._replace(poses=[pose for i, pose in enumerate(fit.poses) if i not in held_out])
+    return fit_camera(others, board, model=fit.model, size=size, prior=fit.prior, start=start)
 
 
 class LeaveOneOut(NamedTuple):
@@ -185,7 +241,13 @@ def leave_each_out(views: Sequence[View], board: Board, fit: Fit) -> list[LeaveO
 
 
 def drop_outliers(
-    views: Sequence[View], board: Board, *, model: str, size: tuple[int, int], max_share: float = 0.25
+    views: Sequence[View],
+    board: Board,
+    *,
+    model: str,
+    size: tuple[int, int],
+    max_share: float = 0.25,
+    prior: str = "none",
 ) -> Selection:
     """Drop views that do not fit the others, one at a time.
 
@@ -193,13 +255,13 @@ def drop_outliers(
     remains or no more views may be dropped.
 
     Args:
-        views, board, model, size: as for `fit_camera`, with at least four views.
+        views, board, model, size, prior: as for `fit_camera`, with at least four views.
         max_share: of the views that may be dropped; at least four views always stay.
     """
     kept, dropped = list(views), dict[str, str]()
     max_dropped = min(int(max_share * len(kept)), len(kept) - MIN_VIEWS - 1)
     while True:
-        fit = fit_camera(kept, board, model=model, size=size)
+        fit = fit_camera(kept, board, model=model, size=size, prior=prior)
         ranking = sorted(leave_each_out(kept, board, fit), key=lambda result: result.others)
         outliers = [result for result in ranking if result.error > result.limit]
         if not outliers or len(dropped) >= max_dropped:
@@ -218,10 +280,9 @@ def _minimize(
     objects: list[np.ndarray], images: list[np.ndarray], model: str, size: tuple[int, int], start: Camera | None
 ) -> tuple[Camera, list[np.ndarray]]:
     """Run OpenCV's calibration, whose fisheye takes float64 and four coefficients; return the camera and the poses."""
-    is_fisheye = model == "fisheye"
-    count = 4 if is_fisheye else int(model.removeprefix("opencv"))
-    matrix, vector = np.eye(3), np.zeros((4 if is_fisheye else 14, 1))
-    flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW if is_fisheye else _FLAGS[model]
+    is_fisheye, flags = model.startswith("fisheye"), _FLAGS[model]
+    count = 4 if is_fisheye else max(4, num_coefficients(model))
+    matrix, vector = np.eye(3), np.zeros((4 if is_fisheye else max(5, count), 1))
     if start is not None:
         flags |= cv2.CALIB_USE_INTRINSIC_GUESS
         matrix, vector[:count, 0] = np.array(start.matrix), start.coefficients
@@ -240,15 +301,97 @@ def _minimize(
     return Camera(width=size[0], height=size[1], **pinhole, coefficients=coefficients, model=kind), poses
 
 
-def _deviations(slopes: Sequence[Sequence[np.ndarray]], errors: np.ndarray) -> np.ndarray:
-    """Return the deviations of a fit from the slopes of its views; the Schur complement eliminates the poses."""
-    normal = np.zeros((1, 1))
-    for pose_slopes, camera_slopes in slopes:
-        shared = pose_slopes.T @ camera_slopes
-        normal = normal + camera_slopes.T @ camera_slopes
-        normal -= shared.T @ np.linalg.solve(pose_slopes.T @ pose_slopes, shared)
-    degrees_of_freedom = max(1, errors.size - len(normal) - 6 * len(slopes))
+@lru_cache
+def _published_deviations(model: str) -> np.ndarray:
+    """Return for the principal point, in widths, and five coefficients what 68 % of the database's lenses stay below.
+
+    A normal distribution stays within its standard deviation for 68 % of the draws. A few extreme lenses do not count.
+    """
+    cameras = [lens.camera for lens in read_lenses()]
+    lenses = [c.coefficients for c in cameras if c.model == model and len(c.coefficients) <= 5]
+    values = [[(c.cx - (c.width - 1) / 2) / c.width for c in cameras]]
+    values.append([(c.cy - (c.height - 1) / 2) / c.width for c in cameras])
+    values += [[lens[k] for lens in lenses if len(lens) > k and lens[k]] for k in range(5 if model == "opencv" else 4)]
+    return np.array([np.quantile(np.abs(column), _ONE_SIGMA) for column in values])
+
+
+def prior_deviations(camera: Camera, prior: str) -> np.ndarray:
+    """Return standard deviations of fx, fy (infinite), cx, cy and the coefficients, from published lenses."""
+    center, lens = np.split(_published_deviations(camera.model), [2])
+    if prior == "centered":
+        center = np.full(2, _CENTERED_PX / camera.width)
+    rest = np.full(max(0, len(camera.coefficients) - len(lens)), np.inf)
+    return np.concatenate([(np.inf, np.inf), camera.width * center, lens, rest])
+
+
+def _linearize(
+    objects: Sequence[np.ndarray], images: Sequence[np.ndarray], camera: Camera, poses: Sequence[np.ndarray], count: int
+) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, Callable[[np.ndarray], list[np.ndarray]]]:
+    """Return the errors, and the normal equations of the camera's first `count` values without the poses.
+
+    The Schur complement eliminates the poses. The last result maps a step of the values to the poses after it.
+    """
+    errors, normal, right, parts = [], np.zeros((count, count)), np.zeros(count), []
+    for points, image, pose in zip(objects, images, poses, strict=True):
+        pixels, pose_slopes, slopes = project(camera, pose, points)
+        errors.append(image - pixels)
+        inverse = np.linalg.pinv(pose_slopes)
+        slopes, error = slopes[:, :count], errors[-1].ravel()
+        free = slopes - pose_slopes @ (inverse @ slopes)  # the part that no motion of the board explains
+        normal += free.T @ free
+        right += free.T @ error
+        parts.append((pose, inverse @ error, inverse @ slopes))
+    return errors, normal, right, lambda step: [pose + move - turn @ step for pose, move, turn in parts]
+
+
+def _refine(
+    objects: Sequence[np.ndarray],
+    images: Sequence[np.ndarray],
+    camera: Camera,
+    poses: list[np.ndarray],
+    precision: np.ndarray,
+) -> tuple[Camera, list[np.ndarray]]:
+    """Minimize the errors and the prior from a fit without it, by the Levenberg-Marquardt method."""
+    count, damping = len(precision), 1e-3
+    mean = np.zeros(count)
+    mean[2:4] = (camera.width - 1) / 2, (camera.height - 1) / 2
+    errors, normal, right, move = _linearize(objects, images, camera, poses, count)
+    weight = _variance(errors, count) * precision
+
+    def cost(errors: list[np.ndarray], camera: Camera) -> float:
+        return float(sum((e**2).sum() for e in errors) + (weight * (camera_values(camera)[:count] - mean) ** 2).sum())
+
+    for _ in range(_MAX_STEPS):
+        before, values = cost(errors, camera), camera_values(camera)
+        system, target = normal + np.diag(weight), right + weight * (mean - values[:count])
+        while damping < _MAX_DAMPING:
+            step = _inverse(system + damping * np.diag(np.diag(system))) @ target
+            values[:count] = camera_values(camera)[:count] + step
+            try:
+                candidate = with_values(camera, values)
+                candidate_poses = move(step)
+                result = _linearize(objects, images, candidate, candidate_poses, count)
+                if cost(result[0], candidate) < before:
+                    break
+            except ValueError:  # the lens folds within a pixel
+                pass
+            damping *= 10
+        else:
+            break
+        camera, poses, (errors, normal, right, move) = candidate, candidate_poses, result
+        damping /= 10
+        if before - cost(errors, camera) <= _CONVERGED * before:
+            break
+    return camera, poses
+
+
+def _variance(errors: Sequence[np.ndarray], num_fitted: int) -> float:
+    """Return sum |error|^2 / (2 N - parameters)."""
+    degrees_of_freedom = sum(e.size for e in errors) - num_fitted - 6 * len(errors)
+    return float(sum((e**2).sum() for e in errors)) / max(1, degrees_of_freedom)
+
+
+def _inverse(normal: np.ndarray) -> np.ndarray:
     # Correlated coefficients make the matrix nearly singular; scaled to a unit diagonal it can be inverted.
     scale = np.sqrt(np.diag(normal).clip(min=np.finfo(float).tiny))
-    inverse = np.linalg.pinv(normal / np.outer(scale, scale), hermitian=True)
-    return np.sqrt(np.diag(inverse).clip(min=0) * (errors**2).sum() / degrees_of_freedom) / scale
+    return np.linalg.pinv(normal / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)

@@ -1,5 +1,6 @@
 """Quality of a calibration, and its report in Markdown with figures of the corners and of the errors."""
 
+import contextlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -10,12 +11,16 @@ from matplotlib.figure import Figure
 
 from torchrefract._io import replace_file
 from torchrefract.cameras.calibration.boards import Board
+from torchrefract.cameras.calibration.choice import AUTO, FOLDS, Candidate, choose_model
 from torchrefract.cameras.calibration.detection import Detection, View
 from torchrefract.cameras.calibration.fit import Fit, LeaveOneOut, cross_validate, drop_outliers, rms
+from torchrefract.cameras.calibration.uncertainty import MAX_DEVIATION_PX, rectified_deviation
 from torchrefract.cameras.camera import Camera
 
 CAMERA_FILE, REPORT_FILE = "camera.yaml", "report.md"
-_FIGURES = ("coverage.png", "residuals.png")
+_FIGURES = ("coverage.png", "residuals.png", "uncertainty.png")
+_FIRST_MODEL = "opencv4"  # to find views that do not fit before the lens model is chosen
+_UNCERTAINTY_GRID = (60, 80)  # rows and columns
 _DPI = 100
 _MAX_DRAWN = 12  # views in the figure of errors, those that cost the others most
 _COLUMNS = 4  # of that figure
@@ -28,7 +33,7 @@ _REPORT = """\
 # Calibration
 
 Board: `{board}`
-Lens model: {model}, frames of {camera.width} x {camera.height} px
+Lens model: {model}{prior}, frames of {camera.width} x {camera.height} px
 Used: {num_views} views of {num_pictures} pictures, {num_corners} corners
 
 {errors}
@@ -39,6 +44,11 @@ its pose is fitted.
 ## Camera
 
 {parameters}
+
+Standard deviation of the rectified position, px: {corners}, from the standard deviations above. It is of the chosen
+lens model; where the frame has no corners, another model may differ by more.
+
+![Standard deviation of the rectified position](uncertainty.png)
 
 {warnings}
 
@@ -51,7 +61,17 @@ outlier if its held-out error is above its limit. All errors are in px rms.
 
 {views}
 
-![Reprojection errors](residuals.png)"""
+![Reprojection errors](residuals.png){models}"""
+_MODELS = """
+
+## Choice of the lens model
+
+The number in a name counts the coefficients that are fitted. The chosen model is the one of fewest parameters, of
+those that are one-to-one over the frame, with an error of held-out views within one standard error of the best one and
+within two standard errors of the difference to it. Coefficients and principal point have weak priors: the spread of
+published lenses.
+
+{table}"""
 
 
 class Calibration(NamedTuple):
@@ -64,6 +84,7 @@ class Calibration(NamedTuple):
     ranking: list[LeaveOneOut]  # of these views, the one that costs the others most first
     dropped: dict[str, str]  # the reason by the name of each dropped view
     held_out_rms: float  # error of views that the camera was not fitted to, px, by `cross_validate`
+    candidates: Sequence[Candidate] = ()  # lens models that were tried; empty if the model was given
 
 
 def calibrate_camera(
@@ -71,17 +92,28 @@ def calibrate_camera(
 ) -> Calibration:
     """Fit a camera to all usable detections, at least four, without views that do not fit the others.
 
-    The other arguments are those of `drop_outliers`. Raises ValueError if no camera fits the views.
+    The model "auto" is chosen by `choose_model`. The other arguments are those of `drop_outliers`. Raises ValueError if
+    no camera fits the views.
     """
     views = [detection.view for detection in detections if not detection.problem]
-    selection = drop_outliers(views, board, model=model, size=size, max_share=max_drop_share)
+    prior, candidates = "none", list[Candidate]()
+    if model == AUTO:
+        good = views
+        with contextlib.suppress(ValueError):  # another model may fit
+            first = drop_outliers(
+                views, board, model=_FIRST_MODEL, size=size, max_share=max_drop_share, prior="published"
+            )
+            good = first.views
+        chosen, candidates = choose_model(good, board, size=size)
+        model, prior = chosen.model, chosen.prior
+    selection = drop_outliers(views, board, model=model, size=size, max_share=max_drop_share, prior=prior)
     held_out = cross_validate(selection.views, board, selection.fit)
-    return Calibration(board, detections, *selection, rms(np.concatenate(held_out)))
+    return Calibration(board, detections, *selection, rms(np.concatenate(held_out)), candidates)
 
 
 def write_report(calibration: Calibration, read_gray: Callable[[str], np.ndarray], folder: Path) -> None:
-    """Write report.md, coverage.png and residuals.png; `read_gray` returns (H, W), uint8, by the name of a view."""
-    figures = _draw_coverage(calibration), _draw_residuals(calibration, read_gray)
+    """Write report.md and its figures; `read_gray` returns (H, W), uint8, by the name of a view."""
+    figures = _draw_coverage(calibration), _draw_residuals(calibration, read_gray), _draw_uncertainty(calibration.fit)
     for name, figure in zip(_FIGURES, figures, strict=True):
         with replace_file(folder / name) as path:
             figure.savefig(path)
@@ -139,12 +171,42 @@ def _report(calibration: Calibration) -> str:
             ("parameter", "value", "standard deviation"),
             [(name, f"{value:.6g}", f"{deviation:.2g}") for name, value, deviation in parameters],
         ),
-        warnings="\n".join(f"- {message}" for message in calibration_warnings(views, fit)),
+        prior=", principal point in the middle of the frame" if fit.prior == "centered" else "",
+        corners=describe_corners(fit),
+        models=_describe_models(calibration),
+        warnings="\n".join(f"- {message}" for message in calibration_warnings(views, fit, calibration.candidates)),
         views=_table(("view", "corners", "error", "held-out error", "limit", "others without it"), view_rows),
     )
     unused = [(name, f"dropped: {reason}") for name, reason in calibration.dropped.items()]
     unused += [(d.view.name, d.problem) for d in calibration.detections if d.problem]
     return f"{text}\n\n## Pictures not used\n\n{_table(('picture', 'reason'), unused)}" if unused else text
+
+
+def corner_deviations(fit: Fit) -> np.ndarray:
+    """Return the standard deviations of the rectified position in the four corners, px; NaN without a ray."""
+    right, bottom = fit.camera.width - 1.0, fit.camera.height - 1.0
+    pixels = np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
+    return rectified_deviation(fit.camera, fit.covariance, pixels)
+
+
+def describe_corners(fit: Fit) -> str:
+    """Return the standard deviations of the rectified position in the corners of the frame as text."""
+    names = ("upper left", "upper right", "lower left", "lower right")
+    return ", ".join(f"{name} {value:.2g}" for name, value in zip(names, corner_deviations(fit), strict=True))
+
+
+def _describe_models(calibration: Calibration) -> str:
+    if not calibration.candidates:
+        return ""
+    fit, rows = calibration.fit, []
+    for one in sorted(calibration.candidates, key=lambda one: (one.num_parameters, one.held_out)):
+        center = "in the middle" if one.prior == "centered" else "fitted"
+        note = "chosen" if (one.model, one.prior) == (fit.model, fit.prior) else one.problem
+        numbers = (f"{one.held_out:.4f}", f"{one.excess:.2f}", f"{one.paired_excess:.2f}")
+        rows.append((one.model, center, str(one.num_parameters), *numbers, note))
+    head = ("lens model", "principal point", "parameters", "held-out error, px rms")
+    table = _table((*head, "excess, standard errors", "excess, standard errors of the difference", ""), rows)
+    return _MODELS.format(table=table)
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -190,6 +252,22 @@ def _draw_residuals(calibration: Calibration, read_gray: Callable[[str], np.ndar
     return figure
 
 
+def _draw_uncertainty(fit: Fit) -> Figure:
+    """Draw the standard deviation of the rectified position over the frame."""
+    camera, (rows, columns) = fit.camera, _UNCERTAINTY_GRID
+    x, y = np.meshgrid(np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows))
+    deviation = rectified_deviation(camera, fit.covariance, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
+    figure = Figure(figsize=(9.6, 9.6 * camera.height / camera.width + 0.9), dpi=_DPI, layout="constrained")
+    axes = figure.add_subplot()
+    extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
+    image = axes.imshow(deviation, extent=extent, cmap="viridis", vmin=0, interpolation="bilinear")
+    if np.nanmax(deviation, initial=0.0) > MAX_DEVIATION_PX:
+        axes.contour(x, y, deviation, levels=[MAX_DEVIATION_PX], colors="#ff5030")
+    axes.set_title(f"standard deviation of the rectified position, px; the line is at {MAX_DEVIATION_PX:g} px")
+    figure.colorbar(image, ax=axes, shrink=0.8)
+    return figure
+
+
 def corner_counts(views: Sequence[View], size: tuple[int, int]) -> np.ndarray:
     """Count the corners in each of 6 x 8 cells of a frame of (width, height) px."""
     corners = np.concatenate([view.corners for view in views]) + 0.5
@@ -197,8 +275,8 @@ def corner_counts(views: Sequence[View], size: tuple[int, int]) -> np.ndarray:
     return np.histogram2d(corners[:, 1], corners[:, 0], bins=CELLS, range=limits)[0].astype(int)
 
 
-def calibration_warnings(views: Sequence[View], fit: Fit) -> list[str]:
-    """Return warnings about a calibration: sides without corners, coefficients near zero, and `camera_warnings`."""
+def calibration_warnings(views: Sequence[View], fit: Fit, candidates: Sequence[Candidate] = ()) -> list[str]:
+    """Return warnings about a calibration: sides without corners, vague coefficients, refused models, the camera."""
     counts, messages = corner_counts(views, (fit.camera.width, fit.camera.height)), []
     empty = [
         f"{side} ({np.sum(counts[cells] == 0)} of {counts[cells].size} cells)"
@@ -214,12 +292,23 @@ def calibration_warnings(views: Sequence[View], fit: Fit) -> list[str]:
     vague = [
         f"{name} = {value:.4g} +- {deviation:.2g}"
         for name, value, deviation in rows
-        if abs(value) < _NUM_DEVIATIONS * deviation
+        if deviation > 0 and abs(value) < _NUM_DEVIATIONS * deviation
     ]
     if vague:
         messages.append(
             f"These coefficients are zero within two standard deviations: {', '.join(vague)}. A lens_model with fewer "
             "coefficients may be enough."
+        )
+    best = min((one for one in candidates if one.problem == FOLDS), key=lambda one: one.excess, default=None)
+    if best is not None and best.excess < -1:
+        messages.append(
+            f"{best.model} has a held-out error of only {best.held_out:.3f} px rms, but {best.problem}. If the frame "
+            f"is black there, as behind a circular fisheye, set lens_model={best.model}."
+        )
+    if (worst := np.nanmax(corner_deviations(fit), initial=0.0)) > MAX_DEVIATION_PX:
+        messages.append(
+            f"The rectified position of a corner of the frame has a standard deviation of {worst:.1f} px. Add pictures "
+            "with the board in the corners, or use rectify with crop=true."
         )
     return [*messages, *camera_warnings(fit.camera)]
 

@@ -1,0 +1,73 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from torchrefract.cameras.calibration.boards import Chessboard
+from torchrefract.cameras.calibration.choice import FOLDS, choose_model, is_one_to_one
+from torchrefract.cameras.calibration.fit import camera_values, fit_camera, prior_deviations
+from torchrefract.cameras.camera import Camera
+
+BOARD = Chessboard(squares="9x7", square_mm=25)
+SIZE = (800, 600)
+PINHOLE = Camera(width=800, height=600, fx=700.0, fy=702.0, cx=405.0, cy=297.0, coefficients=(0.0,) * 4)
+BARREL = replace(PINHOLE, coefficients=(-0.2, 0.06, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("camera", "max_coefficients"),
+    [(PINHOLE, 0), (BARREL, 2), (replace(PINHOLE, coefficients=(-0.03, 0.0, 0.0, 0.0), model="fisheye"), 2)],
+    ids=["pinhole", "barrel", "fisheye"],
+)
+def test_the_lens_model_has_no_more_coefficients_than_needed(camera, max_coefficients, projected):
+    chosen, tried = choose_model(projected(BOARD, camera, noise=0.3), BOARD, size=SIZE)
+    assert chosen.num_parameters <= max_coefficients + 2
+    assert not chosen.problem
+    assert chosen.held_out <= 1.2 * min(one.held_out for one in tried)
+
+
+def test_edge_rays_stay_near_the_exact_camera_where_no_corner_reaches_the_border(projected):
+    # The same lens in a frame of 1.5 times the sides: all corners lie in its middle.
+    camera = replace(BARREL, width=1200, height=900, cx=605.0, cy=447.0)
+    views, size = projected(BOARD, camera, noise=0.3), (1200, 900)
+    chosen, _ = choose_model(views, BOARD, size=size)
+    fit = fit_camera(views, BOARD, model=chosen.model, size=size, prior=chosen.prior)
+    border = camera.grid(9)
+    pixels = fit.camera.project(camera.unproject(border).points)
+    assert pixels.valid.all()
+    assert (pixels.points - border).norm(dim=1).max() < 100
+
+
+def test_a_model_that_folds_inside_the_frame_is_refused(projected):
+    # 1 + 3 k1 r^2 = 0 at r = 0.91, which the lens shows at 0.61, inside of the corners at 0.71.
+    folding = replace(PINHOLE, coefficients=(-0.4, 0.0, 0.0, 0.0))
+    views = projected(BOARD, folding, noise=0.3)
+    chosen, tried = choose_model(views, BOARD, size=SIZE)
+    assert not is_one_to_one(folding)
+    assert {one.problem for one in tried if one.model == "opencv1"} == {FOLDS}
+    assert is_one_to_one(fit_camera(views, BOARD, model=chosen.model, size=SIZE, prior=chosen.prior).camera)
+
+
+def test_a_fit_under_a_prior_is_a_minimum(projected):
+    views = projected(BOARD, BARREL, noise=0.3)[:4]
+    fit = fit_camera(views, BOARD, model="opencv5", size=SIZE, prior="published")
+    free = fit_camera(views, BOARD, model="opencv5", size=SIZE)
+    weight = prior_deviations(fit.camera, "published") ** -2.0
+    mean = np.array([0, 0, 399.5, 299.5, 0, 0, 0, 0, 0])
+    degrees_of_freedom = sum(2 * len(view.ids) - 6 for view in views) - 9
+
+    def cost(one):
+        squares = sum((e**2).sum() for e in one.errors)
+        return squares, (weight * (camera_values(one.camera) - mean) ** 2).sum()
+
+    variance = cost(free)[0] / degrees_of_freedom
+    assert sum(np.array(cost(fit)) * (1, variance)) < sum(np.array(cost(free)) * (1, variance))
+    # Starting from the minimum does not move it.
+    again = fit_camera(views, BOARD, model="opencv5", size=SIZE, prior="published", start=fit)
+    np.testing.assert_allclose(again.values, fit.values, atol=0.05 * fit.deviations.max(), rtol=1e-3)
+    assert (fit.deviations <= free.deviations * 1.05).all()
+
+
+def test_a_centered_principal_point_stays_in_the_middle(projected):
+    fit = fit_camera(projected(BOARD, BARREL, noise=0.3), BOARD, model="opencv2", size=SIZE, prior="centered")
+    assert (fit.camera.cx, fit.camera.cy) == pytest.approx((399.5, 299.5), abs=1e-3)

@@ -1,0 +1,90 @@
+"""Uncertainty of rectified pictures, from the covariance of a calibration."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrefract.cameras.calibration.fit import camera_values, with_values
+from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.projection import undistort
+
+MAX_DEVIATION_PX = 2.0  # above which `rectify` warns
+_STEP = 1e-3  # standard deviations
+_GRID = 65  # points along each side of the frame
+_SIDES = np.linspace(1.0, 0.1, 91)  # of a crop, in sides of the frame
+
+
+def rectified_deviation(camera: Camera, covariance: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Compute the standard deviation of where `rectify` shows pixels.
+
+        u(p) = f undistort((p - c) / f) + c,  sqrt(trace(J covariance J^T)),  J = du / d(fx, fy, cx, cy, coefficients)
+
+    J is a central difference along the axes of the covariance.
+
+    Args:
+        camera: of the frames.
+        covariance: (4 + n, 4 + n), of fx, fy, cx, cy and the n coefficients.
+        pixels: (N, 2), px, in frames of the camera.
+
+    Returns:
+        (N,), px; NaN where the rectified picture shows nothing.
+    """
+    values, axes = np.linalg.eigh(covariance)
+    start, variance = camera_values(camera), np.zeros(len(pixels))
+    is_shown = _rectify(camera, pixels)[1]
+    for axis in (axes * np.sqrt(values.clip(min=0))).T:
+        if not axis.any():
+            continue
+        (ahead, _), (before, _) = (_rectify(with_values(camera, start + s * _STEP * axis), pixels) for s in (1, -1))
+        variance += (((ahead - before) / (2 * _STEP)) ** 2).sum(axis=1)
+    return np.where(is_shown, np.sqrt(variance), np.nan)
+
+
+def _rectify(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    coefficients = torch.tensor([camera.coefficients], dtype=torch.float64)
+    result = undistort(torch.from_numpy((pixels - center) / focal)[None], coefficients, model=camera.model)
+    return result.points[0].numpy() * focal + center, result.valid[0].numpy()
+
+
+class Crop(NamedTuple):
+    """The middle part of a rectified frame, px."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    def of(self, image: Tensor, frame_width: int) -> Tensor:
+        """Return this part of a frame (C, H, W) in any resolution; its sides are even, which videos need."""
+        scale = image.shape[2] / frame_width
+        left, top = round(self.left * scale), round(self.top * scale)
+        width, height = (int(side * scale) // 2 * 2 for side in (self.width, self.height))
+        return image[:, top : top + height, left : left + width]
+
+
+def certain_part(camera: Camera, covariance: np.ndarray, pinhole: Camera) -> tuple[float, Crop]:
+    """Return the largest deviation over a rectified frame, px, and the largest part of its middle below 2 px.
+
+    Args:
+        camera, covariance: as for `rectified_deviation`.
+        pinhole: of the rectified frame.
+    """
+    grid = pinhole.grid(_GRID)
+    center, focal = torch.tensor([pinhole.cx, pinhole.cy]), torch.tensor([pinhole.fx, pinhole.fy])
+    sources = camera.distort((grid - center) / focal)
+    pixels = sources.points * torch.tensor([camera.fx, camera.fy]) + torch.tensor([camera.cx, camera.cy])
+    scale = pinhole.fx / camera.fx
+    deviation = np.full(len(grid), np.nan)
+    shown = sources.valid.numpy()
+    deviation[shown] = scale * rectified_deviation(camera, covariance, pixels.numpy()[shown])
+    middle = (np.array([pinhole.width, pinhole.height]) - 1) / 2
+    distance = (np.abs(grid.numpy() - middle) / middle).max(axis=1)
+    is_vague = deviation > MAX_DEVIATION_PX
+    side = next((side for side in _SIDES if not is_vague[distance <= side].any()), _SIDES[-1])
+    # Video codecs need even sizes.
+    width, height = (int(size * side) // 2 * 2 for size in (pinhole.width, pinhole.height))
+    crop = Crop((pinhole.width - width) // 2, (pinhole.height - height) // 2, width, height)
+    return float(np.nanmax(deviation, initial=0.0)), crop

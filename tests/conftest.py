@@ -204,6 +204,8 @@ def call(monkeypatch, tmp_path, capsys, on_threads) -> Iterator[Callable[..., Ou
         monkeypatch.setenv(name, "")  # restored after the test
     monkeypatch.chdir(tmp_path)
     on_threads(1)
+    # A slow machine would print lines of progress between the lines that tests compare.
+    monkeypatch.setattr(importlib.import_module("torchrefract.cli.command"), "_MESSAGE_INTERVAL", 3600.0)
     hydra = importlib.import_module("hydra.core.global_hydra").GlobalHydra.instance()
     handlers = list(logging.root.handlers)
 

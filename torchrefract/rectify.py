@@ -6,6 +6,7 @@ Options:
     input=PATH              folder of pictures and videos, a picture or a video, required
     camera=FILE             camera.yaml of `calibrate`, or another camera file, required
     out=rectified           output folder
+    crop=false              true keeps the middle part where the camera is certain to 2 px
     zoom=1.0                factor of the focal length; below 1 the rectified frames show more
 
 Examples:

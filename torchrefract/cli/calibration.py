@@ -284,7 +284,7 @@ def rectify(cfg: DictConfig) -> None:
         try:
             if media.is_complete(file, target):
                 continue
-            with replace_file(target) as path:
+            with replace_file(target, alone=True) as path:
                 if media.is_video(file):
                     media.convert_video(file, path, change=rectify_frames, upright=False)
                 else:

@@ -5,6 +5,7 @@ import errno
 import logging
 import os
 import re
+import signal
 import sys
 import threading
 import time
@@ -275,6 +276,9 @@ def _one_line_errors(name: str) -> Iterator[None]:
             raise
         print(f"error: {message}", file=sys.stderr)
         raise SystemExit(1) from error
+    except KeyboardInterrupt as error:
+        print(f"stopped; {error if str(error) else 'the same command continues'}", file=sys.stderr)
+        raise SystemExit(128 + signal.SIGINT) from None
 
 
 def _user_message(error: Exception, name: str) -> str | None:

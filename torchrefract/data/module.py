@@ -2,7 +2,8 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,11 +19,43 @@ from torchrefract.effects.base import Effect
 from torchrefract.types import Frame, Pair
 
 
+class _Sampler(DistributedSampler[Any]):
+    """A sampler that can begin inside an epoch."""
+
+    start = 0  # number of samples to skip
+
+    def __iter__(self) -> Iterator[Any]:
+        return islice(super().__iter__(), self.start, None)
+
+
+class _TrainingLoader(DataLoader[Any]):
+    """A loader that a resumed run continues at the next batch; Lightning keeps its state in checkpoints."""
+
+    done = (0, 0)  # the epoch, and the number of its batches that were handed out
+    resumed = (0, 0)
+
+    def __iter__(self) -> Iterator[Any]:  # pyright: ignore[reportIncompatibleMethodOverride]  # an iterator is enough
+        # A generator starts at its first batch, when Lightning has set the epoch. Workers would take the order of the
+        # sampler at once, which is still that of epoch 0 in a resumed run.
+        sampler = cast(_Sampler, self.sampler)
+        epoch, start = sampler.epoch, self.resumed[1] if self.resumed[0] == sampler.epoch else 0
+        self.resumed, sampler.start = (0, 0), start * cast(int, self.batch_size)
+        for number, batch in enumerate(super().__iter__(), start + 1):
+            self.done = epoch, number
+            yield batch
+
+    def state_dict(self) -> dict[str, int]:
+        return dict(zip(("epoch", "batches"), self.done, strict=True))
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self.done = self.resumed = (state["epoch"], state["batches"])
+
+
 class PairData(LightningDataModule):
     """Pairs of clean and degraded frames for Lightning.
 
     In training, the draw of a frame depends on (seed, epoch, key of the frame); in validation, on the seed and the key.
-    A resumed run therefore sees the same pairs as an uninterrupted one.
+    A resumed run therefore sees the same pairs in the same order as an uninterrupted one, also from within an epoch.
 
     Args:
         train, val: clean frames, or pairs from disk; `val` should be of other drives than `train`.
@@ -95,8 +128,8 @@ class PairData(LightningDataModule):
         ranks, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
         self.check_ranks(ranks)
         # Each rank has its own frames, in training without repetition; Lightning sets the epoch.
-        sampler = DistributedSampler(frames, ranks, rank, shuffle=training, seed=self.seed, drop_last=training)
-        return DataLoader(
+        sampler = _Sampler(frames, ranks, rank, shuffle=training, seed=self.seed, drop_last=training)
+        return (_TrainingLoader if training else DataLoader)(
             frames,
             batch_size=self.batch_size,
             sampler=sampler,

@@ -85,7 +85,8 @@ def expected(tmp_path_factory) -> dict[tuple[int, int], tuple[list[int], float]]
 
 
 @pytest.mark.parametrize(
-    ("workers", "stop_at"), [(1, None), (1, ("train", 1, 1)), (0, ("train", 0, 0)), (0, ("train", 1, 2)), (0, ("val", 1, 0))]
+    ("workers", "stop_at"),
+    [(1, None), (1, ("train", 1, 1)), (0, ("train", 0, 0)), (0, ("train", 1, 2)), (0, ("val", 1, 0))],
 )
 def test_a_resumed_training_gets_the_batches_of_an_uninterrupted_one(tmp_path, expected, capsys, workers, stop_at):
     first = fit(tmp_path, workers=workers, epochs=2 if stop_at is None else EPOCHS, stop_at=stop_at)

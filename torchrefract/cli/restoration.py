@@ -6,6 +6,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -35,7 +36,7 @@ from torchrefract.data.media import (
     write_picture,
 )
 from torchrefract.data.module import PairData, fingerprint
-from torchrefract.data.pairs.manifest import claim
+from torchrefract.data.pairs.manifest import claim, locked
 from torchrefract.restoration.checkpoints import (
     check_fits,
     how_to_continue,
@@ -60,6 +61,22 @@ def train(cfg: DictConfig) -> None:
         raise UsageError(f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}")
     model.origin = _origin(cfg, data)
     _save_config(cfg, trainer)
+    run = Path(cfg.run_dir)
+    with locked("run_dir", run) if trainer.is_global_zero else nullcontext():
+        if trainer.is_global_zero:
+            _remove_incomplete({run} if cfg.ckpt_path is None else {run, Path(cfg.ckpt_path).parent}, run)
+        _fit(cfg, data, model, trainer)
+
+
+def _remove_incomplete(folders: Iterable[Path], locked_folder: Path) -> None:
+    """Remove the checkpoints that killed runs left incomplete in folders, unless another run uses the folder."""
+    for folder in folders:
+        with suppress(UsageError, OSError), nullcontext() if folder == locked_folder else locked("ckpt_path", folder):
+            for path in folder.glob(".*.ckpt"):
+                path.unlink()
+
+
+def _fit(cfg: DictConfig, data: PairData, model: RestorationModule, trainer: Trainer) -> None:
     try:
         trainer.fit(model, data, ckpt_path=cfg.ckpt_path, weights_only=True)
     except SIGTERMException:
@@ -92,6 +109,11 @@ def restore(cfg: DictConfig) -> None:
     job = _make_job(cfg, source if source.is_dir() else source.parent, out)
     with naming("out"):
         claim(out, _settings(cfg, job), count=0, about={})
+    with locked("out", out):
+        _restore_missing(files, job, out)
+
+
+def _restore_missing(files: Sequence[Path], job: "_Job", out: Path) -> None:
     todo = [file for file in files if not job.is_done(file)]
     for loss in describe_losses(todo, upright=True):
         print(f"warning: {loss}", file=sys.stderr)

@@ -97,7 +97,7 @@ class StopOnSigterm(Callback):
         """Write the checkpoint, and say how to continue."""
         if not isinstance(exception, SIGTERMException):
             return
-        epochs = trainer.fit_loop.epoch_progress.current
+        epochs: Any = trainer.fit_loop.epoch_progress.current
         # At the end of an epoch, the checkpoint exists already.
         if trainer.world_size == 1 and epochs.processed < epochs.ready:
             trainer.save_checkpoint(self.path)

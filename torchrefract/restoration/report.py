@@ -77,7 +77,8 @@ class RunSummary(Callback):
             save_figure(plot_curves(self.run_dir, epe_unit=f"px at {width}x{height}"), self.run_dir / "curves.png")
         save_figure(draw_panel(*self._examples), self.run_dir / "panel.png")
         print("\n".join(summary(trainer.callback_metrics, pl_module.metric_size)))
-        print(f"{self.run_dir}: {', '.join(sorted(path.name for path in self.run_dir.iterdir() if path.is_file()))}")
+        names = sorted(path.name for path in self.run_dir.glob("[!.]*") if path.is_file())
+        print(f"{self.run_dir}: {', '.join(names)}")
 
 
 def save_figure(figure: Figure, out: Path) -> None:

@@ -48,6 +48,8 @@ class Recorder(LightningModule):
         self._stop("val", index)
 
     def configure_optimizers(self):
+        # As a cosine schedule does; it makes Lightning create the loader before it restores the state of the loops.
+        assert self.trainer.estimated_stepping_batches == EPOCHS * BATCHES or self.trainer.max_epochs != EPOCHS
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
     def _stop(self, stage: str, index: int) -> None:

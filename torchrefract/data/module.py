@@ -28,27 +28,39 @@ class _Sampler(DistributedSampler[Any]):
         return islice(super().__iter__(), self.start, None)
 
 
-class _TrainingLoader(DataLoader[Any]):
-    """A loader that a resumed run continues at the next batch; Lightning keeps its state in checkpoints."""
+class _Position:
+    """A point in a training, as an epoch and the number of its batches that were handed out."""
 
-    done = (0, 0)  # the epoch, and the number of its batches that were handed out
-    resumed = (0, 0)
-
-    def __iter__(self) -> Iterator[Any]:  # pyright: ignore[reportIncompatibleMethodOverride]  # an iterator is enough
-        # A generator starts at its first batch, when Lightning has set the epoch. Workers would take the order of the
-        # sampler at once, which is still that of epoch 0 in a resumed run.
-        sampler = cast(_Sampler, self.sampler)
-        epoch, start = sampler.epoch, self.resumed[1] if self.resumed[0] == sampler.epoch else 0
-        self.resumed, sampler.start = (0, 0), start * cast(int, self.batch_size)
-        for number, batch in enumerate(super().__iter__(), start + 1):
-            self.done = epoch, number
-            yield batch
+    def __init__(self) -> None:
+        self.done = self.resumed = (0, 0)
 
     def state_dict(self) -> dict[str, int]:
         return dict(zip(("epoch", "batches"), self.done, strict=True))
 
     def load_state_dict(self, state: dict[str, int]) -> None:
         self.done = self.resumed = (state["epoch"], state["batches"])
+
+
+class _TrainingLoader(DataLoader[Any]):
+    """A loader that a resumed run continues at the next batch."""
+
+    position = _Position()
+
+    def __iter__(self) -> Iterator[Any]:  # pyright: ignore[reportIncompatibleMethodOverride]  # an iterator is enough
+        # A generator starts at its first batch, when Lightning has set the epoch. Workers would take the order of the
+        # sampler at once, which is still that of epoch 0 in a resumed run.
+        sampler, position = cast(_Sampler, self.sampler), self.position
+        epoch, start = sampler.epoch, position.resumed[1] if position.resumed[0] == sampler.epoch else 0
+        position.resumed, sampler.start = (0, 0), start * cast(int, self.batch_size)
+        for number, batch in enumerate(super().__iter__(), start + 1):
+            position.done = epoch, number
+            yield batch
+
+    def state_dict(self) -> dict[str, int]:  # Lightning warns of a loader without the two functions
+        return self.position.state_dict()
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self.position.load_state_dict(state)
 
 
 class PairData(LightningDataModule):
@@ -88,6 +100,7 @@ class PairData(LightningDataModule):
         self.workers = check_count("workers", workers, low=0)
         self.seed = check_count("seed", seed, low=0)
         self._maps = {"transmission": check_flag("transmission", transmission), "flow": check_flag("flow", flow)}
+        self._position = _Position()
         self.check_ranks(1)
 
     def check_ranks(self, ranks: int) -> None:
@@ -103,9 +116,19 @@ class PairData(LightningDataModule):
         if isinstance(first, Frame) and self.effect is not None:
             make_pair(default_collate([first]), self.effect, seed=0, **self._maps)
 
+    def state_dict(self) -> dict[str, int]:
+        """Return the position in the training, which checkpoints hold."""
+        return self._position.state_dict()
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """Continue at a position; Lightning may have made the loader before."""
+        self._position.load_state_dict(state_dict)
+
     def train_dataloader(self) -> DataLoader[Any]:
         """Return batches of training frames or pairs, shuffled in each epoch."""
-        return self._loader(self.train, training=True)
+        loader = self._loader(self.train, training=True)
+        cast(_TrainingLoader, loader).position = self._position
+        return loader
 
     def val_dataloader(self) -> DataLoader[Any]:
         """Return batches of validation frames or pairs, in order."""

@@ -117,6 +117,39 @@ def test_a_killed_run_resumes_at_its_epoch_and_ends_like_an_uninterrupted_one(ca
     assert torch.allclose(weights[name], expected[name], rtol=0, atol=1e-4)
 
 
+def test_a_stopped_run_says_how_to_continue_and_keeps_its_metrics(call, trained, monkeypatch):
+    step = Restoration.training_step
+
+    def stop(number: int) -> None:
+        def stopped_step(self, batch, index):
+            if (self.current_epoch, index) == (1, 1):
+                os.kill(os.getpid(), number)
+            return step(self, batch, index)
+
+        monkeypatch.setattr(Restoration, "training_step", stopped_step)
+
+    words = (*trained.words, "hydra.run.dir=run")
+    stop(signal.SIGTERM)
+    outcome, path = call("train", *words), Path("run", "last.ckpt").resolve()
+    assert (outcome.code, outcome.err) == (143, f"stopped by SIGTERM in step 6; ckpt_path={path} continues\n")
+    before = metrics(path.parent, "val/loss")
+    for name in (".last.part.ckpt", ".best-0123abcd.ckpt"):
+        (path.parent / name).touch()
+    stop(0)
+    assert call("train", *words, f"ckpt_path={path}").code == 0
+    assert metrics(path.parent, "val/loss", file="metrics_before.csv") == before
+    assert sorted(metrics(path.parent, "val/loss")) == [1]
+    assert not list(path.parent.glob(".*"))
+    weights, expected = (read_checkpoint(run / "last.ckpt")["state_dict"] for run in (path.parent, trained.folder))
+    assert all(torch.allclose(weights[name], expected[name], rtol=0, atol=1e-4) for name in weights)
+
+
+def test_several_processes_with_a_trainer_of_one_raise(call, trained, monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    message = call("train", *trained.words, "hydra.run.dir=run").message
+    assert message.startswith("trainer must be ddp with trainer.devices=2 under torchrun, got one that uses 1 of 2")
+
+
 def test_a_finished_run_cannot_be_resumed(call, trained):
     message = call("train", *trained.words, f"ckpt_path={trained.folder / 'last.ckpt'}", "hydra.run.dir=run").message
     assert message == "trainer.max_epochs must be above the 2 epochs of ckpt_path, got 2"

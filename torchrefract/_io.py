@@ -24,7 +24,7 @@ def replace_file(path: Path, *, alone: bool = False) -> Iterator[Path]:
             overwrites what a killed one left.
     """
     # tempfile creates files that only their owner can read.
-    name = f".{path.name}.part" if alone else f".{path.stem}-{uuid4().hex[:8]}{path.suffix}"
+    name = f".{path.stem}.part{path.suffix}" if alone else f".{path.stem}-{uuid4().hex[:8]}{path.suffix}"
     temporary = path.with_name(name)
     try:
         yield temporary

@@ -44,6 +44,7 @@ from torchrefract.cameras.io import read_covariance, read_opencv, write_opencv
 from torchrefract.cli.command import make, naming, progress
 from torchrefract.data import media
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, pixels_of, read_image
+from torchrefract.data.pairs.manifest import locked
 from torchrefract.fields.rectification import camera_flow
 from torchrefract.warping.warp import warp
 
@@ -279,21 +280,22 @@ def rectify(cfg: DictConfig) -> None:
         return (pixels_of(rectify_frame(frame)) for frame in frames)
 
     num_written, skipped = 0, dict[Path, str]()
-    for file in progress(files, "rectifying", count=len(files)):
-        target = out / media.output_name(file).name
-        try:
-            if media.is_complete(file, target):
-                continue
-            with replace_file(target) as path:
-                if media.is_video(file):
-                    media.convert_video(file, path, change=rectify_frames, upright=False)
-                else:
-                    frame = read_image(file, upright=False)[None].contiguous()
-                    media.write_picture(rectify_frame(frame), path, source=file, upright=False)
-            num_written += 1
-        except ValueError as error:
-            skipped[file] = str(error) if isinstance(error, UnreadableImageError) else f"{file}: {error}"
-            print(f"skipped: {skipped[file]}", file=sys.stderr)
+    with locked("out", out):
+        for file in progress(files, "rectifying", count=len(files)):
+            target = out / media.output_name(file).name
+            try:
+                if media.is_complete(file, target):
+                    continue
+                with replace_file(target, alone=True) as path:
+                    if media.is_video(file):
+                        media.convert_video(file, path, change=rectify_frames, upright=False)
+                    else:
+                        frame = read_image(file, upright=False)[None].contiguous()
+                        media.write_picture(rectify_frame(frame), path, source=file, upright=False)
+                num_written += 1
+            except ValueError as error:
+                skipped[file] = str(error) if isinstance(error, UnreadableImageError) else f"{file}: {error}"
+                print(f"skipped: {skipped[file]}", file=sys.stderr)
     if len(skipped) == len(files):
         raise UsageError(f"input must hold a file that can be rectified, got {next(iter(skipped.values()))}")
     num_existing = len(files) - len(skipped) - num_written

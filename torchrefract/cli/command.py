@@ -5,6 +5,7 @@ import errno
 import logging
 import os
 import re
+import signal
 import sys
 import threading
 import time
@@ -50,6 +51,7 @@ _TASK_OPTIONS = ("+task=", "++task=", "+experiment=", "++experiment=")  # an exp
 _OPTIONS_WITH_VALUE = ("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--cfg", "-c")
 _OPTIONS_WITH_VALUE += ("--package", "-p", "--info", "-i", "--experimental-rerun")
 _UNKNOWN_OPTION = re.compile(r"Could not override '(\w+)'")
+_REMOTE_OUTPUT = re.compile(r"\+*(out|run_dir|hydra\.(?:run|sweep)\.dir)=['\"]?([A-Za-z][\w+.-]*://.*?)['\"]?$")
 # Warnings of libraries about settings that are intended.
 _IGNORED_WARNINGS = (
     ".*does not have many workers.*",
@@ -84,6 +86,7 @@ def run(name: str, function: Callable[[DictConfig], None]) -> None:
     # Hydra creates the folder of a run before it calls the job.
     existing = _existing_folders([*filter(None, values), *Path("runs").glob("*"), "runs"])
     with _one_line_errors(name):
+        _check_outputs(sys.argv[1:])
         sys.argv[1:] = prepare_arguments(name, sys.argv[1:])
         hydra.main(config_path=CONFIG_DIR, config_name=name, version_base="1.3")(job)()
 
@@ -130,6 +133,16 @@ def quote_text(override: str, *, is_multirun: bool = False) -> str:
             return override
         return f"{option}=" + ",".join(_quote(part, is_literal=_exists(part)) for part in text.split(","))
     return f"{option}={_quote(text, is_literal=exists or not is_path)}"
+
+
+def _check_outputs(arguments: list[str]) -> None:
+    """Raise UsageError if an output option is an address, of which pathlib would make a folder such as "s3:"."""
+    for argument in arguments:
+        if match := _REMOTE_OUTPUT.match(argument):
+            raise UsageError(
+                f"{match[1]} must be a path on this machine, got {match[2]}; write to a folder and copy it, or mount "
+                "the storage"
+            )
 
 
 def require_task(name: str, arguments: list[str]) -> list[str]:
@@ -275,6 +288,9 @@ def _one_line_errors(name: str) -> Iterator[None]:
             raise
         print(f"error: {message}", file=sys.stderr)
         raise SystemExit(1) from error
+    except KeyboardInterrupt as error:
+        print(f"stopped; {error if str(error) else 'the same command continues'}", file=sys.stderr)
+        raise SystemExit(128 + signal.SIGINT) from None
 
 
 def _user_message(error: Exception, name: str) -> str | None:

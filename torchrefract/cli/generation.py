@@ -35,7 +35,7 @@ from torchrefract.data.pairs.generator import (
     find_sources,
     generate_pairs,
 )
-from torchrefract.data.pairs.manifest import Manifest, PairRow, claim, find_manifests, scan_rows
+from torchrefract.data.pairs.manifest import Manifest, PairRow, claim, find_manifests, locked_shard, scan_rows
 from torchrefract.effects.base import Effect
 
 _T = TypeVar("_T")
@@ -89,21 +89,28 @@ def generate(cfg: DictConfig) -> None:
         previous = claim(out, options.settings, count=options.num_pairs, about=about).get("made_with", _VERSIONS)
         if previous != _VERSIONS:
             print(f"existing pairs were made with {previous}, new ones are made with {_VERSIONS}: bytes may differ")
-        storage = PairStorage(out, options.settings["tar"])
-        manifest = Manifest(out, *options.shard)
-        complete, damaged = manifest.open(
-            lambda number: options.shard.holds(number, options.num_pairs, storage.unit), verify=options.verify
-        )
-        _report(options, complete, damaged)
-        units = [u for u in options.shard.units(options.num_pairs, storage.unit) if not complete.issuperset(u)]
-        if units:
-            _check_disk(options, [number for unit in units for number in unit], storage)
-            tasks = ([options.task(number) for number in unit] for unit in units)
-            rows = generate_pairs(tasks, options.generator, storage, workers=min(options.workers, len(units)))
-            for unit in _with_progress(rows, total=sum(map(len, units))):
-                manifest.add(unit)
-        manifest.close()
-        _finish(options, out, num_made=sum(map(len, units)))
+        with locked_shard(out, *options.shard):
+            num_made = _make_missing(options, out)
+        _finish(options, out, num_made=num_made)
+
+
+def _make_missing(options: Options, out: Path) -> int:
+    """Write the missing pairs of a shard; return their number."""
+    storage = PairStorage(out, options.settings["tar"])
+    manifest = Manifest(out, *options.shard)
+    complete, damaged = manifest.open(
+        lambda number: options.shard.holds(number, options.num_pairs, storage.unit), verify=options.verify
+    )
+    _report(options, complete, damaged)
+    units = [u for u in options.shard.units(options.num_pairs, storage.unit) if not complete.issuperset(u)]
+    if units:
+        _check_disk(options, [number for unit in units for number in unit], storage)
+        tasks = ([options.task(number) for number in unit] for unit in units)
+        rows = generate_pairs(tasks, options.generator, storage, workers=min(options.workers, len(units)))
+        for unit in _with_progress(rows, total=sum(map(len, units))):
+            manifest.add(unit)
+    manifest.close()
+    return sum(map(len, units))
 
 
 def _parse(cfg: DictConfig) -> Options:

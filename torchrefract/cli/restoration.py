@@ -1,9 +1,12 @@
 """The commands `train` and `eval`, and those that apply a model: `restore` writes pictures, `export` a program."""
 
 import hashlib
+import os
+import signal
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -13,7 +16,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning import Trainer, seed_everything
-from pytorch_lightning.utilities.exceptions import MisconfigurationException
+from pytorch_lightning.utilities.exceptions import MisconfigurationException, SIGTERMException
 from torch import Tensor
 
 from torchrefract._io import replace_file
@@ -33,8 +36,14 @@ from torchrefract.data.media import (
     write_picture,
 )
 from torchrefract.data.module import PairData, fingerprint
-from torchrefract.data.pairs.manifest import claim
-from torchrefract.restoration.checkpoints import check_fits, load_model, read_checkpoint
+from torchrefract.data.pairs.manifest import claim, locked
+from torchrefract.restoration.checkpoints import (
+    check_fits,
+    how_to_continue,
+    load_model,
+    num_epochs_done,
+    read_checkpoint,
+)
 from torchrefract.restoration.export import FORMATS, export_model
 from torchrefract.restoration.inference import Restorer
 from torchrefract.restoration.models.coordconv import weights_license
@@ -52,7 +61,30 @@ def train(cfg: DictConfig) -> None:
         raise UsageError(f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}")
     model.origin = _origin(cfg, data)
     _save_config(cfg, trainer)
-    trainer.fit(model, data, ckpt_path=cfg.ckpt_path, weights_only=True)
+    run = Path(cfg.run_dir)
+    with locked("run_dir", run) if trainer.is_global_zero else nullcontext():
+        if trainer.is_global_zero:
+            _remove_incomplete({run} if cfg.ckpt_path is None else {run, Path(cfg.ckpt_path).parent}, run)
+        _fit(cfg, data, model, trainer)
+
+
+def _remove_incomplete(folders: Iterable[Path], locked_folder: Path) -> None:
+    """Remove the checkpoints that killed runs left incomplete in folders, unless another run uses the folder."""
+    for folder in folders:
+        with suppress(UsageError, OSError), nullcontext() if folder == locked_folder else locked("ckpt_path", folder):
+            for path in folder.glob(".*.ckpt"):
+                path.unlink()
+
+
+def _fit(cfg: DictConfig, data: PairData, model: RestorationModule, trainer: Trainer) -> None:
+    try:
+        trainer.fit(model, data, ckpt_path=cfg.ckpt_path, weights_only=True)
+    except SIGTERMException:
+        raise SystemExit(128 + signal.SIGTERM) from None
+    except SystemExit as error:  # Lightning turns Ctrl-C into the status 1
+        if isinstance(error.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt(how_to_continue(Path(cfg.run_dir, "last.ckpt"))) from None
+        raise
 
 
 def evaluate(cfg: DictConfig) -> None:
@@ -77,6 +109,11 @@ def restore(cfg: DictConfig) -> None:
     job = _make_job(cfg, source if source.is_dir() else source.parent, out)
     with naming("out"):
         claim(out, _settings(cfg, job), count=0, about={})
+    with locked("out", out):
+        _restore_missing(files, job, out)
+
+
+def _restore_missing(files: Sequence[Path], job: "_Job", out: Path) -> None:
     todo = [file for file in files if not job.is_done(file)]
     for loss in describe_losses(todo, upright=True):
         print(f"warning: {loss}", file=sys.stderr)
@@ -123,12 +160,17 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
         trainer = make(cfg, "trainer")
     except MisconfigurationException as error:
         raise UsageError(f"trainer: {error}") from error
+    if (processes := int(os.environ.get("WORLD_SIZE") or 1)) != trainer.world_size:
+        raise UsageError(
+            f"trainer must be ddp with trainer.devices={os.environ.get('LOCAL_WORLD_SIZE', processes)} under torchrun, "
+            f"got one that uses {trainer.world_size} of {processes} processes"
+        )
     with naming("data"):
         data.check_ranks(trainer.world_size)
         data.check_pair()
     if path and checkpoint:
         check_fits(checkpoint, model, path, config=cfg.model)
-    return data, model, trainer, checkpoint.get("epoch", -1) + 1 if checkpoint else 0
+    return data, model, trainer, num_epochs_done(checkpoint) if checkpoint else 0
 
 
 def _save_config(cfg: DictConfig, trainer: Trainer) -> None:
@@ -227,7 +269,7 @@ def _restore_pictures(files: Sequence[Path], job: _Job, failed: dict[Path, str])
         for file, image in zip(images, job.restore([*images.values()]) if images else (), strict=True):
             target = job.target(file)
             target.parent.mkdir(parents=True, exist_ok=True)
-            with replace_file(target) as path:
+            with replace_file(target, alone=True) as path:
                 write_picture(image, path, source=file)
             count += 1
     return count
@@ -244,7 +286,7 @@ def _restore_video(file: Path, job: _Job, failed: dict[Path, str]) -> int:
     target = job.target(file)
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with replace_file(target) as path:
+        with replace_file(target, alone=True) as path:
             return convert_video(file, path, change=change)
     except UnreadableImageError as error:
         _skip(file, error, failed)

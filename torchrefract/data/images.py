@@ -21,12 +21,14 @@ from torch import Tensor
 
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract._validation import check_size, check_tensor
+from torchrefract.data.jpeg import lacks_pixel_data
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 
 _TAIL = 4096  # bytes at the end that are searched first for an end marker
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"
+_JPEG = b"\xff\xd8\xff"
 _JPEG_END = b"\xff\xd9"
 _START_OF_SCAN = 0xDA
 _BARE_MARKERS = (0x01, *range(0xD0, 0xD8))  # TEM and RST0 to RST7 have no length
@@ -216,13 +218,20 @@ def _read_header(path: str | Path, stream: BinaryIO) -> ImageHeader:
 def _decode(path: str | Path, data: bytes, *, upright: bool) -> np.ndarray:
     # From a file instead of memory, OpenCV would fill the missing rows of a truncated JPEG with gray.
     mode = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
+
+    def decode(data: bytes) -> np.ndarray | None:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), mode)
+
     try:
         with _silent_opencv():
-            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
+            pixels = decode(data)
+            is_partial = data.startswith(_JPEG) and pixels is not None and lacks_pixel_data(data, pixels, decode)
     except cv2.error as error:
         raise UnreadableImageError(f"{path} cannot be decoded ({error.err})") from error
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         raise UnreadableImageError(f"{path} is damaged: its pixels cannot be decoded")
+    if is_partial:
+        raise UnreadableImageError(f"{path} is damaged: a part of its pixels is missing")
     return pixels
 
 

@@ -2,7 +2,8 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,11 +19,55 @@ from torchrefract.effects.base import Effect
 from torchrefract.types import Frame, Pair
 
 
+class _Sampler(DistributedSampler[Any]):
+    """A sampler that can begin inside an epoch."""
+
+    start = 0  # number of samples to skip
+
+    def __iter__(self) -> Iterator[Any]:
+        return islice(super().__iter__(), self.start, None)
+
+
+class _Position:
+    """A point in a training, as an epoch and the number of its batches that were handed out."""
+
+    def __init__(self) -> None:
+        self.done = self.resumed = (0, 0)
+
+    def state_dict(self) -> dict[str, int]:
+        return dict(zip(("epoch", "batches"), self.done, strict=True))
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self.done = self.resumed = (state["epoch"], state["batches"])
+
+
+class _TrainingLoader(DataLoader[Any]):
+    """A loader that a resumed run continues at the next batch."""
+
+    position = _Position()
+
+    def __iter__(self) -> Iterator[Any]:  # pyright: ignore[reportIncompatibleMethodOverride]  # an iterator is enough
+        # A generator starts at its first batch, when Lightning has set the epoch. Workers would take the order of the
+        # sampler at once, which is still that of epoch 0 in a resumed run.
+        sampler, position = cast(_Sampler, self.sampler), self.position
+        epoch, start = sampler.epoch, position.resumed[1] if position.resumed[0] == sampler.epoch else 0
+        position.resumed, sampler.start = (0, 0), start * cast(int, self.batch_size)
+        for number, batch in enumerate(super().__iter__(), start + 1):
+            position.done = epoch, number
+            yield batch
+
+    def state_dict(self) -> dict[str, int]:  # Lightning warns of a loader without the two functions
+        return self.position.state_dict()
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self.position.load_state_dict(state)
+
+
 class PairData(LightningDataModule):
     """Pairs of clean and degraded frames for Lightning.
 
     In training, the draw of a frame depends on (seed, epoch, key of the frame); in validation, on the seed and the key.
-    A resumed run therefore sees the same pairs as an uninterrupted one.
+    A resumed run therefore sees the same pairs in the same order as an uninterrupted one, also from within an epoch.
 
     Args:
         train, val: clean frames, or pairs from disk; `val` should be of other drives than `train`.
@@ -55,6 +100,7 @@ class PairData(LightningDataModule):
         self.workers = check_count("workers", workers, low=0)
         self.seed = check_count("seed", seed, low=0)
         self._maps = {"transmission": check_flag("transmission", transmission), "flow": check_flag("flow", flow)}
+        self._position = _Position()
         self.check_ranks(1)
 
     def check_ranks(self, ranks: int) -> None:
@@ -70,9 +116,19 @@ class PairData(LightningDataModule):
         if isinstance(first, Frame) and self.effect is not None:
             make_pair(default_collate([first]), self.effect, seed=0, **self._maps)
 
+    def state_dict(self) -> dict[str, int]:
+        """Return the position in the training, which checkpoints hold."""
+        return self._position.state_dict()
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """Continue at a position; Lightning may have made the loader before."""
+        self._position.load_state_dict(state_dict)
+
     def train_dataloader(self) -> DataLoader[Any]:
         """Return batches of training frames or pairs, shuffled in each epoch."""
-        return self._loader(self.train, training=True)
+        loader = self._loader(self.train, training=True)
+        cast(_TrainingLoader, loader).position = self._position
+        return loader
 
     def val_dataloader(self) -> DataLoader[Any]:
         """Return batches of validation frames or pairs, in order."""
@@ -95,8 +151,8 @@ class PairData(LightningDataModule):
         ranks, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
         self.check_ranks(ranks)
         # Each rank has its own frames, in training without repetition; Lightning sets the epoch.
-        sampler = DistributedSampler(frames, ranks, rank, shuffle=training, seed=self.seed, drop_last=training)
-        return DataLoader(
+        sampler = _Sampler(frames, ranks, rank, shuffle=training, seed=self.seed, drop_last=training)
+        return (_TrainingLoader if training else DataLoader)(
             frames,
             batch_size=self.batch_size,
             sampler=sampler,

@@ -5,8 +5,10 @@ caches the machine code on disk.
 """
 
 import os
+import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache
 from itertools import pairwise
 from typing import Any, TypeVar, cast
@@ -31,9 +33,38 @@ if numba.config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]  # n
 def _jit(function: _F) -> _F:
     options: Any = {"nogil": True, "error_model": "numpy"}
     try:
-        return cast(_F, numba.njit(cache=True, **options)(function))
+        kernel: Any = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder is writable, so the kernel is compiled once for each process
         return cast(_F, numba.njit(**options)(function))
+    storage = kernel._cache
+    storage.load_overload = _optional(storage.load_overload, storage)
+    storage.save_overload = _optional(storage.save_overload, storage)
+    return cast(_F, kernel)
+
+
+def _optional(access: Callable[..., Any], storage: Any) -> Callable[..., Any]:
+    """Return an access to numba's cache that returns None if it fails, as on a full disk or for a torn file."""
+
+    def run(*arguments: Any) -> Any:
+        try:
+            return access(*arguments)
+        except Exception:  # pickle and LLVM raise many types for a torn file
+            _warn_of_cache(storage.cache_path)
+            with suppress(Exception):
+                storage.flush()  # an index that is torn would fail for ever
+            return None
+
+    return run
+
+
+@cache
+def _warn_of_cache(folder: str) -> None:
+    warnings.warn(
+        f"numba cannot use its cache in {folder}, so each process compiles kernels again; free disk space, remove the "
+        "folder, or set NUMBA_CACHE_DIR",
+        RuntimeWarning,
+        stacklevel=2,
+    )
 
 
 def why_unsupported(image: Tensor, flow: Tensor) -> str | None:

@@ -1,6 +1,9 @@
 """Checkpoints: written atomically, verified before use, and sufficient to rebuild their model safely."""
 
 import re
+import signal
+import sys
+import threading
 import zipfile
 from collections.abc import Callable, Mapping
 from importlib import import_module
@@ -12,8 +15,9 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from pytorch_lightning import LightningModule
+from pytorch_lightning import Callback, LightningModule, Trainer
 from pytorch_lightning.plugins.io import TorchCheckpointIO
+from pytorch_lightning.utilities.exceptions import SIGTERMException
 from torch import Tensor, nn
 
 from torchrefract._io import replace_file
@@ -39,7 +43,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         path = Path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with replace_file(path) as temporary:
+            with replace_file(path, alone=True) as temporary:
                 torch.save(checkpoint, temporary)
         # If the disk is full, torch raises a RuntimeError of its archive writer.
         except (OSError, RuntimeError) as error:
@@ -49,6 +53,66 @@ class AtomicCheckpointIO(TorchCheckpointIO):
                 f"{path} could not be written ({reason}){previous}: free disk space or choose another hydra.run.dir, "
                 "and resume with ckpt_path="
             ) from error
+
+
+class StopOnSigterm(Callback):
+    """Stop a training on SIGTERM between two steps, with a checkpoint that continues at the next one.
+
+    A validation is completed first. A training on several devices keeps the checkpoint of its last epoch, because its
+    processes receive the signal in different steps.
+
+    Args:
+        run_dir: the run folder, whose last.ckpt the callback replaces.
+    """
+
+    def __init__(self, run_dir: str):
+        self.path = Path(run_dir) / "last.ckpt"
+        self._is_pending = False
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Delay the signal until the end of a validation, whose state no checkpoint holds."""
+        forward = signal.getsignal(signal.SIGTERM)
+
+        def receive(number: int, frame: Any) -> None:
+            if trainer.validating:
+                self._is_pending = True
+            elif callable(forward):
+                forward(number, frame)
+
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, receive)  # Lightning restores the handler of the caller
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Delay a signal of the last step, too."""
+        if trainer.received_sigterm:
+            self._is_pending, trainer._signal_connector.received_sigterm = True, False
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Deliver a delayed signal."""
+        if self._is_pending:
+            self._is_pending = False
+            signal.raise_signal(signal.SIGTERM)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Write the checkpoint, and say how to continue."""
+        if not isinstance(exception, SIGTERMException):
+            return
+        epochs: Any = trainer.fit_loop.epoch_progress.current
+        # At the end of an epoch, the checkpoint exists already.
+        if trainer.world_size == 1 and epochs.processed < epochs.ready:
+            trainer.save_checkpoint(self.path)
+        if trainer.is_global_zero:
+            print(f"stopped by SIGTERM in step {trainer.global_step}; {how_to_continue(self.path)}", file=sys.stderr)
+
+
+def how_to_continue(path: Path) -> str:
+    """Return the words that continue a stopped training from the last checkpoint."""
+    return f"ckpt_path={path} continues" if path.is_file() else "no epoch was completed, so nothing is saved"
+
+
+def num_epochs_done(checkpoint: Mapping[str, Any]) -> int:
+    """Return the number of complete epochs of a training checkpoint."""
+    return int(checkpoint["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"])
 
 
 class Loaded(NamedTuple):

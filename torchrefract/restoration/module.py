@@ -164,6 +164,7 @@ class RestorationModule(LightningModule, ABC):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the task, the sums of the flows and the origin to a checkpoint."""
+        self.on_validation_start()  # within an epoch, flows are left to be added
         checkpoint.update(self.origin, task=self.task.name, flows=(self.flows[:2], self.flows[2:]))
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:

@@ -45,6 +45,8 @@ class RunSummary(Callback):
     def __init__(self, run_dir: str, ckpt_path: str | None = None):
         self.run_dir = Path(run_dir)
         self.resumed_run = None if ckpt_path is None else Path(ckpt_path).parent
+        if self.resumed_run is not None and self.resumed_run.resolve() == self.run_dir.resolve():
+            carry_over(self.resumed_run, self.run_dir)  # the logger deletes the table when the run starts
         self._examples: tuple[Restored, Pair] | None = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -75,7 +77,8 @@ class RunSummary(Callback):
             save_figure(plot_curves(self.run_dir, epe_unit=f"px at {width}x{height}"), self.run_dir / "curves.png")
         save_figure(draw_panel(*self._examples), self.run_dir / "panel.png")
         print("\n".join(summary(trainer.callback_metrics, pl_module.metric_size)))
-        print(f"{self.run_dir}: {', '.join(sorted(path.name for path in self.run_dir.iterdir() if path.is_file()))}")
+        names = sorted(path.name for path in self.run_dir.glob("[!.]*") if path.is_file())
+        print(f"{self.run_dir}: {', '.join(names)}")
 
 
 def save_figure(figure: Figure, out: Path) -> None:
@@ -111,9 +114,11 @@ def metrics_rows(run: Path) -> Iterator[dict[str, str]]:
                 yield from csv.DictReader(file)
 
 
-def carry_over(resumed: Path, run: Path, *, before_epoch: int) -> None:
+def carry_over(resumed: Path, run: Path, *, before_epoch: float = math.inf) -> None:
     """Copy the metrics of the epochs below `before_epoch` from the folder `resumed` into the folder `run`."""
-    rows = [row for row in metrics_rows(resumed) if _epoch_of(row) < before_epoch]
+    complete = (row for row in metrics_rows(resumed) if _epoch_of(row) < before_epoch)
+    # A row that is in both tables counts once.
+    rows = [dict(row) for row in dict.fromkeys(tuple(pair for pair in row.items() if pair[1]) for row in complete)]
     names = list(dict.fromkeys(name for row in rows for name in row))
     if not rows:
         return

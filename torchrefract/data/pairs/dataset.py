@@ -11,6 +11,7 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from torchrefract._tensor import to_float
 from torchrefract._validation import check_choice, check_count, check_flag
+from torchrefract.data.images import opened
 from torchrefract.data.pairs.files import DamagedPairError, decode_pair
 from torchrefract.data.pairs.manifest import PairRow, find_manifests, read_row, read_stored, scan_rows
 from torchrefract.types import Pair
@@ -68,6 +69,7 @@ class PairedFolder(Dataset[Pair]):
             arrays = decode_pair(
                 {suffix: partial(read_stored, self.root, file) for suffix, file in row.files.items()},
                 (_FLOW, _VALID, _TRANSMISSION) if self.transmission else (_FLOW, _VALID),
+                size=(row.height, row.width),
             )
         except DamagedPairError as error:
             raise DamagedPairError(
@@ -95,7 +97,7 @@ class PairedFolder(Dataset[Pair]):
     def row(self, index: int) -> PairRow:
         """Read the manifest's row of a pair."""
         number, offset, length = self._locations[index].tolist()
-        with self._manifests[number].open("rb") as stream:
+        with opened(self._manifests[number]) as stream:
             stream.seek(offset)
             return read_row(stream.read(length))
 

@@ -27,6 +27,7 @@ IMAGES = ("clean", "corrupted")
 
 _LEVELS_PER_PX, _ZERO_LEVEL, _LAST_LEVEL = 64, 1 << 15, (1 << 16) - 1  # of a flow in a PNG
 _ZLIB_RATIO = 1032  # the largest ratio of compression that zlib reaches
+_MAX_PIXELS = 2 * 89_478_485  # as of Pillow; a small file of zeros could fill the memory
 _MAPS_STEM = "maps"  # name of the file that holds all maps of an npz or safetensors pair
 
 # Level 1 of zlib is the fastest. The row above predicts photographs best, the left neighbor predicts maps best.
@@ -80,24 +81,31 @@ def encode_pair(pair: PairArrays, file_format: str) -> dict[str, bytes]:
     return files | {f"{name}.png": _encode_map(name, value, pair.maps) for name, value in pair.maps.items()}
 
 
-def decode_pair(files: Mapping[str, Callable[[], bytes]], names: tuple[str, ...] | None = None) -> PairArrays:
+def decode_pair(
+    files: Mapping[str, Callable[[], bytes]],
+    names: tuple[str, ...] | None = None,
+    *,
+    size: tuple[int, int] | None = None,
+) -> PairArrays:
     """Decode a pair.
 
     Args:
         files: a function that reads the content of each file, by the suffix of its name.
         names: maps to decode if they are PNG files; None for all.
+        size: (height, width) of all images and maps, px; None for that of the clean image.
 
     Raises:
-        DamagedPairError: a file is invalid.
+        DamagedPairError: a file is invalid or of another size, or a map has NaN or another type.
     """
+    size = size or _png_size(files["clean.png"]())
     maps: dict[str, np.ndarray] = {}
     for suffix, read in files.items():
         name, _, file_format = suffix.partition(".")
         if name == _MAPS_STEM:
-            maps |= _decode(suffix, read(), _decode_npz if file_format == "npz" else load)
+            maps |= _decode(suffix, read(), partial(_decode_maps, size, file_format))
         elif name not in IMAGES and (names is None or name in names):
-            maps[name] = _decode(suffix, read(), partial(_decode_map, name))
-    clean, corrupted = (_decode(f"{name}.png", files[f"{name}.png"](), _decode_image) for name in IMAGES)
+            maps[name] = _decode(suffix, read(), partial(_decode_map, name, size))
+    clean, corrupted = (_decode(f"{name}.png", files[f"{name}.png"](), partial(_decode_image, size)) for name in IMAGES)
     return PairArrays(clean, corrupted, maps)
 
 
@@ -124,15 +132,15 @@ def encode_flow(flow: np.ndarray, valid: np.ndarray) -> bytes:
     return _encode_png(np.dstack([(valid & _in_range(flow)).astype(np.uint16), levels[1], levels[0]]), _MAP_OPTIONS)
 
 
-def decode_flow(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+def decode_flow(data: bytes, size: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Decode a PNG of `encode_flow` into a flow (2, H, W), float32, px, and a validity mask (H, W), bool."""
-    levels = _decode_png(data, np.uint16, 3)
+    levels = _decode_png(data, np.uint16, 3, size)
     flow = (levels[..., :0:-1].astype(np.float32) - _ZERO_LEVEL) / _LEVELS_PER_PX
     return np.ascontiguousarray(flow.transpose(2, 0, 1)), levels[..., 0] > 0
 
 
-def _decode_image(data: bytes) -> np.ndarray:
-    return np.ascontiguousarray(_decode_png(data, np.uint8, 3)[..., ::-1])
+def _decode_image(size: tuple[int, int], data: bytes) -> np.ndarray:
+    return np.ascontiguousarray(_decode_png(data, np.uint8, 3, size)[..., ::-1])
 
 
 def _in_range(flow: np.ndarray) -> np.ndarray:
@@ -152,16 +160,28 @@ def _encode_map(name: str, value: np.ndarray, maps: Mapping[str, np.ndarray]) ->
     return _encode_png(levels.astype(np.uint16), _MAP_OPTIONS)
 
 
-def _decode_map(name: str, data: bytes) -> np.ndarray:
+def _decode_map(name: str, size: tuple[int, int], data: bytes) -> np.ndarray:
     if name in FLOWS:
-        return decode_flow(data)[0]
+        return decode_flow(data, size)[0]
     if name in MASKS:
-        return _decode_png(data, np.uint8, 1) > 0
-    return _decode_png(data, np.uint16, 1).astype(np.float32) / LIGHTS[name]
+        return _decode_png(data, np.uint8, 1, size) > 0
+    return _decode_png(data, np.uint16, 1, size).astype(np.float32) / LIGHTS[name]
 
 
 def _encode_png(pixels: np.ndarray, options: list[int]) -> bytes:
     return cv2.imencode(".png", np.ascontiguousarray(pixels), options)[1].tobytes()
+
+
+def _decode_maps(size: tuple[int, int], file_format: str, data: bytes) -> dict[str, np.ndarray]:
+    maps = _decode_npz(data) if file_format == "npz" else load(data)
+    for name in maps.keys() & {*FLOWS, *MASKS, *LIGHTS}:
+        shape, kind = ((2, *size) if name in FLOWS else size), (np.bool_ if name in MASKS else np.float32)
+        if maps[name].shape != shape or maps[name].dtype != kind:
+            kinds = f"got {maps[name].dtype} of shape {maps[name].shape}"
+            raise ValueError(f"{name} must be {kind.__name__} of shape {shape}, {kinds}")
+        if not np.isfinite(maps[name]).all():
+            raise ValueError(f"{name} must be finite, got NaN or infinity")
+    return maps
 
 
 def _decode_npz(data: bytes) -> dict[str, np.ndarray]:
@@ -180,11 +200,21 @@ def _decode(suffix: str, data: bytes, decoder: Callable[[bytes], _T]) -> _T:
         raise DamagedPairError(f"{suffix} is damaged ({str(error)[:_LONGEST_MESSAGE]})") from error
 
 
-def _decode_png(data: bytes, dtype: type, channels: int) -> np.ndarray:
-    height, width = (int.from_bytes(data[i : i + 4], "big") for i in (20, 16))
+def _png_size(data: bytes) -> tuple[int, int]:
+    """Return (height, width) from the header of a PNG."""
+    return int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big")
+
+
+def _decode_png(data: bytes, dtype: type, channels: int, size: tuple[int, int] | None = None) -> np.ndarray:
+    height, width = _png_size(data)
+    if size not in (None, (height, width)):
+        raise DamagedPairError(f"it must be of {size} px (height, width), got {(height, width)}")
     # OpenCV allocates the size that the header states before it reads a pixel.
-    if not has_complete_png_chunks(data) or height * width > _ZLIB_RATIO * len(data):
-        raise DamagedPairError("it is not a complete PNG, or states a larger size than its bytes can hold")
+    num_bytes = height * width * channels * np.dtype(dtype).itemsize
+    if not has_complete_png_chunks(data) or num_bytes > _ZLIB_RATIO * len(data) or height * width > _MAX_PIXELS:
+        raise DamagedPairError(
+            f"it is not a complete PNG, states a larger size than its bytes can hold, or has over {_MAX_PIXELS} px"
+        )
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != dtype or pixels.ndim != (3 if channels == 3 else 2):
         raise DamagedPairError(f"it is not a PNG of {channels} channels of {np.dtype(dtype).itemsize * 8} bits")

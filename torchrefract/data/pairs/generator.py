@@ -192,6 +192,11 @@ class PairGenerator(NamedTuple):
         try:
             image = self.reader.read(source)
         except UnreadableImageError as error:
+            # A missing file or a lost disk says nothing about the frame.
+            if isinstance(error.__cause__, OSError) and error.__cause__.errno is not None:
+                raise UsageError(
+                    f"source must stay unchanged during a run, got {error}; the same command continues"
+                ) from error
             return GeneratedPair(row._replace(skipped=str(error).replace(f"{self.reader.root}/", "")), {})
         except ValueError as error:
             raise UsageError(f"size: {error}") from error

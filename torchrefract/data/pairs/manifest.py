@@ -4,9 +4,11 @@ import hashlib
 import json
 import os
 import re
+import sys
+import tarfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -14,7 +16,11 @@ from typing import Any, BinaryIO, NamedTuple
 
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError
+from torchrefract.data.images import UnreadableImageError, opened
 from torchrefract.data.pairs.files import DamagedPairError
+
+if sys.platform != "win32":
+    import fcntl
 
 _MANIFESTS = "manifest*.jsonl"
 _SHOWN = 6  # differences in a message
@@ -122,7 +128,7 @@ def scan_rows(
     seen = set[int]()
     for path in paths:
         offset = 0
-        with path.open("rb") as stream:
+        with opened(path) as stream:
             for line in stream:
                 try:
                     row = read_row(line)
@@ -150,12 +156,12 @@ def read_lines(locations: Iterable[RowLocation]) -> Iterator[bytes]:
 def read_stored(root: Path, file: StoredFile) -> bytes:
     """Read a file of a pair; raises DamagedPairError if it is missing or too short."""
     try:
-        with (root / file.path).open("rb") as stream:
+        with opened(root / file.path) as stream:
             stream.seek(file.offset)
             # `read` allocates the full count first, which an invalid manifest could make larger than memory.
             data = stream.read(min(file.bytes, os.fstat(stream.fileno()).st_size))
-    except OSError as error:
-        raise DamagedPairError(f"{root / file.path} cannot be read ({error.strerror})") from error
+    except UnreadableImageError as error:
+        raise DamagedPairError(str(error)) from error
     if len(data) != file.bytes:
         raise DamagedPairError(f"{root / file.path} is truncated")
     return data
@@ -171,8 +177,8 @@ class Manifest:
     def open(self, is_in_shard: Callable[[int], bool], *, verify: bool) -> tuple[set[int], int]:
         """Write the rows of this shard whose files exist, from all manifests of the folder.
 
-        With `verify`, checksums are compared too, files that disagree are deleted, and frames that were skipped are
-        dropped, to be tried again.
+        With `verify`, checksums are compared too, and frames that were skipped are dropped, to be tried again. Rows
+        move into the manifest of this shard, so that a set that goes on with another number of shards has each once.
 
         Returns:
             the numbers of complete pairs, and the number of damaged pairs that `verify` has detected.
@@ -185,11 +191,23 @@ class Manifest:
                     if is_complete and not (verify and row.skipped):
                         kept.append((row.number, location))
                     elif verify:
-                        damaged += bool(row.files)
-                        for path in {file.path for file in row.files.values()}:
-                            (self.out / path).unlink(missing_ok=True)
+                        damaged += bool(row.files)  # a new file replaces a damaged one, and a tar has intact pairs
         self._write(kept)
+        self._take_rows(is_in_shard)
         return {number for number, _ in kept}, damaged
+
+    def _take_rows(self, is_in_shard: Callable[[int], bool]) -> None:
+        """Remove the rows of this shard from the manifests of another number of shards."""
+        others = f"manifest-[0-9]*{self.path.name[14:]}" if "-of-" in self.path.name else self.path.name
+        current = set(self.out.glob(others))
+        with locked("out", self.out, "manifests", wait=True):
+            for path in set(find_manifests(self.out)) - current:
+                rows = scan_rows([path], lambda row: not is_in_shard(row.number), skip_invalid=True)
+                kept = sorted((row.number, location) for row, location in rows)
+                if kept:
+                    self._write(kept, path)
+                else:
+                    path.unlink()
 
     def add(self, rows: Iterable[PairRow]) -> None:
         """Append the rows of pairs whose files are written."""
@@ -201,23 +219,35 @@ class Manifest:
         rows = scan_rows([self.path], lambda _: True, skip_invalid=True)
         self._write([(row.number, location) for row, location in rows])
 
-    def _write(self, rows: Sequence[tuple[int, RowLocation]]) -> None:
-        with replace_file(self.path, alone=True) as temporary, temporary.open("wb") as stream:
+    def _write(self, rows: Sequence[tuple[int, RowLocation]], path: Path | None = None) -> None:
+        with replace_file(path or self.path, alone=True) as temporary, temporary.open("wb") as stream:
             stream.writelines(read_lines(location for _, location in sorted(rows)))
 
     def _is_complete(self, row: PairRow, *, verify: bool) -> bool:
         """Return True if the files of a pair have their sizes and, with `verify`, their checksums."""
         try:
             sizes = {path: (self.out / path).stat().st_size for path in {file.path for file in row.files.values()}}
-            for file in row.files.values():
+            for suffix, file in row.files.items():
                 end = file.offset + file.bytes
                 if sizes[file.path] < end or (file.offset == 0 and sizes[file.path] > end):  # a tar continues
+                    return False
+                if verify and file.path.endswith(".tar") and not self._has_tar_header(row.name, suffix, file):
                     return False
                 if verify and hashlib.sha256(read_stored(self.out, file)).hexdigest() != file.sha256:
                     return False
         except (OSError, DamagedPairError):
             return False
         return True
+
+    def _has_tar_header(self, name: str, suffix: str, file: StoredFile) -> bool:
+        """Return True if the header before a file of a tar is intact; other programs stop reading at a damaged one."""
+        size = tarfile.BLOCKSIZE
+        header = read_stored(self.out, file._replace(offset=file.offset - size, bytes=size))
+        try:
+            info = tarfile.TarInfo.frombuf(header, "utf-8", "surrogateescape")
+        except tarfile.HeaderError:
+            return False
+        return (info.name, info.size) == (f"{name}.{suffix}", file.bytes)
 
 
 def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[str, Any]) -> dict[str, Any]:
@@ -257,6 +287,53 @@ def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[
         with replace_file(path) as temporary:
             temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     return previous
+
+
+@contextmanager
+def locked(argument: str, folder: Path, name: str = "run", *, wait: bool = False) -> Iterator[None]:
+    """Hold a lock on an existing folder until the block or the process ends; on Windows, do nothing.
+
+    Args:
+        argument: that names the folder.
+        folder: gets a hidden empty file while the lock is held.
+        name: of the lock; locks of different names do not exclude each other.
+        wait: True to wait for another process instead of raising.
+
+    Raises:
+        UsageError: another process holds the lock.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    path = folder / f".{name}.lock"
+    while True:
+        with path.open("w") as stream:
+            try:
+                fcntl.flock(stream, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            except BlockingIOError as error:
+                raise UsageError(
+                    f"{argument} must not be in use, got {folder}, which another run writes to; wait for it, or choose "
+                    "another folder"
+                ) from error
+            # Another process may have removed the file in the meantime.
+            if path.exists() and os.path.samestat(os.fstat(stream.fileno()), path.stat()):
+                try:
+                    yield
+                finally:
+                    path.unlink(missing_ok=True)
+                return
+
+
+@contextmanager
+def locked_shard(out: Path, shard: int, shards: int) -> Iterator[None]:
+    """Hold the lock of a shard; raise UsageError if another run makes it, or makes another number of shards."""
+    end = f"-of-{shards}"
+    with locked("out", out, f"shard-{shard}{end}"):
+        for path in out.glob(".shard-*-of-*.lock"):
+            if not path.stem.endswith(end):
+                with locked("out", out, path.stem.removeprefix(".")):
+                    pass
+        yield
 
 
 def _check_same(previous: Any, new: Any, out: Path) -> None:

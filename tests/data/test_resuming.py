@@ -1,0 +1,98 @@
+"""A resumed training gets the pairs of an uninterrupted one, in the same order."""
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from pytorch_lightning import LightningModule, Trainer
+from pytorch_lightning.callbacks import ModelCheckpoint
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from torchrefract import Frame, Pair, UniformFog
+from torchrefract.data.module import PairData
+from torchrefract.restoration.checkpoints import StopOnSigterm
+
+EPOCHS, BATCHES = 3, 3
+_IGNORED = ("LeafSpec", "does not have many workers", "multi-threaded", "exists and is not empty")
+pytestmark = [pytest.mark.filterwarnings(f"ignore:.*{text}") for text in _IGNORED]
+
+
+class Images(Dataset[Frame]):
+    def __init__(self, count: int):
+        self.count = count
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> Frame:
+        return Frame(torch.full((3, 8, 12), index / 20), torch.tensor(index), torch.empty(0))
+
+
+class Recorder(LightningModule):
+    """Note the keys and the draws of each batch; receive SIGTERM at a batch of the training or the validation."""
+
+    def __init__(self, stop_at: tuple[str, int, int] | None = None):
+        super().__init__()
+        self.stop_at, self.batches = stop_at, dict[tuple[int, int], tuple[list[int], float]]()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+
+    def training_step(self, batch: Pair, index: int) -> Tensor:
+        self.batches[self.current_epoch, index] = batch.key.tolist(), batch.degraded.sum().item()
+        self._stop("train", index)
+        return self.weight * batch.degraded.mean()
+
+    def validation_step(self, batch: Pair, index: int) -> None:
+        self._stop("val", index)
+
+    def configure_optimizers(self):
+        # As a cosine schedule does; it makes Lightning create the loader before it restores the state of the loops.
+        assert self.trainer.estimated_stepping_batches == EPOCHS * BATCHES or self.trainer.max_epochs != EPOCHS
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+    def _stop(self, stage: str, index: int) -> None:
+        if self.stop_at == (stage, self.current_epoch, index):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+def fit(folder: Path, *, workers: int, epochs: int = EPOCHS, stop_at=None, resume: bool = False) -> Recorder:
+    model = Recorder(stop_at)
+    data = PairData(Images(13), Images(8), effect=UniformFog(), batch_size=4, workers=workers)
+    trainer = Trainer(
+        max_epochs=epochs,
+        accelerator="cpu",
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        num_sanity_val_steps=0,
+        callbacks=[StopOnSigterm(str(folder)), ModelCheckpoint(folder, save_last=True)],
+    )
+    path = folder / "last.ckpt" if resume else None
+    try:
+        trainer.fit(model, data, ckpt_path=path, weights_only=True)
+    except SystemExit:
+        assert stop_at is not None
+    return model
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory) -> dict[tuple[int, int], tuple[list[int], float]]:
+    batches = fit(tmp_path_factory.mktemp("run"), workers=0).batches
+    assert sorted(batches) == [(epoch, index) for epoch in range(EPOCHS) for index in range(BATCHES)]
+    assert len({tuple(keys) for keys, _ in batches.values()}) > BATCHES
+    return batches
+
+
+@pytest.mark.parametrize(
+    ("workers", "stop_at"),
+    [(1, None), (1, ("train", 1, 1)), (0, ("train", 0, 0)), (0, ("train", 1, 2)), (0, ("val", 1, 0))],
+)
+def test_a_resumed_training_gets_the_batches_of_an_uninterrupted_one(tmp_path, expected, capsys, workers, stop_at):
+    first = fit(tmp_path, workers=workers, epochs=2 if stop_at is None else EPOCHS, stop_at=stop_at)
+    assert ("stopped by SIGTERM" in capsys.readouterr().err) == (stop_at is not None)
+    rest = fit(tmp_path, workers=workers, resume=True)
+    assert not first.batches.keys() & rest.batches.keys()
+    assert first.batches | rest.batches == expected

@@ -61,7 +61,8 @@ def test_the_restore_flow_restores_real_frames_and_the_negative_flow_does_not(fr
 def test_both_flows_undo_each_other(pixels):
     x, y = pixels(60, 90)
     ramp = torch.stack([x, y])[None]
-    d = LensDistortion(k1_range=(-0.3, -0.3), k2_range=(0.1, 0.1)).degrade(ramp, seed=7)
+    effect = LensDistortion(k1_range=(-0.3, -0.3), k2_range=(0.1, 0.1))
+    d = effect.apply(ramp, effect.sample(torch.zeros_like(ramp), seed=7))  # `degrade` rejects values beyond [0, 1]
     restore_flow, restore_valid = d.restore_flow, d.restore_valid
     back, seen = warp(d.image, restore_flow)
     assert restore_valid.double().mean() > 0.8

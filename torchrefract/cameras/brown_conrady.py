@@ -19,8 +19,8 @@ from torchrefract.warping.flow import Jacobian
 
 POLYNOMIAL12 = (*RADIAL, "p1", "p2", "s1", "s2", "s3", "s4")
 MAX_RESIDUAL = {torch.float32: 2e-6, torch.float64: 1e-12}  # of an inverted point, relative to 1 + r_d
-# Rounding of a position is divided by the determinant, so that these keep it below 16 units in the last place.
-_MIN_DETERMINANT = {torch.float32: 1 / 12, torch.float64: 1e-9}
+# Rounding of a position is divided by the determinant, so that these keep it below 40 units in the last place.
+_MIN_DETERMINANT = {torch.float32: 1 / 32, torch.float64: 1e-9}
 _MIN_RADIAL_FACTOR = 0.1  # in the first guess of Newton's method
 _MAX_NEWTON_STEPS = 12  # in the plane; strong prisms need more than the usual 3
 _SMALL_STEP = {torch.float32: 1e-4, torch.float64: 1e-7}  # after which the error is about its square
@@ -131,7 +131,7 @@ def undistort_polynomial(
     Returns:
         x, y: (B, ...), on the plane z = 1, finite everywhere.
         exists: (B, ...), bool: the point lies before the fold of the radial terms, distorts back to (x_d, y_d), and is
-            not so near a fold that rounding decides where it lies: the Jacobian determinant is at least 1/12 in single
+            not so near a fold that rounding decides where it lies: the Jacobian determinant is at least 1/32 in single
             precision.
     """
     with torch.no_grad():

@@ -106,7 +106,7 @@ class Effect(nn.Module, ABC):
         leaves, spec = pytree.tree_flatten(image)
         place = _find_image(leaves)
         degraded, flow = self._degrade_like(leaves[place])
-        marker = torch.empty(())  # stands for the image, which is not a label
+        marker = torch.empty((), dtype=torch.float32, device="cpu")  # stands for the image, which is not a label
         (moved,) = self._move_labels(
             (pytree.tree_unflatten([*leaves[:place], marker, *leaves[place + 1 :]], spec),), flow, image
         )

@@ -95,7 +95,7 @@ def test_a_killed_worker_stops_the_run_with_a_message(tmp_path, words):
         os.kill(int(worker), signal.SIGKILL)
     _, err = run.communicate(timeout=100)
     assert run.returncode == 1, err
-    assert err.startswith("error: workers must fit the memory, got 1 of which one was killed")
+    assert "\nerror: workers must fit the memory, got 1 of which one was killed" in "\n" + err
 
 
 @pytest.mark.parametrize("way", ["jobs", "multirun", "torchrun"])

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.detection import View
@@ -79,5 +78,6 @@ def is_one_to_one(camera: Camera) -> bool:
     """Return True if the camera shows a ray in all of its frame, and in all of its rectified frame."""
     if camera.coverage() < 1:
         return False
-    points = (camera.grid(_GRID) - torch.tensor([camera.cx, camera.cy])) / torch.tensor([camera.fx, camera.fy])
+    grid = camera.grid(_GRID)
+    points = (grid - grid.new_tensor([camera.cx, camera.cy])) / grid.new_tensor([camera.fx, camera.fy])
     return bool(camera.distort(points).valid.all())

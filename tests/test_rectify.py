@@ -63,10 +63,12 @@ def test_an_uncertain_camera_is_warned_of_and_crop_keeps_the_certain_part(call, 
     assert match is not None
     assert float(match[1]) > 2
     assert call("rectify", "input=raw", "camera=cam.yaml", "crop=true", "out=cropped").err == ""
-    picture = cv2.imread(str(folder / "cropped" / "0.png"))
+    picture, rectified = (cv2.imread(str(folder / name / "0.png")) for name in ("cropped", "rectified"))
+    assert picture is not None
+    assert rectified is not None
     assert picture.shape == (int(match[3]), int(match[2]), 3)
     left, top = (96 - int(match[2])) // 2, (64 - int(match[3])) // 2
-    expected = cv2.imread(str(folder / "rectified" / "0.png"))[top:, left:][: picture.shape[0], : picture.shape[1]]
+    expected = rectified[top:, left:][: picture.shape[0], : picture.shape[1]]
     np.testing.assert_array_equal(picture, expected)
     assert read_opencv(folder / "cropped" / "camera.yaml").cx == 46.2 - left
 

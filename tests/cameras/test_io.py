@@ -38,6 +38,7 @@ def test_a_covariance_is_read_back_and_varies_a_lens(ending, tmp_path, make_came
     root = np.tril(np.linspace(-1, 1, 64).reshape(8, 8)) * 1e-3
     io.write_opencv(path, camera, covariance=root @ root.T)
     covariance = io.read_covariance(path)
+    assert covariance is not None
     assert np.array_equal(covariance, root @ root.T)
     assert io.read_opencv(path) == camera
     effect = LensDistortion.from_camera(io.read_opencv(path), covariance=covariance)

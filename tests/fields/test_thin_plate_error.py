@@ -26,6 +26,7 @@ def flow_on(lattice: Lattice, smoothing: float) -> torch.Tensor:
 @pytest.mark.parametrize("smoothing", [0.0, 0.2])
 def test_errors_of_cubics_and_gradients_are_bounded(smoothing):
     bounds = ThinPlateErrorModel(1.0, (3, 4), (smoothing, smoothing)).bounds(HEIGHT, WIDTH)
+    assert bounds is not None
     dense = flow_on(pixel_lattice(HEIGHT, WIDTH), smoothing)
     for stride in (3, 8, 20):
         lattice = Lattice(HEIGHT, WIDTH, stride)

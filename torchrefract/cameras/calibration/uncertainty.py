@@ -44,7 +44,7 @@ def rectified_deviation(camera: Camera, covariance: np.ndarray, pixels: np.ndarr
 
 def _rectify(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-    coefficients = torch.tensor([camera.coefficients], dtype=torch.float64)
+    coefficients = torch.tensor([camera.coefficients], dtype=torch.float64, device="cpu")
     result = undistort(torch.from_numpy((pixels - center) / focal)[None], coefficients, model=camera.model)
     return result.points[0].numpy() * focal + center, result.valid[0].numpy()
 
@@ -73,9 +73,9 @@ def certain_part(camera: Camera, covariance: np.ndarray, pinhole: Camera) -> tup
         pinhole: of the rectified frame.
     """
     grid = pinhole.grid(_GRID)
-    center, focal = torch.tensor([pinhole.cx, pinhole.cy]), torch.tensor([pinhole.fx, pinhole.fy])
+    center, focal = _numbers(pinhole.cx, pinhole.cy), _numbers(pinhole.fx, pinhole.fy)
     sources = camera.distort((grid - center) / focal)
-    pixels = sources.points * torch.tensor([camera.fx, camera.fy]) + torch.tensor([camera.cx, camera.cy])
+    pixels = sources.points * _numbers(camera.fx, camera.fy) + _numbers(camera.cx, camera.cy)
     scale = pinhole.fx / camera.fx
     deviation = np.full(len(grid), np.nan)
     shown = sources.valid.numpy()
@@ -88,3 +88,7 @@ def certain_part(camera: Camera, covariance: np.ndarray, pinhole: Camera) -> tup
     width, height = (int(size * side) // 2 * 2 for size in (pinhole.width, pinhole.height))
     crop = Crop((pinhole.width - width) // 2, (pinhole.height - height) // 2, width, height)
     return float(np.nanmax(deviation, initial=0.0)), crop
+
+
+def _numbers(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64, device="cpu")

@@ -228,7 +228,9 @@ def test_a_run_that_fails_leaves_no_empty_folder_but_those_that_existed(call, tm
     (tmp_path / "kept").mkdir()
     for words in ((), ("hydra.run.dir=new/run",), ("run_dir=other",), ("hydra.run.dir=kept",)):
         assert call("train", "+task=undistort", *frames, *words).code == 1
-    assert call("train", "-m", "+task=undistort", *frames, "seed=1,2").code == 1
+    several = call("train", "-m", "+task=undistort", *frames, "seed=1,2")
+    assert several.code == 1
+    assert "root must be a folder of frames" in several.message
     assert call("calibrate", "images=none", "out=a/camera").code == 1
     assert call("rectify", "input=none", "camera=none", "out=a/rectified").code == 1
     assert call("generate", "scene=paper_weather", "source=none", "out=a/pairs", "license=CC0").code == 1

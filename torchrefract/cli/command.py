@@ -261,7 +261,10 @@ def _existing_folders(paths: Iterable[str | Path]) -> set[Path]:
 
 @contextmanager
 def _no_empty_folder(cfg: DictConfig, existing: set[Path]) -> Iterator[None]:
-    """Delete the output folders of a run that fails if they are empty and did not exist before."""
+    """Delete the output folders of a run that fails if they are empty and did not exist before.
+
+    Of several runs, a folder that holds Hydra's list of them alone counts as empty.
+    """
     outputs = [str(path) for key in ("out", "run_dir") if (path := OmegaConf.select(cfg, key))]
     outputs = [path for path in outputs if path != HydraConfig.get().runtime.output_dir]
     existing = existing | _existing_folders([Path.cwd(), *outputs])
@@ -272,6 +275,8 @@ def _no_empty_folder(cfg: DictConfig, existing: set[Path]) -> Iterator[None]:
             folder = Path(path).resolve()
             with suppress(OSError):  # not empty, or missing
                 while folder not in existing:
+                    if [child.name for child in folder.iterdir()] == ["multirun.yaml"]:
+                        (folder / "multirun.yaml").unlink()
                     folder.rmdir()
                     folder = folder.parent
         raise

@@ -6,6 +6,7 @@ python benchmarks/effects.py --calls [--verbose]
 """
 
 import sys
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -168,10 +169,12 @@ def count_calls(call: Candidate) -> Calls:
 
     previous = sys.getprofile()
     sys.setprofile(profile)
+    threading.setprofile(profile)  # new plans are computed in a thread of their own
     try:
         call()
     finally:
         sys.setprofile(previous)
+        threading.setprofile(None)
     return Calls(entered)
 
 

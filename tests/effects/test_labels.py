@@ -10,6 +10,7 @@ from torch.utils import _pytree as pytree
 
 from torchrefract import Compose, LensDistortion, ThinPlateSpline, Turbulence, UniformFog, warp_points
 from torchrefract.effects.base import Effect
+from torchrefract.warping.lattice import LatticeFlow
 
 tv_tensors = pytest.importorskip("torchvision.tv_tensors", reason="torchvision is in the extra test")
 v2 = pytest.importorskip("torchvision.transforms.v2", reason="torchvision is in the extra test")
@@ -191,3 +192,16 @@ def test_a_sample_without_one_image_raises():
 def test_plain_positions_raise_even_if_the_effect_does_not_apply():
     with pytest.raises(TypeError, match=r"target\['boxes'\] must be a BoundingBoxes of torchvision to move with the"):
         LensDistortion(p=0.0)(torch.rand(3, 40, 56), {"boxes": torch.zeros(2, 4)})
+
+
+@pytest.mark.quick
+def test_an_image_without_labels_computes_no_flow_at_every_pixel(monkeypatch):
+    def dense(flow: LatticeFlow) -> Tensor:
+        raise AssertionError("computed at every pixel")
+
+    monkeypatch.setattr(LatticeFlow, "dense", dense)
+    effect = LensDistortion(k1_range=(-0.2, -0.2), k2_range=(0.05, 0.05))
+    image = torch.rand(1, 3, 128, 160)
+    assert not torch.equal(effect(image), image)
+    with pytest.raises(AssertionError, match="every pixel"):
+        effect(image, {"masks": tv_tensors.Mask(torch.ones(1, 1, 128, 160, dtype=torch.uint8))})

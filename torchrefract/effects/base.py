@@ -96,27 +96,27 @@ class Effect(nn.Module, ABC):
             What was passed, in the same nesting, with the degraded image and the moved labels.
         """
         if target:
-            degraded, flow = self._degrade_like(image)
-            return degraded, *self._move_labels(target, flow, (image, *target))
+            result, degraded = self._degrade_like(image)
+            return result, *self._move_labels(target, degraded.flow, (image, *target))
         if isinstance(image, Tensor):
-            degraded, flow = self._degrade_like(image)
-            if flow is not None:
+            result, degraded = self._degrade_like(image)
+            if degraded.has("flow"):
                 _check_kornia_keys()
-            return degraded
+            return result
         leaves, spec = pytree.tree_flatten(image)
         place = _find_image(leaves)
-        degraded, flow = self._degrade_like(leaves[place])
+        result, degraded = self._degrade_like(leaves[place])
         marker = torch.empty((), dtype=torch.float32, device="cpu")  # stands for the image, which is not a label
         (moved,) = self._move_labels(
-            (pytree.tree_unflatten([*leaves[:place], marker, *leaves[place + 1 :]], spec),), flow, image
+            (pytree.tree_unflatten([*leaves[:place], marker, *leaves[place + 1 :]], spec),), degraded.flow, image
         )
-        return pytree.tree_map(lambda leaf: degraded if leaf is marker else leaf, moved)
+        return pytree.tree_map(lambda leaf: result if leaf is marker else leaf, moved)
 
-    def _degrade_like(self, image: Any) -> tuple[Tensor, Tensor | None]:
-        """Return the degraded image in the torchvision type of the image, and the flow of a warp."""
+    def _degrade_like(self, image: Any) -> tuple[Tensor, Degraded]:
+        """Return the degraded image in the torchvision type of the image, and with its maps."""
         degraded = self.degrade(image)
         is_tv = is_tv_tensor(image, "Image") or is_tv_tensor(image, "Video")
-        return wrap_like(degraded.image, image) if is_tv else degraded.image, degraded.flow
+        return wrap_like(degraded.image, image) if is_tv else degraded.image, degraded
 
     def _move_labels(self, targets: tuple[Any, ...], flow: Tensor | None, inputs: Any) -> tuple[Any, ...]:
         """Return the targets of an image, or of a batch of images, that moved along its flow."""

@@ -260,6 +260,13 @@ def test_all_rows_of_dropped_boxes_are_removed():
     assert warped["ids"] is other["ids"]
 
 
+def test_a_matrix_that_loses_rows_with_the_boxes_is_warned_of():
+    sample = detection() | {"K": torch.eye(3)}
+    with pytest.warns(UserWarning, match=r"target\['K'\] has as many rows as there are boxes and lost those"):
+        assert warp_labels(sample, SHIFT)["K"].shape == (2, 3)
+    assert warp_labels(sample, 0 * SHIFT)["K"].shape == (3, 3)  # no box is removed, and nothing is said
+
+
 def test_several_sets_of_boxes_take_the_rows_of_their_own_dict():
     far, near = boxes_of([[1.0, 1.0, 9.0, 9.0], [30.0, 5.0, 50.0, 20.0]]), boxes_of([[30.0, 5.0, 50.0, 20.0]] * 2)
     sample = {"car": {"boxes": far, "labels": torch.arange(2)}, "sign": {"boxes": near, "labels": torch.arange(2)}}
@@ -343,6 +350,20 @@ def test_empty_boxes_masks_and_keypoints_stay_empty():
     warped = warp_labels(sample, SHIFT)
     for key, leaf in sample.items():
         assert (type(warped[key]), warped[key].shape, warped[key].dtype) == (type(leaf), leaf.shape, leaf.dtype)
+
+
+def test_gradients_of_rotated_boxes_are_those_of_finite_differences(wave):
+    rotated = rotated_of("XYXYXYXY")  # torchvision converts the other formats in place, and PyTorch raises
+    boxes = tv.wrap(rotated.as_subclass(Tensor).double(), like=rotated)
+
+    def positions(strength: Tensor) -> Tensor:
+        moved = warp_labels({"boxes": boxes}, strength * wave.double(), drop=False)["boxes"].as_subclass(Tensor)
+        return (moved * torch.linspace(1, 2, moved.numel()).double().view(moved.shape)).sum()
+
+    strength, step = torch.tensor(0.7, dtype=torch.float64, requires_grad=True), 1e-5
+    (gradient,) = torch.autograd.grad(positions(strength), strength)
+    difference = (positions(strength + step) - positions(strength - step)).item() / (2 * step)
+    assert gradient.item() == pytest.approx(difference, rel=1e-4)
 
 
 def test_gradients_reach_the_flow_through_keypoints_and_boxes(wave):

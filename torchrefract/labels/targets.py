@@ -7,6 +7,7 @@ import math
 import numbers
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -172,6 +173,12 @@ def _warp_sample(sample: Any, flow: Tensor, options: _Options) -> Any:
     for i in boxes if options.drop else []:
         flags = cast(Tensor, warped[i].flags)
         for k in _rows_of_boxes(sample, paths, leaves, boxes, i, options.labels_getter):
+            if options.labels_getter == "default" and _looks_like_camera_matrix(leaves[k]) and not flags.all():
+                warnings.warn(
+                    f"target{pytree.keystr(paths[k])} has as many rows as there are boxes and lost those of removed "
+                    "boxes; if it is a matrix of the camera, say so in its name ('camera_...') or pass labels_getter",
+                    stacklevel=2,
+                )
             values[k] = _select(values[k], flags)
     return pytree.tree_unflatten(values, spec)
 
@@ -315,7 +322,7 @@ def _box_axes(points: Tensor, converged: Tensor, corners: Tensor) -> Tensor:
 
 
 def _length(vector: Tensor) -> Tensor:
-    return vector.detach().square().sum(dim=-1, keepdim=True).sqrt()
+    return vector.square().sum(dim=-1, keepdim=True).sqrt()
 
 
 def _siblings(paths: list[Any], i: int) -> dict[str, int]:
@@ -364,6 +371,11 @@ def _num_rows(leaf: Any) -> int | None:
     if isinstance(leaf, Tensor | np.ndarray):
         return leaf.shape[0] if leaf.ndim else None
     return len(leaf) if type(leaf) in (list, tuple) else None
+
+
+def _looks_like_camera_matrix(leaf: Any) -> bool:
+    is_plain = type(leaf) in (Tensor, np.ndarray) and tuple(leaf.shape) in ((3, 3), (3, 4), (4, 4))
+    return is_plain and "float" in str(leaf.dtype)
 
 
 def _is_of_image(leaf: Any, name: str) -> bool:

@@ -22,7 +22,9 @@ MAX_RESIDUAL = {torch.float32: 2e-6, torch.float64: 1e-12}  # of an inverted poi
 # Rounding of a position is divided by the determinant, so that these keep it below 40 units in the last place.
 _MIN_DETERMINANT = {torch.float32: 1 / 32, torch.float64: 1e-9}
 _MIN_RADIAL_FACTOR = 0.1  # in the first guess of Newton's method
-_MAX_NEWTON_STEPS = 12  # in the plane; strong prisms need more than the usual 3
+# In the plane; strong prisms need more than the usual 3. In graphs and on accelerators, where convergence cannot be read,
+# all points take the second number of steps, and those that need more count as having no preimage.
+_MAX_NEWTON_STEPS, _BLIND_NEWTON_STEPS = 12, 8
 _SMALL_STEP = {torch.float32: 1e-4, torch.float64: 1e-7}  # after which the error is about its square
 
 Point = tuple[Tensor, Tensor]  # x and y
@@ -183,12 +185,13 @@ def newton(
 
 
 def converge(iterates: Iterator[Point]) -> Point:
-    """Return the first iterate that a small step leads to, as far as values can be read, or the one after 12 steps."""
+    """Return the first iterate that a small step leads to, or the one after 12 steps; 8 if values cannot be read."""
     x, y = next(iterates)
-    for new_x, new_y in islice(iterates, _MAX_NEWTON_STEPS):
+    for count, (new_x, new_y) in enumerate(islice(iterates, _MAX_NEWTON_STEPS), start=1):
         step = torch.maximum((new_x - x).abs(), (new_y - y).abs())
         x, y = new_x, new_y
-        if eager_bool((step <= _SMALL_STEP[step.dtype]).all, of=step):
+        is_small = eager_bool((step <= _SMALL_STEP[step.dtype]).all, of=step)
+        if is_small or (is_small is None and count == _BLIND_NEWTON_STEPS):
             break
     return x, y
 

@@ -22,7 +22,7 @@ MAX_RESIDUAL = {torch.float32: 2e-6, torch.float64: 1e-12}  # of an inverted poi
 # Rounding of a position is divided by the determinant, so that these keep it below 40 units in the last place.
 _MIN_DETERMINANT = {torch.float32: 1 / 32, torch.float64: 1e-9}
 _MIN_RADIAL_FACTOR = 0.1  # in the first guess of Newton's method
-# In the plane; strong prisms need more than the usual 3. In graphs and on accelerators, where convergence cannot be read,
+# In the plane; strong prisms need more than the usual 3. In graphs and on accelerators, where nothing can be read,
 # all points take the second number of steps, and those that need more count as having no preimage.
 _MAX_NEWTON_STEPS, _BLIND_NEWTON_STEPS = 12, 8
 _SMALL_STEP = {torch.float32: 1e-4, torch.float64: 1e-7}  # after which the error is about its square

@@ -261,6 +261,8 @@ class Effect(nn.Module, ABC):
         if not isinstance(params, self.params_type):
             raise TypeError(f"params must be {self.params_type.__name__}, got {type(params).__name__}")
         for name, value in zip(params._fields, params, strict=True):
+            if value is None and name in params._field_defaults:
+                continue
             if not isinstance(value, Tensor) or value.ndim == 0 or value.shape[0] != image.shape[0]:
                 got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
                 raise ValueError(f"params.{name} must have one row for each of the {image.shape[0]} images, got {got}")

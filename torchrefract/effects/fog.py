@@ -31,7 +31,14 @@ from torchrefract.effects.batch import (
     to_batch,
 )
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
-from torchrefract.fields.depth import DepthProvider, LinearDepth, check_depth, check_floating, ray_distance
+from torchrefract.fields.depth import (
+    DepthProvider,
+    LinearDepth,
+    check_depth_provider,
+    check_floating,
+    frame_depth,
+    ray_distance,
+)
 from torchrefract.fields.fog import blend_fog, extinction, transmission, unblend_fog
 from torchrefract.planning.photometric import (
     FogErrorModel,
@@ -103,13 +110,7 @@ class FogMedium:
         Returns:
             (N, B or 1, 1, H, 1 or W), m.
         """
-        dtype, (height, width) = field_dtype(image.dtype), image.shape[2:]
-        if depth is None:
-            depth = self.depth(height, width, dtype=dtype, device=image.device)
-        else:
-            check_depth(depth)
-            # On an accelerator nothing is read: invalid values become 0.
-            depth = depth.to(dtype).nan_to_num(nan=0.0, posinf=torch.inf).clamp(min=0)
+        depth, (height, width) = frame_depth(self.depth, image, depth), image.shape[2:]
         if self.camera is None:
             return depth
         camera = self.camera.resized(width=width, height=height)
@@ -178,15 +179,12 @@ def make_medium(
     linear_light: bool,
 ) -> FogMedium:
     """Make a medium from arguments as `UniformFog` takes them."""
-    depth = LinearDepth() if depth is None else depth
-    if not isinstance(depth, DepthProvider):
-        raise TypeError(f"depth must be a depth provider such as LinearDepth(), got {type(depth).__name__}")
     if camera is not None and not isinstance(camera, Camera):
         raise TypeError(f"camera must be a Camera, got {type(camera).__name__}")
     return FogMedium(
         airlight=None if airlight is None else check_color("airlight", airlight, high=1.0),
         threshold=check_number("threshold", threshold, low=1e-6, high=1 - 1e-6),
-        depth=depth,
+        depth=LinearDepth() if depth is None else check_depth_provider(depth),
         camera=camera,
         linear_light=check_flag("linear_light", linear_light),
     )

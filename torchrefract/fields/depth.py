@@ -31,6 +31,39 @@ class DepthProvider(ABC):
         """
 
 
+def check_depth_provider(depth: DepthProvider) -> DepthProvider:
+    """Return `depth` if it is a depth provider.
+
+    Raises:
+        TypeError: otherwise.
+    """
+    if not isinstance(depth, DepthProvider):
+        raise TypeError(f"depth must be a depth provider such as LinearDepth(), got {type(depth).__name__}")
+    return depth
+
+
+def frame_depth(provider: DepthProvider, image: Tensor, depth: Tensor | None) -> Tensor:
+    """Return the depth of frames: the map that was passed in, or that of the provider.
+
+    Args:
+        provider: of the effect.
+        image: (N, C, H, W), the frames.
+        depth: (N or B, 1, H, W), m; None takes that of the provider.
+
+    Returns:
+        (N, B or 1, 1, H, W or 1), m, of the type of a field.
+
+    Raises:
+        ValueError: a depth that is not in meters, see `check_depth`.
+    """
+    dtype, (height, width) = field_dtype(image.dtype), image.shape[2:]
+    if depth is None:
+        return provider(height, width, dtype=dtype, device=image.device)
+    check_depth(depth)
+    # On an accelerator nothing is read: invalid values become 0.
+    return depth.to(dtype).nan_to_num(nan=0.0, posinf=torch.inf).clamp(min=0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class LinearDepth(DepthProvider):
     """The ramp over the rows of the paper: d(y) = (1 - (y + 1/2) / H) max_depth.

@@ -31,6 +31,7 @@ from torchrefract.effects.fog import FogParams, UniformFog, remove_fog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog, HeterogeneousFogParams
 from torchrefract.effects.lens import LensDistortion, LensParams
 from torchrefract.effects.rectification import Rectification, RectificationParams
+from torchrefract.effects.rolling_shutter import RollingShutter, RollingShutterParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence, TurbulenceParams
 from torchrefract.fields.depth import (
@@ -77,6 +78,8 @@ __all__ = [
     "Pair",
     "Rectification",
     "RectificationParams",
+    "RollingShutter",
+    "RollingShutterParams",
     "ThinPlateParams",
     "ThinPlateSpline",
     "Turbulence",

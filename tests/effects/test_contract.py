@@ -25,6 +25,7 @@ from torchrefract import (
     LensFlare,
     OneOf,
     Rectification,
+    RollingShutter,
     ThinPlateSpline,
     Turbulence,
     UniformFog,
@@ -95,6 +96,13 @@ EFFECTS = {
         identity={"amplitude_range": NO_RANGE},
         gradient_field="amplitude",
         fields=("amplitude", "length", *MOTION),
+    ),
+    "rolling shutter": Case(
+        RollingShutter,
+        strongest={"speed_range": (60.0, 100.0), "readout_range": (25.0, 33.0), "roll_range": (1.0, 2.0)},
+        identity={"speed_range": NO_RANGE, "pitch_range": NO_RANGE, "yaw_range": NO_RANGE, "roll_range": NO_RANGE},
+        gradient_field="speed",
+        fields=("speed", "readout", "exposure", "amplitude", "frequency", "phase", "frame"),
     ),
     "flare": Case(
         LensFlare,

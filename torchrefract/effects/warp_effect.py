@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import assume_constant_result, expand_batch
+from torchrefract._tensor import assume_constant_result, expand_batch, to_float
 from torchrefract._validation import check_choice, eager_bool, requires_grad
 from torchrefract.effects.base import Effect
 from torchrefract.effects.batch import ParamsAtDepth, params_per_frame, per_sample, where_active
@@ -68,6 +68,7 @@ class WarpEffect(Effect):
 
     rounding_ulps = DEFAULT_ULPS
     has_closed_form = False  # whether `flow` computes any points, not only the nodes of a lattice
+    has_kinks = False  # whether the lattice follows from error bounds alone, since measurements miss kinks
     depth: DepthProvider | None = None  # of frames without a depth map; None for a flow that depends on no depth
 
     def __init__(
@@ -111,6 +112,10 @@ class WarpEffect(Effect):
         """Return error bounds for all parameters in the ranges, or None if none are known."""
         return None
 
+    def exposures(self) -> list["WarpEffect"]:
+        """Return the effects whose images are averaged, each with the same parameters; by default this one alone."""
+        return [self]
+
     @property
     def keeps_uint8(self) -> bool:
         """Return True: sampling rounds its result."""
@@ -130,7 +135,7 @@ class WarpEffect(Effect):
             request = replace(request, tolerance_px=None)
         plan = plan_warp(self.error_model() if request.tolerance_px else None, request)
         is_fine = 0 < plan.stride < _FINE_STRIDE and request.height * request.width >= _MIN_PIXELS
-        if self.has_closed_form and is_fine and request.tolerance_px is not None:
+        if self.has_closed_form and not self.has_kinks and is_fine and request.tolerance_px is not None:
             plan = replace(plan, is_measured=True, error_px=request.tolerance_px)
         return plan
 
@@ -182,7 +187,8 @@ class WarpEffect(Effect):
         return where_active(inverse, 0.0, active, params), exists | ~per_sample(active)
 
     def planned_flow(self, params: Any, height: int, width: int, *, is_exact: bool = False) -> BatchFlow:
-        """Compute the flow by the plan of the ranges, or exactly."""
+        """Compute the flow by the plan of the ranges, or exactly, as for any map of depth."""
+        is_exact = is_exact or (isinstance(params, ParamsAtDepth) and params.is_map)
         plan = self._constant_plan(id(self), height, width, flow_dtype(params), is_exact)
         return BatchFlow(self.flow_parts(params, plan))
 
@@ -201,13 +207,21 @@ class WarpEffect(Effect):
         if not self.may_change(params) or height * width == 1:
             return unchanged(image, params)
         drawn, params = params, self.at_depth(params, image, depth)
-        flow = self.planned_flow(params, height, width)
-        if flow.is_zero:
+        flow, effects = self.planned_flow(params, height, width), self.exposures()
+        if flow.is_zero and len(effects) == 1:
             return unchanged(image, drawn)
         active = self.active(params, height, width)  # a flow has B rows, or as many as there are images
-        options = SamplingOptions(self.padding, self.interpolation, self.backend)
+        moves, options = (
+            expand_batch(active, len(image)),
+            SamplingOptions(self.padding, self.interpolation, self.backend),
+        )
+
+        def sampled(source: Tensor, k: int) -> Tensor:
+            along = flow if len(effects) == 1 else effects[k].planned_flow(params, height, width)
+            return along.sample(source, moves, params, options)
+
         return warped(
-            flow.sample(image, expand_batch(active, image.shape[0]), params, options),
+            mean_of_exposures(image, len(effects), sampled, moves, params),
             drawn,
             flow=lambda: flow.dense,
             valid=lambda: (flow.exists & inside(flow.dense)) | ~per_sample(expand_batch(active, flow.dense.shape[0])),
@@ -219,6 +233,26 @@ class WarpEffect(Effect):
         # torch.compile takes the plan as a constant. It accepts this of methods only, and tells effects apart by the
         # argument.
         return (self.exact() if is_exact else self).plan_for_dtype(height, width, dtype)
+
+
+def mean_of_exposures(
+    image: Tensor, count: int, sample: Callable[[Tensor, int], Tensor], active: Tensor, params: Any
+) -> Tensor:
+    """Return the mean of several samplings of images (N, C, H, W), uint8 if they are and there is one sampling.
+
+    Args:
+        image: as above.
+        count: of samplings.
+        sample: returns sampling k of images.
+        active, params: as for `where_active`.
+    """
+    if count == 1:
+        return sample(image, 0)
+    source = to_float(image) if image.dtype is torch.uint8 else image
+    total = sample(source, 0)
+    for k in range(1, count):
+        total = total + sample(source, k)
+    return where_active(total / count, source, active, params)
 
 
 def warped(

@@ -24,6 +24,7 @@ if _sys.argv[:1] == ["-m"] and _sys.stderr is not None:
     print("torchrefract: loading …", file=_sys.stderr, flush=True)
 
 from torchrefract.cameras.camera import Camera
+from torchrefract.effects.chromatic_aberration import ChromaticAberration, ChromaticAberrationParams
 from torchrefract.effects.compose import Compose, ComposeParams, OneOf
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams
 from torchrefract.effects.flare import FlareParams, LensFlare
@@ -34,6 +35,7 @@ from torchrefract.effects.rectification import Rectification, RectificationParam
 from torchrefract.effects.rolling_shutter import RollingShutter, RollingShutterParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence, TurbulenceParams
+from torchrefract.effects.vignetting import Vignetting, VignettingParams
 from torchrefract.fields.depth import (
     DepthProvider,
     GroundPlaneDepth,
@@ -57,6 +59,8 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Camera",
+    "ChromaticAberration",
+    "ChromaticAberrationParams",
     "Compose",
     "ComposeParams",
     "Degraded",
@@ -85,6 +89,8 @@ __all__ = [
     "Turbulence",
     "TurbulenceParams",
     "UniformFog",
+    "Vignetting",
+    "VignettingParams",
     "check_depth",
     "compose_flows",
     "depth_from_disparity",

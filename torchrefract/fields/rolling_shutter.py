@@ -16,7 +16,8 @@ from torchrefract.warping.grid import Points
 
 _SMALLEST_SCALE = 0.05  # of the distance to a point while the rows are read; below, the camera passes the point
 _OUTSIDE = 2.0  # frames off, where points without a source are sampled
-_STEPS = 10  # of the time at which a point is exposed; each reduces its error by the speed in frames per readout
+_LARGEST_SHARE = 0.9  # of a step of the time at which a point is exposed, as far as it is extrapolated
+_LARGEST_MISS_PX = 0.01
 _LARGEST_SLOPE = 0.5  # of the fixed point of depth, as far as it is extrapolated; edges of depth are steeper
 
 
@@ -127,7 +128,7 @@ def rolling_shutter_restore_flow(
     """Compute the flow from the pixels of a clean frame to where a rolling shutter shows them.
 
     The point at depth Z on the ray of a pixel lies at R(t)^T (X - v t e_z) at time t. The time at which its row is
-    exposed is found by fixed-point steps.
+    exposed is found by fixed-point steps, extrapolated as by Aitken.
 
     Args:
         motion, pinhole: as for `rolling_shutter_flow`.
@@ -136,25 +137,31 @@ def rolling_shutter_restore_flow(
 
     Returns:
         flow: (N, 2, H, W), px.
-        exists: (N, 1, H, W), bool: the point is in front of the camera when its row is exposed, and the steps converged
-            to 0.01 px.
+        exists: (N, 1, H, W), bool: the point is in front of the camera when its row is exposed, and the last step moved
+            it by at most 0.01 px.
     """
     height = points.lattice.height
     (fx, fy), (cx, cy) = pinhole
     x, y = (points.x - cx) / fx, (points.y - cy) / fy
     speed = motion.speed.view(-1, 1, 1, 1)
-    row, exists = points.y, torch.ones((), dtype=torch.bool, device=x.device)
-    u = v = torch.zeros_like(inverse_depth)
-    for _ in range(_STEPS):
+
+    def exposed(row: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return u, v, the row, within a frame from the frame, and where the point is in front of the camera."""
         time = row_time(motion, row, height=height)
         (a, b, c), (d, e, f), (g, h, i) = rotation(turn(motion, time))
         z = 1 - speed * time * inverse_depth
         rx, ry, rz = a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z
-        is_ahead, rz = rz > _SMALLEST_SCALE, rz.clamp(min=_SMALLEST_SCALE)
+        ahead, rz = rz > _SMALLEST_SCALE, rz.clamp(min=_SMALLEST_SCALE)
         u, v = cx + fx * (rx / rz) - points.x, cy + fy * (ry / rz) - points.y
-        # Rows far outside the frame have no time, and steps that diverge stay finite.
-        end = (points.y + v).clamp(-height, 2 * height)
-        exists = is_ahead & (z > 0) & ((end - row).abs() <= 0.01)
-        row = end
-    flow = torch.cat(torch.broadcast_tensors(u, v), dim=1)
-    return torch.where(exists, flow, 0.0), exists
+        return u, v, (points.y + v).clamp(-height, 2 * height), ahead & (z > 0)
+
+    rows = [points.y]
+    for _ in range(2):
+        rows.append(exposed(rows[-1])[2])
+    # The rows of the steps are nearly a geometric series.
+    step = rows[1] - rows[0]
+    share = ((rows[2] - rows[1]) / torch.where(step.abs() < 1e-6, 1.0, step)).clamp(-_LARGEST_SHARE, _LARGEST_SHARE)
+    row = exposed(rows[2] + (rows[2] - rows[1]) * share / (1 - share))[2]
+    u, v, end, is_ahead = exposed(row)
+    exists = is_ahead & ((end - row).abs() <= _LARGEST_MISS_PX)
+    return torch.where(exists, torch.cat(torch.broadcast_tensors(u, v), dim=1), 0.0), exists

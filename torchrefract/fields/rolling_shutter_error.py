@@ -15,11 +15,12 @@ from torchrefract.cameras.camera import Camera, pinhole_of
 from torchrefract.fields.depth import DepthProvider
 from torchrefract.types import FlowBounds, Range, Simplification
 
-_SAFETY = 2.0  # of measured errors; rows end where others measure them, up to the slope of the fixed point
+_SAFETY = 1.25  # of measured errors, since the flow is not quite linear along rows
 _LARGEST_SHARE = 0.4  # of a depth, driven while the rows are read
 _FOURTH = 9 / 16 / 24  # times the fourth derivative and stride^4: error of cubics through four nodes
 _OFFSETS = 4  # of the lattice, at which errors are measured
 _LARGEST_STRIDE = 128  # px
+_SMALLEST_FRAME = 1 << 14  # pixels
 _ROUNDING = 1e-5  # relative, of drawn values
 
 
@@ -63,7 +64,9 @@ class RollingShutterErrorModel:
         return _bounds(self, height, width)
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification:
-        """Leave out nothing."""
+        """Leave out nothing; a small frame is computed at every pixel, since a lattice saves no time."""
+        if height * width < _SMALLEST_FRAME:
+            return Simplification(0.0, can_interpolate=False, why="the frame is small")
         return Simplification(0.0, why="as smooth as the depth and the vibration")
 
     def contains(self, params: Any) -> Tensor:
@@ -86,7 +89,7 @@ def _bounds(model: RollingShutterErrorModel, height: int, width: int) -> FlowBou
         return None
     (fx, fy), (cx, cy) = pinhole_of(model.camera, height=height, width=width)
     reach_x, reach_y = (max(abs(c), abs(size - 1 - c)) for c, size in ((cx, width), (cy, height)))
-    reach, focal = math.hypot(reach_x, reach_y), max(fx, fy)
+    focal = max(fx, fy)
     stretch = 1 + (reach_x / fx) ** 2 + (reach_y / fy) ** 2  # of angles, far from the axis
     # Sines at any time: their difference is at most 2, and at most the change of phase.
     turned = math.sqrt(model.num_frequencies) * np.array(model.amplitude)
@@ -103,16 +106,19 @@ def _bounds(model: RollingShutterErrorModel, height: int, width: int) -> FlowBou
     slope = way * reach_y * _steepest(inverse)
     if share > _LARGEST_SHARE or slope > _LARGEST_SHARE:
         return None
-    grown = 1 / (1 - slope)  # of distances, since the depth is that at the end
-    moved = share * reach * grown + angle * focal * stretch
-    gradient = share + reach * grown * sum(map(_steepest, profiles))
+    # Of each row: the largest distance from the principal point, and its growth, since the depth is that at the end.
+    distance = np.hypot(reach_x, np.arange(height) - cy)
+    time = sum(map(np.abs, times))
+    grown = distance / (1 - model.speed * time * np.abs(np.arange(height) - cy) * _steepest(inverse))
+    moved = share * float(grown.max()) + angle * focal * stretch
+    gradient = share + float(grown.max()) * sum(map(_steepest, profiles))
     gradient += step * float(turned.sum()) * focal * stretch + 4 * angle * stretch
-    measured = [_interpolation_error(profile) for profile in profiles]
+    measured = [_interpolation_error(profile, grown) for profile in profiles]
     # Per px^4, along columns the sines, along rows and columns perspective.
     fourth = focal * stretch * float(turned.sum()) * step**4 + 24 * angle * stretch**2 / focal**3
 
     def interpolation_error(strides: np.ndarray) -> np.ndarray:
-        between = _SAFETY * reach * grown * sum(error(strides) for error in measured)
+        between = _SAFETY * sum(error(strides) for error in measured)
         return np.where(strides > _LARGEST_STRIDE, np.inf, between + _FOURTH * fourth * strides**4)
 
     return FlowBounds(moved, gradient, interpolation_error)
@@ -123,8 +129,8 @@ def _steepest(profile: np.ndarray) -> float:
     return float(np.abs(np.diff(profile)).max()) if len(profile) > 1 else 0.0
 
 
-def _interpolation_error(profile: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Measure the error of cubics through every s-th row of a profile, (H,), linear beyond its ends."""
+def _interpolation_error(profile: np.ndarray, weight: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Measure the weighted error of cubics through every s-th row of a profile, (H,), linear beyond its ends."""
     height = len(profile)
     margin = 2 * _LARGEST_STRIDE
     ends = (
@@ -152,7 +158,7 @@ def _interpolation_error(profile: np.ndarray) -> Callable[[np.ndarray], np.ndarr
                 + node(1) * (-(t + 1) * t * (t - 2) / 2)
                 + node(2) * ((t + 1) * t * (t - 1) / 6)
             )
-            errors.append(np.abs(cubic - profile).max())
+            errors.append((weight * np.abs(cubic - profile)).max())
         return float(max(errors))
 
     return lambda strides: np.array([largest(int(stride)) for stride in np.atleast_1d(strides)])

@@ -493,7 +493,7 @@ def test_an_infinite_field_of_the_params_raises(case, value):
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_range_with_nan_or_infinity_raises(case, value):
     names = [name for name, ends in vars(case.strong()).items() if name.endswith("_range") and isinstance(ends, tuple)]
-    assert len(names) >= 2
+    assert names
     for name in names:
         low, high = getattr(case.strong(), name)
         for wrong in ((value, high), (low, value)):

@@ -273,3 +273,17 @@ class Plane(DepthProvider):
 
     def __call__(self, height, width, *, dtype, device):
         return torch.full((1, 1, height, 1), self.depth, dtype=dtype, device=device)
+
+
+def test_a_pole_that_moves_farther_than_it_is_wide_is_skewed_as_a_whole():
+    depth = torch.full((1, 1, HEIGHT, WIDTH), 40.0, dtype=torch.float64)
+    depth[..., 200:204] = 6.0
+    image = (depth < 10).double()
+    degraded = RollingShutter(camera=CAMERA).apply(image, driving(100.0, 30.0), depth=depth)
+    for row in (8, 30, 100, HEIGHT - 3):
+        time = ((row + 0.5) / HEIGHT - 0.5) * 0.030
+        edges = [121 + (edge - 121) / (1 - 100 / 3.6 * time / 6) for edge in (199.5, 203.5)]
+        seen = degraded.image[0, 0, row]
+        assert seen.sum().item() == pytest.approx(edges[1] - edges[0], abs=1.0)
+        columns = torch.arange(WIDTH, dtype=torch.float64)
+        assert ((seen * columns).sum() / seen.sum()).item() == pytest.approx(sum(edges) / 2, abs=1.0)

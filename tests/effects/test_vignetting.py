@@ -68,4 +68,4 @@ def test_invalid_arguments_of_vignetting_and_chromatic_aberration_raise():
         with pytest.raises(ValueError, match=rule):
             make()
     with pytest.raises(TypeError, match="camera must be a Camera"):
-        Vignetting(camera=1.0)
+        Vignetting(camera=1.0)  # pyright: ignore[reportArgumentType]  # the error is tested

@@ -86,7 +86,8 @@ class ChromaticAberration(PhotometricEffect):
     def render(self, image: Tensor, params: ChromaticAberrationParams, depth: Tensor | None) -> Rendered:
         """Scale the first and the last channel of images."""
         height, width = image.shape[2:]
-        scale = finite_or(params.scale.to(field_dtype(image.dtype)), 0.0).clamp(-_LARGEST_SCALE, _LARGEST_SCALE)
+        # On an accelerator invalid values cannot be read; a clamp would have no gradient at the ends of the range.
+        scale = finite_or(params.scale.to(field_dtype(image.dtype)), 0.0).clamp(-2 * _LARGEST_SCALE, 2 * _LARGEST_SCALE)
         center = pinhole_of(self.camera, height=height, width=width).center
         red, blue = (
             scale_about(each, center, height=height, width=width) for each in expand_batch(scale, len(image)).unbind(1)

@@ -14,7 +14,12 @@ from torchrefract.effects.batch import LATEST_FRAME, ParamsAtDepth, check_shapes
 from torchrefract.effects.random_field import check_frame
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.depth import DepthProvider, GroundPlaneDepth, check_depth_provider
-from torchrefract.fields.rolling_shutter import ShutterMotion, rolling_shutter_flow, rolling_shutter_restore_flow
+from torchrefract.fields.rolling_shutter import (
+    ShutterMotion,
+    nearest_exposed,
+    rolling_shutter_flow,
+    rolling_shutter_restore_flow,
+)
 from torchrefract.fields.rolling_shutter_error import RollingShutterErrorModel
 from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan
 from torchrefract.types import Range
@@ -71,7 +76,8 @@ class RollingShutter(WarpEffect):
     vibration goes on from frame to frame. Place it before the lens: rows are those of the pinhole.
 
     With a depth map, which has edges, the flow is computed at every pixel. What the camera sees behind such an edge is
-    not in the clean frame: it is filled by what is next to it. `restore_valid` leaves out what becomes hidden.
+    not in the clean frame: it is filled by what is next to it. `restore_valid` leaves out what becomes hidden. Give the
+    car's own bonnet an infinite depth, since it drives along.
 
     With an exposure, the image is the mean of `num_exposures` images at times spread evenly over it, and costs as many
     samplings. All maps and labels are those of the middle of the exposure.
@@ -161,7 +167,13 @@ class RollingShutter(WarpEffect):
         """Compute the flow at the depth where each point ends."""
         motion, inverse_depth = self._motion(params)
         view = pinhole_of(self.camera, height=plan.height, width=plan.width)
-        return rolling_shutter_flow(motion, lambda ends: sample_at(inverse_depth, ends), points, view)
+        nearest = None
+        if params.is_map:
+            pixels = pixel_lattice(plan.height, plan.width).points(
+                dtype=inverse_depth.dtype, device=inverse_depth.device
+            )
+            nearest = sample_at(nearest_exposed(motion, inverse_depth, pixels, view), points)
+        return rolling_shutter_flow(motion, lambda ends: sample_at(inverse_depth, ends), points, view, nearest=nearest)
 
     def inverse_flow(self, params: ParamsAtDepth, flow: Tensor) -> tuple[Tensor, Tensor]:
         """Compute where each point of the clean frame is exposed; it exists where the flow leads back to the point."""
@@ -213,7 +225,9 @@ class RollingShutter(WarpEffect):
         params, depth = at_depth
 
         def bounded(name: str, value: Tensor) -> Tensor:
-            return finite_or(value, 0.0).clamp(*_BOUNDS[name])
+            # On an accelerator invalid values cannot be read; a clamp would have no gradient at the ends of the range.
+            largest = 2 * _BOUNDS[name][1]
+            return finite_or(value, 0.0).clamp(-largest, largest)
 
         frequency = bounded("frequency", params.frequency)
         frame = finite_or(params.frame, 0.0).clamp(-LATEST_FRAME, LATEST_FRAME)

@@ -10,7 +10,7 @@ from torchrefract._validation import check_flag, check_range, check_within, fini
 from torchrefract.cameras.camera import Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
-from torchrefract.fields.fog import blend_fog
+from torchrefract.fields.fog import linear_to_srgb, srgb_to_linear
 from torchrefract.fields.vignetting import vignetting
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
@@ -82,9 +82,8 @@ class Vignetting(PhotometricEffect):
     def render(self, image: Tensor, params: VignettingParams, depth: Tensor | None) -> Rendered:
         """Darken images."""
         height, width = image.shape[2:]
-        strength = finite_or(params.strength.to(field_dtype(image.dtype)), 0.0).clamp(0, 1)
+        strength = finite_or(params.strength.to(field_dtype(image.dtype)), 0.0)
         view = pinhole_of(self.camera, height=height, width=width)
         t = vignetting(expand_batch(strength, len(image)), view, height=height, width=width)
-        black = t.new_zeros(1, image.shape[1], 1, 1)
-        darkened = blend_fog(image, t, black, linear_light=self.linear_light)
+        darkened = linear_to_srgb(srgb_to_linear(image) * t) if self.linear_light else image * t
         return Rendered(darkened, lambda: t >= _MIN_TRANSMISSION, transmission=t)

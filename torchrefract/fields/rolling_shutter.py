@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract.cameras.camera import Pinhole
@@ -18,6 +19,7 @@ _SMALLEST_SCALE = 0.05  # of the distance to a point while the rows are read; be
 _OUTSIDE = 2.0  # frames off, where points without a source are sampled
 _LARGEST_SHARE = 0.9  # of a step of the time at which a point is exposed, as far as it is extrapolated
 _LARGEST_MISS_PX = 0.01
+_SAME_DEPTH = 0.8  # of the inverse depth of a surface is still that surface
 _LARGEST_SLOPE = 0.5  # of the fixed point of depth, as far as it is extrapolated; edges of depth are steeper
 
 
@@ -74,21 +76,61 @@ def rotation(angles: list[Tensor]) -> list[list[Tensor]]:
     ]
 
 
+def nearest_exposed(motion: ShutterMotion, inverse_depth: Tensor, points: Points, pinhole: Pinhole) -> Tensor:
+    """Return about which 1/Z each pixel of the rolling frame shows, (N, 1, H, W), and 0 where none is known.
+
+    Each pixel of the clean frame is moved to the pixel that shows it, and the nearest one counts, also for the pixels
+    around. It finds thin objects that move farther than they are wide. Without gradient.
+
+    Args:
+        motion, pinhole: as for `rolling_shutter_flow`.
+        inverse_depth: (N, 1, H, W), 1/m, of the clean frame.
+        points: its pixels.
+    """
+    height, width = points.lattice.height, points.lattice.width
+    (fx, fy), (cx, cy) = pinhole
+    with torch.no_grad():
+        inverse_depth = inverse_depth.detach()
+        motion = ShutterMotion(*(value.detach() for value in motion))
+        x, y, speed = (points.x - cx) / fx, (points.y - cy) / fy, motion.speed.view(-1, 1, 1, 1)
+        time = row_time(motion, points.y, height=height)
+        (a, b, c), (d, e, f), (g, h, i) = rotation(turn(motion, time))
+        column = row = points.y
+        for _ in range(2):
+            z = 1 - speed * time * inverse_depth
+            depth = (c * x + f * y + i * z).clamp(min=_SMALLEST_SCALE)
+            column, row = cx + fx * ((a * x + d * y + g * z) / depth), cy + fy * ((b * x + e * y + h * z) / depth)
+            time = row_time(motion, row.clamp(-height, 2 * height), height=height)
+        column, row = column.round(), row.round()
+        is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        index = torch.where(is_inside, row * width + column, float(height * width)).long().flatten(1)
+        nearest = inverse_depth.new_zeros(len(index), height * width + 1)
+        nearest = nearest.scatter_reduce(1, index, inverse_depth.flatten(1), "amax")[:, :-1]
+        return F.max_pool2d(nearest.view(-1, 1, height, width), kernel_size=3, stride=1, padding=1)
+
+
 def rolling_shutter_flow(
-    motion: ShutterMotion, inverse_depth: Callable[[Points], Tensor], points: Points, pinhole: Pinhole
+    motion: ShutterMotion,
+    inverse_depth: Callable[[Points], Tensor],
+    points: Points,
+    pinhole: Pinhole,
+    *,
+    nearest: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Compute the backward flow of a rolling shutter.
 
         p + flow(p) = c + f (r_x, r_y) / r_z (1 - v t / Z),  r = R(t) ((x - cx) / fx, (y - cy) / fy, 1),  t = t(y)
 
     Z is the depth where the point ends, at p + flow(p). It is found by a fixed-point step from the depth at the point
-    without forward motion, and extrapolated by its slope: exact for planes.
+    without forward motion, and extrapolated by its slope: exact for planes. An object in front of that counts where
+    `nearest` leads to it.
 
     Args:
         motion: of N cameras.
         inverse_depth: returns 1/Z, (N, 1, h, w), 1/m, at points of the clean frame.
         points: where the flow is computed, px.
         pinhole: of the camera.
+        nearest: (N, 1, h, w), 1/m, at the points, from `nearest_exposed`.
 
     Returns:
         flow: (N, 2, h, w), px.
@@ -115,6 +157,10 @@ def rolling_shutter_flow(
     second = inverse_depth(at((1 - along * first).clamp(min=_SMALLEST_SCALE)))
     slope = (second - first) / first.clamp(min=1e-12)
     w = torch.where(slope.abs() <= _LARGEST_SLOPE, first / (1 - slope), second)
+    if nearest is not None:
+        front = inverse_depth(at((1 - along * nearest).clamp(min=_SMALLEST_SCALE)))
+        is_front = (front >= _SAME_DEPTH * nearest) & (_SAME_DEPTH * front > w)
+        w = torch.where(is_front, front, w)
     scale = 1 - along * w
     exists = is_ahead & (scale > _SMALLEST_SCALE)
     end = at(scale)

@@ -13,9 +13,9 @@ from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.fields.chromatic_aberration import scale_about, shift_colors
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype, inside
-from torchrefract.warping.warp import INTERPOLATIONS
 
 _LARGEST_SCALE = 0.1
+_INTERPOLATIONS = ("bilinear", "bicubic")
 
 
 class ChromaticAberrationParams(NamedTuple):
@@ -44,7 +44,7 @@ class ChromaticAberration(PhotometricEffect):
     Args:
         red_range, blue_range: s, relative, within [-0.1, 0.1]; 0.001 shifts the corner of a frame of 1920 px by 1.1 px.
         camera: of the frames, whose principal point counts; None is the center of the frame.
-        interpolation: "nearest", "bilinear" or "bicubic".
+        interpolation: "bilinear" or "bicubic".
         tolerance: has no effect, since all of it is computed.
         p: probability that a sample is degraded.
 
@@ -72,7 +72,7 @@ class ChromaticAberration(PhotometricEffect):
         self.red_range = check_range("red_range", red_range, low=-_LARGEST_SCALE, high=_LARGEST_SCALE)
         self.blue_range = check_range("blue_range", blue_range, low=-_LARGEST_SCALE, high=_LARGEST_SCALE)
         self.camera = check_camera(camera)
-        self.interpolation = check_choice("interpolation", interpolation, INTERPOLATIONS)
+        self.interpolation = check_choice("interpolation", interpolation, _INTERPOLATIONS)
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> ChromaticAberrationParams:
         """Draw both scales uniformly in their ranges."""

@@ -73,7 +73,8 @@ class RollingShutterErrorModel:
         """Return (), bool: all parameters lie in the ranges."""
         inside = []
         for name, ranges in self.ranges:
-            values = getattr(params, name).reshape(len(params.applied), -1)
+            values = getattr(params, name)
+            values = values[:, None] if values.ndim == 1 else values
             if values.shape[1] != len(ranges):  # another number of frequencies
                 return torch.zeros((), dtype=torch.bool, device=values.device)
             low, high = as_device_tensor(ranges, dtype=values.dtype, device=values.device).unbind(1)

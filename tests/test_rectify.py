@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,7 +9,7 @@ import torch
 from PIL import Image
 
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io import read_opencv, write_opencv
+from torchrefract.cameras.io import read_opencv, write_kalibr, write_opencv
 from torchrefract.data.media import video_info
 from torchrefract.fields.rectification import camera_flow
 
@@ -92,6 +93,15 @@ def test_rectified_pictures_match_opencv(call, folder, name):
         assert error.mean() < 1
         assert np.abs(np.asarray(result) - raw)[4:-4, 4:-4].mean() > 5
     assert read_opencv(folder / "rectified" / "camera.yaml") == camera_flow(CAMERAS[name])[2]
+
+
+def test_a_chain_of_kalibr_is_a_camera_file(call, folder):
+    other = replace(CAMERAS["opencv"], fx=60.0)
+    write_kalibr(folder / "chain.yaml", {"cam0": CAMERAS["opencv"], "cam1": other})
+    message = call("rectify", "input=raw", "camera=chain.yaml").message
+    assert message == "camera: name must be one of the cameras in chain.yaml: cam0, cam1; got None"
+    assert call("rectify", "input=raw", "camera=chain.yaml", "camera_name=cam1").code == 0
+    assert read_opencv(folder / "rectified" / "camera.yaml").fx == 60.0
 
 
 def test_an_interrupted_run_continues(call, folder):

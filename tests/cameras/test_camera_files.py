@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchrefract.cameras.documents import parse_documents
 from torchrefract.cameras.io import read_camera, read_covariance, read_opencv, write_opencv
 
 RADIAL = (-0.28, 0.074, 2e-4, 1.8e-5)
@@ -107,7 +108,7 @@ distortion_model: "plumb_bob"
 D: [-0.28, 0.17, 0.0008, -0.0004, -0.05]
 K: [510.25, 0.0, 322.5, 0.0, 505.75, 237.125, 0.0, 0.0, 1.0]
 ---
-"""
+""".replace("header:", "header: ")
 INFO = """image_width: 640
 image_height: 480
 camera_name: head
@@ -214,6 +215,13 @@ def test_a_file_is_read_as_its_program_defines_it(form, tmp_path, make_camera):
     (tmp_path / name).write_text(content, encoding="utf-8")
     assert read_camera(tmp_path / name, **options) == make_camera(*lens)
     assert read_covariance(tmp_path / name) is None
+
+
+def test_a_long_recording_of_equal_messages_is_parsed_once(tmp_path):
+    messages = [message(FIVE, "plumb_bob", stamp) for stamp in range(500)]
+    assert len(parse_documents(tmp_path, "".join(messages))) == 1
+    assert len(parse_documents(tmp_path, ROS1 + ROS1.replace("seq: 12", "seq: 13"))) == 1
+    assert len(parse_documents(tmp_path, "".join([*messages, ROS1]))) == 2
 
 
 @pytest.mark.parametrize("ending", ["json", "xml", "yaml"])

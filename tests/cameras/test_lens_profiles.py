@@ -145,7 +145,8 @@ def test_a_measured_focal_length_of_lensfun_is_the_one_at_the_center(tmp_path):
 
 
 def test_the_lens_and_its_focal_length_are_asked_for(tmp_path):
-    path, size = tmp_path / "misc.xml", {"width": 800, "height": 600}
+    path = tmp_path / "misc.xml"
+    size: dict[str, Any] = {"width": 800, "height": 600}
     one = lensfun('model="poly3" focal="3" k1="-0.03"', extra='<distortion model="poly3" focal="5" k1="0.01"/>')
     path.write_text(one)
     with pytest.raises(
@@ -171,7 +172,7 @@ NO_LENS = "no lens model here computes it exactly: calibrate the camera"
 POLY3 = 'model="poly3" focal="3" k1="-0.03"'
 ODD = lensfun('model="ptlens" focal="3" a="0.01" b="-0.03" c="0.02"')
 PHOTOSCAN = metashape({"fx": 510.25, "fy": 505.75, "cx": 322.5, "cy": 237.125})
-FRAME = {"width": 800, "height": 600}
+FRAME: dict[str, Any] = {"width": 800, "height": 600}
 # Content, arguments, message.
 REFUSED: dict[str, tuple[str, dict[str, Any], str]] = {
     "Gyroflow, another model": (

@@ -165,13 +165,9 @@ def parse_documents(path: Path, text: str) -> list[Document]:
             pass  # OpenCV writes .Nan and 1., which only YAML takes
     # OpenCV's first line, %YAML:1.0, is not a valid directive of YAML.
     text = text.partition("\n")[2] if text.startswith("%YAML") else text
-    texts = [
-        re.sub(r"^header:\n(?:[ \t].*\n)+", "", part, flags=re.M)
-        for part in re.split(r"^---(?=\s|$)", text, flags=re.M)
-    ]
-    return [Document(path, _load_yaml(path, part, form)) for part in dict.fromkeys(filter(str.strip, texts))] or [
-        Document(path, None)
-    ]
+    parts = re.split(r"^---(?=\s|$)", text, flags=re.M)
+    texts = {re.sub(r"^header:[ \t]*\n(?:[ \t].*\n)+", "", part, flags=re.M).strip("\n"): None for part in parts}
+    return [Document(path, _load_yaml(path, part, form)) for part in texts if part.strip()] or [Document(path, None)]
 
 
 def dump_yaml(values: Mapping[str, Any]) -> str:

@@ -204,12 +204,12 @@ def test_unreadable_pictures_are_reported_and_skipped(call, folder):
         ),
         (
             ("input=raw", "camera=bad.yaml"),
-            "camera: path must hold a mapping of names to values, got bad.yaml with str",
+            "camera: path must hold a camera of OpenCV, ROS, Kalibr, COLMAP, ORB-SLAM, VINS, Gyroflow, lensfun or "
+            "Metashape, got bad.yaml with other text (path must hold a mapping of names to values",
         ),
         (
             ("input=raw", "camera=short.yaml"),
-            "camera: path must hold a camera, got short.yaml: coefficients must be 4 or 5 or 8 or 12 or 14 numbers for "
-            "the model opencv, got 3",
+            "camera: path must hold 4 x 1 numbers as distortion_coefficients, got short.yaml with 3",
         ),
         (("input=raw", "camera=cam.yaml", "zoom=0"), "zoom: zoom must be a number in [0.05, 20], got 0"),
         (("input=raw", "camera=cam.yaml", "out=raw"), "out must be another folder than that of input, got raw"),

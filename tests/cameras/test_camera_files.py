@@ -242,6 +242,7 @@ def test_files_that_opencv_writes_are_read(lens, ending, tmp_path, make_camera):
 UNKNOWN = "path must hold a camera of OpenCV, ROS, .*, got .* with"
 ORB_UNTYPED = ORB_FISHEYE.replace('Camera.type: "KannalaBrandt8"', "")
 ROI = message(FIVE, "plumb_bob").replace("x_offset: 0", "x_offset: 8")
+HALF = message(FIVE, "plumb_bob").replace("height: 0", "height: 240")
 TWO = message(FIVE, "plumb_bob") + message(EIGHT, "rational_polynomial")
 ZERO_K = message((), "plumb_bob").replace("510.25", "0.0")
 # Content, arguments, message.
@@ -260,6 +261,8 @@ REFUSED = {
     "a stereo pair": (storage(FIVE).replace("camera_matrix", "M1"), {}, f"{UNKNOWN} .*M1, .*create torchrefract.Cam"),
     "messages that differ": (TWO, {}, "must hold one camera, got .* of 2 different ones; keep those of one"),
     "a part of the frame": (ROI, {}, "whole frames, got .* the roi .*; remove roi, and use camera.cropped"),
+    "the upper half": (HALF, {}, "must describe whole frames, got .* the roi .*; remove roi, and use camera.cropped"),
+    "a model of others": (storage(FIVE), {"model": "omni"}, "model must be one of opencv, fisheye, got 'omni'"),
     "a fisheye without k": (message((), "equidistant"), {}, "must hold the four coefficients of a fisheye"),
     "a fisheye with five": (message(FIVE, "equidistant"), {}, "must be 4 numbers for the model fisheye, got 5"),
     "ROS, another model": (message(FIVE, "thin_prism"), {}, "_model of plumb_bob, .*, got .* 'thin_prism'; calibrate"),
@@ -292,7 +295,7 @@ REFUSED = {
     ),
     "VINS, MEI": (VINS.replace("KANNALA_BRANDT", "MEI"), {}, "of PINHOLE, KANNALA_BRANDT, got .* 'MEI'; calibrate"),
     "another XML": ("<document><chunk/></document>", {}, f"{UNKNOWN} <document>; create"),
-    "TOML": ("[cams.0]\nsize = [640, 480]\n", {}, f"{UNKNOWN} other text: .*; create"),
+    "TOML": ("[cams.0]\nsize = [640, 480]\n", {}, f"{UNKNOWN} other text .*; create"),
     "a recording": (b"#ROSBAG V2.0\n\xff\xfe", {}, f"{UNKNOWN} binary data; create"),
 }
 

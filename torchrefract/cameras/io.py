@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from torchrefract._validation import check_choice
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.colmap import colmap_rows, is_colmap, read_colmap, write_colmap
 from torchrefract.cameras.documents import (
@@ -85,6 +86,8 @@ def read_camera(
         ValueError: the file is of another form, has no exact counterpart here, leaves open what the arguments state,
             or contradicts them.
     """
+    if model is not None:
+        check_choice("model", model, ("opencv", "fisheye"))
     form = _recognize(Path(path))
     options = {"name": name, "width": width, "height": height, "model": model}
     options |= {"focal_mm": focal_mm, "crop_factor": crop_factor}
@@ -250,7 +253,7 @@ def _recognize(path: Path) -> _Form:
     try:
         documents = parse_documents(path, text)
     except ValueError as error:
-        raise _unknown_form(path, f"other text: {error}") from error
+        raise _unknown_form(path, f"other text ({error})") from error
     return _recognize_values(path, documents)
 
 
@@ -302,8 +305,8 @@ def _document_camera(
     path, values = document.path, document.values
     pinhole = document.pinhole(document.find(*_MATRIX))
     size = document.size(width, height)
-    region = values.get("roi")
-    if isinstance(region, dict) and (region.get("x_offset") or region.get("y_offset")):
+    region, whole = values.get("roi"), {"x_offset": 0, "y_offset": 0, "width": size[0], "height": size[1]}
+    if isinstance(region, dict) and any(region.get(key) not in (None, 0, side) for key, side in whole.items()):
         raise ValueError(
             f"path must describe whole frames, got {path} with the roi {abbreviate(region)}; remove roi, and use "
             "camera.cropped"

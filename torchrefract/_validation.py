@@ -176,10 +176,10 @@ def requires_grad(values: Iterable[Any]) -> bool:
     """
     if torch._C._are_functorch_transforms_active():
         return True
-    values = list(values)
+    values = [value for value in values if isinstance(value, Tensor)]
     if torch.is_grad_enabled() and any([value.requires_grad for value in values]):  # a list takes less time
         return True
-    return any([isinstance(value, Tensor) and _has_tangent(value) for value in values])
+    return any([_has_tangent(value) for value in values])
 
 
 def _has_tangent(value: Tensor) -> bool:

@@ -185,9 +185,9 @@ def check_frames(params: Any, shape: BatchShape) -> None:
 
 
 def map_params(params: Any, function: Any) -> Any:
-    """Apply a function to each tensor of the parameters, and to those of the children of a composition."""
-    if isinstance(params, Tensor):
-        return function(params)
+    """Apply a function to each tensor of the parameters, and to those of the children of a composition; None stays."""
+    if params is None or isinstance(params, Tensor):
+        return None if params is None else function(params)
     if isinstance(params, tuple) and not hasattr(params, "_fields"):  # the children of a composition
         return tuple(map_params(child, function) for child in params)
     return type(params)(*(map_params(value, function) for value in params))

@@ -247,14 +247,14 @@ TWO = message(FIVE, "plumb_bob") + message(EIGHT, "rational_polynomial")
 ZERO_K = message((), "plumb_bob").replace("510.25", "0.0")
 # Content, arguments, message.
 REFUSED = {
-    "four coefficients": (storage(FISHEYE), {}, 'must state the lens model of four .*model="opencv" if .*"fisheye"'),
+    "four coefficients": (storage(FISHEYE), {}, 'the lens model of four .*; add fisheye_model: .*model="opencv" or'),
     "four zeros": (storage((0.0,) * 4), {}, "must state the lens model of four coefficients"),
     "another model": (
         message(FISHEYE, "equidistant"),
         {"model": "opencv"},
         "model must be fisheye as .* states, got o",
     ),
-    "no size": (storage(FIVE, ""), {}, "must hold image_width, got .*; or state width in read_camera"),
+    "no size": (storage(FIVE, ""), {}, "must hold image_width, got .*; add it, or state width in read_camera"),
     "another size": (storage(FIVE), {"width": 320}, "width must be 640 as .* states, got 320; use camera.resized"),
     "an option of others": (storage(FIVE), {"focal_mm": 3}, "focal_mm must be None for a file of OpenCV or ROS, got 3"),
     "two matrices": (storage(FIVE) + "K: [1]\n", {}, "must hold one camera_matrix, got .* with camera_matrix, K"),
@@ -291,7 +291,7 @@ REFUSED = {
     "ORB-SLAM, no size": (
         ORB_SLAM.replace("Camera.width", "w"),
         {},
-        "must hold Camera.width, got .*; or state width in",
+        "must hold Camera.width, got .*; add it, or state width",
     ),
     "VINS, MEI": (VINS.replace("KANNALA_BRANDT", "MEI"), {}, "of PINHOLE, KANNALA_BRANDT, got .* 'MEI'; calibrate"),
     "another XML": ("<document><chunk/></document>", {}, f"{UNKNOWN} <document>; create"),

@@ -90,7 +90,9 @@ class Document:
             key = self.find(f"{prefix}{side}", side)
             if key not in self.values and given is None:
                 names = list_names(self.values)
-                raise ValueError(f"path must hold {key}, got {self.path} with {names}; or state {side} in read_camera")
+                raise ValueError(
+                    f"path must hold {key}, got {self.path} with {names}; add it, or state {side} in read_camera"
+                )
             stated = self.integers(key)[0] if key in self.values else given
             if given not in (None, stated):
                 raise ValueError(

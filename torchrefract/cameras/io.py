@@ -321,7 +321,8 @@ def _document_camera(
     if len(coefficients) == 4 and model is None:
         raise ValueError(
             f"path must state the lens model of four coefficients, got {path} without fisheye_model and "
-            'distortion_model; state it in read_camera: model="opencv" if they are k1, k2, p1, p2, or "fisheye"'
+            "distortion_model; add fisheye_model: 0 if they are k1, k2, p1, p2, or 1 for those of cv2.fisheye; or "
+            'state model="opencv" or "fisheye" in read_camera'
         )
     return document.camera(size, pinhole, coefficients or [0.0] * 4, model or "opencv")
 

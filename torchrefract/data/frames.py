@@ -103,8 +103,9 @@ class FrameFolder(Dataset[Frame]):
         self.paths = [self.root / frame.path for frame in frames]
         self.drives = sorted({frame.drive for frame in frames})
         self.keys = [path_key(frame.path) for frame in frames]
-        for frame in frames if self.depth is not None else ():
-            self.depth.find(frame.path)  # raises if there is none
+        if self.depth is not None:
+            for frame in frames:
+                self.depth.find(frame.path)  # raises if there is none
 
     def __len__(self) -> int:
         return len(self.paths)

@@ -35,9 +35,9 @@ from torchrefract.fields.depth import (
     DepthProvider,
     DepthSource,
     LinearDepth,
-    check_depth,
+    check_depth_provider,
     check_floating,
-    depth_of,
+    frame_depth,
     ray_distance,
 )
 from torchrefract.fields.fog import blend_fog, extinction, transmission, unblend_fog
@@ -111,13 +111,7 @@ class FogMedium:
         Returns:
             (N, B or 1, 1, H, 1 or W), m.
         """
-        dtype, (height, width) = field_dtype(image.dtype), image.shape[2:]
-        if depth is None:
-            depth = depth_of(self.depth, image, dtype)
-        else:
-            check_depth(depth)
-            # On an accelerator nothing is read: invalid values become 0.
-            depth = depth.to(dtype).nan_to_num(nan=0.0, posinf=torch.inf).clamp(min=0)
+        depth, (height, width) = frame_depth(self.depth, image, depth), image.shape[2:]
         if self.camera is None:
             return depth
         camera = self.camera.resized(width=width, height=height)
@@ -187,18 +181,12 @@ def make_medium(
     linear_light: bool,
 ) -> FogMedium:
     """Make a medium from arguments as `UniformFog` takes them."""
-    depth = LinearDepth() if depth is None else depth
-    if not callable(depth):
-        raise TypeError(
-            "depth must be a provider such as LinearDepth(), or a function from images (B, C, H, W) to their depth "
-            f"(B, 1, H, W) in m, got {type(depth).__name__}"
-        )
     if camera is not None and not isinstance(camera, Camera):
         raise TypeError(f"camera must be a Camera, got {type(camera).__name__}")
     return FogMedium(
         airlight=None if airlight is None else check_color("airlight", airlight, high=1.0),
         threshold=check_number("threshold", threshold, low=1e-6, high=1 - 1e-6),
-        depth=depth,
+        depth=LinearDepth() if depth is None else check_depth_provider(depth),
         camera=camera,
         linear_light=check_flag("linear_light", linear_light),
     )

@@ -94,6 +94,42 @@ class GroundPlaneDepth(DepthProvider):
 DepthSource = DepthProvider | Callable[[Tensor], Tensor]
 
 
+def check_depth_provider(depth: DepthSource) -> DepthSource:
+    """Return `depth` if it is a depth provider or a function.
+
+    Raises:
+        TypeError: otherwise.
+    """
+    if not callable(depth):
+        raise TypeError(
+            "depth must be a provider such as LinearDepth(), or a function from images (B, C, H, W) to their depth "
+            f"(B, 1, H, W) in m, got {type(depth).__name__}"
+        )
+    return depth
+
+
+def frame_depth(source: DepthSource, image: Tensor, depth: Tensor | None) -> Tensor:
+    """Return the depth of frames: the map that was passed in, or that of the effect.
+
+    Args:
+        source: of the effect.
+        image: (N, C, H, W), the frames.
+        depth: (N or B, 1, H, W), m; None takes that of the source.
+
+    Returns:
+        (N, B or 1, 1, H, W or 1), m, of the type of a field.
+
+    Raises:
+        ValueError: a depth that is not in meters, see `check_depth`.
+    """
+    dtype = field_dtype(image.dtype)
+    if depth is None:
+        return depth_of(source, image, dtype)
+    check_depth(depth)
+    # On an accelerator nothing is read: invalid values become 0.
+    return depth.to(dtype).nan_to_num(nan=0.0, posinf=torch.inf).clamp(min=0)
+
+
 def depth_of(source: DepthSource, image: Tensor, dtype: torch.dtype) -> Tensor:
     """Return the depth of images (N, C, H, W) by a provider, or by a function of the images, in m.
 

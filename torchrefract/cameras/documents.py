@@ -116,7 +116,7 @@ class Document:
         (width, height), (fx, fy, cx, cy), lens = size, pinhole, tuple(coefficients)
         try:
             return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=lens, model=model)
-        except ValueError as error:
+        except (ValueError, OverflowError) as error:
             raise ValueError(f"path must hold a camera, got {self.path}: {error}") from error
 
 

@@ -8,7 +8,7 @@ Options:
                             others, required
     camera_name=NAME        of the camera in a file of several, such as cam0
     out=rectified           output folder
-    crop=false              true keeps the middle part where the camera is certain to 2 px
+    crop=false              true zooms until no border is black, and keeps the part that is certain to 2 px
     zoom=1.0                factor of the focal length; below 1 the rectified frames show more
 
 Examples:

@@ -32,7 +32,7 @@ def airlight_of_frame(image: Tensor) -> Tensor:
     Source: He, Sun and Tang, "Single image haze removal using dark channel prior", IEEE TPAMI 33 (2011).
     """
     image = image.detach()
-    batch, channels, height, width = image.shape
+    channels, height, width = image.shape[1:]
     stride = max(1, max(height, width) // _NODES)
     nodes = image[:, :, ::stride, ::stride].double().nan_to_num(nan=0.0).clamp(0, 1)
     is_sky = sky_mask(image)[:, :, ::stride, ::stride]

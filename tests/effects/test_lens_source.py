@@ -40,7 +40,7 @@ def draw_lenses(effect: LensDistortion, count: int, seed: int = 7) -> Tensor:
 
 
 def test_from_camera_moves_each_ray_to_its_pixel_in_the_camera():
-    effect = LensDistortion.from_camera(CAR, tolerance_px=None)
+    effect = LensDistortion.from_camera(CAR, tolerance_px=None, frame="pad")
     degraded = effect.degrade(torch.zeros(1, 1, 360, 640, dtype=torch.float64), seed=0)
     pixels = torch.tensor([[0.0, 0.0], [639.0, 359.0], [100.0, 250.0]], dtype=torch.float64)
     seen = CAR.project(CAR.unproject(pixels).points).points
@@ -54,7 +54,7 @@ def test_from_camera_moves_each_ray_to_its_pixel_in_the_camera():
 
 def test_cameras_of_degraded_frames_agree_with_the_restore_flow():
     height, width = 36, 64
-    wide = LensDistortion(s1_range=(-0.01, 0.01), s4_range=(-0.01, 0.01), aspect_range=(0.95, 1.05), p=0.6)
+    wide = LensDistortion(s1_range=(-0.01, 0.01), s4_range=(-0.01, 0.01), aspect_range=(0.95, 1.05), p=0.6, frame="pad")
     degraded = wide.degrade(torch.zeros(6, 3, height, width, dtype=torch.float64), seed=2)
     cameras = wide.cameras(degraded.params, height=height, width=width)
     y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")

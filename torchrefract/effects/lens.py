@@ -321,9 +321,7 @@ class LensDistortion(WarpEffect):
                 return torch.where(exists, pixels + flow, torch.nan)
 
             zoom, shift = zoom_to_fill(position, lens[2], height=height, width=width)
-            is_pinhole = (params.coefficients == 0).all(dim=1)
-            zoom, shift = torch.where(is_pinhole, 1.0, zoom), torch.where(is_pinhole[:, None], 0.0, shift / width)
-        return zoom.to(dtype), shift.to(dtype)
+        return zoom.to(dtype), (shift / width).to(dtype)
 
     def _ranges(self) -> LensRanges:
         others = (self.focal_range, self.aspect_range, self.center_x_range, self.center_y_range)

@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,7 +9,7 @@ import torch
 from PIL import Image
 
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io import read_opencv, write_opencv
+from torchrefract.cameras.io import read_opencv, write_kalibr, write_opencv
 from torchrefract.data.media import video_info
 from torchrefract.fields.rectification import camera_flow
 
@@ -92,6 +93,15 @@ def test_rectified_pictures_match_opencv(call, folder, name):
         assert error.mean() < 1
         assert np.abs(np.asarray(result) - raw)[4:-4, 4:-4].mean() > 5
     assert read_opencv(folder / "rectified" / "camera.yaml") == camera_flow(CAMERAS[name])[2]
+
+
+def test_a_chain_of_kalibr_is_a_camera_file(call, folder):
+    other = replace(CAMERAS["opencv"], fx=60.0)
+    write_kalibr(folder / "chain.yaml", {"cam0": CAMERAS["opencv"], "cam1": other})
+    message = call("rectify", "input=raw", "camera=chain.yaml").message
+    assert message == "camera: name must be one of the cameras in chain.yaml: cam0, cam1; got None"
+    assert call("rectify", "input=raw", "camera=chain.yaml", "camera_name=cam1").code == 0
+    assert read_opencv(folder / "rectified" / "camera.yaml").fx == 60.0
 
 
 def test_an_interrupted_run_continues(call, folder):
@@ -194,12 +204,12 @@ def test_unreadable_pictures_are_reported_and_skipped(call, folder):
         ),
         (
             ("input=raw", "camera=bad.yaml"),
-            "camera: path must hold a mapping of names to values, got bad.yaml with str",
+            "camera: path must hold a camera of OpenCV, ROS, Kalibr, COLMAP, ORB-SLAM, VINS, Gyroflow, lensfun or "
+            "Metashape, got bad.yaml with other text (path must hold a mapping of names to values",
         ),
         (
             ("input=raw", "camera=short.yaml"),
-            "camera: path must hold a camera, got short.yaml: coefficients must be 4 or 5 or 8 or 12 or 14 numbers for "
-            "the model opencv, got 3",
+            "camera: path must hold 4 x 1 numbers as distortion_coefficients, got short.yaml with 3",
         ),
         (("input=raw", "camera=cam.yaml", "zoom=0"), "zoom: zoom must be a number in [0.05, 20], got 0"),
         (("input=raw", "camera=cam.yaml", "out=raw"), "out must be another folder than that of input, got raw"),

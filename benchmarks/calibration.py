@@ -117,7 +117,7 @@ def measure_board(name: str, entry: Mapping[str, Any], folder: Path) -> BoardRow
         views = (detector(gray, board, name=name) for name, gray in pictures.items())
         return [view for view in views if has_enough_corners(view, board)]
 
-    def fitted(views: Sequence[View], model: str) -> tuple[Fit, float]:
+    def fit_and_validate(views: Sequence[View], model: str) -> tuple[Fit, float]:
         fit = fit_camera(views, board, model=model, size=size)
         return fit, rms(np.concatenate(cross_validate(views, board, fit)))
 
@@ -126,11 +126,12 @@ def measure_board(name: str, entry: Mapping[str, Any], folder: Path) -> BoardRow
     calibration = calibrate_camera(detections, board, model=AUTO, size=size, max_drop_share=_DROP_SHARE)
     kept, fit = calibration.views, calibration.fit
     camera, published = fit.camera, entry.get("published")
-    opencv_fit, opencv_held_out = fitted(opencv_views, OPENCV_MODEL)
+    opencv_fit, opencv_held_out = fit_and_validate(opencv_views, OPENCV_MODEL)
     return BoardRow(
         name, f"{fit.model}, {fit.prior}", len(pictures), len(kept), sum(len(view.ids) for view in kept),
         fit.rms, calibration.held_out_rms, len(opencv_views), opencv_fit.rms, opencv_held_out,
-        fitted(kept, "opencv4")[1], edge_distance(camera, published) if published else None, 1 - camera.coverage(),
+        fit_and_validate(kept, "opencv4")[1], edge_distance(camera, published) if published else None,
+        1 - camera.coverage(),
         *_line_errors(kept, pictures, board, camera),
         camera.fx, 100 * (camera.fx / published["fx"] - 1) if published else None,
         _plant(views, pictures, board, size),

@@ -51,7 +51,7 @@ from torchrefract.warping.warp import warp
 _SYNTHETIC = "synthetic"
 _MIN_USABLE = MIN_VIEWS + 1  # views, so that each can be left out of the fit
 _MAX_REASONS = 300  # characters
-_CACHE_VERSION = 4  # of detections.jsonl; lines of other versions are ignored
+_CACHE_VERSION = 5  # of detections.jsonl; lines of other versions are ignored
 _MIN_SAME_SIZE = 0.75  # share of the pictures
 _MAX_MARKER_ERROR = 0.15  # of the side of a marker; blur shrinks it by some percent
 _NUM_DIAGNOSED = 3  # pictures in which another board is searched if the expected one is missing

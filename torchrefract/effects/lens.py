@@ -165,7 +165,7 @@ class LensDistortion(WarpEffect):
             jitter: largest relative change of each number, drawn uniformly, in [0, 0.99]: focal length, aspect, offset
                 of the principal point, and each coefficient.
             covariance: (4 + n, 4 + n), of fx, fy, cx, cy in px and n coefficients, in place of `jitter`: the numbers
-                vary together. Only for cameras that are polynomials.
+                vary together.
             residual_px: largest distance between the camera and its polynomial, px.
             strict, frame, padding, interpolation, backend, tolerance_px, p: as for `LensDistortion`.
 
@@ -178,7 +178,7 @@ class LensDistortion(WarpEffect):
             return cls(**ranges, strict=strict, tolerance_px=tolerance_px, **warp)
         if jitter:
             raise ValueError(f"jitter must be 0 if a covariance is given, got {jitter}")
-        source = camera_with_covariance(camera, covariance)
+        source = camera_with_covariance(camera, covariance, residual_px=residual_px)
         return cls._from_source(source, strict=strict, tolerance_px=tolerance_px, **warp)
 
     @classmethod

@@ -7,7 +7,6 @@ short, which the next run detects by its size, or hold zeros, which verify=true 
 
 import hashlib
 import io
-import json
 import math
 import multiprocessing
 import os
@@ -280,7 +279,7 @@ class PairStorage(NamedTuple):
         """Return the size of a pair on disk, with its row: files fill blocks, and those of a tar have a header."""
         sizes, block, header = [len(data) for data in pair.data.values()], _DISK_BLOCK, 0
         if self.tar is not None:
-            sizes.append(len(_row_without_files(pair.row)))
+            sizes.append(len(pair.row.without_files()))
             block = header = _TAR_BLOCK
         return sum(header + math.ceil(size / block) * block for size in sizes) + len(pair.row.as_line())
 
@@ -294,18 +293,12 @@ class PairStorage(NamedTuple):
         return pair.row._replace(files=files)
 
 
-def _row_without_files(row: PairRow) -> bytes:
-    document = row._asdict()
-    del document["files"]
-    return json.dumps(document).encode()
-
-
 def _add_pair(tar: tarfile.TarFile, pair: GeneratedPair, path: str) -> PairRow:
     row, files = pair.row, {}
     for suffix, data in pair.data.items():
         files[suffix] = row.files[suffix]._replace(path=path, offset=_add_file(tar, f"{row.name}.{suffix}", data))
     if files:
-        _add_file(tar, f"{row.name}.json", _row_without_files(row))
+        _add_file(tar, f"{row.name}.json", row.without_files())
     return row._replace(files=files)
 
 

@@ -29,7 +29,7 @@ from torch import Tensor
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError
 from torchrefract.data.frames import Source, assign_frames, list_files, path_key, select_val_drives
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, pixels_of, read_image
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, is_lost, pixels_of, read_image
 from torchrefract.data.media import VIDEOS, read_video, video_info
 from torchrefract.data.pairs.files import FLOWS, LIGHTS, PairArrays, count_out_of_range, encode_pair
 from torchrefract.data.pairs.manifest import PairRow, StoredFile
@@ -191,8 +191,7 @@ class PairGenerator(NamedTuple):
         try:
             image = self.reader.read(source)
         except UnreadableImageError as error:
-            # A missing file or a lost disk says nothing about the frame.
-            if isinstance(error.__cause__, OSError) and error.__cause__.errno is not None:
+            if is_lost(error):
                 raise UsageError(
                     f"source must stay unchanged during a run, got {error}; the same command continues"
                 ) from error

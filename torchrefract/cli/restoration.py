@@ -161,7 +161,9 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
         trainer = make(cfg, "trainer")
     except MisconfigurationException as error:
         raise UsageError(f"trainer: {error}") from error
-    if (processes := int(os.environ.get("WORLD_SIZE") or 1)) != trainer.world_size:
+    # Lightning starts the processes of other runs itself.
+    processes = int(os.environ.get("WORLD_SIZE") or trainer.world_size)
+    if processes != trainer.world_size:
         raise UsageError(
             f"trainer must be ddp with trainer.devices={os.environ.get('LOCAL_WORLD_SIZE', processes)} under torchrun, "
             f"got one that uses {trainer.world_size} of {processes} processes"

@@ -36,28 +36,9 @@ def cheap_dashcam(severity: int = 3) -> LensDistortion:
 
     Args:
         severity: 1 to 5, radial coefficient k1 of -0.03 … -0.10 at 1, -0.15 … -0.35 at 3, -0.45 … -0.60 at 5, for focal
-            lengths of 0.7 to 1.1 widths.
+            lengths of 0.7 to 1.1 widths. The frames are filled.
     """
-    k1, k2 = _at_severity(
-        severity,
-        # k2 >= 0.45 k1^2: r (1 + k1 r^2 + k2 r^4) increases for every r.
-        [
-            ((-0.10, -0.03), (0.005, 0.02)),
-            ((-0.20, -0.10), (0.02, 0.05)),
-            ((-0.35, -0.15), (0.06, 0.12)),
-            ((-0.45, -0.35), (0.10, 0.16)),
-            ((-0.60, -0.45), (0.17, 0.24)),
-        ],
-    )
-    return LensDistortion(
-        k1_range=k1,
-        k2_range=k2,
-        p1_range=(-0.001, 0.001),
-        p2_range=(-0.001, 0.001),
-        focal_range=(0.7, 1.1),
-        center_x_range=(-0.01, 0.01),
-        center_y_range=(-0.01, 0.01),
-    )
+    return _cheap_lens(severity, frame="fill")
 
 
 def cape_town_fog(severity: int = 3) -> HeterogeneousFog:
@@ -129,14 +110,15 @@ def paper_refractive(severity: int = 3, *, width: float = _REFERENCE_WIDTH) -> O
     """Create the paper's four refractive distortions, one of them for each sample.
 
     Args:
-        severity: 1 to 5, displacements of severity / 3 times the paper's; the lens is that of `cheap_dashcam`.
+        severity: 1 to 5, displacements of severity / 3 times the paper's; the lens is that of `cheap_dashcam`, with a
+            black border.
         width: of the frames, px.
     """
     scale = _at_severity(severity, [1 / 3, 2 / 3, 1.0, 4 / 3, 5 / 3])
     px = check_positive("width", width) / _REFERENCE_WIDTH
     return OneOf(
         [
-            cheap_dashcam(severity),
+            _cheap_lens(severity, frame="pad"),
             Turbulence(
                 amplitude_range=(0.5 * scale * px, 1.5 * scale * px),
                 length_range=(20.0 * px, 60.0 * px),
@@ -162,6 +144,30 @@ def paper_weather(severity: int = 3) -> OneOf:
             HeterogeneousFog(visibility_range=limits),
             LensFlare(strength_range=_around(strength, 0.05)),
         ]
+    )
+
+
+def _cheap_lens(severity: int, *, frame: str) -> LensDistortion:
+    k1, k2 = _at_severity(
+        severity,
+        # k2 >= 0.45 k1^2: r (1 + k1 r^2 + k2 r^4) increases for every r.
+        [
+            ((-0.10, -0.03), (0.005, 0.02)),
+            ((-0.20, -0.10), (0.02, 0.05)),
+            ((-0.35, -0.15), (0.06, 0.12)),
+            ((-0.45, -0.35), (0.10, 0.16)),
+            ((-0.60, -0.45), (0.17, 0.24)),
+        ],
+    )
+    return LensDistortion(
+        k1_range=k1,
+        k2_range=k2,
+        p1_range=(-0.001, 0.001),
+        p2_range=(-0.001, 0.001),
+        focal_range=(0.7, 1.1),
+        center_x_range=(-0.01, 0.01),
+        center_y_range=(-0.01, 0.01),
+        frame=frame,
     )
 
 

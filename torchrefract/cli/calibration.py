@@ -45,7 +45,7 @@ from torchrefract.cli.command import check_none_lost, make, naming, progress
 from torchrefract.data import media
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, pixels_of, read_image
 from torchrefract.data.pairs.manifest import locked
-from torchrefract.fields.rectification import camera_flow
+from torchrefract.fields.rectification import camera_flow, zoom_to_crop
 from torchrefract.warping.warp import warp
 
 _SYNTHETIC = "synthetic"
@@ -249,6 +249,8 @@ def rectify(cfg: DictConfig) -> None:
     with naming("camera"):
         camera = read_opencv(str(cfg.camera))
         covariance = read_covariance(str(cfg.camera))
+        if cfg.crop:
+            zoom = max(zoom, zoom_to_crop(camera))
         _, exists, pinhole = camera_flow(camera, zoom=zoom)
     part, pinhole = _part_to_keep(cfg, camera, covariance, pinhole)
     files = media.find_media(source)
@@ -320,8 +322,6 @@ def _part_to_keep(
             )
         elif cfg.crop and deviation > MAX_DEVIATION_PX:
             return crop, pinhole.cropped(**crop._asdict())
-    elif cfg.crop:
-        raise UsageError(f"crop must be false for a camera file without a covariance, got true with {cfg.camera}")
     return None, pinhole
 
 

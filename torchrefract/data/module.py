@@ -167,9 +167,9 @@ class PairData(LightningDataModule):
 
 def _start_method() -> str:
     """Return how workers start: as the program chose, or as Python does by default."""
-    chosen, known = multiprocessing.get_start_method(), multiprocessing.get_all_start_methods()
+    chosen, methods = multiprocessing.get_start_method(), multiprocessing.get_all_start_methods()
     # Launchers of jobs, as joblib, choose a method of their own, with which no DataLoader starts workers.
-    return chosen if chosen in known else known[0]
+    return chosen if chosen in methods else methods[0]
 
 
 @torch.no_grad()

@@ -212,6 +212,21 @@ def test_unreadable_pictures_are_reported_and_skipped(call, folder):
     assert outcome.out.startswith("out: 2 rectified, 0 already existed, 1 skipped")
 
 
+def test_a_file_that_vanishes_during_a_run_is_named_and_rectified_by_the_next(call, folder, monkeypatch):
+    file, words = folder / "raw" / "1.png", ("input=raw", "camera=cam.yaml", "out=out")
+    with monkeypatch.context() as patch:
+        patch.setattr("torchrefract.data.media.describe_turned", lambda _: str(file.rename(folder / "away.png"))[:0])
+        outcome = call("rectify", *words)
+    assert outcome.code == 1
+    assert outcome.out.startswith("out: 2 rectified, 0 already existed, 1 skipped")
+    assert outcome.err.splitlines()[-1] == (
+        "error: input must stay unchanged during a run, got raw/1.png cannot be opened (No such file or directory); "
+        "the same command tries them again"
+    )
+    (folder / "away.png").rename(file)
+    assert call("rectify", *words).out.startswith("out: 1 rectified, 2 already existed, 0 skipped")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -144,13 +144,11 @@ class LensFlare(PhotometricEffect):
         size = (request.width, request.height)
         radius = max(self.radius_range[1] * math.hypot(*size) * (1 + _ROUNDING), 1e-6)
         # The sun moves up to the latest frame of a clip, and is some distance from the nearest pixel there.
-        drifts = [
-            latest * max(map(abs, ends)) if any(ends) else 0.0 for ends in (self.drift_x_range, self.drift_y_range)
-        ]
-        centers = [
-            (low - drift, high + drift)
-            for (low, high), drift in zip((self.center_x_range, self.center_y_range), drifts, strict=True)
-        ]
+        center_ranges, drift_ranges = (
+            [getattr(self, f"{name}_{axis}_range") for axis in "xy"] for name in ("center", "drift")
+        )
+        drifts = [latest * max(map(abs, ends)) if any(ends) else 0.0 for ends in drift_ranges]
+        centers = [(low - drift, high + drift) for (low, high), drift in zip(center_ranges, drifts, strict=True)]
         distance = math.hypot(*map(_distance_from_frame, centers, size))
         light = self.strength_range[1] * max(self.color) * (1 + _ROUNDING)
         light *= math.exp(-0.5 * (distance / radius) ** 2) if self.radius_range[1] > 0 else 0.0
@@ -161,8 +159,9 @@ class LensFlare(PhotometricEffect):
         latest = eager_values(lambda: params.frame.abs().amax(), of=params.frame) if params.frame.numel() else 0.0
         if latest == 0 or self.tolerance is None or requires_grad(params):
             return super().plan_for(image, params, depth)
-        dtype, latest = field_dtype(image.dtype), math.inf if latest is None else float(latest)
-        return self._constant_clip_plan(id(self), *image.shape[2:], dtype, latest)
+        height, width = image.shape[2:]
+        latest = math.inf if latest is None else float(latest)
+        return self._constant_clip_plan(id(self), height, width, field_dtype(image.dtype), latest)
 
     def render(self, image: Tensor, params: FlareParams, depth: Tensor | None) -> Rendered:
         """Add the light of the sun to images."""

@@ -173,9 +173,9 @@ def is_shown_once(flow: Tensor, valid: Tensor | None = None) -> Tensor:
         flow = flow.detach()
         is_steep = torch.zeros_like(flow[:, :1], dtype=torch.bool)
         for jacobian in _corner_jacobians(flow):
-            squares = sum(torch.square(entry) for entry in jacobian)
+            norm = torch.hypot(torch.hypot(jacobian.xx, jacobian.xy), torch.hypot(jacobian.yx, jacobian.yy))
             # ||J^-1|| is ||J|| / det J in two dimensions. NaN counts as steep.
-            is_steep = is_steep | ~(squares.sqrt() <= _LARGEST_STRETCH * jacobian.determinant)
+            is_steep = is_steep | ~(norm <= _LARGEST_STRETCH * jacobian.determinant)
         if valid is not None:
             is_steep = is_steep & ~_near_invalid(valid)
         if eager_bool(is_steep.any, of=flow) is False:

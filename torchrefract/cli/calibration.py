@@ -40,12 +40,12 @@ from torchrefract.cameras.calibration.report import (
 from torchrefract.cameras.calibration.synthetic import CAMERA, NUM_VIEWS, render_views
 from torchrefract.cameras.calibration.uncertainty import MAX_DEVIATION_PX, Crop, certain_part
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io import read_covariance, read_opencv, write_opencv
+from torchrefract.cameras.io import read_camera, read_covariance, read_opencv, write_opencv
 from torchrefract.cli.command import make, naming, progress
 from torchrefract.data import media
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, pixels_of, read_image
 from torchrefract.data.pairs.manifest import locked
-from torchrefract.fields.rectification import camera_flow
+from torchrefract.fields.rectification import camera_flow, zoom_to_crop
 from torchrefract.warping.warp import warp
 
 _SYNTHETIC = "synthetic"
@@ -247,8 +247,10 @@ def rectify(cfg: DictConfig) -> None:
     with naming("zoom"):
         zoom = check_number("zoom", cfg.zoom, low=0.05, high=20.0)
     with naming("camera"):
-        camera = read_opencv(str(cfg.camera))
+        camera = read_camera(str(cfg.camera), name=cfg.camera_name)
         covariance = read_covariance(str(cfg.camera))
+        if cfg.crop:
+            zoom = max(zoom, zoom_to_crop(camera))
         _, exists, pinhole = camera_flow(camera, zoom=zoom)
     part, pinhole = _part_to_keep(cfg, camera, covariance, pinhole)
     files = media.find_media(source)
@@ -319,8 +321,6 @@ def _part_to_keep(
             )
         elif cfg.crop and deviation > MAX_DEVIATION_PX:
             return crop, pinhole.cropped(**crop._asdict())
-    elif cfg.crop:
-        raise UsageError(f"crop must be false for a camera file without a covariance, got true with {cfg.camera}")
     return None, pinhole
 
 

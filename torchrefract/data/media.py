@@ -60,25 +60,25 @@ _UPRIGHT = np.eye(3, dtype=np.int32)
 _MAX_NAMES = 3  # of files in a message
 
 
-def find_media(source: Path, *, deep: bool = False) -> Sequence[Path]:
+def find_media(source: Path, *, deep: bool = False, name: str = "input") -> Sequence[Path]:
     """Find the pictures and videos of a folder, or return the one file that `source` names.
 
-    With `deep`, the folders below it are searched too.
+    With `deep`, the folders below it are searched too. `name` is the option to blame.
 
     Raises:
         UsageError: if `source` does not exist or holds no picture or video, or if two videos would be written under one
             name.
     """
     if not source.exists():
-        raise UsageError(f"input must be a folder, a picture or a video, got {source}, which does not exist")
+        raise UsageError(f"{name} must be a folder, a picture or a video, got {source}, which does not exist")
     suffixes = (*EXTENSIONS, *VIDEOS)
     candidates = [source] if not source.is_dir() else sorted(list_files(source)) if deep else files_in(source, suffixes)
     files = [file for file in candidates if file.suffix.lower() in suffixes]
     if not files:
-        raise UsageError(f"input must be, or hold, {', '.join(suffixes)}, got {source}")
+        raise UsageError(f"{name} must be, or hold, {', '.join(suffixes)}, got {source}")
     names = [output_name(file) for file in files]
     if repeated := {str(name) for name in names if names.count(name) > 1}:
-        raise UsageError(f"input must not hold two videos of one name, got {', '.join(sorted(repeated))}")
+        raise UsageError(f"{name} must not hold two videos of one name, got {', '.join(sorted(repeated))}")
     return files
 
 

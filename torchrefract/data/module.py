@@ -264,10 +264,11 @@ def frames(
     seed: int = 0,
     transmission: bool = False,
     flow: bool = False,
+    depth: str | Path | None = None,
 ) -> PairData:
     """Make the data of a folder of frames, split by drive; see `FrameFolder` and `PairData` for the arguments."""
     train, val = (
-        FrameFolder(root, size=size, split=split, drive_by=drive_by, val_share=val_share, seed=seed)
+        FrameFolder(root, size=size, split=split, drive_by=drive_by, val_share=val_share, seed=seed, depth=depth)
         for split in ("train", "val")
     )
     options = {"batch_size": batch_size, "workers": workers, "seed": seed, "transmission": transmission, "flow": flow}

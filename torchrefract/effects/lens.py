@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import (
+    check_choice,
     check_flag,
     check_range,
     check_values,
@@ -18,10 +20,11 @@ from torchrefract._validation import (
     eager_values,
     requires_grad,
 )
-from torchrefract.cameras.brown_conrady import ALL_TERMS, POLYNOMIAL12
+from torchrefract.cameras.brown_conrady import ALL_TERMS, POLYNOMIAL12, used_terms
 from torchrefract.cameras.camera import Camera
-from torchrefract.effects.batch import params_to
+from torchrefract.effects.batch import check_shapes, map_params, params_to
 from torchrefract.effects.warp_effect import WarpEffect
+from torchrefract.fields.filled_frame import points_without_zoom, zoom_to_fill, zoomed_flow
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, newton_lens_flow
 from torchrefract.fields.lens_error import LensErrorModel, LensRanges
 from torchrefract.fields.lens_source import LensSource, camera_with_covariance, jittered_camera, lenses_from_cameras
@@ -32,6 +35,8 @@ from torchrefract.warping.lattice import pixel_lattice
 
 _LARGEST_COEFFICIENT = 100.0
 _FARTHEST = 1e10  # widths
+_SAME_VIEW = 1e-3  # difference of zooms and of shifts, in widths
+FRAMES = ("fill", "pad")
 _MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors are another model in another order)"
 
 
@@ -42,13 +47,19 @@ class LensParams(NamedTuple):
     coefficients: Tensor  # (B, 12): k1 ... k6, p1, p2, s1 ... s4
     focal: Tensor  # (B, 2), in widths of the frame: fx / W and fy / W
     center: Tensor  # (B, 2), in widths: the principal point's offset from the center of the frame
+    # The pinhole of the clean frame, if it is not that of the lens:
+    zoom: Tensor | None = None  # (B,), in (0, 1]: its focal length over that of the lens
+    shift: Tensor | None = None  # (B, 2), in widths: its principal point minus that of the lens
 
     to = params_to
 
     @property
     def is_identity(self) -> Tensor:
-        """Return (B,), bool: all coefficients are zero."""
-        return (self.coefficients == 0).all(dim=1)
+        """Return (B,), bool: all coefficients are zero, and the clean view is that of the lens."""
+        is_pinhole = (self.coefficients == 0).all(dim=1)
+        if self.zoom is None or self.shift is None:
+            return is_pinhole
+        return is_pinhole & (self.zoom == 1) & (self.shift == 0).all(dim=1)
 
 
 class LensDistortion(WarpEffect):
@@ -58,10 +69,16 @@ class LensDistortion(WarpEffect):
         y_d = y (1 + sum k_i r^2i) + p1 (r^2 + 2 y^2) + 2 p2 x y + s3 r^2 + s4 r^4,  i = 1 ... 6
 
     `flow` undistorts (the exact inverse), `restore_flow` distorts (closed form). Pixels beyond the radius where the
-    model folds back show nothing: they are padded and not valid. OpenCV's k4, k5, k6 belong to another model. The
-    defaults are those of a fleet of cheap dashcams: barrel lenses that fold nowhere. Under a tolerance each drawn lens
-    has a lattice of its own where values can be read (on the CPU, without `torch.compile` and without gradients of the
-    lens) and the frame has at least 2^16 px.
+    model folds back show nothing: they are padded and not valid.
+
+    A barrel lens sees more than a pinhole with its focal length. With `frame="fill"` the clean frame is a wider view:
+    for each sample the smallest zoom and shift are found with which no pixel of the degraded frame looks outside of it.
+    Both are part of the parameters and of both flows, see `clean_cameras`. With `frame="pad"` the clean frame keeps the
+    focal length, and the pixels that look outside of it are padded and not valid.
+
+    OpenCV's k4, k5, k6 belong to another model. The defaults are those of a fleet of cheap dashcams: barrel lenses that
+    fold nowhere. Under a tolerance each drawn lens has a lattice of its own where values can be read (on the CPU,
+    without `torch.compile` and without gradients of the lens) and the frame has at least 2^16 px.
 
     Args:
         k1_range ... k6_range: radial coefficients, each within [-100, 100].
@@ -71,6 +88,7 @@ class LensDistortion(WarpEffect):
         aspect_range: fy / fx, above 0.
         center_x_range, center_y_range: offset of the principal point from the center of the frame, in widths.
         strict: raise, instead of warning, if the model folds back inside the frame (on the CPU).
+        frame: "fill" or "pad".
         padding, interpolation, backend, tolerance_px, p: as for every warp.
 
     Raises:
@@ -103,6 +121,7 @@ class LensDistortion(WarpEffect):
         center_x_range: Range = (-0.01, 0.01),
         center_y_range: Range = (-0.01, 0.01),
         strict: bool = False,
+        frame: str = "fill",
         padding: str = "zeros",
         interpolation: str = "bilinear",
         backend: str = "auto",
@@ -120,6 +139,7 @@ class LensDistortion(WarpEffect):
         self.center_x_range = check_range("center_x_range", center_x_range, low=-10.0, high=10.0)
         self.center_y_range = check_range("center_y_range", center_y_range, low=-10.0, high=10.0)
         self.strict = check_flag("strict", strict)
+        self.frame = check_choice("frame", frame, FRAMES)
         self._source: LensSource | None = None
 
     @classmethod
@@ -131,6 +151,7 @@ class LensDistortion(WarpEffect):
         covariance: Any = None,
         residual_px: float = 0.5,
         strict: bool = False,
+        frame: str = "fill",
         padding: str = "zeros",
         interpolation: str = "bilinear",
         backend: str = "auto",
@@ -146,12 +167,12 @@ class LensDistortion(WarpEffect):
             covariance: (4 + n, 4 + n), of fx, fy, cx, cy in px and n coefficients, in place of `jitter`: the numbers
                 vary together. Only for cameras that are polynomials.
             residual_px: largest distance between the camera and its polynomial, px.
-            strict, padding, interpolation, backend, tolerance_px, p: as for `LensDistortion`.
+            strict, frame, padding, interpolation, backend, tolerance_px, p: as for `LensDistortion`.
 
         Raises:
             ValueError: a number out of range; a camera too far from a polynomial, or that folds inside its frame.
         """
-        warp = {"padding": padding, "interpolation": interpolation, "backend": backend, "p": p}
+        warp = {"padding": padding, "interpolation": interpolation, "backend": backend, "p": p, "frame": frame}
         if covariance is None:
             ranges = jittered_camera(camera, jitter=jitter, residual_px=residual_px).ranges
             return cls(**ranges, strict=strict, tolerance_px=tolerance_px, **warp)
@@ -167,6 +188,7 @@ class LensDistortion(WarpEffect):
         *,
         residual_px: float = 0.5,
         strict: bool = False,
+        frame: str = "fill",
         padding: str = "zeros",
         interpolation: str = "bilinear",
         backend: str = "auto",
@@ -179,12 +201,12 @@ class LensDistortion(WarpEffect):
             table: their cameras; None takes the lens database of the package (`torchrefract.cameras.read_lenses`).
             residual_px: largest distance between a camera of another model and its polynomial, px; lenses of the
                 database that are farther off are left out, others raise.
-            strict, padding, interpolation, backend, tolerance_px, p: as for `LensDistortion`.
+            strict, frame, padding, interpolation, backend, tolerance_px, p: as for `LensDistortion`.
 
         Raises:
             ValueError: an empty table; a camera too far from a polynomial, or that folds inside its frame.
         """
-        warp = {"padding": padding, "interpolation": interpolation, "backend": backend, "p": p}
+        warp = {"padding": padding, "interpolation": interpolation, "backend": backend, "p": p, "frame": frame}
         source = lenses_from_cameras(table, residual_px=residual_px)
         return cls._from_source(source, strict=strict, tolerance_px=tolerance_px, **warp)
 
@@ -202,51 +224,106 @@ class LensDistortion(WarpEffect):
             applied, values = self.draw_in_ranges(stream, self._source.draw_ranges, image)
             values = self._source.select(values)
         fx, aspect = values[:, 12], values[:, 13]
-        return LensParams(applied, values[:, :12], torch.stack([fx, fx * aspect], dim=1), values[:, 14:])
+        params = LensParams(applied, values[:, :12], torch.stack([fx, fx * aspect], dim=1), values[:, 14:])
+        return self.fill(params, *image.shape[2:]) if self.frame == "fill" else params
+
+    def fill(self, params: LensParams, height: int, width: int) -> LensParams:
+        """Return the same lenses with the zoom and the shift that leave no pixel of such frames without a source.
+
+        They carry no gradient. Lenses that see no more than the pinhole, as pincushion lenses, keep a zoom of 1.
+        """
+        zoom, shift = self._fit(params, height, width)
+        return params._replace(zoom=zoom, shift=shift)
 
     def validate(self, params: LensParams, image: Tensor) -> None:
         """Raise ValueError for invalid lenses."""
         check_lens(params, image.shape[0])
+        if (params.zoom is None) != (params.shift is None):
+            raise ValueError("params.zoom and params.shift must be given both or not at all, got one of them")
+        if params.zoom is not None and params.shift is not None:
+            check_shapes(params, {"zoom": (), "shift": (2,)})
+            check_values("params.zoom", "lie in (0, 1]", params.zoom, lambda v: (v > 0) & (v <= 1))
+            check_within("params.shift", params.shift, -_FARTHEST, _FARTHEST)
 
     def flow(self, params: LensParams, points: Points, plan: WarpPlan) -> tuple[Tensor, Tensor]:
-        """Undistort the points: `newton_lens_flow` under a tolerance, otherwise `lens_flow`."""
+        """Undistort the points, and lead on to the clean view."""
         height, width = points.lattice.height, points.lattice.width
         lens = lens_in_px(params, height, width)
-        if plan.details is not None:
-            terms = ALL_TERMS if requires_grad((params.coefficients,)) else plan.details.terms
-            num_steps = plan.details.steps_for(points.lattice.stride)
-            flow = newton_lens_flow(*lens, points, num_steps=num_steps, terms=terms)
-            return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=flow.device)
-        flow, exists = lens_flow(*lens, points)
-        if points.lattice.stride == 1 and eager_bool(exists.all, of=exists) is False:
+        flow, exists = _flow(lens, points, plan)
+        if plan.details is None and points.lattice.stride == 1 and eager_bool(exists.all, of=exists) is False:
             self._report_fold(params, height, width)
+        if params.zoom is not None and params.shift is not None:
+            flow = zoomed_flow(flow, points, lens[2], params.zoom, params.shift * width)
         return flow, exists
 
     def inverse_flow(self, params: LensParams, flow: Tensor) -> tuple[Tensor, Tensor]:
         """Distort the pixels, in closed form."""
         height, width = flow.shape[2:]
         points = pixel_lattice(height, width).points(dtype=params.focal.dtype, device=params.focal.device)
-        return lens_restore_flow(*lens_in_px(params, height, width), points)
+        lens = lens_in_px(params, height, width)
+        if params.zoom is None or params.shift is None:
+            return lens_restore_flow(*lens, points)
+        wide = points_without_zoom(points, lens[2], params.zoom, params.shift * width)
+        inverse, exists = lens_restore_flow(*lens, wide)
+        return inverse + torch.cat([wide.x - points.x, wide.y - points.y], dim=1), exists
 
     def error_model(self) -> LensErrorModel:
         """Return the error bounds of the ranges or of the source."""
-        return LensErrorModel((self._ranges(),) if self._source is None else self._source.boxes)
+        boxes = (self._ranges(),) if self._source is None else self._source.boxes
+        return LensErrorModel(boxes, fills=self.frame == "fill")
+
+    def for_params(self, params: LensParams, height: int, width: int) -> WarpEffect:
+        """Return this effect, or an exact one if the plan does not hold for the lenses, or for their clean view."""
+        effect = super().for_params(params, height, width)
+        if params.zoom is None or params.shift is None or self.tolerance_px is None:
+            return effect
+        fits = self._fit(params, height, width)
+        difference = torch.cat([(params.zoom - fits[0])[:, None], params.shift - fits[1]], dim=1).abs()
+        return effect.exact() if eager_bool((difference <= _SAME_VIEW).all, of=difference) is False else effect
 
     def cameras(self, params: LensParams, *, height: int, width: int) -> list[Camera]:
-        """Return the camera of each degraded frame; that of the clean frame is the pinhole with the same numbers.
+        """Return the camera of each degraded frame; see `clean_cameras` for that of its clean frame.
 
-        A sample that is not degraded has a pinhole. Reads values, which waits for an accelerator.
+        A sample that is not degraded has the pinhole of its clean frame. Reads values, which waits for an accelerator.
 
         Raises:
             ValueError: a lens that cannot be a `Camera`.
         """
-        cameras = []
-        rows = zip(*(value.tolist() for value in (params.applied, *lens_in_px(params, height, width))), strict=True)
-        for is_applied, coefficients, (fx, fy), (cx, cy) in rows:
-            numbers = tuple(coefficients) if is_applied else (0.0,) * len(coefficients)
-            pinhole = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
-            cameras.append(Camera(**pinhole, coefficients=numbers, model="polynomial12"))
-        return cameras
+        clean = self.clean_cameras(params, height=height, width=width)
+        rows = zip(params.applied.tolist(), *map(Tensor.tolist, lens_in_px(params, height, width)), clean, strict=True)
+        return [
+            replace(view, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=tuple(coefficients)) if is_applied else view
+            for is_applied, coefficients, (fx, fy), (cx, cy), view in rows
+        ]
+
+    def clean_cameras(self, params: LensParams, *, height: int, width: int) -> list[Camera]:
+        """Return the pinhole of each clean frame: that of the lens, with its zoom and its shift."""
+        _, focal, center = lens_in_px(params, height, width)
+        if params.zoom is not None and params.shift is not None:
+            focal, center = focal * params.zoom[:, None], center + width * params.shift
+        size: Any = {"width": width, "height": height, "coefficients": (0.0,) * 12, "model": "polynomial12"}
+        return [
+            Camera(fx=fx, fy=fy, cx=cx, cy=cy, **size)
+            for (fx, fy), (cx, cy) in zip(focal.tolist(), center.tolist(), strict=True)
+        ]
+
+    def _fit(self, params: LensParams, height: int, width: int) -> tuple[Tensor, Tensor]:
+        dtype = params.focal.dtype
+        folds_nowhere = self._constant_plan(id(self), height, width, dtype, False).details is not None
+        with torch.no_grad():
+            lens = lens_in_px(map_params(params, lambda value: value.detach().double()), height, width)
+
+            def position(points: Points) -> Tensor:
+                pixels = torch.cat([points.x, points.y], dim=1)
+                if folds_nowhere:
+                    return pixels + newton_lens_flow(*lens, points, num_steps=None, terms=used_terms(lens[0]))
+                flow, exists = lens_flow(*lens, points)
+                return torch.where(exists, pixels + flow, torch.nan)
+
+            zoom, shift = zoom_to_fill(position, lens[2], height=height, width=width)
+            is_pinhole = (params.coefficients == 0).all(dim=1)
+            zoom, shift = torch.where(is_pinhole, 1.0, zoom), torch.where(is_pinhole[:, None], 0.0, shift / width)
+        return zoom.to(dtype), shift.to(dtype)
 
     def _ranges(self) -> LensRanges:
         others = (self.focal_range, self.aspect_range, self.center_x_range, self.center_y_range)
@@ -265,6 +342,15 @@ class LensDistortion(WarpEffect):
             k1, k2 = params.coefficients[sample, :2].tolist()
             raise ValueError(f"coefficients: {rule}, got k1 = {k1:g} and k2 = {k2:g} in sample {sample}")
         warnings.warn(f"{rule}: pixels beyond have no preimage and are padded, not valid", stacklevel=2)
+
+
+def _flow(lens: tuple[Tensor, Tensor, Tensor], points: Points, plan: WarpPlan) -> tuple[Tensor, Tensor]:
+    """Undistort the points: `newton_lens_flow` under a tolerance, otherwise `lens_flow`."""
+    if plan.details is None:
+        return lens_flow(*lens, points)
+    terms = ALL_TERMS if requires_grad(lens[:1]) else plan.details.terms
+    flow = newton_lens_flow(*lens, points, num_steps=plan.details.steps_for(points.lattice.stride), terms=terms)
+    return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=flow.device)
 
 
 def check_lens(

@@ -1,23 +1,27 @@
 """A frame of a calibrated camera as a pinhole would have shown it."""
 
 import warnings
+from dataclasses import replace
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor
-from torchrefract._validation import eager_bool
+from torchrefract._validation import check_choice, check_within, eager_bool
 from torchrefract.cameras.camera import Camera
-from torchrefract.effects.batch import params_to
+from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.lens import check_lens, lens_in_px
 from torchrefract.effects.warp_effect import WarpEffect
+from torchrefract.fields.filled_frame import points_without_zoom, zoomed_flow
 from torchrefract.fields.lens import lens_flow, lens_restore_flow
 from torchrefract.fields.rectification import (
     RectificationErrorModel,
     is_border_missing,
     rectification_flow,
     rectification_restore_flow,
+    zoom_to_crop,
 )
 from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan
 from torchrefract.warping.grid import Points, field_dtype
@@ -33,6 +37,7 @@ class RectificationParams(NamedTuple):
     coefficients: Tensor  # (B, n), of `Rectification.model`
     focal: Tensor  # (B, 2), in widths of the frame: fx / W and fy / W
     center: Tensor  # (B, 2), in widths: the principal point's offset from the center of the frame
+    zoom: Tensor | None = None  # (B,), above 0: focal length of the rectified frame over that of the camera; None is 1
 
     to = params_to
 
@@ -41,11 +46,12 @@ class RectificationParams(NamedTuple):
         """Return (B,), bool: all coefficients are zero; never so for a fisheye, which has 4 of them."""
         # The radius of a fisheye is an angle, so that it distorts without any coefficient too.
         is_fisheye = self.coefficients.shape[1] == 4
-        return (self.coefficients == 0).all(dim=1) & (not is_fisheye)
+        is_pinhole = (self.coefficients == 0).all(dim=1) & (not is_fisheye)
+        return is_pinhole if self.zoom is None else is_pinhole & (self.zoom == 1)
 
 
 class Rectification(WarpEffect):
-    """Remove the distortion of a calibrated camera from its frames, which keep their focal length and size.
+    """Remove the distortion of a calibrated camera from its frames, which keep their size.
 
         flow(p) = f (distort((p - c) / f) - (p - c) / f)
 
@@ -58,9 +64,12 @@ class Rectification(WarpEffect):
         clean = scene.effects[0](raw)  # what a network should restore
 
     `d.restore_flow` then leads back to the raw frame. Pixels whose ray the camera does not show are padded, not valid.
+    Pincushion lenses leave such pixels along the border; `frame="crop"` multiplies the focal length by the smallest
+    zoom with which there are none, see `clean_camera`.
 
     Args:
         camera: of the frames, which may have another size with the same ratio of the sides.
+        frame: "pad" keeps the focal length, "crop" keeps valid pixels only.
         padding, interpolation, backend, tolerance_px, p: as for every warp.
 
     Raises:
@@ -79,6 +88,7 @@ class Rectification(WarpEffect):
         self,
         camera: Camera,
         *,
+        frame: str = "pad",
         padding: str = "zeros",
         interpolation: str = "bilinear",
         backend: str = "auto",
@@ -90,6 +100,7 @@ class Rectification(WarpEffect):
             raise TypeError(f"camera must be a Camera, got {type(camera).__name__}")
         camera.check_pole()
         self.camera = camera
+        self.frame = check_choice("frame", frame, ("pad", "crop"))
 
     @property
     def model(self) -> str:
@@ -101,10 +112,14 @@ class Rectification(WarpEffect):
         applied = random.uniform(stream, 1)[:, 0] < self.p
         dtype, count = field_dtype(image.dtype), image.shape[0]
         rows = (as_device_tensor([row], dtype=dtype, device=image.device).repeat(count, 1) for row in self._numbers())
-        return RectificationParams(applied, *rows)
+        params = RectificationParams(applied, *rows)
+        return params._replace(zoom=self._zoom(params, *image.shape[2:])) if self.frame == "crop" else params
 
     def validate(self, params: RectificationParams, image: Tensor) -> None:
         """Raise ValueError for invalid cameras."""
+        if params.zoom is not None:
+            check_shapes(params, {"zoom": ()})
+            check_within("params.zoom", params.zoom, 1e-2, 1e2)
         if self.model == "polynomial12":
             check_lens(params, image.shape[0])
             return
@@ -116,10 +131,13 @@ class Rectification(WarpEffect):
         height, width = points.lattice.height, points.lattice.width
         self.camera.resized(width=width, height=height)  # raises for another ratio of the sides
         camera = lens_in_px(params, height, width)
+        rays = points if params.zoom is None else points_without_zoom(points, camera[2], params.zoom)
         if self.model == "polynomial12":
-            flow, exists = lens_restore_flow(*camera, points)
+            flow, exists = lens_restore_flow(*camera, rays)
         else:
-            flow, exists = rectification_flow(*camera, points, model=self.model)
+            flow, exists = rectification_flow(*camera, rays, model=self.model)
+        if params.zoom is not None:
+            flow = flow + torch.cat([rays.x - points.x, rays.y - points.y], dim=1)
 
         def folds() -> Tensor:
             is_missing = is_border_missing(*camera, model=self.model, height=height, width=width)
@@ -138,12 +156,35 @@ class Rectification(WarpEffect):
         camera = lens_in_px(params, height, width)
         points = pixel_lattice(height, width).points(dtype=params.focal.dtype, device=params.focal.device)
         if self.model == "polynomial12":
-            return lens_flow(*camera, points)
-        return rectification_restore_flow(*camera, points, model=self.model)
+            inverse, exists = lens_flow(*camera, points)
+        else:
+            inverse, exists = rectification_restore_flow(*camera, points, model=self.model)
+        if params.zoom is not None:
+            inverse = zoomed_flow(inverse, points, camera[2], params.zoom)
+        return inverse, exists
 
     def error_model(self) -> RectificationErrorModel:
         """Return the error bounds of the camera."""
-        return RectificationErrorModel(self.camera, tuple(number for row in self._numbers() for number in row))
+        numbers = tuple(number for row in self._numbers() for number in row)
+        return RectificationErrorModel(self.camera, numbers, crops=self.frame == "crop")
+
+    def for_params(self, params: RectificationParams, height: int, width: int) -> WarpEffect:
+        """Return this effect, or an exact one if the plan does not hold for the cameras, or for their zoom."""
+        effect, zoom = super().for_params(params, height, width), params.zoom
+        if zoom is None or self.tolerance_px is None:
+            return effect
+        is_same = eager_bool(((zoom - self._zoom(params, height, width)).abs() <= 1e-3).all, of=zoom)
+        return effect.exact() if is_same is False else effect
+
+    def clean_camera(self, height: int, width: int) -> Camera:
+        """Return the pinhole of the rectified frames of a size."""
+        camera = self.camera.resized(width=width, height=height)
+        zoom = zoom_to_crop(camera) if self.frame == "crop" else 1.0
+        return replace(camera, model="opencv", coefficients=(0.0,) * 4, fx=zoom * camera.fx, fy=zoom * camera.fy)
+
+    def _zoom(self, params: RectificationParams, height: int, width: int) -> Tensor:
+        zoom = zoom_to_crop(self.camera.resized(width=width, height=height))
+        return torch.full_like(params.focal[:, 0], zoom)
 
     def _numbers(self) -> tuple[tuple[float, ...], ...]:
         """Return the coefficients, and in widths the focal lengths and the offset of the principal point."""

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrefract._tensor import assume_constant_result, expand_batch
 from torchrefract._validation import check_choice, eager_bool, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.batch import per_sample, where_active
+from torchrefract.effects.batch import ParamsAtDepth, params_per_frame, per_sample, where_active
 from torchrefract.effects.batch_flow import (
     COARSEST,
     BatchFlow,
@@ -25,6 +25,7 @@ from torchrefract.effects.batch_flow import (
     flow_on_measured_lattice,
     zero_flow,
 )
+from torchrefract.fields.depth import DepthSource, frame_depth
 from torchrefract.planning.plan import (
     DEFAULT_ULPS,
     TOLERANCE_PX,
@@ -53,7 +54,8 @@ class WarpEffect(Effect):
     """An effect that moves pixels.
 
     Subclasses implement `sample_params`, `validate` and `flow`, and where they can `inverse_flow` and `error_model`.
-    Their parameters are a NamedTuple with `applied` and a property `is_identity`, both (B,), bool.
+    Their parameters are a NamedTuple with `applied` and a property `is_identity`, both (B,), bool. Those that depend on
+    depth set `depth`; `flow` and `inverse_flow` then take a `ParamsAtDepth` in place of the parameters.
 
     Args:
         padding: values outside the frame: "zeros", "border" or "reflection".
@@ -68,6 +70,7 @@ class WarpEffect(Effect):
 
     rounding_ulps = DEFAULT_ULPS
     has_closed_form = False  # whether `flow` computes any points, not only the nodes of a lattice
+    depth: DepthSource | None = None  # of frames without a depth map; None for a flow that depends on no depth
 
     def __init__(
         self,
@@ -89,7 +92,7 @@ class WarpEffect(Effect):
         """Compute the flow at points of the frame.
 
         Args:
-            params: with B rows.
+            params: with B rows; a `ParamsAtDepth`, with N rows, if the effect has a `depth`.
             points: the nodes of a lattice with the plan's stride; any points, with N rows, if `has_closed_form`.
             plan: how exact the flow has to be.
 
@@ -101,8 +104,8 @@ class WarpEffect(Effect):
     def inverse_flow(self, params: Any, flow: Tensor) -> tuple[Tensor, Tensor]:
         """Return the flow (N, 2, H, W) that undoes `flow`, and where it exists.
 
-        By default Newton's method inverts the flow. Pixels next to a fold, or that a fold shows several times, have no
-        inverse: there a small error of the flow moves it far.
+        `params` are as for `flow`. By default Newton's method inverts the flow. Pixels next to a fold, or that a fold
+        shows several times, have no inverse: there a small error of the flow moves it far.
         """
         inverse, is_solved, _ = invert_flow(flow, tolerance_px=_SOLVED_PX)
         return inverse, is_solved & is_shown_once(flow)
@@ -151,6 +154,20 @@ class WarpEffect(Effect):
         effect.tolerance_px = None
         return effect
 
+    def at_depth(self, params: Any, image: Tensor, depth: Tensor | None) -> Any:
+        """Return what `flow` takes for images (N, C, H, W): parameters with the depth of each frame, if it counts.
+
+        Args:
+            params: with B rows, or N.
+            image: before the warp.
+            depth: of the image, (N or B, 1, H, W), m; None takes that of the provider.
+        """
+        if self.depth is None:
+            return params
+        rows = image.shape[0]
+        params = params_per_frame(params, rows // max(len(params.applied), 1))
+        return ParamsAtDepth(params, expand_batch(frame_depth(self.depth, image, depth), rows))
+
     def active(self, params: Any, height: int, width: int) -> Tensor:
         """Return (B,), bool: the samples that move."""
         return params.applied & ~params.is_identity & (height * width > 1)
@@ -187,14 +204,15 @@ class WarpEffect(Effect):
         height, width = image.shape[2:]
         if not self.may_change(params) or height * width == 1:
             return unchanged(image, params)
+        drawn, params = params, self.at_depth(params, image, depth)
         flow = BatchFlow(self.flow_parts(params, self._constant_plan(id(self), height, width, flow_dtype(params))))
         if flow.is_zero:
-            return unchanged(image, params)
+            return unchanged(image, drawn)
         active = self.active(params, height, width)  # a flow has B rows, or as many as there are images
         options = SamplingOptions(self.padding, self.interpolation, self.backend)
         return warped(
             flow.sample(image, expand_batch(active, image.shape[0]), params, options),
-            params,
+            drawn,
             flow=lambda: flow.dense,
             valid=lambda: (flow.exists & inside(flow.dense)) | ~per_sample(expand_batch(active, flow.dense.shape[0])),
             inverse=lambda: self.masked_inverse_flow(params, flow.dense),

@@ -8,7 +8,7 @@ random lenses. That no lens of the ranges folds is proved.
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -84,13 +84,16 @@ class LensErrorModel:
     """Error bounds for lenses drawn from one of several boxes of ranges; see `ErrorModel`."""
 
     boxes: tuple[LensRanges, ...]
+    fills: bool = False  # the clean view is zoomed so that it holds all that the lens shows
 
     is_random = False
 
     def bounds(self, height: int, width: int) -> FlowBounds | None:
         """Return measured bounds, or None if a lens may fold inside the frame."""
         measured = _measure(self.boxes, height, width)
-        return None if measured is None else measured.bounds
+        if measured is None:
+            return None
+        return widened(measured.bounds) if self.fills else measured.bounds
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification | None:
         """Drop terms that move less than a share of the budget, and choose the number of Newton steps."""
@@ -159,6 +162,15 @@ def _measure(boxes: tuple[LensRanges, ...], height: int, width: int) -> Measured
     stretch = torch.hypot(solved_x, solved_y) / torch.hypot(x, y).clamp(min=1e-9)
     bounds = flow_bounds(flow, num_levels, stretch)
     return None if bounds is None else MeasuredErrors(bounds, newton, moved)
+
+
+def widened(bounds: FlowBounds) -> FlowBounds:
+    """Return the bounds of flows with the zoom and the shift that fit them to a frame.
+
+    They move no point by more than the flow moves the border of the frame, on two sides, and change the gradient by no
+    more than its mean across the frame. Cubics interpolate them exactly.
+    """
+    return replace(bounds, max_displacement=3 * bounds.max_displacement, max_gradient=2 * bounds.max_gradient)
 
 
 def cell_lines(height: int, width: int, num_levels: int) -> Tensor:

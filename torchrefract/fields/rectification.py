@@ -7,18 +7,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor
+from torchrefract._tensor import as_device_tensor, cached_constant
 from torchrefract._validation import check_positive
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.projection import columns, image_of, on_plane, radius_within, ray_of
 from torchrefract.fields import lens
+from torchrefract.fields.filled_frame import MARGIN_PX, border_points
 from torchrefract.fields.lens import REACH, border_on_plane, corner_radius
-from torchrefract.fields.lens_error import cell_lines, flow_bounds, outermost_nodes
+from torchrefract.fields.lens_error import cell_lines, flow_bounds, outermost_nodes, widened
 from torchrefract.types import FlowBounds, Simplification
 from torchrefract.warping.grid import Points
 from torchrefract.warping.lattice import pixel_lattice
 
 _FAR = 8.0  # frames, to where pixels without a ray are sent
+_LARGEST_ZOOM = 64.0
 _CLOSE = 1e-5  # relative rounding error of camera parameters
 
 
@@ -98,12 +100,46 @@ def camera_flow(camera: Camera, *, zoom: float = 1.0) -> tuple[Tensor, Tensor, C
     return flow.float(), exists, pinhole
 
 
+@cached_constant(maxsize=256)
+def zoom_to_crop(camera: Camera) -> float:
+    """Return the smallest zoom, 1 or above, for which the camera shows all that its rectified frame does.
+
+    Found by bisection, from the border of the frame alone.
+
+    Raises:
+        ValueError: there is none up to 64.
+    """
+    numbers = camera.tensors(torch.empty(0, dtype=torch.float64, device="cpu"))
+    border = border_points(camera.height, camera.width, 0.0, numbers[2])
+
+    def is_shown(zoom: float) -> bool:
+        flow, exists = rectification_flow(*numbers, border, model=camera.model, zoom=zoom)
+        inside = [
+            (axis + flow[:, i : i + 1] - (side - 1) / 2).abs() <= (side - 1) / 2 - MARGIN_PX
+            for i, (axis, side) in enumerate(((border.x, camera.width), (border.y, camera.height)))
+        ]
+        return bool((exists & inside[0] & inside[1]).all())
+
+    if is_shown(1.0) or camera.is_pinhole:
+        return 1.0
+    low, high = 1.0, 2.0
+    while not is_shown(high):
+        low, high = high, 2 * high
+        if high > _LARGEST_ZOOM:
+            raise ValueError(f"camera must show the rays around its axis, got {camera} that shows too few to crop to")
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (low, middle) if is_shown(middle) else (middle, high)
+    return high
+
+
 @dataclass(frozen=True)
 class RectificationErrorModel:
     """Error bounds for the rectification of one camera, measured as those of a lens; see `ErrorModel`."""
 
     camera: Camera
     numbers: tuple[float, ...]  # coefficients, then focal lengths and center as the parameters hold them
+    crops: bool = False
 
     is_random = False
 
@@ -113,7 +149,8 @@ class RectificationErrorModel:
         Raises:
             ValueError: frames with another ratio of the sides than those of the camera.
         """
-        return _measure(self.camera.resized(width=width, height=height))
+        bounds = _measure(self.camera.resized(width=width, height=height))
+        return widened(bounds) if self.crops and bounds is not None else bounds
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification | None:
         """Keep all terms: the model is of one camera, and each of its terms counts."""
@@ -121,7 +158,7 @@ class RectificationErrorModel:
 
     def contains(self, params: Any) -> Tensor:
         """Return (), bool: the parameters are those of the camera, up to rounding."""
-        values = torch.cat(params[1:], dim=1)
+        values = torch.cat([params.coefficients, params.focal, params.center], dim=1)
         numbers = as_device_tensor(self.numbers, dtype=values.dtype, device=values.device)
         return ((values - numbers).abs() <= _CLOSE * numbers.abs()).all()
 

@@ -1,0 +1,109 @@
+"""The zoom and the shift of the clean view that leave no pixel of a degraded frame without a source.
+
+A barrel lens sees more of the scene than a pinhole with the same focal length. The clean frame is therefore taken as
+the view of a pinhole with a shorter focal length, and where the lens is decentered, another principal point.
+"""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchrefract._tensor import as_device_tensor
+from torchrefract.warping.grid import Points
+from torchrefract.warping.lattice import pixel_lattice
+
+_POINTS = 33  # on each side of the frame
+# The border of the pixel centers, and that of the pixels, so that the zoom also fits the same frame in another size.
+_OUTSETS_PX = (0.0, 0.5)
+MARGIN_PX = 1 / 16  # to keep from the border of the clean frame, above the default tolerance of flows
+_STEPS = 2.0**22  # the results are rounded to multiples of 1 / _STEPS, so that they have equal bits in every batch
+
+
+def zoom_to_fill(
+    position: Callable[[Points], Tensor], center: Tensor, *, height: int, width: int
+) -> tuple[Tensor, Tensor]:
+    """Find the largest zoom, at most 1, for which the clean frame holds all that a degraded frame shows.
+
+    A position q of the clean view without zoom moves to c + zoom (q - c) + shift. Only the border of the frame is
+    looked at, which decides for lenses whose distortion is monotone.
+
+    Args:
+        position: returns the position in the clean view without zoom, px, (B, 2, h, w), NaN where there is none.
+        center: (B, 2), px, c, in float64.
+        height, width: px, of the frame.
+
+    Returns:
+        zoom: (B,), in (0, 1].
+        shift: (B, 2), px; zero unless a smaller zoom would be needed without it.
+    """
+    low, high = zip(
+        *[_extent(position(border_points(height, width, outset, center)), center) for outset in _OUTSETS_PX],
+        strict=True,
+    )
+    low, high = torch.stack(low, dim=-1), torch.stack(high, dim=-1)  # (B, 2, outsets), from the center
+    size = as_device_tensor([width - 1, height - 1], dtype=center.dtype, device=center.device)[:, None]
+    room = as_device_tensor(_OUTSETS_PX, dtype=center.dtype, device=center.device) - MARGIN_PX
+    # Each lower end must fit together with each upper end.
+    spans = (high[..., None] - low[..., None, :]).clamp(min=1e-9)
+    zoom = ((size[..., None] + room[:, None] + room) / spans).flatten(1).amin(dim=1).clamp(max=1.0)
+    zoom = (zoom * _STEPS).floor() / _STEPS
+    middle, scale = center[..., None], zoom[:, None, None]
+    least = (-room - middle - scale * low).amax(dim=2)
+    most = (size + room - middle - scale * high).amin(dim=2)
+    return zoom, torch.zeros_like(center).clamp(min=least).clamp(max=most)
+
+
+def zoomed_flow(flow: Tensor, points: Points, center: Tensor, zoom: Tensor, shift: Tensor | None = None) -> Tensor:
+    """Return the flow into the zoomed clean view, from that into the view without zoom.
+
+        p + flow'(p) = c + zoom (p + flow(p) - c) + shift
+
+    Args:
+        flow: (B, 2, h, w), px, at the points.
+        points: positions in the degraded frame.
+        center, zoom, shift: as for `zoom_to_fill`; None is no shift.
+    """
+    parts = []
+    for i, axis in enumerate((points.x, points.y)):
+        offset = axis - center[:, i, None, None, None]
+        moved = 0.0 if shift is None else _view(shift[:, i])
+        parts.append(_view(zoom) * flow[:, i : i + 1] + (moved - (1 - _view(zoom)) * offset))
+    return torch.cat(parts, dim=1)
+
+
+def points_without_zoom(points: Points, center: Tensor, zoom: Tensor, shift: Tensor | None = None) -> Points:
+    """Return the positions in the clean view without zoom of positions in the zoomed one; arguments as above."""
+    parts = []
+    for i, axis in enumerate((points.x, points.y)):
+        offset = axis - center[:, i, None, None, None]
+        moved = 0.0 if shift is None else _view(shift[:, i])
+        parts.append(((1 - _view(zoom)) * offset - moved) / _view(zoom))
+    return points.displaced(torch.cat(torch.broadcast_tensors(*parts), dim=1))
+
+
+def _view(values: Tensor) -> Tensor:
+    """View (B,) as (B, 1, 1, 1)."""
+    return values.view(-1, 1, 1, 1)
+
+
+def border_points(height: int, width: int, outset: float, like: Tensor) -> Points:
+    """Return positions on each of the four sides of a frame, (1, 1, 4, n), px, with the type of another tensor."""
+    steps = torch.linspace(0, 1, _POINTS, dtype=like.dtype, device=like.device)
+    start, end = torch.zeros_like(steps), torch.ones_like(steps)
+    x = torch.stack([steps, steps, start, end]) * (width - 1 + 2 * outset) - outset
+    y = torch.stack([start, end, steps, steps]) * (height - 1 + 2 * outset) - outset
+    return Points(x[None, None], y[None, None], pixel_lattice(height, width), is_displaced=True)
+
+
+def _extent(position: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the lowest and the highest coordinates, (B, 2), from the center, of positions along the border."""
+    offset = position - center[:, :, None, None]
+    offset = torch.where(offset.isfinite(), offset, 0.0)
+    # The extremes of the parabolas through three points each, where they lie between these.
+    before, at, after = offset[..., :-2], offset[..., 1:-1], offset[..., 2:]
+    slope, bend = (after - before) / 2, before - 2 * at + after
+    is_between = slope.abs() < bend.abs()
+    extremes = torch.where(is_between, at - slope.square() / (2 * torch.where(is_between, bend, 1.0)), at)
+    values = torch.cat([offset, extremes], dim=3)
+    return values.amin(dim=(2, 3)), values.amax(dim=(2, 3))

@@ -309,7 +309,7 @@ class LensDistortion(WarpEffect):
 
     def _fit(self, params: LensParams, height: int, width: int) -> tuple[Tensor, Tensor]:
         dtype = params.focal.dtype
-        folds_nowhere = self._constant_plan(id(self), height, width, dtype, False).details is not None
+        folds_nowhere = self._constant_plan(id(self), height, width, dtype).details is not None
         with torch.no_grad():
             lens = lens_in_px(map_params(params, lambda value: value.detach().double()), height, width)
 

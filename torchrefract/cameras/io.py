@@ -305,8 +305,8 @@ def _document_camera(
     path, values = document.path, document.values
     pinhole = document.pinhole(document.find(*_MATRIX))
     size = document.size(width, height)
-    region, whole = values.get("roi"), {"x_offset": 0, "y_offset": 0, "width": size[0], "height": size[1]}
-    if isinstance(region, dict) and any(region.get(key) not in (None, 0, side) for key, side in whole.items()):
+    region, frame = values.get("roi"), {"x_offset": 0, "y_offset": 0, "width": size[0], "height": size[1]}
+    if isinstance(region, dict) and any(region.get(key) not in (None, 0, side) for key, side in frame.items()):
         raise ValueError(
             f"path must describe whole frames, got {path} with the roi {abbreviate(region)}; remove roi, and use "
             "camera.cropped"

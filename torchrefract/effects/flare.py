@@ -147,8 +147,8 @@ class LensFlare(PhotometricEffect):
         center_ranges, drift_ranges = (
             [getattr(self, f"{name}_{axis}_range") for axis in "xy"] for name in ("center", "drift")
         )
-        drifts = [latest * max(map(abs, ends)) if any(ends) else 0.0 for ends in drift_ranges]
-        centers = [(low - drift, high + drift) for (low, high), drift in zip(center_ranges, drifts, strict=True)]
+        moved = [latest * max(map(abs, ends)) if any(ends) else 0.0 for ends in drift_ranges]
+        centers = [(low - drift, high + drift) for (low, high), drift in zip(center_ranges, moved, strict=True)]
         distance = math.hypot(*map(_distance_from_frame, centers, size))
         light = self.strength_range[1] * max(self.color) * (1 + _ROUNDING)
         light *= math.exp(-0.5 * (distance / radius) ** 2) if self.radius_range[1] > 0 else 0.0

@@ -43,15 +43,15 @@ def zoom_to_fill(
     low, high = zip(*(_extent(reached, center) for reached in positions), strict=True)
     low, high = torch.stack(low, dim=-1), torch.stack(high, dim=-1)  # (B, 2, outsets), from the center
     size = as_device_tensor([width - 1, height - 1], dtype=center.dtype, device=center.device)[:, None]
-    room = as_device_tensor(_OUTSETS_PX, dtype=center.dtype, device=center.device) - MARGIN_PX
+    space = as_device_tensor(_OUTSETS_PX, dtype=center.dtype, device=center.device) - MARGIN_PX
     # Each lower end must fit together with each upper end.
     spans = (high[..., None] - low[..., None, :]).clamp(min=1e-9)
-    zoom = ((size[..., None] + room[:, None] + room) / spans).flatten(1).amin(dim=1).clamp(max=1.0)
+    zoom = ((size[..., None] + space[:, None] + space) / spans).flatten(1).amin(dim=1).clamp(max=1.0)
     zoom = (zoom * _STEPS).floor() / _STEPS
     middle, scale = center[..., None], zoom[:, None, None]
-    least = (-room - middle - scale * low).amax(dim=2)
-    most = (size + room - middle - scale * high).amin(dim=2)
-    shift = torch.zeros_like(center).clamp(min=least).clamp(max=most)
+    lowest_shift = (-space - middle - scale * low).amax(dim=2)
+    highest_shift = (size + space - middle - scale * high).amin(dim=2)
+    shift = torch.zeros_like(center).clamp(min=lowest_shift).clamp(max=highest_shift)
     is_still = (positions[0] - torch.cat([borders[0].x, borders[0].y], dim=1)).abs().amax(dim=(1, 2, 3)) <= STILL_PX
     return torch.where(is_still, 1.0, zoom), torch.where(is_still[:, None], 0.0, shift)
 

@@ -94,7 +94,7 @@ class LensErrorModel:
         measured = _measure(self.boxes, height, width)
         if measured is None:
             return None
-        return widened(measured.bounds) if self.fills else measured.bounds
+        return with_zoom(measured.bounds) if self.fills else measured.bounds
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification | None:
         """Drop terms that move less than a share of the budget, and choose the number of Newton steps."""
@@ -165,7 +165,7 @@ def _measure(boxes: tuple[LensRanges, ...], height: int, width: int) -> Measured
     return None if bounds is None else MeasuredErrors(bounds, newton, moved)
 
 
-def widened(bounds: FlowBounds) -> FlowBounds:
+def with_zoom(bounds: FlowBounds) -> FlowBounds:
     """Return the bounds of flows with the zoom and the shift that fit them to a frame.
 
     They move no point by more than the flow moves the border of the frame, on two sides with their margin, and change

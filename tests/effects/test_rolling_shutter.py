@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers import random_image
 from scipy.spatial.transform import Rotation
-from torch import Tensor
+from torch import Tensor, nn
 from torch.testing import assert_close
 from torchvision import tv_tensors
 
@@ -173,8 +173,8 @@ def test_planned_flows_of_a_road_are_within_the_tolerance(horizon, exposure_rang
         for look in effect.exposures():
             params = effect.sample(image, seed=3)
             at_depth = effect.at_depth(params, image, None)
-            planned = look.planned_flow(at_depth, *size).dense
-            exact = look.planned_flow(at_depth, *size, is_exact=True).dense
+            planned = look.flow_by_plan(at_depth, *size).dense
+            exact = look.planned_flow(at_depth, *size, None).dense
             assert (planned - exact).norm(dim=1).max() <= tolerance_px + 1e-3
 
 
@@ -222,12 +222,12 @@ def test_an_exposure_averages_images_at_times_within_it():
     params = effect.sample(image, seed=1)
     at_depth = effect.at_depth(params, image, None)
     sharp = [
-        warp(image, look.planned_flow(at_depth, 40, 60).dense, padding="reflection")[0] for look in effect.exposures()
+        warp(image, look.flow_by_plan(at_depth, 40, 60).dense, padding="reflection")[0] for look in effect.exposures()
     ]
     assert (sharp[0] - sharp[2]).abs().max() > 0.1
     degraded = effect.apply(image, params)
     assert_close(degraded.image, sum(sharp) / 3)
-    assert_close(degraded.flow, effect.exposures()[1].planned_flow(at_depth, 40, 60).dense)  # of the middle
+    assert_close(degraded.flow, effect.exposures()[1].flow_by_plan(at_depth, 40, 60).dense)  # of the middle
     composed = Compose([effect], tolerance_px=None)
     result = composed.apply(image, composed.sample(image)._replace(children=(params,)))
     assert_close(result.image, degraded.image)
@@ -245,8 +245,24 @@ def test_a_moment_of_an_exposure_is_that_of_the_renderer():
     expected, depth = rendered_flow(params, SCENES["road"], moment=-0.004)
     image = torch.zeros(1, 1, HEIGHT, WIDTH, dtype=torch.float64)
     at_depth = first.at_depth(params, image, torch.from_numpy(depth)[None, None])
-    flow = first.planned_flow(at_depth, HEIGHT, WIDTH).dense[0]
+    flow = first.flow_by_plan(at_depth, HEIGHT, WIDTH).dense[0]
     assert (flow - torch.from_numpy(expected))[:, :-10].abs().max() < 0.02
+
+
+def test_a_network_gives_the_depth_of_each_image():
+    class Network(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.scale = nn.Parameter(torch.tensor(20.0))
+
+        def forward(self, image: Tensor) -> Tensor:
+            return 5 + self.scale.detach() * image.mean(dim=1, keepdim=True)
+
+    network, image = Network(), random_image(2, 3, 40, 60)
+    effect = RollingShutter(depth=network)
+    assert not list(effect.parameters())
+    flow = effect.degrade(image, seed=1).flow
+    assert_close(flow, RollingShutter().degrade(image, seed=1, depth=network(image)).flow)
 
 
 def test_invalid_arguments_raise():
@@ -259,7 +275,7 @@ def test_invalid_arguments_raise():
     ):
         with pytest.raises(ValueError, match=rule):
             RollingShutter(**given)
-    with pytest.raises(TypeError, match="depth must be a depth provider"):
+    with pytest.raises(TypeError, match="depth must be a provider"):
         RollingShutter(depth=8.0)
     with pytest.raises(TypeError, match="camera must be a Camera"):
         RollingShutter(camera=(1400, 1400))

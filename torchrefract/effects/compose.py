@@ -211,18 +211,15 @@ class Compose(Effect):
         moving = self._at_depth(progress, [leaves[k] for k in places], places, request)
         active = [cast(WarpEffect, leaf.effect).active(leaf.params, *frame) for leaf in moving]
         exposures = [cast(WarpEffect, leaf.effect).exposures() for leaf in moving]
-        count = max(map(len, exposures))
-        parts = [
-            self._parts(
-                [leaf._replace(effect=each[k % len(each)]) for leaf, each in zip(moving, exposures, strict=True)],
-                places,
-                active,
-                request,
-            )
-            for k in range(count)
-        ]
-        middle = parts[0] if count == 1 else self._parts(moving, places, active, request)
-        progress.move(moving, active, middle, exposures=parts, is_exact=request.tolerance_px is None)
+        parts = []
+        for k in range(max(map(len, exposures))):
+            looks = [leaf._replace(effect=each[k % len(each)]) for leaf, each in zip(moving, exposures, strict=True)]
+            parts.append(self._parts(looks, places, active, request))
+        middle = parts[0] if len(parts) == 1 else self._parts(moving, places, active, request)
+        # The share must not depend on the warps that move other samples of the batch.
+        num_warps = sum(isinstance(leaf.effect, WarpEffect) for leaf in leaves)
+        share_px = None if request.tolerance_px is None else request.tolerance_px / num_warps
+        progress.move(moving, active, middle, share_px, exposures=parts)
 
     def _parts(
         self,
@@ -235,22 +232,18 @@ class Compose(Effect):
     ) -> list[FlowPart]:
         """Compute the composed flow of warps; arguments as for `Progress.move` and `_at_depth`."""
         warps = [(cast(WarpEffect, leaf.effect), leaf.params) for leaf in moving]
-        can_measure = can_measure and can_read(moving[0].params)
+        has_map = [isinstance(params, ParamsAtDepth) and params.is_map for _, params in warps]
+        frame, can_measure = (request.height, request.width), can_measure and can_read(moving[0].params)
         can_group = can_measure and not any(requires_grad(params) for _, params in warps)
         parts: list[FlowPart] = []
         for samples, acting in _group_samples(active) if can_group else [(None, list(range(len(warps))))]:
             chosen = [warps[k] for k in acting]
             if samples is not None:
                 chosen = [(effect, select_params(params, samples)) for effect, params in chosen]
+            acting_places = tuple([places[k] for k in acting])
+            exact_places = tuple([places[k] for k in acting if has_map[k]])
             plan = self._constant_plan(
-                id(self),
-                tuple([places[k] for k in acting]),
-                tuple([places[k] for k in acting if isinstance(p := warps[k][1], ParamsAtDepth) and p.is_map]),
-                request.height,
-                request.width,
-                request.tolerance_px,
-                request.is_double,
-                can_measure,
+                id(self), acting_places, exact_places, *frame, request.tolerance_px, request.is_double, can_measure
             )
             parts += [part.of_samples(samples) for part in _composed_flow(chosen, plan, request.tolerance_px)]
         return parts

@@ -33,6 +33,7 @@ from torchrefract.effects.batch import (
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.fields.depth import (
     DepthProvider,
+    DepthSource,
     LinearDepth,
     check_depth_provider,
     check_floating,
@@ -81,7 +82,7 @@ class FogMedium:
 
     airlight: tuple[float, ...] | None
     threshold: float
-    depth: DepthProvider = field(hash=False)  # providers may have no hash
+    depth: DepthSource = field(hash=False)  # providers may have no hash
     camera: Camera | None
     linear_light: bool
 
@@ -124,7 +125,8 @@ class FogMedium:
     def error_model(self, extinction_range: Range, height: int, width: int, *, has_depth: bool) -> FogErrorModel:
         """Return error bounds of uniform fog; `has_depth` if the depth is passed in, so that it has no bound."""
         largest = extinction_range[1]
-        farthest = math.inf if has_depth else _farthest(self, height, width)
+        is_known = isinstance(self.depth, DepthProvider) and not has_depth
+        farthest = _farthest(self, height, width) if is_known else math.inf
         thickness = largest * min(farthest, 1e12) if largest > 0 else 0.0
         return FogErrorModel(thickness, self.colors, self.linear_light)
 
@@ -166,7 +168,7 @@ def make_medium(
     *,
     airlight: float | Sequence[float] | None,
     threshold: float,
-    depth: DepthProvider | None,
+    depth: DepthSource | None,
     camera: Camera | None,
     linear_light: bool,
 ) -> FogMedium:
@@ -194,7 +196,8 @@ class UniformFog(PhotometricEffect):
         airlight: color of the fog in [0, 1], one number for each channel or one for all; None is that of the paper,
             (220, 220, 235) / 255 for three channels and its luminance for any other number.
         threshold: contrast that remains at the distance V, in (0, 1); 0.05 is the meteorological optical range.
-        depth: gives d if no depth is passed in; None is `LinearDepth()`, the ramp over the rows of the paper.
+        depth: gives d if no depth is passed in: a provider, or any function from images (B, C, H, W) in [0, 1] to their
+            depth (B, 1, H, W) in m, such as a network. None is `LinearDepth()`, the ramp over the rows of the paper.
         camera: of the frames; with it, depth along its axis is converted to the distance along each ray.
         linear_light: blend linear light, not stored values (sRGB).
         tolerance: largest error of the image, levels of 1/255; fog too thin to be seen is not computed, see `plan`.
@@ -218,7 +221,7 @@ class UniformFog(PhotometricEffect):
         deviation_range: Range = (-0.05, 0.05),
         airlight: float | Sequence[float] | None = None,
         threshold: float = 0.05,
-        depth: DepthProvider | None = None,
+        depth: DepthSource | None = None,
         camera: Camera | None = None,
         linear_light: bool = False,
         tolerance: float | None = None,

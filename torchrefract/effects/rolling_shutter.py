@@ -13,7 +13,7 @@ from torchrefract.cameras.camera import Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import LATEST_FRAME, ParamsAtDepth, check_shapes, params_to
 from torchrefract.effects.random_field import check_frame
 from torchrefract.effects.warp_effect import WarpEffect
-from torchrefract.fields.depth import DepthProvider, GroundPlaneDepth, check_depth_provider
+from torchrefract.fields.depth import DepthSource, GroundPlaneDepth, check_depth_provider
 from torchrefract.fields.rolling_shutter import (
     ShutterMotion,
     nearest_exposed,
@@ -92,8 +92,8 @@ class RollingShutter(WarpEffect):
         num_frequencies: K.
         num_exposures: times that are averaged if there is an exposure.
         fps: frames per second of clips.
-        depth: gives Z if no depth map is passed in; None is `GroundPlaneDepth()`, a flat road. Depths below 0.1 m count
-            as 0.1 m.
+        depth: gives Z if no depth map is passed in, a provider or a function of the image; None is the flat road of
+            `GroundPlaneDepth()`. Depths below 0.1 m count as 0.1 m.
         camera: of the frames, whose pinhole counts; None is a centered one with a focal length of 0.9 widths.
         padding, interpolation, backend, tolerance_px, p: as for every warp.
 
@@ -122,7 +122,7 @@ class RollingShutter(WarpEffect):
         num_frequencies: int = 3,
         num_exposures: int = 5,
         fps: float = 30.0,
-        depth: DepthProvider | None = None,
+        depth: DepthSource | None = None,
         camera: Camera | None = None,
         padding: str = "reflection",
         interpolation: str = "bilinear",
@@ -137,7 +137,8 @@ class RollingShutter(WarpEffect):
         self.num_frequencies = check_count("num_frequencies", num_frequencies)
         self.num_exposures = check_count("num_exposures", num_exposures)
         self.fps = check_number("fps", fps, low=1e-3, high=1e6)
-        self.depth = GroundPlaneDepth() if depth is None else check_depth_provider(depth)
+        # A network stays outside of the module, whose state holds nothing of an effect.
+        vars(self)["depth"] = GroundPlaneDepth() if depth is None else check_depth_provider(depth)
         self.camera = check_camera(camera)
         self._moment = 0.0  # of the exposure, from its middle, as a share of it
 
@@ -201,7 +202,7 @@ class RollingShutter(WarpEffect):
             frequency=largest["frequency"],
             num_frequencies=self.num_frequencies,
             ranges=tuple(ranges),
-            depth=cast(DepthProvider, self.depth),
+            depth=cast(DepthSource, self.depth),
             camera=self.camera,
         )
 

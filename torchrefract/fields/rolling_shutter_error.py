@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor
 from torchrefract.cameras.camera import Camera, pinhole_of
-from torchrefract.fields.depth import DepthProvider
+from torchrefract.fields.depth import DepthProvider, DepthSource
 from torchrefract.types import FlowBounds, Range, Simplification
 
 _SAFETY = 1.25  # of measured errors, since the flow is not quite linear along rows
@@ -46,7 +46,7 @@ class RollingShutterErrorModel:
     frequency: float
     num_frequencies: int
     ranges: tuple[tuple[str, tuple[Range, ...]], ...]
-    depth: DepthProvider
+    depth: DepthSource
     camera: Camera | None
 
     is_random = False
@@ -85,6 +85,8 @@ class RollingShutterErrorModel:
 
 @lru_cache(maxsize=256)
 def _bounds(model: RollingShutterErrorModel, height: int, width: int) -> FlowBounds | None:
+    if not isinstance(model.depth, DepthProvider):
+        return None
     depth = model.depth(height, width, dtype=torch.float64, device=torch.device("cpu"))
     if depth.shape[3] > 1:
         return None

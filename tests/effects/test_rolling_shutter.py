@@ -170,11 +170,10 @@ def test_planned_flows_of_a_road_are_within_the_tolerance(horizon, exposure_rang
         given = {"depth": depth, "exposure_range": exposure_range, "tolerance_px": tolerance_px}
         effect = RollingShutter(**given, speed_range=(100.0, 100.0), readout_range=(30.0, 33.0), pitch_range=(0.2, 0.2))
         image = torch.zeros(8, 1, *size)
-        for look in effect.exposures():
-            params = effect.sample(image, seed=3)
-            at_depth = effect.at_depth(params, image, None)
-            planned = look.flow_by_plan(at_depth, *size).dense
-            exact = look.planned_flow(at_depth, *size, None).dense
+        at_depth = effect.at_depth(effect.sample(image, seed=3), image, None)
+        for moment in effect.moments():
+            planned = effect.flow_by_plan(at_depth.at(moment), *size).dense
+            exact = effect.planned_flow(at_depth.at(moment), *size, None).dense
             assert (planned - exact).norm(dim=1).max() <= tolerance_px + 1e-3
 
 
@@ -221,13 +220,12 @@ def test_an_exposure_averages_images_at_times_within_it():
     effect = RollingShutter(exposure_range=(10.0, 20.0), num_exposures=3, speed_range=(100.0, 100.0), tolerance_px=None)
     params = effect.sample(image, seed=1)
     at_depth = effect.at_depth(params, image, None)
-    sharp = [
-        warp(image, look.flow_by_plan(at_depth, 40, 60).dense, padding="reflection")[0] for look in effect.exposures()
-    ]
+    flows = [effect.flow_by_plan(at_depth.at(moment), 40, 60).dense for moment in (-1 / 3, 0.0, 1 / 3)]
+    sharp = [warp(image, flow, padding="reflection")[0] for flow in flows]
     assert (sharp[0] - sharp[2]).abs().max() > 0.1
     degraded = effect.apply(image, params)
     assert_close(degraded.image, sum(sharp) / 3)
-    assert_close(degraded.flow, effect.exposures()[1].flow_by_plan(at_depth, 40, 60).dense)  # of the middle
+    assert_close(degraded.flow, flows[1])  # of the middle
     composed = Compose([effect], tolerance_px=None)
     result = composed.apply(image, composed.sample(image)._replace(children=(params,)))
     assert_close(result.image, degraded.image)
@@ -239,13 +237,11 @@ def test_an_exposure_averages_images_at_times_within_it():
 
 def test_a_moment_of_an_exposure_is_that_of_the_renderer():
     params = driving(100.0, 30.0, exposure=12.0, **VIBRATION)
-    first = RollingShutter(camera=CAMERA, exposure_range=(12.0, 12.0), num_exposures=3, tolerance_px=None).exposures()[
-        0
-    ]
+    effect = RollingShutter(camera=CAMERA, exposure_range=(12.0, 12.0), tolerance_px=None)
     expected, depth = rendered_flow(params, SCENES["road"], moment=-0.004)
     image = torch.zeros(1, 1, HEIGHT, WIDTH, dtype=torch.float64)
-    at_depth = first.at_depth(params, image, torch.from_numpy(depth)[None, None])
-    flow = first.flow_by_plan(at_depth, HEIGHT, WIDTH).dense[0]
+    at_depth = effect.at_depth(params, image, torch.from_numpy(depth)[None, None]).at(-1 / 3)
+    flow = effect.flow_by_plan(at_depth, HEIGHT, WIDTH).dense[0]
     assert (flow - torch.from_numpy(expected))[:, :-10].abs().max() < 0.02
 
 

@@ -210,10 +210,13 @@ class Compose(Effect):
         frame = request.height, request.width
         moving = self._at_depth(progress, [leaves[k] for k in places], places, request)
         active = [cast(WarpEffect, leaf.effect).active(leaf.params, *frame) for leaf in moving]
-        exposures = [cast(WarpEffect, leaf.effect).exposures() for leaf in moving]
+        moments = [cast(WarpEffect, leaf.effect).moments() for leaf in moving]
         parts = []
-        for k in range(max(map(len, exposures))):
-            looks = [leaf._replace(effect=each[k % len(each)]) for leaf, each in zip(moving, exposures, strict=True)]
+        for k in range(max(map(len, moments))):
+            looks = [
+                leaf if len(each) == 1 else leaf._replace(params=leaf.params.at(each[k % len(each)]))
+                for leaf, each in zip(moving, moments, strict=True)
+            ]
             parts.append(self._parts(looks, places, active, request))
         middle = parts[0] if len(parts) == 1 else self._parts(moving, places, active, request)
         # The share must not depend on the warps that move other samples of the batch.
@@ -255,8 +258,7 @@ class Compose(Effect):
 
         Args:
             progress: before the warps.
-            leaves: the warps that will be sampled together.
-            places: of the warps among all effects.
+            leaves, places: the warps that will be sampled together, and their places among all effects.
             request: for the composed flow.
         """
         frame = request.height, request.width

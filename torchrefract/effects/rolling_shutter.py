@@ -1,7 +1,6 @@
 """The rolling shutter of a camera that moves and vibrates."""
 
 import math
-from copy import copy
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -140,7 +139,6 @@ class RollingShutter(WarpEffect):
         # A network stays outside of the module, whose state holds nothing of an effect.
         vars(self)["depth"] = GroundPlaneDepth() if depth is None else check_depth_provider(depth)
         self.camera = check_camera(camera)
-        self._moment = 0.0  # of the exposure, from its middle, as a share of it
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> RollingShutterParams:
         """Draw all numbers uniformly in their ranges, and phases over the circle."""
@@ -206,16 +204,10 @@ class RollingShutter(WarpEffect):
             camera=self.camera,
         )
 
-    def exposures(self) -> list[WarpEffect]:
-        """Return this effect at the times that are averaged."""
-        if self._range("exposure")[1] == 0 or self.num_exposures == 1:
-            return [self]
-        effects: list[WarpEffect] = []
-        for k in range(self.num_exposures):
-            effect = copy(self)
-            effect._moment = (k + 0.5) / self.num_exposures - 0.5
-            effects.append(effect)
-        return effects
+    def moments(self) -> list[float]:
+        """Return the moments of the exposure that are averaged; its middle if there is none."""
+        count = self.num_exposures if self._range("exposure")[1] > 0 else 1
+        return [(k + 0.5) / count - 0.5 for k in range(count)]
 
     def _range(self, name: str) -> Range:
         return getattr(self, f"{name}_range")
@@ -223,7 +215,7 @@ class RollingShutter(WarpEffect):
     def _motion(self, at_depth: ParamsAtDepth) -> tuple[ShutterMotion, Tensor]:
         """Return the motion of each frame in SI units, and 1 / depth; values that are not finite move nothing."""
         params: Any
-        params, depth = at_depth
+        params, depth, moment = at_depth
 
         def bounded(name: str, value: Tensor) -> Tensor:
             # On an accelerator invalid values cannot be read; a clamp would have no gradient at the ends of the range.
@@ -241,7 +233,7 @@ class RollingShutter(WarpEffect):
         motion = ShutterMotion(
             speed=bounded("speed", params.speed) / 3.6,
             readout=bounded("readout", params.readout) / 1000,
-            moment=self._moment * exposure,
+            moment=torch.zeros_like(exposure) if moment is None else moment.to(exposure.dtype) * exposure,
             amplitude=torch.deg2rad(bounded("pitch", params.amplitude)),
             frequency=frequency,
             phase=phase,

@@ -115,9 +115,12 @@ class WarpEffect(Effect):
         """Return error bounds for all parameters in the ranges, or None if none are known."""
         return None
 
-    def exposures(self) -> list["WarpEffect"]:
-        """Return the effects whose images are averaged, each with the same parameters; by default this one alone."""
-        return [self]
+    def moments(self) -> list[float]:
+        """Return the moments of the exposure whose images are averaged, as for `ParamsAtDepth`; by default its middle.
+
+        A warp with several of them has a `depth`.
+        """
+        return [0.0]
 
     @property
     def keeps_uint8(self) -> bool:
@@ -217,8 +220,8 @@ class WarpEffect(Effect):
         if not self.may_change(params) or height * width == 1:
             return unchanged(image, params)
         drawn, params = params, self.at_depth(params, image, depth)
-        flow, effects = self.flow_by_plan(params, height, width), self.exposures()
-        if flow.is_zero and len(effects) == 1:
+        flow, moments = self.flow_by_plan(params, height, width), self.moments()
+        if flow.is_zero and len(moments) == 1:
             return unchanged(image, drawn)
         active = self.active(params, height, width)  # a flow has B rows, or as many as there are images
         moves, options = (
@@ -227,11 +230,11 @@ class WarpEffect(Effect):
         )
 
         def sampled(source: Tensor, k: int) -> Tensor:
-            along = flow if len(effects) == 1 else effects[k].flow_by_plan(params, height, width)
+            along = flow if len(moments) == 1 else self.flow_by_plan(params.at(moments[k]), height, width)
             return along.sample(source, moves, params, options)
 
         return warped(
-            mean_of_exposures(image, len(effects), sampled, moves, params),
+            mean_of_exposures(image, len(moments), sampled, moves, params),
             drawn,
             flow=lambda: flow.dense,
             valid=lambda: (flow.exists & inside(flow.dense)) | ~per_sample(expand_batch(active, flow.dense.shape[0])),

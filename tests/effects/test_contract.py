@@ -77,7 +77,7 @@ EFFECTS = {
         },
         identity={"k1_range": NO_RANGE, "k2_range": NO_RANGE, "p1_range": NO_RANGE, "p2_range": NO_RANGE},
         gradient_field="coefficients",
-        fields=("coefficients", "focal", "center"),
+        fields=("coefficients", "focal", "center", "zoom", "shift"),
     ),
     "turbulence": Case(
         Turbulence,

@@ -225,7 +225,8 @@ class LensDistortion(WarpEffect):
             values = self._source.select(values)
         fx, aspect = values[:, 12], values[:, 13]
         params = LensParams(applied, values[:, :12], torch.stack([fx, fx * aspect], dim=1), values[:, 14:])
-        return self.fill(params, *image.shape[2:]) if self.frame == "fill" else params
+        zoom, shift = self._view(params, *image.shape[2:])
+        return params._replace(zoom=zoom, shift=shift)
 
     def fill(self, params: LensParams, height: int, width: int) -> LensParams:
         """Return the same lenses with the zoom and the shift that leave no pixel of such frames without a source.
@@ -277,7 +278,7 @@ class LensDistortion(WarpEffect):
         effect = super().for_params(params, height, width)
         if params.zoom is None or params.shift is None or self.tolerance_px is None:
             return effect
-        fits = self._fit(params, height, width)
+        fits = self._view(params, height, width)
         difference = torch.cat([(params.zoom - fits[0])[:, None], params.shift - fits[1]], dim=1).abs()
         return effect.exact() if eager_bool((difference <= _SAME_VIEW).all, of=difference) is False else effect
 
@@ -306,6 +307,12 @@ class LensDistortion(WarpEffect):
             Camera(fx=fx, fy=fy, cx=cx, cy=cy, **size)
             for (fx, fy), (cx, cy) in zip(focal.tolist(), center.tolist(), strict=True)
         ]
+
+    def _view(self, params: LensParams, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """Return the zoom and the shift of `frame`."""
+        if self.frame == "fill":
+            return self._fit(params, height, width)
+        return torch.ones_like(params.focal[:, 0]), torch.zeros_like(params.center)
 
     def _fit(self, params: LensParams, height: int, width: int) -> tuple[Tensor, Tensor]:
         dtype = params.focal.dtype

@@ -35,6 +35,7 @@ from torchrefract.warping.lattice import pixel_lattice
 
 _LARGEST_COEFFICIENT = 100.0
 _FARTHEST = 1e10  # widths
+_SMALLEST_ZOOM = 1e-6
 _SAME_VIEW = 1e-3  # difference of zooms and of shifts, in widths
 FRAMES = ("fill", "pad")
 _MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors are another model in another order)"
@@ -48,7 +49,7 @@ class LensParams(NamedTuple):
     focal: Tensor  # (B, 2), in widths of the frame: fx / W and fy / W
     center: Tensor  # (B, 2), in widths: the principal point's offset from the center of the frame
     # The pinhole of the clean frame, if it is not that of the lens:
-    zoom: Tensor | None = None  # (B,), in (0, 1]: its focal length over that of the lens
+    zoom: Tensor | None = None  # (B,), in [1e-6, 1]: its focal length over that of the lens
     shift: Tensor | None = None  # (B, 2), in widths: its principal point minus that of the lens
 
     to = params_to
@@ -243,7 +244,7 @@ class LensDistortion(WarpEffect):
             raise ValueError("params.zoom and params.shift must be given both or not at all, got one of them")
         if params.zoom is not None and params.shift is not None:
             check_shapes(params, {"zoom": (), "shift": (2,)})
-            check_values("params.zoom", "lie in (0, 1]", params.zoom, lambda v: (v > 0) & (v <= 1))
+            check_within("params.zoom", params.zoom, _SMALLEST_ZOOM, 1.0)
             check_within("params.shift", params.shift, -_FARTHEST, _FARTHEST)
 
     def flow(self, params: LensParams, points: Points, plan: WarpPlan) -> tuple[Tensor, Tensor]:

@@ -48,7 +48,7 @@ def zoom_to_fill(
     # Each lower end must fit together with each upper end.
     spans = (high[..., None] - low[..., None, :]).clamp(min=1e-9)
     zoom = ((size[..., None] + space[:, None] + space) / spans).flatten(1).amin(dim=1).clamp(max=1.0)
-    zoom = (zoom * _STEPS).floor().clamp(min=1) / _STEPS
+    zoom = (zoom * _STEPS).floor().clamp(min=8) / _STEPS
     middle, scale = center[..., None], zoom[:, None, None]
     lowest_shift = (-space - middle - scale * low).amax(dim=2)
     highest_shift = (size + space - middle - scale * high).amin(dim=2)

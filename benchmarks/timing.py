@@ -53,6 +53,8 @@ PHOTOMETRIC: dict[str, Callable[..., Any]] = {
     "heterogeneous fog": tr.HeterogeneousFog,
     "volumetric fog": partial(tr.HeterogeneousFog, mode="ray", depth=tr.GroundPlaneDepth()),
     "flare": tr.LensFlare,
+    "vignetting": tr.Vignetting,
+    "chromatic aberration": tr.ChromaticAberration,
 }
 
 

@@ -28,6 +28,7 @@ if _sys.argv[:1] == ["-m"] and _sys.stderr is not None:
     print("torchrefract: loading …", file=_sys.stderr, flush=True)
 
 from torchrefract.cameras.camera import Camera
+from torchrefract.effects.chromatic_aberration import ChromaticAberration, ChromaticAberrationParams
 from torchrefract.effects.compose import Compose, ComposeParams, OneOf
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams
 from torchrefract.effects.exposure import Exposure, ExposureParams
@@ -36,9 +37,11 @@ from torchrefract.effects.fog import FogParams, UniformFog, remove_fog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog, HeterogeneousFogParams
 from torchrefract.effects.lens import LensDistortion, LensParams
 from torchrefract.effects.rectification import Rectification, RectificationParams
+from torchrefract.effects.rolling_shutter import RollingShutter, RollingShutterParams
 from torchrefract.effects.sun_glare import SunGlare, SunGlareParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence, TurbulenceParams
+from torchrefract.effects.vignetting import Vignetting, VignettingParams
 from torchrefract.fields.corridor import CorridorDepth
 from torchrefract.fields.depth import (
     DepthProvider,
@@ -63,6 +66,8 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Camera",
+    "ChromaticAberration",
+    "ChromaticAberrationParams",
     "Compose",
     "ComposeParams",
     "CorridorDepth",
@@ -87,6 +92,8 @@ __all__ = [
     "Pair",
     "Rectification",
     "RectificationParams",
+    "RollingShutter",
+    "RollingShutterParams",
     "SunGlare",
     "SunGlareParams",
     "ThinPlateParams",
@@ -94,6 +101,8 @@ __all__ = [
     "Turbulence",
     "TurbulenceParams",
     "UniformFog",
+    "Vignetting",
+    "VignettingParams",
     "check_depth",
     "compose_flows",
     "depth_from_disparity",

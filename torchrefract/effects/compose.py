@@ -390,7 +390,11 @@ def _plan_group(effects: Sequence[Effect], request: PlanRequest, *, can_measure:
         plan = warps[0].plan_under(alone if alone.is_reachable else replace(alone, tolerance_px=None))
         return CompositionPlan(max(plan.stride, 1), True, (plan,), plan.error_px, plan.max_gradient)
     planned = [
-        PlannedWarp(warp.error_model() if warp.tolerance_px else None, warp.rounding_ulps, warp.has_closed_form)
+        PlannedWarp(
+            warp.error_model() if warp.tolerance_px else None,
+            warp.rounding_ulps,
+            warp.has_closed_form and warp.can_interpolate,
+        )
         for warp in warps
     ]
     return plan_composition(tuple(planned), request, can_measure=can_measure)

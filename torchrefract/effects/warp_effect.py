@@ -68,6 +68,7 @@ class WarpEffect(Effect):
 
     rounding_ulps = DEFAULT_ULPS
     has_closed_form = False  # whether `flow` computes any points, not only the nodes of a lattice
+    can_interpolate = True  # whether a lattice that is fine enough may interpolate a flow in closed form
     depth: DepthSource | None = None  # of frames without a depth map; None for a flow that depends on no depth
 
     def __init__(
@@ -130,7 +131,7 @@ class WarpEffect(Effect):
             request = replace(request, tolerance_px=None)
         plan = plan_warp(self.error_model() if request.tolerance_px else None, request)
         is_fine = 0 < plan.stride < _FINE_STRIDE and request.height * request.width >= _MIN_PIXELS
-        if self.has_closed_form and is_fine and request.tolerance_px is not None:
+        if self.has_closed_form and self.can_interpolate and is_fine and request.tolerance_px is not None:
             plan = replace(plan, is_measured=True, error_px=request.tolerance_px)
         return plan
 

@@ -26,7 +26,6 @@ transformers = pytest.importorskip("transformers")
 # Nobody may reach the hub in a test.
 pytestmark = [
     pytest.mark.usefixtures("without_hub"),
-    pytest.mark.filterwarnings("ignore:depth is that of a road between walls"),
 ]
 
 

@@ -4,18 +4,22 @@ Effects, each an `nn.Module` from images to images; in parentheses what they sho
     LensDistortion (a lens), Turbulence (heat haze), PhysicalTurbulence (heat haze by Cn2 and depth), RoadMirage,
     ThinPlateSpline and DivergenceFree (smooth random warps), Rectification (removes the lens of a calibrated camera),
     UniformFog, HeterogeneousFog, LensFlare,
+    SunGlare (the sun, its glare and ghosts, and a camera that exposes for it), Exposure (gain, noise and clipping),
     Compose (several effects in order), OneOf (one of several, at random)
 
 Presets, in `torchrefract.presets`, are effects with the parameters of a place and a severity of 1 to 5:
     cheap_dashcam, cape_town_fog, limpopo_sun_glare, highveld_heat_haze, unpaved_road, and paper_refractive and
     paper_weather, which draw one of several effects for each image
 
+Depth for fog: a map in m, `CorridorDepth`, `GroundPlaneDepth`, any function of the image, or a network
+(`torchrefract.depth.from_transformers`).
+
 `effect(image)` degrades an image; `effect.degrade(image, seed=..., keys=...)` returns a `Degraded` with the flow, its
 inverse, masks and the drawn parameters, and `effect.apply(image, params)` repeats a draw. `warp`, `invert_flow` and
 `compose_flows` work on flows, which are backward and in pixels: out(p) = image(p + flow(p)).
 
 Commands, each with a `--help`: python -m torchrefract.preview, generate, train, eval, restore, export, calibrate,
-rectify, make_board.
+rectify, make_board, estimate_depth.
 """
 
 import sys as _sys
@@ -27,6 +31,7 @@ if _sys.argv[:1] == ["-m"] and _sys.stderr is not None:
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.compose import Compose, ComposeParams, OneOf
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams
+from torchrefract.effects.exposure import Exposure, ExposureParams
 from torchrefract.effects.flare import FlareParams, LensFlare
 from torchrefract.effects.fog import FogParams, UniformFog, remove_fog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog, HeterogeneousFogParams
@@ -34,8 +39,10 @@ from torchrefract.effects.lens import LensDistortion, LensParams
 from torchrefract.effects.physical_turbulence import PhysicalTurbulence, PhysicalTurbulenceParams
 from torchrefract.effects.rectification import Rectification, RectificationParams
 from torchrefract.effects.road_mirage import RoadMirage, RoadMirageParams
+from torchrefract.effects.sun_glare import SunGlare, SunGlareParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence, TurbulenceParams
+from torchrefract.fields.corridor import CorridorDepth
 from torchrefract.fields.depth import (
     DepthProvider,
     GroundPlaneDepth,
@@ -61,10 +68,13 @@ __all__ = [
     "Camera",
     "Compose",
     "ComposeParams",
+    "CorridorDepth",
     "Degraded",
     "DepthProvider",
     "DivergenceFree",
     "DivergenceFreeParams",
+    "Exposure",
+    "ExposureParams",
     "FlareParams",
     "FogParams",
     "Folding",
@@ -84,6 +94,8 @@ __all__ = [
     "RectificationParams",
     "RoadMirage",
     "RoadMirageParams",
+    "SunGlare",
+    "SunGlareParams",
     "ThinPlateParams",
     "ThinPlateSpline",
     "Turbulence",

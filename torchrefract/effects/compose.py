@@ -223,7 +223,10 @@ class Compose(Effect):
                 id(self), acting_places, *frame, request.tolerance_px, request.is_double, can_measure
             )
             parts += [part.of_samples(samples) for part in _composed_flow(chosen, plan, request.tolerance_px)]
-        progress.move(moving, active, parts, is_exact=request.tolerance_px is None)
+        # The share must not depend on the warps that move other samples of the batch.
+        num_warps = sum(isinstance(leaf.effect, WarpEffect) for leaf in leaves)
+        share_px = None if request.tolerance_px is None else request.tolerance_px / num_warps
+        progress.move(moving, active, parts, share_px)
 
     def _at_depth(
         self, progress: Progress, leaves: Sequence[Leaf], places: Sequence[int], request: PlanRequest

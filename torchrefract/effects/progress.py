@@ -77,7 +77,7 @@ class Progress:
         self.light: dict[str, Callable[[], Tensor]] = {}
 
     def move(
-        self, leaves: Sequence[Leaf], active: Sequence[Tensor], parts: Sequence[FlowPart], *, is_exact: bool
+        self, leaves: Sequence[Leaf], active: Sequence[Tensor], parts: Sequence[FlowPart], share_px: float | None
     ) -> None:
         """Sample the images along the composed flow of several warps.
 
@@ -85,7 +85,7 @@ class Progress:
             leaves: the warps, in order, with parameters of N rows.
             active: (N,), bool, for each warp: the samples that it moves.
             parts: the composed flow.
-            is_exact: True if the flow was computed without a tolerance.
+            share_px: tolerance of the flow of each warp, from which valid and inverse follow; None is exact.
         """
         height, width = self.image.shape[2:]
         segment = _segment(leaves, active, parts)
@@ -94,7 +94,7 @@ class Progress:
         self.light = {name: _moved(value, segment) for name, value in self.light.items()}
         for leaf, moves in zip(leaves, active, strict=True):
             warp = cast(WarpEffect, leaf.effect)
-            flow = _remember(partial(warp.planned_flow, leaf.params, height, width, is_exact=is_exact))
+            flow = _remember(partial(warp.planned_flow, leaf.params, height, width, share_px))
             self.warps.append((warp, leaf.params, flow, moves))
             self.valid = _valid_after(self.valid, flow, moves)
         self.segments.append(segment)

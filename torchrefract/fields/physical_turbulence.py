@@ -64,7 +64,7 @@ class Layers(NamedTuple):
 
 
 def tilt_variance(distance: float, air: Air) -> float:
-    """Return the variance of the angle of arrival along one axis, rad^2, for Cn2 = 1 m^(-2/3), constant on a level path.
+    """Return the variance of the angle of arrival along one axis, rad^2, for Cn2 = 1, m^(-2/3), everywhere.
 
     Multiply it by Cn2. For D >> l0 it is 1.062 L D^(-1/3), for D << l0 1.093 L l0^(-1/3).
 

@@ -7,7 +7,6 @@ short, which the next run detects by its size, or hold zeros, which verify=true 
 
 import hashlib
 import io
-import json
 import math
 import multiprocessing
 import os
@@ -31,7 +30,7 @@ from torchrefract._io import replace_file
 from torchrefract._validation import UsageError
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import Source, assign_frames, list_files, path_key, select_val_drives
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, pixels_of, read_image
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, is_lost, pixels_of, read_image
 from torchrefract.data.media import VIDEOS, read_video, video_info
 from torchrefract.data.pairs.files import DEPTH, FLOWS, LIGHTS, PairArrays, count_out_of_range, encode_pair
 from torchrefract.data.pairs.manifest import PairRow, StoredFile
@@ -219,8 +218,7 @@ class PairGenerator(NamedTuple):
         try:
             image, depth = self.reader.read_with_depth(source)
         except UnreadableImageError as error:
-            # A missing file or a lost disk says nothing about the frame.
-            if isinstance(error.__cause__, OSError) and error.__cause__.errno is not None:
+            if is_lost(error):
                 raise UsageError(
                     f"source must stay unchanged during a run, got {error}; the same command continues"
                 ) from error
@@ -317,7 +315,7 @@ class PairStorage(NamedTuple):
         """Return the size of a pair on disk, with its row: files fill blocks, and those of a tar have a header."""
         sizes, block, header = [len(data) for data in pair.data.values()], _DISK_BLOCK, 0
         if self.tar is not None:
-            sizes.append(len(_row_without_files(pair.row)))
+            sizes.append(len(pair.row.without_files()))
             block = header = _TAR_BLOCK
         return sum(header + math.ceil(size / block) * block for size in sizes) + len(pair.row.as_line())
 
@@ -331,18 +329,12 @@ class PairStorage(NamedTuple):
         return pair.row._replace(files=files)
 
 
-def _row_without_files(row: PairRow) -> bytes:
-    document = row._asdict()
-    del document["files"]
-    return json.dumps(document).encode()
-
-
 def _add_pair(tar: tarfile.TarFile, pair: GeneratedPair, path: str) -> PairRow:
     row, files = pair.row, {}
     for suffix, data in pair.data.items():
         files[suffix] = row.files[suffix]._replace(path=path, offset=_add_file(tar, f"{row.name}.{suffix}", data))
     if files:
-        _add_file(tar, f"{row.name}.json", _row_without_files(row))
+        _add_file(tar, f"{row.name}.json", row.without_files())
     return row._replace(files=files)
 
 

@@ -143,10 +143,13 @@ class PhysicalTurbulence(WarpEffect):
             raise ValueError(f"num_layers must be at most 8, got {num_layers}")
         self.depth = self._road() if depth is None else check_depth_provider(depth)
         self._layers = layers_of(self.reach, self.num_layers, self._air)
+        sigma = 1e6 * math.sqrt(tilt_variance(self.reach, self._air))
+        low, high = (min(sigma * math.sqrt(end), _LARGEST_TILT) for end in self.cn2_range)
+        self._tilts = low, high
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> PhysicalTurbulenceParams:
         """Draw the air of each sample, the displacement and the wind uniform in their ranges."""
-        applied, values = self.draw_in_ranges(stream, [self._tilt_range, self.wind_x_range, self.wind_y_range], image)
+        applied, values = self.draw_in_ranges(stream, [self._tilts, self.wind_x_range, self.wind_y_range], image)
         key, frame = random.noise_key(stream), torch.zeros_like(values[:, :1])
         return PhysicalTurbulenceParams(applied, values[:, 0], values[:, 1:], frame, key)
 
@@ -180,7 +183,7 @@ class PhysicalTurbulence(WarpEffect):
         u = v = torch.zeros((), dtype=dtype, device=depth.device)
         for share, (along_x, along_y) in zip(shares, gradients, strict=True):
             u, v = torch.addcmul(u, share, along_x), torch.addcmul(v, share, along_y)
-        scale = finite_or(air.tilt, 0.0).clamp(0.0, _LARGEST_TILT).view(-1, 1, 1, 1) * 1e-6
+        scale = finite_or(air.tilt, 0.0).clamp(-_LARGEST_TILT, _LARGEST_TILT).view(-1, 1, 1, 1) * 1e-6
         if self.height is not None:
             below = (points.y - (self.horizon * height - 0.5)) / focal[1]
             scale = scale * height_gain(1 - depth * below / self.height, self._layers)
@@ -190,7 +193,7 @@ class PhysicalTurbulence(WarpEffect):
     def error_model(self) -> "_TurbulenceBounds":
         """Return the largest displacement of the ranges."""
         gain = 1.0 if self.height is None else max(self._layers.gains)
-        return _TurbulenceBounds(self._tilt_range, gain, self.camera)
+        return _TurbulenceBounds(self._tilts, gain, self.camera)
 
     def equivalent_amplitude(self, width: int, *, distance: float | None = None) -> Range:
         """Return the displacement, px, of what is a distance away in frames of a width, for the ends of `cn2_range`.
@@ -208,13 +211,6 @@ class PhysicalTurbulence(WarpEffect):
     @property
     def _air(self) -> Air:
         return Air(self.aperture, self.inner_scale, self.outer_scale)
-
-    @property
-    def _tilt_range(self) -> Range:
-        """Return the standard deviation of the angle of arrival from the reach, microradians."""
-        sigma = 1e6 * math.sqrt(tilt_variance(self.reach, self._air))
-        low, high = (min(sigma * math.sqrt(end), _LARGEST_TILT) for end in self.cn2_range)
-        return low, high
 
     def _road(self) -> GroundPlaneDepth:
         focal = 0.9 if self.camera is None else self.camera.fx / self.camera.width

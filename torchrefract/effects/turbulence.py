@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -158,7 +158,7 @@ class Turbulence(WarpEffect):
         """Compute the flow of each frame; it exists everywhere."""
         everywhere = torch.ones(1, 1, 1, 1, dtype=torch.bool, device=params.applied.device)
         if not isinstance(params, ParamsAtDepth):
-            return self._field(params, points, plan), everywhere
+            return self._field(params, points, plan, plan.details), everywhere
         share = share_at_depth(params.depth.to(params.params.amplitude.dtype), self.reference_distance)
         return self._smooth_field(params.params, points, plan) * sample_at(share, points), everywhere
 
@@ -239,10 +239,11 @@ class Turbulence(WarpEffect):
         low, high = self.amplitude_range
         return low * low / unit, high * high / unit
 
-    def _field(self, params: TurbulenceParams, points: Points, plan: WarpPlan) -> Tensor:
-        """Compute the flow of the whole amplitude at the nodes of a lattice."""
+    def _field(
+        self, params: TurbulenceParams, points: Points, plan: WarpPlan, frequencies: Frequencies | None
+    ) -> Tensor:
+        """Compute the flow of the whole amplitude at the nodes of a lattice, from some frequencies or from all."""
         self._warn_if_folded(params)
-        frequencies = plan.details
         if frequencies is None:
             longest, widest = self.length_range[1], self.aperture_range[1]
             size = embedding_size(plan.height, plan.width, length=longest, kind=self.covariance, aperture=widest)
@@ -258,17 +259,13 @@ class Turbulence(WarpEffect):
 
     def _smooth_field(self, params: TurbulenceParams, points: Points, plan: WarpPlan) -> Tensor:
         """Compute the flow of the whole amplitude at pixels, interpolated from the lattice that its own plan allows."""
-        field = plan.details or replace(plan, details=None)
-        if field.stride <= 1:
-            return self._field(params, points, field)
+        stride, frequencies = (1, None) if plan.details is None else plan.details
+        if stride <= 1:
+            return self._field(params, points, plan, frequencies)
         is_pixels = points.lattice == pixel_lattice(plan.height, plan.width)
-        lattice = (
-            lattice_with_stride(plan.height, plan.width, field.stride)
-            if is_pixels
-            else lattice_around(points, field.stride)
-        )
+        lattice = lattice_with_stride(plan.height, plan.width, stride) if is_pixels else lattice_around(points, stride)
         nodes = lattice.points(dtype=params.amplitude.dtype, device=params.amplitude.device)
-        flow = LatticeFlow(self._field(params, nodes, field), lattice)
+        flow = LatticeFlow(self._field(params, nodes, plan, frequencies), lattice)
         return flow.dense() if is_pixels else flow.at(points)
 
     def _warn_if_folded(self, params: TurbulenceParams) -> None:
@@ -286,7 +283,10 @@ class Turbulence(WarpEffect):
 
 @dataclass(frozen=True)
 class _AtDepthErrorModel:
-    """Error bounds of a field whose share changes with depth from pixel to pixel; `details` is the field's plan."""
+    """Error bounds of a field whose share changes with depth from pixel to pixel.
+
+    `details` are the stride of the lattice that the field is interpolated from, and its frequencies.
+    """
 
     field: RandomFieldErrorModel
 
@@ -302,7 +302,7 @@ class _AtDepthErrorModel:
         # Rounding is part of the budget already.
         plan = plan_warp(self.field, PlanRequest(height, width, budget_px, is_double=True))
         why = f"its share changes with depth; the field {plan.summary()}"
-        return Simplification(plan.error_px, details=plan, can_interpolate=False, why=why)
+        return Simplification(plan.error_px, details=(plan.stride, plan.details), can_interpolate=False, why=why)
 
     def contains(self, params: Any) -> Tensor:
         """Return (), bool: the field lies in the ranges."""

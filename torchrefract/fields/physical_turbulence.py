@@ -30,6 +30,7 @@ from torchrefract.random import white_noise
 _RATIO = 3.0  # of the far ends of successive layers
 _HEIGHT_EXPONENT = -4 / 3  # of Cn2, by day
 _NEAREST = 1e-3  # of the reach
+_SMALLEST_DOMAIN = 8  # px; smaller ones have hardly any frequency that has a derivative
 _NUM_GAINS = 513  # nodes of the table of gains
 _SUBCELLS = (-0.5 / math.sqrt(3), 0.5 / math.sqrt(3))  # Gauss-Legendre, of a cell
 
@@ -172,7 +173,7 @@ def layer_gradients(
 
 def domain_size(height: int, width: int) -> tuple[int, int]:
     """Return (Ht, Wt), px: the periodic domain of a frame."""
-    return fast_size(height), fast_size(width)
+    return fast_size(max(height, _SMALLEST_DOMAIN)), fast_size(max(width, _SMALLEST_DOMAIN))
 
 
 def _spectrum(k: Tensor, air: Air) -> Tensor:
@@ -213,12 +214,12 @@ def _exponent(air: Air) -> float:
 def _gains(exponent: float) -> list[float]:
     """Return the table of `height_gain` over 1 / (1 + e^(1/3)) from 0 to 1."""
     y, weight = np.polynomial.legendre.leggauss(64)
-    # With x = y^3 the integrand is smooth at both ends.
     y, weight = (y + 1) / 2, weight / 2
     z = np.linspace(0, 1, _NUM_GAINS)
-    e = (1 / np.maximum(z, 1e-9) - 1) ** 3
-    heights = e[:, None] + (1 - e[:, None]) * y**3
-    values = exponent * (3 * y ** (3 * exponent - 1) * np.maximum(heights, 1e-300) ** _HEIGHT_EXPONENT) @ weight
+    e = (1 / np.maximum(z, 1e-9) - 1)[:, None] ** 3
+    # The integrand is smooth in the cubic root of the distance to the lower end of the ray.
+    x = np.where(e < 1, y**3, 1 - y**3)
+    values = (exponent * x ** (exponent - 1) * (e + (1 - e) * x) ** _HEIGHT_EXPONENT * 3 * y * y) @ weight
     return np.where(z > 0, np.sqrt(values), 0.0).tolist()
 
 

@@ -4,11 +4,14 @@
     python benchmarks/calibration.py lenses LENSES.json [--step PX] [--out RESULTS.json] [--table LENSES.csv]
 
 `boards` calibrates with the pictures of FOLDER, which holds charuco/ and chessboard/, each with a reference.json.
-"OpenCV" is cv2.calibrateCamera with the corners of OpenCV's detectors in all pictures. Held-out errors are of five
-folds. All errors are in px rms over corners. Bad views are planted in place of a good one, one at a time: a picture
-bent over the width of its board by up to a hundredth of the frame's width; corners of a picture enlarged by a tenth;
-one corner 5 px off; two neighboring corners swapped; the mirrored picture. "lines" is the distance of corners of one
-row or column from a straight line, in the pictures and after `rectify`.
+The lens model is the one that `calibrate` chooses. "OpenCV" is cv2.calibrateCamera, with its five coefficients, of the
+corners of OpenCV's detectors in all pictures; "four" is the same without k3, of the corners of this library. Held-out
+errors are of five folds. All errors are in px rms over corners. "edge" is the largest distance over the frame, px,
+between where the camera and the published one show a ray; "folded" is the share of the frame without a ray. Bad views
+are planted in place of a good one, one at a time: a picture bent over the width of its board by up to a hundredth of
+the frame's width; corners of a picture enlarged by a tenth; one corner 5 px off; two neighboring corners swapped; the
+mirrored picture. They are searched as `calibrate` does before it chooses the lens model. "lines" is the distance of
+corners of one row or column from a straight line, in the pictures and after `rectify`.
 
 `lenses` unprojects the pixels of each lens and puts the rays into OpenCV's forward formula. "wrong" is the share of
 pixels that are off by more than 1e-6 px and not marked: `valid` marks pixels of this library, -1e6 those of OpenCV's
@@ -24,6 +27,7 @@ import importlib
 import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,9 +40,10 @@ from torch import Tensor
 from torchrefract._io import replace_file
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract.cameras.calibration.boards import Board, Charuco, Chessboard
-from torchrefract.cameras.calibration.detection import SEARCH_FLAGS, View, detect, has_enough_corners
+from torchrefract.cameras.calibration.choice import AUTO
+from torchrefract.cameras.calibration.detection import SEARCH_FLAGS, Detection, View, detect, has_enough_corners
 from torchrefract.cameras.calibration.fit import Fit, cross_validate, drop_outliers, fit_camera, rms
-from torchrefract.cameras.calibration.report import straightness
+from torchrefract.cameras.calibration.report import FIRST_MODEL, FIRST_PRIOR, calibrate_camera, straightness
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.conversion import Conversion, convert
 from torchrefract.cameras.lens_database import COLUMNS
@@ -46,10 +51,12 @@ from torchrefract.cli.calibration import find_pictures, read_gray
 from torchrefract.fields.rectification import camera_flow
 from torchrefract.warping.warp import warp
 
-LENS_MODEL = "opencv5"
+OPENCV_MODEL = "opencv5"
 MAX_ERROR_PX = 1e-6
 _MODELS = {"opencv5": "opencv", "rational8": "opencv", "thin-prism12": "opencv", "fisheye4": "fisheye"}
 _MAX_RESIDUAL_PX = 1.0  # of a polynomial in the table
+_DROP_SHARE = 0.25  # as `calibrate` has it
+_EDGE_GRID = 17  # points along each side of the frame
 _ZERO = np.zeros(3)
 
 
@@ -57,6 +64,7 @@ class BoardRow(NamedTuple):
     """Results of a set of pictures; errors in px rms."""
 
     name: str
+    model: str
     pictures: int
     views: int
     corners: int
@@ -65,6 +73,9 @@ class BoardRow(NamedTuple):
     opencv_views: int
     opencv_error: float
     opencv_held_out: float
+    four_held_out: float
+    edge_px: float | None  # largest distance from the published camera
+    folded: float  # share of the frame
     lines: float
     rectified_lines: float
     fx: float
@@ -106,21 +117,36 @@ def measure_board(name: str, entry: Mapping[str, Any], folder: Path) -> BoardRow
         views = (detector(gray, board, name=name) for name, gray in pictures.items())
         return [view for view in views if has_enough_corners(view, board)]
 
-    def held_out(views: Sequence[View], fit: Fit) -> float:
-        return rms(np.concatenate(cross_validate(views, board, fit)))
+    def fit_and_validate(views: Sequence[View], model: str) -> tuple[Fit, float]:
+        fit = fit_camera(views, board, model=model, size=size)
+        return fit, rms(np.concatenate(cross_validate(views, board, fit)))
 
     views, opencv_views = usable(detect), usable(opencv_detect)
-    selection = drop_outliers(views, board, model=LENS_MODEL, size=size)
-    opencv_fit = fit_camera(opencv_views, board, model=LENS_MODEL, size=size)
-    camera, published = selection.fit.camera, entry.get("published")
-    lines, rectified_lines = _line_errors(selection.views, pictures, board, camera)
+    detections = [Detection(view, size, 0.0, "") for view in views]
+    calibration = calibrate_camera(detections, board, model=AUTO, size=size, max_drop_share=_DROP_SHARE)
+    kept, fit = calibration.views, calibration.fit
+    camera, published = fit.camera, entry.get("published")
+    opencv_fit, opencv_held_out = fit_and_validate(opencv_views, OPENCV_MODEL)
     return BoardRow(
-        name, len(pictures), len(selection.views), sum(len(view.ids) for view in selection.views),
-        selection.fit.rms, held_out(selection.views, selection.fit),
-        len(opencv_views), opencv_fit.rms, held_out(opencv_views, opencv_fit), lines, rectified_lines,
+        name, f"{fit.model}, {fit.prior}", len(pictures), len(kept), sum(len(view.ids) for view in kept),
+        fit.rms, calibration.held_out_rms, len(opencv_views), opencv_fit.rms, opencv_held_out,
+        fit_and_validate(kept, "opencv4")[1], edge_distance(camera, published) if published else None,
+        1 - camera.coverage(),
+        *_line_errors(kept, pictures, board, camera),
         camera.fx, 100 * (camera.fx / published["fx"] - 1) if published else None,
         _plant(views, pictures, board, size),
     )  # fmt: skip
+
+
+def edge_distance(camera: Camera, published: Mapping[str, Any]) -> float:
+    """Return the largest distance over the frame, px, between where a camera and a published one show a ray."""
+    numbers = {name: published[name] for name in ("fx", "fy", "cx", "cy")}
+    other = replace(camera, **numbers, coefficients=tuple(published["dist_k1k2p1p2k3"]), model="opencv")
+    pixels = other.grid(_EDGE_GRID)
+    rays, has_ray, _ = other.unproject(pixels)
+    shown, valid, _ = camera.project(rays)
+    distance = torch.where(valid, (shown - pixels).norm(dim=1), torch.inf)
+    return distance[has_ray].max().item()
 
 
 def opencv_detect(gray: np.ndarray, board: Board, *, name: str) -> View:
@@ -162,7 +188,7 @@ def _plant(views: list[View], pictures: dict[str, np.ndarray], board: Board, siz
             if not has_enough_corners(bad, board):
                 results[kind] = "no view"
             else:
-                dropped = drop_outliers(mixed, board, model=LENS_MODEL, size=size).dropped
+                dropped = drop_outliers(mixed, board, model=FIRST_MODEL, size=size, prior=FIRST_PRIOR).dropped
                 results[kind] = "dropped" if bad.name in dropped else "missed"
         return results
     return {}
@@ -280,7 +306,10 @@ def _csv_row(row: Mapping[str, Any], polynomial: Conversion) -> dict[str, Any]:
 def run_boards(args: argparse.Namespace) -> list[dict[str, Any]]:
     """Measure and print the sets of pictures."""
     print("px rms over corners; OpenCV: its detectors and all views; lines: in the pictures, and rectified")
-    print(f"{'set':16} views corners  error held-out | OpenCV held-out |  lines rectified       fx published planted")
+    print(
+        f"{'set':16} {'model':20} views corners  error held-out | OpenCV held-out | four held-out   edge folded | "
+        " lines rectified       fx published planted"
+    )
     rows = []
     for kind in ("charuco", "chessboard"):
         entries = json.loads((args.folder / kind / "reference.json").read_text(encoding="utf-8"))
@@ -290,9 +319,11 @@ def run_boards(args: argparse.Namespace) -> list[dict[str, Any]]:
             row = measure_board(name, entry, args.folder / kind / name)
             published = "" if row.published_fx_percent is None else f"{row.published_fx_percent:+.2f} %"
             planted = ", ".join(f"{kind}: {result}" for kind, result in row.planted.items())
+            edge = "" if row.edge_px is None else f"{row.edge_px:.1f}"
             print(
-                f"{name:16} {row.views:2}/{row.pictures:2} {row.corners:7} {row.error:6.3f} {row.held_out:8.3f} | "
-                f"{row.opencv_error:6.3f} {row.opencv_held_out:8.3f} | {row.lines:6.3f} {row.rectified_lines:9.3f} "
+                f"{name:16} {row.model:20} {row.views:2}/{row.pictures:2} {row.corners:7} {row.error:6.3f} "
+                f"{row.held_out:8.3f} | {row.opencv_error:6.3f} {row.opencv_held_out:8.3f} | {row.four_held_out:13.3f} "
+                f"{edge:>6} {row.folded:6.1%} | {row.lines:6.3f} {row.rectified_lines:9.3f} "
                 f"{row.fx:8.1f} {published:>9} {planted}",
                 flush=True,
             )

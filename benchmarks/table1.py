@@ -132,7 +132,7 @@ def effects_of(task: str, width: int) -> dict[str, tuple[Effect, bool]]:
     """Return the scored effects of a task by name, each with True if it is in the paper's mix."""
     if task == "undistort":
         names = ("cheap_dashcam lens", "turbulence", "thin-plate spline", "divergence-free")
-        wide = LensDistortion(k1_range=(-0.4, 0.2), focal_range=(0.9, 1.1))
+        wide = LensDistortion(k1_range=(-0.4, 0.2), focal_range=(0.9, 1.1), frame="pad")
         return _in_mix(paper_refractive(width=width), names) | {"wide lens": (wide, False)}
     return _in_mix(paper_weather(), ("uniform fog", "heterogeneous fog", "lens flare"))
 

@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,7 +9,7 @@ import torch
 from PIL import Image
 
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io import read_opencv, write_opencv
+from torchrefract.cameras.io import read_opencv, write_kalibr, write_opencv
 from torchrefract.data.media import video_info
 from torchrefract.fields.rectification import camera_flow
 
@@ -73,9 +74,27 @@ def test_an_uncertain_camera_is_warned_of_and_crop_keeps_the_certain_part(call, 
     assert read_opencv(folder / "cropped" / "camera.yaml").cx == 46.2 - left
 
 
-def test_crop_needs_a_covariance(call, folder):
-    message = call("rectify", "input=raw", "camera=cam.yaml", "crop=true").message
-    assert message == "crop must be false for a camera file without a covariance, got true with cam.yaml"
+def test_crop_leaves_no_black_border_of_a_pincushion_lens(call, folder):
+    pincushion = Camera(**PINHOLE, coefficients=(0.3, 0.1, 0.0, 0.0))
+    write_opencv(folder / "cam.yaml", pincushion)
+    for k in range(3):
+        cv2.imwrite(str(folder / "raw" / f"{k}.png"), np.full((64, 96, 3), 200, np.uint8))
+    assert call("rectify", "input=raw", "camera=cam.yaml").code == 0
+    assert call("rectify", "input=raw", "camera=cam.yaml", "crop=true", "out=cropped").code == 0
+    padded, cropped = (cv2.imread(str(folder / name / "0.png")) for name in ("rectified", "cropped"))
+    assert padded is not None
+    assert cropped is not None
+    assert padded.min() == 0
+    assert cropped.shape == (64, 96, 3)
+    assert cropped.min() == 200
+    camera = read_opencv(folder / "cropped" / "camera.yaml")
+    assert camera.fx > 1.05 * PINHOLE["fx"]
+    # With 2 % less zoom a border pixel would have looked outside.
+    flow, exists, _ = camera_flow(pincushion, zoom=0.98 * camera.fx / PINHOLE["fx"])
+    flow = flow[0]
+    y, x = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
+    outside = (x + flow[0] < 0) | (x + flow[0] > 95) | (y + flow[1] < 0) | (y + flow[1] > 63)
+    assert outside.any() or not exists.all()
 
 
 @pytest.mark.parametrize("name", ["opencv", "fisheye"])
@@ -92,6 +111,15 @@ def test_rectified_pictures_match_opencv(call, folder, name):
         assert error.mean() < 1
         assert np.abs(np.asarray(result) - raw)[4:-4, 4:-4].mean() > 5
     assert read_opencv(folder / "rectified" / "camera.yaml") == camera_flow(CAMERAS[name])[2]
+
+
+def test_a_chain_of_kalibr_is_a_camera_file(call, folder):
+    other = replace(CAMERAS["opencv"], fx=60.0)
+    write_kalibr(folder / "chain.yaml", {"cam0": CAMERAS["opencv"], "cam1": other})
+    message = call("rectify", "input=raw", "camera=chain.yaml").message
+    assert message == "camera: name must be one of the cameras in chain.yaml: cam0, cam1; got None"
+    assert call("rectify", "input=raw", "camera=chain.yaml", "camera_name=cam1").code == 0
+    assert read_opencv(folder / "rectified" / "camera.yaml").fx == 60.0
 
 
 def test_an_interrupted_run_continues(call, folder):
@@ -184,6 +212,21 @@ def test_unreadable_pictures_are_reported_and_skipped(call, folder):
     assert outcome.out.startswith("out: 2 rectified, 0 already existed, 1 skipped")
 
 
+def test_a_file_that_vanishes_during_a_run_is_named_and_rectified_by_the_next(call, folder, monkeypatch):
+    file, words = folder / "raw" / "1.png", ("input=raw", "camera=cam.yaml", "out=out")
+    with monkeypatch.context() as patch:
+        patch.setattr("torchrefract.data.media.describe_turned", lambda _: str(file.rename(folder / "away.png"))[:0])
+        outcome = call("rectify", *words)
+    assert outcome.code == 1
+    assert outcome.out.startswith("out: 2 rectified, 0 already existed, 1 skipped")
+    assert outcome.err.splitlines()[-1] == (
+        "error: input must stay unchanged during a run, got raw/1.png cannot be opened (No such file or directory); "
+        "the same command tries them again"
+    )
+    (folder / "away.png").rename(file)
+    assert call("rectify", *words).out.startswith("out: 1 rectified, 2 already existed, 0 skipped")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -194,12 +237,12 @@ def test_unreadable_pictures_are_reported_and_skipped(call, folder):
         ),
         (
             ("input=raw", "camera=bad.yaml"),
-            "camera: path must hold a mapping of names to values, got bad.yaml with str",
+            "camera: path must hold a camera of OpenCV, ROS, Kalibr, COLMAP, ORB-SLAM, VINS, Gyroflow, lensfun or "
+            "Metashape, got bad.yaml with other text (path must hold a mapping of names to values",
         ),
         (
             ("input=raw", "camera=short.yaml"),
-            "camera: path must hold a camera, got short.yaml: coefficients must be 4 or 5 or 8 or 12 or 14 numbers for "
-            "the model opencv, got 3",
+            "camera: path must hold 4 x 1 numbers as distortion_coefficients, got short.yaml with 3",
         ),
         (("input=raw", "camera=cam.yaml", "zoom=0"), "zoom: zoom must be a number in [0.05, 20], got 0"),
         (("input=raw", "camera=cam.yaml", "out=raw"), "out must be another folder than that of input, got raw"),

@@ -128,6 +128,24 @@ def test_a_damaged_picture_is_reported_and_skipped(call, folder, brighter):
     assert written(folder / "out") == sorted({*SIZES, "config.json"} - {"one/b.png"})
 
 
+@pytest.mark.parametrize("name", ["one/b.png", "one/clip.avi"])
+def test_a_file_that_vanishes_during_a_run_is_named_and_restored_by_the_next(call, folder, brighter, monkeypatch, name):
+    clip(folder / "raw" / "one" / "clip.avi", 3)
+    file, away, words = folder / "raw" / name, folder / "away", (f"ckpt_path={brighter}", "input=raw", "out=out")
+    with monkeypatch.context() as patch:
+        patch.setattr("torchrefract.cli.restoration.describe_losses", lambda *_, **__: [file.rename(away)][1:])
+        outcome = call("restore", *words)
+    assert outcome.code == 1
+    assert outcome.out.startswith("out: 4 restored, 0 already existed, 1 skipped")
+    reason = f"raw/{name} cannot be opened (No such file or directory)"
+    assert outcome.err.splitlines() == [
+        f"skipped: {reason}",
+        f"error: input must stay unchanged during a run, got {reason}; the same command tries them again",
+    ]
+    away.rename(file)
+    assert call("restore", *words).out.startswith("out: 1 restored, 4 already existed, 0 skipped")
+
+
 def clip(path: Path, count: int, *, height: int = 64) -> None:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 12, (96, height))
     for k in range(count):

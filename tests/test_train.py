@@ -3,7 +3,9 @@ import importlib
 import multiprocessing
 import os
 import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +150,25 @@ def test_several_processes_with_a_trainer_of_one_raise(call, trained, monkeypatc
     monkeypatch.setenv("WORLD_SIZE", "2")
     message = call("train", *trained.words, "hydra.run.dir=run").message
     assert message.startswith("trainer must be ddp with trainer.devices=2 under torchrun, got one that uses 1 of 2")
+
+
+def test_a_training_in_two_processes_stops_on_sigterm_with_its_last_checkpoint(small, tmp_path):
+    words = ("+task=undistort", *small, "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "run_dir=run")
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "torchrefract.train", *words, "trainer.max_epochs=1000", "data.batch_size=4"]
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            path, end = tmp_path / "run" / "last.ckpt", time.monotonic() + 200
+            while not path.exists() and process.poll() is None and time.monotonic() < end:
+                time.sleep(0.1)
+            process.terminate()
+            _, message = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 143, message
+    (line,) = (line for line in message.splitlines() if line.startswith("stopped by SIGTERM"))
+    assert line.endswith("ckpt_path=run/last.ckpt continues")
+    assert read_checkpoint(path, task="undistort")["global_step"] >= 4
 
 
 def test_a_finished_run_cannot_be_resumed(call, trained):

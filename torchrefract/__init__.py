@@ -10,12 +10,15 @@ Presets, in `torchrefract.presets`, are effects with the parameters of a place a
     cheap_dashcam, cape_town_fog, limpopo_sun_glare, highveld_heat_haze, unpaved_road, and paper_refractive and
     paper_weather, which draw one of several effects for each image
 
+Depth for fog: a map in m, `CorridorDepth`, `GroundPlaneDepth`, any function of the image, or a network
+(`torchrefract.depth.from_transformers`).
+
 `effect(image)` degrades an image; `effect.degrade(image, seed=..., keys=...)` returns a `Degraded` with the flow, its
 inverse, masks and the drawn parameters, and `effect.apply(image, params)` repeats a draw. `warp`, `invert_flow` and
 `compose_flows` work on flows, which are backward and in pixels: out(p) = image(p + flow(p)).
 
 Commands, each with a `--help`: python -m torchrefract.preview, generate, train, eval, restore, export, calibrate,
-rectify, make_board.
+rectify, make_board, estimate_depth.
 """
 
 import sys as _sys
@@ -36,6 +39,7 @@ from torchrefract.effects.rectification import Rectification, RectificationParam
 from torchrefract.effects.sun_glare import SunGlare, SunGlareParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence, TurbulenceParams
+from torchrefract.fields.corridor import CorridorDepth
 from torchrefract.fields.depth import (
     DepthProvider,
     GroundPlaneDepth,
@@ -61,6 +65,7 @@ __all__ = [
     "Camera",
     "Compose",
     "ComposeParams",
+    "CorridorDepth",
     "Degraded",
     "DepthProvider",
     "DivergenceFree",

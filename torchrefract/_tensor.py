@@ -1,6 +1,6 @@
 """Small operations on tensors that several packages share."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache, wraps
@@ -114,15 +114,6 @@ def rows_at_once(device: torch.device, rows: int, *, each: int, cached: int, sha
     if device.type != "cpu" or torch.compiler.is_compiling():
         return max(1, rows)
     return max(1, (torch.get_num_threads() if shared else 1) * cached // max(1, each))
-
-
-def scatter_batch(parts: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
-    """Assemble (B, ...) from pairs of indices (n,) and rows (n, ...) that together cover 0 ... B - 1."""
-    rows = parts[0][1]
-    result = rows.new_empty(sum(len(index) for index, _ in parts), *rows.shape[1:])
-    for index, values in parts:
-        result.index_copy_(0, index, values)
-    return result
 
 
 def is_channels_last(image: Tensor) -> bool:

@@ -176,10 +176,21 @@ def requires_grad(values: Iterable[Any]) -> bool:
     """
     if torch._C._are_functorch_transforms_active():
         return True
-    values = [value for value in values if isinstance(value, Tensor)]
-    if torch.is_grad_enabled() and any([value.requires_grad for value in values]):  # a list takes less time
+    tensors = tensors_in(values)
+    if torch.is_grad_enabled() and any([value.requires_grad for value in tensors]):  # a list takes less time
         return True
-    return any([_has_tangent(value) for value in values])
+    return any([_has_tangent(value) for value in tensors])
+
+
+def tensors_in(values: Iterable[Any]) -> list[Tensor]:
+    """Return the tensors among values and in the tuples among them, in order."""
+    tensors: list[Tensor] = []
+    for value in values:
+        if isinstance(value, Tensor):
+            tensors.append(value)
+        elif isinstance(value, tuple):
+            tensors += tensors_in(value)
+    return tensors
 
 
 def _has_tangent(value: Tensor) -> bool:

@@ -3,13 +3,25 @@
 `severity` is 1 (barely visible), 2, 3 (typical of the place), 4 or 5 (barely anything else is visible). It sets a
 physical quantity, which each scene states, so that the score of a model can be plotted over it.
 
-Displacements are in px of a frame 1920 px wide and scale with `width`, the width of your frames.
+All scenes but the paper's take the same keyword arguments, and ignore those that mean nothing for them:
+
+    camera: of the frames, a `Camera` or a camera file; None is unknown, with a focal length of 0.9 widths.
+    horizon: its position in the frame, 0 at the top edge and 1 at the bottom edge. Dashcams point slightly upward.
+    depth: a depth provider or a function from images to their depth in m, for frames without a depth map. None is a
+        `CorridorDepth`, which warns that it is a guess.
+    width: of the frames, px; displacements are stated for a width of 1920 px and scale with it.
+    arguments: of the effect of the scene, in place of their values here.
 """
 
-from collections.abc import Sequence
-from typing import TypeVar
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from torch import Tensor
 
 from torchrefract._validation import check_positive
+from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.io import read_camera
 from torchrefract.effects.compose import Compose, OneOf
 from torchrefract.effects.divergence_free import DivergenceFree
 from torchrefract.effects.flare import LensFlare
@@ -18,92 +30,122 @@ from torchrefract.effects.heterogeneous_fog import HeterogeneousFog
 from torchrefract.effects.lens import LensDistortion
 from torchrefract.effects.thin_plate import ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence
-from torchrefract.fields.depth import GroundPlaneDepth
+from torchrefract.fields.corridor import CorridorDepth
+from torchrefract.fields.depth import DepthProvider
 from torchrefract.types import Range
 
 SEVERITIES = (1, 2, 3, 4, 5)
 
 _REFERENCE_WIDTH = 1920.0
+_HORIZON, _SPREAD = 0.55, 0.1  # an angle that varies from car to car
 _DUST = (0.78, 0.71, 0.61)  # airlight of laterite dust
 _LOW_SUN = (1.0, 0.94, 0.82)
-# Dashcams point slightly upward, at an angle that varies from car to car.
-_ROAD = GroundPlaneDepth(horizon=0.55, spread=0.1)
 _T = TypeVar("_T")
+_CameraSource = Camera | str | Path | None
+_DepthSource = DepthProvider | Callable[[Tensor], Tensor] | None
 
 
-def cheap_dashcam(severity: int = 3) -> LensDistortion:
+def cheap_dashcam(severity: int = 3, **arguments: Any) -> LensDistortion:
     """Create the lenses of a fleet of cheap dashcams: barrel distortion, slightly off center, without folds.
 
     Args:
         severity: 1 to 5, radial coefficient k1 of -0.03 … -0.10 at 1, -0.15 … -0.35 at 3, -0.45 … -0.60 at 5, for focal
             lengths of 0.7 to 1.1 widths. The frames are filled.
+        arguments: of `LensDistortion`, and those of all scenes.
     """
-    return _cheap_lens(severity, frame="fill")
+    return _cheap_lens(severity, **_without_place(arguments))
 
 
-def cape_town_fog(severity: int = 3) -> HeterogeneousFog:
+def cape_town_fog(
+    severity: int = 3,
+    *,
+    camera: _CameraSource = None,
+    horizon: float = _HORIZON,
+    depth: _DepthSource = None,
+    **arguments: Any,
+) -> HeterogeneousFog:
     """Create heterogeneous morning fog, through which the car drives at 50 to 70 km/h, at 30 frames per second.
 
     Args:
         severity: 1 to 5, visibility of 500 … 1000 m at 1, 60 … 200 m at 3, 20 … 40 m at 5.
+        camera, horizon, depth: as for all scenes.
+        arguments: of `HeterogeneousFog`, and those of all scenes.
     """
     visibility = _at_severity(severity, [(500.0, 1000.0), (200.0, 500.0), (60.0, 200.0), (40.0, 60.0), (20.0, 40.0)])
-    return HeterogeneousFog(
-        mode="ray",
-        visibility_range=visibility,
-        depth=_ROAD,
-        contrast_range=(0.4, 0.8),
-        wind_x_range=(-0.1, 0.1),
-        wind_z_range=(-0.65, -0.45),
-    )
+    options: dict[str, Any] = {
+        "mode": "ray",
+        "visibility_range": visibility,
+        "contrast_range": (0.4, 0.8),
+        "wind_x_range": (-0.1, 0.1),
+        "wind_z_range": (-0.65, -0.45),
+    }
+    return HeterogeneousFog(**options | _place(camera, horizon, depth) | _without_place(arguments))
 
 
-def limpopo_sun_glare(severity: int = 3) -> LensFlare:
+def limpopo_sun_glare(severity: int = 3, **arguments: Any) -> LensFlare:
     """Create the flare of a low sun ahead.
 
     Args:
         severity: 1 to 5, light added at the sun of 0.2 at 1, 0.6 at 3 (as in the paper), 1.0 at 5, and radius of 0.2,
             0.3, 0.4 diagonals of the frame; each +-0.05.
+        arguments: of `LensFlare`, and those of all scenes.
     """
     strength, radius = _at_severity(severity, [(0.2, 0.2), (0.4, 0.25), (0.6, 0.3), (0.8, 0.35), (1.0, 0.4)])
-    return LensFlare(strength_range=_around(strength, 0.05), radius_range=_around(radius, 0.05), color=_LOW_SUN)
+    options: dict[str, Any] = {
+        "strength_range": _around(strength, 0.05),
+        "radius_range": _around(radius, 0.05),
+        "color": _LOW_SUN,
+    }
+    return LensFlare(**options | _without_place(arguments))
 
 
-def highveld_heat_haze(severity: int = 3, *, width: float = _REFERENCE_WIDTH) -> Turbulence:
+def highveld_heat_haze(severity: int = 3, *, width: float = _REFERENCE_WIDTH, **arguments: Any) -> Turbulence:
     """Create turbulence over a tarred road at noon.
 
     Args:
         severity: 1 to 5, standard deviation of the displacement of 0.5 at 1, 1.5 at 3, 3.0 px at 5, each +-20 %.
-        width: of the frames, px.
+        width: as for all scenes.
+        arguments: of `Turbulence`, and those of all scenes.
     """
-    return _turbulence(_at_severity(severity, [0.5, 1.0, 1.5, 2.2, 3.0]), width)
+    return _turbulence(_at_severity(severity, [0.5, 1.0, 1.5, 2.2, 3.0]), width, **_without_place(arguments))
 
 
-def unpaved_road(severity: int = 3, *, width: float = _REFERENCE_WIDTH) -> Compose:
+def unpaved_road(
+    severity: int = 3,
+    *,
+    camera: _CameraSource = None,
+    horizon: float = _HORIZON,
+    depth: _DepthSource = None,
+    width: float = _REFERENCE_WIDTH,
+    dust: dict[str, Any] | None = None,
+    haze: dict[str, Any] | None = None,
+) -> Compose:
     """Create the dust of a car ahead on a gravel road, as heterogeneous fog, seen through turbulence.
 
     Args:
         severity: 1 to 5, visibility of 400 … 800 m at 1, 80 … 200 m at 3, 25 … 50 m at 5, and standard deviation of the
             displacement of 0.3, 0.8, 1.5 px, each +-20 %.
-        width: of the frames, px.
+        camera, horizon, depth, width: as for all scenes.
+        dust: arguments of `HeterogeneousFog`.
+        haze: arguments of `Turbulence`.
     """
     visibility, amplitude = _at_severity(
         severity,
         [((400.0, 800.0), 0.3), ((200.0, 400.0), 0.5), ((80.0, 200.0), 0.8), ((50.0, 80.0), 1.1), ((25.0, 50.0), 1.5)],
     )
-    dust = HeterogeneousFog(
-        mode="ray",
-        visibility_range=visibility,
-        airlight=_DUST,
-        depth=_ROAD,
-        scales=(6.0, 12.0, 24.0, 48.0),
-        weights=(0.2, 0.3, 0.3, 0.2),
-        contrast_range=(0.7, 1.1),
-        wind_x_range=(-0.15, 0.15),
-        wind_z_range=(-0.5, -0.3),
-        decorrelation_range=(30.0, 60.0),
-    )
-    return Compose([dust, _turbulence(amplitude, width)])
+    options: dict[str, Any] = {
+        "mode": "ray",
+        "visibility_range": visibility,
+        "airlight": _DUST,
+        "scales": (6.0, 12.0, 24.0, 48.0),
+        "weights": (0.2, 0.3, 0.3, 0.2),
+        "contrast_range": (0.7, 1.1),
+        "wind_x_range": (-0.15, 0.15),
+        "wind_z_range": (-0.5, -0.3),
+        "decorrelation_range": (30.0, 60.0),
+    }
+    options |= _place(camera, horizon, depth) | (dust or {})
+    return Compose([HeterogeneousFog(**options), _turbulence(amplitude, width, **(haze or {}))])
 
 
 def paper_refractive(severity: int = 3, *, width: float = _REFERENCE_WIDTH) -> OneOf:
@@ -147,7 +189,21 @@ def paper_weather(severity: int = 3) -> OneOf:
     )
 
 
-def _cheap_lens(severity: int, *, frame: str) -> LensDistortion:
+def _place(camera: _CameraSource, horizon: float, depth: _DepthSource) -> dict[str, Any]:
+    """Return the arguments of a fog that tell the camera and the depth."""
+    camera = read_camera(camera) if isinstance(camera, str | Path) else camera
+    if depth is None:
+        focal = {} if camera is None else {"focal": camera.fx / camera.width}
+        depth = CorridorDepth(horizon=horizon, spread=_SPREAD, **focal)
+    return {"camera": camera, "depth": depth}
+
+
+def _without_place(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return the arguments of an effect, without those that all scenes take."""
+    return {name: value for name, value in arguments.items() if name not in ("camera", "horizon", "depth", "width")}
+
+
+def _cheap_lens(severity: int, **arguments: Any) -> LensDistortion:
     k1, k2 = _at_severity(
         severity,
         # k2 >= 0.45 k1^2: r (1 + k1 r^2 + k2 r^4) increases for every r.
@@ -159,28 +215,21 @@ def _cheap_lens(severity: int, *, frame: str) -> LensDistortion:
             ((-0.60, -0.45), (0.17, 0.24)),
         ],
     )
-    return LensDistortion(
-        k1_range=k1,
-        k2_range=k2,
-        p1_range=(-0.001, 0.001),
-        p2_range=(-0.001, 0.001),
-        focal_range=(0.7, 1.1),
-        center_x_range=(-0.01, 0.01),
-        center_y_range=(-0.01, 0.01),
-        frame=frame,
-    )
+    options: dict[str, Any] = {"k1_range": k1, "k2_range": k2, "focal_range": (0.7, 1.1)}
+    return LensDistortion(**options | arguments)
 
 
-def _turbulence(amplitude: float, width: float) -> Turbulence:
+def _turbulence(amplitude: float, width: float, **arguments: Any) -> Turbulence:
     px = check_positive("width", width) / _REFERENCE_WIDTH
-    return Turbulence(
-        amplitude_range=(0.8 * amplitude * px, 1.2 * amplitude * px),
-        length_range=(40.0 * px, 80.0 * px),
-        aperture_range=(4.0 * px, 6.0 * px),
+    options: dict[str, Any] = {
+        "amplitude_range": (0.8 * amplitude * px, 1.2 * amplitude * px),
+        "length_range": (40.0 * px, 80.0 * px),
+        "aperture_range": (4.0 * px, 6.0 * px),
         # Thermal convection moves upward.
-        wind_x_range=(-1.5 * px, 1.5 * px),
-        wind_y_range=(-3.0 * px, -1.0 * px),
-    )
+        "wind_x_range": (-1.5 * px, 1.5 * px),
+        "wind_y_range": (-3.0 * px, -1.0 * px),
+    }
+    return Turbulence(**options | arguments)
 
 
 def _around(value: float, spread: float) -> Range:

@@ -2,6 +2,7 @@ import json
 from collections.abc import Callable
 
 import pytest
+import torch
 
 from torchrefract import Camera
 
@@ -34,3 +35,10 @@ def make_camera() -> Callable[..., Camera]:
         return Camera(width=640, height=480, **numbers, coefficients=coefficients, model=model)
 
     return make
+
+
+@pytest.fixture
+def rays() -> torch.Tensor:
+    """Return rays (50, 3), float64, up to 35 degrees from the axis."""
+    points = torch.rand(50, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return torch.cat([points - 0.5, torch.ones(50, 1, dtype=torch.float64)], dim=1)

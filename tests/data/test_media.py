@@ -5,7 +5,7 @@ import resource
 import warnings
 from collections.abc import Sequence
 from fractions import Fraction
-from itertools import product
+from itertools import count, product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from av.codec.context import Flags
 from PIL import Image, ImageCms, ImageOps
 
 from torchrefract.data.images import UnreadableImageError, image_header, read_image
@@ -210,6 +211,31 @@ def test_pixels_that_are_not_square_keep_their_shape(tmp_path):
         convert_video(tmp_path / "wide.mp4", tmp_path / "b.mp4", change=unchanged, upright=upright)
         with media_file(tmp_path / "b.mp4") as container:
             assert container.streams.video[0].sample_aspect_ratio == ratio
+
+
+@pytest.mark.parametrize("angle", [10, 45, -80, 170])
+def test_a_video_that_is_turned_by_an_odd_angle_raises(tmp_path, angle):
+    c, s = (round(ONE * f(np.deg2rad(angle))) for f in (np.cos, np.sin))
+    write(tmp_path / "a.mp4", [page()], matrix=(c, s, 0, -s, c, 0, 0, 0, 1 << 14))
+    message = rf"a\.mp4 must be turned for display by a multiple of 90 degrees, got {angle}; remove its tag: ffmpeg "
+    with pytest.raises(UnreadableImageError, match=message):
+        next(read_video(tmp_path / "a.mp4", count()))
+    for upright in (True, False):
+        with pytest.raises(UnreadableImageError, match=message):
+            convert_video(tmp_path / "a.mp4", tmp_path / "b.mp4", change=unchanged, upright=upright)
+
+
+def test_an_interlaced_video_is_warned_of_once(tmp_path):
+    with media_file(tmp_path / "a.mp4", "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
+        stream.codec_context.flags |= Flags.interlaced_dct
+        for k in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(page(k), format="rgb24")))
+        container.mux(stream.encode(None))
+    with pytest.warns(UserWarning, match=r"a\.mp4 is interlaced: .* Deinterlace it first: ffmpeg .*bwdif") as caught:
+        assert convert_video(tmp_path / "a.mp4", tmp_path / "b.mp4", change=unchanged) == 3
+    assert len(caught) == 1
 
 
 def test_what_a_video_loses_is_described(tmp_path):

@@ -1,3 +1,6 @@
+import multiprocessing
+from typing import Any
+
 import pytest
 import torch
 from PIL import Image
@@ -112,6 +115,19 @@ def test_a_pair_depends_on_seed_epoch_and_key_alone(first_epoch, batch_size, wor
     pairs = by_key(batches(scenes(batch_size=batch_size, workers=workers)))
     assert len(pairs) == COUNT // batch_size * batch_size
     assert_same(pairs, first_epoch)
+
+
+class LauncherContext(type(multiprocessing.get_context("spawn"))):
+    """A start method of a launcher of jobs, as joblib's, whose processes run its jobs only."""
+
+    _name = "loky"
+    Process: Any = None
+
+
+def test_workers_start_in_a_job_of_a_launcher_with_its_own_start_method(first_epoch, batches, monkeypatch):
+    default = multiprocessing.context._default_context  # pyright: ignore[reportAttributeAccessIssue]  # not in stubs
+    monkeypatch.setattr(default, "_actual_context", LauncherContext())
+    assert_same(by_key(batches(scenes(workers=1))), first_epoch)
 
 
 def test_each_epoch_of_training_has_another_order_and_other_draws_of_the_same_frames(first_epoch, batches):

@@ -53,7 +53,7 @@ def four_warps() -> list[WarpEffect]:
         Turbulence(amplitude_range=(0.4, 0.8), length_range=(30.0, 40.0), covariance="gaussian"),
         ThinPlateSpline(amplitude_range=(1.0, 2.0)),
         DivergenceFree(amplitude_range=(0.5, 1.0), length_range=(30.0, 40.0)),
-        LensDistortion(**LENS),
+        LensDistortion(**LENS, frame="pad"),
     ]
 
 
@@ -89,7 +89,8 @@ def undistort(x: Tensor, y: Tensor, params: Any) -> tuple[Tensor, Tensor]:
 
 
 def test_the_composed_flow_of_two_radial_lenses_is_the_one_found_by_bisection():
-    lenses = [LensDistortion(k1_range=(k, k), k2_range=(0.1, 0.1), p1_range=NONE, p2_range=NONE) for k in (-0.2, -0.1)]
+    options = {"k2_range": (0.1, 0.1), "p1_range": NONE, "p2_range": NONE, "frame": "pad"}
+    lenses = [LensDistortion(k1_range=(k, k), **options) for k in (-0.2, -0.1)]
     degraded = Compose(lenses, tolerance_px=None).degrade(torch.zeros(1, 1, 540, 960, dtype=torch.float64), seed=0)
     first, second = degraded.params.children
     y, x = torch.meshgrid(torch.arange(540.0).double(), torch.arange(960.0).double(), indexing="ij")

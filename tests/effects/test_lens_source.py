@@ -40,7 +40,7 @@ def draw_lenses(effect: LensDistortion, count: int, seed: int = 7) -> Tensor:
 
 
 def test_from_camera_moves_each_ray_to_its_pixel_in_the_camera():
-    effect = LensDistortion.from_camera(CAR, tolerance_px=None)
+    effect = LensDistortion.from_camera(CAR, tolerance_px=None, frame="pad")
     degraded = effect.degrade(torch.zeros(1, 1, 360, 640, dtype=torch.float64), seed=0)
     pixels = torch.tensor([[0.0, 0.0], [639.0, 359.0], [100.0, 250.0]], dtype=torch.float64)
     seen = CAR.project(CAR.unproject(pixels).points).points
@@ -54,7 +54,7 @@ def test_from_camera_moves_each_ray_to_its_pixel_in_the_camera():
 
 def test_cameras_of_degraded_frames_agree_with_the_restore_flow():
     height, width = 36, 64
-    wide = LensDistortion(s1_range=(-0.01, 0.01), s4_range=(-0.01, 0.01), aspect_range=(0.95, 1.05), p=0.6)
+    wide = LensDistortion(s1_range=(-0.01, 0.01), s4_range=(-0.01, 0.01), aspect_range=(0.95, 1.05), p=0.6, frame="pad")
     degraded = wide.degrade(torch.zeros(6, 3, height, width, dtype=torch.float64), seed=2)
     cameras = wide.cameras(degraded.params, height=height, width=width)
     y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
@@ -107,6 +107,22 @@ def test_drawn_lenses_have_the_given_covariance():
     sampled = torch.from_numpy(np.corrcoef(numbers.T.numpy()))
     assert_close(sampled, torch.from_numpy(correlation), rtol=0, atol=0.03)
     assert not values[:, (3, 4, 5, 8, 9, 10, 11)].any()
+
+
+def test_drawn_polynomials_move_rays_as_the_covariance_of_a_fisheye_does():
+    deviations = np.array([2.0, 2.0, 1.0, 1.0, 0.01, 0.012, 0.0, 0.0])
+    covariance = np.diag(deviations**2)
+    covariance[4, 5] = covariance[5, 4] = -0.8 * 0.01 * 0.012
+    effect = LensDistortion.from_camera(FISHEYE, covariance=covariance)
+    numbers = draw_lenses(effect, 20_000).numpy()
+    for angle in (0.2, 0.4, 0.6):
+        # theta_d = theta (1 + k1 theta^2 + k2 theta^4 + ...), and the polynomial is in r = tan theta.
+        slopes = np.array([angle**3, angle**5])
+        expected = np.sqrt(slopes @ covariance[4:6, 4:6] @ slopes)
+        r = math.tan(angle)
+        drawn = r * (1 + numbers[:, :6] @ r ** np.arange(2.0, 14.0, 2.0))
+        assert drawn.std() == pytest.approx(expected, rel=0.05)
+    assert numbers[:, 12].std() * FISHEYE.width == pytest.approx(2.0, rel=0.05)
 
 
 def test_all_lenses_of_a_table_are_drawn_equally_often():
@@ -210,7 +226,7 @@ def test_a_fisheye_is_replaced_by_the_nearest_polynomial():
         (CAR, {"covariance": np.full((9, 9), np.nan)}, ValueError, "covariance must be finite"),
         (CAR, {"covariance": -np.eye(9)}, ValueError, "covariance must have no negative eigenvalue"),
         (CAR, {"covariance": np.triu(np.ones((9, 9)))}, ValueError, "covariance must be symmetric"),
-        (FISHEYE, {"covariance": np.eye(8)}, ValueError, "model must be polynomial12, or opencv without"),
+        (FISHEYE, {"covariance": np.eye(9)}, ValueError, r"covariance must have shape \(8, 8\), .* got \(9, 9\)"),
         (FISHEYE, {"residual_px": 1e-4}, ValueError, "within residual_px = 0.0001 px of a polynomial, got fisheye"),
         (replace(CAR, coefficients=(-0.6, 0.0, 0.0, 0.0)), {}, ValueError, "camera must show rays .* without folding"),
         (replace(CAR, coefficients=POLE), {}, ValueError, "camera must keep its denominator .* inside the frame"),

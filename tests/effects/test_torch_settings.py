@@ -10,6 +10,7 @@ import pytest
 import torch
 from helpers import EFFECTS, SIZE, assert_equal_maps, maps_of, random_image
 from torch import Tensor, nn
+from torch._dynamo.exc import FailOnRecompileLimitHit
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.testing import assert_close
 
@@ -121,6 +122,22 @@ def test_a_graph_takes_another_frame_size_and_batch(make):
         expected = effect(image)
         torch.manual_seed(3)
         assert_close(compiled(image), expected, rtol=0, atol=2e-4)
+
+
+def test_the_number_of_frame_sizes_of_a_graph_is_the_recompile_limit_of_pytorch():
+    effect, images = tr.UniformFog(), [random_image(1, 3, 8 + k, 12 + 2 * k) for k in range(2)]
+    for limit in (1, 2):
+        torch.compiler.reset()
+        compiled = torch.compile(effect, fullgraph=True, backend="eager")
+        with torch._dynamo.config.patch(recompile_limit=limit):
+            for image in images[:limit]:
+                torch.manual_seed(3)
+                expected = effect(image)
+                torch.manual_seed(3)
+                assert_close(compiled(image), expected, rtol=0, atol=2e-4)
+            if limit < len(images):
+                with pytest.raises(FailOnRecompileLimitHit):
+                    compiled(images[limit])
 
 
 def test_a_model_with_an_effect_is_exported_as_a_graph_that_draws():

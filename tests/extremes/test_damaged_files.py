@@ -178,14 +178,45 @@ def camera_files(folder: Path) -> Iterator[Reader]:
         "kalibr.yaml": (partial(camera_io.write_kalibr, cameras={"cam0": CAMERA}), camera_io.read_kalibr),
         "cameras.txt": (partial(camera_io.write_colmap, cameras={1: CAMERA}), camera_io.read_colmap),
         "lenses.csv": (lambda path: path.write_text(TABLE), read_lenses),
+        "cameras.bin": (lambda path: path.write_bytes(COLMAP_BINARY), camera_io.read_colmap),
+        "lensfun.xml": (lambda path: path.write_text(LENSFUN), partial(camera_io.read_camera, width=640, height=480)),
     }
+    files |= {name: (partial(Path.write_text, data=text), camera_io.read_camera) for name, text in PROFILES.items()}
     for name, (write, read) in files.items():
         write(folder / name)
         yield Reader(folder / name, (folder / name).read_bytes(), read)
 
 
 TABLE = ",".join(COLUMNS) + '\na,b,c,opencv,640,480,500,500,320,240,"[-0.3, 0.1, 0, 0]",,0.1,1,s,l\n'
-CAMERA_FILES = ("opencv.yaml", "opencv.xml", "ros.yaml", "kalibr.yaml", "cameras.txt", "lenses.csv")
+COLMAP_BINARY = struct.pack("<QiiQQ8d", 1, 1, 4, 640, 480, 500, 510, 320, 240, -0.3, 0.1, 0.001, 0.002)
+LENSFUN = """<lensdatabase><lens><model>a</model><cropfactor>2</cropfactor><aspect-ratio>640:480</aspect-ratio>
+<calibration><distortion model="poly3" focal="500" k1="-0.03"/></calibration></lens></lensdatabase>"""
+NUMBERS = {"fx": 500, "fy": 510, "cx": 320, "cy": 240, "k1": -0.3, "k2": 0.1, "p1": 0.001, "p2": 0.002}
+PROFILES = {
+    "topic.yaml": "header:\n  seq: 1\nheight: 480\nwidth: 640\ndistortion_model: plumb_bob\nd: [-0.3, 0.1, 0, 0, 0]\n"
+    "k: [500, 0, 320, 0, 510, 240, 0, 0, 1]\n---\n",
+    "gyroflow.json": '{"calib_dimension": {"w": 640, "h": 480}, "fisheye_params": {"distortion_coeffs": [0.1, 0, 0, 0],'
+    ' "camera_matrix": [[500, 0, 320], [0, 510, 240], [0, 0, 1]]}}',
+    "metashape.xml": "<calibration><projection>frame</projection><width>640</width><height>480</height>"
+    "<f>500</f><cx>1</cx><k1>-0.3</k1></calibration>",
+    "orb_slam.yaml": "".join(f"Camera.{name}: {value}\n" for name, value in NUMBERS.items())
+    + "Camera.width: 640\nCamera.height: 480\n",
+    "vins.yaml": "%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 640\nimage_height: 480\nprojection_parameters:\n"
+    + "".join(f"  {name}: {value}\n" for name, value in NUMBERS.items()),
+}
+CAMERA_FILES = (
+    *(
+        "opencv.yaml",
+        "opencv.xml",
+        "ros.yaml",
+        "kalibr.yaml",
+        "cameras.txt",
+        "lenses.csv",
+        "cameras.bin",
+        "lensfun.xml",
+    ),
+    *PROFILES,
+)
 
 
 @pytest.fixture

@@ -67,7 +67,7 @@ def flow_named(name: str, pixels, waves, size: tuple[int, int]) -> Tensor:
         return ThinPlateSpline().degrade(image, seed=3).flow[0]
     if name == "lens":
         return LensDistortion().degrade(image, seed=3).flow[0]
-    folding = LensDistortion(k1_range=(-0.6, -0.6), k2_range=(0.0, 0.0), focal_range=(0.7, 0.7))
+    folding = LensDistortion(k1_range=(-0.6, -0.6), k2_range=(0.0, 0.0), focal_range=(0.7, 0.7), frame="pad")
     with pytest.warns(UserWarning, match="fold"):
         return folding.degrade(image, seed=3).flow[0]
 

@@ -39,7 +39,7 @@ SIMPLIFIED: dict[str, Any] = {
     "faint flare": (LensFlare, {"strength_range": (1e-3, 3e-3)}),
     "far flare": (
         LensFlare,
-        {"center_y_range": (-2.0, -1.5), "drift_x_range": (0.0, 0.0), "radius_range": (0.15, 0.2)},
+        {"center_y_range": (-2.0, -1.5), "radius_range": (0.15, 0.2)},
     ),
 }
 every_effect = pytest.mark.parametrize("name", SIMPLIFIED)
@@ -92,6 +92,22 @@ def test_an_effect_that_cannot_be_seen_returns_the_image_itself(name):
         for map_name in ("transmission", "extinction", "intensity"):
             if getattr(exact, map_name) is not None:
                 assert torch.equal(getattr(degraded, map_name), getattr(exact, map_name))
+
+
+def test_a_sun_that_drifts_into_the_frame_is_planned_for_the_frame_that_is_asked_for():
+    exact, effect = (effect_with("far flare", value, drift_y_range=(0.01, 0.01)) for value in (None, 1.0))
+    image = picture(1)
+    params = effect.sample(image, seed=3)
+    for frame, is_seen in ((0, False), (10, False), (-100, True), (100, True)):
+        result, expected = (each.apply(image, params, frame=frame) for each in (effect, exact))
+        assert (result.image is not image) == is_seen
+        assert levels_apart(result.image, expected.image) <= 1
+    clip, expected = (
+        each.apply(image[:, None].expand(-1, 200, -1, -1, -1), params, frame=0) for each in (effect, exact)
+    )
+    assert levels_apart(clip.image, expected.image) <= 1
+    compiled = torch.compile(lambda image, params: effect.apply(image, params, frame=100).image, fullgraph=True)
+    assert levels_apart(compiled(image, params), exact.apply(image, params, frame=100).image) < 0.1
 
 
 def test_the_plan_names_dropped_octaves():

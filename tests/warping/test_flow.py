@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import compose_flows, folding, jacobian_determinant, warp
-from torchrefract.warping.flow import Jacobian, resize_flow, resize_image
+from torchrefract.warping.flow import Jacobian, is_shown_once, resize_flow, resize_image
 from torchrefract.warping.grid import inside
 
 SIZE = (90, 120)
@@ -198,3 +200,32 @@ def test_jacobians_multiply_and_solve_like_matrices():
     assert_close(a.determinant, torch.linalg.det(first))
     right = torch.rand(5, 2, generator=generator)
     assert_close(torch.stack(a.solve(*right.unbind(1)), dim=1), torch.linalg.solve(first, right))
+
+
+@pytest.mark.quick
+def test_pixels_that_a_fold_shows_several_times_are_not_shown_once():
+    x = torch.arange(200, dtype=torch.float64)
+    # x + 20 sin(x / 10) goes back between the pixels 21 and 42, from 39 to 24.
+    u = (20 * torch.sin(x / 10)).expand(1, 1, 30, 200)
+    flow = torch.cat([u, torch.zeros_like(u)], dim=1)
+    once = is_shown_once(flow)[0, 0]
+    positions = x + u[0, 0, 0]
+    counts = torch.zeros(200)
+    for low, high in pairwise(positions.tolist()):
+        counts += (x >= min(low, high)) & (x < max(low, high))
+    assert (counts > 1).any()
+    assert not once[:, counts > 1].any()
+    # A slope of 1 + 2 cos(x / 10) keeps ||J^-1|| below 4 where it is above 0.26.
+    is_gentle = 1 + 2 * torch.cos(x / 10) > 0.4
+    solved = positions[is_gentle].round().long().unique()
+    solved = solved[(solved > 0) & (solved < 199) & (counts[solved.clamp(0, 199)] == 1)]
+    assert once[:, solved].float().mean() > 0.8
+
+
+def test_a_flow_that_shrinks_little_is_shown_once_everywhere():
+    x = torch.arange(40, dtype=torch.float64).expand(1, 1, 30, 40)
+    flow = torch.cat([-0.7 * x, torch.zeros_like(x)], dim=1)
+    assert is_shown_once(flow).all()
+    assert not is_shown_once(flow * 1.2)[..., :6].any()
+    nothing = torch.zeros(1, 1, 30, 40, dtype=torch.bool)
+    assert is_shown_once(flow * 1.2, nothing).all()

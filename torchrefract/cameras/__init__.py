@@ -2,7 +2,7 @@
 
 `Camera` is one camera in plain numbers. `distort`, `undistort`, `project` and `unproject` take a batch of cameras as
 tensors, with gradients. `convert` fits another lens model to a camera. `read_lenses` reads real lenses.
-`torchrefract.cameras.io` reads and writes the files of OpenCV, ROS, Kalibr and COLMAP.
+`torchrefract.cameras.io.read_camera` reads the files of other programs; others there write them.
 """
 
 from torchrefract.cameras.camera import Camera

@@ -263,5 +263,6 @@ class Camera:
         else:
             lens = RationalLens.of((*c, *(0.0,) * 4) if self.model == "opencv" else c, self.model)
             growths = [growth(lens.numerator, lens.denominator), lens.denominator]
-        if any(falls_before(a, 1 / min(self.fx, self.fy) ** 2) for a in growths):
+        focal = min(self.fx, self.fy)
+        if any(falls_before(a, 1 / focal / focal) for a in growths):  # a square could overflow
             raise ValueError(f"coefficients must leave at least one pixel that does not fold back, got {c}")

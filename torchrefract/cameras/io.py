@@ -1,53 +1,116 @@
-"""Readers and writers of camera files of OpenCV, ROS, Kalibr and COLMAP; YAML needs the `calibration` extra.
+"""Readers and writers of camera files; YAML needs the `calibration` extra.
 
-Readers raise ValueError with the name of the file if it does not hold what they describe. Writers raise ValueError if
-the format cannot hold the camera; readers of the path find the old file or the complete new one.
+`read_camera` takes every form. The other readers take one, and return all cameras where it holds several. All raise
+ValueError with the name of the file if it does not hold what they describe. Writers raise ValueError if the format
+cannot hold the camera; readers of the path find the old file or the complete new one.
 """
 
-import reprlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 
-from torchrefract._io import replace_file
+from torchrefract._validation import check_choice
 from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.colmap import colmap_rows, is_colmap, read_colmap, write_colmap
+from torchrefract.cameras.documents import (
+    Document,
+    abbreviate,
+    dump_yaml,
+    fit_coefficients,
+    list_names,
+    parse_documents,
+    parse_xml,
+    read_text,
+    write_text,
+    xml_document,
+)
+from torchrefract.cameras.lens_profiles import (
+    gyroflow_camera,
+    lensfun_rows,
+    metashape_camera,
+    orb_slam_rows,
+    vins_camera,
+)
+
+__all__ = [
+    "read_camera",
+    "read_colmap",
+    "read_covariance",
+    "read_kalibr",
+    "read_opencv",
+    "read_ros",
+    "write_colmap",
+    "write_kalibr",
+    "write_opencv",
+    "write_ros",
+]
 
 _ROS_MODELS = {"plumb_bob": "opencv", "rational_polynomial": "opencv", "equidistant": "fisheye"}
 _KALIBR_MODELS = {"radtan": "opencv", "equidistant": "fisheye", "none": "opencv"}
-# COLMAP's parameters are one or two focal lengths, cx, cy, then the lens: the model here, and the numbers of both.
-_COLMAP_MODELS = {
-    "SIMPLE_PINHOLE": ("opencv", 1, 0),
-    "PINHOLE": ("opencv", 2, 0),
-    "SIMPLE_RADIAL": ("opencv", 1, 1),
-    "RADIAL": ("opencv", 1, 2),
-    "OPENCV": ("opencv", 2, 4),
-    "FULL_OPENCV": ("opencv", 2, 8),
-    "OPENCV_FISHEYE": ("fisheye", 2, 4),
-    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1, 1),
-    "RADIAL_FISHEYE": ("fisheye", 1, 2),
-}
-_COLMAP_OFFSET = 0.5  # px: COLMAP has the center of the first pixel at (0.5, 0.5), this library at (0, 0)
-_MAX_MESSAGE = 400  # characters of PyYAML's error to repeat
-# A list that refers to itself through YAML's aliases is small in memory but endless in print.
-_SHORT = reprlib.Repr()
-_SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxstring, _SHORT.maxother = 2, 14, 80, 80
+# Names for the matrix of the pinhole and for the coefficients, in any case, with or without underscores.
+_MATRIX = ("camera_matrix", "K", "mtx", "intrinsic_matrix")
+_COEFFICIENTS = ("distortion_coefficients", "D", "dist", "dist_coeffs", "dist_coeff", "dist_coefs")
+
+
+def read_camera(
+    path: str | Path,
+    *,
+    name: str | int | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    model: str | None = None,
+    focal_mm: float | None = None,
+    crop_factor: float | None = None,
+) -> Camera:
+    """Read one camera from a file of another program.
+
+    The content tells the form: YAML, JSON or XML of OpenCV's FileStorage, and the same names in other YAML and JSON; a
+    camera_info file of ROS or a recorded topic of it (`ros2 topic echo`); a camchain.yaml of Kalibr; cameras.txt,
+    cameras.bin or the folder of a COLMAP model; settings of ORB-SLAM and VINS; a lens profile of Gyroflow; a file of
+    lensfun's database; a calibration that Metashape saved as XML. An empty list of coefficients is no distortion.
+
+    Args:
+        path: of the file, or of a folder of COLMAP.
+        name: of the camera in a file of several: cam0 of Kalibr, the id of COLMAP, the lens of lensfun, Camera1.
+        width, height: of the frames, px, for a file that does not state them.
+        model: "opencv" or "fisheye", for a file that does not state to which of them its four coefficients belong.
+        focal_mm, crop_factor: of a lens of lensfun, see `lens_profiles.lensfun_rows`.
+
+    Raises:
+        ValueError: the file is of another form, has no exact counterpart here, leaves open what the arguments state,
+            or contradicts them.
+    """
+    if model is not None:
+        check_choice("model", model, ("opencv", "fisheye"))
+    form = _recognize(Path(path))
+    options = {"name": name, "width": width, "height": height, "model": model}
+    options |= {"focal_mm": focal_mm, "crop_factor": crop_factor}
+    given = {key: value for key, value in options.items() if value is not None}
+    if unused := [key for key in given if key not in form.options]:
+        raise ValueError(f"{unused[0]} must be None for a file of {form.program}, got {given[unused[0]]!r} with {path}")
+    chosen = [camera for key, camera in form.cameras.items() if name is None or str(name) == str(key)]
+    if len(chosen) != 1:
+        raise ValueError(f"name must be one of the cameras in {path}: {list_names(form.cameras)}; got {name!r}")
+    given.pop("name", None)
+    return chosen[0](**given)
 
 
 def read_opencv(path: str | Path) -> Camera:
     """Read image_width, image_height, camera_matrix, distortion_coefficients and fisheye_model of a camera.
 
-    The model is "fisheye" if fisheye_model is present and not 0, otherwise "opencv".
+    The model is "fisheye" if fisheye_model is present and not 0, otherwise "opencv". Four coefficients without
+    fisheye_model may be of either and raise ValueError; `read_camera` takes the model.
 
     Args:
-        path: ending in .xml, .yml or .yaml.
+        path: of YAML, JSON or XML.
     """
-    document = _read_storage(Path(path))
-    is_fisheye = "fisheye_model" in document.values and document.integers("fisheye_model") != [0]
-    return document.camera("fisheye" if is_fisheye else "opencv")
+    return _plain_camera(Path(path), _storage(Path(path)))
 
 
 def read_covariance(path: str | Path) -> np.ndarray | None:
@@ -55,23 +118,20 @@ def read_covariance(path: str | Path) -> np.ndarray | None:
 
     Returns None if the file has none. `LensDistortion.from_camera` takes the result.
     """
-    document = _read_storage(Path(path))
+    if is_colmap(Path(path)):
+        return None
+    document = _storage(Path(path))[0]
     if "covariance" not in document.values:
         return None
     size = 4 + len(document.numbers("distortion_coefficients", is_matrix=True))
     return np.array(document.numbers("covariance", count=size * size, is_matrix=True)).reshape(size, size)
 
 
-def _read_storage(path: Path) -> "_Document":
-    if _is_xml(path):
-        try:
-            root = ElementTree.fromstring(_read(path))
-        except ElementTree.ParseError as error:
-            raise ValueError(f"path must hold XML, got {path}: {error}") from error
-        return _Document(path, {node.tag: _xml_value(node) for node in root})
-    text = _read(path)
-    # OpenCV's first line, %YAML:1.0, is not a valid directive of YAML.
-    return _parse_yaml(path, text.partition("\n")[2] if text.startswith("%YAML") else text)
+def _storage(path: Path) -> list[Document]:
+    text = read_text(path)
+    if text.lstrip().startswith("<") or path.suffix.lower() == ".xml":
+        return [xml_document(path, parse_xml(path, text))]
+    return parse_documents(path, text)
 
 
 def write_opencv(path: str | Path, camera: Camera, *, covariance: np.ndarray | None = None) -> None:
@@ -82,7 +142,7 @@ def write_opencv(path: str | Path, camera: Camera, *, covariance: np.ndarray | N
         camera: of the model "opencv" or "fisheye".
         covariance: (4 + n, 4 + n), of fx, fy, cx, cy and the n coefficients; None writes none.
     """
-    path, coefficients = Path(path), _fit_coefficients(camera, (len(camera.coefficients),))
+    path, coefficients = Path(path), fit_coefficients(camera, (len(camera.coefficients),))
     is_fisheye = int(camera.model == "fisheye")
     scalars = {"image_width": camera.width, "image_height": camera.height, "fisheye_model": is_fisheye}
     matrices = {"camera_matrix": _matrix(3, chain(*camera.matrix))}
@@ -106,17 +166,18 @@ def write_opencv(path: str | Path, camera: Camera, *, covariance: np.ndarray | N
             data = ", ".join(f"{value:.17e}" for value in matrix["data"])
             lines += [f"{name}: !!opencv-matrix", f"   rows: {matrix['rows']}", f"   cols: {matrix['cols']}"]
             lines += ["   dt: d", f"   data: [ {data} ]"]
-    _write(path, "\n".join(lines) + "\n")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def read_ros(path: str | Path) -> Camera:
     """Read a camera_info file, as camera_calibration_parsers does.
 
-    plumb_bob and rational_polynomial become "opencv", equidistant becomes "fisheye". The rectification and projection
-    matrices are ignored: they describe a rectified view.
+    Reads a recorded topic as well. plumb_bob and rational_polynomial become "opencv", equidistant becomes "fisheye".
+    The rectification and projection matrices are ignored: they describe a rectified view.
     """
-    document = _parse_yaml(Path(path), _read(Path(path)))
-    return document.camera(document.choice("distortion_model", _ROS_MODELS))
+    documents = parse_documents(Path(path), read_text(Path(path)))
+    documents[0].get("distortion_model")
+    return _plain_camera(Path(path), documents)
 
 
 def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None:
@@ -127,7 +188,7 @@ def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None
         camera: "fisheye", or "opencv" without prism and tilt.
         name: of the camera.
     """
-    coefficients = _fit_coefficients(camera, (5, 8))
+    coefficients = fit_coefficients(camera, (5, 8))
     (fx, _, cx), (_, fy, cy), _ = camera.matrix
     document = {
         "image_width": camera.width,
@@ -139,7 +200,7 @@ def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None
         "rectification_matrix": _matrix(3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
         "projection_matrix": _matrix(3, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
     }
-    _write(path, _dump_yaml(document))
+    write_text(path, dump_yaml(document))
 
 
 def read_kalibr(path: str | Path) -> dict[str, Camera]:
@@ -148,8 +209,8 @@ def read_kalibr(path: str | Path) -> dict[str, Camera]:
     Pinholes with radtan (k1, k2, p1, p2) or none become "opencv", with equidistant "fisheye". A camera with another
     camera_model (omni, eucm, ds) or distortion_model (fov) raises ValueError.
     """
-    chains = _parse_yaml(Path(path), _read(Path(path))).values
-    return {str(name): _kalibr_camera(_Document(f"{path}, {name},", chain)) for name, chain in chains.items()}
+    rows = _kalibr_rows(path, parse_documents(Path(path), read_text(Path(path))))
+    return {name: camera() for name, camera in rows.items()}
 
 
 def write_kalibr(path: str | Path, cameras: Mapping[str, Camera]) -> None:
@@ -164,144 +225,141 @@ def write_kalibr(path: str | Path, cameras: Mapping[str, Camera]) -> None:
             "camera_model": "pinhole",
             "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
             "distortion_model": "radtan" if camera.model == "opencv" else "equidistant",
-            "distortion_coeffs": list(_fit_coefficients(camera, (4,))),
+            "distortion_coeffs": list(fit_coefficients(camera, (4,))),
             "resolution": [camera.width, camera.height],
         }
         for name, camera in cameras.items()
     }
-    _write(path, _dump_yaml(chains))
+    write_text(path, dump_yaml(chains))
 
 
-def read_colmap(path: str | Path) -> dict[int, Camera]:
-    """Read the cameras of a cameras.txt by their ids.
+class _Form(NamedTuple):
+    """The form of a camera file."""
 
-    Pinholes, radial models, OPENCV and FULL_OPENCV become "opencv", models with FISHEYE become "fisheye". Others (FOV,
-    THIN_PRISM_FISHEYE and more) raise ValueError. The principal point moves by half a pixel between COLMAP's convention
-    and the one of this library.
-    """
-    lines = [line.split() for line in _read(Path(path)).splitlines() if line.strip() and not line.startswith("#")]
-    return dict(_colmap_camera(path, words) for words in lines)
+    program: str
+    options: tuple[str, ...]  # arguments of `read_camera` that it takes
+    cameras: Mapping[Any, Callable[..., Camera]]  # by their names; functions of the options but for name
 
 
-def write_colmap(path: str | Path, cameras: Mapping[int, Camera]) -> None:
-    """Write a cameras.txt that `read_colmap` and COLMAP read.
-
-    A camera becomes PINHOLE, OPENCV, FULL_OPENCV or OPENCV_FISHEYE, the first that holds its coefficients.
-
-    Args:
-        path: to write.
-        cameras: by their ids, "fisheye", or "opencv" without prism and tilt.
-    """
-    lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", f"# Number of cameras: {len(cameras)}"]
-    for number, camera in cameras.items():
-        coefficients = _fit_coefficients(camera, (0, 4, 8))
-        model = {0: "PINHOLE", 4: "OPENCV", 8: "FULL_OPENCV"}[len(coefficients)]
-        model = "OPENCV_FISHEYE" if camera.model == "fisheye" else model
-        pinhole = (camera.fx, camera.fy, camera.cx + _COLMAP_OFFSET, camera.cy + _COLMAP_OFFSET)
-        values = " ".join(map(repr, (*pinhole, *coefficients)))
-        lines.append(f"{number} {model} {camera.width} {camera.height} {values}")
-    _write(path, "\n".join(lines) + "\n")
+def _recognize(path: Path) -> _Form:
+    if is_colmap(path):
+        return _Form("COLMAP", ("name",), colmap_rows(path))
+    try:
+        text = read_text(path)
+    except ValueError as error:
+        raise _unknown_form(path, "binary data") from error
+    if text.lstrip().startswith("<"):
+        return _recognize_xml(path, parse_xml(path, text))
+    try:
+        documents = parse_documents(path, text)
+    except ValueError as error:
+        raise _unknown_form(path, f"other text ({error})") from error
+    return _recognize_values(path, documents)
 
 
-class _Document:
-    """Values by their names in a file; every method raises ValueError, with the name of the file, for invalid ones."""
-
-    def __init__(self, path: Path | str, values: Any):
-        if not isinstance(values, dict):
-            raise ValueError(f"path must hold a mapping of names to values, got {path} with {type(values).__name__}")
-        self.path, self.values = path, values
-
-    def get(self, name: str) -> Any:
-        if name not in self.values:
-            names = ", ".join(map(str, self.values)) or "nothing"
-            raise ValueError(f"path must hold {name}, got {self.path} with {names}")
-        return self.values[name]
-
-    def choice(self, name: str, choices: Mapping[str, Any]) -> Any:
-        """Return one of `choices` by the value of a name."""
-        value = self.get(name)
-        if not isinstance(value, str) or value not in choices:
-            raise ValueError(
-                f"path must have a {name} of {', '.join(choices)}, got {self.path} with {_abbreviate(value)}"
-            )
-        return choices[value]
-
-    def numbers(self, name: str, *, count: int | None = None, is_matrix: bool = False) -> list[float]:
-        """Return a number, a list of numbers, or a matrix, which is a mapping with the name data, as a list."""
-        values = self.get(name)
-        if is_matrix:
-            if not isinstance(values, dict) or "data" not in values:
-                raise ValueError(f"path must hold a matrix as {name}, got {self.path} with {_abbreviate(values)}")
-            values = values["data"]
-        try:
-            result = [float(value) for value in (values if isinstance(values, list) else [values])]
-        except (TypeError, ValueError, OverflowError):
-            raise ValueError(f"path must hold numbers as {name}, got {self.path} with {_abbreviate(values)}") from None
-        if count is not None and len(result) != count:
-            raise ValueError(f"path must hold {count} numbers as {name}, got {self.path} with {len(result)}")
-        return result
-
-    def integers(self, name: str, *, count: int = 1) -> list[int]:
-        values = self.numbers(name, count=count)
-        if wrong := [value for value in values if not value.is_integer()]:
-            raise ValueError(f"path must hold a whole number as {name}, got {self.path} with {wrong[0]}")
-        return [int(value) for value in values]
-
-    def camera(self, model: str) -> Camera:
-        """Return the camera of the names that OpenCV and ROS use, without skew."""
-        fx, skew, cx, _, fy, cy, *last = self.numbers("camera_matrix", count=9, is_matrix=True)
-        if skew != 0 or last != [0.0, 0.0, 1.0]:
-            raise ValueError(
-                f"path must hold a camera_matrix without skew, got {self.path} with skew {skew:g}, last row {last}"
-            )
-        size = (*self.integers("image_width"), *self.integers("image_height"))
-        coefficients = self.numbers("distortion_coefficients", is_matrix=True)
-        return self.create_camera(size, (fx, fy, cx, cy), coefficients, model)
-
-    def create_camera(
-        self, size: Sequence[int], pinhole: Sequence[float], coefficients: Sequence[float], model: str
-    ) -> Camera:
-        (width, height), (fx, fy, cx, cy), lens = size, pinhole, tuple(coefficients)
-        try:
-            return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=lens, model=model)
-        except ValueError as error:
-            raise ValueError(f"path must hold a camera, got {self.path}: {error}") from error
+def _recognize_xml(path: Path, root: ElementTree.Element) -> _Form:
+    if root.tag == "lensdatabase":
+        return _Form("lensfun", ("name", "width", "height", "focal_mm", "crop_factor"), lensfun_rows(path, root))
+    if root.tag == "calibration":
+        return _Form("Metashape", (), {"": partial(metashape_camera, path, root)})
+    if root.tag != "opencv_storage":
+        raise _unknown_form(path, f"<{root.tag}>")
+    return _recognize_values(path, [xml_document(path, root)])
 
 
-def _kalibr_camera(document: _Document) -> Camera:
+def _recognize_values(path: Path, documents: Sequence[Document]) -> _Form:
+    values = documents[0].values
+    if "fisheye_params" in values or "calib_dimension" in values:
+        return _Form("Gyroflow", (), {"": partial(gyroflow_camera, documents[0])})
+    if any(isinstance(value, dict) and "camera_model" in value for value in values.values()):
+        return _Form("Kalibr", ("name",), _kalibr_rows(path, documents))
+    if rows := orb_slam_rows(documents[0]):
+        return _Form("ORB-SLAM", ("name", "width", "height"), rows)
+    if "model_type" in values and "projection_parameters" in values:
+        return _Form("VINS", (), {"": partial(vins_camera, documents[0])})
+    if documents[0].find(*_MATRIX) not in values:
+        raise _unknown_form(path, list_names(values))
+    return _Form("OpenCV or ROS", ("width", "height", "model"), {"": partial(_plain_camera, path, documents)})
+
+
+def _unknown_form(path: Path, content: str) -> ValueError:
+    return ValueError(
+        "path must hold a camera of OpenCV, ROS, Kalibr, COLMAP, ORB-SLAM, VINS, Gyroflow, lensfun or Metashape, got "
+        f"{path} with {content}; create torchrefract.Camera(...) of its numbers"
+    )
+
+
+def _plain_camera(path: Path, documents: Sequence[Document], **given: Any) -> Camera:
+    """Return the camera that all documents of a file describe by the names of OpenCV and ROS."""
+    cameras = Counter(_document_camera(document, **given) for document in documents)
+    if len(cameras) > 1:
+        raise ValueError(
+            f"path must hold one camera, got {path} with messages of {len(cameras)} different ones; keep those of one"
+        )
+    return next(iter(cameras))
+
+
+def _document_camera(
+    document: Document, *, width: int | None = None, height: int | None = None, model: str | None = None
+) -> Camera:
+    path, values = document.path, document.values
+    pinhole = document.pinhole(document.find(*_MATRIX))
+    size = document.size(width, height)
+    region, frame = values.get("roi"), {"x_offset": 0, "y_offset": 0, "width": size[0], "height": size[1]}
+    if isinstance(region, dict) and any(region.get(key) not in (None, 0, side) for key, side in frame.items()):
+        raise ValueError(
+            f"path must describe whole frames, got {path} with the roi {abbreviate(region)}; remove roi, and use "
+            "camera.cropped"
+        )
+    coefficients = document.numbers(document.find(*_COEFFICIENTS), is_matrix=True)
+    stated = _stated_model(document)
+    if model is not None and stated not in (None, model):
+        raise ValueError(f"model must be {stated} as {path} states, got {model}")
+    model = stated or model
+    if not coefficients and model == "fisheye":
+        raise ValueError(f"path must hold the four coefficients of a fisheye, got {path} without")
+    if len(coefficients) == 4 and model is None:
+        raise ValueError(
+            f"path must state the lens model of four coefficients, got {path} without fisheye_model and "
+            "distortion_model; add fisheye_model: 0 if they are k1, k2, p1, p2, or 1 for those of cv2.fisheye; or "
+            'state model="opencv" or "fisheye" in read_camera'
+        )
+    return document.camera(size, pinhole, coefficients or [0.0] * 4, model or "opencv")
+
+
+def _stated_model(document: Document) -> str | None:
+    # A topic of ROS has an empty text for a camera that is not calibrated, or whose frames are rectified.
+    if document.values.get("distortion_model") not in (None, ""):
+        remedy = "; calibrate the camera for one of these models, such as with python -m torchrefract.calibrate"
+        return document.choice("distortion_model", _ROS_MODELS, remedy=remedy)
+    if "fisheye_model" in document.values:
+        return "fisheye" if document.integers("fisheye_model") != [0] else "opencv"
+    return None
+
+
+def _kalibr_rows(path: str | Path, documents: Sequence[Document]) -> dict[str, Callable[[], Camera]]:
+    if len(documents) > 1:
+        raise ValueError(f"path must hold one chain of cameras, got {path} with {len(documents)} documents")
+    chains = documents[0].values
+    return {str(name): partial(_kalibr_camera, Document(f"{path}, {name},", values)) for name, values in chains.items()}
+
+
+def _kalibr_camera(document: Document) -> Camera:
     document.values.setdefault("distortion_model", "none")
-    document.choice("camera_model", {"pinhole": ""})
-    model = document.choice("distortion_model", _KALIBR_MODELS)
-    has_lens = document.get("distortion_model") != "none"
-    coefficients = document.numbers("distortion_coeffs", count=4) if has_lens else [0.0] * 4
+    remedy = "; calibrate again with pinhole-radtan or pinhole-equi"
+    document.choice("camera_model", {"pinhole": ""}, remedy=remedy)
+    model = document.choice("distortion_model", _KALIBR_MODELS, remedy=remedy)
+    coefficients = document.numbers("distortion_coeffs") if "distortion_coeffs" in document.values else []
+    kind = document.get("distortion_model")
+    if kind == "none" and any(coefficients):
+        raise ValueError(
+            f"path must have no distortion_coeffs for the distortion_model none, got {document.path} with "
+            f"{abbreviate(coefficients)}; state radtan or equidistant"
+        )
+    if kind == "equidistant" or (kind == "radtan" and coefficients):
+        coefficients = document.numbers("distortion_coeffs", count=4)
     size, pinhole = document.integers("resolution", count=2), document.numbers("intrinsics", count=4)
-    return document.create_camera(size, pinhole, coefficients, model)
-
-
-def _colmap_camera(path: str | Path, words: list[str]) -> tuple[int, Camera]:
-    if len(words) < 4:
-        raise ValueError(
-            f"path must have a number, model, width and height in each line, got {path} with {_abbreviate(words)}"
-        )
-    if words[1] not in _COLMAP_MODELS:
-        raise ValueError(
-            f"path must have a camera model of {', '.join(_COLMAP_MODELS)}, got {path} with {words[1][:80]}"
-        )
-    model, num_focal, num_coefficients = _COLMAP_MODELS[words[1]]
-    parameters, head = f"parameters of {words[1]}", "CAMERA_ID, WIDTH or HEIGHT"
-    document = _Document(path, {head: [words[0], *words[2:4]], parameters: words[4:]})
-    number, *size = document.integers(head, count=3)
-    values = document.numbers(parameters, count=num_focal + 2 + num_coefficients)
-    (*focal, cx, cy), lens = values[: num_focal + 2], values[num_focal + 2 :]
-    pinhole = focal[0], focal[-1], cx - _COLMAP_OFFSET, cy - _COLMAP_OFFSET
-    return number, document.create_camera(size, pinhole, (*lens, *(0.0,) * (4 - len(lens))), model)
-
-
-def _xml_value(node: ElementTree.Element) -> Any:
-    values: dict[str, Any] = {child.tag: (child.text or "").strip() for child in node}
-    if "data" in values:
-        return values | {"data": values["data"].split()}
-    return (node.text or "").strip()
+    return document.camera(size, pinhole, coefficients or [0.0] * 4, model)
 
 
 def _matrix(rows: int, values: Iterable[float]) -> dict[str, Any]:
@@ -309,79 +367,7 @@ def _matrix(rows: int, values: Iterable[float]) -> dict[str, Any]:
     return {"rows": rows, "cols": len(data) // rows, "data": data}
 
 
-def _fit_coefficients(camera: Camera, counts: Sequence[int]) -> tuple[float, ...]:
-    """Return those of a fisheye, or those of OpenCV with zeros in the first of the lengths `counts` that holds them."""
-    if camera.model not in ("opencv", "fisheye"):
-        raise ValueError(
-            "camera must be of the model opencv or fisheye for this file (convert(camera, to=...) finds the nearest), "
-            f"got {camera.model}"
-        )
-    values = camera.coefficients
-    if camera.model == "fisheye":
-        return values
-    for count in counts:
-        if not any(values[count:]):
-            return (*values[:count], *(0.0,) * (count - len(values)))
-    raise ValueError(f"camera must have at most {counts[-1]} coefficients for this file, got {values}")
-
-
 def _is_xml(path: Path) -> bool:
     if path.suffix.lower() not in (".xml", ".yml", ".yaml"):
         raise ValueError(f"path must end in .xml, .yml or .yaml, got {path}")
     return path.suffix.lower() == ".xml"
-
-
-def _read(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"path must hold text in UTF-8, got {path}") from error
-
-
-def _write(path: str | Path, text: str) -> None:
-    with replace_file(Path(path)) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-
-
-def _abbreviate(value: Any) -> str:
-    """Return a short representation of a value of a file, for errors."""
-    try:
-        return _SHORT.repr(value)
-    except ValueError:  # an integer with more digits than Python prints
-        return type(value).__name__
-
-
-def _parse_yaml(path: Path, text: str) -> _Document:
-    """Parse a text of plain values, and of OpenCV's matrices as mappings; raise ValueError for any other."""
-    yaml = _import_yaml()
-
-    class Loader(yaml.SafeLoader):
-        def flatten_mapping(self, node: Any) -> None:
-            # No camera file has merge keys, and a few lines of them can fill the memory.
-            for key, _ in node.value:
-                if key.tag == "tag:yaml.org,2002:merge":
-                    raise yaml.constructor.ConstructorError(None, None, "found a merge key", key.start_mark)
-            super().flatten_mapping(node)
-
-    Loader.add_constructor(
-        "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
-    )
-    try:
-        values = yaml.load(text, Loader=Loader)
-    except Exception as error:  # malformed scalars and keys raise many types besides YAMLError
-        raise ValueError(f"path must hold YAML, got {path}: {' '.join(str(error).split())[:_MAX_MESSAGE]}") from error
-    return _Document(path, values)
-
-
-def _dump_yaml(values: Mapping[str, Any]) -> str:
-    """Return a mapping as YAML, in its order, with each list on one line."""
-    return _import_yaml().safe_dump(values, sort_keys=False, default_flow_style=None, width=1000)
-
-
-def _import_yaml() -> Any:
-    try:
-        import yaml  # noqa: PLC0415
-    except ModuleNotFoundError as missing:
-        message = 'cameras in YAML files need PyYAML: pip install "torchrefract[calibration]"'
-        raise ModuleNotFoundError(message, name=missing.name) from missing
-    return yaml

@@ -40,8 +40,8 @@ from torchrefract.cameras.calibration.report import (
 from torchrefract.cameras.calibration.synthetic import CAMERA, NUM_VIEWS, render_views
 from torchrefract.cameras.calibration.uncertainty import MAX_DEVIATION_PX, Crop, certain_part
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io import read_covariance, read_opencv, write_opencv
-from torchrefract.cli.command import make, naming, progress
+from torchrefract.cameras.io import read_camera, read_covariance, read_opencv, write_opencv
+from torchrefract.cli.command import check_none_lost, make, naming, progress
 from torchrefract.data import media
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, pixels_of, read_image
 from torchrefract.data.pairs.manifest import locked
@@ -51,7 +51,7 @@ from torchrefract.warping.warp import warp
 _SYNTHETIC = "synthetic"
 _MIN_USABLE = MIN_VIEWS + 1  # views, so that each can be left out of the fit
 _MAX_REASONS = 300  # characters
-_CACHE_VERSION = 4  # of detections.jsonl; lines of other versions are ignored
+_CACHE_VERSION = 5  # of detections.jsonl; lines of other versions are ignored
 _MIN_SAME_SIZE = 0.75  # share of the pictures
 _MAX_MARKER_ERROR = 0.15  # of the side of a marker; blur shrinks it by some percent
 _NUM_DIAGNOSED = 3  # pictures in which another board is searched if the expected one is missing
@@ -247,7 +247,7 @@ def rectify(cfg: DictConfig) -> None:
     with naming("zoom"):
         zoom = check_number("zoom", cfg.zoom, low=0.05, high=20.0)
     with naming("camera"):
-        camera = read_opencv(str(cfg.camera))
+        camera = read_camera(str(cfg.camera), name=cfg.camera_name)
         covariance = read_covariance(str(cfg.camera))
         if cfg.crop:
             zoom = max(zoom, zoom_to_crop(camera))
@@ -281,7 +281,7 @@ def rectify(cfg: DictConfig) -> None:
     def rectify_frames(frames: Iterator[Tensor]) -> Iterator[np.ndarray]:
         return (pixels_of(rectify_frame(frame)) for frame in frames)
 
-    num_written, skipped = 0, dict[Path, str]()
+    num_written, failed = 0, dict[Path, ValueError]()
     with locked("out", out):
         for file in progress(files, "rectifying", count=len(files)):
             target = out / media.output_name(file).name
@@ -296,15 +296,16 @@ def rectify(cfg: DictConfig) -> None:
                         media.write_picture(rectify_frame(frame), path, source=file, upright=False)
                 num_written += 1
             except ValueError as error:
-                skipped[file] = str(error) if isinstance(error, UnreadableImageError) else f"{file}: {error}"
-                print(f"skipped: {skipped[file]}", file=sys.stderr)
-    if len(skipped) == len(files):
-        raise UsageError(f"input must hold a file that can be rectified, got {next(iter(skipped.values()))}")
-    num_existing = len(files) - len(skipped) - num_written
+                failed[file] = error if isinstance(error, UnreadableImageError) else ValueError(f"{file}: {error}")
+                print(f"skipped: {failed[file]}", file=sys.stderr)
+    if len(failed) == len(files):
+        raise UsageError(f"input must hold a file that can be rectified, got {next(iter(failed.values()))}")
+    num_existing = len(files) - len(failed) - num_written
     print(
-        f"{out}: {num_written} rectified, {num_existing} already existed, {len(skipped)} skipped; camera of the "
+        f"{out}: {num_written} rectified, {num_existing} already existed, {len(failed)} skipped; camera of the "
         f"results: {out}/{CAMERA_FILE}"
     )
+    check_none_lost(failed)
 
 
 def _part_to_keep(

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -29,7 +29,7 @@ from yaml import YAMLError
 from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
 from torchrefract.cli.entry import missing_library
-from torchrefract.data.images import UnreadableImageError
+from torchrefract.data.images import UnreadableImageError, is_lost
 from torchrefract.data.pairs.files import DamagedPairError
 
 _T = TypeVar("_T")
@@ -41,7 +41,7 @@ _INFORMATION_OPTIONS = ("--hydra-help", "--info", "--shell-completion", "-sc")
 _MULTIRUN = ("-m", "--multirun")
 # Options whose value is text, mostly the path of a file: Hydra's syntax in it means nothing.
 _TEXT_OPTION = re.compile(
-    r"(\+{0,2}(?:image|images|input|source|depth|camera|out|ckpt_path|license|run_dir|data\.root|hydra\.run\.dir"
+    r"(\+{0,2}(?:image|images|input|source|depth|network|camera|out|ckpt_path|license|run_dir|data\.root|data\.depth|hydra\.run\.dir"
     r"|hydra\.sweep\.dir|hydra\.sweep\.subdir|model\.network\.pretrained))=(.*)",
     re.DOTALL,
 )
@@ -232,6 +232,20 @@ def progress(items: Iterable[_T], name: str, *, count: int) -> Iterator[_T]:
             done += 1
     finally:
         finished.set()
+
+
+def check_none_lost(failed: Mapping[Path, Exception]) -> None:
+    """Raise UsageError if files of the input could not be opened, as those that vanish during a run.
+
+    Args:
+        failed: the error of each file without a result.
+    """
+    lost = [str(error) for error in failed.values() if is_lost(error)]
+    if lost:
+        more = f" and {len(lost) - 1} more" if lost[1:] else ""
+        raise UsageError(
+            f"input must stay unchanged during a run, got {lost[0]}{more}; the same command tries them again"
+        )
 
 
 def _is_picture(argument: str) -> bool:

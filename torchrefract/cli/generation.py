@@ -21,8 +21,17 @@ from rich.filesize import decimal
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from torchrefract._io import replace_file
-from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_number, check_size
+from torchrefract._validation import (
+    UsageError,
+    check_choice,
+    check_count,
+    check_flag,
+    check_number,
+    check_positive,
+    check_size,
+)
 from torchrefract.cli.command import check_seed, make, naming
+from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import first_names
 from torchrefract.data.pairs.card import HISTOGRAMS, draw_histograms, format_card, summarize
 from torchrefract.data.pairs.files import FORMATS
@@ -139,11 +148,15 @@ def _parse(cfg: DictConfig) -> Options:
         sources = find_sources(source, **options)
     num_pairs = len(sources.frames) if cfg.count is None else _checked(cfg, "count", check_count)
     sources = sources.limited(num_pairs)
+    depth = None
+    if cfg.depth is not None:
+        depth = DepthFolder(Path(str(cfg.depth)).expanduser(), _checked(cfg, "depth_scale", check_positive))
+        plain |= {"depth": sources.depth_digest(depth), "depth_scale": depth.scale}
     if not str(cfg.license or "").strip():
         raise UsageError("license must be that of the source, in words, got nothing")
     scene: dict[str, Any] = {"name": str(HydraConfig.get().runtime.choices["scene"])}
     scene |= cast(dict[str, Any], OmegaConf.to_container(cfg.scene, resolve=True))
-    reader = SourceReader(sources.root, plain["size"])
+    reader = SourceReader(sources.root, plain["size"], depth)
     generator = PairGenerator(effect, scene["name"], reader, cfg.seed, plain["maps"])
     settings = {"scene": scene, **plain, "frames": len(sources.frames), "sources": sources.digest()}
     return Options(generator, sources, settings, num_pairs, str(cfg.license), shard, workers, verify)

@@ -6,8 +6,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
-import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from matplotlib.figure import Figure
@@ -17,17 +15,16 @@ from torch import Tensor
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_count, check_number, check_positive, check_size
 from torchrefract.cli.command import check_seed, make, naming, progress
-from torchrefract.data.images import EXTENSIONS, files_in, fit, image_size, read_image
+from torchrefract.data.depth_maps import crop_depth, read_depth
+from torchrefract.data.images import EXTENSIONS, files_in, fit, read_image
 from torchrefract.data.media import VIDEOS, read_video
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
-from torchrefract.fields.depth import check_depth
 from torchrefract.visualization.animation import FrameSequence, animation_formats, make_animation, save_animation
 from torchrefract.visualization.figures import contact_sheet, contact_sheet_row
 
 _RENDERED_SIZE = (540, 960)  # height and width
 _MAX_FPS = 50.0  # many viewers take the shorter delays that a GIF can hold for no delay
-_MAX_STEPS = 65535  # of a 16-bit depth picture, means farther than measured
 
 
 class _Source(NamedTuple):
@@ -152,50 +149,10 @@ def _read_depth(cfg: DictConfig, image: Tensor, size: tuple[int, int] | None) ->
     with naming("depth_scale"):
         scale = check_positive("depth_scale", cfg.depth_scale)
     path = Path(str(cfg.depth))
-    depth, note = (_read_npy(path), "") if path.suffix.lower() == ".npy" else _read_depth_png(path, scale)
-    (height, width), (rows, columns) = image.shape[2:], depth.shape
-    if 2 * abs(rows * width - columns * height) > max(height, width):
-        raise UsageError(
-            f"depth must be of the size of the picture, {height}x{width} (height x width), or of its shape, "
-            f"got {rows}x{columns}"
-        )
+    depth, missing = read_depth(path, scale=scale)
     with naming("depth"):
-        check_depth(depth[None, None])
-    # Crop and reduce a picture of relative coordinates like the image, and sample the depth at the results: an average
-    # over the edge of an object would be a distance at which there is nothing.
-    position = torch.zeros(1, 3, height, width)
-    position[0, 0] = ((torch.arange(height) + 0.5) / height)[:, None]
-    position[0, 1] = (torch.arange(width) + 0.5) / width
-    y, x, _ = _fit(position, size)[0]
-    y, x = (y * rows).long().clamp(max=rows - 1), (x * columns).long().clamp(max=columns - 1)
-    return depth[y, x][None, None], note
-
-
-def _read_npy(path: Path) -> Tensor:
-    try:
-        value = np.load(path, allow_pickle=False)
-    except OSError as error:
-        raise UsageError(
-            f"depth must be a file that can be read, got {path} ({error.strerror or 'damaged'})"
-        ) from error
-    except (ValueError, EOFError) as error:
-        raise UsageError(f"depth must be an array of numbers, got {path}, which is damaged or not an array") from error
-    if not isinstance(value, np.ndarray) or value.dtype.kind != "f" or value.size == 0 or value.squeeze().ndim != 2:
-        raise UsageError(f"depth must be (height, width) of floating numbers, in m, got {path}")
-    return torch.from_numpy(value.squeeze().astype(np.float32))
-
-
-def _read_depth_png(path: Path, scale: float) -> tuple[Tensor, str]:
-    """Read a 16-bit picture; pixels that were not measured are infinitely far, and the note counts them."""
-    image_size(path)  # raises UnreadableImageError
-    steps = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    if steps is None or steps.dtype != np.uint16 or steps.ndim != 2:
-        raise UsageError(f"depth must be a gray PNG of 16 bits, or a .npy in m, got {path}")
-    missing = float((steps == 0).mean())
-    if missing > 0.5:
-        raise UsageError(f"depth must be known in half of the pixels at least, got {path} with {missing:.1%} at 0")
-    depth = np.where((steps == 0) | (steps == _MAX_STEPS), np.inf, steps * scale).astype(np.float32)
-    return torch.from_numpy(depth), f"; {missing:.1%} of its depth is 0, taken as infinite" if missing else ""
+        depth = crop_depth(depth, (image.shape[2], image.shape[3]), size, name=str(path))
+    return depth[None], f"; {missing:.1%} of its depth is 0, taken as infinite" if missing else ""
 
 
 def _printable(name: str) -> str:

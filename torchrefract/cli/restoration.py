@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
-from torchrefract.cli.command import check_seed, make, naming, progress
+from torchrefract.cli.command import check_none_lost, check_seed, make, naming, progress
 from torchrefract.cli.evaluation import describe_validation, use_validation_config
 from torchrefract.data.images import UnreadableImageError, pixels_of, read_image
 from torchrefract.data.media import (
@@ -118,7 +118,7 @@ def _restore_missing(files: Sequence[Path], job: "_Job", out: Path) -> None:
     for loss in describe_losses(todo, upright=True):
         print(f"warning: {loss}", file=sys.stderr)
     start = time.perf_counter()
-    failed = dict[Path, str]()
+    failed = dict[Path, UnreadableImageError]()
     num_frames = _restore_pictures([file for file in todo if not is_video(file)], job, failed)
     num_frames += sum(_restore_video(file, job, failed) for file in todo if is_video(file))
     if len(failed) == len(files):
@@ -127,6 +127,7 @@ def _restore_missing(files: Sequence[Path], job: "_Job", out: Path) -> None:
     num_restored, num_existing = len(todo) - len(failed), len(files) - len(todo)
     print(f"{out}: {num_restored} restored, {num_existing} already existed, {len(failed)} skipped")
     print(f"{num_frames} frames, {rate:.3g} frames a second on {job.device}")
+    check_none_lost(failed)
 
 
 def export(cfg: DictConfig) -> None:
@@ -160,7 +161,9 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
         trainer = make(cfg, "trainer")
     except MisconfigurationException as error:
         raise UsageError(f"trainer: {error}") from error
-    if (processes := int(os.environ.get("WORLD_SIZE") or 1)) != trainer.world_size:
+    # Lightning starts the processes of other runs itself.
+    processes = int(os.environ.get("WORLD_SIZE") or trainer.world_size)
+    if processes != trainer.world_size:
         raise UsageError(
             f"trainer must be ddp with trainer.devices={os.environ.get('LOCAL_WORLD_SIZE', processes)} under torchrun, "
             f"got one that uses {trainer.world_size} of {processes} processes"
@@ -256,7 +259,7 @@ def _settings(cfg: DictConfig, job: _Job) -> dict[str, Any]:
     }
 
 
-def _restore_pictures(files: Sequence[Path], job: _Job, failed: dict[Path, str]) -> int:
+def _restore_pictures(files: Sequence[Path], job: _Job, failed: dict[Path, UnreadableImageError]) -> int:
     """Restore pictures, note the unreadable ones in `failed`, and return the number restored."""
     count = 0
     for chunk in _batches(progress(files, "restoring", count=len(files)), job.batch):
@@ -269,13 +272,16 @@ def _restore_pictures(files: Sequence[Path], job: _Job, failed: dict[Path, str])
         for file, image in zip(images, job.restore([*images.values()]) if images else (), strict=True):
             target = job.target(file)
             target.parent.mkdir(parents=True, exist_ok=True)
-            with replace_file(target, alone=True) as path:
-                write_picture(image, path, source=file)
-            count += 1
+            try:
+                with replace_file(target, alone=True) as path:
+                    write_picture(image, path, source=file)
+                count += 1
+            except UnreadableImageError as error:  # the file vanished after it was read
+                _skip(file, error, failed)
     return count
 
 
-def _restore_video(file: Path, job: _Job, failed: dict[Path, str]) -> int:
+def _restore_video(file: Path, job: _Job, failed: dict[Path, UnreadableImageError]) -> int:
     """Restore a video and return the number of its frames; note an unreadable one in `failed` and return 0."""
 
     def change(frames: Iterable[Tensor]) -> Iterator[np.ndarray]:
@@ -293,8 +299,8 @@ def _restore_video(file: Path, job: _Job, failed: dict[Path, str]) -> int:
         return 0
 
 
-def _skip(file: Path, error: UnreadableImageError, failed: dict[Path, str]) -> None:
-    failed[file] = str(error)
+def _skip(file: Path, error: UnreadableImageError, failed: dict[Path, UnreadableImageError]) -> None:
+    failed[file] = error
     print(f"skipped: {error}", file=sys.stderr)
 
 

@@ -20,6 +20,7 @@ import torch
 from torch.utils.data import Dataset
 
 from torchrefract._validation import check_choice, check_number, check_size
+from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, image_size, read_image
 from torchrefract.types import Frame
 
@@ -71,6 +72,7 @@ class FrameFolder(Dataset[Frame]):
         drive_by: "auto", "folder" or "prefix".
         val_share: share of the frames in val, between 0 and 1.
         seed: of the split.
+        depth: folder of depth maps of the frames, see `DepthFolder`; each frame needs one.
 
     Raises:
         ValueError: an argument is out of range; the folder has no frames, or has only one drive to split; more than a
@@ -87,8 +89,10 @@ class FrameFolder(Dataset[Frame]):
         drive_by: str = "auto",
         val_share: float = 0.2,
         seed: int = 0,
+        depth: str | Path | None = None,
     ):
         self.root = Path(root).expanduser()
+        self.depth = None if depth is None else DepthFolder(Path(depth).expanduser())
         self.size = check_size("size", size)
         check_choice("split", split, ("all", "train", "val"))
         check_choice("drive_by", drive_by, ("auto", "folder", "prefix"))
@@ -99,18 +103,20 @@ class FrameFolder(Dataset[Frame]):
         self.paths = [self.root / frame.path for frame in frames]
         self.drives = sorted({frame.drive for frame in frames})
         self.keys = [path_key(frame.path) for frame in frames]
+        if self.depth is not None:
+            for frame in frames:
+                self.depth.find(frame.path)  # raises if there is none
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> Frame:
-        """Read a frame: image (3, h, w), key () and an empty depth (0,)."""
-        image = read_image(self.paths[index])
-        return Frame(
-            fit(image, self.size),
-            torch.tensor(self.keys[index], device="cpu"),
-            torch.empty(0, dtype=torch.float32, device="cpu"),
-        )
+        """Read a frame: image (3, h, w), key (), and its depth (1, h, w), m, or an empty one (0,)."""
+        image, depth = read_image(self.paths[index]), torch.empty(0, dtype=torch.float32, device="cpu")
+        if self.depth is not None:
+            name = self.paths[index].relative_to(self.root).as_posix()
+            depth = self.depth.read(name, frame_size=(image.shape[1], image.shape[2]), size=self.size)
+        return Frame(fit(image, self.size), torch.tensor(self.keys[index], device="cpu"), depth)
 
 
 def assign_frames(

@@ -44,6 +44,12 @@ class UnreadableImageError(ValueError):
     """Raised for a file that is not a complete image."""
 
 
+def is_lost(error: Exception) -> bool:
+    """Return True if a file could not be opened or read, as one that vanished: this says nothing about its content."""
+    cause = error.__cause__
+    return isinstance(error, UnreadableImageError) and isinstance(cause, OSError) and cause.errno is not None
+
+
 class ImageHeader(NamedTuple):
     """Size, orientation and form of an image, by the header of its file."""
 

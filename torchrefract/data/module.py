@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import multiprocessing
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -158,9 +159,17 @@ class PairData(LightningDataModule):
             sampler=sampler,
             drop_last=training,
             num_workers=self.workers,
+            multiprocessing_context=_start_method() if self.workers else None,
             persistent_workers=self.workers > 0,
             pin_memory=torch.cuda.is_available(),
         )
+
+
+def _start_method() -> str:
+    """Return how workers start: as the program chose, or as Python does by default."""
+    chosen, methods = multiprocessing.get_start_method(), multiprocessing.get_all_start_methods()
+    # Launchers of jobs, as joblib, choose a method of their own, with which no DataLoader starts workers.
+    return chosen if chosen in methods else methods[0]
 
 
 @torch.no_grad()
@@ -264,10 +273,11 @@ def frames(
     seed: int = 0,
     transmission: bool = False,
     flow: bool = False,
+    depth: str | Path | None = None,
 ) -> PairData:
     """Make the data of a folder of frames, split by drive; see `FrameFolder` and `PairData` for the arguments."""
     train, val = (
-        FrameFolder(root, size=size, split=split, drive_by=drive_by, val_share=val_share, seed=seed)
+        FrameFolder(root, size=size, split=split, drive_by=drive_by, val_share=val_share, seed=seed, depth=depth)
         for split in ("train", "val")
     )
     options = {"batch_size": batch_size, "workers": workers, "seed": seed, "transmission": transmission, "flow": flow}

@@ -35,6 +35,7 @@ from torchrefract.effects.batch import (
     promote_params,
     to_batch,
 )
+from torchrefract.fields.depth import depth_of
 from torchrefract.labels.targets import is_tv_tensor, warp_moved_labels, wrap_like
 from torchrefract.types import Degraded, Range
 from torchrefract.warping.grid import field_dtype
@@ -149,7 +150,7 @@ class Effect(nn.Module, ABC):
         *,
         seed: int | Tensor | None = None,
         keys: Tensor | Sequence[int] | None = None,
-        depth: Tensor | None = None,
+        depth: Tensor | Callable[[Tensor], Tensor] | None = None,
         frame: float | Tensor = 0,
     ) -> Degraded:
         """Degrade an image and return it with its flow, masks, maps and drawn parameters.
@@ -159,7 +160,8 @@ class Effect(nn.Module, ABC):
             seed: of the draw; None takes one from the global torch generator.
             keys: (B,), integers: sample i depends on (seed, keys[i]) alone; None counts from 0.
             depth: (B, 1, H, W) or (1, H, W), m, for effects that need it; for clips (B, T, 1, H, W), or
-                (B, 1, 1, H, W) if it is the same in all frames.
+                (B, 1, 1, H, W) if it is the same in all frames. Or a function from images (N, C, H, W), floating, all
+                frames of clips in one batch, to their depth (N, 1, H, W), such as `depth.from_transformers` returns.
             frame: number of the image in its clip, or of the first frame of a clip, in [-1e9, 1e9]; a number or (B,).
 
         Raises:
@@ -186,7 +188,12 @@ class Effect(nn.Module, ABC):
         return self._draw(image, shape, seed, keys, place, frame)
 
     def apply(  # pyright: ignore[reportIncompatibleMethodOverride]  # nn.Module uses this name; both uses work
-        self, image: Any, params: Any = None, *, depth: Tensor | None = None, frame: float | Tensor | None = None
+        self,
+        image: Any,
+        params: Any = None,
+        *,
+        depth: Tensor | Callable[[Tensor], Tensor] | None = None,
+        frame: float | Tensor | None = None,
     ) -> Any:
         """Degrade an image with given parameters, such as those of an earlier draw -> Degraded.
 
@@ -310,10 +317,16 @@ class Effect(nn.Module, ABC):
             return params  # the frame numbers that were drawn
         return params_at_frames(params, frame_numbers(frame, image, shape))
 
-    def _degrade(self, image: Tensor, shape: BatchShape, params: Any, depth: Tensor | None) -> Degraded:
+    def _degrade(
+        self, image: Tensor, shape: BatchShape, params: Any, depth: Tensor | Callable[[Tensor], Tensor] | None
+    ) -> Degraded:
         batch = to_batch(image, keep_uint8=self.keeps_uint8)
         check_frames(params, shape)
-        depth = None if depth is None else check_depth_fits(depth, image, shape)
+        if depth is not None and not isinstance(depth, Tensor) and callable(depth):
+            given = depth_of(depth, to_batch(image), field_dtype(image.dtype))
+            depth = given.expand(len(batch), 1, *batch.shape[2:])
+        elif depth is not None:
+            depth = check_depth_fits(depth, image, shape)
         if image.device.type != "meta" and torch.is_autocast_enabled(image.device.type):
             # Autocast would compute matrix products in half, and positions need float32.
             with torch.autocast(image.device.type, enabled=False):

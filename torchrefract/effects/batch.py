@@ -231,6 +231,23 @@ def params_per_frame(params: Any, frames: int) -> Any:
     return map_params(params, lambda value: value.repeat_interleave(frames, dim=0))
 
 
+class ParamsAtDepth(NamedTuple):
+    """The parameters of a warp that depends on depth, with the depth of each frame."""
+
+    params: Any  # with N rows, each with one frame number
+    depth: Tensor  # (N, 1, H, W or 1), m
+
+    @property
+    def applied(self) -> Tensor:
+        """Return (N,), bool: the frame is degraded."""
+        return self.params.applied
+
+    @property
+    def is_identity(self) -> Tensor:
+        """Return (N,), bool: the parameters change nothing at any depth."""
+        return self.params.is_identity
+
+
 def check_shapes(params: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Raise ValueError unless these fields of the parameters have rows of the given shapes."""
     for name, row in shapes.items():
@@ -302,7 +319,7 @@ def where_active(changed: Tensor, unchanged: Tensor | float, active: Tensor, par
     rows = changed.shape[0]
     shape = (-1, *[1] * (changed.ndim - 1))
     value = torch.where(expand_batch(active, rows).view(shape), changed, unchanged)
-    if not requires_grad(value for value in params if isinstance(value, Tensor)):
+    if not requires_grad(params):
         return value
     differentiable = torch.where(expand_batch(params.applied, rows).view(shape), changed, unchanged)
     swap = _SwapGradient if torch.compiler.is_compiling() else _SwapGradientForward

@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import eager_bool, requires_grad
+from torchrefract._validation import eager_bool, requires_grad, tensors_in
 from torchrefract.effects.batch import per_sample, rows_of_samples, select_params, where_active
 from torchrefract.planning.plan import PlanRequest, WarpPlan, plan_warp
 from torchrefract.warping.grid import Points
@@ -350,7 +350,7 @@ class BatchFlow:
 
 def flow_dtype(params: Any) -> torch.dtype:
     """Return the type of the flow that parameters give."""
-    return next(value.dtype for value in params if value.is_floating_point())
+    return next(value.dtype for value in tensors_in(params) if value.is_floating_point())
 
 
 def everywhere(device: torch.device) -> Tensor:

@@ -208,7 +208,7 @@ class Compose(Effect):
         """Sample the images along the composed flow of the warps at some places."""
         request = cast(PlanRequest, requests[places[0]])
         frame = request.height, request.width
-        moving = [leaves[k]._replace(params=params_per_frame(leaves[k].params, progress.frames)) for k in places]
+        moving = self._at_depth(progress, [leaves[k] for k in places], places, request)
         warps = [(cast(WarpEffect, leaf.effect), leaf.params) for leaf in moving]
         active = [effect.active(params, *frame) for effect, params in warps]
         can_measure = can_read(moving[0].params)
@@ -223,7 +223,42 @@ class Compose(Effect):
                 id(self), acting_places, *frame, request.tolerance_px, request.is_double, can_measure
             )
             parts += [part.of_samples(samples) for part in _composed_flow(chosen, plan, request.tolerance_px)]
-        progress.move(moving, active, parts, is_exact=request.tolerance_px is None)
+        # The share must not depend on the warps that move other samples of the batch.
+        num_warps = sum(isinstance(leaf.effect, WarpEffect) for leaf in leaves)
+        share_px = None if request.tolerance_px is None else request.tolerance_px / num_warps
+        progress.move(moving, active, parts, share_px)
+
+    def _at_depth(
+        self, progress: Progress, leaves: Sequence[Leaf], places: Sequence[int], request: PlanRequest
+    ) -> list[Leaf]:
+        """Return warps with the parameters of each frame, and with its depth, moved by the warps before, if it counts.
+
+        Args:
+            progress: before the warps.
+            leaves: the warps that will be sampled together.
+            places: of the warps among all effects.
+            request: for the composed flow.
+        """
+        height, width = request.height, request.width
+        placed: list[Leaf] = []
+        for leaf in leaves:
+            effect, depth = cast(WarpEffect, leaf.effect), progress.depth
+            params = params_per_frame(leaf.params, progress.frames)
+            if placed and depth is not None and effect.depth is not None:
+                active = [cast(WarpEffect, before.effect).active(before.params, height, width) for before in placed]
+                plan = self._constant_plan(
+                    id(self),
+                    tuple(places[: len(placed)]),
+                    height,
+                    width,
+                    request.tolerance_px,
+                    request.is_double,
+                    False,
+                )
+                warps = [(cast(WarpEffect, before.effect), before.params) for before in placed]
+                depth = progress.moved_depth(placed, active, _composed_flow(warps, plan, request.tolerance_px))
+            placed.append(leaf._replace(params=effect.at_depth(params, progress.image, depth)))
+        return placed
 
     def _requests(self, height: int, width: int, dtype: torch.dtype) -> tuple[PlanRequest | None, ...]:
         """Return for each effect the request of its group of warps, or None if it separates groups.

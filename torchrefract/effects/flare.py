@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import as_device_tensor, expand_batch
+from torchrefract._tensor import as_device_tensor, assume_constant_result, expand_batch
 from torchrefract._validation import (
     check_choice,
     check_color,
@@ -16,7 +16,9 @@ from torchrefract._validation import (
     check_range,
     check_values,
     color_per_channel,
+    eager_values,
     finite_or,
+    requires_grad,
 )
 from torchrefract.effects.batch import check_shapes, params_to, per_sample
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
@@ -68,7 +70,8 @@ class LensFlare(PhotometricEffect):
         clip: clip the result of "add" to [0, 1]; without, it is linear in everything.
         drift_x_range, drift_y_range: widths and heights per frame of a clip.
         tolerance: largest error of the image, levels of 1/255; a flare too faint to be seen is not computed, see
-            `plan`. None is exact.
+            `plan`, which is of images. In clips, how far the sun drifts counts too: by the latest frame of the batch
+            where values can be read, otherwise without a limit. None is exact.
         p: probability that a sample is degraded.
 
     Raises:
@@ -133,16 +136,32 @@ class LensFlare(PhotometricEffect):
         return in_ranges(values, [getattr(self, f"{name}_range") for name in names]) & in_ranges(params.color, colors)
 
     def make_plan(self, request: PhotometricRequest, *, has_depth: bool) -> PhotometricPlan:
-        """Plan frames by the largest light that the ranges add to a pixel; flare does not depend on depth."""
+        """Plan images by the largest light that the ranges add to a pixel; flare does not depend on depth."""
+        return self._plan_until(0.0, request)
+
+    def _plan_until(self, latest: float, request: PhotometricRequest) -> PhotometricPlan:
+        """Plan the frames of clips up to the latest one."""
         size = (request.width, request.height)
         radius = max(self.radius_range[1] * math.hypot(*size) * (1 + _ROUNDING), 1e-6)
-        # The sun may move anywhere in a clip; a still one is some distance from the nearest pixel.
-        centers, speeds = ([getattr(self, f"{name}_{axis}_range") for axis in "xy"] for name in ("center", "drift"))
-        is_still = speeds == [(0.0, 0.0)] * 2
-        distance = math.hypot(*map(_distance_from_frame, centers, size)) if is_still else 0.0
+        # The sun moves up to the latest frame of a clip, and is some distance from the nearest pixel there.
+        center_ranges, drift_ranges = (
+            [getattr(self, f"{name}_{axis}_range") for axis in "xy"] for name in ("center", "drift")
+        )
+        moved = [latest * max(map(abs, ends)) if any(ends) else 0.0 for ends in drift_ranges]
+        centers = [(low - drift, high + drift) for (low, high), drift in zip(center_ranges, moved, strict=True)]
+        distance = math.hypot(*map(_distance_from_frame, centers, size))
         light = self.strength_range[1] * max(self.color) * (1 + _ROUNDING)
         light *= math.exp(-0.5 * (distance / radius) ** 2) if self.radius_range[1] > 0 else 0.0
         return plan_flare(light, request, is_bounded=self.clip or self.blend == "screen")
+
+    def plan_for(self, image: Tensor, params: FlareParams, depth: Tensor | None) -> PhotometricPlan:
+        """Return the plan for the latest frame of a batch, for all frames if it cannot be read; see the base class."""
+        latest = eager_values(lambda: params.frame.abs().amax(), of=params.frame) if params.frame.numel() else 0.0
+        if latest == 0 or self.tolerance is None or requires_grad(params):
+            return super().plan_for(image, params, depth)
+        height, width = image.shape[2:]
+        latest = math.inf if latest is None else float(latest)
+        return self._constant_clip_plan(id(self), height, width, field_dtype(image.dtype), latest)
 
     def render(self, image: Tensor, params: FlareParams, depth: Tensor | None) -> Rendered:
         """Add the light of the sun to images."""
@@ -172,9 +191,17 @@ class LensFlare(PhotometricEffect):
             result = add_light(image, along_x, along_y * color, clip=self.clip)
         return Rendered(result, is_valid, intensity=lambda: along_y * along_x)
 
+    @assume_constant_result
+    def _constant_clip_plan(
+        self, _: int, height: int, width: int, dtype: torch.dtype, latest: float
+    ) -> PhotometricPlan:
+        return self._plan_until(latest, PhotometricRequest(height, width, self.tolerance, dtype is torch.float64))
+
 
 def _distance_from_frame(center_range: Range, size: int) -> float:
     """Distance in px along an axis from the nearest center of a range, in shares of a side, to the nearest pixel."""
+    if not all(map(math.isfinite, center_range)):
+        return 0.0
     margin = 1e-5 * size * max(1.0, *map(math.fabs, center_range))  # rounding of given parameters
     low, high = (end * size - 0.5 for end in center_range)
     return max(low - margin - (size - 1), -high - margin, 0.0)

@@ -31,7 +31,15 @@ from torchrefract.effects.batch import (
     to_batch,
 )
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
-from torchrefract.fields.depth import DepthProvider, LinearDepth, check_depth, check_floating, ray_distance
+from torchrefract.fields.depth import (
+    DepthProvider,
+    DepthSource,
+    LinearDepth,
+    check_depth_provider,
+    check_floating,
+    frame_depth,
+    ray_distance,
+)
 from torchrefract.fields.fog import blend_fog, extinction, transmission, unblend_fog
 from torchrefract.planning.photometric import (
     FogErrorModel,
@@ -75,7 +83,7 @@ class FogMedium:
 
     airlight: tuple[float, ...] | None
     threshold: float
-    depth: DepthProvider = field(hash=False)  # providers may have no hash
+    depth: DepthSource = field(hash=False)  # providers may have no hash
     camera: Camera | None
     linear_light: bool
 
@@ -103,13 +111,7 @@ class FogMedium:
         Returns:
             (N, B or 1, 1, H, 1 or W), m.
         """
-        dtype, (height, width) = field_dtype(image.dtype), image.shape[2:]
-        if depth is None:
-            depth = self.depth(height, width, dtype=dtype, device=image.device)
-        else:
-            check_depth(depth)
-            # On an accelerator nothing is read: invalid values become 0.
-            depth = depth.to(dtype).nan_to_num(nan=0.0, posinf=torch.inf).clamp(min=0)
+        depth, (height, width) = frame_depth(self.depth, image, depth), image.shape[2:]
         if self.camera is None:
             return depth
         camera = self.camera.resized(width=width, height=height)
@@ -131,7 +133,8 @@ class FogMedium:
     def error_model(self, extinction_range: Range, height: int, width: int, *, has_depth: bool) -> FogErrorModel:
         """Return error bounds of uniform fog; `has_depth` if the depth is passed in, so that it has no bound."""
         largest = extinction_range[1]
-        farthest = math.inf if has_depth else _farthest(self, height, width)
+        is_known = isinstance(self.depth, DepthProvider) and not has_depth
+        farthest = _farthest(self, height, width) if is_known else math.inf
         thickness = largest * min(farthest, 1e12) if largest > 0 else 0.0
         return FogErrorModel(thickness, self.colors, self.linear_light)
 
@@ -173,20 +176,17 @@ def make_medium(
     *,
     airlight: float | Sequence[float] | None,
     threshold: float,
-    depth: DepthProvider | None,
+    depth: DepthSource | None,
     camera: Camera | None,
     linear_light: bool,
 ) -> FogMedium:
     """Make a medium from arguments as `UniformFog` takes them."""
-    depth = LinearDepth() if depth is None else depth
-    if not isinstance(depth, DepthProvider):
-        raise TypeError(f"depth must be a depth provider such as LinearDepth(), got {type(depth).__name__}")
     if camera is not None and not isinstance(camera, Camera):
         raise TypeError(f"camera must be a Camera, got {type(camera).__name__}")
     return FogMedium(
         airlight=None if airlight is None else check_color("airlight", airlight, high=1.0),
         threshold=check_number("threshold", threshold, low=1e-6, high=1 - 1e-6),
-        depth=depth,
+        depth=LinearDepth() if depth is None else check_depth_provider(depth),
         camera=camera,
         linear_light=check_flag("linear_light", linear_light),
     )
@@ -206,7 +206,8 @@ class UniformFog(PhotometricEffect):
         airlight: color of the fog in [0, 1], one number for each channel or one for all; None is that of the paper,
             (220, 220, 235) / 255 for three channels and its luminance for any other number.
         threshold: contrast that remains at the distance V, in (0, 1); 0.05 is the meteorological optical range.
-        depth: gives d if no depth is passed in; None is `LinearDepth()`, the ramp over the rows of the paper.
+        depth: gives d if no depth is passed in: a provider, or any function from images (B, C, H, W) in [0, 1] to their
+            depth (B, 1, H, W) in m, such as a network. None is `LinearDepth()`, the ramp over the rows of the paper.
         camera: of the frames; with it, depth along its axis is converted to the distance along each ray.
         linear_light: blend linear light, not stored values (sRGB).
         tolerance: largest error of the image, levels of 1/255; fog too thin to be seen is not computed, see `plan`.
@@ -230,7 +231,7 @@ class UniformFog(PhotometricEffect):
         deviation_range: Range = (-0.05, 0.05),
         airlight: float | Sequence[float] | None = None,
         threshold: float = 0.05,
-        depth: DepthProvider | None = None,
+        depth: DepthSource | None = None,
         camera: Camera | None = None,
         linear_light: bool = False,
         tolerance: float | None = None,

@@ -23,7 +23,7 @@ from torchrefract.effects.random_field import (
     motion_of,
     motion_ranges,
 )
-from torchrefract.fields.depth import DepthProvider
+from torchrefract.fields.depth import DepthSource
 from torchrefract.fields.fog_volume import ExtinctionField, mean_extinction_along_rays
 from torchrefract.fields.heterogeneous_fog import image_noise, normalize_weights, periods_in_frame
 from torchrefract.planning.photometric import (
@@ -121,7 +121,7 @@ class HeterogeneousFog(PhotometricEffect):
         deviation_range: Range = (-0.05, 0.05),
         airlight: float | Sequence[float] | None = None,
         threshold: float = 0.05,
-        depth: DepthProvider | None = None,
+        depth: DepthSource | None = None,
         camera: Camera | None = None,
         linear_light: bool = False,
         scales: Sequence[float] | None = None,

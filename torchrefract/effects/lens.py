@@ -165,7 +165,7 @@ class LensDistortion(WarpEffect):
             jitter: largest relative change of each number, drawn uniformly, in [0, 0.99]: focal length, aspect, offset
                 of the principal point, and each coefficient.
             covariance: (4 + n, 4 + n), of fx, fy, cx, cy in px and n coefficients, in place of `jitter`: the numbers
-                vary together. Only for cameras that are polynomials.
+                vary together.
             residual_px: largest distance between the camera and its polynomial, px.
             strict, frame, padding, interpolation, backend, tolerance_px, p: as for `LensDistortion`.
 
@@ -178,7 +178,7 @@ class LensDistortion(WarpEffect):
             return cls(**ranges, strict=strict, tolerance_px=tolerance_px, **warp)
         if jitter:
             raise ValueError(f"jitter must be 0 if a covariance is given, got {jitter}")
-        source = camera_with_covariance(camera, covariance)
+        source = camera_with_covariance(camera, covariance, residual_px=residual_px)
         return cls._from_source(source, strict=strict, tolerance_px=tolerance_px, **warp)
 
     @classmethod
@@ -309,7 +309,7 @@ class LensDistortion(WarpEffect):
 
     def _fit(self, params: LensParams, height: int, width: int) -> tuple[Tensor, Tensor]:
         dtype = params.focal.dtype
-        folds_nowhere = self._constant_plan(id(self), height, width, dtype, False).details is not None
+        folds_nowhere = self._constant_plan(id(self), height, width, dtype).details is not None
         with torch.no_grad():
             lens = lens_in_px(map_params(params, lambda value: value.detach().double()), height, width)
 
@@ -321,9 +321,7 @@ class LensDistortion(WarpEffect):
                 return torch.where(exists, pixels + flow, torch.nan)
 
             zoom, shift = zoom_to_fill(position, lens[2], height=height, width=width)
-            is_pinhole = (params.coefficients == 0).all(dim=1)
-            zoom, shift = torch.where(is_pinhole, 1.0, zoom), torch.where(is_pinhole[:, None], 0.0, shift / width)
-        return zoom.to(dtype), shift.to(dtype)
+        return zoom.to(dtype), (shift / width).to(dtype)
 
     def _ranges(self) -> LensRanges:
         others = (self.focal_range, self.aspect_range, self.center_x_range, self.center_y_range)

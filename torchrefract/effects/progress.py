@@ -47,6 +47,16 @@ class _Segment(NamedTuple):
         return self.flow.sample(image, self.active, _Applied(self.applied, self.flow.parts[0].flow.nodes), options)
 
 
+def _segment(leaves: Sequence[Leaf], active: Sequence[Tensor], parts: Sequence[FlowPart]) -> _Segment:
+    """Return the segment of warps with a composed flow; arguments as for `Progress.move`."""
+    applied = torch.stack([leaf.params.applied for leaf in leaves]).any(dim=0)
+    moved = torch.stack(list(active)).any(dim=0)
+    for part in parts:
+        if part.is_zero:
+            moved = torch.zeros_like(moved) if part.samples is None else moved.index_fill(0, part.samples, False)
+    return _Segment(applied, moved, BatchFlow(parts))
+
+
 class _Applied(NamedTuple):
     """The parts of parameters that `where_active` reads."""
 
@@ -67,7 +77,7 @@ class Progress:
         self.light: dict[str, Callable[[], Tensor]] = {}
 
     def move(
-        self, leaves: Sequence[Leaf], active: Sequence[Tensor], parts: Sequence[FlowPart], *, is_exact: bool
+        self, leaves: Sequence[Leaf], active: Sequence[Tensor], parts: Sequence[FlowPart], share_px: float | None
     ) -> None:
         """Sample the images along the composed flow of several warps.
 
@@ -75,26 +85,23 @@ class Progress:
             leaves: the warps, in order, with parameters of N rows.
             active: (N,), bool, for each warp: the samples that it moves.
             parts: the composed flow.
-            is_exact: True if the flow was computed without a tolerance.
+            share_px: tolerance of the flow of each warp, from which valid and inverse follow; None is exact.
         """
-        rows, _, height, width = self.image.shape
-        applied = torch.stack([leaf.params.applied for leaf in leaves]).any(dim=0)
-        moved = torch.stack(list(active)).any(dim=0)
-        for part in parts:
-            if part.is_zero:
-                moved = torch.zeros_like(moved) if part.samples is None else moved.index_fill(0, part.samples, False)
-        segment = _Segment(applied, moved, BatchFlow(parts))
+        height, width = self.image.shape[2:]
+        segment = _segment(leaves, active, parts)
+        self.depth = self._sample_depth(segment)
         self.image = _sample_segment(self.image, segment, leaves, active)
-        if self.depth is not None:
-            depth, detached = expand_batch(self.depth, rows), segment._replace(flow=segment.flow.detach())
-            self.depth = detached.sample(depth, SamplingOptions("border", "nearest", "auto"))
         self.light = {name: _moved(value, segment) for name, value in self.light.items()}
         for leaf, moves in zip(leaves, active, strict=True):
             warp = cast(WarpEffect, leaf.effect)
-            flow = _remember(partial(warp.planned_flow, leaf.params, height, width, is_exact=is_exact))
+            flow = _remember(partial(warp.planned_flow, leaf.params, height, width, share_px))
             self.warps.append((warp, leaf.params, flow, moves))
             self.valid = _valid_after(self.valid, flow, moves)
         self.segments.append(segment)
+
+    def moved_depth(self, leaves: Sequence[Leaf], active: Sequence[Tensor], parts: Sequence[FlowPart]) -> Tensor | None:
+        """Return the depth after warps that are not sampled yet; arguments as for `move`."""
+        return self._sample_depth(_segment(leaves, active, parts))
 
     def shade(self, effect: PhotometricEffect, params: Any) -> None:
         """Apply a photometric effect."""
@@ -136,6 +143,12 @@ class Progress:
             is_composed=self._is_composed if len(self.warps) > 1 else None,
             light=self.light,
         )
+
+    def _sample_depth(self, segment: _Segment) -> Tensor | None:
+        if self.depth is None:
+            return None
+        depth, detached = expand_batch(self.depth, len(self.image)), segment._replace(flow=segment.flow.detach())
+        return detached.sample(depth, SamplingOptions("border", "nearest", "auto"))
 
     def _flow(self) -> Tensor:
         """Return (N, 2, H, W), px, the composed flow of all segments."""

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrefract._tensor import assume_constant_result, expand_batch
 from torchrefract._validation import check_choice, eager_bool, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.batch import per_sample, where_active
+from torchrefract.effects.batch import ParamsAtDepth, params_per_frame, per_sample, where_active
 from torchrefract.effects.batch_flow import (
     COARSEST,
     BatchFlow,
@@ -25,6 +25,7 @@ from torchrefract.effects.batch_flow import (
     flow_on_measured_lattice,
     zero_flow,
 )
+from torchrefract.fields.depth import DepthSource, frame_depth
 from torchrefract.planning.plan import (
     DEFAULT_ULPS,
     TOLERANCE_PX,
@@ -36,7 +37,7 @@ from torchrefract.planning.plan import (
     plan_warp,
 )
 from torchrefract.types import Degraded, Inverse, Map
-from torchrefract.warping.flow import compose_flows, folding
+from torchrefract.warping.flow import compose_flows, folding, is_shown_once
 from torchrefract.warping.grid import Points, field_dtype, inside, length
 from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.warp import BACKENDS, INTERPOLATIONS, PADDINGS, sees_only_valid
@@ -44,6 +45,7 @@ from torchrefract.warping.warp import BACKENDS, INTERPOLATIONS, PADDINGS, sees_o
 _MAX_RESIDUAL_PX = (
     0.5  # of a composed inverse; smooth ones are off by far less, those between two sheets of a fold by more
 )
+_SOLVED_PX = 0.005  # residual of a valid inverse of one flow; frames of 8K have positions that are rounded to 0.001 px
 # Measuring the error in each sample pays off if the bounds need a lattice finer than this, in frames of this size.
 _FINE_STRIDE, _MIN_PIXELS = 4, 1 << 16
 
@@ -52,7 +54,8 @@ class WarpEffect(Effect):
     """An effect that moves pixels.
 
     Subclasses implement `sample_params`, `validate` and `flow`, and where they can `inverse_flow` and `error_model`.
-    Their parameters are a NamedTuple with `applied` and a property `is_identity`, both (B,), bool.
+    Their parameters are a NamedTuple with `applied` and a property `is_identity`, both (B,), bool. Those that depend on
+    depth set `depth`; `flow` and `inverse_flow` then take a `ParamsAtDepth` in place of the parameters.
 
     Args:
         padding: values outside the frame: "zeros", "border" or "reflection".
@@ -60,12 +63,14 @@ class WarpEffect(Effect):
         backend: "auto", "torch", "numba" or "triton", as for `warp`.
         tolerance_px: largest error of the flow in px, anywhere and for all parameters in the ranges of the effect; the
             flow is then computed on a coarser lattice, see `plan`. None is exact, and so is the default in frames so
-            large that float32 cannot reach it.
+            large that float32 cannot reach it. Where it is valid, `restore_flow` is within 4 `tolerance_px` + 0.02 px
+            of the exact one, as pixels next to a fold, where it would move farther, are not valid.
         p: probability that a sample is degraded.
     """
 
     rounding_ulps = DEFAULT_ULPS
     has_closed_form = False  # whether `flow` computes any points, not only the nodes of a lattice
+    depth: DepthSource | None = None  # of frames without a depth map; None for a flow that depends on no depth
 
     def __init__(
         self,
@@ -87,7 +92,7 @@ class WarpEffect(Effect):
         """Compute the flow at points of the frame.
 
         Args:
-            params: with B rows.
+            params: with B rows; a `ParamsAtDepth`, with N rows, if the effect has a `depth`.
             points: the nodes of a lattice with the plan's stride; any points, with N rows, if `has_closed_form`.
             plan: how exact the flow has to be.
 
@@ -97,9 +102,13 @@ class WarpEffect(Effect):
         """
 
     def inverse_flow(self, params: Any, flow: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the flow (N, 2, H, W) that undoes `flow`, and where it exists; by default with Newton's method."""
-        inverse, valid, _ = invert_flow(flow)
-        return inverse, valid
+        """Return the flow (N, 2, H, W) that undoes `flow`, and where it exists.
+
+        `params` are as for `flow`. By default Newton's method inverts the flow. Pixels next to a fold, or that a fold
+        shows several times, have no inverse: there a small error of the flow moves it far.
+        """
+        inverse, is_solved, _ = invert_flow(flow, tolerance_px=_SOLVED_PX)
+        return inverse, is_solved & is_shown_once(flow)
 
     def error_model(self) -> ErrorModel | None:
         """Return error bounds for all parameters in the ranges, or None if none are known."""
@@ -145,6 +154,20 @@ class WarpEffect(Effect):
         effect.tolerance_px = None
         return effect
 
+    def at_depth(self, params: Any, image: Tensor, depth: Tensor | None) -> Any:
+        """Return what `flow` takes for images (N, C, H, W): parameters with the depth of each frame, if it counts.
+
+        Args:
+            params: with B rows, or N.
+            image: before the warp.
+            depth: of the image, (N or B, 1, H, W), m; None takes that of the provider.
+        """
+        if self.depth is None:
+            return params
+        rows = image.shape[0]
+        params = params_per_frame(params, rows // max(len(params.applied), 1))
+        return ParamsAtDepth(params, expand_batch(frame_depth(self.depth, image, depth), rows))
+
     def active(self, params: Any, height: int, width: int) -> Tensor:
         """Return (B,), bool: the samples that move."""
         return params.applied & ~params.is_identity & (height * width > 1)
@@ -161,10 +184,11 @@ class WarpEffect(Effect):
         inverse = expand_batch(inverse, flow.shape[0])
         return where_active(inverse, 0.0, active, params), exists | ~per_sample(active)
 
-    def planned_flow(self, params: Any, height: int, width: int, *, is_exact: bool = False) -> BatchFlow:
-        """Compute the flow by the plan of the ranges, or exactly."""
-        plan = self._constant_plan(id(self), height, width, flow_dtype(params), is_exact)
-        return BatchFlow(self.flow_parts(params, plan))
+    def planned_flow(self, params: Any, height: int, width: int, share_px: float | None) -> BatchFlow:
+        """Compute the flow for a share of the tolerance of a composition, exactly if rounding exceeds it."""
+        return BatchFlow(
+            self.flow_parts(params, self._constant_share(id(self), height, width, flow_dtype(params), share_px))
+        )
 
     def flow_parts(self, params: Any, plan: WarpPlan) -> list[FlowPart]:
         """Compute the flow by a plan."""
@@ -180,24 +204,30 @@ class WarpEffect(Effect):
         height, width = image.shape[2:]
         if not self.may_change(params) or height * width == 1:
             return unchanged(image, params)
-        flow = self.planned_flow(params, height, width)
+        drawn, params = params, self.at_depth(params, image, depth)
+        flow = BatchFlow(self.flow_parts(params, self._constant_plan(id(self), height, width, flow_dtype(params))))
         if flow.is_zero:
-            return unchanged(image, params)
+            return unchanged(image, drawn)
         active = self.active(params, height, width)  # a flow has B rows, or as many as there are images
         options = SamplingOptions(self.padding, self.interpolation, self.backend)
         return warped(
             flow.sample(image, expand_batch(active, image.shape[0]), params, options),
-            params,
+            drawn,
             flow=lambda: flow.dense,
             valid=lambda: (flow.exists & inside(flow.dense)) | ~per_sample(expand_batch(active, flow.dense.shape[0])),
             inverse=lambda: self.masked_inverse_flow(params, flow.dense),
         )
 
+    # torch.compile takes the plan as a constant. It accepts this of methods only, and tells effects apart by the first
+    # argument.
     @assume_constant_result
-    def _constant_plan(self, _: int, height: int, width: int, dtype: torch.dtype, is_exact: bool) -> WarpPlan:
-        # torch.compile takes the plan as a constant. It accepts this of methods only, and tells effects apart by the
-        # argument.
-        return (self.exact() if is_exact else self).plan_for_dtype(height, width, dtype)
+    def _constant_plan(self, _: int, height: int, width: int, dtype: torch.dtype) -> WarpPlan:
+        return self.plan_for_dtype(height, width, dtype)
+
+    @assume_constant_result
+    def _constant_share(self, _: int, height: int, width: int, dtype: torch.dtype, share_px: float | None) -> WarpPlan:
+        request = replace(self.plan_request(height, width, dtype), tolerance_px=share_px)
+        return self.plan_under(request if request.is_reachable else replace(request, tolerance_px=None))
 
 
 def warped(
@@ -226,7 +256,8 @@ def warped(
         composed = None if is_composed is None else is_composed()
         if composed is None or eager_bool(composed.any, of=composed) is False:
             return good
-        return good & (~per_sample(composed) | (result.restore_residual <= _MAX_RESIDUAL_PX))
+        is_inverse = (result.restore_residual <= _MAX_RESIDUAL_PX) & is_shown_once(result.flow, result.valid)
+        return good & (~per_sample(composed) | is_inverse)
 
     return Degraded(
         image,

@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -88,6 +89,65 @@ class GroundPlaneDepth(DepthProvider):
         distance = self.camera_height * math.hypot(self.focal * width, (height - 1) / 2 - y_h)
         z = distance / _mean_positive(below, self.spread * height)
         return z.clamp(max=self.far).to(dtype).view(1, 1, height, 1)
+
+
+DepthSource = DepthProvider | Callable[[Tensor], Tensor]
+
+
+def check_depth_provider(depth: DepthSource) -> DepthSource:
+    """Return `depth` if it is a depth provider or a function.
+
+    Raises:
+        TypeError: otherwise.
+    """
+    if not callable(depth):
+        raise TypeError(
+            "depth must be a provider such as LinearDepth(), or a function from images (B, C, H, W) to their depth "
+            f"(B, 1, H, W) in m, got {type(depth).__name__}"
+        )
+    return depth
+
+
+def frame_depth(source: DepthSource, image: Tensor, depth: Tensor | None) -> Tensor:
+    """Return the depth of frames: the map that was passed in, or that of the effect.
+
+    Args:
+        source: of the effect.
+        image: (N, C, H, W), the frames.
+        depth: (N or B, 1, H, W), m; None takes that of the source.
+
+    Returns:
+        (N, B or 1, 1, H, W or 1), m, of the type of a field.
+
+    Raises:
+        ValueError: a depth that is not in meters, see `check_depth`.
+    """
+    dtype = field_dtype(image.dtype)
+    if depth is None:
+        return depth_of(source, image, dtype)
+    check_depth(depth)
+    # On an accelerator nothing is read: invalid values become 0.
+    return depth.to(dtype).nan_to_num(nan=0.0, posinf=torch.inf).clamp(min=0)
+
+
+def depth_of(source: DepthSource, image: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return the depth of images (N, C, H, W) by a provider, or by a function of the images, in m.
+
+    Raises:
+        TypeError: the function returns no floating tensor.
+        ValueError: it returns another shape than (N, 1, H, W), or a depth that `check_depth` refuses.
+    """
+    height, width = image.shape[2:]
+    if isinstance(source, DepthProvider):
+        return source(height, width, dtype=dtype, device=image.device)
+    depth = check_floating("depth(image)", source(image))
+    if depth.shape != (image.shape[0], 1, height, width):
+        raise ValueError(
+            f"depth(image) must have shape {(image.shape[0], 1, height, width)}, (N, 1, H, W) for images (N, C, H, W), "
+            f"got {tuple(depth.shape)}"
+        )
+    check_depth(depth, name="depth(image)")
+    return depth.to(dtype).nan_to_num(nan=0.0, posinf=torch.inf).clamp(min=0)
 
 
 def _mean_positive(value: Tensor, deviation: float) -> Tensor:

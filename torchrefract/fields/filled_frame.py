@@ -17,6 +17,7 @@ _POINTS = 33  # on each side of the frame
 # The border of the pixel centers, and that of the pixels, so that the zoom also fits the same frame in another size.
 _OUTSETS_PX = (0.0, 0.5)
 MARGIN_PX = 1 / 16  # to keep from the border of the clean frame, above the default tolerance of flows
+STILL_PX = 1e-3  # a frame whose border moves by less is left as it is
 _STEPS = 2.0**22  # the results are rounded to multiples of 1 / _STEPS, so that they have equal bits in every batch
 
 
@@ -37,21 +38,22 @@ def zoom_to_fill(
         zoom: (B,), in (0, 1].
         shift: (B, 2), px; zero unless a smaller zoom would be needed without it.
     """
-    low, high = zip(
-        *[_extent(position(border_points(height, width, outset, center)), center) for outset in _OUTSETS_PX],
-        strict=True,
-    )
+    borders = [border_points(height, width, outset, center) for outset in _OUTSETS_PX]
+    positions = [position(border) for border in borders]
+    low, high = zip(*(_extent(reached, center) for reached in positions), strict=True)
     low, high = torch.stack(low, dim=-1), torch.stack(high, dim=-1)  # (B, 2, outsets), from the center
     size = as_device_tensor([width - 1, height - 1], dtype=center.dtype, device=center.device)[:, None]
-    room = as_device_tensor(_OUTSETS_PX, dtype=center.dtype, device=center.device) - MARGIN_PX
+    space = as_device_tensor(_OUTSETS_PX, dtype=center.dtype, device=center.device) - MARGIN_PX
     # Each lower end must fit together with each upper end.
     spans = (high[..., None] - low[..., None, :]).clamp(min=1e-9)
-    zoom = ((size[..., None] + room[:, None] + room) / spans).flatten(1).amin(dim=1).clamp(max=1.0)
+    zoom = ((size[..., None] + space[:, None] + space) / spans).flatten(1).amin(dim=1).clamp(max=1.0)
     zoom = (zoom * _STEPS).floor() / _STEPS
     middle, scale = center[..., None], zoom[:, None, None]
-    least = (-room - middle - scale * low).amax(dim=2)
-    most = (size + room - middle - scale * high).amin(dim=2)
-    return zoom, torch.zeros_like(center).clamp(min=least).clamp(max=most)
+    lowest_shift = (-space - middle - scale * low).amax(dim=2)
+    highest_shift = (size + space - middle - scale * high).amin(dim=2)
+    shift = torch.zeros_like(center).clamp(min=lowest_shift).clamp(max=highest_shift)
+    is_still = (positions[0] - torch.cat([borders[0].x, borders[0].y], dim=1)).abs().amax(dim=(1, 2, 3)) <= STILL_PX
+    return torch.where(is_still, 1.0, zoom), torch.where(is_still[:, None], 0.0, shift)
 
 
 def zoomed_flow(flow: Tensor, points: Points, center: Tensor, zoom: Tensor, shift: Tensor | None = None) -> Tensor:

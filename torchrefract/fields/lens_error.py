@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor
 from torchrefract.cameras.brown_conrady import POLYNOMIAL12, Terms, newton_iterates, used_terms
+from torchrefract.fields.filled_frame import MARGIN_PX, STILL_PX
 from torchrefract.types import FlowBounds, Range, Simplification
 
 _SAFETY = 1.25
@@ -93,7 +94,7 @@ class LensErrorModel:
         measured = _measure(self.boxes, height, width)
         if measured is None:
             return None
-        return widened(measured.bounds) if self.fills else measured.bounds
+        return with_zoom(measured.bounds) if self.fills else measured.bounds
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification | None:
         """Drop terms that move less than a share of the budget, and choose the number of Newton steps."""
@@ -164,13 +165,15 @@ def _measure(boxes: tuple[LensRanges, ...], height: int, width: int) -> Measured
     return None if bounds is None else MeasuredErrors(bounds, newton, moved)
 
 
-def widened(bounds: FlowBounds) -> FlowBounds:
+def with_zoom(bounds: FlowBounds) -> FlowBounds:
     """Return the bounds of flows with the zoom and the shift that fit them to a frame.
 
-    They move no point by more than the flow moves the border of the frame, on two sides, and change the gradient by no
-    more than its mean across the frame. Cubics interpolate them exactly.
+    They move no point by more than the flow moves the border of the frame, on two sides with their margin, and change
+    the gradient by no more than its mean across the frame. Cubics interpolate them exactly.
     """
-    return replace(bounds, max_displacement=3 * bounds.max_displacement, max_gradient=2 * bounds.max_gradient)
+    moved = 3 * bounds.max_displacement
+    margins = 2 * MARGIN_PX if moved > STILL_PX else 0.0
+    return replace(bounds, max_displacement=moved + margins, max_gradient=2 * bounds.max_gradient)
 
 
 def cell_lines(height: int, width: int, num_levels: int) -> Tensor:

@@ -18,8 +18,7 @@ from torchrefract.fields.lens_error import LensRanges
 from torchrefract.types import Range
 
 _NAMES = (*POLYNOMIAL12, "focal", "aspect", "center_x", "center_y")
-# Positions of the polynomial's coefficients in OpenCV's order: k1, k2, p1, p2, k3, k4 ... k6, s1 ... s4.
-_OPENCV_PLACES = {0: 0, 1: 1, 2: 6, 3: 7, 4: 2, 8: 8, 9: 9, 10: 10, 11: 11}
+_STEP = 1e-3  # of a coefficient, to differentiate the nearest polynomial
 
 
 class LensSource(NamedTuple):
@@ -97,19 +96,22 @@ def jittered_camera(camera: Camera, *, jitter: float, residual_px: float) -> Len
     return LensSource((lens,), tuple(tuple(jitter * abs(n) * (i == j) for j in range(16)) for i, n in enumerate(lens)))
 
 
-def camera_with_covariance(camera: Camera, covariance: Any) -> LensSource:
+def camera_with_covariance(camera: Camera, covariance: Any, *, residual_px: float) -> LensSource:
     """Vary the numbers of a camera together, by the covariance of its calibration.
 
-        lens + sqrt(3) S u,  u uniform in [-1, 1], S S^T = covariance: uniform numbers have a variance of 1 / 3
+        lens + sqrt(3) S u,  u uniform in [-1, 1], S S^T = J covariance J^T,  J = d lens / d camera
+
+    Uniform numbers have a variance of 1 / 3.
 
     Args:
-        camera: "polynomial12", or "opencv" without denominator and tilt.
+        camera, residual_px: as for `as_polynomial`.
         covariance: (4 + n, 4 + n) of fx, fy, cx, cy in px and the n coefficients of the camera, in its order.
 
     Raises:
         ValueError: another camera; a covariance of another shape, not finite, not symmetric, or not positive.
     """
-    polynomial = as_polynomial("camera", replace(camera, coefficients=camera.polynomial(), model="polynomial12"), 0.0)
+    residual_px = check_number("residual_px", residual_px, low=0.0)
+    lens = _numbers(as_polynomial("camera", camera, residual_px))
     size = 4 + len(camera.coefficients)
     matrix = np.array(covariance, dtype=float)
     if matrix.shape != (size, size):
@@ -121,12 +123,12 @@ def camera_with_covariance(camera: Camera, covariance: Any) -> LensSource:
     scale = np.sqrt(np.outer(matrix.diagonal().clip(0), matrix.diagonal().clip(0)))
     if (np.abs(matrix - matrix.T) > 1e-6 * scale).any():
         raise ValueError("covariance must be symmetric, got one that is not")
-    jacobian = _jacobian(camera, size)
+    jacobian = _jacobian(camera, is_fixed=matrix.diagonal() == 0)
     eigenvalues, vectors = np.linalg.eigh(jacobian @ ((matrix + matrix.T) / 2) @ jacobian.T)
     if eigenvalues.min() < -1e-6 * max(eigenvalues.max(), 0.0):
         raise ValueError(f"covariance must have no negative eigenvalue, got {eigenvalues.min():g}")
     spread = math.sqrt(3) * vectors * np.sqrt(eigenvalues.clip(0))
-    return LensSource((_numbers(polynomial),), tuple(tuple(row) for row in spread.tolist()))
+    return LensSource((lens,), tuple(tuple(row) for row in spread.tolist()))
 
 
 def as_polynomial(name: str, camera: Camera, residual_px: float) -> Camera:
@@ -161,13 +163,19 @@ def _numbers(camera: Camera) -> tuple[float, ...]:
     return (*camera.coefficients, camera.fx / width, camera.fy / camera.fx, *center)
 
 
-def _jacobian(camera: Camera, size: int) -> np.ndarray:
-    """Return (16, size): derivatives of the 16 numbers with respect to fx, fy, cx, cy and the coefficients."""
-    jacobian = np.zeros((16, size))
+def _jacobian(camera: Camera, *, is_fixed: np.ndarray) -> np.ndarray:
+    """Return (16, 4 + n): derivatives of the 16 numbers with respect to fx, fy, cx, cy and the n coefficients.
+
+    Those of coefficients are central differences of the nearest polynomial; columns of a mask (4 + n,) are zero.
+    """
+    jacobian = np.zeros((16, len(is_fixed)))
     jacobian[12, 0], jacobian[14, 2], jacobian[15, 3] = (1 / camera.width,) * 3
     jacobian[13, :2] = -camera.fy / camera.fx**2, 1 / camera.fx
-    for i in range(size - 4):
-        place = i if camera.model == "polynomial12" else _OPENCV_PLACES.get(i)
-        if place is not None:
-            jacobian[place, 4 + i] = 1.0
+    for i in np.flatnonzero(~is_fixed[4:]):
+        ahead, before = (
+            replace(camera, coefficients=tuple(c + step * (k == i) for k, c in enumerate(camera.coefficients)))
+            for step in (_STEP, -_STEP)
+        )
+        ahead, before = (np.array(convert(one, to="polynomial12").camera.coefficients) for one in (ahead, before))
+        jacobian[:12, 4 + i] = (ahead - before) / (2 * _STEP)
     return jacobian

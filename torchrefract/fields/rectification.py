@@ -14,7 +14,7 @@ from torchrefract.cameras.projection import columns, image_of, on_plane, radius_
 from torchrefract.fields import lens
 from torchrefract.fields.filled_frame import MARGIN_PX, border_points
 from torchrefract.fields.lens import REACH, border_on_plane, corner_radius
-from torchrefract.fields.lens_error import cell_lines, flow_bounds, outermost_nodes, widened
+from torchrefract.fields.lens_error import cell_lines, flow_bounds, outermost_nodes, with_zoom
 from torchrefract.types import FlowBounds, Simplification
 from torchrefract.warping.grid import Points
 from torchrefract.warping.lattice import pixel_lattice
@@ -150,7 +150,7 @@ class RectificationErrorModel:
             ValueError: frames with another ratio of the sides than those of the camera.
         """
         bounds = _measure(self.camera.resized(width=width, height=height))
-        return widened(bounds) if self.crops and bounds is not None else bounds
+        return with_zoom(bounds) if self.crops and bounds is not None else bounds
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification | None:
         """Keep all terms: the model is of one camera, and each of its terms counts."""

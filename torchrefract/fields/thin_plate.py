@@ -41,6 +41,9 @@ def fit_spline(points: Tensor, displacement: Tensor, smoothing: Tensor) -> Splin
         displacement: (B, P, 2), px, of each point.
         smoothing: (B,), 0 or above; 0 interpolates.
 
+    U has no second derivative at r = 0, where it diverges like ln r: second derivatives of the spline at a control
+    point, with respect to positions or points, are finite and have no meaning; first ones are right everywhere.
+
     Source: Bookstein, "Principal warps", IEEE TPAMI 11 (1989).
     """
     points, displacement, smoothing = points.double(), displacement.double(), smoothing.double()

@@ -1,6 +1,6 @@
 """Operations on flows: compose, resize, and measure where they fold."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -8,11 +8,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor, exact_matmul
-from torchrefract._validation import check_count, check_flow, check_tensor
+from torchrefract._validation import check_count, check_flow, check_tensor, eager_bool
 from torchrefract.types import Folding
-from torchrefract.warping.grid import field_dtype
+from torchrefract.warping.grid import field_dtype, pixel_axes
 from torchrefract.warping.warp import sample_image
 
+_LARGEST_STRETCH = 4.0  # of an inverse flow that counts as unique
 _GHOSTS = 2  # nodes beyond each border that a cubic may need
 
 
@@ -146,18 +147,62 @@ def jacobian_determinant(flow: Tensor) -> Tensor:
     (2000), for the use of corner determinants.
     """
     check_flow("flow", flow)
-    determinants = []
-    for forward_x in (False, True):
-        u_x, v_x = _difference(flow, -1, forward_x).unbind(1)
-        for forward_y in (False, True):
-            u_y, v_y = _difference(flow, -2, forward_y).unbind(1)
-            determinants.append((1 + u_x) * (1 + v_y) - u_y * v_x)
-    return torch.stack(determinants, dim=1).amin(dim=1, keepdim=True)
+    return torch.stack([jacobian.determinant for jacobian in _corner_jacobians(flow)], dim=1).amin(dim=1)
 
 
 def folded(flow: Tensor, valid: Tensor | None = None) -> Tensor:
     """Return True for pixels that lie on a fold, (B, 1, H, W); arguments as for `folding`."""
     return _valid_determinant(flow, valid) <= 0
+
+
+def is_shown_once(flow: Tensor, valid: Tensor | None = None) -> Tensor:
+    """Return True for the pixels of the input image that a fold neither shows several times nor nearly so.
+
+    The map p -> p + flow(p) with the Jacobian J sends several pixels to one position only if det J <= 0 at a pixel that
+    it sends there too. Positions are excluded where it sends pixels with ||J^-1|| above 4 (Frobenius norm) or
+    det J <= 0. Elsewhere the inverse is unique, and an error e of the flow moves it by 4 e at most.
+
+    Args:
+        flow: (B, 2, H, W), px.
+        valid: (B, 1, H, W), bool, where the flow is defined; None for everywhere.
+
+    Returns:
+        (B, 1, H, W), bool.
+    """
+    with torch.no_grad():
+        flow = flow.detach()
+        is_steep = torch.zeros_like(flow[:, :1], dtype=torch.bool)
+        for jacobian in _corner_jacobians(flow):
+            norm = torch.hypot(torch.hypot(jacobian.xx, jacobian.xy), torch.hypot(jacobian.yx, jacobian.yy))
+            # ||J^-1|| is ||J|| / det J in two dimensions. NaN counts as steep.
+            is_steep = is_steep | ~(norm <= _LARGEST_STRETCH * jacobian.determinant)
+        if valid is not None:
+            is_steep = is_steep & ~_near_invalid(valid)
+        if eager_bool(is_steep.any, of=flow) is False:
+            return ~is_steep
+        return ~_cover(flow, is_steep)
+
+
+def _cover(flow: Tensor, chosen: Tensor) -> Tensor:
+    """Return True for the positions in the boxes around where a map sends chosen pixels and their neighbors."""
+    height, width = flow.shape[2:]
+    x, y = pixel_axes(height, width, dtype=flow.dtype, device=flow.device)
+    positions = flow + torch.cat(torch.broadcast_tensors(x, y), dim=1)
+    size = as_device_tensor([width, height], dtype=flow.dtype, device=flow.device).view(1, 2, 1, 1)
+    low, high = (
+        end.nan_to_num(0.0).clamp(min=0).minimum(size).long()
+        for end in (
+            (-F.max_pool2d(-positions, 3, stride=1, padding=1)).floor(),
+            F.max_pool2d(positions, 3, stride=1, padding=1).ceil() + 1,
+        )
+    )
+    # The number of boxes at a position is the sum of their corners, with signs, above and to the left of it.
+    corners = torch.zeros(len(flow), (height + 1) * (width + 1), dtype=torch.int32, device=flow.device)
+    for rows, columns, sign in ((low, low, 1), (high, high, 1), (low, high, -1), (high, low, -1)):
+        index = rows[:, 1] * (width + 1) + columns[:, 0]
+        corners = corners.scatter_add(1, index.flatten(1), sign * chosen.flatten(1).int())
+    counts = corners.view(-1, 1, height + 1, width + 1).cumsum(2).cumsum(3)
+    return counts[..., :height, :width] > 0
 
 
 def folding(flow: Tensor, valid: Tensor | None = None) -> Folding:
@@ -180,8 +225,21 @@ def _valid_determinant(flow: Tensor, valid: Tensor | None) -> Tensor:
     determinant = jacobian_determinant(flow)
     if valid is None:
         return determinant
-    is_excluded = F.max_pool2d((~valid).to(flow.dtype), kernel_size=3, stride=1, padding=1) > 0
-    return torch.where(is_excluded, torch.inf, determinant)
+    return torch.where(_near_invalid(valid), torch.inf, determinant)
+
+
+def _near_invalid(valid: Tensor) -> Tensor:
+    """Return True for pixels that are not valid and for their neighbors."""
+    return F.max_pool2d((~valid).float(), kernel_size=3, stride=1, padding=1) > 0
+
+
+def _corner_jacobians(flow: Tensor) -> Iterator[Jacobian]:
+    """Yield the Jacobians of p -> p + flow(p), entries (B, 1, H, W), by forward and backward differences."""
+    for forward_x in (False, True):
+        u_x, v_x = _difference(flow, -1, forward_x).split(1, dim=1)
+        for forward_y in (False, True):
+            u_y, v_y = _difference(flow, -2, forward_y).split(1, dim=1)
+            yield Jacobian(1 + u_x, u_y, v_x, 1 + v_y)
 
 
 def _difference(flow: Tensor, dim: int, forward: bool) -> Tensor:

@@ -11,7 +11,11 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from torchrefract._validation import requires_grad
 from torchrefract.warping.flow import Jacobian
+from torchrefract.warping.grid import Points, pixel_axes
+from torchrefract.warping.lattice import pixel_lattice
+from torchrefract.warping.warp import sample_image
 
 _SMALLEST_DETERMINANT = 1e-6
 # Outside the frame the flow continues along its secant over this many border pixels: the slope of one pixel is noise.
@@ -101,11 +105,12 @@ def implicit(solution: Solution, inputs: Sequence[Tensor], equation: Equation) -
             respect to the unknowns. Uses no other tensor.
 
     Returns:
-        The same values, differentiable in the inputs: in reverse and forward mode, in torch.func, in any order.
+        The same values, differentiable in the inputs: in reverse and forward mode, in torch.func, in any order; up to
+        the third order inside torch.compile.
     """
     if not torch.compiler.is_compiling():
         return _Implicit.apply(equation, len(solution), *solution, *inputs)  # pyright: ignore[reportReturnType]
-    # Newton steps of length zero; as many of them as derivatives that torch.compile can take.
+    # Newton steps of length zero. Each doubles the number of right terms of the Taylor series: 2, then 4.
     for _ in range(2):
         errors, jacobian = equation(*solution, *inputs)
         steps = _solve(jacobian, errors)
@@ -160,6 +165,31 @@ def sample_linear(table: Tensor, points: Tensor) -> LinearSample:
     upper, lower = a + tx * (b - a), c + tx * (d - c)
     value = upper + ty * (lower - upper)
     return LinearSample(value, ((b - a) + ty * ((d - c) - (b - a))) / span_x, (lower - upper) / span_y)
+
+
+def sample_at(values: Tensor, points: Points) -> Tensor:
+    """Sample maps of a frame bilinearly at points, and beyond their border at its nearest pixel.
+
+    Args:
+        values: (N, C, H, W), or (N, C, H, 1) if all pixels of a row are equal; finite, so of a depth its inverse.
+        points: in the same frame, of N rows or one.
+
+    Returns:
+        (N, C, h, w), differentiable in the values and the points in all modes.
+    """
+    lattice = points.lattice
+    values = values.expand(-1, -1, lattice.height, lattice.width)
+    is_pixels = lattice == pixel_lattice(lattice.height, lattice.width)
+    if is_pixels and not points.is_displaced:
+        return values
+    if is_pixels and not requires_grad((values, points.x, points.y)):
+        x, y = pixel_axes(lattice.height, lattice.width, dtype=points.x.dtype, device=points.x.device)
+        flow = torch.cat(torch.broadcast_tensors(points.x - x, points.y - y), dim=1)
+        return sample_image(values, flow, padding="border", interpolation="bilinear")
+    x = points.x.nan_to_num(nan=0.0).clamp(0, lattice.width - 1)
+    y = points.y.nan_to_num(nan=0.0).clamp(0, lattice.height - 1)
+    positions = torch.cat(torch.broadcast_tensors(x, y), dim=1).expand(len(values), -1, -1, -1)
+    return sample_linear(values, positions.flatten(2)).value.unflatten(2, positions.shape[2:])
 
 
 def _interval(position: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:

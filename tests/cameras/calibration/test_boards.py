@@ -43,6 +43,7 @@ def test_corners_match_opencv():
     [
         ({"squares": "11"}, "squares must be columns x rows, such as 11x8, got '11'"),
         ({"squares": "2x8"}, "squares must be from 3 to 100 in columns and rows, got 2x8"),
+        ({"squares": "3x3"}, "squares must have at least 6 inner corners, which a view needs, got 3x3 with 4"),
         ({"square_mm": 0}, "square_mm must be above 0, got 0"),
         ({"marker_mm": 22}, "marker_mm must be below square_mm = 22, got 22"),
         ({"dictionary": "DICT_3X3"}, "dictionary must be one of .*, got 'DICT_3X3'"),
@@ -54,6 +55,11 @@ def test_corners_match_opencv():
 def test_invalid_boards_raise(options, message):
     with pytest.raises(ValueError, match=message):
         Charuco(**options)
+
+
+def test_a_chessboard_has_the_corners_that_opencv_detects():
+    with pytest.raises(ValueError, match="squares must be from 4 to 100 in columns and rows, got 3x7"):
+        Chessboard(squares="3x7")
 
 
 def test_a_description_lists_the_options_of_the_command():

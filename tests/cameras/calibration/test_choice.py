@@ -7,6 +7,7 @@ from torchrefract.cameras.calibration.boards import Chessboard
 from torchrefract.cameras.calibration.choice import FOLDS, choose_model, is_one_to_one
 from torchrefract.cameras.calibration.fit import camera_values, fit_camera, prior_deviations
 from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.lens_database import read_lenses
 
 BOARD = Chessboard(squares="9x7", square_mm=25)
 SIZE = (800, 600)
@@ -36,6 +37,22 @@ def test_edge_rays_stay_near_the_exact_camera_where_no_corner_reaches_the_border
     pixels = fit.camera.project(camera.unproject(border).points)
     assert pixels.valid.all()
     assert (pixels.points - border).norm(dim=1).max() < 100
+
+
+@pytest.mark.parametrize("name", ["ov_euroc_mav_cam0", "gf_16", "cv_aruco_params"])
+def test_edge_rays_of_published_lenses_stay_near(name, projected):
+    camera = next(lens.camera for lens in read_lenses() if lens.name == name)
+    views = [
+        view.only(((view.corners > 0) & (view.corners < (camera.width - 1, camera.height - 1))).all(axis=1))
+        for view in projected(BOARD, camera, noise=0.3)
+    ]
+    views, size = [view for view in views if len(view.ids) >= 20], (camera.width, camera.height)
+    chosen, _ = choose_model(views, BOARD, size=size)
+    fit = fit_camera(views, BOARD, model=chosen.model, size=size, prior=chosen.prior)
+    border = camera.grid(9)
+    pixels = fit.camera.project(camera.unproject(border).points)
+    assert pixels.valid.all()
+    assert (pixels.points - border).norm(dim=1).max() < 30
 
 
 def test_a_model_that_folds_inside_the_frame_is_refused(projected):

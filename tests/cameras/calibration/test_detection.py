@@ -1,8 +1,10 @@
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from torchrefract.cameras.calibration import detection
 from torchrefract.cameras.calibration.boards import Charuco, Chessboard
@@ -62,6 +64,47 @@ def test_pattern_and_colors_are_detected(squares, legacy, inverted, small_camera
     assert has_enough_corners(view, board)
     assert rms_error(view.corners, expected_corners(small_camera, board, view.ids, pose)) < 0.1
     assert len(detect(gray, Charuco(**options, inverted=not inverted)).ids) == 0
+
+
+def drawn(board, *, px_per_mm=3, margin_mm=30) -> np.ndarray:
+    """Draw a board seen from the front, with a margin."""
+    x, y = (np.arange((side + 2 * margin_mm) * px_per_mm) / px_per_mm - margin_mm for side in map(int, board.size_mm))
+    return np.where(board.is_black(*np.meshgrid(x, y)), 20, 230).astype(np.uint8)
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+@pytest.mark.parametrize("part", [np.s_[:360], np.s_[200:], np.s_[:, 300:], np.s_[200:, :560], np.s_[:]], ids=str)
+def test_a_part_of_a_board_shows_its_pattern(legacy, part):
+    board = Charuco(squares="5x4", square_mm=40, marker_mm=28, dictionary="DICT_4X4_50", legacy=legacy)
+    view = detect(np.ascontiguousarray(drawn(board)[part]), replace(board, legacy="auto"))
+    rows, columns = part if isinstance(part, tuple) else (part, slice(None))
+    offset = np.array([columns.start or 0, rows.start or 0])
+    assert has_enough_corners(view, board)
+    moved = view.corners + offset - 3 * (board.corners(view.ids)[:, :2] + 30)
+    # Two rows of markers may be those of a board one square aside, which is another pose for all corners.
+    assert np.ptp(moved, axis=0).max() < 1
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"coefficients": (-0.4, 0.17, 0.002, -0.003, -0.025)},
+        {"fx": 300.0, "fy": 300.0, "coefficients": (-0.02, 0.005, 0.0, 0.0), "model": "fisheye"},
+    ],
+    ids=["barrel", "fisheye"],
+)
+def test_a_strong_lens_moves_no_corner(lens, small_camera):
+    camera = replace(small_camera, **lens)
+    board = Charuco(squares="5x4", square_mm=40, marker_mm=28, dictionary="DICT_4X4_50", legacy=False, inverted=False)
+    corners, errors = 0, []
+    for _, gray, pose in render_views(board, camera, count=4):
+        rays = torch.from_numpy(board.corners() @ cv2.Rodrigues(pose[:3])[0].T + pose[3:])
+        expected = camera.project(rays).points.numpy()
+        view = detect(gray, board)
+        errors.append(np.linalg.norm(view.corners - expected[view.ids], axis=1))
+        corners += len(view.ids)
+    assert corners >= 30
+    assert np.concatenate(errors).max() < 0.2
 
 
 def test_corners_behind_a_finger_are_dropped(rendered, small_board, small_camera):
@@ -152,6 +195,25 @@ def test_mirrored_and_blurred_pictures_and_few_corners_are_explained(picture, sm
 def test_another_charuco_board_is_described(expected, picture):
     text = "15 markers of DICT_4X4_50, from number 0 to 14, with 20 corners as on a board of squares=6x5"
     assert describe_other_board(picture, expected) == text
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+@pytest.mark.parametrize("squares", ["3x4", "4x4", "6x4", "5x7"])
+def test_a_description_has_the_squares_and_corners_of_the_board(squares, legacy):
+    board = Charuco(squares=squares, dictionary="DICT_4X4_50", legacy=legacy)
+    picture = drawn(board)
+    picture[90:156, 90:156] = 130  # the first square
+    text = describe_other_board(picture, Charuco(squares="11x8", dictionary="DICT_4X4_50"))
+    count = len(detect(picture, replace(board, legacy="auto")).ids)
+    assert text.endswith(f"with {count} corners as on a board of squares={squares}")
+
+
+@pytest.mark.parametrize("squares", ["4x4", "6x4", "4x6", "7x6"])
+def test_columns_and_rows_of_a_chessboard_are_those_of_the_picture(squares):
+    board = Chessboard(squares=squares)
+    columns, rows = board.num_corners
+    text = f"a chessboard of {columns}x{rows} inner corners, which is squares={squares}"
+    assert describe_other_board(drawn(board), Chessboard()) == text
 
 
 def test_another_chessboard_is_described(small_camera):

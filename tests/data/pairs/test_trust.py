@@ -44,8 +44,9 @@ def test_a_flipped_byte_of_a_tar_costs_one_pair(call, words, tmp_path, sums):
     assert call("generate", *arguments).code == 0
     before, path = sums(tmp_path / "out"), tmp_path / "out" / "tars" / "00000000.tar"
     with tarfile.open(path) as tar:
-        member = tar.getmember("00000003.clean.png")
-    for position in (member.offset + 5, member.offset_data + 90):  # in the header and in the content
+        members = [tar.getmember(f"00000003.{suffix}") for suffix in ("clean.png", "json")]
+    headers, contents = ([getattr(member, name) for member in members] for name in ("offset", "offset_data"))
+    for position in (*(start + 5 for start in headers), *(start + 90 for start in contents)):
         data = bytearray(path.read_bytes())
         data[position] ^= 1
         path.write_bytes(data)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -18,7 +19,8 @@ LARGEST_DICTIONARIES = (
     "DICT_ARUCO_ORIGINAL",
     *(f"DICT_APRILTAG_{kind}" for kind in ("16h5", "25h9", "36h10", "36h11")),
 )
-_MIN_SQUARES, _MAX_SQUARES = 3, 100  # along a side
+MIN_CORNERS = 6  # of a view
+_MAX_SQUARES = 100  # along a side
 _MM_PER_INCH = 25.4
 _CAPTION_MM = 12.0  # height of the strip below the margin
 _RULER_MM = 100.0
@@ -32,12 +34,13 @@ class Board:
     Coordinates are in mm from the upper left corner of the board, x to the right and y down.
 
     Args:
-        squares: columns x rows of squares, such as "11x8", at least 3 of each.
+        squares: columns x rows of squares, such as "11x8", at least 3 of each and 6 inner corners.
         square_mm: side of a square.
     """
 
     squares: str = "11x8"
     square_mm: float = 22.0
+    min_squares: ClassVar[int] = 3  # along a side
 
     def __post_init__(self) -> None:
         _ = self.num_squares
@@ -49,9 +52,14 @@ class Board:
         columns, _, rows = str(self.squares).lower().partition("x")
         if not (columns.isdecimal() and rows.isdecimal()):
             raise ValueError(f"squares must be columns x rows, such as 11x8, got {self.squares!r}")
-        if not all(_MIN_SQUARES <= int(n) <= _MAX_SQUARES for n in (columns, rows)):
+        if not all(self.min_squares <= int(n) <= _MAX_SQUARES for n in (columns, rows)):
             raise ValueError(
-                f"squares must be from {_MIN_SQUARES} to {_MAX_SQUARES} in columns and rows, got {self.squares}"
+                f"squares must be from {self.min_squares} to {_MAX_SQUARES} in columns and rows, got {self.squares}"
+            )
+        if (count := (int(columns) - 1) * (int(rows) - 1)) < MIN_CORNERS:
+            raise ValueError(
+                f"squares must have at least {MIN_CORNERS} inner corners, which a view needs, got {self.squares} with "
+                f"{count}"
             )
         return int(columns), int(rows)
 
@@ -96,7 +104,9 @@ class Board:
 
 
 class Chessboard(Board):
-    """A chessboard; all of it must be visible, since its squares look alike."""
+    """A chessboard; all of it must be visible, since its squares look alike. It has at least 4 x 4 squares."""
+
+    min_squares: ClassVar[int] = 4  # OpenCV detects three inner corners and more
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,9 +9,14 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from torchrefract.cameras.calibration.boards import LARGEST_DICTIONARIES, Board, Charuco, marker_dictionary
+from torchrefract.cameras.calibration.boards import (
+    LARGEST_DICTIONARIES,
+    MIN_CORNERS,
+    Board,
+    Charuco,
+    marker_dictionary,
+)
 
-MIN_CORNERS = 6
 SEARCH_FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
 # Half the side of the window for the refinement of a corner: this share of the distance to the nearest marker, or of
 # half a square, within these bounds in px. On small squares the lower bound is a share of the square.
@@ -53,9 +58,9 @@ class Detection(NamedTuple):
 def detect(gray: np.ndarray, board: Board, *, name: str = "") -> View:
     """Find the corners of a board in a picture, to a few hundredths of a pixel.
 
-    A ChArUco board is found by its markers, in the pattern and colors that give most corners. A chessboard is found by
-    OpenCV's `findChessboardCornersSB`, or else by `findChessboardCorners`. Each corner is then refined in a window
-    that contains little but its four squares.
+    A ChArUco board is found by its markers, in the colors that show most of them and the pattern that they fit. A
+    chessboard is found by OpenCV's `findChessboardCornersSB`, or else by `findChessboardCorners`. Each corner is then
+    refined in a window that contains little but its four squares, so that a lens that bends lines does not move it.
 
     Drops corners that the refinement moves far, that lie at the border of the picture, or that do not fit their
     neighbors. Drops corners of a ChArUco board where black and white do not cross, such as behind a finger. Keeps the
@@ -87,19 +92,60 @@ def candidates(option: str | bool) -> tuple[bool, ...]:
     return (False, True) if option == "auto" else (bool(option),)
 
 
+class _Markers(NamedTuple):
+    """Markers of a dictionary in a picture."""
+
+    picture: np.ndarray  # (H, W), uint8
+    corners: Sequence[np.ndarray]  # each (1, 4, 2), px
+    ids: np.ndarray  # (N, 1), int
+
+
+def _find_markers(picture: np.ndarray, dictionary: str) -> _Markers:
+    corners, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(dictionary)).detectMarkers(picture)
+    return _Markers(picture, corners, np.empty((0, 1), dtype=np.int32) if ids is None else ids)
+
+
 def _find_charuco(gray: np.ndarray, board: Charuco) -> tuple[Any, Any]:
     """Return ids and corners as OpenCV has them, or two empty tuples."""
-    best: tuple[Any, Any] = (), ()
+    pictures = (255 - gray if is_inverted else gray for is_inverted in candidates(board.inverted))
+    markers = max((_find_markers(picture, board.dictionary) for picture in pictures), key=lambda one: len(one.ids))
+    return _interpolate(markers, _best_pattern(markers, board)[0])
+
+
+def _interpolate(markers: _Markers, pattern: "cv2.aruco.CharucoBoard") -> tuple[Any, Any]:
+    """Return ids and corners of a board by its markers, or two empty tuples."""
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = 1  # next to a corner, so that corners near the border of the picture count
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(pattern, parameters).detectBoard(
+        markers.picture, markerCorners=markers.corners, markerIds=markers.ids
+    )
+    return ((), ()) if ids is None else (ids, corners)
+
+
+def _best_pattern(markers: _Markers, board: Charuco) -> tuple["cv2.aruco.CharucoBoard", float]:
+    """Return the pattern of a board that fits markers best, the current one if both do, and their misfit."""
     # On boards with an odd number of rows both patterns are equal.
     legacies = candidates(board.legacy) if board.num_squares[1] % 2 == 0 else (False,)
-    for inverted, legacy in itertools.product(candidates(board.inverted), legacies):
-        detector = cv2.aruco.CharucoDetector(board.to_opencv(legacy=legacy), parameters)
-        corners, ids, _, _ = detector.detectBoard(255 - gray if inverted else gray)
-        if ids is not None and len(ids) > len(best[0]):
-            best = ids, corners
-    return best
+    patterns = [board.to_opencv(legacy=legacy) for legacy in legacies]
+    return min(((pattern, _marker_misfit(markers, pattern)) for pattern in patterns), key=lambda result: result[1])
+
+
+def _marker_misfit(markers: _Markers, pattern: "cv2.aruco.CharucoBoard") -> float:
+    """Return the rms distance of markers from their places on a board by one homography, in hundredths of a square.
+
+    It is rounded, so that patterns that differ by the bending of a lens only are equal. Infinite without markers.
+    """
+    places, ids = pattern.getObjPoints(), markers.ids.ravel()
+    on_board = [k for k, number in enumerate(ids) if number < len(places)]
+    if not on_board:
+        return math.inf
+    plane = np.concatenate([np.asarray(places[ids[k]])[:, :2] for k in on_board])
+    picture = np.concatenate([markers.corners[k][0] for k in on_board])
+    matrix, _ = cv2.findHomography(picture, plane, 0)
+    if matrix is None:
+        return math.inf
+    errors = cv2.perspectiveTransform(picture[:, None], matrix)[:, 0] - plane
+    return round(100 * float((errors**2).sum(axis=1).mean()) ** 0.5 / pattern.getSquareLength())
 
 
 def _find_chessboard(gray: np.ndarray, board: Board) -> tuple[Any, Any]:
@@ -214,37 +260,29 @@ def describe_other_board(gray: np.ndarray, board: Board) -> str:
     """Describe the board that a picture shows instead of the expected one; empty if it shows none."""
     if text := _other_charuco(gray, board if isinstance(board, Charuco) else Charuco()):
         return text
-    has_board, _, cells = cv2.findChessboardCornersSBWithMeta(gray, (3, 3), SEARCH_FLAGS | cv2.CALIB_CB_LARGER)
+    has_board, corners, cells = cv2.findChessboardCornersSBWithMeta(gray, (3, 3), SEARCH_FLAGS | cv2.CALIB_CB_LARGER)
     if not has_board:
         return ""
     rows, columns = cells.shape
+    x, y = np.abs(corners.reshape(rows, columns, 2)[0, -1] - corners.reshape(rows, columns, 2)[0, 0])
+    if y > x:  # OpenCV counts along either side of the board
+        rows, columns = columns, rows
     return f"a chessboard of {columns}x{rows} inner corners, which is squares={columns + 1}x{rows + 1}"
 
 
 def _other_charuco(gray: np.ndarray, board: Charuco) -> str:
-    best: _Markers | None = None
-    for picture, color in ((gray, ""), (255 - gray, ", black and white exchanged")):
-        for name in LARGEST_DICTIONARIES:
-            corners, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(name)).detectMarkers(picture)
-            if len(corners) >= (_MIN_MARKERS if best is None else len(best.corners) + 1):
-                best = _Markers(picture, color, name, ids, corners)
-    if best is None:
+    pictures = (gray, ""), (255 - gray, ", black and white exchanged")
+    tried = [
+        (_find_markers(picture, name), name, color) for picture, color in pictures for name in LARGEST_DICTIONARIES
+    ]
+    markers, name, color = max(tried, key=lambda one: len(one[0].ids))
+    if len(markers.ids) < _MIN_MARKERS:
         return ""
-    low, high = int(best.ids.min()), int(best.ids.max())
-    name = _smallest_dictionary(best.dictionary, high, preferred=board.dictionary)
-    text = f"{len(best.ids)} markers of {name}{best.color}, from number {low} to {high}"
-    squares, count = _find_squares(best, replace(board, squares="3x3", dictionary=name))
+    low, high = int(markers.ids.min()), int(markers.ids.max())
+    name = _smallest_dictionary(name, high, preferred=board.dictionary)
+    text = f"{len(markers.ids)} markers of {name}{color}, from number {low} to {high}"
+    squares, count = _find_squares(markers, replace(board, squares="3x4", dictionary=name))
     return f"{text}, with {count} corners as on a board of squares={squares}" if count >= MIN_CORNERS else text
-
-
-class _Markers(NamedTuple):
-    """The markers of a dictionary in a picture."""
-
-    picture: np.ndarray
-    color: str
-    dictionary: str
-    ids: np.ndarray
-    corners: Sequence[np.ndarray]
 
 
 def _smallest_dictionary(dictionary: str, highest: int, *, preferred: str) -> str:
@@ -257,18 +295,16 @@ def _smallest_dictionary(dictionary: str, highest: int, *, preferred: str) -> st
 
 
 def _find_squares(markers: _Markers, board: Charuco) -> tuple[str, int]:
-    """Return the squares of the smallest board that turns these markers into most corners, and their number."""
-    squares, num_corners, available = "", 0, len(marker_dictionary(board.dictionary).bytesList)
-    for columns, rows in sorted(itertools.product(_SIDES, _SIDES), key=math.prod):
-        if not markers.ids.max() < columns * rows // 2 <= available:
-            continue
-        candidate = replace(board, squares=f"{columns}x{rows}")
-        for legacy in candidates(board.legacy):
-            detector = cv2.aruco.CharucoDetector(candidate.to_opencv(legacy=legacy))
-            _, ids, _, _ = detector.detectBoard(markers.picture, markerCorners=markers.corners, markerIds=markers.ids)
-            if ids is not None and len(ids) > num_corners:
-                squares, num_corners = candidate.squares, len(ids)
-    return squares, num_corners
+    """Return the squares of the smallest of the boards that fit markers best, and the number of corners on it."""
+    available = len(marker_dictionary(board.dictionary).bytesList)
+    sizes = sorted(itertools.product(_SIDES, _SIDES), key=math.prod)
+    sizes = [(columns, rows) for columns, rows in sizes if markers.ids.max() < columns * rows // 2 <= available]
+    boards = [replace(board, squares=f"{columns}x{rows}") for columns, rows in sizes if columns + rows > 2 * _SIDES[0]]
+    results = [(*_best_pattern(markers, one), one.squares) for one in boards]
+    if not results:
+        return "", 0
+    pattern, _, squares = min(results, key=lambda result: result[1])
+    return squares, len(_interpolate(markers, pattern)[0])
 
 
 def measure_marker(gray: np.ndarray, view: View, board: Charuco) -> float:

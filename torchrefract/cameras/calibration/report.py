@@ -19,7 +19,7 @@ from torchrefract.cameras.camera import Camera
 
 CAMERA_FILE, REPORT_FILE = "camera.yaml", "report.md"
 _FIGURES = ("coverage.png", "residuals.png", "uncertainty.png")
-_FIRST_MODEL = "opencv4"  # to find views that do not fit before the lens model is chosen
+FIRST_MODEL, FIRST_PRIOR = "opencv4", "published"  # to find views that do not fit before the lens model is chosen
 _UNCERTAINTY_GRID = (60, 80)  # rows and columns
 _DPI = 100
 _MAX_DRAWN = 12  # views in the figure of errors, those that cost the others most
@@ -101,7 +101,7 @@ def calibrate_camera(
         good = views
         with contextlib.suppress(ValueError):  # another model may fit
             first = drop_outliers(
-                views, board, model=_FIRST_MODEL, size=size, max_share=max_drop_share, prior="published"
+                views, board, model=FIRST_MODEL, size=size, max_share=max_drop_share, prior=FIRST_PRIOR
             )
             good = first.views
         chosen, candidates = choose_model(good, board, size=size)

@@ -24,10 +24,11 @@ _FORMATS = {
     "restore_flow(p))",
     "transmission.png": "16 bits, gray: value / 65535 is the fraction of the clean light that reaches the camera",
     "intensity.png": "16 bits, gray: value / 32768 is the light that flare adds",
+    "depth.png": "16 bits, gray: value / 256 is the depth of the clean frame in m, 65535 is infinite",
     "valid.png": "255 where corrupted shows content of clean",
     "restore_valid.png": "255 where restore_flow restores clean",
-    "maps.npz": "NumPy arrays: flow, restore_flow (px), transmission, intensity, valid, restore_valid, as far as the "
-    "scene has them; corrupted(p) = clean(p + flow(p)), clean(p) = corrupted(p + restore_flow(p))",
+    "maps.npz": "NumPy arrays: flow, restore_flow (px), transmission, intensity, depth (m) and masks, as far "
+    "as the scene has them; corrupted(p) = clean(p + flow(p)), clean(p) = corrupted(p + restore_flow(p))",
 }
 _FORMATS["maps.safetensors"] = _FORMATS["maps.npz"].replace("NumPy arrays", "tensors")
 _COLUMNS, _MAX_BINS = 4, 30

@@ -15,6 +15,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from torchrefract.data.depth_maps import depth_levels, depth_of_levels
 from torchrefract.data.images import has_complete_png_chunks
 
 _T = TypeVar("_T")
@@ -22,6 +23,7 @@ _T = TypeVar("_T")
 FORMATS = ("png", "npz", "safetensors")
 FLOWS = {"flow": "valid", "restore_flow": "restore_valid"}  # each with its validity mask
 LIGHTS = {"transmission": 65535, "intensity": 32768}  # each with its number of PNG levels for a value of 1
+DEPTH = "depth"  # of the clean frame, if a map was given; a level of its PNG is 1/256 m, the last one is infinite
 MASKS = tuple(FLOWS.values())
 IMAGES = ("clean", "corrupted")
 
@@ -51,7 +53,7 @@ class PairArrays(NamedTuple):
     Args:
         clean, corrupted: (H, W, 3), uint8, RGB.
         maps: by name: flow and restore_flow (2, H, W), float32, px; transmission and intensity (H, W), float32; valid
-            and restore_valid (H, W), bool.
+            and restore_valid (H, W), bool; depth (H, W), float32, m, may be inf.
     """
 
     clean: np.ndarray
@@ -153,6 +155,8 @@ def _encode_map(name: str, value: np.ndarray, maps: Mapping[str, np.ndarray]) ->
         return encode_flow(value, maps[FLOWS[name]])
     if name in MASKS:
         return _encode_png(value.astype(np.uint8) * 255, _MAP_OPTIONS)
+    if name == DEPTH:
+        return _encode_png(depth_levels(value), _MAP_OPTIONS)
     levels = np.rint(value * LIGHTS[name])
     if not ((levels >= 0) & (levels <= _LAST_LEVEL)).all():
         limit = f"{_LAST_LEVEL / LIGHTS[name]:.3g}"
@@ -165,6 +169,8 @@ def _decode_map(name: str, size: tuple[int, int], data: bytes) -> np.ndarray:
         return decode_flow(data, size)[0]
     if name in MASKS:
         return _decode_png(data, np.uint8, 1, size) > 0
+    if name == DEPTH:
+        return depth_of_levels(_decode_png(data, np.uint16, 1, size))
     return _decode_png(data, np.uint16, 1, size).astype(np.float32) / LIGHTS[name]
 
 

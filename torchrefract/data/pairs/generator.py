@@ -7,7 +7,6 @@ short, which the next run detects by its size, or hold zeros, which verify=true 
 
 import hashlib
 import io
-import json
 import math
 import multiprocessing
 import os
@@ -29,10 +28,11 @@ from torch import Tensor
 
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError
+from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import Source, assign_frames, list_files, path_key, select_val_drives
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, pixels_of, read_image
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, is_lost, pixels_of, read_image
 from torchrefract.data.media import VIDEOS, read_video, video_info
-from torchrefract.data.pairs.files import FLOWS, LIGHTS, PairArrays, count_out_of_range, encode_pair
+from torchrefract.data.pairs.files import DEPTH, FLOWS, LIGHTS, PairArrays, count_out_of_range, encode_pair
 from torchrefract.data.pairs.manifest import PairRow, StoredFile
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
@@ -66,6 +66,18 @@ class Sources(NamedTuple):
             digest.update(ascii([*frame, sizes[frame.path]]).encode())
         return digest.hexdigest()
 
+    def depth_digest(self, depth: DepthFolder) -> str:
+        """Return a SHA-256 digest of the names and sizes of the depth maps.
+
+        Raises:
+            UsageError: a frame has none.
+        """
+        digest = hashlib.sha256()
+        for frame in self.frames:
+            path = depth.find(frame.path, frame.frame)
+            digest.update(ascii([path.name, path.stat().st_size]).encode())
+        return digest.hexdigest()
+
 
 class SourceReader:
     """Reads clean frames. Frames of a video are read fastest in their order. A new reader can be pickled.
@@ -73,10 +85,11 @@ class SourceReader:
     Args:
         root: folder of the sources.
         size: (height, width), px, to crop and reduce frames to; None keeps their size.
+        depth: folder of their depth maps.
     """
 
-    def __init__(self, root: Path, size: tuple[int, int] | None):
-        self.root, self.size = root, size
+    def __init__(self, root: Path, size: tuple[int, int] | None, depth: DepthFolder | None = None):
+        self.root, self.size, self.depth = root, size, depth
         self._video, self._index = "", -1  # path and frame that were read last
         self._frames: Iterator[tuple[int, Tensor]] = iter(())
 
@@ -86,9 +99,22 @@ class SourceReader:
         Raises:
             UnreadableImageError: the file is damaged, or the video ends before the frame.
         """
+        return self.read_with_depth(source)[0]
+
+    def read_with_depth(self, source: Source) -> tuple[Tensor, Tensor | None]:
+        """Read a frame as `read` does, and its depth (1, H, W), m, if there is a folder of depth maps.
+
+        Raises:
+            UsageError: there is no depth map of the frame.
+        """
         path = self.root / source.path
         image = read_image(path) if source.frame is None else self._read_video(source.path, source.frame)
-        return image.contiguous() if self.size is None else fit(image, self.size)
+        depth = None
+        if self.depth is not None:
+            depth = self.depth.read(
+                source.path, source.frame, frame_size=(image.shape[1], image.shape[2]), size=self.size
+            )
+        return image.contiguous() if self.size is None else fit(image, self.size), depth
 
     def _read_video(self, path: str, index: int) -> Tensor:
         if path != self._video or index <= self._index:
@@ -190,23 +216,26 @@ class PairGenerator(NamedTuple):
         origin = (source.path, source.frame, source.drive, source.split)
         row = PairRow(task.number, *origin, self.scene, seed, key, height=0, width=0, effects=[], beyond={}, files={})
         try:
-            image = self.reader.read(source)
+            image, depth = self.reader.read_with_depth(source)
         except UnreadableImageError as error:
-            # A missing file or a lost disk says nothing about the frame.
-            if isinstance(error.__cause__, OSError) and error.__cause__.errno is not None:
+            if is_lost(error):
                 raise UsageError(
                     f"source must stay unchanged during a run, got {error}; the same command continues"
                 ) from error
             return GeneratedPair(row._replace(skipped=str(error).replace(f"{self.reader.root}/", "")), {})
+        except UsageError:
+            raise
         except ValueError as error:
             raise UsageError(f"size: {error}") from error
         try:
             with warnings.catch_warnings(), torch.no_grad():
                 warnings.simplefilter("ignore", UserWarning)  # of folded pixels, which the masks exclude
-                degraded = self.effect.degrade(image[None], seed=seed, keys=[key])
+                degraded = self.effect.degrade(
+                    image[None], seed=seed, keys=[key], depth=None if depth is None else depth[None]
+                )
         except (ValueError, TypeError, OSError) as error:
             raise UsageError(f"scene: {error}") from error
-        pair = PairArrays(pixels_of(image), pixels_of(degraded.image[0]), _maps(degraded))
+        pair = PairArrays(pixels_of(image), pixels_of(degraded.image[0]), _maps(degraded, depth))
         try:
             data = encode_pair(pair, self.maps)
         except ValueError as error:
@@ -226,7 +255,11 @@ def _applied_effects(effect: Effect, params: Any) -> list[dict[str, Any]]:
     leaves = effect.effects_with_params(params) if isinstance(effect, Compose) else [(effect, params)]
     return [
         {"effect": type(leaf).__name__}
-        | {name: _plain(value[0].tolist()) for name, value in values._asdict().items() if name != "applied"}
+        | {
+            name: _plain(value[0].tolist())
+            for name, value in values._asdict().items()
+            if name != "applied" and value is not None
+        }
         for leaf, values in leaves
         if values.applied[0]
     ]
@@ -239,8 +272,10 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _maps(degraded: Degraded) -> dict[str, np.ndarray]:
+def _maps(degraded: Degraded, depth: Tensor | None) -> dict[str, np.ndarray]:
     maps = {"valid": degraded.valid[0, 0].numpy()}
+    if depth is not None:
+        maps[DEPTH] = depth[0].numpy()
     if degraded.has("flow"):
         maps["restore_valid"] = degraded.restore_valid[0, 0].numpy()
         maps |= {name: getattr(degraded, name)[0].float().numpy() for name in FLOWS}
@@ -280,7 +315,7 @@ class PairStorage(NamedTuple):
         """Return the size of a pair on disk, with its row: files fill blocks, and those of a tar have a header."""
         sizes, block, header = [len(data) for data in pair.data.values()], _DISK_BLOCK, 0
         if self.tar is not None:
-            sizes.append(len(_row_without_files(pair.row)))
+            sizes.append(len(pair.row.without_files()))
             block = header = _TAR_BLOCK
         return sum(header + math.ceil(size / block) * block for size in sizes) + len(pair.row.as_line())
 
@@ -294,18 +329,12 @@ class PairStorage(NamedTuple):
         return pair.row._replace(files=files)
 
 
-def _row_without_files(row: PairRow) -> bytes:
-    document = row._asdict()
-    del document["files"]
-    return json.dumps(document).encode()
-
-
 def _add_pair(tar: tarfile.TarFile, pair: GeneratedPair, path: str) -> PairRow:
     row, files = pair.row, {}
     for suffix, data in pair.data.items():
         files[suffix] = row.files[suffix]._replace(path=path, offset=_add_file(tar, f"{row.name}.{suffix}", data))
     if files:
-        _add_file(tar, f"{row.name}.json", _row_without_files(row))
+        _add_file(tar, f"{row.name}.json", row.without_files())
     return row._replace(files=files)
 
 

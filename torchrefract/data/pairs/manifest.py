@@ -69,6 +69,12 @@ class PairRow(NamedTuple):
         document = self._asdict() | {"files": {suffix: file._asdict() for suffix, file in self.files.items()}}
         return json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n"
 
+    def without_files(self) -> bytes:
+        """Return the row as JSON without its files, which a tar holds behind the files of the pair."""
+        document = self._asdict()
+        del document["files"]
+        return json.dumps(document).encode()
+
 
 class RowLocation(NamedTuple):
     """The location of a row in a manifest file."""
@@ -235,9 +241,16 @@ class Manifest:
                     return False
                 if verify and hashlib.sha256(read_stored(self.out, file)).hexdigest() != file.sha256:
                     return False
+            in_tar = [file for file in row.files.values() if file.path.endswith(".tar")]
+            return not (verify and in_tar) or self._has_row_in_tar(row, max(in_tar, key=lambda file: file.offset))
         except (OSError, DamagedPairError):
             return False
-        return True
+
+    def _has_row_in_tar(self, row: PairRow, last: StoredFile) -> bool:
+        """Return True if the row lies behind the last file of its pair in a tar."""
+        content, blocks = row.without_files(), -(-last.bytes // tarfile.BLOCKSIZE)
+        file = last._replace(offset=last.offset + (blocks + 1) * tarfile.BLOCKSIZE, bytes=len(content))
+        return read_stored(self.out, file) == content and self._has_tar_header(row.name, "json", file)
 
     def _has_tar_header(self, name: str, suffix: str, file: StoredFile) -> bool:
         """Return True if the header before a file of a tar is intact; other programs stop reading at a damaged one."""

@@ -1,0 +1,355 @@
+"""Depth from networks: they are tiny, with random weights, but of the classes that users load."""
+
+import json
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+import torchrefract as tr
+from torchrefract.data.depth_maps import DepthFolder, read_depth
+from torchrefract.data.road_scenes import render_road_scenes
+from torchrefract.data.road_scenes.scene import draw_scene
+from torchrefract.depth import RoadSpreadError, TransformersDepth, from_transformers, road_scale
+from torchrefract.fields.corridor import CorridorDepth
+from torchrefract.fields.depth import GroundPlaneDepth, LinearDepth
+from torchrefract.fields.sky import sky_mask
+
+transformers = pytest.importorskip("transformers")
+# Nobody may reach the hub in a test.
+pytestmark = [
+    pytest.mark.usefixtures("without_hub"),
+]
+
+
+@pytest.fixture
+def without_hub(monkeypatch) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+
+
+@pytest.fixture(scope="session")
+def network(tmp_path_factory) -> Callable[[str], Path]:
+    """Return a function that writes a tiny depth network of a type to a folder."""
+
+    def write(kind: str) -> Path:
+        folder = tmp_path_factory.mktemp(kind)
+        torch.manual_seed(0)
+        dino = transformers.Dinov2Config(
+            hidden_size=12,
+            num_hidden_layers=2,
+            num_attention_heads=2,
+            image_size=28,
+            patch_size=14,
+            out_features=["stage1", "stage2"],
+            reshape_hidden_states=False,
+        )
+        options = {
+            "backbone_config": dino,
+            "reassemble_hidden_size": 12,
+            "patch_size": 14,
+            "reassemble_factors": [2, 1],
+            "neck_hidden_sizes": [8, 8],
+            "fusion_hidden_size": 8,
+            "head_hidden_size": 8,
+        }
+        if kind == "dpt":
+            config = transformers.DPTConfig(
+                hidden_size=12,
+                num_hidden_layers=2,
+                num_attention_heads=2,
+                intermediate_size=16,
+                image_size=28,
+                patch_size=14,
+                backbone_out_indices=[0, 0, 1, 1],
+                neck_hidden_sizes=[8, 8, 8, 8],
+                fusion_hidden_size=8,
+            )
+            model = transformers.DPTForDepthEstimation(config)
+        else:
+            metric = {"depth_estimation_type": kind, "max_depth": 80}
+            model = transformers.DepthAnythingForDepthEstimation(
+                transformers.DepthAnythingConfig(**options, **(metric if kind == "metric" else {}))
+            )
+        model.save_pretrained(folder)
+        size = {"height": 28, "width": 28}
+        processor = transformers.DPTImageProcessor(size=size, keep_aspect_ratio=True, ensure_multiple_of=14)
+        processor.save_pretrained(folder)
+        return folder
+
+    return write
+
+
+def constant_network(depth: Tensor, **options) -> TransformersDepth:
+    """Return a provider whose network predicts a given depth (B, 1, H, W)."""
+    settings = {"scale": "road", "road": GroundPlaneDepth(), "max_spread": 0.3} | options
+    provider = TransformersDepth(torch.nn.Identity(), None, **settings)
+    provider._predict = lambda image: depth  # type: ignore[method-assign]
+    return provider
+
+
+def roads(count: int, height: int, width: int) -> list[tuple[Tensor, Tensor, GroundPlaneDepth]]:
+    """Return rendered roads with their true depth, and the flat road that their camera sees."""
+    result = []
+    for key in range(count):
+        image, depth = render_road_scenes(torch.tensor([key]), height, width)
+        view = draw_scene(np.random.default_rng((0, key))).view
+        focal = view.focal * max(height, width)
+        right_up, down_up, ahead_up = view.axes[:, 1]
+        middle = height / 2 - 0.5 + focal * ahead_up / -down_up
+        road = GroundPlaneDepth(
+            camera_height=float(view.position[1]),
+            focal=focal / width,
+            horizon=float((middle + 0.5) / height),
+            far=math.inf,
+        )
+        assert abs(right_up) < 0.2
+        result.append((image, depth, road))
+    return result
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+def test_the_scale_of_a_depth_is_recovered_from_the_road(factor):
+    errors = []
+    for _, depth, road in roads(12, 90, 160):
+        result = road_scale(depth * factor, road)
+        assert result.spread.item() < 0.3
+        errors.append(abs(result.scale.item() * factor - 1))
+    assert max(errors) < 0.1
+
+
+def test_the_scale_makes_a_network_agree_with_the_road_and_the_sky_infinite():
+    image, depth, road = roads(1, 90, 160)[0]
+    wrong = torch.where(depth.isfinite(), 2 * depth, 500.0)
+    result = constant_network(wrong, road=road)(image)
+    assert result[sky_mask(image)].isinf().all()
+    known = depth.isfinite() & result.isfinite()
+    assert ((result / depth)[known].log10().abs() < math.log10(1.1)).float().mean() > 0.95
+    trusted = constant_network(wrong, road=road, scale="model")(image)
+    assert_close(trusted[known], 2 * depth[known])
+
+
+def test_a_scale_that_the_road_contradicts_raises_with_the_remedy():
+    image = torch.rand(2, 3, 40, 60)
+    noise = torch.exp(torch.randn(2, 1, 40, 60, generator=torch.Generator().manual_seed(0))) * 10
+    provider = constant_network(noise)
+    with pytest.raises(RoadSpreadError, match=r"spread of 0\.3.*scale=\"model\""):
+        provider(image)
+    assert all(isinstance(result, RoadSpreadError) for result in provider.each(image))
+
+
+@pytest.mark.parametrize("kind", range(20))
+def test_maps_that_are_not_in_meters_are_refused(kind):
+    image, depth, road = roads(kind % 10 + 1, 90, 160)[-1]
+    depth = torch.where(depth.isfinite(), depth, 1000.0)
+    disparity, normalized = 500 / depth, (1 / depth - (1 / depth).amin()) / (1 / depth).amax()
+    provider = constant_network(disparity if kind < 10 else normalized, road=road)
+    with pytest.raises(ValueError, match="must be in m"):
+        provider(image)
+
+
+def test_a_metric_network_serves_as_the_depth_of_fog(network):
+    provider = from_transformers(network("metric"), scale="model")
+    image = torch.rand(2, 3, 30, 44)
+    depth = provider(image)
+    assert depth.shape == (2, 1, 30, 44)
+    assert depth.min() >= 0
+    assert depth[depth.isfinite()].max() <= 80
+    fog = tr.UniformFog(depth=provider, visibility_range=(50, 50), deviation_range=(0, 0))
+    expected = tr.UniformFog(visibility_range=(50, 50), deviation_range=(0, 0)).degrade(image, depth=depth, seed=0)
+    assert_close(fog.degrade(image, seed=0).image, expected.image)
+    assert_close(
+        tr.UniformFog(visibility_range=(50, 50), deviation_range=(0, 0)).degrade(image, depth=provider, seed=0).image,
+        expected.image,
+    )
+
+
+def test_the_network_predicts_as_the_library_s_own_pipeline_does(network):
+    folder = network("metric")
+    image = torch.rand(1, 3, 42, 56)
+    ours = from_transformers(folder, scale="model")._predict(image)
+    processor = transformers.AutoImageProcessor.from_pretrained(folder)
+    model = transformers.AutoModelForDepthEstimation.from_pretrained(folder).eval()
+    picture = (image[0].permute(1, 2, 0) * 255).round().byte().numpy()
+    with torch.no_grad():
+        output = model(**processor(images=picture, return_tensors="pt"))
+    theirs = processor.post_process_depth_estimation(output, target_sizes=[(42, 56)])[0]["predicted_depth"]
+    assert_close(ours[0, 0], theirs, rtol=0.02, atol=0.05)
+
+
+@pytest.mark.parametrize("kind", ["relative", "dpt"])
+def test_relative_networks_are_refused(network, kind):
+    with pytest.raises(ValueError, match=r"predicts? meters.*relative depth"):
+        from_transformers(network(kind))
+
+
+def test_without_a_network_the_error_names_the_folder_option():
+    with pytest.raises(ValueError, match=r"or a folder of one \(download it elsewhere"):
+        from_transformers("someone/no-such-depth-model")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [({"scale": "metric"}, "scale must be"), ({"road": 3}, "road must be"), ({"max_spread": 0}, "max_spread must be")],
+)
+def test_invalid_arguments_raise(network, arguments, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        from_transformers(network("metric"), **arguments)
+
+
+# --- functions of the image as depth
+
+
+@pytest.mark.parametrize(
+    ("function", "error", "message"),
+    [
+        (lambda x: x[:, :1, :-1] * 100, ValueError, r"depth\(image\) must have shape \(2, 1, 20, 30\)"),
+        (lambda x: 1.0, TypeError, r"depth\(image\) must be a tensor"),
+        (lambda x: -x[:, :1] * 100, ValueError, r"depth\(image\) must be at least 0"),
+        (lambda x: x[:, :1], ValueError, "not normalized"),
+    ],
+)
+def test_a_function_that_gives_no_depth_raises(function, error, message):
+    image = torch.rand(2, 3, 20, 30)
+    for degrade in (
+        lambda: tr.UniformFog(depth=function).degrade(image),
+        lambda: tr.UniformFog().degrade(image, depth=function),
+    ):
+        with pytest.raises(error, match=message):
+            degrade()
+
+
+def test_depth_that_is_no_function_raises():
+    with pytest.raises(TypeError, match=r"depth must be a provider such as LinearDepth\(\), or a function"):
+        tr.UniformFog(depth=3)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_function_sees_the_frames_of_clips():
+    clip = torch.rand(2, 3, 3, 20, 30)
+    seen = []
+
+    def depth(image: Tensor) -> Tensor:
+        seen.append(image)
+        return 10 + 100 * image[:, :1]
+
+    moving = tr.UniformFog().degrade(clip, depth=depth, seed=0).image
+    assert seen[0].equal(clip.flatten(0, 1))
+    given = tr.UniformFog().degrade(clip, depth=10 + 100 * clip[:, :, :1], seed=0).image
+    assert_close(moving, given)
+
+
+# --- the corridor
+
+
+def log_error(depth: Tensor, truth: Tensor) -> float:
+    known = truth.isfinite()
+    ratio = depth.expand_as(truth)[known].clamp(1, 250) / truth[known].clamp(1, 250)
+    return ratio.log10().abs().mean().item()
+
+
+def test_the_corridor_is_nearer_to_rendered_depth_than_a_flat_road_and_the_ramp():
+    image, depth = render_road_scenes(torch.arange(16), 90, 160)
+    size = {"dtype": torch.float32, "device": torch.device("cpu")}
+    errors = [
+        log_error(d, depth)
+        for d in (CorridorDepth()(image), GroundPlaneDepth()(90, 160, **size), LinearDepth()(90, 160, **size))
+    ]
+    assert errors[0] < 0.8 * errors[1] < 0.8 * errors[2]
+
+
+def test_the_corridor_is_nearer_to_lidar_than_a_flat_road_and_the_ramp(shared_data):
+    size = {"dtype": torch.float32, "device": torch.device("cpu")}
+    for name in ("clear_road_lidar", "haze_road_lidar"):
+        folder = shared_data / "references" / name
+        picture = cv2.imread(str(folder / "image_640x360.jpg"))
+        assert picture is not None
+        image = torch.from_numpy(picture[..., ::-1].copy()).permute(2, 0, 1)[None].float() / 255
+        truth = read_depth(folder / "depth_dense_derived_640x360.png")[0][None, None]
+        focal = json.loads((folder / "meta.json").read_text())["fx"] / 1920
+        road = {"focal": focal, "horizon": 0.55, "spread": 0.1}
+        corridor = CorridorDepth(**road)(image)
+        errors = [
+            log_error(d, truth)
+            for d in (corridor, GroundPlaneDepth(**road)(360, 640, **size), LinearDepth()(360, 640, **size))
+        ]
+        assert errors[0] < 0.8 * errors[1] < 0.8 * errors[2]
+
+
+def test_the_walls_stand_where_they_should_and_the_depth_is_announced_as_assumed():
+    with pytest.warns(UserWarning, match="pass depth="):
+        depth = CorridorDepth(side=6.0, focal=1.0, spread=0.0)(torch.zeros(1, 3, 100, 200))
+    # A wall 6 m to the side, seen 50.5 px from the middle with a focal length of 200 px.
+    assert_close(depth[0, 0, 50, 150], torch.tensor(6.0 * 200 / 50.5))
+    # The road 40.5 px below the horizon: 1.3 m below the camera.
+    assert_close(depth[0, 0, 90, 100], torch.tensor(1.3 * 200 / 41.0), rtol=0.02, atol=0)
+
+
+# --- the command
+
+
+def write_frames(folder: Path) -> list[Path]:
+    (folder / "frames" / "b").mkdir(parents=True)
+    image, _ = render_road_scenes(torch.arange(3), 56, 84)
+    paths = [folder / "frames" / name for name in ("a.png", "b/c.jpg", "b/d.png")]
+    for path, picture in zip(paths, image, strict=True):
+        cv2.imwrite(str(path), (picture.permute(1, 2, 0).numpy()[..., ::-1] * 255).round())
+    return paths
+
+
+def test_the_command_writes_maps_that_fog_and_pairs_use_and_continues(call, network, tmp_path):
+    write_frames(tmp_path)
+    words = ("source=frames", "out=depth", f"network={network('metric')}", "scale_by=model", "batch=2")
+    outcome = call("estimate_depth", *words)
+    assert outcome.code == 0, outcome.err
+    assert "3 depth maps written, 0 frames skipped" in outcome.out
+    maps = [tmp_path / "depth" / name for name in ("a.png", "b/c.png", "b/d.png")]
+    times = [path.stat().st_mtime_ns for path in maps]
+    maps[1].unlink()
+    assert "1 depth maps written" in call("estimate_depth", *words).out
+    assert [path.stat().st_mtime_ns for path in maps][::2] == times[::2]
+    folder = DepthFolder(tmp_path / "depth")
+    depth = folder.read("b/c.jpg", frame_size=(56, 84), size=None)
+    picture = cv2.imread(str(tmp_path / "frames" / "b" / "c.jpg"))
+    assert picture is not None
+    image = torch.from_numpy(picture[..., ::-1].copy()).permute(2, 0, 1)[None].float() / 255
+    expected = from_transformers(network("metric"), scale="model")(image)[0]
+    assert depth.isinf().equal(expected.isinf())
+    assert (depth - expected)[expected.isfinite()].abs().max() <= 1 / 512 + 1e-4
+
+    options = ("scene=cape_town_fog", "source=frames", "license=CC0", "workers=0", "depth=depth")
+    outcome = call("generate", *options, "out=pairs")
+    assert outcome.code == 0, outcome.err
+    stored = sorted((tmp_path / "pairs").rglob("*.depth.png"))
+    assert len(stored) == 3
+    assert any(read_depth(path)[0].equal(read_depth(maps[1])[0]) for path in stored)
+    maps[0].unlink()
+    message = call("generate", *options, "out=other").message
+    assert re.fullmatch(r"depth must be a folder with a map for each frame, got none for a\.png in depth .*", message)
+
+
+def test_the_frames_of_videos_have_maps_by_their_numbers(call, network, tmp_path):
+    (tmp_path / "drives").mkdir()
+    writer = cv2.VideoWriter(str(tmp_path / "drives" / "a.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, (84, 56))
+    for k in range(3):
+        writer.write(np.full((56, 84, 3), 40 * k, np.uint8))
+    writer.release()
+    words = ("source=drives", "out=depth", f"network={network('metric')}", "scale_by=model")
+    assert call("estimate_depth", *words).code == 0
+    assert sorted(path.name for path in (tmp_path / "depth" / "a.mp4").iterdir()) == [f"{k:06d}.png" for k in range(3)]
+
+
+def test_frames_without_a_trusted_scale_are_skipped_and_named(call, network, tmp_path):
+    write_frames(tmp_path)
+    words = ("source=frames", "out=depth", f"network={network('metric')}", "max_spread=0.0001")
+    outcome = call("estimate_depth", *words)
+    assert outcome.code == 1
+    assert outcome.err.count("skipped: ") == 3
+    assert "spread of 0.0001" in outcome.err
+    assert not list((tmp_path / "depth").rglob("*.png"))

@@ -1,0 +1,94 @@
+"""The command that estimates depth maps of pictures and videos with a network."""
+
+import statistics
+import sys
+from collections.abc import Iterable, Iterator
+from itertools import count
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from omegaconf import DictConfig
+from torch import Tensor
+
+from torchrefract._validation import UsageError, check_count
+from torchrefract.cli.command import make, naming, progress
+from torchrefract.data import media
+from torchrefract.data.depth_maps import DepthFolder, write_depth
+from torchrefract.data.images import UnreadableImageError, read_image
+from torchrefract.data.pairs.manifest import locked
+from torchrefract.depth import RoadSpreadError, TransformersDepth
+
+
+class _Frame(NamedTuple):
+    image: Tensor  # (3, H, W)
+    target: Path
+    name: str
+
+
+def estimate_depth(cfg: DictConfig) -> None:
+    """Write the depth maps of a picture, a video or a folder that are not in the output folder yet."""
+    source, out = Path(str(cfg.source)).expanduser(), Path(str(cfg.out)).expanduser()
+    with naming("batch"):
+        size = check_count("batch", cfg.batch)
+    files = media.find_media(source, deep=True, name="source")
+    media.check_output_folder(out, source, deep=True)
+    network = make(cfg, "model")
+    if not isinstance(network, TransformersDepth):
+        raise UsageError(f"model must be torchrefract.depth.from_transformers, got {type(network).__name__}")
+    with naming("out"):
+        out.mkdir(parents=True, exist_ok=True)
+    folder, root = DepthFolder(out), source if source.is_dir() else source.parent
+    skipped, spreads = dict[str, str](), list[float]()
+    num_written = 0
+    with locked("out", out):
+        frames = _missing_frames(progress(files, "estimating depth", count=len(files)), root, folder, skipped)
+        for batch in _batches(frames, size):
+            for frame, result in zip(batch, network.each(torch.stack([frame.image for frame in batch])), strict=True):
+                if isinstance(result, RoadSpreadError):
+                    _skip(skipped, frame.name, f"{frame.name}: {result}")
+                    continue
+                frame.target.parent.mkdir(parents=True, exist_ok=True)
+                write_depth(frame.target, result.depth[0].cpu())
+                num_written += 1
+                spreads += [] if result.spread is None else [result.spread]
+    if num_written == 0 and skipped:
+        raise UsageError(f"source must hold a frame whose depth can be estimated, got {next(iter(skipped.values()))}")
+    spread = f", median spread of the scale {statistics.median(spreads):.2f}" if spreads else ""
+    print(f"{out}: {num_written} depth maps written, {len(skipped)} frames skipped{spread}")
+    if skipped:
+        raise SystemExit(1)
+
+
+def _missing_frames(
+    files: Iterable[Path], root: Path, folder: DepthFolder, skipped: dict[str, str]
+) -> Iterator[_Frame]:
+    """Yield the frames that have no map yet; name those that cannot be read."""
+    for file in files:
+        name = file.relative_to(root).as_posix()
+        try:
+            if media.is_video(file):
+                for index, image in media.read_video(file, count()):
+                    if not folder.path(name, index).is_file():
+                        yield _Frame(image[0], folder.path(name, index), f"{name}#{index}")
+            elif not folder.path(name).is_file():
+                yield _Frame(read_image(file), folder.path(name), name)
+        except UnreadableImageError as error:
+            _skip(skipped, name, str(error))
+
+
+def _skip(skipped: dict[str, str], name: str, reason: str) -> None:
+    skipped[name] = reason
+    print(f"skipped: {reason}", file=sys.stderr)
+
+
+def _batches(frames: Iterator[_Frame], size: int) -> Iterator[list[_Frame]]:
+    """Yield up to `size` frames in a row of one shape."""
+    batch = list[_Frame]()
+    for frame in frames:
+        if batch and (len(batch) == size or frame.image.shape != batch[0].image.shape):
+            yield batch
+            batch = []
+        batch.append(frame)
+    if batch:
+        yield batch

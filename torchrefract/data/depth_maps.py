@@ -1,0 +1,134 @@
+"""Depth maps of frames in files: gray PNGs of 16 bits, or .npy arrays in m."""
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrefract._io import replace_file
+from torchrefract._validation import UsageError
+from torchrefract.data.images import fit, image_size
+from torchrefract.fields.depth import check_depth
+
+STEP = 1 / 256  # m, of a level of a PNG
+_LAST = 65535  # the level of an infinite depth; 0 was not measured
+_SUFFIXES = (".png", ".npy")
+
+
+@dataclass(frozen=True)
+class DepthFolder:
+    """The depth maps of the frames of another folder, as `torchrefract.estimate_depth` writes them.
+
+    The map of a picture a/b.jpg is a/b.png or a/b.npy, that of frame 7 of a video a/c.mp4 is a/c.mp4/000007.png.
+
+    root: the folder.
+    scale: m, of a level of a PNG.
+    """
+
+    root: Path
+    scale: float = STEP
+
+    def path(self, name: str, frame: int | None = None) -> Path:
+        """Return the path of the map of a picture, or of a frame of a video, by its name relative to the frames."""
+        stem = PurePosixPath(name)
+        place = stem / f"{frame:06d}" if frame is not None else stem.with_suffix("")
+        paths = [self.root / f"{place}{suffix}" for suffix in _SUFFIXES]
+        return next((path for path in paths if path.is_file()), paths[0])
+
+    def find(self, name: str, frame: int | None = None) -> Path:
+        """Return the path of an existing map; raise UsageError if there is none."""
+        path = self.path(name, frame)
+        if not path.is_file():
+            raise UsageError(
+                f"depth must be a folder with a map for each frame, got none for {name} in {self.root} ({path} is "
+                "missing; python -m torchrefract.estimate_depth writes maps)"
+            )
+        return path
+
+    def read(
+        self, name: str, frame: int | None = None, *, frame_size: tuple[int, int], size: tuple[int, int] | None
+    ) -> Tensor:
+        """Read the map of a frame, (1, h, w), m, cropped and reduced from `frame_size` to `size` like the frame.
+
+        Raises:
+            UsageError: there is no such file, or not one of this frame.
+        """
+        path = self.find(name, frame)
+        return crop_depth(read_depth(path, scale=self.scale)[0], frame_size, size, name=str(path))
+
+
+def write_depth(path: Path, depth: Tensor) -> None:
+    """Write a map (H, W), m, as a PNG of 16 bits in steps of 1/256 m; from 256 m on, it is infinite."""
+    with replace_file(path) as temporary:
+        temporary.write_bytes(cv2.imencode(".png", depth_levels(depth.numpy()))[1].tobytes())
+
+
+def depth_levels(depth: np.ndarray) -> np.ndarray:
+    """Return the levels of a PNG, uint16, for a depth in m."""
+    return np.clip(np.rint(depth.astype(float) / STEP), 1, _LAST).astype(np.uint16)
+
+
+def depth_of_levels(levels: np.ndarray, scale: float = STEP) -> np.ndarray:
+    """Return the depth in m, float32, of the levels of a PNG; pixels that were not measured are infinite."""
+    return np.where((levels == 0) | (levels == _LAST), np.inf, levels * scale).astype(np.float32)
+
+
+def read_depth(path: Path, *, scale: float = STEP) -> tuple[Tensor, float]:
+    """Read a map (H, W), m, and the share of its pixels that were not measured, which are infinite.
+
+    Raises:
+        UsageError, UnreadableImageError: the file is not such a map.
+    """
+    if path.suffix.lower() == ".npy":
+        return _read_npy(path), 0.0
+    image_size(path)  # raises UnreadableImageError
+    steps = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    if steps is None or steps.dtype != np.uint16 or steps.ndim != 2:
+        raise UsageError(f"depth must be a gray PNG of 16 bits, or a .npy in m, got {path}")
+    missing = float((steps == 0).mean())
+    if missing > 0.5:
+        raise UsageError(f"depth must be known in half of the pixels at least, got {path} with {missing:.1%} at 0")
+    return torch.from_numpy(depth_of_levels(steps, scale)), missing
+
+
+def crop_depth(
+    depth: Tensor, frame_size: tuple[int, int], size: tuple[int, int] | None, *, name: str = "depth"
+) -> Tensor:
+    """Return a map (H', W') as (1, h, w), cropped and reduced like its frame of `frame_size`.
+
+    Raises:
+        UsageError: the map has not the shape of the frame.
+        ValueError: it is not in m, see `check_depth`.
+    """
+    (height, width), (rows, columns) = frame_size, depth.shape
+    if 2 * abs(rows * width - columns * height) > max(height, width):
+        raise UsageError(
+            f"depth must be of the size of the picture, {height}x{width} (height x width), or of its shape, "
+            f"got {rows}x{columns} in {name}"
+        )
+    check_depth(depth[None, None])
+    # Crop and reduce a picture of relative coordinates like the image, and sample the depth at the results: an average
+    # over the edge of an object would be a distance at which there is nothing.
+    position = torch.zeros(3, height, width)
+    position[0] = ((torch.arange(height) + 0.5) / height)[:, None]
+    position[1] = (torch.arange(width) + 0.5) / width
+    y, x, _ = position if size is None else fit(position, size)
+    y, x = (y * rows).long().clamp(max=rows - 1), (x * columns).long().clamp(max=columns - 1)
+    return depth[y, x][None]
+
+
+def _read_npy(path: Path) -> Tensor:
+    try:
+        value = np.load(path, allow_pickle=False)
+    except OSError as error:
+        raise UsageError(
+            f"depth must be a file that can be read, got {path} ({error.strerror or 'damaged'})"
+        ) from error
+    except (ValueError, EOFError) as error:
+        raise UsageError(f"depth must be an array of numbers, got {path}, which is damaged or not an array") from error
+    if not isinstance(value, np.ndarray) or value.dtype.kind != "f" or value.size == 0 or value.squeeze().ndim != 2:
+        raise UsageError(f"depth must be (height, width) of floating numbers, in m, got {path}")
+    return torch.from_numpy(value.squeeze().astype(np.float32))

@@ -1,0 +1,74 @@
+"""Depth of a road between walls, with the sky from the frame: a stand-in where no depth map is known."""
+
+import math
+import warnings
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchrefract._validation import check_number, check_positive
+from torchrefract.fields.depth import GroundPlaneDepth
+from torchrefract.fields.sky import sky_mask
+from torchrefract.warping.grid import field_dtype
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorridorDepth:
+    """The depth of a flat road between two walls along it, and of the sky that is found in the image.
+
+        z = min(z_road(y), f w / |x - x_v|, far),  inf in the sky
+
+    The walls stand for houses, trees and slopes beside the road, which a flat road alone puts at the horizon. Pass it
+    as `depth=` to a fog; a depth map, or a network (`torchrefract.depth.from_transformers`), is better.
+
+    camera_height, focal, horizon, spread: of the road, as for `GroundPlaneDepth`.
+    side: m, w, from the camera to each wall.
+    vanishing: x_v, where the road vanishes, 0 at the left edge of the frame and 1 at its right edge.
+    far: m, the largest depth outside of the sky.
+    """
+
+    camera_height: float = 1.3
+    focal: float = 0.9
+    horizon: float = 0.5
+    spread: float = 0.05
+    side: float = 8.0
+    vanishing: float = 0.5
+    far: float = 300.0
+
+    def __post_init__(self) -> None:
+        self.road  # noqa: B018 - raises for invalid numbers
+        for name in ("side", "far"):
+            object.__setattr__(self, name, check_positive(name, getattr(self, name)))
+        object.__setattr__(self, "vanishing", check_number("vanishing", self.vanishing, low=-10.0, high=10.0))
+
+    @property
+    def road(self) -> GroundPlaneDepth:
+        """Return the depth of the road."""
+        return GroundPlaneDepth(
+            camera_height=self.camera_height,
+            focal=self.focal,
+            horizon=self.horizon,
+            spread=self.spread,
+            far=math.inf,
+        )
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """Return the depth of images (B, C, H, W) in [0, 1], (B, 1, H, W), m.
+
+        Warns:
+            UserWarning: once for each place in the code, that the depth is assumed.
+        """
+        if not torch.compiler.is_compiling():
+            warnings.warn(
+                "depth is that of a road between walls; pass depth=, a map in m or torchrefract.depth."
+                "from_transformers(...), for fog that knows what stands where",
+                stacklevel=2,
+            )
+        height, width = image.shape[2:]
+        dtype, device = field_dtype(image.dtype), image.device
+        columns = torch.arange(width, dtype=dtype, device=device) - (self.vanishing * width - 0.5)
+        walls = self.side * self.focal * width / columns.abs().clamp(min=1e-6)
+        road = self.road(height, width, dtype=dtype, device=device)
+        depth = torch.minimum(road, walls.view(1, 1, 1, width)).clamp(max=self.far)
+        return torch.where(sky_mask(image), torch.inf, depth)

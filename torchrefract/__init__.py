@@ -1,8 +1,9 @@
 """Differentiable image degradations for road cameras, and the maps that undo them.
 
 Effects, each an `nn.Module` from images to images; in parentheses what they show:
-    LensDistortion (a lens), Turbulence (heat haze), ThinPlateSpline and DivergenceFree (smooth random warps),
-    Rectification (removes the lens of a calibrated camera), UniformFog, HeterogeneousFog, LensFlare,
+    LensDistortion (a lens), Turbulence (heat haze), PhysicalTurbulence (heat haze by Cn2 and depth), RoadMirage,
+    ThinPlateSpline and DivergenceFree (smooth random warps), Rectification (removes the lens of a calibrated camera),
+    UniformFog, HeterogeneousFog, LensFlare,
     SunGlare (the sun, its glare and ghosts, and a camera that exposes for it), Exposure (gain, noise and clipping),
     Compose (several effects in order), OneOf (one of several, at random)
 
@@ -36,7 +37,9 @@ from torchrefract.effects.flare import FlareParams, LensFlare
 from torchrefract.effects.fog import FogParams, UniformFog, remove_fog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog, HeterogeneousFogParams
 from torchrefract.effects.lens import LensDistortion, LensParams
+from torchrefract.effects.physical_turbulence import PhysicalTurbulence, PhysicalTurbulenceParams
 from torchrefract.effects.rectification import Rectification, RectificationParams
+from torchrefract.effects.road_mirage import RoadMirage, RoadMirageParams
 from torchrefract.effects.rolling_shutter import RollingShutter, RollingShutterParams
 from torchrefract.effects.sun_glare import SunGlare, SunGlareParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
@@ -90,8 +93,12 @@ __all__ = [
     "LinearDepth",
     "OneOf",
     "Pair",
+    "PhysicalTurbulence",
+    "PhysicalTurbulenceParams",
     "Rectification",
     "RectificationParams",
+    "RoadMirage",
+    "RoadMirageParams",
     "RollingShutter",
     "RollingShutterParams",
     "SunGlare",

@@ -22,11 +22,14 @@ from torchrefract import (
     Compose,
     DivergenceFree,
     Exposure,
+    GroundPlaneDepth,
     HeterogeneousFog,
     LensDistortion,
     LensFlare,
     OneOf,
+    PhysicalTurbulence,
     Rectification,
+    RoadMirage,
     RollingShutter,
     SunGlare,
     ThinPlateSpline,
@@ -80,7 +83,7 @@ EFFECTS = {
         },
         identity={"k1_range": NO_RANGE, "k2_range": NO_RANGE, "p1_range": NO_RANGE, "p2_range": NO_RANGE},
         gradient_field="coefficients",
-        fields=("coefficients", "focal", "center"),
+        fields=("coefficients", "focal", "center", "zoom", "shift"),
     ),
     "turbulence": Case(
         Turbulence,
@@ -88,6 +91,27 @@ EFFECTS = {
         identity={"amplitude_range": NO_RANGE},
         gradient_field="amplitude",
         fields=("amplitude", "length", "aperture", *MOTION),
+    ),
+    "turbulence with depth": Case(
+        partial(Turbulence, depth=GroundPlaneDepth(), reference_distance=20.0),
+        strongest={"amplitude_range": (0.5, 0.9), "length_range": (9.0, 14.0), "aperture_range": (1.5, 2.0)},
+        identity={"amplitude_range": NO_RANGE},
+        gradient_field="amplitude",
+        fields=("amplitude", "length", "aperture", *MOTION),
+    ),
+    "physical turbulence": Case(
+        PhysicalTurbulence,
+        strongest={"cn2_range": (1e-8, 3e-8), "wind_x_range": (5.0, 9.0)},
+        identity={"cn2_range": NO_RANGE},
+        gradient_field="tilt",
+        fields=("tilt", "wind", "frame"),
+    ),
+    "road mirage": Case(
+        partial(RoadMirage, focal=30.0, horizon=0.3, half_width=math.inf),
+        strongest={"difference_range": (20.0, 30.0), "shimmer_range": (0.1, 0.3)},
+        identity={"difference_range": NO_RANGE},
+        gradient_field=None,  # the critical angle is a root
+        fields=("difference", "shimmer", "wave", "rate", "phase", "frame"),
     ),
     "thin-plate spline": Case(
         ThinPlateSpline,
@@ -560,9 +584,12 @@ def test_other_types_than_params_raise(case):
     for params in (None, {"applied": torch.ones(2)}, (1.0, 2.0)):
         with pytest.raises(TypeError, match=r"params must be \w+Params, got"):
             effect.apply(image, params)
-    for other in (other for other in EFFECTS.values() if other.make is not case.make):
-        with pytest.raises((TypeError, ValueError), match="params"):
-            effect.apply(image, other.strong().sample(image, seed=7))
+    own = effect.sample(image, seed=7)
+    for other in (other.strong().sample(image, seed=7) for other in EFFECTS.values()):
+        # Two cases of one effect may have the same parameters.
+        if type(other) is not type(own) or any(a.shape != b.shape for a, b in zip(other, own, strict=True)):
+            with pytest.raises((TypeError, ValueError), match="params"):
+                effect.apply(image, other)
 
 
 def test_unknown_arguments_raise(case):

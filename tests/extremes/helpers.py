@@ -28,6 +28,8 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "rolling shutter": tr.RollingShutter,
     "vignetting": tr.Vignetting,
     "chromatic aberration": partial(tr.ChromaticAberration, red_range=(0.02, 0.05)),
+    "sun glare": tr.SunGlare,
+    "exposure": partial(tr.Exposure, shot_range=(1e-4, 1e-3)),
     "compose": lambda: tr.Compose([tr.Turbulence(), tr.LensDistortion(), tr.UniformFog()]),
     "one of": lambda: tr.OneOf([tr.DivergenceFree(), tr.ThinPlateSpline(), tr.LensFlare()]),
     "rectification": partial(tr.Rectification, _CAMERA),

@@ -139,6 +139,7 @@ class Exposure(PhotometricEffect):
 
     def render(self, image: Tensor, params: ExposureParams, depth: Tensor | None) -> Rendered:
         """Expose images."""
+        image = image.contiguous()  # the rounding of a sum of products depends on the memory format
         rows, dtype = len(image), field_dtype(image.dtype)
         target, shot, read = (
             expand_batch(finite_or(value.to(dtype), 0.0), rows) for value in (params.target, params.shot, params.read)

@@ -186,7 +186,7 @@ class SunGlare(PhotometricEffect):
             u = random.uniform(inner.at(0), 4).to(values.dtype)
             sky = find_sky(image)
             point, has_sky = sky_point(sky, u[:, 1:], height=image.shape[2], width=image.shape[3])
-            above = torch.stack([center[:, 0], center[:, 1] + torch.where(has_sky, 0.0, _HIGH_ABOVE)], dim=1)
+            above = torch.stack([center[:, 0], center[:, 1] + _HIGH_ABOVE * (~has_sky).to(center.dtype)], dim=1)
             center = torch.where((has_sky & (u[:, 0] >= self.outside))[:, None], point, above)
             luminance = torch.where(sky.is_night, 0.0, luminance)
         batch, channels = image.shape[:2]
@@ -235,6 +235,7 @@ class SunGlare(PhotometricEffect):
 
     def render(self, image: Tensor, params: SunGlareParams, depth: Tensor | None) -> Rendered:
         """Add the light of the sun to images and expose them."""
+        image = image.contiguous()  # the rounding of a sum of products depends on the memory format
         height, width = image.shape[2:]
         camera = None if self.camera is None else self.camera.resized(width=width, height=height)
         focal = _FOCAL * width if camera is None else camera.fx

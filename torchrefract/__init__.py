@@ -3,7 +3,8 @@
 Effects, each an `nn.Module` from images to images; in parentheses what they show:
     LensDistortion (a lens), Turbulence (heat haze), PhysicalTurbulence (heat haze by Cn2 and depth), RoadMirage,
     ThinPlateSpline and DivergenceFree (smooth random warps), Rectification (removes the lens of a calibrated camera),
-    UniformFog, HeterogeneousFog, LensFlare,
+    RollingShutter (rows that a moving, shaking camera exposes one after the other),
+    UniformFog, HeterogeneousFog, LensFlare, Vignetting (dark corners), ChromaticAberration (colored edges),
     SunGlare (the sun, its glare and ghosts, and a camera that exposes for it), Exposure (gain, noise and clipping),
     Compose (several effects in order), OneOf (one of several, at random)
 

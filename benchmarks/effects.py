@@ -49,15 +49,17 @@ WHAT = (
 )
 PACKAGE = str(Path(tr.__file__).parent)
 ALL = "all four warps"
+ROLLING_SHUTTER = "rolling shutter"
 OTHER_WARPS: dict[str, Callable[..., Any]] = {
     "default lenses": tr.LensDistortion,
+    ROLLING_SHUTTER: tr.RollingShutter,
     "rough turbulence": partial(
         tr.Turbulence, amplitude_range=(1.2, 1.8), length_range=(40.0, 80.0), aperture_range=(4.0, 6.0)
     ),
 }
 # Largest multiples of the bare grid_sample for 1x3x1080x1920 float32 on two threads.
 LIMITS = {
-    "auto": dict(zip((*WARPS, ALL), (0.9, 0.9, 0.9, 1.0, 1.4), strict=True)),
+    "auto": dict(zip((*WARPS, ALL), (0.9, 0.9, 0.9, 1.0, 1.4), strict=True)) | {ROLLING_SHUTTER: 1.0},
     "torch": dict(zip((*WARPS, ALL), (1.6, 1.6, 1.6, 1.6, 3.0), strict=True)),
 }
 PHOTOMETRIC_LIMITS = {

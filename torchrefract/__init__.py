@@ -1,8 +1,9 @@
 """Differentiable image degradations for road cameras, and the maps that undo them.
 
 Effects, each an `nn.Module` from images to images; in parentheses what they show:
-    LensDistortion (a lens), Turbulence (heat haze), ThinPlateSpline and DivergenceFree (smooth random warps),
-    Rectification (removes the lens of a calibrated camera), UniformFog, HeterogeneousFog, LensFlare,
+    LensDistortion (a lens), Turbulence (heat haze), PhysicalTurbulence (heat haze by Cn2 and depth), RoadMirage,
+    ThinPlateSpline and DivergenceFree (smooth random warps), Rectification (removes the lens of a calibrated camera),
+    UniformFog, HeterogeneousFog, LensFlare,
     SunGlare (the sun, its glare and ghosts, and a camera that exposes for it), Exposure (gain, noise and clipping),
     Compose (several effects in order), OneOf (one of several, at random)
 
@@ -28,6 +29,7 @@ if _sys.argv[:1] == ["-m"] and _sys.stderr is not None:
     print("torchrefract: loading …", file=_sys.stderr, flush=True)
 
 from torchrefract.cameras.camera import Camera
+from torchrefract.effects.chromatic_aberration import ChromaticAberration, ChromaticAberrationParams
 from torchrefract.effects.compose import Compose, ComposeParams, OneOf
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams
 from torchrefract.effects.exposure import Exposure, ExposureParams
@@ -35,10 +37,14 @@ from torchrefract.effects.flare import FlareParams, LensFlare
 from torchrefract.effects.fog import FogParams, UniformFog, remove_fog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog, HeterogeneousFogParams
 from torchrefract.effects.lens import LensDistortion, LensParams
+from torchrefract.effects.physical_turbulence import PhysicalTurbulence, PhysicalTurbulenceParams
 from torchrefract.effects.rectification import Rectification, RectificationParams
+from torchrefract.effects.road_mirage import RoadMirage, RoadMirageParams
+from torchrefract.effects.rolling_shutter import RollingShutter, RollingShutterParams
 from torchrefract.effects.sun_glare import SunGlare, SunGlareParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence, TurbulenceParams
+from torchrefract.effects.vignetting import Vignetting, VignettingParams
 from torchrefract.fields.corridor import CorridorDepth
 from torchrefract.fields.depth import (
     DepthProvider,
@@ -63,6 +69,8 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Camera",
+    "ChromaticAberration",
+    "ChromaticAberrationParams",
     "Compose",
     "ComposeParams",
     "CorridorDepth",
@@ -85,8 +93,14 @@ __all__ = [
     "LinearDepth",
     "OneOf",
     "Pair",
+    "PhysicalTurbulence",
+    "PhysicalTurbulenceParams",
     "Rectification",
     "RectificationParams",
+    "RoadMirage",
+    "RoadMirageParams",
+    "RollingShutter",
+    "RollingShutterParams",
     "SunGlare",
     "SunGlareParams",
     "ThinPlateParams",
@@ -94,6 +108,8 @@ __all__ = [
     "Turbulence",
     "TurbulenceParams",
     "UniformFog",
+    "Vignetting",
+    "VignettingParams",
     "check_depth",
     "compose_flows",
     "depth_from_disparity",

@@ -126,7 +126,7 @@ def noise_key(source: Stream) -> Tensor:
     return _drawn(np.concatenate([child, more]).T.copy(), source)
 
 
-def white_noise(key: Tensor, count: int) -> Tensor:
+def white_noise(key: Tensor, count: int, *, start: int = 0) -> Tensor:
     """Compute (B, 2, count) standard normal numbers, float32, below `LARGEST_NORMAL` in magnitude.
 
     Made for millions of numbers: pair i of a sample is the Box-Muller transform of a hash of i under the sample's key,
@@ -135,13 +135,14 @@ def white_noise(key: Tensor, count: int) -> Tensor:
     Args:
         key: (B, 4), int64, from `noise_key`.
         count: number of pairs of a sample.
+        start: number of the first pair.
     """
     if torch.compiler.is_compiling() or key.device.type != "cpu":
-        return white_noise_at(key, torch.arange(count, device=key.device))
+        return white_noise_at(key, torch.arange(start, start + count, device=key.device))
     band = max(1, _BAND // max(1, len(key)))
     bands = (
-        white_noise_at(key, torch.arange(start, min(start + band, count), device=key.device))
-        for start in range(0, max(1, count), band)
+        white_noise_at(key, torch.arange(start + first, start + min(first + band, count), device=key.device))
+        for first in range(0, max(1, count), band)
     )
     return cat_bands(bands, dim=2, length=count)
 

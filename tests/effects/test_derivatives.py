@@ -20,6 +20,7 @@ from torchrefract import (
     LensDistortion,
     LensFlare,
     Rectification,
+    RollingShutter,
     SunGlare,
     ThinPlateSpline,
     Turbulence,
@@ -60,6 +61,10 @@ WARPS = {  # and their parameter that has a gradient at strength zero
     "thin-plate spline": (
         partial(ThinPlateSpline, amplitude_range=(0.2, 0.3), lattice=(3, 3), smoothing_range=(0.01, 0.02)),
         "displacement",
+    ),
+    "rolling shutter": (
+        partial(RollingShutter, num_frequencies=1, roll_range=(1.0, 2.0), exposure_range=(1.0, 2.0), num_exposures=1),
+        "speed",
     ),
     "divergence-free": (
         partial(DivergenceFree, amplitude_range=(0.5, 1.0), length_range=(3.0, 4.0)),

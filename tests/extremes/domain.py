@@ -106,6 +106,29 @@ DOMAINS = {
             "steps": st.integers(1, 3),
         },
     ),
+    "rolling shutter": Domain(
+        tr.RollingShutter,
+        {
+            "speed_range": (-1000.0, 1000.0),
+            "readout_range": (-200.0, 200.0),
+            "exposure_range": (0.0, 200.0),
+            **{f"{axis}_range": (0.0, 5.0) for axis in ("pitch", "yaw", "roll")},
+            "frequency_range": (0.0, 1000.0),
+        },
+        {
+            **_WARP_OPTIONS,
+            "num_frequencies": st.integers(1, 4),
+            "num_exposures": st.integers(1, 3),
+            "fps": st.floats(1.0, 240.0),
+            "depth": _FOG_OPTIONS["depth"],
+        },
+    ),
+    "vignetting": Domain(tr.Vignetting, {"strength_range": (0.0, 1.0)}, {"linear_light": st.booleans()}),
+    "chromatic aberration": Domain(
+        tr.ChromaticAberration,
+        {"red_range": (-0.1, 0.1), "blue_range": (-0.1, 0.1)},
+        {"interpolation": st.sampled_from(["bilinear", "bicubic"])},
+    ),
     "uniform fog": Domain(tr.UniformFog, _FOG, _FOG_OPTIONS),
     "heterogeneous fog": Domain(
         tr.HeterogeneousFog,

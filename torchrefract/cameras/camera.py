@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from torchrefract.cameras.radial import falls_before, first_root, growth
 from torchrefract.cameras.rational import RationalLens
 
 _GRID = 129  # points along each side of the frame at which `coverage` looks for a ray
+_UNKNOWN_FOCAL = 0.9  # widths of the frame, of the pinhole that stands in for an unknown camera
 DIRECTIONS = ("horizontal", "vertical")
 # Coefficients whose term is odd in x, or in y: they change their sign in a mirrored frame.
 _ODD = {"horizontal": ("p2", "s1", "s2", "tau_y"), "vertical": ("p1", "s3", "s4", "tau_x")}
@@ -266,3 +267,29 @@ class Camera:
         focal = min(self.fx, self.fy)
         if any(falls_before(a, 1 / focal / focal) for a in growths):  # a square could overflow
             raise ValueError(f"coefficients must leave at least one pixel that does not fold back, got {c}")
+
+
+class Pinhole(NamedTuple):
+    """A pinhole for frames of one size."""
+
+    focal: tuple[float, float]  # px, fx and fy
+    center: tuple[float, float]  # px, principal point
+
+
+def pinhole_of(camera: Camera | None, *, height: int, width: int) -> Pinhole:
+    """Return the pinhole of a camera for frames of a size; None is a centered one with a focal length of 0.9 widths."""
+    if camera is None:
+        return Pinhole((_UNKNOWN_FOCAL * width, _UNKNOWN_FOCAL * width), ((width - 1) / 2, (height - 1) / 2))
+    camera = camera.resized(width=width, height=height)
+    return Pinhole((camera.fx, camera.fy), (camera.cx, camera.cy))
+
+
+def check_camera(camera: Camera | None) -> Camera | None:
+    """Return `camera` if it is a camera or None.
+
+    Raises:
+        TypeError: otherwise.
+    """
+    if camera is not None and not isinstance(camera, Camera):
+        raise TypeError(f"camera must be a Camera, got {type(camera).__name__}")
+    return camera

@@ -247,6 +247,11 @@ class ParamsAtDepth(NamedTuple):
         """Return (N,), bool: the parameters change nothing at any depth."""
         return self.params.is_identity
 
+    @property
+    def is_map(self) -> bool:
+        """Return True if depth varies along rows, so that no plan of the ranges holds."""
+        return self.depth.shape[3] > 1
+
 
 def check_shapes(params: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Raise ValueError unless these fields of the parameters have rows of the given shapes."""

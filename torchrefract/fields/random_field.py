@@ -151,7 +151,7 @@ def embedding_size(height: int, width: int, *, length: float, kind: str, apertur
     # A frame as large as the cap still gets a margin, so that its edges do not join.
     cap = max(_MAX_POINTS, 2 * height * width)
     margin = math.ceil(min(math.hypot(REACH[kind] * length, _APERTURE_REACH * aperture), cap))
-    size = _fast_size(height + margin), _fast_size(width + margin)
+    size = fast_size(height + margin), fast_size(width + margin)
     if size[0] * size[1] <= cap:
         return size
     # The largest margin for which (height + margin) (width + margin) stays below the cap.
@@ -398,7 +398,7 @@ def _root(values: Tensor) -> Tensor:
     return torch.where(values > 0, values, 1).sqrt() * (values > 0)
 
 
-def _fast_size(least: int) -> int:
+def fast_size(least: int) -> int:
     """Return the smallest even number from `least` on that has no prime factor above 7."""
     return next(filter(_has_small_factors, itertools.count(max(2, least + least % 2), 2)))
 
@@ -406,7 +406,7 @@ def _fast_size(least: int) -> int:
 def _fast_size_below(largest: int, least: int) -> int:
     """Return the largest such number up to `largest`, or the smallest from `least` on if that is below `least`."""
     sizes = range(largest - largest % 2, max(least, 2) - 1, -2)
-    return next(filter(_has_small_factors, sizes), _fast_size(least))
+    return next(filter(_has_small_factors, sizes), fast_size(least))
 
 
 def _has_small_factors(size: int) -> bool:

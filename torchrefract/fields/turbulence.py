@@ -5,6 +5,8 @@ from torch import Tensor
 from torchrefract.fields.random_field import FieldParams, Frequencies, node_positions, sample_field
 from torchrefract.warping.lattice import Lattice
 
+_SMALLEST_SHARE = 1e-8  # of the path
+
 
 def turbulence_flow(
     params: FieldParams,
@@ -44,3 +46,18 @@ def turbulence_flow(
         variance = (frame - mean).square().mean(dim=(2, 3), keepdim=True)
         field = (field - mean) / variance.clamp(min=1e-12).sqrt()
     return amplitude[:, None, None, None] * field, clipped
+
+
+def share_at_depth(depth: Tensor, reference_distance: float) -> Tensor:
+    """Return the share of the displacement that the air up to a depth causes: sqrt(min(d, D) / D).
+
+    The variance of the angle of arrival grows with the length of the path through air of one strength.
+
+    Args:
+        depth: m, of any shape, inf for the sky.
+        reference_distance: m, D.
+
+    Source: Fried, "Optical resolution through a randomly inhomogeneous medium", JOSA 56 (1966).
+    """
+    # The root of 0 would have an infinite gradient.
+    return (depth / reference_distance).clamp(min=_SMALLEST_SHARE, max=1).sqrt()

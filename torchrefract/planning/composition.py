@@ -25,7 +25,7 @@ class PlannedWarp(NamedTuple):
 
     model: ErrorModel | None  # None if the warp must be computed exactly
     ulps: int
-    has_closed_form: bool  # the flow at a displaced point needs no lattice of its own
+    has_closed_form: bool  # the flow at a displaced point needs no lattice of its own, and one may interpolate it
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,346 @@
+"""Turbulent air along the rays of a camera: angles of arrival from layers of air with a von Karman spectrum.
+
+The variance of the angle of arrival of a point at the distance L, along each axis, is
+
+    sigma^2 = 2 pi int_0^L ds Cn2(s) (1 - s/L)^2 int d^2k kx^2 Phi(k) A(k D (1 - s/L)),
+    Phi = 0.033 (k^2 + k0^2)^(-11/6) exp(-(k / km)^2),  k0 = 2 pi / L0,  km = 5.92 / l0,  A(u) = (2 J1(u/2) / (u/2))^2
+
+for an aperture D, an inner scale l0 and an outer scale L0, in m. No wavelength counts. Layers are the gradients of
+potentials, so the field of each has no curl; depth changes their weights alone.
+
+Source: Tatarskii, "Wave propagation in a turbulent medium" (1961); Andrews and Phillips, "Laser beam propagation
+through random media" (2005), section 6.5; Wyngaard, Izumi, Collins, "Behavior of the refractive-index-structure
+parameter near the ground", JOSA 61 (1971), for the decrease with height.
+"""
+
+import math
+from collections.abc import Iterator
+from functools import lru_cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrefract._tensor import as_device_tensor, cached, exact_matmul
+from torchrefract.fields.random_field import fast_size
+from torchrefract.random import white_noise
+
+_RATIO = 3.0  # of the far ends of successive layers
+_HEIGHT_EXPONENT = -4 / 3  # of Cn2, by day
+_NEAREST = 1e-3  # of the reach
+_SMALLEST_DOMAIN = 8  # px; smaller ones have hardly any frequency that has a derivative
+_NUM_GAINS = 513  # nodes of the table of gains
+_SUBCELLS = (-0.5 / math.sqrt(3), 0.5 / math.sqrt(3))  # Gauss-Legendre, of a cell
+
+
+class Air(NamedTuple):
+    """Aperture and turbulence, m: aperture D, inner scale l0, outer scale L0."""
+
+    aperture: float
+    inner_scale: float
+    outer_scale: float
+
+
+class Layers(NamedTuple):
+    """Layers of air, from the camera to the reach; layer k lies between edges k and k + 1.
+
+    edges: m, the first one is 0 and the last one the reach.
+    distances: m, of the potential that stands for each layer.
+    apertures: m, the mean width that the light of a point at the reach has there.
+    strengths: rad^2/m, int kx^2 Phi A d^2k of each layer, for Cn2 = 1.
+    air: aperture and scales.
+    exponent: m in [8/3, 3]: a stretch of air at s adds to the variance of a path of length L as (1 - s/L)^(m - 1).
+    gains: the table of `height_gain`.
+    """
+
+    edges: tuple[float, ...]
+    distances: tuple[float, ...]
+    apertures: tuple[float, ...]
+    strengths: tuple[float, ...]
+    air: Air
+    exponent: float
+    gains: tuple[float, ...]
+
+
+def tilt_variance(distance: float, air: Air) -> float:
+    """Return the variance of the angle of arrival along one axis, rad^2, for Cn2 = 1, m^(-2/3), everywhere.
+
+    Multiply it by Cn2. For D >> l0 it is 1.062 L D^(-1/3), for D << l0 1.093 L l0^(-1/3).
+
+    Args:
+        distance: m, L.
+        air: aperture and scales.
+    """
+    return 2 * math.pi * distance * _strength(air) / _exponent(air)
+
+
+def layers_of(reach: float, count: int, air: Air) -> Layers:
+    """Divide the path up to a reach, m, into layers whose far ends form a geometric series."""
+    exponent = _exponent(air)
+    edges = (0.0, *(reach * _RATIO ** (k - count + 1) for k in range(count)))
+    distances, apertures = [], []
+    for start, end in pairwise(edges):
+        s = start + (end - start) * (np.arange(1000) + 0.5) / 1000
+        weight = (1 - s / reach) ** (exponent - 1)
+        # The correlation is nearly linear in the cubic root of the distance.
+        distances.append(float(np.average(np.cbrt(s), weights=weight) ** 3))
+        apertures.append(float(air.aperture * (1 - np.average(s, weights=weight) / reach)))
+    strengths = [_strength(air._replace(aperture=aperture)) for aperture in apertures]
+    return Layers(edges, tuple(distances), tuple(apertures), tuple(strengths), air, exponent, tuple(_gains(exponent)))
+
+
+def layer_shares(depth: Tensor, layers: Layers) -> list[Tensor]:
+    """Return the weight of each layer for a pixel at a depth, relative to the standard deviation at the reach.
+
+        w_k^2 = (d / R) ((1 - a_k / d)_+^m - (1 - a_(k+1) / d)_+^m),  sum_k w_k^2 = d / R,  d = min(depth, reach R)
+
+    It is the root mean square of the weight 1 - s/d over the part of the layer in front of the pixel.
+
+    Args:
+        depth: m, of any shape, inf for the sky.
+        layers: with edges a_k and exponent m.
+    """
+    reach = layers.edges[-1]
+    share = (depth / reach).clamp(_NEAREST, 1.0)
+    beyond = [(1 - edge / reach / share).clamp(min=0) for edge in layers.edges[1:-1]]
+    powers = [torch.ones_like(share), *(value**layers.exponent for value in beyond), torch.zeros_like(share)]
+    return [_root(share * (near - far)) for near, far in pairwise(powers)]
+
+
+def height_gain(end_height: Tensor, layers: Layers) -> Tensor:
+    """Return the standard deviation of the angle of arrival relative to that of a level ray.
+
+        gain^2 = m int_0^1 x^(m - 1) (e + (1 - e) x)^(-4/3) dx
+
+    Cn2 falls with the height above the ground as h^(-4/3). The ray leads from the camera, x = 1, to the height e.
+
+    Args:
+        end_height: e, of the end of each ray, in heights of the camera, of any shape; below 0 counts as 0.
+        layers: with the exponent m and the table of gains.
+    """
+    gains = as_device_tensor(layers.gains, dtype=end_height.dtype, device=end_height.device)
+    # The gain is smooth in 1 / (1 + e^(1/3)).
+    place = (_NUM_GAINS - 1) / (1 + end_height.clamp(min=1e-9) ** (1 / 3))
+    low = place.detach().floor().clamp(0, _NUM_GAINS - 2)
+    index = low.long().flatten()
+    near, far = (gains.index_select(0, index + step).view_as(place) for step in (0, 1))
+    return near + (far - near) * (place - low)
+
+
+def layer_gradients(
+    key: Tensor,
+    layers: Layers,
+    *,
+    focal: tuple[float, float],
+    size: tuple[int, int],
+    rows: range,
+    columns: range,
+    shift: Tensor | None,
+    dtype: torch.dtype,
+) -> Iterator[list[Tensor]]:
+    """Compute the gradient of each layer's potential, with a variance of 1 along each axis.
+
+    The potential is periodic, and its spectrum is that of the air as far as pixels resolve it. The variance of what
+    they do not resolve is spread evenly over all frequencies, and that of waves longer than the domain is a uniform
+    tilt.
+
+    Args:
+        key: (N, 4), int64, of the white noise.
+        layers: of the path.
+        focal: px, fx and fy.
+        size: (Ht, Wt), px, even, of the periodic domain.
+        rows, columns: px, where the gradient is computed.
+        shift: (N, 2), m, of the air to the right and down since frame 0; None is 0.
+        dtype: of the result.
+
+    Yields:
+        For each layer two tensors (N, 1, n, m), along x and along y.
+    """
+    height, half = size[0], size[1] // 2 + 1
+    count = height * half
+    qy, qx = (q.to(dtype) for q in _frequencies(focal, size, key.device))
+    for k, distance in enumerate(layers.distances):
+        noise = white_noise(key, count, start=k * count).to(dtype).unflatten(2, (height, half))
+        air = layers.air._replace(aperture=layers.apertures[k])
+        amplitude, uniform = _amplitudes(distance, air, layers.strengths[k], focal, size, dtype, key.device)
+        values = noise * amplitude
+        if shift is not None:
+            values = _moved(values, shift / distance, focal, size)
+        yield _gradient(values, noise[:, :, :1, :1] * uniform, (qx, qy), size, rows, columns)
+
+
+def domain_size(height: int, width: int) -> tuple[int, int]:
+    """Return (Ht, Wt), px: the periodic domain of a frame."""
+    return fast_size(max(height, _SMALLEST_DOMAIN)), fast_size(max(width, _SMALLEST_DOMAIN))
+
+
+def _spectrum(k: Tensor, air: Air) -> Tensor:
+    """Return k^2 Phi(k) A(k D) at wave numbers k, 1/m, float64."""
+    k0, km = 2 * math.pi / air.outer_scale, 5.92 / air.inner_scale
+    u = (k * (air.aperture / 2)).clamp(min=1e-6)
+    seen = (2 * torch.special.bessel_j1(u) / u).square()
+    return 0.033 * k.square() * (k.square() + k0 * k0) ** (-11 / 6) * torch.exp(-(k / km).square()) * seen
+
+
+def _integral(air: Air, highest: Tensor) -> Tensor:
+    """Return int kx^2 Phi A d^2k = pi int k (k^2 Phi A) dk up to wave numbers, 1/m, (n,), float64."""
+    lowest = 1e-5 * 2 * math.pi / air.outer_scale
+    steps = torch.linspace(0, 1, 4097, dtype=torch.float64, device=highest.device)
+    k = lowest * (highest[:, None] / lowest) ** steps
+    logs = (highest / lowest).log() / 4096
+    values = k.square() * _spectrum(k, air)
+    return math.pi * logs * (values.sum(dim=1) - (values[:, 0] + values[:, -1]) / 2)
+
+
+@lru_cache(maxsize=4096)
+def _strength(air: Air) -> float:
+    """Return int kx^2 Phi A d^2k, rad^2/m, for Cn2 = 1."""
+    highest = torch.tensor([5 * 5.92 / air.inner_scale], dtype=torch.float64, device="cpu")
+    return _integral(air, highest).item()
+
+
+@lru_cache(maxsize=64)
+def _exponent(air: Air) -> float:
+    """Return m with int_0^1 x^2 v(D x) dx = v(D) / m, v the strength: 3 for D << l0, 8/3 for D >> l0."""
+    x, weight = np.polynomial.legendre.leggauss(24)
+    x, weight = (x + 1) / 2, weight / 2
+    values = [_strength(air._replace(aperture=air.aperture * share)) for share in x.tolist()]
+    return _strength(air) / float(weight @ (x * x * np.array(values)))
+
+
+@lru_cache(maxsize=64)
+def _gains(exponent: float) -> list[float]:
+    """Return the table of `height_gain` over 1 / (1 + e^(1/3)) from 0 to 1."""
+    y, weight = np.polynomial.legendre.leggauss(64)
+    y, weight = (y + 1) / 2, weight / 2
+    z = np.linspace(0, 1, _NUM_GAINS)
+    e = (1 / np.maximum(z, 1e-9) - 1)[:, None] ** 3
+    # The integrand is smooth in the cubic root of the distance to the lower end of the ray.
+    x = np.where(e < 1, y**3, 1 - y**3)
+    values = (exponent * x ** (exponent - 1) * (e + (1 - e) * x) ** _HEIGHT_EXPONENT * 3 * y * y) @ weight
+    return np.where(z > 0, np.sqrt(values), 0.0).tolist()
+
+
+def _frequencies(focal: tuple[float, float], size: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return qy, (Ht, 1), and qx, (Wt / 2 + 1,), 1/rad, float64: wave numbers at a distance of 1 m."""
+    height, width = size
+    ky = torch.arange(height, dtype=torch.float64, device=device)
+    ky = torch.where(2 * ky < height, ky, ky - height)[:, None]
+    kx = torch.arange(width // 2 + 1, dtype=torch.float64, device=device)
+    return ky * (2 * math.pi * focal[1] / height), kx * (2 * math.pi * focal[0] / width)
+
+
+@cached
+def _amplitudes(
+    distance: float,
+    air: Air,
+    strength: float,
+    focal: tuple[float, float],
+    size: tuple[int, int],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> tuple[Tensor, Tensor]:
+    """Return the factors of the noise, for the potential, (Ht, Wt / 2 + 1), and for the uniform tilt, (2, 1, 1)."""
+    qy, qx = _frequencies(focal, size, device)
+    cell_y, cell_x = (2 * math.pi * f / n / distance for f, n in zip(focal[::-1], size, strict=True))
+    power = torch.zeros(qy.shape[0], qx.shape[0], dtype=torch.float64, device=device)
+    for dy in _SUBCELLS:  # the spectrum is steep at the lowest frequencies
+        for dx in _SUBCELLS:
+            power = power + _spectrum(torch.hypot(qy / distance + dy * cell_y, qx / distance + dx * cell_x), air) / 4
+    power = power * (cell_x * cell_y / strength)
+    # The highest frequency of an even size has no derivative, and that of 0 is the uniform tilt.
+    ky, kx = (torch.arange(n, device=device) for n in power.shape)
+    is_used = (ky[:, None] != size[0] // 2) & (kx != size[1] // 2) & ((ky[:, None] != 0) | (kx != 0))
+    times = torch.where(kx == 0, 1.0, 2.0) * is_used  # how often a frequency of the half occurs among all
+    radius = torch.full((1,), math.sqrt(cell_x * cell_y / math.pi), dtype=torch.float64, device=device)
+    uniform = (_integral(air, radius)[0] / strength).clamp(max=1)
+    missing = (1 - uniform - (power * times).sum() / 2).clamp(min=0)
+    power = (power + 2 * missing / times.sum()) * is_used
+    power = power * ((1 - uniform) / ((power * times).sum() / 2))
+    q = torch.hypot(qy, qx).clamp(min=1e-12)
+    # A frame that is not square resolves more of the long waves along one axis than along the other.
+    variances = [1 - (power * times * (along / q).square()).sum() for along in (qx, qy)]
+    uniform = torch.stack(variances).clamp(min=0).sqrt().view(2, 1, 1)
+    amplitude = (power / torch.where(kx == 0, 1.0, 2.0)).sqrt() / q
+    return amplitude.to(dtype), uniform.to(dtype)
+
+
+def _moved(values: Tensor, angle: Tensor, focal: tuple[float, float], size: tuple[int, int]) -> Tensor:
+    """Move waves (N, 2, Ky, Kx), real and imaginary part, by angles (N, 2), rad, to the right and down."""
+    qy, qx = _frequencies(focal, size, values.device)
+    # Whole turns are subtracted in float64, so that late frames are as exact as the first.
+    phase_x, phase_y = angle[:, 0, None, None].double() * qx, angle[:, 1, None, None].double() * qy
+    phase = (phase_x + phase_y).remainder(2 * math.pi).to(values.dtype)
+    cos, sin = phase.cos(), phase.sin()
+    real, imaginary = values.unbind(1)
+    return torch.stack([real * cos + imaginary * sin, imaginary * cos - real * sin], dim=1)
+
+
+def _gradient(
+    values: Tensor,
+    uniform: Tensor,
+    wave_numbers: tuple[Tensor, Tensor],
+    size: tuple[int, int],
+    rows: range,
+    columns: range,
+) -> list[Tensor]:
+    """Compute the gradient of Re sum_k c z_k exp(i q . p), along x and along y, c = 1 for kx = 0 and otherwise 2.
+
+    Args:
+        values: (N, 2, Ht, Wt / 2 + 1), real and imaginary part of i z, which are distributed as those of z.
+        uniform: (N, 2, 1, 1), added to the gradient.
+        wave_numbers: qx and qy.
+        size: px, of the domain.
+        rows, columns: px, of p.
+
+    Returns:
+        Two tensors (N, 1, n, m).
+    """
+    real, imaginary = values.split(1, dim=1)
+    qx, qy = wave_numbers
+    offsets = uniform.split(1, dim=1)
+    if torch.compiler.is_compiling() or not len(values):  # the compiler supports no complex numbers
+        return [
+            _sum(real * q, imaginary * q, size, rows, columns) + offset
+            for q, offset in zip((qx, qy), offsets, strict=True)
+        ]
+    spectrum = torch.complex(real, imaginary)
+    along_x = _part(torch.fft.ifft(spectrum, dim=2, norm="forward"), 2, rows) * qx
+    along_y = _part(torch.fft.ifft(spectrum * qy, dim=2, norm="forward"), 2, rows)
+    gradient = []
+    for lines, offset in zip((along_x, along_y), offsets, strict=True):
+        lines.narrow(3, 0, 1).add_(offset)  # kx = 0 is what all pixels of a row share
+        gradient.append(_part(torch.fft.irfft(lines, n=size[1], dim=3, norm="forward"), 3, columns))
+    return gradient
+
+
+def _part(values: Tensor, dim: int, span: range) -> Tensor:
+    """Return some positions of a periodic dimension."""
+    size = values.shape[dim]
+    if span.step == 1 and span.start >= 0 and span.stop <= size:  # far faster than by index
+        return values.narrow(dim, span.start, len(span))
+    index = torch.arange(span.start, span.stop, span.step, device=values.device)
+    return values.index_select(dim, index.remainder(size))
+
+
+def _sum(real: Tensor, imaginary: Tensor, size: tuple[int, int], rows: range, columns: range) -> Tensor:
+    """Compute the sum of waves (N, 1, Ky, Kx) by products of matrices, (N, 1, n, m)."""
+    ky, kx = (torch.arange(n, device=real.device) for n in real.shape[2:])
+    turn_y, turn_x = (
+        (torch.arange(span.start, span.stop, span.step, device=k.device)[:, None] * k).remainder(n).to(real.dtype)
+        * (2 * math.pi / n)
+        for span, k, n in zip((rows, columns), (ky, kx), size, strict=True)
+    )
+    cos, sin = turn_y.cos(), turn_y.sin()
+    real_lines = exact_matmul(cos, real) - exact_matmul(sin, imaginary)
+    imaginary_lines = exact_matmul(sin, real) + exact_matmul(cos, imaginary)
+    times = torch.where(kx == 0, 1.0, 2.0).to(real.dtype)
+    cos, sin = turn_x.cos() * times, turn_x.sin() * times
+    return exact_matmul(real_lines, cos.mT) - exact_matmul(imaginary_lines, sin.mT)
+
+
+def _root(value: Tensor) -> Tensor:
+    """Return the square root, with a gradient of 0 where the value is 0 or, by rounding, below."""
+    return torch.where(value > 0, value, 1).sqrt() * (value > 0)

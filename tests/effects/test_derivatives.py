@@ -50,7 +50,7 @@ LENSES = {
     "division": (-0.2,),
 }
 ALL_TERMS = {f"{name}_range": (-0.02, 0.02) for name in ("k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")}
-SUN = {
+SUN: dict[str, Any] = {
     **{"center_x_range": (0.3, 0.4), "center_y_range": (0.3, 0.4), "time_constant_range": (1.0, 2.0)},
     **{"luminance_range": (9.0, 20.0), "ghost_share_range": (0.01, 0.02), "ghost_radius_range": (9.0, 20.0)},
 }

@@ -32,10 +32,10 @@ def airlight_of_frame(image: Tensor) -> Tensor:
     Source: He, Sun and Tang, "Single image haze removal using dark channel prior", IEEE TPAMI 33 (2011).
     """
     image = image.detach()
-    found = find_sky(image)
-    nodes = image[:, :, :: found.stride, :: found.stride].double().nan_to_num(nan=0.0).clamp(0, 1)
-    count = found.nodes.sum(dim=(2, 3))
-    is_low = found.nodes & (found.nodes.sum(dim=3).cumsum(dim=2) > (1 - _LOWEST) * count[:, :, None])[..., None]
+    seen = find_sky(image)
+    nodes = image[:, :, :: seen.stride, :: seen.stride].double().nan_to_num(nan=0.0).clamp(0, 1)
+    count = seen.nodes.sum(dim=(2, 3))
+    is_low = seen.nodes & (seen.nodes.sum(dim=3).cumsum(dim=2) > (1 - _LOWEST) * count[:, :, None])[..., None]
     sky = (nodes * is_low).sum(dim=(2, 3)) / is_low.sum(dim=(2, 3)).clamp(min=1)
     gray = luma(sky[:, :, None, None])[:, :, 0, 0]
     sky = gray + _TINT * (sky - gray)
@@ -44,7 +44,7 @@ def airlight_of_frame(image: Tensor) -> Tensor:
     haze = nodes.flatten(2).gather(2, places[:, None].expand(-1, image.shape[1], -1)).mean(dim=2)
     top = nodes[:, :, : max(1, nodes.shape[2] // 3)]
     upper, middle = (luma(part).flatten(1).median(dim=1).values for part in (top, nodes))
-    is_night = found.is_night | (upper < _NIGHT) | ((upper < _DUSK) & (upper < 0.9 * middle))
+    is_night = seen.is_night | (upper < _NIGHT) | ((upper < _DUSK) & (upper < 0.9 * middle))
     rest = torch.where(is_night[:, None], top.mean(dim=(2, 3)), haze)
-    has_sky = found.nodes.double().mean(dim=(1, 2, 3))[:, None] >= _MIN_SKY
+    has_sky = seen.nodes.double().mean(dim=(1, 2, 3))[:, None] >= _MIN_SKY
     return (torch.where(has_sky, sky, rest) * _STEPS).round() / _STEPS

@@ -1,4 +1,4 @@
-"""How a camera exposes a frame: metering, gain and noise, in linear light."""
+"""Exposure of a frame by a camera, in linear light: metering, gain, noise, and the delay of the gain in clips."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ _CEILING = 16.0  # times white; brighter light counts as this, since a sensor sa
 _CLIPPED = 0.8  # linear light, from where a frame may be clipped
 _DARK = 1e-3  # added to both sides of a ratio of means, so that black frames have a gain
 _SHORTEST = 1e-3  # frames, of a time constant
-_CACHED_VALUES = 1 << 17  # float32 values that fit into the cache of one core
+_CACHED_VALUES = 1 << 18  # float32 values; half as many take as long, with more starts of operations
 _LEAST_WIDTH = 1e-6  # of the part between line and power, which vanishes for a gain of 1
 _LEAST_VARIANCE = 1e-20  # whose square root has a finite gradient
 

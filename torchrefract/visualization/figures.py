@@ -23,6 +23,7 @@ from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
 from torchrefract.effects.flare import LensFlare
 from torchrefract.effects.fog import remove_fog
+from torchrefract.effects.physical_turbulence import PhysicalTurbulence
 from torchrefract.effects.rolling_shutter import RollingShutter
 from torchrefract.effects.sun_glare import SunGlare
 from torchrefract.types import Degraded
@@ -71,6 +72,7 @@ _PARAMETER_TEXTS: dict[str, Callable[[Tensor], str]] = {
     "strength": lambda value: f"strength {value:.2g}",
     "center": lambda value: f"center off by ({value[0]:.1g}, {value[1]:.1g}) widths",
     "wind": lambda value: f"wind ({value[0]:.2g}, {value[1]:.2g}) px/frame",
+    "wind_s": lambda value: f"wind ({value[0]:.2g}, {value[1]:.2g}) m/s",
     "wind_m": lambda value: f"wind ({', '.join(f'{v:.2g}' for v in value.tolist())}) m/frame",
 }
 _MAP_UNITS = {"extinction": "/m"}
@@ -271,6 +273,8 @@ def describe_params(effect: Effect, params: Any) -> str:
     # One field means different things in different effects.
     if isinstance(effect, LensFlare | SunGlare):
         values["sun"] = values.pop("center")
+    if isinstance(effect, PhysicalTurbulence):
+        values["wind_s"] = values.pop("wind")
     if isinstance(effect, RollingShutter):
         values["vibration"] = values.pop("amplitude")
     mode = getattr(effect, "mode", None)

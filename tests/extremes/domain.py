@@ -53,7 +53,7 @@ _WARP_OPTIONS = {
     "tolerance_px": st.sampled_from([None, 0.02, 0.5]),
 }
 _FOG_OPTIONS = {
-    "airlight": st.none() | st.floats(0.0, 1.0),
+    "airlight": st.none() | st.just("frame") | st.floats(0.0, 1.0),
     "threshold": st.floats(1e-6, 1 - 1e-6),
     "linear_light": st.booleans(),
     "tolerance": st.sampled_from([None, 0.5]),

@@ -60,7 +60,10 @@ LIMITS = {
     "auto": dict(zip((*WARPS, ALL), (0.9, 0.9, 0.9, 1.0, 1.4), strict=True)),
     "torch": dict(zip((*WARPS, ALL), (1.6, 1.6, 1.6, 1.6, 3.0), strict=True)),
 }
-PHOTOMETRIC_LIMITS = {"uniform fog": 0.3, "flare": 0.35, "heterogeneous fog": 1.6, "volumetric fog": 1.6}
+PHOTOMETRIC_LIMITS = {
+    **{"uniform fog": 0.3, "flare": 0.35, "heterogeneous fog": 1.6, "volumetric fog": 1.6},
+    **{"sun glare": 1.5, "exposure": 0.3},
+}
 LENS, COMPOSITION = "lens", "composition of four warps and fog"
 # Files, functions and calls of the package that one call may cross.
 CALL_LIMITS = {LENS: (14, 60, 120), COMPOSITION: (24, 150, 500)}

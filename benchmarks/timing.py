@@ -53,6 +53,8 @@ PHOTOMETRIC: dict[str, Callable[..., Any]] = {
     "heterogeneous fog": tr.HeterogeneousFog,
     "volumetric fog": partial(tr.HeterogeneousFog, mode="ray", depth=tr.GroundPlaneDepth()),
     "flare": tr.LensFlare,
+    "sun glare": partial(tr.SunGlare, center_x_range=(0.3, 0.7), center_y_range=(0.1, 0.3)),
+    "exposure": tr.Exposure,
 }
 
 

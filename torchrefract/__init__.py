@@ -3,6 +3,7 @@
 Effects, each an `nn.Module` from images to images; in parentheses what they show:
     LensDistortion (a lens), Turbulence (heat haze), ThinPlateSpline and DivergenceFree (smooth random warps),
     Rectification (removes the lens of a calibrated camera), UniformFog, HeterogeneousFog, LensFlare,
+    SunGlare (the sun, its glare and ghosts, and a camera that exposes for it), Exposure (gain, noise and clipping),
     Compose (several effects in order), OneOf (one of several, at random)
 
 Presets, in `torchrefract.presets`, are effects with the parameters of a place and a severity of 1 to 5:
@@ -29,11 +30,13 @@ if _sys.argv[:1] == ["-m"] and _sys.stderr is not None:
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.compose import Compose, ComposeParams, OneOf
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams
+from torchrefract.effects.exposure import Exposure, ExposureParams
 from torchrefract.effects.flare import FlareParams, LensFlare
 from torchrefract.effects.fog import FogParams, UniformFog, remove_fog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog, HeterogeneousFogParams
 from torchrefract.effects.lens import LensDistortion, LensParams
 from torchrefract.effects.rectification import Rectification, RectificationParams
+from torchrefract.effects.sun_glare import SunGlare, SunGlareParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence, TurbulenceParams
 from torchrefract.fields.corridor import CorridorDepth
@@ -67,6 +70,8 @@ __all__ = [
     "DepthProvider",
     "DivergenceFree",
     "DivergenceFreeParams",
+    "Exposure",
+    "ExposureParams",
     "FlareParams",
     "FogParams",
     "Folding",
@@ -82,6 +87,8 @@ __all__ = [
     "Pair",
     "Rectification",
     "RectificationParams",
+    "SunGlare",
+    "SunGlareParams",
     "ThinPlateParams",
     "ThinPlateSpline",
     "Turbulence",

@@ -20,11 +20,13 @@ import torchrefract
 from torchrefract import (
     Compose,
     DivergenceFree,
+    Exposure,
     HeterogeneousFog,
     LensDistortion,
     LensFlare,
     OneOf,
     Rectification,
+    SunGlare,
     ThinPlateSpline,
     Turbulence,
     UniformFog,
@@ -47,6 +49,7 @@ class Case(NamedTuple):
     identity: arguments of strength zero.
     gradient_field: the parameter with a gradient at strength zero; None if there is none.
     fields: all floating parameters.
+    meters: True if the effect meters the frame, so that each pixel and channel changes all others a little.
     """
 
     make: Callable[..., Effect]
@@ -54,6 +57,7 @@ class Case(NamedTuple):
     identity: dict[str, Any]
     gradient_field: str | None
     fields: tuple[str, ...]
+    meters: bool = False
 
     def strong(self, **options: Any) -> Effect:
         return self.make(**self.strongest, **options)
@@ -116,6 +120,32 @@ EFFECTS = {
         identity={"visibility_range": (math.inf, math.inf)},
         gradient_field=None,
         fields=HETEROGENEOUS_FOG,
+    ),
+    "sun glare": Case(
+        SunGlare,
+        strongest={
+            **{"center_x_range": (0.2, 0.8), "center_y_range": (0.1, 0.6), "luminance_range": (200.0, 900.0)},
+            **{"scale_range": (3.0, 6.0), "ghost_radius_range": (5.0, 20.0), "ghost_share_range": (0.05, 0.1)},
+            **{"color": (0.9, 0.8, 0.5), "drift_y_range": (-0.01, 0.01), "time_constant_range": (1.0, 3.0)},
+        },
+        identity={"luminance_range": NO_RANGE, "center_x_range": (0.2, 0.8), "center_y_range": (0.1, 0.6)},
+        gradient_field="luminance",
+        fields=(
+            *("center", "luminance", "scatter", "scale", "shape", "color", "ghosts", "tints"),
+            *("gamma", "time_constant", "drift", "frame"),
+        ),
+        meters=True,
+    ),
+    "exposure": Case(
+        Exposure,
+        strongest={
+            **{"target_range": (0.05, 0.15), "time_constant_range": (1.0, 3.0)},
+            **{"shot_range": (0.001, 0.01), "read_range": (0.001, 0.002)},
+        },
+        identity={"gamma_range": NO_RANGE},
+        gradient_field="gamma",
+        fields=("target", "gamma", "time_constant", "shot", "read", "frame"),
+        meters=True,
     ),
     "uniform fog": Case(
         UniformFog,
@@ -291,12 +321,26 @@ def test_shape_type_and_layout_stay_and_the_result_is_that_of_float32(case, dtyp
 
 
 def test_channels_are_degraded_independently(case):
+    if case.meters:
+        channels_change_each_other_by_the_gain_alone(case)
+        return
     options = case.strongest | {name: 0.7 for name in ("airlight", "color") if name in case.strongest}
     effect, image = case.make(**options), random_image(2, 4, 20, 30)
     result = effect.degrade(image, seed=7).image
     for channel in range(4):
         single = effect.degrade(image[:, [channel]], seed=7).image
         assert torch.equal(single[:, 0], result[:, channel])
+
+
+def channels_change_each_other_by_the_gain_alone(case: Case) -> None:
+    """Check that without a gain a channel does not depend on the others."""
+    options = case.strongest | {"gamma_range": NO_RANGE} | {name: 0.7 for name in ("color",) if name in case.strongest}
+    effect = case.make(**options)
+    image = random_image(2, 4, 20, 30)
+    params = effect.sample(image, seed=7)
+    changed = image.clone()
+    changed[:, 1:] = random_image(2, 3, 20, 30, seed=1)
+    assert torch.equal(effect.apply(changed, params).image[:, 0], effect.apply(image, params).image[:, 0])
 
 
 @pytest.mark.parametrize("size", [(1, 13), (13, 1), (31, 37), (2, 2)])
@@ -333,7 +377,7 @@ def test_an_empty_batch_stays_empty(case):
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
 def test_an_invalid_pixel_does_not_change_the_gradients_of_others(case, value, interpolation):
-    effect = case.strong()
+    effect = case.strong(**{"gamma_range": NO_RANGE} if case.meters else {})  # a gain has another test
     if isinstance(effect, WarpEffect):
         effect = case.strong(interpolation=interpolation)
     params = effect.sample(random_image(2, 3, 24, 32), seed=7)

@@ -138,6 +138,38 @@ DOMAINS = {
             "tolerance": st.sampled_from([None, 0.5]),
         },
     ),
+    "sun glare": Domain(
+        tr.SunGlare,
+        {
+            "luminance_range": (0.0, 1e9),
+            "scatter_range": (0.0, 1.0),
+            "scale_range": (0.01, 100.0),
+            "shape_range": (0.1, 4.0),
+            "ghost_radius_range": (0.01, 100.0),
+            "ghost_share_range": (0.0, 1.0),
+            "gamma_range": (0.0, 4.0),
+            "time_constant_range": (0.0, 1e6),
+            "drift_x_range": (-1e4, 1e4),
+            "drift_y_range": (-1e4, 1e4),
+        },
+        {
+            "outside": st.floats(0.0, 1.0),
+            "num_ghosts": st.integers(0, 3),
+            "color": st.floats(0.0, 1e3),
+            "min_gain": st.floats(1 / 32, 1.0),
+        },
+    ),
+    "exposure": Domain(
+        tr.Exposure,
+        {
+            "target_range": (1e-3, 1.0),
+            "gamma_range": (0.0, 4.0),
+            "time_constant_range": (0.0, 1e6),
+            "shot_range": (0.0, 1.0),
+            "read_range": (0.0, 1.0),
+        },
+        {"min_gain": st.floats(1 / 32, 1.0), "max_gain": st.floats(1.0, 4.0), "quantize": st.booleans()},
+    ),
 }
 
 

@@ -25,6 +25,8 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "heterogeneous fog": tr.HeterogeneousFog,
     "volumetric fog": partial(tr.HeterogeneousFog, mode="ray"),
     "flare": tr.LensFlare,
+    "sun glare": tr.SunGlare,
+    "exposure": partial(tr.Exposure, shot_range=(1e-4, 1e-3)),
     "compose": lambda: tr.Compose([tr.Turbulence(), tr.LensDistortion(), tr.UniformFog()]),
     "one of": lambda: tr.OneOf([tr.DivergenceFree(), tr.ThinPlateSpline(), tr.LensFlare()]),
     "rectification": partial(tr.Rectification, _CAMERA),

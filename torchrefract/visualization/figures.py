@@ -23,6 +23,7 @@ from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
 from torchrefract.effects.flare import LensFlare
 from torchrefract.effects.fog import remove_fog
+from torchrefract.effects.sun_glare import SunGlare
 from torchrefract.types import Degraded
 from torchrefract.visualization.color import (
     checkerboard,
@@ -257,7 +258,7 @@ def describe_params(effect: Effect, params: Any) -> str:
         return "not applied"
     values = {name: value[0] for name, value in zip(params._fields, params, strict=True)}
     # One field means different things in different effects.
-    if isinstance(effect, LensFlare):
+    if isinstance(effect, LensFlare | SunGlare):
         values["sun"] = values.pop("center")
     mode = getattr(effect, "mode", None)
     if mode == "image":

@@ -55,6 +55,7 @@ PHOTOMETRIC: dict[str, Callable[..., Any]] = {
     "flare": tr.LensFlare,
     "sun glare": partial(tr.SunGlare, center_x_range=(0.3, 0.7), center_y_range=(0.1, 0.3)),
     "exposure": tr.Exposure,
+    "night glow": tr.NightGlow,
 }
 
 

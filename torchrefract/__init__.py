@@ -4,6 +4,7 @@ Effects, each an `nn.Module` from images to images; in parentheses what they sho
     LensDistortion (a lens), Turbulence (heat haze), ThinPlateSpline and DivergenceFree (smooth random warps),
     Rectification (removes the lens of a calibrated camera), UniformFog, HeterogeneousFog, LensFlare,
     SunGlare (the sun, its glare and ghosts, and a camera that exposes for it), Exposure (gain, noise and clipping),
+    NightGlow (lamps in fog),
     Compose (several effects in order), OneOf (one of several, at random)
 
 Presets, in `torchrefract.presets`, are effects with the parameters of a place and a severity of 1 to 5:
@@ -35,6 +36,7 @@ from torchrefract.effects.flare import FlareParams, LensFlare
 from torchrefract.effects.fog import FogParams, UniformFog, remove_fog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog, HeterogeneousFogParams
 from torchrefract.effects.lens import LensDistortion, LensParams
+from torchrefract.effects.night_glow import NightGlow, NightGlowParams
 from torchrefract.effects.rectification import Rectification, RectificationParams
 from torchrefract.effects.sun_glare import SunGlare, SunGlareParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
@@ -83,6 +85,8 @@ __all__ = [
     "LensFlare",
     "LensParams",
     "LinearDepth",
+    "NightGlow",
+    "NightGlowParams",
     "OneOf",
     "Pair",
     "Rectification",

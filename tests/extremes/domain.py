@@ -159,6 +159,11 @@ DOMAINS = {
             "min_gain": st.floats(1 / 32, 1.0),
         },
     ),
+    "night glow": Domain(
+        tr.NightGlow,
+        {"optical_depth_range": (0.0, 50.0), "asymmetry_range": (0.1, 1.0), "luminance_range": (0.0, 1e6)},
+        {"threshold": st.floats(0.0, 0.999)},
+    ),
     "exposure": Domain(
         tr.Exposure,
         {

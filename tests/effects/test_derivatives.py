@@ -89,7 +89,9 @@ def vector_of(params: Any) -> tuple[Tensor, Callable[[Tensor], Any]]:
         return torch.cat(vectors), lambda x: params._replace(
             children=tuple(build(part) for build, part in zip(builds, x.split(sizes), strict=True))
         )
-    fields = {name: value for name, value in params._asdict().items() if value.is_floating_point()}
+    fields = {
+        name: value for name, value in params._asdict().items() if value is not None and value.is_floating_point()
+    }
 
     def build(x: Tensor) -> Any:
         parts = x.split([value.numel() for value in fields.values()])

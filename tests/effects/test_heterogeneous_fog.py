@@ -214,3 +214,30 @@ def test_params_out_of_range_raise(field, value, rule):
 def test_a_normalized_depth_raises():
     with pytest.raises(ValueError, match="depth must be in m, not normalized"):
         HeterogeneousFog().degrade(picture(1, 3, 8, 9), depth=picture(1, 1, 8, 9))
+
+
+def test_a_scale_height_that_does_not_fit_raises():
+    with pytest.raises(ValueError, match="scale_height_range must be None for mode='image'"):
+        HeterogeneousFog(scale_height_range=(1.0, 2.0))
+    with pytest.raises(ValueError, match="scale_height_range must"):
+        HeterogeneousFog(mode="ray", scale_height_range=(0.0, 2.0))
+    image = torch.zeros(1, 3, 8, 9)
+    even, plume = HeterogeneousFog(mode="ray"), HeterogeneousFog(mode="ray", scale_height_range=(1.0, 2.0))
+    with pytest.raises(ValueError, match=r"params\.scale_height must be None"):
+        even.apply(image, plume.sample(image, seed=7))
+    with pytest.raises(ValueError, match=r"params\.scale_height must be a tensor"):
+        plume.apply(image, even.sample(image, seed=7))
+
+
+def test_the_transmission_of_dust_is_that_of_its_optical_depth():
+    image, depth = torch.zeros(1, 3, 40, 60, dtype=torch.float64), torch.full((1, 1, 40, 60), 30.0, dtype=torch.float64)
+    camera = Camera(width=60, height=40, fx=50.0, fy=50.0, cx=29.5, cy=19.5, coefficients=(0.0,) * 4)
+    ranges = {"visibility_range": (50.0, 50.0), "deviation_range": (0.0, 0.0), "contrast_range": (0.0, 0.0)}
+    effect = HeterogeneousFog(mode="ray", camera=camera, scale_height_range=(1.5, 1.5), horizon=0.5, **ranges)
+    t = effect.degrade(image, seed=7, depth=depth).transmission[0, 0]
+    for row, column in ((3, 7), (19, 30), (20, 50)):
+        ray = torch.tensor([(column - 29.5) / 50, (row - 19.5) / 50, 1.0], dtype=torch.float64)
+        share = (torch.arange(20000, dtype=torch.float64) + 0.5) / 20000
+        height = 1.3 - 30 * ray[1] * share
+        expected = torch.exp(math.log(0.05) / 50 * 30 * ray.norm() * torch.exp(-height / 1.5).mean())
+        assert_close(t[row, column], expected, rtol=1e-6, atol=0)

@@ -206,7 +206,7 @@ def params() -> Iterator[Case]:
     for name, make in {**WARPS, **LIGHTS}.items():
         effect = make()
         drawn = effect.sample(random_image(), seed=7)
-        fields = [field for field, value in drawn._asdict().items() if value.is_floating_point()]
+        fields = [field for field, value in drawn._asdict().items() if value is not None and value.is_floating_point()]
         for field, value, is_mapped in product(fields, VALUES, (False, True)):
             mode = " inside vmap" if is_mapped else ""
             yield f"{name}, {value} in {field}{mode}", partial(_params, effect, field, value, is_mapped)

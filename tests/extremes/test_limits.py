@@ -138,7 +138,11 @@ def test_lens_gradients_are_finite_where_pixels_have_no_preimage(name, dtype, de
     for size in SIZES[1:]:
         image = random_image(2, 3, *size, dtype=dtype, device=device)
         params = effect.sample(image, seed=7)
-        leaves = {key: v.clone().requires_grad_() for key, v in params._asdict().items() if v.is_floating_point()}
+        leaves = {
+            key: v.clone().requires_grad_()
+            for key, v in params._asdict().items()
+            if v is not None and v.is_floating_point()
+        }
         degraded = effect.apply(image, params._replace(**leaves))
         for value in (degraded.image, degraded.flow, degraded.restore_flow):
             for gradient in torch.autograd.grad(value.double().sum(), list(leaves.values()), retain_graph=True):

@@ -10,7 +10,15 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor, expand_batch
-from torchrefract._validation import check_choice, check_number, check_positive, check_range, check_values, check_within
+from torchrefract._validation import (
+    check_choice,
+    check_number,
+    check_positive,
+    check_range,
+    check_values,
+    check_within,
+    finite_or,
+)
 from torchrefract.cameras.camera import Camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, frame_mean, params_to, per_sample
 from torchrefract.effects.fog import Airlight, check_fog_params, check_fog_ranges, draw_fog, make_medium
@@ -24,6 +32,7 @@ from torchrefract.effects.random_field import (
     motion_ranges,
 )
 from torchrefract.fields.depth import DepthSource
+from torchrefract.fields.dust import descent_of_rows, mean_density
 from torchrefract.fields.fog_volume import ExtinctionField, mean_extinction_along_rays
 from torchrefract.fields.heterogeneous_fog import image_noise, normalize_weights, periods_in_frame
 from torchrefract.planning.photometric import (
@@ -44,6 +53,7 @@ _PAPER_WEIGHTS = (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)
 _ROAD_SCALES = (12.0, 24.0, 48.0, 96.0)
 _ROAD_WEIGHTS = (0.2, 0.3, 0.3, 0.2)
 _CONTRASTS = (0.0, 2.0)
+_SCALE_HEIGHTS = (0.05, 1e6)  # m
 
 
 class HeterogeneousFogParams(NamedTuple):
@@ -59,6 +69,9 @@ class HeterogeneousFogParams(NamedTuple):
     decorrelation: Tensor  # (B,), frames, above 0; inf for fog that only moves with the wind
     frame: Tensor  # (B, T), number of each frame in its clip
     key: Tensor  # (B, 4), int64, of the noise
+    scale_height: Tensor | None = (
+        None  # (B,), m, in [0.05, 1e6], over which the density falls to 1/e; None: it does not
+    )
 
     to = params_to
 
@@ -95,6 +108,11 @@ class HeterogeneousFog(PhotometricEffect):
         wind_x_range, wind_y_range, wind_z_range: how far the fog moves per frame of a clip, to the right, down and
             ahead, as seen by the camera: m in space, where a car at v m per frame sees -v ahead; px of the reference in
             the image, which has no z.
+        scale_height_range: m, in [0.05, 1e6], H of a plume of dust or of ground fog in the mode "ray", whose density
+            falls with the height above the road as exp(-h / H). Its mean along each ray is exact, see `mean_density`,
+            and multiplies that of the random field; V is the visibility on the road. None is an even density.
+        camera_height, horizon: m, of the camera above the road, and share of the height of the frame, from the top, at
+            which the road vanishes; for a plume.
         decorrelation_range: frames, above 0 or inf, until k in the wind has the correlation 1/e with itself; one over
             it is uniform.
         tolerance: largest error of the image, levels of 1/255: octaves that are too faint, and fog or a contrast that
@@ -136,6 +154,9 @@ class HeterogeneousFog(PhotometricEffect):
         wind_y_range: Range = (0.0, 0.0),
         wind_z_range: Range = (0.0, 0.0),
         decorrelation_range: Range = (60.0, 150.0),
+        scale_height_range: Range | None = None,
+        camera_height: float = 1.3,
+        horizon: float = 0.5,
         tolerance: float | None = None,
         p: float = 1.0,
     ):
@@ -160,17 +181,29 @@ class HeterogeneousFog(PhotometricEffect):
                 f"wind_z_range must be (0, 0) for mode='image', which has no depth, got {self.wind_z_range}"
             )
         self.decorrelation_range = check_decorrelation(decorrelation_range)
+        self.scale_height_range = scale_height_range
+        if scale_height_range is not None:
+            if mode == "image":
+                raise ValueError(f"scale_height_range must be None for mode='image', got {scale_height_range}")
+            low, high = _SCALE_HEIGHTS
+            self.scale_height_range = check_range("scale_height_range", scale_height_range, low=low, high=high)
+        self.camera_height = check_positive("camera_height", camera_height)
+        self.horizon = check_number("horizon", horizon, low=-10.0, high=10.0)
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> HeterogeneousFogParams:
         """Draw all parameters uniformly in their ranges, and the key of the noise."""
         motion = motion_ranges(
             self.wind_x_range, self.wind_y_range, self.wind_z_range, decorrelation=self.decorrelation_range
         )
-        fog, values = draw_fog(self, stream, image, [self.contrast_range, *motion])
+        plume = [] if self.scale_height_range is None else [self.scale_height_range]
+        fog, values = draw_fog(self, stream, image, [self.contrast_range, *motion, *plume])
+        values, scale_height = (values[:, :-1], values[:, -1]) if plume else (values, None)
         weights = as_device_tensor([self.weights] * image.shape[0], dtype=values.dtype, device=values.device)
         weights = weights.view(-1, len(self.scales))
         motion = drawn_motion(values[:, 1:])
-        return HeterogeneousFogParams(*fog, weights, values[:, 0], **motion, key=random.noise_key(stream))
+        return HeterogeneousFogParams(
+            *fog, weights, values[:, 0], **motion, key=random.noise_key(stream), scale_height=scale_height
+        )
 
     def validate(self, params: HeterogeneousFogParams, image: Tensor) -> None:
         """Raise ValueError for invalid parameters."""
@@ -182,6 +215,12 @@ class HeterogeneousFog(PhotometricEffect):
         check_values("params.weights", "have a sum above 0", sums, lambda v: v > 0)
         check_values("params.weights", "have a finite sum", sums, torch.isfinite)
         check_within("params.contrast", params.contrast, *_CONTRASTS)
+        if (params.scale_height is not None) != (self.scale_height_range is not None):
+            rule = "be None" if self.scale_height_range is None else "be a tensor"
+            raise ValueError(f"params.scale_height must {rule} for scale_height_range={self.scale_height_range}")
+        if params.scale_height is not None:
+            check_shapes(params, {"scale_height": ()})
+            check_within("params.scale_height", params.scale_height, *_SCALE_HEIGHTS)
 
     def params_in_range(self, params: HeterogeneousFogParams) -> Tensor:
         """Return (), bool: fog and contrast lie in the ranges, and the weights are those of the effect."""
@@ -217,6 +256,8 @@ class HeterogeneousFog(PhotometricEffect):
             rows = image.shape[0]
             distance = expand_batch(distance, rows) if distance.shape[0] > 1 else distance
             k = self._extinction(expand_batch(k, rows), params, distance, image, plan)
+        if params.scale_height is not None:
+            k = self._plume(params.scale_height, distance, image) * expand_batch(k, image.shape[0])
         return self.medium.blend(image, params, distance, k, is_visible=not plan.is_identity)
 
     def _extinction(
@@ -239,6 +280,17 @@ class HeterogeneousFog(PhotometricEffect):
             q = mean_extinction_along_rays(field, distance, **size, **view)
         of_all_fogs = 0.5 if self.mode == "image" else 1.0
         return q * (k / (frame_mean(q) if self.mean == "image" else of_all_fogs))
+
+    def _plume(self, scale_height: Tensor, distance: Tensor, image: Tensor) -> Tensor:
+        """Compute (N, 1, H, 1 or W): the mean density along each ray."""
+        height, width = image.shape[2:]
+        (_, focal), (_, center) = pinhole_of(self.medium.camera, height=height, width=width)
+        options = {"dtype": distance.dtype, "device": image.device}
+        descent = descent_of_rows(self.horizon, height=height, focal=focal, center=center, **options)
+        length = self.medium.distance(image, torch.ones_like(descent))  # m along the ray per m of depth
+        scale = finite_or(scale_height.to(distance.dtype), 1.0).clamp(min=_SCALE_HEIGHTS[0] / 2)
+        scale = per_sample(expand_batch(scale, image.shape[0]))
+        return mean_density(distance, descent / length, scale, camera_height=self.camera_height)
 
     def _unit_weights(self) -> tuple[float, ...]:
         return tuple(weight / sum(self.weights) for weight in self.weights)

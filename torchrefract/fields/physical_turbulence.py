@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor, cached, exact_matmul
+from torchrefract._validation import why_not_eager
 from torchrefract.fields.random_field import fast_size
 from torchrefract.random import white_noise
 
@@ -161,10 +162,12 @@ def layer_gradients(
     height, half = size[0], size[1] // 2 + 1
     count = height * half
     qy, qx = (q.to(dtype) for q in _frequencies(focal, size, key.device))
+    # A FakeTensor cannot be mixed with cached values.
+    amplitudes = _cached_amplitudes if why_not_eager(key) is None else _amplitudes
     for k, distance in enumerate(layers.distances):
         noise = white_noise(key, count, start=k * count).to(dtype).unflatten(2, (height, half))
         air = layers.air._replace(aperture=layers.apertures[k])
-        amplitude, uniform = _amplitudes(distance, air, layers.strengths[k], focal, size, dtype, key.device)
+        amplitude, uniform = amplitudes(distance, air, layers.strengths[k], focal, size, dtype, key.device)
         values = noise * amplitude
         if shift is not None:
             values = _moved(values, shift / distance, focal, size)
@@ -232,7 +235,6 @@ def _frequencies(focal: tuple[float, float], size: tuple[int, int], device: torc
     return ky * (2 * math.pi * focal[1] / height), kx * (2 * math.pi * focal[0] / width)
 
 
-@cached
 def _amplitudes(
     distance: float,
     air: Air,
@@ -265,6 +267,9 @@ def _amplitudes(
     uniform = torch.stack(variances).clamp(min=0).sqrt().view(2, 1, 1)
     amplitude = (power / torch.where(kx == 0, 1.0, 2.0)).sqrt() / q
     return amplitude.to(dtype), uniform.to(dtype)
+
+
+_cached_amplitudes = cached(_amplitudes)
 
 
 def _moved(values: Tensor, angle: Tensor, focal: tuple[float, float], size: tuple[int, int]) -> Tensor:

@@ -16,7 +16,8 @@ CALM: dict[str, Any] = {"focal": 1400 / WIDTH, "shimmer_range": (0.0, 0.0), "hal
 
 
 def mirage(difference: float, **options: Any) -> RoadMirage:
-    return RoadMirage(**CALM | {"difference_range": (difference, difference)} | options)
+    arguments: dict[str, Any] = CALM | {"difference_range": (difference, difference)} | options
+    return RoadMirage(**arguments)
 
 
 def line_of(flow: Tensor) -> Tensor:

@@ -142,7 +142,8 @@ def test_the_displacement_grows_with_the_root_of_depth_up_to_the_reference(optio
 
 def test_a_field_at_depth_is_within_its_tolerance_alone_and_in_a_composition():
     image, depth = torch.rand(1, 3, 90, 120), 300 * torch.rand(1, 1, 90, 120)
-    options = FIELD | {"covariance": "gaussian", "depth": GroundPlaneDepth(), "length_range": (30.0, 40.0)}
+    smooth: dict[str, Any] = {"covariance": "gaussian", "length_range": (30.0, 40.0), "depth": GroundPlaneDepth()}
+    options: dict[str, Any] = FIELD | smooth
     for tolerance_px in (0.02, 0.1):
         effect = Turbulence(**options, tolerance_px=tolerance_px)
         stride, _ = effect.plan(90, 120).details
@@ -151,12 +152,11 @@ def test_a_field_at_depth_is_within_its_tolerance_alone_and_in_a_composition():
         params = effect.sample(image, seed=1)
         flows = [one.apply(image, params, depth=depth).flow for one in (effect, exact)]
         assert (flows[0] - flows[1]).norm(dim=1).max() <= tolerance_px
-        # The depth is that of the scene, so the warp nearest to it has it as it is.
         composed = Compose([effect, ThinPlateSpline()], tolerance_px=tolerance_px)
         composed_exact = Compose([exact, ThinPlateSpline(tolerance_px=None)], tolerance_px=None)
         params = composed.sample(image, seed=1)
-        smooth = torch.full((1, 1, 90, 120), 300.0)
-        flows = [one.apply(image, params, depth=smooth).flow for one in (composed, composed_exact)]
+        wall = torch.full((1, 1, 90, 120), 300.0)
+        flows = [one.apply(image, params, depth=wall).flow for one in (composed, composed_exact)]
         assert (flows[0] - flows[1]).norm(dim=1).max() <= tolerance_px
 
 

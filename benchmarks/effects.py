@@ -49,8 +49,10 @@ WHAT = (
 )
 PACKAGE = str(Path(tr.__file__).parent)
 ALL = "all four warps"
+ROLLING_SHUTTER = "rolling shutter"
 OTHER_WARPS: dict[str, Callable[..., Any]] = {
     "default lenses": tr.LensDistortion,
+    ROLLING_SHUTTER: tr.RollingShutter,
     "rough turbulence": partial(
         tr.Turbulence, amplitude_range=(1.2, 1.8), length_range=(40.0, 80.0), aperture_range=(4.0, 6.0)
     ),
@@ -62,11 +64,14 @@ OTHER_WARPS: dict[str, Callable[..., Any]] = {
 LIMITS = {
     "auto": {
         **dict(zip((*WARPS, ALL), (0.9, 0.9, 0.9, 1.0, 1.4), strict=True)),
-        **{"physical turbulence": 4.0, "road mirage": 1.0},
+        **{"physical turbulence": 4.0, "road mirage": 1.0, ROLLING_SHUTTER: 1.0},
     },
     "torch": dict(zip((*WARPS, ALL), (1.6, 1.6, 1.6, 1.6, 3.0), strict=True)),
 }
-PHOTOMETRIC_LIMITS = {"uniform fog": 0.3, "flare": 0.35, "heterogeneous fog": 1.6, "volumetric fog": 1.6}
+PHOTOMETRIC_LIMITS = {
+    **{"uniform fog": 0.3, "flare": 0.35, "heterogeneous fog": 1.6, "volumetric fog": 1.6},
+    **{"sun glare": 1.5, "exposure": 0.3},
+}
 LENS, COMPOSITION = "lens", "composition of four warps and fog"
 # Files, functions and calls of the package that one call may cross.
 CALL_LIMITS = {LENS: (14, 60, 120), COMPOSITION: (24, 150, 500)}

@@ -53,6 +53,10 @@ PHOTOMETRIC: dict[str, Callable[..., Any]] = {
     "heterogeneous fog": tr.HeterogeneousFog,
     "volumetric fog": partial(tr.HeterogeneousFog, mode="ray", depth=tr.GroundPlaneDepth()),
     "flare": tr.LensFlare,
+    "vignetting": tr.Vignetting,
+    "chromatic aberration": tr.ChromaticAberration,
+    "sun glare": partial(tr.SunGlare, center_x_range=(0.3, 0.7), center_y_range=(0.1, 0.3)),
+    "exposure": tr.Exposure,
 }
 
 

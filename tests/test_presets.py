@@ -16,6 +16,10 @@ from torchrefract import (
     LensDistortion,
     LensFlare,
     OneOf,
+    PhysicalTurbulence,
+    RoadMirage,
+    RollingShutter,
+    SunGlare,
     ThinPlateSpline,
     Turbulence,
     UniformFog,
@@ -32,9 +36,10 @@ SCENES: dict[str, Callable[..., Any]] = {
 EFFECTS = {
     "cheap_dashcam": {LensDistortion},
     "cape_town_fog": {HeterogeneousFog},
-    "limpopo_sun_glare": {LensFlare},
-    "highveld_heat_haze": {Turbulence},
-    "unpaved_road": {HeterogeneousFog, Turbulence},
+    "limpopo_sun_glare": {SunGlare},
+    "highveld_heat_haze": {RoadMirage, Turbulence},
+    "highveld_telephoto": {PhysicalTurbulence},
+    "unpaved_road": {HeterogeneousFog, Turbulence, RollingShutter},
     "paper_refractive": {LensDistortion, Turbulence, ThinPlateSpline, DivergenceFree},
     "paper_weather": {UniformFog, HeterogeneousFog, LensFlare},
 }
@@ -108,10 +113,12 @@ def test_severities_have_the_documented_values():
     for name, severity, field, low, high in (
         ("cape_town_fog", 1, "visibility", 500, 1000),
         ("cape_town_fog", 5, "visibility", 20, 40),
-        ("limpopo_sun_glare", 5, "strength", 0.95, 1.05),
-        ("highveld_heat_haze", 5, "amplitude", 2.4, 3.6),
+        ("limpopo_sun_glare", 5, "scatter", 0.2, 0.4),
+        ("highveld_heat_haze", 5, "difference", 24, 36),
+        ("unpaved_road", 5, "visibility", 25, 50),
     ):
-        values = getattr(SCENES[name](severity).sample(image, seed=2), field)
+        params = SCENES[name](severity).sample(image, seed=2)
+        values = getattr(params.children[0] if hasattr(params, "children") else params, field)
         assert low <= values.min() < values.max() <= high
         assert values.mean().item() == pytest.approx((low + high) / 2, rel=0.03)
     for severity in presets.SEVERITIES:

@@ -3,13 +3,14 @@
 Effects, each an `nn.Module` from images to images; in parentheses what they show:
     LensDistortion (a lens), Turbulence (heat haze), PhysicalTurbulence (heat haze by Cn2 and depth), RoadMirage,
     ThinPlateSpline and DivergenceFree (smooth random warps), Rectification (removes the lens of a calibrated camera),
-    UniformFog, HeterogeneousFog, LensFlare,
+    RollingShutter (rows that a moving, shaking camera exposes one after the other),
+    UniformFog, HeterogeneousFog, LensFlare, Vignetting (dark corners), ChromaticAberration (colored edges),
     SunGlare (the sun, its glare and ghosts, and a camera that exposes for it), Exposure (gain, noise and clipping),
     Compose (several effects in order), OneOf (one of several, at random)
 
 Presets, in `torchrefract.presets`, are effects with the parameters of a place and a severity of 1 to 5:
-    cheap_dashcam, cape_town_fog, limpopo_sun_glare, highveld_heat_haze, unpaved_road, and paper_refractive and
-    paper_weather, which draw one of several effects for each image
+    cheap_dashcam, cape_town_fog, limpopo_sun_glare, highveld_heat_haze, highveld_telephoto, unpaved_road, and
+    paper_refractive and paper_weather, which draw one of several effects for each image
 
 Depth for fog: a map in m, `CorridorDepth`, `GroundPlaneDepth`, any function of the image, or a network
 (`torchrefract.depth.from_transformers`).
@@ -29,6 +30,7 @@ if _sys.argv[:1] == ["-m"] and _sys.stderr is not None:
     print("torchrefract: loading …", file=_sys.stderr, flush=True)
 
 from torchrefract.cameras.camera import Camera
+from torchrefract.effects.chromatic_aberration import ChromaticAberration, ChromaticAberrationParams
 from torchrefract.effects.compose import Compose, ComposeParams, OneOf
 from torchrefract.effects.divergence_free import DivergenceFree, DivergenceFreeParams
 from torchrefract.effects.exposure import Exposure, ExposureParams
@@ -39,9 +41,11 @@ from torchrefract.effects.lens import LensDistortion, LensParams
 from torchrefract.effects.physical_turbulence import PhysicalTurbulence, PhysicalTurbulenceParams
 from torchrefract.effects.rectification import Rectification, RectificationParams
 from torchrefract.effects.road_mirage import RoadMirage, RoadMirageParams
+from torchrefract.effects.rolling_shutter import RollingShutter, RollingShutterParams
 from torchrefract.effects.sun_glare import SunGlare, SunGlareParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence, TurbulenceParams
+from torchrefract.effects.vignetting import Vignetting, VignettingParams
 from torchrefract.fields.corridor import CorridorDepth
 from torchrefract.fields.depth import (
     DepthProvider,
@@ -66,6 +70,8 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Camera",
+    "ChromaticAberration",
+    "ChromaticAberrationParams",
     "Compose",
     "ComposeParams",
     "CorridorDepth",
@@ -94,6 +100,8 @@ __all__ = [
     "RectificationParams",
     "RoadMirage",
     "RoadMirageParams",
+    "RollingShutter",
+    "RollingShutterParams",
     "SunGlare",
     "SunGlareParams",
     "ThinPlateParams",
@@ -101,6 +109,8 @@ __all__ = [
     "Turbulence",
     "TurbulenceParams",
     "UniformFog",
+    "Vignetting",
+    "VignettingParams",
     "check_depth",
     "compose_flows",
     "depth_from_disparity",

@@ -28,6 +28,10 @@ from torchrefract.effects.flare import LensFlare
 from torchrefract.effects.fog import UniformFog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog
 from torchrefract.effects.lens import LensDistortion
+from torchrefract.effects.physical_turbulence import PhysicalTurbulence
+from torchrefract.effects.road_mirage import RoadMirage
+from torchrefract.effects.rolling_shutter import RollingShutter
+from torchrefract.effects.sun_glare import SunGlare
 from torchrefract.effects.thin_plate import ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence
 from torchrefract.fields.corridor import CorridorDepth
@@ -40,6 +44,9 @@ _REFERENCE_WIDTH = 1920.0
 _HORIZON, _SPREAD = 0.55, 0.1  # an angle that varies from car to car
 _DUST = (0.78, 0.71, 0.61)  # airlight of laterite dust
 _LOW_SUN = (1.0, 0.94, 0.82)
+_TELEPHOTO = Camera(
+    width=1920, height=1080, fx=7680.0, fy=7680.0, cx=959.5, cy=539.5, coefficients=(0.0,) * 4, model="opencv"
+)
 _T = TypeVar("_T")
 _CameraSource = Camera | str | Path | None
 _DepthSource = DepthProvider | Callable[[Tensor], Tensor] | None
@@ -82,32 +89,70 @@ def cape_town_fog(
     return HeterogeneousFog(**options | _place(camera, horizon, depth) | _without_place(arguments))
 
 
-def limpopo_sun_glare(severity: int = 3, **arguments: Any) -> LensFlare:
-    """Create the flare of a low sun ahead.
+def limpopo_sun_glare(severity: int = 3, *, camera: _CameraSource = None, **arguments: Any) -> SunGlare:
+    """Create the glare of a low sun ahead, through a windscreen that scatters the more the dirtier it is.
+
+    The camera darkens the frame for it, the road with it. The sun stands in the sky of the frame or above it.
 
     Args:
-        severity: 1 to 5, light added at the sun of 0.2 at 1, 0.6 at 3 (as in the paper), 1.0 at 5, and radius of 0.2,
-            0.3, 0.4 diagonals of the frame; each +-0.05.
-        arguments: of `LensFlare`, and those of all scenes.
+        severity: 1 to 5, share of the sun's light that is scattered: 0.5 … 1.5 % at 1, 4 … 8 % at 3, 20 … 40 % at 5.
+        camera: as for all scenes.
+        arguments: of `SunGlare`, and those of all scenes.
     """
-    strength, radius = _at_severity(severity, [(0.2, 0.2), (0.4, 0.25), (0.6, 0.3), (0.8, 0.35), (1.0, 0.4)])
-    options: dict[str, Any] = {
-        "strength_range": _around(strength, 0.05),
-        "radius_range": _around(radius, 0.05),
-        "color": _LOW_SUN,
-    }
-    return LensFlare(**options | _without_place(arguments))
+    scatter = _at_severity(severity, [(0.005, 0.015), (0.015, 0.04), (0.04, 0.08), (0.08, 0.2), (0.2, 0.4)])
+    options: dict[str, Any] = {"scatter_range": scatter, "color": _LOW_SUN, "camera": _camera(camera)}
+    return SunGlare(**options | _without_place(arguments))
 
 
-def highveld_heat_haze(severity: int = 3, *, width: float = _REFERENCE_WIDTH, **arguments: Any) -> Turbulence:
-    """Create turbulence over a tarred road at noon.
+def highveld_heat_haze(
+    severity: int = 3,
+    *,
+    camera: _CameraSource = None,
+    horizon: float = _HORIZON,
+    depth: _DepthSource = None,
+    width: float = _REFERENCE_WIDTH,
+    mirage: dict[str, Any] | None = None,
+    **arguments: Any,
+) -> Compose:
+    """Create the air over a tarred road at noon: a mirage on the road, a shimmering horizon, and a still bonnet.
+
+    The displacement of far things is exaggerated for a wide lens, as haze of a hot day moves them by some tenths of a
+    pixel: `Turbulence.equivalent_cn2` tells by how much. See `highveld_telephoto` for what physics gives.
 
     Args:
-        severity: 1 to 5, standard deviation of the displacement of 0.5 at 1, 1.5 at 3, 3.0 px at 5, each +-20 %.
-        width: as for all scenes.
-        arguments: of `Turbulence`, and those of all scenes.
+        severity: 1 to 5, temperature of the air at the road above that at the camera of 5, 10, 15, 20, 30 K, and
+            standard deviation of the displacement 200 m away of 0.5, 1.0, 1.5, 2.2, 3.0 px, each +-20 %.
+        camera, horizon, depth, width: as for all scenes.
+        mirage: arguments of `RoadMirage`.
+        arguments: of `Turbulence`.
     """
-    return _turbulence(_at_severity(severity, [0.5, 1.0, 1.5, 2.2, 3.0]), width, **_without_place(arguments))
+    kelvin, amplitude = _at_severity(severity, [(5.0, 0.5), (10.0, 1.0), (15.0, 1.5), (20.0, 2.2), (30.0, 3.0)])
+    place = _place(camera, horizon, depth)
+    focal = {} if place["camera"] is None else {"focal": place["camera"].fx / place["camera"].width}
+    options: dict[str, Any] = {"difference_range": _around(kelvin, 0.2 * kelvin), "horizon": horizon, **focal}
+    haze = _turbulence(amplitude, width, **{"depth": place["depth"]} | arguments)
+    return Compose([RoadMirage(**options | (mirage or {})), haze])
+
+
+def highveld_telephoto(
+    severity: int = 3,
+    *,
+    camera: _CameraSource = None,
+    horizon: float = _HORIZON,
+    depth: _DepthSource = None,
+    **arguments: Any,
+) -> PhysicalTurbulence:
+    """Create the heat haze of `highveld_heat_haze` as a camera with a long lens sees it, by its physics.
+
+    Args:
+        severity: 1 to 5, Cn2 of 1e-13, 3e-13, 1e-12, 3e-12, 1e-11 m^(-2/3), each +-50 %. 1e-12 is a hot day.
+        camera, horizon, depth: as for all scenes; without a camera, the focal length is 4 widths.
+        arguments: of `PhysicalTurbulence`, and those of all scenes.
+    """
+    cn2 = _at_severity(severity, [1e-13, 3e-13, 1e-12, 3e-12, 1e-11])
+    options: dict[str, Any] = {"cn2_range": (0.5 * cn2, 1.5 * cn2), "horizon": horizon}
+    options |= _place(camera or _TELEPHOTO, horizon, depth)
+    return PhysicalTurbulence(**options | _without_place(arguments))
 
 
 def unpaved_road(
@@ -119,21 +164,31 @@ def unpaved_road(
     width: float = _REFERENCE_WIDTH,
     dust: dict[str, Any] | None = None,
     haze: dict[str, Any] | None = None,
+    shutter: dict[str, Any] | None = None,
 ) -> Compose:
-    """Create the dust of a car ahead on a gravel road, as heterogeneous fog, seen through turbulence.
+    """Create the dust of a car ahead on a gravel road, as heterogeneous fog, seen through haze by a shaken camera.
 
     Args:
-        severity: 1 to 5, visibility of 400 … 800 m at 1, 80 … 200 m at 3, 25 … 50 m at 5, and standard deviation of the
-            displacement of 0.3, 0.8, 1.5 px, each +-20 %.
+        severity: 1 to 5, visibility of 400 … 800 m at 1, 80 … 200 m at 3, 25 … 50 m at 5; standard deviation of the
+            displacement 200 m away of 0.3, 0.8, 1.5 px, each +-20 %; time to read out a frame of 15, 25, 40 ms, and
+            vibration of the pitch of 0.05, 0.12, 0.2 degrees. The car drives at 40 to 80 km/h.
         camera, horizon, depth, width: as for all scenes.
         dust: arguments of `HeterogeneousFog`.
         haze: arguments of `Turbulence`.
+        shutter: arguments of `RollingShutter`.
     """
-    visibility, amplitude = _at_severity(
+    visibility, amplitude, readout, pitch = _at_severity(
         severity,
-        [((400.0, 800.0), 0.3), ((200.0, 400.0), 0.5), ((80.0, 200.0), 0.8), ((50.0, 80.0), 1.1), ((25.0, 50.0), 1.5)],
+        [
+            ((400.0, 800.0), 0.3, 15.0, 0.05),
+            ((200.0, 400.0), 0.5, 20.0, 0.08),
+            ((80.0, 200.0), 0.8, 25.0, 0.12),
+            ((50.0, 80.0), 1.1, 33.0, 0.16),
+            ((25.0, 50.0), 1.5, 40.0, 0.2),
+        ],
     )
-    options: dict[str, Any] = {
+    place = _place(camera, horizon, depth)
+    of_dust: dict[str, Any] = {
         "mode": "ray",
         "visibility_range": visibility,
         "airlight": _DUST,
@@ -144,8 +199,20 @@ def unpaved_road(
         "wind_z_range": (-0.5, -0.3),
         "decorrelation_range": (30.0, 60.0),
     }
-    options |= _place(camera, horizon, depth) | (dust or {})
-    return Compose([HeterogeneousFog(**options), _turbulence(amplitude, width, **(haze or {}))])
+    of_shutter: dict[str, Any] = {
+        "speed_range": (40.0, 80.0),
+        "readout_range": (readout, readout),
+        "pitch_range": (0.5 * pitch, pitch),
+        "yaw_range": (0.25 * pitch, 0.5 * pitch),
+        "roll_range": (0.5 * pitch, pitch),
+    }
+    return Compose(
+        [
+            HeterogeneousFog(**of_dust | place | (dust or {})),
+            _turbulence(amplitude, width, **{"depth": place["depth"]} | (haze or {})),
+            RollingShutter(**of_shutter | place | (shutter or {})),
+        ]
+    )
 
 
 def paper_refractive(severity: int = 3, *, width: float = _REFERENCE_WIDTH) -> OneOf:
@@ -189,9 +256,13 @@ def paper_weather(severity: int = 3) -> OneOf:
     )
 
 
-def _place(camera: _CameraSource, horizon: float, depth: _DepthSource) -> dict[str, Any]:
-    """Return the arguments of a fog that tell the camera and the depth."""
-    camera = read_camera(camera) if isinstance(camera, str | Path) else camera
+def _camera(source: _CameraSource) -> Camera | None:
+    return read_camera(source) if isinstance(source, str | Path) else source
+
+
+def _place(source: _CameraSource, horizon: float, depth: _DepthSource) -> dict[str, Any]:
+    """Return the arguments of an effect that tell the camera and the depth."""
+    camera = _camera(source)
     if depth is None:
         focal = {} if camera is None else {"focal": camera.fx / camera.width}
         depth = CorridorDepth(horizon=horizon, spread=_SPREAD, **focal)

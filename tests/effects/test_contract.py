@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 
 import torchrefract
 from torchrefract import (
+    ChromaticAberration,
     Compose,
     DivergenceFree,
     Exposure,
@@ -29,10 +30,12 @@ from torchrefract import (
     PhysicalTurbulence,
     Rectification,
     RoadMirage,
+    RollingShutter,
     SunGlare,
     ThinPlateSpline,
     Turbulence,
     UniformFog,
+    Vignetting,
     warp,
 )
 from torchrefract.effects.base import Effect
@@ -80,7 +83,7 @@ EFFECTS = {
         },
         identity={"k1_range": NO_RANGE, "k2_range": NO_RANGE, "p1_range": NO_RANGE, "p2_range": NO_RANGE},
         gradient_field="coefficients",
-        fields=("coefficients", "focal", "center"),
+        fields=("coefficients", "focal", "center", "zoom", "shift"),
     ),
     "turbulence": Case(
         Turbulence,
@@ -124,12 +127,39 @@ EFFECTS = {
         gradient_field="amplitude",
         fields=("amplitude", "length", *MOTION),
     ),
+    "rolling shutter": Case(
+        RollingShutter,
+        strongest={
+            "speed_range": (60.0, 100.0),
+            "readout_range": (25.0, 33.0),
+            "roll_range": (1.0, 2.0),
+            "exposure_range": (1.0, 2.0),
+            "num_exposures": 1,
+        },
+        identity={"speed_range": NO_RANGE, "pitch_range": NO_RANGE, "yaw_range": NO_RANGE, "roll_range": NO_RANGE},
+        gradient_field="speed",
+        fields=("speed", "readout", "exposure", "amplitude", "frequency", "phase", "frame"),
+    ),
     "flare": Case(
         LensFlare,
         strongest={"color": (0.9, 0.8, 0.5), "drift_y_range": (-0.01, 0.01), "strength_range": (0.2, 0.5)},
         identity={"strength_range": NO_RANGE},
         gradient_field="strength",
         fields=("center", "radius", "strength", "color", "drift", "frame"),
+    ),
+    "vignetting": Case(
+        Vignetting,
+        strongest={"strength_range": (0.9, 1.0), "linear_light": False},
+        identity={"strength_range": NO_RANGE},
+        gradient_field="strength",
+        fields=("strength",),
+    ),
+    "chromatic aberration": Case(
+        ChromaticAberration,
+        strongest={"red_range": (0.05, 0.09), "blue_range": (-0.09, -0.05)},
+        identity={"red_range": NO_RANGE, "blue_range": NO_RANGE},
+        gradient_field="scale",
+        fields=("scale",),
     ),
     "heterogeneous fog": Case(
         HeterogeneousFog,
@@ -350,6 +380,8 @@ def test_channels_are_degraded_independently(case):
         return
     options = case.strongest | {name: 0.7 for name in ("airlight", "color") if name in case.strongest}
     effect, image = case.make(**options), random_image(2, 4, 20, 30)
+    if isinstance(effect, ChromaticAberration):  # whose channels differ
+        return
     result = effect.degrade(image, seed=7).image
     for channel in range(4):
         single = effect.degrade(image[:, [channel]], seed=7).image
@@ -378,7 +410,7 @@ def test_narrow_and_prime_frames_follow_the_equations(case, size):
         expected = warp(image, degraded.flow, padding=effect.padding, interpolation=effect.interpolation)[0]
         assert torch.equal(degraded.image, expected)
     if degraded.transmission is not None:
-        t, airlight = degraded.transmission, degraded.params.airlight[..., None, None]
+        t, airlight = degraded.transmission, getattr(degraded.params, "airlight", torch.zeros(1, 3))[..., None, None]
         assert_close(degraded.image, t * image + (1 - t) * airlight, rtol=0, atol=1e-6)
 
 
@@ -529,7 +561,7 @@ def test_an_infinite_field_of_the_params_raises(case, value):
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_range_with_nan_or_infinity_raises(case, value):
     names = [name for name, ends in vars(case.strong()).items() if name.endswith("_range") and isinstance(ends, tuple)]
-    assert len(names) >= 2
+    assert names
     for name in names:
         low, high = getattr(case.strong(), name)
         for wrong in ((value, high), (low, value)):

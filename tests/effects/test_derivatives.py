@@ -15,10 +15,13 @@ from torchrefract import (
     Camera,
     Compose,
     DivergenceFree,
+    Exposure,
     HeterogeneousFog,
     LensDistortion,
     LensFlare,
     Rectification,
+    RollingShutter,
+    SunGlare,
     ThinPlateSpline,
     Turbulence,
     UniformFog,
@@ -47,6 +50,10 @@ LENSES = {
     "division": (-0.2,),
 }
 ALL_TERMS = {f"{name}_range": (-0.02, 0.02) for name in ("k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")}
+SUN: dict[str, Any] = {
+    **{"center_x_range": (0.3, 0.4), "center_y_range": (0.3, 0.4), "time_constant_range": (1.0, 2.0)},
+    **{"luminance_range": (9.0, 20.0), "ghost_share_range": (0.01, 0.02), "ghost_radius_range": (9.0, 20.0)},
+}
 FOG = {"visibility_range": (20.0, 60.0), "airlight": (0.9, 0.7, 0.8), "tolerance": None}
 WARPS = {  # and their parameter that has a gradient at strength zero
     "lens": (partial(LensDistortion, k1_range=(-0.3, -0.2), **ALL_TERMS), "coefficients"),
@@ -54,6 +61,10 @@ WARPS = {  # and their parameter that has a gradient at strength zero
     "thin-plate spline": (
         partial(ThinPlateSpline, amplitude_range=(0.2, 0.3), lattice=(3, 3), smoothing_range=(0.01, 0.02)),
         "displacement",
+    ),
+    "rolling shutter": (
+        partial(RollingShutter, num_frequencies=1, roll_range=(1.0, 2.0), exposure_range=(1.0, 2.0), num_exposures=1),
+        "speed",
     ),
     "divergence-free": (
         partial(DivergenceFree, amplitude_range=(0.5, 1.0), length_range=(3.0, 4.0)),
@@ -64,6 +75,8 @@ PHOTOMETRIC = {
     "uniform fog": lambda: UniformFog(**FOG),
     "heterogeneous fog": lambda: HeterogeneousFog(**FOG),
     "flare": lambda: LensFlare(drift_y_range=(-0.01, 0.01), strength_range=(0.2, 0.5), tolerance=None),
+    "sun glare": lambda: SunGlare(**SUN),
+    "exposure": lambda: Exposure(shot_range=(0.001, 0.01), read_range=(0.001, 0.01), time_constant_range=(1.0, 2.0)),
 }
 Function = Callable[[Tensor], Tensor]
 
@@ -115,7 +128,7 @@ def effect_cases() -> dict[str, Callable[[], tuple[Function, Tensor]]]:
         for output in ("flow", "restore_flow"):
             cases[f"{name}, {output}"] = lambda m=make, o=output: function_of(m(tolerance_px=None), o)
     for name, make in PHOTOMETRIC.items():
-        cases[name] = lambda m=make, n=name: function_of(m(), "image", None if n == "flare" else depth)
+        cases[name] = lambda m=make, n=name: function_of(m(), "image", depth if "fog" in n else None)
     for model, coefficients in LENSES.items():
         camera = Camera(
             width=WIDTH, height=HEIGHT, fx=7.0, fy=7.5, cx=3.4, cy=3.2, coefficients=coefficients, model=model

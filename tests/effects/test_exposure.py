@@ -1,6 +1,7 @@
 """Exposure against a reference in NumPy, its noise, and its memory in clips."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,9 +26,10 @@ def encode(light: np.ndarray) -> np.ndarray:
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def fixed(**options) -> Exposure:
+def fixed(**options: Any) -> Exposure:
     """Return an exposure with the target 0.18 and the strength 0.9."""
-    return Exposure(**({"target_range": (0.18, 0.18), "gamma_range": (0.9, 0.9)} | options))
+    fixed_options: dict[str, Any] = {"target_range": (0.18, 0.18), "gamma_range": (0.9, 0.9)}
+    return Exposure(**(fixed_options | options))
 
 
 @pytest.mark.quick

@@ -188,7 +188,7 @@ def test_gradients_reach_the_zoom_and_the_shift():
     assert torch.autograd.gradcheck(flow, inputs)
 
 
-@pytest.mark.parametrize(("name", "value", "message"), [("zoom", 1.5, r"\(0, 1\]"), ("zoom", 0.0, r"\(0, 1\]")])
+@pytest.mark.parametrize(("name", "value", "message"), [("zoom", 1.5, "zoom must"), ("zoom", 0.0, "zoom must")])
 def test_a_zoom_out_of_range_raises(name, value, message):
     effect = LensDistortion()
     image = torch.rand(1, 1, 12, 20)
@@ -208,7 +208,8 @@ def test_padded_frames_keep_the_focal_length():
     effect = LensDistortion(frame="pad")
     params = effect.sample(torch.zeros(3, 1, 45, 80), seed=0)
     filled = LensDistortion().sample(torch.zeros(3, 1, 45, 80), seed=0)
-    assert params.zoom is None
+    assert (params.zoom == 1).all()
+    assert not params.shift.any()
     assert params.coefficients.equal(filled.coefficients)
     assert not effect.degrade(torch.zeros(3, 1, 45, 80), seed=0).valid.all()
 

@@ -106,6 +106,29 @@ DOMAINS = {
             "steps": st.integers(1, 3),
         },
     ),
+    "rolling shutter": Domain(
+        tr.RollingShutter,
+        {
+            "speed_range": (-1000.0, 1000.0),
+            "readout_range": (-200.0, 200.0),
+            "exposure_range": (0.0, 200.0),
+            **{f"{axis}_range": (0.0, 5.0) for axis in ("pitch", "yaw", "roll")},
+            "frequency_range": (0.0, 1000.0),
+        },
+        {
+            **_WARP_OPTIONS,
+            "num_frequencies": st.integers(1, 4),
+            "num_exposures": st.integers(1, 3),
+            "fps": st.floats(1.0, 240.0),
+            "depth": _FOG_OPTIONS["depth"],
+        },
+    ),
+    "vignetting": Domain(tr.Vignetting, {"strength_range": (0.0, 1.0)}, {"linear_light": st.booleans()}),
+    "chromatic aberration": Domain(
+        tr.ChromaticAberration,
+        {"red_range": (-0.1, 0.1), "blue_range": (-0.1, 0.1)},
+        {"interpolation": st.sampled_from(["bilinear", "bicubic"])},
+    ),
     "uniform fog": Domain(tr.UniformFog, _FOG, _FOG_OPTIONS),
     "heterogeneous fog": Domain(
         tr.HeterogeneousFog,
@@ -137,6 +160,38 @@ DOMAINS = {
             "clip": st.booleans(),
             "tolerance": st.sampled_from([None, 0.5]),
         },
+    ),
+    "sun glare": Domain(
+        tr.SunGlare,
+        {
+            "luminance_range": (0.0, 1e9),
+            "scatter_range": (0.0, 1.0),
+            "scale_range": (0.01, 100.0),
+            "shape_range": (0.1, 4.0),
+            "ghost_radius_range": (0.01, 100.0),
+            "ghost_share_range": (0.0, 1.0),
+            "gamma_range": (0.0, 4.0),
+            "time_constant_range": (0.0, 1e6),
+            "drift_x_range": (-1e4, 1e4),
+            "drift_y_range": (-1e4, 1e4),
+        },
+        {
+            "outside": st.floats(0.0, 1.0),
+            "num_ghosts": st.integers(0, 3),
+            "color": st.floats(0.0, 1e3),
+            "min_gain": st.floats(1 / 32, 1.0),
+        },
+    ),
+    "exposure": Domain(
+        tr.Exposure,
+        {
+            "target_range": (1e-3, 1.0),
+            "gamma_range": (0.0, 4.0),
+            "time_constant_range": (0.0, 1e6),
+            "shot_range": (0.0, 1.0),
+            "read_range": (0.0, 1.0),
+        },
+        {"min_gain": st.floats(1 / 32, 1.0), "max_gain": st.floats(1.0, 4.0), "quantize": st.booleans()},
     ),
 }
 

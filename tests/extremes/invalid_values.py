@@ -42,6 +42,9 @@ LIGHTS: dict[str, Callable[..., Effect]] = {
     "volumetric fog": partial(tr.HeterogeneousFog, mode="ray", visibility_range=(20.0, 60.0)),
     "flare": tr.LensFlare,
     "flare with screen blending": partial(tr.LensFlare, blend="screen"),
+    # Without a gain, since every pixel counts for it; in tests of exposure an invalid one counts as black.
+    "sun glare": partial(tr.SunGlare, center_x_range=(0.2, 0.8), center_y_range=(0.1, 0.6), gamma_range=(0.0, 0.0)),
+    "exposure": partial(tr.Exposure, gamma_range=(0.0, 0.0), shot_range=(1e-4, 1e-3)),
 }
 
 
@@ -242,7 +245,7 @@ def _params(effect: Effect, field: str, value: float, is_mapped: bool) -> None:
 
 def depths() -> Iterator[Case]:
     """Yield cases with a value in a depth that the caller passes."""
-    fogs = {name: make for name, make in LIGHTS.items() if "flare" not in name}
+    fogs = {name: make for name, make in LIGHTS.items() if "fog" in name}
     for (name, make), value in product(fogs.items(), (*VALUES, -1.0, -1e38, 0.0, 1e-38)):
         yield f"{name}, {value} in a depth", partial(_depth, make(), value)
     for value in (*VALUES, -1.0):

@@ -14,7 +14,7 @@ GRAY = torch.full((1, 3, 8, 9), 0.5)
 EFFECTS = (
     *(tr.LensDistortion, tr.Turbulence, tr.ThinPlateSpline, tr.DivergenceFree),
     *(tr.PhysicalTurbulence, tr.RoadMirage),
-    *(tr.UniformFog, tr.HeterogeneousFog, tr.LensFlare),
+    *(tr.UniformFog, tr.HeterogeneousFog, tr.LensFlare, tr.SunGlare, tr.Exposure),
 )
 FOLDING: dict[str, Any] = {"k1_range": (-0.6, -0.6), "focal_range": (0.5, 0.5), "strict": True}
 
@@ -59,6 +59,8 @@ CALLS: dict[str, Callable[[], Any]] = {
     "difference_range of a road mirage": lambda: tr.RoadMirage(difference_range=(-5.0, 5.0)),
     "contrast_range of fog": lambda: tr.HeterogeneousFog(contrast_range=(-0.1, 0.1)),
     "radius_range of flare": lambda: tr.LensFlare(radius_range=(-0.1, 0.2)),
+    "luminance_range of sun glare": lambda: tr.SunGlare(luminance_range=(-1.0, 2.0)),
+    "gamma_range of exposure": lambda: tr.Exposure(gamma_range=(-0.1, 0.2)),
     "strength_range of flare": lambda: tr.LensFlare(strength_range=(-0.1, 0.2)),
     # A lens out of bounds, or one that folds.
     "k1_range = -1e3": lambda: tr.LensDistortion(k1_range=(-1e3, 0.0)),

@@ -63,8 +63,13 @@ IDENTITIES: dict[str, Callable[..., Effect]] = {
     "uniform fog, depth 0": partial(tr.UniformFog, **NEAR),
     "heterogeneous fog, depth 0": partial(tr.HeterogeneousFog, **NEAR),
     "uniform fog, depth 0 in linear light": partial(tr.UniformFog, linear_light=True, **NEAR),
+    "rolling shutter, readout 0": partial(tr.RollingShutter, readout_range=ZERO),
+    "vignetting, strength 0": partial(tr.Vignetting, strength_range=ZERO),
+    "chromatic aberration, scale 0": partial(tr.ChromaticAberration, red_range=ZERO, blue_range=ZERO),
     "flare, radius 0": partial(tr.LensFlare, radius_range=ZERO),
     "flare, strength 0": partial(tr.LensFlare, strength_range=ZERO),
+    "sun glare, luminance 0": partial(tr.SunGlare, luminance_range=ZERO),
+    "exposure, gamma 0": partial(tr.Exposure, gamma_range=ZERO),
 }
 FOLDS: dict[str, Callable[..., Effect]] = {
     "lens, k1 = -0.6": lenses(k1_range=(-0.6, -0.6), focal_range=(0.5, 0.5)),

@@ -1,6 +1,7 @@
 """Metering, gain and noise against the sRGB curve, closed forms and a numeric solver."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -137,8 +138,8 @@ def test_gradients_match_finite_differences():
     for function, inputs in (
         (apply_gain, (image, gain)),
         (follow_gain, (metered, tau)),
-        (lambda *values: sensor_noise(*values, noise), (image, gain, shot, read)),
+        (partial(sensor_noise, noise=noise), (image, gain, shot, read)),
         (lambda x, g: expose_clipped(x, g.view(-1, 1, 1, 1)), (image, gain / 2)),
-        (lambda *values: exposure_gain(*values, low=0.01, high=100.0), (gain, metered[:, 0], tau)),
+        (partial(exposure_gain, low=0.01, high=100.0), (gain, metered[:, 0], tau)),
     ):
         assert torch.autograd.gradcheck(function, [value.clone().requires_grad_() for value in inputs])

@@ -236,6 +236,7 @@ class ParamsAtDepth(NamedTuple):
 
     params: Any  # with N rows, each with one frame number
     depth: Tensor  # (N, 1, H, W or 1), m
+    moment: Tensor | None = None  # (N,), in the exposure, as a share of it from its middle; None is the middle
 
     @property
     def applied(self) -> Tensor:
@@ -246,6 +247,16 @@ class ParamsAtDepth(NamedTuple):
     def is_identity(self) -> Tensor:
         """Return (N,), bool: the parameters change nothing at any depth."""
         return self.params.is_identity
+
+    @property
+    def is_map(self) -> bool:
+        """Return True if depth varies along rows, so that no plan of the ranges holds."""
+        return self.depth.shape[3] > 1
+
+    def at(self, moment: float) -> "ParamsAtDepth":
+        """Return the same at a moment of the exposure."""
+        depth = self.depth
+        return self._replace(moment=torch.full(depth.shape[:1], moment, dtype=depth.dtype, device=depth.device))
 
 
 def check_shapes(params: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:

@@ -12,7 +12,7 @@ from torchrefract import random
 from torchrefract._tensor import as_device_tensor, assume_constant_result
 from torchrefract._validation import check_choice, check_number, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.batch import params_per_frame, params_to, select_params
+from torchrefract.effects.batch import ParamsAtDepth, params_per_frame, params_to, select_params
 from torchrefract.effects.batch_flow import FlowPart, SamplingOptions, can_read, flow_on_measured_lattice, zero_flow
 from torchrefract.effects.photometric_effect import PhotometricEffect
 from torchrefract.effects.progress import Leaf, Progress
@@ -209,9 +209,34 @@ class Compose(Effect):
         request = cast(PlanRequest, requests[places[0]])
         frame = request.height, request.width
         moving = self._at_depth(progress, [leaves[k] for k in places], places, request)
+        active = [cast(WarpEffect, leaf.effect).active(leaf.params, *frame) for leaf in moving]
+        moments = [cast(WarpEffect, leaf.effect).moments() for leaf in moving]
+        parts = []
+        for k in range(max(map(len, moments))):
+            looks = [
+                leaf if len(each) == 1 else leaf._replace(params=leaf.params.at(each[k % len(each)]))
+                for leaf, each in zip(moving, moments, strict=True)
+            ]
+            parts.append(self._parts(looks, places, active, request))
+        middle = parts[0] if len(parts) == 1 else self._parts(moving, places, active, request)
+        # The share must not depend on the warps that move other samples of the batch.
+        num_warps = sum(isinstance(leaf.effect, WarpEffect) for leaf in leaves)
+        share_px = None if request.tolerance_px is None else request.tolerance_px / num_warps
+        progress.move(moving, active, middle, share_px, exposures=parts)
+
+    def _parts(
+        self,
+        moving: Sequence[Leaf],
+        places: Sequence[int],
+        active: Sequence[Tensor],
+        request: PlanRequest,
+        *,
+        can_measure: bool = True,
+    ) -> list[FlowPart]:
+        """Compute the composed flow of warps; arguments as for `Progress.move` and `_at_depth`."""
         warps = [(cast(WarpEffect, leaf.effect), leaf.params) for leaf in moving]
-        active = [effect.active(params, *frame) for effect, params in warps]
-        can_measure = can_read(moving[0].params)
+        has_map = [isinstance(params, ParamsAtDepth) and params.is_map for _, params in warps]
+        frame, can_measure = (request.height, request.width), can_measure and can_read(moving[0].params)
         can_group = can_measure and not any(requires_grad(params) for _, params in warps)
         parts: list[FlowPart] = []
         for samples, acting in _group_samples(active) if can_group else [(None, list(range(len(warps))))]:
@@ -219,14 +244,12 @@ class Compose(Effect):
             if samples is not None:
                 chosen = [(effect, select_params(params, samples)) for effect, params in chosen]
             acting_places = tuple([places[k] for k in acting])
+            exact_places = tuple([places[k] for k in acting if has_map[k]])
             plan = self._constant_plan(
-                id(self), acting_places, *frame, request.tolerance_px, request.is_double, can_measure
+                id(self), acting_places, exact_places, *frame, request.tolerance_px, request.is_double, can_measure
             )
             parts += [part.of_samples(samples) for part in _composed_flow(chosen, plan, request.tolerance_px)]
-        # The share must not depend on the warps that move other samples of the batch.
-        num_warps = sum(isinstance(leaf.effect, WarpEffect) for leaf in leaves)
-        share_px = None if request.tolerance_px is None else request.tolerance_px / num_warps
-        progress.move(moving, active, parts, share_px)
+        return parts
 
     def _at_depth(
         self, progress: Progress, leaves: Sequence[Leaf], places: Sequence[int], request: PlanRequest
@@ -235,28 +258,18 @@ class Compose(Effect):
 
         Args:
             progress: before the warps.
-            leaves: the warps that will be sampled together.
-            places: of the warps among all effects.
+            leaves, places: the warps that will be sampled together, and their places among all effects.
             request: for the composed flow.
         """
-        height, width = request.height, request.width
+        frame = request.height, request.width
         placed: list[Leaf] = []
         for leaf in leaves:
             effect, depth = cast(WarpEffect, leaf.effect), progress.depth
             params = params_per_frame(leaf.params, progress.frames)
             if placed and depth is not None and effect.depth is not None:
-                active = [cast(WarpEffect, before.effect).active(before.params, height, width) for before in placed]
-                plan = self._constant_plan(
-                    id(self),
-                    tuple(places[: len(placed)]),
-                    height,
-                    width,
-                    request.tolerance_px,
-                    request.is_double,
-                    False,
-                )
-                warps = [(cast(WarpEffect, before.effect), before.params) for before in placed]
-                depth = progress.moved_depth(placed, active, _composed_flow(warps, plan, request.tolerance_px))
+                active = [cast(WarpEffect, before.effect).active(before.params, *frame) for before in placed]
+                parts = self._parts(placed, places[: len(placed)], active, request, can_measure=False)
+                depth = progress.moved_depth(placed, active, parts)
             placed.append(leaf._replace(params=effect.at_depth(params, progress.image, depth)))
         return placed
 
@@ -294,6 +307,7 @@ class Compose(Effect):
         self,
         _: int,
         places: tuple[int, ...],
+        exact_places: tuple[int, ...],
         height: int,
         width: int,
         tolerance_px: float | None,
@@ -301,7 +315,9 @@ class Compose(Effect):
         can_measure: bool,
     ) -> "_FlowPlan":
         leaves, request = self._leaves(), PlanRequest(height, width, tolerance_px, is_double)
-        plan = _plan_group([leaves[place].effect for place in places], request, can_measure=can_measure)
+        warps = [cast(WarpEffect, leaves[place].effect) for place in places]
+        effects = [warp.exact() if k in exact_places else warp for k, warp in zip(places, warps, strict=True)]
+        plan = _plan_group(effects, request, can_measure=can_measure)
         return _FlowPlan(plan.stride, plan.is_smooth, plan.plans)
 
     def _children(self) -> list[Effect]:
@@ -396,7 +412,7 @@ def _plan_group(effects: Sequence[Effect], request: PlanRequest, *, can_measure:
         PlannedWarp(
             warp.error_model() if warp.tolerance_px else None,
             warp.rounding_ulps,
-            warp.has_closed_form and warp.can_interpolate,
+            warp.has_closed_form and not warp.has_kinks,
         )
         for warp in warps
     ]

@@ -126,7 +126,9 @@ class Exposure(PhotometricEffect):
         ranges = [self.target_range, self.gamma_range, self.time_constant_range, self.shot_range, self.read_range]
         applied, values = self.draw_in_ranges(stream, ranges, image)
         key = random.noise_key(stream)
-        return ExposureParams(applied, *values.unbind(1), key, torch.zeros_like(values[:, :1]))
+        target, gamma, time_constant, shot, read = values.unbind(1)
+        frame = torch.zeros_like(values[:, :1])
+        return ExposureParams(applied, target, gamma, time_constant, shot, read, key, frame)
 
     def validate(self, params: ExposureParams, image: Tensor) -> None:
         """Raise ValueError for invalid parameters."""
@@ -139,6 +141,7 @@ class Exposure(PhotometricEffect):
 
     def render(self, image: Tensor, params: ExposureParams, depth: Tensor | None) -> Rendered:
         """Expose images."""
+        image = image.contiguous()  # the rounding of a sum of products depends on the memory format
         rows, dtype = len(image), field_dtype(image.dtype)
         target, shot, read = (
             expand_batch(finite_or(value.to(dtype), 0.0), rows) for value in (params.target, params.shot, params.read)
@@ -163,8 +166,8 @@ class Exposure(PhotometricEffect):
         """Return False if no sample has noise, as far as that is known without waiting for a device."""
         if requires_grad((params.shot, params.read)):
             return True
-        some = eager_bool(((params.shot > 0) | (params.read > 0)).any, of=params.shot)
-        return self.shot_range[1] + self.read_range[1] > 0 if some is None else some
+        is_noisy = eager_bool(((params.shot > 0) | (params.read > 0)).any, of=params.shot)
+        return self.shot_range[1] + self.read_range[1] > 0 if is_noisy is None else is_noisy
 
 
 def check_control(params: Any) -> None:

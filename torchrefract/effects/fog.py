@@ -20,7 +20,7 @@ from torchrefract._validation import (
     color_per_channel,
     finite_or,
 )
-from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.camera import Camera, check_camera
 from torchrefract.effects.batch import (
     BatchShape,
     check_image,
@@ -54,7 +54,6 @@ from torchrefract.warping.grid import field_dtype
 _PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)
 _REC_709 = (0.2126, 0.7152, 0.0722)
 _GRAY = sum(weight * value for weight, value in zip(_REC_709, _PAPER_AIRLIGHT, strict=True))
-_FOCAL = 0.9  # widths of the frame, of the pinhole that stands in for an unknown camera
 _MIN_TRANSMISSION = 1 / 255  # of what 8 bits can recover
 _ROUNDING = 2e-5  # relative, of a drawn extinction
 _ENDLESS = 1e30  # m, of a visibility that float32 hardly holds
@@ -117,13 +116,6 @@ class FogMedium:
         camera = self.camera.resized(width=width, height=height)
         return ray_distance(depth, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy, width=width)
 
-    def pinhole(self, height: int, width: int) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return focal lengths and principal point in px; without a camera, those of a centered pinhole."""
-        if self.camera is None:
-            return (_FOCAL * width, _FOCAL * width), ((width - 1) / 2, (height - 1) / 2)
-        camera = self.camera.resized(width=width, height=height)
-        return (camera.fx, camera.fy), (camera.cx, camera.cy)
-
     def extinction_range(self, visibility_range: Range, deviation_range: Range) -> Range:
         """Return the lowest and the highest mean extinction in 1/m, with a margin for rounding."""
         (near, far), (thin, dense) = visibility_range, deviation_range
@@ -181,13 +173,11 @@ def make_medium(
     linear_light: bool,
 ) -> FogMedium:
     """Make a medium from arguments as `UniformFog` takes them."""
-    if camera is not None and not isinstance(camera, Camera):
-        raise TypeError(f"camera must be a Camera, got {type(camera).__name__}")
     return FogMedium(
         airlight=None if airlight is None else check_color("airlight", airlight, high=1.0),
         threshold=check_number("threshold", threshold, low=1e-6, high=1 - 1e-6),
         depth=LinearDepth() if depth is None else check_depth_provider(depth),
-        camera=camera,
+        camera=check_camera(camera),
         linear_light=check_flag("linear_light", linear_light),
     )
 

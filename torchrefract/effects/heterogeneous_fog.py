@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor, expand_batch
 from torchrefract._validation import check_choice, check_number, check_positive, check_range, check_values, check_within
-from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.camera import Camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, frame_mean, params_to, per_sample
 from torchrefract.effects.fog import check_fog_params, check_fog_ranges, draw_fog, make_medium
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
@@ -233,7 +233,7 @@ class HeterogeneousFog(PhotometricEffect):
             periods, stretch = self._periods(height, width), self.normalize == "image"
             q = image_noise(key, weights, octaves=octaves, periods=periods, motion=motion, stretch=stretch, **size)
         else:
-            focal, center = self.medium.pinhole(height, width)
+            focal, center = pinhole_of(self.medium.camera, height=height, width=width)
             field = ExtinctionField(key, weights, contrast.to(k.dtype), motion)
             view = {"focal": focal, "center": center, "scales": self.scales, "reach": self.reach}
             q = mean_extinction_along_rays(field, distance, **size, **view)

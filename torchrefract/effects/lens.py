@@ -35,6 +35,7 @@ from torchrefract.warping.lattice import pixel_lattice
 
 _LARGEST_COEFFICIENT = 100.0
 _FARTHEST = 1e10  # widths
+_SMALLEST_ZOOM = 1e-6
 _SAME_VIEW = 1e-3  # difference of zooms and of shifts, in widths
 FRAMES = ("fill", "pad")
 _MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors are another model in another order)"
@@ -48,7 +49,7 @@ class LensParams(NamedTuple):
     focal: Tensor  # (B, 2), in widths of the frame: fx / W and fy / W
     center: Tensor  # (B, 2), in widths: the principal point's offset from the center of the frame
     # The pinhole of the clean frame, if it is not that of the lens:
-    zoom: Tensor | None = None  # (B,), in (0, 1]: its focal length over that of the lens
+    zoom: Tensor | None = None  # (B,), in [1e-6, 1]: its focal length over that of the lens
     shift: Tensor | None = None  # (B, 2), in widths: its principal point minus that of the lens
 
     to = params_to
@@ -225,7 +226,8 @@ class LensDistortion(WarpEffect):
             values = self._source.select(values)
         fx, aspect = values[:, 12], values[:, 13]
         params = LensParams(applied, values[:, :12], torch.stack([fx, fx * aspect], dim=1), values[:, 14:])
-        return self.fill(params, *image.shape[2:]) if self.frame == "fill" else params
+        zoom, shift = self._view(params, *image.shape[2:])
+        return params._replace(zoom=zoom, shift=shift)
 
     def fill(self, params: LensParams, height: int, width: int) -> LensParams:
         """Return the same lenses with the zoom and the shift that leave no pixel of such frames without a source.
@@ -242,7 +244,7 @@ class LensDistortion(WarpEffect):
             raise ValueError("params.zoom and params.shift must be given both or not at all, got one of them")
         if params.zoom is not None and params.shift is not None:
             check_shapes(params, {"zoom": (), "shift": (2,)})
-            check_values("params.zoom", "lie in (0, 1]", params.zoom, lambda v: (v > 0) & (v <= 1))
+            check_within("params.zoom", params.zoom, _SMALLEST_ZOOM, 1.0)
             check_within("params.shift", params.shift, -_FARTHEST, _FARTHEST)
 
     def flow(self, params: LensParams, points: Points, plan: WarpPlan) -> tuple[Tensor, Tensor]:
@@ -277,7 +279,7 @@ class LensDistortion(WarpEffect):
         effect = super().for_params(params, height, width)
         if params.zoom is None or params.shift is None or self.tolerance_px is None:
             return effect
-        fits = self._fit(params, height, width)
+        fits = self._view(params, height, width)
         difference = torch.cat([(params.zoom - fits[0])[:, None], params.shift - fits[1]], dim=1).abs()
         return effect.exact() if eager_bool((difference <= _SAME_VIEW).all, of=difference) is False else effect
 
@@ -306,6 +308,12 @@ class LensDistortion(WarpEffect):
             Camera(fx=fx, fy=fy, cx=cx, cy=cy, **size)
             for (fx, fy), (cx, cy) in zip(focal.tolist(), center.tolist(), strict=True)
         ]
+
+    def _view(self, params: LensParams, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """Return the zoom and the shift of `frame`."""
+        if self.frame == "fill":
+            return self._fit(params, height, width)
+        return torch.ones_like(params.focal[:, 0]), torch.zeros_like(params.center)
 
     def _fit(self, params: LensParams, height: int, width: int) -> tuple[Tensor, Tensor]:
         dtype = params.focal.dtype

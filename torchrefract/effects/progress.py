@@ -13,7 +13,7 @@ from torchrefract.effects.base import Effect
 from torchrefract.effects.batch import per_sample
 from torchrefract.effects.batch_flow import BatchFlow, FlowPart, SamplingOptions
 from torchrefract.effects.photometric_effect import PhotometricEffect
-from torchrefract.effects.warp_effect import WarpEffect, warped
+from torchrefract.effects.warp_effect import WarpEffect, mean_of_exposures, warped
 from torchrefract.types import Degraded
 from torchrefract.warping.flow import compose_flows
 from torchrefract.warping.grid import field_dtype, inside
@@ -77,7 +77,13 @@ class Progress:
         self.light: dict[str, Callable[[], Tensor]] = {}
 
     def move(
-        self, leaves: Sequence[Leaf], active: Sequence[Tensor], parts: Sequence[FlowPart], share_px: float | None
+        self,
+        leaves: Sequence[Leaf],
+        active: Sequence[Tensor],
+        parts: Sequence[FlowPart],
+        share_px: float | None,
+        *,
+        exposures: Sequence[Sequence[FlowPart]],
     ) -> None:
         """Sample the images along the composed flow of several warps.
 
@@ -86,11 +92,18 @@ class Progress:
             active: (N,), bool, for each warp: the samples that it moves.
             parts: the composed flow.
             share_px: tolerance of the flow of each warp, from which valid and inverse follow; None is exact.
+            exposures: the composed flows along which images are sampled, whose mean is the image.
         """
         height, width = self.image.shape[2:]
         segment = _segment(leaves, active, parts)
         self.depth = self._sample_depth(segment)
-        self.image = _sample_segment(self.image, segment, leaves, active)
+        segments = [segment] if len(exposures) == 1 else [_segment(leaves, active, each) for each in exposures]
+
+        def sampled(image: Tensor, k: int) -> Tensor:
+            return _sample_segment(image, segments[k], leaves, active)
+
+        applied = _Applied(segment.applied, segment.flow.parts[0].flow.nodes)
+        self.image = mean_of_exposures(self.image, len(segments), sampled, segment.active, applied)
         self.light = {name: _moved(value, segment) for name, value in self.light.items()}
         for leaf, moves in zip(leaves, active, strict=True):
             warp = cast(WarpEffect, leaf.effect)

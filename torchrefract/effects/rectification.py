@@ -113,7 +113,7 @@ class Rectification(WarpEffect):
         dtype, count = field_dtype(image.dtype), image.shape[0]
         rows = (as_device_tensor([row], dtype=dtype, device=image.device).repeat(count, 1) for row in self._numbers())
         params = RectificationParams(applied, *rows)
-        return params._replace(zoom=self._zoom(params, *image.shape[2:])) if self.frame == "crop" else params
+        return params._replace(zoom=self._zoom(params, *image.shape[2:]))
 
     def validate(self, params: RectificationParams, image: Tensor) -> None:
         """Raise ValueError for invalid cameras."""
@@ -183,7 +183,8 @@ class Rectification(WarpEffect):
         return replace(camera, model="opencv", coefficients=(0.0,) * 4, fx=zoom * camera.fx, fy=zoom * camera.fy)
 
     def _zoom(self, params: RectificationParams, height: int, width: int) -> Tensor:
-        zoom = zoom_to_crop(self.camera.resized(width=width, height=height))
+        is_cropped = self.frame == "crop"
+        zoom = zoom_to_crop(self.camera.resized(width=width, height=height)) if is_cropped else 1.0
         return torch.full_like(params.focal[:, 0], zoom)
 
     def _numbers(self) -> tuple[tuple[float, ...], ...]:

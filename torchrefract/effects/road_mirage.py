@@ -92,7 +92,7 @@ class RoadMirage(WarpEffect):
 
     params_type = RoadMirageParams
     has_closed_form = True
-    can_interpolate = False
+    has_kinks = True
 
     def __init__(
         self,

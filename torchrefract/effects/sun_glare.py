@@ -109,7 +109,8 @@ class SunGlare(PhotometricEffect):
         ghost_radius_range: degrees.
         ghost_share_range: of the light of the sun; two reflections of 0.5 % give 2.5e-5.
         color: of the sun, one number for each channel or one for all.
-        gamma_range: strength of the exposure; 0 keeps the gain of the clean frame.
+        gamma_range: strength of the exposure; 0 keeps the gain of the clean frame, and above 1 the camera darkens more
+            than the mean asks for, as real ones do to keep highlights.
         min_gain: lowest G, in [1/32, 1].
         time_constant_range: of the exposure in a clip, in frames; with 0 each frame is exposed by itself.
         drift_x_range, drift_y_range: of the sun, in widths and heights per frame of a clip.
@@ -135,14 +136,14 @@ class SunGlare(PhotometricEffect):
         center_y_range: Range | None = None,
         outside: float = 0.2,
         luminance_range: Range = (5e4, 1.5e5),
-        scatter_range: Range = (0.03, 0.15),
-        scale_range: Range = (0.4, 1.0),
+        scatter_range: Range = (0.02, 0.12),
+        scale_range: Range = (0.3, 0.8),
         shape_range: Range = (0.45, 0.55),
         num_ghosts: int = 4,
         ghost_radius_range: Range = (0.5, 2.5),
         ghost_share_range: Range = (0.0, 5e-5),
         color: float | Sequence[float] = 1.0,
-        gamma_range: Range = (1.0, 1.3),
+        gamma_range: Range = (1.2, 1.8),
         min_gain: float = 1 / 16,
         time_constant_range: Range = (0.0, 0.0),
         drift_x_range: Range = (-0.002, 0.002),
@@ -186,7 +187,7 @@ class SunGlare(PhotometricEffect):
             u = random.uniform(inner.at(0), 4).to(values.dtype)
             sky = find_sky(image)
             point, has_sky = sky_point(sky, u[:, 1:], height=image.shape[2], width=image.shape[3])
-            above = torch.stack([center[:, 0], center[:, 1] + torch.where(has_sky, 0.0, _HIGH_ABOVE)], dim=1)
+            above = torch.stack([center[:, 0], center[:, 1] + _HIGH_ABOVE * (~has_sky).to(center.dtype)], dim=1)
             center = torch.where((has_sky & (u[:, 0] >= self.outside))[:, None], point, above)
             luminance = torch.where(sky.is_night, 0.0, luminance)
         batch, channels = image.shape[:2]
@@ -195,17 +196,21 @@ class SunGlare(PhotometricEffect):
         ghosts = ghosts.view(batch, self.num_ghosts, 3 + channels)
         colors = [color_per_channel("color", self.color, channels)] * batch
         color = as_device_tensor(colors, dtype=values.dtype, device=values.device).view(batch, channels)
+        _, _, _, scatter, scale, shape, gamma, time_constant = values[:, :8].unbind(1)
         return SunGlareParams(
             applied,
             center,
             luminance,
-            *values[:, 3:6].unbind(1),
+            scatter,
+            scale,
+            shape,
             color,
             ghosts[..., :3],
             ghosts[..., 3:],
-            *values[:, 6:8].unbind(1),
-            values[:, 8:],
-            torch.zeros_like(values[:, :1]),
+            gamma,
+            time_constant,
+            drift=values[:, 8:],
+            frame=torch.zeros_like(values[:, :1]),
         )
 
     def validate(self, params: SunGlareParams, image: Tensor) -> None:
@@ -235,6 +240,7 @@ class SunGlare(PhotometricEffect):
 
     def render(self, image: Tensor, params: SunGlareParams, depth: Tensor | None) -> Rendered:
         """Add the light of the sun to images and expose them."""
+        image = image.contiguous()  # the rounding of a sum of products depends on the memory format
         height, width = image.shape[2:]
         camera = None if self.camera is None else self.camera.resized(width=width, height=height)
         focal = _FOCAL * width if camera is None else camera.fx

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import assume_constant_result, expand_batch
+from torchrefract._tensor import assume_constant_result, expand_batch, to_float
 from torchrefract._validation import check_choice, eager_bool, requires_grad
 from torchrefract.effects.base import Effect
 from torchrefract.effects.batch import ParamsAtDepth, params_per_frame, per_sample, where_active
@@ -70,7 +70,7 @@ class WarpEffect(Effect):
 
     rounding_ulps = DEFAULT_ULPS
     has_closed_form = False  # whether `flow` computes any points, not only the nodes of a lattice
-    can_interpolate = True  # whether a lattice that is fine enough may interpolate a flow in closed form
+    has_kinks = False  # whether the lattice follows from error bounds alone, since measurements miss kinks
     depth: DepthSource | None = None  # of frames without a depth map; None for a flow that depends on no depth
 
     def __init__(
@@ -115,6 +115,13 @@ class WarpEffect(Effect):
         """Return error bounds for all parameters in the ranges, or None if none are known."""
         return None
 
+    def moments(self) -> list[float]:
+        """Return the moments of the exposure whose images are averaged, as for `ParamsAtDepth`; by default its middle.
+
+        A warp with several of them has a `depth`.
+        """
+        return [0.0]
+
     @property
     def keeps_uint8(self) -> bool:
         """Return True: sampling rounds its result."""
@@ -134,7 +141,7 @@ class WarpEffect(Effect):
             request = replace(request, tolerance_px=None)
         plan = plan_warp(self.error_model() if request.tolerance_px else None, request)
         is_fine = 0 < plan.stride < _FINE_STRIDE and request.height * request.width >= _MIN_PIXELS
-        if self.has_closed_form and self.can_interpolate and is_fine and request.tolerance_px is not None:
+        if self.has_closed_form and not self.has_kinks and is_fine and request.tolerance_px is not None:
             plan = replace(plan, is_measured=True, error_px=request.tolerance_px)
         return plan
 
@@ -185,8 +192,15 @@ class WarpEffect(Effect):
         inverse = expand_batch(inverse, flow.shape[0])
         return where_active(inverse, 0.0, active, params), exists | ~per_sample(active)
 
+    def flow_by_plan(self, params: Any, height: int, width: int) -> BatchFlow:
+        """Compute the flow by the plan of the ranges, or exactly at a map of depth, for which no plan holds."""
+        if isinstance(params, ParamsAtDepth) and params.is_map:
+            return self.planned_flow(params, height, width, None)
+        return BatchFlow(self.flow_parts(params, self._constant_plan(id(self), height, width, flow_dtype(params))))
+
     def planned_flow(self, params: Any, height: int, width: int, share_px: float | None) -> BatchFlow:
         """Compute the flow for a share of the tolerance of a composition, exactly if rounding exceeds it."""
+        share_px = None if isinstance(params, ParamsAtDepth) and params.is_map else share_px
         return BatchFlow(
             self.flow_parts(params, self._constant_share(id(self), height, width, flow_dtype(params), share_px))
         )
@@ -206,13 +220,21 @@ class WarpEffect(Effect):
         if not self.may_change(params) or height * width == 1:
             return unchanged(image, params)
         drawn, params = params, self.at_depth(params, image, depth)
-        flow = BatchFlow(self.flow_parts(params, self._constant_plan(id(self), height, width, flow_dtype(params))))
-        if flow.is_zero:
+        flow, moments = self.flow_by_plan(params, height, width), self.moments()
+        if flow.is_zero and len(moments) == 1:
             return unchanged(image, drawn)
         active = self.active(params, height, width)  # a flow has B rows, or as many as there are images
-        options = SamplingOptions(self.padding, self.interpolation, self.backend)
+        moves, options = (
+            expand_batch(active, len(image)),
+            SamplingOptions(self.padding, self.interpolation, self.backend),
+        )
+
+        def sampled(source: Tensor, k: int) -> Tensor:
+            along = flow if len(moments) == 1 else self.flow_by_plan(params.at(moments[k]), height, width)
+            return along.sample(source, moves, params, options)
+
         return warped(
-            flow.sample(image, expand_batch(active, image.shape[0]), params, options),
+            mean_of_exposures(image, len(moments), sampled, moves, params),
             drawn,
             flow=lambda: flow.dense,
             valid=lambda: (flow.exists & inside(flow.dense)) | ~per_sample(expand_batch(active, flow.dense.shape[0])),
@@ -229,6 +251,26 @@ class WarpEffect(Effect):
     def _constant_share(self, _: int, height: int, width: int, dtype: torch.dtype, share_px: float | None) -> WarpPlan:
         request = replace(self.plan_request(height, width, dtype), tolerance_px=share_px)
         return self.plan_under(request if request.is_reachable else replace(request, tolerance_px=None))
+
+
+def mean_of_exposures(
+    image: Tensor, count: int, sample: Callable[[Tensor, int], Tensor], active: Tensor, params: Any
+) -> Tensor:
+    """Return the mean of several samplings of images (N, C, H, W), uint8 if they are and there is one sampling.
+
+    Args:
+        image: as above.
+        count: of samplings.
+        sample: returns sampling k of images.
+        active, params: as for `where_active`.
+    """
+    if count == 1:
+        return sample(image, 0)
+    source = to_float(image) if image.dtype is torch.uint8 else image
+    total = sample(source, 0)
+    for k in range(1, count):
+        total = total + sample(source, k)
+    return where_active(total / count, source, active, params)
 
 
 def warped(

@@ -1,4 +1,4 @@
-"""How a camera exposes a frame: metering, gain and noise, in linear light."""
+"""Exposure of a frame by a camera, in linear light: metering, gain, noise, and the delay of the gain in clips."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -11,12 +11,13 @@ from torchrefract._validation import requires_grad
 from torchrefract.fields.fog import linear_to_srgb
 
 _STORED_TOE, _LINEAR_TOE = 0.04045, 0.0031308  # where the line of the sRGB curve ends and its power begins
+_HIGHEST = 1e4  # stored value; higher ones, whose power would be infinite, count as this
 _NODES = 192  # of the metered lattice along the longer side
 _CEILING = 16.0  # times white; brighter light counts as this, since a sensor saturates
 _CLIPPED = 0.8  # linear light, from where a frame may be clipped
 _DARK = 1e-3  # added to both sides of a ratio of means, so that black frames have a gain
 _SHORTEST = 1e-3  # frames, of a time constant
-_CACHED_VALUES = 1 << 17  # float32 values that fit into the cache of one core
+_CACHED_VALUES = 1 << 18  # float32 values; half as many take as long, with more starts of operations
 _LEAST_WIDTH = 1e-6  # of the part between line and power, which vanishes for a gain of 1
 _LEAST_VARIANCE = 1e-20  # whose square root has a finite gradient
 
@@ -47,7 +48,7 @@ def exposure_gain(mean: Tensor, target: Tensor, gamma: Tensor, *, low: float, hi
         gamma: 1 reaches the target, 0 leaves the frame as it is.
         low, high: limits, above 0.
     """
-    stops = gamma * ((target + _DARK) / (mean + _DARK)).log()
+    stops = gamma * ((target + _DARK).log() - (mean + _DARK).log())
     return stops.clamp(math.log(low), math.log(high)).exp()
 
 
@@ -75,7 +76,7 @@ def follow_gain(gain: Tensor, time_constant: Tensor) -> Tensor:
 def light_from_stored(value: Tensor) -> Tensor:
     """Convert stored values in [0, 1] to linear light as `srgb_to_linear`, to 3e-8 and in a third of the time."""
     # Line and power are continuous up to 3e-8, so they add up. torch.where and pow take several times as long.
-    power = value.clamp(min=_STORED_TOE).mul_(1 / 1.055).add_(0.055 / 1.055).log2().mul_(2.4).exp2_()
+    power = value.clamp(min=_STORED_TOE, max=_HIGHEST).mul_(1 / 1.055).add_(0.055 / 1.055).log2().mul_(2.4).exp2_()
     return (value.clamp(max=_STORED_TOE) - _STORED_TOE).mul_(1 / 12.92).add_(power)
 
 

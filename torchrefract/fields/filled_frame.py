@@ -42,12 +42,13 @@ def zoom_to_fill(
     positions = [position(border) for border in borders]
     low, high = zip(*(_extent(reached, center) for reached in positions), strict=True)
     low, high = torch.stack(low, dim=-1), torch.stack(high, dim=-1)  # (B, 2, outsets), from the center
-    size = as_device_tensor([width - 1, height - 1], dtype=center.dtype, device=center.device)[:, None]
+    sides = [side - 1 if side > 1 else torch.inf for side in (width, height)]  # a side of one pixel decides nothing
+    size = as_device_tensor(sides, dtype=center.dtype, device=center.device)[:, None]
     space = as_device_tensor(_OUTSETS_PX, dtype=center.dtype, device=center.device) - MARGIN_PX
     # Each lower end must fit together with each upper end.
     spans = (high[..., None] - low[..., None, :]).clamp(min=1e-9)
     zoom = ((size[..., None] + space[:, None] + space) / spans).flatten(1).amin(dim=1).clamp(max=1.0)
-    zoom = (zoom * _STEPS).floor() / _STEPS
+    zoom = (zoom * _STEPS).floor().clamp(min=8) / _STEPS
     middle, scale = center[..., None], zoom[:, None, None]
     lowest_shift = (-space - middle - scale * low).amax(dim=2)
     highest_shift = (size + space - middle - scale * high).amin(dim=2)

@@ -23,6 +23,9 @@ from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
 from torchrefract.effects.flare import LensFlare
 from torchrefract.effects.fog import remove_fog
+from torchrefract.effects.physical_turbulence import PhysicalTurbulence
+from torchrefract.effects.rolling_shutter import RollingShutter
+from torchrefract.effects.sun_glare import SunGlare
 from torchrefract.types import Degraded
 from torchrefract.visualization.color import (
     checkerboard,
@@ -56,9 +59,20 @@ _PARAMETER_TEXTS: dict[str, Callable[[Tensor], str]] = {
     "contrast": lambda value: f"contrast {value:.2g}",
     "sun": lambda value: f"sun at {value[0]:.2f} widths, {value[1]:.2f} heights",
     "radius": lambda value: f"radius {value:.2g} diagonals",
+    "scatter": lambda value: f"{value:.2g} of the light scattered",
+    "speed": lambda value: f"{value:.3g} km/h",
+    "readout": lambda value: f"readout {value:.3g} ms",
+    "vibration": lambda value: f"vibration {value.abs().max():.2g} deg",
+    "difference": lambda value: f"road {value:.2g} K hotter",
+    "tilt": lambda value: f"tilt {value:.2g} microradians",
+    "scale": lambda value: (
+        f"red {value[0]:.2g}, blue {value[-1]:.2g} larger" if value.ndim else f"scale {value:.2g} deg"
+    ),
+    "target": lambda value: f"mean light {value:.2g}",
     "strength": lambda value: f"strength {value:.2g}",
     "center": lambda value: f"center off by ({value[0]:.1g}, {value[1]:.1g}) widths",
     "wind": lambda value: f"wind ({value[0]:.2g}, {value[1]:.2g}) px/frame",
+    "wind_s": lambda value: f"wind ({value[0]:.2g}, {value[1]:.2g}) m/s",
     "wind_m": lambda value: f"wind ({', '.join(f'{v:.2g}' for v in value.tolist())}) m/frame",
 }
 _MAP_UNITS = {"extinction": "/m"}
@@ -255,16 +269,20 @@ def describe_params(effect: Effect, params: Any) -> str:
         return " + ".join(leaves) or "not applied"
     if not params.applied[0]:
         return "not applied"
-    values = {name: value[0] for name, value in zip(params._fields, params, strict=True)}
+    values = {name: value[0] for name, value in params._asdict().items() if value is not None}
     # One field means different things in different effects.
-    if isinstance(effect, LensFlare):
+    if isinstance(effect, LensFlare | SunGlare):
         values["sun"] = values.pop("center")
+    if isinstance(effect, PhysicalTurbulence):
+        values["wind_s"] = values.pop("wind")
+    if isinstance(effect, RollingShutter):
+        values["vibration"] = values.pop("amplitude")
     mode = getattr(effect, "mode", None)
     if mode == "image":
         values.pop("contrast")  # used in mode="ray" only
     elif mode == "ray":
         values["wind_m"] = values.pop("wind")
-    names = [name for name in _PARAMETER_TEXTS if name in values and values[name].any()]
+    names = [name for name in _PARAMETER_TEXTS if values.get(name) is not None and values[name].any()]
     return ", ".join(_PARAMETER_TEXTS[name](values[name]) for name in names)
 
 

@@ -171,17 +171,20 @@ def sample_at(values: Tensor, points: Points) -> Tensor:
     """Sample maps of a frame bilinearly at points, and beyond their border at its nearest pixel.
 
     Args:
-        values: (N, C, H, W), or (N, C, H, 1) if all pixels of a row are equal; finite, so of a depth its inverse.
+        values: (N, C, H, W), or (N, C, H, 1) if all pixels of a row are equal, which are extrapolated beyond the
+            border; finite, so of a depth its inverse.
         points: in the same frame, of N rows or one.
 
     Returns:
-        (N, C, h, w), differentiable in the values and the points in all modes.
+        (N, C, h, w), or (N, C, h, 1) of rows at points of a lattice; differentiable in the values and the points in all
+        modes.
     """
-    lattice = points.lattice
-    values = values.expand(-1, -1, lattice.height, lattice.width)
+    lattice, is_rows = points.lattice, values.shape[3] == 1
     is_pixels = lattice == pixel_lattice(lattice.height, lattice.width)
     if is_pixels and not points.is_displaced:
-        return values
+        return values.expand(-1, -1, -1, lattice.width)
+    if is_rows:
+        return _sample_rows(values, points.y.nan_to_num(nan=0.0).clamp(-lattice.height, 2 * lattice.height))
     if is_pixels and not requires_grad((values, points.x, points.y)):
         x, y = pixel_axes(lattice.height, lattice.width, dtype=points.x.dtype, device=points.x.device)
         flow = torch.cat(torch.broadcast_tensors(points.x - x, points.y - y), dim=1)
@@ -190,6 +193,18 @@ def sample_at(values: Tensor, points: Points) -> Tensor:
     y = points.y.nan_to_num(nan=0.0).clamp(0, lattice.height - 1)
     positions = torch.cat(torch.broadcast_tensors(x, y), dim=1).expand(len(values), -1, -1, -1)
     return sample_linear(values, positions.flatten(2)).value.unflatten(2, positions.shape[2:])
+
+
+def _sample_rows(values: Tensor, y: Tensor) -> Tensor:
+    """Interpolate rows (N, C, H, 1) at y, (N or 1, 1, h, w), linearly, and extrapolate the first and the last two."""
+    batch, channels, height, _ = values.shape
+    if height == 1:
+        return values + torch.zeros_like(y)
+    row = y.detach().floor().clamp(0, height - 2)
+    index = row.long().expand(batch, channels, -1, -1).flatten(2)
+    rows = values[..., 0]
+    low, step = (table.gather(2, index).view(batch, channels, *y.shape[2:]) for table in (rows[:, :, :-1], rows.diff()))
+    return torch.addcmul(low, step, y - row)
 
 
 def _interval(position: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -248,5 +248,11 @@ def _sample_at(field: Tensor, x: Tensor, y: Tensor, shift: Tensor) -> Tensor:
     return grid_sample(field, grid, padding="border", interpolation="bilinear")
 
 
+def residual_of(flow: Tensor, inverse: Tensor) -> Tensor:
+    """Return |inverse(p) + flow(p + inverse(p))|, (B, 1, H, W), px, without gradient."""
+    flow, inverse = flow.detach(), inverse.detach()
+    return _squared_length(_sample(flow, inverse) + inverse).sqrt_()
+
+
 def _sample(field: Tensor, flow: Tensor) -> Tensor:
     return sample(field, flow, padding="border", interpolation="bilinear")

@@ -70,7 +70,7 @@ LIMITS = {
 }
 PHOTOMETRIC_LIMITS = {
     **{"uniform fog": 0.3, "flare": 0.35, "heterogeneous fog": 1.6, "volumetric fog": 1.6},
-    **{"sun glare": 1.5, "exposure": 0.3},
+    **{"sun glare": 1.5, "exposure": 0.3, "night glow": 2.0},
 }
 LENS, COMPOSITION = "lens", "composition of four warps and fog"
 # Files, functions and calls of the package that one call may cross.

@@ -57,6 +57,7 @@ PHOTOMETRIC: dict[str, Callable[..., Any]] = {
     "chromatic aberration": tr.ChromaticAberration,
     "sun glare": partial(tr.SunGlare, center_x_range=(0.3, 0.7), center_y_range=(0.1, 0.3)),
     "exposure": tr.Exposure,
+    "night glow": tr.NightGlow,
 }
 
 

@@ -6,6 +6,7 @@ Effects, each an `nn.Module` from images to images; in parentheses what they sho
     RollingShutter (rows that a moving, shaking camera exposes one after the other),
     UniformFog, HeterogeneousFog, LensFlare, Vignetting (dark corners), ChromaticAberration (colored edges),
     SunGlare (the sun, its glare and ghosts, and a camera that exposes for it), Exposure (gain, noise and clipping),
+    NightGlow (lamps in fog),
     Compose (several effects in order), OneOf (one of several, at random)
 
 Presets, in `torchrefract.presets`, are effects with the parameters of a place and a severity of 1 to 5:
@@ -38,6 +39,7 @@ from torchrefract.effects.flare import FlareParams, LensFlare
 from torchrefract.effects.fog import FogParams, UniformFog, remove_fog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog, HeterogeneousFogParams
 from torchrefract.effects.lens import LensDistortion, LensParams
+from torchrefract.effects.night_glow import NightGlow, NightGlowParams
 from torchrefract.effects.physical_turbulence import PhysicalTurbulence, PhysicalTurbulenceParams
 from torchrefract.effects.rectification import Rectification, RectificationParams
 from torchrefract.effects.road_mirage import RoadMirage, RoadMirageParams
@@ -92,6 +94,8 @@ __all__ = [
     "LensFlare",
     "LensParams",
     "LinearDepth",
+    "NightGlow",
+    "NightGlowParams",
     "OneOf",
     "Pair",
     "PhysicalTurbulence",

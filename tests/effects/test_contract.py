@@ -26,6 +26,7 @@ from torchrefract import (
     HeterogeneousFog,
     LensDistortion,
     LensFlare,
+    NightGlow,
     OneOf,
     PhysicalTurbulence,
     Rectification,
@@ -189,6 +190,13 @@ EFFECTS = {
             *("gamma", "time_constant", "drift", "frame"),
         ),
         meters=True,
+    ),
+    "night glow": Case(
+        NightGlow,
+        strongest={"threshold": 0.8, "luminance_range": (20.0, 40.0)},
+        identity={"luminance_range": NO_RANGE, "threshold": 0.2},
+        gradient_field="luminance",
+        fields=("optical_depth", "asymmetry", "luminance"),
     ),
     "exposure": Case(
         Exposure,

@@ -8,7 +8,8 @@ from scipy import stats
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import Camera, FogParams, LinearDepth, UniformFog, remove_fog
+from torchrefract import Camera, FogParams, HeterogeneousFog, LinearDepth, UniformFog, remove_fog
+from torchrefract.fields.airlight import airlight_of_frame
 
 PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)
 
@@ -130,6 +131,54 @@ def test_the_airlight_fits_the_channels():
     assert color_of_opaque_fog(3, (0.5,)) == [0.5] * 3
 
 
+def test_the_airlight_of_the_frame_is_that_of_its_sky_and_dark_at_night():
+    image = 0.05 + 0.3 * picture(2, 3, 90, 160)
+    image[0, :, :40] = 0.8
+    image[1] *= 0.3
+    effect = UniformFog(visibility_range=(1e-3, 1e-3), airlight="frame")
+    degraded = effect.degrade(image, seed=7)
+    assert_close(degraded.params.airlight, airlight_of_frame(image), rtol=0, atol=0)
+    assert_close(degraded.image[0, :, 3, 3], torch.full((3,), 0.8, dtype=torch.float64), rtol=0, atol=1e-4)
+    assert degraded.image[1, :, 3, 3].max() < 0.15
+    other = effect.apply(picture(2, 3, 90, 160), degraded.params)  # the color is a parameter
+    assert torch.equal(other.image[:, :, 3, 3], degraded.image[:, :, 3, 3])
+    stored = (255 * image).round().to(torch.uint8)
+    assert torch.equal(effect.sample(stored, seed=7).airlight, effect.sample(stored.float() / 255, seed=7).airlight)
+
+
+def test_a_clip_has_the_airlight_of_its_first_frame():
+    clip = torch.stack([0.3 * picture(3, 90, 160), 0.6 * picture(3, 90, 160)])[None]
+    effect = UniformFog(airlight="frame")
+    degraded = effect.degrade(clip, seed=7)
+    assert torch.equal(degraded.params.airlight, airlight_of_frame(clip[:, 0]))
+    alone = effect.apply(clip[:, 1], degraded.params, frame=1)
+    assert_close(alone.image, degraded.image[:, 1], rtol=0, atol=1e-12)
+
+
+def test_the_plan_of_fog_holds_for_the_airlight_of_any_frame():
+    def error(airlight: Any) -> float:
+        thin: dict[str, Any] = {"visibility_range": (1e5, 1e5), "depth": LinearDepth(max_depth=10.0), "tolerance": 2.0}
+        return UniformFog(airlight=airlight, linear_light=True, **thin).plan(90, 160).error
+
+    assert error("frame") == error((0.0, 1.0, 0.0)) > error(None) > 0
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float16, torch.float32])
+def test_fog_of_the_color_of_the_frame_is_the_same_in_any_batch_and_graph(dtype):
+    image = picture(3, 3, 24, 32, dtype=torch.float32) * torch.tensor([1.0, 0.5, 0.1]).view(3, 1, 1, 1)
+    image = (255 * image).round().to(dtype) if dtype is torch.uint8 else image.to(dtype)
+    effect = HeterogeneousFog(airlight="frame")
+    expected = effect.degrade(image, seed=7, keys=[3, 4, 5])
+    part = effect.degrade(image[[2, 0]], seed=7, keys=[5, 3])
+    assert torch.equal(part.params.airlight, expected.params.airlight[[2, 0]])
+    assert_close(part.image, expected.image[[2, 0]], rtol=0, atol=1 if dtype is torch.uint8 else 1e-3)
+    if dtype is torch.float32:
+        torch.manual_seed(3)
+        eager = effect(image)
+        torch.manual_seed(3)
+        assert_close(torch.compile(effect, fullgraph=True)(image), eager, rtol=0, atol=2e-4)
+
+
 def test_an_airlight_for_other_channels_raises():
     with pytest.raises(ValueError, match="airlight must have 1 number or 4, one for each channel"):
         UniformFog(airlight=(0.1, 0.2, 0.3)).degrade(picture(1, 4, 2, 2), seed=7)
@@ -144,6 +193,7 @@ def test_an_airlight_for_other_channels_raises():
         {"airlight": ()},
         {"airlight": (0.5, math.nan, 0.5)},
         {"airlight": 1.1},
+        {"airlight": "sky"},
         {"deviation_range": (-1.0, 0.0)},
         {"deviation_range": (0.0, 1.0)},
         {"threshold": 0.0},

@@ -53,7 +53,7 @@ _WARP_OPTIONS = {
     "tolerance_px": st.sampled_from([None, 0.02, 0.5]),
 }
 _FOG_OPTIONS = {
-    "airlight": st.none() | st.floats(0.0, 1.0),
+    "airlight": st.none() | st.just("frame") | st.floats(0.0, 1.0),
     "threshold": st.floats(1e-6, 1 - 1e-6),
     "linear_light": st.booleans(),
     "tolerance": st.sampled_from([None, 0.5]),
@@ -181,6 +181,11 @@ DOMAINS = {
             "color": st.floats(0.0, 1e3),
             "min_gain": st.floats(1 / 32, 1.0),
         },
+    ),
+    "night glow": Domain(
+        tr.NightGlow,
+        {"optical_depth_range": (0.0, 50.0), "asymmetry_range": (0.1, 1.0), "luminance_range": (0.0, 1e6)},
+        {"threshold": st.floats(0.0, 0.999)},
     ),
     "exposure": Domain(
         tr.Exposure,

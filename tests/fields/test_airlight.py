@@ -1,10 +1,76 @@
+"""The color of fog, estimated from painted frames whose haze is known."""
+
 import cv2
 import pytest
 import torch
+from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract.fields.airlight import airlight_of_frame
 from torchrefract.fields.sky import sky_mask
+
+HEIGHT, WIDTH = 90, 160
+
+
+def rough(low: float, high: float) -> Tensor:
+    """Return texture (3, H, W) without a smooth part."""
+    return low + (high - low) * torch.rand(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+
+
+def day() -> Tensor:
+    """Return a frame (1, 3, H, W) whose sky grows brighter from row 0 to row 39."""
+    frame = rough(0.1, 0.4)
+    frame[:, :40] = torch.tensor([0.5, 0.6, 0.8])[:, None, None] + 0.002 * torch.arange(40.0)[:, None]
+    return frame[None]
+
+
+def night() -> Tensor:
+    """Return a dark frame (1, 3, H, W) with lamps."""
+    frame = rough(0.02, 0.1)
+    frame[:, 20:26, 50:60] = frame[:, 60:66, 80:90] = 1.0
+    return frame[None]
+
+
+def haze(color: Tensor) -> Tensor:
+    """Return a frame (1, 3, H, W) without sky in haze of a color, through which the upper left corner is not seen."""
+    frame = rough(0.0, 0.9)
+    t = torch.ones(HEIGHT, WIDTH)
+    t[:25, :40] = 0.0
+    return (frame * t + color[:, None, None] * (1 - t))[None]
+
+
+def test_the_airlight_of_a_blue_day_is_the_light_of_its_horizon_with_a_quarter_of_its_blue():
+    sky = torch.tensor([[0.5, 0.6, 0.8]], dtype=torch.float64) + 0.002 * 33.5  # rows 29 to 38; the rim is not smooth
+    gray = 0.2126 * sky[0, 0] + 0.7152 * sky[0, 1] + 0.0722 * sky[0, 2]
+    assert_close(airlight_of_frame(day()), gray + (sky - gray) / 4, rtol=0, atol=1e-4)
+
+
+def test_the_airlight_of_an_evening_keeps_the_color_of_the_sky():
+    frame = day().flip(1)  # red exceeds blue
+    expected = torch.tensor([[0.8, 0.6, 0.5]], dtype=torch.float64) + 0.002 * 33.5
+    assert_close(airlight_of_frame(frame), expected, rtol=0, atol=1e-4)
+
+
+def test_the_airlight_of_a_night_is_dark_and_not_that_of_its_lamps():
+    frame = night()
+    expected = frame[:, :, :30].double().mean(dim=(2, 3))
+    assert_close(airlight_of_frame(frame), expected, rtol=0, atol=1e-5)
+    assert expected.max() < 0.1
+
+
+def test_the_airlight_without_sky_is_the_color_of_the_thickest_haze():
+    color = torch.tensor([0.45, 0.42, 0.36])
+    assert_close(airlight_of_frame(haze(color)), color[None].double(), rtol=0, atol=1e-4)
+
+
+@pytest.mark.quick
+def test_each_frame_is_judged_alone_with_equal_bits():
+    frames = torch.cat([day(), night(), haze(torch.tensor([0.45, 0.42, 0.36]))])
+    expected = torch.cat([airlight_of_frame(frame[None]) for frame in frames])
+    assert torch.equal(airlight_of_frame(frames), expected)
+    assert torch.equal(airlight_of_frame(frames[[2, 0, 1]]), expected[[2, 0, 1]])
+    assert airlight_of_frame(frames[:0]).shape == (0, 3)
+    assert airlight_of_frame(frames[:, :1]).shape == (3, 1)
 
 
 def street(sky: tuple[float, float, float], road: tuple[float, float, float]) -> torch.Tensor:
@@ -13,39 +79,6 @@ def street(sky: tuple[float, float, float], road: tuple[float, float, float]) ->
     noise = 0.06 * (torch.rand(1, 1, 60, 200, generator=torch.Generator().manual_seed(0)) - 0.5)
     image[:, :, 60:] = torch.tensor(road).view(1, 3, 1, 1) + noise
     return image
-
-
-def test_a_gray_sky_is_the_airlight():
-    assert_close(
-        airlight_of_frame(street((0.8, 0.8, 0.8), (0.3, 0.3, 0.3))), torch.full((1, 3), 0.8).double(), atol=1e-4, rtol=0
-    )
-
-
-def test_a_blue_sky_gives_a_fog_that_is_nearly_gray():
-    (color,) = airlight_of_frame(street((0.4, 0.6, 0.8), (0.3, 0.3, 0.3)))
-    gray = 0.2126 * 0.4 + 0.7152 * 0.6 + 0.0722 * 0.8
-    expected = [gray + 0.35 * (value - gray) for value in (0.4, 0.6, 0.8)]
-    assert color.tolist() == pytest.approx(expected, abs=1e-4)
-
-
-def test_lamps_at_night_are_not_the_airlight():
-    image = street((0.08, 0.08, 0.1), (0.2, 0.18, 0.15))
-    image[:, :, 20:40, 90:110] = 1.0
-    assert airlight_of_frame(image).max() < 0.2
-
-
-def test_haze_without_sky_is_found_by_the_dark_channel():
-    image = street((0.45, 0.5, 0.4), (0.45, 0.42, 0.4))
-    image[:, :, :60] += 0.1 * (torch.rand(1, 3, 60, 200, generator=torch.Generator().manual_seed(1)) - 0.5)
-    image[:, :, 50:70, 80:120] = torch.tensor([0.7, 0.72, 0.74]).view(1, 3, 1, 1)
-    assert_close(airlight_of_frame(image), torch.tensor([[0.7, 0.72, 0.74]]).double(), atol=1e-3, rtol=0)
-
-
-def test_the_airlight_has_equal_bits_in_every_batch():
-    images = torch.rand(5, 3, 90, 160, generator=torch.Generator().manual_seed(2))
-    images[::2] = torch.cat([street((0.7, 0.8, 0.9), (0.3, 0.3, 0.3))[:, :, ::1, :160][:, :, :90]] * 3)
-    together = airlight_of_frame(images)
-    assert torch.equal(together, torch.cat([airlight_of_frame(image[None]) for image in images]))
 
 
 def test_real_frames_have_a_bright_airlight_by_day_and_a_dark_one_at_night(shared_data):

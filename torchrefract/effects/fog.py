@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -31,6 +31,7 @@ from torchrefract.effects.batch import (
     to_batch,
 )
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
+from torchrefract.fields.airlight import airlight_of_frame
 from torchrefract.fields.depth import (
     DepthProvider,
     DepthSource,
@@ -50,6 +51,8 @@ from torchrefract.planning.photometric import (
 )
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
+
+Airlight = float | Sequence[float] | Literal["frame"] | None
 
 _PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)
 _REC_709 = (0.2126, 0.7152, 0.0722)
@@ -80,7 +83,7 @@ class FogParams(NamedTuple):
 class FogMedium:
     """The light of the fog and the distance through it, without its density; fields as arguments of `UniformFog`."""
 
-    airlight: tuple[float, ...] | None
+    airlight: tuple[float, ...] | Literal["frame"] | None
     threshold: float
     depth: DepthSource = field(hash=False)  # providers may have no hash
     camera: Camera | None
@@ -88,12 +91,16 @@ class FogMedium:
 
     @property
     def colors(self) -> tuple[float, ...]:
-        """Return all values that the airlight can have."""
-        return (*_PAPER_AIRLIGHT, _GRAY) if self.airlight is None else tuple(self.airlight)
+        """Return all values that the airlight can have, or the ends of their range for that of the frame."""
+        if self.airlight == "frame":
+            return (0.0, 1.0)
+        return (*_PAPER_AIRLIGHT, _GRAY) if self.airlight is None else self.airlight
 
     def airlight_of(self, image: Tensor, dtype: torch.dtype) -> Tensor:
         """Return the airlight for images (B, C, H, W) as (B, C)."""
         batch, channels = image.shape[:2]
+        if self.airlight == "frame":
+            return airlight_of_frame(to_batch(image)).to(dtype)
         if self.airlight is None:
             color = _PAPER_AIRLIGHT if channels == 3 else [_GRAY] * channels
         else:
@@ -166,7 +173,7 @@ class FogMedium:
 
 def make_medium(
     *,
-    airlight: float | Sequence[float] | None,
+    airlight: Airlight,
     threshold: float,
     depth: DepthSource | None,
     camera: Camera | None,
@@ -174,12 +181,20 @@ def make_medium(
 ) -> FogMedium:
     """Make a medium from arguments as `UniformFog` takes them."""
     return FogMedium(
-        airlight=None if airlight is None else check_color("airlight", airlight, high=1.0),
+        airlight=_check_airlight(airlight),
         threshold=check_number("threshold", threshold, low=1e-6, high=1 - 1e-6),
         depth=LinearDepth() if depth is None else check_depth_provider(depth),
         camera=check_camera(camera),
         linear_light=check_flag("linear_light", linear_light),
     )
+
+
+def _check_airlight(airlight: Airlight) -> tuple[float, ...] | Literal["frame"] | None:
+    if isinstance(airlight, str):
+        if airlight != "frame":
+            raise ValueError(f"airlight must be 'frame', None or numbers in [0, 1], got {airlight!r}")
+        return "frame"
+    return None if airlight is None else check_color("airlight", airlight, high=1.0)
 
 
 class UniformFog(PhotometricEffect):
@@ -194,7 +209,9 @@ class UniformFog(PhotometricEffect):
         visibility_range: V in m, above 0, inf for clear air.
         deviation_range: relative deviation of the extinction, within (-1, 1).
         airlight: color of the fog in [0, 1], one number for each channel or one for all; None is that of the paper,
-            (220, 220, 235) / 255 for three channels and its luminance for any other number.
+            (220, 220, 235) / 255 for three channels and its luminance for any other number; "frame" estimates it from
+            each image, see `airlight_of_frame`: gray under clouds, dark at night. A clip has the color of its first
+            frame, and frame t alone its own, so pass the params of the clip to `apply` for frames one by one.
         threshold: contrast that remains at the distance V, in (0, 1); 0.05 is the meteorological optical range.
         depth: gives d if no depth is passed in: a provider, or any function from images (B, C, H, W) in [0, 1] to their
             depth (B, 1, H, W) in m, such as a network. None is `LinearDepth()`, the ramp over the rows of the paper.
@@ -219,7 +236,7 @@ class UniformFog(PhotometricEffect):
         *,
         visibility_range: Range = (100.0, 100.0),
         deviation_range: Range = (-0.05, 0.05),
-        airlight: float | Sequence[float] | None = None,
+        airlight: Airlight = None,
         threshold: float = 0.05,
         depth: DepthSource | None = None,
         camera: Camera | None = None,

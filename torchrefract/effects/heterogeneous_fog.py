@@ -13,7 +13,7 @@ from torchrefract._tensor import as_device_tensor, expand_batch
 from torchrefract._validation import check_choice, check_number, check_positive, check_range, check_values, check_within
 from torchrefract.cameras.camera import Camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, frame_mean, params_to, per_sample
-from torchrefract.effects.fog import check_fog_params, check_fog_ranges, draw_fog, make_medium
+from torchrefract.effects.fog import Airlight, check_fog_params, check_fog_ranges, draw_fog, make_medium
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.effects.random_field import (
     check_decorrelation,
@@ -119,7 +119,7 @@ class HeterogeneousFog(PhotometricEffect):
         mode: str = "image",
         visibility_range: Range = (100.0, 100.0),
         deviation_range: Range = (-0.05, 0.05),
-        airlight: float | Sequence[float] | None = None,
+        airlight: Airlight = None,
         threshold: float = 0.05,
         depth: DepthSource | None = None,
         camera: Camera | None = None,

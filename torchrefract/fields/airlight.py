@@ -9,19 +9,20 @@ from torchrefract.fields.sky import find_sky, luma
 _PATCH = 7  # nodes
 _BRIGHTEST = 0.001  # share of the dark channel
 _MIN_SKY, _LOWEST = 0.04, 0.25  # share of the frame from which sky counts, and of the sky that does
-_TINT = 0.35  # share of the sky's saturation that fog keeps: droplets scatter all colors alike, and the sun lights them
 _NIGHT, _DUSK = 0.3, 0.35  # median luma of the upper third at night; and if it is darker than the rest by a tenth
+_KEPT_CHROMA = 0.25  # of blue light by day
 _STEPS = 2.0**16  # results are rounded to multiples of 1 / _STEPS, so that they have equal bits in every batch
 
 
 def airlight_of_frame(image: Tensor) -> Tensor:
     """Estimate the airlight of frames: the light that fog would scatter towards the camera.
 
-    With at least 4 % of sky, the mean color of the quarter of it that is lowest in the frame, with 0.35 of its
-    saturation: at the horizon, the light of the sky has come through as much air as that of thick fog. Otherwise, by
-    day, the mean color where the dark channel (the minimum over channels and patches) is among its brightest 0.1 %; by
-    night, where these are lamps, the mean color of the upper third. A frame is taken for one of the night if it has no
-    sky and a dark upper third.
+    With at least 4 % of sky, the mean color of the quarter of it that is lowest in the frame: at the horizon, the light
+    of the sky has come through as much air as that of thick fog. Otherwise, by day, the mean color where the dark
+    channel (the minimum over channels and patches) is among its brightest 0.1 %; by night, where these are lamps, the
+    mean color of the upper third. A frame is taken for one of the night if it has no sky and a dark upper third. By day
+    a color that is more blue than red keeps a quarter of its chroma: droplets scatter all colors alike, and sun and sky
+    together are white.
 
     Args:
         image: (N, C, H, W), stored values in [0, 1], floating.
@@ -37,14 +38,17 @@ def airlight_of_frame(image: Tensor) -> Tensor:
     count = seen.nodes.sum(dim=(2, 3))
     is_low = seen.nodes & (seen.nodes.sum(dim=3).cumsum(dim=2) > (1 - _LOWEST) * count[:, :, None])[..., None]
     sky = (nodes * is_low).sum(dim=(2, 3)) / is_low.sum(dim=(2, 3)).clamp(min=1)
-    gray = luma(sky[:, :, None, None])[:, :, 0, 0]
-    sky = gray + _TINT * (sky - gray)
     dark = -F.max_pool2d(-nodes.amin(dim=1, keepdim=True), _PATCH, 1, _PATCH // 2)
-    places = dark.flatten(1).topk(max(1, round(dark[0].numel() * _BRIGHTEST)), dim=1).indices
-    haze = nodes.flatten(2).gather(2, places[:, None].expand(-1, image.shape[1], -1)).mean(dim=2)
+    count = max(1, round(dark.shape[2:].numel() * _BRIGHTEST))
+    places = dark.flatten(1).topk(count, dim=1).indices[:, None].expand(-1, image.shape[1], -1)
+    haze = nodes.flatten(2).gather(2, places).mean(dim=2)
     top = nodes[:, :, : max(1, nodes.shape[2] // 3)]
     upper, middle = (luma(part).flatten(1).median(dim=1).values for part in (top, nodes))
     is_night = seen.is_night | (upper < _NIGHT) | ((upper < _DUSK) & (upper < 0.9 * middle))
-    rest = torch.where(is_night[:, None], top.mean(dim=(2, 3)), haze)
     has_sky = seen.nodes.double().mean(dim=(1, 2, 3))[:, None] >= _MIN_SKY
-    return (torch.where(has_sky, sky, rest) * _STEPS).round() / _STEPS
+    day = torch.where(has_sky, sky, haze)
+    if image.shape[1] == 3:
+        gray = luma(day[..., None, None])[..., 0, 0]
+        day = torch.where(day[:, 2:] > day[:, :1], torch.lerp(gray, day, _KEPT_CHROMA), day)
+    color = torch.where(is_night[:, None] & ~has_sky, top.mean(dim=(2, 3)), day)
+    return (color * _STEPS).round() / _STEPS

@@ -1,0 +1,160 @@
+"""Glow around lamps in fog: light that droplets scatter forward, so that it reaches the camera from beside the lamp."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchrefract._tensor import exact_matmul, rows_at_once, without_autocast
+from torchrefract._validation import eager_bool, requires_grad
+from torchrefract.fields.exposure import finite_image
+
+_NODES = 320  # of the lattice along the longer side, on which light is spread
+_SMOOTHING = 0.6  # nodes, standard deviation; a lattice cannot hold the peak of the glow
+_CACHED_VALUES = 1 << 17  # float32 values that fit into the cache of one core
+_THINNEST = 1e-6  # optical depth; the shape of the glow of thinner fog is that of this one
+_SMALLEST = 1e-30
+
+
+def lamp_light(image: Tensor, threshold: float) -> Tensor:
+    """Return the light of lamps at the nodes of a lattice, relative to that of a pixel of 1.
+
+        mean over a block of max(I - threshold, 0)^2 / (1 - threshold)^2, at most 1
+
+    In blocks of an even side every second row counts.
+
+    Args:
+        image: (N, C, H, W), stored values, I; NaN and infinite ones count as black.
+        threshold: in [0, 1), from which a value counts as that of a lamp.
+
+    Returns:
+        (N, C, h, w), at the centers of blocks of one side, so that the longer side of a frame has at most 320.
+    """
+    stride = lattice_stride(image)
+    step = 2 if stride % 2 == 0 else 1  # lamps of frames that large are several pixels high
+
+    def of_rows(band: Tensor) -> Tensor:
+        excess = (band[:, :, ::step] - threshold).relu_().square()
+        return F.avg_pool2d(excess, (stride // step, stride), ceil_mode=True, count_include_pad=False)
+
+    if len(image) == 0:
+        return image[:, :, ::stride, ::stride]
+    if torch.compiler.is_compiling() or requires_grad((image,)):
+        light = of_rows(finite_image(image))
+    else:
+        each, height = image.shape[0] * image.shape[1] * image.shape[3], image.shape[2]
+        count = rows_at_once(image.device, height, each=each, cached=_CACHED_VALUES, shared=True)
+        count = max(stride, count // stride * stride)
+        light = torch.cat([of_rows(image[:, :, start : start + count]) for start in range(0, height, count)], dim=2)
+        if eager_bool(lambda: light.isfinite().all(), of=light) is False:
+            light = of_rows(finite_image(image))
+    return (light / (1 - threshold) ** 2).clamp(max=1.0)
+
+
+def lattice_stride(image: Tensor) -> int:
+    """Return the side in px of the blocks of `lamp_light`."""
+    return -(-max(image.shape[2:]) // _NODES)
+
+
+def glow_transfer(frequency: Tensor, optical_depth: Tensor, asymmetry: Tensor) -> Tensor:
+    """Return the Fourier transform of the light that reaches the camera from a lamp of light 1, scattered or not.
+
+        exp(-T (1 - (1 - exp(-a q)) / (a q))),  a = (1 - g) / sqrt(g)
+
+    Each of a Poisson number of droplets, uniformly distributed over the way, turns the light by a small angle with the
+    Henyey-Greenstein phase function, whose transform is exp(-a q). An angle at the share u of the way from the lamp is
+    u times as large at the camera. exp(-T) arrives unscattered, and all light arrives: the transform is 1 at q = 0.
+
+    Args:
+        frequency: q, radians per radian, at least 0.
+        optical_depth: T, extinction times distance of the lamp, broadcasts with q.
+        asymmetry: g, mean cosine of the angle of scattering, in (0, 1].
+
+    Source: Wells, "Loss of resolution in water as a result of multiple small-angle scattering", Journal of the Optical
+    Society of America 59 (1969), for the form; Narasimhan and Nayar, "Shedding light on the weather", CVPR 2003.
+    """
+    return torch.exp(-optical_depth * (1 - _single_transfer(frequency, asymmetry)))
+
+
+def _single_transfer(frequency: Tensor, asymmetry: Tensor) -> Tensor:
+    x = frequency * (1 - asymmetry) / asymmetry.sqrt()
+    is_small = x < 1e-3
+    safe = torch.where(is_small, 1.0, x)
+    return torch.where(is_small, 1 - x / 2 + x * x / 6, -torch.expm1(-safe) / safe)
+
+
+def glow_at_nodes(light: Tensor, optical_depth: Tensor, asymmetry: Tensor, *, focal: float, stride: int) -> Tensor:
+    """Return the scattered part of the light of lamps, relative to its sum: both have the same sum.
+
+    The transform is that of `glow_transfer` less exp(-T), over 1 - exp(-T); without fog, that of single scattering.
+
+    Light that would leave the frame is reflected at its border.
+
+    Args:
+        light: (N, C, h, w), at least 0.
+        optical_depth, asymmetry: (N,), T and g of `glow_transfer`.
+        focal: px, of the frame.
+        stride: px, between nodes.
+
+    Returns:
+        (N, C, h, w), at least 0.
+    """
+    optical_depth, asymmetry = (value.view(-1, 1, 1, 1) for value in (optical_depth, asymmetry))
+    (down, fy), (across, fx) = (_cosines(size, light) for size in light.shape[2:])
+    squared = fy.square()[:, None] + fx.square()
+    frequency = (squared + _SMALLEST).sqrt() * (2 * math.pi * focal / stride)
+    thickness = optical_depth.clamp(min=_THINNEST)
+    transfer = torch.expm1(thickness * _single_transfer(frequency, asymmetry)) / torch.expm1(thickness)
+    transfer = transfer * torch.exp(-2 * (math.pi * _SMOOTHING) ** 2 * squared)
+    with without_autocast(light.device):
+        spectrum = exact_matmul(exact_matmul(down, light), across.mT)
+        glow = exact_matmul(exact_matmul(down.mT, spectrum * transfer), across)
+    return glow.clamp(min=0).contiguous()
+
+
+def spread_glow(glow: Tensor, light: Tensor, strength: Tensor, *, height: int, width: int, stride: int) -> Tensor:
+    """Interpolate glow from nodes to pixels; its sum becomes that of the light of the lamps times a strength.
+
+    Args:
+        glow, light: (N, C, h, w), see `glow_at_nodes`.
+        strength: (N,), (1 - exp(-T)) times the luminance of lamps of light 1.
+        height, width: px, of the frame.
+        stride: px, between nodes.
+
+    Returns:
+        (N, C, H, W), linear light.
+    """
+    rows, columns = (_pixels_of_nodes(size, stride, light) for size in (height, width))
+    scattered = strength[:, None] * (light * rows[:, None] * columns).sum(dim=(2, 3))
+    rows, columns = (_weights_of_nodes(size, stride, light) for size in (height, width))
+    total = (glow * rows[:, None] * columns).sum(dim=(2, 3)).clamp(min=_SMALLEST)
+    glow = glow * (scattered / total)[:, :, None, None]
+    return _interpolate(glow, stride)[:, :, :height, :width]
+
+
+def _interpolate(nodes: Tensor, stride: int) -> Tensor:
+    size = (nodes.shape[2] * stride, nodes.shape[3] * stride)
+    return F.interpolate(nodes, size=size, mode="bilinear", align_corners=False)
+
+
+def _pixels_of_nodes(size: int, stride: int, like: Tensor) -> Tensor:
+    """Return how many pixels of a side each block has; the last may be cut."""
+    nodes = torch.arange(-(-size // stride), device=like.device)
+    return (size - nodes * stride).clamp(max=stride).to(like.dtype)
+
+
+def _weights_of_nodes(size: int, stride: int, like: Tensor) -> Tensor:
+    """Return the sum of the weights that each node has in pixels along a side: the stride, less what is cut."""
+    count = -(-size // stride)
+    nodes, cut = (torch.arange(*ends, device=like.device) for ends in ((0, count), (size, count * stride)))
+    place = ((cut + 0.5) / stride - 0.5).clamp(0, count - 1)
+    return (stride - (1 - (place - nodes[:, None]).abs()).clamp(min=0).sum(dim=1)).to(like.dtype)
+
+
+def _cosines(size: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the orthonormal matrix of the cosine transform, (size, size), and its frequencies, cycles per node."""
+    node = torch.arange(size, dtype=torch.float64, device=like.device)
+    scale = torch.where(node == 0, 1.0, 2.0).div(size).sqrt()
+    matrix = scale[:, None] * torch.cos(math.pi / size * node[:, None] * (node + 0.5))
+    return matrix.to(like.dtype), (node / (2 * size)).to(like.dtype)

@@ -258,7 +258,8 @@ def test_a_displacement_below_the_tolerance_is_not_computed():
     weak = PhysicalTurbulence(cn2_range=(1e-18, 1e-17))
     assert weak.plan(1080, 1920).is_identity
     image = torch.rand(1, 3, 36, 64)
-    assert torch.equal(weak.degrade(image, seed=1).image, image)
+    for depth in (None, 300 * torch.rand(1, 1, 36, 64)):
+        assert torch.equal(weak.degrade(image, seed=1, depth=depth).image, image)
     assert "each pixel has a ray of its own" in str(PhysicalTurbulence().plan(1080, 1920))
 
 

@@ -93,6 +93,7 @@ class RoadMirage(WarpEffect):
     params_type = RoadMirageParams
     has_closed_form = True
     has_kinks = True
+    bounds_hold_at_any_depth = True
 
     def __init__(
         self,

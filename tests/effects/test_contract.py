@@ -592,10 +592,10 @@ def test_other_types_than_params_raise(case):
     for params in (None, {"applied": torch.ones(2)}, (1.0, 2.0)):
         with pytest.raises(TypeError, match=r"params must be \w+Params, got"):
             effect.apply(image, params)
-    own = effect.sample(image, seed=7)
+    params = effect.sample(image, seed=7)
     for other in (other.strong().sample(image, seed=7) for other in EFFECTS.values()):
         # Two cases of one effect may have the same parameters.
-        if type(other) is not type(own) or any(a.shape != b.shape for a, b in zip(other, own, strict=True)):
+        if type(other) is not type(params) or any(a.shape != b.shape for a, b in zip(other, params, strict=True)):
             with pytest.raises((TypeError, ValueError), match="params"):
                 effect.apply(image, other)
 

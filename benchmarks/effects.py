@@ -56,10 +56,16 @@ OTHER_WARPS: dict[str, Callable[..., Any]] = {
     "rough turbulence": partial(
         tr.Turbulence, amplitude_range=(1.2, 1.8), length_range=(40.0, 80.0), aperture_range=(4.0, 6.0)
     ),
+    "Gaussian turbulence with depth": partial(WARPS["Gaussian turbulence"], depth=tr.GroundPlaneDepth()),
+    "physical turbulence": tr.PhysicalTurbulence,
+    "road mirage": tr.RoadMirage,
 }
 # Largest multiples of the bare grid_sample for 1x3x1080x1920 float32 on two threads.
 LIMITS = {
-    "auto": dict(zip((*WARPS, ALL), (0.9, 0.9, 0.9, 1.0, 1.4), strict=True)) | {ROLLING_SHUTTER: 1.0},
+    "auto": {
+        **dict(zip((*WARPS, ALL), (0.9, 0.9, 0.9, 1.0, 1.4), strict=True)),
+        **{"physical turbulence": 4.0, "road mirage": 1.0, ROLLING_SHUTTER: 1.0},
+    },
     "torch": dict(zip((*WARPS, ALL), (1.6, 1.6, 1.6, 1.6, 3.0), strict=True)),
 }
 PHOTOMETRIC_LIMITS = {

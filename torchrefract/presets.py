@@ -73,6 +73,8 @@ def cape_town_fog(
 ) -> HeterogeneousFog:
     """Create heterogeneous morning fog, through which the car drives at 50 to 70 km/h, at 30 frames per second.
 
+    Its color comes from the frame: that of the sky at the horizon, dark at night.
+
     Args:
         severity: 1 to 5, visibility of 500 … 1000 m at 1, 60 … 200 m at 3, 20 … 40 m at 5.
         camera, horizon, depth: as for all scenes.
@@ -82,6 +84,7 @@ def cape_town_fog(
     options: dict[str, Any] = {
         "mode": "ray",
         "visibility_range": visibility,
+        "airlight": "frame",
         "contrast_range": (0.4, 0.8),
         "wind_x_range": (-0.1, 0.1),
         "wind_z_range": (-0.65, -0.45),

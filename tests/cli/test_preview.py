@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 from PIL import Image
 
 import torchrefract as tr
@@ -22,6 +23,7 @@ from torchrefract.presets import cape_town_fog, limpopo_sun_glare
 from torchrefract.visualization.animation import Animation
 from torchrefract.visualization.figures import ContactSheetRow, contact_sheet_row
 
+SHOWN = list(OmegaConf.load(Path(__file__).parents[2] / "conf" / "preview.yaml").effects)
 LENS = ("scene=cheap_dashcam",)  # a lens with its defaults
 FOG = ("scene=cape_town_fog",)
 FLARE = ("scene=limpopo_sun_glare", "seed=3")
@@ -105,10 +107,7 @@ def test_a_picture_becomes_a_contact_sheet(call, picture, tmp_path):
 
 def test_without_a_picture_all_effects_are_drawn_on_a_rendered_scene(call, tmp_path):
     outcome = call("preview", "size=[24,32]", "out=sheet.png")
-    names = (
-        "LensDistortion, Turbulence, ThinPlateSpline, DivergenceFree, UniformFog, HeterogeneousFog, LensFlare, Compose"
-    )
-    assert outcome.out == f"sheet.png: {names} on a rendered road scene, as no picture was given\n"
+    assert outcome.out == f"sheet.png: {', '.join(SHOWN)} on a rendered road scene, as no picture was given\n"
     assert [path.name for path in tmp_path.iterdir()] == ["sheet.png"]
 
 
@@ -121,7 +120,7 @@ def test_fog_has_the_depth_of_the_rendered_scene(call, tmp_path):
 
 
 def test_the_settings_of_an_effect_can_be_changed(call, picture, tmp_path):
-    names = ("LensDistortion", "ThinPlateSpline", "DivergenceFree", "HeterogeneousFog", "LensFlare", "Compose")
+    names = [name for name in SHOWN if name not in ("Turbulence", "UniformFog")]
     words = ["effects.Turbulence.amplitude_range=[1,1]", "effects.UniformFog.visibility_range=[9,9]"]
     outcome = call("preview", "frame.png", *(f"~effects.{name}" for name in names), *words)
     assert outcome.out == "preview.png: Turbulence, UniformFog on frame.png\n"

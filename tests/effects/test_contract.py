@@ -605,11 +605,11 @@ def test_other_types_than_params_raise(case):
     for params in (None, {"applied": torch.ones(2)}, (1.0, 2.0)):
         with pytest.raises(TypeError, match=r"params must be \w+Params, got"):
             effect.apply(image, params)
-    own = effect.sample(image, seed=7)
+    params = effect.sample(image, seed=7)
     for other in (other.strong().sample(image, seed=7) for other in EFFECTS.values()):
         # Two cases of one effect may have the same parameters.
-        shapes, expected = ({k: v.shape for k, v in tensors_in(params).items()} for params in (other, own))
-        if type(other) is not type(own) or shapes != expected:
+        shapes, expected = ({k: v.shape for k, v in tensors_in(drawn).items()} for drawn in (other, params))
+        if type(other) is not type(params) or shapes != expected:
             with pytest.raises((TypeError, ValueError), match="params"):
                 effect.apply(image, other)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from torchrefract import DivergenceFree, Turbulence, folding
+from torchrefract import Compose, DivergenceFree, GroundPlaneDepth, ThinPlateSpline, Turbulence, folding
 from torchrefract.fields import random_field
 from torchrefract.fields.random_field import COVARIANCES
 
@@ -121,3 +121,58 @@ def test_a_length_beyond_the_largest_domain_warns(effect, monkeypatch):
     # Samples that are not degraded do not warn, and shorter lengths fit.
     effect(length_range=(60.0, 60.0), covariance="gaussian", p=0.0).degrade(torch.rand(2, 1, 27, 48), seed=0)
     effect(length_range=(4.0, 4.0), amplitude_range=(0.1, 0.1)).degrade(torch.rand(2, 1, 27, 48), seed=0)
+
+
+FIELD: dict[str, Any] = {"amplitude_range": (0.8, 0.8), "length_range": (12.0, 12.0), "aperture_range": (2.0, 2.0)}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"covariance": "gaussian"}, {"tolerance_px": None}, {"normalize": "image", "covariance": "gaussian"}],
+)
+def test_the_displacement_grows_with_the_root_of_depth_up_to_the_reference(options):
+    image, columns = torch.rand(2, 3, 48, 64), torch.arange(64)
+    depth = (2.0 * (1 + columns)).expand(2, 1, 48, -1)  # m
+    depth = torch.where(columns < 60, depth, torch.inf)
+    effect = Turbulence(**FIELD, **options, depth=GroundPlaneDepth(), reference_distance=80.0)
+    flow = effect.degrade(image, seed=1, depth=depth).flow
+    whole = Turbulence(**FIELD, **options).degrade(image, seed=1).flow
+    assert_close(flow, whole * (depth / 80).clamp(max=1).sqrt(), rtol=0, atol=0.03 if effect.tolerance_px else 1e-6)
+
+
+def test_a_field_at_depth_is_within_its_tolerance_alone_and_in_a_composition():
+    image, depth = torch.rand(1, 3, 90, 120), 300 * torch.rand(1, 1, 90, 120)
+    smooth: dict[str, Any] = {"covariance": "gaussian", "length_range": (30.0, 40.0), "depth": GroundPlaneDepth()}
+    options: dict[str, Any] = FIELD | smooth
+    for tolerance_px in (0.02, 0.1):
+        effect = Turbulence(**options, tolerance_px=tolerance_px)
+        stride, _ = effect.plan(90, 120).details
+        assert stride > 2  # the field, not its share, is interpolated
+        exact = Turbulence(**options, tolerance_px=None)
+        params = effect.sample(image, seed=1)
+        flows = [one.apply(image, params, depth=depth).flow for one in (effect, exact)]
+        assert 0 < (flows[0] - flows[1]).norm(dim=1).max() <= tolerance_px
+        composed = Compose([effect, ThinPlateSpline()], tolerance_px=tolerance_px)
+        composed_exact = Compose([exact, ThinPlateSpline(tolerance_px=None)], tolerance_px=None)
+        params = composed.sample(image, seed=1)
+        wall = torch.full((1, 1, 90, 120), 300.0)
+        flows = [one.apply(image, params, depth=wall).flow for one in (composed, composed_exact)]
+        assert (flows[0] - flows[1]).norm(dim=1).max() <= tolerance_px
+
+
+def test_the_flow_has_the_gradient_of_its_depth():
+    effect = Turbulence(**FIELD, depth=GroundPlaneDepth(), reference_distance=100.0, tolerance_px=None)
+    image, depth = torch.rand(1, 1, 3, 4, dtype=torch.float64), 90 * torch.rand(1, 1, 3, 4, dtype=torch.float64)
+    params = effect.sample(image, seed=1)
+    assert torch.autograd.gradcheck(lambda d: effect.apply(image, params, depth=d).flow, depth.requires_grad_())
+
+
+def test_without_a_depth_of_its_own_a_field_ignores_depth():
+    image, effect = torch.rand(1, 3, 36, 48), Turbulence(**FIELD)
+    assert torch.equal(
+        effect.degrade(image, seed=1, depth=torch.full((1, 1, 36, 48), 5.0)).flow, effect.degrade(image, seed=1).flow
+    )
+    with pytest.raises(TypeError, match="depth must be a provider"):
+        Turbulence(depth=3.0)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="reference_distance must be above 0"):
+        Turbulence(reference_distance=0.0)

@@ -19,6 +19,8 @@ _CAMERA = tr.Camera(width=48, height=32, fx=40, fy=40, cx=23, cy=16, coefficient
 EFFECTS: dict[str, Callable[[], Effect]] = {
     "lens": tr.LensDistortion,
     "turbulence": tr.Turbulence,
+    "physical turbulence": partial(tr.PhysicalTurbulence, cn2_range=(1e-9, 1e-8)),
+    "road mirage": tr.RoadMirage,
     "thin-plate spline": tr.ThinPlateSpline,
     "divergence-free": tr.DivergenceFree,
     "uniform fog": tr.UniformFog,

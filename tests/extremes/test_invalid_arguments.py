@@ -13,6 +13,7 @@ import torchrefract as tr
 GRAY = torch.full((1, 3, 8, 9), 0.5)
 EFFECTS = (
     *(tr.LensDistortion, tr.Turbulence, tr.ThinPlateSpline, tr.DivergenceFree),
+    *(tr.PhysicalTurbulence, tr.RoadMirage),
     *(tr.UniformFog, tr.HeterogeneousFog, tr.LensFlare, tr.SunGlare, tr.Exposure),
 )
 FOLDING: dict[str, Any] = {"k1_range": (-0.6, -0.6), "focal_range": (0.5, 0.5), "strict": True}
@@ -54,6 +55,8 @@ CALLS: dict[str, Callable[[], Any]] = {
     "amplitude_range of turbulence": lambda: tr.Turbulence(amplitude_range=(-1.0, 0.0)),
     "amplitude_range of a thin-plate spline": lambda: tr.ThinPlateSpline(amplitude_range=(-1.0, 0.0)),
     "amplitude_range of divergence-free warps": lambda: tr.DivergenceFree(amplitude_range=(-1.0, 0.0)),
+    "cn2_range of physical turbulence": lambda: tr.PhysicalTurbulence(cn2_range=(-1e-12, 0.0)),
+    "difference_range of a road mirage": lambda: tr.RoadMirage(difference_range=(-5.0, 5.0)),
     "contrast_range of fog": lambda: tr.HeterogeneousFog(contrast_range=(-0.1, 0.1)),
     "radius_range of flare": lambda: tr.LensFlare(radius_range=(-0.1, 0.2)),
     "luminance_range of sun glare": lambda: tr.SunGlare(luminance_range=(-1.0, 2.0)),

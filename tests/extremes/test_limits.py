@@ -55,6 +55,8 @@ IDENTITIES: dict[str, Callable[..., Effect]] = {
     "lens, k = 0": lenses(),
     "thin-plate spline, amplitude 0": partial(tr.ThinPlateSpline, amplitude_range=ZERO),
     "divergence-free, amplitude 0": fields(tr.DivergenceFree, 0.0),
+    "physical turbulence, Cn2 = 0": partial(tr.PhysicalTurbulence, cn2_range=ZERO),
+    "road mirage, dT = 0": partial(tr.RoadMirage, difference_range=ZERO),
     "uniform fog, V = inf": partial(tr.UniformFog, **CLEAR),
     "heterogeneous fog, V = inf": partial(tr.HeterogeneousFog, **CLEAR),
     "volumetric fog, V = inf": partial(tr.HeterogeneousFog, mode="ray", **CLEAR),

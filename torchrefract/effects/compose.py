@@ -12,7 +12,7 @@ from torchrefract import random
 from torchrefract._tensor import as_device_tensor, assume_constant_result
 from torchrefract._validation import check_choice, check_number, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.batch import ParamsAtDepth, params_per_frame, params_to, select_params
+from torchrefract.effects.batch import params_per_frame, params_to, select_params
 from torchrefract.effects.batch_flow import FlowPart, SamplingOptions, can_read, flow_on_measured_lattice, zero_flow
 from torchrefract.effects.photometric_effect import PhotometricEffect
 from torchrefract.effects.progress import Leaf, Progress
@@ -235,7 +235,7 @@ class Compose(Effect):
     ) -> list[FlowPart]:
         """Compute the composed flow of warps; arguments as for `Progress.move` and `_at_depth`."""
         warps = [(cast(WarpEffect, leaf.effect), leaf.params) for leaf in moving]
-        has_map = [isinstance(params, ParamsAtDepth) and params.is_map for _, params in warps]
+        is_exact = [effect.must_be_exact(params) for effect, params in warps]
         frame, can_measure = (request.height, request.width), can_measure and can_read(moving[0].params)
         can_group = can_measure and not any(requires_grad(params) for _, params in warps)
         parts: list[FlowPart] = []
@@ -244,7 +244,7 @@ class Compose(Effect):
             if samples is not None:
                 chosen = [(effect, select_params(params, samples)) for effect, params in chosen]
             acting_places = tuple([places[k] for k in acting])
-            exact_places = tuple([places[k] for k in acting if has_map[k]])
+            exact_places = tuple([places[k] for k in acting if is_exact[k]])
             plan = self._constant_plan(
                 id(self), acting_places, exact_places, *frame, request.tolerance_px, request.is_double, can_measure
             )

@@ -103,6 +103,7 @@ class PhysicalTurbulence(WarpEffect):
     """
 
     params_type = PhysicalTurbulenceParams
+    bounds_hold_at_any_depth = True
 
     def __init__(
         self,

@@ -93,13 +93,14 @@ class RoadMirage(WarpEffect):
     params_type = RoadMirageParams
     has_closed_form = True
     has_kinks = True
+    bounds_hold_at_any_depth = True
 
     def __init__(
         self,
         *,
         difference_range: Range = (5.0, 30.0),
         shimmer_range: Range = (0.2, 0.4),
-        wave_range: Range = (5.0, 60.0),
+        wave_range: Range = (3.0, 25.0),
         rate_range: Range = (-2.0, 2.0),
         num_waves: int = 6,
         fps: float = 30.0,

@@ -110,6 +110,7 @@ class Turbulence(WarpEffect):
     """
 
     params_type = TurbulenceParams
+    bounds_hold_at_any_depth = True
 
     def __init__(
         self,

@@ -71,6 +71,7 @@ class WarpEffect(Effect):
     rounding_ulps = DEFAULT_ULPS
     has_closed_form = False  # whether `flow` computes any points, not only the nodes of a lattice
     has_kinks = False  # whether the lattice follows from error bounds alone, since measurements miss kinks
+    bounds_hold_at_any_depth = False  # whether error bounds hold for maps of depth, not only for that of the provider
     depth: DepthSource | None = None  # of frames without a depth map; None for a flow that depends on no depth
 
     def __init__(
@@ -192,15 +193,19 @@ class WarpEffect(Effect):
         inverse = expand_batch(inverse, flow.shape[0])
         return where_active(inverse, 0.0, active, params), exists | ~per_sample(active)
 
+    def must_be_exact(self, params: Any) -> bool:
+        """Return True at a map of depth for which no plan of the ranges holds."""
+        return isinstance(params, ParamsAtDepth) and params.is_map and not self.bounds_hold_at_any_depth
+
     def flow_by_plan(self, params: Any, height: int, width: int) -> BatchFlow:
         """Compute the flow by the plan of the ranges, or exactly at a map of depth, for which no plan holds."""
-        if isinstance(params, ParamsAtDepth) and params.is_map:
+        if self.must_be_exact(params):
             return self.planned_flow(params, height, width, None)
         return BatchFlow(self.flow_parts(params, self._constant_plan(id(self), height, width, flow_dtype(params))))
 
     def planned_flow(self, params: Any, height: int, width: int, share_px: float | None) -> BatchFlow:
         """Compute the flow for a share of the tolerance of a composition, exactly if rounding exceeds it."""
-        share_px = None if isinstance(params, ParamsAtDepth) and params.is_map else share_px
+        share_px = None if self.must_be_exact(params) else share_px
         return BatchFlow(
             self.flow_parts(params, self._constant_share(id(self), height, width, flow_dtype(params), share_px))
         )

@@ -93,7 +93,7 @@ def test_transmission_and_intensity_have_16_bits(call, words, rows, frames, tmp_
 def test_a_composition_has_both_flows_and_light(call, words, rows, frames, tmp_path):
     assert call("generate", *words("out", "count=2", scene="unpaved_road")).code == 0
     for row in rows(tmp_path / "out"):
-        assert [effect["effect"] for effect in row["effects"]] == ["HeterogeneousFog", "Turbulence"]
+        assert [effect["effect"] for effect in row["effects"]] == ["HeterogeneousFog", "Turbulence", "RollingShutter"]
         _, d = made_again(row, frames, presets.unpaved_road())
         stored = np.asarray(Image.open(tmp_path / "out" / row["files"]["transmission.png"]["path"])) / 65535
         assert np.abs(stored - d.transmission[0, 0].numpy()).max() <= 0.5 / 65535 + 1e-6

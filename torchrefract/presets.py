@@ -169,7 +169,7 @@ def unpaved_road(
     haze: dict[str, Any] | None = None,
     shutter: dict[str, Any] | None = None,
 ) -> Compose:
-    """Create the dust of a car ahead on a gravel road, as heterogeneous fog, seen through haze by a shaken camera.
+    """Create the dust of a car ahead on a gravel road, which thins with height, seen through haze by a shaken camera.
 
     Args:
         severity: 1 to 5, visibility of 400 … 800 m at 1, 80 … 200 m at 3, 25 … 50 m at 5; standard deviation of the
@@ -201,6 +201,8 @@ def unpaved_road(
         "wind_x_range": (-0.15, 0.15),
         "wind_z_range": (-0.5, -0.3),
         "decorrelation_range": (30.0, 60.0),
+        "scale_height_range": (1.5, 4.0),
+        "horizon": horizon,
     }
     of_shutter: dict[str, Any] = {
         "speed_range": (40.0, 80.0),

@@ -45,8 +45,9 @@ from torchrefract.effects.warp_effect import WarpEffect
 
 NO_RANGE = (0.0, 0.0)
 MOTION = ("wind", "decorrelation", "frame")
-HETEROGENEOUS_FOG = ("visibility", "deviation", "airlight", "weights", "contrast", *MOTION)
-MAY_BE_INFINITE = {"visibility", "decorrelation"}  # clear air, and a field that only moves with the wind
+HETEROGENEOUS_FOG = ("visibility", "deviation", "airlight", "weights", "contrast", *MOTION, "scale_height")
+# Clear air, a field that only moves with the wind, and an even density.
+MAY_BE_INFINITE = {"visibility", "decorrelation", "scale_height"}
 
 
 class Case(NamedTuple):
@@ -215,7 +216,7 @@ EFFECTS = {
         strongest={"visibility_range": (20.0, 60.0), "wind_z_range": (-1.0, 0.0), "airlight": (0.9, 0.7, 0.8)},
         identity={"visibility_range": (math.inf, math.inf)},
         gradient_field=None,
-        fields=(*HETEROGENEOUS_FOG, "scale_height"),
+        fields=HETEROGENEOUS_FOG,
     ),
     "uniform fog": Case(
         UniformFog,

@@ -222,11 +222,23 @@ def test_a_scale_height_that_does_not_fit_raises():
     with pytest.raises(ValueError, match="scale_height_range must"):
         HeterogeneousFog(mode="ray", scale_height_range=(0.0, 2.0))
     image = torch.zeros(1, 3, 8, 9)
-    even, plume = HeterogeneousFog(mode="ray"), HeterogeneousFog(mode="ray", scale_height_range=(1.0, 2.0))
-    with pytest.raises(ValueError, match=r"params\.scale_height must be None"):
-        even.apply(image, plume.sample(image, seed=7))
-    with pytest.raises(ValueError, match=r"params\.scale_height must be a tensor"):
-        plume.apply(image, even.sample(image, seed=7))
+    plume = HeterogeneousFog(mode="ray", scale_height_range=(1.0, 2.0)).sample(image, seed=7)
+    with pytest.raises(ValueError, match=r"params\.scale_height must be inf for mode='image'"):
+        HeterogeneousFog().apply(
+            image, HeterogeneousFog().sample(image, seed=7)._replace(scale_height=plume.scale_height)
+        )
+    with pytest.raises(ValueError, match=r"params\.scale_height must lie in \[0\.05, 1e\+06\] m, or be inf"):
+        HeterogeneousFog(mode="ray").apply(image, plume._replace(scale_height=torch.tensor([0.01])))
+
+
+def test_the_parameters_alone_decide_whether_the_density_is_even():
+    image = torch.zeros(1, 3, 8, 9)
+    even, dust = HeterogeneousFog(mode="ray"), HeterogeneousFog(mode="ray", scale_height_range=(1.0, 2.0))
+    plume = dust.sample(image, seed=7)
+    assert torch.equal(even.apply(image, plume).transmission, dust.apply(image, plume).transmission)
+    thick = even.sample(image, seed=7)
+    assert torch.equal(dust.apply(image, thick).transmission, even.apply(image, thick).transmission)
+    assert torch.equal(even.apply(image, thick).image, even.apply(image, thick._replace(scale_height=None)).image)
 
 
 def test_the_transmission_of_dust_is_that_of_its_optical_depth():

@@ -17,6 +17,7 @@ from torchrefract._validation import (
     check_range,
     check_values,
     check_within,
+    eager_bool,
     finite_or,
 )
 from torchrefract.cameras.camera import Camera, pinhole_of
@@ -54,6 +55,7 @@ _ROAD_SCALES = (12.0, 24.0, 48.0, 96.0)
 _ROAD_WEIGHTS = (0.2, 0.3, 0.3, 0.2)
 _CONTRASTS = (0.0, 2.0)
 _SCALE_HEIGHTS = (0.05, 1e6)  # m
+_EVEN = 1e12  # m, a scale height at which the density is even
 
 
 class HeterogeneousFogParams(NamedTuple):
@@ -69,9 +71,7 @@ class HeterogeneousFogParams(NamedTuple):
     decorrelation: Tensor  # (B,), frames, above 0; inf for fog that only moves with the wind
     frame: Tensor  # (B, T), number of each frame in its clip
     key: Tensor  # (B, 4), int64, of the noise
-    scale_height: Tensor | None = (
-        None  # (B,), m, in [0.05, 1e6], over which the density falls to 1/e; None: it does not
-    )
+    scale_height: Tensor | None = None  # (B,), m, over which the density falls to 1/e; inf or None: it does not
 
     to = params_to
 
@@ -197,7 +197,9 @@ class HeterogeneousFog(PhotometricEffect):
         )
         plume = [] if self.scale_height_range is None else [self.scale_height_range]
         fog, values = draw_fog(self, stream, image, [self.contrast_range, *motion, *plume])
-        values, scale_height = (values[:, :-1], values[:, -1]) if plume else (values, None)
+        values, scale_height = (
+            (values[:, :-1], values[:, -1]) if plume else (values, torch.full_like(values[:, 0], torch.inf))
+        )
         weights = as_device_tensor([self.weights] * image.shape[0], dtype=values.dtype, device=values.device)
         weights = weights.view(-1, len(self.scales))
         motion = drawn_motion(values[:, 1:])
@@ -215,12 +217,16 @@ class HeterogeneousFog(PhotometricEffect):
         check_values("params.weights", "have a sum above 0", sums, lambda v: v > 0)
         check_values("params.weights", "have a finite sum", sums, torch.isfinite)
         check_within("params.contrast", params.contrast, *_CONTRASTS)
-        if (params.scale_height is not None) != (self.scale_height_range is not None):
-            rule = "be None" if self.scale_height_range is None else "be a tensor"
-            raise ValueError(f"params.scale_height must {rule} for scale_height_range={self.scale_height_range}")
         if params.scale_height is not None:
             check_shapes(params, {"scale_height": ()})
-            check_within("params.scale_height", params.scale_height, *_SCALE_HEIGHTS)
+            low, high = _SCALE_HEIGHTS if self.mode == "ray" else (torch.inf, torch.inf)
+            rule = f"lie in [{low:g}, {high:g}] m, or be inf" if self.mode == "ray" else "be inf for mode='image'"
+            check_values(
+                "params.scale_height",
+                rule,
+                params.scale_height,
+                lambda v: ((v >= low) & (v <= high)) | (v == torch.inf),
+            )
 
     def params_in_range(self, params: HeterogeneousFogParams) -> Tensor:
         """Return (), bool: fog and contrast lie in the ranges, and the weights are those of the effect."""
@@ -256,7 +262,8 @@ class HeterogeneousFog(PhotometricEffect):
             rows = image.shape[0]
             distance = expand_batch(distance, rows) if distance.shape[0] > 1 else distance
             k = self._extinction(expand_batch(k, rows), params, distance, image, plan)
-        if params.scale_height is not None:
+        is_even = params.scale_height is None or eager_bool(params.scale_height.isinf().all, of=k) is True
+        if self.mode == "ray" and not is_even:
             k = self._plume(params.scale_height, distance, image) * expand_batch(k, image.shape[0])
         return self.medium.blend(image, params, distance, k, is_visible=not plan.is_identity)
 
@@ -288,7 +295,7 @@ class HeterogeneousFog(PhotometricEffect):
         options = {"dtype": distance.dtype, "device": image.device}
         descent = descent_of_rows(self.horizon, height=height, focal=focal, center=center, **options)
         length = self.medium.distance(image, torch.ones_like(descent))  # m along the ray per m of depth
-        scale = finite_or(scale_height.to(distance.dtype), 1.0).clamp(min=_SCALE_HEIGHTS[0] / 2)
+        scale = finite_or(scale_height.to(distance.dtype), _EVEN).clamp(min=_SCALE_HEIGHTS[0] / 2)
         scale = per_sample(expand_batch(scale, image.shape[0]))
         return mean_density(distance, descent / length, scale, camera_height=self.camera_height)
 

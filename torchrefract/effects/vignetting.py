@@ -85,5 +85,6 @@ class Vignetting(PhotometricEffect):
         strength = finite_or(params.strength.to(field_dtype(image.dtype)), 0.0)
         view = pinhole_of(self.camera, height=height, width=width)
         t = vignetting(expand_batch(strength, len(image)), view, height=height, width=width)
-        darkened = linear_to_srgb(srgb_to_linear(image) * t) if self.linear_light else image * t
+        # Powers are rounded by the place of a value in memory, so that all layouts are computed in one.
+        darkened = linear_to_srgb(srgb_to_linear(image.contiguous()) * t) if self.linear_light else image * t
         return Rendered(darkened, lambda: t >= _MIN_TRANSMISSION, transmission=t)

@@ -111,6 +111,13 @@ def test_without_a_picture_all_effects_are_drawn_on_a_rendered_scene(call, tmp_p
     assert [path.name for path in tmp_path.iterdir()] == ["sheet.png"]
 
 
+def test_a_guess_of_the_depth_is_said(call, picture):
+    assert (
+        "warning: HeterogeneousFog assumes the depth of a road between walls" in call("preview", "frame.png", *FOG).err
+    )
+    assert call("preview", *FOG, "size=[24,32]").err == ""  # a rendered scene has its own
+
+
 def test_fog_has_the_depth_of_the_rendered_scene(call, tmp_path):
     assert call("preview", *FOG, "size=[24,32]", "seed=7").code == 0
     frame, depth = render_road_scenes(torch.tensor([7]), 24, 32)

@@ -90,7 +90,9 @@ def vector_of(params: Any) -> tuple[Tensor, Callable[[Tensor], Any]]:
             children=tuple(build(part) for build, part in zip(builds, x.split(sizes), strict=True))
         )
     fields = {
-        name: value for name, value in params._asdict().items() if value is not None and value.is_floating_point()
+        name: value
+        for name, value in params._asdict().items()
+        if value is not None and value.is_floating_point() and value.isfinite().all()
     }
 
     def build(x: Tensor) -> Any:

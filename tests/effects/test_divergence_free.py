@@ -76,7 +76,7 @@ def test_the_change_of_areas_is_what_the_stream_function_predicts():
 def test_an_amplitude_that_folds_is_measured_and_folded_pixels_are_not_valid():
     image = torch.rand(2, 3, 64, 96, generator=torch.Generator().manual_seed(0))
     calm, wild = (
-        DivergenceFree(amplitude_range=(a, a), length_range=(12.0, 12.0)).degrade(image, seed=1) for a in (1.0, 40.0)
+        DivergenceFree(amplitude_range=(a, a), length_range=(12.0, 12.0)).degrade(image, seed=1) for a in (1.0, 8.0)
     )
     assert not folding(calm.flow).fraction.any()
     assert (folding(calm.flow).min_determinant > 0).all()

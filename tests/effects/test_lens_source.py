@@ -97,7 +97,7 @@ def test_drawn_lenses_have_the_given_covariance():
     correlation[0, 1] = correlation[1, 0] = 0.98
     correlation[4, 5] = correlation[5, 4] = -0.9
     covariance = correlation * np.outer(deviations, deviations)
-    values = draw_lenses(LensDistortion.from_camera(CAR, covariance=covariance), 40_000)
+    values = draw_lenses(LensDistortion.from_camera(CAR, covariance=covariance, frame="pad"), 40_000)
     width = CAR.width
     # fx, fy, cx, cy, k1, k2, p1, p2, k3.
     numbers = values[:, (12, 13, 14, 15, 0, 1, 6, 7, 2)] * torch.tensor([width] * 4 + [1] * 5)
@@ -113,7 +113,7 @@ def test_drawn_polynomials_move_rays_as_the_covariance_of_a_fisheye_does():
     deviations = np.array([2.0, 2.0, 1.0, 1.0, 0.01, 0.012, 0.0, 0.0])
     covariance = np.diag(deviations**2)
     covariance[4, 5] = covariance[5, 4] = -0.8 * 0.01 * 0.012
-    effect = LensDistortion.from_camera(FISHEYE, covariance=covariance)
+    effect = LensDistortion.from_camera(FISHEYE, covariance=covariance, frame="pad")
     numbers = draw_lenses(effect, 20_000).numpy()
     for angle in (0.2, 0.4, 0.6):
         # theta_d = theta (1 + k1 theta^2 + k2 theta^4 + ...), and the polynomial is in r = tan theta.

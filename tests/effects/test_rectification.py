@@ -149,8 +149,8 @@ def test_gradients_of_the_camera_are_those_of_finite_differences(camera):
     effect, image = Rectification(camera, tolerance_px=None), smooth(1, 1, 9, 16, dtype=torch.float64)
     params = effect.sample(image, seed=0)
 
-    def rectified(coefficients: Tensor, focal: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
-        degraded = effect.apply(image, RectificationParams(params.applied, coefficients, focal, center))
+    def rectified(*values: Tensor) -> tuple[Tensor, Tensor]:
+        degraded = effect.apply(image, RectificationParams(params.applied, *values))
         return degraded.image, degraded.restore_flow
 
     values = [value.clone().requires_grad_() for value in params[1:]]

@@ -106,6 +106,21 @@ DOMAINS = {
             "steps": st.integers(1, 3),
         },
     ),
+    "physical turbulence": Domain(
+        tr.PhysicalTurbulence,
+        {"cn2_range": (0.0, 1e-9), "wind_x_range": (-100.0, 100.0), "wind_y_range": (-100.0, 100.0)},
+        {**_WARP_OPTIONS, "num_layers": st.integers(3, 8), "depth": _FOG_OPTIONS["depth"]},
+    ),
+    "road mirage": Domain(
+        tr.RoadMirage,
+        {
+            "difference_range": (0.0, 300.0),
+            "shimmer_range": (0.0, 1.0),
+            "wave_range": (-1e4, 1e4),
+            "rate_range": (-1e3, 1e3),
+        },
+        {**_WARP_OPTIONS, "num_waves": st.integers(1, 8), "depth": _FOG_OPTIONS["depth"]},
+    ),
     "rolling shutter": Domain(
         tr.RollingShutter,
         {

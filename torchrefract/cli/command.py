@@ -24,6 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 from rich.progress import track
+from torch import nn
 from yaml import YAMLError
 
 from torchrefract._io import CONFIG_DIR
@@ -31,6 +32,7 @@ from torchrefract._validation import UsageError
 from torchrefract.cli.entry import missing_library
 from torchrefract.data.images import UnreadableImageError, is_lost
 from torchrefract.data.pairs.files import DamagedPairError
+from torchrefract.fields.corridor import CorridorDepth
 
 _T = TypeVar("_T")
 
@@ -210,6 +212,19 @@ def naming(part: str) -> Iterator[None]:
         raise
     except (ValueError, TypeError, OSError) as error:
         raise UsageError(f"{part}: {error}") from error
+
+
+def warn_of_assumed_depth(effect: nn.Module) -> None:
+    """Print that a part of the effect assumes the depth of frames, for a command that has no depth maps."""
+    for part in effect.modules():
+        source = getattr(getattr(part, "medium", part), "depth", None)
+        if isinstance(source, CorridorDepth):
+            print(
+                f"warning: {type(part).__name__} assumes the depth of a road between walls; depth maps, as "
+                "estimate_depth writes them, are better: depth=...",
+                file=sys.stderr,
+            )
+            return
 
 
 def progress(items: Iterable[_T], name: str, *, count: int) -> Iterator[_T]:

@@ -30,7 +30,7 @@ from torchrefract._validation import (
     check_positive,
     check_size,
 )
-from torchrefract.cli.command import check_seed, make, naming
+from torchrefract.cli.command import check_seed, make, naming, warn_of_assumed_depth
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import first_names
 from torchrefract.data.pairs.card import HISTOGRAMS, draw_histograms, format_card, summarize
@@ -198,6 +198,8 @@ def _report(options: Options, complete: set[int], damaged: int) -> None:
         print(
             f"{options.num_pairs} pairs of {num_frames} frames: each frame is used up to {times} times, with new keys"
         )
+    if options.generator.reader.depth is None:
+        warn_of_assumed_depth(options.generator.effect)
     if damaged:
         print(f"{damaged} pairs were damaged or missing and are made again")
     if complete:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_count, check_number, check_positive, check_size
-from torchrefract.cli.command import check_seed, make, naming, progress
+from torchrefract.cli.command import check_seed, make, naming, progress, warn_of_assumed_depth
 from torchrefract.data.depth_maps import crop_depth, read_depth
 from torchrefract.data.images import EXTENSIONS, files_in, fit, read_image
 from torchrefract.data.media import VIDEOS, read_video
@@ -43,6 +43,9 @@ def preview(cfg: DictConfig) -> None:
         fps = check_number("fps", cfg.fps, low=0.1, high=_MAX_FPS)
     source = _source(cfg)
     num_frames = source.frames.num_frames
+    if source.depth is None:
+        for effect in effects.values():
+            warn_of_assumed_depth(effect)
     with _writing(str(cfg.out)) as path:
         if is_animation := path.suffix.lower() in animation_formats():
             animation = make_animation(effects, source.frames, seed=seed, depth=source.depth)

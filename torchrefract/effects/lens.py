@@ -321,12 +321,16 @@ class LensDistortion(WarpEffect):
         with torch.no_grad():
             lens = lens_in_px(map_params(params, lambda value: value.detach().double()), height, width)
 
+            rows = range(len(params.focal))
+            folds_nowhere = folds_nowhere or not rows
+
             def position(points: Points) -> Tensor:
                 pixels = torch.cat([points.x, points.y], dim=1)
                 if folds_nowhere:
                     return pixels + newton_lens_flow(*lens, points, num_steps=None, terms=used_terms(lens[0]))
-                flow, exists = lens_flow(*lens, points)
-                return torch.where(exists, pixels + flow, torch.nan)
+                # One sample at a time: next to a fold, the number of Newton steps of a batch would show.
+                flow, exists = zip(*(lens_flow(*(v[i : i + 1] for v in lens), points) for i in rows), strict=True)
+                return torch.where(torch.cat(exists), pixels + torch.cat(flow), torch.nan)
 
             zoom, shift = zoom_to_fill(position, lens[2], height=height, width=width)
         return zoom.to(dtype), (shift / width).to(dtype)

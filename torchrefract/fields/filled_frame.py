@@ -52,6 +52,7 @@ def zoom_to_fill(
     middle, scale = center[..., None], zoom[:, None, None]
     lowest_shift = (-space - middle - scale * low).amax(dim=2)
     highest_shift = (size + space - middle - scale * high).amin(dim=2)
+    lowest_shift = torch.where(size.isfinite().all(dim=1), lowest_shift, -torch.inf)
     shift = torch.zeros_like(center).clamp(min=lowest_shift).clamp(max=highest_shift)
     is_still = (positions[0] - torch.cat([borders[0].x, borders[0].y], dim=1)).abs().amax(dim=(1, 2, 3)) <= STILL_PX
     return torch.where(is_still, 1.0, zoom), torch.where(is_still[:, None], 0.0, shift)

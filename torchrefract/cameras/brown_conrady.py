@@ -154,16 +154,14 @@ def undistort_polynomial(
         return x.nan_to_num(0, 0, 0), y.nan_to_num(0, 0, 0), exists
 
 
-def newton_undistort(
-    x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, steps: int | None, terms: Terms = ALL_TERMS
-) -> Point:
-    """Invert `distort_polynomial` by Newton steps in the plane, 0 or more or until they are small, without gradient.
+def newton_undistort(x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, steps: int, terms: Terms = ALL_TERMS) -> Point:
+    """Invert `distort_polynomial` by a fixed number of Newton steps in the plane, 0 or more, without gradient.
 
     Converges for lenses that do not fold near the points; checks nothing.
     """
     with torch.no_grad():
         iterates = newton_iterates(x_d, y_d, coefficients, terms=terms)
-        return converge(iterates) if steps is None else next(islice(iterates, steps, None))
+        return next(islice(iterates, steps, None))
 
 
 def newton_iterates(x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, terms: Terms = ALL_TERMS) -> Iterator[Point]:

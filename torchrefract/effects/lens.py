@@ -36,6 +36,7 @@ from torchrefract.warping.lattice import pixel_lattice
 _LARGEST_COEFFICIENT = 100.0
 _FARTHEST = 1e10  # widths
 _SMALLEST_ZOOM = 1e-6
+_FIT_STEPS = 7  # of Newton's method, after which lenses that fold nowhere have converged in float64
 _SAME_VIEW = 1e-3  # difference of zooms and of shifts, in widths
 FRAMES = ("fill", "pad")
 _MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors are another model in another order)"
@@ -327,7 +328,7 @@ class LensDistortion(WarpEffect):
             def position(points: Points) -> Tensor:
                 pixels = torch.cat([points.x, points.y], dim=1)
                 if folds_nowhere:
-                    return pixels + newton_lens_flow(*lens, points, num_steps=None, terms=used_terms(lens[0]))
+                    return pixels + newton_lens_flow(*lens, points, num_steps=_FIT_STEPS, terms=used_terms(lens[0]))
                 # One sample at a time: next to a fold, the number of Newton steps of a batch would show.
                 flow, exists = zip(*(lens_flow(*(v[i : i + 1] for v in lens), points) for i in rows), strict=True)
                 return torch.where(torch.cat(exists), pixels + torch.cat(flow), torch.nan)

@@ -76,13 +76,13 @@ def lens_restore_flow(coefficients: Tensor, focal: Tensor, center: Tensor, point
 
 
 def newton_lens_flow(
-    coefficients: Tensor, focal: Tensor, center: Tensor, points: Points, *, num_steps: int | None, terms: Terms
+    coefficients: Tensor, focal: Tensor, center: Tensor, points: Points, *, num_steps: int, terms: Terms
 ) -> Tensor:
     """Compute `lens_flow` with a fixed number of Newton steps, for lenses that fold nowhere near the points.
 
     Args:
         coefficients, focal, center, points: as for `lens_flow`.
-        num_steps: of `newton_undistort`; None goes on until the steps are small.
+        num_steps: of `newton_undistort`.
         terms: the terms of the polynomial to compute.
 
     Returns:

@@ -329,8 +329,11 @@ class LensDistortion(WarpEffect):
                 pixels = torch.cat([points.x, points.y], dim=1)
                 if folds_nowhere:
                     return pixels + newton_lens_flow(*lens, points, num_steps=_FIT_STEPS, terms=used_terms(lens[0]))
-                # One sample at a time: next to a fold, the number of Newton steps of a batch would show.
-                flow, exists = zip(*(lens_flow(*(v[i : i + 1] for v in lens), points) for i in rows), strict=True)
+                if torch.compiler.is_compiling():  # with a fixed number of Newton steps
+                    flow, exists = ([value] for value in lens_flow(*lens, points))
+                else:
+                    # One sample at a time: next to a fold, the number of Newton steps of a batch would show.
+                    flow, exists = zip(*(lens_flow(*(v[i : i + 1] for v in lens), points) for i in rows), strict=True)
                 return torch.where(torch.cat(exists), pixels + torch.cat(flow), torch.nan)
 
             zoom, shift = zoom_to_fill(position, lens[2], height=height, width=width)

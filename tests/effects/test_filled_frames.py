@@ -250,3 +250,22 @@ def test_a_cropped_rectification_shows_valid_pixels_only_and_as_many_as_it_can(r
     assert_close(grid + d.flow[0].flatten(1).T, expected.points, atol=0.02, rtol=0)
     residual = d.restore_residual[d.restore_valid]
     assert residual.max() < 0.2
+
+
+def test_lenses_outside_the_ranges_fill_their_frames_too():
+    effect, wide = LensDistortion(), LensDistortion(k1_range=(-1.5, -1.2), k2_range=(1.0, 1.2), focal_range=(0.6, 0.6))
+    image = torch.zeros(4, 1, 45, 80)
+    params = wide.sample(image, seed=0)
+    with_view = effect.fill(params, 45, 80)
+    assert_close(with_view.zoom, params.zoom)
+    assert_close(with_view.shift, params.shift)
+
+
+def test_the_zoom_of_a_lens_next_to_a_fold_does_not_depend_on_its_batch():
+    folding = LensDistortion(k2_range=(-3.0, 1.0), p1_range=(-1.0, 0.0))
+    image = torch.zeros(12, 1, 9, 16)
+    together = folding.sample(image, seed=3)
+    for i in range(12):
+        alone = folding.sample(image[:1], seed=3, keys=[i])
+        assert torch.equal(alone.zoom[0], at_least(together.zoom)[i])
+        assert torch.equal(alone.shift[0], at_least(together.shift)[i])

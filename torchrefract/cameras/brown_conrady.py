@@ -186,13 +186,18 @@ def newton(
 
 
 def converge(iterates: Iterator[Point]) -> Point:
-    """Return the first iterate that a small step leads to, or the one after 12 steps; 8 if values cannot be read."""
+    """Return for each point the first iterate that a small step leads to, or the one after 12 steps.
+
+    A point does not depend on the others. If values cannot be read, all points take 8 steps.
+    """
     x, y = next(iterates)
+    is_done = torch.zeros_like(x, dtype=torch.bool)
     for count, (new_x, new_y) in enumerate(islice(iterates, _MAX_NEWTON_STEPS), start=1):
         step = torch.maximum((new_x - x).abs(), (new_y - y).abs())
-        x, y = new_x, new_y
-        is_small = eager_bool((step <= _SMALL_STEP[step.dtype]).all, of=step)
-        if is_small or (is_small is None and count == _BLIND_NEWTON_STEPS):
+        x, y = torch.where(is_done, x, new_x), torch.where(is_done, y, new_y)
+        is_done = is_done | (step <= _SMALL_STEP[step.dtype])
+        all_done = eager_bool(is_done.all, of=step)
+        if all_done or (all_done is None and count == _BLIND_NEWTON_STEPS):
             break
     return x, y
 

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -235,7 +235,9 @@ class LensDistortion(WarpEffect):
 
         They carry no gradient. Lenses that see no more than the pinhole, as pincushion lenses, keep a zoom of 1.
         """
-        zoom, shift = self._fit(params, height, width)
+        # The plan of the ranges says nothing of other lenses.
+        effect = cast(LensDistortion, super().for_params(params, height, width))
+        zoom, shift = effect._fit(params, height, width)
         return params._replace(zoom=zoom, shift=shift)
 
     def validate(self, params: LensParams, image: Tensor) -> None:
@@ -278,7 +280,7 @@ class LensDistortion(WarpEffect):
     def for_params(self, params: LensParams, height: int, width: int) -> WarpEffect:
         """Return this effect, or an exact one if the plan does not hold for the lenses, or for their clean view."""
         effect = super().for_params(params, height, width)
-        if params.zoom is None or params.shift is None or self.tolerance_px is None:
+        if params.zoom is None or params.shift is None or effect is not self or self.tolerance_px is None:
             return effect
         fits = self._view(params, height, width)
         difference = torch.cat([(params.zoom - fits[0])[:, None], params.shift - fits[1]], dim=1).abs()
@@ -322,19 +324,12 @@ class LensDistortion(WarpEffect):
         with torch.no_grad():
             lens = lens_in_px(map_params(params, lambda value: value.detach().double()), height, width)
 
-            rows = range(len(params.focal))
-            folds_nowhere = folds_nowhere or not rows
-
             def position(points: Points) -> Tensor:
                 pixels = torch.cat([points.x, points.y], dim=1)
                 if folds_nowhere:
                     return pixels + newton_lens_flow(*lens, points, num_steps=_FIT_STEPS, terms=used_terms(lens[0]))
-                if torch.compiler.is_compiling():  # with a fixed number of Newton steps
-                    flow, exists = ([value] for value in lens_flow(*lens, points))
-                else:
-                    # One sample at a time: next to a fold, the number of Newton steps of a batch would show.
-                    flow, exists = zip(*(lens_flow(*(v[i : i + 1] for v in lens), points) for i in rows), strict=True)
-                return torch.where(torch.cat(exists), pixels + torch.cat(flow), torch.nan)
+                flow, exists = lens_flow(*lens, points)
+                return torch.where(exists, pixels + flow, torch.nan)
 
             zoom, shift = zoom_to_fill(position, lens[2], height=height, width=width)
         return zoom.to(dtype), (shift / width).to(dtype)

@@ -4,7 +4,7 @@ A barrel lens sees more of the scene than a pinhole with the same focal length. 
 the view of a pinhole with a shorter focal length, and where the lens is decentered, another principal point.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -38,10 +38,9 @@ def zoom_to_fill(
         zoom: (B,), in (0, 1].
         shift: (B, 2), px; zero unless a smaller zoom would be needed without it.
     """
-    borders = [border_points(height, width, outset, center) for outset in _OUTSETS_PX]
-    positions = [position(border) for border in borders]
-    low, high = zip(*(_extent(reached, center) for reached in positions), strict=True)
-    low, high = torch.stack(low, dim=-1), torch.stack(high, dim=-1)  # (B, 2, outsets), from the center
+    border = border_points(height, width, _OUTSETS_PX, center)
+    reached = position(border).unflatten(2, (len(_OUTSETS_PX), -1))  # (B, 2, outsets, sides, points)
+    low, high = _extent(reached - center[:, :, None, None, None])
     sides = [side - 1 if side > 1 else torch.inf for side in (width, height)]  # a side of one pixel decides nothing
     size = as_device_tensor(sides, dtype=center.dtype, device=center.device)[:, None]
     space = as_device_tensor(_OUTSETS_PX, dtype=center.dtype, device=center.device) - MARGIN_PX
@@ -54,7 +53,8 @@ def zoom_to_fill(
     highest_shift = (size + space - middle - scale * high).amin(dim=2)
     lowest_shift = torch.where(size.isfinite().all(dim=1), lowest_shift, -torch.inf)
     shift = torch.zeros_like(center).clamp(min=lowest_shift).clamp(max=highest_shift)
-    is_still = (positions[0] - torch.cat([borders[0].x, borders[0].y], dim=1)).abs().amax(dim=(1, 2, 3)) <= STILL_PX
+    pixels = torch.cat([border.x, border.y], dim=1).unflatten(2, (len(_OUTSETS_PX), -1))
+    is_still = (reached - pixels).abs().amax(dim=(1, 2, 3, 4)) <= STILL_PX
     return torch.where(is_still, 1.0, zoom), torch.where(is_still[:, None], 0.0, shift)
 
 
@@ -91,23 +91,29 @@ def _view(values: Tensor) -> Tensor:
     return values.view(-1, 1, 1, 1)
 
 
-def border_points(height: int, width: int, outset: float, like: Tensor) -> Points:
-    """Return positions on each of the four sides of a frame, (1, 1, 4, n), px, with the type of another tensor."""
+def border_points(height: int, width: int, outsets: Sequence[float], like: Tensor) -> Points:
+    """Return positions on the four sides of rectangles around a frame, (1, 1, 4 outsets, n), px.
+
+    Args:
+        height, width: px, of the frame.
+        outsets: px, of each rectangle from the pixel centers of the border.
+        like: gives dtype and device.
+    """
     steps = torch.linspace(0, 1, _POINTS, dtype=like.dtype, device=like.device)
     start, end = torch.zeros_like(steps), torch.ones_like(steps)
-    x = torch.stack([steps, steps, start, end]) * (width - 1 + 2 * outset) - outset
-    y = torch.stack([start, end, steps, steps]) * (height - 1 + 2 * outset) - outset
+    along, across = torch.stack([steps, steps, start, end]), torch.stack([start, end, steps, steps])
+    x = torch.cat([along * (width - 1 + 2 * outset) - outset for outset in outsets])
+    y = torch.cat([across * (height - 1 + 2 * outset) - outset for outset in outsets])
     return Points(x[None, None], y[None, None], pixel_lattice(height, width), is_displaced=True)
 
 
-def _extent(position: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the lowest and the highest coordinates, (B, 2), from the center, of positions along the border."""
-    offset = position - center[:, :, None, None]
+def _extent(offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the lowest and the highest of offsets (..., sides, points) along borders; NaN counts as zero."""
     offset = torch.where(offset.isfinite(), offset, 0.0)
     # The extremes of the parabolas through three points each, where they lie between these.
     before, at, after = offset[..., :-2], offset[..., 1:-1], offset[..., 2:]
     slope, bend = (after - before) / 2, before - 2 * at + after
     is_between = slope.abs() < bend.abs()
     extremes = torch.where(is_between, at - slope.square() / (2 * torch.where(is_between, bend, 1.0)), at)
-    values = torch.cat([offset, extremes], dim=3)
-    return values.amin(dim=(2, 3)), values.amax(dim=(2, 3))
+    values = torch.cat([offset, extremes], dim=-1)
+    return values.amin(dim=(-2, -1)), values.amax(dim=(-2, -1))

@@ -110,7 +110,7 @@ def zoom_to_crop(camera: Camera) -> float:
         ValueError: there is none up to 64.
     """
     numbers = camera.tensors(torch.empty(0, dtype=torch.float64, device="cpu"))
-    border = border_points(camera.height, camera.width, 0.0, numbers[2])
+    border = border_points(camera.height, camera.width, [0.0], numbers[2])
 
     def is_shown(zoom: float) -> bool:
         flow, exists = rectification_flow(*numbers, border, model=camera.model, zoom=zoom)

@@ -51,7 +51,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--references", type=Path)
     arguments = parser.parse_args()
-    warnings.filterwarnings("ignore", "depth is that of a road")
+    warnings.filterwarnings("ignore", "depth is that of a road")  # which is what is measured
     print(f"{'':24}{'LinearDepth':>16}{'GroundPlaneDepth':>20}{'CorridorDepth':>16}")
     for name, image, truth, focal in frames(arguments.references):
         sources = (tr.LinearDepth(), tr.GroundPlaneDepth(focal=focal), tr.CorridorDepth(focal=focal))

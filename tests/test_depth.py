@@ -87,11 +87,19 @@ def network(tmp_path_factory) -> Callable[[str], Path]:
     return write
 
 
+class ConstantDepth(TransformersDepth):
+    """A provider whose network predicts a given depth (B, 1, H, W)."""
+
+    depth: Tensor
+
+    def _predict(self, image: Tensor) -> Tensor:
+        return self.depth
+
+
 def constant_network(depth: Tensor, **options) -> TransformersDepth:
-    """Return a provider whose network predicts a given depth (B, 1, H, W)."""
     settings = {"scale": "road", "road": GroundPlaneDepth(), "max_spread": 0.3} | options
-    provider = TransformersDepth(torch.nn.Identity(), None, **settings)
-    provider._predict = lambda image: depth  # type: ignore[method-assign]
+    provider = ConstantDepth(torch.nn.Identity(), None, **settings)
+    provider.depth = depth
     return provider
 
 
@@ -228,7 +236,7 @@ def test_a_function_that_gives_no_depth_raises(function, error, message):
 
 def test_depth_that_is_no_function_raises():
     with pytest.raises(TypeError, match=r"depth must be a provider such as LinearDepth\(\), or a function"):
-        tr.UniformFog(depth=3)  # pyright: ignore[reportArgumentType]
+        tr.UniformFog(depth=3)  # pyright: ignore[reportArgumentType]  # the error is tested
 
 
 def test_a_function_sees_the_frames_of_clips():

@@ -173,6 +173,6 @@ def test_without_a_depth_of_its_own_a_field_ignores_depth():
         effect.degrade(image, seed=1, depth=torch.full((1, 1, 36, 48), 5.0)).flow, effect.degrade(image, seed=1).flow
     )
     with pytest.raises(TypeError, match="depth must be a provider"):
-        Turbulence(depth=3.0)  # pyright: ignore[reportArgumentType]
+        Turbulence(depth=3.0)  # pyright: ignore[reportArgumentType]  # the error is tested
     with pytest.raises(ValueError, match="reference_distance must be above 0"):
         Turbulence(reference_distance=0.0)

@@ -36,7 +36,7 @@ class Shift(WarpEffect):
         return ShiftParams(applied, values[:, 0])
 
     def validate(self, params, image):
-        pass
+        """Accept all parameters."""
 
     def flow(self, params: Any, points, plan):
         share = 1.0

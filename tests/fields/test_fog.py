@@ -5,7 +5,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from torchrefract.fields.fog import blend_fog, extinction, linear_to_srgb, srgb_to_linear, transmission, unblend_fog
+from torchrefract.fields.fog import blend_fog, extinction, transmission, unblend_fog
+from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
 
 
 def srgb_by_the_standard(linear: np.ndarray) -> np.ndarray:
@@ -65,6 +66,7 @@ def test_the_srgb_curves_are_those_of_the_standard():
     stored = torch.from_numpy(srgb_by_the_standard(linear))
     assert_close(linear_to_srgb(torch.from_numpy(linear)), stored, rtol=0, atol=1e-14)
     assert_close(srgb_to_linear(stored), torch.from_numpy(linear), rtol=0, atol=1e-7)
+    assert_close(linear_to_srgb(srgb_to_linear(stored.float())), stored.float(), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("convert", [linear_to_srgb, srgb_to_linear])

@@ -18,7 +18,7 @@ from torchrefract.cameras.radial import falls_before, first_root, growth
 from torchrefract.cameras.rational import RationalLens
 
 _GRID = 129  # points along each side of the frame at which `coverage` looks for a ray
-_UNKNOWN_FOCAL = 0.9  # widths of the frame, of the pinhole that stands in for an unknown camera
+UNKNOWN_FOCAL = 0.9  # widths of the frame, of the pinhole that stands in for an unknown camera
 DIRECTIONS = ("horizontal", "vertical")
 # Coefficients whose term is odd in x, or in y: they change their sign in a mirrored frame.
 _ODD = {"horizontal": ("p2", "s1", "s2", "tau_y"), "vertical": ("p1", "s3", "s4", "tau_x")}
@@ -279,7 +279,7 @@ class Pinhole(NamedTuple):
 def pinhole_of(camera: Camera | None, *, height: int, width: int) -> Pinhole:
     """Return the pinhole of a camera for frames of a size; None is a centered one with a focal length of 0.9 widths."""
     if camera is None:
-        return Pinhole((_UNKNOWN_FOCAL * width, _UNKNOWN_FOCAL * width), ((width - 1) / 2, (height - 1) / 2))
+        return Pinhole((UNKNOWN_FOCAL * width, UNKNOWN_FOCAL * width), ((width - 1) / 2, (height - 1) / 2))
     camera = camera.resized(width=width, height=height)
     return Pinhole((camera.fx, camera.fy), (camera.cx, camera.cy))
 

@@ -176,8 +176,8 @@ def convert_video(
 
 def _open(path: Path) -> av.VideoStream | None:
     """Open a file and return its video stream, whose container must be closed; None if the file is not a video."""
-    with opened(path):
-        pass
+    with opened(path) as stream:
+        stream.read(1)  # FFmpeg's error would not say why a file cannot be read
     try:
         # FFmpeg takes the part of a relative path before a colon for a protocol.
         container = av.open(str(path.resolve()), metadata_errors="replace")

@@ -25,12 +25,11 @@ from torchrefract.fields.exposure import (
     exposure_gain,
     finite_image,
     follow_gain,
-    light_from_stored,
     metered_mean,
     metered_nodes,
     sensor_noise,
-    stored_from_light,
 )
+from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 
@@ -149,16 +148,16 @@ class Exposure(PhotometricEffect):
         light, _ = metered_nodes(image)
         gain = controlled_gain(metered_mean(light), target, params, low=self.min_gain, high=self.max_gain)
         if self._has_noise(params):
-            light = gain.view(-1, 1, 1, 1) * light_from_stored(finite_image(image))
+            light = gain.view(-1, 1, 1, 1) * srgb_to_linear(finite_image(image))
             light = light + sensor_noise(light, gain, shot, read, _white_noise(params, image))
-            result = stored_from_light(light).clamp(0, 1)
+            result = linear_to_srgb(light).clamp(0, 1)
         else:
             result = apply_gain(image, gain)
         if self.quantize:
             result = result + ((_LEVELS * result).round() / _LEVELS - result).detach()
 
         def is_valid() -> Tensor:
-            return is_unsaturated(image, gain.view(-1, 1, 1, 1) * light_from_stored(finite_image(image)))
+            return is_unsaturated(image, gain.view(-1, 1, 1, 1) * srgb_to_linear(finite_image(image)))
 
         return Rendered(result, is_valid)
 

@@ -69,9 +69,9 @@ class LensFlare(PhotometricEffect):
         blend: "add" or "screen".
         clip: clip the result of "add" to [0, 1]; without, it is linear in everything.
         drift_x_range, drift_y_range: widths and heights per frame of a clip.
-        tolerance: largest error of the image, levels of 1/255; a flare too faint to be seen is not computed, see
-            `plan`, which is of images. In clips, how far the sun drifts counts too: by the latest frame of the batch
-            where values can be read, otherwise without a limit. None is exact.
+        tolerance: largest error of the image, levels of 1/255; a flare too faint to be seen is not computed. None is
+            exact. `plan` is that of single images. For a clip the sun moves, up to the latest frame of the batch if
+            values can be read, and otherwise without a limit.
         p: probability that a sample is degraded.
 
     Raises:

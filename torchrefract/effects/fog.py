@@ -42,6 +42,7 @@ from torchrefract.fields.depth import (
     ray_distance,
 )
 from torchrefract.fields.fog import blend_fog, extinction, transmission, unblend_fog
+from torchrefract.fields.srgb import REC_709
 from torchrefract.planning.photometric import (
     FogErrorModel,
     PhotometricPlan,
@@ -55,8 +56,7 @@ from torchrefract.warping.grid import field_dtype
 Airlight = float | Sequence[float] | Literal["frame"] | None
 
 _PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)
-_REC_709 = (0.2126, 0.7152, 0.0722)
-_GRAY = sum(weight * value for weight, value in zip(_REC_709, _PAPER_AIRLIGHT, strict=True))
+_GRAY = sum(weight * value for weight, value in zip(REC_709, _PAPER_AIRLIGHT, strict=True))
 _MIN_TRANSMISSION = 1 / 255  # of what 8 bits can recover
 _ROUNDING = 2e-5  # relative, of a drawn extinction
 _ENDLESS = 1e30  # m, of a visibility that float32 hardly holds

@@ -262,9 +262,9 @@ class HeterogeneousFog(PhotometricEffect):
             rows = image.shape[0]
             distance = expand_batch(distance, rows) if distance.shape[0] > 1 else distance
             k = self._extinction(expand_batch(k, rows), params, distance, image, plan)
-        is_even = params.scale_height is None or eager_bool(params.scale_height.isinf().all, of=k) is True
-        if self.mode == "ray" and not is_even:
-            k = self._plume(params.scale_height, distance, image) * expand_batch(k, image.shape[0])
+        scale_height = params.scale_height if self.mode == "ray" else None
+        if scale_height is not None and eager_bool(lambda: scale_height.isinf().all(), of=k) is not True:
+            k = self._plume(scale_height, distance, image) * expand_batch(k, image.shape[0])
         return self.medium.blend(image, params, distance, k, is_visible=not plan.is_identity)
 
     def _extinction(

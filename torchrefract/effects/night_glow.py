@@ -8,17 +8,17 @@ from torch import Tensor
 from torchrefract import random
 from torchrefract._tensor import expand_batch
 from torchrefract._validation import check_number, check_range, check_within, finite_or
-from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.camera import Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.exposure import is_unsaturated
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
-from torchrefract.fields.exposure import finite_image, light_from_stored, map_rows, stored_from_light
+from torchrefract.fields.exposure import finite_image, map_rows
 from torchrefract.fields.night_glow import glow_at_nodes, lamp_light, lattice_stride, spread_glow
 from torchrefract.fields.sky import find_sky
+from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 
-_FOCAL = 0.9  # widths of the frame, of the pinhole that stands in for an unknown camera
 _LIMITS = {"optical_depth": (0.0, 50.0), "asymmetry": (0.1, 1.0), "luminance": (0.0, 1e6)}
 
 
@@ -92,9 +92,7 @@ class NightGlow(PhotometricEffect):
             low, high = _LIMITS[name]
             setattr(self, f"{name}_range", check_range(f"{name}_range", value, low=low, high=high))
         self.threshold = check_number("threshold", threshold, low=0.0, high=0.999)
-        if camera is not None and not isinstance(camera, Camera):
-            raise TypeError(f"camera must be a Camera, got {type(camera).__name__}")
-        self.camera = camera
+        self.camera = check_camera(camera)
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> NightGlowParams:
         """Draw all parameters uniformly in their ranges; frames with a sky of the day have lamps without light."""
@@ -112,7 +110,7 @@ class NightGlow(PhotometricEffect):
         """Add glow to images."""
         image = image.contiguous()  # the rounding of a sum depends on the memory format
         height, width = image.shape[2:]
-        focal = _FOCAL * width if self.camera is None else self.camera.resized(width=width, height=height).fx
+        focal = pinhole_of(self.camera, height=height, width=width).focal[0]
         stride = lattice_stride(image)
         # Invalid values, which cannot be read on an accelerator, scatter nothing.
         thickness, asymmetry, luminance = (
@@ -125,11 +123,11 @@ class NightGlow(PhotometricEffect):
         glow = spread_glow(nodes, light, strength, height=height, width=width, stride=stride)
 
         def of_rows(band: Tensor, rows: slice, out: Tensor | None) -> Tensor:
-            lit = light_from_stored(finite_image(band)).add_(glow[:, :, rows])
-            return torch.clamp(stored_from_light(lit), 0, 1, out=out)
+            lit = srgb_to_linear(finite_image(band)).add_(glow[:, :, rows])
+            return torch.clamp(linear_to_srgb(lit), 0, 1, out=out)
 
         return Rendered(
             map_rows(of_rows, image, (glow,)),
-            lambda: is_unsaturated(image, light_from_stored(finite_image(image)) + glow),
+            lambda: is_unsaturated(image, srgb_to_linear(finite_image(image)) + glow),
             intensity=lambda: glow.mean(dim=1, keepdim=True),
         )

@@ -20,7 +20,7 @@ from torchrefract._validation import (
     finite_or,
     requires_grad,
 )
-from torchrefract.cameras.camera import Camera, check_camera, pinhole_of
+from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import LATEST_FRAME, ParamsAtDepth, check_shapes, params_to
 from torchrefract.effects.random_field import check_frame
 from torchrefract.effects.warp_effect import WarpEffect
@@ -214,7 +214,7 @@ class PhysicalTurbulence(WarpEffect):
         return Air(self.aperture, self.inner_scale, self.outer_scale)
 
     def _road(self) -> GroundPlaneDepth:
-        focal = 0.9 if self.camera is None else self.camera.fx / self.camera.width
+        focal = focal_px(self.camera, 1)
         height = 1.3 if self.height is None else self.height
         return GroundPlaneDepth(camera_height=height, focal=focal, horizon=self.horizon, far=math.inf)
 
@@ -262,4 +262,4 @@ class _TurbulenceBounds:
 def focal_px(camera: Camera | None, width: int) -> float:
     """Return the focal length in frames of a width, px."""
     check_count("width", width)
-    return 0.9 * width if camera is None else camera.fx * width / camera.width
+    return UNKNOWN_FOCAL * width if camera is None else camera.fx * width / camera.width

@@ -19,7 +19,7 @@ from torchrefract._validation import (
     color_per_channel,
     finite_or,
 )
-from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.camera import Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.exposure import (
     LONGEST,
@@ -33,19 +33,17 @@ from torchrefract.effects.random_field import check_frame
 from torchrefract.fields.exposure import (
     expose_clipped,
     finite_image,
-    light_from_stored,
     map_rows,
     metered_mean,
     metered_nodes,
-    stored_from_light,
 )
 from torchrefract.fields.sky import find_sky, sky_point
+from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
 from torchrefract.fields.sun import Sun, sun_light
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 
 _FARTHEST = 1e4  # widths and heights
-_FOCAL = 0.9  # widths of the frame, of the pinhole that stands in for an unknown camera
 _BRIGHTEST = 1e9
 _HIGHEST_GAIN = 2.0  # never reached, as the sun only adds light
 _SCALES, _SHAPES, _RADII = (0.01, 100.0), (0.1, 4.0), (0.01, 100.0)
@@ -171,9 +169,7 @@ class SunGlare(PhotometricEffect):
         self.time_constant_range = check_range("time_constant_range", time_constant_range, low=0.0, high=LONGEST)
         self.drift_x_range = _check_place("drift_x_range", drift_x_range)
         self.drift_y_range = _check_place("drift_y_range", drift_y_range)
-        if camera is not None and not isinstance(camera, Camera):
-            raise TypeError(f"camera must be a Camera, got {type(camera).__name__}")
-        self.camera = camera
+        self.camera = check_camera(camera)
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> SunGlareParams:
         """Draw all parameters uniformly in their ranges, and the place of the sun in the sky of the frame."""
@@ -242,9 +238,7 @@ class SunGlare(PhotometricEffect):
         """Add the light of the sun to images and expose them."""
         image = image.contiguous()  # the rounding of a sum of products depends on the memory format
         height, width = image.shape[2:]
-        camera = None if self.camera is None else self.camera.resized(width=width, height=height)
-        focal = _FOCAL * width if camera is None else camera.fx
-        point = ((width - 1) / 2, (height - 1) / 2) if camera is None else (camera.cx, camera.cy)
+        (focal, _), point = pinhole_of(self.camera, height=height, width=width)
         sun = self._sun(params, image)
         x, y = (torch.arange(size, dtype=sun.center.dtype, device=image.device) for size in (width, height))
 
@@ -257,11 +251,11 @@ class SunGlare(PhotometricEffect):
         light_at, each_gain = light_of(x, y), gain.view(-1, 1, 1, 1)
 
         def exposed(band: Tensor, rows: slice) -> Tensor:
-            light = expose_clipped(light_from_stored(finite_image(band)), each_gain)
+            light = expose_clipped(srgb_to_linear(finite_image(band)), each_gain)
             return torch.addcmul(light, each_gain, light_at(rows))
 
         def of_rows(band: Tensor, rows: slice, out: Tensor | None) -> Tensor:
-            return torch.clamp(stored_from_light(exposed(band, rows)), 0, 1, out=out)
+            return torch.clamp(linear_to_srgb(exposed(band, rows)), 0, 1, out=out)
 
         return Rendered(
             map_rows(of_rows, image, (gain, *sun)),

@@ -10,7 +10,7 @@ from torchrefract._validation import check_flag, check_range, check_within, fini
 from torchrefract.cameras.camera import Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
-from torchrefract.fields.fog import linear_to_srgb, srgb_to_linear
+from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
 from torchrefract.fields.vignetting import vignetting
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype

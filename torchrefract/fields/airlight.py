@@ -4,7 +4,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract.fields.sky import find_sky, luma
+from torchrefract.fields.sky import find_sky
+from torchrefract.fields.srgb import luma
 
 _PATCH = 7  # nodes
 _BRIGHTEST = 0.001  # share of the dark channel

@@ -8,10 +8,8 @@ from torch import Tensor
 
 from torchrefract._tensor import rows_at_once
 from torchrefract._validation import requires_grad
-from torchrefract.fields.fog import linear_to_srgb
+from torchrefract.fields.srgb import LINEAR_TOE, STORED_TOE, linear_to_srgb, srgb_to_linear
 
-_STORED_TOE, _LINEAR_TOE = 0.04045, 0.0031308  # where the line of the sRGB curve ends and its power begins
-_HIGHEST = 1e4  # stored value; higher ones, whose power would be infinite, count as this
 _NODES = 192  # of the metered lattice along the longer side
 _CEILING = 16.0  # times white; brighter light counts as this, since a sensor saturates
 _CLIPPED = 0.8  # linear light, from where a frame may be clipped
@@ -31,7 +29,7 @@ def metered_nodes(image: Tensor) -> tuple[Tensor, int]:
     """
     stride = -(-max(image.shape[2:]) // _NODES)
     # Contiguous, since the order of a sum must not depend on the memory format of the image.
-    return light_from_stored(finite_image(image[:, :, ::stride, ::stride].contiguous())), stride
+    return srgb_to_linear(finite_image(image[:, :, ::stride, ::stride].contiguous())), stride
 
 
 def metered_mean(light: Tensor) -> Tensor:
@@ -73,20 +71,6 @@ def follow_gain(gain: Tensor, time_constant: Tensor) -> Tensor:
     return torch.stack(followed, dim=1).exp()
 
 
-def light_from_stored(value: Tensor) -> Tensor:
-    """Convert stored values in [0, 1] to linear light as `srgb_to_linear`, to 3e-8 and in a third of the time."""
-    # Line and power are continuous up to 3e-8, so they add up. torch.where and pow take several times as long.
-    power = value.clamp(min=_STORED_TOE, max=_HIGHEST).mul_(1 / 1.055).add_(0.055 / 1.055).log2().mul_(2.4).exp2_()
-    return (value.clamp(max=_STORED_TOE) - _STORED_TOE).mul_(1 / 12.92).add_(power)
-
-
-def stored_from_light(value: Tensor) -> Tensor:
-    """Convert linear light in [0, 1] to stored values as `linear_to_srgb`, to 3e-8 and in a third of the time."""
-    power = value.clamp(min=_LINEAR_TOE).log2().mul_(1 / 2.4).exp2_()
-    line = value.clamp(max=_LINEAR_TOE).mul_(12.92).sub_(12.92 * _LINEAR_TOE + 0.055)
-    return line.add_(power, alpha=1.055)
-
-
 def apply_gain(image: Tensor, gain: Tensor) -> Tensor:
     """Return the stored values of G x, clipped to [0, 1], where x is the linear light of the image.
 
@@ -99,8 +83,8 @@ def apply_gain(image: Tensor, gain: Tensor) -> Tensor:
         gain: (N,), G, above 0.
     """
     gain = gain.view(-1, 1, 1, 1)
-    end = linear_to_srgb(_LINEAR_TOE / gain)
-    low, high = end.clamp(max=_STORED_TOE), end.clamp(min=_STORED_TOE)
+    end = linear_to_srgb(LINEAR_TOE / gain)
+    low, high = end.clamp(max=STORED_TOE), end.clamp(min=STORED_TOE)
     # G (low + t) + a2 t^2 + a3 t^3, t = I - low, has the values and slopes of line and power at both ends.
     steep, width = gain ** (1 / 2.4), high - low + _LEAST_WIDTH
     secant = (steep * (high + 0.055) - 0.055 - gain * low) / width

@@ -5,6 +5,8 @@ import math
 import torch
 from torch import Tensor
 
+from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
+
 _FARTHEST = 1e12  # m; depths are clamped to it
 
 
@@ -57,15 +59,3 @@ def unblend_fog(image: Tensor, t: Tensor, airlight: Tensor, *, linear_light: boo
     if linear_light:
         return linear_to_srgb(torch.lerp(srgb_to_linear(airlight), srgb_to_linear(image), 1 / t))
     return torch.lerp(airlight, image, 1 / t)
-
-
-def srgb_to_linear(value: Tensor) -> Tensor:
-    """Convert stored values in [0, 1] to linear light, any shape. Source: IEC 61966-2-1."""
-    curve = ((value.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
-    return torch.where(value <= 0.04045, value / 12.92, curve)
-
-
-def linear_to_srgb(value: Tensor) -> Tensor:
-    """Convert linear light in [0, 1] to stored values, any shape. Source: IEC 61966-2-1."""
-    curve = 1.055 * value.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
-    return torch.where(value <= 0.0031308, 12.92 * value, curve)

@@ -6,7 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-_LUMA = (0.2126, 0.7152, 0.0722)  # Rec. 709
+from torchrefract.fields.srgb import luma
+
 _NODES = 192  # of the lattice along the longer side
 _MAX_RANGE = 0.06  # of the luma in a smooth neighborhood of three by three nodes
 _MIN_LUMA, _ABOVE_MEDIAN = 0.5, 0.05  # of a gray or white sky; streets at night and most roads are darker
@@ -100,14 +101,6 @@ def sky_point(sky: Sky, u: Tensor, *, height: int, width: int) -> tuple[Tensor, 
     columns = sky.nodes.shape[3]
     x, y = index % columns + u[:, 1], index.div(columns, rounding_mode="floor") + u[:, 2]
     return torch.stack([sky.stride * x / width, sky.stride * y / height], dim=1), counted[:, -1] > 0
-
-
-def luma(image: Tensor) -> Tensor:
-    """Return the luma (N, 1, H, W) of images (N, C, H, W): Rec. 709 for three channels, otherwise their mean."""
-    if image.shape[1] != 3:
-        return image.mean(dim=1, keepdim=True)
-    red, green, blue = image.unbind(1)
-    return (_LUMA[0] * red + _LUMA[1] * green + _LUMA[2] * blue)[:, None]
 
 
 def _connected_to_top(candidate: Tensor) -> Tensor:

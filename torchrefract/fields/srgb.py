@@ -1,0 +1,31 @@
+"""Stored values (sRGB), linear light, and luma."""
+
+from torch import Tensor
+
+REC_709 = (0.2126, 0.7152, 0.0722)  # shares of red, green and blue in the luma
+# Where the line and the power of the curve meet. The standard rounds it to 0.0031308, and its inverse to 0.04045.
+LINEAR_TOE = 0.003130668442500535
+STORED_TOE = 12.92 * LINEAR_TOE
+_HIGHEST = 1e4  # stored value; higher ones, whose power would be infinite, count as this
+
+
+def srgb_to_linear(value: Tensor) -> Tensor:
+    """Convert stored values in [0, 1] to linear light, any shape. Source: IEC 61966-2-1."""
+    # A sum of line and power, which meet: torch.where and pow take several times as long.
+    power = value.clamp(min=STORED_TOE, max=_HIGHEST).mul_(1 / 1.055).add_(0.055 / 1.055).log2().mul_(2.4).exp2_()
+    return (value.clamp(max=STORED_TOE) - STORED_TOE).mul_(1 / 12.92).add_(power)
+
+
+def linear_to_srgb(value: Tensor) -> Tensor:
+    """Convert linear light in [0, 1] to stored values, any shape. Source: IEC 61966-2-1."""
+    power = value.clamp(min=LINEAR_TOE).log2().mul_(1 / 2.4).exp2_()
+    line = value.clamp(max=LINEAR_TOE).mul_(12.92).sub_(12.92 * LINEAR_TOE + 0.055)
+    return line.add_(power, alpha=1.055)
+
+
+def luma(image: Tensor) -> Tensor:
+    """Return the luma (N, 1, H, W) of images (N, C, H, W): Rec. 709 for three channels, otherwise their mean."""
+    if image.shape[1] != 3:
+        return image.mean(dim=1, keepdim=True)
+    red, green, blue = image.unbind(1)
+    return (REC_709[0] * red + REC_709[1] * green + REC_709[2] * blue)[:, None]

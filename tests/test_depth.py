@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,13 +15,17 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import torchrefract as tr
-from torchrefract.data.depth_maps import DepthFolder, read_depth
+from torchrefract._validation import UsageError
+from torchrefract.data.depth_maps import DepthFolder, read_depth, write_depth
+from torchrefract.data.frames import FrameFolder
+from torchrefract.data.module import fingerprint, make_pair
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.data.road_scenes.scene import draw_scene
 from torchrefract.depth import RoadSpreadError, TransformersDepth, from_transformers, road_scale
 from torchrefract.fields.corridor import CorridorDepth
 from torchrefract.fields.depth import GroundPlaneDepth, LinearDepth
 from torchrefract.fields.sky import sky_mask
+from torchrefract.types import Frame
 
 transformers = pytest.importorskip("transformers")
 # Nobody may reach the hub in a test.
@@ -340,6 +345,45 @@ def test_the_command_writes_maps_that_fog_and_pairs_use_and_continues(call, netw
     maps[0].unlink()
     message = call("generate", *options, "out=other").message
     assert re.fullmatch(r"depth must be a folder with a map for each frame, got none for a\.png in depth .*", message)
+
+
+def test_two_pictures_that_would_share_a_map_raise(call, tmp_path):
+    write_frames(tmp_path)
+    (tmp_path / "frames" / "a.jpg").write_bytes((tmp_path / "frames" / "b" / "c.jpg").read_bytes())
+    message = call("estimate_depth", "source=frames", "out=depth", "network=unused").message
+    assert re.search(r"got one path, depth/a\.png, for a\.jpg and a\.png: give the frames names that differ", message)
+    (tmp_path / "depth").mkdir(exist_ok=True)
+    for name in ("a", "b/c", "b/d"):
+        (tmp_path / "depth" / name).parent.mkdir(exist_ok=True)
+        write_depth(tmp_path / "depth" / f"{name}.png", torch.full((56, 84), 20.0))
+    with pytest.raises(UsageError, match=r"for a\.jpg and a\.png"):
+        FrameFolder(tmp_path / "frames", size=(28, 42), depth=tmp_path / "depth")
+
+
+def test_frames_for_training_carry_their_depth(tmp_path):
+    write_frames(tmp_path)
+    for k, name in enumerate(("a", "b/c", "b/d")):
+        (tmp_path / "depth" / name).parent.mkdir(parents=True, exist_ok=True)
+        depth = torch.full((56, 84), 20.0 + k)
+        depth[:10] = math.inf
+        write_depth(tmp_path / "depth" / f"{name}.png", depth)
+    frames = FrameFolder(tmp_path / "frames", size=(28, 42), depth=tmp_path / "depth")
+    for k, frame in enumerate(frames):
+        assert frame.depth.shape == (1, 28, 42)
+        assert frame.depth[:, :5].isinf().all()
+        assert_close(frame.depth[:, 5:], torch.full((1, 23, 42), 20.0 + k))
+    assert fingerprint(frames)["depth"] == str(tmp_path / "depth")
+    data = {name: torch.stack([getattr(frame, name) for frame in frames]) for name in ("image", "key", "depth")}
+    pair = make_pair(Frame(**data), tr.UniformFog(visibility_range=(50, 50)), seed=0, transmission=True)
+    assert pair.transmission[:, :, :5].max() == 0
+    assert pair.transmission[0, 0, 10, 0] > pair.transmission[2, 0, 10, 0] > 0
+
+
+def test_a_missing_library_is_named(call, tmp_path, monkeypatch):
+    write_frames(tmp_path)
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    message = call("estimate_depth", "source=frames", "out=depth", "network=anywhere").message
+    assert message == 'model: depth networks need transformers: pip install "torchrefract[depth]"'
 
 
 def test_the_frames_of_videos_have_maps_by_their_numbers(call, network, tmp_path):

@@ -33,12 +33,17 @@ def estimate_depth(cfg: DictConfig) -> None:
         size = check_count("batch", cfg.batch)
     files = media.find_media(source, deep=True, name="source")
     media.check_output_folder(out, source, deep=True)
-    network = make(cfg, "model")
+    folder, root = DepthFolder(out), source if source.is_dir() else source.parent
+    pictures = [file.relative_to(root).as_posix() for file in files if not media.is_video(file)]
+    folder.check([(name, None) for name in pictures], exist=False)
+    try:
+        network = make(cfg, "model")
+    except ImportError as error:
+        raise UsageError(f"model: {error}") from error
     if not isinstance(network, TransformersDepth):
         raise UsageError(f"model must be torchrefract.depth.from_transformers, got {type(network).__name__}")
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
-    folder, root = DepthFolder(out), source if source.is_dir() else source.parent
     skipped, spreads = dict[str, str](), list[float]()
     num_written = 0
     with locked("out", out):

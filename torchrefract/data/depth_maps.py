@@ -1,5 +1,6 @@
 """Depth maps of frames in files: gray PNGs of 16 bits, or .npy arrays in m."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -37,6 +38,18 @@ class DepthFolder:
         place = stem / f"{frame:06d}" if frame is not None else stem.with_suffix("")
         paths = [self.root / f"{place}{suffix}" for suffix in _SUFFIXES]
         return next((path for path in paths if path.is_file()), paths[0])
+
+    def check(self, frames: Iterable[tuple[str, int | None]], *, exist: bool = True) -> None:
+        """Raise UsageError if two frames, by name and number, share a map or, with `exist`, if one has none."""
+        owners: dict[Path, str] = {}
+        for name, frame in frames:
+            path = self.find(name, frame) if exist else self.path(name, frame)
+            if path in owners:
+                raise UsageError(
+                    f"depth must have a map for each frame, got one path, {path}, for {owners[path]} and {name}: give "
+                    "the frames names that differ in more than their extension"
+                )
+            owners[path] = name
 
     def find(self, name: str, frame: int | None = None) -> Path:
         """Return the path of an existing map; raise UsageError if there is none."""

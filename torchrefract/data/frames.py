@@ -104,8 +104,7 @@ class FrameFolder(Dataset[Frame]):
         self.drives = sorted({frame.drive for frame in frames})
         self.keys = [path_key(frame.path) for frame in frames]
         if self.depth is not None:
-            for frame in frames:
-                self.depth.find(frame.path)  # raises if there is none
+            self.depth.check((frame.path, None) for frame in frames)
 
     def __len__(self) -> int:
         return len(self.paths)

@@ -208,6 +208,7 @@ def fingerprint(frames: Dataset[Frame] | Dataset[Pair]) -> dict[str, Any]:
     Returns:
         source: name of the dataset's class.
         root: its folder; None for rendered scenes.
+        depth: the folder of its depth maps, if there is one.
         drives: number of drives; None if unknown.
         license: of the frames; None if unknown.
         frames: number of frames.
@@ -218,6 +219,7 @@ def fingerprint(frames: Dataset[Frame] | Dataset[Pair]) -> dict[str, Any]:
     lines: Iterable[str] = ()
     if isinstance(frames, FrameFolder):
         result |= {"root": str(frames.root), "drives": len(frames.drives)}
+        result |= {} if frames.depth is None else {"depth": str(frames.depth.root)}
         lines = (f"{path.relative_to(frames.root).as_posix()} {path.stat().st_size}" for path in frames.paths)
     elif isinstance(frames, PairedFolder):
         rows = list(frames.rows())

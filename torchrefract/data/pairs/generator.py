@@ -70,8 +70,9 @@ class Sources(NamedTuple):
         """Return a SHA-256 digest of the names and sizes of the depth maps.
 
         Raises:
-            UsageError: a frame has none.
+            UsageError: a frame has none, or two frames share one.
         """
+        depth.check((frame.path, frame.frame) for frame in self.frames)
         digest = hashlib.sha256()
         for frame in self.frames:
             path = depth.find(frame.path, frame.frame)

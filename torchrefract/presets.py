@@ -149,7 +149,7 @@ def highveld_telephoto(
 
     Args:
         severity: 1 to 5, Cn2 of 1e-13, 3e-13, 1e-12, 3e-12, 1e-11 m^(-2/3), each +-50 %. 1e-12 is a hot day.
-        camera, horizon, depth: as for all scenes; without a camera, frames must be 16:9, with a focal length of 4 widths.
+        camera, horizon, depth: as for all scenes; without a camera, frames are 16:9, with a focal length of 4 widths.
         arguments: of `PhysicalTurbulence`, and those of all scenes.
     """
     cn2 = _at_severity(severity, [1e-13, 3e-13, 1e-12, 3e-12, 1e-11])

@@ -6,11 +6,13 @@ import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
+import transformers
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -27,7 +29,6 @@ from torchrefract.fields.depth import GroundPlaneDepth, LinearDepth
 from torchrefract.fields.sky import sky_mask
 from torchrefract.types import Frame
 
-transformers = pytest.importorskip("transformers")
 # Nobody may reach the hub in a test.
 pytestmark = [
     pytest.mark.usefixtures("without_hub"),
@@ -47,15 +48,16 @@ def network(tmp_path_factory) -> Callable[[str], Path]:
     def write(kind: str) -> Path:
         folder = tmp_path_factory.mktemp(kind)
         torch.manual_seed(0)
-        dino = transformers.Dinov2Config(
-            hidden_size=12,
-            num_hidden_layers=2,
-            num_attention_heads=2,
-            image_size=28,
-            patch_size=14,
-            out_features=["stage1", "stage2"],
-            reshape_hidden_states=False,
-        )
+        backbone: dict[str, Any] = {
+            "hidden_size": 12,
+            "num_hidden_layers": 2,
+            "num_attention_heads": 2,
+            "image_size": 28,
+            "patch_size": 14,
+            "out_features": ["stage1", "stage2"],
+            "reshape_hidden_states": False,
+        }
+        dino = transformers.Dinov2Config(**backbone)
         options = {
             "backbone_config": dino,
             "reassemble_hidden_size": 12,

@@ -244,8 +244,15 @@ def test_the_parameters_alone_decide_whether_the_density_is_even():
 def test_the_transmission_of_dust_is_that_of_its_optical_depth():
     image, depth = torch.zeros(1, 3, 40, 60, dtype=torch.float64), torch.full((1, 1, 40, 60), 30.0, dtype=torch.float64)
     camera = Camera(width=60, height=40, fx=50.0, fy=50.0, cx=29.5, cy=19.5, coefficients=(0.0,) * 4)
-    ranges = {"visibility_range": (50.0, 50.0), "deviation_range": (0.0, 0.0), "contrast_range": (0.0, 0.0)}
-    effect = HeterogeneousFog(mode="ray", camera=camera, scale_height_range=(1.5, 1.5), horizon=0.5, **ranges)
+    effect = HeterogeneousFog(
+        mode="ray",
+        camera=camera,
+        horizon=0.5,
+        visibility_range=(50.0, 50.0),
+        deviation_range=(0.0, 0.0),
+        contrast_range=(0.0, 0.0),
+        scale_height_range=(1.5, 1.5),
+    )
     t = effect.degrade(image, seed=7, depth=depth).transmission[0, 0]
     for row, column in ((3, 7), (19, 30), (20, 50)):
         ray = torch.tensor([(column - 29.5) / 50, (row - 19.5) / 50, 1.0], dtype=torch.float64)

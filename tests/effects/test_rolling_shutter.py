@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from torchrefract import (
 from torchrefract.effects.rolling_shutter import RollingShutterParams
 
 NONE = (0.0, 0.0)
-STILL = {"pitch_range": NONE, "yaw_range": NONE, "roll_range": NONE}
+STILL: dict[str, Any] = {"pitch_range": NONE, "yaw_range": NONE, "roll_range": NONE}
 HEIGHT, WIDTH, FOCAL, CAMERA_HEIGHT = 135, 240, 175.0, 1.3  # px and m: a dashcam of f = 1400 px at 1920 px
 CAMERA = Camera(width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx=121.0, cy=60.0, coefficients=(0.0,) * 4)
 
@@ -200,7 +201,10 @@ def test_the_vibration_of_a_clip_goes_on_from_frame_to_frame():
 
 def test_labels_move_along_and_in_a_composition_the_scene_is_sampled_once():
     image = torch.rand(3, HEIGHT, WIDTH)
-    boxes = tv_tensors.BoundingBoxes([[190, 20, 200, 110]], format="XYXY", canvas_size=(HEIGHT, WIDTH))
+    corners = torch.tensor([[190, 20, 200, 110]])
+    boxes = tv_tensors.BoundingBoxes(  # pyright: ignore[reportCallIssue]  # torchvision's overloads
+        corners, format="XYXY", canvas_size=(HEIGHT, WIDTH)
+    )
     effect = RollingShutter(speed_range=(100.0, 100.0), readout_range=(30.0, 30.0), depth=Plane(8.0), **STILL)
     moved = effect(image, {"boxes": boxes, "labels": torch.tensor([1])})[1]["boxes"]
     # The upper left and the lower right corner, relative to the center of the frame, grow by 1 / (1 - v t / Z).
@@ -262,19 +266,20 @@ def test_a_network_gives_the_depth_of_each_image():
 
 
 def test_invalid_arguments_raise():
-    for given, rule in (
+    invalid: list[tuple[dict[str, Any], str]] = [
         ({"speed_range": (0.0, 2000.0)}, "speed_range must"),
         ({"exposure_range": (-1.0, 0.0)}, "exposure_range must"),
         ({"pitch_range": (0.0, 6.0)}, "pitch_range must"),
         ({"num_frequencies": 0}, "num_frequencies must be at least 1"),
         ({"fps": 0.0}, "fps must"),
-    ):
+    ]
+    for given, rule in invalid:
         with pytest.raises(ValueError, match=rule):
             RollingShutter(**given)
-    with pytest.raises(TypeError, match="depth must be a provider"):
-        RollingShutter(depth=8.0)
-    with pytest.raises(TypeError, match="camera must be a Camera"):
-        RollingShutter(camera=(1400, 1400))
+    unfit: dict[str, Any] = {"depth": 8.0, "camera": (1400, 1400)}
+    for name, rule in (("depth", "depth must be a provider"), ("camera", "camera must be a Camera")):
+        with pytest.raises(TypeError, match=rule):
+            RollingShutter(**{name: unfit[name]})
 
 
 @dataclass(frozen=True)

@@ -232,7 +232,7 @@ def _load_yaml(path: Path, text: str, form: str) -> Any:
 
 def _import_yaml() -> Any:
     try:
-        import yaml  # noqa: PLC0415
+        import yaml  # noqa: PLC0415 - an extra
     except ModuleNotFoundError as missing:
         message = 'cameras in YAML files need PyYAML: pip install "torchrefract[calibration]"'
         raise ModuleNotFoundError(message, name=missing.name) from missing

@@ -37,7 +37,9 @@ class CorridorDepth:
     far: float = 300.0
 
     def __post_init__(self) -> None:
-        self.road  # noqa: B018 - raises for invalid numbers
+        road = self.road  # raises for invalid numbers
+        for name in ("camera_height", "focal", "horizon", "spread"):
+            object.__setattr__(self, name, getattr(road, name))
         for name in ("side", "far"):
             object.__setattr__(self, name, check_positive(name, getattr(self, name)))
         object.__setattr__(self, "vanishing", check_number("vanishing", self.vanishing, low=-10.0, high=10.0))

@@ -72,6 +72,7 @@ _PARAMETER_TEXTS: dict[str, Callable[[Tensor], str]] = {
         f"red {value[0]:.2g}, blue {value[-1]:.2g} larger" if value.ndim else f"scale {value:.2g} deg"
     ),
     "target": lambda value: f"mean light {value:.2g}",
+    "sunlight": lambda value: f"{value[2]:.0%} of sunlight from {value[0]:.0f} deg right, {value[1]:.0f} deg high",
     "strength": lambda value: f"strength {value:.2g}",
     "center": lambda value: f"center off by ({value[0]:.1g}, {value[1]:.1g}) widths",
     "wind": lambda value: f"wind ({value[0]:.2g}, {value[1]:.2g}) px/frame",
@@ -299,6 +300,8 @@ def describe_params(effect: Effect, params: Any) -> str:
     # One field means different things in different effects.
     if isinstance(effect, LensFlare | SunGlare):
         values["sun"] = values.pop("center")
+    elif values.get("sun") is not None:
+        values["sunlight"] = values.pop("sun")
     if isinstance(effect, PhysicalTurbulence):
         values["wind_s"] = values.pop("wind")
     if isinstance(effect, RollingShutter):
@@ -387,6 +390,8 @@ def _restore(effect: Effect, degraded: Degraded) -> _Restored | None:
     # A float image would be restored exactly, which no image file allows.
     stored, fog = to_float(to_uint8(degraded.image)), cast(Any, effect)
     t, airlight = degraded.transmission, degraded.params.airlight
+    if getattr(degraded.params, "sun", None) is not None:
+        airlight = fog.airlight_map(degraded.params, *stored.shape[2:])
     return _Restored(*remove_fog(stored, t, airlight, linear_light=fog.medium.linear_light), "restored from 8 bits")
 
 

@@ -18,7 +18,7 @@ _COLOR = (0.8, 0.0, 0.1)
 
 
 class FlowArrows(NamedTuple):
-    """Where the content of a frame moves, at points of the displayed image."""
+    """The motion of the content of a frame, at points of the displayed image."""
 
     x: Tensor  # (N,), px of the display
     y: Tensor  # (N,)

@@ -11,7 +11,7 @@ from torchrefract.effects.base import Effect
 from torchrefract.robustness import Quantity, evaluate
 from torchrefract.robustness.scores import as_labels, classification_score, detection_score
 
-VISIBILITY = Quantity("visibility", "m", lambda params: params.visibility)
+VISIBILITY = Quantity("visibility", "m", False, lambda params: params.visibility)
 RANGES = {1: (500.0, 1000.0), 2: (200.0, 500.0), 3: (60.0, 200.0), 4: (40.0, 60.0), 5: (20.0, 40.0)}
 
 

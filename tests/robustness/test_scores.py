@@ -17,10 +17,13 @@ def test_the_average_precision_of_one_image_is_the_area_below_its_curve():
     boxes = torch.tensor([[1.0, 0, 10, 10], [50, 50, 60, 60], [20, 20, 30, 31]])
     prediction = {"boxes": boxes, "labels": torch.tensor([1, 1, 1]), "scores": torch.tensor([0.9, 0.8, 0.7])}
     assert detection_score(prediction, target) == pytest.approx(0.5 + 0.5 * 2 / 3)
-    assert detection_score(prediction | {"labels": torch.tensor([1, 2, 1])}, target) == pytest.approx(0.5)
+    # Classes that the image does not hold do not count, as in COCO's metric.
+    assert detection_score(prediction | {"labels": torch.tensor([1, 2, 1])}, target) == 1
     nothing = {name: value[:0] for name, value in prediction.items()}
     assert detection_score(nothing, target) == 0
-    assert detection_score(nothing, {"boxes": torch.zeros(0, 4), "labels": torch.zeros(0).long()}) == 1
+    empty = {"boxes": torch.zeros(0, 4), "labels": torch.zeros(0).long()}
+    assert [detection_score(given, empty) for given in (nothing, prediction)] == [1, 0]
+    assert detection_score({name: value[2:] * 0.5 for name, value in prediction.items()}, empty) == 1  # not confident
 
 
 def test_a_detection_twice_is_a_miss_and_the_larger_overlap_counts():

@@ -35,7 +35,9 @@ def test_the_interval_of_the_tolerated_visibility_holds_the_truth_for_90_of_100_
         threshold = median * np.exp(spread * generator.standard_normal(60))
         visibility = np.stack([generator.uniform(low, high, 60) for low, high in RANGES])
         truth = median * math.exp(spread * stats.norm.ppf(0.9))
-        estimate = tolerated_value(visibility.ravel(), (visibility > threshold).astype(float).ravel(), least=0.9)
+        estimate = tolerated_value(
+            visibility.ravel(), (visibility > threshold).astype(float).ravel(), least=0.9, is_harm=False
+        )
         assert estimate.low <= estimate.value <= estimate.high
         hits += estimate.low <= truth <= estimate.high
         errors.append(math.log(estimate.value / truth))
@@ -48,7 +50,9 @@ def test_the_interval_of_the_tolerated_visibility_holds_the_truth_for_90_of_100_
 def test_the_direction_of_harm_is_that_of_the_scores(sign):
     generator = np.random.default_rng(0)
     strength = generator.uniform(0, 1, 250)
-    estimate = tolerated_value(sign * strength, 1 - strength + 0.05 * generator.normal(size=250), least=0.7)
+    estimate = tolerated_value(
+        sign * strength, 1 - strength + 0.05 * generator.normal(size=250), least=0.7, is_harm=sign == 1
+    )
     assert estimate.value == pytest.approx(sign * 0.3, abs=0.05)
     assert estimate.low < estimate.value < estimate.high
 
@@ -56,9 +60,9 @@ def test_the_direction_of_harm_is_that_of_the_scores(sign):
 @pytest.mark.quick
 def test_a_value_outside_the_levels_has_an_open_interval():
     visibility = np.random.default_rng(0).uniform(50, 100, 200)
-    harmless = tolerated_value(visibility, visibility / 1000 + 0.9, least=0.5)
+    harmless = tolerated_value(visibility, visibility / 1000 + 0.9, least=0.5, is_harm=False)
     assert harmless.low == -math.inf
     assert harmless.value == visibility.min()
-    hopeless = tolerated_value(visibility, visibility / 1000, least=0.5)
+    hopeless = tolerated_value(visibility, visibility / 1000, least=0.5, is_harm=False)
     assert hopeless.high == math.inf
     assert hopeless.value == visibility.max()

@@ -21,11 +21,13 @@ class Quantity(NamedTuple):
     """A parameter by which a scene is stated, such as the visibility of a fog.
 
     name, unit: of the parameter.
+    is_harm: True if higher values harm more, False for one such as visibility.
     get: returns its value for each sample, (B,), from the params of the scene.
     """
 
     name: str
     unit: str
+    is_harm: bool
     get: Callable[[Any], Tensor]
 
 
@@ -34,6 +36,16 @@ class Level(NamedTuple):
 
     scene: str
     severity: int
+
+
+class Scored(NamedTuple):
+    """The scores of one image: clean, and at each level with the value of the quantity, 0 without one."""
+
+    clean: float
+    levels: dict[Level, tuple[float, float]]
+
+
+Scenes = Mapping[str, Mapping[int, Effect]]
 
 
 @dataclass(frozen=True)
@@ -85,6 +97,10 @@ class Robustness:
             rows.append(Row(*level, name, value, unit, len(scores), *estimates))
         return rows
 
+    def clean_estimate(self) -> Estimate:
+        """Return the mean score of the clean images."""
+        return mean_estimate(self.clean)
+
     def tolerated(self, scene: str, *, loss: float = 0.1) -> Estimate:
         """Estimate the value of a scene's quantity up to which the mean score falls by at most a share.
 
@@ -97,7 +113,8 @@ class Robustness:
             raise ValueError(f"scene must be one with a quantity: {', '.join(self.quantities)}, got {scene}")
         levels = [level for level in self.scores if level.scene == scene]
         values, scores = (np.stack([by[level] for level in levels]) for by in (self.values, self.scores))
-        return tolerated_value(values.ravel(), scores.ravel(), least=(1 - loss) * float(self.clean.mean()))
+        least, is_harm = (1 - loss) * float(self.clean.mean()), self.quantities[scene].is_harm
+        return tolerated_value(values.ravel(), scores.ravel(), least=least, is_harm=is_harm)
 
     def mean_performance(self, scene: str | None = None) -> float:
         """Return the mean score over the levels of a scene, or over those of all scenes with equal weights: mPC.
@@ -116,13 +133,15 @@ class Robustness:
 def evaluate(
     predict: Callable[[Tensor], Any],
     samples: Iterable[tuple[str, Tensor, Any]],
-    scenes: Mapping[str, Mapping[int, Effect]],
+    scenes: Scenes | Callable[[int], Scenes],
     score: Callable[[Any, Any], float],
     *,
     as_target: Callable[[Any, tuple[int, int]], Any] | None = None,
     quantities: Mapping[str, Quantity] | None = None,
     seed: int = 0,
     depth: Callable[[Tensor], Tensor] | None = None,
+    done: Mapping[str, Scored] | None = None,
+    on_scored: Callable[[str, Scored], None] | None = None,
 ) -> Robustness:
     """Score a model on images as they are, and at each severity of each scene.
 
@@ -132,13 +151,15 @@ def evaluate(
     Args:
         predict: from images (1, 3, H, W), float in [0, 1], to a sequence of one prediction.
         samples: name, image (3, H, W) and target of each image. Labels of the target move along the flow.
-        scenes: by name, and in each the effects by severity.
+        scenes: by name, and in each the effects by severity; or a function that returns them for a width in px.
         score: from a prediction and a target to a number in [0, 1], higher is better; see `robustness.scores`.
         as_target: makes a target of the prediction for the clean image and its (height, width), for targets that are
             None: the score is then the agreement with it. See `scores.as_labels`.
         quantities: of the scenes, by name.
         seed: of the draws.
         depth: as for `effect.degrade`.
+        done: scores of an earlier run, by name, which are not computed again.
+        on_scored: is called with the name and the scores of each other image.
 
     Returns:
         The scores of all images but those whose prediction raised.
@@ -147,17 +168,21 @@ def evaluate(
         RuntimeError: the prediction raised for more than a tenth of the images, from ten on, or for all of them.
         ValueError: a target of None without `as_target`.
     """
-    quantities = dict(quantities or {})
-    levels = {Level(name, severity): effect for name, by in scenes.items() for severity, effect in by.items()}
-    scored: dict[str, tuple[float, dict[Level, tuple[float, float]]]] = {}
+    quantities, done = dict(quantities or {}), done or {}
+    scored: dict[str, Scored] = {}
     failures: dict[str, str] = {}
     for name, image, given in samples:
-        target = given
-        if target is None and as_target is None:
+        if name in done:
+            scored[name] = done[name]
+            continue
+        if given is None and as_target is None:
             raise ValueError(f"target must be labels, or as_target a function, got None for {name}")
+        by_name = scenes(image.shape[-1]) if callable(scenes) else scenes
+        levels = {Level(scene, severity): effect for scene, by in by_name.items() for severity, effect in by.items()}
         try:
             (prediction,) = predict(image[None])
-            if target is None and as_target is not None:
+            target = given
+            if given is None and as_target is not None:
                 target = as_target(prediction, (image.shape[-2], image.shape[-1]))
             clean, by_level = score(prediction, target), {}
             for level, effect in levels.items():
@@ -166,12 +191,14 @@ def evaluate(
                 moved = target if flow is None else warp_moved_labels(target, flow, effect.labels_getter)
                 (prediction,) = predict(degraded.image[None])
                 quantity = quantities.get(level.scene)
-                value = quantity.get(degraded.params).item() if quantity else float("nan")
+                value = quantity.get(degraded.params).item() if quantity else 0.0
                 by_level[level] = (score(prediction, moved), value)
         except Exception as error:  # a model may raise anything
             failures[name] = f"{type(error).__name__}: {error}"
         else:
-            scored[name] = (clean, by_level)
+            scored[name] = Scored(clean, by_level)
+            if on_scored is not None:
+                on_scored(name, scored[name])
         if _fails_too_often(len(failures), len(scored)):
             break
     if not scored or _fails_too_often(len(failures), len(scored)):
@@ -181,18 +208,27 @@ def evaluate(
             f"{len(scored) + len(failures)}; the last was {name}: {reason}"
         )
     if failures:
-        warnings.warn(f"predict failed for {first_names(list(failures))}, which are left out", stacklevel=2)
+        name, reason = next(iter(failures.items()))
+        names = first_names(list(failures))
+        warnings.warn(f"predict failed for {names}, which are left out; for {name}: {reason}", stacklevel=2)
+    return collect(scored, quantities, failures)
+
+
+def collect(
+    scored: Mapping[str, Scored], quantities: Mapping[str, Quantity], failures: Mapping[str, str] | None = None
+) -> Robustness:
+    """Return the scores of images, by name and of the same levels, as arrays."""
+    levels = next(iter(scored.values())).levels
+    by_level = {level: np.array([of.levels[level] for of in scored.values()]) for level in levels}
     return Robustness(
         names=list(scored),
-        clean=np.array([clean for clean, _ in scored.values()]),
-        scores={level: np.array([by_level[level][0] for _, by_level in scored.values()]) for level in levels},
-        values={
-            level: np.array([by_level[level][1] for _, by_level in scored.values()])
-            for level in levels
-            if level.scene in quantities
+        clean=np.array([of.clean for of in scored.values()]),
+        scores={level: pairs[:, 0] for level, pairs in by_level.items()},
+        values={level: pairs[:, 1] for level, pairs in by_level.items() if level.scene in quantities},
+        quantities={
+            scene: quantities[scene] for scene in {level.scene: None for level in levels} if scene in quantities
         },
-        quantities=quantities,
-        failures=failures,
+        failures=dict(failures or {}),
     )
 
 

@@ -10,7 +10,9 @@ _CONFIDENT = 0.5  # score from which a detection counts as a label
 
 
 def detection_score(prediction: dict[str, Tensor], target: dict[str, Any]) -> float:
-    """Compute the mean average precision at an IoU of 0.5 over the classes of one image; 1 if there is nothing.
+    """Compute the mean average precision at an IoU of 0.5 over the classes that one image holds.
+
+    For an image that holds nothing, 1 without a detection of a score of at least 0.5, and 0 with one.
 
     Args:
         prediction: `boxes` (n, 4), x1 y1 x2 y2 in px, `labels` (n,) and `scores` (n,), as of torchvision's detectors.
@@ -19,13 +21,12 @@ def detection_score(prediction: dict[str, Tensor], target: dict[str, Any]) -> fl
     boxes, labels, scores = (prediction[name].detach().cpu() for name in ("boxes", "labels", "scores"))
     true_boxes = torch.as_tensor(target["boxes"]).cpu().as_subclass(Tensor).view(-1, 4)
     true_labels = torch.as_tensor(target["labels"]).cpu()
-    classes = torch.cat([labels, true_labels]).unique().tolist()
     values = []
-    for name in classes:
+    for name in true_labels.unique().tolist():
         chosen = (labels == name).nonzero()[:, 0]
         chosen = chosen[scores[chosen].argsort(descending=True, stable=True)]
         values.append(_average_precision(boxes[chosen], true_boxes[true_labels == name]))
-    return sum(values) / len(values) if values else 1.0
+    return sum(values) / len(values) if values else float(not (scores >= _CONFIDENT).any())
 
 
 def segmentation_score(prediction: Tensor, target: Tensor) -> float:

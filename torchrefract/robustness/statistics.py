@@ -29,17 +29,17 @@ def mean_estimate(values: np.ndarray, *, seed: int = 0) -> Estimate:
     return Estimate(float(values.mean()), float(low), float(high))
 
 
-def tolerated_value(quantity: np.ndarray, score: np.ndarray, *, least: float) -> Estimate:
+def tolerated_value(quantity: np.ndarray, score: np.ndarray, *, least: float, is_harm: bool) -> Estimate:
     """Estimate up to which value of a quantity the mean score stays at `least` or above.
 
-    The mean score is taken for a monotone function of the quantity, fitted by isotonic regression, and falls in the
-    direction of the quantity in which the scores fall. The interval holds the values at which the monotone function may
+    The mean score is taken for a monotone function of the quantity, fitted by isotonic regression. The interval holds the values at which the monotone function may
     reach `least`, by the likelihood ratio with the largest variance that scores with such a mean can have.
 
     Args:
         quantity: (n,), such as the visibility in m.
         score: (n,), in [0, 1], higher is better.
         least: the lowest mean score that is tolerated, in (0, 1).
+        is_harm: True if scores fall with the quantity, False if they rise with it, as with visibility.
 
     Returns:
         The value, with an interval that is open on a side on which the data do not bound it. Where no value is
@@ -48,8 +48,7 @@ def tolerated_value(quantity: np.ndarray, score: np.ndarray, *, least: float) ->
     Source: Barlow, Bartholomew, Bremner and Brunk, "Statistical inference under order restrictions", Wiley 1972;
     Banerjee and Wellner, "Likelihood ratio tests for monotone functions", Annals of Statistics 29 (2001).
     """
-    falls = np.corrcoef(quantity, score)[0, 1] if quantity.std() > 0 and score.std() > 0 else -1.0
-    sign = -1.0 if falls > 0 else 1.0
+    sign = 1.0 if is_harm else -1.0
     order = np.argsort(sign * quantity, kind="stable")
     harm, score = sign * quantity[order], score[order]
     monotone = isotonic_decreasing(score)

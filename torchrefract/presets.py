@@ -88,6 +88,7 @@ def cape_town_fog(
         "contrast_range": (0.4, 0.8),
         "wind_x_range": (-0.1, 0.1),
         "wind_z_range": (-0.65, -0.45),
+        "horizon": horizon,
     }
     return HeterogeneousFog(**options | _place(camera, horizon, depth) | _without_place(arguments))
 
@@ -131,8 +132,8 @@ def highveld_heat_haze(
     """
     kelvin, amplitude = _at_severity(severity, [(5.0, 0.5), (10.0, 1.0), (15.0, 1.5), (20.0, 2.2), (30.0, 3.0)])
     place = _place(camera, horizon, depth)
-    focal = {} if place["camera"] is None else {"focal": place["camera"].fx / place["camera"].width}
-    options: dict[str, Any] = {"difference_range": _around(kelvin, 0.2 * kelvin), "horizon": horizon, **focal}
+    options: dict[str, Any] = {"difference_range": _around(kelvin, 0.2 * kelvin), "horizon": horizon}
+    options |= _focal(place["camera"]) | ({} if depth is None else {"depth": depth})
     haze = _turbulence(amplitude, width, **{"depth": place["depth"]} | arguments)
     return Compose([RoadMirage(**options | (mirage or {})), haze])
 
@@ -269,9 +270,13 @@ def _place(source: _CameraSource, horizon: float, depth: _DepthSource) -> dict[s
     """Return the arguments of an effect that tell the camera and the depth."""
     camera = _camera(source)
     if depth is None:
-        focal = {} if camera is None else {"focal": camera.fx / camera.width}
-        depth = CorridorDepth(horizon=horizon, spread=_SPREAD, **focal)
+        depth = CorridorDepth(horizon=horizon, spread=_SPREAD, **_focal(camera))
     return {"camera": camera, "depth": depth}
+
+
+def _focal(camera: Camera | None) -> dict[str, float]:
+    """Return the argument of an effect that tells the focal length, widths."""
+    return {} if camera is None else {"focal": camera.fx / camera.width}
 
 
 def _without_place(arguments: dict[str, Any]) -> dict[str, Any]:

@@ -127,7 +127,7 @@ def test_severities_have_the_documented_values():
         ("cape_town_fog", 5, "visibility", 20, 40),
         ("limpopo_sun_glare", 5, "scatter", 0.2, 0.4),
         ("highveld_heat_haze", 5, "difference", 24, 36),
-        ("unpaved_road", 5, "visibility", 25, 50),
+        ("unpaved_road", 5, "visibility", 20, 35),
     ):
         params = SCENES[name](severity).sample(image, seed=2)
         values = getattr(params.children[0] if hasattr(params, "children") else params, field)

@@ -62,6 +62,7 @@ def sky_mask(image: Tensor) -> Tensor:
         found = found | is_near & is_smooth & ((nodes - nearby).abs().amax(dim=1, keepdim=True) < _MAX_DIFFERENCE)
     nearby, is_near = _mean_nearby(found, nodes)
     color, weight = torch.where(is_near, nearby, _mean_where(found, nodes)), found.float()
+    color = torch.where(found, torch.minimum(color, nodes), color)  # of blue sky between white clouds
     is_above = weight.flip(2).cummax(dim=2).values.flip(2)
     size = (image.shape[2], image.shape[3])
     candidate = F.interpolate(torch.maximum(is_above, _highest_nearby(weight)), size) > 0

@@ -1,4 +1,4 @@
-"""How near the scenes come to real fog, haze, dust and sun, beside the clear frames that they degrade.
+"""Distance of the scenes to real fog, haze, dust and sun, beside that of the clear frames that they degrade.
 
     python benchmarks/references.py                   # DATA is ../shared/data beside the checkout
     python benchmarks/references.py --pictures FOLDER # and saves them side by side
@@ -98,8 +98,8 @@ def main() -> None:
         for severity in presets.SEVERITIES:
             effect = scene_for_width(reference.scene, severity, SIZE[1])
             versions.append(effect.degrade(clear, seed=0, depth=depth).image)
-        found = [np.mean([distances(real, image) for image in images], axis=0) for images in versions]
-        print(f"| {name} | `{reference.scene}` |", " | ".join(f"{a:.3f}, {b:.3f}" for a, b in found), "|", flush=True)
+        results = [np.mean([distances(real, image) for image in images], axis=0) for images in versions]
+        print(f"| {name} | `{reference.scene}` |", " | ".join(f"{a:.3f}, {b:.3f}" for a, b in results), "|", flush=True)
         if arguments.pictures:
             arguments.pictures.mkdir(parents=True, exist_ok=True)
             picture = pixels_of(torch.cat([real, *(images[0] for images in versions)], dim=2))[..., ::-1]

@@ -1,4 +1,4 @@
-"""How much each scene takes from a frame at each severity, by one score for all of them.
+"""Share that each scene takes from a frame at each severity, by one score for all of them.
 
     python benchmarks/severity.py --root FRAMES                   # a table of real frames
     python benchmarks/severity.py                                 # of rendered roads
@@ -50,7 +50,7 @@ REFERENCE_WIDTH = 1920  # px, for which displacements are stated
 
 
 class Score(NamedTuple):
-    """What a degraded frame keeps, in [0, 1]; NaN if the clean frame has none."""
+    """Shares that a degraded frame keeps, in [0, 1]; NaN if the clean frame has none."""
 
     edges: float
     corners: float

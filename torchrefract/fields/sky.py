@@ -54,15 +54,15 @@ def sky_mask(image: Tensor) -> Tensor:
         (N, 1, H, W), bool. It has no gradient. Each image is judged alone.
     """
     image = image.detach()
-    found, stride, _ = find_sky(image)
+    mask, stride, _ = find_sky(image)
     nodes = _nodes(image, stride)
     is_smooth = _is_smooth(luma(nodes))
     for _ in range(_GROWTHS):
-        nearby, is_near = _mean_nearby(found, nodes)
-        found = found | is_near & is_smooth & ((nodes - nearby).abs().amax(dim=1, keepdim=True) < _MAX_DIFFERENCE)
-    nearby, is_near = _mean_nearby(found, nodes)
-    color, weight = torch.where(is_near, nearby, _mean_where(found, nodes)), found.float()
-    color = torch.where(found, torch.minimum(color, nodes), color)  # of blue sky between white clouds
+        nearby, is_near = _mean_nearby(mask, nodes)
+        mask = mask | is_near & is_smooth & ((nodes - nearby).abs().amax(dim=1, keepdim=True) < _MAX_DIFFERENCE)
+    nearby, is_near = _mean_nearby(mask, nodes)
+    color, weight = torch.where(is_near, nearby, _mean_where(mask, nodes)), mask.float()
+    color = torch.where(mask, torch.minimum(color, nodes), color)  # of blue sky between white clouds
     is_above = weight.flip(2).cummax(dim=2).values.flip(2)
     size = (image.shape[2], image.shape[3])
     candidate = F.interpolate(torch.maximum(is_above, _highest_nearby(weight)), size) > 0
@@ -72,7 +72,7 @@ def sky_mask(image: Tensor) -> Tensor:
 
 
 def find_sky(image: Tensor) -> Sky:
-    """Return the sky at the nodes of a lattice; see `sky_mask`."""
+    """Return the sky at the nodes of a lattice, before smooth nodes around join it; see `sky_mask`."""
     stride = max(1, max(image.shape[2:]) // _NODES)
     nodes = _nodes(image.detach(), stride)
     y = luma(nodes)

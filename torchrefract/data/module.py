@@ -289,6 +289,7 @@ def frames(
 def pairs(
     *,
     root: str | Path,
+    size: Sequence[int] | None = None,
     batch_size: int = 16,
     workers: int = 2,
     seed: int = 0,
@@ -296,5 +297,6 @@ def pairs(
     flow: bool = False,
 ) -> PairData:
     """Make the data of pairs from disk, with their splits; see `PairedFolder` and `PairData` for the arguments."""
-    train, val = (PairedFolder(root, split=split, transmission=transmission, flow=flow) for split in ("train", "val"))
+    options: dict[str, Any] = {"size": size, "transmission": transmission, "flow": flow}
+    train, val = (PairedFolder(root, split=split, **options) for split in ("train", "val"))
     return PairData(train, val, effect=None, batch_size=batch_size, workers=workers, seed=seed)

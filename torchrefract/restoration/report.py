@@ -108,13 +108,15 @@ def describe_training(trainer: Trainer, model: RestorationModule) -> list[str]:
     train, val = origin["data"], fingerprint(data.val)
     share = val["frames"] / (train["frames"] + val["frames"])
     steps, per_epoch = trainer.estimated_stepping_batches, trainer.num_training_batches
+    batch = data.batch_size * trainer.world_size
     lines = {
         "frames": f"{train['frames']} of {train['source']}" + (f" {root}" if (root := train["root"]) else ""),
         "drives": "unknown" if train["drives"] is None else str(train["drives"]),
         "size": f"{train['size'][0]}x{train['size'][1]} px, height and width",
         "validation": f"{val['frames']} frames, {share:.0%} of all"
-        + ("" if val["drives"] is None else f", of {val['drives']} other drives"),
-        "steps": f"{steps} in {trainer.max_epochs} epochs of {per_epoch}, of {data.batch_size} frames each",
+        + ("" if val["drives"] is None else f", of {val['drives']} other drives")
+        + ("" if (limit := trainer.limit_val_batches) == 1.0 else f", limit_val_batches {limit}"),
+        "steps": f"{steps} in {trainer.max_epochs} epochs of {per_epoch}, of {batch} frames each",
         "scene": describe_scene(data.effect, origin["config"]["data"].get("effect")),
     }
     if model.schedule == "cosine" and (num := model.num_warmup_steps(int(steps))) < model.warmup_steps:

@@ -29,7 +29,7 @@ from torch.utils.data import DataLoader, Subset
 
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract.data.frames import FrameFolder
-from torchrefract.data.module import make_pair
+from torchrefract.data.module import BORDERS, make_pair
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import OneOf
 from torchrefract.effects.flare import LensFlare
@@ -140,11 +140,10 @@ def effects_of(task: str, width: int) -> dict[str, tuple[Effect, bool]]:
     """Return the scored effects of a task by name, each with True if it is in the paper's mix."""
     if task == "undistort":
         names = ("cheap_dashcam lens", "turbulence", "thin-plate spline", "divergence-free")
-        others = {"wide lens": LensDistortion(k1_range=(-0.4, 0.2), focal_range=(0.9, 1.1))}
-        for border, padding in (("black", "zeros"), ("mirrored", "reflection")):
-            others[f"cheap_dashcam lens, {border} border"] = cheap_dashcam(frame="pad", padding=padding)
+        wide = LensDistortion(k1_range=(-0.4, 0.2), focal_range=(0.9, 1.1))
+        bordered = {f"cheap_dashcam lens, {border} border": (cheap_dashcam(), False) for border in BORDERS}
         mix = _in_mix(paper_refractive(width=width, frame="fill"), names)
-        return mix | {name: (lens, False) for name, lens in others.items()}
+        return mix | {"wide lens": (wide, False)} | bordered
     return _in_mix(paper_weather(), ("uniform fog", "heterogeneous fog", "lens flare"))
 
 
@@ -152,9 +151,10 @@ def _in_mix(mix: OneOf, names: Sequence[str]) -> dict[str, tuple[Effect, bool]]:
     return {name: (cast(Effect, effect), True) for name, effect in zip(names, mix.effects, strict=True)}
 
 
-def corrupt(frames: Iterable[Frame], effect: Effect) -> list[Pair]:
-    """Degrade batches of frames; the draws depend on the keys of the frames only."""
-    return [make_pair(frame, effect, seed=_SEED) for frame in frames]
+def corrupt(frames: Iterable[Frame], effect: Effect, name: str) -> list[Pair]:
+    """Degrade batches of frames, with a border if the name ends in one; draws depend on the keys of the frames only."""
+    border = next((border for border in BORDERS if name.endswith(f"{border} border")), None)
+    return [make_pair(frame, effect, seed=_SEED, border=border) for frame in frames]
 
 
 def score_references(task: str, effect: Effect, frames: Iterable[Frame], pairs: list[Pair]) -> dict[str, Tensor]:
@@ -222,7 +222,7 @@ def score_task(task: str, models: dict[str, Loaded], args: argparse.Namespace) -
         held_out = FrameFolder(args.source, size=size, split="val")
         frames = _load_frames(held_out, args.frames, args.device)
         effects = effects_of(task, size[1])
-        pairs = {name: corrupt(frames, effect) for name, (effect, _) in effects.items()}
+        pairs = {name: corrupt(frames, effect, name) for name, (effect, _) in effects.items()}
         groups = _group_keys(held_out, args.groups)
         references, keys = dict[str, dict[str, Tensor]](), _keys(frames)
         for name, (effect, _) in effects.items():

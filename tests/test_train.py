@@ -212,6 +212,10 @@ def test_a_finished_run_cannot_be_resumed(call, trained):
             ("+task=deweather", "task.transmission_head=true", "scene=cheap_dashcam"),
             "data: effect must have a transmission, as fog has, got LensDistortion",
         ),
+        (
+            ("+task=undistort", "scene=paper_refractive", "data.border=black"),
+            "data: border must be null unless the scene is a lens that fills its frames, got black",
+        ),
         (("+task=undistort", "run_dir=/dev/null/run"), "run_dir: "),
         (("+task=undistort", "model.lr=nan"), "model: lr must not be NaN, got nan"),
         (("+task=undistort", "model.weight_decay=-1"), "model: weight_decay must be a number of at least 0, got -1"),
@@ -301,7 +305,7 @@ def test_an_evaluation_scores_by_default_what_the_checkpoint_was_validated_on_an
     assert "; unlike its own validation in data.effect.severity, data.val_count\n" in outcome.out
     outcome = call("eval", f"ckpt_path={checkpoint}", "scene=paper_refractive")
     assert (
-        " px, paper_refractive of severity 3, black border; unlike its own validation in data.effect._targ"
+        " px, paper_refractive of severity 3, padded frames; unlike its own validation in data.effect._targ"
         in outcome.out
     )
 
@@ -313,26 +317,23 @@ def test_the_same_checkpoint_is_scored_with_filled_frames_and_with_named_borders
         if "head" in name:
             weight.zero_()
     AtomicCheckpointIO().save_checkpoint(content, path)
-    borders = {
-        "": (),
-        ", black border": ("scene.frame=pad",),
-        ", mirrored border": ("scene.frame=pad", "scene.padding=reflection"),
-    }
-    for name, words in borders.items():
+    loader = DataLoader(RoadScenes(4, size=(32, 64), first=32), batch_size=4)
+    errors = []
+    for border, name in ((None, ""), ("black", ", black border"), ("mirrored", ", mirrored border")):
+        words = [] if border is None else [f"data.border={border}"]
         outcome = call("eval", f"ckpt_path={path}", *words, "data.val_count=4", "data.batch_size=4")
         assert outcome.code == 0, outcome.err
         head, *rows, _, verdict = outcome.out.splitlines()
         assert f"cheap_dashcam of severity 3{name}; " in head
-        options = dict(word.removeprefix("scene.").split("=") for word in words)
-        loader = DataLoader(RoadScenes(4, size=(32, 64), first=32), batch_size=4)
-        pair = make_pair(next(iter(loader)), presets.cheap_dashcam(**options), seed=0)
+        pair = make_pair(next(iter(loader)), presets.cheap_dashcam(), seed=0, border=border)
         expected_psnr = float(psnr(pair.degraded, pair.clean, pair.valid).mean())
-        expected_epe = float(endpoint_error(0 * pair.flow, pair.flow, pair.valid, size=(1080, 1920)).mean())
+        errors.append(float(endpoint_error(0 * pair.flow, pair.flow, pair.valid, size=(1080, 1920)).mean()))
         for method in ("do nothing", "model"):
             (row,) = (line for line in rows if line.startswith(f"{method}{name}  "))
             assert f"{expected_psnr:.2f} (+0.00)" in row
-            assert f"{expected_epe:.2f} (1.00 x do nothing)" in row
+            assert f"{errors[-1]:.2f} (1.00 x do nothing)" in row
         assert re.search(r"NOT (better )?than doing nothing \([+-]0\.00 px\)", verdict)
+    assert errors == [errors[0]] * 3
 
 
 def test_an_evaluation_runs_no_code_that_a_checkpoint_names(call, known_model, tmp_path):

@@ -9,7 +9,7 @@ import table1
 import torch
 from table1 import MIX, Scores, effects_of
 
-from torchrefract import LensDistortion, Pair
+from torchrefract import Frame, LensDistortion, Pair
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.restoration.checkpoints import load_model
 from torchrefract.restoration.tasks import Restored
@@ -31,17 +31,18 @@ def test_the_mix_is_the_mean_of_its_effects_for_all_frames_and_for_each_group():
     assert effects == {name: (1 + i) * 15 / 4 for i, name in enumerate(by_effect)}
 
 
-def test_lenses_fill_their_frames_but_in_the_rows_that_name_a_border():
-    lenses = {}
-    for name, (effect, in_mix) in effects_of("undistort", SIZE[1]).items():
-        if isinstance(effect, LensDistortion):
-            lenses[name] = (effect.frame, effect.padding, in_mix)
-    assert lenses == {
-        "cheap_dashcam lens": ("fill", "zeros", True),
-        "wide lens": ("fill", "zeros", False),
-        "cheap_dashcam lens, black border": ("pad", "zeros", False),
-        "cheap_dashcam lens, mirrored border": ("pad", "reflection", False),
+def test_lenses_fill_their_frames_but_in_the_tables_that_name_a_border():
+    lenses = {
+        n: effect for n, (effect, _) in effects_of("undistort", SIZE[1]).items() if isinstance(effect, LensDistortion)
     }
+    assert {lens.frame for lens in lenses.values()} == {"fill"}
+    names = ["cheap_dashcam lens, black border", "cheap_dashcam lens, mirrored border"]
+    assert [*lenses] == ["cheap_dashcam lens", "wide lens", *names]
+    frame = Frame(torch.ones(2, 3, *SIZE), torch.arange(2), torch.empty(0))
+    plain, black, mirrored = (table1.corrupt([frame], lenses[n], n)[0] for n in ("cheap_dashcam lens", *names))
+    assert plain.degraded.min() > 0.99
+    assert mirrored.degraded.min() > 0.99
+    assert 0.02 < (black.degraded == 0).float().mean() < 0.4
 
 
 def test_scores_are_those_of_the_task_with_nan_for_a_missing_map():

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor, nn
 
 from torchrefract import Pair, presets
+from torchrefract.data.module import road_scenes
 from torchrefract.restoration.module import Restoration
 from torchrefract.restoration.report import (
     RunSummary,
@@ -266,19 +267,20 @@ def test_the_verdict_compares_the_model_with_each_baseline_in_the_unit_of_the_ta
 
 @pytest.mark.quick
 @pytest.mark.parametrize(
-    ("effect", "name"),
+    ("effect", "border", "name"),
     [
-        (presets.cheap_dashcam(), ""),
-        (presets.cheap_dashcam(frame="pad"), "black border"),
-        (presets.paper_refractive(padding="reflection"), "mirrored border"),
-        (presets.paper_refractive(frame="fill"), ""),
-        (None, ""),
+        (presets.cheap_dashcam(), None, ""),
+        (presets.cheap_dashcam(), "black", "black border"),
+        (presets.cheap_dashcam(), "mirrored", "mirrored border"),
+        (presets.paper_refractive(), None, "padded frames"),
+        (presets.paper_refractive(frame="fill"), None, ""),
     ],
 )
-def test_a_border_of_padded_frames_names_the_scene_and_the_rows(effect, name):
-    assert border_name(effect) == name
-    scene = describe_scene(effect, {"_target_": "torchrefract.presets.a_scene", "severity": 3})
-    assert scene == ("degraded on disk" if effect is None else "a_scene of severity 3" + (f", {name}" if name else ""))
+def test_a_border_names_the_scene_and_the_rows(effect, border, name):
+    data = road_scenes(effect=effect, border=border)
+    assert border_name(data) == name
+    scene = describe_scene(data, {"_target_": "torchrefract.presets.a_scene", "severity": 3})
+    assert scene == "a_scene of severity 3" + (f", {name}" if name else "")
     rows = [line[:36].rstrip() for line in summary(scores(), (1080, 1920), border=name)]
     methods = ["do nothing", "best constant flow", "model"]
     assert rows == ["validation", *(f"{method}, {name}" if name else method for method in methods)]

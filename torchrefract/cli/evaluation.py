@@ -86,7 +86,7 @@ def use_validation_config(
 def describe_validation(data: PairData, cfg: DictConfig, changed: list[str] | None) -> str:
     """State in a line on what a checkpoint is scored, and how that differs from its own validation."""
     facts, limit = fingerprint(data.val), cfg.trainer.limit_val_batches
-    scene = describe_scene(data.effect, cfg.data.get("effect"))
+    scene = describe_scene(data, cfg.data.get("effect"))
     height, width = facts["size"]
     text = f"{facts['frames']} validation frames of {facts['source']}{f' {root}' if (root := facts['root']) else ''}"
     text += f", {height}x{width} px, {scene}" + ("" if limit is None else f", limit_val_batches {limit}")

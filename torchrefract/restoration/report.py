@@ -17,7 +17,6 @@ from torch import Tensor
 
 from torchrefract._io import replace_file
 from torchrefract.data.module import PairData, fingerprint
-from torchrefract.effects.base import Effect
 from torchrefract.effects.lens import LensDistortion
 from torchrefract.restoration.metrics import psnr
 from torchrefract.restoration.module import RestorationModule
@@ -35,7 +34,6 @@ from torchrefract.visualization.figures import (
 METRICS, METRICS_BEFORE = "metrics.csv", "metrics_before.csv"
 _PANEL_ROWS = 4
 _NAME_WIDTH = 36  # of the first column of the table
-_BORDERS = {"zeros": "black", "border": "smeared", "reflection": "mirrored"}  # by the padding of a lens
 _METHODS = {"do nothing": "_identity", "best constant flow": "_constant", "model": ""}
 
 
@@ -88,7 +86,7 @@ class RunSummary(Callback):
             save_figure(plot_curves(self.run_dir, epe_unit=f"px at {width}x{height}"), self.run_dir / "curves.png")
         save_figure(draw_panel(*self._examples), self.run_dir / "panel.png")
         data = getattr(trainer, "datamodule", None)
-        border = border_name(data.effect) if isinstance(data, PairData) else ""
+        border = border_name(data) if isinstance(data, PairData) else ""
         print("\n".join(summary(trainer.callback_metrics, pl_module.metric_size, border=border)))
         names = sorted(path.name for path in self.run_dir.glob("[!.]*") if path.is_file())
         print(f"{self.run_dir}: {', '.join(names)}")
@@ -117,31 +115,34 @@ def describe_training(trainer: Trainer, model: RestorationModule) -> list[str]:
         + ("" if val["drives"] is None else f", of {val['drives']} other drives")
         + ("" if (limit := trainer.limit_val_batches) == 1.0 else f", limit_val_batches {limit}"),
         "steps": f"{steps} in {trainer.max_epochs} epochs of {per_epoch}, of {batch} frames each",
-        "scene": describe_scene(data.effect, origin["config"]["data"].get("effect")),
+        "scene": describe_scene(data, origin["config"]["data"].get("effect")),
     }
     if model.schedule == "cosine" and (num := model.num_warmup_steps(int(steps))) < model.warmup_steps:
         lines["steps"] += f"; warm-up {num}, a tenth, instead of warmup_steps={model.warmup_steps}"
     return [f"{name:<12}{text}" for name, text in lines.items()]
 
 
-def describe_scene(effect: Effect | None, config: Mapping[str, Any] | None) -> str:
-    """Name a scene, its severity, and the border of frames that it pads.
+def describe_scene(data: PairData, config: Mapping[str, Any] | None) -> str:
+    """Name the scene of data, its severity, and the border of its frames.
 
     Args:
-        effect: the scene; None for pairs from disk.
-        config: of the effect.
+        data: frames and the scene, or pairs from disk.
+        config: of the scene.
     """
-    if effect is None or config is None:
+    if data.effect is None or config is None:
         return "degraded on disk"
     severity = f" of severity {config['severity']}" if "severity" in config else ""
-    border = f", {name}" if (name := border_name(effect)) else ""
+    border = f", {name}" if (name := border_name(data)) else ""
     return f"{str(config.get('_target_')).rpartition('.')[2]}{severity}{border}"
 
 
-def border_name(effect: Effect | None) -> str:
-    """Name the border that lenses leave in padded frames; empty if they fill their frames."""
-    lenses = (part for part in (() if effect is None else effect.modules()) if isinstance(part, LensDistortion))
-    return next((f"{_BORDERS[lens.padding]} border" for lens in lenses if lens.frame == "pad"), "")
+def border_name(data: PairData) -> str:
+    """Name the border of frames behind a lens; empty if they are filled."""
+    if data.border is not None:
+        return f"{data.border} border"
+    parts = () if data.effect is None else data.effect.modules()
+    is_padded = any(isinstance(part, LensDistortion) and part.frame == "pad" for part in parts)
+    return "padded frames" if is_padded else ""
 
 
 def summary(metrics: Mapping[str, Tensor], metric_size: tuple[int, int], *, border: str = "") -> list[str]:

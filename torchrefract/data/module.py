@@ -126,7 +126,7 @@ class PairData(LightningDataModule):
         """Raise ValueError if the first pair is unreadable or lacks a required map."""
         first = self.train[0]
         if isinstance(first, Frame) and self.effect is not None:
-            make_pair(default_collate([first]), self.effect, seed=0, **self._maps)
+            make_pair(default_collate([first]), self.effect, seed=0, border=None, **self._maps)
 
     def state_dict(self) -> dict[str, int]:
         """Return the position in the training, which checkpoints hold."""

@@ -77,7 +77,7 @@ def test_reduced_pairs_are_means_of_the_center_in_px_of_the_new_size(made, scene
 
 def test_a_reduced_pair_is_the_pair_of_the_reduced_frame(made):
     """The lens of a key is the same at any size of the frame; the zoom that fills frames depends on its pixels."""
-    out, effect = made("scene.frame=pad", scene="cheap_dashcam"), presets.cheap_dashcam(frame="pad")
+    out, effect = made("+scene.frame=pad", scene="cheap_dashcam"), presets.cheap_dashcam(frame="pad")
     small = PairedFolder(out, size=(16, 24), flow=True)
     for i in range(3):
         row, pair = small.row(i), small[i]

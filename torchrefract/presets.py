@@ -220,19 +220,19 @@ def unpaved_road(
     )
 
 
-def paper_refractive(severity: int = 3, *, width: float = _REFERENCE_WIDTH) -> OneOf:
+def paper_refractive(severity: int = 3, *, width: float = _REFERENCE_WIDTH, frame: str = "pad") -> OneOf:
     """Create the paper's four refractive distortions, one of them for each sample.
 
     Args:
-        severity: 1 to 5, displacements of severity / 3 times the paper's; the lens is that of `cheap_dashcam`, with a
-            black border.
+        severity: 1 to 5, displacements of severity / 3 times the paper's; the lens is that of `cheap_dashcam`.
         width: of the frames, px.
+        frame: of the lens, see `LensDistortion`. The paper's has a black border; Table 1 fills the frames.
     """
     scale = _at_severity(severity, [1 / 3, 2 / 3, 1.0, 4 / 3, 5 / 3])
     px = check_positive("width", width) / _REFERENCE_WIDTH
     return OneOf(
         [
-            _cheap_lens(severity, frame="pad"),
+            _cheap_lens(severity, frame=frame),
             Turbulence(
                 amplitude_range=(0.5 * scale * px, 1.5 * scale * px),
                 length_range=(20.0 * px, 60.0 * px),

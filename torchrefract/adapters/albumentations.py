@@ -47,8 +47,8 @@ class AlbumentationsEffect(DualTransform):
             and know the colors of fog and sun.
 
     Raises:
-        ValueError: p or channels out of range; images of one call whose draw gives them different flows, by a depth that is
-            computed from the image: degrade them one by one.
+        ValueError: p or channels out of range; images of one call whose draw gives them different flows, by a depth
+            that is computed from the image: degrade them one by one.
     """
 
     _targets = ALL_TARGETS

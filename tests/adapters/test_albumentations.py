@@ -1,11 +1,14 @@
 """Effects inside pipelines of Albumentations."""
 
+import importlib
 import json
-from typing import Any
+import sys
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 import torchrefract as tr
 from torchrefract import presets
@@ -72,8 +75,7 @@ def native(effect: Any, image: np.ndarray, out: dict[str, Any]) -> tuple[Any, di
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("name", EFFECTS)
-@pytest.mark.parametrize("form", CONVERSIONS)
+@pytest.mark.parametrize(("name", "form"), [*zip(EFFECTS, CONVERSIONS, strict=True)])
 @pytest.mark.filterwarnings("ignore:depth is that of a road")
 def test_labels_agree_with_the_native_ones_to_a_twentieth_of_a_pixel(name, form):
     effect, image = EFFECTS[name], picture()
@@ -159,9 +161,8 @@ def test_angles_and_scales_of_keypoints_follow_the_local_jacobian(name, degrees)
     assert np.allclose(out["keypoints"][:, 3], 3 * (u * t - v * s).abs().sqrt(), rtol=2e-3)
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
-@pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize("effect", [CHAIN, tr.UniformFog()])
+@pytest.mark.parametrize(("channels", "dtype"), [(1, np.float32), (3, np.uint8)])
+@pytest.mark.parametrize("effect", [STRONG, tr.UniformFog()])
 def test_pictures_keep_their_kind_and_equal_the_native_ones(effect, channels, dtype):
     image = picture(channels, dtype)
     for given in (image, image[:, ::-1]):
@@ -223,21 +224,43 @@ def test_images_whose_depths_give_them_other_flows_raise():
 
 
 def test_the_seed_of_a_pipeline_and_replay_repeat_the_draws():
-    one, two = pipeline(CHAIN, seed=5), pipeline(CHAIN, seed=5)
+    one, two = pipeline(STRONG, seed=5), pipeline(STRONG, seed=5)
     first = [one(image=picture(), **labels()) for _ in range(2)]
     again = [two(image=picture(), **labels()) for _ in range(2)]
     for a, b in zip(first, again, strict=True):
         assert np.array_equal(a["image"], b["image"])
         assert np.array_equal(a["bboxes"], b["bboxes"])
     assert not np.array_equal(first[0]["image"], first[1]["image"])
-    recorded = A.ReplayCompose([adapter.AlbumentationsEffect(CHAIN, p=0.9), A.HorizontalFlip()])(image=picture())
+    recorded = A.ReplayCompose([adapter.AlbumentationsEffect(STRONG, p=0.9), A.HorizontalFlip()])(image=picture())
     for image in (picture(), picture(1)):
         replayed = A.ReplayCompose.replay(json.loads(json.dumps(recorded["replay"])), image=image)["image"]
         assert image.ndim == 2 or np.array_equal(replayed, recorded["image"])
     assert replayed.shape == (H, W)
 
 
-@pytest.mark.parametrize("name", EFFECTS)
+def pictures_of_workers(seed: int | None) -> list[bytes]:
+    transform = A.Compose([adapter.AlbumentationsEffect(STRONG)], seed=seed)
+    loader = DataLoader(
+        cast(Any, [picture()] * 4), num_workers=2, collate_fn=lambda rows: transform(image=rows[0])["image"]
+    )
+    return [image.tobytes() for _ in range(2) for image in loader]
+
+
+def test_workers_and_epochs_draw_anew_without_a_seed_and_repeat_with_one():
+    torch.manual_seed(0)
+    drawn = pictures_of_workers(None)
+    assert len(set(drawn)) == 8
+    assert len(set(pictures_of_workers(9))) == 2
+
+
+def test_without_albumentations_the_error_names_the_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "albumentations.core.transforms_interface", None)
+    monkeypatch.delitem(sys.modules, adapter.__name__)
+    with pytest.raises(ImportError, match=r'needs Albumentations: pip install "torchrefract\[albumentations\]"'):
+        importlib.import_module(adapter.__name__)
+
+
+@pytest.mark.parametrize("name", ["chain", "haze"])
 @pytest.mark.filterwarnings("ignore:depth is that of a road")
 def test_a_saved_pipeline_gives_the_same_pictures(name, tmp_path):
     chain = A.Compose([adapter.AlbumentationsEffect(EFFECTS[name], p=0.99)], seed=6)

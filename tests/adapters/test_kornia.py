@@ -1,5 +1,8 @@
 """Effects inside containers of kornia."""
 
+import importlib
+import sys
+
 import pytest
 import torch
 from torch import nn
@@ -56,9 +59,16 @@ def test_labels_follow_a_depth_that_is_computed_from_the_image():
     flow = near_or_far.degrade(image, seed=params["seed"], keys=params["keys"]).flow
     assert_close(moved, warp_points(points, flow)[0], rtol=0, atol=1e-3)
     assert (moved - points).abs().max() > 0.1
+    other = K.AugmentationSequential(adapter.KorniaEffect(near_or_far), data_keys=["input"])
     with pytest.raises(ValueError, match="labels must be passed in one call with their image"):
-        other = K.AugmentationSequential(adapter.KorniaEffect(near_or_far), data_keys=["input"])
         other(points, params=container._params, data_keys=["keypoints"])
+
+
+def test_without_kornia_the_error_names_the_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "kornia.constants", None)
+    monkeypatch.delitem(sys.modules, adapter.__name__)
+    with pytest.raises(ImportError, match="needs kornia: pip install kornia"):
+        importlib.import_module(adapter.__name__)
 
 
 def test_extra_args_of_the_container_interpolate_masks():

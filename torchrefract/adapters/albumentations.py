@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.data import get_worker_info
 
 from torchrefract._validation import check_choice, check_number
 from torchrefract.adapters.config import effect_from_config, effect_to_config
@@ -30,8 +31,11 @@ class AlbumentationsEffect(DualTransform):
     """Make an effect a transform for `albumentations.Compose`, also inside the `augmentations=[...]` of Ultralytics.
 
     One draw degrades all images of a call and moves all labels: `image`, `images`, `mask`, `masks`, `bboxes`,
-    `keypoints`, volumes, and additional targets. Images are uint8 or floating in [0, 1]. The seed of the draw comes
-    from the generator of the `Compose`, so `Compose(seed=...)` and `ReplayCompose` repeat it.
+    `keypoints`, volumes, and additional targets. Images are uint8 or floating in [0, 1].
+
+    The seed of the draw comes from the generator of the `Compose`, so `Compose(seed=...)` and `ReplayCompose` repeat
+    it. In workers of a DataLoader, a `Compose` without a seed draws by the seed of the worker; one with a seed repeats
+    its draws in each worker and epoch, as it does for all transforms.
 
     Boxes become the smallest boxes around the part of their warped outlines in the frame. Those that leave it go, with
     their labels, as do those below the `min_visibility` of `BboxParams`, the visible share of the warped box. Masks
@@ -69,7 +73,9 @@ class AlbumentationsEffect(DualTransform):
 
     def get_params(self) -> dict[str, Any]:
         """Draw the seed, which determines the parameters of the effect."""
-        return {"seed": int(self.random_generator.integers(2**63))}
+        seed, worker = int(self.random_generator.integers(2**63)), get_worker_info()
+        # Each worker of each epoch gets a copy of the same generator; Ultralytics seeds them itself.
+        return {"seed": seed if worker is None or self.seed is not None else seed ^ worker.seed}
 
     def apply_with_params(self, params: dict[str, Any], *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Degrade the first image, whose flow all labels follow, then each target."""

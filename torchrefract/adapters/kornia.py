@@ -3,10 +3,6 @@
 from typing import Any
 
 import torch
-from kornia.augmentation import RigidAffineAugmentationBase2D
-from kornia.constants import Resample
-from kornia.geometry.boxes import Boxes
-from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 
 from torchrefract import random
@@ -14,6 +10,14 @@ from torchrefract.effects.base import Effect
 from torchrefract.labels.boxes import warp_boxes
 from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.points import warp_points
+
+try:
+    from kornia.augmentation import RigidAffineAugmentationBase2D
+    from kornia.constants import Resample
+    from kornia.geometry.boxes import Boxes
+    from kornia.geometry.keypoints import Keypoints
+except ModuleNotFoundError as error:
+    raise ImportError("this adapter needs kornia: pip install kornia") from error
 
 
 class KorniaEffect(RigidAffineAugmentationBase2D):

@@ -38,8 +38,7 @@ class FindSign(pl.LightningModule):
         return SCENE(*batch) if self.trainer.training else batch
 
     def training_step(self, batch: Any) -> Tensor:
-        frames, boxes = batch
-        return nn.functional.l1_loss(self.net(frames), torch.cat(boxes) / SIZE[1])
+        return nn.functional.l1_loss(self.net(batch[0]), torch.cat(batch[1]) / SIZE[1])
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return torch.optim.AdamW(self.parameters(), lr=1e-3)

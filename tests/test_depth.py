@@ -269,6 +269,13 @@ def log_error(depth: Tensor, truth: Tensor) -> float:
     return ratio.log10().abs().mean().item()
 
 
+@pytest.mark.parametrize("effect", [tr.Turbulence, tr.UniformFog])
+def test_a_function_sees_uint8_frames_as_floats(effect):
+    image, seen = torch.randint(0, 256, (1, 3, 16, 20), dtype=torch.uint8), []
+    effect(depth=lambda frames: seen.append(frames) or 50 + frames[:, :1]).degrade(image)
+    assert_close(seen[0], image / 255)
+
+
 def test_the_corridor_is_nearer_to_rendered_depth_than_a_flat_road_and_the_ramp():
     image, depth = render_road_scenes(torch.arange(16), 90, 160)
     size = {"dtype": torch.float32, "device": torch.device("cpu")}

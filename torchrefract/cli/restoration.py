@@ -220,7 +220,7 @@ def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
         batch = check_count("batch", cfg.batch)
     with naming("side_by_side"):
         side_by_side = check_flag("side_by_side", cfg.side_by_side)
-    device = _find_device(str(cfg.device))
+    device = find_device(str(cfg.device))
     loaded = load_model(Path(str(cfg.ckpt_path)), changes=cfg.model)
     with naming("size"):
         size = loaded.size if cfg.size is None else check_size("size", cfg.size)
@@ -235,7 +235,7 @@ def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
     return _Job(restorer, source, out, batch, side_by_side, device)
 
 
-def _find_device(name: str) -> torch.device:
+def find_device(name: str) -> torch.device:
     try:
         device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
         torch.empty(0, device=device)

@@ -1,0 +1,333 @@
+"""The radial lens that makes straight edges of pictures straight, without a board.
+
+A lens of k1 and k2 is fitted to edge chains: smooth pieces of edges, long enough to tell whether they bend. Many chains
+of a road picture are really curved, so that the cost of a chain is bounded. Coefficients are relative to the half
+diagonal of the frame here: k1 + k2 is the shift of a corner, in half diagonals. They need no focal length.
+
+Source: Devernay and Faugeras, "Straight lines have to be straight", Machine Vision and Applications 13 (2001).
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrefract.cameras.brown_conrady import POLYNOMIAL12, Terms, distort_with_jacobian
+from torchrefract.cameras.projection import undistort, valid_radius
+
+NUM_POINTS = 24  # of a chain
+_MAX_WIDTH = 1280  # px, to which wider frames are reduced for the detection: edges of larger frames break in noise
+_BLUR_PX = 1.0
+_GRADIENT, _ANCHOR = 20, 4  # thresholds of edge drawing, in levels of an 8-bit picture
+_BORDER_PX = 4  # chains this close to the border may be the border
+_MIN_LENGTH = 0.05  # widths
+_ARM, _MAX_TURN_DEG = 0.006, 12.0  # widths, of the chords between which a chain turns less than the angle
+_TRIMMED = 3  # points next to a corner
+
+_RASTER = 320  # px, width of the map that tells the edges of the car from those of the road
+_MIN_STATIC, _STATIC_SHARE = 2.5, 0.2  # frames, and their share, with an edge at one place
+_MIN_OFFSET = 0.2  # half diagonals, of the chain's line from the center
+_MIN_LEVERAGE = 0.3  # standard deviations of bend that a lens of k1 = -0.1 adds
+_MAX_CHAINS = 600
+
+_NOISE_FACTOR, _MIN_NOISE_PX, _WORLD_BEND = 1.5, 0.03, 6e-4  # of the bend; the last in lengths of the chain
+_CURVED_BEND = 0.004  # lengths, typical bend of edges that are curved
+_OUTLIERS = 0.2  # relative density of curved edges
+# Standard deviations of k1, and of k2 + 0.4 k1: published lenses lie within about one.
+_PRIOR_K1, _PRIOR_K2, _SLOPE = 0.2, 0.07, -0.4
+_K1 = np.linspace(-0.45, 0.25, 36)
+_K2 = np.linspace(-0.15, 0.15, 13)  # minus the slope times k1
+_MIN_FRAMES = 8  # for a bootstrap over frames; below, over chains
+_NUM_BOOTSTRAPS = 200
+
+
+class Chains(NamedTuple):
+    """Chains of several frames of one camera that tell something about its lens."""
+
+    points: Tensor  # (C, 24, 2), px, float64
+    noise: Tensor  # (C,), px, standard deviation of the bend of a straight edge
+    curved: Tensor  # (C,), px, scale of the bend of a curved edge
+    frame: Tensor  # (C,), number of the frame
+    size: tuple[int, int]  # height and width of the frames, px
+
+
+class Gaussian(NamedTuple):
+    """A normal distribution of k1 and k2, relative to the half diagonal."""
+
+    mean: Tensor  # (2,)
+    covariance: Tensor  # (2, 2)
+
+
+class LineFit(NamedTuple):
+    """A lens that makes chains straight."""
+
+    coefficients: Tensor  # (2,), k1 and k2, relative to the half diagonal
+    covariance: Tensor  # (2, 2)
+    is_straight: Tensor  # (C,), bool: the chain is more likely straight than curved
+
+
+def published_prior() -> Gaussian:
+    """Return the distribution of published lenses, centered at no distortion; a barrel mostly has a positive k2."""
+    variance = _PRIOR_K1**2
+    rows = [[variance, _SLOPE * variance], [_SLOPE * variance, _SLOPE**2 * variance + _PRIOR_K2**2]]
+    return Gaussian(torch.zeros(2, dtype=torch.float64), torch.tensor(rows, dtype=torch.float64))
+
+
+def find_chains(gray: np.ndarray) -> Tensor:
+    """Find edge chains (C, 24, 2), px, float64, in a gray picture (H, W), uint8.
+
+    Edge drawing finds connected edges. They are moved to the maximum of the gradient along its direction, cut at
+    corners, and kept from a length of 0.05 widths on. The points of a chain are means over 24 equal parts of it.
+
+    Source: Topal and Akinlar, "Edge Drawing", Journal of Visual Communication and Image Representation 23 (2012).
+    """
+    scale = min(1.0, _MAX_WIDTH / gray.shape[1])
+    if scale < 1:
+        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    height, width = gray.shape
+    smooth = cv2.GaussianBlur(gray, (0, 0), _BLUR_PX)
+    options = cv2.ximgproc.EdgeDrawing.Params()
+    options.EdgeDetectionOperator = cv2.ximgproc.EDGE_DRAWING_SOBEL
+    options.GradientThresholdValue, options.AnchorThresholdValue = _GRADIENT, _ANCHOR
+    options.MinPathLength, options.NFAValidation = round(_MIN_LENGTH * width), False
+    options.Sigma = 1e-3  # the picture is smooth already
+    detector = cv2.ximgproc.createEdgeDrawing()
+    detector.setParams(options)
+    detector.detectEdges(smooth)
+    slopes = [cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1))]
+    chains = [
+        _resample(piece)
+        for edge in detector.getSegments()
+        for piece in _smooth_pieces(_to_subpixel(np.asarray(edge, np.float32).reshape(-1, 2), *slopes), width)
+    ]
+    points = np.array(chains, dtype=np.float64).reshape(-1, NUM_POINTS, 2)
+    inside = (points > _BORDER_PX) & (points < np.array([width, height]) - 1 - _BORDER_PX)
+    return torch.from_numpy((points[inside.all(axis=(1, 2))] + 0.5) / scale - 0.5)
+
+
+def pool_chains(chains: Sequence[Tensor], size: tuple[int, int]) -> Chains:
+    """Pool the chains of frames of one camera, and drop those that tell nothing about its lens.
+
+    Dropped are edges that stay at one place, as those of the bonnet; lines through the middle of the frame, which a
+    lens bends less than a road does; and chains whose noise exceeds what a lens of k1 = -0.1 bends them by.
+
+    Args:
+        chains: of each frame, by `find_chains`.
+        size: height and width of the frames, px.
+    """
+    points = torch.cat([*chains, torch.empty(0, NUM_POINTS, 2, dtype=torch.float64)])
+    frame = torch.cat([torch.full((len(c),), i) for i, c in enumerate(chains)] + [torch.empty(0, dtype=torch.long)])
+    half_diagonal, center = _frame(size)
+    chord = points[:, -1] - points[:, 0]
+    normal = torch.stack([-chord[:, 1], chord[:, 0]], dim=1) / chord.norm(dim=1, keepdim=True)
+    offset = ((points.mean(dim=1) - center) * normal).sum(dim=1).abs() / half_diagonal
+    keep = ~_is_static(points, frame, len(chains), size) & (offset > _MIN_OFFSET)
+    points, frame, length = points[keep], frame[keep], chord[keep].norm(dim=1)
+    none, barrel = points.new_tensor([0.0, 0.0]), points.new_tensor([-0.1, 0.0])
+    errors, _ = _line_errors(points, none, size)
+    shapes = _polynomials(NUM_POINTS, 4)
+    rough = (errors - errors @ shapes @ shapes.T).square().mean(dim=1)
+    pixel = max(1.0, size[1] / _MAX_WIDTH)
+    noise = (_NOISE_FACTOR**2 * rough / NUM_POINTS + (_MIN_NOISE_PX * pixel) ** 2 + (_WORLD_BEND * length) ** 2).sqrt()
+    leverage = (bends(points, barrel, size)[0] - bends(points, none, size)[0]).abs() / noise
+    best = leverage.argsort(descending=True)[:_MAX_CHAINS]
+    best = best[leverage[best] > _MIN_LEVERAGE].sort().values
+    return Chains(points[best], noise[best], _CURVED_BEND * length[best], frame[best], size)
+
+
+def bends(points: Tensor, coefficients: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Compute how far chains are bent after undistortion, measured back in px of the distorted frame.
+
+        bend = sum_i q_i e_i / sqrt(M),  e_i = n (u_i - mean u) / |J^T n|,  J = du / dp
+
+    u_i are the undistorted points p_i of a chain, n is the normal of the line fitted to them by total least squares,
+    and q is the unit vector of a parabola along the chain. The division by |J^T n| turns a distance from the line into
+    a distance in the distorted frame, so that a lens that shrinks the frame gains nothing. Differentiable.
+
+    Args:
+        points: (C, M, 2), px, float64.
+        coefficients: (2,), k1 and k2, relative to the half diagonal.
+        size: height and width of the frame, px; its middle is the center of the lens.
+
+    Returns:
+        (C,), px, and (C,), bool: the lens does not fold back at the chain.
+
+    Source: Sampson, "Fitting conic sections to very scattered data", Computer Graphics and Image Processing 18 (1982).
+    """
+    errors, valid = _line_errors(points, coefficients, size)
+    return errors @ _polynomials(points.shape[1], 3)[:, 2] / math.sqrt(points.shape[1]), valid
+
+
+def line_costs(chains: Chains, coefficients: Tensor) -> Tensor:
+    """Return the cost (C,) of chains, -log of the likelihood of a mixture of straight and curved edges.
+
+        cost = -log((exp(-z^2 / 2) + e) / (1 + e)),  z = bend / noise,  e = 0.2 noise / curved
+
+    A chain at which the lens folds back has the cost of a curved one. Differentiable in k1 and k2 (2,).
+    """
+    return _costs(*bends(chains.points, coefficients, chains.size), chains)
+
+
+def fit_lens(chains: Chains, prior: Gaussian) -> LineFit:
+    """Fit k1 and k2 to chains: the minimum of the sum of `line_costs` and the prior.
+
+    The cost has several minima. The search starts at the best of a grid of lenses that do not fold back inside the
+    frame; L-BFGS refines it in float64. The covariance is that of the posterior on the grid, over 200 resamples of the
+    frames (of the chains, for less than eight frames), about the minimum.
+    """
+    grid = _lens_grid()
+    sparse = chains._replace(points=chains.points[:, 1::2])
+    with torch.no_grad():
+        table = torch.stack([line_costs(sparse, lens) for lens in grid])
+    start = grid[(table.sum(dim=1) + _prior_cost(grid, prior)).argmin()]
+    best = _refine(chains, prior, start)
+    covariance = _bootstrap(table, grid, prior, chains.frame, best)
+    bend, valid = bends(chains.points, best, chains.size)
+    odds = torch.exp(-(bend / chains.noise).square() / 2) * chains.curved / (_OUTLIERS * chains.noise)
+    return LineFit(best, covariance, valid & (odds > 1))
+
+
+def covers_frame(coefficients: Tensor) -> bool:
+    """Return True if a lens (2,), relative to the half diagonal, shows a ray in every pixel of its frame."""
+    radius = min(valid_radius(_polynomial(coefficients), model="polynomial12").item(), 10.0)
+    k1, k2 = coefficients.tolist()
+    return radius * (1 + k1 * radius**2 + k2 * radius**4) >= 1
+
+
+def _to_subpixel(edge: np.ndarray, slope_x: np.ndarray, slope_y: np.ndarray) -> np.ndarray:
+    """Move points (N, 2) by at most 1 px to the maximum of the gradient along it, by a parabola."""
+    x, y = edge.astype(int).T
+    strength = np.hypot(slope_x[y, x], slope_y[y, x])
+    normal = np.stack([slope_x[y, x], slope_y[y, x]], axis=1) / np.maximum(strength, 1e-6)[:, None]
+
+    def gradient(shift: int) -> np.ndarray:
+        u, v = (edge + shift * normal).T.copy()
+        return np.hypot(*(cv2.remap(slope, u, v, cv2.INTER_LINEAR)[:, 0] for slope in (slope_x, slope_y)))
+
+    before, after = gradient(-1), gradient(1)
+    curvature = np.minimum(before - 2 * strength + after, -1e-3)
+    return edge.astype(np.float64) + ((before - after) / (2 * curvature)).clip(-1, 1)[:, None] * normal
+
+
+def _smooth_pieces(edge: np.ndarray, width: int) -> Iterator[np.ndarray]:
+    """Cut an edge (N, 2) where the chords before and behind a point turn, and yield the long pieces."""
+    arm = max(6, round(_ARM * width))
+    ahead, behind = edge[2 * arm :] - edge[arm:-arm], edge[arm:-arm] - edge[: -2 * arm]
+    cross = behind[:, 0] * ahead[:, 1] - behind[:, 1] * ahead[:, 0]
+    turn = np.abs(np.arctan2(cross, (behind * ahead).sum(axis=1)))
+    corners = arm + np.flatnonzero(turn > math.radians(_MAX_TURN_DEG))
+    for piece in np.split(edge, corners):
+        kept = piece[_TRIMMED:-_TRIMMED]
+        if len(kept) >= NUM_POINTS and np.hypot(*(kept[-1] - kept[0])) >= _MIN_LENGTH * width:
+            yield kept
+
+
+def _resample(piece: np.ndarray) -> np.ndarray:
+    """Return the means (24, 2) over equal parts of a chain (N, 2)."""
+    return np.array([part.mean(axis=0) for part in np.array_split(piece, NUM_POINTS)])
+
+
+def _is_static(points: Tensor, frame: Tensor, num_frames: int, size: tuple[int, int]) -> Tensor:
+    """Return (C,), bool: other frames have an edge at the same place, so that it belongs to the car or the lens."""
+    scale = _RASTER / size[1]
+    shape = math.ceil(size[0] * scale) + 1, _RASTER + 1
+    pixels, count = (points.numpy() * scale).round().astype(np.int32), np.zeros(shape, np.int32)
+    for i in range(num_frames):
+        drawn = np.zeros(shape, np.uint8)
+        cv2.polylines(drawn, list(pixels[frame.numpy() == i]), isClosed=False, color=1)
+        count += drawn
+    mean = count[pixels[..., 1], pixels[..., 0]].mean(axis=1)
+    return torch.from_numpy(mean >= max(_MIN_STATIC, _STATIC_SHARE * num_frames))
+
+
+def _frame(size: tuple[int, int]) -> tuple[float, Tensor]:
+    """Return the half diagonal, px, and the center (2,) of a frame."""
+    height, width = size
+    center = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
+    return math.hypot(height, width) / 2, center
+
+
+def _polynomials(count: int, number: int) -> Tensor:
+    """Return orthonormal polynomials of degrees 0, 1, ... at evenly spaced points, (count, number)."""
+    t = torch.linspace(-1, 1, count, dtype=torch.float64)
+    basis, triangle = torch.linalg.qr(torch.stack([t**i for i in range(number)], dim=1))
+    return basis * triangle.diagonal().sign()
+
+
+def _polynomial(coefficients: Tensor) -> Tensor:
+    """Return k1 and k2 (2,) as coefficients (1, 12) of "polynomial12"."""
+    return torch.cat([coefficients, coefficients.new_zeros(len(POLYNOMIAL12) - 2)])[None]
+
+
+def _line_errors(points: Tensor, coefficients: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Return e_i of `bends`, (C, M), px, and the validity (C,)."""
+    half_diagonal, center = _frame(size)
+    lens, shape = _polynomial(coefficients), points.shape[:2]
+    result = undistort(((points - center) / half_diagonal).reshape(1, -1, 2), lens, model="polynomial12")
+    x, y = (axis.unflatten(0, shape) for axis in result.points[0].unbind(-1))
+    _, jacobian = distort_with_jacobian(x, y, lens[..., None, None], Terms(2, False, False))
+    x, y = x - x.mean(dim=1, keepdim=True), y - y.mean(dim=1, keepdim=True)
+    # The direction of least variance: half the angle of the covariance, plus a right angle.
+    angle = torch.atan2(2 * (x * y).sum(dim=1), (x * x - y * y).sum(dim=1)) / 2
+    normal_x, normal_y = -angle.sin()[:, None], angle.cos()[:, None]
+    xx, xy, yx, yy = (value.view(shape) for value in jacobian)
+    # J is the inverse of the Jacobian of the distortion.
+    slope = torch.hypot(yy * normal_x - yx * normal_y, xx * normal_y - xy * normal_x) / (xx * yy - xy * yx).abs()
+    errors = half_diagonal * (x * normal_x + y * normal_y) / slope
+    return errors, result.valid.view(shape).all(dim=1)
+
+
+def _costs(bend: Tensor, valid: Tensor, chains: Chains) -> Tensor:
+    floor = _OUTLIERS * chains.noise / chains.curved
+    z = torch.where(valid, bend, 0.0) / chains.noise
+    cost = -torch.log((torch.exp(-z.square() / 2) + floor) / (1 + floor))
+    return torch.where(valid, cost, -torch.log(floor / (1 + floor)))
+
+
+def _lens_grid() -> Tensor:
+    """Return lenses (G, 2) that do not fold back inside the frame."""
+    lenses = torch.tensor([(k1, _SLOPE * k1 + k2) for k1 in _K1 for k2 in _K2], dtype=torch.float64)
+    return torch.stack([lens for lens in lenses if covers_frame(lens)])
+
+
+def _prior_cost(lenses: Tensor, prior: Gaussian) -> Tensor:
+    shift = lenses - prior.mean
+    return (shift @ torch.linalg.inv(prior.covariance) * shift).sum(dim=-1) / 2
+
+
+def _refine(chains: Chains, prior: Gaussian, start: Tensor) -> Tensor:
+    """Minimize the cost by L-BFGS from a lens (2,); return the start if the result folds back inside the frame."""
+    lens = start.clone().requires_grad_()
+    optimizer = torch.optim.LBFGS([lens], max_iter=40, line_search_fn="strong_wolfe")
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        cost = line_costs(chains, lens).sum() + _prior_cost(lens, prior)
+        cost.backward()
+        return cost
+
+    with torch.enable_grad():
+        optimizer.step(closure)
+    result = lens.detach()
+    return result if result.isfinite().all() and covers_frame(result) else start
+
+
+def _bootstrap(table: Tensor, grid: Tensor, prior: Gaussian, frame: Tensor, best: Tensor) -> Tensor:
+    """Return the covariance (2, 2) of the posterior about `best`, over resamples of the columns of a table (G, C)."""
+    groups = frame.unique(return_inverse=True)[1]
+    if len(groups) and int(groups.max()) + 1 < _MIN_FRAMES:
+        groups = torch.arange(len(frame))
+    number = int(groups.max()) + 1 if len(groups) else 1
+    random = torch.Generator().manual_seed(0)
+    drawn = torch.randint(number, (_NUM_BOOTSTRAPS, number), generator=random)
+    counts = torch.zeros(_NUM_BOOTSTRAPS, number, dtype=table.dtype).scatter_add_(
+        1, drawn, torch.ones_like(drawn, dtype=table.dtype)
+    )
+    cost = table @ counts[:, groups].T + _prior_cost(grid, prior)[:, None]
+    weight = torch.softmax(-cost, dim=0).mean(dim=1)
+    shift = grid - best
+    return (weight[:, None] * shift).T @ shift

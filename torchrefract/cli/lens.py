@@ -1,0 +1,96 @@
+"""The command that estimates the lens of a camera from the frames of a drive."""
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from itertools import accumulate
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig
+from torch import Tensor
+
+from torchrefract._validation import UsageError, check_count
+from torchrefract.cameras.calibration import estimate_lens as estimate
+from torchrefract.cameras.io import write_opencv
+from torchrefract.cli.command import naming, progress
+from torchrefract.data import media
+from torchrefract.data.images import UnreadableImageError, read_image
+from torchrefract.warping.flow import resize_image
+
+
+def estimate_lens(cfg: DictConfig) -> None:
+    """Estimate the lens of the camera of pictures and videos, write the camera, and print how certain it is."""
+    out = Path(str(cfg.out))
+    with naming("frames"):
+        most = check_count("frames", cfg.frames)
+    files = media.find_media(Path(str(cfg.input)))
+    if turned := media.describe_turned(files):
+        print(f"warning: {turned}", file=sys.stderr)
+    predict = None if cfg.checkpoint is None else _load_network(cfg)
+    chosen = _select_frames(files, most)
+    frames = progress(_read_frames(chosen), "estimating the lens", count=sum(len(times) for _, times in chosen))
+    with naming("input"):
+        result = estimate(frames, fov_deg=cfg.fov_deg, predict=predict)
+    with naming("out"):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_opencv(out, result.camera, covariance=result.covariance)
+    for message in result.warnings:
+        print(f"warning: {message}", file=sys.stderr)
+    k1, k2, *_ = result.camera.coefficients
+    deviations = result.covariance.diagonal()[4:6] ** 0.5
+    print(
+        f"{out}: k1 {k1:.3f} +- {deviations[0]:.3f}, k2 {k2:.3f} +- {deviations[1]:.3f} for a focal length of "
+        f"{result.camera.fx:.0f} px, from {result.num_frames} frames with {result.num_straight} straight edges of "
+        f"{result.num_chains}; standard deviation of the rectified position: {result.edge_px:.1f} px at the left and "
+        f"right edge, {result.corner_px:.1f} px in the corners"
+    )
+
+
+def _select_frames(files: Sequence[Path], most: int) -> list[tuple[Path, list[int]]]:
+    """Choose at most so many frames, evenly spaced over all files; return their numbers in each file."""
+    counts = [media.video_info(file)[0] if media.is_video(file) else 1 for file in files]
+    total, chosen = sum(counts), list[tuple[Path, list[int]]]()
+    numbers = [i * total // min(most, total) for i in range(min(most, total))]
+    for file, start, end in zip(files, accumulate([0, *counts]), accumulate(counts), strict=False):
+        chosen.append((file, [number - start for number in numbers if start <= number < end]))
+    return chosen
+
+
+def _read_frames(chosen: Sequence[tuple[Path, list[int]]]) -> Iterator[Tensor]:
+    """Yield frames (1, 3, H, W) as stored, in the frame of the sensor; name and skip unreadable files."""
+    num_read, reason = 0, ""
+    for file, times in chosen:
+        try:
+            if media.is_video(file):
+                frames = (frame for _, frame in media.read_video(file, times, upright=False))
+            else:
+                frames = (read_image(file, upright=False)[None] for _ in times)
+            for frame in frames:
+                yield frame
+                num_read += 1
+        except UnreadableImageError as error:
+            reason = str(error)
+            print(f"skipped: {reason}", file=sys.stderr)
+    if num_read == 0:
+        raise UsageError(f"input must hold a readable picture or video, got {reason or 'no frames'}")
+
+
+def _load_network(cfg: DictConfig) -> Callable[[Tensor], Tensor]:
+    """Return a function that predicts the flow of a frame by the model of a checkpoint, at the size of its training."""
+    # Estimation by lines alone needs no training stack.
+    from torchrefract.cli.restoration import find_device  # noqa: PLC0415
+    from torchrefract.restoration.checkpoints import load_model  # noqa: PLC0415
+    from torchrefract.restoration.tasks import Undistort  # noqa: PLC0415
+
+    loaded, device = load_model(Path(str(cfg.checkpoint))), find_device(str(cfg.device))
+    if loaded.task != Undistort.name:
+        raise UsageError(f"checkpoint must be of the task {Undistort.name}, got {cfg.checkpoint} of {loaded.task}")
+    model = loaded.model.to(device)
+
+    @torch.inference_mode()
+    def predict(frame: Tensor) -> Tensor:
+        flow = model(resize_image(frame.to(device), loaded.size)).flow
+        assert flow is not None  # the task predicts it
+        return flow.cpu()
+
+    return predict

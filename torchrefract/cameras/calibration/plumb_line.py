@@ -9,6 +9,7 @@ Source: Devernay and Faugeras, "Straight lines have to be straight", Machine Vis
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import cv2
@@ -43,6 +44,8 @@ _K1 = np.linspace(-0.45, 0.25, 36)
 _K2 = np.linspace(-0.15, 0.15, 13)  # minus the slope times k1
 _MIN_FRAMES = 8  # for a bootstrap over frames; below, over chains
 _NUM_BOOTSTRAPS = 200
+_LENSES_AT_ONCE = 16
+_MAX_STEPS, _SMALL_STEP = 30, 1e-6  # of Newton's method
 
 
 class Chains(NamedTuple):
@@ -127,13 +130,14 @@ def pool_chains(chains: Sequence[Tensor], size: tuple[int, int]) -> Chains:
     offset = ((points.mean(dim=1) - center) * normal).sum(dim=1).abs() / half_diagonal
     keep = ~_is_static(points, frame, len(chains), size) & (offset > _MIN_OFFSET)
     points, frame, length = points[keep], frame[keep], chord[keep].norm(dim=1)
-    none, barrel = points.new_tensor([0.0, 0.0]), points.new_tensor([-0.1, 0.0])
-    errors, _ = _line_errors(points, none, size)
+    none_and_barrel = points.new_tensor([[0.0, 0.0], [-0.1, 0.0]])
+    errors = _line_errors(points, none_and_barrel[:1], size)[0][0]
     shapes = _polynomials(NUM_POINTS, 4)
     rough = (errors - errors @ shapes @ shapes.T).square().mean(dim=1)
     pixel = max(1.0, size[1] / _MAX_WIDTH)
     noise = (_NOISE_FACTOR**2 * rough / NUM_POINTS + (_MIN_NOISE_PX * pixel) ** 2 + (_WORLD_BEND * length) ** 2).sqrt()
-    leverage = (bends(points, barrel, size)[0] - bends(points, none, size)[0]).abs() / noise
+    none, barrel = bends(points, none_and_barrel, size)[0]
+    leverage = (barrel - none).abs() / noise
     best = leverage.argsort(descending=True)[:_MAX_CHAINS]
     best = best[leverage[best] > _MIN_LEVERAGE].sort().values
     return Chains(points[best], noise[best], _CURVED_BEND * length[best], frame[best], size)
@@ -150,11 +154,11 @@ def bends(points: Tensor, coefficients: Tensor, size: tuple[int, int]) -> tuple[
 
     Args:
         points: (C, M, 2), px, float64.
-        coefficients: (2,), k1 and k2, relative to the half diagonal.
+        coefficients: (L, 2), k1 and k2 of lenses, relative to the half diagonal.
         size: height and width of the frame, px; its middle is the center of the lens.
 
     Returns:
-        (C,), px, and (C,), bool: the lens does not fold back at the chain.
+        (L, C), px, and (L, C), bool: the lens does not fold back at the chain.
 
     Source: Sampson, "Fitting conic sections to very scattered data", Computer Graphics and Image Processing 18 (1982).
     """
@@ -163,37 +167,40 @@ def bends(points: Tensor, coefficients: Tensor, size: tuple[int, int]) -> tuple[
 
 
 def line_costs(chains: Chains, coefficients: Tensor) -> Tensor:
-    """Return the cost (C,) of chains, -log of the likelihood of a mixture of straight and curved edges.
+    """Return the costs (L, C) of chains for lenses (L, 2), by the likelihood of a mixture of straight and curved edges.
 
         cost = -log((exp(-z^2 / 2) + e) / (1 + e)),  z = bend / noise,  e = 0.2 noise / curved
 
-    A chain at which the lens folds back has the cost of a curved one. Differentiable in k1 and k2 (2,).
+    A chain at which the lens folds back has the cost of a curved one. Differentiable.
     """
-    return _costs(*bends(chains.points, coefficients, chains.size), chains)
+    bend, valid = bends(chains.points, coefficients, chains.size)
+    floor = _OUTLIERS * chains.noise / chains.curved
+    likelihood = torch.where(valid, torch.exp(-(bend / chains.noise).square() / 2), 0.0)
+    return -torch.log((likelihood + floor) / (1 + floor))
 
 
 def fit_lens(chains: Chains, prior: Gaussian) -> LineFit:
     """Fit k1 and k2 to chains: the minimum of the sum of `line_costs` and the prior.
 
     The cost has several minima. The search starts at the best of a grid of lenses that do not fold back inside the
-    frame; L-BFGS refines it in float64. The covariance is that of the posterior on the grid, over 200 resamples of the
+    frame; Newton's method refines it. The covariance is that of the posterior on the grid, over 200 resamples of the
     frames (of the chains, for less than eight frames), about the minimum.
     """
     grid = _lens_grid()
     sparse = chains._replace(points=chains.points[:, 1::2])
     with torch.no_grad():
-        table = torch.stack([line_costs(sparse, lens) for lens in grid])
+        table = torch.cat([line_costs(sparse, lenses) for lenses in grid.split(_LENSES_AT_ONCE)])
     start = grid[(table.sum(dim=1) + _prior_cost(grid, prior)).argmin()]
     best = _refine(chains, prior, start)
     covariance = _bootstrap(table, grid, prior, chains.frame, best)
-    bend, valid = bends(chains.points, best, chains.size)
+    bend, valid = bends(chains.points, best[None], chains.size)
     odds = torch.exp(-(bend / chains.noise).square() / 2) * chains.curved / (_OUTLIERS * chains.noise)
-    return LineFit(best, covariance, valid & (odds > 1))
+    return LineFit(best, covariance, (valid & (odds > 1))[0])
 
 
 def covers_frame(coefficients: Tensor) -> bool:
     """Return True if a lens (2,), relative to the half diagonal, shows a ray in every pixel of its frame."""
-    radius = min(valid_radius(_polynomial(coefficients), model="polynomial12").item(), 10.0)
+    radius = min(valid_radius(_polynomial(coefficients[None]), model="polynomial12").item(), 10.0)
     k1, k2 = coefficients.tolist()
     return radius * (1 + k1 * radius**2 + k2 * radius**4) >= 1
 
@@ -206,7 +213,7 @@ def _to_subpixel(edge: np.ndarray, slope_x: np.ndarray, slope_y: np.ndarray) -> 
 
     def gradient(shift: int) -> np.ndarray:
         u, v = (edge + shift * normal).T.copy()
-        return np.hypot(*(cv2.remap(slope, u, v, cv2.INTER_LINEAR)[:, 0] for slope in (slope_x, slope_y)))
+        return np.hypot(*(cv2.remap(slope, u, v, cv2.INTER_LINEAR).ravel() for slope in (slope_x, slope_y)))
 
     before, after = gradient(-1), gradient(1)
     curvature = np.minimum(before - 2 * strength + after, -1e-3)
@@ -259,35 +266,29 @@ def _polynomials(count: int, number: int) -> Tensor:
 
 
 def _polynomial(coefficients: Tensor) -> Tensor:
-    """Return k1 and k2 (2,) as coefficients (1, 12) of "polynomial12"."""
-    return torch.cat([coefficients, coefficients.new_zeros(len(POLYNOMIAL12) - 2)])[None]
+    """Return k1 and k2 (L, 2) as coefficients (L, 12) of "polynomial12"."""
+    return torch.cat([coefficients, coefficients.new_zeros(len(coefficients), len(POLYNOMIAL12) - 2)], dim=1)
 
 
 def _line_errors(points: Tensor, coefficients: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Return e_i of `bends`, (C, M), px, and the validity (C,)."""
+    """Return e_i of `bends` for lenses (L, 2), (L, C, M), px, and the validity (L, C)."""
     half_diagonal, center = _frame(size)
-    lens, shape = _polynomial(coefficients), points.shape[:2]
-    result = undistort(((points - center) / half_diagonal).reshape(1, -1, 2), lens, model="polynomial12")
-    x, y = (axis.unflatten(0, shape) for axis in result.points[0].unbind(-1))
-    _, jacobian = distort_with_jacobian(x, y, lens[..., None, None], Terms(2, False, False))
-    x, y = x - x.mean(dim=1, keepdim=True), y - y.mean(dim=1, keepdim=True)
-    # The direction of least variance: half the angle of the covariance, plus a right angle.
-    angle = torch.atan2(2 * (x * y).sum(dim=1), (x * x - y * y).sum(dim=1)) / 2
-    normal_x, normal_y = -angle.sin()[:, None], angle.cos()[:, None]
+    lens, shape = _polynomial(coefficients), (len(coefficients), *points.shape[:2])
+    distorted = ((points - center) / half_diagonal).reshape(1, -1, 2).expand(len(coefficients), -1, -1)
+    result = undistort(distorted, lens, model="polynomial12")
+    x, y = result.points.unbind(-1)
+    _, jacobian = distort_with_jacobian(x, y, lens[..., None], Terms(2, False, False))
     xx, xy, yx, yy = (value.view(shape) for value in jacobian)
+    x, y = (axis.view(shape) - axis.view(shape).mean(dim=2, keepdim=True) for axis in (x, y))
+    # The direction of least variance: half the angle of the covariance, plus a right angle.
+    angle = torch.atan2(2 * (x * y).sum(dim=2), (x * x - y * y).sum(dim=2)) / 2
+    normal_x, normal_y = -angle.sin()[..., None], angle.cos()[..., None]
     # J is the inverse of the Jacobian of the distortion.
     slope = torch.hypot(yy * normal_x - yx * normal_y, xx * normal_y - xy * normal_x) / (xx * yy - xy * yx).abs()
-    errors = half_diagonal * (x * normal_x + y * normal_y) / slope
-    return errors, result.valid.view(shape).all(dim=1)
+    return half_diagonal * (x * normal_x + y * normal_y) / slope, result.valid.view(shape).all(dim=2)
 
 
-def _costs(bend: Tensor, valid: Tensor, chains: Chains) -> Tensor:
-    floor = _OUTLIERS * chains.noise / chains.curved
-    z = torch.where(valid, bend, 0.0) / chains.noise
-    cost = -torch.log((torch.exp(-z.square() / 2) + floor) / (1 + floor))
-    return torch.where(valid, cost, -torch.log(floor / (1 + floor)))
-
-
+@cache
 def _lens_grid() -> Tensor:
     """Return lenses (G, 2) that do not fold back inside the frame."""
     lenses = torch.tensor([(k1, _SLOPE * k1 + k2) for k1 in _K1 for k2 in _K2], dtype=torch.float64)
@@ -300,20 +301,22 @@ def _prior_cost(lenses: Tensor, prior: Gaussian) -> Tensor:
 
 
 def _refine(chains: Chains, prior: Gaussian, start: Tensor) -> Tensor:
-    """Minimize the cost by L-BFGS from a lens (2,); return the start if the result folds back inside the frame."""
-    lens = start.clone().requires_grad_()
-    optimizer = torch.optim.LBFGS([lens], max_iter=40, line_search_fn="strong_wolfe")
+    """Minimize the cost by Newton's method with halved steps, from a lens (2,), inside the lenses that do not fold."""
 
-    def closure() -> Tensor:
-        optimizer.zero_grad()
-        cost = line_costs(chains, lens).sum() + _prior_cost(lens, prior)
-        cost.backward()
-        return cost
+    def cost(lens: Tensor) -> Tensor:
+        return line_costs(chains, lens[None]).sum() + _prior_cost(lens, prior)
 
-    with torch.enable_grad():
-        optimizer.step(closure)
-    result = lens.detach()
-    return result if result.isfinite().all() and covers_frame(result) else start
+    lens, value = start, cost(start)
+    for _ in range(_MAX_STEPS):
+        gradient = torch.autograd.functional.jacobian(cost, lens)
+        curvatures, axes = torch.linalg.eigh(torch.autograd.functional.hessian(cost, lens))
+        step = -axes @ (axes.T @ gradient / curvatures.abs().clamp(min=1.0))
+        while step.norm() > _SMALL_STEP and not (covers_frame(lens + step) and cost(lens + step) < value):
+            step = step / 2
+        if step.norm() <= _SMALL_STEP:
+            break
+        lens, value = lens + step, cost(lens + step)
+    return lens
 
 
 def _bootstrap(table: Tensor, grid: Tensor, prior: Gaussian, frame: Tensor, best: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ inverse, masks and the drawn parameters, and `effect.apply(image, params)` repea
 `compose_flows` work on flows, which are backward and in pixels: out(p) = image(p + flow(p)).
 
 Commands, each with a `--help`: python -m torchrefract.preview, generate, train, eval, restore, export, calibrate,
-rectify, make_board, estimate_depth.
+rectify, make_board, estimate_lens, estimate_depth.
 """
 
 import sys as _sys

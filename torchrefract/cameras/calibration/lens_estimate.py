@@ -24,7 +24,6 @@ from torchrefract.cameras.calibration.uncertainty import rectified_deviation
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera
 
 _MIN_STRAIGHT = 10  # chains
-_DISTINCT = 5.99  # squared distance from no distortion in standard deviations: 95 % of a normal distribution in 2D
 _FLOW_GRID = 33  # points along each side of the frame to which a camera is fitted
 
 
@@ -64,8 +63,11 @@ def estimate_lens(
         predict: maps a frame (1, 3, H, W) to the flow (1, 2, h, w), px of its own size, that undistorts it.
 
     Raises:
-        ValueError: there are no frames, or they differ in size.
+        ValueError: there are no frames, they differ in size, or `fov_deg` is not in [1, 170].
     """
+    focal = UNKNOWN_FOCAL  # widths
+    if fov_deg is not None:
+        focal = 0.5 / math.tan(math.radians(check_number("fov_deg", fov_deg, low=1.0, high=170.0) / 2))
     size, chains, lenses = None, list[Tensor](), list[Tensor]()
     for i, frame in enumerate(frames):
         image = _check_frame(frame, i, size)
@@ -77,7 +79,7 @@ def estimate_lens(
         raise ValueError("frames must hold at least one frame, got none")
     pooled = pool_chains(chains, size)
     prior = _pool_lenses(torch.stack(lenses)) if lenses else published_prior()
-    return _to_estimate(pooled, prior, len(chains), fov_deg)
+    return _to_estimate(pooled, prior, len(chains), focal * size[1])
 
 
 def radial_lens_of_flow(flow: Tensor, *, aspect: float | None = None) -> Tensor:
@@ -96,8 +98,8 @@ def radial_lens_of_flow(flow: Tensor, *, aspect: float | None = None) -> Tensor:
     """
     height, width = check_flow("flow", flow).shape[2:]
     stretch = (aspect or width / height) * height / width  # of the flow's pixels, x / y
-    y, x = (torch.linspace(0, side - 1, _FLOW_GRID, dtype=torch.float64).round().long() for side in (height, width))
-    u, v = flow.detach().cpu().double()[0][:, y][:, :, x]
+    y, x = (torch.linspace(0, side - 1, _FLOW_GRID, dtype=torch.float64).round() for side in (height, width))
+    u, v = flow.detach().cpu().double()[0][:, y.long()][:, :, x.long()]
     half_diagonal = math.hypot(width * stretch, height) / 2
     x, y = (x - (width - 1) / 2) * stretch / half_diagonal, (y - (height - 1) / 2)[:, None] / half_diagonal
     r2 = x * x + y * y
@@ -137,12 +139,8 @@ def _pool_lenses(lenses: Tensor) -> Gaussian:
     return Gaussian(median, (published_prior().covariance + shift.T @ shift) / (1 + len(lenses)))
 
 
-def _to_estimate(chains: Chains, prior: Gaussian, num_frames: int, fov_deg: float | None) -> LensEstimate:
+def _to_estimate(chains: Chains, prior: Gaussian, num_frames: int, focal: float) -> LensEstimate:
     fit, (height, width) = fit_lens(chains, prior), chains.size
-    focal = UNKNOWN_FOCAL * width
-    if fov_deg is not None:
-        angle = check_number("fov_deg", fov_deg, low=1.0, high=170.0)
-        focal = width / 2 / math.tan(math.radians(angle / 2))
     # k1 r^2 stays if r is counted in focal lengths instead of half diagonals.
     scale = focal / (math.hypot(height, width) / 2)
     units = torch.tensor([scale**2, scale**4], dtype=torch.float64)
@@ -156,20 +154,18 @@ def _to_estimate(chains: Chains, prior: Gaussian, num_frames: int, fov_deg: floa
     covariance[4:6, 4:6] = (fit.covariance * units * units[:, None]).numpy()
     border = np.array([[0.0, (height - 1) / 2], [0.0, 0.0]])
     edge_px, corner_px = rectified_deviation(camera, covariance, border).tolist()
-    distance = fit.coefficients @ torch.linalg.solve(fit.covariance, fit.coefficients)
-    is_distorted, num_straight = distance.item() > _DISTINCT, int(fit.is_straight.sum())
-    warnings = []
+    num_straight, warnings = int(fit.is_straight.sum()), []
     if num_straight < _MIN_STRAIGHT:
         warnings.append(
             f"the frames hold {num_straight} straight edges that could tell a lens, fewer than {_MIN_STRAIGHT}: add "
             "frames of a moving camera with buildings, poles or signs near the border"
         )
-    if not is_distorted:
+    if not fit.is_distorted:
         warnings.append(
             "the lens cannot be distinguished from no distortion (95 %): add frames, or calibrate with a board"
         )
     return LensEstimate(
         camera=camera, covariance=covariance, num_frames=num_frames, num_chains=len(chains.points),
-        num_straight=num_straight, edge_px=edge_px, corner_px=corner_px, is_distorted=is_distorted,
+        num_straight=num_straight, edge_px=edge_px, corner_px=corner_px, is_distorted=fit.is_distorted,
         warnings=tuple(warnings),
     )  # fmt: skip

@@ -18,7 +18,8 @@ Depth for fog: a map in m, `CorridorDepth`, `GroundPlaneDepth`, any function of 
 
 `effect(image)` degrades an image; `effect.degrade(image, seed=..., keys=...)` returns a `Degraded` with the flow, its
 inverse, masks and the drawn parameters, and `effect.apply(image, params)` repeats a draw. `warp`, `invert_flow` and
-`compose_flows` work on flows, which are backward and in pixels: out(p) = image(p + flow(p)).
+`compose_flows` work on flows, which are backward and in pixels: out(p) = image(p + flow(p)). `worst_case` searches the
+parameters of an effect that harm a model most.
 
 Commands, each with a `--help`: python -m torchrefract.preview, generate, train, eval, restore, export, calibrate,
 rectify, make_board, estimate_lens, estimate_depth.
@@ -63,6 +64,7 @@ from torchrefract.labels.boxes import warp_boxes
 from torchrefract.labels.maps import warp_depth, warp_mask, warp_optical_flow
 from torchrefract.labels.points import warp_points
 from torchrefract.labels.targets import warp_labels
+from torchrefract.robustness.worst_case import WorstCase, worst_case
 from torchrefract.types import Degraded, Folding, Frame, Pair
 from torchrefract.warping.flow import compose_flows, folding, jacobian_determinant
 from torchrefract.warping.invert import invert_flow
@@ -115,6 +117,7 @@ __all__ = [
     "UniformFog",
     "Vignetting",
     "VignettingParams",
+    "WorstCase",
     "check_depth",
     "compose_flows",
     "depth_from_disparity",
@@ -132,4 +135,5 @@ __all__ = [
     "warp_mask",
     "warp_optical_flow",
     "warp_points",
+    "worst_case",
 ]

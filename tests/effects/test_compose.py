@@ -279,7 +279,7 @@ def test_type_and_layout_are_kept(dtype):
 
 @pytest.mark.quick
 def test_one_of_chooses_one_effect_by_its_weight():
-    effect = OneOf([LensDistortion(), UniformFog(), ThinPlateSpline()], weights=[1, 2, 5], p=0.8)
+    effect = OneOf([LensDistortion(frame="pad"), UniformFog(), ThinPlateSpline()], weights=[1, 2, 5], p=0.8)
     params = effect.sample(torch.zeros(8000, 3, 1, 1), seed=2)
     applied = torch.stack([child.applied for child in params.children])
     assert torch.equal(applied.sum(dim=0), params.applied.long())

@@ -269,3 +269,22 @@ def test_the_zoom_of_a_lens_next_to_a_fold_does_not_depend_on_its_batch():
         alone = folding.sample(image[:1], seed=3, keys=[i])
         assert torch.equal(alone.zoom[0], at_least(together.zoom)[i])
         assert torch.equal(alone.shift[0], at_least(together.shift)[i])
+
+
+def test_the_zoom_has_the_gradient_of_the_lens():
+    effect = LensDistortion(p1_range=(0.0, 0.0), p2_range=(0.0, 0.0))
+    params = effect.sample(torch.zeros(3, 1, 60, 90, dtype=torch.float64), seed=1)
+
+    def zoom(coefficients: Tensor, focal: Tensor) -> Tensor:
+        filled = effect.fill(params._replace(coefficients=coefficients, focal=focal), 60, 90)
+        return torch.ones(3) if filled.zoom is None else filled.zoom
+
+    for name in ("coefficients", "focal"):
+        value = getattr(params, name).clone().requires_grad_()
+        of = {"coefficients": params.coefficients, "focal": params.focal}
+        (gradient,) = torch.autograd.grad(zoom(**of | {name: value}).sum(), value)
+        for column in range(3 if name == "coefficients" else 2):
+            step = torch.zeros_like(value)
+            step[:, column] = 1e-3  # the zoom is rounded to 2^-22
+            low, high = (zoom(**of | {name: value.detach() + sign * step}) for sign in (-1, 1))
+            assert_close(gradient[:, column], (high - low) / 2e-3, rtol=0, atol=5e-4)

@@ -176,7 +176,8 @@ def test_fog_of_the_color_of_the_frame_is_the_same_in_any_batch_and_graph(dtype)
         torch.manual_seed(3)
         eager = effect(image)
         torch.manual_seed(3)
-        assert_close(torch.compile(effect, fullgraph=True)(image), eager, rtol=0, atol=2e-4)
+        compiled = torch.compile(effect, fullgraph=True, backend="aot_eager")
+        assert_close(compiled(image), eager, rtol=0, atol=2e-4)
 
 
 def test_an_airlight_for_other_channels_raises():
@@ -377,7 +378,7 @@ def test_invalid_pixels_do_not_spread_where_fog_is_removed():
         ({"transmission": torch.full((1, 1, 4, 5), math.nan)}, ValueError, r"transmission must be in \[0, 1\]"),
         ({"airlight": 1.5}, ValueError, "airlight must be a number in"),
         ({"airlight": (0.1, 0.2)}, ValueError, "airlight must have 1 number or 3"),
-        ({"airlight": torch.ones(2, 3)}, ValueError, r"airlight must have shape \(3,\) or \(1, 3\)"),
+        ({"airlight": torch.ones(2, 3)}, ValueError, r"airlight must have shape \(3,\), \(1, 3\) or that of"),
         ({"airlight": torch.tensor([0.1, math.nan, 0.2])}, ValueError, "airlight must be finite"),
         ({"linear_light": 1}, TypeError, "linear_light must be True or False"),
     ],

@@ -1,15 +1,19 @@
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import Camera, GroundPlaneDepth, HeterogeneousFog, UniformFog
+from torchrefract import Camera, GroundPlaneDepth, HeterogeneousFog, UniformFog, remove_fog
 from torchrefract.data.road_scenes import render_road_scenes
+from torchrefract.fields.airlight import forward_scattering
 from torchrefract.fields.perlin import draw_octave, perlin_noise
 from torchrefract.fields.random_field import Motion
+from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
 
 SIZE = (36, 64)
 PAPER = {"scales": (4, 8, 16, 32, 64, 128), "weights": (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)}
@@ -260,3 +264,49 @@ def test_the_transmission_of_dust_is_that_of_its_optical_depth():
         height = 1.3 - 30 * ray[1] * share
         expected = torch.exp(math.log(0.05) / 50 * 30 * ray.norm() * torch.exp(-height / 1.5).mean())
         assert_close(t[row, column], expected, rtol=1e-6, atol=0)
+
+
+def test_fog_is_brighter_on_the_side_of_the_sun_by_henyey_and_greensteins_phase_function():
+    image, depth = torch.zeros(1, 3, 40, 60, dtype=torch.float64), torch.full((1, 1, 40, 60), math.inf)
+    camera = Camera(width=60, height=40, fx=50.0, fy=45.0, cx=31.0, cy=18.0, coefficients=(0.0,) * 4)
+    effect = HeterogeneousFog(
+        camera=camera,
+        horizon=0.6,
+        airlight=(0.5, 0.4, 0.3),
+        sunlight_range=(0.2, 0.2),
+        sun_azimuth_range=(35.0, 35.0),
+        sun_elevation_range=(12.0, 12.0),
+        asymmetry=0.6,
+    )
+    degraded = effect.degrade(image, seed=3, depth=depth)
+    # In coordinates of the road: x to the right, y down, z ahead; the camera looks up, for its horizon is low.
+    pitch = Rotation.from_euler("x", math.atan((0.6 * 40 - 0.5 - 18) / 45)).as_matrix()
+    to_sun = Rotation.from_euler("xy", [12.0, 35.0], degrees=True).as_matrix() @ [0, 0, 1]
+    for row, column in ((0, 0), (5, 50), (39, 30), (20, 59)):
+        ray = pitch @ [(column - 31) / 50, (row - 18) / 45, 1]
+        cosine = ray @ to_sun / np.linalg.norm(ray)
+        factor = 0.8 + 0.2 * 0.64 / (1.36 - 1.2 * cosine) ** 1.5
+        color = linear_to_srgb(srgb_to_linear(torch.tensor([0.5, 0.4, 0.3], dtype=torch.float64)) * factor)
+        assert_close(degraded.image[0, :, row, column], color, rtol=0, atol=1e-6)
+    right, left = degraded.image[..., 40:].mean(), degraded.image[..., :20].mean()
+    assert right > left + 0.05
+
+
+def test_all_directions_together_receive_the_light_that_falls_on_a_particle():
+    cosine = torch.linspace(-1, 1, 20001, dtype=torch.float64)
+    for asymmetry in (0.0, 0.6, 0.9):
+        assert torch.trapezoid(forward_scattering(cosine, asymmetry), cosine).item() == pytest.approx(2, rel=1e-4)
+
+
+def test_fog_lit_by_the_sun_is_removed_with_the_map_of_its_airlight():
+    image = picture(2, 3, *SIZE)
+    effect = HeterogeneousFog(sunlight_range=(0.1, 0.3), airlight=0.5)
+    degraded = effect.degrade(image, seed=3)
+    assert degraded.params.sun is not None
+    airlight = effect.airlight_map(degraded.params, *SIZE)
+    clean, valid = remove_fog(degraded.image, degraded.transmission, airlight)
+    assert valid.any()
+    assert_close(torch.where(valid, clean, image), image, rtol=0, atol=1e-9)
+    without = effect.apply(image, degraded.params._replace(sun=None))
+    assert_close(without.image, HeterogeneousFog(airlight=0.5).apply(image, degraded.params._replace(sun=None)).image)
+    assert (without.image - degraded.image).abs().max() > 0.02

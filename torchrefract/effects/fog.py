@@ -148,7 +148,16 @@ class FogMedium:
         colors = [(min(self.colors), max(self.colors))] * params.airlight.shape[1]
         return in_ranges(k[:, None], [extinction_range]) & in_ranges(params.airlight, colors)
 
-    def blend(self, image: Tensor, params: Any, distance: Tensor, k: Tensor, *, is_visible: bool) -> Rendered:
+    def blend(
+        self,
+        image: Tensor,
+        params: Any,
+        distance: Tensor,
+        k: Tensor,
+        *,
+        is_visible: bool,
+        airlight: Tensor | None = None,
+    ) -> Rendered:
         """Blend images with fog, or return them as they are and maps.
 
         Args:
@@ -157,6 +166,7 @@ class FogMedium:
             distance: (N, B or 1, 1, H, 1 or W), m.
             k: (N or B, 1, H or 1, W or 1), extinction, 1/m.
             is_visible: False returns the image as it is.
+            airlight: (N, C, H, W), stored values; None is that of the params everywhere.
         """
         rows, batch = max(len(k), len(distance)), len(image)
 
@@ -165,8 +175,10 @@ class FogMedium:
 
         if not is_visible:
             return Rendered(image, lambda: through() >= _MIN_TRANSMISSION, transmission=through, extinction=k)
-        t, airlight = through(), finite_or(params.airlight.to(field_dtype(image.dtype)), 0.0)[:, :, None, None]
-        airlight = expand_batch(airlight, batch)
+        t = through()
+        if airlight is None:
+            airlight = finite_or(params.airlight.to(field_dtype(image.dtype)), 0.0)[:, :, None, None]
+            airlight = expand_batch(airlight, batch)
         blended = blend_fog(image, expand_batch(t, batch), airlight, linear_light=self.linear_light)
         return Rendered(blended, lambda: t >= _MIN_TRANSMISSION, transmission=t, extinction=k)
 
@@ -322,7 +334,8 @@ def remove_fog(
     Args:
         image: (B, C, H, W), (C, H, W) or (B, T, C, H, W), floating, or uint8, which is converted, rounded and clamped.
         transmission: t in [0, 1], (B, 1, H, W), (1, H, W) or (B, T, 1, H, W), or a shape that broadcasts to it.
-        airlight: A, color of the fog: one number in [0, 1], or one for each channel; (C,) or (B, C) as a tensor.
+        airlight: A, color of the fog: one number in [0, 1], or one for each channel; (C,), (B, C) or, for images
+            (B, C, H, W), of their shape as a tensor.
         linear_light: the fog was blended in linear light, not in stored values (sRGB).
 
     Returns:
@@ -355,12 +368,16 @@ def _transmission_to_batch(t: Tensor, image: Tensor, shape: BatchShape) -> Tenso
 
 
 def _airlight_to_batch(airlight: float | Sequence[float] | Tensor, image: Tensor, shape: BatchShape) -> Tensor:
-    """(N or 1, C, 1, 1) for images (N, C, H, W)."""
+    """(N or 1, C, 1, 1), or (N, C, H, W), for images (N, C, H, W)."""
     batch, channels = shape.batch, image.shape[1]
     if isinstance(airlight, Tensor):
+        if airlight.shape == image.shape:
+            check_values("airlight", "be finite", airlight, torch.isfinite)
+            return airlight.to(image.dtype)
         if airlight.shape not in ((channels,), (1, channels), (batch, channels)):
             raise ValueError(
-                f"airlight must have shape ({channels},) or ({batch}, {channels}), got {tuple(airlight.shape)}"
+                f"airlight must have shape ({channels},), ({batch}, {channels}) or that of the image, "
+                f"got {tuple(airlight.shape)}"
             )
         check_values("airlight", "be finite", airlight, torch.isfinite)
         return expand_batch(airlight.to(image.dtype).view(-1, channels), image.shape[0])[:, :, None, None]

@@ -32,6 +32,7 @@ from torchrefract.effects.random_field import (
     motion_of,
     motion_ranges,
 )
+from torchrefract.fields.airlight import sunlit_airlight
 from torchrefract.fields.depth import DepthSource
 from torchrefract.fields.dust import descent_of_rows, mean_density
 from torchrefract.fields.fog_volume import ExtinctionField, mean_extinction_along_rays
@@ -72,6 +73,9 @@ class HeterogeneousFogParams(NamedTuple):
     frame: Tensor  # (B, T), number of each frame in its clip
     key: Tensor  # (B, 4), int64, of the noise
     scale_height: Tensor | None = None  # (B,), m, over which the density falls to 1/e; inf or None: it does not
+    # (B, 3): degrees to the right of the camera, degrees above the horizon, share of direct sunlight in the airlight;
+    # None: none
+    sun: Tensor | None = None
 
     to = params_to
 
@@ -112,7 +116,14 @@ class HeterogeneousFog(PhotometricEffect):
             falls with the height above the road as exp(-h / H). Its mean along each ray is exact, see `mean_density`,
             and multiplies that of the random field; V is the visibility on the road. None is an even density.
         camera_height, horizon: m, of the camera above the road, and share of the height of the frame, from the top, at
-            which the road vanishes; for a plume.
+            which the road vanishes; for a plume, and the horizon for the sun.
+        sunlight_range: share of direct sunlight in the airlight, within [0, 1]: it makes the fog brighter on the side
+            of the sun and darker on the other, see `sunlit_airlight`. About 0.1 for a sun that is hardly seen through
+            fog and 0.5 for dust under a clear sky. None is the same airlight everywhere.
+        sun_azimuth_range, sun_elevation_range: degrees, of the sun to the right of the camera, within [-360, 360], and
+            above the horizon, within [-10, 90].
+        asymmetry: mean cosine of the angle by which the fog scatters light, in (-1, 1): 0.6 to 0.9 for thin haze and
+            dust, less for fog, in which light is scattered many times.
         decorrelation_range: frames, above 0 or inf, until k in the wind has the correlation 1/e with itself; one over
             it is uniform.
         tolerance: largest error of the image, levels of 1/255: octaves that are too faint, and fog or a contrast that
@@ -157,6 +168,10 @@ class HeterogeneousFog(PhotometricEffect):
         scale_height_range: Range | None = None,
         camera_height: float = 1.3,
         horizon: float = 0.5,
+        sunlight_range: Range | None = None,
+        sun_azimuth_range: Range = (-180.0, 180.0),
+        sun_elevation_range: Range = (5.0, 30.0),
+        asymmetry: float = 0.5,
         tolerance: float | None = None,
         p: float = 1.0,
     ):
@@ -189,6 +204,12 @@ class HeterogeneousFog(PhotometricEffect):
             self.scale_height_range = check_range("scale_height_range", scale_height_range, low=low, high=high)
         self.camera_height = check_positive("camera_height", camera_height)
         self.horizon = check_number("horizon", horizon, low=-10.0, high=10.0)
+        self.sunlight_range = (
+            None if sunlight_range is None else check_range("sunlight_range", sunlight_range, high=1.0)
+        )
+        self.sun_azimuth_range = check_range("sun_azimuth_range", sun_azimuth_range, low=-360.0, high=360.0)
+        self.sun_elevation_range = check_range("sun_elevation_range", sun_elevation_range, low=-10.0, high=90.0)
+        self.asymmetry = check_number("asymmetry", asymmetry, low=-0.99, high=0.99)
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> HeterogeneousFogParams:
         """Draw all parameters uniformly in their ranges, and the key of the noise."""
@@ -196,7 +217,9 @@ class HeterogeneousFog(PhotometricEffect):
             self.wind_x_range, self.wind_y_range, self.wind_z_range, decorrelation=self.decorrelation_range
         )
         plume = [] if self.scale_height_range is None else [self.scale_height_range]
-        fog, values = draw_fog(self, stream, image, [self.contrast_range, *motion, *plume])
+        sun = [self.sun_azimuth_range, self.sun_elevation_range, self.sunlight_range] if self.sunlight_range else []
+        fog, values = draw_fog(self, stream, image, [self.contrast_range, *motion, *plume, *sun])
+        values, sunlight = (values[:, :-3], values[:, -3:]) if sun else (values, None)
         values, scale_height = (
             (values[:, :-1], values[:, -1]) if plume else (values, torch.full_like(values[:, 0], torch.inf))
         )
@@ -204,7 +227,13 @@ class HeterogeneousFog(PhotometricEffect):
         weights = weights.view(-1, len(self.scales))
         motion = drawn_motion(values[:, 1:])
         return HeterogeneousFogParams(
-            *fog, weights, values[:, 0], **motion, key=random.noise_key(stream), scale_height=scale_height
+            *fog,
+            weights,
+            values[:, 0],
+            **motion,
+            key=random.noise_key(stream),
+            scale_height=scale_height,
+            sun=sunlight,
         )
 
     def validate(self, params: HeterogeneousFogParams, image: Tensor) -> None:
@@ -227,13 +256,31 @@ class HeterogeneousFog(PhotometricEffect):
                 params.scale_height,
                 lambda v: ((v >= low) & (v <= high)) | (v == torch.inf),
             )
+        if params.sun is not None:
+            check_shapes(params, {"sun": (3,)})
+            check_values("params.sun", "be finite", params.sun, torch.isfinite)
+            check_within("params.sun[:, 2]", params.sun[:, 2], 0.0, 1.0)
+
+    def airlight_map(self, params: HeterogeneousFogParams, height: int, width: int) -> Tensor:
+        """Return the airlight at each pixel, with which `remove_fog` undoes fog lit by the sun.
+
+        Returns (B, C, height, width), stored values in [0, 1].
+        """
+        airlight = params.airlight
+        if params.sun is None:
+            return airlight[:, :, None, None].expand(-1, -1, height, width)
+        focal, center = pinhole_of(self.medium.camera, height=height, width=width)
+        view = {"height": height, "width": width, "focal": focal, "center": center, "horizon": self.horizon}
+        return sunlit_airlight(airlight, params.sun.to(airlight.dtype), **view, asymmetry=self.asymmetry)
 
     def params_in_range(self, params: HeterogeneousFogParams) -> Tensor:
         """Return (), bool: fog and contrast lie in the ranges, and the weights are those of the effect."""
         span = self.medium.extinction_range(self.visibility_range, self.deviation_range)
         weights = in_ranges(normalize_weights(params.weights), [(weight, weight) for weight in self._unit_weights()])
         contrast = in_ranges(params.contrast[:, None], [self.contrast_range])
-        return self.medium.params_in_range(params, span) & weights & contrast
+        is_fog = self.medium.params_in_range(params, span) & weights & contrast
+        # The plan of an effect without a sun holds for the airlight of the params only.
+        return is_fog if params.sun is None or self.sunlight_range else is_fog & (params.sun[:, 2] == 0).all()
 
     def make_plan(self, request: PhotometricRequest, *, has_depth: bool) -> PhotometricPlan:
         """Plan frames for the depth of the effect or, with `has_depth`, for any depth."""
@@ -246,6 +293,8 @@ class HeterogeneousFog(PhotometricEffect):
             weights=self._unit_weights(),
             contrast=self.contrast_range[1] if self.mode == "ray" else 0.0,
         )
+        if self.sunlight_range is not None:
+            model = replace(model, colors=(0.0, 1.0))
         if self.mode == "ray":
             return plan_volumetric_fog(model, request)
         if self.normalize == "image":
@@ -265,7 +314,11 @@ class HeterogeneousFog(PhotometricEffect):
         scale_height = params.scale_height if self.mode == "ray" else None
         if scale_height is not None and eager_bool(lambda: scale_height.isinf().all(), of=k) is not True:
             k = self._plume(scale_height, distance, image) * expand_batch(k, image.shape[0])
-        return self.medium.blend(image, params, distance, k, is_visible=not plan.is_identity)
+        airlight = None
+        if params.sun is not None:
+            lit = params._replace(airlight=finite_or(params.airlight.to(field_dtype(image.dtype)), 0.0))
+            airlight = expand_batch(self.airlight_map(lit, *image.shape[2:]), image.shape[0])
+        return self.medium.blend(image, params, distance, k, is_visible=not plan.is_identity, airlight=airlight)
 
     def _extinction(
         self, k: Tensor, params: HeterogeneousFogParams, distance: Tensor, image: Tensor, plan: PhotometricPlan

@@ -233,7 +233,7 @@ class LensDistortion(WarpEffect):
     def fill(self, params: LensParams, height: int, width: int) -> LensParams:
         """Return the same lenses with the zoom and the shift that leave no pixel of such frames without a source.
 
-        They carry no gradient. Lenses that see no more than the pinhole, as pincushion lenses, keep a zoom of 1.
+        Lenses that see no more than the pinhole, as pincushion lenses, keep a zoom of 1.
         """
         # The plan of the ranges says nothing of other lenses.
         effect = cast(LensDistortion, super().for_params(params, height, width))
@@ -320,13 +320,14 @@ class LensDistortion(WarpEffect):
 
     def _fit(self, params: LensParams, height: int, width: int) -> tuple[Tensor, Tensor]:
         dtype = params.focal.dtype
+        is_fixed = not (torch.is_grad_enabled() and requires_grad(params))
         folds_nowhere = self._constant_plan(id(self), height, width, dtype).details is not None
-        with torch.no_grad():
-            lens = lens_in_px(map_params(params, lambda value: value.detach().double()), height, width)
+        with torch.set_grad_enabled(not is_fixed):
+            lens = lens_in_px(map_params(params, torch.Tensor.double), height, width)
 
             def position(points: Points) -> Tensor:
                 pixels = torch.cat([points.x, points.y], dim=1)
-                if folds_nowhere:
+                if folds_nowhere and is_fixed:
                     return pixels + newton_lens_flow(*lens, points, num_steps=_FIT_STEPS, terms=used_terms(lens[0]))
                 flow, exists = lens_flow(*lens, points)
                 return torch.where(exists, pixels + flow, torch.nan)

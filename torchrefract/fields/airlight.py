@@ -1,11 +1,13 @@
-"""The color of fog, from the frame that it will be added to."""
+"""The color of fog: from the frame that it will be added to, and brighter towards the sun."""
+
+import math
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract.fields.sky import find_sky
-from torchrefract.fields.srgb import luma
+from torchrefract.fields.srgb import linear_to_srgb, luma, srgb_to_linear
 
 _PATCH = 7  # nodes
 _BRIGHTEST = 0.001  # share of the dark channel
@@ -53,3 +55,61 @@ def airlight_of_frame(image: Tensor) -> Tensor:
         day = torch.where(day[:, 2:] > day[:, :1], torch.lerp(gray, day, _KEPT_CHROMA), day)
     color = torch.where(is_night[:, None] & ~has_sky, top.mean(dim=(2, 3)), day)
     return (color * _STEPS).round() / _STEPS
+
+
+def forward_scattering(cosine: Tensor, asymmetry: float) -> Tensor:
+    """Return how much light a particle scatters by an angle, relative to equal scattering in all directions.
+
+        (1 - g^2) / (1 + g^2 - 2 g cosine)^(3/2)
+
+    Args:
+        cosine: of the angle between the ways of the light before and after, in [-1, 1].
+        asymmetry: g, the mean cosine, in (-1, 1).
+
+    Source: Henyey and Greenstein, "Diffuse radiation in the galaxy", Astrophysical Journal 93 (1941).
+    """
+    return (1 - asymmetry**2) / (1 + asymmetry**2 - 2 * asymmetry * cosine) ** 1.5
+
+
+def sunlit_airlight(
+    airlight: Tensor,
+    sun: Tensor,
+    *,
+    height: int,
+    width: int,
+    focal: tuple[float, float],
+    center: tuple[float, float],
+    horizon: float,
+    asymmetry: float,
+) -> Tensor:
+    """Return the airlight at each pixel of a frame: brighter on the side of the sun, darker on the other.
+
+        A (1 - w + w p(theta)),  in linear light, at most 1
+
+    A is the airlight of equal light from all directions, w the share of direct sunlight in it, p `forward_scattering`
+    and theta the angle between the ray of the pixel and the sun. Light is taken to be scattered once.
+
+    Args:
+        airlight: (N, C), stored values in [0, 1].
+        sun: (N, 3), degrees to the right of the camera, degrees above the horizon, and w in [0, 1].
+        height, width: px.
+        focal, center: px, of the camera.
+        horizon: share of the height, from the top, at which the road vanishes.
+        asymmetry: g in (-1, 1), as for `forward_scattering`.
+
+    Returns:
+        (N, C, H, W), stored values in [0, 1].
+    """
+    options = {"dtype": airlight.dtype, "device": airlight.device}
+    x = ((torch.arange(width, **options) - center[0]) / focal[0]).view(1, 1, width)
+    y = ((torch.arange(height, **options) - center[1]) / focal[1]).view(1, height, 1)
+    azimuth, elevation = sun[:, 0].deg2rad().view(-1, 1, 1), sun[:, 1].deg2rad().view(-1, 1, 1)
+    right, up, ahead = elevation.cos() * azimuth.sin(), elevation.sin(), elevation.cos() * azimuth.cos()
+    # The axis of the camera points above the horizon by the pitch.
+    pitch = math.atan((horizon * height - 0.5 - center[1]) / focal[1])
+    down, ahead = math.sin(pitch) * ahead - math.cos(pitch) * up, math.cos(pitch) * ahead + math.sin(pitch) * up
+    cosine = (x * right + y * down + ahead) / (x * x + y * y + 1).sqrt()
+    share = sun[:, 2].view(-1, 1, 1)
+    factor = 1 - share + share * forward_scattering(cosine, asymmetry)
+    light = srgb_to_linear(airlight)[:, :, None, None] * factor[:, None]
+    return linear_to_srgb(light.clamp(max=1.0))

@@ -47,7 +47,8 @@ def zoom_to_fill(
     # Each lower end must fit together with each upper end.
     spans = (high[..., None] - low[..., None, :]).clamp(min=1e-9)
     zoom = ((size[..., None] + space[:, None] + space) / spans).flatten(1).amin(dim=1).clamp(max=1.0)
-    zoom = (zoom * _STEPS).floor().clamp(min=8) / _STEPS
+    rounded = (zoom.detach() * _STEPS).floor().clamp(min=8) / _STEPS
+    zoom = zoom + (rounded - zoom).detach() if zoom.requires_grad else rounded  # with the gradient before rounding
     middle, scale = center[..., None], zoom[:, None, None]
     lowest_shift = (-space - middle - scale * low).amax(dim=2)
     highest_shift = (size + space - middle - scale * high).amin(dim=2)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, cast
 
 import torch
 import torch.nn.functional as F
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -37,6 +38,7 @@ from torchrefract.visualization.color import (
     round_up,
     transmission_to_rgb,
 )
+from torchrefract.visualization.details import FlowArrows, cut_detail, detail_rows, draw_arrows, flow_arrows
 from torchrefract.warping.flow import folded
 from torchrefract.warping.grid import length
 from torchrefract.warping.warp import warp
@@ -45,6 +47,7 @@ _DPI = 100
 _SMALLEST_SIDE = 320  # px, longer side of a displayed image
 _SHEET_SIDE = 480  # px, largest longer side of an image on a contact sheet
 _COLUMNS = ("frame", "corrupted", "checkerboard", "map", "restored")  # fields of ContactSheetRow
+_DETAILS = ("horizon", "horizon, corrupted", "road", "road, corrupted")
 _SQUARES = 20  # of the checkerboard along the longer side
 _PARAMETER_TEXTS: dict[str, Callable[[Tensor], str]] = {
     "amplitude": lambda value: f"amplitude {value:.2g} px",
@@ -69,6 +72,7 @@ _PARAMETER_TEXTS: dict[str, Callable[[Tensor], str]] = {
         f"red {value[0]:.2g}, blue {value[-1]:.2g} larger" if value.ndim else f"scale {value:.2g} deg"
     ),
     "target": lambda value: f"mean light {value:.2g}",
+    "sunlight": lambda value: f"{value[2]:.0%} of sunlight from {value[0]:.0f} deg right, {value[1]:.0f} deg high",
     "strength": lambda value: f"strength {value:.2g}",
     "center": lambda value: f"center off by ({value[0]:.1g}, {value[1]:.1g}) widths",
     "wind": lambda value: f"wind ({value[0]:.2g}, {value[1]:.2g}) px/frame",
@@ -114,6 +118,7 @@ class FigureLayout:
     header_lines: int = 2  # above the first caption
     footer_lines: int = 4  # below the last row
     min_column_lines: int = 12  # smallest distance of columns, in lines: a narrow image leaves space for its title
+    detailed: bool = False  # a second image below each
 
     @property
     def text(self) -> int:
@@ -137,7 +142,13 @@ class FigureLayout:
     def top(self, row: int) -> int:
         """Upper side of the images in a row."""
         caption = round((1.3 * self.caption_lines + 0.8) * self.text)
-        return self.header_lines * self.text + row * (self.height + caption) + caption
+        images = self.detail_offset + self.height if self.detailed else self.height
+        return self.header_lines * self.text + row * (images + caption) + caption
+
+    @property
+    def detail_offset(self) -> int:
+        """Distance from the upper side of an image to that of its details, below a line of text."""
+        return self.height + 2 * self.text
 
     @cached_property
     def figure(self) -> Figure:
@@ -149,13 +160,14 @@ class FigureLayout:
         position, points = (x / self.size[0], 1 - y / self.size[1]), 0.8 * self.text * 72 / _DPI
         self.figure.text(*position, text, ha=ha, va="bottom", weight=weight, fontsize=points, parse_math=False)
 
-    def show(self, image: Tensor, x: int, y: int) -> None:
+    def show(self, image: Tensor, x: int, y: int) -> Axes:
         """Place an image (3, h, w) in [0, 1] with its upper left corner at (x, y), pixel by pixel."""
         (height, width), (total_width, total_height) = image.shape[1:], self.size
         box = (x / total_width, 1 - (y + height) / total_height, width / total_width, height / total_height)
         axes = self.figure.add_axes(box)
         axes.set_axis_off()
         axes.imshow(to_uint8(image[None])[0].movedim(0, -1).numpy(), interpolation="nearest", aspect="auto")
+        return axes
 
     def explain(self, image: Tensor, text: str, *, x: int, y: int) -> None:
         """Write a legend: a patch of an image (3, h, w), three lines wide and two high, and a text to its right."""
@@ -181,6 +193,8 @@ class ContactSheetRow(NamedTuple):
     map: Tensor | None
     scales: tuple[MapScale, ...]  # of the map, one for each half if there are two
     restored: Tensor | None
+    details: tuple[Tensor, Tensor, Tensor, Tensor]  # horizon and road, each of the frame and corrupted, pixel by pixel
+    arrows: FlowArrows | None
 
 
 class _Restored(NamedTuple):
@@ -216,6 +230,11 @@ def contact_sheet_row(
     scales, restored = map_scales(degraded), _restore(effect, degraded)
     folds = folded(degraded.flow, degraded.valid) if degraded.has("flow") else torch.zeros_like(degraded.valid)
     hatched_board = hatch_invalid(_sheet_size(degraded_board), degraded.valid)
+    size = dict(zip(("height", "width"), hatched_board.shape[2:], strict=True))
+    arrows = flow_arrows(degraded.flow, degraded.valid, **size) if degraded.has("flow") else None
+    horizon, road = (
+        [cut_detail(image, row, **size) for image in (frame, degraded.image)] for row in detail_rows(effect)
+    )
     return ContactSheetRow(
         title=": ".join(filter(None, (name, describe_params(effect, degraded.params)))),
         scores=_scores(degraded, frame, restored=restored, folds=folds),
@@ -225,6 +244,8 @@ def contact_sheet_row(
         map=map_image(degraded, scales, largest=_SHEET_SIDE) if scales else None,
         scales=scales,
         restored=None if restored is None else hatch_invalid(_sheet_size(restored.image), restored.valid)[0],
+        details=(horizon[0], horizon[1], road[0], road[1]),
+        arrows=arrows,
     )
 
 
@@ -236,7 +257,13 @@ def contact_sheet(rows: Sequence[ContactSheetRow], *, title: str) -> Figure:
         title: one line.
     """
     layout = FigureLayout(
-        len(rows), len(_COLUMNS), *rows[0].frame.shape[1:], caption_lines=1, header_lines=4, footer_lines=1
+        len(rows),
+        len(_COLUMNS),
+        *rows[0].frame.shape[1:],
+        caption_lines=1,
+        header_lines=4,
+        footer_lines=1,
+        detailed=True,
     )
     # A letter is about half as wide as a line is high. A caption ends where the legend of the map begins.
     letters = 2 * _COLUMNS.index("map") * layout.column_px // layout.text
@@ -273,6 +300,8 @@ def describe_params(effect: Effect, params: Any) -> str:
     # One field means different things in different effects.
     if isinstance(effect, LensFlare | SunGlare):
         values["sun"] = values.pop("center")
+    elif values.get("sun") is not None:
+        values["sunlight"] = values.pop("sun")
     if isinstance(effect, PhysicalTurbulence):
         values["wind_s"] = values.pop("wind")
     if isinstance(effect, RollingShutter):
@@ -361,6 +390,8 @@ def _restore(effect: Effect, degraded: Degraded) -> _Restored | None:
     # A float image would be restored exactly, which no image file allows.
     stored, fog = to_float(to_uint8(degraded.image)), cast(Any, effect)
     t, airlight = degraded.transmission, degraded.params.airlight
+    if getattr(degraded.params, "sun", None) is not None:
+        airlight = fog.airlight_map(degraded.params, *stored.shape[2:])
     return _Restored(*remove_fog(stored, t, airlight, linear_light=fog.medium.linear_light), "restored from 8 bits")
 
 
@@ -395,3 +426,15 @@ def _draw_row(layout: FigureLayout, row: ContactSheetRow, i: int) -> None:
             text = "no flow or fog to undo" if column == "restored" else "no map"
             layout.write(text, x + layout.width / 2, y + layout.height / 2, ha="center")
     draw_legend(layout, row.scales, x=layout.left(_COLUMNS.index("map")), y=layout.top(i))
+    y = layout.top(i) + layout.detail_offset
+    for j, (name, detail) in enumerate(zip(_DETAILS, row.details, strict=True)):
+        layout.write(name, layout.left(j) + layout.width / 2, y - 0.4 * layout.text, ha="center")
+        layout.show(detail, layout.left(j) + (layout.width - detail.shape[2]) // 2, y)
+    x = layout.left(len(_DETAILS))
+    if row.arrows is None:
+        layout.write("no motion", x + layout.width / 2, y + layout.height / 2, ha="center")
+        return
+    text = f"motion x {row.arrows.enlargement:g}, up to {row.arrows.longest:.2g} px"
+    layout.write(text, x + layout.width / 2, y - 0.4 * layout.text, ha="center")
+    axes = layout.show(0.3 * row.corrupted + 0.7, x, y)
+    draw_arrows(axes, row.arrows)

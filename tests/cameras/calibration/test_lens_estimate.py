@@ -1,3 +1,4 @@
+import json
 import math
 from typing import Any
 
@@ -10,6 +11,7 @@ from torchrefract.cameras.calibration import LensEstimate, estimate_lens
 from torchrefract.cameras.calibration.lens_estimate import radial_lens_of_flow
 from torchrefract.cameras.calibration.uncertainty import rectified_deviation
 from torchrefract.cameras.camera import Camera
+from torchrefract.data.images import read_image
 from torchrefract.fields.rectification import camera_flow
 from torchrefract.warping.flow import resize_flow
 
@@ -94,6 +96,26 @@ def test_the_covariance_gives_the_printed_deviations(drive):
     edge, corner = rectified_deviation(result.camera, result.covariance, points)
     assert (edge, corner) == pytest.approx((result.edge_px, result.corner_px), rel=1e-6)
     assert np.linalg.eigvalsh(result.covariance).min() > -1e-12
+
+
+def test_the_lens_of_a_real_wide_camera_is_found_in_three_pictures(shared_data):
+    """Hold the accuracy on a camera with a calibration: half of the error of doing nothing at most."""
+    folder = shared_data / "chessboard"
+    fit = json.loads((folder / "reference.json").read_text())["pjlab_wide"]["opencv_5param"]
+    names = ("fx", "fy", "cx", "cy")
+    truth = Camera(width=1920, height=1200, **{n: fit[n] for n in names}, coefficients=tuple(fit["dist_k1k2p1p2k3"]))
+    result = estimate_lens(read_image(folder / "pjlab_wide" / f"{i:02}.jpg") for i in (2, 12, 20))
+    assert result.is_distorted
+    pixels = truth.grid(21)
+
+    def shown_by(camera: Camera) -> Tensor:
+        _, focal, center = camera.tensors(pixels)
+        return camera.distort((pixels - center) / focal).points * focal + center
+
+    expected = shown_by(truth)
+    inside = ((expected >= 0) & (expected <= torch.tensor([1919, 1199]))).all(dim=1)
+    error, nothing = ((at - expected)[inside].norm(dim=1).mean() for at in (shown_by(result.camera), pixels))
+    assert error < 0.5 * nothing
 
 
 @pytest.mark.parametrize(

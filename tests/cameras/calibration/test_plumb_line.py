@@ -109,7 +109,7 @@ def test_the_lens_is_found_although_most_chains_are_really_curved(numbers):
         return HALF_DIAGONAL * radius**3 * (k[0] + k[1] * radius**2)
 
     error = (shift(fit.coefficients) - shift(torch.tensor(numbers))).abs().max().item()
-    assert error < 1.5  # px, half of the spacing of the grid
+    assert error < 1.0  # px
     assert fit.is_straight[:60].float().mean() > 0.9
     assert fit.is_straight[60:].float().mean() < 0.3
     difference = fit.coefficients - torch.tensor(numbers, dtype=torch.float64)

@@ -198,8 +198,7 @@ def fit_lens(chains: Chains, prior: Gaussian) -> LineFit:
     covariance = _covariance(grid, weight, lens)
     is_distorted = (lens @ torch.linalg.solve(covariance, lens)).item() > _DISTINCT
     if not is_distorted:
-        # The mean of the prior on the grid, which holds no folding lenses, is not that of the prior.
-        lens = prior.mean + (weight - torch.softmax(-_prior_cost(grid, prior), dim=0)) @ grid
+        lens = _posterior_mean(grid, weight, prior)
         covariance = _covariance(grid, weight, lens)
     bend, valid = bends(chains.points, lens[None], chains.size)
     odds = torch.exp(-(bend / chains.noise).square() / 2) * chains.curved / (_OUTLIERS * chains.noise)
@@ -339,6 +338,17 @@ def _bootstrap(table: Tensor, prior_cost: Tensor, frame: Tensor) -> Tensor:
     drawn = torch.randint(number, (_NUM_BOOTSTRAPS, number), generator=torch.Generator().manual_seed(0))
     counts = torch.stack([row.bincount(minlength=number) for row in drawn]).to(table.dtype)
     return torch.softmax(-(table @ counts[:, groups].T + prior_cost[:, None]), dim=0).mean(dim=1)
+
+
+def _posterior_mean(grid: Tensor, weight: Tensor, prior: Gaussian) -> Tensor:
+    """Return the mean of a posterior on the grid, as if the grid held the folding lenses of the prior as well.
+
+    mean + covariance prior covariance^-1 (true prior mean - prior mean),  all on the grid
+    """
+    mean, prior_weight = weight @ grid, torch.softmax(-_prior_cost(grid, prior), dim=0)
+    prior_mean = prior_weight @ grid
+    gain = _covariance(grid, weight, mean) @ torch.linalg.inv(_covariance(grid, prior_weight, prior_mean))
+    return mean + gain @ (prior.mean - prior_mean)
 
 
 def _covariance(lenses: Tensor, weight: Tensor, center: Tensor) -> Tensor:

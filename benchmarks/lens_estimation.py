@@ -93,8 +93,8 @@ def errors(estimate: Camera, truth: Camera) -> tuple[float, float]:
     """Return the mean error of an estimate and of doing nothing, px of a frame 1920 px wide."""
     pixels, scale = truth.grid(_GRID), _WIDTH / truth.width
     expected, is_shown = shown_at(truth, pixels)
-    found, _ = shown_at(estimate, pixels)
-    error, nothing = (scale * (at - expected)[is_shown].norm(dim=1).mean().item() for at in (found, pixels))
+    estimated, _ = shown_at(estimate, pixels)
+    error, nothing = (scale * (at - expected)[is_shown].norm(dim=1).mean().item() for at in (estimated, pixels))
     return error, nothing
 
 

@@ -25,25 +25,25 @@ Predictor = Callable[[Tensor], Tensor]  # from a frame (1, 3, H, W) to the flow 
 def estimate_lens(cfg: DictConfig) -> None:
     """Estimate the lens of the camera of pictures and videos, write the camera, and print how certain it is."""
     with naming("frames"):
-        most = check_count("frames", cfg.frames)
+        max_frames = check_count("frames", cfg.frames)
     files = media.find_media(Path(str(cfg.input)))
     if turned := media.describe_turned(files):
         print(f"warning: {turned}", file=sys.stderr)
     predict = None if cfg.checkpoint is None else _load_network(cfg)
-    estimate_camera(files, Path(str(cfg.out)), most=most, fov_deg=cfg.fov_deg, predict=predict)
+    estimate_camera(files, Path(str(cfg.out)), max_frames=max_frames, fov_deg=cfg.fov_deg, predict=predict)
 
 
 def estimate_camera(
     files: Sequence[Path],
     out: Path,
     *,
-    most: int = 100,
+    max_frames: int = 100,
     fov_deg: float | None = None,
     predict: Predictor | None = None,
     upright: bool = False,
 ) -> Camera:
     """Estimate the camera of at most so many frames of files, write it to `out`, and print how certain it is."""
-    chosen = _select_frames(files, most)
+    chosen = _select_frames(files, max_frames)
     count = sum(len(times) for _, times in chosen)
     frames = progress(_read_frames(chosen, upright=upright), "estimating the lens", count=count)
     with naming("input"):
@@ -76,11 +76,11 @@ def flow_predictor(model: Callable[[Tensor], Any], size: tuple[int, int], device
     return predict
 
 
-def _select_frames(files: Sequence[Path], most: int) -> list[tuple[Path, list[int]]]:
+def _select_frames(files: Sequence[Path], max_frames: int) -> list[tuple[Path, list[int]]]:
     """Choose at most so many frames, evenly spaced over all files; return their numbers in each file."""
     counts = [media.video_info(file)[0] if media.is_video(file) else 1 for file in files]
     total, chosen = sum(counts), list[tuple[Path, list[int]]]()
-    numbers = [i * total // min(most, total) for i in range(min(most, total))]
+    numbers = [i * total // min(max_frames, total) for i in range(min(max_frames, total))]
     for file, start, end in zip(files, accumulate([0, *counts]), accumulate(counts), strict=False):
         chosen.append((file, [number - start for number in numbers if start <= number < end]))
     return chosen

@@ -230,9 +230,9 @@ def _to_subpixel(edge: np.ndarray, slope_x: np.ndarray, slope_y: np.ndarray) -> 
 def _smooth_pieces(edge: np.ndarray, width: int) -> Iterator[np.ndarray]:
     """Cut an edge (N, 2) where the chords before and behind a point turn, and yield the long pieces."""
     arm = max(6, round(_ARM * width))
-    ahead, behind = edge[2 * arm :] - edge[arm:-arm], edge[arm:-arm] - edge[: -2 * arm]
-    cross = behind[:, 0] * ahead[:, 1] - behind[:, 1] * ahead[:, 0]
-    turn = np.abs(np.arctan2(cross, (behind * ahead).sum(axis=1)))
+    forward, backward = edge[2 * arm :] - edge[arm:-arm], edge[arm:-arm] - edge[: -2 * arm]
+    cross = backward[:, 0] * forward[:, 1] - backward[:, 1] * forward[:, 0]
+    turn = np.abs(np.arctan2(cross, (backward * forward).sum(axis=1)))
     corners = arm + np.flatnonzero(turn > math.radians(_MAX_TURN_DEG))
     for piece in np.split(edge, corners):
         kept = piece[_TRIMMED:-_TRIMMED]

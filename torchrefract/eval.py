@@ -6,8 +6,7 @@ of its training. Options change single values; the first line says what is score
 Options:
     ckpt_path=FILE          a checkpoint of `train`, required
     data=frames             other frames: road_scenes (rendered), frames (a folder) or pairs (of `generate`)
-    data.root=DIR           folder of the frames or pairs
-    data.size=[64,112]      [height, width] to which frames are cropped and reduced, px
+    data.root=DIR           folder of the frames or pairs; data.size=[64,112] crops and reduces them
     scene=NAME              another degradation: cheap_dashcam, cape_town_fog, paper_refractive, paper_weather, ...
     scene.severity=3        1 to 5
     data.border=black       a black or mirrored border, where frames padded by the lens would have one; names the rows

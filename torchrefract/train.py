@@ -7,8 +7,7 @@ the model with doing nothing, and end in a verdict.
 Options:
     +task=undistort         what to learn, required unless an experiment is given: undistort or deweather
     data=road_scenes        clean frames: road_scenes (rendered), frames (a folder) or pairs (of `generate`)
-    data.root=DIR           folder of the frames or pairs
-    data.size=[64,112]      [height, width] to which frames are cropped and reduced, px
+    data.root=DIR           folder of the frames or pairs; data.size=[64,112] crops and reduces them
     scene=NAME              degradation: cheap_dashcam, cape_town_fog, paper_refractive, paper_weather, ...
     model=resunet           network: resunet, segformer, ddpm or ddpm_cat256
     trainer=cpu             hardware: cpu, gpu or ddp; trainer.max_epochs=6 sets the length

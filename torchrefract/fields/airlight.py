@@ -115,9 +115,8 @@ def sunlit_airlight(
     Returns:
         (N, C, H, W), stored values in [0, 1].
     """
-    options = {"dtype": airlight.dtype, "device": airlight.device}
-    x = ((torch.arange(width, **options) - center[0]) / focal[0]).view(1, 1, width)
-    y = ((torch.arange(height, **options) - center[1]) / focal[1]).view(1, height, 1)
+    columns, rows = (torch.arange(size, dtype=airlight.dtype, device=airlight.device) for size in (width, height))
+    x, y = ((columns - center[0]) / focal[0]).view(1, 1, width), ((rows - center[1]) / focal[1]).view(1, height, 1)
     azimuth, elevation = sun[:, 0].deg2rad().view(-1, 1, 1), sun[:, 1].deg2rad().view(-1, 1, 1)
     right, up, ahead = elevation.cos() * azimuth.sin(), elevation.sin(), elevation.cos() * azimuth.cos()
     # The axis of the camera points above the horizon by the pitch.

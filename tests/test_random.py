@@ -1,4 +1,5 @@
 import math
+from pathlib import PurePosixPath, PureWindowsPath
 
 import pytest
 import torch
@@ -7,7 +8,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from torchrefract import random
+from torchrefract import key_of, random
 
 WORD = 2**32
 COUNT, NOISE_COUNT = 20_000, 400_000
@@ -313,3 +314,20 @@ def test_lattice_noise_is_uniform_and_independent(sides):
     for dim in range(2, numbers.ndim):
         first, second = (numbers.narrow(dim, i, numbers.shape[dim] - 1) - 0.5 for i in (0, 1))
         assert (12 * first * second).mean().abs() < bound
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(
+    ("name", "digest"),  # as `printf NAME | b2sum -l 64` prints it
+    [
+        ("", 0xE4A6A0577479B2B4),
+        ("drive/0001.jpg", 0xBA615AFDF666345B),
+        ("Kap/Fähre.jpg", 0xDFC1EE6F450C9A8C),
+        (b"\xff.png".decode(errors="surrogateescape"), 0x9364C752A966B744),
+    ],
+)
+def test_the_key_of_a_name_is_its_blake2b_digest_on_every_machine(name, digest):
+    assert key_of(name) == digest >> 1 < 2**63
+    assert key_of(PurePosixPath(name)) == (digest >> 1 if name else key_of("."))
+    assert key_of(PureWindowsPath("drive", "0001.jpg")) == key_of("drive/0001.jpg")
+    assert random.uniform(random.stream(0, torch.tensor([key_of(name)])), 1).shape == (1, 1)

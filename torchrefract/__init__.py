@@ -64,6 +64,7 @@ from torchrefract.labels.boxes import warp_boxes
 from torchrefract.labels.maps import warp_depth, warp_mask, warp_optical_flow
 from torchrefract.labels.points import warp_points
 from torchrefract.labels.targets import warp_labels
+from torchrefract.random import key_of
 from torchrefract.robustness.worst_case import WorstCase, worst_case
 from torchrefract.types import Degraded, Folding, Frame, Pair
 from torchrefract.warping.flow import compose_flows, folding, jacobian_determinant
@@ -126,6 +127,7 @@ __all__ = [
     "folding",
     "invert_flow",
     "jacobian_determinant",
+    "key_of",
     "ray_distance",
     "remove_fog",
     "warp",

@@ -6,8 +6,11 @@ Source: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3
 rounds; Wellons, "Prospecting for hash functions" (2018), for the hash of the white noise; Box and Muller (1958).
 """
 
+import hashlib
 import math
+import os
 from collections.abc import Callable, Sequence
+from pathlib import PurePath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,6 +52,23 @@ class Stream(NamedTuple):
     def to(self, device: torch.device | None) -> "Stream":
         """Return the same streams, whose numbers are moved to a device."""
         return self._replace(device=device)
+
+
+def key_of(name: str | PurePath) -> int:
+    """Hash the name of a sample to its key, the same on every machine and in any listing.
+
+    Two names share a key with a probability of 2^-63. A name that is not valid Unicode is hashed by its bytes.
+
+    Args:
+        name: mostly the path of a file relative to its data set; a string has forward slashes, as "drive/0001.jpg".
+
+    Returns:
+        An integer in [0, 2^63): the highest 63 bits of the BLAKE2b digest of 8 bytes.
+
+    Source: Saarinen and Aumasson, "The BLAKE2 cryptographic hash and message authentication code", RFC 7693 (2015).
+    """
+    text = name.as_posix() if isinstance(name, PurePath) else name
+    return int.from_bytes(hashlib.blake2b(os.fsencode(text), digest_size=8).digest(), "big") >> 1
 
 
 def stream(seed: int | Tensor, keys: Tensor | range, *, device: torch.device | None = None) -> Stream:

@@ -4,7 +4,6 @@ Neighboring frames of a drive look alike, so a split by frame would validate on 
 go to training or to validation instead. Folders or file names tell the drives apart.
 """
 
-import hashlib
 import os
 import posixpath
 import re
@@ -22,6 +21,7 @@ from torch.utils.data import Dataset
 from torchrefract._validation import check_choice, check_number, check_size
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, image_size, read_image
+from torchrefract.random import key_of
 from torchrefract.types import Frame
 
 _SPLITS = {"train": "train", "val": "val", "valid": "val", "validation": "val"}  # folder names
@@ -102,7 +102,7 @@ class FrameFolder(Dataset[Frame]):
         frames, self.skipped = assign_frames(self.root, size=self.size, split=split, **options)
         self.paths = [self.root / frame.path for frame in frames]
         self.drives = sorted({frame.drive for frame in frames})
-        self.keys = [path_key(frame.path) for frame in frames]
+        self.keys = [key_of(frame.path) for frame in frames]
         if self.depth is not None:
             self.depth.check((frame.path, None) for frame in frames)
 
@@ -257,7 +257,7 @@ def select_val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: flo
         )
         warnings.warn(message, stacklevel=4)
     val, missing = set(), val_share * len(drive_of)
-    order = sorted(frames, key=lambda drive: path_key(f"{seed}/{drive}"))
+    order = sorted(frames, key=lambda drive: key_of(f"{seed}/{drive}"))
     for drive in order:
         if abs(missing - frames[drive]) < missing:
             val.add(drive)
@@ -301,11 +301,3 @@ def first_names(names: Sequence[str]) -> str:
     """Join the first names and the number of the others, for a message."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + more
-
-
-def path_key(text: str) -> int:
-    """Hash a path to an integer below 2^63 that is the same on every machine.
-
-    A path that is not valid Unicode is hashed by its bytes.
-    """
-    return int.from_bytes(hashlib.blake2b(os.fsencode(text), digest_size=8).digest(), "big") >> 1

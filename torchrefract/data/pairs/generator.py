@@ -29,13 +29,14 @@ from torch import Tensor
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError
 from torchrefract.data.depth_maps import DepthFolder
-from torchrefract.data.frames import Source, assign_frames, list_files, path_key, select_val_drives
+from torchrefract.data.frames import Source, assign_frames, list_files, select_val_drives
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, is_lost, pixels_of, read_image
 from torchrefract.data.media import VIDEOS, read_video, video_info
 from torchrefract.data.pairs.files import DEPTH, FLOWS, LIGHTS, PairArrays, count_out_of_range, encode_pair
 from torchrefract.data.pairs.manifest import PairRow, StoredFile
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
+from torchrefract.random import key_of
 from torchrefract.types import Degraded
 
 _PAIRS_PER_FOLDER = 1000
@@ -178,7 +179,7 @@ def draw_of(source: Source, *, seed: int, repeat: int) -> tuple[int, int]:
 
     At repeat 0 they are those of the first epoch of `PairData` with the same seed, and of its validation.
     """
-    key = path_key(source.name if repeat == 0 else f"{source.name}\0{repeat}")
+    key = key_of(source.name if repeat == 0 else f"{source.name}\0{repeat}")
     return (seed << 32) + (source.split != "val"), key
 
 

@@ -118,6 +118,7 @@ ODD_NAMES = (
 FILE_OPTIONS = {
     "preview": (("image", "depth"), ()),
     "generate": (("source",), ("scene=paper_weather", "out=o", "license=l")),
+    "degrade": (("source", "out", "labels", "depth"), ("scene=paper_weather", "source=s", "out=o")),
     "calibrate": (("images", "out"), ()),
     "rectify": (("input", "camera"), ("camera=c", "input=i")),
     "restore": (("ckpt_path", "input", "out"), ("ckpt_path=a", "input=b")),

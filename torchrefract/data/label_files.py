@@ -9,6 +9,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -285,15 +286,14 @@ def _moved_annotations(annotations: Sequence[Annotation], flow: Tensor) -> Itera
     boxes, keep = _moved_boxes([*torch.cat([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], dim=1)], flow)
     parts = [torch.tensor(part).view(-1, 2) for annotation in annotations for part in _polygons(annotation)]
     outlines = iter(_moved_polygons(parts, flow))
+    # One search for all points of a picture takes hardly longer than one for a single point.
+    keypoints = iter(_moved_keypoints([v for row in annotations for v in row.get("keypoints") or ()], flow))
     for annotation, box, is_kept in zip(annotations, boxes, keep.tolist(), strict=True):
         moved, is_visible, area = dict(annotation), True, None
         if annotation.get("bbox"):
-            sides = box[2:] - box[:2]
-            moved["bbox"], is_visible, area = (
-                _rounded([*box[:2].tolist(), *sides.tolist()]),
-                is_kept,
-                sides.prod().item(),
-            )
+            x1, y1, x2, y2 = box.tolist()
+            moved["bbox"] = _rounded([x1, y1, x2 - x1, y2 - y1])
+            is_visible, area = is_kept, (x2 - x1) * (y2 - y1)
         if annotation.get("segmentation"):
             visible = [part for _ in _polygons(annotation) if len(part := next(outlines))]
             if isinstance(annotation["segmentation"], dict):
@@ -303,7 +303,7 @@ def _moved_annotations(annotations: Sequence[Annotation], flow: Tensor) -> Itera
                 area = sum(map(polygon_area, visible))
             is_visible = is_visible and area > 0
         if annotation.get("keypoints"):
-            moved["keypoints"] = _moved_keypoints(annotation["keypoints"], flow)
+            moved["keypoints"] = [*islice(keypoints, len(annotation["keypoints"]))]
             moved["num_keypoints"] = sum(value > 0 for value in moved["keypoints"][2::3])
         if "area" in annotation and area is not None:
             moved["area"] = round(area, _DIGITS)
@@ -334,6 +334,8 @@ def _moved_polygons(polygons: Collection[Tensor], flow: Tensor) -> list[Tensor]:
 
 def _moved_keypoints(keypoints: Sequence[float], flow: Tensor) -> list[float]:
     """Move x, y, v of each keypoint; those that leave the frame become 0, 0, 0, which COCO calls not labeled."""
+    if not keypoints:
+        return []
     rows = torch.tensor(keypoints, dtype=flow.dtype).view(1, -1, 3)
     points, converged, upright = solve_points(rows[..., :2], flow[None], STEPS, TOLERANCE_PX)
     is_visible = converged & upright & in_frame(points, flow[None], 0.5) & (rows[..., 2] > 0)

@@ -43,7 +43,7 @@ _INFORMATION_OPTIONS = ("--hydra-help", "--info", "--shell-completion", "-sc")
 _MULTIRUN = ("-m", "--multirun")
 # Options whose value is text, mostly the path of a file: Hydra's syntax in it means nothing.
 _TEXT_OPTION = re.compile(
-    r"(\+{0,2}(?:image|images|input|source|labels|depth|network|camera|scene\.camera|out|ckpt_path|license|run_dir|data\.root|data\.depth|hydra\.run\.dir"
+    r"(\+{0,2}(?:image|images|input|data|labels|weights|source|depth|network|camera|scene\.camera|out|ckpt_path|license|run_dir|data\.root|data\.depth|hydra\.run\.dir"
     r"|hydra\.sweep\.dir|hydra\.sweep\.subdir|model\.network\.pretrained))=(.*)",
     re.DOTALL,
 )
@@ -90,7 +90,7 @@ def run(name: str, function: Callable[[DictConfig], None]) -> None:
     with _one_line_errors(name):
         _check_outputs(sys.argv[1:])
         sys.argv[1:] = prepare_arguments(name, sys.argv[1:])
-        hydra.main(config_path=CONFIG_DIR, config_name=name, version_base="1.3")(job)()
+        hydra.main(config_path=str(_config_file(name).parent), config_name=name, version_base="1.3")(job)()
 
 
 def prepare_arguments(name: str, arguments: list[str]) -> list[str]:
@@ -353,7 +353,7 @@ def _unknown_option(name: str, option: str) -> str:
 
 def _options(name: str) -> list[str]:
     """Return the names before "=" that a command accepts: keys and groups of its configuration."""
-    config = cast(DictConfig, OmegaConf.load(Path(CONFIG_DIR, f"{name}.yaml")))
+    config = cast(DictConfig, OmegaConf.load(_config_file(name)))
     options = [str(key) for key in config if key not in ("defaults", "hydra")]
     given = dict(argument.split("=", 1) for argument in sys.argv[1:] if "=" in argument)
     for part in cast(list[Any], OmegaConf.to_container(config.defaults)):  # a group may be missing
@@ -364,3 +364,9 @@ def _options(name: str) -> list[str]:
             if file.is_file() and file.read_text(encoding="utf-8").startswith("# @package _global_"):
                 options += [str(key) for key in OmegaConf.load(file)]
     return list(dict.fromkeys(options))
+
+
+def _config_file(name: str) -> Path:
+    """Return the configuration of a command: in a folder of its own if its options have the names of groups."""
+    own = Path(CONFIG_DIR, name, f"{name}.yaml")
+    return own if own.is_file() else Path(CONFIG_DIR, f"{name}.yaml")

@@ -1,0 +1,178 @@
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torchvision import models
+
+from torchrefract import presets
+from torchrefract.robustness.predictors import load_predictor
+from torchrefract.robustness.quantities import QUANTITIES
+
+COMMAND = ("robustness.__main__", "model=bright:detect", "data=frames", "out=out")
+MODEL = """
+import torch
+
+def detect(images):
+    '''Detect the bright square.'''
+    if images.amin() > 0.99:
+        raise RuntimeError("a white picture")
+    rows, columns = (images[0].mean(dim=0) > 0.6).nonzero().unbind(1)
+    if len(rows) == 0:
+        return [{"boxes": torch.zeros(0, 4), "labels": torch.zeros(0).long(), "scores": torch.zeros(0)}]
+    box = torch.stack([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]).float()
+    return [{"boxes": box[None], "labels": torch.tensor([1]), "scores": torch.tensor([0.9])}]
+
+def count(prediction, target):
+    return float(len(prediction["boxes"]) == len(target["boxes"]))
+
+network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten(), torch.nn.Linear(3, 2))
+"""
+
+
+@pytest.fixture
+def frames(tmp_path, monkeypatch) -> Path:
+    """Write four pictures with a bright square, their labels, and a model."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    images, rows = [], []
+    for i in range(4):
+        picture = np.full((72, 128, 3), 90, np.uint8)
+        picture[30:50, 40 + 10 * i : 60 + 10 * i] = 255
+        cv2.imwrite(str(folder / f"{i} a=b.png"), picture)
+        images.append({"id": i, "file_name": f"sub/{i} a=b.png"})
+        rows.append({"image_id": i, "bbox": [40 + 10 * i, 30, 20, 20], "category_id": 1})
+    (tmp_path / "coco.json").write_text(json.dumps({"images": images, "annotations": rows}))
+    (tmp_path / "bright.py").write_text(MODEL)
+    monkeypatch.syspath_prepend(tmp_path)
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if not path.name.startswith(".")}
+
+
+def test_a_run_writes_tables_and_a_report_and_continues_with_equal_bytes(call, tmp_path, frames):
+    words = (*COMMAND, "labels=coco.json", "scene=[cape_town_fog,cheap_dashcam]", "severity=[1,5]")
+    outcome = call(*words)
+    assert outcome.code == 0
+    assert "out/report.html: 4 pictures, clean score 1.000" in outcome.out
+    complete = contents(tmp_path / "out")
+    assert set(complete) == {"results.csv", "results.json", "report.html", "scores.jsonl"}
+    results = json.loads(complete["results.json"])
+    assert results["clean"]["value"] == 1
+    assert [row["scene"] for row in results["levels"]] == ["cape_town_fog"] * 2 + ["cheap_dashcam"] * 2
+    for row, (low, high) in zip(results["levels"], [(500, 1000), (20, 40), (-0.1, -0.03), (-0.6, -0.45)], strict=True):
+        assert low <= row["value"] <= high
+        assert row["num_images"] == 4
+    # A lens keeps the square in one piece, and its label moves with it.
+    assert [row["score"] for row in results["levels"][2:]] == [1, 1]
+    assert complete["report.html"].count(b"data:image/jpeg;base64,") == 4
+    # A run that was killed in the middle of a line continues.
+    lines = complete["scores.jsonl"].splitlines(keepends=True)
+    for path in (tmp_path / "out").iterdir():
+        path.unlink()
+    (tmp_path / "out" / "scores.jsonl").write_bytes(b"".join(lines[:3]) + lines[3][:20])
+    assert call(*words).code == 0
+    assert contents(tmp_path / "out") == complete
+
+
+def test_other_settings_in_the_same_folder_are_refused(call, frames):
+    assert call(*COMMAND, "scene=[cheap_dashcam]", "severity=[1]").code == 0
+    message = call(*COMMAND, "scene=[cheap_dashcam]", "severity=[2]").message
+    assert message == "out must be a folder of the same settings, got one with severity=[1]; choose another"
+
+
+def test_predictions_of_clean_pictures_stand_for_labels_and_a_function_for_the_score(call, tmp_path, frames):
+    outcome = call(*COMMAND, "score=bright:count", "scene=cheap_dashcam", "severity=5", "limit=2")
+    assert "2 pictures, clean score 1.000" in outcome.out
+    assert "cheap_dashcam: k1 at least" in outcome.out
+
+
+def test_masks_and_modules_are_taken(call, tmp_path, frames):
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for path in frames.iterdir():
+        cv2.imwrite(str(masks / path.name), np.zeros((72, 128), np.uint8))
+    (tmp_path / "classes.py").write_text(
+        "import torch\n\ndef segment(images):\n    return torch.stack([1 - images[:, 0], images[:, 0] - 0.9], dim=1)\n"
+    )
+    words = ("robustness.__main__", "model=classes:segment", "data=frames", "out=out", "labels=masks")
+    assert "4 pictures, clean score 0." in call(*words, "scene=cheap_dashcam", "severity=1").out
+    outcome = call("robustness.__main__", "model=bright:network", "data=frames", "out=o2", "scene=cheap_dashcam")
+    assert "clean score 1.000" in outcome.out
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("model=nothing:here", "model: a function must be package.module:name that can be imported, got nothing:here"),
+        ("model=bright", "model: model must be package.module:name, torchvision:name, opencv:hog or a file"),
+        ("model=lost.onnx", "model: model must be a file that exists, got lost.onnx"),
+        ("model=torchvision:no_such_net", "model: model must be one of torchvision.models.list_models()"),
+        ("data=empty", "data must be a folder of pictures, got empty, which holds none"),
+        ("labels=bright.py", "labels must be a JSON file of COCO with images and annotations, or a folder of masks"),
+        ("labels=few.json", "labels must name each picture, got nothing for 0 a=b.png, 1 a=b.png"),
+        ("scene=[cape_town_frog]", "scene must be some of cheap_dashcam, cape_town_fog"),
+        ("severity=[6]", "severity must be some of (1, 2, 3, 4, 5), got [6]"),
+        ("loss=2", "loss: loss must"),
+        ("score=bright:nothing", "score: a function must be package.module:name"),
+    ],
+)
+def test_an_invalid_option_is_one_line_of_error(call, tmp_path, frames, word, message):
+    (tmp_path / "few.json").write_text('{"images": [], "annotations": []}')
+    assert call(*COMMAND, word).message.startswith(message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_model_that_fails_for_one_picture_is_said_and_for_all_stops(call, tmp_path, frames):
+    cv2.imwrite(str(frames / "white.png"), np.full((72, 128, 3), 255, np.uint8))
+    outcome = call(*COMMAND, "scene=cheap_dashcam", "severity=1")
+    assert "warning: the model failed for white.png, which are left out" in outcome.err
+    assert "4 pictures" in outcome.out
+    assert b"a white picture" in (tmp_path / "out" / "report.html").read_bytes()
+    for path in frames.glob("* a=b.png"):
+        path.unlink()
+    message = call(*COMMAND[:-1], "out=o2", "scene=cheap_dashcam").message
+    assert message.endswith("the last was white.png: RuntimeError: a white picture")
+
+
+@pytest.mark.filterwarnings("ignore:.*deprecated:FutureWarning")  # of TorchScript, which people still have
+def test_exported_programs_and_the_detector_of_opencv_predict(tmp_path):
+    network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten(), torch.nn.Linear(3, 2)).eval()
+    image = torch.rand(1, 3, 40, 60)
+    torch.jit.save(torch.jit.trace(network, image), tmp_path / "net.pt")
+    torch.export.save(torch.export.export(network, (image,)), tmp_path / "net.pt2")
+    for name in ("net.pt", "net.pt2"):
+        torch.testing.assert_close(load_predictor(str(tmp_path / name))(image), network(image).detach())
+    (found,) = load_predictor("opencv:hog")(torch.rand(1, 3, 160, 120))
+    assert set(found) == {"boxes", "labels", "scores"}
+
+
+def test_a_local_state_dict_of_torchvision_is_loaded_without_network(tmp_path):
+    network = models.get_model("mobilenet_v3_small", weights=None, num_classes=1000).eval()
+    torch.save(network.state_dict(), tmp_path / "weights.pth")
+    predict = load_predictor("torchvision:mobilenet_v3_small", weights=str(tmp_path / "weights.pth"))
+    image = torch.rand(1, 3, 40, 60)
+    assert predict(image).shape == (1, 1000)
+    prepare = models.get_model_weights("mobilenet_v3_small")["DEFAULT"].transforms()
+    torch.testing.assert_close(predict(image), network(prepare(image)).detach())
+
+
+@pytest.mark.quick
+def test_each_scene_with_a_quantity_has_its_value_in_the_stated_range():
+    image = torch.rand(2, 3, 36, 64)
+    expected = {
+        "cheap_dashcam": (-0.35, -0.15),
+        "cape_town_fog": (60, 200),
+        "limpopo_sun_glare": (4, 8),
+        "highveld_heat_haze": (12, 18),
+        "unpaved_road": (60, 200),
+    }
+    for name, quantity in QUANTITIES.items():
+        values = quantity.get(getattr(presets, name)(3).sample(image, seed=0))
+        assert values.shape == (2,)
+        low, high = expected.get(name, (0, 1e6))
+        assert ((values >= low) & (values <= high)).all(), name

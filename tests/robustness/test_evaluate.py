@@ -1,0 +1,119 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torchvision import tv_tensors
+
+from torchrefract import LensDistortion, UniformFog
+from torchrefract.effects.base import Effect
+from torchrefract.robustness import Quantity, evaluate
+from torchrefract.robustness.scores import as_labels, classification_score, detection_score
+
+VISIBILITY = Quantity("visibility", "m", False, lambda params: params.visibility)
+RANGES = {1: (500.0, 1000.0), 2: (200.0, 500.0), 3: (60.0, 200.0), 4: (40.0, 60.0), 5: (20.0, 40.0)}
+
+
+def flat_depth(images: Tensor) -> Tensor:
+    return torch.full_like(images[:, :1], 50.0)
+
+
+def fogs(**options) -> dict[int, Effect]:
+    return {
+        severity: UniformFog(visibility_range=limits, deviation_range=(0.0, 0.0), airlight=1.0, **options)
+        for severity, limits in RANGES.items()
+    }
+
+
+def black(count: int) -> list[tuple[str, Tensor, int]]:
+    return [(f"drive/{i:03}.png", torch.zeros(3, 8, 12), 1) for i in range(count)]
+
+
+def test_a_model_that_fails_below_a_visibility_has_it_as_its_tolerated_value():
+    # At 50 m a black image has the light 1 - 0.05^(50 / V), which is 0.6 at V = 163 m.
+    def predict(images: Tensor) -> Tensor:
+        return torch.stack([images.mean(dim=(1, 2, 3)) - 0.6, 0.6 - images.mean(dim=(1, 2, 3))], dim=1)
+
+    result = evaluate(
+        predict, black(40), {"fog": fogs()}, classification_score, quantities={"fog": VISIBILITY}, depth=flat_depth
+    )
+    truth = 50 * math.log(0.05) / math.log(0.4)
+    estimate = result.tolerated("fog", loss=0.1)
+    assert estimate.low <= truth <= estimate.high
+    assert estimate.value == pytest.approx(truth, rel=0.1)
+    rows = result.rows()
+    assert [row.score.value for row in rows[:2]] == [1, 1]
+    assert [row.score.value for row in rows[3:]] == [0, 0]
+    assert [(row.quantity, row.unit, row.num_images) for row in rows] == [("visibility", "m", 40)] * 5
+    assert 500 < rows[0].value < 1000
+    share = rows[2].score.value
+    assert result.mean_performance("fog") == pytest.approx((2 + share) / 5)
+    assert result.relative_performance() == pytest.approx((2 + share) / 5)
+
+
+def test_differences_between_levels_are_less_than_half_as_uncertain_as_with_independent_draws():
+    def score(prediction: Tensor, target: Tensor) -> float:
+        return 1 - prediction.mean().item()
+
+    levels: dict[int, Effect] = {
+        1: UniformFog(visibility_range=(50.0, 500.0)),
+        2: UniformFog(visibility_range=(40.0, 400.0)),
+    }
+    runs = [evaluate(lambda x: x, black(60), {"fog": levels}, score, seed=seed, depth=flat_depth) for seed in (0, 1)]
+    mild, strong = (next(v for level, v in runs[0].scores.items() if level.severity == s) for s in (1, 2))
+    independent = next(v for level, v in runs[1].scores.items() if level.severity == 2)
+    assert np.std(mild - strong) < 0.5 * np.std(mild - independent)
+    again = evaluate(lambda x: x, black(60)[::-1], {"fog": levels}, score, depth=flat_depth)
+    assert again.names == runs[0].names[::-1]
+    for level, values in runs[0].scores.items():
+        np.testing.assert_allclose(again.scores[level][::-1], values, atol=1e-6)
+
+
+def test_labels_and_clean_predictions_move_along_the_flow():
+    image = torch.zeros(3, 60, 90)
+    image[:, 20:32, 60:80] = 1
+
+    def predict(images: Tensor) -> list[dict[str, Tensor]]:
+        """Detect the one bright box."""
+        rows, columns = (images[0].mean(dim=0) > 0.5).nonzero().unbind(1)
+        box = torch.stack([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]).float()
+        return [{"boxes": box[None], "labels": torch.tensor([1]), "scores": torch.tensor([0.9])}]
+
+    lens = LensDistortion(k1_range=(-0.5, -0.4), k2_range=(0.15, 0.2), focal_range=(0.7, 0.8))
+    boxes = tv_tensors.BoundingBoxes(  # pyright: ignore[reportCallIssue]  # torchvision's overloads
+        torch.tensor([[60.0, 20, 80, 32]]), format="XYXY", canvas_size=(60, 90)
+    )
+    target = {"boxes": boxes, "labels": torch.tensor([1])}
+    still = detection_score(predict(lens.degrade(image, seed=0).image[None])[0], target)
+    assert still == 0  # the lens moves the box by more than half of its size
+    for given in (target, None):
+        result = evaluate(predict, [("a.png", image, given)], {"lens": {3: lens}}, detection_score, as_target=as_labels)
+        assert [row.score.value for row in result.rows()] == [1]
+
+
+def test_a_prediction_that_raises_is_left_out_and_said_and_many_stop_the_run():
+    def predict(images: Tensor) -> Tensor:
+        if images.amax() > 0.9:
+            raise RuntimeError("out of memory")
+        return torch.tensor([[0.0, 1.0]])
+
+    samples = [(f"{i}.png", torch.full((3, 8, 12), 1.0 if i == 7 else 0.1), 1) for i in range(20)]
+    effects: dict[str, dict[int, Effect]] = {"fog": {1: UniformFog(airlight=0.5)}}
+    with pytest.warns(UserWarning, match=r"predict failed for 7\.png, which are left out"):
+        result = evaluate(predict, samples, effects, classification_score)
+    assert len(result.names) == 19
+    assert result.failures == {"7.png": "RuntimeError: out of memory"}
+    bright = [(name, torch.ones_like(image), target) for name, image, target in samples]
+    with pytest.raises(RuntimeError, match=r"failed for 10 of 10; the last was 9\.png: RuntimeError: out of memory"):
+        evaluate(predict, bright, effects, classification_score)
+    with pytest.raises(RuntimeError, match="there are no samples"):
+        evaluate(predict, [], effects, classification_score)
+    with pytest.raises(ValueError, match="target must be labels, or as_target a function"):
+        evaluate(predict, [("a.png", samples[0][1], None)], effects, classification_score)
+
+
+def test_unknown_scenes_raise():
+    result = evaluate(lambda x: [x], black(2), {"fog": {1: UniformFog()}}, lambda *_: 1.0)
+    with pytest.raises(ValueError, match="scene must be one with a quantity: , got fog"):
+        result.tolerated("fog")

@@ -1,0 +1,64 @@
+from typing import Any
+
+import pytest
+import torch
+
+from torchrefract.robustness.scores import as_labels, classification_score, detection_score, segmentation_score
+
+pytestmark = pytest.mark.quick
+
+
+def test_the_average_precision_of_one_image_is_the_area_below_its_curve():
+    target: dict[str, Any] = {
+        "boxes": torch.tensor([[0.0, 0, 10, 10], [20, 20, 30, 30]]),
+        "labels": torch.tensor([1, 1]),
+    }
+    # Hit, miss, hit: precision 1 up to a recall of 1/2, then 2/3.
+    boxes = torch.tensor([[1.0, 0, 10, 10], [50, 50, 60, 60], [20, 20, 30, 31]])
+    prediction = {"boxes": boxes, "labels": torch.tensor([1, 1, 1]), "scores": torch.tensor([0.9, 0.8, 0.7])}
+    assert detection_score(prediction, target) == pytest.approx(0.5 + 0.5 * 2 / 3)
+    # Classes that the image does not hold do not count, as in COCO's metric.
+    assert detection_score(prediction | {"labels": torch.tensor([1, 2, 1])}, target) == 1
+    nothing = {name: value[:0] for name, value in prediction.items()}
+    assert detection_score(nothing, target) == 0
+    empty = {"boxes": torch.zeros(0, 4), "labels": torch.zeros(0).long()}
+    assert [detection_score(given, empty) for given in (nothing, prediction)] == [1, 0]
+    assert detection_score({name: value[2:] * 0.5 for name, value in prediction.items()}, empty) == 1  # not confident
+
+
+def test_a_detection_twice_is_a_miss_and_the_larger_overlap_counts():
+    target = {"boxes": torch.tensor([[0.0, 0, 10, 10]]), "labels": torch.tensor([1])}
+    prediction = {
+        "boxes": torch.tensor([[0.0, 0, 10, 10]] * 2),
+        "labels": torch.tensor([1, 1]),
+        "scores": torch.ones(2),
+    }
+    assert detection_score(prediction, target) == 1
+    prediction["boxes"] = torch.tensor([[0.0, 0, 10, 4.9], [0, 0, 10, 9]])
+    prediction["scores"] = torch.tensor([0.9, 0.8])
+    assert detection_score(prediction, target) == pytest.approx(0.5)
+
+
+def test_segmentation_and_classification():
+    target = torch.tensor([[0, 0, 1], [1, 1, 255]])
+    logits = torch.nn.functional.one_hot(torch.tensor([[0, 1, 1], [1, 1, 0]]), 2).movedim(-1, 0).float()
+    assert segmentation_score(logits, target) == pytest.approx((1 / 2 + 3 / 4) / 2)
+    assert segmentation_score(torch.tensor([[0, 1, 1], [1, 1, 0]]), target[None]) == pytest.approx((1 / 2 + 3 / 4) / 2)
+    assert classification_score(torch.tensor([0.1, 0.9]), 1) == 1
+    assert classification_score(torch.tensor([0.1, 0.9]), 0) == 0
+
+
+def test_confident_detections_become_labels():
+    prediction = {
+        "boxes": torch.tensor([[0.0, 0, 5, 5], [1, 1, 3, 3]]),
+        "labels": torch.tensor([3, 4]),
+        "scores": torch.tensor([0.9, 0.2]),
+    }
+    target = as_labels(prediction, (20, 30))
+    assert target["labels"].tolist() == [3]
+    assert tuple(target["boxes"].canvas_size) == (20, 30)
+    assert detection_score(prediction, target) > 0
+    assert as_labels(torch.tensor([0.1, 0.9]), (2, 2)) == 1
+    assert as_labels(torch.tensor([[[0.0]], [[1.0]]]), (1, 1)).tolist() == [[1]]
+    with pytest.raises(TypeError, match="predictions must be dicts of boxes"):
+        as_labels("a car", (2, 2))

@@ -1,0 +1,36 @@
+"""Score a model by scene and severity: `python -m torchrefract.robustness model=NAME data=DIR out=DIR`.
+
+Writes results.csv, results.json and report.html: scores with 95 % intervals, the value of a physical quantity that
+the model tolerates ("visibility at least 142 m"), and the worst pictures. A picture has the same fog, lens or haze at
+all severities but for its strength. Without labels, a prediction is scored by its agreement with that for the clean
+picture. A run that is stopped continues where it was.
+
+Options:
+    model=NAME              required: package.module:name of a function from images (1, 3, H, W) in [0, 1] to
+                            predictions, torchvision:NAME, opencv:hog (pedestrians), or a file .pt2, .onnx or .pt
+    data=DIR                folder of pictures, required
+    out=DIR                 output folder, required
+    labels=PATH             COCO JSON, or a folder of masks with the names of the pictures
+    scene=[NAME,...]        cheap_dashcam, cape_town_fog, limpopo_sun_glare, highveld_heat_haze, ...
+    severity=[1,3,5]        1 to 5
+    score=NAME              package.module:name of a function from a prediction and a target to a number in [0, 1]
+    weights=FILE            state_dict for a model of torchvision
+    loss=0.1                share of the clean score that is tolerated
+    limit=N                 number of pictures
+    device=cpu              or cuda
+    seed=0                  of the draws
+
+Examples:
+    python -m torchrefract.robustness model=opencv:hog data=frames out=robustness scene=[cape_town_fog]
+    python -m torchrefract.robustness model=my_detector:predict data=frames labels=instances.json out=robustness
+
+Options of Hydra: `--cfg job` prints all options with their values. A file name may hold any letters; only the shell
+needs quotes, as in `'data=my drive (1)'`.
+"""
+
+from torchrefract.cli.entry import command
+
+main = command("robustness", __doc__, "robustness:test_robustness")
+
+if __name__ == "__main__":
+    main()

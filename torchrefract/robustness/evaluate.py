@@ -1,0 +1,237 @@
+"""The score of a model on degraded images, by scene and severity, and the physical value that it tolerates."""
+
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from torch import Tensor
+
+from torchrefract._validation import check_number
+from torchrefract.data.frames import first_names
+from torchrefract.effects.base import Effect
+from torchrefract.labels.targets import warp_moved_labels
+from torchrefract.random import key_of
+from torchrefract.robustness.statistics import Estimate, mean_estimate, tolerated_value
+
+_MAX_FAILED, _MIN_COUNT = 0.1, 10  # share of the images whose prediction may raise, and from how many on it counts
+
+
+class Quantity(NamedTuple):
+    """A parameter by which a scene is stated, such as the visibility of a fog.
+
+    name, unit: of the parameter.
+    is_harm: True if higher values harm more, False for one such as visibility.
+    get: returns its value for each sample, (B,), from the params of the scene.
+    """
+
+    name: str
+    unit: str
+    is_harm: bool
+    get: Callable[[Any], Tensor]
+
+
+class Level(NamedTuple):
+    """A scene at a severity."""
+
+    scene: str
+    severity: int
+
+
+class Scored(NamedTuple):
+    """The scores of one image: clean, and at each level with the value of the quantity, 0 without one."""
+
+    clean: float
+    levels: dict[Level, tuple[float, float]]
+
+
+Scenes = Mapping[str, Mapping[int, Effect]]
+
+
+@dataclass(frozen=True)
+class Row:
+    """The scores at a level.
+
+    quantity, value, unit: the physical quantity and its mean over the images; empty and NaN without one.
+    score: mean over the images.
+    drop: mean of the score of each clean image less that of the degraded one.
+    """
+
+    scene: str
+    severity: int
+    quantity: str
+    value: float
+    unit: str
+    num_images: int
+    score: Estimate
+    drop: Estimate
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """The scores of a model.
+
+    names: of the images that were scored.
+    clean: (n,), the scores of the clean images.
+    scores: for each level, (n,), the scores of the degraded images.
+    values: for each level of a scene with a quantity, (n,), its value for each image.
+    quantities: by scene.
+    failures: names of the images whose prediction raised, and why.
+    """
+
+    names: list[str]
+    clean: np.ndarray
+    scores: dict[Level, np.ndarray]
+    values: dict[Level, np.ndarray]
+    quantities: Mapping[str, Quantity] = field(default_factory=dict)
+    failures: dict[str, str] = field(default_factory=dict)
+
+    def rows(self) -> list[Row]:
+        """Return the scores by level, with 95 % intervals by resampling of the images."""
+        rows = []
+        for level, scores in self.scores.items():
+            quantity = self.quantities.get(level.scene)
+            name, unit = (quantity.name, quantity.unit) if quantity else ("", "")
+            value = float(self.values[level].mean()) if quantity else float("nan")
+            estimates = mean_estimate(scores), mean_estimate(self.clean - scores)
+            rows.append(Row(*level, name, value, unit, len(scores), *estimates))
+        return rows
+
+    def clean_estimate(self) -> Estimate:
+        """Return the mean score of the clean images."""
+        return mean_estimate(self.clean)
+
+    def tolerated(self, scene: str, *, loss: float = 0.1) -> Estimate:
+        """Estimate the value of a scene's quantity up to which the mean score falls by at most a share.
+
+        Args:
+            scene: one with a quantity.
+            loss: share of the mean score of the clean images, in (0, 1).
+        """
+        loss = check_number("loss", loss, low=1e-6, high=1 - 1e-6)
+        if scene not in self.quantities:
+            raise ValueError(f"scene must be one with a quantity: {', '.join(self.quantities)}, got {scene}")
+        levels = [level for level in self.scores if level.scene == scene]
+        values, scores = (np.stack([by[level] for level in levels]) for by in (self.values, self.scores))
+        least, is_harm = (1 - loss) * float(self.clean.mean()), self.quantities[scene].is_harm
+        return tolerated_value(values.ravel(), scores.ravel(), least=least, is_harm=is_harm)
+
+    def mean_performance(self, scene: str | None = None) -> float:
+        """Return the mean score over the levels of a scene, or over those of all scenes with equal weights: mPC.
+
+        Source: Michaelis et al., "Benchmarking robustness in object detection", 2019.
+        """
+        scenes = [scene] if scene else list(dict.fromkeys(level.scene for level in self.scores))
+        means = [np.mean([scores.mean() for level, scores in self.scores.items() if level.scene == s]) for s in scenes]
+        return float(np.mean(means))
+
+    def relative_performance(self, scene: str | None = None) -> float:
+        """Return `mean_performance` divided by the mean score of the clean images: rPC."""
+        return self.mean_performance(scene) / float(self.clean.mean())
+
+
+def evaluate(
+    predict: Callable[[Tensor], Any],
+    samples: Iterable[tuple[str, Tensor, Any]],
+    scenes: Scenes | Callable[[int], Scenes],
+    score: Callable[[Any, Any], float],
+    *,
+    as_target: Callable[[Any, tuple[int, int]], Any] | None = None,
+    quantities: Mapping[str, Quantity] | None = None,
+    seed: int = 0,
+    depth: Callable[[Tensor], Tensor] | None = None,
+    done: Mapping[str, Scored] | None = None,
+    on_scored: Callable[[str, Scored], None] | None = None,
+) -> Robustness:
+    """Score a model on images as they are, and at each severity of each scene.
+
+    An image has one key, that of its name, at all levels: its lens, fog or haze differs from level to level by its
+    strength alone, so that differences between levels have small intervals.
+
+    Args:
+        predict: from images (1, 3, H, W), float in [0, 1], to a sequence of one prediction.
+        samples: name, image (3, H, W) and target of each image. Labels of the target move along the flow.
+        scenes: by name, and in each the effects by severity; or a function that returns them for a width in px.
+        score: from a prediction and a target to a number in [0, 1], higher is better; see `robustness.scores`.
+        as_target: makes a target of the prediction for the clean image and its (height, width), for targets that are
+            None: the score is then the agreement with it. See `scores.as_labels`.
+        quantities: of the scenes, by name.
+        seed: of the draws.
+        depth: as for `effect.degrade`.
+        done: scores of an earlier run, by name, which are not computed again.
+        on_scored: is called with the name and the scores of each other image.
+
+    Returns:
+        The scores of all images but those whose prediction raised.
+
+    Raises:
+        RuntimeError: the prediction raised for more than a tenth of the images, from ten on, or for all of them.
+        ValueError: a target of None without `as_target`.
+    """
+    quantities, done = dict(quantities or {}), done or {}
+    scored: dict[str, Scored] = {}
+    failures: dict[str, str] = {}
+    for name, image, given in samples:
+        if name in done:
+            scored[name] = done[name]
+            continue
+        if given is None and as_target is None:
+            raise ValueError(f"target must be labels, or as_target a function, got None for {name}")
+        by_name = scenes(image.shape[-1]) if callable(scenes) else scenes
+        levels = {Level(scene, severity): effect for scene, by in by_name.items() for severity, effect in by.items()}
+        try:
+            (prediction,) = predict(image[None])
+            target = given
+            if given is None and as_target is not None:
+                target = as_target(prediction, (image.shape[-2], image.shape[-1]))
+            clean, by_level = score(prediction, target), {}
+            for level, effect in levels.items():
+                degraded = effect.degrade(image, seed=seed, keys=[key_of(name)], depth=depth)
+                flow = degraded.flow if degraded.has("flow") else None
+                moved = target if flow is None else warp_moved_labels(target, flow, effect.labels_getter)
+                (prediction,) = predict(degraded.image[None])
+                quantity = quantities.get(level.scene)
+                value = quantity.get(degraded.params).item() if quantity else 0.0
+                by_level[level] = (score(prediction, moved), value)
+        except Exception as error:  # a model may raise anything
+            failures[name] = f"{type(error).__name__}: {error}"
+        else:
+            scored[name] = Scored(clean, by_level)
+            if on_scored is not None:
+                on_scored(name, scored[name])
+        if _fails_too_often(len(failures), len(scored)):
+            break
+    if not scored or _fails_too_often(len(failures), len(scored)):
+        name, reason = next(reversed(failures.items()), ("none", "there are no samples"))
+        raise RuntimeError(
+            f"predict must succeed for nine of ten images, failed for {len(failures)} of "
+            f"{len(scored) + len(failures)}; the last was {name}: {reason}"
+        )
+    if failures:
+        name, reason = next(iter(failures.items()))
+        names = first_names(list(failures))
+        warnings.warn(f"predict failed for {names}, which are left out; for {name}: {reason}", stacklevel=2)
+    return collect(scored, quantities, failures)
+
+
+def collect(
+    scored: Mapping[str, Scored], quantities: Mapping[str, Quantity], failures: Mapping[str, str] | None = None
+) -> Robustness:
+    """Return the scores of images, by name and of the same levels, as arrays."""
+    levels = next(iter(scored.values())).levels
+    by_level = {level: np.array([of.levels[level] for of in scored.values()]) for level in levels}
+    return Robustness(
+        names=list(scored),
+        clean=np.array([of.clean for of in scored.values()]),
+        scores={level: pairs[:, 0] for level, pairs in by_level.items()},
+        values={level: pairs[:, 1] for level, pairs in by_level.items() if level.scene in quantities},
+        quantities={
+            scene: quantities[scene] for scene in {level.scene: None for level in levels} if scene in quantities
+        },
+        failures=dict(failures or {}),
+    )
+
+
+def _fails_too_often(failed: int, scored: int) -> bool:
+    return failed + scored >= _MIN_COUNT and failed > _MAX_FAILED * (failed + scored)

@@ -1,0 +1,140 @@
+"""Models of others as functions from images (1, 3, H, W) in [0, 1] to a sequence of one prediction."""
+
+import importlib
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+_PROGRAMS = (".pt2", ".onnx", ".pt")
+_HOG_SCALE = 4.0  # its scores have no upper end; this one counts as certain
+
+Predict = Callable[[Tensor], Any]
+
+
+def load_predictor(model: str, *, weights: str | None = None, device: str = "cpu") -> Predict:
+    """Load a model.
+
+    Args:
+        model: one of
+            "package.module:name": a function from images to predictions, or an nn.Module, of a module that Python can
+                import from here.
+            "torchvision:name": a detector, segmenter or classifier of `torchvision.models`, such as
+                "torchvision:fasterrcnn_resnet50_fpn".
+            "opencv:hog": the pedestrian detector of OpenCV (Dalal and Triggs 2005), which needs no weights.
+            a file: .pt2 of torch.export, .onnx, or .pt of TorchScript, whose first output is scores (1, K) or
+                (1, K, H, W), for images of the size that it takes.
+        weights: for torchvision: a file of its state_dict, or None for the weights that torchvision downloads.
+        device: of models in PyTorch.
+
+    Returns:
+        A function without gradients.
+
+    Raises:
+        ValueError: a model that is none of these, or that cannot be found.
+    """
+    kind, _, name = model.partition(":")
+    if Path(model).suffix in _PROGRAMS:
+        predict = _load_program(Path(model), device)
+    elif kind == "torchvision":
+        predict = _load_torchvision(name, weights, device)
+    elif model == "opencv:hog":
+        predict = HogDetector()
+    elif name:
+        predict = import_function(kind, name, device)
+    else:
+        raise ValueError(
+            f"model must be package.module:name, torchvision:name, opencv:hog or a file .pt2, .onnx or .pt, got {model}"
+        )
+
+    def without_gradient(images: Tensor) -> Any:
+        with torch.inference_mode():
+            outputs = predict(images.to(device))
+        # Segmenters of torchvision return a dictionary.
+        return outputs["out"] if isinstance(outputs, dict) and "out" in outputs else outputs
+
+    return without_gradient
+
+
+class HogDetector:
+    """The pedestrian detector of OpenCV: boxes of class 1."""
+
+    def __init__(self) -> None:
+        self._hog = cv2.HOGDescriptor()
+        self._hog.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector(), np.float32))
+
+    def __call__(self, images: Tensor) -> list[dict[str, Tensor]]:
+        """Detect pedestrians in images (B, 3, H, W)."""
+        return [self._detect((255 * image).round().byte().movedim(0, -1).cpu().numpy()) for image in images]
+
+    def _detect(self, image: np.ndarray) -> dict[str, Tensor]:
+        found, weights = self._hog.detectMultiScale(
+            np.ascontiguousarray(image[..., ::-1]), winStride=(8, 8), scale=1.05
+        )
+        corners = torch.tensor(np.array(found, np.float32).reshape(-1, 4))
+        scores = torch.tensor(np.array(weights, np.float32).reshape(-1)) / _HOG_SCALE
+        boxes = torch.cat([corners[:, :2], corners[:, :2] + corners[:, 2:]], dim=1)
+        return {"boxes": boxes, "labels": torch.ones(len(boxes), dtype=torch.int64), "scores": scores.clamp(0, 1)}
+
+
+def _load_program(path: Path, device: str) -> Predict:
+    if not path.is_file():
+        raise ValueError(f"model must be a file that exists, got {path}")
+    if path.suffix == ".onnx":
+        onnxruntime = importlib.import_module("onnxruntime")
+        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        name = session.get_inputs()[0].name
+        return lambda images: torch.from_numpy(session.run(None, {name: images.cpu().numpy()})[0])
+    program = torch.export.load(path).module() if path.suffix == ".pt2" else torch.jit.load(path, map_location=device)
+
+    def predict(images: Tensor) -> Any:
+        outputs = program(images)
+        return outputs[0] if isinstance(outputs, tuple | list) and isinstance(outputs[0], Tensor) else outputs
+
+    return predict
+
+
+def _load_torchvision(name: str, weights: str | None, device: str) -> Predict:
+    from torchvision import models  # noqa: PLC0415 - an extra
+
+    if name not in models.list_models():
+        raise ValueError(f"model must be one of torchvision.models.list_models(), got torchvision:{name}")
+    kind = models.get_model_builder(name).__module__.split(".")[2]  # detection, segmentation or a family of classifiers
+    stored: Any = models.get_model_weights(name)["DEFAULT"]
+    if weights is None:
+        network = models.get_model(name, weights=stored)
+    else:
+        parts = {"weights_backbone": None} if kind in ("detection", "segmentation") else {}
+        network = models.get_model(name, weights=None, **parts)
+        network.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
+    # A segmenter must keep the size of the images, in which the labels are.
+    prepare = stored.transforms(resize_size=None) if kind == "segmentation" else stored.transforms()
+    network = network.eval().to(device)
+    return lambda images: network(prepare(images))
+
+
+def import_function(module: str, name: str, device: str = "cpu") -> Callable[..., Any]:
+    """Import a function or an nn.Module, which is moved to the device, from a module below the current folder or not.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())  # as `python -m` does
+    try:
+        function = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"a function must be package.module:name that can be imported, got {module}:{name}: {error}"
+        ) from error
+    if isinstance(function, nn.Module):
+        return function.eval().to(device)
+    if not callable(function):
+        raise ValueError(f"a function or an nn.Module must be named, got {module}:{name}, {type(function).__name__}")
+    return function

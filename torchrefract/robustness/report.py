@@ -1,0 +1,192 @@
+"""The report of a robustness test: tables of numbers, and one HTML file that opens anywhere."""
+
+import base64
+import csv
+import html
+import io
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from torchrefract._io import replace_file
+from torchrefract._tensor import to_uint8
+from torchrefract.robustness.evaluate import Robustness, Row
+from torchrefract.robustness.statistics import Estimate
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
+table { border-collapse: collapse; margin: 1rem 0; } td, th { padding: .25rem .8rem; text-align: right; }
+th { border-bottom: 1px solid #888; } td:first-child, th:first-child { text-align: left; }
+figure { display: inline-block; margin: .5rem; vertical-align: top; } img { max-width: 100%; }
+figcaption { font-size: 13px; max-width: 29rem; }
+"""
+_COLORS = {"labels": (40, 160, 60), "predictions": (220, 40, 30)}
+
+
+@dataclass(frozen=True)
+class Example:
+    """A degraded image with its labels and predictions: boxes (n, 4) in px, or None.
+
+    caption: name, level and scores.
+    """
+
+    image: Tensor  # (3, H, W)
+    caption: str
+    labels: Tensor | None
+    predictions: Tensor | None
+
+
+def write_tables(result: Robustness, out: Path, about: dict[str, Any], *, loss: float) -> None:
+    """Write results.csv and results.json into a folder.
+
+    Args:
+        result: the scores.
+        out: an existing folder.
+        about: settings and versions, for results.json.
+        loss: share of the clean score that is tolerated, in (0, 1).
+    """
+    rows = [_flat(row) for row in result.rows()]
+    with replace_file(out / "results.csv") as path, path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    summary = {
+        "about": about,
+        "clean": asdict_estimate(result.clean_estimate()),
+        "mean_performance": result.mean_performance(),
+        "relative_performance": result.relative_performance(),
+        "tolerated": {scene: asdict_estimate(result.tolerated(scene, loss=loss)) for scene in result.quantities},
+        "levels": rows,
+        "failures": result.failures,
+    }
+    with replace_file(out / "results.json") as path:
+        path.write_text(json.dumps(_without_nan(summary), indent=1) + "\n", encoding="utf-8")
+
+
+def write_report(result: Robustness, examples: Sequence[Example], out: Path, *, title: str, loss: float) -> None:
+    """Write report.html into a folder: curves, tables, the tolerated values, and examples as pictures.
+
+    Args:
+        result: the scores.
+        examples: such as the worst images.
+        out: an existing folder.
+        title: one line.
+        loss: as for `write_tables`.
+    """
+    clean = result.clean_estimate()
+    parts = [
+        f"<h1>{html.escape(title)}</h1>",
+        f"<p>{len(result.names)} images; score of the clean images {clean.value:.3f} "
+        f"[{clean.low:.3f}, {clean.high:.3f}]. Mean over all scenes and severities (mPC) "
+        f"{result.mean_performance():.3f}, relative to the clean score (rPC) {result.relative_performance():.3f}. "
+        "Intervals hold 95 %.</p>",
+        f'<img alt="scores by severity" src="data:image/svg+xml;base64,{_encoded(_curves(result))}">',
+        f"<h2>What the model tolerates</h2><p>Values up to which the mean score falls by at most {loss:.0%}.</p>",
+        _table(["scene", "quantity", "tolerated", "95 % interval"], _tolerated_cells(result, loss)),
+        "<h2>Scores</h2>",
+        _table(["scene", "severity", "quantity", "score", "95 % interval", "drop"], map(_score_cells, result.rows())),
+    ]
+    if result.failures:
+        parts.append(f"<h2>Images left out</h2><p>The model failed for {len(result.failures)} images:</p>")
+        parts.append(_table(["image", "reason"], result.failures.items()))
+    if examples:
+        parts.append("<h2>The worst images</h2><p>Labels are green, predictions red.</p>")
+        parts += map(_figure, examples)
+    page = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
+    with replace_file(out / "report.html") as path:
+        path.write_text(f"{page}<style>{_STYLE}</style>{''.join(parts)}</html>\n", encoding="utf-8")
+
+
+def format_tolerated(result: Robustness, scene: str, *, loss: float) -> str:
+    """Describe the tolerated value of a scene, as "visibility at least 142 m [131, 155]"."""
+    estimate, quantity = result.tolerated(scene, loss=loss), result.quantities[scene]
+    side = "at most" if quantity.is_harm else "at least"
+    low, high = ("open" if math.isinf(end) else f"{end:.3g}" for end in estimate[1:])
+    return f"{quantity.name} {side} {estimate.value:.3g} {quantity.unit}".rstrip() + f" [{low}, {high}]"
+
+
+def asdict_estimate(estimate: Estimate) -> dict[str, float]:
+    """Return an estimate as a dictionary."""
+    return {name: float(value) for name, value in estimate._asdict().items()}
+
+
+def _flat(row: Row) -> dict[str, Any]:
+    values = asdict(row) | {"score": row.score.value, "low": row.score.low, "high": row.score.high}
+    return values | {"drop": row.drop.value, "drop_low": row.drop.low, "drop_high": row.drop.high}
+
+
+def _without_nan(value: Any) -> Any:
+    """Replace numbers that JSON cannot hold by null."""
+    if isinstance(value, dict):
+        return {name: _without_nan(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _curves(result: Robustness) -> bytes:
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    axes = figure.subplots()
+    for scene in dict.fromkeys(level.scene for level in result.scores):
+        rows = [row for row in result.rows() if row.scene == scene]
+        x, y = [row.severity for row in rows], np.array([row.score for row in rows])
+        axes.errorbar(x, y[:, 0], yerr=abs(y[:, 1:] - y[:, :1]).T, marker="o", capsize=3, label=scene)
+    axes.axhline(float(result.clean.mean()), color="gray", linestyle="--", label="clean")
+    axes.set(
+        xlabel="severity", ylabel="score", ylim=(0, 1.02), xticks=sorted({level.severity for level in result.scores})
+    )
+    axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+    buffer = io.BytesIO()
+    # Without a date and with fixed names, equal scores give equal bytes.
+    with rc_context({"svg.hashsalt": "torchrefract"}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
+
+
+def _tolerated_cells(result: Robustness, loss: float) -> list[tuple[str, ...]]:
+    cells = []
+    for scene, quantity in result.quantities.items():
+        text = format_tolerated(result, scene, loss=loss).removeprefix(quantity.name)
+        value, _, interval = text.partition("[")
+        cells.append((scene, quantity.name, value.strip(), interval.rstrip("]")))
+    return cells
+
+
+def _score_cells(row: Row) -> tuple[str, ...]:
+    value = f"{row.quantity} {row.value:.3g} {row.unit}" if row.quantity else ""
+    interval = f"{row.score.low:.3f} to {row.score.high:.3f}"
+    return row.scene, str(row.severity), value, f"{row.score.value:.3f}", interval, f"{row.drop.value:.3f}"
+
+
+def _table(head: Sequence[str], rows: Any) -> str:
+    def line(cells: Sequence[str], tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+
+    return "<table>" + line(head, "th") + "".join(line(row, "td") for row in rows) + "</table>"
+
+
+def _figure(example: Example) -> str:
+    picture = Image.fromarray(to_uint8(example.image[None])[0].movedim(0, -1).cpu().numpy())
+    draw = ImageDraw.Draw(picture)
+    for name, boxes in (("labels", example.labels), ("predictions", example.predictions)):
+        for box in [] if boxes is None else boxes.tolist():
+            draw.rectangle(box, outline=_COLORS[name], width=max(2, picture.width // 320))
+    picture.thumbnail((460, 460))
+    buffer = io.BytesIO()
+    picture.save(buffer, format="JPEG", quality=85)
+    caption = html.escape(example.caption)
+    source = f"data:image/jpeg;base64,{_encoded(buffer.getvalue())}"
+    return f'<figure><img alt="{caption}" src="{source}"><figcaption>{caption}</figcaption></figure>'
+
+
+def _encoded(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")

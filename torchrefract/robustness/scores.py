@@ -1,0 +1,99 @@
+"""Scores in [0, 1] of the prediction for one image, and predictions as labels."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+_IOU = 0.5  # from which a box is found
+_CONFIDENT = 0.5  # score from which a detection counts as a label
+
+
+def detection_score(prediction: dict[str, Tensor], target: dict[str, Any]) -> float:
+    """Compute the mean average precision at an IoU of 0.5 over the classes that one image holds.
+
+    For an image that holds nothing, 1 without a detection of a score of at least 0.5, and 0 with one.
+
+    Args:
+        prediction: `boxes` (n, 4), x1 y1 x2 y2 in px, `labels` (n,) and `scores` (n,), as of torchvision's detectors.
+        target: `boxes` (m, 4) and `labels` (m,).
+    """
+    boxes, labels, scores = (prediction[name].detach().cpu() for name in ("boxes", "labels", "scores"))
+    true_boxes = torch.as_tensor(target["boxes"]).cpu().as_subclass(Tensor).view(-1, 4)
+    true_labels = torch.as_tensor(target["labels"]).cpu()
+    values = []
+    for name in true_labels.unique().tolist():
+        chosen = (labels == name).nonzero()[:, 0]
+        chosen = chosen[scores[chosen].argsort(descending=True, stable=True)]
+        values.append(_average_precision(boxes[chosen], true_boxes[true_labels == name]))
+    return sum(values) / len(values) if values else float(not (scores >= _CONFIDENT).any())
+
+
+def segmentation_score(prediction: Tensor, target: Tensor) -> float:
+    """Compute the mean IoU over the classes that one image holds; negative and 255 classes of the target are ignored.
+
+    Args:
+        prediction: (K, H, W), a score of each class at each pixel, or (H, W), integers.
+        target: (H, W) or (1, H, W), integers.
+    """
+    classes = prediction.detach().cpu()
+    classes = classes.argmax(dim=0) if classes.ndim == 3 else classes
+    expected = torch.as_tensor(target).cpu().as_subclass(Tensor).reshape(classes.shape)
+    counts = (expected >= 0) & (expected != 255)
+    classes, expected = classes[counts], expected[counts]
+    values = []
+    for name in torch.cat([classes, expected]).unique().tolist():
+        union = ((classes == name) | (expected == name)).sum().item()
+        values.append(((classes == name) & (expected == name)).sum().item() / union)
+    return sum(values) / len(values) if values else 1.0
+
+
+def classification_score(prediction: Tensor, target: Tensor | int) -> float:
+    """Return 1.0 if the class with the highest of the scores (K,) is the target, else 0.0."""
+    return float(prediction.detach().cpu().argmax().item() == int(target))
+
+
+def as_labels(prediction: Any, size: tuple[int, int]) -> Any:
+    """Turn the prediction for an image of a size (height, width) into labels that warps move, to score agreement.
+
+    Detections with a score of at least 0.5 become boxes, scores of classes at each pixel become a mask, and those of
+    an image its class.
+    """
+    from torchvision import tv_tensors  # noqa: PLC0415 - an extra
+
+    if isinstance(prediction, dict):
+        keep = prediction["scores"] >= _CONFIDENT
+        boxes = prediction["boxes"][keep].detach()
+        options: dict[str, Any] = {"format": "XYXY", "canvas_size": size}
+        return {"boxes": tv_tensors.BoundingBoxes(boxes, **options), "labels": prediction["labels"][keep].detach()}
+    if isinstance(prediction, Tensor) and prediction.ndim == 3:
+        return tv_tensors.Mask(prediction.detach().argmax(dim=0))
+    if isinstance(prediction, Tensor) and prediction.ndim == 2:
+        return tv_tensors.Mask(prediction.detach())
+    if isinstance(prediction, Tensor) and prediction.ndim == 1:
+        return int(prediction.argmax())
+    kind = tuple(prediction.shape) if isinstance(prediction, Tensor) else type(prediction).__name__
+    raise TypeError(
+        f"predictions must be dicts of boxes, labels and scores, or tensors (K, H, W), (H, W) or (K,), got {kind}"
+    )
+
+
+def _average_precision(boxes: Tensor, expected: Tensor) -> float:
+    """Compute the area below precision over recall of boxes (n, 4) in the order of their scores."""
+    if len(boxes) == 0 or len(expected) == 0:
+        return 0.0
+    low = torch.maximum(boxes[:, None, :2], expected[:, :2])
+    high = torch.minimum(boxes[:, None, 2:], expected[:, 2:])
+    shared = (high - low).clamp(min=0).prod(dim=2)
+    areas = [(value[:, 2:] - value[:, :2]).clamp(min=0).prod(dim=1) for value in (boxes, expected)]
+    iou = shared / (areas[0][:, None] + areas[1] - shared).clamp(min=1e-9)
+    is_free = torch.ones(len(expected), dtype=torch.bool)
+    hits = torch.zeros(len(boxes))
+    for i, row in enumerate(iou):
+        best = torch.where(is_free, row, -1.0).argmax()
+        if is_free[best] and row[best] >= _IOU:
+            hits[i], is_free[best] = 1.0, False
+    precision = hits.cumsum(0) / torch.arange(1, len(boxes) + 1)
+    # The precision at each recall is the highest one at this recall or a higher one.
+    envelope = precision.flip(0).cummax(0).values.flip(0)
+    return ((envelope * hits).sum() / len(expected)).item()

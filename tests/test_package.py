@@ -50,7 +50,7 @@ def test_commands_without_a_model_import_neither_the_training_stack_nor_workers_
     workers = IMPORT.format(
         module="torchrefract.generate, torchrefract.cli.generation", names=(*LEARNING, "matplotlib")
     )
-    modules = ", ".join(f"torchrefract.cli.{name}" for name in ("calibration", "generation", "preview"))
+    modules = ", ".join(f"torchrefract.cli.{name}" for name in ("calibration", "degradation", "generation", "preview"))
     outcome = spawn("-c", f"{workers}; {IMPORT.format(module=modules, names=LEARNING)}", cwd=tmp_path)
     assert (outcome.code, outcome.out.split()) == (0, ["[]", "[]"]), outcome.err
 

@@ -19,12 +19,11 @@ import torchrefract
 from torchrefract import presets
 from torchrefract._validation import UsageError, check_count, check_number
 from torchrefract.cli.command import check_seed, naming, progress
-from torchrefract.data.frames import first_names
+from torchrefract.data.frames import first_names, path_key
 from torchrefract.data.images import files_in, read_image
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.effects.base import Effect
 from torchrefract.labels.targets import warp_moved_labels
-from torchrefract.random import key_of
 from torchrefract.robustness.evaluate import Level, Robustness, Scored, evaluate
 from torchrefract.robustness.predictors import Predict, import_function, load_predictor
 from torchrefract.robustness.quantities import QUANTITIES
@@ -231,7 +230,7 @@ def _example(
     """Degrade a picture again, and predict it again."""
     _, image, target = next(folder.read([name]))
     effect = scenes(image.shape[2])[level.scene][level.severity]
-    degraded = effect.degrade(image, seed=seed, keys=[key_of(name)])
+    degraded = effect.degrade(image, seed=seed, keys=[path_key(name)])
     target = as_labels(predict(image[None])[0], (image.shape[1], image.shape[2])) if target is None else target
     moved = warp_moved_labels(target, degraded.flow, effect.labels_getter) if degraded.has("flow") else target
     prediction = predict(degraded.image[None])[0]

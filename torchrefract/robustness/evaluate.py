@@ -9,10 +9,9 @@ import numpy as np
 from torch import Tensor
 
 from torchrefract._validation import check_number
-from torchrefract.data.frames import first_names
+from torchrefract.data.frames import first_names, path_key
 from torchrefract.effects.base import Effect
 from torchrefract.labels.targets import warp_moved_labels
-from torchrefract.random import key_of
 from torchrefract.robustness.statistics import Estimate, mean_estimate, tolerated_value
 
 _MAX_FAILED, _MIN_COUNT = 0.1, 10  # share of the images whose prediction may raise, and from how many on it counts
@@ -187,7 +186,7 @@ def evaluate(
                 target = as_target(prediction, (image.shape[-2], image.shape[-1]))
             clean, by_level = score(prediction, target), {}
             for level, effect in levels.items():
-                degraded = effect.degrade(image, seed=seed, keys=[key_of(name)], depth=depth)
+                degraded = effect.degrade(image, seed=seed, keys=[path_key(name)], depth=depth)
                 flow = degraded.flow if degraded.has("flow") else None
                 moved = target if flow is None else warp_moved_labels(target, flow, effect.labels_getter)
                 (prediction,) = predict(degraded.image[None])

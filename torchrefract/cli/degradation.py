@@ -4,6 +4,7 @@ import json
 import sys
 import time
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
@@ -236,8 +237,8 @@ def _job(cfg: DictConfig, out: Path, pictures: Sequence[str], labels: CocoLabels
             depth = DepthFolder(Path(str(cfg.depth)).expanduser(), check_positive("depth_scale", cfg.depth_scale))
         depth.check((name, None) for name in pictures)
     if maps or labels:
-        stems = [PurePosixPath(name).with_suffix("") for name in pictures]
-        if repeated := sorted({str(stem) for stem in stems if stems.count(stem) > 1}):
+        stems = Counter(str(PurePosixPath(name).with_suffix("")) for name in pictures)
+        if repeated := sorted(stem for stem, count in stems.items() if count > 1):
             raise UsageError(
                 "source must hold pictures whose names differ in more than their extension, for the names of their "
                 f"labels and maps, got two of {first_names(repeated)}"

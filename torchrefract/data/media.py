@@ -6,7 +6,7 @@ sensor. Writers keep the tag of a frame of the sensor, so that viewers show ever
 """
 
 import warnings
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -79,8 +79,8 @@ def find_media(source: Path, *, deep: bool = False, name: str = "input") -> Sequ
     files = [file for file in candidates if file.suffix.lower() in suffixes]
     if not files:
         raise UsageError(f"{name} must be, or hold, {', '.join(suffixes)}, got {source}")
-    names = [output_name(file) for file in files]
-    if repeated := {str(name) for name in names if names.count(name) > 1}:
+    names = Counter(str(output_name(file)) for file in files)
+    if repeated := [name for name, count in names.items() if count > 1]:
         raise UsageError(f"{name} must not hold two videos of one name, got {', '.join(sorted(repeated))}")
     return files
 

@@ -135,7 +135,9 @@ def video(path: Path) -> None:
         stream.codec_context.time_base = stream.time_base = Fraction(1, 1000)
         stream.set_display_matrix((0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30))
         for k, t in enumerate(TIMES_MS):
-            frame = av.VideoFrame.from_ndarray(picture(64, 96, seed=k), format="rgb24")
+            # Later frames are darker: the color of fog must stay that of the first one.
+            pixels = (picture(64, 96, seed=k) * (1 - 0.2 * k)).astype(np.uint8)
+            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
             frame.pts, frame.time_base = t, Fraction(1, 1000)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
@@ -156,11 +158,12 @@ def decoded(path: Path, kind: str) -> list[Any]:
 @pytest.mark.parametrize("scene", ["cheap_dashcam", "cape_town_fog"])
 def test_a_video_is_one_clip_that_keeps_its_orientation_times_and_sound(call, tmp_path, scene):
     video(tmp_path / "drive.mov")
-    assert call("degrade", "source=drive.mov", "out=out", f"scene={scene}", "workers=0", "maps=npz").code == 0
+    words = ("source=drive.mov", "out=out", f"scene={scene}", "severity=5", "workers=0", "maps=npz")
+    assert call("degrade", *words).code == 0
     source, target = tmp_path / "drive.mov", tmp_path / "out" / "images" / "drive.mp4"
     clip = torch.stack([frame[0] for _, frame in read_video(source, range(4))])[None]
     assert clip.shape == (1, 4, 3, 96, 64)  # upright
-    expected = getattr(presets, scene)().degrade(clip, seed=0, keys=[key_of("drive.mov")])
+    expected = getattr(presets, scene)(5).degrade(clip, seed=0, keys=[key_of("drive.mov")])
     for (t, frame), image in zip(read_video(target, range(4)), expected.image[0], strict=True):
         assert (frame[0] - image).abs().mean() < 0.02, t  # of the codec
         with np.load(tmp_path / "out" / "maps" / "drive.mov" / f"{t:06d}.maps.npz") as maps:
@@ -171,7 +174,6 @@ def test_a_video_is_one_clip_that_keeps_its_orientation_times_and_sound(call, tm
     assert [frame.time for frame in decoded(target, "video")] == pytest.approx([t / 1000 for t in TIMES_MS], abs=1e-3)
     sounds = [np.concatenate([f.to_ndarray() for f in decoded(path, "audio")], axis=1) for path in (source, target)]
     assert np.array_equal(sounds[0], sounds[1])
-    words = ("source=drive.mov", "out=out", f"scene={scene}", "workers=0", "maps=npz")
     assert call("degrade", *words).out.startswith("out: 0 degraded, 1 already existed, 0 skipped")
 
 

@@ -48,6 +48,8 @@ def test_boxes_and_polygons_count_from_the_edge_and_keypoints_from_the_center_of
     # The frame ends at 80 px: 7 of 30 px remain, then nothing.
     (cut,), dropped = moved(shift(63.0, 0.0), BOX | {"segmentation": [SQUARE]})
     assert (cut["bbox"], cut["area"], dropped) == ([73.0, 20.0, 7.0, 16.0], 112.0, 0)
+    # An object goes with its outline, even if a corner of its box stays.
+    assert moved(shift(63.0, 0.0), BOX | {"segmentation": [[30.0, 20.0, 40.0, 20.0, 40.0, 36.0]]}) == ([], 1)
     assert moved(shift(71.0, 0.0), BOX, BOX | {"bbox": [0.0, 0.0, 5.0, 5.0]})[1] == 1
 
 

@@ -29,27 +29,36 @@ from torch.utils.data import DataLoader, Subset
 
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract.data.frames import FrameFolder
-from torchrefract.data.module import make_pair
+from torchrefract.data.module import BORDERS, make_pair
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import OneOf
 from torchrefract.effects.flare import LensFlare
 from torchrefract.effects.fog import remove_fog
 from torchrefract.effects.lens import LensDistortion
-from torchrefract.presets import paper_refractive, paper_weather
+from torchrefract.presets import cheap_dashcam, paper_refractive, paper_weather
 from torchrefract.restoration.checkpoints import Loaded, load_model
 from torchrefract.restoration.diffusion import Diffusion
-from torchrefract.restoration.metrics import endpoint_error, masked_mean, psnr, ssim
-from torchrefract.restoration.tasks import Restored
+from torchrefract.restoration.module import restoration_scores
+from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
 from torchrefract.types import Frame, Pair
 from torchrefract.warping.warp import warp
 
-TASKS = ("undistort", "deweather")
+TASKS: dict[str, Task] = {"undistort": Undistort(), "deweather": Deweather()}
 ROWS = tuple(f"{model}_{task}" for task in TASKS for model in ("resunet", "segformer", "ddpm"))
 SCALES = ("small", "gpu", "paper")
-# PSNR in dB and endpoint error in px at 1920 x 1080, from the paper, on its own frames.
+# L, L_rec, L_k, PSNR in dB and endpoint error in px at 1920 x 1080, from the paper, on its own frames. Its L_k of
+# weather is that of a map of the fog.
 PAPER = {
-    "undistort": {"ResUNet": (23.24, 5.76), "SegFormer": (16.29, 69.82), "DDPM": (22.80, 6.01)},
-    "deweather": {"ResUNet": (32.54, None), "SegFormer": (28.99, None), "DDPM": (30.80, None)},
+    "undistort": {
+        "ResUNet": (0.034, 0.029, 0.005, 23.24, 5.76),
+        "SegFormer": (0.146, 0.085, 0.055, 16.29, 69.82),
+        "DDPM": (0.044, 0.039, 0.0048, 22.80, 6.01),
+    },
+    "deweather": {
+        "ResUNet": (0.065, 0.059, 0.007, 32.54, None),
+        "SegFormer": (0.096, 0.086, 0.010, 28.99, None),
+        "DDPM": (0.054, 0.051, 0.0065, 30.80, None),
+    },
 }
 METRIC_SIZE = (1080, 1920)  # px, the frame of the paper's endpoint errors
 MIX = "all of the paper's"
@@ -65,9 +74,8 @@ Restore = Callable[[Tensor], Restored]
 class Scores(NamedTuple):
     """Means over frames; flow_loss and epe are NaN for a task without a flow.
 
-    loss: image_loss + flow_loss, the training loss.
-    image_loss: mean |restored - clean| over valid pixels.
-    flow_loss: mean |flow - true flow| over valid pixels, in units of half the frame.
+    loss: L, image_loss + flow_loss, the training loss of the task.
+    image_loss, flow_loss: L_rec and L_k, see `Undistort` and `Deweather`.
     psnr: dB.
     ssim: at most 1.
     epe: endpoint error, px at METRIC_SIZE.
@@ -132,8 +140,10 @@ def effects_of(task: str, width: int) -> dict[str, tuple[Effect, bool]]:
     """Return the scored effects of a task by name, each with True if it is in the paper's mix."""
     if task == "undistort":
         names = ("cheap_dashcam lens", "turbulence", "thin-plate spline", "divergence-free")
-        wide = LensDistortion(k1_range=(-0.4, 0.2), focal_range=(0.9, 1.1), frame="pad")
-        return _in_mix(paper_refractive(width=width), names) | {"wide lens": (wide, False)}
+        wide = LensDistortion(k1_range=(-0.4, 0.2), focal_range=(0.9, 1.1))
+        bordered = {f"cheap_dashcam lens, {border} border": (cheap_dashcam(), False) for border in BORDERS}
+        mix = _in_mix(paper_refractive(width=width, frame="fill"), names)
+        return mix | {"wide lens": (wide, False)} | bordered
     return _in_mix(paper_weather(), ("uniform fog", "heterogeneous fog", "lens flare"))
 
 
@@ -141,9 +151,10 @@ def _in_mix(mix: OneOf, names: Sequence[str]) -> dict[str, tuple[Effect, bool]]:
     return {name: (cast(Effect, effect), True) for name, effect in zip(names, mix.effects, strict=True)}
 
 
-def corrupt(frames: Iterable[Frame], effect: Effect) -> list[Pair]:
-    """Degrade batches of frames; the draws depend on the keys of the frames only."""
-    return [make_pair(frame, effect, seed=_SEED) for frame in frames]
+def corrupt(frames: Iterable[Frame], effect: Effect, name: str) -> list[Pair]:
+    """Degrade batches of frames, with a border if the name ends in one; draws depend on the keys of the frames only."""
+    border = next((border for border in BORDERS if name.endswith(f"{border} border")), None)
+    return [make_pair(frame, effect, seed=_SEED, border=border) for frame in frames]
 
 
 def score_references(task: str, effect: Effect, frames: Iterable[Frame], pairs: list[Pair]) -> dict[str, Tensor]:
@@ -160,12 +171,13 @@ def score_references(task: str, effect: Effect, frames: Iterable[Frame], pairs: 
             _NOTHING: (Restored(pair.degraded) for pair in pairs),
             "the true map": (Restored(remove_weather(frame, effect)) for frame in frames),
         }
-    return {name: score(restored, pairs) for name, restored in methods.items()}
+    return {name: score(task, restored, pairs) for name, restored in methods.items()}
 
 
-def score(restored: Iterable[Restored], pairs: list[Pair]) -> Tensor:
+def score(task: str, restored: Iterable[Restored], pairs: list[Pair]) -> Tensor:
     """Score each frame; return (N, 6), float64, in the order of `Scores`."""
-    return torch.cat([_scores(one, pair) for one, pair in zip(restored, pairs, strict=True)]).double().cpu()
+    scores = [_scores(TASKS[task], one, pair) for one, pair in zip(restored, pairs, strict=True)]
+    return torch.cat(scores).double().cpu()
 
 
 def mean_of(frames: Tensor) -> Scores:
@@ -197,18 +209,11 @@ def _warp_back(pair: Pair, flow: Tensor) -> Restored:
     return Restored(warp(pair.degraded, flow, padding="border")[0], flow)
 
 
-def _scores(restored: Restored, pair: Pair) -> Tensor:
+def _scores(task: Task, restored: Restored, pair: Pair) -> Tensor:
     """Score each frame of a batch; return (B, 6), in the order of `Scores`."""
-    image = restored.image.float().clamp(0, 1)
-    image_loss = masked_mean((image - pair.clean).abs(), pair.valid)
-    flow_loss = epe = torch.full_like(image_loss, torch.nan)
-    if restored.flow is not None:
-        size = pair.flow.new_tensor([pair.flow.shape[3], pair.flow.shape[2]]).view(1, 2, 1, 1)
-        flow_loss = masked_mean((restored.flow - pair.flow).abs() * 2 / size, pair.valid)
-        epe = endpoint_error(restored.flow, pair.flow, pair.valid, size=METRIC_SIZE)
-    loss = image_loss + flow_loss.nan_to_num()
-    similarity = psnr(image, pair.clean, pair.valid), ssim(image, pair.clean, pair.valid)
-    return torch.stack([loss, image_loss, flow_loss, *similarity, epe], dim=1)
+    scores = restoration_scores(task, restored, pair, metric_size=METRIC_SIZE)
+    missing = torch.full_like(scores["L"], torch.nan)
+    return torch.stack([scores.get(name, missing) for name in ("L", "L_rec", "L_k", "psnr", "ssim", "epe")], dim=1)
 
 
 def score_task(task: str, models: dict[str, Loaded], args: argparse.Namespace) -> Iterator[Line]:
@@ -217,7 +222,7 @@ def score_task(task: str, models: dict[str, Loaded], args: argparse.Namespace) -
         held_out = FrameFolder(args.source, size=size, split="val")
         frames = _load_frames(held_out, args.frames, args.device)
         effects = effects_of(task, size[1])
-        pairs = {name: corrupt(frames, effect) for name, (effect, _) in effects.items()}
+        pairs = {name: corrupt(frames, effect, name) for name, (effect, _) in effects.items()}
         groups = _group_keys(held_out, args.groups)
         references, keys = dict[str, dict[str, Tensor]](), _keys(frames)
         for name, (effect, _) in effects.items():
@@ -246,7 +251,8 @@ def _score_model(
         if is_sampled:
             model.steps = steps
         by_effect = {
-            name: score((_call(model, pair.degraded) for pair in chosen), chosen) for name, chosen in batches.items()
+            name: score(task, (_call(model, pair.degraded) for pair in chosen), chosen)
+            for name, chosen in batches.items()
         }
         call = partial(_call_and_wait, model, first[0].degraded[:1])
         milliseconds = 1e3 * median(seconds(call, warmup=int(i == 0)) for i in range(3))
@@ -291,9 +297,9 @@ def _cells(line: Line, nothing: Scores) -> list[str]:
     return [line.method, *numbers, *cost, "" if line.milliseconds is None else f"{line.milliseconds:.0f}"]
 
 
-def _paper_cells(name: str, psnr: float, epe: float | None) -> list[str]:
-    scores = [*[""] * 3, f"{psnr:.2f}", "", "" if epe is None else f"{epe:.2f}"]
-    return [f"paper: {name}, on its own frames", *scores, *[""] * 4]
+def _paper_cells(name: str, *values: float | None) -> list[str]:
+    loss, image_loss, map_loss, psnr, epe = ("" if value is None else f"{value:g}" for value in values)
+    return [f"paper: {name}, on its own frames", loss, image_loss, map_loss, psnr, "", epe, *[""] * 4]
 
 
 def _or_empty(value: float, form: str) -> str:

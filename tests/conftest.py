@@ -118,9 +118,9 @@ class Outcome(NamedTuple):
 
     @property
     def folder(self) -> Path:
-        """Return the run folder, which the last line names."""
+        """Return the run folder, which the line before the verdict names."""
         assert self.code == 0, self.out + self.err
-        return Path(self.out.splitlines()[-1].rsplit(": ", 1)[0])
+        return Path(self.out.splitlines()[-2].rsplit(": ", 1)[0])
 
 
 class Trained(NamedTuple):

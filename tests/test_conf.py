@@ -8,6 +8,8 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning import Trainer
+from pytorch_lightning.callbacks import ModelCheckpoint
+from pytorch_lightning.loggers import CSVLogger, Logger
 
 import torchrefract
 from torchrefract import presets
@@ -99,8 +101,7 @@ DATA = ["data.size=[32,64]", "data.train_count=4", "data.val_count=2", "data.bat
 @pytest.mark.parametrize(("model", "task"), TINY)
 def test_every_model_trains_and_validates(tmp_path, model, task):
     words = (f"+task={task}", f"model={model}", *TINY[model, task], *DATA, "+trainer.fast_dev_run=true")
-    cfg = compose_training(tmp_path, *words)
-    cfg.trainer.callbacks, cfg.trainer.logger = [], False
+    cfg = compose_training(tmp_path, *words, "trainer.callbacks=[]", "trainer.logger=false")
     data, module, trainer = (instantiate(cfg[part]) for part in ("data", "model", "trainer"))
     before = [parameter.clone() for parameter in module.parameters()]
     trainer.fit(module, data)
@@ -145,6 +146,31 @@ def test_every_trainer_writes_into_the_run_folder(tmp_path, trainer):
     assert type(built.strategy).__name__ == {"cpu": "SingleDeviceStrategy", "ddp": "DDPStrategy"}[trainer]
 
 
+@pytest.mark.quick
+def test_every_logger_writes_into_the_run_folder_beside_the_metrics_that_reports_need(tmp_path):
+    assert options("logger") == ["csv", "tensorboard", "wandb"]
+    for name in options("logger"):
+        first, *others = compose_training(tmp_path, "+task=undistort", f"logger={name}").trainer.logger
+        assert get_class(first._target_) is CSVLogger
+        assert [other._target_.rpartition(".")[2].lower() for other in others] == [f"{name}logger"] * (name != "csv")
+        for logger in (first, *others):
+            kind, arguments = get_class(logger._target_), {key: logger[key] for key in logger if key != "_target_"}
+            assert issubclass(kind, Logger)
+            inspect.signature(kind).bind(**arguments)
+            assert arguments["save_dir"] == str(tmp_path)
+            assert arguments.get("offline", True)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("model", options("model"))
+@pytest.mark.parametrize(("task", "monitor", "mode"), [("undistort", "epe", "min"), ("deweather", "psnr", "max")])
+def test_the_best_checkpoint_is_that_of_the_metric_of_the_task(tmp_path, task, monitor, mode, model):
+    cfg = compose_training(tmp_path, f"+task={task}", f"model={model}")
+    callback = instantiate(cfg.trainer.callbacks[0])
+    assert isinstance(callback, ModelCheckpoint)
+    assert (callback.monitor, callback.mode) == (f"val/{monitor}", mode)
+
+
 def test_the_gpu_trainer_uses_bfloat16(tmp_path):
     cfg = compose_training(tmp_path, "+task=undistort", "trainer=gpu")
     assert (cfg.trainer.accelerator, cfg.trainer.devices, cfg.trainer.precision) == ("gpu", 1, "bf16-mixed")
@@ -160,7 +186,7 @@ PROTOCOL = {"resunet": (16, 5e-5), "segformer": (16, 5e-5), "ddpm": (8, 1e-5)}
 def test_the_experiments_of_table_1_follow_the_paper(tmp_path, model, task):
     cfg = compose_training(tmp_path, f"+experiment=table1_{model}_{task}", "data.root=frames")
     batch_size, lr = PROTOCOL[model]
-    scene = presets.paper_refractive() if task == "undistort" else presets.paper_weather()
+    scene = presets.paper_refractive(frame="fill") if task == "undistort" else presets.paper_weather()
     assert instantiate(cfg.task).name == task
     assert repr(instantiate(cfg.scene)) == repr(scene)
     assert (cfg.data.size, cfg.data.val_share, cfg.data.batch_size) == ([1080, 1920], 0.2, batch_size)

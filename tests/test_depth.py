@@ -269,6 +269,13 @@ def log_error(depth: Tensor, truth: Tensor) -> float:
     return ratio.log10().abs().mean().item()
 
 
+@pytest.mark.parametrize("effect", [tr.Turbulence, tr.UniformFog])
+def test_a_function_sees_uint8_frames_as_floats(effect):
+    image, seen = torch.randint(0, 256, (1, 3, 16, 20), dtype=torch.uint8), []
+    effect(depth=lambda frames: seen.append(frames) or 50 + frames[:, :1]).degrade(image)
+    assert_close(seen[0], image / 255)
+
+
 def test_the_corridor_is_nearer_to_rendered_depth_than_a_flat_road_and_the_ramp():
     image, depth = render_road_scenes(torch.arange(16), 90, 160)
     size = {"dtype": torch.float32, "device": torch.device("cpu")}
@@ -299,11 +306,27 @@ def test_the_corridor_is_nearer_to_lidar_than_a_flat_road_and_the_ramp(shared_da
 
 def test_the_walls_stand_where_they_should_and_the_depth_is_announced_as_assumed():
     with pytest.warns(UserWarning, match="pass depth="):
-        depth = CorridorDepth(side=6.0, focal=1.0, spread=0.0)(torch.zeros(1, 3, 100, 200))
-    # A wall 6 m to the side, seen 50.5 px from the middle with a focal length of 200 px.
+        depth = CorridorDepth(side=6.0, focal=1.0, spread=0.0, far=1e9)(torch.zeros(1, 3, 100, 200))
+    # A wall 6 m to the side, seen 50.5 px from the middle with a focal length of 200 px, and 30.5 px above the horizon.
     assert_close(depth[0, 0, 50, 150], torch.tensor(6.0 * 200 / 50.5))
+    assert_close(depth[0, 0, 19, 150], torch.tensor(6.0 * 200 / math.hypot(50.5, 30.5)))
     # The road 40.5 px below the horizon: 1.3 m below the camera.
     assert_close(depth[0, 0, 90, 100], torch.tensor(1.3 * 200 / 41.0), rtol=0.02, atol=0)
+
+
+@pytest.mark.filterwarnings("ignore:depth is that of a road")
+def test_a_frame_by_day_that_shows_no_sky_ends_near_without_a_column():
+    generator = torch.Generator().manual_seed(0)
+    trees = 0.2 + 0.3 * torch.rand(1, 3, 90, 160, generator=generator)
+    sky = trees.clone()
+    sky[:, :, :45] = 0.9
+    depth = CorridorDepth(far=300.0, closed=30.0)(torch.cat([trees, sky, 0.05 * trees]))
+    assert depth[0].max() == pytest.approx(30, rel=0.01)
+    assert depth[1].isinf().any()
+    assert depth[2].max() > 200  # the end of a street at night is not seen
+    in_fog = torch.exp(-3 * depth[0, 0] / 100)  # transmission at a visibility of 100 m
+    assert in_fog.diff(dim=1).abs().max() < 0.02
+    assert in_fog[:45].diff(dim=0).abs().max() < 0.02
 
 
 # --- the command

@@ -19,6 +19,7 @@ from torchrefract.effects.base import Effect
 ROOT = Path(__file__).parents[1]
 HEAVY = (
     "PIL",
+    "albumentations",
     "av",
     "cv2",
     "diffusers",

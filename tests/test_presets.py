@@ -25,6 +25,7 @@ from torchrefract import (
     UniformFog,
     presets,
 )
+from torchrefract.cameras.camera import Camera
 from torchrefract.effects.base import Effect
 
 SIZE = (54, 96)
@@ -42,6 +43,17 @@ EFFECTS = {
     "unpaved_road": {HeterogeneousFog, Turbulence, RollingShutter},
     "paper_refractive": {LensDistortion, Turbulence, ThinPlateSpline, DivergenceFree},
     "paper_weather": {UniformFog, HeterogeneousFog, LensFlare},
+}
+
+# Arguments of each effect of a scene that is not the paper's.
+RARELY: dict[str, Any] = {"p": 0.25}
+ARGUMENTS: dict[str, dict[str, Any]] = {
+    "cheap_dashcam": RARELY,
+    "cape_town_fog": RARELY,
+    "limpopo_sun_glare": RARELY,
+    "highveld_heat_haze": {"mirage": RARELY, **RARELY},
+    "highveld_telephoto": RARELY,
+    "unpaved_road": {"dust": RARELY, "haze": RARELY, "shutter": RARELY},
 }
 
 
@@ -115,7 +127,7 @@ def test_severities_have_the_documented_values():
         ("cape_town_fog", 5, "visibility", 20, 40),
         ("limpopo_sun_glare", 5, "scatter", 0.2, 0.4),
         ("highveld_heat_haze", 5, "difference", 24, 36),
-        ("unpaved_road", 5, "visibility", 25, 50),
+        ("unpaved_road", 5, "visibility", 20, 35),
     ):
         params = SCENES[name](severity).sample(image, seed=2)
         values = getattr(params.children[0] if hasattr(params, "children") else params, field)
@@ -159,3 +171,23 @@ def test_one_of_the_paper_s_effects_is_applied_to_each_sample(name):
     applied = torch.stack([child.applied for child in params.children])
     assert (applied.sum(dim=0) == 1).all()
     assert (applied.sum(dim=1) > 30).all()
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("name", ARGUMENTS)
+def test_camera_horizon_depth_width_and_other_arguments_reach_each_effect(name):
+    def depth(image: torch.Tensor) -> torch.Tensor:
+        return torch.full_like(image[:, :1], 50.0)
+
+    options = {"width": 640, "height": 360, "fx": 500.0, "fy": 500.0, "cx": 319.5, "cy": 179.5}
+    camera = Camera(**options, coefficients=(0.0,) * 4, model="opencv")
+    scene = SCENES[name](camera=camera, horizon=0.4, depth=depth, width=640, **ARGUMENTS[name])
+    for leaf in leaves(scene):
+        assert leaf.p == 0.25
+        view = getattr(leaf, "medium", leaf)
+        assert getattr(view, "camera", camera) == camera
+        assert getattr(view, "depth", None) in (None, depth)  # None of turbulence and lenses is no depth
+        assert getattr(leaf, "horizon", 0.4) == 0.4
+        assert getattr(leaf, "focal", 500 / 640) == 500 / 640
+    with pytest.raises(TypeError, match="mistyped"):
+        SCENES[name](mistyped=1)

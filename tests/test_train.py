@@ -2,6 +2,7 @@ import csv
 import importlib
 import multiprocessing
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,9 +15,14 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from PIL import Image
+from torch.utils.data import DataLoader
 
+from torchrefract import presets
+from torchrefract.data.module import make_pair
 from torchrefract.data.pairs import PairedFolder
+from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint
+from torchrefract.restoration.metrics import endpoint_error, psnr
 from torchrefract.restoration.module import Restoration
 
 FILES = ["best.ckpt", "config.yaml", "curves.png", "last.ckpt", "metrics.csv", "panel.png"]
@@ -49,7 +55,7 @@ def test_a_run_folder_holds_checkpoints_pictures_and_the_resolved_configuration(
 
 
 def test_a_run_prints_a_comparison_with_the_baselines_and_nothing_of_the_libraries(trained):
-    head, nothing, constant, model, files = trained.outcome.out.splitlines()[-5:]
+    head, nothing, constant, model, files, verdict = trained.outcome.out.splitlines()[-6:]
     assert "px at 1920x1080" in head
     assert nothing.startswith("do nothing ")
     assert "(1.00 x do nothing)" in nothing
@@ -58,11 +64,30 @@ def test_a_run_prints_a_comparison_with_the_baselines_and_nothing_of_the_librari
     psnr, nothing_psnr, epe, nothing_epe = (
         metrics(trained.folder, f"val/{name}")[1] for name in ("psnr", "psnr_identity", "epe", "epe_identity")
     )
-    assert model.split()[:3] == ["model", f"{psnr:.2f}", f"({psnr - nothing_psnr:+.2f})"]
+    losses = [f"{metrics(trained.folder, f'val/{name}')[1]:.4f}" for name in ("L", "L_rec", "L_k")]
+    assert model.split()[:6] == ["model", *losses, f"{psnr:.2f}", f"({psnr - nothing_psnr:+.2f})"]
     assert f"{epe:.2f} ({epe / nothing_epe:.2f} x do nothing)" in model
+    gains = [metrics(trained.folder, f"val/epe_{rival}")[1] for rival in ("identity", "constant")]
+    best = min(metrics(trained.folder, "val/epe").values())
+    assert verdict.startswith("best.ckpt: ")
+    assert "NOT better" in verdict or "but NOT" in verdict or min(gains) > best
+    assert f"doing nothing by {gains[0] - best:.2f} px" in verdict
+    assert f"the constant flow ({gains[1] - best:+.2f} px)" in verdict
     assert trained.outcome.err == "torchrefract: loading …\n"
     for word in ("Traceback", "Warning", "Tip:"):
         assert word not in trained.outcome.out
+
+
+def test_a_run_says_on_what_it_trains_before_it_starts(trained):
+    words = [" ".join(line.split()) for line in trained.outcome.out.splitlines()[:6]]
+    assert words == [
+        "frames 32 of RoadScenes",
+        "drives unknown",
+        "size 32x64 px, height and width",
+        "validation 16 frames, 33% of all",
+        "steps 8 in 2 epochs of 4, of 8 frames each; warm-up 0, a tenth, instead of warmup_steps=50",
+        "scene cheap_dashcam of severity 3",
+    ]
 
 
 def test_each_epoch_logs_its_scores_and_constant_baselines(trained):
@@ -75,9 +100,9 @@ def test_each_epoch_logs_its_scores_and_constant_baselines(trained):
 
 
 def test_the_checkpoints_are_those_of_the_last_and_of_the_best_epoch(trained):
-    loss = metrics(trained.folder, "val/loss")
+    epe = metrics(trained.folder, "val/epe")
     assert read_checkpoint(trained.folder / "last.ckpt", task="undistort")["epoch"] == 1
-    assert read_checkpoint(trained.folder / "best.ckpt", task="undistort")["epoch"] == min(loss, key=loss.__getitem__)
+    assert read_checkpoint(trained.folder / "best.ckpt", task="undistort")["epoch"] == min(epe, key=epe.__getitem__)
 
 
 @pytest.fixture
@@ -187,6 +212,10 @@ def test_a_finished_run_cannot_be_resumed(call, trained):
             ("+task=deweather", "task.transmission_head=true", "scene=cheap_dashcam"),
             "data: effect must have a transmission, as fog has, got LensDistortion",
         ),
+        (
+            ("+task=undistort", "scene=paper_refractive", "data.border=black"),
+            "data: border must be null unless the scene is a lens that fills its frames, got black",
+        ),
         (("+task=undistort", "run_dir=/dev/null/run"), "run_dir: "),
         (("+task=undistort", "model.lr=nan"), "model: lr must not be NaN, got nan"),
         (("+task=undistort", "model.weight_decay=-1"), "model: weight_decay must be a number of at least 0, got -1"),
@@ -199,6 +228,12 @@ def test_a_finished_run_cannot_be_resumed(call, trained):
 def test_an_invalid_option_is_one_line_of_error(call, small, words, message):
     options = [word for word in small if not word.startswith("model.")] if "model=ddpm" in words else small
     assert call("train", *options, *words).message.startswith(message)
+
+
+def test_a_logger_without_its_package_names_the_extra(call, small, monkeypatch):
+    monkeypatch.setattr("pytorch_lightning.loggers.wandb._WANDB_AVAILABLE", False)
+    message = call("train", "+task=undistort", *small, "logger=wandb").message
+    assert message == "logger=wandb needs its package: pip install 'torchrefract[loggers]'"
 
 
 def test_a_damaged_pair_is_one_line_of_error(call, small, tmp_path):
@@ -223,9 +258,17 @@ def test_a_damaged_pair_is_one_line_of_error(call, small, tmp_path):
 def test_deweathering_trains_by_the_same_command_into_a_new_folder(call, small, tmp_path):
     outcome = call("train", "+task=deweather", *small, "trainer.max_epochs=1", "run_dir=new/run")
     assert sorted(path.name for path in (tmp_path / "new" / "run").iterdir()) == FILES
-    head, nothing, model = outcome.out.splitlines()[-4:-1]
+    head, nothing, model, _, verdict = outcome.out.splitlines()[-5:]
     assert "endpoint" not in head
     assert (nothing[:10], model[:5]) == ("do nothing", "model")
+    gain = (
+        max(metrics(tmp_path / "new" / "run", "val/psnr").values())
+        - metrics(tmp_path / "new" / "run", "val/psnr_identity")[0]
+    )
+    assert (
+        f"than doing nothing by {gain:.2f} dB" in verdict
+        or f"NOT better than doing nothing ({gain:+.2f} dB)" in verdict
+    )
     assert read_checkpoint(tmp_path / "new" / "run" / "last.ckpt", task="deweather")["epoch"] == 0
 
 
@@ -238,6 +281,8 @@ def test_a_diffusion_model_trains_and_its_evaluation_by_the_moving_average_repea
     path = trained.folder / "last.ckpt"
     checkpoint, name = read_checkpoint(path, task="undistort"), "network.network.conv_out.weight"
     assert not checkpoint["state_dict"][name].equal(checkpoint["current_model_state"][name])
+    (monitored,) = (state for name, state in checkpoint["callbacks"].items() if "'monitor': 'val/epe'" in name)
+    assert float(monitored["best_model_score"]) == pytest.approx(metrics(trained.folder, "val/epe")[0], rel=1e-5)
     evaluated = call("eval", "+task=undistort", *DDPM, f"ckpt_path={path}", "hydra.run.dir=again", "model.steps=3")
     assert evaluated.code == 0, evaluated.err
     assert model_line(evaluated.out) == model_line(trained.out)
@@ -259,7 +304,36 @@ def test_an_evaluation_scores_by_default_what_the_checkpoint_was_validated_on_an
     assert "on 8 validation frames of RoadScenes, 32x64 px, cheap_dashcam of severity 5; " in outcome.out
     assert "; unlike its own validation in data.effect.severity, data.val_count\n" in outcome.out
     outcome = call("eval", f"ckpt_path={checkpoint}", "scene=paper_refractive")
-    assert "32x64 px, paper_refractive of severity 3; unlike its own validation in data.effect._target_" in outcome.out
+    assert (
+        " px, paper_refractive of severity 3, padded frames; unlike its own validation in data.effect._targ"
+        in outcome.out
+    )
+
+
+def test_the_same_checkpoint_is_scored_with_filled_frames_and_with_named_borders(call, trained):
+    """A network whose heads are zero scores like doing nothing, on frames that this test degrades itself."""
+    content, path = read_checkpoint(trained.folder / "best.ckpt"), Path("zero.ckpt").resolve()
+    for name, weight in content["state_dict"].items():
+        if "head" in name:
+            weight.zero_()
+    AtomicCheckpointIO().save_checkpoint(content, path)
+    loader = DataLoader(RoadScenes(4, size=(32, 64), first=32), batch_size=4)
+    errors = []
+    for border, name in ((None, ""), ("black", ", black border"), ("mirrored", ", mirrored border")):
+        words = [] if border is None else [f"data.border={border}"]
+        outcome = call("eval", f"ckpt_path={path}", *words, "data.val_count=4", "data.batch_size=4")
+        assert outcome.code == 0, outcome.err
+        head, *rows, _, verdict = outcome.out.splitlines()
+        assert f"cheap_dashcam of severity 3{name}; " in head
+        pair = make_pair(next(iter(loader)), presets.cheap_dashcam(), seed=0, border=border)
+        expected_psnr = float(psnr(pair.degraded, pair.clean, pair.valid).mean())
+        errors.append(float(endpoint_error(0 * pair.flow, pair.flow, pair.valid, size=(1080, 1920)).mean()))
+        for method in ("do nothing", "model"):
+            (row,) = (line for line in rows if line.startswith(f"{method}{name}  "))
+            assert f"{expected_psnr:.2f} (+0.00)" in row
+            assert f"{errors[-1]:.2f} (1.00 x do nothing)" in row
+        assert re.search(r"NOT (better )?than doing nothing \([+-]0\.00 px\)", verdict)
+    assert errors == [errors[0]] * 3
 
 
 def test_an_evaluation_runs_no_code_that_a_checkpoint_names(call, known_model, tmp_path):

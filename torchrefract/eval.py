@@ -10,6 +10,7 @@ Options:
     data.size=[64,112]      [height, width] to which frames are cropped and reduced, px
     scene=NAME              another degradation: cheap_dashcam, cape_town_fog, paper_refractive, paper_weather, ...
     scene.severity=3        1 to 5
+    data.border=black       a black or mirrored border, where frames padded by the lens would have one; names the rows
     model.steps=50          of a diffusion model
     data.batch_size=16      frames in a step; data.workers=2 processes load them
     trainer=gpu             hardware: cpu, gpu or ddp

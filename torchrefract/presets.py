@@ -42,7 +42,6 @@ SEVERITIES = (1, 2, 3, 4, 5)
 
 _REFERENCE_WIDTH = 1920.0
 _HORIZON, _SPREAD = 0.55, 0.1  # an angle that varies from car to car
-_DUST = (0.78, 0.71, 0.61)  # airlight of laterite dust
 _LOW_SUN = (1.0, 0.94, 0.82)
 _TELEPHOTO = Camera(
     width=1920, height=1080, fx=7680.0, fy=7680.0, cx=959.5, cy=539.5, coefficients=(0.0,) * 4, model="opencv"
@@ -88,6 +87,7 @@ def cape_town_fog(
         "contrast_range": (0.4, 0.8),
         "wind_x_range": (-0.1, 0.1),
         "wind_z_range": (-0.65, -0.45),
+        "horizon": horizon,
     }
     return HeterogeneousFog(**options | _place(camera, horizon, depth) | _without_place(arguments))
 
@@ -131,8 +131,8 @@ def highveld_heat_haze(
     """
     kelvin, amplitude = _at_severity(severity, [(5.0, 0.5), (10.0, 1.0), (15.0, 1.5), (20.0, 2.2), (30.0, 3.0)])
     place = _place(camera, horizon, depth)
-    focal = {} if place["camera"] is None else {"focal": place["camera"].fx / place["camera"].width}
-    options: dict[str, Any] = {"difference_range": _around(kelvin, 0.2 * kelvin), "horizon": horizon, **focal}
+    options: dict[str, Any] = {"difference_range": _around(kelvin, 0.2 * kelvin), "horizon": horizon}
+    options |= _focal(place["camera"]) | ({} if depth is None else {"depth": depth})
     haze = _turbulence(amplitude, width, **{"depth": place["depth"]} | arguments)
     return Compose([RoadMirage(**options | (mirage or {})), haze])
 
@@ -172,7 +172,7 @@ def unpaved_road(
     """Create the dust of a car ahead on a gravel road, which thins with height, seen through haze by a shaken camera.
 
     Args:
-        severity: 1 to 5, visibility of 400 … 800 m at 1, 80 … 200 m at 3, 25 … 50 m at 5; standard deviation of the
+        severity: 1 to 5, visibility of 400 … 800 m at 1, 60 … 150 m at 3, 20 … 35 m at 5; standard deviation of the
             displacement 200 m away of 0.3, 0.8, 1.5 px, each +-20 %; time to read out a frame of 15, 25, 40 ms, and
             vibration of the pitch of 0.05, 0.12, 0.2 degrees. The car drives at 40 to 80 km/h.
         camera, horizon, depth, width: as for all scenes.
@@ -184,17 +184,17 @@ def unpaved_road(
         severity,
         [
             ((400.0, 800.0), 0.3, 15.0, 0.05),
-            ((200.0, 400.0), 0.5, 20.0, 0.08),
-            ((80.0, 200.0), 0.8, 25.0, 0.12),
-            ((50.0, 80.0), 1.1, 33.0, 0.16),
-            ((25.0, 50.0), 1.5, 40.0, 0.2),
+            ((150.0, 300.0), 0.5, 20.0, 0.08),
+            ((60.0, 150.0), 0.8, 25.0, 0.12),
+            ((35.0, 60.0), 1.1, 33.0, 0.16),
+            ((20.0, 35.0), 1.5, 40.0, 0.2),
         ],
     )
     place = _place(camera, horizon, depth)
     of_dust: dict[str, Any] = {
         "mode": "ray",
         "visibility_range": visibility,
-        "airlight": _DUST,
+        "airlight": "dust",
         "scales": (6.0, 12.0, 24.0, 48.0),
         "weights": (0.2, 0.3, 0.3, 0.2),
         "contrast_range": (0.7, 1.1),
@@ -220,19 +220,19 @@ def unpaved_road(
     )
 
 
-def paper_refractive(severity: int = 3, *, width: float = _REFERENCE_WIDTH) -> OneOf:
+def paper_refractive(severity: int = 3, *, width: float = _REFERENCE_WIDTH, frame: str = "pad") -> OneOf:
     """Create the paper's four refractive distortions, one of them for each sample.
 
     Args:
-        severity: 1 to 5, displacements of severity / 3 times the paper's; the lens is that of `cheap_dashcam`, with a
-            black border.
+        severity: 1 to 5, displacements of severity / 3 times the paper's; the lens is that of `cheap_dashcam`.
         width: of the frames, px.
+        frame: of the lens, see `LensDistortion`. The paper's has a black border; Table 1 fills the frames.
     """
     scale = _at_severity(severity, [1 / 3, 2 / 3, 1.0, 4 / 3, 5 / 3])
     px = check_positive("width", width) / _REFERENCE_WIDTH
     return OneOf(
         [
-            _cheap_lens(severity, frame="pad"),
+            _cheap_lens(severity, frame=frame),
             Turbulence(
                 amplitude_range=(0.5 * scale * px, 1.5 * scale * px),
                 length_range=(20.0 * px, 60.0 * px),
@@ -269,9 +269,13 @@ def _place(source: _CameraSource, horizon: float, depth: _DepthSource) -> dict[s
     """Return the arguments of an effect that tell the camera and the depth."""
     camera = _camera(source)
     if depth is None:
-        focal = {} if camera is None else {"focal": camera.fx / camera.width}
-        depth = CorridorDepth(horizon=horizon, spread=_SPREAD, **focal)
+        depth = CorridorDepth(horizon=horizon, spread=_SPREAD, **_focal(camera))
     return {"camera": camera, "depth": depth}
+
+
+def _focal(camera: Camera | None) -> dict[str, float]:
+    """Return the argument of an effect that tells the focal length, widths."""
+    return {} if camera is None else {"focal": camera.fx / camera.width}
 
 
 def _without_place(arguments: dict[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """Train a model that restores images: `python -m torchrefract.train +task=undistort`.
 
-Frames are degraded on the fly by a scene. The run folder receives best.ckpt, last.ckpt, config.yaml, metrics.csv and
-pictures; the last lines compare the model with doing nothing.
+Frames are degraded on the fly by a scene. The first lines say what is trained on. The run folder receives best.ckpt, of
+the epoch with the fewest px or the most dB, last.ckpt, config.yaml, metrics.csv and pictures. The last lines compare
+the model with doing nothing, and end in a verdict.
 
 Options:
     +task=undistort         what to learn, required unless an experiment is given: undistort or deweather
@@ -12,6 +13,7 @@ Options:
     model=resunet           network: resunet, segformer, ddpm or ddpm_cat256
     trainer=cpu             hardware: cpu, gpu or ddp; trainer.max_epochs=6 sets the length
     data.batch_size=16      frames in a step; data.workers=2 processes load them
+    logger=csv              also write for tensorboard, or wandb (offline); both need the extra "loggers"
     ckpt_path=FILE          last.ckpt of a stopped run, which is resumed
     hydra.run.dir=DIR       run folder; seed=0 sets weights, order and degradations
 

@@ -1,5 +1,8 @@
 """Effects inside containers of kornia."""
 
+import importlib
+import sys
+
 import pytest
 import torch
 from torch import nn
@@ -45,6 +48,27 @@ def test_masks_boxes_and_keypoints_follow_the_image(effect):
         assert ((output - value).abs() > 1e-3).float().mean() < 1e-3
     again = container(*inputs(), params=container._params)
     assert all(map(torch.equal, outputs, again))
+
+
+def test_labels_follow_a_depth_that_is_computed_from_the_image():
+    near_or_far = Turbulence(depth=lambda image: 20 + 800 * image.mean(dim=1, keepdim=True))
+    container = K.AugmentationSequential(adapter.KorniaEffect(near_or_far), data_keys=["input", "keypoints"])
+    image, _, points, *_ = inputs()
+    _, moved = container(image, points)
+    params = container._params[0].data
+    flow = near_or_far.degrade(image, seed=params["seed"], keys=params["keys"]).flow
+    assert_close(moved, warp_points(points, flow)[0], rtol=0, atol=1e-3)
+    assert (moved - points).abs().max() > 0.1
+    other = K.AugmentationSequential(adapter.KorniaEffect(near_or_far), data_keys=["input"])
+    with pytest.raises(ValueError, match="labels must be passed in one call with their image"):
+        other(points, params=container._params, data_keys=["keypoints"])
+
+
+def test_without_kornia_the_error_names_the_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "kornia.constants", None)
+    monkeypatch.delitem(sys.modules, adapter.__name__)
+    with pytest.raises(ImportError, match="needs kornia: pip install kornia"):
+        importlib.import_module(adapter.__name__)
 
 
 def test_extra_args_of_the_container_interpolate_masks():

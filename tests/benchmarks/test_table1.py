@@ -9,8 +9,10 @@ import table1
 import torch
 from table1 import MIX, Scores, effects_of
 
+from torchrefract import Frame, LensDistortion, Pair
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.restoration.checkpoints import load_model
+from torchrefract.restoration.tasks import Restored
 
 SIZE = (48, 80)
 OPTIONS: dict[str, Any] = {"device": torch.device("cpu"), "groups": ["drive2"], "frames": 0, "sampled": 1}
@@ -27,6 +29,33 @@ def test_the_mix_is_the_mean_of_its_effects_for_all_frames_and_for_each_group():
     assert mix == {"all": (2 * 15 / 4, 4), "br_*": (2 * (2 + 8) / 2, 2), "others": (2 * (1 + 4) / 2, 2)}
     effects = {line.effect: line.scores.psnr for line in lines if line.effect != MIX}
     assert effects == {name: (1 + i) * 15 / 4 for i, name in enumerate(by_effect)}
+
+
+def test_lenses_fill_their_frames_but_in_the_tables_that_name_a_border():
+    lenses = {
+        n: effect for n, (effect, _) in effects_of("undistort", SIZE[1]).items() if isinstance(effect, LensDistortion)
+    }
+    assert {lens.frame for lens in lenses.values()} == {"fill"}
+    names = ["cheap_dashcam lens, black border", "cheap_dashcam lens, mirrored border"]
+    assert [*lenses] == ["cheap_dashcam lens", "wide lens", *names]
+    frame = Frame(torch.ones(2, 3, *SIZE), torch.arange(2), torch.empty(0))
+    plain, black, mirrored = (table1.corrupt([frame], lenses[n], n)[0] for n in ("cheap_dashcam lens", *names))
+    assert plain.degraded.min() > 0.99
+    assert mirrored.degraded.min() > 0.99
+    assert 0.02 < (black.degraded == 0).float().mean() < 0.4
+
+
+def test_scores_are_those_of_the_task_with_nan_for_a_missing_map():
+    clean, flow = torch.full((2, 3, 8, 16), 0.5), torch.zeros(2, 2, 8, 16)
+    pair = Pair(clean + 0.25, clean, flow, torch.ones(2, 1, 8, 16, dtype=torch.bool), torch.arange(2))
+    moved = Restored(clean + 0.1, torch.tensor([2.0, -1.0]).view(1, 2, 1, 1).expand(2, -1, 8, 16))
+    # 2 of 8 px and 1 of 4 px, halves of the frame, and 20 dB; 240 px and 135 px of 1920x1080.
+    scores = table1.score("undistort", [moved], [pair])[0].tolist()
+    assert scores[:4] + scores[5:] == pytest.approx([0.35, 0.1, 0.25, 20.0, math.hypot(240, 135)], rel=1e-4)
+    scores = table1.score("deweather", [Restored(clean + 0.1)], [pair])[0].tolist()
+    assert scores[:2] == pytest.approx([0.1, 0.1], rel=1e-4)
+    assert math.isnan(scores[2])
+    assert math.isnan(scores[5])
 
 
 @pytest.mark.quick
@@ -61,8 +90,8 @@ def test_a_finished_training_is_loaded_and_the_tables_hold_all_methods(tmp_path,
         assert scores[model, effect].epe == pytest.approx(scores["do nothing", effect].epe, rel=1e-4), effect
     text = table1.format_tables(lines)
     assert "### undistort: wide lens" in text
-    assert "| paper: SegFormer, on its own frames |  |  |  | 16.29 |  | 69.82 |" in text
-    assert text.count("best constant flow") == 8
+    assert "| paper: SegFormer, on its own frames | 0.146 | 0.085 | 0.055 | 16.29 |  | 69.82 |" in text
+    assert text.count("best constant flow") == 10
     assert "### undistort: all of the paper's, frames drive2*" in text
     assert {line.group: line.frames for line in lines} == {"all": 2, "drive2*": 1, "others": 1}
 

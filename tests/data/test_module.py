@@ -64,6 +64,35 @@ def test_a_pair_holds_a_frame_and_its_degraded_copy_without_gradient():
     assert pair.transmission.shape == (2, 0)
 
 
+def test_a_border_changes_only_what_a_padded_frame_would_lack():
+    """A padded frame shows an unzoomed view, linear for a ramp; a mirrored border folds it at the edge of the frame."""
+    size, keys = (48, 80), torch.arange(3)
+    ramp = torch.linspace(0.2, 0.8, size[1]).expand(3, 3, *size).contiguous()
+    lens, frame = presets.cheap_dashcam(5, tolerance_px=None), Frame(ramp, keys, torch.empty(0))
+    filled, black, mirrored = (make_pair(frame, lens, seed=3, border=border) for border in (None, "black", "mirrored"))
+    params = lens.degrade(ramp, seed=3, keys=keys).params
+    padded = lens.apply(ramp, params._replace(zoom=None, shift=None))
+    border = ~padded.valid.expand_as(ramp)
+    assert 0.05 < border.float().mean() < 0.5
+    for pair in (black, mirrored):
+        assert torch.equal(pair.degraded[~border], filled.degraded[~border])
+        for name in ("clean", "flow", "valid", "key"):
+            assert torch.equal(getattr(pair, name), getattr(filled, name))
+    assert (black.degraded[border] == 0).float().mean() > 0.8  # sampling mixes the edge with black
+    assert (black.degraded <= filled.degraded + 1e-6).all()
+    x = torch.arange(size[1]) + padded.flow[:, :1]  # in the unzoomed frame
+    folded = (size[1] - 1) - ((size[1] - 1) - x.abs()).abs()
+    view = torch.zeros_like(ramp[:, :1])
+    for i in range(3):  # the ramp in the unzoomed frame, from the middle rows of the filled one
+        inside = padded.valid[i, 0]
+        slope = torch.linalg.lstsq(
+            torch.stack([x[i, 0][inside], torch.ones_like(x[i, 0][inside])], dim=1),
+            filled.degraded[i, 0][inside][:, None],
+        ).solution.flatten()
+        view[i, 0] = slope[0] * folded[i, 0] + slope[1]
+    assert (mirrored.degraded - view)[border].abs().max() < 0.01
+
+
 @pytest.mark.parametrize(
     "scene", [UniformFog(), UniformFog(p=0.5), presets.paper_weather()], ids=["always", "sometimes", "one of several"]
 )

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract.fields.airlight import airlight_of_frame
+from torchrefract.fields.airlight import airlight_of_frame, dust_airlight
 from torchrefract.fields.sky import sky_mask
+from torchrefract.fields.srgb import luma
 
 HEIGHT, WIDTH = 90, 160
 
@@ -61,6 +62,15 @@ def test_the_airlight_of_a_night_is_dark_and_not_that_of_its_lamps():
 def test_the_airlight_without_sky_is_the_color_of_the_thickest_haze():
     color = torch.tensor([0.45, 0.42, 0.36])
     assert_close(airlight_of_frame(haze(color)), color[None].double(), rtol=0, atol=1e-4)
+
+
+def test_dust_is_laterite_by_day_and_as_dark_as_the_night():
+    laterite = torch.tensor([[0.78, 0.71, 0.61]], dtype=torch.float64)
+    assert torch.equal(dust_airlight(street((0.9, 0.9, 0.9), (0.3, 0.3, 0.3))), laterite)
+    dark = dust_airlight(night())
+    assert_close(dark / dark.mean(), laterite / laterite.mean())
+    assert_close(luma(dark[..., None, None]), luma(airlight_of_frame(night())[..., None, None]))
+    assert dust_airlight(day()[:, :1]).shape == (1, 1)
 
 
 @pytest.mark.quick

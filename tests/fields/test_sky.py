@@ -92,3 +92,17 @@ def test_real_frames_have_sky_by_day_and_where_the_camera_looks_ahead(shared_dat
     paths = sorted((shared_data / "frames").glob(f"*/{prefix}*.jpg"))[::5]
     shares = [sky_mask(read_image(path)[None]).float().mean() for path in paths]
     assert low <= (torch.stack(shares) > 0.05).float().mean() <= high
+
+
+def test_haze_at_the_horizon_and_sky_behind_poles_belong_to_the_sky():
+    frame, expected = painted((0.56, 0.6, 0.64))
+    # The sky fades to a gray that is too dark to be taken for sky by itself.
+    faded = 0.45 + torch.linspace(1, 0, 30) * (torch.tensor([0.56, 0.6, 0.64])[:, None] - 0.45)
+    frame[..., 10:40, :] = torch.where(expected[..., 10:40, :], faded[..., None], frame[..., 10:40, :])
+    for pole in ((slice(40), slice(10, 12)), (slice(30, 32), slice(12))):  # a pole to the ground, and its arm
+        frame[..., *pole], expected[..., *pole] = 0.1, False
+    actual = sky_mask(frame)
+    assert (actual & ~expected).sum() < 0.01 * expected.sum()  # the rim, where the trees are as bright
+    assert (actual & expected)[..., 33:39, :].sum() > 0.9 * expected[..., 33:39, :].sum()
+    frame[..., 5, 100] = torch.nan
+    assert (sky_mask(frame) == actual).float().mean() > 0.999

@@ -117,7 +117,31 @@ def test_a_task_without_a_flow_has_no_endpoint_error(trainer, make_batches, load
     run.fit(Restoration(Constant, Deweather()), loader(fog), loader(fog))
     names = set(run.callback_metrics)
     assert {"val/psnr", "val/psnr_identity", "val/ssim", "val/ssim_identity", "val/loss", "train/loss"} <= names
-    assert not [name for name in names if "epe" in name or "constant" in name]
+    assert not [name for name in names if "epe" in name or "constant" in name or "L_k" in name]
+    assert run.callback_metrics["val/L_rec"] == run.callback_metrics["val/L"] == run.callback_metrics["val/loss"]
+
+
+def test_a_validation_logs_the_loss_and_its_terms_of_the_model_and_of_the_baselines(trainer, training, loader):
+    run, task = trainer(), Undistort()
+    run.validate(Restoration(Constant, task), loader(training[:1]), verbose=False)
+    scores, pair = run.callback_metrics, training[0]
+    nothing = Restored(pair.degraded, torch.zeros_like(pair.flow))
+    image_loss, flow_loss = task.loss_terms(nothing, pair)
+    for suffix in ("", "_identity", "_constant"):  # the network predicts 0, and no flow is known yet
+        assert scores[f"val/L_rec{suffix}"] == pytest.approx(float(image_loss.mean()), rel=1e-4)
+        assert scores[f"val/L_k{suffix}"] == pytest.approx(float(flow_loss.mean()), rel=1e-4)
+        assert scores[f"val/L{suffix}"] == pytest.approx(float((image_loss + flow_loss).mean()), rel=1e-4)
+
+
+def test_doing_nothing_counts_as_clear_air_if_the_task_restores_a_transmission(trainer, make_batches, loader):
+    (pair,) = (
+        pair._replace(transmission=torch.full_like(pair.clean[:, :1], 0.25))
+        for pair in make_batches(UniformFog(), 1, size=SIZE)
+    )
+    run = trainer()
+    run.validate(Restoration(Constant, Deweather(transmission_head=True)), loader([pair]), verbose=False)
+    assert run.callback_metrics["val/L_k_identity"] == pytest.approx(0.75, rel=1e-4)
+    assert run.callback_metrics["val/L_k"] == pytest.approx(0.25, rel=1e-4)  # 1 / (1 + exp(0)) = 0.5
 
 
 class Rates(Callback):
@@ -157,6 +181,12 @@ def test_a_loss_that_is_not_finite_names_the_keys_of_its_batch(trainer, training
     batch = training[1]._replace(clean=torch.full_like(training[1].clean, value), valid=training[1].valid | True)
     with pytest.raises(NotFiniteError, match=rf"got {value:g} in step 1 of epoch 0 for the keys 4, 5, 6, 7$"):
         trainer(max_epochs=1).fit(Restoration(Constant, Undistort()), loader([training[0], batch]))
+
+
+@pytest.mark.quick
+def test_a_warm_up_takes_at_most_a_tenth_of_the_steps():
+    model = Restoration(Constant, Undistort(), warmup_steps=50)
+    assert [model.num_warmup_steps(steps) for steps in (9, 192, 499, 500, 10_000)] == [0, 19, 49, 50, 50]
 
 
 class StoppedError(Exception):

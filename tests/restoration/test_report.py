@@ -10,16 +10,20 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from torchrefract import Pair
+from torchrefract import Pair, presets
+from torchrefract.data.module import road_scenes
 from torchrefract.restoration.module import Restoration
 from torchrefract.restoration.report import (
     RunSummary,
+    border_name,
     carry_over,
     choose_examples,
+    describe_scene,
     draw_panel,
     metrics_rows,
     plot_curves,
     summary,
+    verdict,
 )
 from torchrefract.restoration.tasks import Restored, Undistort
 from torchrefract.visualization.color import flow_to_rgb
@@ -184,6 +188,15 @@ def test_nothing_on_a_panel_overlaps_or_leaves_the_page(size):
 
 SCORES = {
     "val/loss": 0.04,
+    "val/L": 0.03,
+    "val/L_constant": 0.04,
+    "val/L_identity": 0.05,
+    "val/L_rec": 0.02,
+    "val/L_rec_constant": 0.025,
+    "val/L_rec_identity": 0.0301,
+    "val/L_k": 0.01,
+    "val/L_k_constant": 0.015,
+    "val/L_k_identity": 0.0199,
     "val/psnr": 26.0,
     "val/psnr_constant": 25.25,
     "val/psnr_identity": 20.5,
@@ -210,19 +223,67 @@ def words(lines: list[str]) -> list[str]:
 def test_the_table_compares_the_model_with_the_baselines():
     head, *lines = summary(scores(), (1080, 1920))
     assert "px at 1920x1080" in head
+    assert head.split()[:4] == ["validation", "L", "L_rec", "L_k"]
     assert words(lines) == [
-        "do nothing 20.50 (+0.00) 0.700 20.00 (1.00 x do nothing)",
-        "best constant flow 25.25 (+4.75) 0.750 6.00 (0.30 x do nothing)",
-        "model 26.00 (+5.50) 0.800 5.00 (0.25 x do nothing)",
+        "do nothing 0.0500 0.0301 0.0199 20.50 (+0.00) 0.700 20.00 (1.00 x do nothing)",
+        "best constant flow 0.0400 0.0250 0.0150 25.25 (+4.75) 0.750 6.00 (0.30 x do nothing)",
+        "model 0.0300 0.0200 0.0100 26.00 (+5.50) 0.800 5.00 (0.25 x do nothing)",
     ]
     assert len({len(line) for line in lines}) == 1
     worse = words(summary(scores(psnr=18.0, epe=30.0), (1080, 1920)))[-1]
-    assert worse == "model 18.00 (-2.50) 0.800 30.00 (1.50 x do nothing)"
+    assert worse.endswith(" 18.00 (-2.50) 0.800 30.00 (1.50 x do nothing)")
     assert len(summary(scores(epe=0.0, epe_constant=0.0, epe_identity=0.0), (1080, 1920))) == 4
-    without_flow = {name: value for name, value in scores().items() if "epe" not in name and "constant" not in name}
-    head, *lines = summary(without_flow, (1080, 1920))
+    head, *lines = summary(without_flow(), (1080, 1920))
     assert "endpoint" not in head
-    assert words(lines) == ["do nothing 20.50 (+0.00) 0.700", "model 26.00 (+5.50) 0.800"]
+    assert "L_k" not in head
+    assert words(lines) == [
+        "do nothing 0.0500 0.0301 20.50 (+0.00) 0.700",
+        "model 0.0300 0.0200 26.00 (+5.50) 0.800",
+    ]
+
+
+def without_flow(**changes: float) -> dict[str, Tensor]:
+    """Return the scores of a task without a flow."""
+    flow = ("epe", "constant", "L_k")
+    return {name: value for name, value in scores(**changes).items() if not any(word in name for word in flow)}
+
+
+ADVICE = ": train longer, on more frames, or at a larger data.size"
+
+
+@pytest.mark.quick
+def test_the_verdict_compares_the_model_with_each_baseline_in_the_unit_of_the_task():
+    assert verdict(scores()) == "the model: better than doing nothing by 15.00 px and than the constant flow by 1.00 px"
+    best = torch.tensor(1.8)
+    assert verdict(scores(), best=best).startswith("best.ckpt: better than doing nothing by 18.20 px and than ")
+    between = "the model: better than doing nothing by 13.50 px, but NOT than the constant flow (-0.50 px)"
+    assert verdict(scores(epe=6.5)) == between + ADVICE
+    neither = "the model: NOT better than doing nothing (-5.00 px) or the constant flow (-19.00 px)"
+    assert verdict(scores(epe=25.0)) == neither + ADVICE
+    assert verdict(scores(epe=math.nan)).startswith("the model: NOT better than doing nothing (+nan px) or ")
+    assert verdict(without_flow()) == "the model: better than doing nothing by 5.50 dB"
+    assert verdict(without_flow(psnr=20.5)) == "the model: NOT better than doing nothing (+0.00 dB)" + ADVICE
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(
+    ("effect", "border", "name"),
+    [
+        (presets.cheap_dashcam(), None, ""),
+        (presets.cheap_dashcam(), "black", "black border"),
+        (presets.cheap_dashcam(), "mirrored", "mirrored border"),
+        (presets.paper_refractive(), None, "padded frames"),
+        (presets.paper_refractive(frame="fill"), None, ""),
+    ],
+)
+def test_a_border_names_the_scene_and_the_rows(effect, border, name):
+    data = road_scenes(effect=effect, border=border)
+    assert border_name(data) == name
+    scene = describe_scene(data, {"_target_": "torchrefract.presets.a_scene", "severity": 3})
+    assert scene == "a_scene of severity 3" + (f", {name}" if name else "")
+    rows = [line[:36].rstrip() for line in summary(scores(), (1080, 1920), border=name)]
+    methods = ["do nothing", "best constant flow", "model"]
+    assert rows == ["validation", *(f"{method}, {name}" if name else method for method in methods)]
 
 
 def test_the_panel_shows_four_examples_by_degradation():

@@ -47,6 +47,8 @@ def test_the_loss_of_an_undistortion_is_image_plus_flow_in_half_frames_over_vali
     error = (flow - pair.flow).abs() / torch.tensor([width / 2, height / 2]).view(1, 2, 1, 1)
     expected = (mean_per_image((image - pair.clean).abs(), valid) + mean_per_image(error, valid)).mean()
     assert_close(Undistort().loss(Restored(image, flow), pair), expected)
+    terms = Undistort().loss_terms(Restored(image, flow), pair)
+    assert_close(terms, (mean_per_image((image - pair.clean).abs(), valid), mean_per_image(error, valid)))
     garbage = Restored(torch.where(valid, image, 0.77), torch.where(valid, flow, 1e3))
     assert_close(Undistort().loss(garbage, pair), expected)
 
@@ -58,8 +60,14 @@ def test_the_loss_of_a_deweathering_is_the_image_over_all_pixels_and_the_transmi
     assert_close(Deweather().loss(Restored(foggy.clean + offset), pair), torch.tensor(0.3))
     wrong = (foggy.transmission - 0.25).abs()
     expected = 0.3 + (wrong - foggy.transmission).abs().double().mean()
-    loss = Deweather(transmission_head=True).loss(Restored(foggy.clean + offset, transmission=wrong), pair)
+    restored = Restored(foggy.clean + offset, transmission=wrong)
+    loss = Deweather(transmission_head=True).loss(restored, pair)
     assert_close(loss.double(), expected, rtol=1e-5, atol=0)
+    image_error, map_error = Deweather().loss_terms(restored, pair)
+    assert_close(image_error, torch.full((3,), 0.3))
+    assert map_error is not None
+    assert_close(map_error, (wrong - foggy.transmission).abs().mean(dim=(1, 2, 3)))
+    assert Deweather().loss_terms(Restored(foggy.clean), pair)[1] is None
 
 
 @pytest.mark.parametrize("cell", [1, 4])

@@ -3,10 +3,6 @@
 from typing import Any
 
 import torch
-from kornia.augmentation import RigidAffineAugmentationBase2D
-from kornia.constants import Resample
-from kornia.geometry.boxes import Boxes
-from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 
 from torchrefract import random
@@ -14,6 +10,14 @@ from torchrefract.effects.base import Effect
 from torchrefract.labels.boxes import warp_boxes
 from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.points import warp_points
+
+try:
+    from kornia.augmentation import RigidAffineAugmentationBase2D
+    from kornia.constants import Resample
+    from kornia.geometry.boxes import Boxes
+    from kornia.geometry.keypoints import Keypoints
+except ModuleNotFoundError as error:
+    raise ImportError("this adapter needs kornia: pip install kornia") from error
 
 
 class KorniaEffect(RigidAffineAugmentationBase2D):
@@ -23,6 +27,7 @@ class KorniaEffect(RigidAffineAugmentationBase2D):
     Boxes become the smallest boxes around their warped outlines, and a box that leaves the frame becomes zeros, as by
     kornia's `filter_boxes_by_area`, since a batch cannot drop one. Keypoints without a position in the degraded image
     become (-1, -1). Class labels stay. `params` replay a draw; it has no inverse, and its matrix is the identity.
+    Labels come in one call with their image, whose depth may decide its flow.
 
     Args:
         effect: the effect; its own `p` decides which samples it degrades.
@@ -33,6 +38,7 @@ class KorniaEffect(RigidAffineAugmentationBase2D):
     def __init__(self, effect: Effect, *, same_on_batch: bool = False, keepdim: bool = False):
         super().__init__(p=1.0, same_on_batch=same_on_batch, keepdim=keepdim)
         self.effect = effect
+        self._drawn: tuple[Tensor | None, Tensor | None] = None, None  # the seed and flow of the last images
         self.flags = {"resample": Resample.NEAREST}  # of masks; `extra_args` of a container replace it
 
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
@@ -48,7 +54,9 @@ class KorniaEffect(RigidAffineAugmentationBase2D):
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
         """Degrade images, (B, C, H, W)."""
-        return self.effect.degrade(input, seed=params["seed"], keys=params["keys"]).image
+        degraded = self.effect.degrade(input, seed=params["seed"], keys=params["keys"])
+        self._drawn = params["seed"], degraded.flow
+        return degraded.image
 
     def apply_transform_mask(
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
@@ -93,8 +101,8 @@ class KorniaEffect(RigidAffineAugmentationBase2D):
     apply_non_transform_mask = apply_non_transform_box = apply_non_transform_keypoint = _unchanged
 
     def _flow(self, params: dict[str, Tensor], like: Tensor) -> Tensor | None:
-        """Return the flow of the draw, (B, 2, H, W), on the device of a label; None for a photometric effect."""
-        shape = [params["keys"].shape[0], *params["forward_input_shape"].tolist()[1:]]
-        dtype = like.dtype if like.dtype is torch.float64 else torch.float32
-        image = torch.zeros(shape, dtype=dtype, device=like.device)
-        return self.effect.degrade(image, seed=params["seed"], keys=params["keys"]).flow
+        """Return the flow of the image, (B, 2, H, W), on the device of a label; None for a photometric effect."""
+        seed, flow = self._drawn
+        if seed is None or not torch.equal(seed, params["seed"]):
+            raise ValueError("labels must be passed in one call with their image, whose depth may decide its flow")
+        return None if flow is None else flow.to(like.device)

@@ -368,5 +368,5 @@ def _options(name: str) -> list[str]:
 
 def _config_file(name: str) -> Path:
     """Return the configuration of a command: in a folder of its own if its options have the names of groups."""
-    own = Path(CONFIG_DIR, name, f"{name}.yaml")
-    return own if own.is_file() else Path(CONFIG_DIR, f"{name}.yaml")
+    in_folder = Path(CONFIG_DIR, name, f"{name}.yaml")
+    return in_folder if in_folder.is_file() else Path(CONFIG_DIR, f"{name}.yaml")

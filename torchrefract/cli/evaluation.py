@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
-from torch.utils.data import Dataset
 
 from torchrefract._io import CONFIG_DIR
-from torchrefract.data.module import fingerprint
+from torchrefract.data.module import PairData, fingerprint
 from torchrefract.effects.base import Effect
 from torchrefract.fields.depth import DepthProvider
 from torchrefract.restoration.checkpoints import read_checkpoint, safe_config
+from torchrefract.restoration.report import describe_scene
 
 _PARTS = ("scene", "task", "data", "model")
 _MODULES = ("torchrefract.presets", "torchrefract.data.module")  # a checkpoint may name their functions
@@ -83,14 +83,13 @@ def use_validation_config(
     return sorted(key for key in before.keys() | after.keys() if before.get(key) != after.get(key))
 
 
-def describe_validation(frames: Dataset[Any], cfg: DictConfig, changed: list[str] | None) -> str:
+def describe_validation(data: PairData, cfg: DictConfig, changed: list[str] | None) -> str:
     """State in a line on what a checkpoint is scored, and how that differs from its own validation."""
-    facts, limit, effect = fingerprint(frames), cfg.trainer.limit_val_batches, cfg.data.get("effect")
-    scene = "degraded on disk" if effect is None else str(effect.get("_target_")).rpartition(".")[2]
-    severity = f" of severity {effect.severity}" if effect is not None and "severity" in effect else ""
+    facts, limit = fingerprint(data.val), cfg.trainer.limit_val_batches
+    scene = describe_scene(data, cfg.data.get("effect"))
     height, width = facts["size"]
     text = f"{facts['frames']} validation frames of {facts['source']}{f' {root}' if (root := facts['root']) else ''}"
-    text += f", {height}x{width} px, {scene}{severity}" + ("" if limit is None else f", limit_val_batches {limit}")
+    text += f", {height}x{width} px, {scene}" + ("" if limit is None else f", limit_val_batches {limit}")
     if changed is None:
         return f"{text}; the checkpoint does not say what it was validated on"
     return f"{text}; " + (

@@ -97,7 +97,7 @@ def evaluate(cfg: DictConfig) -> None:
     data, model, trainer, _ = _make_parts(cfg)
     _save_config(cfg, trainer)
     if trainer.is_global_zero:
-        print(f"scoring {path} on {describe_validation(data.val, cfg, changed)}", flush=True)
+        print(f"scoring {path} on {describe_validation(data, cfg, changed)}", flush=True)
     trainer.validate(model, data, ckpt_path=cfg.ckpt_path, verbose=False, weights_only=True)
 
 
@@ -161,6 +161,9 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
         trainer = make(cfg, "trainer")
     except MisconfigurationException as error:
         raise UsageError(f"trainer: {error}") from error
+    except ModuleNotFoundError as error:
+        name = HydraConfig.get().runtime.choices["logger"]
+        raise UsageError(f"logger={name} needs its package: pip install 'torchrefract[loggers]'") from error
     # Lightning starts the processes of other runs itself.
     processes = int(os.environ.get("WORLD_SIZE") or trainer.world_size)
     if processes != trainer.world_size:

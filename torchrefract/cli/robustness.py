@@ -16,10 +16,10 @@ from torch import Tensor
 from torchvision import tv_tensors
 
 import torchrefract
-from torchrefract import presets
+from torchrefract import presets, random
 from torchrefract._validation import UsageError, check_count, check_number
 from torchrefract.cli.command import check_seed, naming, progress
-from torchrefract.data.frames import first_names, path_key
+from torchrefract.data.frames import first_names
 from torchrefract.data.images import files_in, read_image
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.effects.base import Effect
@@ -230,7 +230,7 @@ def _example(
     """Degrade a picture again, and predict it again."""
     _, image, target = next(folder.read([name]))
     effect = scenes(image.shape[2])[level.scene][level.severity]
-    degraded = effect.degrade(image, seed=seed, keys=[path_key(name)])
+    degraded = effect.degrade(image, seed=seed, keys=[random.key_of(name)])
     target = as_labels(predict(image[None])[0], (image.shape[1], image.shape[2])) if target is None else target
     moved = warp_moved_labels(target, degraded.flow, effect.labels_getter) if degraded.has("flow") else target
     prediction = predict(degraded.image[None])[0]
@@ -240,5 +240,5 @@ def _example(
     )
     if not isinstance(prediction, dict):
         return Example(degraded.image, caption, None, None)
-    found = prediction["boxes"][prediction["scores"] >= 0.5]
-    return Example(degraded.image, caption, moved["boxes"].as_subclass(Tensor), found.detach().cpu())
+    boxes = prediction["boxes"][prediction["scores"] >= 0.5]
+    return Example(degraded.image, caption, moved["boxes"].as_subclass(Tensor), boxes.detach().cpu())

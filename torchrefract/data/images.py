@@ -190,17 +190,29 @@ def fit(image: Tensor, size: Sequence[int]) -> Tensor:
         raise ValueError(f"image must have shape (3, H, W), got {tuple(image.shape)}")
     if image.dtype != torch.float32 or image.device.type != "cpu":
         raise TypeError(f"image must be float32 on the CPU, got {image.dtype} on {image.device}")
-    H, W = image.shape[1:]
+    if (height, width) == image.shape[1:]:
+        return image.detach().clone(memory_format=torch.contiguous_format)
+    # The weights sum to 1 up to rounding, so a mean may exceed 1.
+    return reduce_by_area(crop_center(image.detach(), size), size).clamp_(0, 1)
+
+
+def crop_center(maps: Tensor, size: Sequence[int]) -> Tensor:
+    """Crop the center of maps (C, H, W) to the aspect ratio of `size` = (h, w), at most (H, W)."""
+    (height, width), (H, W) = size, maps.shape[1:]
     if height > H or width > W:
         raise ValueError(f"image must be at least size = {height}x{width} (height x width), got {H}x{W}")
-    if (height, width) == (H, W):
-        return image.detach().clone(memory_format=torch.contiguous_format)
     crop_height, crop_width = min(H, round(W * height / width)), min(W, round(H * width / height))
     top, left = (H - crop_height) // 2, (W - crop_width) // 2
-    crop = image.detach()[:, top : top + crop_height, left : left + crop_width].permute(1, 2, 0).contiguous().numpy()
-    small = cv2.resize(crop, (width, height), interpolation=cv2.INTER_AREA)
-    # The weights sum to 1 up to rounding, so a mean may exceed 1.
-    return torch.from_numpy(small).permute(2, 0, 1).contiguous().clamp_(0, 1)
+    return maps[:, top : top + crop_height, left : left + crop_width]
+
+
+def reduce_by_area(maps: Tensor, size: Sequence[int]) -> Tensor:
+    """Reduce maps (C, H, W), float32, to (C, h, w) of `size` = (h, w): the mean of the pixels that a pixel covers."""
+    parts = []
+    for part in maps.split(4):  # OpenCV takes at most 4 channels
+        small = cv2.resize(part.permute(1, 2, 0).contiguous().numpy(), (size[1], size[0]), interpolation=cv2.INTER_AREA)
+        parts.append(torch.from_numpy(small).view(*size, -1).permute(2, 0, 1))
+    return torch.cat(parts).contiguous()
 
 
 def _read_header(path: str | Path, stream: BinaryIO) -> ImageHeader:

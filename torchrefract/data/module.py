@@ -10,14 +10,19 @@ from typing import Any, cast
 
 import torch
 from pytorch_lightning import LightningDataModule
+from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler, default_collate
 
-from torchrefract._validation import check_count, check_flag
+from torchrefract._validation import check_choice, check_count, check_flag
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.pairs.dataset import PairedFolder
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.effects.base import Effect
-from torchrefract.types import Frame, Pair
+from torchrefract.effects.lens import LensDistortion
+from torchrefract.types import Degraded, Frame, Pair
+from torchrefract.warping.warp import warp
+
+BORDERS = {"black": "zeros", "mirrored": "reflection"}  # with the padding of each
 
 
 class _Sampler(DistributedSampler[Any]):
@@ -78,9 +83,11 @@ class PairData(LightningDataModule):
         seed: of the draws and the order, at least 0.
         transmission: True to add the transmission to pairs of frames.
         flow: True to require a flow in pairs of frames.
+        border: "black" or "mirrored" adds a border to degraded frames, see `add_border`; None keeps them filled.
 
     Raises:
-        ValueError: an argument is out of range, or `batch_size` exceeds the number of training frames.
+        ValueError: an argument is out of range, `batch_size` exceeds the number of training frames, or the effect is
+            no lens that a border could be added for.
     """
 
     def __init__(
@@ -94,8 +101,12 @@ class PairData(LightningDataModule):
         seed: int = 0,
         transmission: bool = False,
         flow: bool = False,
+        border: str | None = None,
     ):
         super().__init__()
+        if border is not None and not (isinstance(effect, LensDistortion) and effect.frame == "fill"):
+            raise ValueError(f"border must be null unless the scene is a lens that fills its frames, got {border}")
+        self.border = border and check_choice("border", border, tuple(BORDERS))
         self.train, self.val, self.effect = train, val, effect
         self.batch_size = check_count("batch_size", batch_size)
         self.workers = check_count("workers", workers, low=0)
@@ -115,7 +126,7 @@ class PairData(LightningDataModule):
         """Raise ValueError if the first pair is unreadable or lacks a required map."""
         first = self.train[0]
         if isinstance(first, Frame) and self.effect is not None:
-            make_pair(default_collate([first]), self.effect, seed=0, **self._maps)
+            make_pair(default_collate([first]), self.effect, seed=0, border=None, **self._maps)
 
     def state_dict(self) -> dict[str, int]:
         """Return the position in the training, which checkpoints hold."""
@@ -146,7 +157,7 @@ class PairData(LightningDataModule):
         training = self.trainer is not None and self.trainer.training
         # Validation has the seed of epoch 0, so training begins at 1.
         epoch = 1 + self.trainer.current_epoch if training and self.trainer else 0
-        return make_pair(batch, self.effect, seed=(self.seed << 32) + epoch, **self._maps)
+        return make_pair(batch, self.effect, seed=(self.seed << 32) + epoch, border=self.border, **self._maps)
 
     def _loader(self, frames: Dataset[Any], *, training: bool) -> DataLoader[Any]:
         ranks, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
@@ -173,7 +184,15 @@ def _start_method() -> str:
 
 
 @torch.no_grad()
-def make_pair(frames: Frame, effect: Effect, *, seed: int, transmission: bool = False, flow: bool = False) -> Pair:
+def make_pair(
+    frames: Frame,
+    effect: Effect,
+    *,
+    seed: int,
+    transmission: bool = False,
+    flow: bool = False,
+    border: str | None = None,
+) -> Pair:
     """Degrade a batch of frames on its device.
 
     Args:
@@ -182,6 +201,7 @@ def make_pair(frames: Frame, effect: Effect, *, seed: int, transmission: bool = 
         seed: of the draws.
         transmission: True to add the transmission.
         flow: True to require a flow; otherwise, an effect without one gives a flow of zeros.
+        border: for a lens, see `add_border`.
 
     Returns:
         degraded and clean images, restore_flow (B, 2, H, W), its validity mask (B, 1, H, W), keys (B,), transmission
@@ -199,7 +219,26 @@ def make_pair(frames: Frame, effect: Effect, *, seed: int, transmission: bool = 
     restore = torch.zeros_like(like).expand(-1, 2, -1, -1) if degraded.restore_flow is None else degraded.restore_flow
     valid = torch.ones_like(like, dtype=torch.bool) if degraded.restore_valid is None else degraded.restore_valid
     transmitted = degraded.transmission if transmission else frames.image.new_empty(len(frames.image), 0)
-    return Pair(degraded.image, frames.image, restore, valid, frames.key, transmitted)
+    image = degraded.image if border is None else add_border(degraded, cast(LensDistortion, effect), border)
+    return Pair(image, frames.image, restore, valid, frames.key, transmitted)
+
+
+def add_border(degraded: Degraded, lens: LensDistortion, border: str) -> Tensor:
+    """Make frames (B, C, H, W) that a lens filled black or mirrored where padded ones would have a border.
+
+    The clean frames, the flows and all other pixels stay, so a model that sees the lens restores them alike.
+
+    Args:
+        degraded: of the lens, with a zoom.
+        lens: fills its frames.
+        border: "black" or "mirrored".
+    """
+    image = degraded.image
+    padded = lens.apply(image, degraded.params._replace(zoom=None, shift=None))
+    # The frame that the padded one would be made of, which the filled one shows in its middle.
+    clean, _ = warp(image, cast(Tensor, padded.restore_flow))
+    bordered, _ = warp(clean, cast(Tensor, padded.flow), padding=BORDERS[border])
+    return torch.where(padded.valid, image, bordered)
 
 
 def fingerprint(frames: Dataset[Frame] | Dataset[Pair]) -> dict[str, Any]:
@@ -255,12 +294,13 @@ def road_scenes(
     seed: int = 0,
     transmission: bool = False,
     flow: bool = False,
+    border: str | None = None,
 ) -> PairData:
     """Make the data of rendered road scenes; see `RoadScenes` and `PairData` for the arguments."""
     train = RoadScenes(train_count, size=size, seed=seed)
     val = RoadScenes(val_count, size=size, seed=seed, first=train_count)
     options = {"batch_size": batch_size, "workers": workers, "seed": seed, "transmission": transmission, "flow": flow}
-    return PairData(train, val, effect=effect, **options)
+    return PairData(train, val, effect=effect, border=border, **options)
 
 
 def frames(
@@ -275,6 +315,7 @@ def frames(
     seed: int = 0,
     transmission: bool = False,
     flow: bool = False,
+    border: str | None = None,
     depth: str | Path | None = None,
 ) -> PairData:
     """Make the data of a folder of frames, split by drive; see `FrameFolder` and `PairData` for the arguments."""
@@ -283,12 +324,13 @@ def frames(
         for split in ("train", "val")
     )
     options = {"batch_size": batch_size, "workers": workers, "seed": seed, "transmission": transmission, "flow": flow}
-    return PairData(train, val, effect=effect, **options)
+    return PairData(train, val, effect=effect, border=border, **options)
 
 
 def pairs(
     *,
     root: str | Path,
+    size: Sequence[int] | None = None,
     batch_size: int = 16,
     workers: int = 2,
     seed: int = 0,
@@ -296,5 +338,6 @@ def pairs(
     flow: bool = False,
 ) -> PairData:
     """Make the data of pairs from disk, with their splits; see `PairedFolder` and `PairData` for the arguments."""
-    train, val = (PairedFolder(root, split=split, transmission=transmission, flow=flow) for split in ("train", "val"))
+    options: dict[str, Any] = {"size": size, "transmission": transmission, "flow": flow}
+    train, val = (PairedFolder(root, split=split, **options) for split in ("train", "val"))
     return PairData(train, val, effect=None, batch_size=batch_size, workers=workers, seed=seed)

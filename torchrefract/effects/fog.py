@@ -31,7 +31,7 @@ from torchrefract.effects.batch import (
     to_batch,
 )
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
-from torchrefract.fields.airlight import airlight_of_frame
+from torchrefract.fields.airlight import airlight_of_frame, dust_airlight
 from torchrefract.fields.depth import (
     DepthProvider,
     DepthSource,
@@ -53,8 +53,10 @@ from torchrefract.planning.photometric import (
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 
-Airlight = float | Sequence[float] | Literal["frame"] | None
+_OfFrame = Literal["frame", "dust"]
+Airlight = float | Sequence[float] | _OfFrame | None
 
+_AIRLIGHTS = {"frame": airlight_of_frame, "dust": dust_airlight}
 _PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)
 _GRAY = sum(weight * value for weight, value in zip(REC_709, _PAPER_AIRLIGHT, strict=True))
 _MIN_TRANSMISSION = 1 / 255  # of what 8 bits can recover
@@ -83,7 +85,7 @@ class FogParams(NamedTuple):
 class FogMedium:
     """The light of the fog and the distance through it, without its density; fields as arguments of `UniformFog`."""
 
-    airlight: tuple[float, ...] | Literal["frame"] | None
+    airlight: tuple[float, ...] | _OfFrame | None
     threshold: float
     depth: DepthSource = field(hash=False)  # providers may have no hash
     camera: Camera | None
@@ -92,15 +94,15 @@ class FogMedium:
     @property
     def colors(self) -> tuple[float, ...]:
         """Return all values that the airlight can have, or the ends of their range for that of the frame."""
-        if self.airlight == "frame":
+        if isinstance(self.airlight, str):
             return (0.0, 1.0)
         return (*_PAPER_AIRLIGHT, _GRAY) if self.airlight is None else self.airlight
 
     def airlight_of(self, image: Tensor, dtype: torch.dtype) -> Tensor:
         """Return the airlight for images (B, C, H, W) as (B, C)."""
         batch, channels = image.shape[:2]
-        if self.airlight == "frame":
-            return airlight_of_frame(to_batch(image)).to(dtype)
+        if isinstance(self.airlight, str):
+            return _AIRLIGHTS[self.airlight](to_batch(image)).to(dtype)
         if self.airlight is None:
             color = _PAPER_AIRLIGHT if channels == 3 else [_GRAY] * channels
         else:
@@ -201,11 +203,11 @@ def make_medium(
     )
 
 
-def _check_airlight(airlight: Airlight) -> tuple[float, ...] | Literal["frame"] | None:
+def _check_airlight(airlight: Airlight) -> tuple[float, ...] | _OfFrame | None:
     if isinstance(airlight, str):
-        if airlight != "frame":
-            raise ValueError(f"airlight must be 'frame', None or numbers in [0, 1], got {airlight!r}")
-        return "frame"
+        if airlight not in _AIRLIGHTS:
+            raise ValueError(f"airlight must be 'frame', 'dust', None or numbers in [0, 1], got {airlight!r}")
+        return airlight
     return None if airlight is None else check_color("airlight", airlight, high=1.0)
 
 
@@ -222,8 +224,9 @@ class UniformFog(PhotometricEffect):
         deviation_range: relative deviation of the extinction, within (-1, 1).
         airlight: color of the fog in [0, 1], one number for each channel or one for all; None is that of the paper,
             (220, 220, 235) / 255 for three channels and its luminance for any other number; "frame" estimates it from
-            each image, see `airlight_of_frame`: gray under clouds, dark at night. A clip has the color of its first
-            frame, and frame t alone its own, so pass the params of the clip to `apply` for frames one by one.
+            each image, see `airlight_of_frame`: gray under clouds, dark at night; "dust" is laterite in that light,
+            see `dust_airlight`. A clip has the color of its first frame, and frame t alone its own, so pass the params
+            of the clip to `apply` for frames one by one.
         threshold: contrast that remains at the distance V, in (0, 1); 0.05 is the meteorological optical range.
         depth: gives d if no depth is passed in: a provider, or any function from images (B, C, H, W) in [0, 1] to their
             depth (B, 1, H, W) in m, such as a network. None is `LinearDepth()`, the ramp over the rows of the paper.

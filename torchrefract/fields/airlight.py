@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchrefract._tensor import as_device_tensor
 from torchrefract.fields.sky import find_sky
 from torchrefract.fields.srgb import linear_to_srgb, luma, srgb_to_linear
 
@@ -13,6 +14,7 @@ _PATCH = 7  # nodes
 _BRIGHTEST = 0.001  # share of the dark channel
 _MIN_SKY, _LOWEST = 0.04, 0.25  # share of the frame from which sky counts, and of the sky that does
 _NIGHT, _DUSK = 0.3, 0.35  # median luma of the upper third at night; and if it is darker than the rest by a tenth
+_DUST = (0.78, 0.71, 0.61)  # of laterite by day
 _KEPT_CHROMA = 0.25  # of blue light by day
 _STEPS = 2.0**16  # results are rounded to multiples of 1 / _STEPS, so that they have equal bits in every batch
 
@@ -55,6 +57,19 @@ def airlight_of_frame(image: Tensor) -> Tensor:
         day = torch.where(day[:, 2:] > day[:, :1], torch.lerp(gray, day, _KEPT_CHROMA), day)
     color = torch.where(is_night[:, None] & ~has_sky, top.mean(dim=(2, 3)), day)
     return (color * _STEPS).round() / _STEPS
+
+
+def dust_airlight(image: Tensor) -> Tensor:
+    """Return the airlight of laterite dust, (0.78, 0.71, 0.61), or as much of it as the frame has light.
+
+        A = dust min(1, luma(A_frame) / luma(dust))
+
+    Args, Returns: as for `airlight_of_frame`, which gives A_frame.
+    """
+    dust = as_device_tensor(_DUST, dtype=torch.float64, device=image.device).view(1, 3, 1, 1)
+    gray, light = luma(dust).view(1, 1), luma(airlight_of_frame(image)[..., None, None]).view(-1, 1)
+    color = dust.view(1, 3) if image.shape[1] == 3 else gray.expand(1, image.shape[1])
+    return color * (light / gray).clamp(max=1)
 
 
 def forward_scattering(cosine: Tensor, asymmetry: float) -> Tensor:

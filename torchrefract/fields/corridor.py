@@ -9,23 +9,29 @@ from torch import Tensor
 
 from torchrefract._validation import check_number, check_positive
 from torchrefract.fields.depth import GroundPlaneDepth
-from torchrefract.fields.sky import sky_mask
+from torchrefract.fields.sky import find_sky, sky_mask
 from torchrefract.warping.grid import field_dtype
+
+_OPEN = 0.1  # share of sky from which a frame counts as open
 
 
 @dataclass(frozen=True, kw_only=True)
 class CorridorDepth:
     """The depth of a flat road between two walls along it, and of the sky that is found in the image.
 
-        z = min(z_road(y), f w / |x - x_v|, far),  inf in the sky
+        z = min(z_road(y), ((r / (f w))^2 + end^-2)^(-1/2)),  inf in the sky
+        r = hypot(x - x_v, max(y_h - y, 0)),  end = far, or min(far, closed) by day without sky
 
-    The walls stand for houses, trees and slopes beside the road, which a flat road alone puts at the horizon. Pass it
-    as `depth=` to a fog; a depth map, or a network (`torchrefract.depth.from_transformers`), is better.
+    The walls stand for houses, trees and slopes beside the road, which a flat road alone puts at the horizon; above the
+    horizon they close in to a tunnel, since what stands far away is not seen high above it. By day a frame without sky
+    looks at something near, such as trees or the road itself. Pass it as `depth=` to a fog; a depth map, or a network
+    (`torchrefract.depth.from_transformers`), is better.
 
     camera_height, focal, horizon, spread: of the road, as for `GroundPlaneDepth`.
     side: m, w, from the camera to each wall.
     vanishing: x_v, where the road vanishes, 0 at the left edge of the frame and 1 at its right edge.
     far: m, the largest depth outside of the sky.
+    closed: m, the largest depth of a frame by day that shows no sky.
     """
 
     camera_height: float = 1.3
@@ -35,12 +41,13 @@ class CorridorDepth:
     side: float = 8.0
     vanishing: float = 0.5
     far: float = 300.0
+    closed: float = 30.0
 
     def __post_init__(self) -> None:
         road = self.road  # raises for invalid numbers
         for name in ("camera_height", "focal", "horizon", "spread"):
             object.__setattr__(self, name, getattr(road, name))
-        for name in ("side", "far"):
+        for name in ("side", "far", "closed"):
             object.__setattr__(self, name, check_positive(name, getattr(self, name)))
         object.__setattr__(self, "vanishing", check_number("vanishing", self.vanishing, low=-10.0, high=10.0))
 
@@ -69,8 +76,13 @@ class CorridorDepth:
             )
         height, width = image.shape[2:]
         dtype, device = field_dtype(image.dtype), image.device
-        columns = torch.arange(width, dtype=dtype, device=device) - (self.vanishing * width - 0.5)
-        walls = self.side * self.focal * width / columns.abs().clamp(min=1e-6)
+        x, y = (torch.arange(size, dtype=dtype, device=device) for size in (width, height))
+        above = (self.horizon * height - 0.5 - y).clamp(min=0)
+        r = torch.hypot(x - (self.vanishing * width - 0.5), above[:, None])
+        sky = sky_mask(image)
+        seen = (sky.to(dtype).mean(dim=(1, 2, 3)) / _OPEN).clamp(max=1)
+        seen = torch.where(find_sky(image).is_night, 1, seen).view(-1, 1, 1, 1)
+        end = seen / self.far + (1 - seen) / min(self.far, self.closed)
+        walls = 1 / torch.hypot(r / (self.side * self.focal * width), end)
         road = self.road(height, width, dtype=dtype, device=device)
-        depth = torch.minimum(road, walls.view(1, 1, 1, width)).clamp(max=self.far)
-        return torch.where(sky_mask(image), torch.inf, depth)
+        return torch.where(sky, torch.inf, torch.minimum(road, walls))

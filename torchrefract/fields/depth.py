@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchrefract._tensor import to_float
 from torchrefract._validation import check_number, check_positive, check_tensor, check_values, eager_values
 from torchrefract.warping.grid import field_dtype, pixel_axes
 
@@ -140,7 +141,7 @@ def depth_of(source: DepthSource, image: Tensor, dtype: torch.dtype) -> Tensor:
     height, width = image.shape[2:]
     if isinstance(source, DepthProvider):
         return source(height, width, dtype=dtype, device=image.device)
-    depth = check_floating("depth(image)", source(image))
+    depth = check_floating("depth(image)", source(to_float(image) if image.dtype is torch.uint8 else image))
     if depth.shape != (image.shape[0], 1, height, width):
         raise ValueError(
             f"depth(image) must have shape {(image.shape[0], 1, height, width)}, (N, 1, H, W) for images (N, C, H, W), "

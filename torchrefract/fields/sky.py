@@ -16,6 +16,7 @@ _MIN_CONTRAST = 0.15  # of the mean luma of a gray or white sky to that of the r
 _MIN_SHARE = 0.02  # of the frame
 _MAX_NIGHT_LUMA, _MIN_NIGHT_SHARE = 0.3, 0.05  # of a sky at night
 _AROUND, _MAX_DARKER = 15, 0.12  # nodes, and difference of a channel, from the color of the sky around a pixel
+_GROWTHS, _MAX_DIFFERENCE = 3, 0.06  # steps, and difference of a channel, from the sky around to more of it
 _SWEEPS = 3  # each goes around one corner
 
 
@@ -40,8 +41,10 @@ def sky_mask(image: Tensor) -> Tensor:
     lies within 0.06, and if its luma is above 0.5 and 0.05 above the median, or if blue exceeds red by 0.1 and the luma
     0.3. The candidates that are connected to the top row are the sky, if they cover 2 % of the frame and are blue or,
     in the mean, 0.15 brighter than the rest. So a road seen from above, a frame at night and a frame without sky have
-    none. A pixel at these nodes, next to them, or above them in its column is then sky unless one of its channels is
-    darker by 0.12 than the sky around it: this follows trees and poles, and fills clouds.
+    none. Three times, nodes join it that are smooth and, in each channel, within 0.06 of the sky at most 7 nodes away:
+    this finds the haze at the horizon, and sky that poles cut off. A pixel at these nodes, next to them, or above them
+    in its column is then sky unless one of its channels is darker by 0.12 than the sky around it: this follows trees
+    and poles, and fills clouds.
 
     Args:
         image: (N, C, H, W), stored values (sRGB) in [0, 1], or uint8. Three channels are red, green and blue; other
@@ -51,12 +54,15 @@ def sky_mask(image: Tensor) -> Tensor:
         (N, 1, H, W), bool. It has no gradient. Each image is judged alone.
     """
     image = image.detach()
-    sky = find_sky(image)
-    nodes = image[:, :, :: sky.stride, :: sky.stride].float() / (255 if image.dtype is torch.uint8 else 1)
-    weight = sky.nodes.float()
-    share = F.avg_pool2d(weight, _AROUND, 1, _AROUND // 2)
-    nearby = F.avg_pool2d(nodes * weight, _AROUND, 1, _AROUND // 2) / share.clamp(min=1e-6)
-    color = torch.where(share > 0, nearby, _mean_where(sky.nodes, nodes))
+    mask, stride, _ = find_sky(image)
+    nodes = _nodes(image, stride)
+    is_smooth = _is_smooth(luma(nodes))
+    for _ in range(_GROWTHS):
+        nearby, is_near = _mean_nearby(mask, nodes)
+        mask = mask | is_near & is_smooth & ((nodes - nearby).abs().amax(dim=1, keepdim=True) < _MAX_DIFFERENCE)
+    nearby, is_near = _mean_nearby(mask, nodes)
+    color, weight = torch.where(is_near, nearby, _mean_where(mask, nodes)), mask.float()
+    color = torch.where(mask, torch.minimum(color, nodes), color)  # of blue sky between white clouds
     is_above = weight.flip(2).cummax(dim=2).values.flip(2)
     size = (image.shape[2], image.shape[3])
     candidate = F.interpolate(torch.maximum(is_above, _highest_nearby(weight)), size) > 0
@@ -66,13 +72,12 @@ def sky_mask(image: Tensor) -> Tensor:
 
 
 def find_sky(image: Tensor) -> Sky:
-    """Return the sky at the nodes of a lattice; see `sky_mask`."""
+    """Return the sky at the nodes of a lattice, before smooth nodes around join it; see `sky_mask`."""
     stride = max(1, max(image.shape[2:]) // _NODES)
-    nodes = image.detach()[:, :, ::stride, ::stride]
-    nodes = (nodes.float() / 255 if image.dtype is torch.uint8 else nodes.float()).nan_to_num(nan=0.0).clamp(0, 1)
+    nodes = _nodes(image.detach(), stride)
     y = luma(nodes)
     blue = nodes[:, 2:] - nodes[:, :1] if image.shape[1] == 3 else torch.zeros_like(y)
-    is_smooth = _highest_nearby(y) + _highest_nearby(-y) < _MAX_RANGE
+    is_smooth = _is_smooth(y)
     median = y.flatten(1).median(dim=1).values.view(-1, 1, 1, 1)
     is_bright = y > (median + _ABOVE_MEDIAN).clamp(min=_MIN_LUMA)
     sky = _connected_to_top(is_smooth & (is_bright | (blue > _MIN_BLUE) & (y > _MIN_BLUE_LUMA)))
@@ -103,6 +108,12 @@ def sky_point(sky: Sky, u: Tensor, *, height: int, width: int) -> tuple[Tensor, 
     return torch.stack([sky.stride * x / width, sky.stride * y / height], dim=1), counted[:, -1] > 0
 
 
+def _nodes(image: Tensor, stride: int) -> Tensor:
+    """Return the values of an image (N, C, H, W) at the nodes, (N, C, h, w), in [0, 1]; NaN is 0."""
+    nodes = image[:, :, ::stride, ::stride]
+    return (nodes.float() / 255 if image.dtype is torch.uint8 else nodes.float()).nan_to_num(nan=0.0).clamp(0, 1)
+
+
 def _connected_to_top(candidate: Tensor) -> Tensor:
     """Return the part of a mask (N, 1, H, W) that a few sweeps along rows and columns reach from its top row."""
     reached = candidate.clone()
@@ -126,6 +137,20 @@ def _mean_where(mask: Tensor, value: Tensor) -> Tensor:
     """Return (N, 1, 1, 1), the mean of a value (N, 1, H, W) over a mask, 0 over an empty one."""
     weight = mask.to(value.dtype)
     return (weight * value).sum(dim=(2, 3), keepdim=True) / weight.sum(dim=(2, 3), keepdim=True).clamp(min=1)
+
+
+def _is_smooth(y: Tensor) -> Tensor:
+    """Return where the luma (N, 1, H, W) of a node and its neighbors differs little."""
+    return _highest_nearby(y) + _highest_nearby(-y) < _MAX_RANGE
+
+
+def _mean_nearby(mask: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the mean of a value (N, C, H, W) over the part of a mask around each node, and where there is one."""
+    weight = mask.to(value.dtype)
+    pooled = torch.cat([value * weight, weight], dim=1)
+    for kernel in ((_AROUND, 1), (1, _AROUND)):
+        pooled = F.avg_pool2d(pooled, kernel, 1, (kernel[0] // 2, kernel[1] // 2))
+    return pooled[:, :-1] / pooled[:, -1:].clamp(min=1e-6), pooled[:, -1:] > 0
 
 
 def _share(mask: Tensor) -> Tensor:

@@ -28,15 +28,15 @@ class RestorationModule(LightningModule, ABC):
     """Train and validate a network that restores pairs.
 
     Logs for each epoch: the loss; PSNR in dB and, for a task with a flow, the endpoint error in px of `metric_size`,
-    for val, and for train if the loss needs a restoration anyway; for val also SSIM and the scores of two baselines:
-    the degraded image (`…_identity`) and the mean flow of the training set (`…_constant`).
+    for val, and for train if the loss needs a restoration anyway; for val all of `restoration_scores`, also of two
+    baselines: the degraded image (`…_identity`) and the mean flow of the training set (`…_constant`).
 
     Args:
         network: predicts the maps of the task.
         task: the kind of restoration.
         lr: peak learning rate of AdamW.
         weight_decay: weight decay of AdamW.
-        warmup_steps: steps of linear warm-up of the schedule "cosine", at most a tenth of all steps.
+        warmup_steps: steps of linear warm-up of the schedule "cosine"; see `num_warmup_steps`.
         schedule: "cosine" decays the learning rate to zero; "plateau" halves it after more than 5 epochs without a
             lower val/loss.
         metric_size: (height, width) of the frame whose pixels are the unit of the endpoint error.
@@ -96,7 +96,8 @@ class RestorationModule(LightningModule, ABC):
                 f"loss must be finite, got {loss:g} in step {self.global_step} of epoch {self.current_epoch} "
                 f"for the keys {keys}"
             )
-        self._log("train", {"loss": loss} | ({} if restored is None else self._scores(restored, batch)), batch)
+        scores = {} if restored is None else _main_scores(restored, batch, self.metric_size)
+        self._log("train", {"loss": loss} | scores, batch)
         weight = batch.valid.double()
         flows = torch.cat([batch.flow.double() * weight, weight], dim=1).sum(dim=0)
         self.new_flows = _add(self.new_flows, flows)
@@ -106,13 +107,14 @@ class RestorationModule(LightningModule, ABC):
         """Log the scores of the model and of the baselines; return the restoration as a dict."""
         loss, restored = self.validation_loss(batch)
         self._log("val", {"loss": loss}, batch)
-        methods = {"": restored, "_identity": Restored(batch.degraded)}
+        clear = None if restored.transmission is None else torch.ones_like(restored.transmission)
+        methods = {"": restored, "_identity": Restored(batch.degraded, transmission=clear)}
         if restored.flow is not None:
             constant = self.constant_flow(batch.flow)
             methods["_identity"] = Restored(batch.degraded, torch.zeros_like(constant))
             methods["_constant"] = Restored(warp(batch.degraded, constant, padding="border")[0], constant)
         for suffix, result in methods.items():
-            scores = self._scores(result, batch) | {"ssim": ssim(result.image, batch.clean, batch.valid)}
+            scores = restoration_scores(self.task, result, batch, metric_size=self.metric_size)
             self._log("val", scores, batch, suffix=suffix)
         return restored._asdict()
 
@@ -132,6 +134,10 @@ class RestorationModule(LightningModule, ABC):
             return torch.zeros_like(like)
         return (self.flows[:2] / self.flows[2:].clamp(min=1)).to(like).expand_as(like)
 
+    def num_warmup_steps(self, num_steps: int) -> int:
+        """Return the steps of the warm-up in a training of `num_steps`: `warmup_steps`, but at most a tenth of all."""
+        return min(self.warmup_steps, num_steps // 10)
+
     def configure_optimizers(self) -> Any:
         """Create AdamW and its learning rate schedule."""
         optimizer = torch.optim.AdamW(self.parameters(), lr=self.lr, weight_decay=self.weight_decay)
@@ -139,7 +145,7 @@ class RestorationModule(LightningModule, ABC):
             scheduler = {"scheduler": ReduceLROnPlateau(optimizer, factor=0.5, patience=5), "monitor": "val/loss"}
         else:
             steps = int(self.trainer.estimated_stepping_batches)
-            cosine = get_cosine_schedule_with_warmup(optimizer, min(self.warmup_steps, steps // 10), steps)
+            cosine = get_cosine_schedule_with_warmup(optimizer, self.num_warmup_steps(steps), steps)
             scheduler = {"scheduler": cosine, "interval": "step"}
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
 
@@ -171,12 +177,6 @@ class RestorationModule(LightningModule, ABC):
         """Restore the sums of the flows; rename weights of an older version."""
         checkpoint["state_dict"] = rename_weights(checkpoint["state_dict"])
         self.flows = torch.cat(checkpoint["flows"])
-
-    def _scores(self, restored: Restored, pair: Pair) -> dict[str, Tensor]:
-        scores = {"psnr": psnr(restored.image.detach(), pair.clean, pair.valid)}
-        if restored.flow is not None:
-            scores["epe"] = endpoint_error(restored.flow.detach(), pair.flow, pair.valid, size=self.metric_size)
-        return scores
 
     def _log(self, split: str, scores: dict[str, Tensor], batch: Pair, suffix: str = "") -> None:
         values = {f"{split}/{name}{suffix}": value.mean() for name, value in scores.items()}
@@ -216,6 +216,31 @@ class Restoration(RestorationModule):
 
     def validation_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
         return self.training_loss(batch)
+
+
+def restoration_scores(
+    task: Task, restored: Restored, pair: Pair, *, metric_size: tuple[int, int]
+) -> dict[str, Tensor]:
+    """Score each restoration of a batch; a score (B,) without meaning for the task is missing.
+
+    Returns:
+        L, L_rec, L_k: the loss of the task and its terms, see `Task.loss_terms`.
+        psnr: dB.
+        ssim: at most 1.
+        epe: endpoint error, px of `metric_size` = (height, width).
+    """
+    reconstruction, of_map = task.loss_terms(restored, pair)
+    losses = {"L": reconstruction, "L_rec": reconstruction}
+    if of_map is not None:
+        losses |= {"L": reconstruction + of_map, "L_k": of_map}
+    return losses | _main_scores(restored, pair, metric_size) | {"ssim": ssim(restored.image, pair.clean, pair.valid)}
+
+
+def _main_scores(restored: Restored, pair: Pair, metric_size: tuple[int, int]) -> dict[str, Tensor]:
+    scores = {"psnr": psnr(restored.image.detach(), pair.clean, pair.valid)}
+    if restored.flow is not None:
+        scores["epe"] = endpoint_error(restored.flow.detach(), pair.flow, pair.valid, size=metric_size)
+    return scores
 
 
 def _add(old: Tensor, new: Tensor) -> Tensor:

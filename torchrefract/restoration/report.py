@@ -16,6 +16,8 @@ from pytorch_lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from torchrefract._io import replace_file
+from torchrefract.data.module import PairData, fingerprint
+from torchrefract.effects.lens import LensDistortion
 from torchrefract.restoration.metrics import psnr
 from torchrefract.restoration.module import RestorationModule
 from torchrefract.restoration.tasks import Restored
@@ -31,11 +33,14 @@ from torchrefract.visualization.figures import (
 
 METRICS, METRICS_BEFORE = "metrics.csv", "metrics_before.csv"
 _PANEL_ROWS = 4
+_NAME_WIDTH = 36  # of the first column of the table
 _METHODS = {"do nothing": "_identity", "best constant flow": "_constant", "model": ""}
 
 
 class RunSummary(Callback):
-    """Save curves.png and panel.png into the run folder, and print a table that compares the model with the baselines.
+    """Print on what a run trains, a table that compares the model with the baselines, and a verdict.
+
+    Saves curves.png and panel.png into the run folder.
 
     Args:
         run_dir: the run folder.
@@ -50,9 +55,13 @@ class RunSummary(Callback):
         self._examples: tuple[Restored, Pair] | None = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Copy the metrics of the run that this one resumes."""
-        if self.resumed_run is not None and trainer.is_global_zero:
+        """Copy the metrics of the run that this one resumes; print on what it trains."""
+        if not trainer.is_global_zero:
+            return
+        if self.resumed_run is not None:
             carry_over(self.resumed_run, self.run_dir, before_epoch=trainer.current_epoch)
+        if isinstance(pl_module, RestorationModule):
+            print("\n".join(describe_training(trainer, pl_module)), flush=True)
 
     def on_validation_batch_end(
         self,
@@ -76,9 +85,13 @@ class RunSummary(Callback):
         if stage == "fit" and any(metrics_rows(self.run_dir)):
             save_figure(plot_curves(self.run_dir, epe_unit=f"px at {width}x{height}"), self.run_dir / "curves.png")
         save_figure(draw_panel(*self._examples), self.run_dir / "panel.png")
-        print("\n".join(summary(trainer.callback_metrics, pl_module.metric_size)))
+        data = getattr(trainer, "datamodule", None)
+        border = border_name(data) if isinstance(data, PairData) else ""
+        print("\n".join(summary(trainer.callback_metrics, pl_module.metric_size, border=border)))
         names = sorted(path.name for path in self.run_dir.glob("[!.]*") if path.is_file())
         print(f"{self.run_dir}: {', '.join(names)}")
+        best = getattr(trainer, "checkpoint_callback", None) if stage == "fit" else None
+        print(verdict(trainer.callback_metrics, best=getattr(best, "best_model_score", None)))
 
 
 def save_figure(figure: Figure, out: Path) -> None:
@@ -87,23 +100,105 @@ def save_figure(figure: Figure, out: Path) -> None:
         figure.savefig(path)
 
 
-def summary(metrics: Mapping[str, Tensor], metric_size: tuple[int, int]) -> list[str]:
-    """Format a table of validation scores with a line for each baseline and for the model."""
-    values = {name.removeprefix("val/"): float(value) for name, value in metrics.items() if name.startswith("val/")}
-    lines = [f"{'validation':<20}{'PSNR (dB)':>18}{'SSIM':>8}"]
+def describe_training(trainer: Trainer, model: RestorationModule) -> list[str]:
+    """State on what a run trains and for how long, one line each."""
+    data, origin = trainer.datamodule, model.origin  # pyright: ignore[reportAttributeAccessIssue]  # set by `fit`
+    train, val = origin["data"], fingerprint(data.val)
+    share = val["frames"] / (train["frames"] + val["frames"])
+    steps, per_epoch = trainer.estimated_stepping_batches, trainer.num_training_batches
+    batch = data.batch_size * trainer.world_size
+    lines = {
+        "frames": f"{train['frames']} of {train['source']}" + (f" {root}" if (root := train["root"]) else ""),
+        "drives": "unknown" if train["drives"] is None else str(train["drives"]),
+        "size": f"{train['size'][0]}x{train['size'][1]} px, height and width",
+        "validation": f"{val['frames']} frames, {share:.0%} of all"
+        + ("" if val["drives"] is None else f", of {val['drives']} other drives")
+        + ("" if (limit := trainer.limit_val_batches) == 1.0 else f", limit_val_batches {limit}"),
+        "steps": f"{steps} in {trainer.max_epochs} epochs of {per_epoch}, of {batch} frames each",
+        "scene": describe_scene(data, origin["config"]["data"].get("effect")),
+    }
+    if model.schedule == "cosine" and (num := model.num_warmup_steps(int(steps))) < model.warmup_steps:
+        lines["steps"] += f"; warm-up {num}, a tenth, instead of warmup_steps={model.warmup_steps}"
+    return [f"{name:<12}{text}" for name, text in lines.items()]
+
+
+def describe_scene(data: PairData, config: Mapping[str, Any] | None) -> str:
+    """Name the scene of data, its severity, and the border of its frames.
+
+    Args:
+        data: frames and the scene, or pairs from disk.
+        config: of the scene.
+    """
+    if data.effect is None or config is None:
+        return "degraded on disk"
+    severity = f" of severity {config['severity']}" if "severity" in config else ""
+    border = f", {name}" if (name := border_name(data)) else ""
+    return f"{str(config.get('_target_')).rpartition('.')[2]}{severity}{border}"
+
+
+def border_name(data: PairData) -> str:
+    """Name the border of frames behind a lens; empty if they are filled."""
+    if data.border is not None:
+        return f"{data.border} border"
+    parts = () if data.effect is None else data.effect.modules()
+    is_padded = any(isinstance(part, LensDistortion) and part.frame == "pad" for part in parts)
+    return "padded frames" if is_padded else ""
+
+
+def summary(metrics: Mapping[str, Tensor], metric_size: tuple[int, int], *, border: str = "") -> list[str]:
+    """Format a table of validation scores with a line for each baseline and for the model.
+
+    Args:
+        metrics: the scores by name.
+        metric_size: (height, width) of the frame whose pixels are the unit of the endpoint error.
+        border: of padded frames, which names the rows.
+    """
+    values = _validation_scores(metrics)
+    losses = [name for name in ("L", "L_rec", "L_k") if name in values]
+    lines = [f"{'validation':<{_NAME_WIDTH}}{''.join(f'{name:>8}' for name in losses)}{'PSNR (dB)':>18}{'SSIM':>8}"]
     if "epe" in values:
         lines[0] += f"{f'endpoint error (px at {metric_size[1]}x{metric_size[0]})':>40}"
     for name, suffix in _METHODS.items():
         if f"psnr{suffix}" not in values:
             continue
         score = values[f"psnr{suffix}"]
-        line = f"{name:<20}" + f"{score:.2f} ({score - values['psnr_identity']:+.2f})".rjust(18)
+        line = f"{f'{name}, {border}' if border else name:<{_NAME_WIDTH}}"
+        line += "".join(f"{values[f'{loss}{suffix}']:8.4f}" for loss in losses)
+        line += f"{score:.2f} ({score - values['psnr_identity']:+.2f})".rjust(18)
         line += f"{values[f'ssim{suffix}']:8.3f}"
         if "epe" in values:
             epe = values[f"epe{suffix}"]
             line += f"{epe:.2f} ({epe / max(values['epe_identity'], 1e-9):.2f} x do nothing)".rjust(40)
         lines.append(line)
     return lines
+
+
+def verdict(metrics: Mapping[str, Tensor], *, best: Tensor | None = None) -> str:
+    """Say by how much a model is better than the baselines, in px for a flow and in dB otherwise.
+
+    Args:
+        metrics: the scores by name.
+        best: the score of best.ckpt in px or dB; None for the scores of the model in `metrics`.
+    """
+    values = _validation_scores(metrics)
+    name, unit, sign = ("epe", "px", -1) if "epe" in values else ("psnr", "dB", 1)
+    score = values[name] if best is None else float(best)
+    gains = {
+        rival: sign * (score - values[f"{name}{suffix}"])
+        for rival, suffix in (("doing nothing", "_identity"), ("the constant flow", "_constant"))
+        if f"{name}{suffix}" in values
+    }
+    model = "the model" if best is None else "best.ckpt"
+    better = " and than ".join(f"{rival} by {gain:.2f} {unit}" for rival, gain in gains.items() if gain > 0)
+    worse = " or ".join(f"{rival} ({gain:+.2f} {unit})" for rival, gain in gains.items() if not gain > 0)  # or NaN
+    if not worse:
+        return f"{model}: better than {better}"
+    verdict = f"better than {better}, but NOT" if better else "NOT better"
+    return f"{model}: {verdict} than {worse}: train longer, on more frames, or at a larger data.size"
+
+
+def _validation_scores(metrics: Mapping[str, Tensor]) -> dict[str, float]:
+    return {name.removeprefix("val/"): float(value) for name, value in metrics.items() if name.startswith("val/")}
 
 
 def metrics_rows(run: Path) -> Iterator[dict[str, str]]:

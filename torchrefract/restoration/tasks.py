@@ -41,15 +41,20 @@ class Task(ABC):
         """
 
     @abstractmethod
+    def loss_terms(self, restored: Restored, pair: Pair) -> tuple[Tensor, Tensor | None]:
+        """Compute L_rec, the L1 loss of each image (B,), and L_k, that of its map; None if the task has no map."""
+
     def loss(self, restored: Restored, pair: Pair) -> Tensor:
-        """Compute the loss (), the mean over the batch."""
+        """Compute the loss (), the mean of L = L_rec + L_k over the batch."""
+        reconstruction, of_map = self.loss_terms(restored, pair)
+        return (reconstruction if of_map is None else reconstruction + of_map).mean()
 
 
 class Undistort(Task):
     """Predict the flow that undoes a warp, and warp the degraded image along it.
 
         flow = limit tanh(prediction) (W, H)
-        loss = mean |warp(degraded, flow) - clean| + mean |flow - true flow| 2 / (W, H)
+        L_rec = mean |warp(degraded, flow) - clean|,  L_k = mean |flow - true flow| 2 / (W, H)
 
     Both means are over valid pixels. A prediction of pixels is averaged over cells of 4 x 4 px, and the cells are
     interpolated, because the flow of a lens is smooth.
@@ -71,19 +76,19 @@ class Undistort(Task):
         flow = self.limit * torch.tanh(smooth) * _frame_size(smooth)
         return Restored(warp(degraded, flow, padding="border")[0], flow)
 
-    def loss(self, restored: Restored, pair: Pair) -> Tensor:
-        """Compute the L1 loss of image and flow."""
+    def loss_terms(self, restored: Restored, pair: Pair) -> tuple[Tensor, Tensor]:
+        """Compute the L1 losses (B,) of image and flow over valid pixels."""
         flow = torch.zeros_like(pair.flow) if restored.flow is None else restored.flow
         flow_error = (flow - pair.flow).abs() * 2 / _frame_size(pair.flow)
         image_error = masked_mean((restored.image - pair.clean).abs(), pair.valid)
-        return (image_error + masked_mean(flow_error, pair.valid)).mean()
+        return image_error, masked_mean(flow_error, pair.valid)
 
 
 class Deweather(Task):
     """Predict the change from the degraded to the clean image and, optionally, the transmission of the fog.
 
         restored = degraded + change,  t = 1 / (1 + exp(-last channel))
-        loss = mean |restored - clean| + mean |t - transmission|, over all pixels
+        L_rec = mean |restored - clean|,  L_k = mean |t - transmission|, over all pixels
 
     Args:
         transmission_head: True adds a channel for t, and its term to the loss.
@@ -103,20 +108,20 @@ class Deweather(Task):
         transmission = torch.sigmoid(maps[:, 3:]) if self.transmission_head else None
         return Restored(degraded + maps[:, :3], transmission=transmission)
 
-    def loss(self, restored: Restored, pair: Pair) -> Tensor:
-        """Compute the L1 loss of the image and, with `transmission_head`, of the transmission.
+    def loss_terms(self, restored: Restored, pair: Pair) -> tuple[Tensor, Tensor | None]:
+        """Compute the L1 losses (B,) of the image and of a restored transmission.
 
         Raises:
             ValueError: the restoration has a transmission and the pair has none.
         """
-        image_error = (restored.image - pair.clean).abs().mean()
+        image_error = (restored.image - pair.clean).abs().mean(dim=(1, 2, 3))
         if restored.transmission is None:
-            return image_error
+            return image_error, None
         if pair.transmission.shape != restored.transmission.shape:
             raise ValueError(
                 "pair must have a transmission for transmission_head: set data.transmission=true, got none"
             )
-        return image_error + (restored.transmission - pair.transmission).abs().mean()
+        return image_error, (restored.transmission - pair.transmission).abs().mean(dim=(1, 2, 3))
 
 
 def _average_cells(prediction: Tensor, degraded: Tensor) -> Tensor:

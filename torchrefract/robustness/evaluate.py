@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
+from torchrefract import random
 from torchrefract._validation import check_number
-from torchrefract.data.frames import first_names, path_key
 from torchrefract.effects.base import Effect
 from torchrefract.labels.targets import warp_moved_labels
 from torchrefract.robustness.statistics import Estimate, mean_estimate, tolerated_value
@@ -186,7 +186,7 @@ def evaluate(
                 target = as_target(prediction, (image.shape[-2], image.shape[-1]))
             clean, by_level = score(prediction, target), {}
             for level, effect in levels.items():
-                degraded = effect.degrade(image, seed=seed, keys=[path_key(name)], depth=depth)
+                degraded = effect.degrade(image, seed=seed, keys=[random.key_of(name)], depth=depth)
                 flow = degraded.flow if degraded.has("flow") else None
                 moved = target if flow is None else warp_moved_labels(target, flow, effect.labels_getter)
                 (prediction,) = predict(degraded.image[None])
@@ -209,7 +209,7 @@ def evaluate(
         )
     if failures:
         name, reason = next(iter(failures.items()))
-        names = first_names(list(failures))
+        names = ", ".join(failures)
         warnings.warn(f"predict failed for {names}, which are left out; for {name}: {reason}", stacklevel=2)
     return collect(scored, quantities, failures)
 

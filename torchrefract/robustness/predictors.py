@@ -74,10 +74,10 @@ class HogDetector:
         return [self._detect((255 * image).round().byte().movedim(0, -1).cpu().numpy()) for image in images]
 
     def _detect(self, image: np.ndarray) -> dict[str, Tensor]:
-        found, weights = self._hog.detectMultiScale(
+        corners, weights = self._hog.detectMultiScale(
             np.ascontiguousarray(image[..., ::-1]), winStride=(8, 8), scale=1.05
         )
-        corners = torch.tensor(np.array(found, np.float32).reshape(-1, 4))
+        corners = torch.tensor(np.array(corners, np.float32).reshape(-1, 4))
         scores = torch.tensor(np.array(weights, np.float32).reshape(-1)) / _HOG_SCALE
         boxes = torch.cat([corners[:, :2], corners[:, :2] + corners[:, 2:]], dim=1)
         return {"boxes": boxes, "labels": torch.ones(len(boxes), dtype=torch.int64), "scores": scores.clamp(0, 1)}

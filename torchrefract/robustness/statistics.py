@@ -32,8 +32,9 @@ def mean_estimate(values: np.ndarray, *, seed: int = 0) -> Estimate:
 def tolerated_value(quantity: np.ndarray, score: np.ndarray, *, least: float, is_harm: bool) -> Estimate:
     """Estimate up to which value of a quantity the mean score stays at `least` or above.
 
-    The mean score is taken for a monotone function of the quantity, fitted by isotonic regression. The interval holds the values at which the monotone function may
-    reach `least`, by the likelihood ratio with the largest variance that scores with such a mean can have.
+    The mean score is taken for a monotone function of the quantity, fitted by isotonic regression. The interval holds
+    the values at which that function may reach `least`, by the likelihood ratio with the largest variance that scores
+    with such a mean can have.
 
     Args:
         quantity: (n,), such as the visibility in m.

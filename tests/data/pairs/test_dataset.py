@@ -1,11 +1,14 @@
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import avg_pool2d
+from torch.testing import assert_close
 from torch.utils.data import DataLoader
 
-from torchrefract import Pair, presets
+from torchrefract import Frame, Pair, presets
+from torchrefract.data.images import fit
 from torchrefract.data.module import frames as frame_data
-from torchrefract.data.module import pairs
+from torchrefract.data.module import make_pair, pairs
 from torchrefract.data.pairs.dataset import PairedFolder, PairStream
 from torchrefract.data.pairs.files import count_out_of_range, decode_flow, encode_flow
 from torchrefract.restoration.tasks import Undistort
@@ -46,6 +49,45 @@ def test_pairs_from_disk_equal_pairs_on_the_fly(made, frames, batches, scene, ma
                 assert disk.valid.all()
                 assert disk.transmission.shape == (4, 1, *SIZE)
                 assert (disk.transmission - fly.transmission).abs().max() <= (0.51 / 65535 if maps == "png" else 0)
+
+
+@pytest.mark.parametrize("scene", ["paper_refractive", "paper_weather"])
+def test_reduced_pairs_are_means_of_the_center_in_px_of_the_new_size(made, scene):
+    out, options = made(scene=scene), {"transmission": scene == "paper_weather"}
+    full, small = PairedFolder(out, **options), PairedFolder(out, size=(8, 8), **options)
+    for pair, reduced in ((full[i], small[i]) for i in range(len(full))):
+        middle = slice((SIZE[1] - SIZE[0]) // 2, (SIZE[1] + SIZE[0]) // 2)
+        for name in ("degraded", "clean", "transmission") if options["transmission"] else ("degraded", "clean"):
+            expected = avg_pool2d(getattr(pair, name)[:, :, middle], 4)
+            assert (getattr(reduced, name) - expected).abs().max() <= 1e-6
+        flow = avg_pool2d(pair.flow[:, :, middle], 4) / 4
+        assert (reduced.flow - flow).abs().max() <= 1e-6
+        is_complete = avg_pool2d(pair.valid[:, :, middle].float(), 4) == 1
+        x, y = torch.meshgrid(torch.arange(8), torch.arange(8), indexing="xy")
+        ends = torch.stack([x, y]) + flow
+        is_inside = ((ends > -1e-3) & (ends < 7 + 1e-3)).all(dim=0)
+        assert torch.equal(reduced.valid, is_complete & is_inside)
+        assert reduced.key == pair.key
+    pair, uneven = full[0], PairedFolder(out, size=(10, 15))[0]  # 3.2 px
+    assert torch.equal(uneven.clean, fit(pair.clean, (10, 15)))
+    assert_close(uneven.flow.mean(dim=(1, 2)), pair.flow.mean(dim=(1, 2)) / 3.2, rtol=0, atol=1e-5)
+    with pytest.raises(ValueError, match="image must be at least size = 8x49"):
+        PairedFolder(out, size=(8, 49))[0]
+
+
+def test_a_reduced_pair_is_the_pair_of_the_reduced_frame(made):
+    """The lens of a key is the same at any size of the frame; the zoom that fills frames depends on its pixels."""
+    out, effect = made("+scene.frame=pad", scene="cheap_dashcam"), presets.cheap_dashcam(frame="pad")
+    small = PairedFolder(out, size=(16, 24), flow=True)
+    for i in range(3):
+        row, pair = small.row(i), small[i]
+        frame = Frame(pair.clean[None], torch.tensor([row.key]), torch.empty(0))
+        expected = make_pair(frame, effect, seed=row.seed)
+        both = pair.valid & expected.valid[0]
+        assert both.float().mean() > 0.7
+        # A mean over 2 x 2 px is off by an eighth of the curvature; the file rounds to 1/128 px of the larger frame.
+        assert (pair.flow - expected.flow[0]).abs()[both.expand(2, -1, -1)].max() < 0.02  # px
+        assert expected.flow.abs().max() > 0.5
 
 
 def test_pairs_without_a_required_map_raise(made):

@@ -95,7 +95,7 @@ def replace(out: Path, suffix: str, data: bytes) -> None:
 
 def test_a_small_png_of_a_large_size_raises_before_it_is_decoded(pair, tmp_path, monkeypatch):
     replace(tmp_path / "out", "clean.png", cv2.imencode(".png", np.zeros((4000, 4000, 3), np.uint8))[1].tobytes())
-    monkeypatch.setattr("torchrefract.data.pairs.files._decode_npz", lambda _: {})
+    monkeypatch.setattr("torchrefract.data.pairs.files._decode_npz", lambda *_: {})
     monkeypatch.setattr(cv2, "imdecode", None)
     with pytest.raises(DamagedPairError, match=r"it must be of \(32, 48\) px \(height, width\), got \(4000, 4000\)"):
         PairedFolder(tmp_path / "out")[0]

@@ -1,6 +1,6 @@
 """Datasets of pairs on disk, as `torchrefract.generate` writes them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -10,13 +10,15 @@ from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from torchrefract._tensor import to_float
-from torchrefract._validation import check_choice, check_count, check_flag
-from torchrefract.data.images import opened
+from torchrefract._validation import check_choice, check_count, check_flag, check_size
+from torchrefract.data.images import crop_center, opened, reduce_by_area
 from torchrefract.data.pairs.files import DamagedPairError, decode_pair
 from torchrefract.data.pairs.manifest import PairRow, find_manifests, read_row, read_stored, scan_rows
 from torchrefract.types import Pair
+from torchrefract.warping.grid import inside
 
 _SPLITS = ("all", "train", "val")
+_ALL_VALID = 0.999  # mean of a mask, up to rounding
 _FLOW, _VALID, _TRANSMISSION = "restore_flow", "restore_valid", "transmission"
 
 
@@ -31,17 +33,27 @@ class PairedFolder(Dataset[Pair]):
         split: "all", "train" or "val".
         transmission: True to load the transmission of each pair.
         flow: True to require a flow in each pair; otherwise, a pair without one has a flow of zeros.
+        size: (height, width) to which pairs are cropped and reduced, see `reduce_pair`; None keeps their own size.
 
     Raises:
-        ValueError: the folder has no pairs of the split, or a manifest is damaged. On access: a file is damaged, or
-            the pair lacks a required map.
+        ValueError: the folder has no pairs of the split, or a manifest is damaged. On access: a file is damaged, the
+            pair lacks a required map, or it is smaller than `size`.
     """
 
-    def __init__(self, root: str | Path, *, split: str = "all", transmission: bool = False, flow: bool = False):
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        split: str = "all",
+        transmission: bool = False,
+        flow: bool = False,
+        size: Sequence[int] | None = None,
+    ):
         self.root = Path(root).expanduser()
         self.split = check_choice("split", split, _SPLITS)
         self.transmission = check_flag("transmission", transmission)
         self.flow = check_flag("flow", flow)
+        self.size = None if size is None else check_size("size", size)
         self._manifests = find_manifests(self.root)
         if not self._manifests:
             raise ValueError(f"root must be a folder with manifest.jsonl, got {self.root}")
@@ -83,7 +95,7 @@ class PairedFolder(Dataset[Pair]):
         size = arrays.clean.shape[:2]
         flow = arrays.maps.get(_FLOW, np.zeros((2, *size), np.float32))
         valid = arrays.maps[_VALID] if _FLOW in arrays.maps else np.ones(size, dtype=bool)
-        return Pair(
+        pair = Pair(
             _image(arrays.corrupted),
             _image(arrays.clean),
             torch.from_numpy(flow),
@@ -93,6 +105,7 @@ class PairedFolder(Dataset[Pair]):
             if self.transmission
             else torch.empty(0, dtype=torch.float32, device="cpu"),
         )
+        return pair if self.size is None else reduce_pair(pair, self.size)
 
     def row(self, index: int) -> PairRow:
         """Read the manifest's row of a pair."""
@@ -107,6 +120,25 @@ class PairedFolder(Dataset[Pair]):
 
     def _is_in_split(self, row: PairRow) -> bool:
         return not row.skipped and self.split in ("all", row.split)
+
+
+def reduce_pair(pair: Pair, size: tuple[int, int]) -> Pair:
+    """Crop the center of a pair to the aspect ratio of `size` = (height, width) and reduce it by area averaging.
+
+    A pixel is valid if all that it covers is, and if its flow stays in the crop.
+    """
+    light = pair.transmission.reshape(len(pair.transmission), *pair.clean.shape[1:])  # (0, H, W) if it is not loaded
+    crop = crop_center(torch.cat([pair.degraded, pair.clean, pair.flow, pair.valid.float(), light]), size)
+    degraded, clean, flow, valid, light = reduce_by_area(crop, size).split([3, 3, 2, 1, len(light)])
+    scale = torch.tensor([size[1] / crop.shape[2], size[0] / crop.shape[1]], dtype=torch.float32, device="cpu")
+    flow = flow * scale.view(2, 1, 1)
+    return pair._replace(
+        degraded=degraded.clamp(0, 1),
+        clean=clean.clamp(0, 1),
+        flow=flow,
+        valid=(valid > _ALL_VALID) & inside(flow[None])[0],
+        transmission=light if len(light) else pair.transmission,
+    )
 
 
 class PairStream(IterableDataset[Pair]):

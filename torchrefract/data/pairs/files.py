@@ -98,7 +98,7 @@ def decode_pair(
 
     Args:
         files: a function that reads the content of each file, by the suffix of its name.
-        names: maps to decode if they are PNG files; None for all.
+        names: maps to decode; None for all.
         size: (height, width) of all images and maps, px; None for that of the clean image.
 
     Raises:
@@ -109,7 +109,7 @@ def decode_pair(
     for suffix, read in files.items():
         name, _, file_format = suffix.partition(".")
         if name == _MAPS_STEM:
-            maps |= _decode(suffix, read(), partial(_decode_maps, size, file_format))
+            maps |= _decode(suffix, read(), partial(_decode_maps, size, file_format, names))
         elif name not in IMAGES and (names is None or name in names):
             maps[name] = _decode(suffix, read(), partial(_decode_map, name, size))
     clean, corrupted = (_decode(f"{name}.png", files[f"{name}.png"](), partial(_decode_image, size)) for name in IMAGES)
@@ -183,8 +183,11 @@ def _encode_png(pixels: np.ndarray, options: list[int]) -> bytes:
     return cv2.imencode(".png", np.ascontiguousarray(pixels), options)[1].tobytes()
 
 
-def _decode_maps(size: tuple[int, int], file_format: str, data: bytes) -> dict[str, np.ndarray]:
-    maps = _decode_npz(data) if file_format == "npz" else load(data)
+def _decode_maps(
+    size: tuple[int, int], file_format: str, names: tuple[str, ...] | None, data: bytes
+) -> dict[str, np.ndarray]:
+    maps = _decode_npz(data, names) if file_format == "npz" else load(data)
+    maps = {name: value for name, value in maps.items() if names is None or name in names}
     for name in maps.keys() & {*FLOWS, *MASKS, *LIGHTS}:
         shape, kind = ((2, *size) if name in FLOWS else size), (np.bool_ if name in MASKS else np.float32)
         if maps[name].shape != shape or maps[name].dtype != kind:
@@ -195,12 +198,12 @@ def _decode_maps(size: tuple[int, int], file_format: str, data: bytes) -> dict[s
     return maps
 
 
-def _decode_npz(data: bytes) -> dict[str, np.ndarray]:
+def _decode_npz(data: bytes, names: tuple[str, ...] | None) -> dict[str, np.ndarray]:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         if sum(member.file_size for member in archive.infolist()) > len(data):
             raise ValueError("it claims more bytes than it has, and is not compressed")
     with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-        return {name: archive[name] for name in archive.files}
+        return {name: archive[name] for name in archive.files if names is None or name in names}
 
 
 def _decode(suffix: str, data: bytes, decoder: Callable[[bytes], _T]) -> _T:

@@ -1,0 +1,110 @@
+"""Distance of the scenes to real fog, haze, dust and sun, beside that of the clear frames that they degrade.
+
+    python benchmarks/references.py                   # DATA is ../shared/data beside the checkout
+    python benchmarks/references.py --pictures FOLDER # and saves them side by side
+
+Real and clear frames show different roads and exposures, so that only statistics are compared: the mean distance, over
+twelve bands of rows, of the histograms of luma, and of those of local contrast, the standard deviation of luma in a
+window of 9 px, both divided by the mean luma of the frame. The distance of two histograms is that of the earth mover
+(Wasserstein-1). A scene is good where its distances are below those of the clear frames, of which at most eight count.
+"""
+
+import argparse
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from severity import gray_levels, scene_for_width
+from torch import Tensor
+
+from torchrefract import presets
+from torchrefract.data.depth_maps import read_depth
+from torchrefract.data.images import fit, pixels_of, read_image
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+SIZE = (360, 640)
+BANDS, WINDOW, QUANTILES, FRAMES = 12, 9, 101, 8
+
+
+class Reference(NamedTuple):
+    """A real picture of what a scene is to show, and clear frames of the same kind: paths and patterns in the data."""
+
+    real: str
+    scene: str
+    clear: str
+    depth: str | None = None
+
+
+HAZE = "references/haze_road_lidar/image_640x360.jpg"
+CLEAR = "references/clear_road_lidar"
+REFERENCES = {
+    "haze, depth by lidar": Reference(
+        HAZE, "cape_town_fog", f"{CLEAR}/image_640x360.jpg", f"{CLEAR}/depth_dense_derived_640x360.png"
+    ),
+    "haze": Reference(HAZE, "cape_town_fog", "fullres/cn_pjlab_road.jpg"),
+    "fog": Reference("references/real_fog_comma/preview_640x360.jpg", "cape_town_fog", "frames/val/in_rdd_g*"),
+    "dust and sun": Reference(
+        "references/sun_dust_india/India_001877_720x720.jpg", "unpaved_road", "frames/train/in_rdd_f*"
+    ),
+    "sun, open road": Reference(
+        "references/sun_glare_boreas/camera_1733249255732230_crop.jpg", "limpopo_sun_glare", "frames/val/us_losaltos*"
+    ),
+    "sun, forest": Reference(
+        "references/sun_glare_forest/glare_strong.jpg", "limpopo_sun_glare", "frames/train/us_forest*"
+    ),
+}
+
+
+def statistics(image: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Return quantiles of the relative luma and local contrast of an image (3, H, W), each (bands, quantiles)."""
+    y = gray_levels(image).astype(np.float32)
+    y /= y.mean()
+    mean, square = (cv2.blur(value, (WINDOW, WINDOW)) for value in (y, y * y))
+    contrast = np.sqrt(np.maximum(square - mean * mean, 0))
+    share = np.linspace(0, 1, QUANTILES)
+    luma, local = (
+        np.stack([np.quantile(band, share) for band in np.array_split(value, BANDS)]) for value in (y, contrast)
+    )
+    return luma, local
+
+
+def distances(first: Tensor, second: Tensor) -> np.ndarray:
+    """Return the distances of the histograms of luma and of local contrast of images (3, H, W), (2,)."""
+    pairs = zip(statistics(first), statistics(second), strict=True)
+    return np.array([np.abs(a - b).mean() for a, b in pairs])
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--pictures", type=Path, help="folder for a picture of each reference beside its scene")
+    arguments = parser.parse_args()
+    if not arguments.data.is_dir():
+        print(f"skipped: needs real pictures, and {arguments.data} does not exist")
+        return
+    warnings.filterwarnings("ignore", "depth is that of a road")
+    print("| reference | scene | clear | " + " | ".join(map(str, presets.SEVERITIES)) + " |")
+    print("| --- | --- | --- |" + " --- |" * len(presets.SEVERITIES))
+    for name, reference in REFERENCES.items():
+        real = fit(read_image(arguments.data / reference.real), SIZE)
+        paths = sorted(arguments.data.glob(reference.clear))[:FRAMES]
+        clear = torch.stack([fit(read_image(path), SIZE) for path in paths])
+        depth = None if reference.depth is None else read_depth(arguments.data / reference.depth)[0][None, None]
+        versions = [clear]
+        for severity in presets.SEVERITIES:
+            effect = scene_for_width(reference.scene, severity, SIZE[1])
+            versions.append(effect.degrade(clear, seed=0, depth=depth).image)
+        results = [np.mean([distances(real, image) for image in images], axis=0) for images in versions]
+        print(f"| {name} | `{reference.scene}` |", " | ".join(f"{a:.3f}, {b:.3f}" for a, b in results), "|", flush=True)
+        if arguments.pictures:
+            arguments.pictures.mkdir(parents=True, exist_ok=True)
+            picture = pixels_of(torch.cat([real, *(images[0] for images in versions)], dim=2))[..., ::-1]
+            cv2.imwrite(str(arguments.pictures / f"{name.replace(',', '').replace(' ', '_')}.png"), picture)
+
+
+if __name__ == "__main__":
+    main()

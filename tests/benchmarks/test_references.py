@@ -1,0 +1,30 @@
+import sys
+from pathlib import Path
+
+import pytest
+import references
+import torch
+from references import REFERENCES, distances
+
+
+@pytest.mark.quick
+def test_the_distance_ignores_exposure_and_is_that_of_the_earth_mover():
+    image = torch.full((3, 48, 64), 0.4)
+    assert distances(image, image / 2) == pytest.approx([0, 0], abs=1e-3)
+    split = image.clone()
+    split[..., :32] = 0.2  # luma of 2/3 and 4/3 of the mean, which is 1/3 away from it
+    assert distances(split, image)[0] == pytest.approx(1 / 3, abs=0.01)
+    assert distances(split, image)[1] > 0.02
+
+
+@pytest.mark.quick
+def test_without_the_pictures_the_command_says_why_it_skips(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(sys, "argv", ["references.py", "--data", str(tmp_path / "none")])
+    references.main()
+    assert capsys.readouterr().out == f"skipped: needs real pictures, and {tmp_path / 'none'} does not exist\n"
+
+
+def test_every_reference_has_its_pictures(shared_data: Path):
+    for reference in REFERENCES.values():
+        for pattern in filter(None, (reference.real, reference.clear, reference.depth)):
+            assert any(shared_data.glob(pattern)), pattern

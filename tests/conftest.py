@@ -5,12 +5,15 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 import torch
 from torch import Tensor
+
+from torchrefract.cameras.projection import undistort
 
 
 def pytest_addoption(parser) -> None:
@@ -99,6 +102,50 @@ def pixels() -> Callable[[int, int], tuple[Tensor, Tensor]]:
         return x, y
 
     return axes
+
+
+@pytest.fixture(scope="session")
+def drive() -> Callable[..., list[Tensor]]:
+    """Return a function that draws frames (3, 270, 480) of straight strokes through a lens.
+
+    The lens is k1 and k2 relative to the half diagonal of the frame; `strokes` (N, 2, 2), px of the rectified frame,
+    are the same in all frames if given, else random ones that pass the middle at some distance.
+    """
+    height, width = 270, 480
+    half_diagonal, center = math.hypot(height, width) / 2, torch.tensor([(width - 1) / 2, (height - 1) / 2]).double()
+    y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    pixels = (torch.stack([x, y], dim=-1).reshape(1, -1, 2) - center) / half_diagonal
+
+    @lru_cache
+    def rectified(k1: float, k2: float) -> Tensor:
+        lens = torch.tensor([[k1, k2, 0.0, 0.0]], dtype=torch.float64)
+        return (undistort(pixels, lens, model="opencv").points[0] * half_diagonal + center).view(height, width, 2)
+
+    @lru_cache
+    def draw(numbers: tuple[float, float], count: int, strokes: Tensor | None = None) -> list[Tensor]:
+        random, frames, points = torch.Generator().manual_seed(0), list[Tensor](), rectified(*numbers)
+        for _ in range(count):
+            angle, offset, start = torch.rand(3, 9, 1, generator=random, dtype=torch.float64) * math.pi
+            along = torch.cat([angle.cos(), angle.sin()], dim=1) * half_diagonal
+            middle = center + along.flip(1) * torch.tensor([-1.0, 1.0]) * (offset / 4 - 0.4)
+            ends = torch.stack([middle - along * start / 4, middle + along / 2], dim=1)
+            ends = ends if strokes is None else strokes.double()
+            gray = torch.full((height, width), 0.4, dtype=torch.float64)
+            for i, (first, last) in enumerate(ends):
+                length = (last - first).norm()
+                u, v = (last - first) / length
+                across = (points - first) @ torch.stack([-v, u])
+                position = (points - first) @ torch.stack([u, v]) / length
+                gray += (
+                    (0.4 - 0.6 * (i % 2))
+                    * (across + 0.5).clamp(0, 1)
+                    * (8.5 - across).clamp(0, 1)
+                    * ((position > 0) & (position < 1))
+                )
+            frames.append(gray.clamp(0, 1).float().expand(3, -1, -1))
+        return frames
+
+    return draw
 
 
 class Outcome(NamedTuple):

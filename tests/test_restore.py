@@ -1,4 +1,5 @@
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -8,8 +9,10 @@ import torch
 from PIL import Image
 
 from torchrefract import warp
-from torchrefract.data.images import read_image
+from torchrefract.cameras.io import read_camera
+from torchrefract.data.images import pixels_of, read_image
 from torchrefract.data.media import video_info
+from torchrefract.fields.rectification import camera_flow
 from torchrefract.restoration.checkpoints import read_checkpoint
 
 SIZES = {"a.png": (48, 96), "one/b.png": (90, 70), "one/two/b.png": (48, 96), "one/c.bmp": (1, 1)}
@@ -60,6 +63,20 @@ def test_pictures_keep_their_names_and_sizes_and_are_warped_along_the_flow(call,
         expected = warp(image, flow, padding="border", interpolation=interpolation)[0][0]
         # Files hold bytes.
         assert (read_image(folder / "out" / name) - expected).abs().max() < 0.51 / 255 + 1e-4
+
+
+def test_pooled_frames_of_a_camera_are_restored_along_one_flow(call, tmp_path, drive, shifted):
+    for i, frame in enumerate(drive((-0.16, 0.06), 6)):
+        write(tmp_path / "raw" / f"{i}.png", pixels_of(frame)[..., ::-1])
+    outcome = call("restore", f"ckpt_path={shifted}", "input=raw", "out=out", "pool=lens")
+    assert re.search(r"out/camera.yaml: k1 -0\.\d+ .* from 6 frames", outcome.out)
+    flow = camera_flow(read_camera(tmp_path / "out" / "camera.yaml"))[0]
+    for i in range(6):
+        image = read_image(tmp_path / "raw" / f"{i}.png")[None].contiguous()
+        expected = warp(image, flow, padding="border", interpolation="bicubic")[0][0].clamp(0, 1)
+        assert (read_image(tmp_path / "out" / f"{i}.png") - expected).abs().max() < 0.51 / 255 + 1e-4
+    again = call("restore", f"ckpt_path={shifted}", "input=raw", "out=out", "pool=lens").out
+    assert "out: 0 restored, 6 already existed" in again
 
 
 @pytest.mark.parametrize("tile", ["null", "[20,40]"])
@@ -206,6 +223,7 @@ def test_the_checkpoint_of_a_training_is_sufficient(call, folder, trained):
         (("batch=0",), "batch: batch must be at least 1, got 0"),
         (("interpolation=cubic",), "interpolation: interpolation must be one of nearest, bilinear, bicubic"),
         (("side_by_side=2",), "side_by_side: side_by_side must be True or False, got 2"),
+        (("pool=lens",), "pool must be null, or lens for the task undistort, got lens for deweather"),
         (("device=gpu",), "device must be auto, cpu or another device of this machine, got gpu"),
         (("ckpt_path=none.ckpt",), "ckpt_path must be a checkpoint file, such as <run>/last.ckpt, got none.ckpt"),
         (("ckpt_path=raw/a.png",), "ckpt_path must be an intact checkpoint, got raw/a.png, which is damaged"),

@@ -8,15 +8,18 @@ Options:
     out=restored            output folder; names and subfolders are those of the input
     size=[720,1280]         [height, width] to which frames are resized for the model; default: that of its training
     tile=512                px or [height, width]; the model sees tiles of a frame instead of the resized frame
+    pool=null               lens: one lens for all files, of one camera, from the model's flows and straight edges, so
+                            that the result does not shake; it is written to camera.yaml in the output folder
     interpolation=bicubic   of the warp along a predicted flow; or bilinear
     side_by_side=false      true writes the input to the left of the restoration
     batch=4                 pictures, frames or tiles that are restored together
     device=auto             cpu, cuda, or auto, which prefers cuda
-    +model.steps=50         changes a value of the model, here of a diffusion model
 
 Examples:
     python -m torchrefract.restore ckpt_path=best.ckpt input=drive.mp4 side_by_side=true
-    python -m torchrefract.restore ckpt_path=best.ckpt input=frames out=clear device=cuda batch=16
+    python -m torchrefract.restore ckpt_path=ddpm.ckpt input=frames out=clear device=cuda batch=16 +model.steps=50
+
+`+model.steps=50` changes a value of the model, here of a diffusion model.
 
 Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
 `seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.

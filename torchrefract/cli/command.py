@@ -43,7 +43,7 @@ _INFORMATION_OPTIONS = ("--hydra-help", "--info", "--shell-completion", "-sc")
 _MULTIRUN = ("-m", "--multirun")
 # Options whose value is text, mostly the path of a file: Hydra's syntax in it means nothing.
 _TEXT_OPTION = re.compile(
-    r"(\+{0,2}(?:image|images|input|data|labels|weights|source|depth|network|camera|scene\.camera|out|ckpt_path|license|run_dir|data\.root|data\.depth|hydra\.run\.dir"
+    r"(\+{0,2}(?:image|images|input|data|labels|weights|source|depth|network|checkpoint|camera|scene\.camera|out|ckpt_path|license|run_dir|data\.root|data\.depth|hydra\.run\.dir"
     r"|hydra\.sweep\.dir|hydra\.sweep\.subdir|model\.network\.pretrained))=(.*)",
     re.DOTALL,
 )

@@ -5,7 +5,12 @@ import sys
 from collections.abc import Callable
 
 _HELP = ("--help", "-h")
-_CAMERA_COMMANDS = ("calibrate", "rectify", "make_board")  # their libraries are in the extra "calibration"
+_CAMERA_COMMANDS = (
+    "calibrate",
+    "rectify",
+    "make_board",
+    "estimate_lens",
+)  # their libraries are in the extra "calibration"
 
 
 def command(name: str, page: str | None, function: str) -> Callable[[], None]:

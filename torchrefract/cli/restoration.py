@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext, suppress
 from itertools import islice
 from pathlib import Path
@@ -23,6 +23,7 @@ from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cli.command import check_none_lost, check_seed, make, naming, progress
 from torchrefract.cli.evaluation import describe_validation, use_validation_config
+from torchrefract.cli.lens import estimate_camera, flow_predictor
 from torchrefract.data.images import UnreadableImageError, is_lost, pixels_of, read_image
 from torchrefract.data.media import (
     check_output_folder,
@@ -45,7 +46,7 @@ from torchrefract.restoration.checkpoints import (
     read_checkpoint,
 )
 from torchrefract.restoration.export import FORMATS, export_model
-from torchrefract.restoration.inference import Restorer
+from torchrefract.restoration.inference import LensRestorer, Restorer
 from torchrefract.restoration.models.coordconv import weights_license
 from torchrefract.restoration.module import Restoration, RestorationModule
 from torchrefract.restoration.tasks import Undistort
@@ -110,6 +111,10 @@ def restore(cfg: DictConfig) -> None:
     with naming("out"):
         claim(out, _settings(cfg, job), count=0, about={})
     with locked("out", out):
+        if cfg.pool is not None:
+            predict = flow_predictor(job.restorer.model, job.restorer.size, job.device)
+            camera = estimate_camera(files, out / "camera.yaml", predict=predict, upright=True)
+            job = job._replace(restore_images=LensRestorer(camera, interpolation=job.restorer.interpolation))
         _restore_missing(files, job, out)
 
 
@@ -199,6 +204,7 @@ class _Job(NamedTuple):
     """The options of a restoration."""
 
     restorer: Restorer
+    restore_images: Callable[[Sequence[Tensor]], list[Tensor]]  # by the restorer, or by the lens of all frames
     source: Path  # outputs are named by the path of a file relative to this folder
     out: Path
     batch: int
@@ -214,7 +220,7 @@ class _Job(NamedTuple):
     def restore(self, images: Sequence[Tensor]) -> Iterator[Tensor]:
         """Restore images (3, H, W) in [0, 1]; `side_by_side` puts the image to the left of its restoration."""
         moved = [image.to(self.device).contiguous() for image in images]
-        for before, after in zip(moved, self.restorer(moved), strict=True):
+        for before, after in zip(moved, self.restore_images(moved), strict=True):
             yield torch.cat([before, after], dim=2) if self.side_by_side else after
 
 
@@ -223,7 +229,7 @@ def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
         batch = check_count("batch", cfg.batch)
     with naming("side_by_side"):
         side_by_side = check_flag("side_by_side", cfg.side_by_side)
-    device = _find_device(str(cfg.device))
+    device = find_device(str(cfg.device))
     loaded = load_model(Path(str(cfg.ckpt_path)), changes=cfg.model)
     with naming("size"):
         size = loaded.size if cfg.size is None else check_size("size", cfg.size)
@@ -232,13 +238,15 @@ def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
         tile = None if sides is None else check_size("tile", sides)
     if tile is not None and loaded.task == Undistort.name:
         raise UsageError(f"tile must be null for {loaded.task}, whose model needs the complete frame, got {cfg.tile}")
+    if cfg.pool not in (None, "lens") or (cfg.pool and loaded.task != Undistort.name):
+        raise UsageError(f"pool must be null, or lens for the task {Undistort.name}, got {cfg.pool} for {loaded.task}")
     with naming("interpolation"):
         options = {"tile": tile, "interpolation": cfg.interpolation, "batch": batch}
         restorer = Restorer(loaded.model.to(device), size=size, **options)
-    return _Job(restorer, source, out, batch, side_by_side, device)
+    return _Job(restorer, restorer, source, out, batch, side_by_side, device)
 
 
-def _find_device(name: str) -> torch.device:
+def find_device(name: str) -> torch.device:
     try:
         device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
         torch.empty(0, device=device)
@@ -258,6 +266,7 @@ def _settings(cfg: DictConfig, job: _Job) -> dict[str, Any]:
         "tile": job.restorer.tile and list(job.restorer.tile),
         "interpolation": job.restorer.interpolation,
         "side_by_side": job.side_by_side,
+        "pool": cfg.pool,
         "model": OmegaConf.to_container(cfg.model),
     }
 

@@ -1,6 +1,7 @@
 """Restore pictures of any size by a model that was trained at one size."""
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from itertools import product
 
 import torch
@@ -8,6 +9,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from torchrefract._validation import check_choice, check_count, check_size
+from torchrefract.cameras.camera import Camera
+from torchrefract.fields.rectification import camera_flow
 from torchrefract.restoration.tasks import Restored
 from torchrefract.warping.flow import resize_flow, resize_image
 from torchrefract.warping.warp import INTERPOLATIONS, warp
@@ -72,6 +75,30 @@ class Restorer:
                 "tile must be None for a model that predicts a flow, because it needs the complete picture"
             )
         return restored.image
+
+
+class LensRestorer:
+    """Restore pictures of one camera along one flow, so that its lens is still from frame to frame.
+
+    Args:
+        camera: whose distortion is removed, from pictures of any size with the ratio of its sides.
+        interpolation: of the warp.
+    """
+
+    def __init__(self, camera: Camera, *, interpolation: str = "bicubic"):
+        self.camera = camera
+        self.interpolation = check_choice("interpolation", interpolation, INTERPOLATIONS)
+        self._flow = lru_cache(maxsize=2)(self._compute_flow)
+
+    @torch.inference_mode()
+    def __call__(self, images: Sequence[Tensor]) -> list[Tensor]:
+        """Restore pictures (3, H, W) in [0, 1]."""
+        flows = [self._flow(*image.shape[1:]).to(image.device, image.dtype) for image in images]
+        options = {"padding": "border", "interpolation": self.interpolation}
+        return [warp(image[None], flow, **options)[0][0].clamp(0, 1) for image, flow in zip(images, flows, strict=True)]
+
+    def _compute_flow(self, height: int, width: int) -> Tensor:
+        return camera_flow(self.camera.resized(width=width, height=height))[0]
 
 
 class FullSizeModel(nn.Module):

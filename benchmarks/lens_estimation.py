@@ -1,0 +1,190 @@
+"""Accuracy of lenses that are estimated from the frames of a drive, without a board.
+
+    python benchmarks/lens_estimation.py  # rendered roads through a known lens, and without a lens
+    python benchmarks/lens_estimation.py --data DATA [--sets ca280_1280 ...]  # real cameras with a calibration
+
+DATA holds frames/train/ca280_*.jpg and fullres/ca280_*.jpg, of the camera of chessboard/udacity_p4, and
+chessboard/pjlab_wide, with chessboard/reference.json. The calibrated camera is that of OpenCV with five coefficients.
+
+"error" is the mean distance, px of a frame 1920 px wide, between where the estimated and the calibrated camera show
+the pixels of the rectified frame. Both rectified frames have their principal point at its place and a magnification of
+1 there, as the flow of `rectify`. "nothing" is the same for the frames as they are. Pools are drawn at random; medians
+over the draws. "rectified" rows are the same frames after `rectify` by the calibrated camera: their lens is none.
+"lines" is the distance of chessboard corners of one row or column from a straight line, px rms, before and after.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from calibration import board_from_entry
+from timing import RESULTS, write_json
+from torch import Tensor
+
+from torchrefract._tensor import to_float, to_uint8
+from torchrefract.cameras.calibration.detection import detect, has_enough_corners
+from torchrefract.cameras.calibration.plumb_line import find_chains, fit_lens, pool_chains, published_prior
+from torchrefract.cameras.calibration.report import straightness, undistort_views
+from torchrefract.cameras.camera import Camera
+from torchrefract.cli.calibration import find_pictures, read_gray
+from torchrefract.data.images import pixels_of
+from torchrefract.data.road_scenes import render_road_scenes
+from torchrefract.fields.rectification import camera_flow
+from torchrefract.warping.warp import warp
+
+SETS = {  # name: pictures, and the entry of reference.json
+    "ca280_1280": ("fullres/ca280_*.jpg", "udacity_p4"),
+    "ca280_640": ("frames/train/ca280_*.jpg", "udacity_p4"),
+    "pjlab_wide": ("chessboard/pjlab_wide/*.jpg", "pjlab_wide"),
+}
+RENDERED_LENS = (-0.16, 0.06)  # relative to the half diagonal
+_NUM_RENDERED, _RENDERED_SIZE, _SHRINK = 30, (720, 1280), 0.7
+_POOLS = {1: 7, 5: 5, 20: 3}  # number of draws by the number of frames
+_WIDTH = 1920  # px, of errors
+_GRID = 41
+
+
+class Row(NamedTuple):
+    """The errors of a set of frames."""
+
+    name: str
+    frames: int
+    error: float
+    nothing: float
+    distinct: float  # share of the draws that can be distinguished from no distortion
+    straight: float  # chains
+
+
+def to_camera(coefficients: Tensor, size: tuple[int, int]) -> Camera:
+    """Return a camera whose focal length is the half diagonal."""
+    (height, width), half_diagonal = size, float(np.hypot(*size)) / 2
+    k1, k2 = coefficients.tolist()
+    center: dict[str, Any] = {"cx": (width - 1) / 2, "cy": (height - 1) / 2}
+    return Camera(
+        width=width, height=height, fx=half_diagonal, fy=half_diagonal, **center, coefficients=(k1, k2, 0.0, 0.0)
+    )
+
+
+def calibrated_camera(entry: dict[str, Any]) -> Camera:
+    """Create the camera of an entry of reference.json."""
+    fit, (width, height) = entry["opencv_5param"], entry["image_size"]
+    pinhole = {name: fit[name] for name in ("fx", "fy", "cx", "cy")}
+    return Camera(width=width, height=height, **pinhole, coefficients=tuple(fit["dist_k1k2p1p2k3"]))
+
+
+def shown_at(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Return where the camera shows the pixels of its rectified frame, and which of them it does."""
+    focal, center = (
+        torch.tensor(pair, dtype=torch.float64) for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy))
+    )
+    result = camera.distort((pixels - center) / focal)
+    shown = result.points * focal + center
+    last = torch.tensor([camera.width - 1, camera.height - 1])
+    return shown, result.valid & (shown >= 0).all(dim=1) & (shown <= last).all(dim=1)
+
+
+def errors(estimate: Camera, truth: Camera) -> tuple[float, float]:
+    """Return the mean error of an estimate and of doing nothing, px of a frame 1920 px wide."""
+    pixels, scale = truth.grid(_GRID), _WIDTH / truth.width
+    expected, is_shown = shown_at(truth, pixels)
+    estimated, _ = shown_at(estimate, pixels)
+    error, nothing = (scale * (at - expected)[is_shown].norm(dim=1).mean().item() for at in (estimated, pixels))
+    return error, nothing
+
+
+def measure(name: str, grays: Sequence[np.ndarray], truth: Camera) -> tuple[list[Row], Camera]:
+    """Estimate the lens from pools of frames; return the rows and the camera of all frames."""
+    size, random = (truth.height, truth.width), np.random.default_rng(0)
+    chains = [find_chains(gray) for gray in grays]
+    rows, camera = [], truth
+    for number, draws in {**{n: d for n, d in _POOLS.items() if n < len(grays)}, len(grays): 1}.items():
+        results = []
+        for _ in range(draws):
+            pool = pool_chains([chains[i] for i in random.choice(len(grays), number, replace=False)], size)
+            fit = fit_lens(pool, published_prior())
+            camera = to_camera(fit.coefficients, size)
+            results.append((*errors(camera, truth), fit.is_distorted, int(fit.is_straight.sum())))
+        error, nothing, distinct, straight = zip(*results, strict=True)
+        rows.append(Row(name, number, median(error), nothing[0], sum(distinct) / draws, median(straight)))
+        print(
+            f"{name:26}{number:4} frames  error {rows[-1].error:6.1f}  nothing {nothing[0]:6.1f}  "
+            f"distinct in {rows[-1].distinct:4.0%}  straight edges {rows[-1].straight:4.0f}",
+            flush=True,
+        )
+    return rows, camera
+
+
+def rendered(lens: tuple[float, float]) -> tuple[list[np.ndarray], Camera]:
+    """Render roads through a lens, relative to the half diagonal; a part of the rendered frames is shown."""
+    camera, (height, width) = to_camera(torch.tensor(lens), _RENDERED_SIZE), _RENDERED_SIZE
+    y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    pixels, center = torch.stack([x, y], dim=-1).reshape(-1, 2), torch.tensor([camera.cx, camera.cy])
+    rectified = camera.undistort((pixels - center) / camera.fx).points * camera.fx * _SHRINK + center
+    flow = (rectified - pixels).T.reshape(1, 2, height, width).float()
+    grays = []
+    for key in range(_NUM_RENDERED):
+        image, _ = render_road_scenes(torch.tensor([key]), height, width)
+        grays.append(to_gray(warp(image, flow, interpolation="bicubic")[0][0]))
+    return grays, camera
+
+
+def to_gray(image: Tensor) -> np.ndarray:
+    """Convert a frame (3, H, W) in [0, 1] to gray bytes."""
+    return cv2.cvtColor(pixels_of(image), cv2.COLOR_RGB2GRAY)
+
+
+def rectify(gray: np.ndarray, flow: Tensor) -> np.ndarray:
+    """Warp a gray picture along a flow."""
+    image = to_float(torch.from_numpy(gray)[None, None])
+    return to_uint8(warp(image, flow, interpolation="bicubic")[0])[0, 0].numpy()
+
+
+def board_lines(folder: Path, name: str, estimate: Camera) -> tuple[float, float]:
+    """Return the straightness of the corners of a chessboard in pictures, and after rectification, px rms."""
+    board = board_from_entry(json.loads((folder / "reference.json").read_text())[name])
+    grays = {path.name: read_gray(path) for path in find_pictures(folder / name)}
+    grays = {key: gray for key, gray in grays.items() if gray.shape == (estimate.height, estimate.width)}
+    views = [view for key, gray in grays.items() if has_enough_corners(view := detect(gray, board, name=key), board)]
+    return straightness(views, board), straightness(undistort_views(views, estimate), board)
+
+
+def real(data: Path, sets: Sequence[str]) -> list[Row]:
+    """Measure sets of real frames, and the same after rectification by the calibrated camera."""
+    entries, rows = json.loads((data / "chessboard" / "reference.json").read_text()), []
+    for name, (pattern, entry) in ((name, SETS[name]) for name in sets):
+        grays = [read_gray(path) for path in sorted(data.glob(pattern))]
+        truth = calibrated_camera(entries[entry])
+        camera = truth.resized(width=grays[0].shape[1], height=grays[0].shape[0])
+        measured, estimate = measure(name, grays, camera)
+        flow = camera_flow(camera)[0]
+        none = to_camera(torch.zeros(2), (camera.height, camera.width))
+        rows += measured + measure(f"{name}, rectified", [rectify(gray, flow) for gray in grays], none)[0]
+        resized = estimate.resized(width=truth.width, height=truth.height)
+        before, after = board_lines(data / "chessboard", entry, resized)
+        print(f"{name:26} chessboard lines {before:.2f} px, {after:.2f} px after rectification", flush=True)
+    return rows
+
+
+def main() -> None:
+    """Print the rows and write them as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, help="folder of real frames and chessboards")
+    parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
+    parser.add_argument("--out", type=Path, default=RESULTS / "lens_estimation.json")
+    arguments = parser.parse_args()
+    if arguments.data:
+        rows = real(arguments.data, arguments.sets)
+    else:
+        lenses = {"rendered roads, barrel": RENDERED_LENS, "rendered roads, no lens": (0.0, 0.0)}
+        rows = [row for name, lens in lenses.items() for row in measure(name, *rendered(lens))[0]]
+    write_json(arguments.out, [row._asdict() for row in rows])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,118 @@
+"""The command that estimates the lens of a camera from the frames of a drive."""
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from torch import Tensor
+
+from torchrefract._validation import UsageError, check_count
+from torchrefract.cameras.calibration import estimate_lens as estimate
+from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.io import write_opencv
+from torchrefract.cli.command import naming, progress
+from torchrefract.data import media
+from torchrefract.data.images import UnreadableImageError, read_image
+from torchrefract.warping.flow import resize_image
+
+Predictor = Callable[[Tensor], Tensor]  # from a frame (1, 3, H, W) to the flow (1, 2, h, w) that undistorts it
+
+
+def estimate_lens(cfg: DictConfig) -> None:
+    """Estimate the lens of the camera of pictures and videos, write the camera, and print how certain it is."""
+    with naming("frames"):
+        max_frames = check_count("frames", cfg.frames)
+    files = media.find_media(Path(str(cfg.input)))
+    if turned := media.describe_turned(files):
+        print(f"warning: {turned}", file=sys.stderr)
+    predict = None if cfg.checkpoint is None else _load_network(cfg)
+    estimate_camera(files, Path(str(cfg.out)), max_frames=max_frames, fov_deg=cfg.fov_deg, predict=predict)
+
+
+def estimate_camera(
+    files: Sequence[Path],
+    out: Path,
+    *,
+    max_frames: int = 100,
+    fov_deg: float | None = None,
+    predict: Predictor | None = None,
+    upright: bool = False,
+) -> Camera:
+    """Estimate the camera of at most so many frames of files, write it to `out`, and print how certain it is."""
+    chosen = _select_frames(files, max_frames)
+    count = sum(len(times) for _, times in chosen)
+    frames = progress(_read_frames(chosen, upright=upright), "estimating the lens", count=count)
+    with naming("input"):
+        result = estimate(frames, fov_deg=fov_deg, predict=predict)
+    with naming("out"):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_opencv(out, result.camera, covariance=result.covariance)
+    for message in result.warnings:
+        print(f"warning: {message}", file=sys.stderr)
+    k1, k2, *_ = result.camera.coefficients
+    deviations = result.covariance.diagonal()[4:6] ** 0.5
+    print(
+        f"{out}: k1 {k1:.3f} +- {deviations[0]:.3f}, k2 {k2:.3f} +- {deviations[1]:.3f} for a focal length of "
+        f"{result.camera.fx:.0f} px, from {result.num_frames} frames with {result.num_straight} straight edges of "
+        f"{result.num_chains}; standard deviation of the rectified position: {result.edge_px:.1f} px at the left and "
+        f"right edge, {result.corner_px:.1f} px in the corners"
+    )
+    return result.camera
+
+
+def flow_predictor(model: Callable[[Tensor], Any], size: tuple[int, int], device: torch.device) -> Predictor:
+    """Return a function that predicts the flow of a frame (1, 3, H, W) by a model of frames of a size."""
+
+    @torch.inference_mode()
+    def predict(frame: Tensor) -> Tensor:
+        flow = model(resize_image(frame.to(device), size)).flow
+        assert flow is not None  # the task predicts it
+        return flow.cpu().clone()
+
+    return predict
+
+
+def _select_frames(files: Sequence[Path], max_frames: int) -> list[tuple[Path, list[int]]]:
+    """Choose at most so many frames, evenly spaced over all files; return their numbers in each file."""
+    counts = [media.video_info(file)[0] if media.is_video(file) else 1 for file in files]
+    total, chosen = sum(counts), list[tuple[Path, list[int]]]()
+    numbers = [i * total // min(max_frames, total) for i in range(min(max_frames, total))]
+    for file, start, end in zip(files, accumulate([0, *counts]), accumulate(counts), strict=False):
+        chosen.append((file, [number - start for number in numbers if start <= number < end]))
+    return chosen
+
+
+def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> Iterator[Tensor]:
+    """Yield frames (1, 3, H, W) as stored, or as a viewer shows them; name and skip unreadable files."""
+    num_read, reason = 0, ""
+    for file, times in chosen:
+        try:
+            if media.is_video(file):
+                frames = (frame for _, frame in media.read_video(file, times, upright=upright))
+            else:
+                frames = (read_image(file, upright=upright)[None] for _ in times)
+            for frame in frames:
+                yield frame
+                num_read += 1
+        except UnreadableImageError as error:
+            reason = str(error)
+            print(f"skipped: {reason}", file=sys.stderr)
+    if num_read == 0:
+        raise UsageError(f"input must hold a readable picture or video, got {reason or 'no frames'}")
+
+
+def _load_network(cfg: DictConfig) -> Predictor:
+    """Return a function that predicts the flow of a frame by the model of a checkpoint, at the size of its training."""
+    # Estimation by lines alone needs no training stack.
+    from torchrefract.cli.restoration import find_device  # noqa: PLC0415
+    from torchrefract.restoration.checkpoints import load_model  # noqa: PLC0415
+    from torchrefract.restoration.tasks import Undistort  # noqa: PLC0415
+
+    loaded, device = load_model(Path(str(cfg.checkpoint))), find_device(str(cfg.device))
+    if loaded.task != Undistort.name:
+        raise UsageError(f"checkpoint must be of the task {Undistort.name}, got {cfg.checkpoint} of {loaded.task}")
+    return flow_predictor(loaded.model.to(device), loaded.size, device)

@@ -1,0 +1,28 @@
+"""Estimate the lens of a camera from a drive: `python -m torchrefract.estimate_lens input=drive.mp4 out=camera.yaml`.
+
+Needs no board. Edges of buildings, poles and signs must become straight; the frames of a moving camera are pooled.
+Writes camera.yaml with its covariance, which `rectify` and `LensDistortion.from_camera` read. It prints how uncertain
+the rectified position is, and warns if the frames hold too few straight edges to tell the lens from none.
+
+Options:
+    input=PATH              a picture, a video, or a folder of them, all of one camera, required
+    out=camera.yaml         the camera; an existing file is replaced
+    frames=100              the most frames to use, evenly spaced
+    fov_deg=null            horizontal field of view; k1 and k2 are relative to it, the rectified frames are not
+    checkpoint=null         of a training of the task undistort; its flows give the start
+    device=auto             cpu, cuda, or auto, which prefers cuda
+
+Examples:
+    python -m torchrefract.estimate_lens input=drive.mp4 out=camera.yaml
+    python -m torchrefract.estimate_lens input=frames out=camera.yaml checkpoint=best.ckpt fov_deg=120
+
+Options of Hydra: `--cfg job` prints all options with their values. A file name may hold any letters; only the shell
+needs quotes, as in `'input=my drive (1).mp4'`.
+"""
+
+from torchrefract.cli.entry import command
+
+main = command("estimate_lens", __doc__, "lens:estimate_lens")
+
+if __name__ == "__main__":
+    main()

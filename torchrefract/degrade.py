@@ -19,7 +19,6 @@ Options:
 Examples:
     python -m torchrefract.degrade source=drive.mp4 out=fog scene=cape_town_fog
     python -m torchrefract.degrade source=val2017 labels=instances_val2017.json out=lens scene=cheap_dashcam severity=5
-    python -m torchrefract.degrade -m source=frames out='haze/${severity}' scene=highveld_heat_haze severity=1,2,3,4,5
 
 Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
 `seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'source=my drive (1).mp4'`.

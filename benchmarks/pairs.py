@@ -41,8 +41,8 @@ from torchrefract.data.pairs.generator import (
     PairTask,
     SourceReader,
     find_sources,
-    use_one_thread,
 )
+from torchrefract.data.workers import use_one_thread
 from torchrefract.effects.base import Effect
 
 PROTOCOL = {

@@ -51,7 +51,7 @@ def test_commands_without_a_model_import_neither_the_training_stack_nor_workers_
     workers = IMPORT.format(
         module="torchrefract.generate, torchrefract.cli.generation", names=(*LEARNING, "matplotlib")
     )
-    modules = ", ".join(f"torchrefract.cli.{name}" for name in ("calibration", "generation", "preview"))
+    modules = ", ".join(f"torchrefract.cli.{name}" for name in ("calibration", "degradation", "generation", "preview"))
     outcome = spawn("-c", f"{workers}; {IMPORT.format(module=modules, names=LEARNING)}", cwd=tmp_path)
     assert (outcome.code, outcome.out.split()) == (0, ["[]", "[]"]), outcome.err
 
@@ -127,7 +127,7 @@ def test_the_help_of_the_package_names_all_effects_presets_and_commands():
     effects = [name for name in torchrefract.__all__ if issubclass(kind(getattr(torchrefract, name)), Effect)]
     scenes = [path.stem for path in (ROOT / "conf" / "scene").glob("*.yaml")]
     commands = [path.stem for path in (ROOT / "torchrefract").glob("*.py") if "import command" in path.read_text()]
-    assert len(commands) == 11
+    assert len(commands) == 12
     assert [name for name in effects + scenes + commands if name not in re.findall(r"\w+", text)] == []
 
 

@@ -21,8 +21,8 @@ inverse, masks and the drawn parameters, and `effect.apply(image, params)` repea
 `compose_flows` work on flows, which are backward and in pixels: out(p) = image(p + flow(p)). `worst_case` searches the
 parameters of an effect that harm a model most.
 
-Commands, each with a `--help`: python -m torchrefract.preview, generate, train, eval, restore, export, calibrate,
-rectify, make_board, estimate_lens, estimate_depth, robustness.
+Commands, each with a `--help`: python -m torchrefract.preview, degrade, generate, train, eval, restore, export,
+calibrate, rectify, make_board, estimate_lens, estimate_depth, robustness.
 """
 
 import sys as _sys

@@ -118,6 +118,7 @@ ODD_NAMES = (
 FILE_OPTIONS = {
     "preview": (("image", "depth"), ()),
     "generate": (("source",), ("scene=paper_weather", "out=o", "license=l")),
+    "degrade": (("source", "out", "labels", "depth"), ("scene=paper_weather", "source=s", "out=o")),
     "calibrate": (("images", "out"), ()),
     "rectify": (("input", "camera"), ("camera=c", "input=i")),
     "restore": (("ckpt_path", "input", "out"), ("ckpt_path=a", "input=b")),
@@ -176,7 +177,18 @@ def test_names_of_files_are_the_values_of_a_multirun(call, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} >= {"ä=1.pdf", "b#2.pdf"}
 
 
-COMMANDS = ("train", "eval", "preview", "generate", "restore", "export", "calibrate", "rectify", "make_board")
+COMMANDS = (
+    "train",
+    "eval",
+    "preview",
+    "degrade",
+    "generate",
+    "restore",
+    "export",
+    "calibrate",
+    "rectify",
+    "make_board",
+)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -200,7 +212,7 @@ def test_a_help_page_says_what_a_command_does_with_options_that_exist_and_two_ex
         for example in words:
             compose(name, [*example, *choices["eval"]] if name == "eval" else prepare_arguments(name, example))
         required = [word for word in words[0] if "=" in word and word.partition("=")[0] not in ("data", "scene")]
-        if name == "generate":
+        if name in ("degrade", "generate"):
             required += ["scene=cape_town_fog"]
         cfg: Any = compose(
             name, [quote_text(word) for word in required] + choices.get(name, []), return_hydra_config=True

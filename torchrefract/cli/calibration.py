@@ -43,7 +43,7 @@ from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera, read_covariance, read_opencv, write_opencv
 from torchrefract.cli.command import check_none_lost, make, naming, progress
 from torchrefract.data import media
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, pixels_of, read_image
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, is_lost, pixels_of, read_image
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.fields.rectification import camera_flow, zoom_to_crop
 from torchrefract.warping.warp import warp
@@ -305,7 +305,7 @@ def rectify(cfg: DictConfig) -> None:
         f"{out}: {num_written} rectified, {num_existing} already existed, {len(failed)} skipped; camera of the "
         f"results: {out}/{CAMERA_FILE}"
     )
-    check_none_lost(failed)
+    check_none_lost([str(error) for error in failed.values() if is_lost(error)])
 
 
 def _part_to_keep(

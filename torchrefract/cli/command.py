@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -30,7 +30,7 @@ from yaml import YAMLError
 from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
 from torchrefract.cli.entry import missing_library
-from torchrefract.data.images import UnreadableImageError, is_lost
+from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.pairs.files import DamagedPairError
 from torchrefract.fields.corridor import CorridorDepth
 
@@ -249,17 +249,17 @@ def progress(items: Iterable[_T], name: str, *, count: int) -> Iterator[_T]:
         finished.set()
 
 
-def check_none_lost(failed: Mapping[Path, Exception]) -> None:
+def check_none_lost(lost: Sequence[str], *, name: str = "input") -> None:
     """Raise UsageError if files of the input could not be opened, as those that vanish during a run.
 
     Args:
-        failed: the error of each file without a result.
+        lost: the error of each such file.
+        name: option that names the input.
     """
-    lost = [str(error) for error in failed.values() if is_lost(error)]
     if lost:
         more = f" and {len(lost) - 1} more" if lost[1:] else ""
         raise UsageError(
-            f"input must stay unchanged during a run, got {lost[0]}{more}; the same command tries them again"
+            f"{name} must stay unchanged during a run, got {lost[0]}{more}; the same command tries them again"
         )
 
 
@@ -356,8 +356,8 @@ def _options(name: str) -> list[str]:
     config = cast(DictConfig, OmegaConf.load(_config_file(name)))
     options = [str(key) for key in config if key not in ("defaults", "hydra")]
     given = dict(argument.split("=", 1) for argument in sys.argv[1:] if "=" in argument)
-    for part in config.defaults:
-        for group, choice in part.items() if isinstance(part, DictConfig) else ():
+    for part in cast(list[Any], OmegaConf.to_container(config.defaults)):  # a group may be missing
+        for group, choice in part.items() if isinstance(part, dict) else ():
             file = Path(CONFIG_DIR, str(group), f"{given.get(str(group), choice)}.yaml")
             if group != "hydra" and not str(group).startswith("override"):
                 options.append(str(group))

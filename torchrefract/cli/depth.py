@@ -32,7 +32,7 @@ def estimate_depth(cfg: DictConfig) -> None:
     with naming("batch"):
         size = check_count("batch", cfg.batch)
     files = media.find_media(source, deep=True, name="source")
-    media.check_output_folder(out, source, deep=True)
+    media.check_output_folder(out, source, deep=True, name="source")
     folder, root = DepthFolder(out), source if source.is_dir() else source.parent
     pictures = [file.relative_to(root).as_posix() for file in files if not media.is_video(file)]
     folder.check([(name, None) for name in pictures], exist=False)

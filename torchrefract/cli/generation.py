@@ -45,6 +45,7 @@ from torchrefract.data.pairs.generator import (
     generate_pairs,
 )
 from torchrefract.data.pairs.manifest import Manifest, PairRow, claim, find_manifests, locked_shard, scan_rows
+from torchrefract.data.workers import num_cores
 from torchrefract.effects.base import Effect
 
 _T = TypeVar("_T")
@@ -183,8 +184,7 @@ def _shard(cfg: DictConfig) -> Shard:
 def _workers(cfg: DictConfig) -> int:
     if cfg.workers is not None:
         return _checked(cfg, "workers", check_count, low=0)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+    return num_cores()
 
 
 def _report(options: Options, complete: set[int], damaged: int) -> None:

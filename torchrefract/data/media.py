@@ -6,7 +6,7 @@ sensor. Writers keep the tag of a frame of the sensor, so that viewers show ever
 """
 
 import warnings
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -79,19 +79,22 @@ def find_media(source: Path, *, deep: bool = False, name: str = "input") -> Sequ
     files = [file for file in candidates if file.suffix.lower() in suffixes]
     if not files:
         raise UsageError(f"{name} must be, or hold, {', '.join(suffixes)}, got {source}")
-    names = [output_name(file) for file in files]
-    if repeated := {str(name) for name in names if names.count(name) > 1}:
+    names = Counter(str(output_name(file)) for file in files)
+    if repeated := [name for name, count in names.items() if count > 1]:
         raise UsageError(f"{name} must not hold two videos of one name, got {', '.join(sorted(repeated))}")
     return files
 
 
-def check_output_folder(out: Path, source: Path, *, deep: bool = False) -> None:
-    """Raise UsageError if files in `out` would replace those of `source` or, if `deep`, be among them."""
+def check_output_folder(out: Path, source: Path, *, deep: bool = False, name: str = "input") -> None:
+    """Raise UsageError if files in `out` would replace those of `source` or, if `deep`, be among them.
+
+    `name` is the option of `source`.
+    """
     folder = (source if source.is_dir() else source.parent).resolve()
     if out.resolve() == folder:
-        raise UsageError(f"out must be another folder than that of input, got {out}")
+        raise UsageError(f"out must be another folder than that of {name}, got {out}")
     if deep and source.is_dir() and out.resolve().is_relative_to(folder):
-        raise UsageError(f"out must be a folder that does not lie in that of input, got {out}")
+        raise UsageError(f"out must be a folder that does not lie in that of {name}, got {out}")
 
 
 def is_video(file: Path) -> bool:
@@ -134,14 +137,19 @@ def describe_losses(files: Sequence[Path], *, upright: bool) -> list[str]:
     return [f"{loss}: {_names(affected)}" for loss, affected in lossy.items()]
 
 
-def describe_turned(files: Sequence[Path]) -> str:
+def describe_turned(files: Sequence[Path], *, upright: bool = False) -> str:
     """Describe the files whose tags turn the stored pixels for display; empty without such files."""
     turned = [file for file in files if _is_turned(file)]
     if not turned:
         return ""
+    use = (
+        "They are read as displayed, and so labels must be of the displayed pictures"
+        if upright
+        else "Their pixels are used as stored, since a camera's geometry holds in that frame"
+    )
     return (
         f"{len(turned)} of {len(files)} files have a tag that turns them for display (EXIF orientation, or rotation of "
-        f"a video): {_names(turned)}. Their pixels are used as stored, since a camera's geometry holds in that frame"
+        f"a video): {_names(turned)}. {use}"
     )
 
 

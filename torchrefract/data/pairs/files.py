@@ -71,16 +71,21 @@ def encode_pair(pair: PairArrays, file_format: str) -> dict[str, bytes]:
         ValueError: an intensity is 2 or more and the format is "png".
     """
     files = {f"{name}.png": _encode_png(getattr(pair, name)[..., ::-1], _IMAGE_OPTIONS) for name in IMAGES}
-    if file_format != "png":
-        # safetensors writes memory in its order, so arrays must be contiguous.
-        arrays: dict[str, Any] = {name: np.ascontiguousarray(pair.maps[name]) for name in sorted(pair.maps)}
-        stream = io.BytesIO()
-        if file_format == "npz":
-            np.savez(stream, **arrays)  # compression gains little on flows in float32
-        else:
-            stream.write(save(arrays))
-        return files | {f"{_MAPS_STEM}.{file_format}": stream.getvalue()}
-    return files | {f"{name}.png": _encode_map(name, value, pair.maps) for name, value in pair.maps.items()}
+    return files | encode_maps(pair.maps, file_format)
+
+
+def encode_maps(maps: Mapping[str, np.ndarray], file_format: str) -> dict[str, bytes]:
+    """Encode the maps of `PairArrays` as `encode_pair` does."""
+    if file_format == "png":
+        return {f"{name}.png": _encode_map(name, value, maps) for name, value in maps.items()}
+    # safetensors writes memory in its order, so arrays must be contiguous.
+    arrays: dict[str, Any] = {name: np.ascontiguousarray(maps[name]) for name in sorted(maps)}
+    stream = io.BytesIO()
+    if file_format == "npz":
+        np.savez(stream, **arrays)  # compression gains little on flows in float32
+    else:
+        stream.write(save(arrays))
+    return {f"{_MAPS_STEM}.{file_format}": stream.getvalue()}
 
 
 def decode_pair(

@@ -8,20 +8,13 @@ short, which the next run detects by its size, or hold zeros, which verify=true 
 import hashlib
 import io
 import math
-import multiprocessing
-import os
-import signal
 import tarfile
-import threading
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.context import BaseContext
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -34,6 +27,7 @@ from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, is_l
 from torchrefract.data.media import VIDEOS, read_video, video_info
 from torchrefract.data.pairs.files import DEPTH, FLOWS, LIGHTS, PairArrays, count_out_of_range, encode_pair
 from torchrefract.data.pairs.manifest import PairRow, StoredFile
+from torchrefract.data.workers import map_in_processes
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
 from torchrefract.random import key_of
@@ -41,7 +35,6 @@ from torchrefract.types import Degraded
 
 _PAIRS_PER_FOLDER = 1000
 _DISK_BLOCK, _TAR_BLOCK = 4096, 512  # bytes
-_QUEUED_UNITS = 2  # for each worker, so that none waits
 
 
 class Sources(NamedTuple):
@@ -237,7 +230,7 @@ class PairGenerator(NamedTuple):
                 )
         except (ValueError, TypeError, OSError) as error:
             raise UsageError(f"scene: {error}") from error
-        pair = PairArrays(pixels_of(image), pixels_of(degraded.image[0]), _maps(degraded, depth))
+        pair = PairArrays(pixels_of(image), pixels_of(degraded.image[0]), maps_of(degraded, depth))
         try:
             data = encode_pair(pair, self.maps)
         except ValueError as error:
@@ -274,7 +267,8 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _maps(degraded: Degraded, depth: Tensor | None) -> dict[str, np.ndarray]:
+def maps_of(degraded: Degraded, depth: Tensor | None) -> dict[str, np.ndarray]:
+    """Return the maps of the first sample, and the depth (1, H, W), m, as `PairArrays` holds them."""
     maps = {"valid": degraded.valid[0, 0].numpy()}
     if depth is not None:
         maps[DEPTH] = depth[0].numpy()
@@ -360,65 +354,5 @@ def generate_pairs(
         UsageError: a worker was killed.
         Exception: any error of a worker, after the others have finished their units.
     """
-    if workers == 0:
-        use_one_thread()
-        yield from (storage.write(unit, generator) for unit in units)
-        return
-    pool = ProcessPoolExecutor(workers, mp_context=_context(), initializer=_start, initargs=(generator, storage))
-    pending = set[Future[list[PairRow]]]()
-    try:
-        for unit in units:
-            pending.add(pool.submit(_write, unit))
-            if len(pending) >= _QUEUED_UNITS * workers:
-                done, pending = wait(pending, return_when=FIRST_COMPLETED)
-                yield from (future.result() for future in done)
-        while pending:
-            done, pending = wait(pending, return_when=FIRST_COMPLETED)
-            yield from (future.result() for future in done)
-    except BrokenProcessPool as error:
-        raise UsageError(
-            f"workers must fit the memory, got {workers} of which one was killed; pairs that are written stay, and the "
-            "same command continues"
-        ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def use_one_thread() -> None:
-    """Limit PyTorch and OpenCV to one thread in this process."""
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-
-
-def _context() -> BaseContext:
-    """Choose the start method of workers: forking this process, which has threads, could hang."""
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return multiprocessing.get_context("spawn")
-    multiprocessing.set_forkserver_preload([__name__])  # imported once, not in each worker
-    return multiprocessing.get_context("forkserver")
-
-
-class _Worker:
-    """The state of a worker process between units."""
-
-    generator: PairGenerator
-    storage: PairStorage
-
-
-def _start(generator: PairGenerator, storage: PairStorage) -> None:
-    use_one_thread()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
-    _Worker.generator, _Worker.storage = generator, storage
-
-
-def _exit_with_parent() -> None:
-    """Exit if the parent is killed; otherwise the worker could write at the same time as the next run."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def _write(unit: Sequence[PairTask]) -> list[PairRow]:
-    return _Worker.storage.write(unit, _Worker.generator)
+    work = partial(storage.write, generator=generator)
+    return map_in_processes(work, units, workers=workers, preload=__name__)

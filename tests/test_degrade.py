@@ -1,0 +1,348 @@
+"""The command `degrade`: pictures and videos of a keyed draw, resumable, in processes."""
+
+import json
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from pycocotools.coco import COCO
+
+from torchrefract import key_of, presets, warp_boxes, warp_mask
+from torchrefract.data.images import read_image
+from torchrefract.data.media import read_video
+from torchrefract.data.pairs.files import decode_flow
+
+NAMES = ("a.png", "one/b.png", "one/two/c.bmp")
+TIMES_MS = (0, 40, 80, 600)
+
+
+def picture(height: int = 48, width: int = 96, seed: int = 0) -> np.ndarray:
+    """Return (H, W, 3), uint8, smooth enough for a video codec."""
+    y, x = np.mgrid[:height, :width]
+    waves = [127 + 100 * np.sin(x / (9 + c) + seed) * np.cos(y / (11 - c)) for c in range(3)]
+    return np.stack(waves, axis=-1).astype(np.uint8)
+
+
+def write(path: Path, pixels: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), pixels)
+
+
+def written(folder: Path) -> list[str]:
+    files = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    return sorted(file for file in files if not file.startswith("."))
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """Write pictures into raw/ and return the working folder."""
+    for i, name in enumerate(NAMES):
+        write(tmp_path / "raw" / name, picture(width=96 + 32 * i, seed=i))
+    return tmp_path
+
+
+WORDS = ("source=raw", "out=out", "scene=cheap_dashcam", "severity=4", "workers=0")
+
+
+def degraded(folder: Path, name: str, effect: Any, seed: int = 0) -> Any:
+    image = read_image(folder / "raw" / name)[None].contiguous()
+    return effect.degrade(image, seed=seed, keys=[key_of(name)])
+
+
+def test_pictures_keep_their_names_and_are_drawn_by_them(call, folder):
+    outcome = call("degrade", *WORDS, "seed=5")
+    assert outcome.out.splitlines()[0] == "out: 3 degraded, 0 already existed, 0 skipped"
+    assert (outcome.code, outcome.err) == (0, "")
+    assert written(folder / "out") == sorted([*NAMES, "config.json"])
+    for name in NAMES:
+        expected = degraded(folder, name, presets.cheap_dashcam(4), seed=5).image[0]
+        result = np.asarray(cv2.imread(str(folder / "out" / name)))[..., ::-1]
+        assert np.abs(result / 255 - expected.movedim(0, -1).numpy()).max() < 0.51 / 255 + 1e-5
+    # A file keeps its draw if it is the only one.
+    (folder / "raw" / "a.png").unlink()
+    assert call("degrade", *WORDS, "seed=5", "out=more").code == 0
+    assert (folder / "more" / NAMES[1]).read_bytes() == (folder / "out" / NAMES[1]).read_bytes()
+
+
+def test_a_stopped_run_is_resumed_with_the_same_bytes_in_processes(call, folder):
+    assert call("degrade", *WORDS).code == 0
+    complete = {name: (folder / "out" / name).read_bytes() for name in NAMES}
+    (folder / "out" / "a.png").unlink()
+    (folder / "out" / NAMES[1]).write_bytes(complete[NAMES[1]][:100])
+    outcome = call("degrade", *WORDS, "workers=2")
+    assert outcome.out.startswith("out: 2 degraded, 1 already existed, 0 skipped")
+    assert {name: (folder / "out" / name).read_bytes() for name in NAMES} == complete
+    message = call("degrade", *WORDS, "severity=3").message
+    assert message.startswith("out must be a folder of the same configuration, got out, where scene.severity is 4")
+
+
+def test_displacements_scale_with_the_width_of_each_picture_unless_a_width_is_given(call, folder):
+    words = ("source=raw", "scene=paper_refractive", "maps=true", "workers=0")
+    assert call("degrade", *words, "out=own").code == 0
+    assert call("degrade", *words, "out=given", "scene.width=640").code == 0
+    for out, width in (("own", None), ("given", 640)):
+        for i, name in enumerate(NAMES):
+            expected = degraded(folder, name, presets.paper_refractive(width=width or 96 + 32 * i))
+            data = (folder / out / "maps" / Path(name).with_suffix(".flow.png")).read_bytes()
+            flow, valid = (torch.from_numpy(array) for array in decode_flow(data))
+            assert torch.equal(valid, expected.valid[0, 0])
+            assert (flow - expected.flow[0]).abs()[:, valid].max() < 0.01
+
+
+def test_maps_are_those_of_the_effect(call, folder):
+    words = ("source=raw", "out=out", "scene=paper_weather", "workers=0", "maps=npz")
+    assert call("degrade", *words).code == 0
+    stems = [Path(name).with_suffix("").as_posix() for name in NAMES]
+    names = [f"images/{name}" for name in NAMES] + [f"maps/{stem}.maps.npz" for stem in stems]
+    assert written(folder / "out") == sorted([*names, "config.json"])
+    for name, stem in zip(NAMES, stems, strict=True):
+        expected = degraded(folder, name, presets.paper_weather())
+        with np.load(folder / "out" / "maps" / f"{stem}.maps.npz") as maps:
+            assert np.array_equal(maps["valid"], expected.valid[0, 0].numpy())
+            for kind in ("transmission", "intensity"):
+                assert (kind in maps) == expected.has(kind)
+                if expected.has(kind):
+                    np.testing.assert_allclose(maps[kind], getattr(expected, kind)[0, 0].numpy(), atol=1e-5)
+
+
+def test_fog_takes_depth_maps(call, folder):
+    for name in NAMES:
+        path = folder / "depth" / Path(name).with_suffix(".npy")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, np.full(picture(width=int(read_image(folder / "raw" / name).shape[2])).shape[:2], 30, np.float32))
+    words = ("source=raw", "scene=cape_town_fog", "workers=0")
+    assert "depth maps, as estimate_depth writes them, are better" in call("degrade", *words, "out=assumed").err
+    outcome = call("degrade", *words, "out=given", "depth=depth")
+    assert (outcome.code, outcome.err) == (0, "")
+    near = presets.cape_town_fog(depth=lambda image: torch.full_like(image[:, :1], 30.0))
+    for name in NAMES:
+        expected = degraded(folder, name, near).image[0]
+        assert (read_image(folder / "given" / name) - expected).abs().max() < 0.51 / 255 + 1e-4
+
+
+def video(path: Path) -> None:
+    """Write a video of unequal times with sound, which a player turns by 90 degrees."""
+    container: Any = av.open(str(path), "w")
+    with container:
+        stream, track = container.add_stream("libx264", rate=25), container.add_stream("aac", rate=48000, layout="mono")
+        stream.height, stream.width, stream.pix_fmt = 64, 96, "yuv420p"
+        stream.codec_context.time_base = stream.time_base = Fraction(1, 1000)
+        stream.set_display_matrix((0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30))
+        for k, t in enumerate(TIMES_MS):
+            # Later frames are darker: the color of fog must stay that of the first one.
+            pixels = (picture(64, 96, seed=k) * (1 - 0.2 * k)).astype(np.uint8)
+            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+            frame.pts, frame.time_base = t, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+        wave = (9000 * np.sin(np.arange(10240) / 17)).astype(np.float32)[None] / 32768
+        for start in range(0, 10240, 1024):
+            sound = av.AudioFrame.from_ndarray(wave[:, start : start + 1024], format="fltp", layout="mono")
+            sound.sample_rate, sound.pts = 48000, start
+            container.mux(track.encode(sound))
+        container.mux(track.encode(None))
+
+
+def decoded(path: Path, kind: str) -> list[Any]:
+    container: Any = av.open(str(path))
+    with container:
+        return list(container.decode(**{kind: 0}))
+
+
+@pytest.mark.parametrize("scene", ["cheap_dashcam", "cape_town_fog"])
+def test_a_video_is_one_clip_that_keeps_its_orientation_times_and_sound(call, tmp_path, scene):
+    video(tmp_path / "drive.mov")
+    words = ("source=drive.mov", "out=out", f"scene={scene}", "severity=5", "workers=0", "maps=npz")
+    assert call("degrade", *words).code == 0
+    source, target = tmp_path / "drive.mov", tmp_path / "out" / "images" / "drive.mp4"
+    clip = torch.stack([frame[0] for _, frame in read_video(source, range(4))])[None]
+    assert clip.shape == (1, 4, 3, 96, 64)  # upright
+    expected = getattr(presets, scene)(5).degrade(clip, seed=0, keys=[key_of("drive.mov")])
+    for (t, frame), image in zip(read_video(target, range(4)), expected.image[0], strict=True):
+        assert (frame[0] - image).abs().mean() < 0.02, t  # of the codec
+        with np.load(tmp_path / "out" / "maps" / "drive.mov" / f"{t:06d}.maps.npz") as maps:
+            name = "flow" if expected.has("flow") else "transmission"
+            np.testing.assert_allclose(maps[name].squeeze(), getattr(expected, name)[0, t].squeeze(), atol=1e-3)
+    first = np.asarray(cv2.VideoCapture(str(target)).read()[1])[..., ::-1]
+    assert np.abs(first / 255 - expected.image[0, 0].movedim(0, -1).numpy()).mean() < 0.02
+    assert [frame.time for frame in decoded(target, "video")] == pytest.approx([t / 1000 for t in TIMES_MS], abs=1e-3)
+    sounds = [np.concatenate([f.to_ndarray() for f in decoded(path, "audio")], axis=1) for path in (source, target)]
+    assert np.array_equal(sounds[0], sounds[1])
+    assert call("degrade", *words).out.startswith("out: 0 degraded, 1 already existed, 0 skipped")
+
+
+def test_a_picture_is_degraded_as_displayed_and_keeps_16_bits(call, tmp_path):
+    (tmp_path / "raw").mkdir()
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(picture()).save(tmp_path / "raw" / "phone.png", exif=exif)
+    write(tmp_path / "raw" / "deep.png", picture().astype(np.uint16) * 257)
+    assert call("degrade", *WORDS).code == 0
+    for name in ("phone.png", "deep.png"):
+        expected = degraded(tmp_path, name, presets.cheap_dashcam(4)).image[0]
+        bits = 16 if name == "deep.png" else 8
+        assert (read_image(tmp_path / "out" / name) - expected).abs().max() < 0.51 / (2**bits - 1) + 1e-5
+    assert expected.shape == (3, 48, 96)
+
+
+def test_what_is_no_picture_is_named_and_skipped(call, folder):
+    (folder / "raw" / "text.jpg").write_text("no picture")
+    outcome = call("degrade", *WORDS)
+    assert (outcome.code, outcome.out.splitlines()[0]) == (0, "out: 3 degraded, 0 already existed, 1 skipped")
+    assert outcome.err == "skipped: raw/text.jpg is not a JPEG, PNG, WebP or BMP image\n"
+
+
+def test_a_file_that_vanishes_during_a_run_is_named_and_degraded_by_the_next(call, folder, monkeypatch):
+    file, away = folder / "raw" / "one" / "b.png", folder / "away.png"
+    with monkeypatch.context() as patch:
+        patch.setattr("torchrefract.data.media.describe_losses", lambda *_, **__: [file.rename(away)][1:])
+        outcome = call("degrade", *WORDS, "workers=1")
+    assert outcome.code == 1
+    reason = "raw/one/b.png cannot be opened (No such file or directory)"
+    assert outcome.err.splitlines() == [
+        f"skipped: {reason}",
+        f"error: source must stay unchanged during a run, got {reason}; the same command tries them again",
+    ]
+    away.rename(file)
+    assert call("degrade", *WORDS).out.startswith("out: 1 degraded, 2 already existed, 0 skipped")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("source=empty",), "source must be, or hold, .jpg, .jpeg, .png,"),
+        (("source=no.png",), "source must hold a file that can be degraded, got no.png is not a JPEG, PNG, WebP"),
+        (("out=raw",), "out must be another folder than that of source, got raw"),
+        (("out=other",), "out must be a new folder or one of this command, got other, which holds a.png"),
+        (("severity=6",), "scene: severity must be one of 1, 2, 3, 4, 5, got 6"),
+        (("maps=jpg",), "maps: maps must be one of png, npz, safetensors, got 'jpg'"),
+        (("labels=empty",), "labels must be a COCO JSON, or a folder of YOLO files (.txt) or masks (.png), got empty"),
+        (("severities=3",), "an option must be one of source, out, severity, labels,"),
+    ],
+)
+def test_an_invalid_option_is_one_line_of_error(call, folder, words, message):
+    (folder / "empty").mkdir()
+    (folder / "no.png").write_text("no picture")
+    write(folder / "other" / "a.png", picture())
+    before = written(folder)
+    given = {word.split("=")[0] for word in words}
+    outcome = call("degrade", *(word for word in WORDS if word.split("=")[0] not in given), *words)
+    assert outcome.code == 1
+    assert outcome.err.splitlines()[-1].startswith(f"error: {message}")
+    assert [name for name in written(folder) if name != "out/config.json"] == before  # nothing is lost
+
+
+def coco(folder: Path, **changes: Any) -> Path:
+    """Write a COCO JSON of the pictures, each with a box in the middle and one in a corner."""
+    images, annotations = [], []
+    for i, name in enumerate(NAMES):
+        width = 96 + 32 * i
+        images.append({"id": 7 * i, "file_name": name, "height": 48, "width": width})
+        for k, (x, y) in enumerate([(width / 2 - 10, 14.0), (0.0, 0.0)]):
+            box = {"bbox": [x, y, 20.0, 18.0], "area": 360.0, "category_id": 3, "iscrowd": 0}
+            annotations.append({"id": 10 * i + k, "image_id": 7 * i, **box})
+    document = {"info": {"year": 2026}, "images": images, "annotations": annotations, "categories": [{"id": 3}]}
+    (folder / "boxes.json").write_text(json.dumps(document | changes))
+    return folder / "boxes.json"
+
+
+def test_labels_of_coco_follow_the_flow_of_their_picture_also_after_a_resume(call, folder, capsys):
+    coco(folder)
+    words = (*WORDS, "labels=boxes.json")
+    assert call("degrade", *words).out.splitlines()[0].endswith("0 skipped; 0 labels left the frame")
+    complete = (folder / "out" / "labels" / "boxes.json").read_bytes()
+    labels = COCO(folder / "out" / "labels" / "boxes.json")
+    capsys.readouterr()
+    for i, name in enumerate(NAMES):
+        flow = degraded(folder, name, presets.cheap_dashcam(4)).flow[0]
+        x, y = (96 + 32 * i) / 2 - 10.5, 13.5
+        expected, _ = warp_boxes(torch.tensor([[x, y, x + 20, y + 18], [-0.5, -0.5, 19.5, 17.5]]), flow)
+        rows = labels.loadAnns(labels.getAnnIds(imgIds=[7 * i]))
+        boxes = torch.tensor([row["bbox"] for row in rows])
+        torch.testing.assert_close(boxes[:, :2], expected[:, :2] + 0.5, atol=2e-3, rtol=0)
+        torch.testing.assert_close(boxes[:, 2:], expected[:, 2:] - expected[:, :2], atol=2e-3, rtol=0)
+        assert [row["area"] for row in rows] == pytest.approx(boxes[:, 2:].prod(dim=1).tolist(), rel=1e-3)
+        assert labels.loadImgs([7 * i])[0]["file_name"] in written(folder / "out" / "images")
+    # A run that was killed leaves a picture without its line, and a line without its end.
+    journal = folder / "out" / ".labels.jsonl"
+    lines = journal.read_text().split("\n")
+    journal.write_text("\n".join(lines[:-1]) + "\n" + lines[-1][:30])
+    (folder / "out" / "labels" / "boxes.json").unlink()
+    assert call("degrade", *words).out.startswith("out: 1 degraded, 2 already existed, 0 skipped")
+    assert (folder / "out" / "labels" / "boxes.json").read_bytes() == complete
+
+
+def test_a_picture_without_result_is_left_out_of_the_labels(call, folder):
+    coco(folder)
+    (folder / "raw" / "a.png").write_text("no picture")
+    write(folder / "raw" / "new.png", picture())
+    outcome = call("degrade", *WORDS, "labels=boxes.json")
+    assert outcome.err.splitlines() == [
+        "warning: labels do not list 1 of the files: new.png",
+        "skipped: raw/a.png is not a JPEG, PNG, WebP or BMP image",
+    ]
+    document = json.loads((folder / "out" / "labels" / "boxes.json").read_text())
+    assert [image["file_name"] for image in document["images"]] == [*NAMES[1:]]
+    assert {annotation["image_id"] for annotation in document["annotations"]} == {7, 14}
+
+
+@pytest.mark.parametrize("kind", ["yolo", "masks"])
+def test_labels_in_a_folder_are_written_under_the_names_of_their_pictures(call, folder, kind):
+    for name in NAMES:
+        path = folder / "labels" / Path(name).with_suffix(".txt" if kind == "yolo" else ".png")
+        ids = np.zeros(read_image(folder / "raw" / name).shape[1:], np.uint8)
+        ids[12:36, 24:72] = 7
+        write(path.with_suffix(".png"), ids)
+        if kind == "yolo":
+            path.with_suffix(".png").unlink()
+            path.write_text(f"4 {48 / ids.shape[1]} 0.5 {48 / ids.shape[1]} 0.5\n")
+    assert call("degrade", *WORDS, "labels=labels").code == 0
+    for name in NAMES:
+        flow = degraded(folder, name, presets.cheap_dashcam(4)).flow[0]
+        path = folder / "out" / "labels" / Path(name).with_suffix(".txt" if kind == "yolo" else ".png")
+        if kind == "masks":
+            source = cv2.imread(str(folder / "labels" / Path(name).with_suffix(".png")), cv2.IMREAD_UNCHANGED)
+            expected = warp_mask(torch.from_numpy(np.asarray(source))[None], flow)[0].numpy()
+            assert np.array_equal(np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)), expected)
+        else:
+            label, *numbers = path.read_text().split()
+            x, y, w, h = (float(n) * side for n, side in zip(numbers, [flow.shape[2], 48] * 2, strict=True))
+            box, _ = warp_boxes(torch.tensor([[23.5, 11.5, 71.5, 35.5]]), flow)
+            expected = (box[0] + 0.5).tolist()
+            assert label == "4"
+            assert [x - w / 2, y - h / 2, x + w / 2, y + h / 2] == pytest.approx(expected, abs=2e-3)
+
+
+def test_labels_that_name_no_picture_are_an_error_before_anything_is_written(call, folder):
+    coco(folder)
+    (folder / "raw" / "a.png").unlink()
+    message = call("degrade", *WORDS, "labels=boxes.json").message
+    assert message == (
+        "labels must name pictures of source, got a.png in boxes.json, which source does not hold; give the folder "
+        "that these names are relative to, or remove them"
+    )
+    (folder / "labels").mkdir()
+    (folder / "labels" / "z.txt").write_text("0 0.5 0.5 0.1 0.1\n")
+    assert call("degrade", *WORDS, "labels=labels").message.startswith("labels must name pictures of source, got z.txt")
+    assert not (folder / "out").exists()
+
+
+def test_pictures_that_would_share_labels_or_maps_are_an_error(call, folder):
+    write(folder / "raw" / "one" / "b.jpg", picture())
+    message = call("degrade", *WORDS, "maps=true").message
+    assert message.startswith("source must hold pictures whose names differ in more than their extension")
+    assert message.endswith("got two of one/b")
+    assert call("degrade", *WORDS).code == 0
+
+
+def test_the_settings_are_kept_beside_the_pictures(call, folder):
+    assert call("degrade", *WORDS).code == 0
+    settings = json.loads((folder / "out" / "config.json").read_text())["settings"]
+    assert settings["scene"] == {"_target_": "torchrefract.presets.cheap_dashcam", "severity": 4}
+    assert (settings["source"], settings["seed"]) == (str(folder / "raw"), 0)

@@ -1,0 +1,284 @@
+"""The command that degrades pictures and videos, and moves the labels of pictures along."""
+
+import json
+import sys
+import time
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from torchrefract._io import replace_file
+from torchrefract._validation import UsageError, check_choice, check_count, check_positive
+from torchrefract.cli.command import check_none_lost, check_seed, make, naming, progress, warn_of_assumed_depth
+from torchrefract.data import media
+from torchrefract.data.depth_maps import DepthFolder
+from torchrefract.data.frames import first_names
+from torchrefract.data.images import is_lost, pixels_of, read_image
+from torchrefract.data.label_files import (
+    Annotation,
+    CocoAnnotations,
+    CocoLabels,
+    LabelFolder,
+    PictureLabels,
+    read_labels,
+)
+from torchrefract.data.pairs.files import FORMATS, encode_maps
+from torchrefract.data.pairs.generator import maps_of
+from torchrefract.data.pairs.manifest import claim, locked
+from torchrefract.data.workers import map_in_processes, num_cores
+from torchrefract.effects.base import Effect
+from torchrefract.random import key_of
+from torchrefract.types import Degraded
+
+_JOURNAL = ".labels.jsonl"  # annotations of finished pictures, for the next run
+
+
+class _Task(NamedTuple):
+    file: Path
+    name: str  # relative to the source, with forward slashes
+    labels: PictureLabels | None
+
+
+class _Result(NamedTuple):
+    file: Path
+    name: str
+    num_frames: int = 0
+    num_dropped: int = 0  # labels that left the frame
+    annotations: list[Annotation] | None = None  # for a COCO JSON
+    error: str = ""
+    is_lost: bool = False  # the file vanished
+
+
+class Degrader(NamedTuple):
+    """Degrades one file at a time, in any order and process; a file that cannot be read becomes an error."""
+
+    scene: str  # configuration of the effect, as JSON
+    has_width: bool  # the effect takes the width of each file
+    seed: int
+    depth: DepthFolder | None
+    maps: str | None  # their format
+    out: Path
+    is_alone: bool  # neither labels nor maps are written
+
+    def target(self, name: str) -> Path:
+        """Return the path of a degraded file."""
+        return self.out / ("" if self.is_alone else "images") / media.output_name(Path(name))
+
+    def __call__(self, task: _Task) -> _Result:
+        """Degrade a file; write its labels and maps first, so that a complete file has them."""
+        target = self.target(task.name)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with torch.no_grad(), replace_file(target, alone=True) as path:
+                return self._video(task, path) if media.is_video(task.file) else self._picture(task, path)
+        except (ValueError, TypeError) as error:
+            reason = str(error) if str(task.file) in str(error) else f"{task.file}: {error}"
+            return _Result(task.file, task.name, error=reason, is_lost=is_lost(error))
+
+    def _picture(self, task: _Task, path: Path) -> _Result:
+        image = read_image(task.file)[None].contiguous()
+        with _no_warnings():
+            options = {"seed": self.seed, "keys": [key_of(task.name)], "depth": self._depth(task.name, image)}
+            degraded = self._effect(image).degrade(image, **options)
+        result = _Result(task.file, task.name, num_frames=1)
+        if task.labels:
+            has_flow = degraded.has("flow") and bool(degraded.flow.any())
+            height, width = image.shape[2:]
+            content, num_dropped = task.labels.move(degraded.flow[0] if has_flow else None, (height, width))
+            result = result._replace(num_dropped=num_dropped)
+            if isinstance(task.labels, CocoAnnotations):
+                result = result._replace(annotations=content)
+            else:
+                _write(self.out / "labels" / PurePosixPath(task.name).with_suffix(task.labels.path.suffix), content)
+        self._write_maps(degraded, PurePosixPath(task.name).with_suffix(""))
+        media.write_picture(degraded.image[0], path, source=task.file)
+        return result
+
+    def _video(self, task: _Task, path: Path) -> _Result:
+        def change(frames: Iterable[Tensor]) -> Iterator[np.ndarray]:
+            effect = params = None
+            for t, frame in enumerate(frames):
+                with _no_warnings():
+                    # What the draw reads from the image, such as the color of its sky, must not change in a clip.
+                    if effect is None:
+                        effect = self._effect(frame)
+                        params = effect.sample(frame, seed=self.seed, keys=[key_of(task.name)])
+                    degraded = effect.apply(frame, params, frame=t, depth=self._depth(task.name, frame, t))
+                self._write_maps(degraded, PurePosixPath(task.name, f"{t:06d}"))
+                yield pixels_of(degraded.image[0])
+
+        return _Result(task.file, task.name, num_frames=media.convert_video(task.file, path, change=change))
+
+    def _effect(self, image: Tensor) -> Effect:
+        return _make_effect(self.scene, image.shape[3] if self.has_width else None)
+
+    def _depth(self, name: str, image: Tensor, frame: int | None = None) -> Tensor | None:
+        height, width = image.shape[2:]
+        return self.depth and self.depth.read(name, frame, frame_size=(height, width), size=None)[None]
+
+    def _write_maps(self, degraded: Degraded, stem: PurePosixPath) -> None:
+        for suffix, data in encode_maps(maps_of(degraded, None), self.maps).items() if self.maps else ():
+            _write(self.out / "maps" / f"{stem}.{suffix}", data)
+
+
+@lru_cache(maxsize=16)
+def _make_effect(scene: str, width: int | None) -> Effect:
+    return instantiate(json.loads(scene) | ({} if width is None else {"width": width}))
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replace_file(path, alone=True) as temporary:
+        temporary.write_bytes(data)
+
+
+@contextmanager
+def _no_warnings() -> Iterator[None]:
+    """Silence warnings of effects: the command warns of an assumed depth itself, and maps show folded pixels."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield
+
+
+def degrade(cfg: DictConfig) -> None:
+    """Degrade the pictures and videos that are not in the output folder yet; print their number and the rate."""
+    source, out = (Path(str(path)).expanduser() for path in (cfg.source, cfg.out))
+    files = media.find_media(source, deep=True, name="source")
+    media.check_output_folder(out, source, deep=True, name="source")
+    root = source if source.is_dir() else source.parent
+    names = {file.relative_to(root).as_posix(): file for file in files}
+    pictures = [name for name, file in names.items() if not media.is_video(file)]
+    labels = _labels(cfg, pictures)
+    job = _job(cfg, out, pictures, labels)
+    with naming("workers"):
+        workers = num_cores() if cfg.workers is None else check_count("workers", cfg.workers, low=0)
+    with naming("out"):
+        claim(out, _settings(cfg, root, job, labels), count=0, about={})
+    with locked("out", out):
+        finished = {name for name, _ in _read_journal(out)}
+        tasks = [
+            _Task(file, name, labels.of(name) if labels and not media.is_video(file) else None)
+            for name, file in names.items()
+        ]
+        missing = [
+            task
+            for task in tasks
+            if not media.is_complete(task.file, job.target(task.name))
+            or (isinstance(labels, CocoLabels) and task.labels and task.name not in finished)
+        ]
+        _warn([task.file for task in missing], tasks, labels)
+        _degrade_missing(missing, job, workers=min(workers, len(missing)), names=names)
+        if isinstance(labels, CocoLabels):
+            moved = dict(_read_journal(out))
+            content = labels.with_moved({name: moved[name] for name in pictures if name in moved})
+            _write(out / "labels" / labels.path.name, content)
+
+
+def _degrade_missing(missing: Sequence[_Task], job: Degrader, *, workers: int, names: dict[str, Path]) -> None:
+    start, num_frames, num_dropped = time.perf_counter(), 0, 0
+    failed = list[_Result]()
+    results = map_in_processes(job, missing, workers=workers, preload=__name__) if missing else ()
+    for result in progress(results, "degrading", count=len(missing)):
+        num_frames, num_dropped = num_frames + result.num_frames, num_dropped + result.num_dropped
+        if result.error:
+            failed.append(result)
+            print(f"skipped: {result.error}", file=sys.stderr)
+        elif result.annotations is not None:
+            with (job.out / _JOURNAL).open("a", encoding="utf-8") as journal:
+                # The line before may be incomplete, if its run was killed.
+                journal.write("\n" + json.dumps([result.name, result.annotations]))
+    if len(failed) == len(names):
+        raise UsageError(f"source must hold a file that can be degraded, got {failed[0].error}")
+    rate = num_frames / (time.perf_counter() - start)
+    num_degraded, num_existing = len(missing) - len(failed), len(names) - len(missing)
+    dropped = f"; {num_dropped} labels left the frame" if any(task.labels for task in missing) else ""
+    print(f"{job.out}: {num_degraded} degraded, {num_existing} already existed, {len(failed)} skipped{dropped}")
+    print(f"{num_frames} frames, {rate:.3g} frames a second")
+    check_none_lost([result.error for result in failed if result.is_lost], name="source")
+
+
+def _labels(cfg: DictConfig, pictures: Sequence[str]) -> CocoLabels | LabelFolder | None:
+    """Read the labels and check that each is of a picture."""
+    if cfg.labels is None:
+        return None
+    with naming("mask_fill"):
+        fill = check_count("mask_fill", cfg.mask_fill, low=0)
+    with naming("labels"):
+        labels = read_labels(Path(str(cfg.labels)).expanduser(), fill=fill)
+    labels.check(pictures)
+    return labels
+
+
+def _job(cfg: DictConfig, out: Path, pictures: Sequence[str], labels: CocoLabels | LabelFolder | None) -> Degrader:
+    if cfg.severity is not None:
+        cfg.scene.severity = cfg.severity
+    effect = make(cfg, "scene")
+    if not isinstance(effect, Effect):
+        raise UsageError(f"scene must be an effect of torchrefract, got {effect}")
+    with naming("maps"):
+        maps = {True: "png", False: None}.get(cfg.maps, cfg.maps)
+        maps = maps if maps is None else check_choice("maps", maps, FORMATS)
+    depth = None
+    if cfg.depth is None:
+        warn_of_assumed_depth(effect)
+    else:
+        with naming("depth_scale"):
+            depth = DepthFolder(Path(str(cfg.depth)).expanduser(), check_positive("depth_scale", cfg.depth_scale))
+        depth.check((name, None) for name in pictures)
+    if maps or labels:
+        stems = Counter(str(PurePosixPath(name).with_suffix("")) for name in pictures)
+        if repeated := sorted(stem for stem, count in stems.items() if count > 1):
+            raise UsageError(
+                "source must hold pictures whose names differ in more than their extension, for the names of their "
+                f"labels and maps, got two of {first_names(repeated)}"
+            )
+    is_given = any(word.lstrip("+").startswith("scene.width=") for word in HydraConfig.get().overrides.task)
+    scene = json.dumps(OmegaConf.to_container(cfg.scene, resolve=True))
+    has_width = "width" in cfg.scene and not is_given
+    return Degrader(scene, has_width, check_seed(cfg.seed), depth, maps, out, not (maps or labels))
+
+
+def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: CocoLabels | LabelFolder | None) -> dict[str, Any]:
+    """Return everything that decides the output, so that a folder is only continued with the same settings."""
+    return {
+        "source": str(root.resolve()),
+        "scene": json.loads(job.scene),
+        "width": "of each file" if job.has_width else None,
+        "seed": job.seed,
+        "maps": job.maps,
+        "depth": job.depth and [str(job.depth.root.resolve()), job.depth.scale],
+        "labels": labels and labels.digest(),
+        "mask_fill": labels and cfg.mask_fill,
+    }
+
+
+def _warn(missing: Sequence[Path], tasks: Sequence[_Task], labels: CocoLabels | LabelFolder | None) -> None:
+    messages = media.describe_losses(missing, upright=True)
+    if labels:
+        messages.append(media.describe_turned(missing, upright=True))
+        without = [t.name for t in tasks if not t.labels and (media.is_video(t.file) or isinstance(labels, CocoLabels))]
+        messages.append(f"labels do not list {len(without)} of the files: {first_names(without)}" if without else "")
+    for message in filter(None, messages):
+        print(f"warning: {message}", file=sys.stderr)
+
+
+def _read_journal(out: Path) -> Iterator[tuple[str, list[Annotation]]]:
+    """Yield the name and the moved annotations of each finished picture; ignore a line that a kill cut off."""
+    path = out / _JOURNAL
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
+        try:
+            name, annotations = json.loads(line)
+        except ValueError:
+            continue
+        yield name, annotations

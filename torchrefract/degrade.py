@@ -1,0 +1,32 @@
+"""Degrade pictures and videos: `python -m torchrefract.degrade source=DIR out=DIR scene=NAME severity=3`.
+
+Writes the degraded files under their names; files that exist already are kept. The draw of a file depends on its name
+and the seed alone. A video is one clip: its lens stays, its fog moves with the wind. With labels or maps, pictures lie
+in out/images, labels in out/labels and maps in out/maps.
+
+Options:
+    source=PATH             picture, video, or folder of them with its subfolders, required
+    out=DIR                 output folder, required
+    scene=NAME              degradation, required: cheap_dashcam, cape_town_fog, unpaved_road, paper_weather, ...
+    severity=3              1 (barely visible) to 5
+    labels=PATH             of the pictures: COCO JSON, folder of YOLO txt files, or folder of masks of the same names
+    mask_fill=0             id of the pixels of a mask that show nothing of the clean picture
+    maps=false              true writes flow, transmission and masks as PNG, as generate does; or npz, safetensors
+    depth=DIR               folder of depth maps, as estimate_depth writes
+    seed=0                  of the draws
+    workers=N               processes, each of which degrades one file at a time; default: one for each core
+
+Examples:
+    python -m torchrefract.degrade source=drive.mp4 out=fog scene=cape_town_fog
+    python -m torchrefract.degrade source=val2017 labels=instances_val2017.json out=lens scene=cheap_dashcam severity=5
+
+Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
+`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'source=my drive (1).mp4'`.
+"""
+
+from torchrefract.cli.entry import command
+
+main = command("degrade", __doc__, "degradation:degrade")
+
+if __name__ == "__main__":
+    main()

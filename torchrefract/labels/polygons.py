@@ -54,7 +54,8 @@ def _divide(polygon: Tensor) -> Tensor:
     steps = polygon.roll(-1, dims=0) - polygon
     counts = (steps.norm(dim=1) / _STEP_PX).ceil().clamp(min=1).long()
     first = counts.cumsum(0) - counts
-    share = (torch.arange(int(counts.sum())) - first.repeat_interleave(counts)) / counts.repeat_interleave(counts)
+    index = torch.arange(int(counts.sum()), device=polygon.device)
+    share = (index - first.repeat_interleave(counts)) / counts.repeat_interleave(counts)
     return polygon.repeat_interleave(counts, dim=0) + share[:, None] * steps.repeat_interleave(counts, dim=0)
 
 

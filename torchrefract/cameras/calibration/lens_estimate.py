@@ -98,7 +98,9 @@ def radial_lens_of_flow(flow: Tensor, *, aspect: float | None = None) -> Tensor:
     """
     height, width = check_flow("flow", flow).shape[2:]
     stretch = (aspect or width / height) * height / width  # of the flow's pixels, x / y
-    y, x = (torch.linspace(0, side - 1, _FLOW_GRID, dtype=torch.float64).round() for side in (height, width))
+    y, x = (
+        torch.linspace(0, side - 1, _FLOW_GRID, dtype=torch.float64, device="cpu").round() for side in (height, width)
+    )
     u, v = flow.detach().cpu().double()[0][:, y.long()][:, :, x.long()]
     half_diagonal = math.hypot(width * stretch, height) / 2
     x, y = (x - (width - 1) / 2) * stretch / half_diagonal, (y - (height - 1) / 2)[:, None] / half_diagonal
@@ -143,7 +145,7 @@ def _to_estimate(chains: Chains, prior: Gaussian, num_frames: int, focal: float)
     fit, (height, width) = fit_lens(chains, prior), chains.size
     # k1 r^2 stays if r is counted in focal lengths instead of half diagonals.
     scale = focal / (math.hypot(height, width) / 2)
-    units = torch.tensor([scale**2, scale**4], dtype=torch.float64)
+    units = torch.tensor([scale**2, scale**4], dtype=torch.float64, device="cpu")
     k1, k2 = (fit.coefficients * units).tolist()
     camera = Camera(
         width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2,

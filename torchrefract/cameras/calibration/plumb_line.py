@@ -79,7 +79,9 @@ def published_prior() -> Gaussian:
     """Return the distribution of published lenses, centered at no distortion; a barrel mostly has a positive k2."""
     variance = _PRIOR_K1**2
     rows = [[variance, _SLOPE * variance], [_SLOPE * variance, _SLOPE**2 * variance + _PRIOR_K2**2]]
-    return Gaussian(torch.zeros(2, dtype=torch.float64), torch.tensor(rows, dtype=torch.float64))
+    return Gaussian(
+        torch.zeros(2, dtype=torch.float64, device="cpu"), torch.tensor(rows, dtype=torch.float64, device="cpu")
+    )
 
 
 def find_chains(gray: np.ndarray) -> Tensor:
@@ -124,8 +126,9 @@ def pool_chains(chains: Sequence[Tensor], size: tuple[int, int]) -> Chains:
         chains: of each frame, by `find_chains`.
         size: height and width of the frames, px.
     """
-    points = torch.cat([*chains, torch.empty(0, NUM_POINTS, 2, dtype=torch.float64)])
-    frame = torch.cat([torch.full((len(c),), i) for i, c in enumerate(chains)] + [torch.empty(0, dtype=torch.long)])
+    points = torch.cat([*chains, torch.empty(0, NUM_POINTS, 2, dtype=torch.float64, device="cpu")])
+    counts = torch.tensor([len(of_frame) for of_frame in chains], dtype=torch.int64, device="cpu")
+    frame = torch.arange(len(counts), device="cpu").repeat_interleave(counts)
     half_diagonal, center = _frame(size)
     chord = points[:, -1] - points[:, 0]
     normal = torch.stack([-chord[:, 1], chord[:, 0]], dim=1) / chord.norm(dim=1, keepdim=True)
@@ -261,13 +264,13 @@ def _is_static(points: Tensor, frame: Tensor, num_frames: int, size: tuple[int, 
 def _frame(size: tuple[int, int]) -> tuple[float, Tensor]:
     """Return the half diagonal, px, and the center (2,) of a frame."""
     height, width = size
-    center = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
+    center = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64, device="cpu")
     return math.hypot(height, width) / 2, center
 
 
 def _polynomials(count: int, number: int) -> Tensor:
     """Return orthonormal polynomials of degrees 0, 1, ... at evenly spaced points, (count, number)."""
-    t = torch.linspace(-1, 1, count, dtype=torch.float64)
+    t = torch.linspace(-1, 1, count, dtype=torch.float64, device="cpu")
     basis, triangle = torch.linalg.qr(torch.stack([t**i for i in range(number)], dim=1))
     return basis * triangle.diagonal().sign()
 
@@ -298,7 +301,7 @@ def _line_errors(points: Tensor, coefficients: Tensor, size: tuple[int, int]) ->
 @cache
 def _lens_grid() -> Tensor:
     """Return lenses (G, 2) that do not fold back inside the frame."""
-    lenses = torch.tensor([(k1, _SLOPE * k1 + k2) for k1 in _K1 for k2 in _K2], dtype=torch.float64)
+    lenses = torch.tensor([(k1, _SLOPE * k1 + k2) for k1 in _K1 for k2 in _K2], dtype=torch.float64, device="cpu")
     return torch.stack([lens for lens in lenses if covers_frame(lens)])
 
 
@@ -334,8 +337,8 @@ def _bootstrap(table: Tensor, prior_cost: Tensor, frame: Tensor) -> Tensor:
     groups = frame.unique(return_inverse=True)[1]
     number = int(groups.max()) + 1 if len(groups) else 1
     if number < _MIN_FRAMES:
-        groups, number = torch.arange(len(frame)), max(1, len(frame))
-    drawn = torch.randint(number, (_NUM_BOOTSTRAPS, number), generator=torch.Generator().manual_seed(0))
+        groups, number = torch.arange(len(frame), device="cpu"), max(1, len(frame))
+    drawn = torch.randint(number, (_NUM_BOOTSTRAPS, number), generator=torch.Generator().manual_seed(0), device="cpu")
     counts = torch.stack([row.bincount(minlength=number) for row in drawn]).to(table.dtype)
     return torch.softmax(-(table @ counts[:, groups].T + prior_cost[:, None]), dim=0).mean(dim=1)
 

@@ -182,7 +182,7 @@ class Trained(NamedTuple):
 def small() -> tuple[str, ...]:
     """Return arguments of a training that takes seconds."""
     data = ("data.train_count=32", "data.val_count=16", "data.batch_size=8", "data.size=[32,64]", "data.workers=0")
-    return (*data, "trainer.max_epochs=2", "model.network.encoder=tu-mobilenetv3_small_050")
+    return (*data, "trainer.max_epochs=2", "model=resunet", "model.network.encoder=tu-mobilenetv3_small_050")
 
 
 @pytest.fixture(scope="session")

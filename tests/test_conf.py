@@ -65,7 +65,7 @@ def test_every_task_builds_its_data_and_its_model(tmp_path, task):
 CAT256 = 113_673_219 + 4 * 128 * 9 - (128 * 9 + 1)
 
 
-@pytest.mark.parametrize(("name", "millions"), [("ddpm", 35.75), ("ddpm_cat256", CAT256 / 1e6)])
+@pytest.mark.parametrize(("name", "millions"), [("ddpm_image", 35.75), ("ddpm_cat256", CAT256 / 1e6)])
 def test_a_diffusion_model_has_its_size_and_the_defaults_of_its_class(tmp_path, name, millions):
     cfg = compose_training(tmp_path, "+task=undistort", f"model={name}", "seed=5")
     with torch.device("meta"):
@@ -76,14 +76,16 @@ def test_a_diffusion_model_has_its_size_and_the_defaults_of_its_class(tmp_path, 
     names = ["lr", "weight_decay", "warmup_steps", "schedule", "metric_size", "sampler", "steps", "val_steps", "crop"]
     for option in (*names, "ema_decay"):
         assert getattr(model, option) == getattr(default, option)
-    assert model.prediction == {"ddpm": "v_prediction", "ddpm_cat256": "epsilon"}[name]
+    assert model.prediction == {"ddpm_image": "v_prediction", "ddpm_cat256": "epsilon"}[name]
 
 
 # Each model once, with a network that trains in a second.
 TINY = {
     ("resunet", "deweather"): ["model.network.encoder=tu-resnet10t"],
     ("segformer", "undistort"): ["model.network.encoder=mit_b0"],
-    ("ddpm", "undistort"): [
+    ("lens_net", "undistort"): ["model.network.weightings=2", "model.network.lenses=3"],
+    ("ddpm", "undistort"): ["model.network.widths=[32,32]", "model.network.weightings=2", "model.samples=2"],
+    ("ddpm_image", "undistort"): [
         "model.network.widths=[8,8]",
         "model.network.attention=[false,true]",
         "model.network.groups=4",
@@ -114,13 +116,15 @@ def test_the_test_above_covers_every_model():
     assert sorted(model for model, _ in TINY) == options("model")
 
 
-@pytest.mark.parametrize("model", ["resunet", "segformer"])
-def test_a_model_has_the_defaults_of_its_class(tmp_path, model):
+@pytest.mark.parametrize(
+    ("model", "own"), [("lens_net", {"lr"}), ("resunet", set()), ("segformer", set()), ("ddpm", set())]
+)
+def test_a_model_has_the_defaults_of_its_class(tmp_path, model, own):
     cfg = compose_training(tmp_path, "+task=undistort", f"model={model}").model
     network = instantiate(cfg.network)
     for builder, given in ((get_class(cfg._target_), cfg), (network.func, network.keywords)):
         for name, parameter in inspect.signature(builder).parameters.items():
-            if parameter.default is not parameter.empty and name != "smooth":  # the task decides it
+            if parameter.default is not parameter.empty and name not in own | {"smooth"}:  # by the task
                 assert given[name] == parameter.default, name
 
 
@@ -142,7 +146,8 @@ def test_every_trainer_writes_into_the_run_folder(tmp_path, trainer):
     assert built.checkpoint_callback.dirpath == str(tmp_path)  # pyright: ignore[reportAttributeAccessIssue]  # a ModelCheckpoint
     assert built.logger is not None
     assert Path(built.logger.log_dir or "") == tmp_path
-    assert built.max_epochs == 6
+    assert built.max_epochs == 16
+    assert compose_training(tmp_path, "+task=deweather", f"trainer={trainer}").trainer.max_epochs == 6
     assert type(built.strategy).__name__ == {"cpu": "SingleDeviceStrategy", "ddp": "DDPStrategy"}[trainer]
 
 

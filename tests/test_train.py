@@ -26,7 +26,12 @@ from torchrefract.restoration.metrics import endpoint_error, psnr
 from torchrefract.restoration.module import Restoration
 
 FILES = ["best.ckpt", "config.yaml", "curves.png", "last.ckpt", "metrics.csv", "panel.png"]
-DDPM = ("model=ddpm", "model.network.widths=[8,16]", "model.network.attention=[false,true]", "model.network.layers=1")
+DDPM = (
+    "model=ddpm_image",
+    "model.network.widths=[8,16]",
+    "model.network.attention=[false,true]",
+    "model.network.layers=1",
+)
 DDPM += ("model.network.groups=4", "model.val_steps=3", "model.lr=0.002", "data.train_count=16", "data.val_count=8")
 DDPM += ("data.batch_size=8", "data.size=[16,32]", "data.workers=0")
 
@@ -226,7 +231,7 @@ def test_a_finished_run_cannot_be_resumed(call, trained):
     ],
 )
 def test_an_invalid_option_is_one_line_of_error(call, small, words, message):
-    options = [word for word in small if not word.startswith("model.")] if "model=ddpm" in words else small
+    options = [word for word in small if not word.startswith("model.")] if "model=ddpm_image" in words else small
     assert call("train", *options, *words).message.startswith(message)
 
 

@@ -1,4 +1,4 @@
-"""Conditional diffusion: sample the flow or the clean image from noise, given the degraded image."""
+"""Conditional diffusion of images, pixel by pixel: `model=ddpm_image` and the paper's `model=ddpm_cat256`."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -29,7 +29,35 @@ _NOISE_WEIGHT = 0.8
 _MU = 100.0
 
 
-class Diffusion(RestorationModule):
+class AveragedRestoration(RestorationModule, ABC):
+    """Validate, save and apply a moving average of the trained weights; draw noise by seed, step and key.
+
+    Args:
+        network, task, lr, weight_decay, warmup_steps, schedule, metric_size: see `RestorationModule`.
+        ema_decay: upper limit of the decay of the moving average, which is (1 + n) / (10 + n) after n steps.
+        seed: seed of all draws.
+    """
+
+    def __init__(self, network: nn.Module, task: Task, *, ema_decay: float, seed: int, **options: Any):
+        super().__init__(network, task, **options)
+        self.ema_decay = check_number("ema_decay", ema_decay, low=0.0, high=1.0)
+        self.seed = check_count("seed", seed, low=0)
+
+    def configure_callbacks(self) -> list[Callback]:
+        """Add the moving average of the weights to a training."""
+        return [WeightAveraging(avg_fn=self._average)] if self.trainer.state.fn == TrainerFn.FITTING else []
+
+    def _average(self, average: Tensor, new: Tensor, count: Tensor) -> Tensor:
+        # With a constant decay, a short training would end near its initial weights.
+        decay = ((1 + count) / (10 + count)).clamp(max=self.ema_decay)
+        return torch.lerp(average, new, (1 - decay).to(average.dtype))
+
+    def _stream(self, key: Tensor, step: int) -> Stream:
+        # The corruption of a batch has the same keys and seeds >= 0, so the complement gives independent numbers.
+        return stream(~((self.seed << 32) + step), key, device=self.device)
+
+
+class Diffusion(AveragedRestoration):
     """Train a conditional diffusion model that restores images.
 
         noisy = sqrt(a) target + sqrt(1 - a) noise
@@ -59,8 +87,7 @@ class Diffusion(RestorationModule):
         val_steps: steps of the sampler in a validation during training, from 1 to 1000.
         crop: side of the squares that training uses, px; a shorter side of the frame is not cropped. None uses whole
             frames.
-        ema_decay: upper limit of the decay of the moving average, which is (1 + n) / (10 + n) after n steps.
-        seed: seed of all draws.
+        ema_decay, seed: see `AveragedRestoration`.
 
     Raises:
         ValueError: a number is outside its range; the sampler or the prediction is unknown.
@@ -89,15 +116,19 @@ class Diffusion(RestorationModule):
         seed: int = 0,
     ):
         target = target_of(task)
-        options = {"lr": lr, "weight_decay": weight_decay, "warmup_steps": warmup_steps, "schedule": schedule}
-        super().__init__(network(target.channels), task, metric_size=metric_size, **options)
+        options: dict[str, Any] = {
+            "lr": lr,
+            "weight_decay": weight_decay,
+            "warmup_steps": warmup_steps,
+            "schedule": schedule,
+        }
+        options |= {"metric_size": metric_size, "ema_decay": ema_decay, "seed": seed}
+        super().__init__(network(target.channels), task, **options)
         self.target = target
         self.prediction = check_choice("prediction", prediction, _PREDICTIONS)
         self.sampler = check_choice("sampler", sampler, SAMPLERS)
-        self.steps, self.val_steps = _check_steps("steps", steps), _check_steps("val_steps", val_steps)
+        self.steps, self.val_steps = check_steps("steps", steps), check_steps("val_steps", val_steps)
         self.crop = None if crop is None else check_count("crop", crop)
-        self.ema_decay = check_number("ema_decay", ema_decay, low=0.0, high=1.0)
-        self.seed = check_count("seed", seed, low=0)
         self.levels = DDPMScheduler(NUM_LEVELS, beta_schedule="linear")
 
     def forward(self, degraded: Tensor, key: Tensor | None = None) -> Restored:
@@ -116,19 +147,6 @@ class Diffusion(RestorationModule):
         loss = self._loss(batch, conditions(batch.degraded), source, size=batch.clean.shape[2:])
         is_training = self.trainer.state.fn == TrainerFn.FITTING
         return loss, self._sample(batch.degraded, batch.key, steps=self.val_steps if is_training else self.steps)
-
-    def configure_callbacks(self) -> list[Callback]:
-        """Add the moving average of the weights to a training."""
-        return [WeightAveraging(avg_fn=self._average)] if self.trainer.state.fn == TrainerFn.FITTING else []
-
-    def _average(self, average: Tensor, new: Tensor, count: Tensor) -> Tensor:
-        # With a constant decay, a short training would end near its initial weights.
-        decay = ((1 + count) / (10 + count)).clamp(max=self.ema_decay)
-        return torch.lerp(average, new, (1 - decay).to(average.dtype))
-
-    def _stream(self, key: Tensor, step: int) -> Stream:
-        # The corruption of a batch has the same keys and seeds >= 0, so the complement gives independent numbers.
-        return stream(~((self.seed << 32) + step), key, device=self.device)
 
     def _crop(self, pair: Pair, condition: Tensor, source: Stream) -> tuple[Pair, Tensor]:
         """Cut a square out of each sample; flows that point out of it become invalid."""
@@ -278,7 +296,13 @@ def normal(source: Stream, like: Tensor) -> Tensor:
 
 
 def sample(
-    start: Tensor, predict_target: Callable[[Tensor, Tensor], Tensor], source: Stream, *, name: str, steps: int
+    start: Tensor,
+    predict_target: Callable[[Tensor, Tensor], Tensor],
+    source: Stream,
+    *,
+    name: str,
+    steps: int,
+    betas: Tensor | None = None,
 ) -> Tensor:
     """Sample a target from noise. "ddpm" adds noise after each step, "dpm_solver" takes steps of second order.
 
@@ -287,18 +311,20 @@ def sample(
         predict_target: predicts the target from a noisy one and its level (B,).
         source: stream of the noise of "ddpm".
         name, steps: as for `Diffusion`.
+        betas: variances of the levels, (1000,); None for those of `Diffusion`.
 
     Source: Ho et al. as for `Diffusion`; Song, Meng, Ermon, "Denoising diffusion implicit models", ICLR 2021; Lu et
     al., "DPM-Solver++", 2022.
     """
-    options: dict[str, Any] = {"beta_schedule": "linear", "prediction_type": "sample"}
+    schedule = {"beta_schedule": "linear"} if betas is None else {"trained_betas": betas.cpu().numpy()}
+    options: dict[str, Any] = {"prediction_type": "sample", **schedule}
     if check_choice("sampler", name, SAMPLERS) == "ddpm":
         scheduler = DDPMScheduler(NUM_LEVELS, clip_sample=False, **options)
     else:
         # DDIM is the first-order solver. DDIMScheduler of diffusers requires that the steps divide 1000.
         scheduler = DPMSolverMultistepScheduler(NUM_LEVELS, solver_order=1 if name == "ddim" else 2, **options)
     # From the highest level down. The spacing of diffusers is uneven, or off by one, if `steps` does not divide 1000.
-    levels = [NUM_LEVELS * (steps - i) // steps - 1 for i in range(_check_steps("steps", steps))]
+    levels = [NUM_LEVELS * (steps - i) // steps - 1 for i in range(check_steps("steps", steps))]
     scheduler.set_timesteps(timesteps=levels)
     # CPU generators draw the same numbers for every device.
     generators = [torch.Generator().manual_seed(word) for word in noise_key(source)[:, 0].tolist()]
@@ -310,7 +336,8 @@ def sample(
     return noisy
 
 
-def _check_steps(name: str, steps: int) -> int:
+def check_steps(name: str, steps: int) -> int:
+    """Return a number of sampling steps; raise ValueError unless it lies from 1 to the number of noise levels."""
     if check_count(name, steps) > NUM_LEVELS:
         raise ValueError(f"{name} must be at most the {NUM_LEVELS} noise levels of the training, got {steps}")
     return steps

@@ -31,6 +31,7 @@ from torchrefract.types import Frame
 Window = tuple[slice, slice, slice]  # rays, rows, columns
 
 _SMALLEST = 8  # px a side
+_KEPT_BYTES = 1 << 30
 _BITS = (1 << 64) - 1  # negative seeds and keys count modulo 2^64
 # Position of each ray in its pixel, (right, down), px from the center, on distinct rows and columns.
 _OFFSETS = np.array([(0.0, 0.0), (-0.15, -0.4), (0.4, -0.15), (0.15, 0.4), (-0.4, 0.15)])
@@ -41,6 +42,9 @@ _HAZE = 9000.0  # m, the distance at which contrast is one half
 
 class RoadScenes(Dataset[Frame]):
     """Rendered road scenes with their depth, see `render_road_scenes`.
+
+    Each process keeps the frames that it renders, up to 1 GiB, because a frame takes longer than a step of a small
+    network.
 
     Args:
         count: number of scenes.
@@ -55,6 +59,7 @@ class RoadScenes(Dataset[Frame]):
         check_count("size", min(self.size), low=_SMALLEST)
         self.seed = check_count("seed", seed, low=-(2**63))
         self.first = check_count("first", first, low=-(2**63))
+        self._frames: dict[int, Frame] = {}
 
     def __len__(self) -> int:
         return self.count
@@ -64,8 +69,13 @@ class RoadScenes(Dataset[Frame]):
         if not -self.count <= index < self.count:
             raise IndexError(f"index must lie in [{-self.count}, {self.count - 1}], got {index}")
         key = torch.tensor(self.first + index % self.count, device="cpu")
-        image, depth = render_road_scenes(key[None], *self.size, seed=self.seed)
-        return Frame(image[0], key, depth[0])
+        frame = self._frames.get(int(key))
+        if frame is None:
+            image, depth = render_road_scenes(key[None], *self.size, seed=self.seed)
+            frame = Frame(image[0], key, depth[0])
+            if len(self._frames) * (image.nbytes + depth.nbytes) < _KEPT_BYTES:
+                self._frames[int(key)] = frame
+        return Frame(*(part.clone() for part in frame))
 
 
 def render_road_scenes(keys: Tensor, height: int, width: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,7 @@ import json
 import re
 import warnings
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -123,7 +123,7 @@ class CoordConvSegmenter(nn.Module):
         maps = maps[:, :, : -(-height // self.cell), : -(-width // self.cell)]
         if self.polynomial_head is None:
             return maps
-        return maps + self.polynomial_head(features[-1], *_cell_axes(image, self.cell))
+        return maps + self.polynomial_head(features[-1], *cell_axes(image, self.cell))
 
 
 class ResUNet(CoordConvSegmenter):
@@ -177,11 +177,18 @@ class PolynomialFlowHead(nn.Module):
         flat = features.float().flatten(2)
         pooled = torch.cat([flat.mean(dim=2), flat.amax(dim=2)], dim=1)
         basis = torch.stack([_chebyshev(y, j)[:, None] * _chebyshev(x, i) for i, j in self.terms])
-        device = features.device.type
-        # bfloat16 has 8 bits of mantissa: a flow of 100 px would be off by a quarter of a pixel.
-        with torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext():
+        with full_precision(features):
             coefficients = self.layers(pooled).unflatten(1, (self.channels, len(self.terms)))
             return torch.einsum("bct,thw->bchw", coefficients, basis)
+
+
+def full_precision(like: Tensor) -> AbstractContextManager[Any]:
+    """Return a context without autocast on the device of a tensor.
+
+    bfloat16 has 8 bits of mantissa: a flow of 100 px would be off by a quarter of a pixel.
+    """
+    device = like.device.type
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
 
 
 def pixel_coordinates(image: Tensor) -> Tensor:
@@ -191,12 +198,12 @@ def pixel_coordinates(image: Tensor) -> Tensor:
 
     A convolution alone cannot tell where on the frame it is, and the effect of a lens depends on that.
     """
-    x, y = _cell_axes(image, 1)
+    x, y = cell_axes(image, 1)
     axes = torch.meshgrid(x, y, indexing="xy")
     return torch.stack(axes).expand(image.shape[0], -1, -1, -1)
 
 
-def _cell_axes(image: Tensor, cell: int) -> tuple[Tensor, Tensor]:
+def cell_axes(image: Tensor, cell: int) -> tuple[Tensor, Tensor]:
     """Return x, (ceil(W / cell),), and y, (ceil(H / cell),), of the centers of cells; the last may exceed 1."""
     height, width = image.shape[2:]
     x, y = pixel_axes(-(-height // cell), -(-width // cell), dtype=image.dtype, device=image.device)

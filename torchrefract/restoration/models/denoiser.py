@@ -1,7 +1,8 @@
-"""The U-Net of the diffusion baseline."""
+"""The U-Nets of the diffusion models: of images, and of flows on a lattice."""
 
 import json
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -9,8 +10,11 @@ from diffusers import UNet2DModel
 from torch import Tensor, nn
 
 from torchrefract._validation import check_count
-from torchrefract.restoration.models.coordconv import pixel_coordinates
+from torchrefract.restoration.models.coordconv import PolynomialFlowHead, pixel_coordinates
+from torchrefract.restoration.models.lens_net import EDGE_FEATURES, LENS_FEATURES, LensEncoder
 
+_LOCAL_CHANNELS = 64
+_NODE_DISTANCE = 16  # px
 _CONDITION_CHANNELS = 5  # the image and the coordinates of its pixels
 # These options follow from the task. A published network may differ in them.
 _FREE_OPTIONS = ("in_channels", "out_channels", "sample_size")
@@ -87,6 +91,80 @@ class Denoiser(nn.Module):
         inputs = torch.cat([noisy, condition], dim=1)
         inputs = F.pad(inputs, (0, -width % self.stride, 0, -height % self.stride), mode="replicate")
         return self.network(inputs, time).sample[:, :, :height, :width].float()
+
+
+class LatticeCondition(NamedTuple):
+    """What a `LatticeDenoiser` sees of images."""
+
+    guess: Tensor  # (B, channels, h, w): the target without a look at the noisy one
+    local: Tensor  # (B, 64, h, w)
+    token: Tensor  # (B, 4 widths[0]), of the whole frame
+
+
+class LatticeDenoiser(nn.Module):
+    """Predict a smooth target on a lattice of nodes about 16 px apart from a noisy one, given the whole frame.
+
+        predicted = guess(image) + unet(noisy, time, image)
+
+    A `LensEncoder` describes the frame: a `PolynomialFlowHead` on it is the guess, and the U-Net takes it in each of
+    its blocks, next to the edges of the frame by two strided convolutions. Both parts start at zero.
+
+    Args:
+        channels: number of channels of the target.
+        widths: channels of the two scales of the U-Net, multiples of 32.
+        weightings, lenses, edges: see `LensEncoder`.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        *,
+        widths: Sequence[int] = (64, 96),
+        weightings: int = 8,
+        lenses: int = 9,
+        edges: int = 1024,
+    ):
+        super().__init__()
+        self.encoder = LensEncoder(weightings=weightings, lenses=lenses, edges=edges)
+        self.head = PolynomialFlowHead(LENS_FEATURES, channels)
+        self.token = nn.Linear(LENS_FEATURES, 4 * widths[0])
+        self.local = nn.Sequential(
+            nn.Conv2d(EDGE_FEATURES, 32, 3, stride=2, padding=1),
+            nn.SiLU(),
+            nn.Conv2d(32, _LOCAL_CHANNELS, 3, stride=2, padding=1),
+        )
+        self.network = UNet2DModel(
+            in_channels=channels + _LOCAL_CHANNELS,
+            out_channels=channels,
+            block_out_channels=tuple(widths),
+            down_block_types=("DownBlock2D", "AttnDownBlock2D"),
+            up_block_types=("AttnUpBlock2D", "UpBlock2D"),
+            layers_per_block=1,
+            class_embed_type="identity",
+        )
+        for parameter in self.network.conv_out.parameters():
+            nn.init.zeros_(parameter)
+
+    def encode(self, image: Tensor) -> LatticeCondition:
+        """Describe images (B, 3, H, W) in [0, 1]; the nodes are those of `lattice_size`."""
+        frame, cells = self.encoder(image)
+        size = lattice_size(image)
+        axes = (torch.linspace(-1, 1, count, device=image.device) for count in reversed(size))
+        local = F.interpolate(self.local(cells), size, mode="bilinear", align_corners=True)
+        return LatticeCondition(self.head(frame, *axes), local, self.token(frame.flatten(1)))
+
+    def forward(self, noisy: Tensor, time: Tensor, condition: LatticeCondition) -> Tensor:
+        """Predict the target (B, channels, h, w), float32, from a noisy one at its noise level (B,), int64."""
+        height, width = noisy.shape[2:]
+        inputs = F.pad(torch.cat([noisy, condition.local], dim=1), (0, width % 2, 0, height % 2), mode="replicate")
+        change = self.network(inputs, time, class_labels=condition.token).sample[:, :, :height, :width]
+        return condition.guess + change.float()
+
+
+def lattice_size(image: Tensor) -> tuple[int, int]:
+    """Return the number of nodes down and across for images (B, C, H, W): the first and the last are at the border."""
+    height, width = image.shape[2:]
+    return 1 + -(-height // _NODE_DISTANCE), 1 + -(-width // _NODE_DISTANCE)
 
 
 def conditions(image: Tensor) -> Tensor:

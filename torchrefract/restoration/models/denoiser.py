@@ -94,7 +94,7 @@ class Denoiser(nn.Module):
 
 
 class LatticeCondition(NamedTuple):
-    """What a `LatticeDenoiser` sees of images."""
+    """The description of images for a `LatticeDenoiser`."""
 
     guess: Tensor  # (B, channels, h, w): the target without a look at the noisy one
     local: Tensor  # (B, 64, h, w)

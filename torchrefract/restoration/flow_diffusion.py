@@ -1,7 +1,7 @@
 """Diffusion of a smooth flow on a lattice, given the whole frame: `model=ddpm`."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -97,7 +97,7 @@ class FlowDiffusion(AveragedRestoration):
         """
         key = torch.zeros(len(degraded), dtype=torch.int64) if key is None else key
         source = self._stream(key, 0)
-        condition = self.network.encode(degraded)
+        condition = cast(Any, self.network).encode(degraded)
         like = condition.guess.repeat(1, self.samples, 1, 1)
         # All samples of an image are in its noise, so that they depend on its key alone.
         start = normal(source.at(3), like).unflatten(1, (self.samples, -1)).flatten(0, 1)
@@ -126,7 +126,7 @@ class FlowDiffusion(AveragedRestoration):
         noise = normal(source.at(1), target)
         time = (uniform(source.at(2), 1)[:, 0] * NUM_LEVELS).long()
         noisy = self.levels.add_noise(target, noise, time)  # pyright: ignore[reportArgumentType]  # takes any int tensor
-        predicted = self.network(noisy, time, self.network.encode(batch.degraded))
+        predicted = self.network(noisy, time, cast(Any, self.network).encode(batch.degraded))
         return masked_mean((predicted - target).abs(), valid).mean()
 
     def _root_mean_square(self, batch: Pair) -> Tensor:

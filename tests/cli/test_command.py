@@ -265,7 +265,7 @@ def test_an_experiment_chooses_its_task_and_is_shown_without_a_run(call, tmp_pat
     ("word", "message"),
     [
         ("+task=sharpen", "task must be one of deweather, undistort, got sharpen"),
-        ("model=unet", "model must be one of ddpm, ddpm_cat256, resunet, segformer, got unet"),
+        ("model=unet", "model must be one of ddpm, ddpm_cat256, ddpm_image, lens_net, resunet, segformer, got unet"),
         ("scene=london", "scene must be one of cape_town_fog, cheap_dashcam, highveld_heat_haze, .* got london"),
         ("sede=1", "an option must be one of .*, got sede; did you mean seed"),
         ("data.color=red", "data.color"),

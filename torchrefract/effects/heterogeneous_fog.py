@@ -73,8 +73,8 @@ class HeterogeneousFogParams(NamedTuple):
     frame: Tensor  # (B, T), number of each frame in its clip
     key: Tensor  # (B, 4), int64, of the noise
     scale_height: Tensor | None = None  # (B,), m, over which the density falls to 1/e; inf or None: it does not
-    # (B, 3): degrees to the right of the camera, degrees above the horizon, share of direct sunlight in the airlight;
-    # None: none
+    # (B, 3): degrees to the right of the camera, degrees above the horizon, share of direct sunlight in the airlight,
+    # 0 for an effect without `sunlight_range`; None is 0
     sun: Tensor | None = None
 
     to = params_to
@@ -219,7 +219,7 @@ class HeterogeneousFog(PhotometricEffect):
         plume = [] if self.scale_height_range is None else [self.scale_height_range]
         sun = [self.sun_azimuth_range, self.sun_elevation_range, self.sunlight_range] if self.sunlight_range else []
         fog, values = draw_fog(self, stream, image, [self.contrast_range, *motion, *plume, *sun])
-        values, sunlight = (values[:, :-3], values[:, -3:]) if sun else (values, None)
+        values, sunlight = (values[:, :-3], values[:, -3:]) if sun else (values, torch.zeros_like(values[:, :3]))
         values, scale_height = (
             (values[:, :-1], values[:, -1]) if plume else (values, torch.full_like(values[:, 0], torch.inf))
         )
@@ -259,7 +259,7 @@ class HeterogeneousFog(PhotometricEffect):
         if params.sun is not None:
             check_shapes(params, {"sun": (3,)})
             check_values("params.sun", "be finite", params.sun, torch.isfinite)
-            check_within("params.sun[:, 2]", params.sun[:, 2], 0.0, 1.0)
+            check_within("params.sun[:, 2]", params.sun[:, 2], 0.0, 1.0 if self.sunlight_range else 0.0)
 
     def airlight_map(self, params: HeterogeneousFogParams, height: int, width: int) -> Tensor:
         """Return the airlight at each pixel, with which `remove_fog` undoes fog lit by the sun.
@@ -267,7 +267,7 @@ class HeterogeneousFog(PhotometricEffect):
         Returns (B, C, height, width), stored values in [0, 1].
         """
         airlight = params.airlight
-        if params.sun is None:
+        if params.sun is None or self.sunlight_range is None:
             return airlight[:, :, None, None].expand(-1, -1, height, width)
         focal, center = pinhole_of(self.medium.camera, height=height, width=width)
         view = {"height": height, "width": width, "focal": focal, "center": center, "horizon": self.horizon}
@@ -278,9 +278,7 @@ class HeterogeneousFog(PhotometricEffect):
         span = self.medium.extinction_range(self.visibility_range, self.deviation_range)
         weights = in_ranges(normalize_weights(params.weights), [(weight, weight) for weight in self._unit_weights()])
         contrast = in_ranges(params.contrast[:, None], [self.contrast_range])
-        is_fog = self.medium.params_in_range(params, span) & weights & contrast
-        # The plan of an effect without a sun holds for the airlight of the params only.
-        return is_fog if params.sun is None or self.sunlight_range else is_fog & (params.sun[:, 2] == 0).all()
+        return self.medium.params_in_range(params, span) & weights & contrast
 
     def make_plan(self, request: PhotometricRequest, *, has_depth: bool) -> PhotometricPlan:
         """Plan frames for the depth of the effect or, with `has_depth`, for any depth."""
@@ -315,7 +313,7 @@ class HeterogeneousFog(PhotometricEffect):
         if scale_height is not None and eager_bool(lambda: scale_height.isinf().all(), of=k) is not True:
             k = self._plume(scale_height, distance, image) * expand_batch(k, image.shape[0])
         airlight = None
-        if params.sun is not None:
+        if params.sun is not None and self.sunlight_range is not None:
             lit = params._replace(airlight=finite_or(params.airlight.to(field_dtype(image.dtype)), 0.0))
             airlight = expand_batch(self.airlight_map(lit, *image.shape[2:]), image.shape[0])
         return self.medium.blend(image, params, distance, k, is_visible=not plan.is_identity, airlight=airlight)

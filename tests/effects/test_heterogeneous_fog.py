@@ -311,4 +311,4 @@ def test_fog_lit_by_the_sun_is_removed_with_the_map_of_its_airlight():
     assert_close(without.image, HeterogeneousFog(airlight=0.5).apply(image, degraded.params._replace(sun=None)).image)
     assert (without.image - degraded.image).abs().max() > 0.02
     with pytest.raises(ValueError, match=r"params\.sun\[:, 2\] must"):
-        HeterogeneousFog(airlight=0.5).apply(image, degraded.params)
+        effect.apply(image, degraded.params._replace(sun=degraded.params.sun + 1))

@@ -73,8 +73,8 @@ class HeterogeneousFogParams(NamedTuple):
     frame: Tensor  # (B, T), number of each frame in its clip
     key: Tensor  # (B, 4), int64, of the noise
     scale_height: Tensor | None = None  # (B,), m, over which the density falls to 1/e; inf or None: it does not
-    # (B, 3): degrees to the right of the camera, degrees above the horizon, share of direct sunlight in the airlight,
-    # 0 for an effect without `sunlight_range`; None is 0
+    # (B, 3): degrees to the right of the camera, degrees above the horizon, share of direct sunlight in the airlight;
+    # used by an effect with `sunlight_range` only; None is no sunlight
     sun: Tensor | None = None
 
     to = params_to
@@ -259,7 +259,8 @@ class HeterogeneousFog(PhotometricEffect):
         if params.sun is not None:
             check_shapes(params, {"sun": (3,)})
             check_values("params.sun", "be finite", params.sun, torch.isfinite)
-            check_within("params.sun[:, 2]", params.sun[:, 2], 0.0, 1.0 if self.sunlight_range else 0.0)
+            if self.sunlight_range is not None:
+                check_within("params.sun[:, 2]", params.sun[:, 2], 0.0, 1.0)
 
     def airlight_map(self, params: HeterogeneousFogParams, height: int, width: int) -> Tensor:
         """Return the airlight at each pixel, with which `remove_fog` undoes fog lit by the sun.

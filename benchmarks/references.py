@@ -86,7 +86,7 @@ def main() -> None:
     if not arguments.data.is_dir():
         print(f"skipped: needs real pictures, and {arguments.data} does not exist")
         return
-    warnings.filterwarnings("ignore", "depth is that of a road")
+    warnings.filterwarnings("ignore", "depth is that of a road")  # real pictures have no depth map
     print("| reference | scene | clear | " + " | ".join(map(str, presets.SEVERITIES)) + " |")
     print("| --- | --- | --- |" + " --- |" * len(presets.SEVERITIES))
     for name, reference in REFERENCES.items():

@@ -76,7 +76,7 @@ def test_the_flows_of_a_checkpoint_are_used(call, folder, shifted):
         (("input=nothing",), "input must be a folder, a picture or a video, got nothing, which does not exist"),
         (("input=raw", "checkpoint=none.ckpt"), "ckpt_path must be a checkpoint file"),
     ],
-)  # fmt: skip
+)
 def test_an_invalid_option_is_one_line_of_error(call, folder, words, message):
     assert message in call("estimate_lens", *words).message
 

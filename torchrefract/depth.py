@@ -156,8 +156,8 @@ def from_transformers(
     if not isinstance(road, DepthProvider):
         raise TypeError(f"road must be a depth provider such as GroundPlaneDepth(), got {type(road).__name__}")
     try:
-        # Importing it takes seconds, and it is an extra.
-        from transformers import AutoConfig, AutoImageProcessor, AutoModelForDepthEstimation  # noqa: PLC0415 - as above
+        # It takes seconds.
+        from transformers import AutoConfig, AutoImageProcessor, AutoModelForDepthEstimation  # noqa: PLC0415 - an extra
     except ImportError as error:
         raise ImportError('depth networks need transformers: pip install "torchrefract[depth]"') from error
     name = str(name_or_folder)

@@ -9,7 +9,7 @@ Options:
     data=road_scenes        clean frames: road_scenes (rendered), frames (a folder) or pairs (of `generate`)
     data.root=DIR           folder of the frames or pairs; data.size=[64,112] crops and reduces them
     scene=NAME              degradation: cheap_dashcam, cape_town_fog, paper_refractive, paper_weather, ...
-    model=resunet           network: resunet, segformer, ddpm or ddpm_cat256
+    model=NAME              network: lens_net (default of undistort), resunet (of deweather), segformer, ddpm, ...
     trainer=cpu             hardware: cpu, gpu or ddp; trainer.max_epochs=6 sets the length
     data.batch_size=16      frames in a step; data.workers=2 processes load them
     logger=csv              also write for tensorboard, or wandb (offline); both need the extra "loggers"

@@ -76,7 +76,7 @@ def native(effect: Any, image: np.ndarray, out: dict[str, Any]) -> tuple[Any, di
 
 @pytest.mark.quick
 @pytest.mark.parametrize(("name", "form"), [*zip(EFFECTS, CONVERSIONS, strict=True)])
-@pytest.mark.filterwarnings("ignore:depth is that of a road")
+@pytest.mark.filterwarnings("ignore:depth is that of a road")  # scenes assume a depth; the test is of others
 def test_labels_agree_with_the_native_ones_to_a_twentieth_of_a_pixel(name, form):
     effect, image = EFFECTS[name], picture()
     out = pipeline(effect, form, points={"remove_invisible": False})(image=image, **labels(form))
@@ -112,7 +112,7 @@ def test_a_picture_without_labels_or_with_none_left_keeps_empty_lists():
     assert [len(out[key]) for key in corner] == [0, 0, 0, 0]
 
 
-@pytest.mark.filterwarnings("ignore:the lens must not fold")
+@pytest.mark.filterwarnings("ignore:the lens must not fold")  # it folds on purpose, to hide points
 def test_keypoints_that_a_fold_hides_go_with_their_labels_and_others_stay_outside():
     folds = tr.LensDistortion(k1_range=(-1.5, -1.5), focal_range=(0.6, 0.6), frame="pad")
     grid = np.stack(np.meshgrid(np.arange(4, W, 8), np.arange(4, H, 8)), axis=-1).reshape(-1, 2).astype(np.float32)
@@ -261,7 +261,7 @@ def test_without_albumentations_the_error_names_the_package(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["chain", "haze"])
-@pytest.mark.filterwarnings("ignore:depth is that of a road")
+@pytest.mark.filterwarnings("ignore:depth is that of a road")  # scenes assume a depth; the test is of others
 def test_a_saved_pipeline_gives_the_same_pictures(name, tmp_path):
     chain = A.Compose([adapter.AlbumentationsEffect(EFFECTS[name], p=0.99)], seed=6)
     for form in ("json", "yaml"):

@@ -30,7 +30,7 @@ def test_every_effect_comes_back_from_json(kind):
 
 
 @pytest.mark.parametrize("name", ["highveld_telephoto", "unpaved_road", "cape_town_fog", "paper_weather"])
-@pytest.mark.filterwarnings("ignore:depth is that of a road")
+@pytest.mark.filterwarnings("ignore:depth is that of a road")  # scenes assume a depth; the test is of others
 def test_a_scene_from_its_config_draws_the_same(name):
     scene = getattr(presets, name)(4)
     again = effect_from_config(effect_to_config(scene))

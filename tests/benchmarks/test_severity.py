@@ -63,7 +63,7 @@ def test_the_command_prints_a_row_for_each_severity_and_saves_a_picture(monkeypa
 
 
 # Level 3 of the scenes that take light; warps take less, as edges are found again where their flow says.
-@pytest.mark.filterwarnings("ignore:depth is that of a road")
+@pytest.mark.filterwarnings("ignore:depth is that of a road")  # scenes assume a depth; the test is of others
 @pytest.mark.parametrize("name", ["cape_town_fog", "limpopo_sun_glare", "unpaved_road"])
 def test_level_3_takes_a_like_share_of_real_frames(shared_data, name):
     frames = severity.frames_in(shared_data / "frames" / "train", 4, ["br_", "us_atx"])

@@ -168,8 +168,15 @@ def test_opencv_shows_a_converted_video_as_the_original(tmp_path, quarter):
 def test_a_converted_video_keeps_times_and_sound(tmp_path, suffix, codec, unit, times, sound):
     source, target = tmp_path / f"a{suffix}", tmp_path / "b.mp4"
     pages = [page(k) for k in range(8)]
-    write(source, pages, times=times, unit=unit, codec=codec, sound=sound,
-          pix_fmt="yuvj420p" if codec == "mjpeg" else "yuv420p")  # fmt: skip  # options in one place
+    write(
+        source,
+        pages,
+        times=times,
+        unit=unit,
+        codec=codec,
+        sound=sound,
+        pix_fmt="yuvj420p" if codec == "mjpeg" else "yuv420p",
+    )  # options in one place
     assert describe_losses([source], upright=True) == []
     assert convert_video(source, target, change=unchanged) == 8
     if suffix != ".avi":  # which has one rate

@@ -232,7 +232,7 @@ def test_a_fisheye_is_replaced_by_the_nearest_polynomial():
         (replace(CAR, coefficients=POLE), {}, ValueError, "camera must keep its denominator .* inside the frame"),
         (replace(FISHEYE, fx=150.0, fy=150.0), {}, ValueError, "camera must show rays within 80 degrees"),
     ],
-)  # fmt: skip  # one line for each
+)  # one line for each
 def test_invalid_cameras_and_arguments_raise(camera, options, error, rule):
     with pytest.raises(error, match=rule):
         LensDistortion.from_camera(camera, **options)

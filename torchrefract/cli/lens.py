@@ -107,10 +107,9 @@ def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> 
 
 def _load_network(cfg: DictConfig) -> Predictor:
     """Return a function that predicts the flow of a frame by the model of a checkpoint, at the size of its training."""
-    # Estimation by lines alone needs no training stack.
-    from torchrefract.cli.restoration import find_device  # noqa: PLC0415
-    from torchrefract.restoration.checkpoints import load_model  # noqa: PLC0415
-    from torchrefract.restoration.tasks import Undistort  # noqa: PLC0415
+    from torchrefract.cli.restoration import find_device  # noqa: PLC0415 - lines alone need no training stack
+    from torchrefract.restoration.checkpoints import load_model  # noqa: PLC0415 - as above
+    from torchrefract.restoration.tasks import Undistort  # noqa: PLC0415 - as above
 
     loaded, device = load_model(Path(str(cfg.checkpoint))), find_device(str(cfg.device))
     if loaded.task != Undistort.name:

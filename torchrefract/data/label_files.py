@@ -363,7 +363,7 @@ def _moved_run_lengths(code: Mapping[str, Any], flow: Tensor) -> tuple[dict[str,
 def _decompressed(code: Mapping[str, Any]) -> np.ndarray:
     """Decode a compressed run-length code into a mask (H, W), uint8."""
     try:
-        from pycocotools import mask  # noqa: PLC0415  # only these codes need it
+        from pycocotools import mask  # noqa: PLC0415 - only these codes need it
     except ImportError as error:
         raise UsageError(
             "labels must have uncompressed run-length codes (counts as a list) unless pycocotools is installed: pip "

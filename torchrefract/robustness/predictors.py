@@ -37,7 +37,7 @@ def load_predictor(model: str, *, weights: str | None = None, device: str = "cpu
         A function without gradients.
 
     Raises:
-        ValueError: a model that is none of these, or that cannot be found.
+        ValueError: the model has another form, or cannot be found.
     """
     kind, _, name = model.partition(":")
     if Path(model).suffix in _PROGRAMS:

@@ -148,9 +148,14 @@ def _to_estimate(chains: Chains, prior: Gaussian, num_frames: int, focal: float)
     units = torch.tensor([scale**2, scale**4], dtype=torch.float64, device="cpu")
     k1, k2 = (fit.coefficients * units).tolist()
     camera = Camera(
-        width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2,
+        width=width,
+        height=height,
+        fx=focal,
+        fy=focal,
+        cx=(width - 1) / 2,
+        cy=(height - 1) / 2,
         coefficients=(k1, k2, 0.0, 0.0),
-    )  # fmt: skip
+    )
     covariance = np.zeros((8, 8))
     covariance[[2, 3], [2, 3]] = prior_deviations(camera, "published")[2:4] ** 2
     covariance[4:6, 4:6] = (fit.covariance * units * units[:, None]).numpy()
@@ -167,7 +172,13 @@ def _to_estimate(chains: Chains, prior: Gaussian, num_frames: int, focal: float)
             "the lens cannot be distinguished from no distortion (95 %): add frames, or calibrate with a board"
         )
     return LensEstimate(
-        camera=camera, covariance=covariance, num_frames=num_frames, num_chains=len(chains.points),
-        num_straight=num_straight, edge_px=edge_px, corner_px=corner_px, is_distorted=fit.is_distorted,
+        camera=camera,
+        covariance=covariance,
+        num_frames=num_frames,
+        num_chains=len(chains.points),
+        num_straight=num_straight,
+        edge_px=edge_px,
+        corner_px=corner_px,
+        is_distorted=fit.is_distorted,
         warnings=tuple(warnings),
-    )  # fmt: skip
+    )

@@ -42,8 +42,8 @@ def frames(tmp_path, monkeypatch) -> Path:
         picture = np.full((72, 128, 3), 90, np.uint8)
         picture[30:50, 40 + 10 * i : 60 + 10 * i] = 255
         cv2.imwrite(str(folder / f"{i} a=b.png"), picture)
-        images.append({"id": i, "file_name": f"sub/{i} a=b.png"})
-        rows.append({"image_id": i, "bbox": [40 + 10 * i, 30, 20, 20], "category_id": 1})
+        images.append({"id": i, "file_name": f"{i} a=b.png", "height": 72, "width": 128})
+        rows.append({"id": i, "image_id": i, "bbox": [40 + 10 * i, 30, 20, 20], "category_id": 1})
     (tmp_path / "coco.json").write_text(json.dumps({"images": images, "annotations": rows}))
     (tmp_path / "bright.py").write_text(MODEL)
     monkeypatch.syspath_prepend(tmp_path)
@@ -77,6 +77,34 @@ def test_a_run_writes_tables_and_a_report_and_continues_with_equal_bytes(call, t
     (tmp_path / "out" / "scores.jsonl").write_bytes(b"".join(lines[:3]) + lines[3][:20])
     assert call(*words).code == 0
     assert contents(tmp_path / "out") == complete
+
+
+def test_pictures_of_one_name_in_two_folders_have_labels_of_their_own_and_yolo_files_are_read(call, tmp_path, frames):
+    labels = tmp_path / "labels"
+    for folder, i in (("left", 0), ("right", 3)):
+        (frames / folder).mkdir()
+        (labels / folder).mkdir(parents=True)
+        (frames / f"{i} a=b.png").rename(frames / folder / "same.png")
+        x, y = (50 + 10 * i) / 128, 40 / 72
+        (labels / folder / "same.txt").write_text(f"1 {x} {y} {20 / 128} {20 / 72}\n")
+    for path in frames.glob("*.png"):
+        path.unlink()
+    outcome = call(*COMMAND, "labels=labels", "scene=cheap_dashcam", "severity=1")
+    assert "2 pictures, clean score 1.000" in outcome.out
+    (labels / "left" / "same.txt").write_text("1 0.1 0.1 0.1 0.1\n")
+    assert call(*COMMAND, "labels=labels", "scene=cheap_dashcam", "severity=1").message.startswith(
+        "out must be a folder of the same settings, got one with labels="
+    )
+    outcome = call(*COMMAND[:-1], "out=o2", "labels=labels", "scene=cheap_dashcam", "severity=1")
+    assert "clean score 0.500" in outcome.out
+    (labels / "right" / "same.txt").unlink()  # an empty road, on which the model sees something
+    message = call(*COMMAND[:-1], "out=o3", "labels=labels", "scene=cheap_dashcam", "severity=1").message
+    assert message == "model must score above 0 on a clean picture, got 0 on all: check labels and classes"
+
+
+def test_a_depth_that_is_assumed_is_said(call, frames):
+    assert "assumes the depth of a road between walls" in call(*COMMAND, "scene=cape_town_fog", "severity=1").err
+    assert call(*COMMAND[:-1], "out=o2", "scene=cheap_dashcam", "severity=1").err == ""
 
 
 def test_other_settings_in_the_same_folder_are_refused(call, frames):
@@ -113,8 +141,12 @@ def test_masks_and_modules_are_taken(call, tmp_path, frames):
         ("model=lost.onnx", "model: model must be a file that exists, got lost.onnx"),
         ("model=torchvision:no_such_net", "model: model must be one of torchvision.models.list_models()"),
         ("data=empty", "data must be a folder of pictures, got empty, which holds none"),
-        ("labels=bright.py", "labels must be a JSON file of COCO with images and annotations, or a folder of masks"),
-        ("labels=few.json", "labels must name each picture, got nothing for 0 a=b.png, 1 a=b.png"),
+        ("labels=bright.py", "labels must be a COCO JSON, or a folder of YOLO files (.txt) or masks (.png)"),
+        ("labels=few.json", "labels must list each picture, got nothing for 0 a=b.png, 1 a=b.png"),
+        (
+            "labels=small.json",
+            "labels: labels must be of pictures as they are displayed, 72x128 (height x width), got 36x64",
+        ),
         ("scene=[cape_town_frog]", "scene must be some of cheap_dashcam, cape_town_fog"),
         ("severity=[6]", "severity must be some of (1, 2, 3, 4, 5), got [6]"),
         ("loss=2", "loss: loss must"),
@@ -123,8 +155,12 @@ def test_masks_and_modules_are_taken(call, tmp_path, frames):
 )
 def test_an_invalid_option_is_one_line_of_error(call, tmp_path, frames, word, message):
     (tmp_path / "few.json").write_text('{"images": [], "annotations": []}')
-    assert call(*COMMAND, word).message.startswith(message)
-    assert not (tmp_path / "out").exists()
+    document = json.loads((tmp_path / "coco.json").read_text())
+    images = [image | {"height": 36, "width": 64} for image in document["images"]]
+    (tmp_path / "small.json").write_text(json.dumps(document | {"images": images}))
+    words = (word,) if word.startswith("scene") else (word, "scene=cheap_dashcam")
+    assert call(*COMMAND, *words).message.startswith(message)
+    assert not list(tmp_path.glob("out/results*"))
 
 
 def test_a_model_that_fails_for_one_picture_is_said_and_for_all_stops(call, tmp_path, frames):

@@ -100,7 +100,9 @@ def test_a_prediction_that_raises_is_left_out_and_said_and_many_stop_the_run():
 
     samples = [(f"{i}.png", torch.full((3, 8, 12), 1.0 if i == 7 else 0.1), 1) for i in range(20)]
     effects: dict[str, dict[int, Effect]] = {"fog": {1: UniformFog(airlight=0.5)}}
-    with pytest.warns(UserWarning, match=r"predict failed for 7\.png, which are left out"):
+    with pytest.warns(
+        UserWarning, match=r"predict failed for 1 of 20 images, which are left out: 7\.png: RuntimeError: out of memory"
+    ):
         result = evaluate(predict, samples, effects, classification_score)
     assert len(result.names) == 19
     assert result.failures == {"7.png": "RuntimeError: out of memory"}
@@ -111,6 +113,22 @@ def test_a_prediction_that_raises_is_left_out_and_said_and_many_stop_the_run():
         evaluate(predict, [], effects, classification_score)
     with pytest.raises(ValueError, match="target must be labels, or as_target a function"):
         evaluate(predict, [("a.png", samples[0][1], None)], effects, classification_score)
+
+
+def test_an_error_of_the_effect_or_the_score_is_not_taken_for_one_of_the_model():
+    def no_depth(images: Tensor) -> Tensor:
+        raise KeyError("no map")
+
+    with pytest.raises(KeyError, match="no map"):
+        evaluate(lambda x: x, black(2), {"fog": fogs()}, lambda *_: 1.0, depth=no_depth)
+    with pytest.raises(ValueError, match=r"score must return a number in \[0, 1\], got 7\.0"):
+        evaluate(lambda x: x, black(2), {"fog": fogs()}, lambda *_: 7.0)
+
+
+def test_a_model_without_a_score_on_clean_images_tolerates_nothing():
+    result = evaluate(lambda x: x, black(3), {"fog": fogs()}, lambda *_: 0.0, quantities={"fog": VISIBILITY})
+    with pytest.raises(ValueError, match="the mean score of the clean images must be above 0"):
+        result.tolerated("fog")
 
 
 def test_unknown_scenes_raise():

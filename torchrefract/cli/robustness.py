@@ -1,51 +1,66 @@
 """The command that scores a model on degraded pictures by scene and severity."""
 
+import io
 import json
-import os
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
+import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
+from PIL import Image
+from torch import Tensor, nn
 from torchvision import tv_tensors
 
 import torchrefract
 from torchrefract import presets, random
+from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_count, check_number
-from torchrefract.cli.command import check_seed, naming, progress
-from torchrefract.data.frames import first_names
-from torchrefract.data.images import files_in, read_image
+from torchrefract.cli.command import check_seed, naming, progress, warn_of_assumed_depth
+from torchrefract.data.frames import first_names, list_files
+from torchrefract.data.images import EXTENSIONS, read_image
+from torchrefract.data.label_files import (
+    CocoLabels,
+    LabelFolder,
+    MaskFile,
+    PictureLabels,
+    YoloFile,
+    read_labels,
+    yolo_rows,
+)
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.effects.base import Effect
-from torchrefract.labels.targets import warp_moved_labels
-from torchrefract.robustness.evaluate import Level, Robustness, Scored, evaluate
+from torchrefract.robustness.evaluate import Level, Robustness, Scored, evaluate, move_target
 from torchrefract.robustness.predictors import Predict, import_function, load_predictor
 from torchrefract.robustness.quantities import QUANTITIES
 from torchrefract.robustness.report import Example, format_tolerated, write_report, write_tables
 from torchrefract.robustness.scores import as_labels, classification_score, detection_score, segmentation_score
 
 _SCORES = "scores.jsonl"  # one line of settings, then one for each picture
+_SAID_ELSEWHERE = ("depth is that of a road", "predict failed for")  # by `warn_of_assumed_depth`, and at the end
 _WITH_WIDTH = ("highveld_heat_haze", "unpaved_road")  # scenes whose displacements are stated for a width
 _SETTINGS = ("model", "weights", "data", "labels", "score", "scene", "severity", "seed")
 
 
 class _Folder(NamedTuple):
-    """Pictures with their targets; a target of None is the prediction for the clean picture."""
+    """Pictures, by their names relative to a folder, and their labels, if there are any."""
 
     path: Path
     names: list[str]
-    target: Callable[[str, Tensor], Any]
+    labels: CocoLabels | LabelFolder | None
 
     def read(self, names: Iterable[str]) -> Iterator[tuple[str, Tensor, Any]]:
+        """Yield name, image and target; a target of None stands for the prediction for the clean picture."""
         for name in names:
             image = read_image(self.path / name)
-            yield name, image, self.target(name, image)
+            with naming("labels"):
+                target = None if self.labels is None else _target(self.labels.of(name), image)
+            yield name, image, target
 
 
 def test_robustness(cfg: DictConfig) -> None:
@@ -55,23 +70,29 @@ def test_robustness(cfg: DictConfig) -> None:
         loss = check_number("loss", cfg.loss, low=0.001, high=0.999)
     with naming("worst"):
         num_worst = check_count("worst", cfg.worst, low=0)
-    values: Any = OmegaConf.to_container(cfg)
-    settings = {name: values[name] for name in _SETTINGS}
-    levels, folder = _levels(settings["scene"], settings["severity"]), _folder(cfg)
+    folder, values = _folder(cfg), cast(dict[str, Any], OmegaConf.to_container(cfg))
+    settings = {name: values[name] for name in _SETTINGS} | {"labels": folder.labels and folder.labels.digest()}
+    levels = _levels(settings["scene"], settings["severity"])
     with naming("model"):
         predict = load_predictor(str(cfg.model), weights=cfg.weights, device=str(cfg.device))
     with naming("score"):
         score = choose_score if cfg.score is None else import_function(*str(cfg.score).partition(":")[::2])
     scenes = lru_cache(lambda width: _scenes(levels, width))
+    warn_of_assumed_depth(nn.ModuleList(effect for by in scenes(1920).values() for effect in by.values()))
     out.mkdir(parents=True, exist_ok=True)
     with locked("out", out), _stored_scores(out / _SCORES, settings) as (done, store), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of the assumed depth and of folds
+        for message in _SAID_ELSEWHERE:
+            warnings.filterwarnings("ignore", message)  # the command prints it once
         names = progress(folder.names, "scoring", count=len(folder.names))
         options = {"as_target": as_labels, "quantities": QUANTITIES, "seed": seed, "done": done, "on_scored": store}
         try:
             result = evaluate(predict, folder.read(names), scenes, score, **options)
         except RuntimeError as error:
             raise UsageError(f"model: {error}") from error
+        except ValueError as error:
+            raise UsageError(str(error)) from error
+        if not result.clean.any():
+            raise UsageError("model must score above 0 on a clean picture, got 0 on all: check labels and classes")
         about = settings | {"torchrefract": torchrefract.__version__, "torch": torch.__version__}
         write_tables(result, out, about, loss=loss)
         examples = [
@@ -117,57 +138,46 @@ def _scenes(levels: Iterable[Level], width: int) -> dict[str, dict[int, Effect]]
 def _folder(cfg: DictConfig) -> _Folder:
     """Find the pictures and their labels."""
     path = Path(str(cfg.data)).expanduser()
-    names = [file.name for file in files_in(path)] if path.is_dir() else []
+    files = sorted(list_files(path)) if path.is_dir() else []
+    names = [file.relative_to(path).as_posix() for file in files if file.suffix.lower() in EXTENSIONS]
     if not names:
         raise UsageError(f"data must be a folder of pictures, got {path}, which holds none")
+    labels = None
+    if cfg.labels is not None:
+        labels = read_labels(Path(str(cfg.labels)).expanduser(), fill=0)
+        labels.check(names)
+        missing = [name for name in names if labels.of(name) is None]
+        if missing and isinstance(labels, CocoLabels):
+            raise UsageError(f"labels must list each picture, got nothing for {first_names(missing)}")
     with naming("limit"):
         names = names if cfg.limit is None else names[: check_count("limit", cfg.limit)]
-    if cfg.labels is None:
-        return _Folder(path, names, lambda *_: None)
-    labels = Path(str(cfg.labels)).expanduser()
-    if labels.is_dir():
-        masks = {file.stem: file for file in files_in(labels, (".png",))}
-        missing = [name for name in names if Path(name).stem not in masks]
-        if missing:
-            raise UsageError(f"labels must hold a mask .png for each picture, got none for {first_names(missing)}")
-        return _Folder(path, names, lambda name, _: _mask(masks[Path(name).stem]))
-    boxes = _coco_boxes(labels)
-    missing = [name for name in names if name not in boxes]
-    if missing:
-        raise UsageError(f"labels must name each picture, got nothing for {first_names(missing)}")
-    return _Folder(path, names, lambda name, image: _boxes(boxes[name], image))
+    return _Folder(path, names, labels)
 
 
-def _coco_boxes(path: Path) -> dict[str, list[tuple[list[float], int]]]:
-    """Read the boxes (x, y, width, height) and classes of each picture."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        names = {image["id"]: Path(image["file_name"]).name for image in content["images"]}
-        boxes: dict[str, list[tuple[list[float], int]]] = {name: [] for name in names.values()}
-        for row in content["annotations"]:
-            if not row.get("iscrowd"):
-                boxes[names[row["image_id"]]].append((row["bbox"], row["category_id"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UsageError(
-            "labels must be a JSON file of COCO with images and annotations, or a folder of masks, "
-            f"got {path}: {error!r}"
-        ) from error
-    return boxes
-
-
-def _boxes(rows: list[tuple[list[float], int]], image: Tensor) -> dict[str, Any]:
-    corners = torch.tensor([box for box, _ in rows]).view(-1, 4)
-    corners = torch.cat([corners[:, :2], corners[:, :2] + corners[:, 2:]], dim=1)
-    options: dict[str, Any] = {"format": "XYXY", "canvas_size": (image.shape[1], image.shape[2])}
-    labels = torch.tensor([label for _, label in rows], dtype=torch.int64)
-    return {"boxes": tv_tensors.BoundingBoxes(corners, **options), "labels": labels}
-
-
-def _mask(path: Path) -> tv_tensors.Mask:
-    from PIL import Image  # noqa: PLC0415 - used here alone
-
-    with Image.open(path) as picture:
-        return tv_tensors.Mask(picture)
+def _target(labels: PictureLabels | None, image: Tensor) -> Any:
+    """Return the labels of a picture (3, H, W) as torchvision's types; without a YOLO file it holds nothing."""
+    size = (image.shape[1], image.shape[2])
+    content: Any = [] if labels is None else labels.move(None, size).content  # raises for labels of another size
+    if isinstance(labels, MaskFile):
+        with Image.open(io.BytesIO(content)) as picture:
+            return tv_tensors.Mask(np.array(picture))
+    if isinstance(labels, YoloFile):
+        scale = np.array([size[1], size[0]])
+        rows = [(int(name), np.reshape(numbers, (-1, 2)) * scale) for name, numbers in yolo_rows(content, labels.path)]
+        # The center and size of a box, or the corners of a polygon.
+        boxes = [
+            [*(at[0] - at[1] / 2), *(at[0] + at[1] / 2)] if len(at) == 2 else [*at.min(axis=0), *at.max(axis=0)]
+            for _, at in rows
+        ]
+        classes = [name for name, _ in rows]
+    else:
+        annotations = [annotation for annotation in content if not annotation.get("iscrowd")]
+        corners = np.reshape([annotation["bbox"] for annotation in annotations], (-1, 4))
+        boxes = np.concatenate([corners[:, :2], corners[:, :2] + corners[:, 2:]], axis=1).tolist()
+        classes = [annotation["category_id"] for annotation in annotations]
+    options: dict[str, Any] = {"format": "XYXY", "canvas_size": size}
+    boxes = tv_tensors.BoundingBoxes(torch.tensor(boxes, dtype=torch.float32).view(-1, 4), **options)
+    return {"boxes": boxes, "labels": torch.tensor(classes, dtype=torch.int64)}
 
 
 @contextmanager
@@ -189,21 +199,15 @@ def _stored_scores(
         row = json.loads(line)
         of_levels = {Level(scene, severity): (score, value) for scene, severity, score, value in row["levels"]}
         done[row["name"]] = Scored(row["clean"], of_levels)
-    with path.open("w", encoding="utf-8") as stream:
-
-        def write(row: Mapping[str, Any]) -> None:
-            stream.write(json.dumps(row) + "\n")
-            stream.flush()
-            os.fsync(stream.fileno())
+    with replace_file(path, alone=True) as repaired:
+        repaired.write_text("".join(lines) or json.dumps(settings) + "\n", encoding="utf-8")
+    with path.open("a", encoding="utf-8") as stream:
 
         def store(name: str, scored: Scored) -> None:
-            write(
-                {"name": name, "clean": scored.clean, "levels": [[*level, *of] for level, of in scored.levels.items()]}
-            )
+            levels = [[*level, *of] for level, of in scored.levels.items()]
+            stream.write(json.dumps({"name": name, "clean": scored.clean, "levels": levels}) + "\n")
+            stream.flush()
 
-        write(settings)
-        for name, scored in done.items():
-            store(name, scored)
         yield done, store
 
 
@@ -232,7 +236,7 @@ def _example(
     effect = scenes(image.shape[2])[level.scene][level.severity]
     degraded = effect.degrade(image, seed=seed, keys=[random.key_of(name)])
     target = as_labels(predict(image[None])[0], (image.shape[1], image.shape[2])) if target is None else target
-    moved = warp_moved_labels(target, degraded.flow, effect.labels_getter) if degraded.has("flow") else target
+    moved = move_target(target, degraded, effect)
     prediction = predict(degraded.image[None])[0]
     i = result.names.index(name)
     caption = (

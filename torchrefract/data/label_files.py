@@ -71,9 +71,7 @@ class YoloFile(NamedTuple):
         """Move boxes and polygons along a flow (2, H, W), px, None for none; raise ValueError for an invalid line."""
         with opened(self.path) as stream:
             data = stream.read()
-        rows = [
-            _yolo_row(line, f"{self.path}, line {i}") for i, line in enumerate(data.splitlines(), 1) if line.split()
-        ]
+        rows = yolo_rows(data, self.path)
         if flow is None or not rows:
             return MovedLabels(data, 0)
         scale = torch.tensor([size[1], size[0]])
@@ -375,6 +373,15 @@ def _decompressed(code: Mapping[str, Any]) -> np.ndarray:
 
 def _rounded(values: Iterable[float]) -> list[float]:
     return [round(value, _DIGITS) for value in values]
+
+
+def yolo_rows(data: bytes, path: Path) -> list[tuple[str, list[float]]]:
+    """Return the class and the numbers of each line of a YOLO file: x y w h, or x y of the corners of a polygon.
+
+    Raises:
+        ValueError: a line is neither; names the path.
+    """
+    return [_yolo_row(line, f"{path}, line {i}") for i, line in enumerate(data.splitlines(), 1) if line.split()]
 
 
 def _yolo_row(line: bytes, place: str) -> tuple[str, list[float]]:

@@ -3,7 +3,7 @@
 import importlib
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -88,11 +88,23 @@ def save_program(
 
 def run_program(path: Path, image: Tensor) -> list[Tensor]:
     """Run an exported file on images (B, C, H, W); ONNX files by ONNX Runtime."""
+    return load_program(path)(image)
+
+
+def load_program(path: Path) -> Callable[[Tensor], list[Tensor]]:
+    """Return a function from images (B, C, H, W) to the outputs of a file .pt2 or .onnx, without gradients."""
     if path.suffix == ".pt2":
-        with torch.no_grad():
-            return list(torch.export.load(path).module()(image))
+        program = torch.export.load(path).module()
+
+        @torch.no_grad()
+        def run(image: Tensor) -> list[Tensor]:
+            outputs = program(image)
+            return [outputs] if isinstance(outputs, Tensor) else list(outputs)
+
+        return run
     session = _import("onnxruntime").InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    return [torch.from_numpy(value) for value in session.run(None, {_INPUT: image.numpy()})]
+    name = session.get_inputs()[0].name
+    return lambda image: [torch.from_numpy(value) for value in session.run(None, {name: image.cpu().numpy()})]
 
 
 def _compare(path: Path, images: Tensor, expected: Sequence[Tensor]) -> dict[str, float]:

@@ -10,15 +10,13 @@ Options:
                             predictions, torchvision:NAME, opencv:hog (pedestrians), or a file .pt2, .onnx or .pt
     data=DIR                folder of pictures, required
     out=DIR                 output folder, required
-    labels=PATH             COCO JSON, or a folder of masks with the names of the pictures
+    labels=PATH             COCO JSON, or a folder of YOLO files or of masks with the names of the pictures
     scene=[NAME,...]        cheap_dashcam, cape_town_fog, limpopo_sun_glare, highveld_heat_haze, ...
     severity=[1,3,5]        1 to 5
     score=NAME              package.module:name of a function from a prediction and a target to a number in [0, 1]
     weights=FILE            state_dict for a model of torchvision
     loss=0.1                share of the clean score that is tolerated
-    limit=N                 number of pictures
-    device=cpu              or cuda
-    seed=0                  of the draws
+    limit=N                 number of pictures; device=cuda, seed=0 of the draws
 
 Examples:
     python -m torchrefract.robustness model=opencv:hog data=frames out=robustness scene=[cape_town_fog]

@@ -13,6 +13,7 @@ from torchrefract._validation import check_number
 from torchrefract.effects.base import Effect
 from torchrefract.labels.targets import warp_moved_labels
 from torchrefract.robustness.statistics import Estimate, mean_estimate, tolerated_value
+from torchrefract.types import Degraded
 
 _MAX_FAILED, _MIN_COUNT = 0.1, 10  # share of the images whose prediction may raise, and from how many on it counts
 
@@ -109,6 +110,8 @@ class Robustness:
             loss: share of the mean score of the clean images, in (0, 1).
         """
         loss = check_number("loss", loss, low=1e-6, high=1 - 1e-6)
+        if not self.clean.any():
+            raise ValueError("the mean score of the clean images must be above 0, got 0: check labels and classes")
         if scene not in self.quantities:
             raise ValueError(f"scene must be one with a quantity: {', '.join(self.quantities)}, got {scene}")
         levels = [level for level in self.scores if level.scene == scene]
@@ -166,7 +169,7 @@ def evaluate(
 
     Raises:
         RuntimeError: the prediction raised for more than a tenth of the images, from ten on, or for all of them.
-        ValueError: a target of None without `as_target`.
+        ValueError: a target of None without `as_target`; a score outside [0, 1].
     """
     quantities, done = dict(quantities or {}), done or {}
     scored: dict[str, Scored] = {}
@@ -180,21 +183,19 @@ def evaluate(
         by_name = scenes(image.shape[-1]) if callable(scenes) else scenes
         levels = {Level(scene, severity): effect for scene, by in by_name.items() for severity, effect in by.items()}
         try:
-            (prediction,) = predict(image[None])
+            prediction = _predict(predict, image)
             target = given
             if given is None and as_target is not None:
                 target = as_target(prediction, (image.shape[-2], image.shape[-1]))
-            clean, by_level = score(prediction, target), {}
+            clean, by_level = _score(score, prediction, target), {}
             for level, effect in levels.items():
                 degraded = effect.degrade(image, seed=seed, keys=[random.key_of(name)], depth=depth)
-                flow = degraded.flow if degraded.has("flow") else None
-                moved = target if flow is None else warp_moved_labels(target, flow, effect.labels_getter)
-                (prediction,) = predict(degraded.image[None])
+                prediction = _predict(predict, degraded.image)
                 quantity = quantities.get(level.scene)
                 value = quantity.get(degraded.params).item() if quantity else 0.0
-                by_level[level] = (score(prediction, moved), value)
-        except Exception as error:  # a model may raise anything
-            failures[name] = f"{type(error).__name__}: {error}"
+                by_level[level] = (_score(score, prediction, move_target(target, degraded, effect)), value)
+        except _PredictionError as error:
+            failures[name] = str(error)
         else:
             scored[name] = Scored(clean, by_level)
             if on_scored is not None:
@@ -209,13 +210,40 @@ def evaluate(
         )
     if failures:
         name, reason = next(iter(failures.items()))
-        names = ", ".join(failures)
-        warnings.warn(f"predict failed for {names}, which are left out; for {name}: {reason}", stacklevel=2)
-    return collect(scored, quantities, failures)
+        count = f"{len(failures)} of {len(scored) + len(failures)}"
+        warnings.warn(f"predict failed for {count} images, which are left out: {name}: {reason}", stacklevel=2)
+    return _collect(scored, quantities, failures)
 
 
-def collect(
-    scored: Mapping[str, Scored], quantities: Mapping[str, Quantity], failures: Mapping[str, str] | None = None
+def move_target(target: Any, degraded: Degraded, effect: Effect) -> Any:
+    """Return the labels of a degraded image, or of a batch, moved along its flow; None stays None."""
+    if target is None or not degraded.has("flow"):
+        return target
+    return warp_moved_labels(target, degraded.flow.detach(), effect.labels_getter)
+
+
+class _PredictionError(Exception):
+    """A model that raised, with its reason."""
+
+
+def _predict(predict: Callable[[Tensor], Any], image: Tensor) -> Any:
+    """Return the prediction for an image (3, H, W)."""
+    try:
+        (prediction,) = predict(image[None])
+    except Exception as error:  # a model may raise anything
+        raise _PredictionError(f"{type(error).__name__}: {error}") from error
+    return prediction
+
+
+def _score(score: Callable[[Any, Any], float], prediction: Any, target: Any) -> float:
+    value = float(score(prediction, target))
+    if not 0 <= value <= 1:
+        raise ValueError(f"score must return a number in [0, 1], got {value}")
+    return value
+
+
+def _collect(
+    scored: Mapping[str, Scored], quantities: Mapping[str, Quantity], failures: Mapping[str, str]
 ) -> Robustness:
     """Return the scores of images, by name and of the same levels, as arrays."""
     levels = next(iter(scored.values())).levels
@@ -228,7 +256,7 @@ def collect(
         quantities={
             scene: quantities[scene] for scene in {level.scene: None for level in levels} if scene in quantities
         },
-        failures=dict(failures or {}),
+        failures=dict(failures),
     )
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 _PROGRAMS = (".pt2", ".onnx", ".pt")
-_HOG_SCALE = 4.0  # its scores have no upper end; this one counts as certain
+_HOG_SCALE = 4.0  # a margin that counts as certain
 
 Predict = Callable[[Tensor], Any]
 
@@ -27,8 +27,9 @@ def load_predictor(model: str, *, weights: str | None = None, device: str = "cpu
                 import from here.
             "torchvision:name": a detector, segmenter or classifier of `torchvision.models`, such as
                 "torchvision:fasterrcnn_resnet50_fpn".
-            "opencv:hog": the pedestrian detector of OpenCV (Dalal and Triggs 2005), which needs no weights.
-            a file: .pt2 of torch.export, .onnx, or .pt of TorchScript, whose first output is scores (1, K) or
+            "opencv:hog": the pedestrian detector of OpenCV (Dalal and Triggs 2005), which needs no weights; its scores
+                are the margins of its classifier, divided by 4.
+            a file: .pt2 of torch.export or .onnx, whose first output counts, or .pt of TorchScript: scores (1, K) or
                 (1, K, H, W), for images of the size that it takes.
         weights: for torchvision: a file of its state_dict, or None for the weights that torchvision downloads.
         device: of models in PyTorch.
@@ -86,18 +87,12 @@ class HogDetector:
 def _load_program(path: Path, device: str) -> Predict:
     if not path.is_file():
         raise ValueError(f"model must be a file that exists, got {path}")
-    if path.suffix == ".onnx":
-        onnxruntime = importlib.import_module("onnxruntime")
-        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-        name = session.get_inputs()[0].name
-        return lambda images: torch.from_numpy(session.run(None, {name: images.cpu().numpy()})[0])
-    program = torch.export.load(path).module() if path.suffix == ".pt2" else torch.jit.load(path, map_location=device)
+    if path.suffix == ".pt":
+        return torch.jit.load(path, map_location=device)
+    from torchrefract.restoration.export import load_program  # noqa: PLC0415 - imports the training stack
 
-    def predict(images: Tensor) -> Any:
-        outputs = program(images)
-        return outputs[0] if isinstance(outputs, tuple | list) and isinstance(outputs[0], Tensor) else outputs
-
-    return predict
+    program = load_program(path)
+    return lambda images: program(images)[0]
 
 
 def _load_torchvision(name: str, weights: str | None, device: str) -> Predict:

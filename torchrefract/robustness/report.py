@@ -20,7 +20,6 @@ from torch import Tensor
 from torchrefract._io import replace_file
 from torchrefract._tensor import to_uint8
 from torchrefract.robustness.evaluate import Robustness, Row
-from torchrefract.robustness.statistics import Estimate
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
@@ -61,10 +60,10 @@ def write_tables(result: Robustness, out: Path, about: dict[str, Any], *, loss: 
         writer.writerows(rows)
     summary = {
         "about": about,
-        "clean": asdict_estimate(result.clean_estimate()),
+        "clean": result.clean_estimate()._asdict(),
         "mean_performance": result.mean_performance(),
         "relative_performance": result.relative_performance(),
-        "tolerated": {scene: asdict_estimate(result.tolerated(scene, loss=loss)) for scene in result.quantities},
+        "tolerated": {scene: result.tolerated(scene, loss=loss)._asdict() for scene in result.quantities},
         "levels": rows,
         "failures": result.failures,
     }
@@ -112,11 +111,6 @@ def format_tolerated(result: Robustness, scene: str, *, loss: float) -> str:
     side = "at most" if quantity.is_harm else "at least"
     low, high = ("open" if math.isinf(end) else f"{end:.3g}" for end in estimate[1:])
     return f"{quantity.name} {side} {estimate.value:.3g} {quantity.unit}".rstrip() + f" [{low}, {high}]"
-
-
-def asdict_estimate(estimate: Estimate) -> dict[str, float]:
-    """Return an estimate as a dictionary."""
-    return {name: float(value) for name, value in estimate._asdict().items()}
 
 
 def _flat(row: Row) -> dict[str, Any]:

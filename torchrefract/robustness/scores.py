@@ -4,6 +4,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torchvision import tv_tensors
+from torchvision.ops import box_iou
 
 _IOU = 0.5  # from which a box is found
 _CONFIDENT = 0.5  # score from which a detection counts as a label
@@ -59,8 +61,6 @@ def as_labels(prediction: Any, size: tuple[int, int]) -> Any:
     Detections with a score of at least 0.5 become boxes, scores of classes at each pixel become a mask, and those of
     an image its class.
     """
-    from torchvision import tv_tensors  # noqa: PLC0415 - an extra
-
     if isinstance(prediction, dict):
         keep = prediction["scores"] >= _CONFIDENT
         boxes = prediction["boxes"][keep].detach()
@@ -82,11 +82,7 @@ def _average_precision(boxes: Tensor, expected: Tensor) -> float:
     """Compute the area below precision over recall of boxes (n, 4) in the order of their scores."""
     if len(boxes) == 0 or len(expected) == 0:
         return 0.0
-    low = torch.maximum(boxes[:, None, :2], expected[:, :2])
-    high = torch.minimum(boxes[:, None, 2:], expected[:, 2:])
-    shared = (high - low).clamp(min=0).prod(dim=2)
-    areas = [(value[:, 2:] - value[:, :2]).clamp(min=0).prod(dim=1) for value in (boxes, expected)]
-    iou = shared / (areas[0][:, None] + areas[1] - shared).clamp(min=1e-9)
+    iou = box_iou(boxes, expected)
     is_free = torch.ones(len(expected), dtype=torch.bool)
     hits = torch.zeros(len(boxes))
     for i, row in enumerate(iou):

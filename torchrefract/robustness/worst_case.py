@@ -11,7 +11,7 @@ from torch.utils import _pytree as pytree
 from torchrefract import random
 from torchrefract._validation import check_count, check_number
 from torchrefract.effects.base import Effect
-from torchrefract.labels.targets import warp_moved_labels
+from torchrefract.robustness.evaluate import move_target
 from torchrefract.types import Degraded
 
 _EDGE = 2.0**-24  # uniform numbers lie in the open interval (0, 1)
@@ -98,7 +98,7 @@ def worst_case(
     with torch.no_grad():
         degraded = effect.apply(image, params, depth=depth)
         value = _evaluate(loss, effect, degraded, target).detach()
-    moved = None if target is None else _moved(effect, degraded, target)
+    moved = move_target(target, degraded, effect)
     curve = torch.stack([value for _, value in steps_taken]).unflatten(0, (restarts, steps))
     return WorstCase(params, degraded.image, moved, value, curve)
 
@@ -140,17 +140,12 @@ class _Draw:
 
 def _evaluate(loss: Callable[[Tensor, Any], Tensor], effect: Effect, degraded: Degraded, target: Any) -> Tensor:
     """Return the loss (B,)."""
-    value = loss(degraded.image, None if target is None else _moved(effect, degraded, target))
+    value = loss(degraded.image, move_target(target, degraded, effect))
     batch = len(degraded.params.applied)
     if not isinstance(value, Tensor) or value.shape not in ((), (batch,)):
         got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
         raise ValueError(f"loss must return a tensor of shape () or ({batch},), got {got}")
     return value.expand(batch)
-
-
-def _moved(effect: Effect, degraded: Degraded, target: Any) -> Any:
-    flow = degraded.flow if degraded.has("flow") else None
-    return target if flow is None else warp_moved_labels(target, flow.detach(), effect.labels_getter)
 
 
 def _keep_worst(best: tuple[Any, Tensor], other: tuple[Any, Tensor]) -> tuple[Any, Tensor]:

@@ -95,6 +95,12 @@ def test_a_run_says_on_what_it_trains_before_it_starts(trained):
     ]
 
 
+def test_a_network_of_lenses_says_so_for_other_warps(call):
+    data = ("data.train_count=8", "data.val_count=8", "data.batch_size=8", "data.size=[32,64]", "data.workers=0")
+    haze = call("train", "+task=undistort", "scene=highveld_heat_haze", *data, "trainer.max_epochs=1").out
+    assert "severity 3; lens_net predicts the flow of a lens alone: add model=resunet for other warps" in haze
+
+
 def test_each_epoch_logs_its_scores_and_constant_baselines(trained):
     for name in ("train/loss", "train/psnr", "train/epe", "val/loss", "val/psnr", "val/epe", "val/epe_constant"):
         assert sorted(metrics(trained.folder, name)) == [0, 1]

@@ -37,13 +37,13 @@ class Stream(NamedTuple):
     words: (2, B), int64, in [0, 2^32): a NumPy array, or a tensor in a compiled graph or on an accelerator.
     lane: numbers of different lanes are independent.
     device: device of the drawn numbers; None is that of the words.
-    replace: returns the uniform numbers (B, n) to use instead of those that were drawn, for a search over draws.
+    substitute: returns the uniform numbers (B, n) to use instead of those that were drawn, for a search over draws.
     """
 
     words: np.ndarray | Tensor
     lane: int = 0
     device: torch.device | None = None
-    replace: Callable[["Stream", Tensor], Tensor] | None = None
+    substitute: Callable[["Stream", Tensor], Tensor] | None = None
 
     def at(self, lane: int) -> "Stream":
         """Return the streams of the same samples in another lane."""
@@ -271,9 +271,9 @@ def _num_blocks(count: int) -> int:
 def _uniform(source: Stream, count: int) -> Any:
     """Compute `uniform` numbers from the first words of all counters, and then their second words."""
     first, second = _threefry(source.words, _counters(source.words, 0, _num_blocks(count), source.lane))
-    if source.replace is not None:
-        drawn = _uniform(source._replace(replace=None), count)
-        return source.replace(source, drawn if isinstance(drawn, Tensor) else torch.from_numpy(drawn))
+    if source.substitute is not None:
+        drawn = _uniform(source._replace(substitute=None), count)
+        return source.substitute(source, drawn if isinstance(drawn, Tensor) else torch.from_numpy(drawn))
     if isinstance(first, Tensor):
         return (torch.cat([first, second], dim=1)[:, :count] >> 9).float().add(0.5).mul(2.0**-23)
     # Exact in float64, and then in float32: the numbers have 24 bits.

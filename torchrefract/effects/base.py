@@ -182,17 +182,17 @@ class Effect(nn.Module, ABC):
         keys: Tensor | Sequence[int] | None = None,
         place: int = 0,
         frame: float | Tensor = 0,
-        replace: Callable[[random.Stream, Tensor], Tensor] | None = None,
+        substitute: Callable[[random.Stream, Tensor], Tensor] | None = None,
     ) -> Any:
         """Draw parameters for an image, a NamedTuple of tensors.
 
         Args:
             image, seed, keys, frame: as for `degrade`.
             place: position in a pipeline.
-            replace: returns other uniform numbers than the drawn ones, see `random.Stream`.
+            substitute: returns other uniform numbers than the drawn ones, see `random.Stream`.
         """
         shape, image = check_image(image), fix_frame_size(image)
-        return self._draw(image, shape, seed, keys, place, frame, replace)
+        return self._draw(image, shape, seed, keys, place, frame, substitute)
 
     def apply(  # pyright: ignore[reportIncompatibleMethodOverride]  # nn.Module uses this name; both uses work
         self,
@@ -316,11 +316,11 @@ class Effect(nn.Module, ABC):
         keys: Tensor | Sequence[int] | None,
         place: int,
         frame: float | Tensor,
-        replace: Callable[[random.Stream, Tensor], Tensor] | None = None,
+        substitute: Callable[[random.Stream, Tensor], Tensor] | None = None,
     ) -> Any:
         seed = random.call_seed() if seed is None else _check_seed(seed)
         stream = random.stream(seed, _check_keys(keys, shape.batch), device=image.device)
-        params = self.sample_params(stream._replace(lane=place, replace=replace), first_frames(image, shape))
+        params = self.sample_params(stream._replace(lane=place, substitute=substitute), first_frames(image, shape))
         if not isinstance(frame, Tensor) and frame == 0 and shape.frames == 1:
             return params  # the frame numbers that were drawn
         return params_at_frames(params, frame_numbers(frame, image, shape))

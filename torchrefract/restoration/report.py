@@ -19,6 +19,7 @@ from torchrefract._io import replace_file
 from torchrefract.data.module import PairData, fingerprint
 from torchrefract.effects.lens import LensDistortion
 from torchrefract.restoration.metrics import psnr
+from torchrefract.restoration.models.lens_net import LensNet
 from torchrefract.restoration.module import RestorationModule
 from torchrefract.restoration.tasks import Restored
 from torchrefract.types import Pair
@@ -117,6 +118,8 @@ def describe_training(trainer: Trainer, model: RestorationModule) -> list[str]:
         "steps": f"{steps} in {trainer.max_epochs} epochs of {per_epoch}, of {batch} frames each",
         "scene": describe_scene(data, origin["config"]["data"].get("effect")),
     }
+    if isinstance(model.network, LensNet) and not isinstance(data.effect, LensDistortion | None):
+        lines["scene"] += "; lens_net predicts the flow of a lens alone: add model=resunet for other warps"
     if model.schedule == "cosine" and (num := model.num_warmup_steps(int(steps))) < model.warmup_steps:
         lines["steps"] += f"; warm-up {num}, a tenth, instead of warmup_steps={model.warmup_steps}"
     return [f"{name:<12}{text}" for name, text in lines.items()]

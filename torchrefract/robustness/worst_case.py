@@ -117,7 +117,7 @@ class _Draw:
 
     def params(self) -> Any:
         """Return the parameters of the numbers."""
-        return self._effect.sample(self._image, seed=self._seed, keys=self._keys, replace=self._replace)
+        return self._effect.sample(self._image, seed=self._seed, keys=self._keys, substitute=self._substitute)
 
     def step(self, optimizer: torch.optim.Optimizer) -> None:
         """Take a step, and clamp the numbers to (0, 1)."""
@@ -129,7 +129,7 @@ class _Draw:
             for number in self._numbers.values():
                 number.clamp_(_EDGE, 1 - _EDGE)
 
-    def _replace(self, source: random.Stream, drawn: Tensor) -> Tensor:
+    def _substitute(self, source: random.Stream, drawn: Tensor) -> Tensor:
         # The streams of different effects differ in their words or their lanes.
         words = source.words.tolist()
         name = (source.lane, drawn.shape[1], *map(tuple, words))

@@ -8,6 +8,7 @@ import torch
 from torchvision import models
 
 from torchrefract import presets
+from torchrefract.data.depth_maps import DepthFolder, write_depth
 from torchrefract.robustness.predictors import load_predictor
 from torchrefract.robustness.quantities import QUANTITIES
 
@@ -105,6 +106,25 @@ def test_pictures_of_one_name_in_two_folders_have_labels_of_their_own_and_yolo_f
 def test_a_depth_that_is_assumed_is_said(call, frames):
     assert "assumes the depth of a road between walls" in call(*COMMAND, "scene=cape_town_fog", "severity=1").err
     assert call(*COMMAND[:-1], "out=o2", "scene=cheap_dashcam", "severity=1").err == ""
+
+
+def test_depth_maps_of_the_pictures_are_taken(call, tmp_path, frames):
+    for folder, meters in (("near", 1), ("far", 40)):
+        for path in frames.iterdir():
+            target = DepthFolder(tmp_path / folder).path(path.name)
+            target.parent.mkdir(exist_ok=True)
+            write_depth(target, torch.full((72, 128), float(meters)))
+    words = ("scene=cape_town_fog", "severity=4", "labels=coco.json")
+    near = call(*COMMAND[:-1], "out=o1", "depth=near", *words)
+    assert near.err == ""
+    assert call(*COMMAND[:-1], "out=o2", "depth=far", *words).code == 0
+    near, far = (
+        json.loads((tmp_path / out / "results.json").read_text())["levels"][0]["score"] for out in ("o1", "o2")
+    )
+    assert near == 1  # the square is seen through 1 m of fog, and not through 40 m
+    assert far == 0
+    (tmp_path / "far" / "0 a=b.png").unlink()
+    assert "depth must" in call(*COMMAND[:-1], "out=o3", "depth=far", *words).message
 
 
 def test_other_settings_in_the_same_folder_are_refused(call, frames):

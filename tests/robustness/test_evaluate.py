@@ -15,8 +15,8 @@ VISIBILITY = Quantity("visibility", "m", False, lambda params: params.visibility
 RANGES = {1: (500.0, 1000.0), 2: (200.0, 500.0), 3: (60.0, 200.0), 4: (40.0, 60.0), 5: (20.0, 40.0)}
 
 
-def flat_depth(images: Tensor) -> Tensor:
-    return torch.full_like(images[:, :1], 50.0)
+def flat_depth(name: str, image: Tensor) -> Tensor:
+    return torch.full_like(image[:1], 50.0)
 
 
 def fogs(**options) -> dict[int, Effect]:
@@ -116,7 +116,7 @@ def test_a_prediction_that_raises_is_left_out_and_said_and_many_stop_the_run():
 
 
 def test_an_error_of_the_effect_or_the_score_is_not_taken_for_one_of_the_model():
-    def no_depth(images: Tensor) -> Tensor:
+    def no_depth(name: str, image: Tensor) -> Tensor:
         raise KeyError("no map")
 
     with pytest.raises(KeyError, match="no map"):

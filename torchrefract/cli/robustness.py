@@ -20,8 +20,9 @@ from torchvision import tv_tensors
 import torchrefract
 from torchrefract import presets, random
 from torchrefract._io import replace_file
-from torchrefract._validation import UsageError, check_count, check_number
+from torchrefract._validation import UsageError, check_count, check_number, check_positive
 from torchrefract.cli.command import check_seed, naming, progress, warn_of_assumed_depth
+from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import first_names, list_files
 from torchrefract.data.images import EXTENSIONS, read_image
 from torchrefract.data.label_files import (
@@ -44,7 +45,7 @@ from torchrefract.robustness.scores import as_labels, classification_score, dete
 _SCORES = "scores.jsonl"  # one line of settings, then one for each picture
 _SAID_ELSEWHERE = ("depth is that of a road", "predict failed for")  # by `warn_of_assumed_depth`, and at the end
 _WITH_WIDTH = ("highveld_heat_haze", "unpaved_road")  # scenes whose displacements are stated for a width
-_SETTINGS = ("model", "weights", "data", "labels", "score", "scene", "severity", "seed")
+_SETTINGS = ("model", "weights", "data", "labels", "score", "scene", "severity", "depth", "depth_scale", "seed")
 
 
 class _Folder(NamedTuple):
@@ -53,6 +54,11 @@ class _Folder(NamedTuple):
     path: Path
     names: list[str]
     labels: CocoLabels | LabelFolder | None
+    depths: DepthFolder | None
+
+    def depth(self, name: str, image: Tensor) -> Tensor | None:
+        """Return the depth map (1, H, W), m, of a picture; None without maps."""
+        return self.depths and self.depths.read(name, None, frame_size=(image.shape[1], image.shape[2]), size=None)
 
     def read(self, names: Iterable[str]) -> Iterator[tuple[str, Tensor, Any]]:
         """Yield name, image and target; a target of None stands for the prediction for the clean picture."""
@@ -78,13 +84,15 @@ def test_robustness(cfg: DictConfig) -> None:
     with naming("score"):
         score = choose_score if cfg.score is None else import_function(*str(cfg.score).partition(":")[::2])
     scenes = lru_cache(lambda width: _scenes(levels, width))
-    warn_of_assumed_depth(nn.ModuleList(effect for by in scenes(1920).values() for effect in by.values()))
+    if folder.depths is None:
+        warn_of_assumed_depth(nn.ModuleList(effect for by in scenes(1920).values() for effect in by.values()))
     out.mkdir(parents=True, exist_ok=True)
     with locked("out", out), _stored_scores(out / _SCORES, settings) as (done, store), warnings.catch_warnings():
         for message in _SAID_ELSEWHERE:
             warnings.filterwarnings("ignore", message)  # the command prints it once
         names = progress(folder.names, "scoring", count=len(folder.names))
         options = {"as_target": as_labels, "quantities": QUANTITIES, "seed": seed, "done": done, "on_scored": store}
+        options["depth"] = folder.depth
         try:
             result = evaluate(predict, folder.read(names), scenes, score, **options)
         except RuntimeError as error:
@@ -151,7 +159,12 @@ def _folder(cfg: DictConfig) -> _Folder:
             raise UsageError(f"labels must list each picture, got nothing for {first_names(missing)}")
     with naming("limit"):
         names = names if cfg.limit is None else names[: check_count("limit", cfg.limit)]
-    return _Folder(path, names, labels)
+    depths = None
+    if cfg.depth is not None:
+        with naming("depth_scale"):
+            depths = DepthFolder(Path(str(cfg.depth)).expanduser(), check_positive("depth_scale", cfg.depth_scale))
+        depths.check((name, None) for name in names)
+    return _Folder(path, names, labels, depths)
 
 
 def _target(labels: PictureLabels | None, image: Tensor) -> Any:
@@ -234,7 +247,7 @@ def _example(
     """Degrade a picture again, and predict it again."""
     _, image, target = next(folder.read([name]))
     effect = scenes(image.shape[2])[level.scene][level.severity]
-    degraded = effect.degrade(image, seed=seed, keys=[random.key_of(name)])
+    degraded = effect.degrade(image, seed=seed, keys=[random.key_of(name)], depth=folder.depth(name, image))
     target = as_labels(predict(image[None])[0], (image.shape[1], image.shape[2])) if target is None else target
     moved = move_target(target, degraded, effect)
     prediction = predict(degraded.image[None])[0]

@@ -14,8 +14,8 @@ Options:
     scene=[NAME,...]        cheap_dashcam, cape_town_fog, limpopo_sun_glare, highveld_heat_haze, ...
     severity=[1,3,5]        1 to 5
     score=NAME              package.module:name of a function from a prediction and a target to a number in [0, 1]
-    weights=FILE            state_dict for a model of torchvision
-    loss=0.1                share of the clean score that is tolerated
+    depth=DIR               depth maps of the pictures, as estimate_depth writes
+    loss=0.1                share of the clean score that is tolerated; weights=FILE for a model of torchvision
     limit=N                 number of pictures; device=cuda, seed=0 of the draws
 
 Examples:

@@ -142,7 +142,7 @@ def evaluate(
     as_target: Callable[[Any, tuple[int, int]], Any] | None = None,
     quantities: Mapping[str, Quantity] | None = None,
     seed: int = 0,
-    depth: Callable[[Tensor], Tensor] | None = None,
+    depth: Callable[[str, Tensor], Tensor | None] | None = None,
     done: Mapping[str, Scored] | None = None,
     on_scored: Callable[[str, Scored], None] | None = None,
 ) -> Robustness:
@@ -160,7 +160,7 @@ def evaluate(
             None: the score is then the agreement with it. See `scores.as_labels`.
         quantities: of the scenes, by name.
         seed: of the draws.
-        depth: as for `effect.degrade`.
+        depth: returns the depth (1, H, W), m, of an image by its name and itself; None takes that which effects assume.
         done: scores of an earlier run, by name, which are not computed again.
         on_scored: is called with the name and the scores of each other image.
 
@@ -188,8 +188,9 @@ def evaluate(
             if given is None and as_target is not None:
                 target = as_target(prediction, (image.shape[-2], image.shape[-1]))
             clean, by_level = _score(score, prediction, target), {}
+            options = {"seed": seed, "keys": [random.key_of(name)], "depth": depth and depth(name, image)}
             for level, effect in levels.items():
-                degraded = effect.degrade(image, seed=seed, keys=[random.key_of(name)], depth=depth)
+                degraded = effect.degrade(image, **options)
                 prediction = _predict(predict, degraded.image)
                 quantity = quantities.get(level.scene)
                 value = quantity.get(degraded.params).item() if quantity else 0.0

@@ -18,8 +18,8 @@ from torchrefract.types import Degraded
 from torchrefract.warping.implicit import sample_linear
 
 try:
-    from albumentations.core.transforms_interface import DualTransform
-    from albumentations.core.type_definitions import ALL_TARGETS
+    from albumentations.core.transforms_interface import DualTransform  # pyright: ignore[reportMissingImports]  # in its own extra
+    from albumentations.core.type_definitions import ALL_TARGETS  # pyright: ignore[reportMissingImports]  # in its own extra
 except ModuleNotFoundError as error:
     raise ImportError('this adapter needs Albumentations: pip install "torchrefract[albumentations]"') from error
 

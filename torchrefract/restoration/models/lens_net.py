@@ -13,6 +13,8 @@ from torchrefract.restoration.models.coordconv import PolynomialFlowHead, cell_a
 _CELL = 4  # px
 _SOBEL = torch.outer(torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0]), torch.tensor([-1.0, -2.0, 0.0, 2.0, 1.0])) / 128
 _WEAK = 0.03  # of the range of an image, per px: the gradient that counts half
+_BLACK = 1.5 / 255  # the most that the padding of an image may have in all channels
+_PADDING_REACH = 4  # px: edges this close to padding may be its border
 _STRONGEST = -0.8  # lambda of the last candidate
 _ANGLE_BIN, _OFFSET_BIN = math.radians(3), 0.015  # rad; widths
 _NUM_ANGLES, _NUM_OFFSETS = 60, 100  # lines farther than 0.75 widths from the center vote for the last bin
@@ -117,7 +119,7 @@ def find_edges(image: Tensor) -> tuple[Edges, Tensor]:
     """Find the edge of each cell of an image.
 
     The gradients of a cell, as the mean of their structure tensor, give one direction; their position is the mean over
-    the pixels, weighted by the squared gradient.
+    the pixels, weighted by the squared gradient. Black counts as padding, whose border is no edge.
 
     Args:
         image: (B, 3, H, W), in [0, 1].
@@ -135,6 +137,8 @@ def find_edges(image: Tensor) -> tuple[Edges, Tensor]:
     # Gradients that need pixels outside the frame would have the direction of the padding.
     inner = torch.zeros_like(image[:1, :1])
     inner[:, :, 2 : max(2, height - 2), 2 : max(2, width - 2)] = 1
+    padding = (image.amax(dim=1, keepdim=True) < _BLACK).to(image)
+    inner = inner * (1 - F.max_pool2d(padding, 2 * _PADDING_REACH + 1, stride=1, padding=_PADDING_REACH))
     gx, gy = (inner * F.conv2d(gray, torch.stack([filters, filters.T])[:, None])).split(1, dim=1)
     energy, within = gx * gx + gy * gy, 2 * (torch.arange(_CELL).to(image) + 0.5) / _CELL - 1
     along_x = energy * within.repeat(image.shape[3] // _CELL)

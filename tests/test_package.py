@@ -177,13 +177,15 @@ def test_a_wheel_contains_the_configuration(wheel):
     assert packed == {path.relative_to(conf).as_posix(): path.read_bytes() for path in conf.rglob("*.yaml")}
 
 
-def test_a_wheel_contains_all_modules_the_lens_table_and_nothing_else(wheel):
+def test_a_wheel_contains_all_modules_data_files_and_nothing_else(wheel):
     names = {name for name in wheel.namelist() if ".dist-info/" not in name and "/conf/" not in name}
     package = ROOT / "torchrefract"
     expected = {path.relative_to(ROOT).as_posix() for path in package.rglob("*.py")}
-    table = "torchrefract/cameras/lenses.csv"
-    assert names == {*expected, "torchrefract/py.typed", table}
-    assert wheel.read(table) == (ROOT / table).read_bytes()
+    weights = "torchrefract/restoration/weights/lens_small"
+    data = {"torchrefract/cameras/lenses.csv", f"{weights}.safetensors", f"{weights}.md"}
+    assert names == {*expected, "torchrefract/py.typed", *data}
+    for name in data:
+        assert wheel.read(name) == (ROOT / name).read_bytes()
 
 
 def test_an_installed_wheel_finds_its_configuration(wheel, tmp_path):

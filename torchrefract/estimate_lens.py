@@ -9,7 +9,7 @@ Options:
     out=camera.yaml         the camera; an existing file is replaced
     frames=100              the most frames to use, evenly spaced
     fov_deg=null            horizontal field of view; k1 and k2 are relative to it, the rectified frames are not
-    checkpoint=null         of a training of the task undistort; its flows give the start
+    checkpoint=null         of the task undistort, or lens_small; its flows give the start
     device=auto             cpu, cuda, or auto, which prefers cuda
 
 Examples:

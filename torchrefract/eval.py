@@ -4,7 +4,7 @@ By default, the model, the validation frames and their degradation are those of 
 of its training. Options change single values; the first line says what is scored.
 
 Options:
-    ckpt_path=FILE          a checkpoint of `train`, required
+    ckpt_path=FILE          a checkpoint of `train`, or lens_small, required
     data=frames             other frames: road_scenes (rendered), frames (a folder) or pairs (of `generate`)
     data.root=DIR           folder of the frames or pairs; data.size=[64,112] crops and reduces them
     scene=NAME              another degradation: cheap_dashcam, cape_town_fog, paper_refractive, paper_weather, ...

@@ -3,8 +3,8 @@
 The file takes frames of one size and any batch size. The command compares it with the model and prints the difference.
 
 Options:
-    ckpt_path=FILE          a checkpoint of `train`, required
-    out=model.onnx          or .pt2, a program of torch.export
+    ckpt_path=FILE          a checkpoint of `train`, or lens_small, required
+    out=model.onnx          or .pt2, a program of torch.export; or .safetensors, the weights alone
     size=720x1280           HEIGHTxWIDTH of the frames that the file accepts, px; default: that of the training
     interpolation=bicubic   of the warp along a predicted flow; or bilinear
 

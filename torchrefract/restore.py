@@ -3,7 +3,7 @@
 Files that are restored already are kept, so the same command continues an interrupted run.
 
 Options:
-    ckpt_path=FILE          a checkpoint of `train`, required
+    ckpt_path=FILE          a checkpoint of `train`, or lens_small, required
     input=PATH              a picture, a video, or a folder of them with its subfolders, required
     out=restored            output folder; names and subfolders are those of the input
     size=[720,1280]         [height, width] to which frames are resized for the model; default: that of its training

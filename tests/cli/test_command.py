@@ -188,6 +188,7 @@ COMMANDS = (
     "calibrate",
     "rectify",
     "make_board",
+    "playground",
 )
 
 

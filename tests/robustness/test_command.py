@@ -70,7 +70,7 @@ def test_a_run_writes_tables_and_a_report_and_continues_with_equal_bytes(call, t
         assert row["num_images"] == 4
     # A lens keeps the square in one piece, and its label moves with it.
     assert [row["score"] for row in results["levels"][2:]] == [1, 1]
-    assert complete["report.html"].count(b"data:image/jpeg;base64,") == 4
+    assert complete["report.html"].count(b"data:image/jpeg;base64,") == 2  # of the fog; the lens takes nothing
     # A run that was killed in the middle of a line continues.
     lines = complete["scores.jsonl"].splitlines(keepends=True)
     for path in (tmp_path / "out").iterdir():

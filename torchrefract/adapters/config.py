@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import math
 from typing import Any
 
 from torch import nn
@@ -73,3 +74,48 @@ def _from_plain(value: Any) -> Any:
     if kind is None:
         raise ValueError(f"_target_ must name an effect, depth or camera of torchrefract, got {value.get('_target_')}")
     return kind(**{key: _from_plain(item) for key, item in value.items() if key != "_target_"})
+
+
+def without_defaults(config: Any) -> Any:
+    """Return a config without the arguments that have their default values.
+
+    The config may be one of `effect_to_config`, or of any function or class that `hydra.utils.instantiate` calls.
+    """
+    if isinstance(config, list):
+        return [without_defaults(item) for item in config]
+    if not isinstance(config, dict):
+        return config
+    module, _, name = config["_target_"].rpartition(".")
+    parameters = inspect.signature(getattr(importlib.import_module(module), name)).parameters
+    short = {"_target_": config["_target_"]}
+    for argument, value in config.items():
+        default = parameters[argument].default if argument in parameters else inspect.Parameter.empty
+        if argument != "_target_" and (default is inspect.Parameter.empty or value != _to_plain(default, argument)):
+            short[argument] = without_defaults(value)
+    return short
+
+
+def config_to_code(config: Any, *, indent: int = 0) -> str:
+    """Return the Python expression that makes what a config describes; it needs the modules of its targets.
+
+    Args:
+        config: as for `without_defaults`.
+        indent: levels by which its lines after the first are indented.
+    """
+    if isinstance(config, dict):
+        given = {name: value for name, value in config.items() if name != "_target_"}
+        arguments = [f"{name}={config_to_code(value, indent=indent + 1)}" for name, value in given.items()]
+        return f"{config['_target_']}({_in_lines(arguments, indent)})"
+    if isinstance(config, list):
+        items = [config_to_code(item, indent=indent + 1) for item in config]
+        if any(isinstance(item, dict) for item in config):
+            return f"[{_in_lines(items, indent)}]"
+        return f"({', '.join(items)}{',' if len(items) == 1 else ''})"
+    if isinstance(config, float) and not math.isfinite(config):
+        return f'float("{config}")'
+    return repr(config)
+
+
+def _in_lines(parts: list[str], indent: int) -> str:
+    line = "\n" + "    " * indent
+    return "".join(f"{line}    {part}," for part in parts) + (line if parts else "")

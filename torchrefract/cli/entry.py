@@ -45,5 +45,8 @@ def missing_library(error: ModuleNotFoundError, name: str) -> str | None:
     library = (error.name or "").partition(".")[0]
     if library in ("", "torchrefract"):
         return None
-    extra = "calibration" if name in _CAMERA_COMMANDS else "export" if library.startswith("onnx") else "train"
+    if name == "playground":
+        extra = name
+    else:
+        extra = "calibration" if name in _CAMERA_COMMANDS else "export" if library.startswith("onnx") else "train"
     return f"{name} needs {library}, which is not installed: pip install 'torchrefract[{extra}]'"

@@ -225,13 +225,14 @@ def _stored_scores(
 
 
 def _worst(result: Robustness, count: int) -> list[tuple[str, Level]]:
-    """Return the pictures whose scores fall most at the highest severity of each scene."""
+    """Return the pictures whose scores fall most at the highest severity of each scene, if they fall."""
     highest = {level.scene: level for level in sorted(result.scores, key=lambda level: level.severity)}
-    order = dict.fromkeys(level.scene for level in result.scores)
+    drops = {scene: result.clean - result.scores[level] for scene, level in highest.items()}
     return [
         (result.names[i], highest[scene])
-        for scene in order
-        for i in (result.clean - result.scores[highest[scene]]).argsort(kind="stable")[::-1][:count]
+        for scene in dict.fromkeys(level.scene for level in result.scores)
+        for i in drops[scene].argsort(kind="stable")[::-1][:count]
+        if drops[scene][i] > 0
     ]
 
 

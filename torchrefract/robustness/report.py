@@ -23,11 +23,14 @@ from torchrefract.robustness.evaluate import Robustness, Row
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-table { border-collapse: collapse; margin: 1rem 0; } td, th { padding: .25rem .8rem; text-align: right; }
+table { border-collapse: collapse; margin: 1rem 0; }
+td, th { padding: .25rem .8rem; text-align: right; white-space: nowrap; }
+.wide { overflow-x: auto; } .wide img { min-width: 40rem; }
 th { border-bottom: 1px solid #888; } td:first-child, th:first-child { text-align: left; }
 figure { display: inline-block; margin: .5rem; vertical-align: top; } img { max-width: 100%; }
 figcaption { font-size: 13px; max-width: 29rem; }
 """
+_SPACING = 0.08  # of the curves, severities
 _COLORS = {"labels": (40, 160, 60), "predictions": (220, 40, 30)}
 
 
@@ -88,7 +91,8 @@ def write_report(result: Robustness, examples: Sequence[Example], out: Path, *, 
         f"[{clean.low:.3f}, {clean.high:.3f}]. Mean over all scenes and severities (mPC) "
         f"{result.mean_performance():.3f}, relative to the clean score (rPC) {result.relative_performance():.3f}. "
         "Intervals hold 95 %.</p>",
-        f'<img alt="scores by severity" src="data:image/svg+xml;base64,{_encoded(_curves(result))}">',
+        f'<div class="wide"><img alt="scores by severity" src="data:image/svg+xml;base64,{_encoded(_curves(result))}">',
+        "</div>",
         f"<h2>What the model tolerates</h2><p>Values up to which the mean score falls by at most {loss:.0%}.</p>",
         _table(["scene", "quantity", "tolerated", "95 % interval"], _tolerated_cells(result, loss)),
         "<h2>Scores</h2>",
@@ -101,6 +105,7 @@ def write_report(result: Robustness, examples: Sequence[Example], out: Path, *, 
         parts.append("<h2>The worst images</h2><p>Labels are green, predictions red.</p>")
         parts += map(_figure, examples)
     page = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
+    page += '<meta name="viewport" content="width=device-width, initial-scale=1">'
     with replace_file(out / "report.html") as path:
         path.write_text(f"{page}<style>{_STYLE}</style>{''.join(parts)}</html>\n", encoding="utf-8")
 
@@ -130,9 +135,11 @@ def _without_nan(value: Any) -> Any:
 def _curves(result: Robustness) -> bytes:
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots()
-    for scene in dict.fromkeys(level.scene for level in result.scores):
+    scenes = list(dict.fromkeys(level.scene for level in result.scores))
+    for i, scene in enumerate(scenes):
         rows = [row for row in result.rows() if row.scene == scene]
-        x, y = [row.severity for row in rows], np.array([row.score for row in rows])
+        shift = _SPACING * (i - (len(scenes) - 1) / 2)  # so that equal scores do not hide one another
+        x, y = [row.severity + shift for row in rows], np.array([row.score for row in rows])
         axes.errorbar(x, y[:, 0], yerr=abs(y[:, 1:] - y[:, :1]).T, marker="o", capsize=3, label=scene)
     axes.axhline(float(result.clean.mean()), color="gray", linestyle="--", label="clean")
     axes.set(
@@ -165,7 +172,8 @@ def _table(head: Sequence[str], rows: Any) -> str:
     def line(cells: Sequence[str], tag: str) -> str:
         return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
 
-    return "<table>" + line(head, "th") + "".join(line(row, "td") for row in rows) + "</table>"
+    lines = line(head, "th") + "".join(line(row, "td") for row in rows)
+    return f'<div class="wide"><table>{lines}</table></div>'
 
 
 def _figure(example: Example) -> str:

@@ -103,7 +103,7 @@ DATA = ["data.size=[32,64]", "data.train_count=4", "data.val_count=2", "data.bat
 @pytest.mark.filterwarnings("ignore:.*does not have many workers", "ignore:.*LeafSpec")
 @pytest.mark.parametrize(("model", "task"), TINY)
 def test_every_model_trains_and_validates(tmp_path, model, task):
-    words = (f"+task={task}", f"model={model}", *TINY[model, task], *DATA, "+trainer.fast_dev_run=true")
+    words = (f"+task={task}", f"model={model}", *TINY[model, task], *DATA, "+trainer.fast_dev_run=2")
     cfg = compose_training(tmp_path, *words, "trainer.callbacks=[]", "trainer.logger=false")
     data, module, trainer = (instantiate(cfg[part]) for part in ("data", "model", "trainer"))
     before = [parameter.clone() for parameter in module.parameters()]

@@ -48,6 +48,8 @@ class AveragedRestoration(RestorationModule, ABC):
         return [WeightAveraging(avg_fn=self._average)] if self.trainer.state.fn == TrainerFn.FITTING else []
 
     def _average(self, average: Tensor, new: Tensor, count: Tensor) -> Tensor:
+        if not average.is_floating_point():  # the counter of a batch normalization
+            return new
         # With a constant decay, a short training would end near its initial weights.
         decay = ((1 + count) / (10 + count)).clamp(max=self.ema_decay)
         return torch.lerp(average, new, (1 - decay).to(average.dtype))

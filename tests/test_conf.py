@@ -84,6 +84,7 @@ def test_a_diffusion_model_has_its_size_and_the_defaults_of_its_class(tmp_path, 
 TINY = {
     ("resunet", "deweather"): ["model.network.encoder=tu-resnet10t"],
     ("segformer", "undistort"): ["model.network.encoder=mit_b0"],
+    ("fog_net", "deweather"): ["model.network.width=4"],
     ("lens_net", "undistort"): ["model.network.weightings=2", "model.network.lenses=3"],
     ("ddpm", "undistort"): ["model.network.widths=[32,32]", "model.network.weightings=2", "model.samples=2"],
     ("ddpm_image", "undistort"): [
@@ -118,7 +119,8 @@ def test_the_test_above_covers_every_model():
 
 
 @pytest.mark.parametrize(
-    ("model", "own"), [("lens_net", {"lr"}), ("resunet", set()), ("segformer", set()), ("ddpm", set())]
+    ("model", "own"),
+    [("lens_net", {"lr"}), ("fog_net", {"lr"}), ("resunet", set()), ("segformer", set()), ("ddpm", set())],
 )
 def test_a_model_has_the_defaults_of_its_class(tmp_path, model, own):
     cfg = compose_training(tmp_path, "+task=undistort", f"model={model}").model
@@ -148,7 +150,7 @@ def test_every_trainer_writes_into_the_run_folder(tmp_path, trainer):
     assert built.logger is not None
     assert Path(built.logger.log_dir or "") == tmp_path
     assert built.max_epochs == 12
-    assert compose_training(tmp_path, "+task=deweather", f"trainer={trainer}").trainer.max_epochs == 6
+    assert compose_training(tmp_path, "+task=deweather", f"trainer={trainer}").trainer.max_epochs == 8
     assert type(built.strategy).__name__ == {"cpu": "SingleDeviceStrategy", "ddp": "DDPStrategy"}[trainer]
 
 

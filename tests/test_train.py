@@ -282,9 +282,9 @@ def test_a_damaged_pair_is_one_line_of_error(call, small, tmp_path):
 def test_deweathering_trains_by_the_same_command_into_a_new_folder(call, small, tmp_path):
     outcome = call("train", "+task=deweather", *small, "trainer.max_epochs=1", "run_dir=new/run")
     assert sorted(path.name for path in (tmp_path / "new" / "run").iterdir()) == FILES
-    head, nothing, model, _, verdict = outcome.out.splitlines()[-5:]
+    head, nothing, fog, model, _, verdict = outcome.out.splitlines()[-6:]
     assert "endpoint" not in head
-    assert (nothing[:10], model[:5]) == ("do nothing", "model")
+    assert (nothing[:10], fog[:8], model[:5]) == ("do nothing", "true fog", "model")
     gain = (
         max(metrics(tmp_path / "new" / "run", "val/psnr").values())
         - metrics(tmp_path / "new" / "run", "val/psnr_identity")[0]

@@ -23,7 +23,7 @@ from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkp
 # Load data and model, and train for no epoch.
 NO_EPOCH = ("trainer.max_epochs=0", "hydra.run.dir=run")
 FOLDER = ("data=frames", "data.root=frames", "data.size=[32,64]", "data.batch_size=4", "data.workers=0")
-DEWEATHER = ("+task=deweather", "model.network.encoder=tu-mobilenetv3_small_050", *FOLDER, "hydra.run.dir=run")
+DEWEATHER = ("+task=deweather", *FOLDER, "hydra.run.dir=run", "model.network.width=4")
 
 
 def write_frames(root: Path, count: int, *, size: tuple[int, int] = (64, 32)) -> list[Path]:
@@ -266,7 +266,10 @@ def test_an_experiment_chooses_its_task_and_is_shown_without_a_run(call, tmp_pat
     ("word", "message"),
     [
         ("+task=sharpen", "task must be one of deweather, undistort, got sharpen"),
-        ("model=unet", "model must be one of ddpm, ddpm_cat256, ddpm_image, lens_net, resunet, segformer, got unet"),
+        (
+            "model=unet",
+            "model must be one of ddpm, ddpm_cat256, ddpm_image, fog_net, lens_net, resunet, segformer, got unet",
+        ),
         ("scene=london", "scene must be one of cape_town_fog, cheap_dashcam, highveld_heat_haze, .* got london"),
         ("sede=1", "an option must be one of .*, got sede; did you mean seed"),
         ("data.color=red", "data.color"),

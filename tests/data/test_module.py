@@ -175,6 +175,14 @@ def test_validation_has_the_same_order_and_draws_in_every_epoch(batches):
     assert_same(by_key(later), by_key(first))
 
 
+def test_a_validation_has_the_transmission_of_fog_and_a_training_only_on_request(during):
+    frame = Frame(*next(iter(scenes().train_dataloader())))
+    for effect, size in ((UniformFog(), (4, 1, *SIZE)), (LensDistortion(), (4, 0))):
+        data = scenes(effect=effect)
+        assert during(data, training=False).on_after_batch_transfer(frame, 0).transmission.shape == size
+        assert during(data).on_after_batch_transfer(frame, 0).transmission.shape == (4, 0)
+
+
 def test_validation_and_each_epoch_of_each_seed_have_different_draws(during):
     frame = Frame(*next(iter(scenes().train_dataloader())))
     flows = [during(scenes(), training=False).on_after_batch_transfer(frame, 0).flow]

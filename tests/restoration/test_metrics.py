@@ -7,7 +7,18 @@ from torch.testing import assert_close
 from torchmetrics.functional.image import structural_similarity_index_measure
 from torchmetrics.functional.image.psnr import peak_signal_noise_ratio
 
-from torchrefract.restoration.metrics import endpoint_error, masked_mean, psnr, ssim
+from torchrefract import LensFlare, UniformFog, remove_fog
+from torchrefract._tensor import to_float, to_uint8
+from torchrefract.data.module import make_pair
+from torchrefract.restoration.metrics import (
+    endpoint_error,
+    masked_mean,
+    psnr,
+    restore_by_transmission,
+    ssim,
+    through_fog,
+)
+from torchrefract.types import Frame
 
 SIZE = (24, 31)
 ROWS = (24, 12, 1)  # valid rows of each image
@@ -96,3 +107,20 @@ def test_invalid_flows_have_no_influence(left):
     error = endpoint_error(torch.where(left, flow, 1e4), target, left, size=SIZE)
     expected = [(flow - target)[i, :, :rows, :20].norm(dim=0).mean() for i, rows in enumerate(ROWS)]
     assert_close(error, torch.stack(expected))
+
+
+@pytest.mark.quick
+def test_the_true_fog_restores_as_remove_fog_does_in_float64_and_leaves_a_flare(pair):
+    frame = Frame(pair[1].double(), torch.arange(3), torch.empty(0))
+    fog = UniformFog(visibility_range=(40.0, 40.0), airlight=0.8)
+    foggy = make_pair(frame, fog, seed=1, transmission=True)
+    rounded = to_float(to_uint8(foggy.degraded)).double()
+    expected, valid = remove_fog(rounded, foggy.transmission, 0.8)
+    assert_close(restore_by_transmission(foggy), expected, rtol=0, atol=1e-9)
+    assert torch.equal(through_fog(foggy), valid)
+    assert 0.2 < valid.double().mean() < 1
+    # A level of rounding grows by 1 / t, and nothing else is wrong.
+    error = (restore_by_transmission(foggy) - frame.image).abs() * foggy.transmission
+    assert error[valid.expand_as(error)].max() <= 0.5 / 255 + 1e-7
+    flare = make_pair(frame, LensFlare(), seed=1)._replace(transmission=torch.ones_like(frame.image[:, :1]))
+    assert torch.equal(restore_by_transmission(flare), to_float(to_uint8(flare.degraded)).double())

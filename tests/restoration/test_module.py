@@ -10,9 +10,10 @@ from pytorch_lightning.callbacks import ModelCheckpoint
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from torchrefract import LensDistortion, Pair, UniformFog, presets
+from torchrefract import Frame, LensDistortion, Pair, UniformFog, presets
+from torchrefract.data.module import make_pair
 from torchrefract.restoration.checkpoints import read_checkpoint
-from torchrefract.restoration.metrics import endpoint_error, psnr
+from torchrefract.restoration.metrics import endpoint_error, psnr, restore_by_transmission
 from torchrefract.restoration.models.coordconv import ResUNet
 from torchrefract.restoration.module import NotFiniteError, Restoration
 from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
@@ -142,6 +143,21 @@ def test_doing_nothing_counts_as_clear_air_if_the_task_restores_a_transmission(t
     run.validate(Restoration(Constant, Deweather(transmission_head=True)), loader([pair]), verbose=False)
     assert run.callback_metrics["val/L_k_identity"] == pytest.approx(0.75, rel=1e-4)
     assert run.callback_metrics["val/L_k"] == pytest.approx(0.25, rel=1e-4)  # 1 / (1 + exp(0)) = 0.5
+
+
+def test_a_validation_of_fog_says_what_its_true_transmission_allows(trainer, make_batches, loader):
+    (clear,) = make_batches(UniformFog(), 1, size=SIZE)
+    frame = Frame(clear.clean, clear.key, torch.empty(0))
+    pair = make_pair(frame, UniformFog(), seed=1, transmission=True)
+    run = trainer()
+    run.validate(Restoration(Constant, Deweather()), loader([pair]), verbose=False)
+    seen = pair.transmission >= 1 / 255
+    expected = {"psnr_fog": psnr(restore_by_transmission(pair), pair.clean, pair.valid)}
+    expected |= {"psnr_seen": psnr(pair.degraded, pair.clean, seen)}  # the network predicts no change
+    expected |= {"psnr_seen_fog": psnr(restore_by_transmission(pair), pair.clean, seen)}
+    for name, value in expected.items():
+        assert run.callback_metrics[f"val/{name}"] == pytest.approx(float(value.mean()), rel=1e-5)
+    assert run.callback_metrics["val/psnr_seen_fog"] > run.callback_metrics["val/psnr_seen"] + 10
 
 
 class Rates(Callback):

@@ -242,6 +242,23 @@ def test_the_table_compares_the_model_with_the_baselines():
     ]
 
 
+@pytest.mark.quick
+def test_table_and_verdict_of_fog_name_what_the_true_fog_allows():
+    fog = {"psnr_fog": 24.5, "ssim_fog": 0.9, "L_fog": 0.01, "L_rec_fog": 0.01}
+    fog |= {"psnr_seen": 27.0, "psnr_seen_identity": 19.0, "psnr_seen_fog": 38.0}
+    values = without_flow(**fog)
+    head, *lines = summary(values, (1080, 1920))
+    assert "PSNR where t >= 1/255 (dB)" in head
+    assert words(lines) == [
+        "do nothing 0.0500 0.0301 20.50 (+0.00) 0.700 19.00 (+0.00)",
+        "true fog, 8 bits 0.0100 0.0100 24.50 (+4.00) 0.900 38.00 (+19.00)",
+        "model 0.0300 0.0200 26.00 (+5.50) 0.800 27.00 (+8.00)",
+    ]
+    better = "the model: better than doing nothing by 5.50 dB (the true fog, in 8 bits, by 4.00 dB)"
+    assert verdict(values) == better
+    assert verdict(without_flow(**fog, psnr=20.0)) == "the model: NOT better than doing nothing (-0.50 dB)" + ADVICE
+
+
 def without_flow(**changes: float) -> dict[str, Tensor]:
     """Return the scores of a task without a flow."""
     flow = ("epe", "constant", "L_k")

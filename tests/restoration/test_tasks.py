@@ -70,6 +70,20 @@ def test_the_loss_of_a_deweathering_is_the_image_over_all_pixels_and_the_transmi
     assert Deweather().loss_terms(Restored(foggy.clean), pair)[1] is None
 
 
+@pytest.mark.quick
+def test_the_loss_psnr_is_the_logarithm_of_the_squared_error_of_each_image_and_the_transmission(foggy):
+    offset = torch.tensor([0.01, 0.1, 0.3]).view(3, 1, 1, 1)
+    restored = Restored(foggy.clean + offset, transmission=foggy.transmission * 0 + 0.5)
+    expected = (offset.square() + 1e-4).log().mean() / 10
+    task = Deweather(loss_of_image="psnr")
+    assert_close(task.loss(restored._replace(transmission=None), foggy), expected, rtol=1e-4, atol=0)
+    of_map = (foggy.transmission - 0.5).abs().mean()
+    assert_close(task.loss(restored, foggy), expected + of_map, rtol=1e-4, atol=0)
+    assert_close(task.loss_terms(restored, foggy), Deweather().loss_terms(restored, foggy))
+    with pytest.raises(ValueError, match="loss_of_image must be one of l1, psnr, got 'l2'"):
+        Deweather(loss_of_image="l2")
+
+
 @pytest.mark.parametrize("cell", [1, 4])
 def test_the_last_channel_is_the_transmission_as_a_logistic(cell):
     task, image = Deweather(transmission_head=True), torch.rand(2, 3, 32, 64)

@@ -157,7 +157,11 @@ class PairData(LightningDataModule):
         training = self.trainer is not None and self.trainer.training
         # Validation has the seed of epoch 0, so training begins at 1.
         epoch = 1 + self.trainer.current_epoch if training and self.trainer else 0
-        return make_pair(batch, self.effect, seed=(self.seed << 32) + epoch, border=self.border, **self._maps)
+        # A validation compares the model with what the true transmission allows, where there is one.
+        maps: dict[str, Any] = dict(self._maps)
+        if not training and not maps["transmission"]:
+            maps["transmission"] = None
+        return make_pair(batch, self.effect, seed=(self.seed << 32) + epoch, border=self.border, **maps)
 
     def _loader(self, frames: Dataset[Any], *, training: bool) -> DataLoader[Any]:
         ranks, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
@@ -189,7 +193,7 @@ def make_pair(
     effect: Effect,
     *,
     seed: int,
-    transmission: bool = False,
+    transmission: bool | None = False,
     flow: bool = False,
     border: str | None = None,
 ) -> Pair:
@@ -199,7 +203,7 @@ def make_pair(
         frames: image (B, 3, H, W), key (B,), and depth (B, 1, H, W) or an empty tensor.
         effect: degrades the frames.
         seed: of the draws.
-        transmission: True to add the transmission.
+        transmission: True to add the transmission; None to add it if the effect has one.
         flow: True to require a flow; otherwise, an effect without one gives a flow of zeros.
         border: for a lens, see `add_border`.
 
@@ -218,7 +222,8 @@ def make_pair(
     like = frames.image[:, :1]
     restore = torch.zeros_like(like).expand(-1, 2, -1, -1) if degraded.restore_flow is None else degraded.restore_flow
     valid = torch.ones_like(like, dtype=torch.bool) if degraded.restore_valid is None else degraded.restore_valid
-    transmitted = degraded.transmission if transmission else frames.image.new_empty(len(frames.image), 0)
+    has_transmission = degraded.has("transmission") if transmission is None else transmission
+    transmitted = degraded.transmission if has_transmission else frames.image.new_empty(len(frames.image), 0)
     image = degraded.image if border is None else add_border(degraded, cast(LensDistortion, effect), border)
     return Pair(image, frames.image, restore, valid, frames.key, transmitted)
 

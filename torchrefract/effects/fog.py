@@ -59,7 +59,7 @@ Airlight = float | Sequence[float] | _OfFrame | None
 _AIRLIGHTS = {"frame": airlight_of_frame, "dust": dust_airlight}
 _PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)
 _GRAY = sum(weight * value for weight, value in zip(REC_709, _PAPER_AIRLIGHT, strict=True))
-_MIN_TRANSMISSION = 1 / 255  # of what 8 bits can recover
+MIN_TRANSMISSION = 1 / 255  # of what 8 bits can recover
 _ROUNDING = 2e-5  # relative, of a drawn extinction
 _ENDLESS = 1e30  # m, of a visibility that float32 hardly holds
 _OPAQUE = 1e20  # 1/m; no light passes, and products with depths stay finite
@@ -176,13 +176,13 @@ class FogMedium:
             return transmission(expand_batch(distance, rows), expand_batch(k, rows))
 
         if not is_visible:
-            return Rendered(image, lambda: through() >= _MIN_TRANSMISSION, transmission=through, extinction=k)
+            return Rendered(image, lambda: through() >= MIN_TRANSMISSION, transmission=through, extinction=k)
         t = through()
         if airlight is None:
             airlight = finite_or(params.airlight.to(field_dtype(image.dtype)), 0.0)[:, :, None, None]
             airlight = expand_batch(airlight, batch)
         blended = blend_fog(image, expand_batch(t, batch), airlight, linear_light=self.linear_light)
-        return Rendered(blended, lambda: t >= _MIN_TRANSMISSION, transmission=t, extinction=k)
+        return Rendered(blended, lambda: t >= MIN_TRANSMISSION, transmission=t, extinction=k)
 
 
 def make_medium(
@@ -353,7 +353,7 @@ def remove_fog(
     check_flag("linear_light", linear_light)
     foggy, t = to_batch(image), _transmission_to_batch(transmission, image, shape)
     t = t.to(foggy.dtype)
-    valid = t >= _MIN_TRANSMISSION
+    valid = t >= MIN_TRANSMISSION
     color = _airlight_to_batch(airlight, foggy, shape)
     clean = unblend_fog(foggy, torch.where(valid, t, 1), color, linear_light=linear_light)
     clean = torch.where(valid & (t < 1), clean, foggy)

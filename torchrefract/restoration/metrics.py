@@ -4,6 +4,10 @@ import torch
 from kornia.metrics import ssim as ssim_map
 from torch import Tensor
 
+from torchrefract._tensor import to_float, to_uint8
+from torchrefract.effects.fog import MIN_TRANSMISSION
+from torchrefract.types import Pair
+
 
 def masked_mean(value: Tensor, valid: Tensor) -> Tensor:
     """Average over the valid pixels and all channels of each image.
@@ -27,6 +31,26 @@ def psnr(restored: Tensor, clean: Tensor, valid: Tensor) -> Tensor:
     """
     error = masked_mean((restored.clamp(0, 1) - clean).square(), valid)
     return -10 * torch.log10(error.clamp(min=1e-10))
+
+
+def through_fog(pair: Pair) -> Tensor:
+    """Return the pixels (B, 1, H, W), bool, that 8 bits still show through fog: valid ones with t >= 1/255."""
+    return pair.valid & (pair.transmission >= MIN_TRANSMISSION)
+
+
+def restore_by_transmission(pair: Pair) -> Tensor:
+    """Remove fog from the degraded images (B, 3, H, W), rounded to 8 bits, by their true transmission and airlight.
+
+        J = (I_8 - V) / t where 1/255 <= t < 1, else I_8,  V = I - J_clean t = A (1 - t)
+
+    It is what a model can reach that knows the fog exactly, and nothing about roads. Other light, as of a flare, stays.
+
+    Args:
+        pair: has a transmission, (B, 1, H, W).
+    """
+    rounded, t = to_float(to_uint8(pair.degraded)).to(pair.degraded.dtype), pair.transmission
+    added = pair.degraded - pair.clean * t
+    return torch.where((t >= MIN_TRANSMISSION) & (t < 1), (rounded - added) / t.clamp(min=MIN_TRANSMISSION), rounded)
 
 
 def ssim(restored: Tensor, clean: Tensor, valid: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch.optim.lr_scheduler import ReduceLROnPlateau
 
 from torchrefract._validation import UsageError, check_choice, check_count, check_number, check_size
 from torchrefract.restoration.checkpoints import rename_weights
-from torchrefract.restoration.metrics import endpoint_error, psnr, ssim
+from torchrefract.restoration.metrics import endpoint_error, psnr, restore_by_transmission, ssim, through_fog
 from torchrefract.restoration.tasks import Restored, Task
 from torchrefract.types import Pair
 from torchrefract.warping.warp import warp
@@ -29,7 +29,8 @@ class RestorationModule(LightningModule, ABC):
 
     Logs for each epoch: the loss; PSNR in dB and, for a task with a flow, the endpoint error in px of `metric_size`,
     for val, and for train if the loss needs a restoration anyway; for val all of `restoration_scores`, also of two
-    baselines: the degraded image (`…_identity`) and the mean flow of the training set (`…_constant`).
+    baselines: the degraded image (`…_identity`) and the mean flow of the training set (`…_constant`); for pairs with a
+    transmission also of the image that it restores, see `restore_by_transmission` (`…_fog`).
 
     Args:
         network: predicts the maps of the task.
@@ -113,6 +114,9 @@ class RestorationModule(LightningModule, ABC):
             constant = self.constant_flow(batch.flow)
             methods["_identity"] = Restored(batch.degraded, torch.zeros_like(constant))
             methods["_constant"] = Restored(warp(batch.degraded, constant, padding="border")[0], constant)
+        elif batch.transmission.ndim == 4:
+            true_map = None if clear is None else batch.transmission
+            methods["_fog"] = Restored(restore_by_transmission(batch), transmission=true_map)
         for suffix, result in methods.items():
             scores = restoration_scores(self.task, result, batch, metric_size=self.metric_size)
             self._log("val", scores, batch, suffix=suffix)
@@ -226,6 +230,7 @@ def restoration_scores(
     Returns:
         L, L_rec, L_k: the loss of the task and its terms, see `Task.loss_terms`.
         psnr: dB.
+        psnr_seen: dB, over the pixels of `through_fog`, for a pair with a transmission.
         ssim: at most 1.
         epe: endpoint error, px of `metric_size` = (height, width).
     """
@@ -240,6 +245,8 @@ def _main_scores(restored: Restored, pair: Pair, metric_size: tuple[int, int]) -
     scores = {"psnr": psnr(restored.image.detach(), pair.clean, pair.valid)}
     if restored.flow is not None:
         scores["epe"] = endpoint_error(restored.flow.detach(), pair.flow, pair.valid, size=metric_size)
+    elif pair.transmission.ndim == 4:
+        scores["psnr_seen"] = psnr(restored.image.detach(), pair.clean, through_fog(pair))
     return scores
 
 

@@ -35,7 +35,7 @@ from torchrefract.visualization.figures import (
 METRICS, METRICS_BEFORE = "metrics.csv", "metrics_before.csv"
 _PANEL_ROWS = 4
 _NAME_WIDTH = 36  # of the first column of the table
-_METHODS = {"do nothing": "_identity", "best constant flow": "_constant", "model": ""}
+_METHODS = {"do nothing": "_identity", "best constant flow": "_constant", "true fog, 8 bits": "_fog", "model": ""}
 
 
 class RunSummary(Callback):
@@ -159,6 +159,8 @@ def summary(metrics: Mapping[str, Tensor], metric_size: tuple[int, int], *, bord
     values = _validation_scores(metrics)
     losses = [name for name in ("L", "L_rec", "L_k") if name in values]
     lines = [f"{'validation':<{_NAME_WIDTH}}{''.join(f'{name:>8}' for name in losses)}{'PSNR (dB)':>18}{'SSIM':>8}"]
+    if "psnr_seen" in values:
+        lines[0] += f"{'PSNR where t >= 1/255 (dB)':>28}"
     if "epe" in values:
         lines[0] += f"{f'endpoint error (px at {metric_size[1]}x{metric_size[0]})':>40}"
     for name, suffix in _METHODS.items():
@@ -169,6 +171,9 @@ def summary(metrics: Mapping[str, Tensor], metric_size: tuple[int, int], *, bord
         line += "".join(f"{values[f'{loss}{suffix}']:8.4f}" for loss in losses)
         line += f"{score:.2f} ({score - values['psnr_identity']:+.2f})".rjust(18)
         line += f"{values[f'ssim{suffix}']:8.3f}"
+        if "psnr_seen" in values:
+            seen = values[f"psnr_seen{suffix}"]
+            line += f"{seen:.2f} ({seen - values['psnr_seen_identity']:+.2f})".rjust(28)
         if "epe" in values:
             epe = values[f"epe{suffix}"]
             line += f"{epe:.2f} ({epe / max(values['epe_identity'], 1e-9):.2f} x do nothing)".rjust(40)
@@ -194,6 +199,9 @@ def verdict(metrics: Mapping[str, Tensor], *, best: Tensor | None = None) -> str
     model = "the model" if best is None else "best.ckpt"
     better = " and than ".join(f"{rival} by {gain:.2f} {unit}" for rival, gain in gains.items() if gain > 0)
     worse = " or ".join(f"{rival} ({gain:+.2f} {unit})" for rival, gain in gains.items() if not gain > 0)  # or NaN
+    if "psnr_fog" in values and unit == "dB":
+        limit = values["psnr_fog"] - values["psnr_identity"]
+        better += f" (the true fog, in 8 bits, by {limit:.2f} dB)" if better else ""
     if not worse:
         return f"{model}: better than {better}"
     verdict = f"better than {better}, but NOT" if better else "NOT better"

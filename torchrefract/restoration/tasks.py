@@ -7,12 +7,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._validation import check_flag
+from torchrefract._validation import check_choice, check_flag
 from torchrefract.restoration.metrics import masked_mean
 from torchrefract.types import Pair
 from torchrefract.warping.warp import warp
 
 _CELL = 4  # px
+_SQUARED_ERROR = 1e-4  # of an image of 40 dB, below which the loss "psnr" ends
 
 
 class Restored(NamedTuple):
@@ -92,11 +93,17 @@ class Deweather(Task):
 
     Args:
         transmission_head: True adds a channel for t, and its term to the loss.
+        loss_of_image: that is minimized: "l1" is L_rec; "psnr" is log(mean (restored - clean)^2 + 1e-4) / 10, so that
+            an image in thin fog, whose errors are small, counts as much as one in dense fog.
+
+    Raises:
+        ValueError: another `loss_of_image`.
     """
 
     name = "deweather"
 
-    def __init__(self, *, transmission_head: bool = False):
+    def __init__(self, *, transmission_head: bool = False, loss_of_image: str = "l1"):
+        self.loss_of_image = check_choice("loss_of_image", loss_of_image, ("l1", "psnr"))
         self.transmission_head = check_flag("transmission_head", transmission_head)
         self.channels = 4 if transmission_head else 3
 
@@ -122,6 +129,15 @@ class Deweather(Task):
                 "pair must have a transmission for transmission_head: set data.transmission=true, got none"
             )
         return image_error, (restored.transmission - pair.transmission).abs().mean(dim=(1, 2, 3))
+
+    def loss(self, restored: Restored, pair: Pair) -> Tensor:
+        """Compute the loss (), with that of the image as `loss_of_image` says."""
+        if self.loss_of_image == "l1":
+            return super().loss(restored, pair)
+        _, of_map = self.loss_terms(restored, pair)
+        squared = (restored.image - pair.clean).square().mean(dim=(1, 2, 3))
+        loss = (squared + _SQUARED_ERROR).log() / 10
+        return (loss if of_map is None else loss + of_map).mean()
 
 
 def _average_cells(prediction: Tensor, degraded: Tensor) -> Tensor:

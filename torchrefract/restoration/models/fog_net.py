@@ -1,0 +1,107 @@
+"""A small network that removes fog: it sees how much each pixel differs from the color of the fog."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from torchrefract._validation import check_count
+from torchrefract.restoration.models.coordconv import pixel_coordinates
+from torchrefract.warping.grid import field_dtype
+
+_STRIDE = 32
+_INPUTS = 9
+_WIDTHS = (1, 2, 4, 6, 6)  # of the scales, in multiples of the width
+_SHARPNESS = 50.0  # of the weights of the airlight, per unit of the dark channel
+_LEVEL = 1 / 255
+
+
+class FogNet(nn.Module):
+    """Predict maps of foggy images by a small U-Net that is given the airlight.
+
+    Fog adds A (1 - t) and leaves t (J - A) of the scene J, so that log |I - A| falls with the distance as log t does.
+    The inputs are I - A, A as of `airlight_in_fog`, the logarithm, and the coordinates of the pixels. The mean of the
+    coarsest features, which tells how dense the fog is, is added to all of them. The last layer starts at zero.
+
+    Args:
+        channels: number of maps to predict.
+        width: number of features of the finest scale.
+        smooth: must be False: the maps follow the edges of the image.
+
+    Raises:
+        ValueError: the width is below 1, or `smooth` is True.
+
+    Source: Ronneberger, Fischer, Brox, "U-Net", MICCAI 2015.
+    """
+
+    def __init__(self, channels: int, *, width: int = 16, smooth: bool = False):
+        super().__init__()
+        if smooth:
+            raise ValueError("smooth must be False for fog_net, which predicts no flow, got True: use model=lens_net")
+        widths = [check_count("width", width) * factor for factor in _WIDTHS]
+        steps = list(zip([_INPUTS, *widths[:-1]], widths, strict=True))
+        self.down = nn.ModuleList(
+            nn.Sequential(_convolution(before, after, stride=2), *[_convolution(after, after)] * (before != _INPUTS))
+            for before, after in steps
+        )
+        self.of_frame = nn.Sequential(nn.Linear(widths[-1], widths[-1]), nn.SiLU(), nn.Linear(widths[-1], widths[-1]))
+        self.up = nn.ModuleList(_convolution(after + before, before) for before, after in reversed(steps[1:]))
+        self.finest = _convolution(widths[0] + _INPUTS, widths[0])
+        self.head = nn.Conv2d(widths[0], channels, 3, padding=1)
+        for parameter in self.head.parameters():
+            nn.init.zeros_(parameter)
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # missing in torch's annotations
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Predict the maps (B, channels, H, W) for images (B, 3, H, W) in [0, 1].
+
+        Raises:
+            ValueError: the image has another shape.
+        """
+        if image.ndim != 4 or image.shape[1] != 3:
+            raise ValueError(f"image must have shape (B, 3, H, W), got {tuple(image.shape)}")
+        height, width = image.shape[2:]
+        airlight = airlight_in_fog(image)[:, :, None, None]
+        difference = image - airlight
+        logarithm = (difference.abs().amax(dim=1, keepdim=True) + _LEVEL).log()
+        parts = [4 * difference, 4 * airlight.expand_as(image) - 2, logarithm / 2 + 1, pixel_coordinates(image)]
+        inputs = F.pad(torch.cat(parts, dim=1), (0, -width % _STRIDE, 0, -height % _STRIDE), mode="replicate")
+        inputs = inputs.contiguous(memory_format=torch.channels_last)
+        scales = [inputs]
+        for layer in self.down:
+            scales.append(layer(scales[-1]))
+        features = scales.pop()
+        features = features + self.of_frame(features.mean(dim=(2, 3)))[:, :, None, None]
+        for layer in (*self.up, self.finest):
+            features = F.interpolate(features, scale_factor=2, mode="bilinear")
+            features = layer(torch.cat([features, scales.pop()], dim=1))
+        return self.head(features)[:, :, :height, :width]
+
+
+def airlight_in_fog(image: Tensor) -> Tensor:
+    """Estimate the airlight of frames that show fog: the mean color, weighted by how bright and how gray they are.
+
+        A = sum_p w_p I_p,  w_p ~ exp(50 d_p),  d_p = min of I over the channels and a patch of a sixth of the frame
+
+    `airlight_of_frame` estimates the light that fog would have from a clear frame, where blue sky must count less.
+
+    Args:
+        image: (B, 3, H, W), stored values in [0, 1].
+
+    Returns:
+        (B, 3), differentiable.
+
+    Source: He, Sun, Tang, "Single image haze removal using dark channel prior", IEEE TPAMI 33 (2011), with the mean in
+    place of the brightest 0.1 %.
+    """
+    radius = min(image.shape[2:]) // 12
+    dark = -image.amin(dim=1, keepdim=True)
+    for kernel, padding in (((2 * radius + 1, 1), (radius, 0)), ((1, 2 * radius + 1), (0, radius))):
+        dark = F.max_pool2d(dark, kernel, 1, padding)
+    weight = (-_SHARPNESS * dark.to(field_dtype(image.dtype))).flatten(1).softmax(dim=1)
+    return torch.einsum("bcn,bn->bc", image.to(weight.dtype).flatten(2), weight).to(image.dtype)
+
+
+def _convolution(before: int, after: int, *, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(before, after, 3, stride, 1, bias=False), nn.BatchNorm2d(after), nn.SiLU(inplace=True)
+    )

@@ -44,10 +44,15 @@ class UnreadableImageError(ValueError):
     """Raised for a file that is not a complete image."""
 
 
+class ChangedImageError(UnreadableImageError):
+    """Raised for a file of another size than it had when it was listed."""
+
+
 def is_lost(error: Exception) -> bool:
-    """Return True if a file could not be opened or read, as one that vanished: this says nothing about its content."""
+    """Return True if a file could not be opened or has changed: this says nothing about the listed content."""
     cause = error.__cause__
-    return isinstance(error, UnreadableImageError) and isinstance(cause, OSError) and cause.errno is not None
+    is_unopened = isinstance(error, UnreadableImageError) and isinstance(cause, OSError) and cause.errno is not None
+    return is_unopened or isinstance(error, ChangedImageError)
 
 
 class ImageHeader(NamedTuple):
@@ -77,7 +82,17 @@ def read_image(path: str | Path, *, upright: bool = True) -> Tensor:
         UnreadableImageError: the file is missing, damaged or not an image.
     """
     with opened(path) as stream:
-        data = stream.read()
+        return decode_image(stream.read(), path, upright=upright)
+
+
+def decode_image(data: bytes, path: str | Path, *, upright: bool = True) -> Tensor:
+    """Decode an image as `read_image` does.
+
+    Args:
+        data: the content of the file.
+        path: of the file, for errors.
+        upright: as for `read_image`.
+    """
     _check_complete(path, io.BytesIO(data), len(data))
     if data.startswith(_PNG) and not has_complete_png_chunks(data):
         raise UnreadableImageError(f"{path} is damaged: its chunks are shorter than they state")

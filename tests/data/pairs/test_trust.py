@@ -17,13 +17,16 @@ from torchrefract.data.pairs.files import DamagedPairError
 from torchrefract.data.pairs.manifest import locked, locked_shard
 
 
-def test_a_frame_that_vanishes_stops_the_run_and_is_made_by_the_next(call, words, frames, tmp_path, monkeypatch, rows):
+def test_a_frame_that_vanishes_is_named_after_the_others_and_made_by_the_next(
+    call, words, frames, tmp_path, monkeypatch, rows
+):
     shutil.copytree(frames, tmp_path / "frames")
     frame = tmp_path / "frames" / "drive1" / "005.png"
     with monkeypatch.context() as patch:
         patch.setattr("torchrefract.cli.generation._check_disk", lambda *_: frame.rename(tmp_path / "away.png"))
         message = call("generate", *words("out", source="frames")).message
     assert message.startswith("source must stay unchanged during a run, got frames/drive1/005.png cannot be opened")
+    assert len(rows(tmp_path / "out")) == 11
     (tmp_path / "away.png").rename(frame)
     assert "12 in total; see" in call("generate", *words("out", source="frames")).out
     assert not any(row["skipped"] for row in rows(tmp_path / "out"))

@@ -29,6 +29,7 @@ _CONFIG = "config.json"
 _PATH = re.compile(r"pairs/[0-9]+/[0-9]+\.[a-z_]+\.[a-z]+|tars/[0-9]+\.tar")
 _SUFFIX = re.compile(r"[a-z_]+\.[a-z]+")
 _INT64_END = 2**63
+LOST = "lost: "  # begins the reason of a frame that could not be opened or has changed; a manifest has no such row
 _CHUNK = 256  # rows that are checked in parallel
 
 
@@ -180,11 +181,14 @@ class Manifest:
         self.out = out
         self.path = out / ("manifest.jsonl" if shards == 1 else f"manifest-{shard:05d}-of-{shards:05d}.jsonl")
 
-    def open(self, is_in_shard: Callable[[int], bool], *, verify: bool) -> tuple[set[int], int]:
+    def open(
+        self, is_in_shard: Callable[[int], bool], *, verify: bool, is_repaired: Callable[[PairRow], bool]
+    ) -> tuple[set[int], int]:
         """Write the rows of this shard whose files exist, from all manifests of the folder.
 
-        With `verify`, checksums are compared too, and frames that were skipped are dropped, to be tried again. Rows
-        move into the manifest of this shard, so that a set that goes on with another number of shards has each once.
+        With `verify`, checksums are compared too. Frames that were skipped are dropped if `is_repaired`, to be tried
+        again. Rows move into the manifest of this shard, so that a set that goes on with another number of shards has
+        each once.
 
         Returns:
             the numbers of complete pairs, and the number of damaged pairs that `verify` has detected.
@@ -194,7 +198,7 @@ class Manifest:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             while chunk := list(islice(rows, _CHUNK)):
                 for (row, location), is_complete in zip(chunk, pool.map(check, [row for row, _ in chunk]), strict=True):
-                    if is_complete and not (verify and row.skipped):
+                    if is_complete and not (row.skipped and is_repaired(row)):
                         kept.append((row.number, location))
                     elif verify:
                         damaged += bool(row.files)  # a new file replaces a damaged one, and a tar has intact pairs

@@ -22,7 +22,7 @@ inverse, masks and the drawn parameters, and `effect.apply(image, params)` repea
 parameters of an effect that harm a model most.
 
 Commands, each with a `--help`: python -m torchrefract.preview, degrade, generate, train, eval, restore, export,
-calibrate, rectify, make_board, estimate_lens, estimate_depth, robustness.
+calibrate, rectify, make_board, estimate_lens, estimate_depth, robustness, merge.
 """
 
 import sys as _sys

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.filesize import decimal
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from torchrefract._io import replace_file
+from torchrefract._io import as_path, is_remote, make_folder
 from torchrefract._validation import (
     UsageError,
     check_choice,
@@ -34,7 +34,7 @@ from torchrefract.cli.command import check_none_lost, check_seed, make, naming, 
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import Source, first_names
 from torchrefract.data.images import UnreadableImageError
-from torchrefract.data.pairs.card import HISTOGRAMS, draw_histograms, format_card, summarize
+from torchrefract.data.pairs.card import summarize, write_card
 from torchrefract.data.pairs.files import FORMATS
 from torchrefract.data.pairs.generator import (
     PairGenerator,
@@ -106,9 +106,10 @@ class Options(NamedTuple):
 
 def generate(cfg: DictConfig) -> None:
     """Write the missing pairs of a shard, and the card when the set is complete."""
-    out = Path(str(cfg.out))
-    with _disk_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
+    with naming("out"):
+        out = as_path(str(cfg.out))
+    with disk_errors(out):
+        make_folder(out)
         with locked("out", out, "sources", wait=True):  # other shards wait for the list instead of scanning again
             options = _parse(cfg, out)
             about = {"license": options.license, "made_with": _VERSIONS}
@@ -138,11 +139,14 @@ def _make_missing(options: Options, out: Path) -> tuple[int, list[str]]:
         _check_disk(options, [number for unit in units for number in unit], storage)
         tasks = ([options.task(number) for number in unit] for unit in units)
         rows = generate_pairs(tasks, options.generator, storage, workers=min(options.workers, len(units)))
-        for unit in _with_progress(rows, total=sum(map(len, units))):
-            lost += [row.skipped.removeprefix(LOST) for row in unit if row.skipped.startswith(LOST)]
-            readable = [row for row in unit if not row.skipped.startswith(LOST)]
-            manifest.add(readable)
-            num_made += len(readable)
+        try:
+            for unit in _with_progress(rows, total=sum(map(len, units))):
+                lost += [row.skipped.removeprefix(LOST) for row in unit if row.skipped.startswith(LOST)]
+                readable = [row for row in unit if not row.skipped.startswith(LOST)]
+                manifest.add(readable)
+                num_made += len(readable)
+        finally:
+            manifest.flush()
     manifest.close()
     return num_made, lost
 
@@ -175,8 +179,12 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
     if not 0 < plain["val_share"] < 1:
         raise UsageError(f"val_share must be between 0 and 1, got {plain['val_share']}")
     verify, shard, workers = _checked(cfg, "verify", check_flag), _shard(cfg), _workers(cfg)
-    source = Path(str(cfg.source)).expanduser()
-    if out.resolve().is_relative_to(source.resolve()):
+    with naming("source"):
+        source = as_path(str(cfg.source))
+    for name, path in (("out", out), ("source", source)):
+        if workers and "memory" in getattr(path, "protocol", ""):
+            raise UsageError(f"workers must be 0 for {name}={path}, because each process has its memory, got {workers}")
+    if is_remote(out) == is_remote(source) and out.resolve().is_relative_to(source.resolve()):
         raise UsageError(f"out must lie outside of source, so that pairs do not become sources, got {cfg.out}")
     if not str(cfg.license or "").strip():
         raise UsageError("license must be that of the source, in words, got nothing")
@@ -200,7 +208,7 @@ def _list_frames(
     cfg: DictConfig, source: Path, out: Path, settings: dict[str, Any]
 ) -> tuple[Sources, Callable[[], None]]:
     """Read the list of frames, or scan the source; return the frames and a function that writes a new list."""
-    path = list_path(out) if cfg.files is None else Path(str(cfg.files)).expanduser()
+    path = list_path(out) if cfg.files is None else as_path(str(cfg.files))
     options = {name: settings[name] for name in ("every", "drive_by", "val_share", "seed")}
     if path.is_file():
         # `claim` compares the options of a list in the folder of the set.
@@ -264,11 +272,10 @@ def _check_disk(options: Options, missing: Sequence[int], storage: PairStorage) 
     if lost := [pair.row.skipped.removeprefix(LOST) for pair in samples if pair.row.skipped.startswith(LOST)]:
         check_none_lost(lost if len(lost) == len(samples) else [], name="source")
     mean = sum(sizes) // max(1, len(sizes))
-    needed, free = mean * len(missing), shutil.disk_usage(storage.out).free
-    estimate = (
-        f"{len(missing)} pairs take about {decimal(needed)} on disk, {decimal(mean)} each; {decimal(free)} are free"
-    )
-    if needed > free:
+    needed, free = mean * len(missing), None if is_remote(storage.out) else shutil.disk_usage(storage.out).free
+    estimate = f"{len(missing)} pairs take about {decimal(needed)} on disk, {decimal(mean)} each"
+    estimate += "" if free is None else f"; {decimal(free)} are free"
+    if free is not None and needed > free:
         raise UsageError(
             f"out must have enough space, got too little: {estimate}; choose another disk or a lower count"
         )
@@ -305,28 +312,23 @@ def _finish(options: Options, out: Path, *, num_made: int) -> None:
     if num_complete == 0 and not missing:
         raise UsageError(f"source must hold readable frames, got {summary.skipped[0]}")
     if not missing:
-        figure = draw_histograms(summary)
-        if figure is not None:
-            _write(out / HISTOGRAMS, figure)
-        card = format_card(
-            summary, settings=options.settings, license_text=options.license, has_histograms=figure is not None
-        )
-        _write(out / "README.md", card.encode())
+        write_card(out, summary, settings=options.settings, license_text=options.license)
     rest = f"{missing} are missing or left to other shards" if missing else "see README.md in this folder"
     skipped = f", {num_skipped} frames are unreadable" if num_skipped else ""
-    for reason in summary.skipped[:_SHOWN]:
-        print(f"unreadable, tried again by the same command: {reason}")
+    list_unreadable(summary.skipped)
     print(f"{out}: {num_made} pairs made, {num_complete} in total{skipped}; {rest}")
 
 
-def _write(path: Path, data: bytes) -> None:
-    """Write a file that several shards may write at the same time."""
-    with replace_file(path) as temporary:
-        temporary.write_bytes(data)
+def list_unreadable(reasons: Sequence[str]) -> None:
+    """Print the reasons of frames without a pair."""
+    for reason in reasons[:_SHOWN]:
+        print(f"unreadable, tried again by the same command: {reason}")
+    if len(reasons) > _SHOWN:
+        print(f"and {len(reasons) - _SHOWN} more, which the manifest names")
 
 
 @contextmanager
-def _disk_errors(out: Path) -> Iterator[None]:
+def disk_errors(out: Path) -> Iterator[None]:
     """Turn errors of the disk into messages for the user; pairs that are written stay."""
     try:
         yield
@@ -336,7 +338,9 @@ def _disk_errors(out: Path) -> Iterator[None]:
                 f"out must have enough space, got {os.strerror(error.errno).lower()} for {error.filename or out}; "
                 "existing pairs are complete, and the same command continues"
             ) from error
-        raise UsageError(f"out must be a folder that can be written to, got {out} ({error.strerror})") from error
+        raise UsageError(
+            f"out must be a folder that can be written to, got {out} ({error.strerror or error})"
+        ) from error
     except KeyboardInterrupt:
         print("stopped; the same command continues")
         raise SystemExit(130) from None

@@ -76,7 +76,7 @@ def test_two_runs_into_one_folder_raise(call, words, tmp_path):
 
 @pytest.mark.parametrize("out", ["s3://bucket/pairs", "gs://a", "file:///tmp/a", "'hf://datasets/a'"])
 def test_an_address_as_output_raises(call, words, tmp_path, out):
-    assert call("generate", *words(out)).message.startswith(
+    assert call("degrade", *words(out)).message.startswith(
         f"out must be a path on this machine, got {out.strip(chr(39))}"
     )
     assert not list(tmp_path.iterdir())

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._io import replace_file
+from torchrefract._io import make_folder, replace_file
 from torchrefract._validation import UsageError
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import Source
@@ -29,8 +29,8 @@ from torchrefract.data.images import (
     decode_image,
     fit,
     is_lost,
-    opened,
     pixels_of,
+    read_file,
 )
 from torchrefract.data.media import read_video
 from torchrefract.data.pairs.files import DEPTH, FLOWS, LIGHTS, PairArrays, count_out_of_range, encode_pair
@@ -83,8 +83,7 @@ class SourceReader:
 
     def _read_image(self, source: Source) -> Tensor:
         path = self.root / source.path
-        with opened(path) as stream:
-            data = stream.read()
+        data = read_file(path)
         if source.bytes not in (None, len(data)):
             raise ChangedImageError(f"{path} has changed since it was listed: {len(data)} bytes, not {source.bytes}")
         return decode_image(data, path)
@@ -222,7 +221,7 @@ class PairStorage(NamedTuple):
             return [self._write_files(generator.generate(task)) for task in tasks]
         path = f"tars/{tasks[0].number // self.tar:08d}.tar"
         target = self.out / path
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(target.parent)
         with (
             replace_file(target, alone=True) as temporary,
             tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar,
@@ -241,7 +240,7 @@ class PairStorage(NamedTuple):
         folder, files = f"pairs/{pair.row.number // _PAIRS_PER_FOLDER:05d}", {}
         for suffix, data in pair.data.items():
             files[suffix] = file = pair.row.files[suffix]._replace(path=f"{folder}/{pair.row.name}.{suffix}")
-            (self.out / folder).mkdir(parents=True, exist_ok=True)
+            make_folder(self.out / folder)
             with replace_file(self.out / file.path, alone=True) as temporary:
                 temporary.write_bytes(data)
         return pair.row._replace(files=files)

@@ -3,14 +3,14 @@
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from torchrefract._io import replace_file
+from torchrefract._io import is_remote, read_bytes, replace_file, retried
 from torchrefract._validation import UsageError
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import Source, first_names, list_names, select_val_drives, split_frames
@@ -90,7 +90,7 @@ def read_sources(path: Path, root: Path, options: dict[str, Any]) -> Sources:
         UsageError: the file is not such a list, or other options were given when it was written.
     """
     try:
-        table = pq.read_table(path)
+        table = pq.read_table(pa.BufferReader(read_bytes(path)))
         about = {name.decode(): json.loads(text) for name, text in (table.schema.metadata or {}).items()}
         previous, skipped = about["options"], about["skipped"]
     except (pa.ArrowInvalid, ValueError, KeyError) as error:
@@ -123,21 +123,23 @@ def find_sources(
     if source.is_file():
         if source.suffix.lower() not in VIDEOS:
             raise UsageError(f"source must be a folder, or a video ({', '.join(VIDEOS)}), got the file {source}")
-        return _find_video_frames(source.parent, [source.name], every, val_share, seed)
-    files = sorted(list_names(source))
+        return _find_video_frames(source.parent, {source.name: source.stat().st_size}, every, val_share, seed)
+    sizes = _sizes(source)
+    files = sorted(sizes)
     videos = [file for file in files if file.lower().endswith(VIDEOS)]
     if not videos:
         options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
         frames = split_frames(source, files, split=None, **options)
         _check_sample(source, [frame.path for frame in frames[:: len(frames) // _SAMPLES or 1]], size or (1, 1))
-        return Sources(source, table_of(source, frames))
+        return Sources(source, table_of(frames, sizes))
     if images := [file for file in files if file.lower().endswith(EXTENSIONS)]:
         both = f"{images[0]} and {videos[0]}"
         raise UsageError(f"source must hold images or videos, got both in {source}, such as {both}")
-    return _find_video_frames(source, videos, every, val_share, seed)
+    return _find_video_frames(source, {name: sizes[name] for name in videos}, every, val_share, seed)
 
 
-def _find_video_frames(root: Path, paths: Sequence[str], every: int, val_share: float, seed: int) -> Sources:
+def _find_video_frames(root: Path, sizes: Mapping[str, int | None], every: int, val_share: float, seed: int) -> Sources:
+    paths = list(sizes)
     counts = {path: video_info(root / path)[0] for path in paths}
     frames = [(path, index) for path in paths for index in range(0, counts[path], every)]
     if not frames:
@@ -148,7 +150,7 @@ def _find_video_frames(root: Path, paths: Sequence[str], every: int, val_share: 
     has_one_drive = len(set(drive_of.values())) < 2
     val = set() if has_one_drive else select_val_drives(root, drive_of, val_share=val_share, seed=seed)
     sources = [Source(path, drives[path] or ".", "val" if drives[path] in val else "train", i) for path, i in frames]
-    return Sources(root, table_of(root, sources), [path for path, count in counts.items() if count == 0])
+    return Sources(root, table_of(sources, sizes), [path for path, count in counts.items() if count == 0])
 
 
 def draw_of(source: Source, *, seed: int, repeat: int) -> tuple[int, int]:
@@ -178,9 +180,8 @@ def _check_sample(root: Path, paths: Sequence[str], size: tuple[int, int]) -> No
         raise ValueError(f"root must hold readable frames, got {first_names(reasons)} in {root}")
 
 
-def table_of(root: Path, frames: Sequence[Source]) -> pa.Table:
-    """Make the table of frames, with the sizes of their files and their keys."""
-    sizes = {path: _size(f"{root}/{path}") for path in {frame.path: None for frame in frames}}
+def table_of(frames: Sequence[Source], sizes: Mapping[str, int | None]) -> pa.Table:
+    """Make the table of frames, with the sizes of their files, by path, and their keys."""
     columns = {
         "path": _texts([frame.path for frame in frames]),
         "drive": _texts([frame.drive for frame in frames]).dictionary_encode(),
@@ -190,6 +191,23 @@ def table_of(root: Path, frames: Sequence[Source]) -> pa.Table:
         "key": pa.array([key_of(frame.name) for frame in frames], pa.int64()),
     }
     return pa.table(columns)
+
+
+def _sizes(root: Path) -> dict[str, int | None]:
+    """Return the size of each file of a root by its name, without hidden ones."""
+    if not is_remote(root):
+        return {name: _size(f"{root}/{name}") for name in list_names(root)}
+    store, sizes = cast(Any, root), dict[str, int | None]()
+
+    def scan() -> None:
+        start = store.path.strip("/")
+        for folder, _, files in store.fs.walk(store.path, detail=True):
+            inner = folder.strip("/")[len(start) :].strip("/")
+            names = {f"{inner}/{name}".lstrip("/"): info["size"] for name, info in files.items()}
+            sizes.update({name: size for name, size in names.items() if "/." not in f"/{name}"})
+
+    retried(scan, root)
+    return sizes
 
 
 def _size(path: str) -> int | None:

@@ -94,6 +94,7 @@ class Options(NamedTuple):
     license: str
     shard: Shard
     workers: int
+    engine: dict[str, Any]
     verify: bool
     repaired: set[int]  # pairs whose frames were unreadable in an earlier run
 
@@ -138,7 +139,8 @@ def _make_missing(options: Options, out: Path) -> tuple[int, list[str]]:
     if units:
         _check_disk(options, [number for unit in units for number in unit], storage)
         tasks = ([options.task(number) for number in unit] for unit in units)
-        rows = generate_pairs(tasks, options.generator, storage, workers=min(options.workers, len(units)))
+        workers = min(options.workers, len(units))
+        rows = generate_pairs(tasks, options.generator, storage, workers=workers, engine=options.engine)
         try:
             for unit in _with_progress(rows, total=sum(map(len, units))):
                 lost += [row.skipped.removeprefix(LOST) for row in unit if row.skipped.startswith(LOST)]
@@ -179,6 +181,9 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
     if not 0 < plain["val_share"] < 1:
         raise UsageError(f"val_share must be between 0 and 1, got {plain['val_share']}")
     verify, shard, workers = _checked(cfg, "verify", check_flag), _shard(cfg), _workers(cfg)
+    engine = cast(dict[str, Any], OmegaConf.to_container(cfg.engine))
+    if engine["name"] == "ray" and workers == 0:
+        raise UsageError("workers must be at least 1 for engine=ray, which counts its actors, got 0")
     with naming("source"):
         source = as_path(str(cfg.source))
     for name, path in (("out", out), ("source", source)):
@@ -201,7 +206,9 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
     reader = SourceReader(sources.root, plain["size"], depth)
     generator = PairGenerator(effect, scene["name"], reader, cfg.seed, plain["maps"])
     settings = {"scene": scene, **plain, "frames": sources.num_frames, "sources": sources.digest()}
-    return Options(generator, sources, write_list, settings, num_pairs, str(cfg.license), shard, workers, verify, set())
+    return Options(
+        generator, sources, write_list, settings, num_pairs, str(cfg.license), shard, workers, engine, verify, set()
+    )
 
 
 def _list_frames(

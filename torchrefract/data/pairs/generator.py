@@ -10,7 +10,7 @@ import io
 import math
 import tarfile
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,6 +35,7 @@ from torchrefract.data.images import (
 from torchrefract.data.media import read_video
 from torchrefract.data.pairs.files import DEPTH, FLOWS, LIGHTS, PairArrays, count_out_of_range, encode_pair
 from torchrefract.data.pairs.manifest import LOST, PairRow, StoredFile
+from torchrefract.data.pairs.ray_engine import map_in_actors
 from torchrefract.data.pairs.sources import draw_of
 from torchrefract.data.workers import map_in_processes
 from torchrefract.effects.base import Effect
@@ -264,9 +265,20 @@ def _add_file(tar: tarfile.TarFile, name: str, data: bytes) -> int:
 
 
 def generate_pairs(
-    units: Iterable[Sequence[PairTask]], generator: PairGenerator, storage: PairStorage, *, workers: int
+    units: Iterable[Sequence[PairTask]],
+    generator: PairGenerator,
+    storage: PairStorage,
+    *,
+    workers: int,
+    engine: Mapping[str, Any] | None = None,
 ) -> Iterator[list[PairRow]]:
     """Generate and write units of pairs in processes, or in this one with `workers` 0.
+
+    Args:
+        units: the pairs of each file that is written as a whole.
+        generator, storage: make and write a pair.
+        workers: number of processes, or of actors.
+        engine: name "ray" and address of a cluster, see `map_in_actors`; None takes processes of this machine.
 
     Yields:
         the rows of each unit when it is written, in any order.
@@ -276,4 +288,7 @@ def generate_pairs(
         Exception: any error of a worker, after the others have finished their units.
     """
     work = partial(storage.write, generator=generator)
+    if engine is not None and engine["name"] == "ray":
+        block = 8 if storage.tar is None else 1  # a tar takes long enough by itself
+        return map_in_actors(work, units, workers=workers, address=engine["address"], block=block)
     return map_in_processes(work, units, workers=workers, preload=__name__)

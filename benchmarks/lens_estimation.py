@@ -2,6 +2,7 @@
 
     python benchmarks/lens_estimation.py  # rendered roads through a known lens, and without a lens
     python benchmarks/lens_estimation.py --data DATA [--sets ca280_1280 ...]  # real cameras with a calibration
+    python benchmarks/lens_estimation.py --checkpoint lens_small  # also by a network, and by both together
 
 DATA holds frames/train/ca280_*.jpg and fullres/ca280_*.jpg, of the camera of chessboard/udacity_p4, and folders of
 chessboard and charuco, with a reference.json each. The calibrated camera is that of OpenCV with five coefficients. The
@@ -30,13 +31,23 @@ from torch import Tensor
 
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract.cameras.calibration.detection import detect, has_enough_corners
-from torchrefract.cameras.calibration.plumb_line import find_chains, fit_lens, pool_chains, published_prior
+from torchrefract.cameras.calibration.lens_estimate import pool_lenses, radial_lens_of_flow
+from torchrefract.cameras.calibration.plumb_line import (
+    LineFit,
+    find_chains,
+    fit_lens,
+    is_distinct,
+    pool_chains,
+    published_prior,
+)
 from torchrefract.cameras.calibration.report import straightness, undistort_views
 from torchrefract.cameras.camera import Camera
 from torchrefract.cli.calibration import find_pictures, read_gray
-from torchrefract.data.images import pixels_of
+from torchrefract.cli.lens import Predictor, flow_predictor
+from torchrefract.data.images import pixels_of, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.fields.rectification import camera_flow
+from torchrefract.restoration.checkpoints import load_model
 from torchrefract.warping.warp import warp
 
 SETS = {  # name: pictures, and the folder with reference.json, its entry and the calibration there
@@ -54,10 +65,18 @@ _WIDTH = 1920  # px, of errors
 _GRID = 41
 
 
+class Network(NamedTuple):
+    """A network and the mean of the flows that it was trained on."""
+
+    predict: Predictor
+    constant: Tensor  # (1, 2, h, w)
+
+
 class Row(NamedTuple):
     """The errors of a set of frames."""
 
     name: str
+    method: str  # "lines", "network", "both" or "constant", the lens of the mean flow of the network's training
     frames: int
     error: float
     nothing: float
@@ -102,40 +121,55 @@ def errors(estimate: Camera, truth: Camera) -> tuple[float, float]:
     return error, nothing
 
 
-def measure(name: str, grays: Sequence[np.ndarray], truth: Camera) -> tuple[list[Row], Camera]:
-    """Estimate the lens from pools of frames; return the rows and the camera of all frames."""
+def measure(
+    name: str, frames: Sequence[Tensor], truth: Camera, *, network: Network | None = None
+) -> tuple[list[Row], Camera]:
+    """Estimate the lens from pools of frames (1, 3, H, W); return the rows and the camera of all frames by lines."""
     size, random = (truth.height, truth.width), np.random.default_rng(0)
-    chains = [find_chains(gray) for gray in grays]
+    chains = [find_chains(to_gray(frame[0])) for frame in frames]
+    aspect = truth.width / truth.height
+    lenses = torch.stack([radial_lens_of_flow(network.predict(f), aspect=aspect) for f in frames]) if network else None
     rows, camera = [], truth
-    for number, draws in {**{n: d for n, d in _POOLS.items() if n < len(grays)}, len(grays): 1}.items():
-        results = []
+    for number, draws in {**{n: d for n, d in _POOLS.items() if n < len(frames)}, len(frames): 1}.items():
+        results: dict[str, list[tuple[float, float, bool, int]]] = {}
         for _ in range(draws):
-            pool = pool_chains([chains[i] for i in random.choice(len(grays), number, replace=False)], size)
-            fit = fit_lens(pool, published_prior())
-            camera = to_camera(fit.coefficients, size)
-            results.append((*errors(camera, truth), fit.is_distorted, int(fit.is_straight.sum())))
-        error, nothing, distinct, straight = zip(*results, strict=True)
-        rows.append(Row(name, number, median(error), nothing[0], sum(distinct) / draws, median(straight)))
-        print(
-            f"{name:26}{number:4} frames  error {rows[-1].error:6.1f}  nothing {nothing[0]:6.1f}  "
-            f"distinct in {rows[-1].distinct:4.0%}  straight edges {rows[-1].straight:4.0f}",
-            flush=True,
-        )
+            chosen = random.choice(len(frames), number, replace=False)
+            pool = pool_chains([chains[i] for i in chosen], size)
+            fits = {"lines": fit_lens(pool, published_prior())}
+            camera = to_camera(fits["lines"].coefficients, size)
+            if network and lenses is not None:
+                prior, none = pool_lenses(lenses[chosen]), fits["lines"].is_straight & False
+                constant = radial_lens_of_flow(network.constant, aspect=aspect)
+                fits["network"] = LineFit(prior.mean, prior.covariance, is_distinct(prior.mean, prior.covariance), none)
+                fits["both"] = fit_lens(pool, prior)
+                fits["constant"] = fits["network"]._replace(coefficients=constant, is_distorted=False)
+            for method, fit in fits.items():
+                error = errors(to_camera(fit.coefficients, size), truth)
+                results.setdefault(method, []).append((*error, fit.is_distorted, int(fit.is_straight.sum())))
+        for method, of_draws in results.items():
+            error, nothing, distinct, straight = zip(*of_draws, strict=True)
+            row = Row(name, method, number, median(error), nothing[0], sum(distinct) / draws, median(straight))
+            rows.append(row)
+            print(
+                f"{name:26}{number:4} frames  {method:8}error {row.error:6.1f}  nothing {row.nothing:6.1f}  "
+                f"distinct in {row.distinct:4.0%}  straight edges {row.straight:4.0f}",
+                flush=True,
+            )
     return rows, camera
 
 
-def rendered(lens: tuple[float, float]) -> tuple[list[np.ndarray], Camera]:
+def rendered(lens: tuple[float, float]) -> tuple[list[Tensor], Camera]:
     """Render roads through a lens, relative to the half diagonal; a part of the rendered frames is shown."""
     camera, (height, width) = to_camera(torch.tensor(lens), _RENDERED_SIZE), _RENDERED_SIZE
     y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
     pixels, center = torch.stack([x, y], dim=-1).reshape(-1, 2), torch.tensor([camera.cx, camera.cy])
     rectified = camera.undistort((pixels - center) / camera.fx).points * camera.fx * _SHRINK + center
     flow = (rectified - pixels).T.reshape(1, 2, height, width).float()
-    grays = []
+    frames = []
     for key in range(_NUM_RENDERED):
         image, _ = render_road_scenes(torch.tensor([key]), height, width)
-        grays.append(to_gray(warp(image, flow, interpolation="bicubic")[0][0]))
-    return grays, camera
+        frames.append(warp(image, flow, interpolation="bicubic")[0])
+    return frames, camera
 
 
 def to_gray(image: Tensor) -> np.ndarray:
@@ -143,10 +177,9 @@ def to_gray(image: Tensor) -> np.ndarray:
     return cv2.cvtColor(pixels_of(image), cv2.COLOR_RGB2GRAY)
 
 
-def rectify(gray: np.ndarray, flow: Tensor) -> np.ndarray:
-    """Warp a gray picture along a flow."""
-    image = to_float(torch.from_numpy(gray)[None, None])
-    return to_uint8(warp(image, flow, interpolation="bicubic")[0])[0, 0].numpy()
+def rectify(frame: Tensor, flow: Tensor) -> Tensor:
+    """Warp a frame along a flow, and round it to bytes."""
+    return to_float(to_uint8(warp(frame, flow, interpolation="bicubic")[0]))
 
 
 def board_lines(folder: Path, name: str, estimate: Camera) -> tuple[float, float]:
@@ -158,19 +191,20 @@ def board_lines(folder: Path, name: str, estimate: Camera) -> tuple[float, float
     return straightness(views, board), straightness(undistort_views(views, estimate), board)
 
 
-def real(data: Path, sets: Sequence[str]) -> list[Row]:
+def real(data: Path, sets: Sequence[str], network: Network | None) -> list[Row]:
     """Measure sets of real frames, and the same after rectification by the calibrated camera."""
     rows = []
     for name in sets:
         pattern, folder, entry, calibration = SETS[name]
-        grays = [read_gray(path) for path in sorted(data.glob(pattern))]
+        frames = [read_image(path)[None] for path in sorted(data.glob(pattern))]
         reference = json.loads((data / folder / "reference.json").read_text())[entry]
         truth = calibrated_camera(reference, calibration)
-        camera = truth.resized(width=grays[0].shape[1], height=grays[0].shape[0])
-        measured, estimate = measure(name, grays, camera)
+        camera = truth.resized(width=frames[0].shape[3], height=frames[0].shape[2])
+        measured, estimate = measure(name, frames, camera, network=network)
         flow = camera_flow(camera)[0]
         none = to_camera(torch.zeros(2), (camera.height, camera.width))
-        rows += measured + measure(f"{name}, rectified", [rectify(gray, flow) for gray in grays], none)[0]
+        rectified = [rectify(frame, flow) for frame in frames]
+        rows += measured + measure(f"{name}, rectified", rectified, none, network=network)[0]
         resized = estimate.resized(width=truth.width, height=truth.height)
         before, after = board_lines(data / folder, entry, resized)
         print(f"{name:26} lines of the board {before:.2f} px, {after:.2f} px after rectification", flush=True)
@@ -181,14 +215,21 @@ def main() -> None:
     """Print the rows and write them as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder of real frames and chessboards")
+    parser.add_argument("--checkpoint", help="of a training of the task undistort")
     parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
     parser.add_argument("--out", type=Path, default=RESULTS / "lens_estimation.json")
     arguments = parser.parse_args()
+    network = None
+    if arguments.checkpoint:
+        loaded = load_model(arguments.checkpoint)
+        model: Any = loaded.model
+        constant = model.constant_flow(torch.zeros(1, 2, *loaded.size))
+        network = Network(flow_predictor(model, loaded.size, torch.device("cpu")), constant)
     if arguments.data:
-        rows = real(arguments.data, arguments.sets)
+        rows = real(arguments.data, arguments.sets, network)
     else:
         lenses = {"rendered roads, barrel": RENDERED_LENS, "rendered roads, no lens": (0.0, 0.0)}
-        rows = [row for name, lens in lenses.items() for row in measure(name, *rendered(lens))[0]]
+        rows = [row for name, lens in lenses.items() for row in measure(name, *rendered(lens), network=network)[0]]
     write_json(arguments.out, [row._asdict() for row in rows])
 
 

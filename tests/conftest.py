@@ -15,6 +15,9 @@ from torch import Tensor
 
 from torchrefract.cameras.projection import undistort
 
+# Files of few and slow tests, which would leave one process of pytest-xdist alone if they ran last.
+SLOW_FILES = ("test_train.py", "test_examples.py", "test_export.py", "test_calibrate.py", "test_table1.py")
+
 
 def pytest_addoption(parser) -> None:
     """Add `--extremes`, which selects how many cases of the stability contract run."""
@@ -26,6 +29,11 @@ def pytest_configure() -> None:
     if "PYTEST_XDIST_WORKER" in os.environ:
         torch.set_num_threads(1)
         os.environ["OMP_NUM_THREADS"] = "1"
+
+
+def pytest_collection_modifyitems(items) -> None:
+    """Put slow files first: pytest-xdist gives files to its processes in this order."""
+    items.sort(key=lambda item: item.path.name not in SLOW_FILES)
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,6 @@
 import importlib.util
 import re
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -13,14 +13,17 @@ SCRIPTS = sorted(EXAMPLES.glob("0*.py"))
 LIBRARIES = {"07_train_yolo.py": ("albumentations", "ultralytics")}  # that no extra of this package installs for tests
 
 
+@pytest.mark.filterwarnings("default")  # of other libraries, which a script shows
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
-def test_an_example_is_short_and_draws_its_picture(script: Path, tmp_path: Path):
+def test_an_example_is_short_and_draws_its_picture(script: Path, tmp_path: Path, monkeypatch):
     assert len(script.read_text().splitlines()) <= 60
     for library in LIBRARIES.get(script.name, ()):
         if importlib.util.find_spec(library) is None:
             pytest.skip(f"{library} is not installed")
     picture = tmp_path / "picture.png"
-    subprocess.run([sys.executable, script, picture], check=True, cwd=tmp_path, timeout=300)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(script), str(picture)])
+    runpy.run_path(str(script), run_name="__main__")
     pixels = np.asarray(Image.open(picture).convert("RGB"))
     assert min(pixels.shape[:2]) >= 200
     assert pixels.std() > 20

@@ -13,7 +13,6 @@ from torchrefract.cameras.io import read_camera
 from torchrefract.data.images import pixels_of, read_image
 from torchrefract.data.media import video_info
 from torchrefract.fields.rectification import camera_flow
-from torchrefract.restoration.checkpoints import read_checkpoint
 
 SIZES = {"a.png": (48, 96), "one/b.png": (90, 70), "one/two/b.png": (48, 96), "one/c.bmp": (1, 1)}
 
@@ -194,19 +193,6 @@ def test_a_video_with_an_odd_side_is_rejected(call, tmp_path, brighter):
     assert outcome.err.splitlines()[-1].startswith("error: input must hold a file that can be restored, got ")
     assert outcome.err.endswith("clip.gif would give frames of 96 x 63, and videos take even sides only\n")
     assert written(tmp_path / "out") == ["config.json"]
-
-
-def test_the_checkpoint_of_a_training_is_sufficient(call, folder, trained):
-    best = trained.folder / "best.ckpt"
-    assert call("restore", f"ckpt_path={best}", "input=raw", "out=out").code == 0
-    checkpoint = read_checkpoint(best)
-    assert checkpoint["config"]["data"]["train_count"] == 32
-    data = checkpoint["data"]
-    assert (data["source"], data["frames"], data["size"], data["license"]) == ("RoadScenes", 32, [32, 64], None)
-    assert checkpoint["licenses"] == {"data": None, "pretrained weights": None}
-    with torch.no_grad():
-        raw = read_image(folder / "raw" / "a.png")[None]
-        assert (read_image(folder / "out" / "a.png") - raw).abs().mean() > 1 / 255
 
 
 @pytest.mark.parametrize(

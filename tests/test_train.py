@@ -116,6 +116,19 @@ def test_the_checkpoints_are_those_of_the_last_and_of_the_best_epoch(trained):
     assert read_checkpoint(trained.folder / "best.ckpt", task="undistort")["epoch"] == min(epe, key=epe.__getitem__)
 
 
+def test_the_checkpoint_of_a_training_is_sufficient_to_restore(call, tmp_path, trained):
+    raw, best = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8), trained.folder / "best.ckpt"
+    Image.fromarray(raw).save(tmp_path / "raw.png")
+    assert call("restore", f"ckpt_path={best}", "input=raw.png", "out=out").code == 0
+    restored = np.asarray(Image.open(tmp_path / "out" / "raw.png"))
+    assert np.abs(restored.astype(float) - raw).mean() > 1
+    checkpoint = read_checkpoint(best)
+    assert checkpoint["config"]["data"]["train_count"] == 32
+    data = checkpoint["data"]
+    assert (data["source"], data["frames"], data["size"], data["license"]) == ("RoadScenes", 32, [32, 64], None)
+    assert checkpoint["licenses"] == {"data": None, "pretrained weights": None}
+
+
 @pytest.fixture
 def killed(monkeypatch, tmp_path, small) -> Path:
     """Return the folder of a run that received SIGKILL in its second epoch."""

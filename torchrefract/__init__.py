@@ -19,7 +19,7 @@ Depth for fog: a map in m, `CorridorDepth`, `GroundPlaneDepth`, any function of 
 `effect(image)` degrades an image; `effect.degrade(image, seed=..., keys=...)` returns a `Degraded` with the flow, its
 inverse, masks and the drawn parameters, and `effect.apply(image, params)` repeats a draw. `warp`, `invert_flow` and
 `compose_flows` work on flows, which are backward and in pixels: out(p) = image(p + flow(p)). `worst_case` searches the
-parameters of an effect that harm a model most.
+parameters of an effect that harm a model most. `pretrained` loads a network that restores the lens of a frame.
 
 Commands, each with a `--help`: python -m torchrefract.preview, degrade, generate, train, eval, restore, export,
 calibrate, rectify, make_board, estimate_lens, estimate_depth, robustness, merge.
@@ -65,6 +65,7 @@ from torchrefract.labels.maps import warp_depth, warp_mask, warp_optical_flow
 from torchrefract.labels.points import warp_points
 from torchrefract.labels.targets import warp_labels
 from torchrefract.random import key_of
+from torchrefract.restoration.pretrained import pretrained
 from torchrefract.robustness.worst_case import WorstCase, worst_case
 from torchrefract.types import Degraded, Folding, Frame, Pair
 from torchrefract.warping.flow import compose_flows, folding, jacobian_determinant
@@ -128,6 +129,7 @@ __all__ = [
     "invert_flow",
     "jacobian_determinant",
     "key_of",
+    "pretrained",
     "ray_distance",
     "remove_fog",
     "warp",

@@ -280,11 +280,10 @@ def test_a_sample_does_not_depend_on_its_batch(case):
 def test_a_sample_does_not_depend_on_the_number_of_threads(case, batch, on_threads):
     effect, images = case.strong(), random_image(batch, 3, 151, 127)
     results = []
-    for threads in (1, 2, 3):
+    for threads in (1, 3):
         on_threads(threads)
         results.append(maps_of(effect.degrade(images, seed=7, keys=range(5, 5 + batch))))
-    for result in results[1:]:
-        assert_close_maps(result, results[0])
+    assert_close_maps(*results)
 
 
 @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
@@ -360,9 +359,9 @@ def test_only_the_applied_samples_of_a_batch_change(case, dtype):
     assert (degraded.image != image).flatten(1).any(dim=1).tolist() == applied.tolist()
 
 
-def test_the_share_of_applied_samples_is_p(case):
-    count, p = 4000, 0.3
-    applied = case.strong(p=p).sample(torch.zeros(count, 3, 1, 1), seed=7).applied
+def test_the_share_of_applied_samples_is_p():
+    count, p = 4000, 0.3  # all effects draw `applied` by the same method
+    applied = UniformFog(p=p).sample(torch.zeros(count, 3, 1, 1), seed=7).applied
     assert abs(applied.double().mean().item() - p) < 4 * math.sqrt(p * (1 - p) / count)
 
 

@@ -13,7 +13,6 @@ from torchrefract import (
     Compose,
     LensDistortion,
     Rectification,
-    RectificationParams,
 )
 
 # A car's camera, from a calibration with 20 chessboards.
@@ -142,19 +141,6 @@ def test_one_graph_gives_the_same_as_eager_mode(name, tolerance_px):
     assert (effect.plan(27, 48).stride > 1) == (tolerance_px is not None)
     compiled = torch.compile(effect, fullgraph=True, backend="eager")
     assert_close(compiled(image), effect(image), rtol=0, atol=2e-4)
-
-
-@every_model
-def test_gradients_of_the_camera_are_those_of_finite_differences(camera):
-    effect, image = Rectification(camera, tolerance_px=None), smooth(1, 1, 9, 16, dtype=torch.float64)
-    params = effect.sample(image, seed=0)
-
-    def rectified(*values: Tensor) -> tuple[Tensor, Tensor]:
-        degraded = effect.apply(image, RectificationParams(params.applied, *values))
-        return degraded.image, degraded.restore_flow
-
-    values = [value.clone().requires_grad_() for value in params[1:]]
-    assert torch.autograd.gradcheck(rectified, values, fast_mode=True)
 
 
 def test_a_composition_shares_its_tolerance_with_a_rectification():

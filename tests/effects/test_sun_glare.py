@@ -74,26 +74,6 @@ def test_the_image_is_that_of_a_renderer_pixel_by_pixel(key):
     assert 0.005 < (~degraded.valid).double().mean() < 0.9
 
 
-def test_gradients_of_all_parameters_match_finite_differences():
-    image = picture(2, 2, 4, 5)
-    effect = SunGlare(
-        **IN_FRAME,
-        luminance_range=(300, 900),
-        scale_range=(3, 6),
-        ghost_radius_range=(5, 20),
-        ghost_share_range=(0.01, 0.1),
-        num_ghosts=2,
-    )
-    params = effect.sample(image, seed=2)
-    names = [name for name, value in params._asdict().items() if value.is_floating_point() and name != "time_constant"]
-
-    def shine(image: Tensor, *values: Tensor) -> Tensor:
-        return effect.apply(image, params._replace(**dict(zip(names, values, strict=True)))).image
-
-    inputs = [image, *(getattr(params, name) for name in names)]
-    assert torch.autograd.gradcheck(shine, [value.clone().requires_grad_() for value in inputs])
-
-
 def test_the_foreground_gets_darker_under_a_sun_in_the_sky_and_colors_lose_contrast():
     frame = torch.full((1, 3, *SIZE), 0.4, dtype=torch.float64)
     frame[:, :, :15] = torch.tensor([0.5, 0.6, 0.8])[:, None, None]

@@ -106,7 +106,11 @@ def test_a_sun_that_drifts_into_the_frame_is_planned_for_the_frame_that_is_asked
         each.apply(image[:, None].expand(-1, 200, -1, -1, -1), params, frame=0) for each in (effect, exact)
     )
     assert levels_apart(clip.image, expected.image) <= 1
-    compiled = torch.compile(lambda image, params: effect.apply(image, params, frame=100).image, fullgraph=True)
+
+    def shine(image: Tensor, params: Any) -> Tensor:
+        return effect.apply(image, params, frame=100).image
+
+    compiled = torch.compile(shine, fullgraph=True, backend="eager")
     assert levels_apart(compiled(image, params), exact.apply(image, params, frame=100).image) < 0.1
 
 
@@ -193,7 +197,7 @@ def test_gradients_of_parameters_are_exact(name):
 
 def test_one_graph_takes_the_plan_as_a_constant():
     effect = effect_with("octave", 1.0)
-    compiled = torch.compile(effect.degrade, fullgraph=True, backend="aot_eager")
+    compiled = torch.compile(effect.degrade, fullgraph=True, backend="eager")
     expected = effect.degrade(picture(), seed=4).image
     assert_close(compiled(picture(), seed=torch.tensor(4)).image, expected, rtol=0, atol=2e-4)
 

@@ -31,16 +31,23 @@ def trainer(tmp_path) -> Callable[..., Trainer]:
 
 
 @pytest.fixture(scope="session")
-def make_batches() -> Callable[..., list[Pair]]:
+def make_frames() -> Callable[..., Frame]:
+    """Return a function that renders a batch of road scenes with consecutive keys."""
+
+    def make(count: int, *, first: int = 0, size: tuple[int, int]) -> Frame:
+        scenes = RoadScenes(count, size=size, first=first)
+        return Frame(*(torch.stack(part) for part in zip(*(scenes[i] for i in range(count)), strict=True)))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_batches(make_frames) -> Callable[..., list[Pair]]:
     """Return a function that renders road scenes and corrupts them: batches with consecutive keys."""
 
     def make(effect: Effect, count: int, *, first: int = 0, size: tuple[int, int], batch: int = 4) -> list[Pair]:
-        batches = []
-        for start in range(first, first + count * batch, batch):
-            scenes = RoadScenes(batch, size=size, first=start)
-            frame = Frame(*(torch.stack(part) for part in zip(*(scenes[i] for i in range(batch)), strict=True)))
-            batches.append(make_pair(frame, effect, seed=start))
-        return batches
+        starts = range(first, first + count * batch, batch)
+        return [make_pair(make_frames(batch, first=start, size=size), effect, seed=start) for start in starts]
 
     return make
 

@@ -12,6 +12,7 @@ from torchrefract.data.module import PairData, fingerprint
 from torchrefract.effects.base import Effect
 from torchrefract.fields.depth import DepthProvider
 from torchrefract.restoration.checkpoints import read_checkpoint, safe_config
+from torchrefract.restoration.pretrained import find_checkpoint
 from torchrefract.restoration.report import describe_scene
 
 _PARTS = ("scene", "task", "data", "model")
@@ -26,7 +27,7 @@ def add_choices(arguments: list[str]) -> list[str]:
     """
     given = {key: value for key, _, value in (argument.lstrip("+").partition("=") for argument in arguments)}
     text = given.get("ckpt_path", "")
-    path = Path(text if Path(text).is_file() else text.strip("'\""))
+    path = find_checkpoint(text if Path(text).is_file() else text.strip("'\""))
     if not text or "experiment" in given or ("task" in given and not path.is_file()):
         return arguments
     checkpoint = read_checkpoint(path)

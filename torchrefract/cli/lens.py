@@ -111,7 +111,7 @@ def _load_network(cfg: DictConfig) -> Predictor:
     from torchrefract.restoration.checkpoints import load_model  # noqa: PLC0415 - as above
     from torchrefract.restoration.tasks import Undistort  # noqa: PLC0415 - as above
 
-    loaded, device = load_model(Path(str(cfg.checkpoint))), find_device(str(cfg.device))
+    loaded, device = load_model(str(cfg.checkpoint)), find_device(str(cfg.device))
     if loaded.task != Undistort.name:
         raise UsageError(f"checkpoint must be of the task {Undistort.name}, got {cfg.checkpoint} of {loaded.task}")
     return flow_predictor(loaded.model.to(device), loaded.size, device)

@@ -49,6 +49,7 @@ from torchrefract.restoration.export import FORMATS, export_model
 from torchrefract.restoration.inference import LensRestorer, Restorer
 from torchrefract.restoration.models.coordconv import weights_license
 from torchrefract.restoration.module import Restoration, RestorationModule
+from torchrefract.restoration.pretrained import WEIGHTS_SUFFIX, find_checkpoint, write_weights
 from torchrefract.restoration.tasks import Undistort
 
 _T = TypeVar("_T")
@@ -56,7 +57,8 @@ _T = TypeVar("_T")
 
 def train(cfg: DictConfig) -> None:
     """Train the model of a configuration on its data; with `ckpt_path`, resume a stopped run."""
-    data, model, trainer, num_epochs = _make_parts(cfg)
+    data, model, trainer, checkpoint = _make_parts(cfg)
+    num_epochs = num_epochs_done(checkpoint) if checkpoint else 0
     limit = trainer.max_epochs
     if num_epochs and limit is not None and -1 < limit <= num_epochs:
         raise UsageError(f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}")
@@ -92,14 +94,14 @@ def evaluate(cfg: DictConfig) -> None:
     """Score a checkpoint, by default on the data that it was validated on."""
     if cfg.ckpt_path is None:
         raise UsageError("ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none")
-    path = Path(str(cfg.ckpt_path))
+    path = find_checkpoint(str(cfg.ckpt_path))
     checkpoint = read_checkpoint(path, task=str(HydraConfig.get().runtime.choices["task"]))
     changed = use_validation_config(cfg, checkpoint, list(HydraConfig.get().overrides.task), path)
     data, model, trainer, _ = _make_parts(cfg)
     _save_config(cfg, trainer)
     if trainer.is_global_zero:
         print(f"scoring {path} on {describe_validation(data, cfg, changed)}", flush=True)
-    trainer.validate(model, data, ckpt_path=cfg.ckpt_path, verbose=False, weights_only=True)
+    trainer.validate(model, data, ckpt_path=path, verbose=False, weights_only=True)
 
 
 def restore(cfg: DictConfig) -> None:
@@ -137,10 +139,14 @@ def _restore_missing(files: Sequence[Path], job: "_Job", out: Path) -> None:
 
 def export(cfg: DictConfig) -> None:
     """Export the model of a checkpoint; print how much the file differs from the model."""
-    out, loaded = Path(str(cfg.out)), load_model(Path(str(cfg.ckpt_path)))
+    out, loaded = Path(str(cfg.out)), load_model(str(cfg.ckpt_path))
     with naming("out"):
-        check_choice("out", out.suffix, FORMATS)
+        check_choice("out", out.suffix, (*FORMATS, WEIGHTS_SUFFIX))
         out.parent.mkdir(parents=True, exist_ok=True)
+    if out.suffix == WEIGHTS_SUFFIX:
+        write_weights(read_checkpoint(find_checkpoint(str(cfg.ckpt_path))), out)
+        print(f"{out}: weights of {loaded.name} for {loaded.task} in half precision, {out.stat().st_size / 1e6:.2f} MB")
+        return
     if not isinstance(loaded.model, Restoration):
         raise UsageError(
             f"ckpt_path must be of a model that restores in a single pass, got {cfg.ckpt_path} of {loaded.name}"
@@ -155,11 +161,11 @@ def export(cfg: DictConfig) -> None:
     )
 
 
-def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, int]:
-    """Instantiate data, model and trainer, check that they fit together, and count the epochs of `ckpt_path`."""
+def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, dict[str, Any] | None]:
+    """Instantiate data, model and trainer, check that they fit together, and read the checkpoint at `ckpt_path`."""
     OmegaConf.resolve(cfg)
     seed_everything(check_seed(cfg.seed), workers=True, verbose=False)
-    path = None if cfg.ckpt_path is None else Path(cfg.ckpt_path)
+    path = None if cfg.ckpt_path is None else find_checkpoint(cfg.ckpt_path)
     checkpoint = path and read_checkpoint(path, task=str(HydraConfig.get().runtime.choices["task"]))
     data, model = make(cfg, "data"), make(cfg, "model")
     try:
@@ -181,7 +187,7 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
         data.check_pair()
     if path and checkpoint:
         check_fits(checkpoint, model, path, config=cfg.model)
-    return data, model, trainer, num_epochs_done(checkpoint) if checkpoint else 0
+    return data, model, trainer, checkpoint
 
 
 def _save_config(cfg: DictConfig, trainer: Trainer) -> None:
@@ -230,7 +236,7 @@ def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
     with naming("side_by_side"):
         side_by_side = check_flag("side_by_side", cfg.side_by_side)
     device = find_device(str(cfg.device))
-    loaded = load_model(Path(str(cfg.ckpt_path)), changes=cfg.model)
+    loaded = load_model(str(cfg.ckpt_path), changes=cfg.model)
     with naming("size"):
         size = loaded.size if cfg.size is None else check_size("size", cfg.size)
     with naming("tile"):
@@ -257,7 +263,7 @@ def find_device(name: str) -> torch.device:
 
 def _settings(cfg: DictConfig, job: _Job) -> dict[str, Any]:
     """Return everything that decides the output, so that a folder is only continued with the same settings."""
-    with Path(str(cfg.ckpt_path)).open("rb") as stream:
+    with find_checkpoint(str(cfg.ckpt_path)).open("rb") as stream:
         checkpoint = hashlib.file_digest(stream, "sha256").hexdigest()
     return {
         "checkpoint": checkpoint,

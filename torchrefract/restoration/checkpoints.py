@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError
+from torchrefract.restoration.pretrained import WEIGHTS_SUFFIX, find_checkpoint, read_weights
 from torchrefract.restoration.tasks import Task
 
 _PACKAGE = "torchrefract."
@@ -53,6 +54,11 @@ class AtomicCheckpointIO(TorchCheckpointIO):
                 f"{path} could not be written ({reason}){previous}: free disk space or choose another hydra.run.dir, "
                 "and resume with ckpt_path="
             ) from error
+
+    def load_checkpoint(self, path: str | Path, *args: Any, **options: Any) -> dict[str, Any]:
+        """Read a checkpoint, or the weights of a model that comes with torchrefract."""
+        path = Path(path)
+        return read_weights(path) if path.suffix == WEIGHTS_SUFFIX else super().load_checkpoint(path, *args, **options)
 
 
 class StopOnSigterm(Callback):
@@ -111,7 +117,15 @@ def how_to_continue(path: Path) -> str:
 
 
 def num_epochs_done(checkpoint: Mapping[str, Any]) -> int:
-    """Return the number of complete epochs of a training checkpoint."""
+    """Return the number of complete epochs of a training checkpoint.
+
+    Raises:
+        CheckpointError: the checkpoint holds weights alone.
+    """
+    if "loops" not in checkpoint:
+        raise CheckpointError(
+            "ckpt_path must be a checkpoint of a training, such as <run>/last.ckpt, got weights alone"
+        )
     return int(checkpoint["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"])
 
 
@@ -125,19 +139,20 @@ class Loaded(NamedTuple):
     licenses: dict[str, Any]  # by source of the model, the license, or None if it is unknown
 
 
-def load_model(path: Path, *, changes: Mapping[str, Any] | None = None) -> Loaded:
+def load_model(path: str | Path, *, changes: Mapping[str, Any] | None = None) -> Loaded:
     """Build the model of a checkpoint from the configuration inside the checkpoint.
 
     Only networks, models and tasks of torchrefract are instantiated. Pretrained weights are not loaded, because the
     checkpoint holds all weights.
 
     Args:
-        path: the checkpoint.
+        path: the checkpoint, or the name of a model that comes with torchrefract, see `pretrained`.
         changes: values that replace those of the model's configuration.
 
     Raises:
         CheckpointError: see `read_checkpoint` and `check_fits`; the configuration is missing or of something else.
     """
+    path = find_checkpoint(path)
     checkpoint = read_checkpoint(path)
     config, data = (checkpoint.get(part) for part in ("config", "data"))
     if not (isinstance(config, dict) and isinstance(config.get("model"), dict) and isinstance(data, dict)):
@@ -162,12 +177,8 @@ def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(f"ckpt_path must be a checkpoint file, such as <run>/last.ckpt, got {path}")
     try:
-        # torch.load compares no checksums, so a hole in the file would silently change weights.
-        with zipfile.ZipFile(path) as archive:
-            if (damaged := archive.testzip()) is not None:
-                raise zipfile.BadZipFile(damaged)
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:  # zipfile and torch.load raise many types for a damaged file
+        checkpoint = read_weights(path) if path.suffix == WEIGHTS_SUFFIX else _read_archive(path)
+    except Exception as error:  # zipfile, torch.load and safetensors raise many types for a damaged file
         raise CheckpointError(
             f"ckpt_path must be an intact checkpoint, got {path}, which is damaged or another kind of file"
         ) from error
@@ -181,6 +192,14 @@ def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
     if task not in (None, name):
         raise CheckpointError(f"ckpt_path must be a checkpoint of the task {task}, got {path} of {name}")
     return checkpoint | {"state_dict": rename_weights(weights)}
+
+
+def _read_archive(path: Path) -> Any:
+    # torch.load compares no checksums, so a hole in the file would silently change weights.
+    with zipfile.ZipFile(path) as archive:
+        if (damaged := archive.testzip()) is not None:
+            raise zipfile.BadZipFile(damaged)
+    return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
 
 
 def rename_weights(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -67,6 +67,26 @@ def test_a_flat_image_has_no_edges():
     assert float(edges.strength.abs().max()) < 1e-3
 
 
+@pytest.mark.parametrize("resized", [False, True])
+def test_a_black_border_adds_no_edges(resized):
+    random = torch.Generator().manual_seed(0)
+    image = 0.3 + 0.4 * torch.rand(1, 3, *SIZE, generator=random)
+    y, x = torch.meshgrid(torch.linspace(-1, 1, SIZE[0]), torch.linspace(-1, 1, SIZE[1]), indexing="ij")
+    shown = x * x + y * y < 1.1
+    bordered = torch.where(shown, image, 0.0)
+    if resized:  # which makes pixels at the border of the padding gray
+        bordered = torch.nn.functional.interpolate(bordered, scale_factor=0.5, mode="bilinear", antialias=True)
+        image = torch.nn.functional.interpolate(image, scale_factor=0.5, mode="bilinear", antialias=True)
+    (edges, _), (with_border, _) = find_edges(image), find_edges(bordered)
+    kept = with_border.strength > 0
+    assert kept.float().mean() > 0.4
+    assert kept.float().mean() < 0.9
+    inside = edges.x.square() * 4 + (edges.y * 2 * SIZE[1] / SIZE[0]).square() < 0.6
+    for value, expected in zip(with_border, edges, strict=True):
+        assert_close(value[inside], expected[inside])
+    assert not kept[edges.x.square() * 4 + (edges.y * 2 * SIZE[1] / SIZE[0]).square() > 1.0].any()
+
+
 @pytest.mark.parametrize("strength", [0.0, -0.2, -0.7])
 def test_the_lens_of_bent_lines_makes_them_straight(strength):
     edges, angle, offset = edges_of_lines(strength)

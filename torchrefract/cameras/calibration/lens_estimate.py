@@ -78,7 +78,7 @@ def estimate_lens(
     if size is None:
         raise ValueError("frames must hold at least one frame, got none")
     pooled = pool_chains(chains, size)
-    prior = _pool_lenses(torch.stack(lenses)) if lenses else published_prior()
+    prior = pool_lenses(torch.stack(lenses)) if lenses else published_prior()
     return _to_estimate(pooled, prior, len(chains), focal * size[1])
 
 
@@ -131,7 +131,7 @@ def _to_gray(image: Tensor) -> np.ndarray:
     return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
 
 
-def _pool_lenses(lenses: Tensor) -> Gaussian:
+def pool_lenses(lenses: Tensor) -> Gaussian:
     """Return the median of lenses (N, 2) and their scatter about it, to which published lenses count as one more.
 
     The scatter is not divided by N: the errors of a network are similar in all frames of a drive.

@@ -199,13 +199,18 @@ def fit_lens(chains: Chains, prior: Gaussian) -> LineFit:
     lens = _refine(chains, prior, grid[(table.sum(dim=1) + _prior_cost(grid, prior)).argmin()])
     weight = _bootstrap(table, _prior_cost(grid, prior), chains.frame)
     covariance = _covariance(grid, weight, lens)
-    is_distorted = (lens @ torch.linalg.solve(covariance, lens)).item() > _DISTINCT
+    is_distorted = is_distinct(lens, covariance)
     if not is_distorted:
         lens = _posterior_mean(grid, weight, prior)
         covariance = _covariance(grid, weight, lens)
     bend, valid = bends(chains.points, lens[None], chains.size)
     odds = torch.exp(-(bend / chains.noise).square() / 2) * chains.curved / (_OUTLIERS * chains.noise)
     return LineFit(lens, covariance, is_distorted, (valid & (odds > 1))[0])
+
+
+def is_distinct(lens: Tensor, covariance: Tensor) -> bool:
+    """Return True if a lens (2,) with a covariance (2, 2) differs from no distortion, at 95 %."""
+    return (lens @ torch.linalg.solve(covariance, lens)).item() > _DISTINCT
 
 
 def covers_frame(coefficients: Tensor) -> bool:

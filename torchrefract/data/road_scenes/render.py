@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from torchrefract._tensor import to_float, to_uint8
 from torchrefract._validation import check_count, check_size, check_tensor
 from torchrefract.data.road_scenes.scene import (
     Array,
@@ -31,7 +32,7 @@ from torchrefract.types import Frame
 Window = tuple[slice, slice, slice]  # rays, rows, columns
 
 _SMALLEST = 8  # px a side
-_KEPT_BYTES = 1 << 30
+_KEPT_BYTES = 2 << 30
 _BITS = (1 << 64) - 1  # negative seeds and keys count modulo 2^64
 # Position of each ray in its pixel, (right, down), px from the center, on distinct rows and columns.
 _OFFSETS = np.array([(0.0, 0.0), (-0.15, -0.4), (0.4, -0.15), (0.15, 0.4), (-0.4, 0.15)])
@@ -43,8 +44,8 @@ _HAZE = 9000.0  # m, the distance at which contrast is one half
 class RoadScenes(Dataset[Frame]):
     """Rendered road scenes with their depth, see `render_road_scenes`.
 
-    Each process keeps the frames that it renders, up to 1 GiB, because a frame takes longer than a step of a small
-    network.
+    The image has 256 levels, as that of a camera. Each process keeps the frames that it renders, up to 2 GiB, because
+    a frame takes longer than a step of a small network.
 
     Args:
         count: number of scenes.
@@ -72,10 +73,10 @@ class RoadScenes(Dataset[Frame]):
         frame = self._frames.get(int(key))
         if frame is None:
             image, depth = render_road_scenes(key[None], *self.size, seed=self.seed)
-            frame = Frame(image[0], key, depth[0])
-            if len(self._frames) * (image.nbytes + depth.nbytes) < _KEPT_BYTES:
+            frame = Frame(to_uint8(image)[0], key, depth[0])
+            if len(self._frames) * (frame.image.nbytes + frame.depth.nbytes) < _KEPT_BYTES:
                 self._frames[int(key)] = frame
-        return Frame(*(part.clone() for part in frame))
+        return Frame(to_float(frame.image), frame.key.clone(), frame.depth.clone())
 
 
 def render_road_scenes(keys: Tensor, height: int, width: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:

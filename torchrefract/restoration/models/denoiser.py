@@ -121,7 +121,7 @@ class LatticeDenoiser(nn.Module):
         *,
         widths: Sequence[int] = (64, 96),
         weightings: int = 8,
-        lenses: int = 9,
+        lenses: int = 11,
         edges: int = 1024,
     ):
         super().__init__()

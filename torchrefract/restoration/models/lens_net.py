@@ -13,7 +13,8 @@ from torchrefract.restoration.models.coordconv import PolynomialFlowHead, cell_a
 _CELL = 4  # px
 _SOBEL = torch.outer(torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0]), torch.tensor([-1.0, -2.0, 0.0, 2.0, 1.0])) / 128
 _WEAK = 0.03  # of the range of an image, per px: the gradient that counts half
-_STRONGEST = -0.8  # lambda of the last candidate
+_BLACK = 1.5 / 255  # the most that the padding of an image may have in all channels
+_CANDIDATES = 0.2, -0.8  # lambda of the first and the last lens: a weak pincushion and a strong barrel
 _ANGLE_BIN, _OFFSET_BIN = math.radians(3), 0.015  # rad; widths
 _NUM_ANGLES, _NUM_OFFSETS = 60, 100  # lines farther than 0.75 widths from the center vote for the last bin
 _SCALE = 0.1  # of predictions, as the flow of a lens is some hundredths of the frame
@@ -33,7 +34,7 @@ class Edges(NamedTuple):
 class LensEncoder(nn.Module):
     """Describe an image by how straight each of several lenses makes its lines.
 
-        undistorted(p) = p / (1 + lambda |p|^2),  lambda = 0 … -0.8,  p in widths from the center of the frame
+        undistorted(p) = p / (1 + lambda |p|^2),  lambda = 0.2 … -0.8,  p in widths from the center of the frame
         concentration = log sum over lines (share of the votes for the line)^2, minus its mean over the lenses
 
     The edges of the frame, moved and turned by each lens, vote for lines in a Hough transform. Votes for straight lines
@@ -52,10 +53,10 @@ class LensEncoder(nn.Module):
     division models", IPOL 4 (2014), for the Hough transform of several lenses, there without learning.
     """
 
-    def __init__(self, *, weightings: int = 8, lenses: int = 9, edges: int = 1024):
+    def __init__(self, *, weightings: int = 8, lenses: int = 11, edges: int = 1024):
         super().__init__()
         self.num_edges, count = check_count("edges", edges), check_count("weightings", weightings)
-        self.lenses = torch.linspace(0, _STRONGEST, check_count("lenses", lenses, low=2)).tolist()
+        self.lenses = torch.linspace(*_CANDIDATES, check_count("lenses", lenses, low=2)).tolist()
         self.weights = nn.Sequential(
             *_convolution(EDGE_FEATURES, 16, dilation=1),
             *_convolution(16, 16, dilation=2),
@@ -101,7 +102,9 @@ class LensNet(nn.Module):
         ValueError: a number is too small, or `smooth` is False.
     """
 
-    def __init__(self, channels: int, *, weightings: int = 8, lenses: int = 9, edges: int = 1024, smooth: bool = False):
+    def __init__(
+        self, channels: int, *, weightings: int = 8, lenses: int = 11, edges: int = 1024, smooth: bool = False
+    ):
         super().__init__()
         if not smooth:
             raise ValueError("task must predict a flow for lens_net, as undistort does: add model=resunet")
@@ -117,7 +120,7 @@ def find_edges(image: Tensor) -> tuple[Edges, Tensor]:
     """Find the edge of each cell of an image.
 
     The gradients of a cell, as the mean of their structure tensor, give one direction; their position is the mean over
-    the pixels, weighted by the squared gradient.
+    the pixels, weighted by the squared gradient. Black counts as padding: cells next to it have no edge.
 
     Args:
         image: (B, 3, H, W), in [0, 1].
@@ -140,7 +143,9 @@ def find_edges(image: Tensor) -> tuple[Edges, Tensor]:
     along_x = energy * within.repeat(image.shape[3] // _CELL)
     along_y = energy * within.repeat(image.shape[2] // _CELL)[:, None]
     maps = torch.cat([energy, gx * gx - gy * gy, 2 * gx * gy, along_x, along_y, image], dim=1)
-    energy, cosine, sine, right, down, color = F.avg_pool2d(maps, _CELL).split((1, 1, 1, 1, 1, 3), dim=1)
+    moments, color = F.avg_pool2d(maps, _CELL).split((5, 3), dim=1)
+    padding = F.max_pool2d((image.amax(dim=1, keepdim=True) < _BLACK).to(image), _CELL)
+    energy, cosine, sine, right, down = (moments * (1 - F.max_pool2d(padding, 3, 1, 1))).split(1, dim=1)
     share = 1 / energy.clamp(min=1e-8)
     cosine, sine, right, down = (value * share for value in (cosine, sine, right, down))  # of twice the angle
     gradient = energy.clamp(min=1e-12).sqrt()

@@ -1,7 +1,7 @@
 """Time the writing of pairs, and the effects in a worker of a DataLoader, by frame size, and by their peak memory.
 
 python benchmarks/pairs.py --source DIR [--scene paper_refractive] [--count 200] [--size 360x640] [--workers 1 2]
-    [--maps png] [--out benchmarks/results/pairs.json]
+    [--maps png] [--listing 300000] [--out benchmarks/results/pairs.json]
 """
 
 import argparse
@@ -16,6 +16,7 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from hydra.utils import instantiate
@@ -40,14 +41,17 @@ from torchrefract.data.pairs.generator import (
     PairGenerator,
     PairTask,
     SourceReader,
-    find_sources,
 )
+from torchrefract.data.pairs.sources import find_sources
 from torchrefract.data.workers import use_one_thread
 from torchrefract.effects.base import Effect
 
 PROTOCOL = {
     "written": "A run of torchrefract.generate for each number of workers, with its start: pairs a second, share of "
     "the cores' time, and peak memory of all its processes (proportional set size, sampled each second).",
+    "listing": "A folder of that many links to 30 images, 1000 in a drive, until the first pair is written: seconds, "
+    "time of cores and peak memory of the main process (proportional set size), for the run that scans it, for one "
+    "that reads the list, and for one of 30 images, which shows what the start itself takes.",
     "one_pair": "One pair on one thread: read, degrade and encode; and, as the reference, read the frame and encode "
     "ready arrays. Means over pairs of the median of three calls, s.",
     "loader": "Frames a second from a DataLoader with one worker, which degrades one frame (3, H, W), uint8, by a new "
@@ -79,6 +83,7 @@ def main() -> None:
     for workers in args.workers:
         with tempfile.TemporaryDirectory(dir=args.disk) as folder:
             results["written"].append(measure_run(args, Path(folder) / "pairs", workers)._asdict())
+    results["listing"] = measure_listing(args) if args.listing else {}
     results["one_pair"] = measure_one_pair(args)
     effects = make_effects()
     image = torch.rand(1, 3, *args.size)
@@ -121,6 +126,44 @@ def measure_run(args: argparse.Namespace, out: Path, workers: int) -> Run:
     return Run(workers, args.count / seconds, share, peak, disk / args.count)
 
 
+def measure_listing(args: argparse.Namespace) -> dict[str, dict[str, float]]:
+    """Time the start of a set of many frames, and measure its memory."""
+    with tempfile.TemporaryDirectory(dir=args.disk) as name:
+        folder = Path(name)
+        for number in range(30):
+            path = folder / "images" / f"drive{number % 2}" / f"{number:02d}.jpg"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            pixels = np.random.default_rng(number).integers(0, 256, (32, 48, 3), np.uint8)
+            path.write_bytes(cv2.imencode(".jpg", pixels)[1].tobytes())
+        images = sorted((folder / "images").rglob("*.jpg"))
+        for number in range(args.listing):
+            path = folder / "frames" / f"drive{number // 1000:04d}" / f"{number:07d}.jpg"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.hardlink_to(images[number % len(images)])
+        runs = {"small": ("images", "small"), "scan": ("frames", "out"), "list": ("frames", "out")}
+        return {name: _first_pair(args, folder / source, folder / out) for name, (source, out) in runs.items()}
+
+
+def _first_pair(args: argparse.Namespace, source: Path, out: Path) -> dict[str, float]:
+    """Start a run, wait for a new pair, and end the run."""
+    words = [
+        f"scene={args.scene}",
+        f"source={source}",
+        f"out={out}",
+        "workers=1",
+        "license=benchmark",
+        *_scene(args)[1],
+    ]
+    pairs, peak, used, start = set(out.rglob("*.clean.png")), 0, 0.0, time.perf_counter()
+    with subprocess.Popen([sys.executable, "-m", "torchrefract.generate", *words], stdout=subprocess.DEVNULL) as run:
+        while run.poll() is None and set(out.rglob("*.clean.png")) == pairs:
+            peak, used = max(peak, _memory(run.pid)), _core_seconds(run.pid)
+            time.sleep(0.1)
+        seconds = time.perf_counter() - start
+        run.kill()
+    return {"seconds": seconds, "core_seconds": used, "main_bytes": peak}
+
+
 def measure_one_pair(args: argparse.Namespace) -> dict[str, float]:
     """Time single pairs in this process, and the reading and encoding alone."""
     use_one_thread()
@@ -129,7 +172,7 @@ def measure_one_pair(args: argparse.Namespace) -> dict[str, float]:
     reader, (scene, _) = SourceReader(sources.root, args.size), _scene(args)
     generator = PairGenerator(instantiate(scene), args.scene, reader, 0, args.maps)
     generated, reference = [], []
-    for number, source in enumerate(sources.frames):
+    for number, source in enumerate(sources.frames()):
         task = PairTask(number, source, 0)
         files = generator.generate(task).data
         arrays = decode_pair({suffix: lambda data=data: data for suffix, data in files.items()})
@@ -254,6 +297,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--size", type=size, default=(360, 640), help="height x width of the frames, 360x640")
     parser.add_argument("--workers", type=count(0), nargs="+", default=[1, 2], help="numbers of processes, 1 2")
     parser.add_argument("--maps", choices=FORMATS, default="png", help="format of the maps, png")
+    parser.add_argument("--listing", type=count(1), help="number of frames in a folder whose start is timed, none")
     parser.add_argument("--seconds", type=float, default=2.0, help="duration of a measurement of the loader, 2")
     parser.add_argument("--disk", type=Path, help="folder for temporary pairs, the system's default")
     parser.add_argument("--out", type=Path, default=RESULTS / "pairs.json", help="JSON file to write")

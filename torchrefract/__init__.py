@@ -22,7 +22,7 @@ inverse, masks and the drawn parameters, and `effect.apply(image, params)` repea
 parameters of an effect that harm a model most. `pretrained` loads a network that restores the lens of a frame.
 
 Commands, each with a `--help`: python -m torchrefract.preview, degrade, generate, train, eval, restore, export,
-calibrate, rectify, make_board, estimate_lens, estimate_depth, robustness, playground.
+calibrate, rectify, make_board, estimate_lens, estimate_depth, robustness, playground, merge.
 """
 
 import sys as _sys

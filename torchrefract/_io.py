@@ -1,28 +1,106 @@
-"""Atomic file writes, and the folder of the configuration files."""
+"""Paths on this machine and in object stores, atomic file writes, and the folder of the configuration files."""
 
+import errno
 import os
-from collections.abc import Iterator
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, TypeVar, cast
 from uuid import uuid4
+
+_T = TypeVar("_T")
+
+_PAUSES = (1.0, 4.0, 16.0)  # seconds, before each further try of a store
 
 _PACKAGE = Path(__file__).parent
 # A wheel carries conf/ inside the package; a checkout and an editable install have it beside the package.
 CONFIG_DIR = str(next((d for d in (_PACKAGE / "conf", _PACKAGE.parent / "conf") if d.is_dir()), _PACKAGE / "conf"))
 
 
+def as_path(text: str | Path) -> Path:
+    """Return the path of a file or folder: of an address such as s3://bucket/folder, one with pathlib's methods.
+
+    Addresses are those of fsspec; its package for the kind of store must be installed, as s3fs for s3://.
+
+    Raises:
+        ValueError: fsspec has no such kind of address, or lacks its package.
+    """
+    if isinstance(text, Path) or is_remote(text) or "://" not in text:
+        return Path(text).expanduser() if isinstance(text, str) else text
+    from upath import UPath  # noqa: PLC0415  # only the extra "train" has it
+
+    try:
+        # Other machines write to the same folder, so a listing must not be remembered.
+        path = UPath(text, use_listings_cache=False)
+        is_local = "file" in path.fs.protocol
+    except ImportError as error:
+        raise ValueError(f"{text} needs another package: {error} (pip install 'torchrefract[remote]')") from error
+    except ValueError as error:
+        raise ValueError(f"a path must be one on this machine or an address of fsspec, got {text} ({error})") from error
+    return Path(path.path) if is_local else cast(Path, path)
+
+
+def is_remote(path: Any) -> bool:
+    """Return True if a path of `as_path` lies in a store of fsspec."""
+    return bool(getattr(path, "protocol", ""))
+
+
+def retried(call: Callable[[], _T], path: Path) -> _T:
+    """Call a function that uses a store; wait and try again, three times at most, if it fails for another reason than
+    a missing file or permission.
+
+    Raises:
+        FileNotFoundError, PermissionError, OSError: with number, reason and path, whatever the store raises.
+    """
+    for pause in (*_PAUSES, None):
+        try:
+            return call()
+        except FileNotFoundError as error:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path)) from error
+        except PermissionError as error:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path)) from error
+        except Exception as error:  # stores have errors of their own for lost connections
+            reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+            if pause is None:
+                raise OSError(errno.EIO, f"{reason}, after {len(_PAUSES) + 1} tries", str(path)) from error
+            print(f"{path}: {reason}; trying again in {pause:.0f} s", file=sys.stderr, flush=True)
+            time.sleep(pause)
+    raise AssertionError("the last try returns or raises")
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a file on this machine or in a store; errors are those of `retried`."""
+    store = cast(Any, path)
+    return retried(lambda: store.fs.cat_file(store.path), path) if is_remote(path) else path.read_bytes()
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder with its parents; stores have none."""
+    if not is_remote(path):
+        path.mkdir(parents=True, exist_ok=True)
+
+
 @contextmanager
 def replace_file(path: Path, *, alone: bool = False) -> Iterator[Path]:
     """Yield a temporary path; move it to `path` if the block succeeds, otherwise delete it.
 
-    Readers of `path` find the old file until the move. The temporary name keeps the suffix of `path`, because writers
-    choose a format by it.
+    Readers of `path` find the old file until the move. For a path in a store, the temporary file lies on this machine
+    and is uploaded by `retried`. The temporary name keeps the suffix of `path`, because writers choose a format by it.
 
     Args:
         path: the file to write, in an existing folder.
         alone: True if no other process writes the same file. The temporary name is then fixed, so that the next run
             overwrites what a killed one left.
     """
+    if is_remote(path):
+        store = cast(Any, path)
+        with tempfile.TemporaryDirectory() as folder:
+            yield (temporary := Path(folder, path.name))
+            retried(lambda: store.fs.put_file(str(temporary), store.path), path)
+        return
     # tempfile creates files that only their owner can read.
     name = f".{path.stem}.part{path.suffix}" if alone else f".{path.stem}-{uuid4().hex[:8]}{path.suffix}"
     temporary = path.with_name(name)

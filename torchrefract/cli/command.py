@@ -43,7 +43,7 @@ _INFORMATION_OPTIONS = ("--hydra-help", "--info", "--shell-completion", "-sc")
 _MULTIRUN = ("-m", "--multirun")
 # Options whose value is text, mostly the path of a file: Hydra's syntax in it means nothing.
 _TEXT_OPTION = re.compile(
-    r"(\+{0,2}(?:image|images|input|data|labels|weights|source|depth|network|checkpoint|camera|scene\.camera|out|ckpt_path|license|run_dir|data\.root|data\.depth|hydra\.run\.dir"
+    r"(\+{0,2}(?:image|images|input|data|labels|weights|source|files|depth|network|checkpoint|camera|scene\.camera|out|ckpt_path|license|run_dir|data\.root|data\.depth|hydra\.run\.dir"
     r"|hydra\.sweep\.dir|hydra\.sweep\.subdir|model\.network\.pretrained))=(.*)",
     re.DOTALL,
 )
@@ -54,6 +54,7 @@ _OPTIONS_WITH_VALUE = ("--config-dir", "-cd", "--config-name", "-cn", "--config-
 _OPTIONS_WITH_VALUE += ("--package", "-p", "--info", "-i", "--experimental-rerun")
 _UNKNOWN_OPTION = re.compile(r"Could not override '(\w+)'")
 _REMOTE_OUTPUT = re.compile(r"\+*(out|run_dir|hydra\.(?:run|sweep)\.dir)=['\"]?([A-Za-z][\w+.-]*://.*?)['\"]?$")
+_REMOTE_OPTIONS = (("generate", "out"), ("merge", "out"))
 # Warnings of libraries about settings that are intended.
 _IGNORED_WARNINGS = (
     ".*does not have many workers.*",
@@ -88,7 +89,7 @@ def run(name: str, function: Callable[[DictConfig], None]) -> None:
     # Hydra creates the folder of a run before it calls the job.
     existing = _existing_folders([*filter(None, values), *Path("runs").glob("*"), "runs"])
     with _one_line_errors(name):
-        _check_outputs(sys.argv[1:])
+        _check_outputs(name, sys.argv[1:])
         sys.argv[1:] = prepare_arguments(name, sys.argv[1:])
         hydra.main(config_path=str(_config_file(name).parent), config_name=name, version_base="1.3")(job)()
 
@@ -137,10 +138,13 @@ def quote_text(override: str, *, is_multirun: bool = False) -> str:
     return f"{option}={_quote(text, is_literal=exists or not is_path)}"
 
 
-def _check_outputs(arguments: list[str]) -> None:
-    """Raise UsageError if an output option is an address, of which pathlib would make a folder such as "s3:"."""
+def _check_outputs(name: str, arguments: list[str]) -> None:
+    """Raise UsageError if an output option is an address, of which pathlib would make a folder such as "s3:".
+
+    Those of `_REMOTE_OPTIONS` may be addresses.
+    """
     for argument in arguments:
-        if match := _REMOTE_OUTPUT.match(argument):
+        if (match := _REMOTE_OUTPUT.match(argument)) and (name, match[1]) not in _REMOTE_OPTIONS:
             raise UsageError(
                 f"{match[1]} must be a path on this machine, got {match[2]}; write to a folder and copy it, or mount "
                 "the storage"

@@ -11,6 +11,7 @@ _CAMERA_COMMANDS = (
     "make_board",
     "estimate_lens",
 )  # their libraries are in the extra "calibration"
+_EXTRAS = {"onnx": "export", "ray": "ray"}  # by the first letters of a library; that of all others is "train"
 
 
 def command(name: str, page: str | None, function: str) -> Callable[[], None]:
@@ -45,8 +46,6 @@ def missing_library(error: ModuleNotFoundError, name: str) -> str | None:
     library = (error.name or "").partition(".")[0]
     if library in ("", "torchrefract"):
         return None
-    if name == "playground":
-        extra = name
-    else:
-        extra = "calibration" if name in _CAMERA_COMMANDS else "export" if library.startswith("onnx") else "train"
+    extras = {"playground": "playground"} | dict.fromkeys(_CAMERA_COMMANDS, "calibration")
+    extra = extras.get(name) or _EXTRAS.get(library[:4], "train")
     return f"{name} needs {library}, which is not installed: pip install 'torchrefract[{extra}]'"

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.filesize import decimal
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from torchrefract._io import replace_file
+from torchrefract._io import as_path, is_remote, make_folder
 from torchrefract._validation import (
     UsageError,
     check_choice,
@@ -30,26 +30,36 @@ from torchrefract._validation import (
     check_positive,
     check_size,
 )
-from torchrefract.cli.command import check_seed, make, naming, warn_of_assumed_depth
+from torchrefract.cli.command import check_none_lost, check_seed, make, naming, warn_of_assumed_depth
 from torchrefract.data.depth_maps import DepthFolder
-from torchrefract.data.frames import first_names
-from torchrefract.data.pairs.card import HISTOGRAMS, draw_histograms, format_card, summarize
+from torchrefract.data.frames import Source, first_names
+from torchrefract.data.images import UnreadableImageError
+from torchrefract.data.pairs.card import summarize, write_card
 from torchrefract.data.pairs.files import FORMATS
 from torchrefract.data.pairs.generator import (
     PairGenerator,
     PairStorage,
     PairTask,
     SourceReader,
-    Sources,
-    find_sources,
     generate_pairs,
 )
-from torchrefract.data.pairs.manifest import Manifest, PairRow, claim, find_manifests, locked_shard, scan_rows
+from torchrefract.data.pairs.manifest import (
+    LOST,
+    Manifest,
+    PairRow,
+    claim,
+    find_manifests,
+    locked,
+    locked_shard,
+    scan_rows,
+)
+from torchrefract.data.pairs.sources import Sources, find_sources, list_path, read_sources
 from torchrefract.data.workers import num_cores
 from torchrefract.effects.base import Effect
 
 _T = TypeVar("_T")
 
+_SHOWN = 20  # unreadable frames that are listed at the end; README.md and the manifest state all
 _SAMPLES = 4  # pairs that the estimate of the size on disk rests on
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _SEED_END = 2**31  # a seed is shifted by 32 bits, and must then fit 64 bits with a sign
@@ -78,52 +88,82 @@ class Options(NamedTuple):
 
     generator: PairGenerator
     sources: Sources
+    write_list: Callable[[], None]  # of the frames, if there is none
     settings: dict[str, Any]  # everything that determines the content of the files
     num_pairs: int
     license: str
     shard: Shard
     workers: int
+    engine: dict[str, Any]
     verify: bool
+    repaired: set[int]  # pairs whose frames were unreadable in an earlier run
 
     def task(self, number: int) -> PairTask:
-        """Return the task of a pair."""
-        repeat, index = divmod(number, len(self.sources.frames))
-        return PairTask(number, self.sources.frames[index], repeat)
+        """Return the task of a pair; the file of a frame that was repaired has another size than in the list."""
+        repeat, index = divmod(number, self.sources.num_frames)
+        source = self.sources.frame(index)
+        return PairTask(number, source._replace(bytes=None) if number in self.repaired else source, repeat)
 
 
 def generate(cfg: DictConfig) -> None:
     """Write the missing pairs of a shard, and the card when the set is complete."""
-    options, out = _parse(cfg), Path(str(cfg.out))
-    with _disk_errors(out):
-        about = {"license": options.license, "made_with": _VERSIONS}
-        previous = claim(out, options.settings, count=options.num_pairs, about=about).get("made_with", _VERSIONS)
+    with naming("out"):
+        out = as_path(str(cfg.out))
+    with disk_errors(out):
+        make_folder(out)
+        with locked("out", out, "sources", wait=True):  # other shards wait for the list instead of scanning again
+            options = _parse(cfg, out)
+            about = {"license": options.license, "made_with": _VERSIONS}
+            previous = claim(out, options.settings, count=options.num_pairs, about=about).get("made_with", _VERSIONS)
+            options.write_list()
         if previous != _VERSIONS:
             print(f"existing pairs were made with {previous}, new ones are made with {_VERSIONS}: bytes may differ")
         with locked_shard(out, *options.shard):
-            num_made = _make_missing(options, out)
+            num_made, lost = _make_missing(options, out)
         _finish(options, out, num_made=num_made)
+    check_none_lost(lost, name="source")
 
 
-def _make_missing(options: Options, out: Path) -> int:
-    """Write the missing pairs of a shard; return their number."""
+def _make_missing(options: Options, out: Path) -> tuple[int, list[str]]:
+    """Write the missing pairs of a shard; return their number, and the errors of frames that could not be opened."""
     storage = PairStorage(out, options.settings["tar"])
     manifest = Manifest(out, *options.shard)
     complete, damaged = manifest.open(
-        lambda number: options.shard.holds(number, options.num_pairs, storage.unit), verify=options.verify
+        lambda number: options.shard.holds(number, options.num_pairs, storage.unit),
+        verify=options.verify,
+        is_repaired=lambda row: _is_repaired(row, options),
     )
     _report(options, complete, damaged)
     units = [u for u in options.shard.units(options.num_pairs, storage.unit) if not complete.issuperset(u)]
+    num_made, lost = 0, list[str]()
     if units:
         _check_disk(options, [number for unit in units for number in unit], storage)
         tasks = ([options.task(number) for number in unit] for unit in units)
-        rows = generate_pairs(tasks, options.generator, storage, workers=min(options.workers, len(units)))
-        for unit in _with_progress(rows, total=sum(map(len, units))):
-            manifest.add(unit)
+        workers = min(options.workers, len(units))
+        rows = generate_pairs(tasks, options.generator, storage, workers=workers, engine=options.engine)
+        try:
+            for unit in _with_progress(rows, total=sum(map(len, units))):
+                lost += [row.skipped.removeprefix(LOST) for row in unit if row.skipped.startswith(LOST)]
+                readable = [row for row in unit if not row.skipped.startswith(LOST)]
+                manifest.add(readable)
+                num_made += len(readable)
+        finally:
+            manifest.flush()
     manifest.close()
-    return sum(map(len, units))
+    return num_made, lost
 
 
-def _parse(cfg: DictConfig) -> Options:
+def _is_repaired(row: PairRow, options: Options) -> bool:
+    """Return True if the frame of a row without a pair is readable by now, and note it."""
+    try:
+        SourceReader(options.sources.root, None).read(Source(row.source, row.drive, row.split, row.frame))
+    except UnreadableImageError:
+        return False
+    options.repaired.add(row.number)
+    return True
+
+
+def _parse(cfg: DictConfig, out: Path) -> Options:
     effect = make(cfg, "scene")
     if not isinstance(effect, Effect):
         raise UsageError(f"scene must be an effect of torchrefract, got {effect}")
@@ -141,26 +181,50 @@ def _parse(cfg: DictConfig) -> Options:
     if not 0 < plain["val_share"] < 1:
         raise UsageError(f"val_share must be between 0 and 1, got {plain['val_share']}")
     verify, shard, workers = _checked(cfg, "verify", check_flag), _shard(cfg), _workers(cfg)
-    source = Path(str(cfg.source)).expanduser()
-    if Path(str(cfg.out)).resolve().is_relative_to(source.resolve()):
-        raise UsageError(f"out must lie outside of source, so that pairs do not become sources, got {cfg.out}")
+    engine = cast(dict[str, Any], OmegaConf.to_container(cfg.engine))
+    if engine["name"] == "ray" and workers == 0:
+        raise UsageError("workers must be at least 1 for engine=ray, which counts its actors, got 0")
     with naming("source"):
-        options = {name: plain[name] for name in ("size", "every", "drive_by", "val_share", "seed")}
-        sources = find_sources(source, **options)
-    num_pairs = len(sources.frames) if cfg.count is None else _checked(cfg, "count", check_count)
-    sources = sources.limited(num_pairs)
+        source = as_path(str(cfg.source))
+    for name, path in (("out", out), ("source", source)):
+        if workers and "memory" in getattr(path, "protocol", ""):
+            raise UsageError(f"workers must be 0 for {name}={path}, because each process has its memory, got {workers}")
+    if is_remote(out) == is_remote(source) and out.resolve().is_relative_to(source.resolve()):
+        raise UsageError(f"out must lie outside of source, so that pairs do not become sources, got {cfg.out}")
+    if not str(cfg.license or "").strip():
+        raise UsageError("license must be that of the source, in words, got nothing")
+    count = None if cfg.count is None else _checked(cfg, "count", check_count)
+    listed, write_list = _list_frames(cfg, source, out, plain)
+    num_pairs = listed.num_frames if count is None else count
+    sources = listed.limited(num_pairs)
     depth = None
     if cfg.depth is not None:
         depth = DepthFolder(Path(str(cfg.depth)).expanduser(), _checked(cfg, "depth_scale", check_positive))
         plain |= {"depth": sources.depth_digest(depth), "depth_scale": depth.scale}
-    if not str(cfg.license or "").strip():
-        raise UsageError("license must be that of the source, in words, got nothing")
     scene: dict[str, Any] = {"name": str(HydraConfig.get().runtime.choices["scene"])}
     scene |= cast(dict[str, Any], OmegaConf.to_container(cfg.scene, resolve=True))
     reader = SourceReader(sources.root, plain["size"], depth)
     generator = PairGenerator(effect, scene["name"], reader, cfg.seed, plain["maps"])
-    settings = {"scene": scene, **plain, "frames": len(sources.frames), "sources": sources.digest()}
-    return Options(generator, sources, settings, num_pairs, str(cfg.license), shard, workers, verify)
+    settings = {"scene": scene, **plain, "frames": sources.num_frames, "sources": sources.digest()}
+    return Options(
+        generator, sources, write_list, settings, num_pairs, str(cfg.license), shard, workers, engine, verify, set()
+    )
+
+
+def _list_frames(
+    cfg: DictConfig, source: Path, out: Path, settings: dict[str, Any]
+) -> tuple[Sources, Callable[[], None]]:
+    """Read the list of frames, or scan the source; return the frames and a function that writes a new list."""
+    path = list_path(out) if cfg.files is None else as_path(str(cfg.files))
+    options = {name: settings[name] for name in ("every", "drive_by", "val_share", "seed")}
+    if path.is_file():
+        # `claim` compares the options of a list in the folder of the set.
+        sources = read_sources(path, source.parent if source.is_file() else source, options if cfg.files else {})
+        print(f"{sources.num_frames} frames, as listed in {path}; files that were added since then are not used")
+        return sources, lambda: None
+    with naming("source"):
+        sources = find_sources(source, size=settings["size"], **options)
+    return sources, lambda: sources.write(path, options)
 
 
 def _checked(cfg: DictConfig, name: str, check: Callable[..., _T], **limits: Any) -> _T:
@@ -188,7 +252,7 @@ def _workers(cfg: DictConfig) -> int:
 
 
 def _report(options: Options, complete: set[int], damaged: int) -> None:
-    num_frames = len(options.sources.frames)
+    num_frames = options.sources.num_frames
     if skipped := options.sources.skipped:
         print(f"{len(skipped)} files of the source are unreadable: {first_names(skipped)}")
     if options.sources.has_one_drive:
@@ -212,12 +276,13 @@ def _check_disk(options: Options, missing: Sequence[int], storage: PairStorage) 
     generator, step = deepcopy(options.generator), max(1, len(missing) // _SAMPLES)
     samples = [generator.generate(options.task(number)) for number in missing[::step][:_SAMPLES]]
     sizes = [storage.disk_bytes(pair) for pair in samples if pair.data]
+    if lost := [pair.row.skipped.removeprefix(LOST) for pair in samples if pair.row.skipped.startswith(LOST)]:
+        check_none_lost(lost if len(lost) == len(samples) else [], name="source")
     mean = sum(sizes) // max(1, len(sizes))
-    needed, free = mean * len(missing), shutil.disk_usage(storage.out).free
-    estimate = (
-        f"{len(missing)} pairs take about {decimal(needed)} on disk, {decimal(mean)} each; {decimal(free)} are free"
-    )
-    if needed > free:
+    needed, free = mean * len(missing), None if is_remote(storage.out) else shutil.disk_usage(storage.out).free
+    estimate = f"{len(missing)} pairs take about {decimal(needed)} on disk, {decimal(mean)} each"
+    estimate += "" if free is None else f"; {decimal(free)} are free"
+    if free is not None and needed > free:
         raise UsageError(
             f"out must have enough space, got too little: {estimate}; choose another disk or a lower count"
         )
@@ -254,26 +319,23 @@ def _finish(options: Options, out: Path, *, num_made: int) -> None:
     if num_complete == 0 and not missing:
         raise UsageError(f"source must hold readable frames, got {summary.skipped[0]}")
     if not missing:
-        figure = draw_histograms(summary)
-        if figure is not None:
-            _write(out / HISTOGRAMS, figure)
-        card = format_card(
-            summary, settings=options.settings, license_text=options.license, has_histograms=figure is not None
-        )
-        _write(out / "README.md", card.encode())
-    rest = f"{missing} are left to other shards" if missing else "see README.md in this folder"
+        write_card(out, summary, settings=options.settings, license_text=options.license)
+    rest = f"{missing} are missing or left to other shards" if missing else "see README.md in this folder"
     skipped = f", {num_skipped} frames are unreadable" if num_skipped else ""
+    list_unreadable(summary.skipped)
     print(f"{out}: {num_made} pairs made, {num_complete} in total{skipped}; {rest}")
 
 
-def _write(path: Path, data: bytes) -> None:
-    """Write a file that several shards may write at the same time."""
-    with replace_file(path) as temporary:
-        temporary.write_bytes(data)
+def list_unreadable(reasons: Sequence[str]) -> None:
+    """Print the reasons of frames without a pair."""
+    for reason in reasons[:_SHOWN]:
+        print(f"unreadable, tried again by the same command: {reason}")
+    if len(reasons) > _SHOWN:
+        print(f"and {len(reasons) - _SHOWN} more, which the manifest names")
 
 
 @contextmanager
-def _disk_errors(out: Path) -> Iterator[None]:
+def disk_errors(out: Path) -> Iterator[None]:
     """Turn errors of the disk into messages for the user; pairs that are written stay."""
     try:
         yield
@@ -283,7 +345,9 @@ def _disk_errors(out: Path) -> Iterator[None]:
                 f"out must have enough space, got {os.strerror(error.errno).lower()} for {error.filename or out}; "
                 "existing pairs are complete, and the same command continues"
             ) from error
-        raise UsageError(f"out must be a folder that can be written to, got {out} ({error.strerror})") from error
+        raise UsageError(
+            f"out must be a folder that can be written to, got {out} ({error.strerror or error})"
+        ) from error
     except KeyboardInterrupt:
         print("stopped; the same command continues")
         raise SystemExit(130) from None

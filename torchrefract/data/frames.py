@@ -40,6 +40,7 @@ class Source(NamedTuple):
     drive: str
     split: str  # train, val, or empty for frames outside of the folders train and val
     frame: int | None = None  # index in a video
+    bytes: int | None = None  # size of the file when it was listed
 
     @property
     def name(self) -> str:
@@ -129,7 +130,19 @@ def assign_frames(
     Returns:
         the readable frames in order, and the unreadable ones with the reasons.
     """
-    paths = _find_frames(root)
+    frames = split_frames(root, _find_files(root), split=split, drive_by=drive_by, val_share=val_share, seed=seed)
+    readable, skipped = _check_frames(root, [frame.path for frame in frames], size or (1, 1))
+    return [frame for frame in frames if frame.path in readable], skipped
+
+
+def split_frames(
+    root: Path, files: Sequence[str], *, split: str | None, drive_by: str, val_share: float, seed: int
+) -> list[Source]:
+    """Assign the images among the files of a root to drives and splits, by their names alone.
+
+    Arguments and errors are those of `assign_frames`; files are relative to the root, with forward slashes.
+    """
+    paths = _frames_of(root, files)
     if folders := _split_folders(root) if drive_by == "auto" else {}:
         frames = _assign_by_folder(root, paths, folders)
     else:
@@ -140,9 +153,7 @@ def assign_frames(
     for name in ("train", "val") if folders and split is None else (split,):
         if name in ("train", "val") and name not in {frame.split for frame in frames}:
             raise ValueError(f"root must hold frames in its folder for {name}, got none in {root}")
-    frames = sorted(frame for frame in frames if split in (None, "all", frame.split))
-    readable, skipped = _check_frames(root, [frame.path for frame in frames], size or (1, 1))
-    return [frame for frame in frames if frame.path in readable], skipped
+    return sorted(frame for frame in frames if split in (None, "all", frame.split))
 
 
 def name_prefix(stem: str) -> str:
@@ -171,8 +182,8 @@ def name_prefix(stem: str) -> str:
     return stem[: ends[-1] if _NUMBERED.search(stem) or not numbers else numbers[-1]]
 
 
-def _find_frames(root: Path) -> list[str]:
-    """List the image files of a root: sorted paths relative to it, with forward slashes."""
+def _find_files(root: Path) -> list[str]:
+    """List the files of a root: sorted paths relative to it, with forward slashes."""
     try:
         is_folder = stat.S_ISDIR(root.stat().st_mode)
     except PermissionError as error:
@@ -181,7 +192,11 @@ def _find_frames(root: Path) -> list[str]:
         raise FileNotFoundError(f"root must be a folder of frames, got {root}, which does not exist") from error
     if not is_folder:
         raise NotADirectoryError(f"root must be a folder of frames, got the file {root}; give the folder it lies in")
-    files = sorted(path.relative_to(root).as_posix() for path in list_files(root))
+    return sorted(list_names(root))
+
+
+def _frames_of(root: Path, files: Sequence[str]) -> list[str]:
+    """Return the files that are images; raise ValueError if there are none."""
     frames = [file for file in files if file.lower().endswith(EXTENSIONS)]
     if not frames:
         raise ValueError(
@@ -193,13 +208,21 @@ def _find_frames(root: Path) -> list[str]:
 
 def list_files(root: Path) -> Iterator[Path]:
     """Yield the files of a root and its sub-folders without hidden ones; follow links, visit each folder once."""
+    return (root / name for name in list_names(root))
+
+
+def list_names(root: Path) -> Iterator[str]:
+    """Yield the names of the files of `list_files` relative to the root, with forward slashes."""
     visited = set()
     for folder, subfolders, files in os.walk(root, followlinks=True, onerror=_raise_permission_error):
         status = os.stat(folder)
         is_new = (status.st_dev, status.st_ino) not in visited  # links may form a loop, or lead to a folder twice
         visited.add((status.st_dev, status.st_ino))
         subfolders[:] = sorted(name for name in subfolders if is_new and not name.startswith("."))
-        yield from (Path(folder, name) for name in files if is_new and not name.startswith("."))
+        inner = Path(folder).relative_to(root).as_posix()
+        prefix = "" if inner == "." else f"{inner}/"
+        # A path object for each file would take longer than the scan.
+        yield from (prefix + name for name in files if is_new and not name.startswith("."))
 
 
 def _raise_permission_error(error: OSError) -> NoReturn:
@@ -221,21 +244,21 @@ def _assign_by_folder(root: Path, paths: list[str], folders: dict[str, str]) -> 
     """Assign frames to the splits of their folders; frames outside of both belong to "all" alone."""
     groups: dict[str, list[str]] = {"train": [], "val": [], "": []}
     for path in paths:
-        groups[folders.get(PurePosixPath(path).parts[0], "")].append(path)
+        groups[folders.get(path.split("/")[0], "")].append(path)
     drives = {name: _drives(group, "auto", skip_levels=1 if name else 0) for name, group in groups.items()}
     shared = sorted(set(drives["train"].values()) & set(drives["val"].values()) - {_UNNAMED})
     if shared:
         names = first_names(shared)
         message = f"train and val in {root} both hold frames of {names}, by name; a drive belongs in one of them"
-        warnings.warn(message, stacklevel=4)
+        warnings.warn(message, stacklevel=5)
     return [Source(path, drive, split) for split, group in drives.items() for path, drive in group.items()]
 
 
 def _drives(paths: list[str], drive_by: str, *, skip_levels: int = 0) -> dict[str, str]:
     """Return the drive of each path, without regard to its first folders."""
-    folders = {path: PurePosixPath(path).parts[skip_levels:-1] for path in paths}
+    folders = {path: tuple(path.split("/")[skip_levels:-1]) for path in paths}
     if drive_by == "prefix" or (drive_by == "auto" and len(set(folders.values())) < 2):
-        return {path: name_prefix(PurePosixPath(path).stem) for path in paths}
+        return {path: name_prefix(posixpath.splitext(posixpath.basename(path))[0]) for path in paths}
     # Deeper folders, as in drive_1/front and drive_1/rear, belong to the same drive.
     level = len(PurePosixPath(posixpath.commonpath("/".join(parts) for parts in folders.values())).parts) + 1
     return {path: "/".join(parts[:level]) or _UNNAMED for path, parts in folders.items()}
@@ -255,7 +278,7 @@ def select_val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: flo
             f"{len(drive_of)} frames in {root} seem to come from {len(frames)} drives ({names}): if that is wrong, "
             "train and val share drives; put each drive in a sub-folder of its own"
         )
-        warnings.warn(message, stacklevel=4)
+        warnings.warn(message, stacklevel=5)
     val, missing = set(), val_share * len(drive_of)
     order = sorted(frames, key=lambda drive: key_of(f"{seed}/{drive}"))
     for drive in order:

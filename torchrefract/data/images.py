@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from torchrefract._io import is_remote, read_bytes, retried
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract._validation import check_size, check_tensor
 from torchrefract.data.jpeg import lacks_pixel_data
@@ -44,10 +45,15 @@ class UnreadableImageError(ValueError):
     """Raised for a file that is not a complete image."""
 
 
+class ChangedImageError(UnreadableImageError):
+    """Raised for a file of another size than it had when it was listed."""
+
+
 def is_lost(error: Exception) -> bool:
-    """Return True if a file could not be opened or read, as one that vanished: this says nothing about its content."""
+    """Return True if a file could not be opened or has changed: this says nothing about the listed content."""
     cause = error.__cause__
-    return isinstance(error, UnreadableImageError) and isinstance(cause, OSError) and cause.errno is not None
+    is_unopened = isinstance(error, UnreadableImageError) and isinstance(cause, OSError) and cause.errno is not None
+    return is_unopened or isinstance(error, ChangedImageError)
 
 
 class ImageHeader(NamedTuple):
@@ -76,8 +82,28 @@ def read_image(path: str | Path, *, upright: bool = True) -> Tensor:
     Raises:
         UnreadableImageError: the file is missing, damaged or not an image.
     """
-    with opened(path) as stream:
-        data = stream.read()
+    return decode_image(read_file(path), path, upright=upright)
+
+
+def read_file(path: str | Path) -> bytes:
+    """Read a file as a whole; errors are those of `opened`."""
+    if not is_remote(path):
+        with opened(path) as stream:
+            return stream.read()
+    try:
+        return read_bytes(cast(Path, path))
+    except OSError as error:
+        raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
+
+
+def decode_image(data: bytes, path: str | Path, *, upright: bool = True) -> Tensor:
+    """Decode an image as `read_image` does.
+
+    Args:
+        data: the content of the file.
+        path: of the file, for errors.
+        upright: as for `read_image`.
+    """
     _check_complete(path, io.BytesIO(data), len(data))
     if data.startswith(_PNG) and not has_complete_png_chunks(data):
         raise UnreadableImageError(f"{path} is damaged: its chunks are shorter than they state")
@@ -128,7 +154,9 @@ def image_header(path: str | Path) -> ImageHeader:
             `read_image` alone.
     """
     with opened(path) as stream:
-        _check_complete(path, stream, os.fstat(stream.fileno()).st_size)
+        length = stream.seek(0, os.SEEK_END)
+        stream.seek(0)
+        _check_complete(path, stream, length)
         return _read_header(path, stream)
 
 
@@ -138,6 +166,15 @@ def opened(path: str | Path) -> Iterator[BinaryIO]:
 
     Pipes and devices raise, because opening them could wait for ever.
     """
+    if is_remote(path):
+        store = cast(Path, path)
+        try:
+            stream = cast(BinaryIO, retried(lambda: store.open("rb"), store))
+        except OSError as error:
+            raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
+        with stream:
+            yield stream
+        return
     try:
         mode = os.stat(path).st_mode
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):

@@ -23,6 +23,7 @@ from av.stream import Stream
 from av.video.reformatter import ColorRange, Colorspace, Interpolation
 from torch import Tensor
 
+from torchrefract._io import is_remote
 from torchrefract._tensor import to_float
 from torchrefract.data.images import UnreadableImageError, opened
 
@@ -180,7 +181,8 @@ def _open(path: Path) -> av.VideoStream | None:
         stream.read(1)  # FFmpeg's error would not say why a file cannot be read
     try:
         # FFmpeg takes the part of a relative path before a colon for a protocol.
-        container = av.open(str(path.resolve()), metadata_errors="replace")
+        source = path.open("rb") if is_remote(path) else str(path.resolve())
+        container = av.open(cast(Any, source), metadata_errors="replace")
     except av.FFmpegError:
         return None
     if isinstance(video := container.streams.best("video"), av.VideoStream):

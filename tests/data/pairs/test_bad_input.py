@@ -88,10 +88,11 @@ def test_an_output_folder_must_be_new_and_lie_outside_of_the_source(call, words,
         PairedFolder(tmp_path / "out")
 
 
-def test_changed_sources_raise(call, words, frames, tmp_path):
+def test_changed_sources_that_are_listed_again_raise(call, words, frames, tmp_path):
     shutil.copytree(frames, tmp_path / "frames")
     assert call("generate", *words("out", source="frames")).code == 0
     (tmp_path / "frames" / "drive0" / "000.png").unlink()
+    (tmp_path / "out" / "sources.parquet").unlink()
     message = call("generate", *words("out", source="frames")).message
     assert re.search(r"frames is 12 there and 11 here, sources is \w+ there", message)
 

@@ -166,5 +166,5 @@ def test_a_larger_count_adds_pairs_and_keeps_the_others(call, tmp_path, words, s
     assert ": 3 pairs made, 15 in total" in outcome.out
     after = sums(tmp_path / "out")
     assert before.items() <= after.items()
-    assert len(set(after) - set(before)) == 3 * 6 + 4
+    assert len(set(after) - set(before)) == 3 * 6 + 5
     assert "count must be at least" in call("generate", *words("out", "count=12")).message

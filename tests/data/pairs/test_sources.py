@@ -12,7 +12,8 @@ from torchrefract.data.frames import Source
 from torchrefract.data.images import UnreadableImageError, fit, read_image
 from torchrefract.data.media import read_video, write_video
 from torchrefract.data.pairs.dataset import PairedFolder
-from torchrefract.data.pairs.generator import SourceReader, draw_of, find_sources
+from torchrefract.data.pairs.generator import SourceReader
+from torchrefract.data.pairs.sources import draw_of, find_sources
 
 OPTIONS = {"size": None, "every": 1, "drive_by": "auto", "val_share": 0.3, "seed": 0}
 FRAMES = 9
@@ -52,21 +53,23 @@ def test_an_image_is_cropped_and_reduced_on_request(size, tmp_path):
 
 def test_each_video_is_a_drive_in_one_split(videos):
     sources = find_sources(videos, **{**OPTIONS, "every": 2})
-    assert [(frame.path, frame.frame) for frame in sources.frames] == [
+    assert [(frame.path, frame.frame) for frame in sources.frames()] == [
         (name, t) for name in ("a.mp4", "b.mp4", "c.mp4") for t in range(0, FRAMES, 2)
     ]
-    splits = {drive: {frame.split for frame in sources.frames if frame.drive == drive} for drive in ("a.mp4", "c.mp4")}
+    splits = {
+        drive: {frame.split for frame in sources.frames() if frame.drive == drive} for drive in ("a.mp4", "c.mp4")
+    }
     assert all(len(names) == 1 for names in splits.values())
-    assert {frame.split for frame in sources.frames} == {"train", "val"}
+    assert {frame.split for frame in sources.frames()} == {"train", "val"}
     # Fewer frames are spread over the source.
-    assert [frame.path for frame in sources.limited(6).frames] == ["a.mp4"] * 2 + ["b.mp4"] * 2 + ["c.mp4"] * 2
+    assert [frame.path for frame in sources.limited(6).frames()] == ["a.mp4"] * 2 + ["b.mp4"] * 2 + ["c.mp4"] * 2
 
 
 def test_a_repeated_source_has_a_new_key(videos):
     sources = find_sources(videos, **OPTIONS)
-    keys = [draw_of(frame, seed=3, repeat=repeat)[1] for repeat in range(3) for frame in sources.frames]
+    keys = [draw_of(frame, seed=3, repeat=repeat)[1] for repeat in range(3) for frame in sources.frames()]
     assert len(set(keys)) == 3 * 3 * FRAMES
-    assert {draw_of(frame, seed=3, repeat=0)[0] for frame in sources.frames} == {3 << 32, (3 << 32) + 1}
+    assert {draw_of(frame, seed=3, repeat=0)[0] for frame in sources.frames()} == {3 << 32, (3 << 32) + 1}
 
 
 def test_pairs_of_a_video_hold_its_frames(call, videos, tmp_path):

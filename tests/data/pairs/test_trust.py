@@ -17,13 +17,16 @@ from torchrefract.data.pairs.files import DamagedPairError
 from torchrefract.data.pairs.manifest import locked, locked_shard
 
 
-def test_a_frame_that_vanishes_stops_the_run_and_is_made_by_the_next(call, words, frames, tmp_path, monkeypatch, rows):
+def test_a_frame_that_vanishes_is_named_after_the_others_and_made_by_the_next(
+    call, words, frames, tmp_path, monkeypatch, rows
+):
     shutil.copytree(frames, tmp_path / "frames")
     frame = tmp_path / "frames" / "drive1" / "005.png"
     with monkeypatch.context() as patch:
         patch.setattr("torchrefract.cli.generation._check_disk", lambda *_: frame.rename(tmp_path / "away.png"))
         message = call("generate", *words("out", source="frames")).message
     assert message.startswith("source must stay unchanged during a run, got frames/drive1/005.png cannot be opened")
+    assert len(rows(tmp_path / "out")) == 11
     (tmp_path / "away.png").rename(frame)
     assert "12 in total; see" in call("generate", *words("out", source="frames")).out
     assert not any(row["skipped"] for row in rows(tmp_path / "out"))
@@ -73,7 +76,7 @@ def test_two_runs_into_one_folder_raise(call, words, tmp_path):
 
 @pytest.mark.parametrize("out", ["s3://bucket/pairs", "gs://a", "file:///tmp/a", "'hf://datasets/a'"])
 def test_an_address_as_output_raises(call, words, tmp_path, out):
-    assert call("generate", *words(out)).message.startswith(
+    assert call("degrade", *words(out)).message.startswith(
         f"out must be a path on this machine, got {out.strip(chr(39))}"
     )
     assert not list(tmp_path.iterdir())

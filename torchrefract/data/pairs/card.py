@@ -5,10 +5,12 @@ import math
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from torchrefract._io import replace_file
 from torchrefract.cameras.brown_conrady import POLYNOMIAL12
 from torchrefract.data.pairs.manifest import PairRow
 
@@ -77,6 +79,17 @@ def summarize(rows: Iterable[PairRow]) -> Summary:
                 for column, number in zip(columns, numbers, strict=False):
                     column.append(number)
     return Summary(splits, drives, effects, sizes, len(sources), skipped, beyond, files, num_bytes, parameters)
+
+
+def write_card(out: Path, summary: Summary, *, settings: Mapping[str, Any], license_text: str) -> None:
+    """Write the card and its figure into the folder of a set; several shards may do so at the same time."""
+    files, figure = dict[str, bytes](), draw_histograms(summary)
+    if figure is not None:
+        files[HISTOGRAMS] = figure
+    card = format_card(summary, settings=settings, license_text=license_text, has_histograms=figure is not None)
+    for name, data in (files | {"README.md": card.encode()}).items():
+        with replace_file(out / name) as temporary:
+            temporary.write_bytes(data)
 
 
 def format_card(summary: Summary, *, settings: Mapping[str, Any], license_text: str, has_histograms: bool) -> str:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
+from torchrefract._io import as_path
 from torchrefract._tensor import to_float
 from torchrefract._validation import check_choice, check_count, check_flag, check_size
 from torchrefract.data.images import crop_center, opened, reduce_by_area
@@ -49,7 +50,7 @@ class PairedFolder(Dataset[Pair]):
         flow: bool = False,
         size: Sequence[int] | None = None,
     ):
-        self.root = Path(root).expanduser()
+        self.root = as_path(root)
         self.split = check_choice("split", split, _SPLITS)
         self.transmission = check_flag("transmission", transmission)
         self.flow = check_flag("flow", flow)

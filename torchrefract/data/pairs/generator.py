@@ -1,4 +1,4 @@
-"""Generation of pairs: list clean frames, read one, degrade it by its own draw, encode and write it, in processes.
+"""Generation of pairs: read a clean frame, degrade it by the draw of its key, encode and write it, in processes.
 
 A pair or a tar is always complete. Files are written under a hidden name and then renamed. They are not flushed to
 disk one by one, which would take longer than everything else. A kill loses nothing. After a power cut, a file may be
@@ -10,7 +10,7 @@ import io
 import math
 import tarfile
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,59 +19,31 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._io import replace_file
+from torchrefract._io import make_folder, replace_file
 from torchrefract._validation import UsageError
 from torchrefract.data.depth_maps import DepthFolder
-from torchrefract.data.frames import Source, assign_frames, list_files, select_val_drives
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, is_lost, pixels_of, read_image
-from torchrefract.data.media import VIDEOS, read_video, video_info
+from torchrefract.data.frames import Source
+from torchrefract.data.images import (
+    ChangedImageError,
+    UnreadableImageError,
+    decode_image,
+    fit,
+    is_lost,
+    pixels_of,
+    read_file,
+)
+from torchrefract.data.media import read_video
 from torchrefract.data.pairs.files import DEPTH, FLOWS, LIGHTS, PairArrays, count_out_of_range, encode_pair
-from torchrefract.data.pairs.manifest import PairRow, StoredFile
+from torchrefract.data.pairs.manifest import LOST, PairRow, StoredFile
+from torchrefract.data.pairs.ray_engine import map_in_actors
+from torchrefract.data.pairs.sources import draw_of
 from torchrefract.data.workers import map_in_processes
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
-from torchrefract.random import key_of
 from torchrefract.types import Degraded
 
 _PAIRS_PER_FOLDER = 1000
 _DISK_BLOCK, _TAR_BLOCK = 4096, 512  # bytes
-
-
-class Sources(NamedTuple):
-    """All clean frames of a root, in order."""
-
-    root: Path
-    frames: Sequence[Source]
-    skipped: Sequence[str]  # unreadable files, relative to the root
-    has_one_drive: bool  # so that there is no validation split
-
-    def limited(self, count: int) -> "Sources":
-        """Keep at most `count` frames, evenly spaced."""
-        total = len(self.frames)
-        if count >= total:
-            return self
-        return self._replace(frames=[self.frames[i * total // count] for i in range(count)])
-
-    def digest(self) -> str:
-        """Return a SHA-256 digest of the names, drives, splits and sizes of the files."""
-        digest = hashlib.sha256()
-        sizes = {path: (self.root / path).stat().st_size for path in {frame.path for frame in self.frames}}
-        for frame in self.frames:
-            digest.update(ascii([*frame, sizes[frame.path]]).encode())
-        return digest.hexdigest()
-
-    def depth_digest(self, depth: DepthFolder) -> str:
-        """Return a SHA-256 digest of the names and sizes of the depth maps.
-
-        Raises:
-            UsageError: a frame has none, or two frames share one.
-        """
-        depth.check((frame.path, frame.frame) for frame in self.frames)
-        digest = hashlib.sha256()
-        for frame in self.frames:
-            path = depth.find(frame.path, frame.frame)
-            digest.update(ascii([path.name, path.stat().st_size]).encode())
-        return digest.hexdigest()
 
 
 class SourceReader:
@@ -102,14 +74,20 @@ class SourceReader:
         Raises:
             UsageError: there is no depth map of the frame.
         """
-        path = self.root / source.path
-        image = read_image(path) if source.frame is None else self._read_video(source.path, source.frame)
+        image = self._read_image(source) if source.frame is None else self._read_video(source.path, source.frame)
         depth = None
         if self.depth is not None:
             depth = self.depth.read(
                 source.path, source.frame, frame_size=(image.shape[1], image.shape[2]), size=self.size
             )
         return image.contiguous() if self.size is None else fit(image, self.size), depth
+
+    def _read_image(self, source: Source) -> Tensor:
+        path = self.root / source.path
+        data = read_file(path)
+        if source.bytes not in (None, len(data)):
+            raise ChangedImageError(f"{path} has changed since it was listed: {len(data)} bytes, not {source.bytes}")
+        return decode_image(data, path)
 
     def _read_video(self, path: str, index: int) -> Tensor:
         if path != self._video or index <= self._index:
@@ -121,59 +99,6 @@ class SourceReader:
             self._video = ""
             raise UnreadableImageError(f"{self.root / path} ends before its frame {index}")
         return frame[1][0]
-
-
-def find_sources(
-    source: Path, *, size: tuple[int, int] | None, every: int, drive_by: str, val_share: float, seed: int
-) -> Sources:
-    """List the frames of a folder of images, a video or a folder of videos, with drives and splits.
-
-    Arguments and errors are those of `FrameFolder`; with size None, images may have any size. Each `every`-th frame of
-    a video is listed. Videos of one folder are a drive each; of several folders, each folder is a drive.
-
-    Raises:
-        UsageError: there are no images or videos, or both.
-    """
-    if not source.exists():
-        raise UsageError(f"source must be a folder of images or videos, or a video, got {source}, which does not exist")
-    if source.is_file():
-        if source.suffix.lower() not in VIDEOS:
-            raise UsageError(f"source must be a folder, or a video ({', '.join(VIDEOS)}), got the file {source}")
-        return _find_video_frames(source.parent, [source.name], every, val_share, seed)
-    files = sorted(path.relative_to(source).as_posix() for path in list_files(source))
-    videos = [file for file in files if file.lower().endswith(VIDEOS)]
-    if not videos:
-        options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
-        frames, skipped = assign_frames(source, size=size, split=None, **options)
-        has_one_drive = len({(frame.drive, frame.split) for frame in frames}) < 2
-        return Sources(source, frames, [path.relative_to(source).as_posix() for path, _ in skipped], has_one_drive)
-    if images := [file for file in files if file.lower().endswith(EXTENSIONS)]:
-        both = f"{images[0]} and {videos[0]}"
-        raise UsageError(f"source must hold images or videos, got both in {source}, such as {both}")
-    return _find_video_frames(source, videos, every, val_share, seed)
-
-
-def _find_video_frames(root: Path, paths: Sequence[str], every: int, val_share: float, seed: int) -> Sources:
-    counts = {path: video_info(root / path)[0] for path in paths}
-    frames = [(path, index) for path in paths for index in range(0, counts[path], every)]
-    if not frames:
-        raise UsageError(f"source must be a video with frames, or hold one, got {root} with {', '.join(paths[:3])}")
-    folders = {path: path.rpartition("/")[0] for path in paths}
-    drives = folders if len(set(folders.values())) > 1 else {path: path for path in paths}
-    drive_of = {f"{path}#{index}": drives[path] for path, index in frames}
-    has_one_drive = len(set(drive_of.values())) < 2
-    val = set() if has_one_drive else select_val_drives(root, drive_of, val_share=val_share, seed=seed)
-    sources = [Source(path, drives[path] or ".", "val" if drives[path] in val else "train", i) for path, i in frames]
-    return Sources(root, sources, [path for path, count in counts.items() if count == 0], has_one_drive)
-
-
-def draw_of(source: Source, *, seed: int, repeat: int) -> tuple[int, int]:
-    """Return the seed and the key of the draw for a source that was used `repeat` times before, in a set of a seed.
-
-    At repeat 0 they are those of the first epoch of `PairData` with the same seed, and of its validation.
-    """
-    key = key_of(source.name if repeat == 0 else f"{source.name}\0{repeat}")
-    return (seed << 32) + (source.split != "val"), key
 
 
 class PairTask(NamedTuple):
@@ -201,7 +126,7 @@ class PairGenerator(NamedTuple):
     maps: str  # format of the maps: png, npz or safetensors
 
     def generate(self, task: PairTask) -> GeneratedPair:
-        """Generate a pair. An unreadable frame gives a row with the reason and no files.
+        """Generate a pair. A frame that is unreadable or lost gives a row with the reason and no files.
 
         Raises:
             UsageError: the scene, the size or the format of the maps does not suit the frame.
@@ -213,11 +138,8 @@ class PairGenerator(NamedTuple):
         try:
             image, depth = self.reader.read_with_depth(source)
         except UnreadableImageError as error:
-            if is_lost(error):
-                raise UsageError(
-                    f"source must stay unchanged during a run, got {error}; the same command continues"
-                ) from error
-            return GeneratedPair(row._replace(skipped=str(error).replace(f"{self.reader.root}/", "")), {})
+            reason = f"{LOST}{error}" if is_lost(error) else str(error).replace(f"{self.reader.root}/", "")
+            return GeneratedPair(row._replace(skipped=reason), {})
         except UsageError:
             raise
         except ValueError as error:
@@ -300,7 +222,7 @@ class PairStorage(NamedTuple):
             return [self._write_files(generator.generate(task)) for task in tasks]
         path = f"tars/{tasks[0].number // self.tar:08d}.tar"
         target = self.out / path
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(target.parent)
         with (
             replace_file(target, alone=True) as temporary,
             tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar,
@@ -319,7 +241,7 @@ class PairStorage(NamedTuple):
         folder, files = f"pairs/{pair.row.number // _PAIRS_PER_FOLDER:05d}", {}
         for suffix, data in pair.data.items():
             files[suffix] = file = pair.row.files[suffix]._replace(path=f"{folder}/{pair.row.name}.{suffix}")
-            (self.out / folder).mkdir(parents=True, exist_ok=True)
+            make_folder(self.out / folder)
             with replace_file(self.out / file.path, alone=True) as temporary:
                 temporary.write_bytes(data)
         return pair.row._replace(files=files)
@@ -343,9 +265,20 @@ def _add_file(tar: tarfile.TarFile, name: str, data: bytes) -> int:
 
 
 def generate_pairs(
-    units: Iterable[Sequence[PairTask]], generator: PairGenerator, storage: PairStorage, *, workers: int
+    units: Iterable[Sequence[PairTask]],
+    generator: PairGenerator,
+    storage: PairStorage,
+    *,
+    workers: int,
+    engine: Mapping[str, Any] | None = None,
 ) -> Iterator[list[PairRow]]:
     """Generate and write units of pairs in processes, or in this one with `workers` 0.
+
+    Args:
+        units: the pairs of each file that is written as a whole.
+        generator, storage: make and write a pair.
+        workers: number of processes, or of actors.
+        engine: name "ray" and address of a cluster, see `map_in_actors`; None takes processes of this machine.
 
     Yields:
         the rows of each unit when it is written, in any order.
@@ -355,4 +288,7 @@ def generate_pairs(
         Exception: any error of a worker, after the others have finished their units.
     """
     work = partial(storage.write, generator=generator)
+    if engine is not None and engine["name"] == "ray":
+        block = 8 if storage.tar is None else 1  # a tar takes long enough by itself
+        return map_in_actors(work, units, workers=workers, address=engine["address"], block=block)
     return map_in_processes(work, units, workers=workers, preload=__name__)

@@ -6,15 +6,16 @@ import os
 import re
 import sys
 import tarfile
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from functools import partial
+from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, cast
 
-from torchrefract._io import replace_file
+from torchrefract._io import is_remote, make_folder, read_bytes, replace_file
 from torchrefract._validation import UsageError
 from torchrefract.data.images import UnreadableImageError, opened
 from torchrefract.data.pairs.files import DamagedPairError
@@ -29,6 +30,8 @@ _CONFIG = "config.json"
 _PATH = re.compile(r"pairs/[0-9]+/[0-9]+\.[a-z_]+\.[a-z]+|tars/[0-9]+\.tar")
 _SUFFIX = re.compile(r"[a-z_]+\.[a-z]+")
 _INT64_END = 2**63
+LOST = "lost: "  # begins the reason of a frame that could not be opened or has changed; a manifest has no such row
+_PART_SECONDS = 30.0  # between two files of rows in a store
 _CHUNK = 256  # rows that are checked in parallel
 
 
@@ -154,7 +157,7 @@ def read_lines(locations: Iterable[RowLocation]) -> Iterator[bytes]:
         streams = dict[Path, BinaryIO]()
         for path, offset, length in locations:
             if path not in streams:
-                streams[path] = stack.enter_context(path.open("rb"))
+                streams[path] = stack.enter_context(cast(BinaryIO, path.open("rb")))
             streams[path].seek(offset)
             yield streams[path].read(length).rstrip(b"\n") + b"\n"
 
@@ -163,9 +166,10 @@ def read_stored(root: Path, file: StoredFile) -> bytes:
     """Read a file of a pair; raises DamagedPairError if it is missing or too short."""
     try:
         with opened(root / file.path) as stream:
+            size = stream.seek(0, os.SEEK_END)
             stream.seek(file.offset)
             # `read` allocates the full count first, which an invalid manifest could make larger than memory.
-            data = stream.read(min(file.bytes, os.fstat(stream.fileno()).st_size))
+            data = stream.read(min(file.bytes, size))
     except UnreadableImageError as error:
         raise DamagedPairError(str(error)) from error
     if len(data) != file.bytes:
@@ -174,37 +178,49 @@ def read_stored(root: Path, file: StoredFile) -> bytes:
 
 
 class Manifest:
-    """The manifest that a shard writes: manifest.jsonl if there is a single one, otherwise one file for each shard."""
+    """The manifest that a shard writes: manifest.jsonl if there is a single one, otherwise one file for each shard.
+
+    A store cannot append to a file. There, rows are collected for half a minute and written as a further file, which
+    the next `open` or `close` merges into the manifest; a kill costs the rows of half a minute, whose pairs are made
+    again.
+    """
 
     def __init__(self, out: Path, shard: int, shards: int):
         self.out = out
         self.path = out / ("manifest.jsonl" if shards == 1 else f"manifest-{shard:05d}-of-{shards:05d}.jsonl")
+        self._rows, self._parts, self._last = list[PairRow](), 0, time.monotonic()
 
-    def open(self, is_in_shard: Callable[[int], bool], *, verify: bool) -> tuple[set[int], int]:
+    def open(
+        self, is_in_shard: Callable[[int], bool], *, verify: bool, is_repaired: Callable[[PairRow], bool]
+    ) -> tuple[set[int], int]:
         """Write the rows of this shard whose files exist, from all manifests of the folder.
 
-        With `verify`, checksums are compared too, and frames that were skipped are dropped, to be tried again. Rows
-        move into the manifest of this shard, so that a set that goes on with another number of shards has each once.
+        With `verify`, checksums are compared too. Frames that were skipped are dropped if `is_repaired`, to be tried
+        again. Rows move into the manifest of this shard, so that a set that goes on with another number of shards has
+        each once.
 
         Returns:
             the numbers of complete pairs, and the number of damaged pairs that `verify` has detected.
         """
         rows = scan_rows(find_manifests(self.out), lambda row: is_in_shard(row.number), skip_invalid=True)
-        kept, damaged, check = [], 0, partial(self._is_complete, verify=verify)
+        size_of = lru_cache(_CHUNK)(lambda path: (self.out / path).stat().st_size)  # a tar holds many pairs
+        kept, damaged, check = [], 0, partial(self._is_complete, size_of=size_of, verify=verify)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             while chunk := list(islice(rows, _CHUNK)):
                 for (row, location), is_complete in zip(chunk, pool.map(check, [row for row, _ in chunk]), strict=True):
-                    if is_complete and not (verify and row.skipped):
+                    if is_complete and not (row.skipped and is_repaired(row)):
                         kept.append((row.number, location))
                     elif verify:
                         damaged += bool(row.files)  # a new file replaces a damaged one, and a tar has intact pairs
         self._write(kept)
+        self._remove_parts()
         self._take_rows(is_in_shard)
         return {number for number, _ in kept}, damaged
 
     def _take_rows(self, is_in_shard: Callable[[int], bool]) -> None:
         """Remove the rows of this shard from the manifests of another number of shards."""
-        others = f"manifest-[0-9]*{self.path.name[14:]}" if "-of-" in self.path.name else self.path.name
+        stem = self.path.stem
+        others = f"manifest-[0-9]*{stem[14:]}.*jsonl" if "-of-" in stem else f"{stem}.*jsonl"  # with their parts
         current = set(self.out.glob(others))
         with locked("out", self.out, "manifests", wait=True):
             for path in set(find_manifests(self.out)) - current:
@@ -217,22 +233,44 @@ class Manifest:
 
     def add(self, rows: Iterable[PairRow]) -> None:
         """Append the rows of pairs whose files are written."""
-        with self.path.open("ab") as stream:
-            stream.write("".join(row.as_line() for row in rows).encode())
+        self._rows += rows
+        if not is_remote(self.path) or time.monotonic() - self._last > _PART_SECONDS:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the rows that `add` has collected."""
+        lines, self._last = "".join(row.as_line() for row in self._rows).encode(), time.monotonic()
+        if is_remote(self.path) and lines:
+            with replace_file(self.path.with_name(f"{self.path.stem}.{self._parts:06d}.jsonl")) as temporary:
+                temporary.write_bytes(lines)
+            self._parts += 1
+        elif lines:
+            with self.path.open("ab") as stream:
+                stream.write(lines)
+        self._rows = []
 
     def close(self) -> None:
-        """Sort the rows by number."""
-        rows = scan_rows([self.path], lambda _: True, skip_invalid=True)
+        """Sort the rows by number, those of its parts included."""
+        self.flush()
+        rows = scan_rows([self.path, *self._part_paths()], lambda _: True, skip_invalid=True)
         self._write([(row.number, location) for row, location in rows])
+        self._remove_parts()
+
+    def _part_paths(self) -> list[Path]:
+        return sorted(self.out.glob(f"{self.path.stem}.[0-9]*.jsonl"))
+
+    def _remove_parts(self) -> None:
+        for path in self._part_paths():
+            path.unlink()
 
     def _write(self, rows: Sequence[tuple[int, RowLocation]], path: Path | None = None) -> None:
         with replace_file(path or self.path, alone=True) as temporary, temporary.open("wb") as stream:
             stream.writelines(read_lines(location for _, location in sorted(rows)))
 
-    def _is_complete(self, row: PairRow, *, verify: bool) -> bool:
+    def _is_complete(self, row: PairRow, *, size_of: Callable[[str], int], verify: bool) -> bool:
         """Return True if the files of a pair have their sizes and, with `verify`, their checksums."""
         try:
-            sizes = {path: (self.out / path).stat().st_size for path in {file.path for file in row.files.values()}}
+            sizes = {path: size_of(path) for path in {file.path for file in row.files.values()}}
             for suffix, file in row.files.items():
                 end = file.offset + file.bytes
                 if sizes[file.path] < end or (file.offset == 0 and sizes[file.path] > end):  # a tar continues
@@ -278,14 +316,14 @@ def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[
         UsageError: the folder has other settings or other content, or `count` is lower than before.
         OSError: the folder cannot be written.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     new = json.loads(json.dumps(settings))
     path, previous = out / _CONFIG, {}
     # List the folder before testing for config.json, because another shard may be writing to it.
-    others = sorted(file.name for file in out.iterdir() if not file.name.startswith("."))
+    others = sorted(file.name for file in (out.iterdir() if out.is_dir() else ()) if not file.name.startswith("."))
     if path.is_file():
         try:
-            previous = json.loads(path.read_bytes())
+            previous = json.loads(read_bytes(path))
         except ValueError:
             previous = None
         if not isinstance(previous, dict):
@@ -304,7 +342,7 @@ def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[
 
 @contextmanager
 def locked(argument: str, folder: Path, name: str = "run", *, wait: bool = False) -> Iterator[None]:
-    """Hold a lock on an existing folder until the block or the process ends; on Windows, do nothing.
+    """Hold a lock on an existing folder until the block or the process ends; on Windows and in a store, do nothing.
 
     Args:
         argument: that names the folder.
@@ -315,7 +353,7 @@ def locked(argument: str, folder: Path, name: str = "run", *, wait: bool = False
     Raises:
         UsageError: another process holds the lock.
     """
-    if sys.platform == "win32":
+    if sys.platform == "win32" or is_remote(folder):
         yield
         return
     path = folder / f".{name}.lock"

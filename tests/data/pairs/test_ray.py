@@ -1,0 +1,78 @@
+"""Actors of Ray write the bytes of the local engine, also if one of them is killed."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[3]
+COUNT = 300
+
+
+@pytest.fixture(scope="module")
+def complete(tmp_path_factory, words) -> Path:
+    """Return a set made by the local engine."""
+    pytest.importorskip("ray")
+    out = tmp_path_factory.mktemp("complete") / "out"
+    run(words(out, f"count={COUNT}"), workers=0)
+    return out
+
+
+def command(words: tuple[str, ...], *, workers: int, engine: str = "local") -> list[str]:
+    return [sys.executable, "-m", "torchrefract.generate", *words, f"workers={workers}", f"engine={engine}"]
+
+
+def run(words: tuple[str, ...], **options) -> str:
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    result = subprocess.run(
+        command(words, **options), env=environment, capture_output=True, text=True, check=False, timeout=500
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def actors() -> Iterator[int]:
+    """Yield the processes of actors that corrupt frames, of this test's Ray."""
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            title = (path / "cmdline").read_bytes()
+            if title.startswith(b"ray::MapWorker"):
+                yield int(path.name)
+        except OSError:
+            continue
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_actors_write_the_bytes_of_the_local_engine(tmp_path, words, sums, complete, workers):
+    assert f"{COUNT} in total" in run(words(tmp_path / "out", f"count={COUNT}"), workers=workers, engine="ray")
+    assert sums(tmp_path / "out") == sums(complete)
+
+
+def test_an_actor_that_is_killed_costs_no_pair(tmp_path, words, sums, complete):
+    out = tmp_path / "out"
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    options = command(words(out, f"count={COUNT}"), workers=2, engine="ray")
+    killed = list[int]()
+    with subprocess.Popen(options, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        end = time.monotonic() + 300
+        while process.poll() is None and not killed and time.monotonic() < end:
+            if len(list(out.rglob("*.clean.png"))) > COUNT // 4:
+                killed = list(actors())[:1]
+                for actor in killed:
+                    os.kill(actor, signal.SIGKILL)
+            time.sleep(0.02)
+        output, _ = process.communicate(timeout=300)
+    assert killed
+    assert f"{COUNT} pairs made, {COUNT} in total" in output
+    assert sums(out) == sums(complete)
+
+
+def test_ray_without_actors_raises(call, words):
+    pytest.importorskip("ray")
+    message = call("generate", *words("out"), "engine=ray").message
+    assert message == "workers must be at least 1 for engine=ray, which counts its actors, got 0"

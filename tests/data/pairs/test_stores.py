@@ -1,0 +1,196 @@
+"""Sources and sets in object stores: the same bytes as on disk, also after a kill, and errors of one line."""
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import numpy as np
+import pytest
+from fsspec.implementations.memory import MemoryFileSystem
+
+from torchrefract._io import as_path
+from torchrefract.data.media import write_video
+from torchrefract.data.pairs import PairedFolder, PairStream
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def memory(frames, monkeypatch) -> Iterator[MemoryFileSystem]:
+    """Return the store memory:// with the frames in memory://frames, without pauses before further tries."""
+    monkeypatch.setattr("torchrefract._io._PAUSES", (0.0, 0.0, 0.0))
+    store = fsspec.filesystem("memory")
+    store.put(str(frames), "/frames", recursive=True)
+    yield store
+    store.rm("/", recursive=True)
+
+
+def sums_in(store: Any, root: str) -> dict[str, str]:
+    """Return the checksum of each file of a set."""
+    return {path.split(root)[1]: hashlib.sha256(store.cat_file(path)).hexdigest() for path in store.find(root)}
+
+
+def sums_on_disk(sums: Callable[[Path], dict[str, str]], out: Path) -> dict[str, str]:
+    return {f"/{name}": value for name, value in sums(out).items()}
+
+
+@pytest.mark.parametrize("tar", ["null", "5"])
+def test_a_set_in_a_store_has_the_bytes_of_one_on_disk(call, words, memory, sums, tmp_path, tar):
+    options = ("count=10", f"tar={tar}")
+    assert call("generate", *words("memory://out", *options, source="memory://frames")).code == 0
+    assert call("generate", *words("file://" + str(tmp_path / "out"), *options)).code == 0
+    assert sums_in(memory, "/out") == sums_on_disk(sums, tmp_path / "out")
+    assert (
+        ": 0 pairs made, 10 in total"
+        in call("generate", *words("memory://out", *options, source="memory://frames")).out
+    )
+    pairs = PairedFolder("memory://out")
+    assert len(list(PairStream("memory://out", split="train"))) == len(PairedFolder("memory://out", split="train"))
+    assert (pairs[3].clean == PairedFolder(tmp_path / "out")[3].clean).all()
+
+
+def test_a_stopped_run_in_a_store_continues(call, words, memory, monkeypatch, sums, tmp_path):
+    monkeypatch.setattr("torchrefract.data.pairs.manifest._PART_SECONDS", -1.0)
+    put, written = memory.put_file, list[str]()
+
+    def stop(source: str, target: str, **more: Any) -> None:
+        written.append(target)
+        if target.endswith("00000007.flow.png"):
+            raise KeyboardInterrupt
+        put(source, target, **more)
+
+    options = words("memory://out", source="memory://frames")
+    with monkeypatch.context() as patch:
+        patch.setattr(MemoryFileSystem, "put_file", lambda _, *names, **more: stop(*names, **more))
+        assert call("generate", *options).code == 130
+    assert len(memory.glob("/out/manifest.0*.jsonl")) == 7  # a file of rows for each time, as after a kill
+    outcome = call("generate", *options)
+    assert "7 pairs exist already" in outcome.out
+    assert ": 5 pairs made, 12 in total" in outcome.out
+    assert call("generate", *words("out")).code == 0
+    assert sums_in(memory, "/out") == sums_on_disk(sums, tmp_path / "out")
+
+
+def test_shards_in_a_store_keep_the_rows_of_one_another(call, words, memory, monkeypatch):
+    monkeypatch.setattr("torchrefract.data.pairs.manifest._PART_SECONDS", -1.0)
+    for shards in (2, 1):
+        for shard in range(shards):
+            options = words("memory://out", f"shards={shards}", f"shard={shard}", source="memory://frames")
+            assert call("generate", *options).code == 0
+        names = [path.rpartition("/")[2] for path in memory.glob("/out/manifest*")]
+        assert len(names) == shards
+    assert len(PairedFolder("memory://out")) == 12
+
+
+def test_a_store_that_denies_writing_is_one_line(call, words, memory, monkeypatch):
+    def deny(*_: Any, **__: Any) -> None:
+        raise PermissionError("Access Denied")
+
+    monkeypatch.setattr(MemoryFileSystem, "put_file", deny)
+    message = call("generate", *words("memory://out", source="memory://frames")).message
+    assert message == "out must be a folder that can be written to, got memory://out (Permission denied)"
+
+
+def test_a_name_that_vanishes_from_a_store_is_named_and_made_by_the_next_run(call, words, memory):
+    data = memory.cat_file("/frames/drive1/005.png")
+    options = words("memory://out", source="memory://frames")
+    assert call("generate", *options, "count=12", "tar=4").code == 0
+    memory.rm("/out/tars", recursive=True)
+    memory.rm("/frames/drive1/005.png")
+    outcome = call("generate", *options, "count=12", "tar=4")
+    assert outcome.message.startswith(
+        "source must stay unchanged during a run, got memory://frames/drive1/005.png cannot be opened (No such file"
+    )
+    memory.pipe_file("/frames/drive1/005.png", data)
+    assert ": 4 pairs made, 12 in total; see" in call("generate", *options, "count=12", "tar=4").out
+
+
+@pytest.mark.parametrize("times", [2, 100])
+def test_a_throttled_request_is_tried_again_with_a_limit(call, words, memory, monkeypatch, times):
+    put, failures = memory.put_file, list[str]()
+
+    def throttle(_: Any, source: str, target: str, **more: Any) -> None:
+        if target.endswith("00000003.flow.png") and len(failures) < times:
+            failures.append(target)
+            raise OSError(16, "Please reduce your request rate")
+        put(source, target, **more)
+
+    options = words("memory://out", source="memory://frames")
+    with monkeypatch.context() as patch:
+        patch.setattr(MemoryFileSystem, "put_file", throttle)
+        outcome = call("generate", *options)
+    lines = [line for line in outcome.err.splitlines() if line.endswith("trying again in 0 s")]
+    assert lines[0].startswith("memory://out/pairs/00000/00000003.flow.png: Please reduce your request rate; trying")
+    if times == 2:
+        assert (outcome.code, len(lines)) == (0, 2)
+        return
+    assert len(lines) == 3
+    reason = "(Please reduce your request rate, after 4 tries)"
+    last = f"error: out must be a folder that can be written to, got memory://out {reason}"
+    assert outcome.err.splitlines()[-1] == last
+    assert "3 pairs exist already" in call("generate", *options).out
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("workers=2", "workers must be 0 for out=memory://out, because each process has its memory, got 2"),
+        ("out=nowhere://out", "out: a path must be one on this machine or an address of fsspec, got nowhere://out ("),
+        ("out=memory://frames/out", "out must lie outside of source"),
+    ],
+)
+def test_an_invalid_address_raises(call, words, memory, option, message):
+    options = [word for word in words("memory://out", source="memory://frames") if word[:4] not in (option[:4])]
+    assert call("generate", *options, option).message.startswith(message)
+
+
+def test_videos_are_read_from_a_store(call, words, memory, tmp_path):
+    pages = [np.full((32, 48, 3), 20 * i, np.uint8) for i in range(6)]
+    for name in ("a.mp4", "b.mp4"):
+        write_video(pages, tmp_path / name, fps=10, size=(48, 32))
+        memory.put_file(str(tmp_path / name), f"/videos/{name}")
+    assert call("generate", *words("memory://out", source="memory://videos")).code == 0
+    assert len(PairedFolder("memory://out")) == 12
+
+
+@pytest.fixture(scope="module")
+def bucket(frames) -> Iterator[dict[str, str]]:
+    """Start a server of the S3 protocol with the frames in s3://bucket/frames; return the environment that names it."""
+    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)
+    pytest.importorskip("s3fs")
+    server.start()
+    host, port = server.get_host_and_port()
+    environment = {"AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b"}
+    environment |= {"AWS_DEFAULT_REGION": "us-east-1"}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        store: Any = fsspec.filesystem("s3", use_listings_cache=False)
+        store.mkdir("bucket")
+        store.put(str(frames), "bucket/frames", recursive=True)
+        yield environment
+    server.stop()
+
+
+def test_a_run_on_s3_that_is_killed_continues_to_the_bytes_on_disk(call, words, bucket, sums, tmp_path):
+    store: Any = as_path("s3://bucket")
+    options = words("s3://bucket/out", "tar=2", source="s3://bucket/frames")
+    command = [sys.executable, "-m", "torchrefract.generate", *options, "workers=1"]
+    with subprocess.Popen(command, env=os.environ | bucket | {"PYTHONPATH": str(ROOT)}) as run:
+        end = time.monotonic() + 120
+        while run.poll() is None and time.monotonic() < end and not store.fs.glob("bucket/out/tars/*"):
+            time.sleep(0.02)
+        run.send_signal(signal.SIGKILL)
+    assert call("generate", *options).code == 0
+    assert call("generate", *words("out", "tar=2")).code == 0
+    assert sums_in(store.fs, "bucket/out") == sums_on_disk(sums, tmp_path / "out")
+    assert len(PairedFolder("s3://bucket/out")) == 12
+    message = call("generate", *words("s3://missing/out", source="s3://bucket/frames")).message
+    assert message == "out must be a folder that can be written to, got s3://missing/out (No such file or directory)"

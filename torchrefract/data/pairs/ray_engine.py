@@ -1,0 +1,81 @@
+"""Work in actors of Ray Data, on this machine or on a cluster: blocks of a lost actor are done again."""
+
+import pickle
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, TypeVar
+
+import pyarrow as pa
+
+from torchrefract.data.workers import use_one_thread
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+_SILENT: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "logging_level": "ERROR"}
+
+
+def map_in_actors(
+    work: Callable[[_Item], _Result], items: Iterable[_Item], *, workers: int, address: str | None, block: int = 8
+) -> Iterator[_Result]:
+    """Apply a function to items in actors of Ray, each with a core and one thread.
+
+    Args:
+        work: can be pickled, and so can its results; called again for an item whose actor was lost.
+        items: all are sent to Ray at the start.
+        workers: number of actors.
+        block: number of items that are done again if their actor is lost.
+        address: of a cluster, as Ray takes it; None starts Ray on this machine.
+
+    Yields:
+        the results, in any order.
+
+    Raises:
+        Exception: any error of `work`.
+    """
+    import ray  # noqa: PLC0415  # pyright: ignore[reportMissingImports]  # in its own extra
+    import ray.data  # noqa: PLC0415  # pyright: ignore[reportMissingImports]  # in its own extra
+
+    started = not ray.is_initialized()
+    if started:
+        ray.init(address=address, **_SILENT, **({} if address else {"num_cpus": workers + 1}))
+    try:
+        ray.data.DataContext.get_current().enable_progress_bars = False
+        rows = [{"item": pickle.dumps(item)} for item in items]
+        blocks = max(workers, -(-len(rows) // block))
+        dataset = ray.data.from_items(rows, override_num_blocks=min(blocks, len(rows)))
+        dataset = dataset.map_batches(
+            _Actor,
+            fn_constructor_args=(work,),
+            batch_size=None,
+            batch_format="pyarrow",
+            concurrency=workers,
+            num_cpus=1,
+        )
+        for batch in dataset.iter_batches(batch_size=None, batch_format="pyarrow", prefetch_batches=0):
+            for data in batch["result"].to_pylist():
+                result, error = pickle.loads(data)
+                if error is not None:
+                    raise error
+                yield result
+    finally:
+        if started:
+            ray.shutdown()
+
+
+class _Actor:
+    """Does the work of blocks of items in a process of Ray."""
+
+    def __init__(self, work: Callable[[Any], Any]):
+        use_one_thread()
+        self.work = work
+
+    def __call__(self, block: pa.Table) -> pa.Table:
+        results = [self._result(pickle.loads(item)) for item in block["item"].to_pylist()]
+        return pa.table({"result": pa.array(map(pickle.dumps, results), pa.binary())})
+
+    def _result(self, item: Any) -> tuple[Any, Exception | None]:
+        """Return the result, or the error, which Ray would wrap and print."""
+        try:
+            return self.work(item), None
+        except Exception as error:
+            return None, error

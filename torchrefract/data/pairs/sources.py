@@ -1,0 +1,230 @@
+"""The list of the clean frames of a set: names, sizes, drives, splits and keys, scanned once and kept as Parquet."""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from torchrefract._io import is_remote, read_bytes, replace_file, retried
+from torchrefract._validation import UsageError
+from torchrefract.data.depth_maps import DepthFolder
+from torchrefract.data.frames import Source, first_names, list_names, select_val_drives, split_frames
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, image_size
+from torchrefract.data.media import VIDEOS, video_info
+from torchrefract.random import key_of
+
+_LIST = "sources.parquet"
+_SAMPLES = 16  # images whose headers are read before a set is started
+_BATCH = 10_000  # rows that are Python objects at a time
+
+
+class Sources(NamedTuple):
+    """All clean frames of a root, in order, in the columns of an Arrow table, which takes about 50 bytes a frame."""
+
+    root: Path
+    table: pa.Table  # the fields of `Source`, and the key of each frame
+    skipped: Sequence[str] = ()  # unreadable videos, relative to the root
+
+    @property
+    def num_frames(self) -> int:
+        """The number of frames."""
+        return len(self.table)
+
+    def frame(self, index: int) -> Source:
+        """Return a frame."""
+        return _source(*(column[index].as_py() for column in self.table.columns[: len(Source._fields)]))
+
+    def frames(self) -> Iterator[Source]:
+        """Yield all frames."""
+        for batch in self.table.to_batches(_BATCH):
+            yield from map(_source, *(column.to_pylist() for column in batch.columns[: len(Source._fields)]))
+
+    @property
+    def has_one_drive(self) -> bool:
+        """Return True if there is no validation split, because the frames are of one drive."""
+        return len(self.table.group_by(["drive", "split"]).aggregate([])) < 2
+
+    def limited(self, count: int) -> "Sources":
+        """Keep at most `count` frames, evenly spaced."""
+        total = self.num_frames
+        if count >= total:
+            return self
+        return self._replace(table=self.table.take([i * total // count for i in range(count)]))
+
+    def digest(self) -> str:
+        """Return a SHA-256 digest of the names, drives, splits and sizes of the files."""
+        digest = hashlib.sha256()
+        for frame in self.frames():
+            digest.update(ascii([*frame]).encode())
+        return digest.hexdigest()
+
+    def depth_digest(self, depth: DepthFolder) -> str:
+        """Return a SHA-256 digest of the names and sizes of the depth maps.
+
+        Raises:
+            UsageError: a frame has none, or two frames share one.
+        """
+        depth.check((frame.path, frame.frame) for frame in self.frames())
+        digest = hashlib.sha256()
+        for frame in self.frames():
+            path = depth.find(frame.path, frame.frame)
+            digest.update(ascii([path.name, path.stat().st_size]).encode())
+        return digest.hexdigest()
+
+    def write(self, path: Path, options: dict[str, Any]) -> None:
+        """Write the list and the options of its scan as a Parquet file."""
+        about = {"options": json.dumps(options), "skipped": json.dumps(list(self.skipped))}
+        with replace_file(path) as temporary:
+            pq.write_table(self.table.replace_schema_metadata(about), temporary)
+
+
+def read_sources(path: Path, root: Path, options: dict[str, Any]) -> Sources:
+    """Read a list that `Sources.write` wrote.
+
+    Raises:
+        UsageError: the file is not such a list, or other options were given when it was written.
+    """
+    try:
+        table = pq.read_table(pa.BufferReader(read_bytes(path)))
+        about = {name.decode(): json.loads(text) for name, text in (table.schema.metadata or {}).items()}
+        previous, skipped = about["options"], about["skipped"]
+    except (pa.ArrowInvalid, ValueError, KeyError) as error:
+        raise UsageError(f"files must be a list of frames that generate wrote, got {path}") from error
+    if different := [name for name in options if previous.get(name) != options[name]]:
+        shown = ", ".join(f"{name} is {previous.get(name)} there and {options[name]} here" for name in different)
+        raise UsageError(f"files must be a list of the same options, got {path}, where {shown}; choose another folder")
+    return Sources(root, table.replace_schema_metadata(), skipped)
+
+
+def list_path(out: Path) -> Path:
+    """Return the path of the list of a set."""
+    return out / _LIST
+
+
+def find_sources(
+    source: Path, *, size: tuple[int, int] | None, every: int, drive_by: str, val_share: float, seed: int
+) -> Sources:
+    """List the frames of a folder of images, a video or a folder of videos, with drives and splits.
+
+    Arguments and errors are those of `FrameFolder`; with size None, images may have any size. The headers of a few
+    images are read: others that turn out to be unreadable are skipped when their pair is made. Each `every`-th frame of
+    a video is listed. Videos of one folder are a drive each; of several folders, each folder is a drive.
+
+    Raises:
+        UsageError: there are no images or videos, or both.
+    """
+    if not source.exists():
+        raise UsageError(f"source must be a folder of images or videos, or a video, got {source}, which does not exist")
+    if source.is_file():
+        if source.suffix.lower() not in VIDEOS:
+            raise UsageError(f"source must be a folder, or a video ({', '.join(VIDEOS)}), got the file {source}")
+        return _find_video_frames(source.parent, {source.name: source.stat().st_size}, every, val_share, seed)
+    sizes = _sizes(source)
+    files = sorted(sizes)
+    videos = [file for file in files if file.lower().endswith(VIDEOS)]
+    if not videos:
+        options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
+        frames = split_frames(source, files, split=None, **options)
+        _check_sample(source, [frame.path for frame in frames[:: len(frames) // _SAMPLES or 1]], size or (1, 1))
+        return Sources(source, table_of(frames, sizes))
+    if images := [file for file in files if file.lower().endswith(EXTENSIONS)]:
+        both = f"{images[0]} and {videos[0]}"
+        raise UsageError(f"source must hold images or videos, got both in {source}, such as {both}")
+    return _find_video_frames(source, {name: sizes[name] for name in videos}, every, val_share, seed)
+
+
+def _find_video_frames(root: Path, sizes: Mapping[str, int | None], every: int, val_share: float, seed: int) -> Sources:
+    paths = list(sizes)
+    counts = {path: video_info(root / path)[0] for path in paths}
+    frames = [(path, index) for path in paths for index in range(0, counts[path], every)]
+    if not frames:
+        raise UsageError(f"source must be a video with frames, or hold one, got {root} with {', '.join(paths[:3])}")
+    folders = {path: path.rpartition("/")[0] for path in paths}
+    drives = folders if len(set(folders.values())) > 1 else {path: path for path in paths}
+    drive_of = {f"{path}#{index}": drives[path] for path, index in frames}
+    has_one_drive = len(set(drive_of.values())) < 2
+    val = set() if has_one_drive else select_val_drives(root, drive_of, val_share=val_share, seed=seed)
+    sources = [Source(path, drives[path] or ".", "val" if drives[path] in val else "train", i) for path, i in frames]
+    return Sources(root, table_of(sources, sizes), [path for path, count in counts.items() if count == 0])
+
+
+def draw_of(source: Source, *, seed: int, repeat: int) -> tuple[int, int]:
+    """Return the seed and the key of the draw for a source that was used `repeat` times before, in a set of a seed.
+
+    At repeat 0 they are those of the first epoch of `PairData` with the same seed, and of its validation.
+    """
+    key = key_of(source.name if repeat == 0 else f"{source.name}\0{repeat}")
+    return (seed << 32) + (source.split != "val"), key
+
+
+def _check_sample(root: Path, paths: Sequence[str], size: tuple[int, int]) -> None:
+    """Raise ValueError if a few images are all unreadable, or one is smaller than `size`."""
+    reasons = []
+    for path in paths:
+        try:
+            H, W = image_size(root / path)
+        except UnreadableImageError as error:
+            reasons.append(str(error).replace(f"{root}/", ""))
+            continue
+        if size[0] > H or size[1] > W:
+            raise ValueError(
+                f"frames must be at least size = {size[0]}x{size[1]} (height x width), got {path} of {H}x{W} in "
+                f"{root}; choose a smaller size or remove them"
+            )
+    if len(reasons) == len(paths):
+        raise ValueError(f"root must hold readable frames, got {first_names(reasons)} in {root}")
+
+
+def table_of(frames: Sequence[Source], sizes: Mapping[str, int | None]) -> pa.Table:
+    """Make the table of frames, with the sizes of their files, by path, and their keys."""
+    columns = {
+        "path": _texts([frame.path for frame in frames]),
+        "drive": _texts([frame.drive for frame in frames]).dictionary_encode(),
+        "split": pa.array([frame.split for frame in frames]).dictionary_encode(),
+        "frame": pa.array([frame.frame for frame in frames], pa.int32()),
+        "bytes": pa.array([sizes[frame.path] for frame in frames], pa.int64()),
+        "key": pa.array([key_of(frame.name) for frame in frames], pa.int64()),
+    }
+    return pa.table(columns)
+
+
+def _sizes(root: Path) -> dict[str, int | None]:
+    """Return the size of each file of a root by its name, without hidden ones."""
+    if not is_remote(root):
+        return {name: _size(f"{root}/{name}") for name in list_names(root)}
+    store, sizes = cast(Any, root), dict[str, int | None]()
+
+    def scan() -> None:
+        start = store.path.strip("/")
+        for folder, _, files in store.fs.walk(store.path, detail=True):
+            inner = folder.strip("/")[len(start) :].strip("/")
+            names = {f"{inner}/{name}".lstrip("/"): info["size"] for name, info in files.items()}
+            sizes.update({name: size for name, size in names.items() if "/." not in f"/{name}"})
+
+    retried(scan, root)
+    return sizes
+
+
+def _size(path: str) -> int | None:
+    """Return the size of a file in bytes; None if it has vanished, which is an error when the frame is read."""
+    try:
+        return os.stat(path).st_size
+    except FileNotFoundError:
+        return None
+
+
+def _texts(texts: Sequence[str]) -> pa.Array:
+    """Make a column of names: bytes if a name is not valid Unicode."""
+    try:
+        return pa.array(texts, pa.string())
+    except UnicodeEncodeError:
+        return pa.array(map(os.fsencode, texts), pa.binary())
+
+
+def _source(path: str | bytes, drive: str | bytes, split: str, frame: int | None, size: int | None) -> Source:
+    return Source(os.fsdecode(path), os.fsdecode(drive), split, frame, size)

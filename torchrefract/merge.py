@@ -1,0 +1,22 @@
+"""Join the manifests of the shards of a set of pairs: `python -m torchrefract.merge out=DIR`.
+
+The rows of all shards are sorted into one manifest.jsonl, repeated rows and rows of missing files are dropped, and the
+card of the set is written anew. The status is 1 if a pair is missing.
+
+Options:
+    out=DIR                 folder of the pairs, required
+    verify=true             compare all files with their checksums
+
+Example:
+    python -m torchrefract.merge out=pairs verify=true
+
+Options of Hydra: `--cfg job` prints all options with their values. A file name may hold any letters; only the shell
+needs quotes, as in `'out=my pairs'`.
+"""
+
+from torchrefract.cli.entry import command
+
+main = command("merge", __doc__, "merging:merge")
+
+if __name__ == "__main__":
+    main()

@@ -5,12 +5,8 @@ import sys
 from collections.abc import Callable
 
 _HELP = ("--help", "-h")
-_CAMERA_COMMANDS = (
-    "calibrate",
-    "rectify",
-    "make_board",
-    "estimate_lens",
-)  # their libraries are in the extra "calibration"
+# Their libraries are in the extra "calibration".
+_CAMERA_COMMANDS = ("calibrate", "rectify", "make_board", "estimate_lens")
 _EXTRAS = {"onnx": "export", "ray": "ray"}  # by the first letters of a library; that of all others is "train"
 
 

@@ -29,7 +29,8 @@ class FlowDiffusion(AveragedRestoration):
 
     The target is the flow at the nodes of a lattice, in shares of width and height, divided by its root mean square in
     the first batch. The network predicts it from the whole frame, see `LatticeDenoiser`. DDIM samples it in few steps.
-    The mean of some samples is the restoration, and their spread says how far it may be off.
+    The mean of some samples is the restoration. Their spread is no measured uncertainty: after short trainings, all
+    samples of a frame are alike, and so is their error.
 
     A lens is a few numbers, which every node shows. Therefore the noise of one number is smaller than that of a node by
     about the square root of their count, and without `shift` a noisy target would tell the lens at nearly all levels.

@@ -133,7 +133,7 @@ def test_the_help_of_the_package_names_all_effects_presets_and_commands():
     effects = [name for name in torchrefract.__all__ if issubclass(kind(getattr(torchrefract, name)), Effect)]
     scenes = [path.stem for path in (ROOT / "conf" / "scene").glob("*.yaml")]
     commands = [path.stem for path in (ROOT / "torchrefract").glob("*.py") if "import command" in path.read_text()]
-    assert len(commands) == 13
+    assert len(commands) == 14
     assert [name for name in effects + scenes + commands if name not in re.findall(r"\w+", text)] == []
 
 

@@ -4,6 +4,8 @@ import lens_estimation
 import pytest
 import torch
 
+from torchrefract.fields.rectification import camera_flow
+
 
 def test_errors_are_in_px_of_a_frame_1920_px_wide_and_grow_with_the_lens():
     truth = lens_estimation.to_camera(torch.tensor([-0.16, 0.06]), (54, 96))
@@ -20,6 +22,18 @@ def test_errors_are_in_px_of_a_frame_1920_px_wide_and_grow_with_the_lens():
 def test_rendered_roads_have_the_size_of_the_camera(monkeypatch):
     monkeypatch.setattr(lens_estimation, "_NUM_RENDERED", 1)
     monkeypatch.setattr(lens_estimation, "_RENDERED_SIZE", (54, 96))
-    (gray,), camera = lens_estimation.rendered((-0.16, 0.06))
-    assert gray.shape == (camera.height, camera.width) == (54, 96)
-    assert gray.std() > 10
+    (frame,), camera = lens_estimation.rendered((-0.16, 0.06))
+    assert frame.shape == (1, 3, camera.height, camera.width) == (1, 3, 54, 96)
+    assert frame.std() > 0.05
+
+
+def test_a_network_that_sees_the_lens_has_rows_without_an_error():
+    size, truth = (54, 96), lens_estimation.to_camera(torch.tensor([-0.16, 0.06]), (54, 96))
+    flow = camera_flow(truth)[0]
+    network = lens_estimation.Network(lambda frame: flow, torch.zeros(1, 2, *size))
+    rows, _ = lens_estimation.measure("gray", [torch.full((1, 3, *size), 0.5)] * 2, truth, network=network)
+    errors = {row.method: row.error for row in rows if row.frames == 2}
+    assert errors["network"] < 0.1
+    assert errors["both"] < 0.5 * rows[0].nothing
+    assert errors["constant"] == pytest.approx(rows[0].nothing)
+    assert errors["lines"] > 0.5 * rows[0].nothing

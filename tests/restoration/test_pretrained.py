@@ -101,6 +101,7 @@ def test_the_shipped_model_is_small(lens_small):
     assert sum(parameter.numel() for parameter in lens_small.model.parameters()) < 2e6
     assert read_weights(path)["data"]["source"] == "RoadScenes"  # rendered, so that no license binds its users
     assert path.with_suffix(".md").is_file()
+    assert b"run_dir" not in path.read_bytes()  # nor other paths of the machine that trained it
 
 
 def test_the_shipped_model_reads_the_lens_and_not_a_border(lens_small, make_frames):

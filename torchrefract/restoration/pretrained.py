@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 WEIGHTS_SUFFIX = ".safetensors"
 _FOLDER = Path(__file__).with_name("weights")
 _METADATA = "torchrefract"  # its key in the header of a file
-_PARTS = ("task", "config", "data", "licenses")  # of a checkpoint
+_PARTS = ("task", "data", "licenses")  # of a checkpoint
+_CONFIG = ("task", "scene", "data", "model", "seed")  # the parts of its configuration that do not name a run
 _CONSTANT = "constant_flow"  # the key of the mean flow of the training set among the weights
 _REDUCTION = 4  # of its size in the file, because it is smooth
 
@@ -72,7 +73,8 @@ def write_weights(checkpoint: Mapping[str, Any], out: Path) -> None:
     constant = (total / count.clamp(min=1))[None].float()
     reduced = _resize(constant, [-(-side // _REDUCTION) for side in total.shape[1:]])
     values = {name: _in_half(value) for name, value in (checkpoint["state_dict"] | {_CONSTANT: reduced}).items()}
-    about = {part: checkpoint[part] for part in _PARTS} | {"crc32": _checksum(values)}
+    config = {part: checkpoint["config"][part] for part in _CONFIG if part in checkpoint["config"]}
+    about = {part: checkpoint[part] for part in _PARTS} | {"config": config, "crc32": _checksum(values)}
     with replace_file(out) as temporary:
         temporary.write_bytes(save(values, metadata={_METADATA: json.dumps(about)}))
 

@@ -12,6 +12,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -179,11 +180,9 @@ def wait_for(condition: Callable[[], Any], what: str) -> Any:
     exceptions = importlib.import_module("selenium.common.exceptions")
     end = time.monotonic() + 120
     while time.monotonic() < end:
-        try:
+        with suppress(exceptions.WebDriverException):
             if value := condition():
                 return value
-        except exceptions.WebDriverException:
-            pass
         time.sleep(0.2)
     raise AssertionError(f"the page showed no {what} in two minutes")
 

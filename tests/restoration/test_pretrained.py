@@ -105,7 +105,6 @@ def test_the_shipped_model_is_small(lens_small):
 
 
 def test_the_shipped_model_reads_the_lens_and_not_a_border(lens_small, make_frames):
-    """It is well below the best constant flow, and black, mirrored and filled borders agree within 20 %."""
     frames: Frame = make_frames(10, first=10_000, size=lens_small.size)
     effect = presets.cheap_dashcam(k1_range=(-0.33, 0.06), k2_range=(0.05, 0.16))  # of its training
     scores = {}
@@ -117,5 +116,5 @@ def test_the_shipped_model_reads_the_lens_and_not_a_border(lens_small, make_fram
     constant = (pair.flow * pair.valid).sum(dim=0) / pair.valid.sum(dim=0).clamp(min=1)
     of_constant = endpoint_error(constant.expand_as(pair.flow), pair.flow, pair.valid, size=FULL_HD).mean().item()
     assert scores[None] < 0.75 * of_constant
-    for border in ("black", "mirrored"):
+    for border in ("black", "mirrored"):  # the same lenses and frames
         assert abs(scores[border] / scores[None] - 1) < 0.2, scores

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchrefract._validation import check_number, check_positive
 from torchrefract.fields.depth import GroundPlaneDepth
-from torchrefract.fields.sky import find_sky, sky_mask
+from torchrefract.fields.sky import find_sky, mask_of_sky
 from torchrefract.warping.grid import field_dtype
 
 _OPEN = 0.1  # share of sky from which a frame counts as open
@@ -78,11 +78,12 @@ class CorridorDepth:
         dtype, device = field_dtype(image.dtype), image.device
         x, y = (torch.arange(size, dtype=dtype, device=device) for size in (width, height))
         above = (self.horizon * height - 0.5 - y).clamp(min=0)
-        r = torch.hypot(x - (self.vanishing * width - 0.5), above[:, None])
-        sky = sky_mask(image)
-        seen = (sky.to(dtype).mean(dim=(1, 2, 3)) / _OPEN).clamp(max=1)
-        seen = torch.where(find_sky(image).is_night, 1, seen).view(-1, 1, 1, 1)
+        r2 = (x - (self.vanishing * width - 0.5)).square() + above.square()[:, None]
+        sky = find_sky(image)
+        mask = mask_of_sky(image, sky)
+        seen = (mask.to(dtype).mean(dim=(1, 2, 3)) / _OPEN).clamp(max=1)
+        seen = torch.where(sky.is_night, 1, seen).view(-1, 1, 1, 1)
         end = seen / self.far + (1 - seen) / min(self.far, self.closed)
-        walls = 1 / torch.hypot(r / (self.side * self.focal * width), end)
+        walls = (r2 / (self.side * self.focal * width) ** 2 + end.square()).rsqrt()
         road = self.road(height, width, dtype=dtype, device=device)
-        return torch.where(sky, torch.inf, torch.minimum(road, walls))
+        return torch.minimum(road, walls).masked_fill(mask, torch.inf)

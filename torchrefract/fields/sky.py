@@ -53,9 +53,13 @@ def sky_mask(image: Tensor) -> Tensor:
     Returns:
         (N, 1, H, W), bool. It has no gradient. Each image is judged alone.
     """
+    return mask_of_sky(image, find_sky(image))
+
+
+def mask_of_sky(image: Tensor, sky: Sky) -> Tensor:
+    """Return the `sky_mask` of images in which the nodes of the sky are known, from `find_sky`."""
     image = image.detach()
-    mask, stride, _ = find_sky(image)
-    nodes = _nodes(image, stride)
+    mask, nodes = sky.nodes, _nodes(image, sky.stride)
     is_smooth = _is_smooth(luma(nodes))
     for _ in range(_GROWTHS):
         nearby, is_near = _mean_nearby(mask, nodes)
@@ -67,7 +71,9 @@ def sky_mask(image: Tensor) -> Tensor:
     size = (image.shape[2], image.shape[3])
     candidate = F.interpolate(torch.maximum(is_above, _highest_nearby(weight)), size) > 0
     pixels = image.float() / 255 if image.dtype is torch.uint8 else image.float()
-    darker = (F.interpolate(color, size, mode="bilinear") - pixels).amax(dim=1, keepdim=True)
+    # PyTorch interpolates three channels by a slower path than as many images of one.
+    color = F.interpolate(color.flatten(0, 1)[:, None], size, mode="bilinear").view(pixels.shape)
+    darker = (color - pixels).amax(dim=1, keepdim=True)
     return candidate & (darker < _MAX_DARKER)
 
 
@@ -111,26 +117,28 @@ def sky_point(sky: Sky, u: Tensor, *, height: int, width: int) -> tuple[Tensor, 
 def _nodes(image: Tensor, stride: int) -> Tensor:
     """Return the values of an image (N, C, H, W) at the nodes, (N, C, h, w), in [0, 1]; NaN is 0."""
     nodes = image[:, :, ::stride, ::stride]
-    return (nodes.float() / 255 if image.dtype is torch.uint8 else nodes.float()).nan_to_num(nan=0.0).clamp(0, 1)
+    nodes = nodes.float() / 255 if image.dtype is torch.uint8 else nodes.float()
+    return nodes.contiguous().nan_to_num(nan=0.0).clamp(0, 1)
 
 
 def _connected_to_top(candidate: Tensor) -> Tensor:
-    """Return the part of a mask (N, 1, H, W) that a few sweeps along rows and columns reach from its top row."""
+    """Return the part of a mask (N, 1, H, W) that a few sweeps along columns and rows reach from its top row."""
     reached = candidate.clone()
     reached[:, :, 1:] = False
+    runs = [_runs(candidate, dim) for dim in (2, 3)]
     for _ in range(_SWEEPS):
-        for dim in (2, 3):
-            reached = _sweep(reached, candidate, dim) | _sweep(reached.flip(dim), candidate.flip(dim), dim).flip(dim)
+        for run in runs:
+            count = run.new_zeros(len(run), candidate.shape[2:].numel() + max(candidate.shape))
+            count = count.scatter_add(1, run, reached.flatten(1).to(run.dtype))
+            reached = candidate & (count.gather(1, run) > 0).view_as(candidate)
     return reached
 
 
-def _sweep(reached: Tensor, candidate: Tensor, dim: int) -> Tensor:
-    """Spread a mask along a dimension, from lower to higher indices, as far as candidates go without a gap."""
-    index = torch.arange(1, candidate.shape[dim] + 1, device=candidate.device)
-    index = index.view([-1 if i == dim else 1 for i in range(4)])
-    latest_reached = (index * reached).cummax(dim).values
-    latest_gap = (index * ~candidate).cummax(dim).values
-    return latest_reached > latest_gap
+def _runs(candidate: Tensor, dim: int) -> Tensor:
+    """Return the number, (N, H W), of the run of successive candidates along a dimension to which a node belongs."""
+    size, lines = candidate.shape[dim], candidate.shape[5 - dim]
+    first = (size + 1) * torch.arange(lines, device=candidate.device)
+    return ((~candidate).cumsum(dim) + (first if dim == 2 else first[:, None])).flatten(1)
 
 
 def _mean_where(mask: Tensor, value: Tensor) -> Tensor:
@@ -147,10 +155,11 @@ def _is_smooth(y: Tensor) -> Tensor:
 def _mean_nearby(mask: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
     """Return the mean of a value (N, C, H, W) over the part of a mask around each node, and where there is one."""
     weight = mask.to(value.dtype)
-    pooled = torch.cat([value * weight, weight], dim=1)
-    for kernel in ((_AROUND, 1), (1, _AROUND)):
-        pooled = F.avg_pool2d(pooled, kernel, 1, (kernel[0] // 2, kernel[1] // 2))
-    return pooled[:, :-1] / pooled[:, -1:].clamp(min=1e-6), pooled[:, -1:] > 0
+    total = torch.cat([value * weight, weight], dim=1)
+    for dim, border in ((2, (0, 0, _AROUND // 2 + 1, _AROUND // 2)), (3, (_AROUND // 2 + 1, _AROUND // 2))):
+        size, up_to = total.shape[dim], F.pad(total, border).cumsum(dim)
+        total = up_to.narrow(dim, _AROUND, size) - up_to.narrow(dim, 0, size)
+    return total[:, :-1] / total[:, -1:].clamp(min=1), total[:, -1:] > 0
 
 
 def _share(mask: Tensor) -> Tensor:

@@ -35,7 +35,7 @@ from torchrefract.effects.batch import (
     promote_params,
     to_batch,
 )
-from torchrefract.fields.depth import depth_of
+from torchrefract.fields.depth import DepthSource, depth_of
 from torchrefract.labels.targets import is_tv_tensor, warp_moved_labels, wrap_like
 from torchrefract.types import Degraded, Range
 from torchrefract.warping.grid import field_dtype
@@ -69,6 +69,7 @@ class Effect(nn.Module, ABC):
 
     params_type: type[Any]
     labels_getter: str | Callable[[Any], Any] | None = "default"
+    depth: DepthSource | None = None  # of frames without a depth map; None for an effect that depends on no depth
 
     def __init__(self, *, p: float = 1.0):
         super().__init__()

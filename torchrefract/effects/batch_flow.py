@@ -73,7 +73,8 @@ class WarpFlow:
 
     def at(self, points: Points) -> tuple[Tensor, Tensor]:
         """Return the flow (N, 2, h, w), px, and where it exists."""
-        if self.has_closed_form:
+        at_nodes = points.lattice.stride == 1 >= self.plan.stride and not points.is_displaced
+        if self.has_closed_form or at_nodes:
             flow, exists = self.evaluate(self.params, points, self.plan)
         else:
             points = within_reach(points)

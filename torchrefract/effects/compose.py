@@ -270,6 +270,8 @@ class Compose(Effect):
                 active = [cast(WarpEffect, before.effect).active(before.params, *frame) for before in placed]
                 parts = self._parts(placed, places[: len(placed)], active, request, can_measure=False)
                 depth = progress.moved_depth(placed, active, parts)
+            elif depth is None:
+                depth = progress.depth_for(effect)
             placed.append(leaf._replace(params=effect.at_depth(params, progress.image, depth)))
         return placed
 

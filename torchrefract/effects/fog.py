@@ -264,6 +264,7 @@ class UniformFog(PhotometricEffect):
         self.medium = make_medium(
             airlight=airlight, threshold=threshold, depth=depth, camera=camera, linear_light=linear_light
         )
+        self.depth = self.medium.depth
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> FogParams:
         """Draw V and the deviation uniformly in their ranges."""

@@ -181,6 +181,7 @@ class HeterogeneousFog(PhotometricEffect):
         self.medium = make_medium(
             airlight=airlight, threshold=threshold, depth=depth, camera=camera, linear_light=linear_light
         )
+        self.depth = self.medium.depth
         self.scales, self.weights = _check_scales(scales, weights, mode=mode)
         self.scale_unit = check_choice("scale_unit", scale_unit, ("px", "cells"))
         self.reference_width = check_positive("reference_width", reference_width)

@@ -14,6 +14,7 @@ from torchrefract.effects.batch import per_sample
 from torchrefract.effects.batch_flow import BatchFlow, FlowPart, SamplingOptions
 from torchrefract.effects.photometric_effect import PhotometricEffect
 from torchrefract.effects.warp_effect import WarpEffect, mean_of_exposures, warped
+from torchrefract.fields.depth import DepthProvider, DepthSource, depth_of
 from torchrefract.types import Degraded
 from torchrefract.warping.flow import compose_flows
 from torchrefract.warping.grid import field_dtype, inside
@@ -69,6 +70,8 @@ class Progress:
 
     def __init__(self, image: Tensor, depth: Tensor | None, batch: int):
         self.image, self.depth = image, depth
+        self._frame = image  # before the photometric effects since the latest warp
+        self._assumed: list[tuple[DepthSource, Tensor]] = []
         self.frames = image.shape[0] // max(batch, 1)
         self.has_warps = False
         self.segments: list[_Segment] = []
@@ -103,7 +106,8 @@ class Progress:
             return _sample_segment(image, segments[k], leaves, active)
 
         applied = _Applied(segment.applied, segment.flow.parts[0].flow.nodes)
-        self.image = mean_of_exposures(self.image, len(segments), sampled, segment.active, applied)
+        self._frame = self.image = mean_of_exposures(self.image, len(segments), sampled, segment.active, applied)
+        self._assumed = []
         self.light = {name: _moved(value, segment) for name, value in self.light.items()}
         for leaf, moves in zip(leaves, active, strict=True):
             warp = cast(WarpEffect, leaf.effect)
@@ -112,13 +116,28 @@ class Progress:
             self.valid = _valid_after(self.valid, flow, moves)
         self.segments.append(segment)
 
+    def depth_for(self, effect: Effect) -> Tensor | None:
+        """Return the depth that was passed in, or what a function of the effect gives, once for all that share it.
+
+        Fog changes no distance, so the function sees the frame before it.
+        """
+        source = effect.depth
+        if self.depth is not None or source is None or isinstance(source, DepthProvider):
+            return self.depth
+        for function, depth in self._assumed:
+            if function is source:
+                return depth
+        self._assumed.append((source, depth_of(source, self._frame, field_dtype(self._frame.dtype))))
+        return self._assumed[-1][1]
+
     def moved_depth(self, leaves: Sequence[Leaf], active: Sequence[Tensor], parts: Sequence[FlowPart]) -> Tensor | None:
         """Return the depth after warps that are not sampled yet; arguments as for `move`."""
         return self._sample_depth(_segment(leaves, active, parts))
 
     def shade(self, effect: PhotometricEffect, params: Any) -> None:
         """Apply a photometric effect."""
-        shaded = effect.degrade_batch(self.image, params, self.depth)
+        depth = self.depth_for(effect) if effect.may_change(params) else self.depth
+        shaded = effect.degrade_batch(self.image, params, depth)
         rows, before, valid = self.image.shape[0], dict(self.light), self.valid
         self.image = shaded.image
         self.valid = (

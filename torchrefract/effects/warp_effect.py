@@ -73,7 +73,6 @@ class WarpEffect(Effect):
     has_closed_form = False  # whether `flow` computes any points, not only the nodes of a lattice
     has_kinks = False  # whether the lattice follows from error bounds alone, since measurements miss kinks
     bounds_hold_at_any_depth = False  # whether error bounds hold for maps of depth, not only for that of the provider
-    depth: DepthSource | None = None  # of frames without a depth map; None for a flow that depends on no depth
 
     def __init__(
         self,

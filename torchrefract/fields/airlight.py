@@ -3,10 +3,9 @@
 import math
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor
+from torchrefract._tensor import as_device_tensor, highest_nearby
 from torchrefract.fields.sky import find_sky
 from torchrefract.fields.srgb import linear_to_srgb, luma, srgb_to_linear
 
@@ -43,7 +42,7 @@ def airlight_of_frame(image: Tensor) -> Tensor:
     count = seen.nodes.sum(dim=(2, 3))
     is_low = seen.nodes & (seen.nodes.sum(dim=3).cumsum(dim=2) > (1 - _LOWEST) * count[:, :, None])[..., None]
     sky = (nodes * is_low).sum(dim=(2, 3)) / is_low.sum(dim=(2, 3)).clamp(min=1)
-    dark = -F.max_pool2d(-nodes.amin(dim=1, keepdim=True), _PATCH, 1, _PATCH // 2)
+    dark = -highest_nearby(-nodes.amin(dim=1, keepdim=True), _PATCH // 2)
     count = max(1, round(dark.shape[2:].numel() * _BRIGHTEST))
     places = dark.flatten(1).topk(count, dim=1).indices[:, None].expand(-1, image.shape[1], -1)
     haze = nodes.flatten(2).gather(2, places).mean(dim=2)

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
+from torchrefract._tensor import highest_nearby
 from torchrefract.cameras.camera import Pinhole
 from torchrefract.warping.grid import Points
 
@@ -106,7 +106,7 @@ def nearest_exposed(motion: ShutterMotion, inverse_depth: Tensor, points: Points
         index = torch.where(is_inside, row * width + column, float(height * width)).long().flatten(1)
         nearest = inverse_depth.new_zeros(len(index), height * width + 1)
         nearest = nearest.scatter_reduce(1, index, inverse_depth.flatten(1), "amax")[:, :-1]
-        return F.max_pool2d(nearest.view(-1, 1, height, width), kernel_size=3, stride=1, padding=1)
+        return highest_nearby(nearest.view(-1, 1, height, width))
 
 
 def rolling_shutter_flow(

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchrefract._tensor import highest_nearby
 from torchrefract.fields.srgb import luma
 
 _NODES = 192  # of the lattice along the longer side
@@ -69,7 +70,7 @@ def mask_of_sky(image: Tensor, sky: Sky) -> Tensor:
     color = torch.where(mask, torch.minimum(color, nodes), color)  # of blue sky between white clouds
     is_above = weight.flip(2).cummax(dim=2).values.flip(2)
     size = (image.shape[2], image.shape[3])
-    candidate = F.interpolate(torch.maximum(is_above, _highest_nearby(weight)), size) > 0
+    candidate = F.interpolate(torch.maximum(is_above, highest_nearby(weight)), size) > 0
     pixels = image.float() / 255 if image.dtype is torch.uint8 else image.float()
     # PyTorch interpolates three channels by a slower path than as many images of one.
     color = F.interpolate(color.flatten(0, 1)[:, None], size, mode="bilinear").view(pixels.shape)
@@ -106,7 +107,7 @@ def sky_point(sky: Sky, u: Tensor, *, height: int, width: int) -> tuple[Tensor, 
         (N, 2), x and y in widths and heights from the upper left corner of the frame, and (N,), bool, False for frames
         without such a point.
     """
-    inner = 1 - _highest_nearby(1 - sky.nodes.to(u.dtype))
+    inner = 1 - highest_nearby(1 - sky.nodes.to(u.dtype))
     counted = inner.flatten(1).cumsum(dim=1)
     index = (counted <= u[:, :1] * counted[:, -1:]).sum(dim=1).clamp(max=counted.shape[1] - 1)
     columns = sky.nodes.shape[3]
@@ -149,7 +150,7 @@ def _mean_where(mask: Tensor, value: Tensor) -> Tensor:
 
 def _is_smooth(y: Tensor) -> Tensor:
     """Return where the luma (N, 1, H, W) of a node and its neighbors differs little."""
-    return _highest_nearby(y) + _highest_nearby(-y) < _MAX_RANGE
+    return highest_nearby(y) + highest_nearby(-y) < _MAX_RANGE
 
 
 def _mean_nearby(mask: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
@@ -164,14 +165,3 @@ def _mean_nearby(mask: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
 
 def _share(mask: Tensor) -> Tensor:
     return mask.float().mean(dim=(2, 3), keepdim=True)
-
-
-def _highest_nearby(value: Tensor) -> Tensor:
-    """Return the highest of the values (N, 1, H, W) at a node and its eight neighbors."""
-    # max_pool2d, which finds the indices too, takes ten times as long.
-    for dim in (2, 3):
-        size = value.shape[dim]
-        before = torch.cat([value.narrow(dim, 0, 1), value.narrow(dim, 0, size - 1)], dim=dim)
-        after = torch.cat([value.narrow(dim, 1, size - 1), value.narrow(dim, size - 1, 1)], dim=dim)
-        value = torch.maximum(value, torch.maximum(before, after))
-    return value

@@ -27,12 +27,11 @@ def lagrange_weights(stride: int, *, dtype: torch.dtype, device: torch.device) -
     return as_device_tensor(_constant_weights(stride), dtype=dtype, device=device)
 
 
-def lagrange_basis(t: Tensor) -> Tensor:
-    """Evaluate the weights of `lagrange_weights` at any t; (...) to (..., 4)."""
+def lagrange_basis(t: Tensor) -> list[Tensor]:
+    """Evaluate each of the four weights of `lagrange_weights` at any t, in its shape."""
     below, above, far = t + 1, t - 1, t - 2
-    return torch.stack(
-        [-t * above * far / 6, below * above * far / 2, -t * below * far / 2, t * below * above / 6], dim=-1
-    )
+    outer, inner = t * below, above * far
+    return [t * inner / -6, below * inner / 2, outer * far / -2, outer * above / 6]
 
 
 def interpolate_nodes(nodes: Tensor, *, stride: int, margin: int, height: int, width: int) -> Tensor:
@@ -71,4 +70,5 @@ def _constant_weights(stride: int) -> list[list[float]]:
 
 @cached_constant(maxsize=64)
 def _cached_weights(stride: int) -> list[list[float]]:
-    return lagrange_basis(torch.arange(stride, dtype=torch.float64, device="cpu") / stride).tolist()
+    t = torch.arange(stride, dtype=torch.float64, device="cpu") / stride
+    return torch.stack(lagrange_basis(t), dim=1).tolist()

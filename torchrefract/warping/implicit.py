@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -183,6 +184,10 @@ def sample_at(values: Tensor, points: Points) -> Tensor:
     is_pixels = lattice == pixel_lattice(lattice.height, lattice.width)
     if is_pixels and not points.is_displaced:
         return values.expand(-1, -1, -1, lattice.width)
+    if lattice.stride == 1 and not points.is_displaced and not is_rows:
+        before, (rows, columns) = lattice.margin, lattice.num_nodes
+        after = columns - before - lattice.width, rows - before - lattice.height
+        return F.pad(values, (before, after[0], before, after[1]), mode="replicate")
     if is_rows:
         return _sample_rows(values, points.y.nan_to_num(nan=0.0).clamp(-lattice.height, 2 * lattice.height))
     if is_pixels and not requires_grad((values, points.x, points.y)):

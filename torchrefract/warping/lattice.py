@@ -140,17 +140,19 @@ def _cubic(nodes: Tensor, x: Tensor, y: Tensor) -> Tensor:
     batch, _, rows, columns = nodes.shape
     x, y = x[:, 0], y[:, 0]
     column, row = _cell(x, columns), _cell(y, rows)
-    weights_x = lagrange_basis(x - column).to(nodes.dtype).unbind(-1)
-    weights_y = lagrange_basis(y - row).to(nodes.dtype).unbind(-1)
+    weights_x, weights_y = ([weight.to(nodes.dtype) for weight in lagrange_basis(t)] for t in (x - column, y - row))
     first = (row - 1) * columns + column - 1  # of the 4 x 4 nodes
     if batch > 1:
         first = first + rows * columns * torch.arange(batch, device=nodes.device).view(-1, 1, 1)
-    index, values = first.flatten(), nodes.movedim(0, 1).flatten(1).contiguous()
-    result = torch.zeros((), dtype=nodes.dtype, device=nodes.device)
-    for i in range(4):
-        line = torch.zeros((), dtype=nodes.dtype, device=nodes.device)
-        for j in range(4):
-            node = values.index_select(1, index + (i * columns + j)).view(2, *first.shape)
-            line = torch.addcmul(line, weights_x[j], node)
-        result = torch.addcmul(result, weights_y[i], line)
-    return result.movedim(0, 1)
+    index, components = first.flatten(), []
+    # Each component by itself: PyTorch takes twice as long for the products of two components with one weight.
+    for values in nodes.movedim(0, 1).flatten(1):
+        component = torch.zeros((), dtype=nodes.dtype, device=nodes.device)
+        for i, weight_y in enumerate(weights_y):
+            line = torch.zeros((), dtype=nodes.dtype, device=nodes.device)
+            for j, weight_x in enumerate(weights_x):
+                node = values[i * columns + j :].index_select(0, index).view(first.shape)
+                line = torch.addcmul(line, weight_x, node)
+            component = torch.addcmul(component, weight_y, line)
+        components.append(component)
+    return torch.stack(components, dim=1)

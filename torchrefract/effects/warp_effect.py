@@ -25,7 +25,7 @@ from torchrefract.effects.batch_flow import (
     flow_on_measured_lattice,
     zero_flow,
 )
-from torchrefract.fields.depth import DepthSource, frame_depth
+from torchrefract.fields.depth import frame_depth
 from torchrefract.planning.plan import (
     DEFAULT_ULPS,
     TOLERANCE_PX,

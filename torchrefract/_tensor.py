@@ -8,6 +8,7 @@ from itertools import chain
 from typing import Any, TypeVar, cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -125,6 +126,13 @@ def highest_nearby(value: Tensor, reach: int = 1) -> Tensor:
         after = torch.cat([value.narrow(dim, 1, size - 1), value.narrow(dim, size - 1, 1)], dim=dim)
         value = torch.maximum(value, torch.maximum(before, after))
     return value
+
+
+def interpolate_channels(nodes: Tensor, size: tuple[int, int]) -> Tensor:
+    """Interpolate (N, C, h, w) bilinearly to a size, (N, C, H, W)."""
+    # PyTorch copies three channels to channels_last and back, which takes longer than to interpolate them.
+    images = F.interpolate(nodes.flatten(0, 1)[:, None], size, mode="bilinear", align_corners=False)
+    return images.view(*nodes.shape[:2], *size)
 
 
 def is_channels_last(image: Tensor) -> bool:

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._tensor import exact_matmul, rows_at_once, without_autocast
+from torchrefract._tensor import exact_matmul, interpolate_channels, rows_at_once, without_autocast
 from torchrefract._validation import eager_bool, requires_grad
 from torchrefract.fields.exposure import finite_image
 
@@ -134,8 +134,7 @@ def spread_glow(glow: Tensor, light: Tensor, strength: Tensor, *, height: int, w
 
 
 def _interpolate(nodes: Tensor, stride: int) -> Tensor:
-    size = (nodes.shape[2] * stride, nodes.shape[3] * stride)
-    return F.interpolate(nodes, size=size, mode="bilinear", align_corners=False)
+    return interpolate_channels(nodes, (nodes.shape[2] * stride, nodes.shape[3] * stride))
 
 
 def _pixels_of_nodes(size: int, stride: int, like: Tensor) -> Tensor:

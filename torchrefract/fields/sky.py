@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._tensor import highest_nearby
+from torchrefract._tensor import highest_nearby, interpolate_channels
 from torchrefract.fields.srgb import luma
 
 _NODES = 192  # of the lattice along the longer side
@@ -72,9 +72,7 @@ def mask_of_sky(image: Tensor, sky: Sky) -> Tensor:
     size = (image.shape[2], image.shape[3])
     candidate = F.interpolate(torch.maximum(is_above, highest_nearby(weight)), size) > 0
     pixels = image.float() / 255 if image.dtype is torch.uint8 else image.float()
-    # PyTorch interpolates three channels by a slower path than as many images of one.
-    color = F.interpolate(color.flatten(0, 1)[:, None], size, mode="bilinear").view(pixels.shape)
-    darker = (color - pixels).amax(dim=1, keepdim=True)
+    darker = (interpolate_channels(color, size) - pixels).amax(dim=1, keepdim=True)
     return candidate & (darker < _MAX_DARKER)
 
 

@@ -2,10 +2,13 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from torchrefract._validation import eager_values, requires_grad
 
 SUN_RADIUS = 0.265  # degrees
 _SUN_AREA = math.pi * SUN_RADIUS**2
@@ -82,17 +85,26 @@ def sun_light(
         along_x, along_y = _squared_distances(torch.lerp(middle, sun.center, ghost[:, :1]), x, y, px_per_degree)
         fading, area = radius.square() * _GHOST_EDGE, math.pi * radius.square() * (1 - _GHOST_EDGE / 2)
         strength = glare * share / area * tint[:, :, None, None]
-        ghosts.append((1 / _GHOST_EDGE - along_x / fading, along_y / fading, strength))
+        along_x, along_y = 1 / _GHOST_EDGE - along_x / fading, along_y / fading
+        # (H,), whether a row shows the ghost of any frame; None if all are computed.
+        shows = partial(_any_row, along_x.detach(), along_y.detach())
+        rows_seen = None if requires_grad(sun) else eager_values(shows, of=along_x)
+        ghosts.append((along_x, along_y, strength, rows_seen))
 
     def light_at(rows: slice) -> Tensor:
         squared = across + down[:, :, rows]
         light = glare * glare_tail(squared, scatter, scale, shape)
         light = torch.addcmul(light, disk, ((SUN_RADIUS**2 - squared) * edge + 0.5).clamp(0, 1)) * color
-        for along_x, along_y, strength in ghosts:
-            light = torch.addcmul(light, (along_x - along_y[:, :, rows]).clamp(0, 1), strength)
+        for along_x, along_y, strength, rows_seen in ghosts:
+            if rows_seen is None or any(rows_seen[rows]):
+                light = torch.addcmul(light, (along_x - along_y[:, :, rows]).clamp(0, 1), strength)
         return light
 
     return light_at
+
+
+def _any_row(along_x: Tensor, along_y: Tensor) -> Tensor:
+    return (along_x.amax(dim=3) > along_y[..., 0]).any(dim=0)[0]
 
 
 def _squared_distances(center: Tensor, x: Tensor, y: Tensor, px_per_degree: float) -> tuple[Tensor, Tensor]:

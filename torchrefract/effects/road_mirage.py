@@ -6,10 +6,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._validation import check_count, check_number, check_positive, check_range, check_within, finite_or
+from torchrefract._validation import (
+    check_count,
+    check_number,
+    check_positive,
+    check_range,
+    check_within,
+    eager_values,
+    finite_or,
+    requires_grad,
+)
 from torchrefract.effects.batch import LATEST_FRAME, ParamsAtDepth, check_shapes, params_to
 from torchrefract.effects.random_field import check_frame
 from torchrefract.effects.warp_effect import WarpEffect
@@ -35,6 +45,7 @@ _BOUNDS: dict[str, Range] = {
 }
 _STEEPEST = 1 / (4 * 0.15)  # 1/px, of the edge
 _NEARER = 0.5  # times the distance of the road: what stands that near hides the road behind it
+_FADED_PX = 3.0  # below the edge, where less than 1e-7 px is left of the flow
 _MOVES_PX = 1e-3  # less flow counts as none
 
 
@@ -152,17 +163,22 @@ class RoadMirage(WarpEffect):
         mirage: RoadMirageParams = params.params
         values = {name: finite_or(getattr(mirage, name), 0.0).clamp(*ends) for name, ends in _BOUNDS.items()}
         frame = finite_or(mirage.frame, 0.0).clamp(-LATEST_FRAME, LATEST_FRAME)
-        place = (points.x + 0.5) / plan.width
-        difference = shimmering_difference(**values, place=place, time=frame.double().reshape(-1) / self.fps)
         below = points.y - (self.horizon * plan.height - 0.5)
         focal = self.focal * plan.width
+        inverse_depth = sample_at(1 / params.depth.detach().to(below.dtype).clamp(min=1e-6), points)
+        hottest = values["difference"] * (1 + values["shimmer"] * math.sqrt(2 * self.num_waves))
+        height, rows = max(below.shape[2], points.x.shape[2]), slice(None)
+        if not requires_grad(params):
+            rows = _rows_between(below, focal * critical_angle(hottest).amax() + _FADED_PX)
+        below, x, inverse_depth = (v[:, :, rows] if v.shape[2] > 1 else v for v in (below, points.x, inverse_depth))
+        place = (x + 0.5) / plan.width
+        difference = shimmering_difference(**values, place=place, time=frame.double().reshape(-1) / self.fps)
         # 1 / distance of the ground, 1/m; that of a depth map may be 0 in the sky.
         ground = below.clamp(min=0) / (focal * self.camera_height)
         lateral = (place - self.vanishing).abs() * plan.width / focal  # m, at a distance of 1 m
-        is_road = lateral <= self.half_width * ground
-        inverse_depth = 1 / params.depth.detach().to(below.dtype).clamp(min=1e-6)
-        is_road = is_road & (sample_at(inverse_depth, points) <= ground / _NEARER)
+        is_road = (lateral <= self.half_width * ground) & (inverse_depth <= ground / _NEARER)
         v = road_mirage_flow(critical_angle(difference), below, is_road, focal=focal)
+        v = F.pad(v, (0, 0, rows.start or 0, height - v.shape[2] - (rows.start or 0)))
         flow = torch.cat([torch.zeros_like(v), v], dim=1)
         return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=v.device)
 
@@ -178,6 +194,15 @@ class RoadMirage(WarpEffect):
 
     def _range(self, name: str) -> Range:
         return getattr(self, f"{name}_range")
+
+
+def _rows_between(below: Tensor, lowest: Tensor) -> slice:
+    """Return the rows (N, 1, h, w) with a value between 0 and a limit; all if values cannot be read."""
+    has_any = eager_values(lambda: ((below > 0) & (below < lowest)).any(dim=3).any(dim=0)[0], of=below)
+    if has_any is None:
+        return slice(None)
+    rows = [row for row, value in enumerate(has_any) if value] or [0]
+    return slice(rows[0], rows[-1] + 1)
 
 
 @dataclass(frozen=True)

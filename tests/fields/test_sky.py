@@ -106,3 +106,19 @@ def test_haze_at_the_horizon_and_sky_behind_poles_belong_to_the_sky():
     assert (actual & expected)[..., 33:39, :].sum() > 0.9 * expected[..., 33:39, :].sum()
     frame[..., 5, 100] = torch.nan
     assert (sky_mask(frame) == actual).float().mean() > 0.999
+
+
+@pytest.mark.quick
+def test_a_frame_that_was_written_to_has_a_sky_of_its_new_values():
+    frame = torch.full((1, 3, HEIGHT, WIDTH), 0.2)
+    assert not sky_mask(frame).any()
+    frame[:, :, : HEIGHT // 2] = 0.9
+    first = sky_mask(frame)
+    assert first.any()
+    assert torch.equal(sky_mask(frame.clone()), first)
+    frame.fill_(0.2)
+    assert not sky_mask(frame).any()
+    with torch.inference_mode():
+        frame = torch.rand(1, 3, HEIGHT, WIDTH)
+        sky_mask(frame)
+    assert not (sky_mask(frame) & torch.ones(1, requires_grad=True).bool()).requires_grad

@@ -204,6 +204,9 @@ def test_exported_programs_and_the_detector_of_opencv_predict(tmp_path):
     for name in ("net.pt", "net.pt2"):
         torch.testing.assert_close(load_predictor(str(tmp_path / name))(image), network(image).detach())
     (found,) = load_predictor("opencv:hog")(torch.rand(1, 3, 160, 120))
+    for size in ((128, 64), (127, 200), (200, 63), (1, 1)):  # smaller images than its window have no pedestrians
+        (smaller,) = load_predictor("opencv:hog")(torch.rand(1, 3, *size))
+        assert smaller["boxes"].shape == (0, 4)
     assert set(found) == {"boxes", "labels", "scores"}
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchrefract._validation import check_number, check_positive
 from torchrefract.fields.depth import GroundPlaneDepth
-from torchrefract.fields.sky import find_sky, mask_of_sky
+from torchrefract.fields.sky import find_sky, sky_mask
 from torchrefract.warping.grid import field_dtype
 
 _OPEN = 0.1  # share of sky from which a frame counts as open
@@ -79,10 +79,9 @@ class CorridorDepth:
         x, y = (torch.arange(size, dtype=dtype, device=device) for size in (width, height))
         above = (self.horizon * height - 0.5 - y).clamp(min=0)
         r2 = (x - (self.vanishing * width - 0.5)).square() + above.square()[:, None]
-        sky = find_sky(image)
-        mask = mask_of_sky(image, sky)
+        mask = sky_mask(image)
         seen = (mask.to(dtype).mean(dim=(1, 2, 3)) / _OPEN).clamp(max=1)
-        seen = torch.where(sky.is_night, 1, seen).view(-1, 1, 1, 1)
+        seen = torch.where(find_sky(image).is_night, 1, seen).view(-1, 1, 1, 1)
         end = seen / self.far + (1 - seen) / min(self.far, self.closed)
         walls = (r2 / (self.side * self.focal * width) ** 2 + end.square()).rsqrt()
         road = self.road(height, width, dtype=dtype, device=device)

@@ -264,8 +264,8 @@ def noise_on_planes(
 
 def _weights(position: Tensor, nodes: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Compute (..., nodes, places): h and h p of every node at positions (..., places)."""
-    node = torch.arange(nodes, dtype=position.dtype, device=position.device)[:, None]
-    distance = (position.unsqueeze(-2) - node).to(dtype)
+    node = torch.arange(nodes, dtype=dtype, device=position.device)[:, None]
+    distance = position.to(dtype).unsqueeze(-2) - node
     hat = fade_out(distance)
     return hat, hat * distance
 

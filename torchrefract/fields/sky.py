@@ -1,12 +1,15 @@
 """The sky of a road frame: its pixels, a point in it, and whether it is that of the night."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._tensor import highest_nearby, interpolate_channels
+from torchrefract._validation import why_not_eager
 from torchrefract.fields.srgb import luma
 
 _NODES = 192  # of the lattice along the longer side
@@ -19,6 +22,8 @@ _MAX_NIGHT_LUMA, _MIN_NIGHT_SHARE = 0.3, 0.05  # of a sky at night
 _AROUND, _MAX_DARKER = 15, 0.12  # nodes, and difference of a channel, from the color of the sky around a pixel
 _GROWTHS, _MAX_DIFFERENCE = 3, 0.06  # steps, and difference of a channel, from the sky around to more of it
 _SWEEPS = 3  # each goes around one corner
+_MAX_KEPT = 1 << 23  # values of an image
+_F = TypeVar("_F", bound=Callable[..., Any])
 
 
 class Sky(NamedTuple):
@@ -35,6 +40,31 @@ class Sky(NamedTuple):
     is_night: Tensor
 
 
+def _keep_latest(function: _F) -> _F:
+    """Keep the latest result of a function of an image without a gradient, for an image of equal values on the CPU.
+
+    Several effects of a scene, and each severity, look for the sky of one frame. Results must not be written to.
+    """
+    latest: list[tuple[Tensor, Any]] = []
+
+    @wraps(function)
+    def result(image: Tensor) -> Any:
+        if why_not_eager(image) is not None or image.numel() > _MAX_KEPT:
+            return function(image)
+        for kept, value in latest:
+            if kept.dtype is image.dtype and torch.equal(kept, image):
+                return value
+        # Tensors made in inference mode cannot be used outside of it.
+        with torch.inference_mode(False), torch.no_grad():
+            kept = torch.empty_like(image).copy_(image)
+            value = function(kept)
+        latest[:] = [(kept, value)]
+        return value
+
+    return cast(_F, result)
+
+
+@_keep_latest
 def sky_mask(image: Tensor) -> Tensor:
     """Return the pixels that show the sky: connected to the top row, smooth, and bright or blue.
 
@@ -54,13 +84,9 @@ def sky_mask(image: Tensor) -> Tensor:
     Returns:
         (N, 1, H, W), bool. It has no gradient. Each image is judged alone.
     """
-    return mask_of_sky(image, find_sky(image))
-
-
-def mask_of_sky(image: Tensor, sky: Sky) -> Tensor:
-    """Return the `sky_mask` of images in which the nodes of the sky are known, from `find_sky`."""
     image = image.detach()
-    mask, nodes = sky.nodes, _nodes(image, sky.stride)
+    mask, stride, _ = find_sky(image)
+    nodes = _nodes(image, stride)
     is_smooth = _is_smooth(luma(nodes))
     for _ in range(_GROWTHS):
         nearby, is_near = _mean_nearby(mask, nodes)
@@ -76,6 +102,7 @@ def mask_of_sky(image: Tensor, sky: Sky) -> Tensor:
     return candidate & (darker < _MAX_DARKER)
 
 
+@_keep_latest
 def find_sky(image: Tensor) -> Sky:
     """Return the sky at the nodes of a lattice, before smooth nodes around join it; see `sky_mask`."""
     stride = max(1, max(image.shape[2:]) // _NODES)

@@ -75,9 +75,10 @@ class HogDetector:
         return [self._detect((255 * image).round().byte().movedim(0, -1).cpu().numpy()) for image in images]
 
     def _detect(self, image: np.ndarray) -> dict[str, Tensor]:
-        corners, weights = self._hog.detectMultiScale(
-            np.ascontiguousarray(image[..., ::-1]), winStride=(8, 8), scale=1.05
-        )
+        corners, weights = (), ()
+        (width, height), image = self._hog.winSize, np.ascontiguousarray(image[..., ::-1])
+        if image.shape[0] >= height and image.shape[1] >= width:  # OpenCV reads beyond the memory of smaller ones
+            corners, weights = self._hog.detectMultiScale(image, winStride=(8, 8), scale=1.05)
         corners = torch.tensor(np.array(corners, np.float32).reshape(-1, 4))
         scores = torch.tensor(np.array(weights, np.float32).reshape(-1)) / _HOG_SCALE
         boxes = torch.cat([corners[:, :2], corners[:, :2] + corners[:, 2:]], dim=1)

@@ -1,0 +1,135 @@
+"""Compare the time of the robustness command with that of the model alone, on the same pictures.
+
+    python benchmarks/robustness.py --root FRAMES [--count 4] [--models opencv:hog]
+
+Six scenes at five severities, as `python -m torchrefract.robustness` scores them by default. The model predicts 31
+pictures of each frame: once inside of the evaluation, and once alone. Times are seconds of the CPU, on one thread, as
+medians over frames. Architectures of torchvision have random weights, which change no time of their network; the file
+of weights is read by the loading code of the command.
+"""
+
+import argparse
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+import torch
+from severity import frames_in
+from timing import Bar, count, size
+from torch import Tensor
+from torchvision import models
+
+from torchrefract import presets, random
+from torchrefract.cli.robustness import choose_score
+from torchrefract.data.road_scenes import render_road_scenes
+from torchrefract.effects.base import Effect
+from torchrefract.robustness.evaluate import evaluate
+from torchrefract.robustness.predictors import Predict, load_predictor
+from torchrefract.robustness.quantities import QUANTITIES
+from torchrefract.robustness.scores import as_labels
+
+LIMIT = 1.2  # of the time of the evaluation over that of the model
+MODELS = ("opencv:hog", "torchvision:ssdlite320_mobilenet_v3_large", "torchvision:fasterrcnn_resnet50_fpn")
+
+
+class Cost(NamedTuple):
+    """Seconds of the CPU for one frame."""
+
+    bare: float  # of the model, on the pictures of all levels
+    evaluation: float  # of all, the model with it
+
+    @property
+    def ratio(self) -> float:
+        """Return the time of the evaluation over that of the model alone."""
+        return self.evaluation / self.bare
+
+
+def main() -> None:
+    """Measure and print; a limit that does not hold is marked and is no failure of the command."""
+    options = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    options.add_argument("--root", type=Path, help="folder of pictures; without one, rendered roads")
+    options.add_argument("--size", type=size, default=(360, 640), help="height x width of rendered roads, 360x640")
+    options.add_argument("--count", type=count(1), default=4, help="frames, 4")
+    options.add_argument("--models", nargs="*", default=MODELS, help="opencv:hog or torchvision:name, or none")
+    args = options.parse_args()
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")  # of the assumed depth
+    frames = (
+        list(render_road_scenes(torch.arange(args.count), *args.size)[0])
+        if args.root is None
+        else [frame[0] for frame in frames_in(args.root, args.count, [])]
+    )
+    print("CPU ms for a picture, by severity")
+    for name, costs in scene_costs(frames).items():
+        print(f"{name:20}", *(f"{1e3 * seconds:6.1f}" for seconds in costs.values()))
+    for model in args.models:
+        costs = [model_cost(predict, frame) for predict in [load(model)] for frame in frames]
+        bare, evaluation, ratio = (
+            median(values) for values in zip(*((*cost, cost.ratio) for cost in costs), strict=True)
+        )
+        print(f"\n{model}: {bare:.2f} s alone, {evaluation:.2f} s in the evaluation of a frame")
+        print(Bar(model, ratio, "<=", LIMIT, "x the model alone"))
+
+
+@lru_cache
+def scenes(width: int) -> Mapping[str, Mapping[int, Effect]]:
+    """Return the scenes of the command for frames of a width, by name and severity."""
+    return {name: {s: getattr(presets, name)(s, width=width) for s in presets.SEVERITIES} for name in QUANTITIES}
+
+
+def scene_costs(frames: Sequence[Tensor]) -> dict[str, dict[int, float]]:
+    """Return the median seconds of the CPU that each scene takes at each severity, for frames (3, H, W)."""
+
+    def cost(effect: Effect) -> float:
+        effect.degrade(frames[0], seed=0)  # plans, and compiles kernels
+        return median(cpu_seconds(lambda f=frame: effect.degrade(f, seed=0)) for frame in frames)
+
+    return {
+        name: {severity: cost(effect) for severity, effect in by.items()}
+        for name, by in scenes(frames[0].shape[-1]).items()
+    }
+
+
+def load(model: str) -> Predict:
+    """Load a model, one of torchvision with random weights."""
+    kind, _, name = model.partition(":")
+    if kind != "torchvision":
+        return load_predictor(model)
+    with tempfile.TemporaryDirectory() as folder:
+        weights = Path(folder) / "weights.pth"
+        torch.save(models.get_model(name, weights=None, weights_backbone=None).state_dict(), weights)
+        return load_predictor(model, weights=str(weights))
+
+
+def model_cost(predict: Predict, frame: Tensor) -> Cost:
+    """Return what the evaluation of a model costs for a frame (3, H, W), and what the model costs alone."""
+    pictures: list[Tensor] = []
+
+    def recorded(images: Tensor) -> object:
+        pictures.append(images)
+        return predict(images)
+
+    options = {"as_target": as_labels, "quantities": QUANTITIES}
+    by_name = scenes(frame.shape[-1])
+    for effects in by_name.values():
+        for effect in effects.values():
+            effect.degrade(frame, keys=[random.key_of("plan")])
+    evaluation = cpu_seconds(lambda: evaluate(recorded, [("frame", frame, None)], by_name, choose_score, **options))
+    bare = cpu_seconds(lambda: [predict(picture) for picture in pictures])
+    return Cost(bare, evaluation)
+
+
+def cpu_seconds(call: Callable[[], object]) -> float:
+    """Return the seconds of the CPU that a call takes."""
+    start = time.process_time()
+    call()
+    return time.process_time() - start
+
+
+if __name__ == "__main__":
+    main()

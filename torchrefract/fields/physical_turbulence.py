@@ -32,7 +32,8 @@ _RATIO = 3.0  # of the far ends of successive layers
 _HEIGHT_EXPONENT = -4 / 3  # of Cn2, by day
 _NEAREST = 1e-3  # of the reach
 _SMALLEST_DOMAIN = 8  # px; smaller ones have hardly any frequency that has a derivative
-_SMALLEST = 2.0**-66  # of a power or root; torch.where in place of a clamp takes several times as long
+# Clamps, since torch.where takes several times as long; the third power of the first one is a normal float32.
+_SMALLEST_BASE, _SMALLEST_SQUARE = 2.0**-40, 2.0**-66
 _NUM_GAINS = 513  # nodes of the table of gains
 _SUBCELLS = (-0.5 / math.sqrt(3), 0.5 / math.sqrt(3))  # Gauss-Legendre, of a cell
 
@@ -350,9 +351,9 @@ def _sum(real: Tensor, imaginary: Tensor, size: tuple[int, int], rows: range, co
 
 def _power(value: Tensor, exponent: float) -> Tensor:
     """Return value^exponent, 0 up to rounding below 0; several times as fast as `pow`."""
-    return (value.clamp(min=_SMALLEST).log() * exponent).exp()
+    return (value.clamp(min=_SMALLEST_BASE).log() * exponent).exp()
 
 
 def _root(value: Tensor) -> Tensor:
     """Return the square root less 2^-33, 0 with a gradient of 0 where the value is 0 or, by rounding, below."""
-    return value.clamp(min=_SMALLEST).sqrt() - math.sqrt(_SMALLEST)
+    return value.clamp(min=_SMALLEST_SQUARE).sqrt() - math.sqrt(_SMALLEST_SQUARE)

@@ -1,10 +1,20 @@
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from torch.testing import assert_close
 
 from torchrefract import Compose, LensFlare, UniformFog, _tensor
-from torchrefract._tensor import cat_bands, exact_matmul, round_to_dtype, rows_at_once, to_float, to_uint8
+from torchrefract._tensor import (
+    cat_bands,
+    exact_matmul,
+    highest_nearby,
+    interpolate_channels,
+    round_to_dtype,
+    rows_at_once,
+    to_float,
+    to_uint8,
+)
 
 
 @pytest.mark.quick
@@ -106,3 +116,11 @@ def test_products_keep_full_precision_at_any_matmul_precision(precision):
     assert torch.equal(product, left @ right if precision == "highest" else exact.float())
     assert (product - exact).abs().max() < 1e-5
     assert torch.equal(product_double, exact)
+
+
+@pytest.mark.quick
+def test_maxima_and_interpolation_are_those_of_pytorch():
+    value = torch.randn(2, 3, 7, 9)
+    for reach in (1, 3):
+        assert torch.equal(highest_nearby(value, reach), F.max_pool2d(value, 2 * reach + 1, 1, reach))
+    assert_close(interpolate_channels(value, (15, 32)), F.interpolate(value, (15, 32), mode="bilinear"))

@@ -15,6 +15,7 @@ from torchrefract import (
     LensDistortion,
     LensFlare,
     OneOf,
+    RollingShutter,
     ThinPlateSpline,
     Turbulence,
     UniformFog,
@@ -438,3 +439,24 @@ def test_an_optimizer_can_start_at_strength_zero():
     effect.apply(image, params).image.square().sum().backward()
     assert amplitude.grad is not None
     assert amplitude.grad.abs().item() > 0
+
+
+def test_effects_that_share_a_function_of_depth_see_the_frame_before_the_fog_once():
+    seen: list[Tensor] = []
+
+    def depth(image: Tensor) -> Tensor:
+        seen.append(image.clone())
+        return 5 + 100 * image.mean(dim=1, keepdim=True)
+
+    fog = UniformFog(visibility_range=(20.0, 20.0), depth=depth)
+    effect, image = Compose([fog, Turbulence(depth=depth), RollingShutter(depth=depth)]), random_image(2, 3, 40, 60)
+    effect.degrade(image, seed=1)
+    assert len(seen) == 1
+    assert torch.equal(seen[0], image)
+    effect = Compose([fog, Turbulence(depth=depth)])
+    degraded, given = effect.degrade(image, seed=1), effect.degrade(image, seed=1, depth=depth(image))
+    assert_close(degraded.image, given.image)
+    assert_close(degraded.flow, given.flow)
+    seen.clear()
+    Compose([fog, Turbulence(depth=depth), fog]).degrade(image, seed=1)
+    assert len(seen) == 2  # a frame that a warp has moved has another depth

@@ -146,3 +146,19 @@ def test_invalid_parameters_raise():
         effect.apply(image, params._replace(difference=torch.tensor([1.0, -1.0])))
     with pytest.raises(ValueError, match=r"params.rate must have shape \(B, 6\)"):
         effect.apply(image, params._replace(rate=torch.zeros(2, 3)))
+
+
+def test_the_rows_that_are_computed_hold_all_of_the_mirage():
+    image, effect = torch.rand(2, 3, 60, 200), RoadMirage(difference_range=(20.0, 30.0), focal=8.0, half_width=math.inf)
+    params = effect.sample(image, seed=2)
+    rows = effect.apply(image, params).flow
+    assert rows[:, 1].abs().max() > 5
+    # With a gradient, every row is computed.
+    every = effect.apply(image, params._replace(difference=params.difference.requires_grad_())).flow.detach()
+    assert_close(rows, every, rtol=0, atol=1e-5)
+    bent = Compose([effect, LensDistortion()])
+    params = bent.sample(image, seed=2)
+    mirage = params.children[0]
+    learned = mirage._replace(difference=mirage.difference.requires_grad_())
+    every = bent.apply(image, params._replace(children=(learned, params.children[1]))).flow.detach()
+    assert_close(bent.apply(image, params).flow, every, rtol=0, atol=1e-4)

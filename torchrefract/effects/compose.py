@@ -42,7 +42,8 @@ class Compose(Effect):
 
     Warps that follow one another sample the image once, along their composed flow, so that it is blurred once. Under a
     tolerance the composed flow is computed at the nodes of one lattice. Photometric effects between warps keep their
-    place: the image is sampled before them, and their maps move with the warps after them. `restore_flow` is the
+    place: the image is sampled before them, and their maps move with the warps after them. Effects that share a
+    function from images to depth get the depth of the frame before fog and light, computed once. `restore_flow` is the
     composition of the inverse flows; it is not valid where it misses by more than 0.5 px, as between the sheets of a
     fold.
 

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -22,7 +23,7 @@ from torchrefract._validation import (
 )
 from torchrefract.cameras.brown_conrady import ALL_TERMS, POLYNOMIAL12, used_terms
 from torchrefract.cameras.camera import Camera
-from torchrefract.effects.batch import check_shapes, map_params, params_to
+from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.filled_frame import points_without_zoom, zoom_to_fill, zoomed_flow
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, newton_lens_flow
@@ -34,6 +35,7 @@ from torchrefract.warping.grid import Points
 from torchrefract.warping.lattice import pixel_lattice
 
 _LARGEST_COEFFICIENT = 100.0
+_COEFFICIENT_RANGES = attrgetter(*(f"{name}_range" for name in POLYNOMIAL12))
 _FARTHEST = 1e10  # widths
 _SMALLEST_ZOOM = 1e-6
 _FIT_STEPS = 7  # of Newton's method, after which lenses that fold nowhere have converged in float64
@@ -323,7 +325,8 @@ class LensDistortion(WarpEffect):
         is_fixed = not (torch.is_grad_enabled() and requires_grad(params))
         folds_nowhere = self._constant_plan(id(self), height, width, dtype).details is not None
         with torch.set_grad_enabled(not is_fixed):
-            lens = lens_in_px(map_params(params, torch.Tensor.double), height, width)
+            coefficients, focal, center = (value.double() for value in lens_in_px(params, height, width))
+            lens = coefficients, focal, center
 
             def position(points: Points) -> Tensor:
                 pixels = torch.cat([points.x, points.y], dim=1)
@@ -337,7 +340,7 @@ class LensDistortion(WarpEffect):
 
     def _ranges(self) -> LensRanges:
         others = (self.focal_range, self.aspect_range, self.center_x_range, self.center_y_range)
-        return LensRanges(tuple([getattr(self, f"{name}_range") for name in POLYNOMIAL12]), *others)
+        return LensRanges(_COEFFICIENT_RANGES(self), *others)
 
     def _report_fold(self, params: LensParams, height: int, width: int) -> None:
         lens = lens_in_px(params, height, width)

@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from operator import attrgetter
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -35,7 +34,6 @@ from torchrefract.warping.grid import Points
 from torchrefract.warping.lattice import pixel_lattice
 
 _LARGEST_COEFFICIENT = 100.0
-_COEFFICIENT_RANGES = attrgetter(*(f"{name}_range" for name in POLYNOMIAL12))
 _FARTHEST = 1e10  # widths
 _SMALLEST_ZOOM = 1e-6
 _FIT_STEPS = 7  # of Newton's method, after which lenses that fold nowhere have converged in float64
@@ -340,7 +338,7 @@ class LensDistortion(WarpEffect):
 
     def _ranges(self) -> LensRanges:
         others = (self.focal_range, self.aspect_range, self.center_x_range, self.center_y_range)
-        return LensRanges(_COEFFICIENT_RANGES(self), *others)
+        return LensRanges(tuple([getattr(self, f"{name}_range") for name in POLYNOMIAL12]), *others)
 
     def _report_fold(self, params: LensParams, height: int, width: int) -> None:
         lens = lens_in_px(params, height, width)

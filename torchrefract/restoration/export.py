@@ -87,7 +87,7 @@ def save_program(
 
 
 def load_program(path: Path) -> Callable[[Tensor], list[Tensor]]:
-    """Return a function from images (B, C, H, W) to the outputs of a file .pt2 or, by ONNX Runtime, .onnx, without gradients."""
+    """Return a function from images (B, C, H, W) to the outputs of a file .pt2 or .onnx, without gradients."""
     if path.suffix == ".pt2":
         program = torch.export.load(path).module()
 

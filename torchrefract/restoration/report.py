@@ -170,7 +170,7 @@ def summary(metrics: Mapping[str, Tensor], metric_size: tuple[int, int], *, bord
         line = f"{f'{name}, {border}' if border else name:<{_NAME_WIDTH}}"
         line += "".join(f"{values[f'{loss}{suffix}']:8.4f}" for loss in losses)
         line += f"{score:.2f} ({score - values['psnr_identity']:+.2f})".rjust(18)
-        line += f"{values[f'ssim{suffix}']:8.3f}"
+        line += f"{values.get(f'ssim{suffix}', math.nan):8.3f}"  # a stopped run has none
         if "psnr_seen" in values:
             seen = values[f"psnr_seen{suffix}"]
             line += f"{seen:.2f} ({seen - values['psnr_seen_identity']:+.2f})".rjust(28)

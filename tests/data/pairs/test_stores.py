@@ -52,7 +52,6 @@ def test_a_set_in_a_store_has_the_bytes_of_one_on_disk(call, words, memory, sums
         in call("generate", *words("memory://out", *options, source="memory://frames")).out
     )
     pairs = PairedFolder("memory://out")
-    assert len(list(PairStream("memory://out", split="train"))) == len(PairedFolder("memory://out", split="train"))
     assert (pairs[3].clean == PairedFolder(tmp_path / "out")[3].clean).all()
 
 
@@ -191,6 +190,8 @@ def test_a_run_on_s3_that_is_killed_continues_to_the_bytes_on_disk(call, words, 
     assert call("generate", *options).code == 0
     assert call("generate", *words("out", "tar=2")).code == 0
     assert sums_in(store.fs, "bucket/out") == sums_on_disk(sums, tmp_path / "out")
-    assert len(PairedFolder("s3://bucket/out")) == 12
+    keys = [row.key for row in PairedFolder("s3://bucket/out").rows()]
+    assert [int(pair.key) for pair in PairStream("s3://bucket/out")] == keys
+    assert len(keys) == 12
     message = call("generate", *words("s3://missing/out", source="s3://bucket/frames")).message
     assert message == "out must be a folder that can be written to, got s3://missing/out (No such file or directory)"

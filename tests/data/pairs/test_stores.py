@@ -159,27 +159,9 @@ def test_videos_are_read_from_a_store(call, words, memory, tmp_path):
     assert len(PairedFolder("memory://out")) == 12
 
 
-@pytest.fixture(scope="module")
-def bucket(frames) -> Iterator[dict[str, str]]:
-    """Start a server of the S3 protocol with the frames in s3://bucket/frames; return the environment that names it."""
-    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)
-    pytest.importorskip("s3fs")
-    server.start()
-    host, port = server.get_host_and_port()
-    environment = {"AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b"}
-    environment |= {"AWS_DEFAULT_REGION": "us-east-1"}
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in environment.items():
-            patch.setenv(name, value)
-        store: Any = fsspec.filesystem("s3", use_listings_cache=False)
-        store.mkdir("bucket")
-        store.put(str(frames), "bucket/frames", recursive=True)
-        yield environment
-    server.stop()
-
-
-def test_a_run_on_s3_that_is_killed_continues_to_the_bytes_on_disk(call, words, bucket, sums, tmp_path):
+def test_a_run_on_s3_that_is_killed_continues_to_the_bytes_on_disk(call, words, frames, bucket, sums, tmp_path):
     store: Any = as_path("s3://bucket")
+    store.fs.put(str(frames), "bucket/frames", recursive=True)
     options = words("s3://bucket/out", "tar=2", source="s3://bucket/frames")
     command = [sys.executable, "-m", "torchrefract.generate", *options, "workers=1"]
     with subprocess.Popen(command, env=os.environ | bucket | {"PYTHONPATH": str(ROOT)}) as run:

@@ -178,9 +178,11 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
     # Lightning starts the processes of other runs itself.
     processes = int(os.environ.get("WORLD_SIZE") or trainer.world_size)
     if processes != trainer.world_size:
+        devices = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
+        nodes = "" if devices == processes else f" and trainer.num_nodes={processes // devices}"
         raise UsageError(
-            f"trainer must be ddp with trainer.devices={os.environ.get('LOCAL_WORLD_SIZE', processes)} under torchrun, "
-            f"got one that uses {trainer.world_size} of {processes} processes"
+            f"trainer must be ddp with trainer.devices={devices}{nodes} under torchrun, got one that uses "
+            f"{trainer.world_size} of {processes} processes"
         )
     with naming("data"):
         data.check_ranks(trainer.world_size)

@@ -129,6 +129,25 @@ def test_a_panel_covers_the_pixels_of_its_projection():
     assert (rows[0], rows[-1], columns[0], columns[-1]) == (15, 20, 13, 19)
 
 
+def test_half_of_the_scenes_show_a_curved_bonnet_a_meter_or_two_ahead():
+    scenes = [draw_scene(np.random.default_rng((0, key))) for key in range(60)]
+    with_bonnet = [scene for scene in scenes if scene.panels[-1].center[2] < 2]
+    assert 20 <= len(with_bonnet) <= 40
+    for scene in with_bonnet[:6]:
+        image, depth = render(scene, 90, 160)
+        road, far = render(scene._replace(panels=scene.panels[:-1]), 90, 160)
+        bonnet = depth < 2.1
+        assert (bonnet == (depth != far)).all()
+        assert far.min() > 2.1
+        assert depth.min() > 0.7
+        edges = np.abs(image - road).max(axis=2) > 0
+        assert edges[bonnet].mean() > 0.99
+        assert not edges[:71].any()
+        height = bonnet.sum(axis=0)  # the outline falls to both sides
+        assert 3 <= height.max() <= 18
+        assert height[[0, -1]].max() < height[60:100].max()
+
+
 def test_a_panel_throws_its_shadow_away_from_the_sun():
     panel = Body(0.0, 10.0).panel((0, 1, 0), (0, 0, 1), (0, 1, 0), textured((0.5,) * 3, 0.0, 0.0))
     scene = scene_with([], casters=[panel], height=10.0, pitch=0.7)

@@ -122,6 +122,20 @@ def test_a_task_without_a_flow_has_no_endpoint_error(trainer, make_batches, load
     assert run.callback_metrics["val/L_rec"] == run.callback_metrics["val/L"] == run.callback_metrics["val/loss"]
 
 
+def test_a_training_computes_ssim_in_its_last_epoch_alone(trainer, training, validation, loader):
+    class Names(Callback):
+        def on_validation_end(self, trainer, pl_module) -> None:
+            logged.append({name for name in trainer.logged_metrics if name.startswith("val/")})
+
+    logged: list[set[str]] = []
+    trainer(max_epochs=3, callbacks=[Names()]).fit(
+        Restoration(Constant, Undistort()), loader(training), loader(validation)
+    )
+    of_last = {f"val/ssim{suffix}" for suffix in ("", "_identity", "_constant")}
+    assert [names & of_last for names in logged] == [set(), set(), of_last]
+    assert "val/epe" in logged[0]
+
+
 def test_a_validation_logs_the_loss_and_its_terms_of_the_model_and_of_the_baselines(trainer, training, loader):
     run, task = trainer(), Undistort()
     run.validate(Restoration(Constant, task), loader(training[:1]), verbose=False)

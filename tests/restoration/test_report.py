@@ -233,6 +233,8 @@ def test_the_table_compares_the_model_with_the_baselines():
     worse = words(summary(scores(psnr=18.0, epe=30.0), (1080, 1920)))[-1]
     assert worse.endswith(" 18.00 (-2.50) 0.800 30.00 (1.50 x do nothing)")
     assert len(summary(scores(epe=0.0, epe_constant=0.0, epe_identity=0.0), (1080, 1920))) == 4
+    stopped = {name: value for name, value in scores().items() if "ssim" not in name}
+    assert [line.split()[-6] for line in words(summary(stopped, (1080, 1920))[1:])] == ["nan"] * 3
     head, *lines = summary(without_flow(), (1080, 1920))
     assert "endpoint" not in head
     assert "L_k" not in head

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from diffusers.optimization import get_cosine_schedule_with_warmup
 from pytorch_lightning import LightningModule
+from pytorch_lightning.trainer.states import TrainerFn
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import ReduceLROnPlateau
 
@@ -28,9 +29,10 @@ class RestorationModule(LightningModule, ABC):
     """Train and validate a network that restores pairs.
 
     Logs for each epoch: the loss; PSNR in dB and, for a task with a flow, the endpoint error in px of `metric_size`,
-    for val, and for train if the loss needs a restoration anyway; for val all of `restoration_scores`, also of two
-    baselines: the degraded image (`…_identity`) and the mean flow of the training set (`…_constant`); for pairs with a
-    transmission also of the image that it restores, see `restore_by_transmission` (`…_fog`).
+    for val, and for train if the loss needs a restoration anyway; for val all of `restoration_scores`, SSIM in the
+    last epoch only, also of two baselines: the degraded image (`…_identity`) and the mean flow of the training set
+    (`…_constant`); for pairs with a transmission also of the image that it restores, see `restore_by_transmission`
+    (`…_fog`).
 
     Args:
         network: predicts the maps of the task.
@@ -99,8 +101,7 @@ class RestorationModule(LightningModule, ABC):
             )
         scores = {} if restored is None else _main_scores(restored, batch, self.metric_size)
         self._log("train", {"loss": loss} | scores, batch)
-        weight = batch.valid.double()
-        flows = torch.cat([batch.flow.double() * weight, weight], dim=1).sum(dim=0)
+        flows = torch.cat([batch.flow * batch.valid, batch.valid], dim=1).sum(dim=0, dtype=torch.float64)
         self.new_flows = _add(self.new_flows, flows)
         return loss
 
@@ -117,8 +118,11 @@ class RestorationModule(LightningModule, ABC):
         elif batch.transmission.ndim == 4:
             true_map = None if clear is None else batch.transmission
             methods["_fog"] = Restored(restore_by_transmission(batch), transmission=true_map)
+        # SSIM takes longer than all other scores together, so a training computes it in its last epoch alone.
+        is_last = self.trainer.current_epoch + 1 == self.trainer.max_epochs
+        with_ssim = is_last or self.trainer.state.fn != TrainerFn.FITTING
         for suffix, result in methods.items():
-            scores = restoration_scores(self.task, result, batch, metric_size=self.metric_size)
+            scores = restoration_scores(self.task, result, batch, metric_size=self.metric_size, with_ssim=with_ssim)
             self._log("val", scores, batch, suffix=suffix)
         return restored._asdict()
 
@@ -223,7 +227,7 @@ class Restoration(RestorationModule):
 
 
 def restoration_scores(
-    task: Task, restored: Restored, pair: Pair, *, metric_size: tuple[int, int]
+    task: Task, restored: Restored, pair: Pair, *, metric_size: tuple[int, int], with_ssim: bool = True
 ) -> dict[str, Tensor]:
     """Score each restoration of a batch; a score (B,) without meaning for the task is missing.
 
@@ -231,14 +235,15 @@ def restoration_scores(
         L, L_rec, L_k: the loss of the task and its terms, see `Task.loss_terms`.
         psnr: dB.
         psnr_seen: dB, over the pixels of `through_fog`, for a pair with a transmission.
-        ssim: at most 1.
+        ssim: at most 1; missing unless `with_ssim`.
         epe: endpoint error, px of `metric_size` = (height, width).
     """
     reconstruction, of_map = task.loss_terms(restored, pair)
     losses = {"L": reconstruction, "L_rec": reconstruction}
     if of_map is not None:
         losses |= {"L": reconstruction + of_map, "L_k": of_map}
-    return losses | _main_scores(restored, pair, metric_size) | {"ssim": ssim(restored.image, pair.clean, pair.valid)}
+    scores = losses | _main_scores(restored, pair, metric_size)
+    return scores | {"ssim": ssim(restored.image, pair.clean, pair.valid)} if with_ssim else scores
 
 
 def _main_scores(restored: Restored, pair: Pair, metric_size: tuple[int, int]) -> dict[str, Tensor]:

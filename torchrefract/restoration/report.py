@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from pytorch_lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from torchrefract._io import replace_file
+from torchrefract._io import as_path, replace_file
 from torchrefract.data.module import PairData, fingerprint
 from torchrefract.effects.lens import LensDistortion
 from torchrefract.restoration.metrics import psnr
@@ -49,8 +49,8 @@ class RunSummary(Callback):
     """
 
     def __init__(self, run_dir: str, ckpt_path: str | None = None):
-        self.run_dir = Path(run_dir)
-        self.resumed_run = None if ckpt_path is None else Path(ckpt_path).parent
+        self.run_dir = as_path(run_dir)
+        self.resumed_run = None if ckpt_path is None else as_path(ckpt_path).parent
         if self.resumed_run is not None and self.resumed_run.resolve() == self.run_dir.resolve():
             carry_over(self.resumed_run, self.run_dir)  # the logger deletes the table when the run starts
         self._examples: tuple[Restored, Pair] | None = None
@@ -170,7 +170,7 @@ def summary(metrics: Mapping[str, Tensor], metric_size: tuple[int, int], *, bord
         line = f"{f'{name}, {border}' if border else name:<{_NAME_WIDTH}}"
         line += "".join(f"{values[f'{loss}{suffix}']:8.4f}" for loss in losses)
         line += f"{score:.2f} ({score - values['psnr_identity']:+.2f})".rjust(18)
-        line += f"{values[f'ssim{suffix}']:8.3f}"
+        line += f"{values.get(f'ssim{suffix}', math.nan):8.3f}"  # a stopped run has none
         if "psnr_seen" in values:
             seen = values[f"psnr_seen{suffix}"]
             line += f"{seen:.2f} ({seen - values['psnr_seen_identity']:+.2f})".rjust(28)

@@ -144,7 +144,7 @@ def render(scene: Scene, height: int, width: int) -> tuple[Array, Array]:
         is_shaded = np.zeros(depth.shape, dtype=bool)
         for panel in scene.casters:
             _cast_shadow(panel, camera, scene.light.sun, depth, is_shaded)
-        color = _backdrop(scene, camera, depth, is_shaded)
+        color = np.repeat(_backdrop(scene, camera, depth, is_shaded)[None], len(depth), axis=0)
         for panel in scene.panels:
             _draw_panel(panel, camera, scene.light, color, depth)
     return np.clip(color.mean(axis=0), 0, 1), depth[0]
@@ -159,7 +159,9 @@ def _draw_panel(panel: Panel, camera: Camera, light: Light, color: Array, depth:
     t = np.float32(distance) / camera.dot(panel.normal, window)
     rays, albedo = _solid_rays(panel, (t > _NEAR) & (t < depth[window]), *_coordinates(panel, camera, window, t))
     facing = -math.copysign(1, distance) * panel.normal
-    shaded = albedo * (light.ambient * (0.75 + 0.25 * facing[1]) + max(facing @ light.sun, 0.0) * light.beam)
+    shaded = albedo * (
+        light.ambient * float(0.75 + 0.25 * facing[1]) + light.beam * max(float(facing @ light.sun), 0.0)
+    )
     color[window][rays] = _tone(_blend(shaded, light.horizon * 0.9, t[rays] / (t[rays] + _HAZE)))
     depth[window][rays] = t[rays]
 
@@ -192,48 +194,48 @@ def _solid_rays(panel: Panel, mask: Array, u: Array, v: Array) -> tuple[tuple[Ar
 
 
 def _backdrop(scene: Scene, camera: Camera, depth: Array, is_shaded: Array) -> Array:
-    """Return ground and sky, (5, H, W, 3); their texture is that of each pixel's center."""
+    """Return ground and sky (H, W, 3): edges are means over the rays, all else is that of each pixel's center."""
     road, light = scene.road, scene.light
     x, y, z = (camera.dot(axis, camera.frame) for axis in np.eye(3))
-    rise, size = y[0], np.where(y[0] < 0, 1, _CLOUD_SCALE)
-    plane_depth = np.minimum(np.where(rise < 0, camera.position[1], _CLOUD_HEIGHT) / np.abs(rise), _FAR)
+    left, height, shift = float(camera.position[0]), float(camera.position[1]), road.shift.astype(np.float32)
+    rise, size = y[0], np.where(y[0] < 0, np.float32(1), np.float32(_CLOUD_SCALE))
+    plane_depth = np.minimum(np.where(rise < 0, np.float32(height), np.float32(_CLOUD_HEIGHT)) / np.abs(rise), _FAR)
     # A pixel covers a distance on the plane that grows with the depth, and more of it ahead than across.
     footprint = plane_depth / camera.scale / size * np.maximum(1, 0.5 / np.abs(rise))
-    plane = (camera.position[0] + plane_depth * x[0]) / size, plane_depth * z[0] / size
+    plane = (left + plane_depth * x[0]) / size, plane_depth * z[0] / size
     # Noise of four cell sizes, each faded out where a pixel covers more than about one cell.
-    cells = np.array([0.035, 0.2, 1.3, 8.0])[:, None, None]
-    grain = noise(plane[0] / cells + road.shift[0], plane[1] / cells + road.shift[1]) / (1 + (footprint / cells) ** 2)
-    grain = np.broadcast_to(grain[:, None].astype(np.float32), (4, *depth.shape))
-    color, is_ground = np.empty((*depth.shape, 3), np.float32), y < 0
-    color[~is_ground] = _tone(_sky(light, np.stack([x, y, z])[:, ~is_ground], grain[:, ~is_ground]))
-    t = np.minimum(depth[is_ground], _FAR)
-    albedo = _ground(road, camera.position[0] + t * x[is_ground], t * z[is_ground], grain[:, is_ground])
-    sunlight = light.beam * (light.sun[1] * np.where(is_shaded[is_ground], 0.15, 1)[:, None])
-    color[is_ground] = _tone(_blend(albedo * (light.ambient * 0.95 + sunlight), light.horizon * 0.9, t / (t + _HAZE)))
+    cells = np.array([0.035, 0.2, 1.3, 8.0], np.float32)[:, None, None]
+    grain = noise(plane[0] / cells + shift[0], plane[1] / cells + shift[1]) / (1 + (footprint / cells) ** 2)
+    color, is_sky, is_ground = np.zeros((*rise.shape, 3), np.float32), (y >= 0).any(axis=0), (y < 0).any(axis=0)
+    color[is_sky] = _tone(_sky(light, np.stack([x[0], y[0], z[0]])[:, is_sky], grain[:, is_sky]))
+    t = np.minimum(depth[:, is_ground], _FAR)
+    albedo = _ground(road, left + t * x[:, is_ground], t * z[:, is_ground], grain[:, is_ground])
+    sunlight = light.beam * (float(light.sun[1]) * (1 - 0.85 * _share(is_shaded[:, is_ground]))[:, None])
+    ground = _blend(albedo * (light.ambient * 0.95 + sunlight), light.horizon * 0.9, t[0] / (t[0] + _HAZE))
+    color[is_ground] = _blend(color[is_ground], _tone(ground), _share(y[:, is_ground] < 0))
     return color
 
 
 def _ground(road: Road, x: Array, z: Array, grain: Array) -> Array:
-    """Return the albedo of the ground (K, 3): verge, shoulder, road, road paint."""
+    """Return the albedo of the ground (K, 3) at rays (5, K): verge, shoulder, road, road paint."""
     fine, small, middle, coarse = grain
-    side = x - road.center(z)
-    distance, is_gravel = np.abs(side), 1 - road.is_paved
+    distance, is_gravel = np.abs(x - road.center(z)), 1 - road.is_paved
     soil = _mix((0.4, 0.3, 0.18), (0.42, 0.17, 0.08), road.red_soil)
     grass = _mix((0.42, 0.33, 0.13), (0.13, 0.2, 0.05), road.green_grass)
     shade, ragged = 0.3 * fine + 0.2 * small, middle + 0.4 * small
     tuft = np.clip(0.62 + coarse + 0.6 * middle + 0.5 * small + 0.3 * fine, 0, 1)
-    tuft[distance < road.half_width + 1.1 * road.is_paved + 0.3 * ragged] = 0  # the shoulder is bare
+    tuft *= _share(distance >= road.half_width + 1.1 * road.is_paved + 0.3 * ragged)  # the shoulder is bare
     albedo = _blend(scale_color(soil, 1 + shade), scale_color(grass, 1 + 1.3 * shade + 0.25 * middle), tuft)
-    track = np.clip(1 - np.abs(np.abs(distance - road.lane / 2) - 0.8) / 0.5, 0, None)  # of wheels
+    track = np.clip(1 - np.abs(np.abs(distance[0] - road.lane / 2) - 0.8) / 0.5, 0, None)  # of wheels
     surface = (road.asphalt,) * 3 if road.is_paved else _mix((0.42, 0.33, 0.22), (0.44, 0.22, 0.12), road.red_soil)
     tone = 1 + 0.35 * fine + (0.1 + 0.2 * is_gravel) * (small + middle) + (0.32 * is_gravel - 0.14) * track
     is_road = distance < road.half_width + (0.06 + 0.3 * is_gravel) * ragged
-    albedo[is_road] = scale_color(surface, tone)[is_road]
+    albedo = _blend(albedo, scale_color(surface, tone), _share(is_road))
     if road.is_paved:
         worn = np.clip(0.85 + 0.2 * fine + 0.2 * small + 0.15 * coarse, 0, 1)
-        is_white = (distance < 0.07) & (road.has_solid_line | ((z + road.shift[0]) % 9.0 < 4.0))
-        albedo = _blend(albedo, (0.7, 0.7, 0.68), is_white * worn)
-        albedo = _blend(albedo, (0.62, 0.42, 0.06), (np.abs(distance - road.lane + 0.05) < 0.065) * worn)
+        is_white = (distance < 0.07) & (road.has_solid_line | ((z + float(road.shift[0])) % 9.0 < 4.0))
+        albedo = _blend(albedo, (0.7, 0.7, 0.68), _share(is_white) * worn)
+        albedo = _blend(albedo, (0.62, 0.42, 0.06), _share(np.abs(distance - road.lane + 0.05) < 0.065) * worn)
     return albedo
 
 
@@ -253,6 +255,11 @@ def _sky(light: Light, ray: Array, grain: Array) -> Array:
 def _tone(light: Array) -> Array:
     """Map linear light to display values; the square root stands for the display's gamma."""
     return np.sqrt(np.clip(light, 0, 1)).astype(np.float32)
+
+
+def _share(mask: Array) -> Array:
+    """Return the share of the rays (5, K) of each pixel that a mask holds, float32."""
+    return mask.mean(axis=0, dtype=np.float32)
 
 
 def _mix(first: Color, second: Color, share: float) -> Array:

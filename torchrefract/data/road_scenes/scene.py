@@ -71,7 +71,8 @@ class Light:
         warm, power = np.clip((0.65 - elevation) / 0.4, 0, 1), random.uniform(0.85, 1.25)
 
         def mix(clear: Color, golden: Color, gray: Color) -> Array:
-            return power * np.array(gray if is_overcast else np.array(clear) * (1 - warm) + np.array(golden) * warm)
+            color = gray if is_overcast else np.array(clear) * (1 - warm) + np.array(golden) * warm
+            return power * np.asarray(color, np.float32)
 
         sun = np.array([math.sin(heading), elevation * 1.2, math.cos(heading)])
         self.sun = sun / np.linalg.norm(sun)
@@ -225,12 +226,20 @@ def _cabin(color: Color, half_width: float, height: float, inset: float, u: Arra
     return albedo, np.abs(u) < end
 
 
+def _bonnet(color: Color, half_width: float, length: float, bend: float, power: float, u: Array, v: Array) -> Painted:
+    """Paint a bonnet whose front recedes by `bend` of its length at the sides; its front and two creases shine."""
+    x, along = np.abs(u) / half_width, v / length
+    gloss = 0.3 * along**4 + 0.25 * np.exp(-(((x - 0.4 - 0.2 * along**2) / 0.03) ** 2))
+    albedo = scale_color(color, 1 + 0.3 * noise(u * 3, v * 3)) + scale_color((0.5, 0.55, 0.6), gloss)
+    return albedo, along < 1 - bend * x**power
+
+
 def draw_scene(random: np.random.Generator) -> Scene:
     """Draw a scene."""
     road, light = Road(random), Light(random)
     view = _draw_view(random, road)
     objects = [*_buildings(random, road), *_poles(random, road), *_vehicles(random, road), *_trees(random, road)]
-    return Scene(road, view, light, [*_horizon(random), *objects], objects)
+    return Scene(road, view, light, [*_horizon(random), *objects, *_ego_car(random, view)], objects)
 
 
 def _draw_view(random: np.random.Generator, road: Road) -> View:
@@ -323,3 +332,16 @@ def _vehicles(random: np.random.Generator, road: Road) -> list[Panel]:
         end = partial(_cabin, color, half_width, math.hypot(height, inset), 0.0)
         panels += body.box((half_width, height, cabin / 2), (side, end, end, top), foot=belt, inset=inset)
     return panels
+
+
+def _ego_car(random: np.random.Generator, view: View) -> list[Panel]:
+    """Draw in half of the scenes the bonnet below the camera, which covers up to a fifth of a frame of 16:9."""
+    down, ahead = np.array([0.52, random.uniform(0.6, 0.92) * 9 / 32]) / view.focal, (0.7, random.uniform(0.9, 2.0))
+    half_width = random.uniform(0.35, 0.7) * ahead[1] / view.focal
+    bend, power = random.uniform(0.25, 1) ** 2, random.uniform(2, 5)
+    if random.random() > 0.5:
+        return []
+    rear, front = (view.position + z * (view.axes[2] + y * view.axes[1]) for y, z in zip(down, ahead, strict=True))
+    right, up, offset = half_width * view.axes[0], (front - rear) / 2, random.uniform(-0.15, 0.15)
+    paint = partial(_bonnet, random.choice(_CARS), half_width, 2 * math.hypot(*up), bend, power)
+    return [Panel((rear + front) / 2 + offset * right, right, up, paint)]

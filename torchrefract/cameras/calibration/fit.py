@@ -185,15 +185,12 @@ def _project_division(
         root = np.sqrt(1 - 4 * k * r2)
         scale, bend = 2 / (1 + root), 4 / (root * (1 + root) ** 2)
     jacobian = scale[:, None, None] * np.eye(2) + (2 * k * bend)[:, None, None] * x[:, :, None] * x[:, None]
-    distorted, focal, identity = (
-        scale[:, None] * x,
-        np.array([camera.fx, camera.fy]),
-        np.broadcast_to(np.eye(2), jacobian.shape),
-    )
+    focal, distorted = np.array([camera.fx, camera.fy]), scale[:, None] * x
+    by_focal, by_center = distorted[:, :, None] * np.eye(2), np.broadcast_to(np.eye(2), jacobian.shape)
     by_k = (focal * (bend * r2)[:, None] * x)[:, :, None]
-    slopes = np.concatenate([distorted[:, :, None] * np.eye(2), identity, by_k], axis=2)
-    pose_slopes = focal[:, None] * (jacobian @ pose_slopes)
-    return focal * distorted + (camera.cx, camera.cy), pose_slopes.reshape(-1, 6), slopes.reshape(-1, 5)
+    slopes = np.concatenate([by_focal, by_center, by_k], axis=2).reshape(-1, 5)
+    pose_slopes = (focal[:, None] * (jacobian @ pose_slopes)).reshape(-1, 6)
+    return focal * distorted + (camera.cx, camera.cy), pose_slopes, slopes
 
 
 def errors_in_best_pose(view: View, board: Board, camera: Camera, pose: np.ndarray) -> np.ndarray:

@@ -159,8 +159,8 @@ def is_shown_once(flow: Tensor, inverse: Tensor, exists: Tensor, valid: Tensor |
     """Return True for the pixels of the input image that are neither shown several times nor nearly so.
 
     The map p -> p + flow(p) with the Jacobian J shows a position several times if the inverse does not lead from there
-    back to each pixel that is sent there. It nearly does next to a fold, where it sends pixels with ||J^-1|| above 4
-    (Frobenius norm) or det J <= 0. Elsewhere the inverse is unique, and an error e of the flow moves it by 4 e at most.
+    back to each pixel that is sent there. Positions next to a fold, where it sends pixels with ||J^-1|| above 4
+    (Frobenius norm) or det J <= 0, are excluded too. Elsewhere an error e of the flow moves the inverse by 4 e at most.
 
     Args:
         flow: (B, 2, H, W), px.

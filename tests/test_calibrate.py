@@ -69,6 +69,24 @@ def test_the_camera_of_rendered_pictures_is_recovered(call, tmp_path, monkeypatc
     }
 
 
+def test_a_camera_of_the_division_model_is_recovered_written_and_rectifies(call, tmp_path):
+    exact = replace(SMALL, coefficients=(-0.25,), model="division")
+    (tmp_path / "pictures").mkdir()
+    for name, gray, _ in render_views(BOARD, exact, count=5):
+        cv2.imwrite(str(tmp_path / "pictures" / name), gray)
+    outcome = call("calibrate", *OPTIONS[:-1], "lens_model=division")
+    assert outcome.out.startswith("calibration/camera.yaml: division from 5 views"), outcome.message
+    camera = read_opencv(tmp_path / "calibration" / "camera.yaml")
+    assert camera.model == "division"
+    assert (camera.fx, camera.fy) == pytest.approx((exact.fx, exact.fy), rel=5e-3)
+    assert camera.coefficients == pytest.approx(exact.coefficients, rel=2e-2)
+    covariance = read_covariance(tmp_path / "calibration" / "camera.yaml")
+    assert covariance is not None
+    assert covariance.shape == (5, 5)
+    assert call("rectify", "input=pictures", "camera=calibration/camera.yaml").code == 0
+    assert (tmp_path / "rectified" / "view_00.png").is_file()
+
+
 def test_markers_of_another_size_than_stated_are_an_error(call, pictures):
     message = call("calibrate", *OPTIONS, "marker_mm=12").message
     assert re.match(r"marker_mm must be the side of the markers, about (19|20)\S* mm in the pictures", message)
@@ -186,7 +204,7 @@ def test_pictures_of_many_sizes_are_rejected(call, pictures):
     [
         (("images=none",), "images must be an existing folder of pictures, got none"),
         (("images=.",), "images must be a folder that holds .jpg, .jpeg, .png, .webp, .bmp, got ."),
-        (("lens_model=opencv7",), "lens_model: lens_model must be one of auto, opencv0, .*, fisheye, got 'opencv7'"),
+        (("lens_model=opencv7",), "lens_model: lens_model must be one of auto, opencv0, .*, division, got 'opencv7'"),
         (("drop_share=2",), "drop_share: drop_share must be a number in .*, got 2"),
         (("dictionary=DICT",), "board: dictionary must be one of DICT_.*, got 'DICT'"),
         (

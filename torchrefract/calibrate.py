@@ -10,7 +10,8 @@ Options:
     square_mm=22            side of a square, mm, measured on the print
     marker_mm=14            side of a marker, mm
     dictionary=NAME         of the markers, such as DICT_5X5_250
-    lens_model=auto         chosen by held-out views; or opencv0 ... opencv14 (number of coefficients), fisheye
+    lens_model=auto         chosen by held-out views; or opencv0 ... opencv14 (number of coefficients), fisheye,
+                            division
     drop_share=0.25         largest share of the views that may be dropped
     out=calibration         output folder
 

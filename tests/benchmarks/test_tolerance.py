@@ -38,9 +38,10 @@ def test_exceeded_tolerances_are_counted_and_end_the_command(monkeypatch, tmp_pa
     assert [trial["error"] for trial in json.loads(out.read_text())] == [0.02, 0.05, 0.3]
 
 
-# Flows that fold: pixels are shown several times, or next to a fold.
+# Flows that fold: pixels are shown several times, or next to a fold. The last one folds outside of the frame.
 @pytest.mark.parametrize(
-    ("name", "seed"), [("Turbulence", 0), ("rough Turbulence", 1), ("DivergenceFree", 1), ("Compose", 13)]
+    ("name", "seed"),
+    [("Turbulence", 0), ("rough Turbulence", 1), ("DivergenceFree", 1), ("Compose", 13), ("DivergenceFree", 124)],
 )
 def test_restore_flows_next_to_folds_keep_their_tolerance(name, seed):
     trial = attempt(name, seed, (270, 480))

@@ -33,9 +33,11 @@ def test_written_files_are_read_back_and_by_opencv(name, ending, tmp_path, make_
 
 
 @pytest.mark.parametrize("ending", [".yml", ".xml"])
-def test_a_covariance_is_read_back_and_varies_a_lens(ending, tmp_path, make_camera):
-    camera, path = make_camera(*VECTORS["4"]), tmp_path / f"camera{ending}"
-    root = np.tril(np.linspace(-1, 1, 64).reshape(8, 8)) * 1e-3
+@pytest.mark.parametrize("vector", [VECTORS["4"], ((-0.2,), "division")], ids=["opencv", "division"])
+def test_a_covariance_is_read_back_and_varies_a_lens(vector, ending, tmp_path, make_camera):
+    camera, path = make_camera(*vector), tmp_path / f"camera{ending}"
+    size = 4 + len(camera.coefficients)
+    root = np.tril(np.linspace(-1, 1, size * size).reshape(size, size)) * 1e-3
     io.write_opencv(path, camera, covariance=root @ root.T)
     covariance = io.read_covariance(path)
     assert covariance is not None
@@ -46,7 +48,7 @@ def test_a_covariance_is_read_back_and_varies_a_lens(ending, tmp_path, make_came
     assert not torch.equal(drawn[0], drawn[1])
     io.write_opencv(path, camera)
     assert io.read_covariance(path) is None
-    with pytest.raises(ValueError, match=r"covariance must have shape \(8, 8\), got \(9, 9\)"):
+    with pytest.raises(ValueError, match=rf"covariance must have shape \({size}, {size}\), got \(9, 9\)"):
         io.write_opencv(path, camera, covariance=np.eye(9))
 
 
@@ -297,8 +299,8 @@ WRITERS = {
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_unsupported_models_are_not_written(name, tmp_path, make_camera):
-    with pytest.raises(ValueError, match=r"camera must be of the model opencv or fisheye .* got division"):
-        WRITERS[name](tmp_path / name, make_camera((-0.2,), "division"))
+    with pytest.raises(ValueError, match=r"camera must be of the model opencv or fisheye .* got polynomial12"):
+        WRITERS[name](tmp_path / name, make_camera((-0.2, *(0.0,) * 11), "polynomial12"))
     assert not list(tmp_path.iterdir())
 
 

@@ -11,6 +11,7 @@ from torch.testing import assert_close
 from torchrefract import compose_flows, folding, jacobian_determinant, warp
 from torchrefract.warping.flow import Jacobian, is_shown_once, resize_flow, resize_image
 from torchrefract.warping.grid import inside
+from torchrefract.warping.invert import invert_flow
 
 SIZE = (90, 120)
 
@@ -208,7 +209,7 @@ def test_pixels_that_a_fold_shows_several_times_are_not_shown_once():
     # x + 20 sin(x / 10) goes back between the pixels 21 and 42, from 39 to 24.
     u = (20 * torch.sin(x / 10)).expand(1, 1, 30, 200)
     flow = torch.cat([u, torch.zeros_like(u)], dim=1)
-    once = is_shown_once(flow)[0, 0]
+    once = is_shown_once(flow, *invert_flow(flow)[:2])[0, 0]
     positions = x + u[0, 0, 0]
     counts = torch.zeros(200)
     for low, high in pairwise(positions.tolist()):
@@ -225,7 +226,22 @@ def test_pixels_that_a_fold_shows_several_times_are_not_shown_once():
 def test_a_flow_that_shrinks_little_is_shown_once_everywhere():
     x = torch.arange(40, dtype=torch.float64).expand(1, 1, 30, 40)
     flow = torch.cat([-0.7 * x, torch.zeros_like(x)], dim=1)
-    assert is_shown_once(flow).all()
-    assert not is_shown_once(flow * 1.2)[..., :6].any()
+    assert is_shown_once(flow, *invert_flow(flow)[:2]).all()
+    assert not is_shown_once(flow * 1.2, *invert_flow(flow * 1.2)[:2])[..., :6].any()
     nothing = torch.zeros(1, 1, 30, 40, dtype=torch.bool)
-    assert is_shown_once(flow * 1.2, nothing).all()
+    assert is_shown_once(flow * 1.2, flow, nothing, nothing).all()
+
+
+@pytest.mark.quick
+def test_pixels_that_a_flow_without_a_fold_shows_twice_are_not_shown_once(pixels):
+    # A column becomes a circle around the middle, run through 1.25 times: the first quarter is shown twice.
+    x, y = pixels(100, 100)
+    radius, angle = 8 + 0.4 * x, 2.5 * torch.pi * y / 99
+    flow = torch.stack([50 + radius * angle.cos() - x, 50 + radius * angle.sin() - y])[None]
+    assert folding(flow).min_determinant > 0.1
+    inverse, exists, _ = invert_flow(flow, steps=50)
+    once = is_shown_once(flow, inverse, exists)[0, 0]
+    radius, angle = torch.hypot(x - 50, y - 50), torch.atan2(y - 50, x - 50) % (2 * torch.pi)
+    is_in_ring = (radius > 9) & (radius < 46)
+    assert not once[is_in_ring & exists[0, 0] & (angle < torch.pi / 2)].any()
+    assert once[is_in_ring & exists[0, 0] & (angle > 2) & (angle < 5.9)].float().mean() > 0.95

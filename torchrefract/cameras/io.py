@@ -104,8 +104,8 @@ def read_camera(
 def read_opencv(path: str | Path) -> Camera:
     """Read image_width, image_height, camera_matrix, distortion_coefficients and fisheye_model of a camera.
 
-    The model is "fisheye" if fisheye_model is present and not 0, otherwise "opencv". Four coefficients without
-    fisheye_model may be of either and raise ValueError; `read_camera` takes the model.
+    The model is "fisheye" if fisheye_model is present and not 0, "division" if division_model is, otherwise "opencv".
+    Four coefficients without fisheye_model may be of two models and raise ValueError; `read_camera` takes the model.
 
     Args:
         path: of YAML, JSON or XML.
@@ -139,12 +139,16 @@ def write_opencv(path: str | Path, camera: Camera, *, covariance: np.ndarray | N
 
     Args:
         path: ending in .xml, .yml or .yaml.
-        camera: of the model "opencv" or "fisheye".
+        camera: of the model "opencv", "fisheye" or "division"; OpenCV itself computes nothing with the last.
         covariance: (4 + n, 4 + n), of fx, fy, cx, cy and the n coefficients; None writes none.
     """
-    path, coefficients = Path(path), fit_coefficients(camera, (len(camera.coefficients),))
-    is_fisheye = int(camera.model == "fisheye")
-    scalars = {"image_width": camera.width, "image_height": camera.height, "fisheye_model": is_fisheye}
+    path, coefficients = Path(path), camera.coefficients
+    scalars = {"image_width": camera.width, "image_height": camera.height}
+    if camera.model == "division":
+        scalars["division_model"] = 1
+    else:
+        coefficients = fit_coefficients(camera, (len(coefficients),))
+        scalars["fisheye_model"] = int(camera.model == "fisheye")
     matrices = {"camera_matrix": _matrix(3, chain(*camera.matrix))}
     matrices["distortion_coefficients"] = _matrix(len(coefficients), coefficients)
     if covariance is not None:
@@ -332,6 +336,8 @@ def _stated_model(document: Document) -> str | None:
     if document.values.get("distortion_model") not in (None, ""):
         remedy = "; calibrate the camera for one of these models, such as with python -m torchrefract.calibrate"
         return document.choice("distortion_model", _ROS_MODELS, remedy=remedy)
+    if "division_model" in document.values and document.integers("division_model") != [0]:
+        return "division"
     if "fisheye_model" in document.values:
         return "fisheye" if document.integers("fisheye_model") != [0] else "opencv"
     return None

@@ -64,8 +64,8 @@ class WarpEffect(Effect):
         tolerance_px: largest error of the flow in px, anywhere and for all parameters in the ranges of the effect; the
             flow is then computed on a coarser lattice, see `plan`. None is exact, and so is the default in frames so
             large that float32 cannot reach it. Where it is valid, `restore_flow` is within 4 `tolerance_px` + 0.02 px
-            of the exact one, as pixels next to a fold, where it would move farther, are not valid. A pixel that a warp
-            shows twice, far apart, may be restored from either place; of 200 random divergence-free warps one did.
+            of the exact one, as pixels next to a fold, where it would move farther, are not valid. Nor are pixels that
+            a warp shows twice.
         p: probability that a sample is degraded.
     """
 
@@ -110,7 +110,7 @@ class WarpEffect(Effect):
         shows several times, have no inverse: there a small error of the flow moves it far.
         """
         inverse, is_solved, _ = invert_flow(flow, tolerance_px=_SOLVED_PX)
-        return inverse, is_solved & is_shown_once(flow)
+        return inverse, is_solved & is_shown_once(flow, inverse, is_solved)
 
     def error_model(self) -> ErrorModel | None:
         """Return error bounds for all parameters in the ranges, or None if none are known."""
@@ -304,7 +304,8 @@ def warped(
         composed = None if is_composed is None else is_composed()
         if composed is None or eager_bool(composed.any, of=composed) is False:
             return good
-        is_inverse = (result.restore_residual <= _MAX_RESIDUAL_PX) & is_shown_once(result.flow, result.valid)
+        is_once = is_shown_once(*_expand_alike(result.flow, result.restore_flow, exists, result.valid))
+        is_inverse = (result.restore_residual <= _MAX_RESIDUAL_PX) & is_once
         return good & (~per_sample(composed) | is_inverse)
 
     return Degraded(

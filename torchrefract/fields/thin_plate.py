@@ -13,7 +13,7 @@ _NEAREST = 1e-6
 # Points count as collinear if the ratio of their two extents is below this.
 _FLATTEST = 1e-5
 _UNIT = 2  # of the coordinates, in root mean square distances from the center
-_TINY = 1e-300
+_TINY = 1e-60  # negligible beside rounding; derivatives of the fifth order, which divide by its fifth power, are finite
 _VALUES_AT_ONCE = 1 << 18  # kernels that stay in a processor's cache
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrefract._tensor import as_device_tensor, exact_matmul
 from torchrefract._validation import check_count, check_flow, check_tensor, eager_bool
 from torchrefract.types import Folding
-from torchrefract.warping.grid import field_dtype, pixel_axes
+from torchrefract.warping.grid import field_dtype, length, pixel_axes
 from torchrefract.warping.warp import sample_image
 
 _LARGEST_STRETCH = 4.0  # of an inverse flow that counts as unique
@@ -155,15 +155,17 @@ def folded(flow: Tensor, valid: Tensor | None = None) -> Tensor:
     return _valid_determinant(flow, valid) <= 0
 
 
-def is_shown_once(flow: Tensor, valid: Tensor | None = None) -> Tensor:
-    """Return True for the pixels of the input image that a fold neither shows several times nor nearly so.
+def is_shown_once(flow: Tensor, inverse: Tensor, exists: Tensor, valid: Tensor | None = None) -> Tensor:
+    """Return True for the pixels of the input image that are neither shown several times nor nearly so.
 
-    The map p -> p + flow(p) with the Jacobian J sends several pixels to one position only if det J <= 0 at a pixel that
-    it sends there too. Positions are excluded where it sends pixels with ||J^-1|| above 4 (Frobenius norm) or
-    det J <= 0. Elsewhere the inverse is unique, and an error e of the flow moves it by 4 e at most.
+    The map p -> p + flow(p) with the Jacobian J shows a position several times if the inverse does not lead from there
+    back to each pixel that is sent there. Positions next to a fold, where it sends pixels with ||J^-1|| above 4
+    (Frobenius norm) or det J <= 0, are excluded too. Elsewhere an error e of the flow moves the inverse by 4 e at most.
 
     Args:
         flow: (B, 2, H, W), px.
+        inverse: (B, 2, H, W), px, a flow that undoes it.
+        exists: (B, 1, H, W), bool, where the inverse is defined.
         valid: (B, 1, H, W), bool, where the flow is defined; None for everywhere.
 
     Returns:
@@ -171,16 +173,19 @@ def is_shown_once(flow: Tensor, valid: Tensor | None = None) -> Tensor:
     """
     with torch.no_grad():
         flow = flow.detach()
-        is_steep = torch.zeros_like(flow[:, :1], dtype=torch.bool)
+        # The inverse at p + flow(p), from those of the four pixels around it where it exists.
+        masked = torch.cat([torch.where(exists, inverse.detach(), 0), exists.to(flow.dtype)], dim=1)
+        back, share = sample_image(masked, flow, padding="zeros", interpolation="bilinear").split((2, 1), dim=1)
+        is_excluded = (share > 1e-3) & (length(flow + back / share.clamp(min=1e-3)) > _LARGEST_STRETCH)
         for jacobian in _corner_jacobians(flow):
             norm = torch.hypot(torch.hypot(jacobian.xx, jacobian.xy), torch.hypot(jacobian.yx, jacobian.yy))
             # ||J^-1|| is ||J|| / det J in two dimensions. NaN counts as steep.
-            is_steep = is_steep | ~(norm <= _LARGEST_STRETCH * jacobian.determinant)
+            is_excluded = is_excluded | ~(norm <= _LARGEST_STRETCH * jacobian.determinant)
         if valid is not None:
-            is_steep = is_steep & ~_near_invalid(valid)
-        if eager_bool(is_steep.any, of=flow) is False:
-            return ~is_steep
-        return ~_cover(flow, is_steep)
+            is_excluded = is_excluded & ~_near_invalid(valid)
+        if eager_bool(is_excluded.any, of=flow) is False:
+            return ~is_excluded
+        return ~_cover(flow, is_excluded)
 
 
 def _cover(flow: Tensor, chosen: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from torchrefract.cameras.calibration.boards import Board, Charuco
 from torchrefract.cameras.calibration.detection import View
@@ -41,8 +42,15 @@ def projected() -> Callable[..., list[View]]:
         for k, (x, y) in enumerate(itertools.product((-0.5, 0.0, 0.5), (-0.25, 0.1, 0.3))):
             turn = generator.uniform(-0.5, 0.5, 3)
             move = np.array([x, y, 1.0]) * 1.3 * width - cv2.Rodrigues(turn)[0] @ (width / 2, height / 2, 0)
-            lens = np.array(camera.matrix), np.array(camera.coefficients)
-            points = (cv2.fisheye if camera.model == "fisheye" else cv2).projectPoints(corners, turn, move, *lens)[0]
+            if camera.model == "division":  # which OpenCV does not have
+                points = camera.project(
+                    torch.from_numpy(corners[:, 0] @ cv2.Rodrigues(turn)[0].T + move)
+                ).points.numpy()
+            else:
+                lens = np.array(camera.matrix), np.array(camera.coefficients)
+                points = (cv2.fisheye if camera.model == "fisheye" else cv2).projectPoints(corners, turn, move, *lens)[
+                    0
+                ]
             pixels = points.reshape(-1, 2)
             views.append(View(f"{k}.png", np.arange(len(pixels)), pixels + generator.normal(0, noise, pixels.shape)))
         return views

@@ -22,9 +22,16 @@ BARREL = replace(PINHOLE, coefficients=(-0.2, 0.06, 0.0, 0.0))
 )
 def test_the_lens_model_has_no_more_coefficients_than_needed(camera, max_coefficients, projected):
     chosen, tried = choose_model(projected(BOARD, camera, noise=0.3), BOARD, size=SIZE)
-    assert chosen.num_parameters <= max_coefficients + 2
+    assert chosen.num_coefficients <= max_coefficients
     assert not chosen.problem
     assert chosen.held_out <= 1.2 * min(one.held_out for one in tried)
+
+
+@pytest.mark.parametrize(("center", "prior"), [((405.0, 297.0), "published"), ((399.5, 299.5), "centered")])
+def test_the_principal_point_is_fitted_where_the_distortion_shows_it(center, prior, projected):
+    lens = replace(BARREL if prior == "published" else PINHOLE, cx=center[0], cy=center[1])
+    chosen, _ = choose_model(projected(BOARD, lens, noise=0.3), BOARD, size=SIZE)
+    assert (chosen.num_coefficients > 0, chosen.prior) == (prior == "published", prior)
 
 
 def test_edge_rays_stay_near_the_exact_camera_where_no_corner_reaches_the_border(projected):

@@ -3,16 +3,20 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from torchrefract.cameras.calibration.boards import Chessboard
 from torchrefract.cameras.calibration.fit import (
     LENS_MODELS,
+    camera_values,
     cross_validate,
     drop_outliers,
     errors_in_best_pose,
     fit_camera,
     leave_each_out,
+    project,
     rms,
+    with_values,
 )
 from torchrefract.cameras.camera import Camera
 
@@ -32,6 +36,7 @@ CAMERAS = {
     "fisheye1": replace(PINHOLE, coefficients=(-0.03, 0.0, 0.0, 0.0), model="fisheye"),
     "fisheye2": replace(PINHOLE, coefficients=(-0.03, 0.01, 0.0, 0.0), model="fisheye"),
     "fisheye": replace(PINHOLE, coefficients=(-0.03, 0.01, -0.005, 0.001), model="fisheye"),
+    "division": replace(PINHOLE, coefficients=(-0.2,), model="division"),
 }
 
 
@@ -49,9 +54,23 @@ def test_exact_corners_give_the_exact_camera(model, projected):
     np.testing.assert_allclose(fit.values[:4], (700, 702, 405, 297), rtol=1e-4)
     if model not in ("opencv8", "opencv12", "opencv14"):  # their coefficients are strongly correlated
         np.testing.assert_allclose(fit.values[4:], CAMERAS[model].coefficients, atol=1e-3)
-    assert fit.names[:5] == ("fx", "fy", "cx", "cy", "k1")
+    assert fit.names[:5] == ("fx", "fy", "cx", "cy", "k" if model == "division" else "k1")
     assert len(fit.names) == len(fit.values) == 4 + len(CAMERAS[model].coefficients)
     assert fit.camera.model == CAMERAS[model].model
+
+
+def test_slopes_of_the_division_model_match_central_differences():
+    camera, pose, points = CAMERAS["division"], np.array([0.2, -0.3, 0.1, -90.0, -70.0, 300.0]), BOARD.corners()
+    pixels, pose_slopes, slopes = project(camera, pose, points)
+    turned = points @ cv2.Rodrigues(pose[:3])[0].T + pose[3:]
+    np.testing.assert_allclose(pixels, camera.project(torch.from_numpy(turned)).points, atol=1e-9)
+    steps = 1e-5 * np.eye(11)
+
+    def at(step):
+        return project(with_values(camera, camera_values(camera) + step[6:]), pose + step[:6], points)[0].ravel()
+
+    expected = np.stack([(at(step) - at(-step)) / 2e-5 for step in steps], axis=1)
+    np.testing.assert_allclose(np.hstack([pose_slopes, slopes]), expected, rtol=1e-6, atol=1e-5)
 
 
 def test_errors_and_deviations_match_opencv(noisy):

@@ -23,7 +23,7 @@ class Candidate(NamedTuple):
 
     model: str  # of `LENS_MODELS`
     prior: str  # of `PRIORS`
-    num_parameters: int  # coefficients, and two of the principal point unless it is fixed
+    num_coefficients: int
     held_out: float  # px rms; infinite if no camera fits
     excess: float  # mean squared error above that of the best model, in standard errors of the latter
     paired_excess: float  # the same, in standard errors of the difference between the two
@@ -33,9 +33,11 @@ class Candidate(NamedTuple):
 def choose_model(views: Sequence[View], board: Board, *, size: tuple[int, int]) -> tuple[Candidate, list[Candidate]]:
     """Choose the lens model by the errors of held-out views.
 
-    Of the models that are one-to-one over the frame, takes the one of fewest parameters whose mean squared error is
+    Of the models that are one-to-one over the frame, takes the one of fewest coefficients whose mean squared error is
     within one standard error of the best, and within two standard errors of the difference to the best. Both are over
-    views; the second is the smaller one where the same views are difficult for all models.
+    views; the second is the smaller one where the same views are difficult for all models. Between equal numbers, and
+    between a fitted and a centered principal point, the held-out error decides. Without distortion the centered one is
+    preferred, since other poses explain nearly all of its motion.
 
     Returns the chosen model and all that were tried.
 
@@ -46,7 +48,7 @@ def choose_model(views: Sequence[View], board: Board, *, size: tuple[int, int]) 
     for model in CANDIDATES:
         fit = None
         for prior in PRIORS[1:]:
-            count, held_out, problem = num_coefficients(model) + 2 * (prior == "published"), np.inf, ""
+            held_out, problem = np.inf, ""
             error = np.full(len(views), np.inf)
             try:
                 fit = fit_camera(views, board, model=model, size=size, prior=prior, start=fit)
@@ -55,7 +57,7 @@ def choose_model(views: Sequence[View], board: Board, *, size: tuple[int, int]) 
                 problem = "" if is_one_to_one(fit.camera) else FOLDS
             except ValueError as reason:
                 problem = str(reason)
-            tried.append(Candidate(model, prior, count, held_out, np.inf, np.inf, problem))
+            tried.append(Candidate(model, prior, num_coefficients(model), held_out, np.inf, np.inf, problem))
             errors.append(error)
     accepted = [k for k, candidate in enumerate(tried) if not candidate.problem]
     if not accepted:
@@ -67,7 +69,11 @@ def choose_model(views: Sequence[View], board: Board, *, size: tuple[int, int]) 
             excess, paired = (difference.mean() / max(_standard_error(e), 1e-12) for e in (best, difference))
             tried[k] = tried[k]._replace(excess=float(excess), paired_excess=float(paired))
     close = [tried[k] for k in accepted if tried[k].excess <= 1 and tried[k].paired_excess <= _NUM_ERRORS]
-    return min(close, key=lambda candidate: (candidate.num_parameters, candidate.held_out)), tried
+
+    def rank(one: Candidate) -> tuple[int, bool, float]:
+        return one.num_coefficients, one.num_coefficients == 0 and one.prior != "centered", one.held_out
+
+    return min(close, key=rank), tried
 
 
 def _standard_error(values: np.ndarray) -> float:

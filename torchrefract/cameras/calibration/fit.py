@@ -33,7 +33,8 @@ _FLAGS = {
     "fisheye2": _FISHEYE | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_K4,
     "fisheye": _FISHEYE,
 }
-LENS_MODELS = tuple(_FLAGS)
+DIVISION = "division"
+LENS_MODELS = (*_FLAGS, DIVISION)
 PRIORS = ("none", "published", "centered")
 _CENTERED_PX = 1e-3  # standard deviation of a principal point that is fixed in the middle
 MIN_VIEWS = 3  # of a fit; cross-validation needs one more
@@ -90,7 +91,7 @@ def with_values(camera: Camera, values: np.ndarray) -> Camera:
 
 def num_coefficients(model: str) -> int:
     """Return the number of coefficients that a model of `LENS_MODELS` fits."""
-    return int(model.removeprefix("opencv").removeprefix("fisheye") or 4)
+    return 1 if model == DIVISION else int(model.removeprefix("opencv").removeprefix("fisheye") or 4)
 
 
 def rms(errors: np.ndarray) -> float:
@@ -107,7 +108,7 @@ def fit_camera(
     prior: str = "none",
     start: Fit | None = None,
 ) -> Fit:
-    """Fit a camera to views of a board by OpenCV's calibration.
+    """Fit a camera to views of a board by OpenCV's calibration, and the division model by the method of a prior.
 
         camera, poses = argmin sum |detected - projected corner|^2
         covariance = (J^T J)^-1 sum |error|^2 / (2 N - parameters),  J with respect to all parameters and poses
@@ -160,12 +161,36 @@ def project(camera: Camera, pose: np.ndarray, points: np.ndarray) -> tuple[np.nd
 
     Returns their derivatives too: with respect to the pose (2 N, 6), and to fx, fy, cx, cy, coefficients (2 N, n).
     """
+    if camera.model == DIVISION:
+        return _project_division(camera, pose, points)
     arguments = points.reshape(-1, 1, 3), pose[:3], pose[3:], np.array(camera.matrix), np.array(camera.coefficients)
     if camera.model == "fisheye":
         pixels, slopes = cv2.fisheye.projectPoints(*arguments)
         return pixels.reshape(-1, 2), slopes[:, 8:14], slopes[:, :8]
     pixels, slopes = cv2.projectPoints(*arguments)
     return pixels.reshape(-1, 2), slopes[:, :6], slopes[:, 6:]
+
+
+def _project_division(
+    camera: Camera, pose: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Project as `project` does; NaN beyond the fold of the lens.
+
+    s = 2 / (1 + q),  q = sqrt(1 - 4 k r^2),  d(s x) = s dx + 4 / (q (1 + q)^2) x (2 k x^T dx + r^2 dk)
+    """
+    x, pose_slopes = cv2.projectPoints(points.reshape(-1, 1, 3), pose[:3], pose[3:], np.eye(3), np.zeros(4))
+    x, pose_slopes, (k,) = x.reshape(-1, 2), pose_slopes[:, :6].reshape(-1, 2, 6), camera.coefficients
+    r2 = (x * x).sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        root = np.sqrt(1 - 4 * k * r2)
+        scale, bend = 2 / (1 + root), 4 / (root * (1 + root) ** 2)
+    jacobian = scale[:, None, None] * np.eye(2) + (2 * k * bend)[:, None, None] * x[:, :, None] * x[:, None]
+    focal, distorted = np.array([camera.fx, camera.fy]), scale[:, None] * x
+    by_focal, by_center = distorted[:, :, None] * np.eye(2), np.broadcast_to(np.eye(2), jacobian.shape)
+    by_k = (focal * (bend * r2)[:, None] * x)[:, :, None]
+    slopes = np.concatenate([by_focal, by_center, by_k], axis=2).reshape(-1, 5)
+    pose_slopes = (focal[:, None] * (jacobian @ pose_slopes)).reshape(-1, 6)
+    return focal * distorted + (camera.cx, camera.cy), pose_slopes, slopes
 
 
 def errors_in_best_pose(view: View, board: Board, camera: Camera, pose: np.ndarray) -> np.ndarray:
@@ -279,7 +304,14 @@ def drop_outliers(
 def _minimize(
     objects: list[np.ndarray], images: list[np.ndarray], model: str, size: tuple[int, int], start: Camera | None
 ) -> tuple[Camera, list[np.ndarray]]:
-    """Run OpenCV's calibration, whose fisheye takes float64 and four coefficients; return the camera and the poses."""
+    """Run OpenCV's calibration, whose fisheye takes float64 and four coefficients; return the camera and the poses.
+
+    The division model starts from OpenCV's k1, which is its k to first order.
+    """
+    if model == DIVISION:
+        camera, poses = _minimize(objects, images, "opencv1", size, None)
+        camera = replace(camera, coefficients=camera.coefficients[:1], model=DIVISION)
+        return _refine(objects, images, camera, poses, np.zeros(4 + num_coefficients(model)))
     is_fisheye, flags = model.startswith("fisheye"), _FLAGS[model]
     count = 4 if is_fisheye else max(4, num_coefficients(model))
     matrix, vector = np.eye(3), np.zeros((4 if is_fisheye else max(5, count), 1))
@@ -317,7 +349,8 @@ def _published_deviations(model: str) -> np.ndarray:
 
 def prior_deviations(camera: Camera, prior: str) -> np.ndarray:
     """Return standard deviations of fx, fy (infinite), cx, cy and the coefficients, from published lenses."""
-    center, lens = np.split(_published_deviations(camera.model), [2])
+    # The k of the division model is OpenCV's k1 to first order.
+    center, lens = np.split(_published_deviations("opencv" if camera.model == DIVISION else camera.model), [2])
     if prior == "centered":
         center = np.full(2, _CENTERED_PX / camera.width)
     rest = np.full(max(0, len(camera.coefficients) - len(lens)), np.inf)

@@ -66,10 +66,10 @@ _MODELS = """
 
 ## Choice of the lens model
 
-The number in a name counts the coefficients that are fitted. The chosen model is the one of fewest parameters, of
+The number in a name counts the coefficients that are fitted. The chosen model is the one of fewest coefficients, of
 those that are one-to-one over the frame, with an error of held-out views within one standard error of the best one and
-within two standard errors of the difference to it. Coefficients and principal point have weak priors: the spread of
-published lenses.
+within two standard errors of the difference to it; of equal numbers, the one of the smallest error. Coefficients and
+principal point have weak priors: the spread of published lenses.
 
 {table}"""
 
@@ -199,12 +199,12 @@ def _describe_models(calibration: Calibration) -> str:
     if not calibration.candidates:
         return ""
     fit, rows = calibration.fit, []
-    for one in sorted(calibration.candidates, key=lambda one: (one.num_parameters, one.held_out)):
+    for one in sorted(calibration.candidates, key=lambda one: (one.num_coefficients, one.held_out)):
         center = "in the middle" if one.prior == "centered" else "fitted"
         note = "chosen" if (one.model, one.prior) == (fit.model, fit.prior) else one.problem
         numbers = (f"{one.held_out:.4f}", f"{one.excess:.2f}", f"{one.paired_excess:.2f}")
-        rows.append((one.model, center, str(one.num_parameters), *numbers, note))
-    head = ("lens model", "principal point", "parameters", "held-out error, px rms")
+        rows.append((one.model, center, str(one.num_coefficients), *numbers, note))
+    head = ("lens model", "principal point", "coefficients", "held-out error, px rms")
     table = _table((*head, "excess, standard errors", "excess, standard errors of the difference", ""), rows)
     return _MODELS.format(table=table)
 

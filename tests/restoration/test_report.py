@@ -233,6 +233,10 @@ def test_the_table_compares_the_model_with_the_baselines():
     worse = words(summary(scores(psnr=18.0, epe=30.0), (1080, 1920)))[-1]
     assert worse.endswith(" 18.00 (-2.50) 0.800 30.00 (1.50 x do nothing)")
     assert len(summary(scores(epe=0.0, epe_constant=0.0, epe_identity=0.0), (1080, 1920))) == 4
+    covered = words(summary(scores(coverage=0.934), (1080, 1920)))[-1]
+    assert (
+        covered == "model 93% of the values of the flow within two predicted standard deviations; 95% if they are right"
+    )
     head, *lines = summary(without_flow(), (1080, 1920))
     assert "endpoint" not in head
     assert "L_k" not in head

@@ -82,6 +82,8 @@ def test_a_sample_depends_on_its_key_alone_and_a_single_one_has_no_deviation():
     for value, same in ((restored.flow, alone.flow), (restored.deviation, alone.deviation)):
         assert_close(same, value[2:], rtol=1e-4, atol=1e-4)
         assert value.abs().mean() > 1e-3
+    with torch.autocast("cpu", torch.bfloat16):
+        assert_close(model(image, torch.tensor([5, 6, 7])).flow, restored.flow, rtol=1e-3, atol=1e-4)
     model.samples = 1
     assert not model(image).deviation.any()
 

@@ -12,7 +12,7 @@ from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import check_count
 from torchrefract.random import Stream, uniform
 from torchrefract.restoration.diffusion import NUM_LEVELS, AveragedRestoration, check_steps, normal, sample
-from torchrefract.restoration.models.coordconv import NUM_TERMS, cell_axes, polynomial_basis
+from torchrefract.restoration.models.coordconv import NUM_TERMS, cell_axes, full_precision, polynomial_basis
 from torchrefract.restoration.tasks import Restored, Task, Undistort
 from torchrefract.types import Pair
 from torchrefract.warping.warp import warp
@@ -104,14 +104,15 @@ class FlowDiffusion(AveragedRestoration):
         numbers = self._sample(cast(Any, self.network).encode(degraded), self._stream(key, 0))
         mean = numbers.mean(dim=1)
         rest = numbers - mean[:, None]
-        covariance = rest.mT @ rest / max(1, self.samples - 1)
-        sides, basis = _sides(degraded), polynomial_basis(*cell_axes(degraded, 1))
-        center, maps = (
-            torch.einsum("kct,thw->kchw", c.unflatten(1, (2, -1)), basis) for c in (self.center[None], self.components)
-        )
-        flow = sides * (center + torch.einsum("bk,kchw->bchw", mean, maps))
-        variance = (torch.einsum("bkl,lchw->bkchw", covariance, maps) * maps).sum(dim=1)
-        deviation = sides * variance.clamp(min=0).sqrt()
+        with full_precision(degraded):
+            basis = polynomial_basis(*cell_axes(degraded, 1))
+            coefficients = torch.cat([self.center[None], self.components]).unflatten(1, (2, -1))
+            maps = _sides(degraded) * torch.einsum("kct,thw->kchw", coefficients, basis)  # px
+            center, maps = maps[0], maps[1:]
+            flow = center + torch.einsum("bk,kchw->bchw", mean, maps)
+            covariance = rest.mT @ rest / max(1, self.samples - 1)
+            variance = (torch.einsum("bkl,lchw->bkchw", covariance, maps) * maps).sum(dim=1)
+        deviation = variance.clamp(min=0).sqrt()
         return Restored(warp(degraded, flow, padding="border")[0], flow, deviation=deviation)
 
     def training_loss(self, batch: Pair) -> tuple[Tensor, None]:
@@ -127,7 +128,8 @@ class FlowDiffusion(AveragedRestoration):
     def _loss(self, batch: Pair, step: int) -> Tensor:
         source, features = self._stream(batch.key, step), cast(Any, self.network).encode(batch.degraded)
         variance = self.components.square().sum(dim=1)
-        numbers = (fit_polynomial(batch) - self.center) @ self.components.mT / variance
+        with full_precision(batch.flow):
+            numbers = (fit_polynomial(batch) - self.center) @ self.components.mT / variance
         numbers = numbers[:, None].expand(-1, _NUM_NOISY, -1)
         # One level in each of equal parts of the range, so that the loss varies less from step to step.
         parts = torch.arange(_NUM_NOISY, device=numbers.device)
@@ -157,7 +159,7 @@ class FlowDiffusion(AveragedRestoration):
 
     def _find_components(self, batch: Pair) -> None:
         """Find the mean and the principal components of the coefficients of a batch, over all ranks."""
-        coefficients = fit_polynomial(batch).double()
+        coefficients = fit_polynomial(batch).double()  # autocast leaves doubles as they are
         reduce = self.trainer.strategy.reduce
         mean = reduce(coefficients.mean(dim=0), reduce_op="mean")
         rest = coefficients - mean

@@ -77,7 +77,7 @@ def test_a_missing_package_is_named(call, tmp_path, brighter, monkeypatch, packa
 def test_a_program_that_disagrees_with_the_model_is_deleted(call, tmp_path, brighter, monkeypatch):
     monkeypatch.setattr(export, "trace", lambda *_: None)
     monkeypatch.setattr(export, "save_program", lambda program, path, **_: path.write_text("a program"))
-    monkeypatch.setattr(export, "run_program", lambda _, image: [image + 0.1])
+    monkeypatch.setattr(export, "load_program", lambda _: lambda image: [image + 0.1])
     message = call("export", f"ckpt_path={brighter}", "out=model.pt2").message
     assert message.startswith("out must agree with the model, got restored off by ")
     assert not list(tmp_path.iterdir())

@@ -176,21 +176,14 @@ def requires_grad(values: Iterable[Any]) -> bool:
     """
     if torch._C._are_functorch_transforms_active():
         return True
-    tensors = tensors_in(values)
-    if torch.is_grad_enabled() and any([value.requires_grad for value in tensors]):  # a list takes less time
-        return True
-    return any([_has_tangent(value) for value in tensors])
-
-
-def tensors_in(values: Iterable[Any]) -> list[Tensor]:
-    """Return the tensors among values and in the tuples among them, in order."""
-    tensors: list[Tensor] = []
+    is_enabled = torch.is_grad_enabled()
     for value in values:
-        if isinstance(value, Tensor):
-            tensors.append(value)
-        elif isinstance(value, tuple):
-            tensors += tensors_in(value)
-    return tensors
+        if isinstance(value, tuple):
+            if requires_grad(value):
+                return True
+        elif isinstance(value, Tensor) and ((is_enabled and value.requires_grad) or _has_tangent(value)):
+            return True
+    return False
 
 
 def _has_tangent(value: Tensor) -> bool:

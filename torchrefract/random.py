@@ -219,7 +219,7 @@ def _threefry(keys: Any, counters: Any) -> Any:
     # NumPy starts each of the hundred operations several times as fast as PyTorch, and Python those on a few integers.
     if keys.shape[1] * counters.shape[1] > _FEW:
         return np.stack(_rounds(*keys[:, :, None], *counters))
-    pairs = [[_rounds(*key, *counter) for counter in counters.T.tolist()] for key in keys.T.tolist()]
+    pairs = [_rounds(*key, *counter) for key in keys.T.tolist() for counter in counters.T.tolist()]
     return np.array(pairs, np.int64).reshape(keys.shape[1], counters.shape[1], 2).transpose(2, 0, 1)
 
 

@@ -558,11 +558,11 @@ def test_a_sample_that_is_not_applied_has_a_gradient_of_the_image_only(case):
 
 def test_one_graph_gives_the_same_as_eager_mode(request, case):
     effect, image = case.strong(p=0.8), random_image(3, 3, 24, 32)
-    # Compiling the largest graphs to machine code takes minutes and tests PyTorch alone.
-    is_large = request.node.callspec.params["case"] in ("lens", "heterogeneous fog", "dust")
+    # Compiling a graph to machine code takes long and tests PyTorch; one warp and one photometric effect suffice.
+    is_compiled = request.node.callspec.params["case"] in ("thin-plate spline", "uniform fog")
     torch.manual_seed(3)
     expected = [effect(image) for _ in range(2)]
-    compiled = torch.compile(effect, fullgraph=True, backend="aot_eager" if is_large else "inductor")
+    compiled = torch.compile(effect, fullgraph=True, backend="inductor" if is_compiled else "aot_eager")
     torch.manual_seed(3)
     assert_close([compiled(image) for _ in range(2)], expected, rtol=0, atol=2e-4)
 

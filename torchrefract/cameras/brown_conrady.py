@@ -7,6 +7,7 @@ principal point. All functions take x and y as separate tensors of any shapes (B
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import islice
 from typing import NamedTuple
 
@@ -54,12 +55,12 @@ def used_terms(coefficients: Tensor) -> Terms:
     values = None if requires_grad((coefficients,)) else eager_values(lambda: coefficients)
     if values is None:
         return ALL_TERMS
-    is_used = [any(column) for column in zip(*values, strict=True)]
+    is_used = list(map(any, zip(*values, strict=True)))
     if not is_used:
         return ALL_TERMS
-    radial, tangential, prism = _split(is_used)
-    order = max((i for i, used in enumerate(radial, start=1) if used), default=0)
-    return Terms(order, any(tangential), any(prism))
+    n = len(RADIAL)
+    order = n - [*is_used[n - 1 :: -1], True].index(True)  # of the last radial term that is used
+    return Terms(order, any(is_used[n : n + 2]), any(is_used[n + 2 :]))
 
 
 def distort_polynomial(x: Tensor, y: Tensor, coefficients: Tensor, terms: Terms = ALL_TERMS) -> Point:
@@ -84,11 +85,17 @@ def distort_with_jacobian(
 ) -> tuple[Point, Jacobian]:
     """Compute `distort_polynomial` and its derivatives with respect to x and y."""
     k, p, s = _groups(coefficients, terms)
-    return distort_by_factor(x, y, k, (), p, s)
+    return distort_by_factor(x, y, k=k, p=p, s=s)
 
 
 def distort_by_factor(
-    x: Tensor, y: Tensor, k: Sequence[Tensor], denominator: Sequence[Tensor], p: Sequence[Tensor], s: Sequence[Tensor]
+    x: Tensor,
+    y: Tensor,
+    *,
+    k: Sequence[Tensor],
+    denominator: Sequence[Tensor] = (),
+    p: Sequence[Tensor],
+    s: Sequence[Tensor],
 ) -> tuple[Point, Jacobian]:
     """Compute the polynomial with the ratio of k and the denominator (see `radial.py`) as g, and its derivatives.
 
@@ -137,7 +144,8 @@ def undistort_polynomial(
             precision.
     """
     with torch.no_grad():
-        k = _groups(coefficients, terms)[0]
+        k, p, s = _groups(coefficients, terms)
+        distort = partial(distort_by_factor, k=k, p=p, s=s)
         r_d = (x_d * x_d + y_d * y_d).sqrt()
         r = limit.inverse(r_d)
         if not terms.bent:
@@ -145,9 +153,8 @@ def undistort_polynomial(
         scale = r / r_d.clamp(min=torch.finfo(r_d.dtype).tiny)
         x, y = scale * x_d, scale * y_d
         if terms.bent:
-            steps = newton((x, y), (x_d, y_d), lambda x, y: distort_with_jacobian(x, y, coefficients, terms))
-            x, y = converge(steps)
-        (back_x, back_y), jacobian = distort_with_jacobian(x, y, coefficients, terms)
+            x, y = converge(newton((x, y), (x_d, y_d), distort))
+        (back_x, back_y), jacobian = distort(x, y)
         residual = torch.maximum((back_x - x_d).abs(), (back_y - y_d).abs())
         exists = (residual <= MAX_RESIDUAL[r_d.dtype] * (1 + r_d)) & (x * x + y * y <= limit.radius.square())
         exists = exists & (jacobian.determinant >= _MIN_DETERMINANT[r_d.dtype])
@@ -169,9 +176,9 @@ def newton_iterates(x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, terms: Te
 
     The first guess divides the distorted point by the radial factor at that point.
     """
-    g = radial_factor(x_d * x_d + y_d * y_d, _groups(coefficients, terms)[0]).clamp(min=_MIN_RADIAL_FACTOR)
-    start = x_d / g, y_d / g
-    return newton(start, (x_d, y_d), lambda x, y: distort_with_jacobian(x, y, coefficients, terms))
+    k, p, s = _groups(coefficients, terms)
+    g = radial_factor(x_d * x_d + y_d * y_d, k).clamp(min=_MIN_RADIAL_FACTOR)
+    return newton((x_d / g, y_d / g), (x_d, y_d), partial(distort_by_factor, k=k, p=p, s=s))
 
 
 def newton(
@@ -202,12 +209,11 @@ def converge(iterates: Iterator[Point]) -> Point:
     return x, y
 
 
-def _split(values: Sequence) -> tuple[Sequence, Sequence, Sequence]:
-    n = len(RADIAL)
-    return values[:n], values[n : n + 2], values[n + 2 :]
-
-
 def _groups(coefficients: Tensor, terms: Terms) -> tuple[Sequence[Tensor], Sequence[Tensor], Sequence[Tensor]]:
     """Return k, p and s of coefficients (B, 12, ...), each (B, ...), without the terms that are not computed."""
-    k, p, s = _split(coefficients.unbind(1))
-    return k[: terms.radial], p if terms.tangential else (), s if terms.prism else ()
+    values, n = coefficients.unbind(1), len(RADIAL)
+    return (
+        values[: terms.radial],
+        values[n : n + 2] if terms.tangential else (),
+        values[n + 2 :] if terms.prism else (),
+    )

@@ -34,17 +34,16 @@ def factor_and_slope(
     r2: Tensor, numerator: Sequence[Tensor], denominator: Sequence[Tensor] = ()
 ) -> tuple[Tensor, Tensor]:
     """Evaluate g and dg/d(r^2) at r^2."""
-    g, slope = radial_factor(r2, numerator, denominator), _slope(r2, numerator)
-    if denominator:
-        slope = (slope - g * _slope(r2, denominator)) / radial_factor(r2, denominator)
-    return g, slope
-
-
-def _slope(r2: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
-    value = torch.zeros_like(r2)
-    for i, coefficient in reversed(list(enumerate(coefficients, start=1))):
-        value = value * r2 + i * coefficient
-    return value
+    value = slope = torch.zeros_like(r2)
+    for coefficient in reversed(numerator):
+        value = value + coefficient
+        value, slope = value * r2, slope * r2 + value
+    g = 1 + value
+    if not denominator:
+        return g, slope
+    below, slope_below = factor_and_slope(r2, denominator)
+    g = g / below
+    return g, (slope - g * slope_below) / below
 
 
 def growth(numerator: Sequence[Any], denominator: Sequence[Any] = ()) -> list[Any]:
@@ -90,10 +89,11 @@ def first_fall(falls: Callable[[Tensor], Tensor], reach: Tensor) -> Tensor:
 
     `falls` maps radii (B, n) to (B, n), bool: the map does not grow there. Returns `reach` if it never falls.
     """
-    has_fall = falls(reach[:, None] * _steps(reach)).any(dim=1)
+    steps = _steps(reach)
+    has_fall = falls(reach[:, None] * steps).any(dim=1)
     radius, width = torch.zeros_like(reach), reach
     for _ in range(3):
-        first = falls(radius[:, None] + width[:, None] * _steps(reach)).long().argmax(dim=1)
+        first = falls(radius[:, None] + width[:, None] * steps).long().argmax(dim=1)
         width = width / _NODES
         radius = torch.where(has_fall, radius + (first - 1).clamp(min=0) * width, reach)
     return radius
@@ -131,7 +131,8 @@ def radial_limit(coefficients: Tensor, reach: Tensor, image_reach: Tensor) -> Ra
     """
     with torch.no_grad():
         k = coefficients.flatten(1)[:, : len(RADIAL), None].unbind(1)
-        radius = first_fall(lambda r: radial_factor(r * r, growth(k)) <= 0, reach)
+        slope = growth(k)
+        radius = first_fall(lambda r: radial_factor(r * r, slope) <= 0, reach)
         limit, shape = _tabulate(radius, image_reach, k, ()), (-1,) + (1,) * (coefficients.ndim - 2)
         return RadialLimit(radius.view(shape), limit.image_radius.view(shape), limit.table)
 
@@ -178,11 +179,12 @@ def _tabulate(
     def curve(r: Tensor) -> Tensor:
         return r * radial_factor(r * r, numerator, denominator)
 
-    r = radius[:, None] * _steps(radius)
+    steps = _steps(radius)
+    r = radius[:, None] * steps
     last = (curve(r) < image_reach[:, None]).sum(dim=1, keepdim=True).clamp(max=_NODES)
-    r = r.gather(1, last) * _steps(radius)  # a shorter table is finer
+    r = r.gather(1, last) * steps  # a shorter table is finer
     r_d = curve(r)
-    nodes = r_d[:, -1:] * (1 - (1 - _steps(radius)).square())
+    nodes = r_d[:, -1:] * (1 - (1 - steps).square())
     node = torch.searchsorted(r_d.contiguous(), nodes.contiguous()).clamp(1, _NODES)
     low, high = r_d.gather(1, node - 1), r_d.gather(1, node)
     weight = ((nodes - low) / (high - low).clamp(min=torch.finfo(r.dtype).tiny)).clamp(0, 1)

@@ -98,7 +98,7 @@ class RationalLens(NamedTuple):
         return q.sqrt()
 
     def _distort_before_tilt(self, x: Tensor, y: Tensor) -> tuple[Point, Jacobian]:
-        return distort_by_factor(x, y, self.numerator, self.denominator, self.p, self.s)
+        return distort_by_factor(x, y, k=self.numerator, denominator=self.denominator, p=self.p, s=self.s)
 
     def _depth(self, x: Tensor, y: Tensor) -> Tensor:
         tau_x, tau_y = self.tilt

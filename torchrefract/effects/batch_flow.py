@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import eager_bool, requires_grad, tensors_in
+from torchrefract._validation import eager_bool, requires_grad
 from torchrefract.effects.batch import per_sample, rows_of_samples, select_params, where_active
 from torchrefract.planning.plan import PlanRequest, WarpPlan, plan_warp
 from torchrefract.warping.grid import Points
@@ -350,7 +350,12 @@ class BatchFlow:
 
 def flow_dtype(params: Any) -> torch.dtype:
     """Return the type of the flow that parameters give."""
-    return next(value.dtype for value in tensors_in(params) if value.is_floating_point())
+    for value in params:
+        if isinstance(value, tuple):
+            return flow_dtype(value)
+        if isinstance(value, Tensor) and value.is_floating_point():
+            return value.dtype
+    raise TypeError(f"params must hold a floating tensor, got {type(params).__name__}")
 
 
 def everywhere(device: torch.device) -> Tensor:

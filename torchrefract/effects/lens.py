@@ -22,7 +22,7 @@ from torchrefract._validation import (
 )
 from torchrefract.cameras.brown_conrady import ALL_TERMS, POLYNOMIAL12, used_terms
 from torchrefract.cameras.camera import Camera
-from torchrefract.effects.batch import check_shapes, map_params, params_to
+from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.filled_frame import points_without_zoom, zoom_to_fill, zoomed_flow
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, newton_lens_flow
@@ -323,7 +323,8 @@ class LensDistortion(WarpEffect):
         is_fixed = not (torch.is_grad_enabled() and requires_grad(params))
         folds_nowhere = self._constant_plan(id(self), height, width, dtype).details is not None
         with torch.set_grad_enabled(not is_fixed):
-            lens = lens_in_px(map_params(params, torch.Tensor.double), height, width)
+            coefficients, focal, center = (value.double() for value in lens_in_px(params, height, width))
+            lens = coefficients, focal, center
 
             def position(points: Points) -> Tensor:
                 pixels = torch.cat([points.x, points.y], dim=1)

@@ -69,27 +69,20 @@ def zoomed_flow(flow: Tensor, points: Points, center: Tensor, zoom: Tensor, shif
         points: positions in the degraded frame.
         center, zoom, shift: as for `zoom_to_fill`; None is no shift.
     """
-    parts = []
-    for i, axis in enumerate((points.x, points.y)):
-        offset = axis - center[:, i, None, None, None]
-        moved = 0.0 if shift is None else _view(shift[:, i])
-        parts.append(_view(zoom) * flow[:, i : i + 1] + (moved - (1 - _view(zoom)) * offset))
-    return torch.cat(parts, dim=1)
+    return zoom[:, None, None, None] * flow + _zoom_offset(points, center, zoom, shift)
 
 
 def points_without_zoom(points: Points, center: Tensor, zoom: Tensor, shift: Tensor | None = None) -> Points:
     """Return the positions in the clean view without zoom of positions in the zoomed one; arguments as above."""
-    parts = []
-    for i, axis in enumerate((points.x, points.y)):
-        offset = axis - center[:, i, None, None, None]
-        moved = 0.0 if shift is None else _view(shift[:, i])
-        parts.append(((1 - _view(zoom)) * offset - moved) / _view(zoom))
-    return points.displaced(torch.cat(torch.broadcast_tensors(*parts), dim=1))
+    return points.displaced(-_zoom_offset(points, center, zoom, shift) / zoom[:, None, None, None])
 
 
-def _view(values: Tensor) -> Tensor:
-    """View (B,) as (B, 1, 1, 1)."""
-    return values.view(-1, 1, 1, 1)
+def _zoom_offset(points: Points, center: Tensor, zoom: Tensor, shift: Tensor | None) -> Tensor:
+    """Return how far the zoom and the shift alone move the points, (B, 2, h, w), px."""
+    (cx, cy), still = center[:, :, None, None, None].unbind(1), (1 - zoom)[:, None, None, None]
+    x, y = torch.broadcast_tensors(still * (cx - points.x), still * (cy - points.y))
+    offset = torch.cat([x, y], dim=1)
+    return offset if shift is None else offset + shift[:, :, None, None]
 
 
 def border_points(height: int, width: int, outsets: Sequence[float], like: Tensor) -> Points:
@@ -103,8 +96,9 @@ def border_points(height: int, width: int, outsets: Sequence[float], like: Tenso
     steps = torch.linspace(0, 1, _POINTS, dtype=like.dtype, device=like.device)
     start, end = torch.zeros_like(steps), torch.ones_like(steps)
     along, across = torch.stack([steps, steps, start, end]), torch.stack([start, end, steps, steps])
-    x = torch.cat([along * (width - 1 + 2 * outset) - outset for outset in outsets])
-    y = torch.cat([across * (height - 1 + 2 * outset) - outset for outset in outsets])
+    outset = as_device_tensor(outsets, dtype=like.dtype, device=like.device)[:, None, None]
+    x = (along * (width - 1 + 2 * outset) - outset).flatten(0, 1)
+    y = (across * (height - 1 + 2 * outset) - outset).flatten(0, 1)
     return Points(x[None, None], y[None, None], pixel_lattice(height, width), is_displaced=True)
 
 

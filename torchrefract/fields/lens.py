@@ -130,11 +130,8 @@ def corner_radius(focal: Tensor, center: Tensor, height: int, width: int) -> Ten
 
 def on_plane(points: Points, focal: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
     """Return x and y of the points on the plane z = 1, which broadcast to (B, 1, h, w)."""
-    x, y = (
-        (axis - center[:, i, None, None, None]) / focal[:, i, None, None, None]
-        for i, axis in enumerate((points.x, points.y))
-    )
-    return x, y
+    (fx, fy), (cx, cy) = focal[:, :, None, None, None].unbind(1), center[:, :, None, None, None].unbind(1)
+    return (points.x - cx) / fx, (points.y - cy) / fy
 
 
 def _replace_missing(x: Tensor, y: Tensor, exists: Tensor) -> tuple[Tensor, Tensor]:

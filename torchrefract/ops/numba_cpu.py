@@ -155,7 +155,7 @@ def _sample(
 
 def _elements(image: Tensor) -> np.ndarray:
     """Return the memory of an image, from its first element to its last one."""
-    count = 1 + sum((size - 1) * stride for size, stride in zip(image.shape, image.stride(), strict=True))
+    count = 1 + int((np.array(image.shape) - 1) @ np.array(image.stride()))
     return image.detach().as_strided((count,), (1,)).numpy()
 
 

@@ -103,8 +103,8 @@ def sample_lattice(
     dtype = sampling_dtype(image, nodes.dtype)
     nodes, limit = nodes.to(dtype), LATTICE_LIMIT
     choice = {"backend": backend, "interpolation": interpolation, "is_lattice": True}
-    fast = next((name for name in ("triton", "numba") if _uses(name, image, nodes, **choice)), None)
-    if fast is not None:
+    fast = backend if backend in _MODULES else "triton" if image.is_cuda else "numba"
+    if _uses(fast, image, nodes, **choice):
         source = image if fast == "numba" and image.dtype is torch.uint8 else image.to(dtype)
         weights = lagrange_weights(stride, dtype=dtype, device=nodes.device)
         options = {"margin": margin, "padding": padding, "limit": limit, "active": active}
@@ -206,6 +206,8 @@ def _like(values: Tensor, image: Tensor) -> Tensor:
 def _uses(name: str, image: Tensor, flow: Tensor, *, backend: str, interpolation: str, is_lattice: bool) -> bool:
     """Return True if the backend `name` samples the image; raise if the caller chose it and it cannot."""
     if backend not in ("auto", name) or requires_grad((image, flow)):
+        return False
+    if backend == "auto" and (name == "triton") != image.is_cuda:
         return False
     if name == "numba" and backend == "auto" and image.shape[2] * image.shape[3] < _SMALLEST_NUMBA_FRAME:
         return False

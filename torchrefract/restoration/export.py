@@ -86,11 +86,6 @@ def save_program(
     exported.save(path)
 
 
-def run_program(path: Path, image: Tensor) -> list[Tensor]:
-    """Run an exported file on images (B, C, H, W); ONNX files by ONNX Runtime."""
-    return load_program(path)(image)
-
-
 def load_program(path: Path) -> Callable[[Tensor], list[Tensor]]:
     """Return a function from images (B, C, H, W) to the outputs of a file .pt2 or .onnx, without gradients."""
     if path.suffix == ".pt2":
@@ -109,9 +104,9 @@ def load_program(path: Path) -> Callable[[Tensor], list[Tensor]]:
 
 def _compare(path: Path, images: Tensor, expected: Sequence[Tensor]) -> dict[str, float]:
     """Compare a file with the model for two batch sizes; one of them is not the traced one."""
-    errors = dict.fromkeys([*_TOLERANCES][: len(expected)], 0.0)
+    errors, run = dict.fromkeys([*_TOLERANCES][: len(expected)], 0.0), load_program(path)
     for batch in (slice(0, 2), slice(0, 1)):
-        for name, output, value in zip(errors, run_program(path, images[batch]), expected, strict=False):
+        for name, output, value in zip(errors, run(images[batch]), expected, strict=False):
             errors[name] = max(errors[name], (output - value[batch]).abs().max().item())
     if wrong := [name for name, error in errors.items() if not error <= _TOLERANCES[name]]:
         raise UsageError(f"out must agree with the model, got {wrong[0]} off by {errors[wrong[0]]:.1e}")

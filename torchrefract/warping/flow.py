@@ -32,10 +32,10 @@ class Jacobian(NamedTuple):
 
     def solve(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         """Return J^-1 (a, b), with the determinant clamped to at least 1e-6."""
-        scale = 1 / self.determinant.clamp(min=1e-6)
+        determinant = self.determinant.clamp(min=1e-6)
         x = torch.addcmul(self.yy * a, self.xy, b, value=-1)
         y = torch.addcmul(self.xx * b, self.yx, a, value=-1)
-        return x * scale, y * scale
+        return x / determinant, y / determinant
 
     def after(self, first: "Jacobian") -> "Jacobian":
         """Return the product J first: the derivatives of this map applied after the first one."""

@@ -33,15 +33,15 @@ class Lattice:
         """Return the numbers of rows and of columns of nodes."""
         if self.margin == 0:
             return self.height, self.width
-        rows, columns = (-(-size // self.stride) + 1 + 2 * self.margin for size in (self.height, self.width))
-        return rows, columns
+        more = 1 + 2 * self.margin
+        return math.ceil(self.height / self.stride) + more, math.ceil(self.width / self.stride) + more
 
     def points(self, *, dtype: torch.dtype, device: torch.device) -> Points:
         """Return the positions of the nodes, px."""
-        y, x = (
-            (torch.arange(count, dtype=dtype, device=device) - self.margin) * self.stride for count in self.num_nodes
-        )
-        return Points(x.view(1, 1, 1, -1), y.view(1, 1, -1, 1), self)
+        rows, columns = self.num_nodes
+        index = torch.arange(max(rows, columns), dtype=dtype, device=device)
+        position = (index - self.margin) * self.stride
+        return Points(position[:columns].view(1, 1, 1, -1), position[:rows].view(1, 1, -1, 1), self)
 
 
 def pixel_lattice(height: int, width: int) -> Lattice:

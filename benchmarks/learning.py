@@ -4,8 +4,8 @@
                                   [--val 64] [--threads 1] [--out benchmarks/results/learning]
 
 All networks see the same rendered roads, rendered before, through the same lenses. Four steps of each give the number
-of steps that its seconds allow; the learning rate ends at zero there. Seconds are of the process, without validations.
-Models with results in `--out` are not trained again.
+of steps that its seconds allow, at least six; the learning rate ends at zero there. Seconds are of the process, without
+validations. Models with results in `--out` are not trained again.
 """
 
 import argparse
@@ -33,9 +33,10 @@ Point = dict[str, float]  # the seconds and the scores of a validation, by name
 
 
 class Clock(Callback):
-    """Measure the processor time of training steps, and keep the scores of each validation."""
+    """Measure the processor time of training steps, and keep and print the scores of each validation."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str) -> None:
+        self.name = name
         self.steps: list[float] = []
         self.points: list[Point] = []
 
@@ -55,6 +56,7 @@ class Clock(Callback):
         """Add a point, and do not count the time of the validation."""
         scores = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("val/")}
         self.points.append({"seconds": sum(self.steps), "steps": len(self.steps)} | scores)
+        print(f"{self.name}: {sum(self.steps):.0f} s, {len(self.steps)} steps, {scores['val/epe']:.2f} px", flush=True)
         self._last = time.process_time()
 
 
@@ -70,7 +72,6 @@ def main() -> None:
                 frames[i]
         for name in missing:
             write_json(files[name], learn(name, data, args))
-            print(f"{name}: trained", flush=True)
     curves = {name: json.loads(file.read_text()) for name, file in files.items()}
     print(table(curves))
     save_figure(plot(curves), args.out / "curves.png")
@@ -78,9 +79,9 @@ def main() -> None:
 
 def learn(name: str, data: PairData, args: argparse.Namespace) -> list[Point]:
     """Train a model for the seconds of the arguments; return its validations."""
-    _fit(name, data, args, trial := Clock(), steps=_TRIAL, interval=None)
+    _fit(name, data, args, trial := Clock(name), steps=_TRIAL, interval=None)
     steps = max(_POINTS, round(args.seconds / median(trial.steps)))
-    _fit(name, data, args, clock := Clock(), steps=steps, interval=steps // _POINTS)
+    _fit(name, data, args, clock := Clock(name), steps=steps, interval=-(-steps // _POINTS))
     return clock.points
 
 

@@ -21,4 +21,5 @@ def test_models_are_trained_for_the_same_seconds_and_only_once(tmp_path, monkeyp
     assert "val/coverage" not in curves["lens_net"][-1]
     assert (tmp_path / "curves.png").stat().st_size > 0
     learning.main()
-    assert first.endswith(capsys.readouterr().out)
+    assert first.endswith(again := capsys.readouterr().out)
+    assert again.count("|\n") == 2 + len(names)  # the table alone

@@ -1,7 +1,8 @@
 """Time the writing of pairs, and the effects in a worker of a DataLoader, by frame size, and by their peak memory.
 
 python benchmarks/pairs.py --source DIR [--scene paper_refractive] [--count 200] [--size 360x640] [--workers 1 2]
-    [--maps png] [--listing 300000] [--out benchmarks/results/pairs.json]
+    [--engines local ray] [--rounds 1] [--tar 25] [--maps png] [--listing 300000] [--only written]
+    [--out benchmarks/results/pairs.json]
 """
 
 import argparse
@@ -46,9 +47,14 @@ from torchrefract.data.pairs.sources import find_sources
 from torchrefract.data.workers import use_one_thread
 from torchrefract.effects.base import Effect
 
+_TOTAL = 3000  # pairs whose time is computed from runs of fewer
 PROTOCOL = {
-    "written": "A run of torchrefract.generate for each number of workers, with its start: pairs a second, share of "
-    "the cores' time, and peak memory of all its processes (proportional set size, sampled each second).",
+    "written": "A run of torchrefract.generate for each round, engine and number of workers, with its start: pairs a "
+    "second, share of the cores' time, and peak memory of all its processes (proportional set size, sampled each "
+    "second). After the first pair or tar: seconds and core seconds for a thousand pairs.",
+    "engines": f"Medians over the rounds of the seconds and core seconds that {_TOTAL} pairs take, with the start; and "
+    "the speed, the time of the first engine in the same round over that of the engine: by seconds, and by core "
+    "seconds, which other programs disturb less.",
     "listing": "A folder of that many links to 30 images, 1000 in a drive, until the first pair is written: seconds, "
     "time of cores and peak memory of the main process (proportional set size), for the run that scans it, for one "
     "that reads the list, and for one of 30 images, which shows what the start itself takes.",
@@ -69,31 +75,38 @@ _SAMPLE_INTERVAL = 1.0  # s, between two readings of the processes
 class Run(NamedTuple):
     """Measurements of one run of the command."""
 
+    engine: str
     workers: int
     pairs_per_second: float
     core_share: float
     peak_bytes: int
     disk_bytes_per_pair: float
+    start_seconds: float  # until the first pair or tar
+    start_core_seconds: float
+    seconds_per_thousand: float
+    core_seconds_per_thousand: float
 
 
 def main() -> None:
     """Measure, print and save."""
     args = _parser().parse_args()
-    results: dict[str, Any] = {"written": []}
-    for workers in args.workers:
-        with tempfile.TemporaryDirectory(dir=args.disk) as folder:
-            results["written"].append(measure_run(args, Path(folder) / "pairs", workers)._asdict())
-    results["listing"] = measure_listing(args) if args.listing else {}
-    results["one_pair"] = measure_one_pair(args)
-    effects = make_effects()
-    image = torch.rand(1, 3, *args.size)
-    results["loader"] = {name: measure_loader(effect, image, args.seconds) for name, effect in effects.items()}
-    results["scaling"] = {name: measure_scaling(effect, args.size) for name, effect in effects.items()}
-    results["memory"] = {
-        name: peak_bytes(lambda effect=effect: effect(image)) / image.nbytes for name, effect in effects.items()
+    effects, image = make_effects(), torch.rand(1, 3, *args.size)
+    parts: dict[str, Callable[[], Any]] = {
+        "listing": lambda: measure_listing(args) if args.listing else {},
+        "one_pair": lambda: measure_one_pair(args),
+        "loader": lambda: {name: measure_loader(effect, image, args.seconds) for name, effect in effects.items()},
+        "scaling": lambda: {name: measure_scaling(effect, args.size) for name, effect in effects.items()},
+        "memory": lambda: {
+            name: peak_bytes(lambda effect=effect: effect(image)) / image.nbytes for name, effect in effects.items()
+        },
     }
-    for name, text in PROTOCOL.items():
-        print(name, text, json.dumps(results[name], indent=2), sep="\n", end="\n\n")
+    results: dict[str, Any] = {}
+    if "written" in args.only:
+        runs = measure_runs(args)
+        results = {"written": [run._asdict() for run in runs], "engines": compare_engines(runs)}
+    results |= {name: measure() for name, measure in parts.items() if name in args.only}
+    for name, values in results.items():
+        print(name, PROTOCOL[name], json.dumps(values, indent=2), sep="\n", end="\n\n")
     conditions = {"cores": os.cpu_count(), "torch": torch.__version__, "size": args.size, "scene": args.scene}
     write_json(args.out, {"protocol": PROTOCOL, "conditions": conditions, **results})
 
@@ -104,11 +117,41 @@ def make_effects() -> dict[str, Effect]:
     return {kind.__name__: kind() for kind in kinds}
 
 
-def measure_run(args: argparse.Namespace, out: Path, workers: int) -> Run:
+def measure_runs(args: argparse.Namespace) -> list[Run]:
+    """Run the command in each round with each number of workers and each engine."""
+    runs = []
+    for _ in range(args.rounds):
+        for workers in args.workers:
+            for engine in args.engines:
+                with tempfile.TemporaryDirectory(dir=args.disk) as folder:
+                    runs.append(measure_run(args, Path(folder) / "pairs", workers, engine))
+                print(runs[-1], file=sys.stderr, flush=True)
+    return runs
+
+
+def compare_engines(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Compare the engines with the first one, for each number of workers."""
+    costs = dict[tuple[int, str], list[np.ndarray]]()  # of each round: seconds and core seconds
+    for run in runs:
+        start, thousand = run[-4:-2], run[-2:]
+        costs.setdefault((run.workers, run.engine), []).append(np.add(start, np.multiply(thousand, _TOTAL / 1000)))
+    rows = []
+    for (workers, engine), rounds in costs.items():
+        reference = next(values for (number, _), values in costs.items() if number == workers)
+        wall, cores = np.median(rounds, axis=0).tolist()
+        speed, core_speed = np.median(np.divide(reference, rounds), axis=0).tolist()
+        row = {"engine": engine, "workers": workers, "seconds": wall, "core_seconds": cores}
+        rows.append(row | {"speed": speed, "speed_by_core_seconds": core_speed})
+    return rows
+
+
+def measure_run(args: argparse.Namespace, out: Path, workers: int, engine: str) -> Run:
     """Run the command once."""
     words = [f"scene={args.scene}", f"source={args.source}", f"out={out}", f"count={args.count}", f"workers={workers}"]
     words += [f"size=[{args.size[0]},{args.size[1]}]", f"maps={args.maps}", "license=benchmark", *_scene(args)[1]]
+    words += [f"engine={engine}", f"tar={args.tar or 'null'}"]
     start, peak, core_seconds = time.perf_counter(), 0, dict[int, float]()
+    first = (0, 0.0, 0.0)  # pairs, seconds and core seconds when some are written
     command = [sys.executable, "-m", "torchrefract.generate", *words]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as run:
         next_sample = start
@@ -117,13 +160,20 @@ def measure_run(args: argparse.Namespace, out: Path, workers: int) -> Run:
             core_seconds |= {process: used for process in processes if (used := _core_seconds(process))}
             if time.perf_counter() >= next_sample:
                 peak, next_sample = max(peak, sum(map(_memory, processes))), time.perf_counter() + _SAMPLE_INTERVAL
-            time.sleep(0.05)
+            if not first[0]:
+                pairs = len(list(out.glob("pairs/*/[0-9]*.clean.png"))) + (args.tar or 0) * len(
+                    list(out.glob("tars/[0-9]*"))
+                )
+                first = pairs, time.perf_counter() - start, sum(core_seconds.values())
+            time.sleep(0.2)
     seconds = time.perf_counter() - start
     if run.returncode:
         raise SystemExit(f"torchrefract.generate failed with code {run.returncode}")
     disk = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
-    share = sum(core_seconds.values()) / seconds / max(workers, 1)
-    return Run(workers, args.count / seconds, share, peak, disk / args.count)
+    used, thousands = sum(core_seconds.values()), (args.count - first[0]) / 1000
+    costs = (first[1], first[2], (seconds - first[1]) / thousands, (used - first[2]) / thousands)
+    share = used / seconds / max(workers, 1)
+    return Run(engine, workers, args.count / seconds, share, peak, disk / args.count, *costs)
 
 
 def measure_listing(args: argparse.Namespace) -> dict[str, dict[str, float]]:
@@ -296,8 +346,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--count", type=count(1), default=200, help="number of pairs, 200")
     parser.add_argument("--size", type=size, default=(360, 640), help="height x width of the frames, 360x640")
     parser.add_argument("--workers", type=count(0), nargs="+", default=[1, 2], help="numbers of processes, 1 2")
+    parser.add_argument("--engines", choices=("local", "ray"), nargs="+", default=["local"], help="engines, local")
+    parser.add_argument("--rounds", type=count(1), default=1, help="number of rounds of runs, 1")
+    parser.add_argument("--tar", type=count(1), help="number of pairs in a tar, files")
     parser.add_argument("--maps", choices=FORMATS, default="png", help="format of the maps, png")
     parser.add_argument("--listing", type=count(1), help="number of frames in a folder whose start is timed, none")
+    parser.add_argument("--only", choices=PROTOCOL, nargs="+", default=[*PROTOCOL], help="parts to measure, all")
     parser.add_argument("--seconds", type=float, default=2.0, help="duration of a measurement of the loader, 2")
     parser.add_argument("--disk", type=Path, help="folder for temporary pairs, the system's default")
     parser.add_argument("--out", type=Path, default=RESULTS / "pairs.json", help="JSON file to write")

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -49,6 +49,24 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"needs the real frames, and {folder} does not exist")
     return folder
+
+
+@pytest.fixture(scope="session")
+def bucket() -> Iterator[dict[str, str]]:
+    """Start a server of the S3 protocol with the empty s3://bucket; return the environment that names it."""
+    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)
+    pytest.importorskip("s3fs")
+    server.start()
+    host, port = server.get_host_and_port()
+    environment = {"AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b"}
+    environment |= {"AWS_DEFAULT_REGION": "us-east-1"}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        fsspec: Any = importlib.import_module("fsspec")
+        fsspec.filesystem("s3", use_listings_cache=False).mkdir("bucket")
+        yield environment
+    server.stop()
 
 
 @pytest.fixture(autouse=True)

@@ -199,6 +199,9 @@ def test_several_processes_with_a_trainer_of_one_raise(call, trained, monkeypatc
     monkeypatch.setenv("WORLD_SIZE", "2")
     message = call("train", *trained.words, "hydra.run.dir=run").message
     assert message.startswith("trainer must be ddp with trainer.devices=2 under torchrun, got one that uses 1 of 2")
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "1")
+    message = call("train", *trained.words, "hydra.run.dir=run").message
+    assert message.startswith("trainer must be ddp with trainer.devices=1 and trainer.num_nodes=2 under torchrun, got")
 
 
 def test_a_training_in_two_processes_stops_on_sigterm_with_its_last_checkpoint(small, tmp_path):

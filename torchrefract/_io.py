@@ -77,6 +77,19 @@ def read_bytes(path: Path) -> bytes:
     return retried(lambda: store.fs.cat_file(store.path), path) if is_remote(path) else path.read_bytes()
 
 
+@contextmanager
+def local_file(path: Path) -> Iterator[Path]:
+    """Yield a path on this machine with the content of a file, which is copied from a store by `retried`."""
+    if not is_remote(path):
+        yield path
+        return
+    store = cast(Any, path)
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder, path.name)
+        retried(lambda: store.fs.get_file(store.path, str(copy)), path)
+        yield copy
+
+
 def make_folder(path: Path) -> None:
     """Create a folder with its parents; stores have none."""
     if not is_remote(path):

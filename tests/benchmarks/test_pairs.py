@@ -30,9 +30,21 @@ def test_the_peak_memory_is_what_a_call_holds_at_once():
         assert pairs.peak_bytes(call) == pytest.approx(tensors * x.nbytes, rel=1e-3)
 
 
+def test_engines_are_compared_by_the_time_of_3000_pairs_in_each_round():
+    costs = {"local": [(10.0, 4.0, 30.0, 20.0), (20.0, 4.0, 40.0, 20.0)], "ray": [(40.0, 8.0, 20.0, 24.0)] * 2}
+    runs = [pairs.Run(engine, 2, 1.0, 1.0, 0, 0.0, *costs[engine][i]) for i in range(2) for engine in costs]
+    local, ray = pairs.compare_engines(runs)
+    assert (local["engine"], local["seconds"], local["core_seconds"], local["speed"]) == ("local", 120.0, 64.0, 1.0)
+    assert (ray["engine"], ray["seconds"], ray["core_seconds"]) == ("ray", 100.0, 80.0)
+    assert ray["speed"] == (100 / 100 + 140 / 100) / 2
+    assert ray["speed_by_core_seconds"] == 64 / 80
+
+
 def test_the_command_writes_all_measurements(args, tmp_path, monkeypatch):
     monkeypatch.setattr(pairs, "make_effects", lambda: {"fog": UniformFog()})
-    monkeypatch.setattr(pairs, "measure_run", lambda *_: pairs.Run(1, 2.0, 1.0, 10, 20.0))
+    monkeypatch.setattr(
+        pairs, "measure_run", lambda *_: pairs.Run("local", 1, 2.0, 1.0, 10, 20.0, 5.0, 4.0, 50.0, 40.0)
+    )
     monkeypatch.setattr(pairs, "measure_one_pair", lambda _: {"generated": 2.0, "read_and_encode": 1.0})
     out = tmp_path / "new" / "pairs.json"
     words = ["--source", str(args.source), "--size", "24x40", "--workers", "1", "--seconds", "0", "--out", str(out)]

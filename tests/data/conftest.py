@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from torchrefract import Pair
+from torchrefract import Pair, presets
 from torchrefract.data.module import PairData
+from torchrefract.data.pairs.generator import PairGenerator, PairStorage, PairTask, SourceReader
+from torchrefract.data.pairs.manifest import Manifest
+from torchrefract.data.pairs.sources import find_sources
 
 SIZE = (32, 48)
 
@@ -40,6 +43,21 @@ def words(frames) -> Callable[..., tuple[str, ...]]:
         return (f"scene={scene}", *width, *(f"{name}={value}" for name, value in options.items()), *more)
 
     return of
+
+
+@pytest.fixture(scope="session")
+def tars(tmp_path_factory, frames) -> Path:
+    """Write 23 pairs of the frames in tars of three, as the command does; some tars hold pairs of both splits."""
+    out = tmp_path_factory.mktemp("tars") / "out"
+    sources = find_sources(frames, size=None, every=1, drive_by="auto", val_share=0.2, seed=0)
+    reader = SourceReader(frames, None)
+    generator = PairGenerator(presets.paper_refractive(width=192), "paper_refractive", reader, 0, "png")
+    tasks = [PairTask(i - 4, sources.frame(i % 12), i // 12) for i in range(4, 27)]
+    out.mkdir()
+    manifest, storage = Manifest(out, 0, 1), PairStorage(out, 3)
+    for i in range(0, len(tasks), 3):
+        manifest.add(storage.write(tasks[i : i + 3], generator))
+    return out
 
 
 @pytest.fixture(scope="session")

@@ -192,7 +192,7 @@ def test_validation_and_each_epoch_of_each_seed_have_different_draws(during):
     assert min((a - b).abs().amax(dim=(1, 2, 3)).min() for i, a in enumerate(flows) for b in flows[:i]) > 1e-6
 
 
-def test_two_ranks_share_the_training_frames_and_validate_all(first_epoch, batches):
+def test_two_ranks_share_the_training_frames_and_validate_each_once(first_epoch, batches):
     with pytest.raises(
         ValueError, match="batch_size must be at most the 5 training frames that each of 2 processes has"
     ):
@@ -202,8 +202,10 @@ def test_two_ranks_share_the_training_frames_and_validate_all(first_epoch, batch
     assert (halves[0] | halves[1]).keys() == first_epoch.keys()
     assert_same(halves[0] | halves[1], first_epoch)
     validated = [batches(scenes(), training=False, ranks=2, rank=rank) for rank in (0, 1)]
-    keys = {key for part in validated for batch in part for key in batch.key.tolist()}
-    assert keys == set(range(COUNT, COUNT + 5))
+    keys = [key for part in validated for batch in part for key in batch.key.tolist()]
+    assert sorted(keys) == list(range(COUNT, COUNT + 5))
+    with pytest.raises(ValueError, match="the validation must have a frame for each of 6 processes, got 5 frames"):
+        scenes(batch_size=1).check_ranks(6)
 
 
 def test_keys_stay_on_the_cpu(during):

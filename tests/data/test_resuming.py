@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from torchrefract import Frame, Pair, UniformFog
-from torchrefract.data.module import PairData
+from torchrefract.data.module import PairData, pairs
 from torchrefract.restoration.checkpoints import StopOnSigterm
 
 EPOCHS, BATCHES = 3, 3
@@ -57,9 +57,14 @@ class Recorder(LightningModule):
             os.kill(os.getpid(), signal.SIGTERM)
 
 
-def fit(folder: Path, *, workers: int, epochs: int = EPOCHS, stop_at=None, resume: bool = False) -> Recorder:
+def fit(
+    folder: Path, *, workers: int, epochs: int = EPOCHS, stop_at=None, resume: bool = False, tars: Path | None = None
+) -> Recorder:
     model = Recorder(stop_at)
-    data = PairData(Images(13), Images(8), effect=UniformFog(), batch_size=4, workers=workers)
+    if tars is None:
+        data = PairData(Images(13), Images(8), effect=UniformFog(), batch_size=4, workers=workers)
+    else:
+        data = pairs(root=tars, buffer=4, batch_size=6, workers=workers)
     trainer = Trainer(
         max_epochs=epochs,
         accelerator="cpu",
@@ -94,5 +99,16 @@ def test_a_resumed_training_gets_the_batches_of_an_uninterrupted_one(tmp_path, e
     first = fit(tmp_path, workers=workers, epochs=2 if stop_at is None else EPOCHS, stop_at=stop_at)
     assert ("stopped by SIGTERM" in capsys.readouterr().err) == (stop_at is not None)
     rest = fit(tmp_path, workers=workers, resume=True)
+    assert not first.batches.keys() & rest.batches.keys()
+    assert first.batches | rest.batches == expected
+
+
+@pytest.mark.parametrize(("workers", "stop_at"), [(1, ("train", 1, 1)), (0, ("train", 0, 0)), (0, None)])
+def test_a_resumed_training_on_tars_gets_the_batches_of_an_uninterrupted_one(tmp_path, tars, workers, stop_at):
+    pytest.importorskip("webdataset")
+    expected = fit(tmp_path / "whole", workers=0, tars=tars).batches
+    assert len(expected) == EPOCHS * BATCHES
+    first = fit(tmp_path, workers=workers, epochs=2 if stop_at is None else EPOCHS, stop_at=stop_at, tars=tars)
+    rest = fit(tmp_path, workers=workers, resume=True, tars=tars)
     assert not first.batches.keys() & rest.batches.keys()
     assert first.batches | rest.batches == expected

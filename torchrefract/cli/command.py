@@ -54,7 +54,7 @@ _OPTIONS_WITH_VALUE = ("--config-dir", "-cd", "--config-name", "-cn", "--config-
 _OPTIONS_WITH_VALUE += ("--package", "-p", "--info", "-i", "--experimental-rerun")
 _UNKNOWN_OPTION = re.compile(r"Could not override '(\w+)'")
 _REMOTE_OUTPUT = re.compile(r"\+*(out|run_dir|hydra\.(?:run|sweep)\.dir)=['\"]?([A-Za-z][\w+.-]*://.*?)['\"]?$")
-_REMOTE_OPTIONS = (("generate", "out"), ("merge", "out"))
+_REMOTE_OPTIONS = (("generate", "out"), ("merge", "out"), ("train", "run_dir"), ("eval", "run_dir"))
 # Warnings of libraries about settings that are intended.
 _IGNORED_WARNINGS = (
     ".*does not have many workers.*",

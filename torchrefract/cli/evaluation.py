@@ -17,7 +17,7 @@ from torchrefract.restoration.report import describe_scene
 
 _PARTS = ("scene", "task", "data", "model")
 _MODULES = ("torchrefract.presets", "torchrefract.data.module")  # a checkpoint may name their functions
-_NOT_COMPARED = ("workers", "batch_size", "pretrained")  # they change no score
+_NOT_COMPARED = ("workers", "batch_size", "buffer", "pretrained")  # they change no score
 
 
 def add_choices(arguments: list[str]) -> list[str]:

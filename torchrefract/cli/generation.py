@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -54,7 +53,7 @@ from torchrefract.data.pairs.manifest import (
     scan_rows,
 )
 from torchrefract.data.pairs.sources import Sources, find_sources, list_path, read_sources
-from torchrefract.data.workers import num_cores
+from torchrefract.data.workers import map_in_processes, num_cores
 from torchrefract.effects.base import Effect
 
 _T = TypeVar("_T")
@@ -272,9 +271,10 @@ def _report(options: Options, complete: set[int], damaged: int) -> None:
 
 def _check_disk(options: Options, missing: Sequence[int], storage: PairStorage) -> None:
     """Print the estimated size of the missing pairs; raise UsageError if the disk has less space."""
-    # A reader that has opened a video cannot be sent to workers.
-    generator, step = deepcopy(options.generator), max(1, len(missing) // _SAMPLES)
-    samples = [generator.generate(options.task(number)) for number in missing[::step][:_SAMPLES]]
+    tasks = [options.task(number) for number in missing[:: max(1, len(missing) // _SAMPLES)][:_SAMPLES]]
+    # A process takes the memory of the compiled effects with it when it ends.
+    work, workers = options.generator.generate, min(1, options.workers)
+    samples = [*map_in_processes(work, tasks, workers=workers, preload="torchrefract.data.pairs.generator")]
     sizes = [storage.disk_bytes(pair) for pair in samples if pair.data]
     if lost := [pair.row.skipped.removeprefix(LOST) for pair in samples if pair.row.skipped.startswith(LOST)]:
         check_none_lost(lost if len(lost) == len(samples) else [], name="source")

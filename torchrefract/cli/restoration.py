@@ -20,7 +20,7 @@ from pytorch_lightning import Trainer, seed_everything
 from pytorch_lightning.utilities.exceptions import MisconfigurationException, SIGTERMException
 from torch import Tensor
 
-from torchrefract._io import replace_file
+from torchrefract._io import as_path, make_folder, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cli.command import check_none_lost, check_seed, make, naming, progress
 from torchrefract.cli.evaluation import describe_validation, use_validation_config
@@ -65,10 +65,10 @@ def train(cfg: DictConfig) -> None:
         raise UsageError(f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}")
     model.origin = _origin(cfg, data)
     _save_config(cfg, trainer)
-    run = Path(cfg.run_dir)
+    run = as_path(cfg.run_dir)
     with locked("run_dir", run) if trainer.is_global_zero else nullcontext():
         if trainer.is_global_zero:
-            _remove_incomplete({run} if cfg.ckpt_path is None else {run, Path(cfg.ckpt_path).parent}, run)
+            _remove_incomplete({run} if cfg.ckpt_path is None else {run, as_path(cfg.ckpt_path).parent}, run)
         _fit(cfg, data, model, trainer)
 
 
@@ -87,7 +87,7 @@ def _fit(cfg: DictConfig, data: PairData, model: RestorationModule, trainer: Tra
         raise SystemExit(128 + signal.SIGTERM) from None
     except SystemExit as error:  # Lightning turns Ctrl-C into the status 1
         if isinstance(error.__context__, KeyboardInterrupt):
-            raise KeyboardInterrupt(how_to_continue(Path(cfg.run_dir, "last.ckpt"))) from None
+            raise KeyboardInterrupt(how_to_continue(as_path(cfg.run_dir) / "last.ckpt")) from None
         raise
 
 
@@ -102,7 +102,7 @@ def evaluate(cfg: DictConfig) -> None:
     _save_config(cfg, trainer)
     if trainer.is_global_zero:
         print(f"scoring {path} on {describe_validation(data, cfg, changed)}", flush=True)
-    trainer.validate(model, data, ckpt_path=path, verbose=False, weights_only=True)
+    trainer.validate(model, data, ckpt_path=str(path), verbose=False, weights_only=True)
 
 
 def restore(cfg: DictConfig) -> None:
@@ -181,9 +181,11 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
     # Lightning starts the processes of other runs itself.
     processes = int(os.environ.get("WORLD_SIZE") or trainer.world_size)
     if processes != trainer.world_size:
+        devices = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
+        nodes = "" if devices == processes else f" and trainer.num_nodes={processes // devices}"
         raise UsageError(
-            f"trainer must be ddp with trainer.devices={os.environ.get('LOCAL_WORLD_SIZE', processes)} under torchrun, "
-            f"got one that uses {trainer.world_size} of {processes} processes"
+            f"trainer must be ddp with trainer.devices={devices}{nodes} under torchrun, got one that uses "
+            f"{trainer.world_size} of {processes} processes"
         )
     with naming("data"):
         data.check_ranks(trainer.world_size)
@@ -196,8 +198,9 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
 def _save_config(cfg: DictConfig, trainer: Trainer) -> None:
     if trainer.is_global_zero:
         with naming("run_dir"):
-            Path(cfg.run_dir).mkdir(parents=True, exist_ok=True)
-            with replace_file(Path(cfg.run_dir, "config.yaml")) as temporary:
+            run = as_path(cfg.run_dir)
+            make_folder(run)
+            with replace_file(run / "config.yaml") as temporary:
                 OmegaConf.save(cfg, temporary)
 
 

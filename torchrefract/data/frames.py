@@ -256,12 +256,16 @@ def _assign_by_folder(root: Path, paths: list[str], folders: dict[str, str]) -> 
 
 def _drives(paths: list[str], drive_by: str, *, skip_levels: int = 0) -> dict[str, str]:
     """Return the drive of each path, without regard to its first folders."""
-    folders = {path: tuple(path.split("/")[skip_levels:-1]) for path in paths}
-    if drive_by == "prefix" or (drive_by == "auto" and len(set(folders.values())) < 2):
+    # Of the folders, which are few, so that paths of a drive share one text.
+    folders = {
+        folder: f"{folder}/".split("/")[skip_levels:-1] for folder in {path.rpartition("/")[0] for path in paths}
+    }
+    if drive_by == "prefix" or (drive_by == "auto" and len(set(map(tuple, folders.values()))) < 2):
         return {path: name_prefix(posixpath.splitext(posixpath.basename(path))[0]) for path in paths}
     # Deeper folders, as in drive_1/front and drive_1/rear, belong to the same drive.
     level = len(PurePosixPath(posixpath.commonpath("/".join(parts) for parts in folders.values())).parts) + 1
-    return {path: "/".join(parts[:level]) or _UNNAMED for path, parts in folders.items()}
+    drives = {folder: "/".join(parts[:level]) or _UNNAMED for folder, parts in folders.items()}
+    return {path: drives[path.rpartition("/")[0]] for path in paths}
 
 
 def select_val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: float, seed: int) -> set[str]:

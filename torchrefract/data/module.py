@@ -13,9 +13,10 @@ from pytorch_lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler, default_collate
 
-from torchrefract._validation import check_choice, check_count, check_flag
+from torchrefract._validation import UsageError, check_choice, check_count, check_flag
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.pairs.dataset import PairedFolder
+from torchrefract.data.pairs.stream import PairBatches, check_streamed
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.effects.base import Effect
 from torchrefract.effects.lens import LensDistortion
@@ -34,17 +35,24 @@ class _Sampler(DistributedSampler[Any]):
         return islice(super().__iter__(), self.start, None)
 
 
+class _BatchSampler(_Sampler):
+    """Gives the epoch and the number of each batch of `PairBatches`."""
+
+    def __iter__(self) -> Iterator[Any]:
+        return ((self.epoch, number) for number in super().__iter__())
+
+
 class _Position:
-    """A point in a training, as an epoch and the number of its batches that were handed out."""
+    """A point in a training: an epoch, the number of its batches that were handed out, and that of all of them."""
 
     def __init__(self) -> None:
-        self.done = self.resumed = (0, 0)
+        self.done = self.resumed = (0, 0, 0)
 
     def state_dict(self) -> dict[str, int]:
-        return dict(zip(("epoch", "batches"), self.done, strict=True))
+        return dict(zip(("epoch", "batches", "of"), self.done, strict=True))
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        self.done = self.resumed = (state["epoch"], state["batches"])
+        self.done = self.resumed = (state["epoch"], state["batches"], state.get("of", 0))
 
 
 class _TrainingLoader(DataLoader[Any]):
@@ -56,10 +64,16 @@ class _TrainingLoader(DataLoader[Any]):
         # A generator starts at its first batch, when Lightning has set the epoch. Workers would take the order of the
         # sampler at once, which is still that of epoch 0 in a resumed run.
         sampler, position = cast(_Sampler, self.sampler), self.position
-        epoch, start = sampler.epoch, position.resumed[1] if position.resumed[0] == sampler.epoch else 0
-        position.resumed, sampler.start = (0, 0), start * cast(int, self.batch_size)
+        epoch, total = sampler.epoch, len(self)
+        start, expected = position.resumed[1:] if position.resumed[0] == epoch else (0, 0)
+        if start and expected not in (0, total):
+            raise UsageError(
+                f"ckpt_path within an epoch of {expected} batches must be continued with the same data.batch_size, "
+                f"workers and processes, got an epoch of {total}; continue with those, or from an earlier best.ckpt"
+            )
+        position.resumed, sampler.start = (0, 0, 0), start * (self.batch_size or 1)
         for number, batch in enumerate(super().__iter__(), start + 1):
-            position.done = epoch, number
+            position.done = epoch, number, total
             yield batch
 
     def state_dict(self) -> dict[str, int]:  # Lightning warns of a loader without the two functions
@@ -84,10 +98,12 @@ class PairData(LightningDataModule):
         transmission: True to add the transmission to pairs of frames.
         flow: True to require a flow in pairs of frames.
         border: "black" or "mirrored" adds a border to degraded frames, see `add_border`; None keeps them filled.
+        buffer: a number of pairs reads the pairs of tars one after another and shuffles them in a buffer of that many
+            for each worker, see `PairBatches`; None reads frames and pairs in any order.
 
     Raises:
-        ValueError: an argument is out of range, `batch_size` exceeds the number of training frames, or the effect is
-            no lens that a border could be added for.
+        ValueError: an argument is out of range, `batch_size` exceeds the number of training frames, the effect is no
+            lens that a border could be added for, or `buffer` is given for other data than tars.
     """
 
     def __init__(
@@ -102,6 +118,7 @@ class PairData(LightningDataModule):
         transmission: bool = False,
         flow: bool = False,
         border: str | None = None,
+        buffer: int | None = None,
     ):
         super().__init__()
         if border is not None and not (isinstance(effect, LensDistortion) and effect.frame == "fill"):
@@ -112,15 +129,20 @@ class PairData(LightningDataModule):
         self.workers = check_count("workers", workers, low=0)
         self.seed = check_count("seed", seed, low=0)
         self._maps = {"transmission": check_flag("transmission", transmission), "flow": check_flag("flow", flow)}
+        self.buffer = buffer if buffer is None else check_count("buffer", buffer)
+        for pairs in (train, val) if buffer else ():
+            check_streamed(pairs if isinstance(pairs, PairedFolder) else None)
         self._position = _Position()
         self.check_ranks(1)
 
     def check_ranks(self, ranks: int) -> None:
-        """Raise ValueError unless each of `ranks` processes has enough training frames for a batch."""
+        """Raise ValueError unless each of `ranks` processes has training frames for a batch and a validation frame."""
         count = len(self.train) // ranks  # pyright: ignore[reportArgumentType]  # a map-style dataset has a length
         if count < self.batch_size:
             share = "" if ranks == 1 else f" that each of {ranks} processes has"
             raise ValueError(f"batch_size must be at most the {count} training frames{share}, got {self.batch_size}")
+        if (count := len(self.val)) < ranks:  # pyright: ignore[reportArgumentType]  # as above
+            raise ValueError(f"the validation must have a frame for each of {ranks} processes, got {count} frames")
 
     def check_pair(self) -> None:
         """Raise ValueError if the first pair is unreadable or lacks a required map."""
@@ -163,19 +185,28 @@ class PairData(LightningDataModule):
             maps["transmission"] = None
         return make_pair(batch, self.effect, seed=(self.seed << 32) + epoch, border=self.border, **maps)
 
-    def _loader(self, frames: Dataset[Any], *, training: bool) -> DataLoader[Any]:
+    def _loader(self, frames: Any, *, training: bool) -> DataLoader[Any]:
         ranks, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
         self.check_ranks(ranks)
-        # Each rank has its own frames, in training without repetition; Lightning sets the epoch.
-        sampler = _Sampler(frames, ranks, rank, shuffle=training, seed=self.seed, drop_last=training)
+        workers, batch_size, sampler = self.workers, self.batch_size, None
+        # Each rank has its own frames, once; Lightning sets the epoch of a sampler.
+        if self.buffer is not None:
+            workers = min(workers, len(frames) // ranks)  # each reads a frame at least
+            options = {"buffer": self.buffer if training else 1, "seed": self.seed, "rank": rank, "ranks": ranks}
+            frames = PairBatches(frames, batch_size=batch_size, workers=workers, **options)
+            sampler, batch_size = _BatchSampler(frames, 1, 0, shuffle=False), None
+        elif training:
+            sampler = _Sampler(frames, ranks, rank, seed=self.seed, drop_last=True)
+        else:
+            sampler = range(rank, len(frames), ranks)
         return (_TrainingLoader if training else DataLoader)(
             frames,
-            batch_size=self.batch_size,
+            batch_size=batch_size,
             sampler=sampler,
-            drop_last=training,
-            num_workers=self.workers,
-            multiprocessing_context=_start_method() if self.workers else None,
-            persistent_workers=self.workers > 0,
+            drop_last=training and batch_size is not None,
+            num_workers=workers,
+            multiprocessing_context=_start_method() if workers else None,
+            persistent_workers=workers > 0,
             pin_memory=torch.cuda.is_available(),
         )
 
@@ -341,8 +372,9 @@ def pairs(
     seed: int = 0,
     transmission: bool = False,
     flow: bool = False,
+    buffer: int | None = None,
 ) -> PairData:
     """Make the data of pairs from disk, with their splits; see `PairedFolder` and `PairData` for the arguments."""
     options: dict[str, Any] = {"size": size, "transmission": transmission, "flow": flow}
     train, val = (PairedFolder(root, split=split, **options) for split in ("train", "val"))
-    return PairData(train, val, effect=None, batch_size=batch_size, workers=workers, seed=seed)
+    return PairData(train, val, effect=None, batch_size=batch_size, workers=workers, seed=seed, buffer=buffer)

@@ -20,7 +20,7 @@ from pytorch_lightning.plugins.io import TorchCheckpointIO
 from pytorch_lightning.utilities.exceptions import SIGTERMException
 from torch import Tensor, nn
 
-from torchrefract._io import replace_file
+from torchrefract._io import as_path, local_file, make_folder, replace_file
 from torchrefract._validation import UsageError
 from torchrefract.restoration.pretrained import WEIGHTS_SUFFIX, find_checkpoint, read_weights
 from torchrefract.restoration.tasks import Task
@@ -41,9 +41,9 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Write the checkpoint to a temporary file, then move it to `path`; raise CheckpointError if that fails."""
-        path = Path(path)
+        path = as_path(path)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
             with replace_file(path, alone=True) as temporary:
                 torch.save(checkpoint, temporary)
         # If the disk is full, torch raises a RuntimeError of its archive writer.
@@ -57,8 +57,9 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
     def load_checkpoint(self, path: str | Path, *args: Any, **options: Any) -> dict[str, Any]:
         """Read a checkpoint, or the weights of a model that comes with torchrefract."""
-        path = Path(path)
-        return read_weights(path) if path.suffix == WEIGHTS_SUFFIX else super().load_checkpoint(path, *args, **options)
+        with local_file(as_path(path)) as file:
+            is_small = file.suffix == WEIGHTS_SUFFIX
+            return read_weights(file) if is_small else super().load_checkpoint(file, *args, **options)
 
 
 class StopOnSigterm(Callback):
@@ -72,7 +73,7 @@ class StopOnSigterm(Callback):
     """
 
     def __init__(self, run_dir: str):
-        self.path = Path(run_dir) / "last.ckpt"
+        self.path = as_path(run_dir) / "last.ckpt"
         self._is_pending = False
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -106,7 +107,7 @@ class StopOnSigterm(Callback):
         epochs: Any = trainer.fit_loop.epoch_progress.current
         # At the end of an epoch, the checkpoint exists already.
         if trainer.world_size == 1 and epochs.processed < epochs.ready:
-            trainer.save_checkpoint(self.path)
+            trainer.save_checkpoint(str(self.path))
         if trainer.is_global_zero:
             print(f"stopped by SIGTERM in step {trainer.global_step}; {how_to_continue(self.path)}", file=sys.stderr)
 
@@ -177,7 +178,8 @@ def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(f"ckpt_path must be a checkpoint file, such as <run>/last.ckpt, got {path}")
     try:
-        checkpoint = read_weights(path) if path.suffix == WEIGHTS_SUFFIX else _read_archive(path)
+        with local_file(path) as file:
+            checkpoint = read_weights(file) if path.suffix == WEIGHTS_SUFFIX else _read_archive(file)
     except Exception as error:  # zipfile, torch.load and safetensors raise many types for a damaged file
         raise CheckpointError(
             f"ckpt_path must be an intact checkpoint, got {path}, which is damaged or another kind of file"

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._io import replace_file
+from torchrefract._io import as_path, replace_file
 
 if TYPE_CHECKING:
     from torchrefract.restoration.checkpoints import Loaded
@@ -62,7 +62,7 @@ def model_names() -> list[str]:
 def find_checkpoint(path: str | Path) -> Path:
     """Return the file of a model that comes with torchrefract if `path` is its name, or else the path as it is."""
     file = _FOLDER / f"{path}{WEIGHTS_SUFFIX}"
-    return file if str(path) in model_names() else Path(path)
+    return file if str(path) in model_names() else as_path(path)
 
 
 def write_weights(checkpoint: Mapping[str, Any], out: Path) -> None:

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from pytorch_lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from torchrefract._io import replace_file
+from torchrefract._io import as_path, replace_file
 from torchrefract.data.module import PairData, fingerprint
 from torchrefract.effects.lens import LensDistortion
 from torchrefract.restoration.metrics import psnr
@@ -49,8 +49,8 @@ class RunSummary(Callback):
     """
 
     def __init__(self, run_dir: str, ckpt_path: str | None = None):
-        self.run_dir = Path(run_dir)
-        self.resumed_run = None if ckpt_path is None else Path(ckpt_path).parent
+        self.run_dir = as_path(run_dir)
+        self.resumed_run = None if ckpt_path is None else as_path(ckpt_path).parent
         if self.resumed_run is not None and self.resumed_run.resolve() == self.run_dir.resolve():
             carry_over(self.resumed_run, self.run_dir)  # the logger deletes the table when the run starts
         self._examples: tuple[Restored, Pair] | None = None

@@ -3,13 +3,12 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 from torch.testing import assert_close
-from torch.utils.data import DataLoader
 
 from torchrefract import Frame, Pair, presets
 from torchrefract.data.images import fit
 from torchrefract.data.module import frames as frame_data
 from torchrefract.data.module import make_pair, pairs
-from torchrefract.data.pairs.dataset import PairedFolder, PairStream
+from torchrefract.data.pairs.dataset import PairedFolder
 from torchrefract.data.pairs.files import count_out_of_range, decode_flow, encode_flow
 from torchrefract.restoration.tasks import Undistort
 
@@ -137,27 +136,6 @@ def test_concatenated_manifests_of_shards_are_one_set(made):
     (out / "manifest.jsonl").write_text("".join(texts))
     one, several = PairedFolder(single, split="val"), PairedFolder(out, split="val")
     assert [one.row(i) for i in range(len(one))] == [several.row(i) for i in range(len(several))]
-
-
-@pytest.mark.parametrize(("workers", "ranks", "buffer"), [(0, 1, 1), (0, 3, 16), (2, 2, 3)])
-def test_a_stream_yields_each_pair_once(made, workers, ranks, buffer):
-    out = made("tar=4")
-    keys = []
-    for rank in range(ranks):
-        stream = PairStream(out, buffer=buffer, rank=rank, ranks=ranks)
-        keys += [int(pair.key) for pair in DataLoader(stream, batch_size=None, num_workers=workers)]
-    expected = [int(pair.key) for pair in (PairedFolder(out)[i] for i in range(12))]
-    assert sorted(keys) == sorted(expected)
-    assert (keys == expected) == (buffer == 1)
-
-
-def test_the_order_of_a_stream_depends_on_the_epoch(made):
-    stream = PairStream(made(), buffer=16, seed=5)
-    orders = []
-    for epoch in (0, 1, 0):
-        stream.set_epoch(epoch)
-        orders.append([int(pair.key) for pair in stream])
-    assert orders[0] == orders[2] != orders[1]
 
 
 @pytest.mark.quick

@@ -12,6 +12,7 @@ from PIL import Image
 from torchrefract import key_of
 from torchrefract.data.frames import Source
 from torchrefract.data.pairs import sources as listing
+from torchrefract.data.pairs.generator import PairGenerator
 from torchrefract.data.pairs.sources import Sources, find_sources, read_sources
 
 OPTIONS: dict[str, Any] = {"every": 1, "drive_by": "auto", "val_share": 0.3, "seed": 0}
@@ -98,3 +99,13 @@ def test_a_list_of_many_frames_takes_little_memory_and_keeps_any_name(tmp_path):
     assert len(digest) == 64
     assert [sources.frame(i) for i in (0, 5000, count - 1)] == [frames[i]._replace(bytes=7) for i in (0, 5000, -1)]
     assert next(iter(sources.frames())) == frames[0]._replace(bytes=7)
+
+
+def test_the_main_process_of_a_run_with_workers_makes_no_pair(call, words, monkeypatch):
+    """Compiled effects would add half to its memory."""
+
+    def generate(*_: Any) -> None:
+        raise AssertionError("a pair of the main process")
+
+    monkeypatch.setattr(PairGenerator, "generate", generate)
+    assert ": 2 pairs made, 2 in total" in call("generate", *words("out", "count=2", workers=1)).out

@@ -14,12 +14,18 @@ ROOT = Path(__file__).parents[3]
 COUNT = 300
 
 
-@pytest.fixture(scope="module")
-def complete(tmp_path_factory, words) -> Path:
-    """Return a set made by the local engine."""
+@pytest.fixture(scope="module", params=["null", "25"], ids=["files", "tars"])
+def tar(request) -> str:
+    """Return the option of the number of pairs in a tar."""
     pytest.importorskip("ray")
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def complete(tmp_path_factory, words, tar) -> Path:
+    """Return a set made by the local engine."""
     out = tmp_path_factory.mktemp("complete") / "out"
-    run(words(out, f"count={COUNT}"), workers=0)
+    run(words(out, f"count={COUNT}", f"tar={tar}"), workers=0)
     return out
 
 
@@ -48,20 +54,21 @@ def actors() -> Iterator[int]:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_actors_write_the_bytes_of_the_local_engine(tmp_path, words, sums, complete, workers):
-    assert f"{COUNT} in total" in run(words(tmp_path / "out", f"count={COUNT}"), workers=workers, engine="ray")
+def test_actors_write_the_bytes_of_the_local_engine(tmp_path, words, sums, complete, tar, workers):
+    options = words(tmp_path / "out", f"count={COUNT}", f"tar={tar}")
+    assert f"{COUNT} in total" in run(options, workers=workers, engine="ray")
     assert sums(tmp_path / "out") == sums(complete)
 
 
-def test_an_actor_that_is_killed_costs_no_pair(tmp_path, words, sums, complete):
+def test_an_actor_that_is_killed_costs_no_pair(tmp_path, words, sums, complete, tar):
     out = tmp_path / "out"
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    options = command(words(out, f"count={COUNT}"), workers=2, engine="ray")
+    options = command(words(out, f"count={COUNT}", f"tar={tar}"), workers=2, engine="ray")
     killed = list[int]()
     with subprocess.Popen(options, env=environment, stdout=subprocess.PIPE, text=True) as process:
         end = time.monotonic() + 300
         while process.poll() is None and not killed and time.monotonic() < end:
-            if len(list(out.rglob("*.clean.png"))) > COUNT // 4:
+            if len(list(out.glob("pairs/*/*.clean.png"))) > COUNT // 4 or len(list(out.glob("tars/0*"))) > 2:
                 killed = list(actors())[:1]
                 for actor in killed:
                     os.kill(actor, signal.SIGKILL)

@@ -1,20 +1,20 @@
 """Datasets of pairs on disk, as `torchrefract.generate` writes them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset, IterableDataset, get_worker_info
+from torch.utils.data import Dataset
 
 from torchrefract._io import as_path
 from torchrefract._tensor import to_float
-from torchrefract._validation import check_choice, check_count, check_flag, check_size
+from torchrefract._validation import check_choice, check_flag, check_size
 from torchrefract.data.images import crop_center, opened, reduce_by_area
 from torchrefract.data.pairs.files import DamagedPairError, decode_pair
-from torchrefract.data.pairs.manifest import PairRow, find_manifests, read_row, read_stored, scan_rows
+from torchrefract.data.pairs.manifest import PairRow, find_manifests, read_row, read_stored, scan_rows, tar_path
 from torchrefract.types import Pair
 from torchrefract.warping.grid import inside
 
@@ -27,7 +27,7 @@ class PairedFolder(Dataset[Pair]):
     """The pairs in a folder in the order of their numbers.
 
     A pair equals what `make_pair` computes from its frame, in the precision of its files. Rows of the manifest are
-    read on access, so that the dataset takes 24 bytes of memory a pair.
+    read on access, so that the dataset takes 40 bytes of memory a pair.
 
     Args:
         root: the folder with pairs/ or tars/.
@@ -60,12 +60,12 @@ class PairedFolder(Dataset[Pair]):
             raise ValueError(f"root must be a folder with manifest.jsonl, got {self.root}")
         numbers = {path: i for i, path in enumerate(self._manifests)}
         rows = [
-            (row.number, numbers[location.manifest], location.offset, location.length)
+            (row.number, _tar_number(row), numbers[location.manifest], location.offset, location.length)
             for row, location in scan_rows(self._manifests, self._is_in_split)
         ]
         if not rows:
             raise ValueError(f"root must hold pairs of the split {split}, got none in {self.root}")
-        self._locations = np.array(sorted(rows), dtype=np.int64)[:, 1:]
+        self._locations = np.array(sorted(rows), dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self._locations)
@@ -78,9 +78,13 @@ class PairedFolder(Dataset[Pair]):
             (1, H, W), or (0,) if it is not loaded.
         """
         row = self.row(index)
+        return self.decode(row, {suffix: partial(read_stored, self.root, file) for suffix, file in row.files.items()})
+
+    def decode(self, row: PairRow, files: Mapping[str, Callable[[], bytes]]) -> Pair:
+        """Make a pair of its row and of functions that read its files, by suffix."""
         try:
             arrays = decode_pair(
-                {suffix: partial(read_stored, self.root, file) for suffix, file in row.files.items()},
+                files,
                 (_FLOW, _VALID, _TRANSMISSION) if self.transmission else (_FLOW, _VALID),
                 size=(row.height, row.width),
             )
@@ -110,7 +114,7 @@ class PairedFolder(Dataset[Pair]):
 
     def row(self, index: int) -> PairRow:
         """Read the manifest's row of a pair."""
-        number, offset, length = self._locations[index].tolist()
+        number, offset, length = self._locations[index, 2:].tolist()
         with opened(self._manifests[number]) as stream:
             stream.seek(offset)
             return read_row(stream.read(length))
@@ -118,6 +122,18 @@ class PairedFolder(Dataset[Pair]):
     def rows(self) -> Iterator[PairRow]:
         """Read all rows of the split, in the order of the manifest."""
         return (row for row, _ in scan_rows(self._manifests, self._is_in_split))
+
+    def tars(self) -> list[tuple[str, np.ndarray]]:
+        """Return the path of each tar, relative to the root, and the numbers of its pairs of the split.
+
+        Raises:
+            ValueError: the pairs are files.
+        """
+        numbers, tars = self._locations[:, 0], self._locations[:, 1]
+        if (tars < 0).any():
+            raise ValueError(f"root must hold tars to be streamed, got files in {self.root}; give generate tar=200")
+        parts = np.split(numbers, np.flatnonzero(np.diff(tars)) + 1)
+        return [(tar_path(tar), part) for tar, part in zip(np.unique(tars), parts, strict=True)]
 
     def _is_in_split(self, row: PairRow) -> bool:
         return not row.skipped and self.split in ("all", row.split)
@@ -142,53 +158,10 @@ def reduce_pair(pair: Pair, size: tuple[int, int]) -> Pair:
     )
 
 
-class PairStream(IterableDataset[Pair]):
-    """The pairs in a folder one after another, for tars and slow disks; each pair once an epoch.
-
-    Each worker of a DataLoader in each process reads its own contiguous part of the set, from start to end. A buffer
-    shuffles the order.
-
-    Args:
-        root, split: as for `PairedFolder`.
-        buffer: number of pairs to choose the next one from; 1 keeps their order.
-        seed: of the order, at least 0.
-        rank, ranks: index of this process, and number of processes.
-    """
-
-    def __init__(
-        self, root: str | Path, *, split: str = "all", buffer: int = 1, seed: int = 0, rank: int = 0, ranks: int = 1
-    ):
-        self.pairs = PairedFolder(root, split=split)
-        self.buffer = check_count("buffer", buffer)
-        self.seed = check_count("seed", seed, low=0)
-        self.ranks = check_count("ranks", ranks)
-        self.rank = check_count("rank", rank, low=0)
-        if rank >= ranks:
-            raise ValueError(f"rank must be below ranks = {ranks}, got {rank}")
-        self.epoch = 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """Select the order of an epoch, at least 0."""
-        self.epoch = check_count("epoch", epoch, low=0)
-
-    def __iter__(self) -> Iterator[Pair]:
-        worker = get_worker_info()
-        index, count = (worker.id, worker.num_workers) if worker else (0, 1)
-        reader, readers = self.rank * count + index, self.ranks * count
-        total = len(self.pairs)
-        part = range(reader * total // readers, (reader + 1) * total // readers)
-        yield from map(self.pairs.__getitem__, _shuffled(part, self.buffer, (self.seed, self.epoch, reader)))
-
-
-def _shuffled(numbers: range, size: int, seed: tuple[int, int, int]) -> Iterator[int]:
-    """Yield the numbers, each drawn from a buffer of `size`."""
-    generator, buffer = np.random.default_rng(seed), list[int]()
-    for number in numbers:
-        buffer.append(number)
-        if len(buffer) == size:
-            yield buffer.pop(generator.integers(len(buffer)))
-    while buffer:
-        yield buffer.pop(generator.integers(len(buffer)))
+def _tar_number(row: PairRow) -> int:
+    """Return the number of the tar that holds a pair; -1 if its files are not in a tar."""
+    path = next((file.path for file in row.files.values()), "")
+    return int(path.removeprefix("tars/").removesuffix(".tar")) if path.startswith("tars/") else -1
 
 
 def _image(pixels: np.ndarray) -> Tensor:

@@ -34,7 +34,7 @@ from torchrefract.data.images import (
 )
 from torchrefract.data.media import read_video
 from torchrefract.data.pairs.files import DEPTH, FLOWS, LIGHTS, PairArrays, count_out_of_range, encode_pair
-from torchrefract.data.pairs.manifest import LOST, PairRow, StoredFile
+from torchrefract.data.pairs.manifest import LOST, PairRow, StoredFile, tar_path
 from torchrefract.data.pairs.ray_engine import map_in_actors
 from torchrefract.data.pairs.sources import draw_of
 from torchrefract.data.workers import map_in_processes
@@ -220,7 +220,7 @@ class PairStorage(NamedTuple):
         """Generate and write the pairs of a unit; return their rows."""
         if self.tar is None:
             return [self._write_files(generator.generate(task)) for task in tasks]
-        path = f"tars/{tasks[0].number // self.tar:08d}.tar"
+        path = tar_path(tasks[0].number // self.tar)
         target = self.out / path
         make_folder(target.parent)
         with (

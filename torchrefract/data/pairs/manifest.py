@@ -87,15 +87,20 @@ class RowLocation(NamedTuple):
     length: int
 
 
-def read_row(line: bytes) -> PairRow:
-    """Parse a line of a manifest.
+def tar_path(number: int) -> str:
+    """Return the path of a tar of a set."""
+    return f"tars/{number:08d}.tar"
+
+
+def read_row(line: bytes, *, has_files: bool = True) -> PairRow:
+    """Parse a line of a manifest, or with `has_files` False the row in a tar, which names no files.
 
     Raises:
         DamagedPairError: the line is invalid, or the path of a file leads outside of pairs/ and tars/.
     """
     try:
         document = json.loads(line)
-        files = {suffix: StoredFile(**file) for suffix, file in document.pop("files").items()}
+        files = {suffix: StoredFile(**file) for suffix, file in (document.pop("files") if has_files else {}).items()}
         row = PairRow(**document, files=files)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise DamagedPairError(f"a row must be one of torchrefract.generate, got {line[:80]!r}") from error

@@ -1,5 +1,7 @@
 """Work in actors of Ray Data, on this machine or on a cluster: blocks of a lost actor are done again."""
 
+import logging
+import os
 import pickle
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
@@ -35,6 +37,8 @@ def map_in_actors(
     import ray  # noqa: PLC0415  # pyright: ignore[reportMissingImports]  # in its own extra
     import ray.data  # noqa: PLC0415  # pyright: ignore[reportMissingImports]  # in its own extra
 
+    logging.getLogger("ray.data").setLevel(logging.ERROR)
+    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # it prints an error when an actor could restart
     started = not ray.is_initialized()
     if started:
         ray.init(address=address, **_SILENT, **({} if address else {"num_cpus": workers + 1}))
@@ -48,7 +52,7 @@ def map_in_actors(
             fn_constructor_args=(work,),
             batch_size=None,
             batch_format="pyarrow",
-            concurrency=workers,
+            compute=ray.data.ActorPoolStrategy(size=workers),
             num_cpus=1,
         )
         for batch in dataset.iter_batches(batch_size=None, batch_format="pyarrow", prefetch_batches=0):

@@ -5,7 +5,7 @@
 
 All networks see the same rendered roads, rendered before, through the same lenses. Four steps of each give the number
 of steps that its seconds allow, at least six; the learning rate ends at zero there. Seconds are of the process, without
-validations. Models with results in `--out` are not trained again.
+validations. Models with results of the same settings in `--out` are not trained again.
 """
 
 import argparse
@@ -64,7 +64,9 @@ def main() -> None:
     """Train the models that have no results yet, print a table, and plot the curves."""
     args = _parser().parse_args()
     torch.set_num_threads(args.threads)
-    files = {name: args.out / f"{name}.json" for name in args.models}
+    height, width = args.size
+    settings = f"{height}x{width}_{args.scenes}_{args.val}_{args.seconds:g}s"
+    files = {name: args.out / f"{name}_{settings}.json" for name in args.models}
     if missing := [name for name, file in files.items() if not file.is_file()]:
         data = instantiate(_config(missing[0], args).data)
         for frames in (data.train, data.val):  # keeps what it renders

@@ -12,7 +12,7 @@ def test_models_are_trained_for_the_same_seconds_and_only_once(tmp_path, monkeyp
     learning.main()
     first = capsys.readouterr().out
     names = ["ddpm", "lens_net"]
-    curves = {name: json.loads((tmp_path / f"{name}.json").read_text()) for name in names}
+    curves = {name: json.loads((tmp_path / f"{name}_32x56_16_2_1s.json").read_text()) for name in names}
     for points in curves.values():
         assert [p["seconds"] for p in points] == sorted(p["seconds"] for p in points)
         assert points[-1]["seconds"] == pytest.approx(1, rel=0.8)

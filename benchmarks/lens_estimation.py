@@ -3,6 +3,7 @@
     python benchmarks/lens_estimation.py  # rendered roads through a known lens, and without a lens
     python benchmarks/lens_estimation.py --data DATA [--sets ca280_1280 ...]  # real cameras with a calibration
     python benchmarks/lens_estimation.py --checkpoint lens_small  # also by a network, and by both together
+    python benchmarks/lens_estimation.py --checkpoint lens_small --clip 100  # speed, and how still the lens is
 
 DATA holds frames/train/ca280_*.jpg and fullres/ca280_*.jpg, of the camera of chessboard/udacity_p4, and folders of
 chessboard and charuco, with a reference.json each. The calibrated camera is that of OpenCV with five coefficients. The
@@ -13,23 +14,31 @@ the pixels of the rectified frame. Both rectified frames have their principal po
 1 there, as the flow of `rectify`. "nothing" is the same for the frames as they are. Pools are drawn at random; medians
 over the draws. "rectified" rows are the same frames after `rectify` by the calibrated camera: their lens is none.
 "lines" is the distance of corners of one row or column from a straight line, px rms, before and after.
+
+--clip writes a video of that many frames, which pan over a rendered road behind a lens that stays, and restores it
+frame by frame and with `pool=lens`. "jitter" is the mean change of the flow from a frame to the next, px of a frame
+1920 px wide: 0 for the true lens.
 """
 
 import argparse
 import json
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 from calibration import board_from_entry
-from timing import RESULTS, write_json
+from timing import RESULTS, count, write_json
 from torch import Tensor
 
 from torchrefract._tensor import to_float, to_uint8
+from torchrefract.cameras.calibration import estimate_lens
 from torchrefract.cameras.calibration.detection import detect, has_enough_corners
 from torchrefract.cameras.calibration.lens_estimate import pool_lenses, radial_lens_of_flow
 from torchrefract.cameras.calibration.plumb_line import (
@@ -46,8 +55,10 @@ from torchrefract.cli.calibration import find_pictures, read_gray
 from torchrefract.cli.lens import Predictor, flow_predictor
 from torchrefract.data.images import pixels_of, read_image
 from torchrefract.data.road_scenes import render_road_scenes
+from torchrefract.data.video import convert_video, read_video, write_video
 from torchrefract.fields.rectification import camera_flow
 from torchrefract.restoration.checkpoints import load_model
+from torchrefract.restoration.inference import LensRestorer, Restorer
 from torchrefract.warping.warp import warp
 
 SETS = {  # name: pictures, and the folder with reference.json, its entry and the calibration there
@@ -158,18 +169,69 @@ def measure(
     return rows, camera
 
 
-def rendered(lens: tuple[float, float]) -> tuple[list[Tensor], Camera]:
-    """Render roads through a lens, relative to the half diagonal; a part of the rendered frames is shown."""
+def lens_flow(lens: tuple[float, float]) -> tuple[Camera, Tensor]:
+    """Return the camera of a lens, relative to the half diagonal, and the flow that shows a part of rendered frames."""
     camera, (height, width) = to_camera(torch.tensor(lens), _RENDERED_SIZE), _RENDERED_SIZE
     y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
     pixels, center = torch.stack([x, y], dim=-1).reshape(-1, 2), torch.tensor([camera.cx, camera.cy])
     rectified = camera.undistort((pixels - center) / camera.fx).points * camera.fx * _SHRINK + center
-    flow = (rectified - pixels).T.reshape(1, 2, height, width).float()
-    frames = []
+    return camera, (rectified - pixels).T.reshape(1, 2, height, width).float()
+
+
+def rendered(lens: tuple[float, float]) -> tuple[list[Tensor], Camera]:
+    """Render roads through a lens."""
+    (camera, flow), frames = lens_flow(lens), []
     for key in range(_NUM_RENDERED):
-        image, _ = render_road_scenes(torch.tensor([key]), height, width)
+        image, _ = render_road_scenes(torch.tensor([key]), *_RENDERED_SIZE)
         frames.append(warp(image, flow, interpolation="bicubic")[0])
     return frames, camera
+
+
+def render_clip(num_frames: int, path: Path) -> None:
+    """Write a video of frames that pan over a rendered road behind the lens of `rendered`, ten a second."""
+    height, width = _RENDERED_SIZE
+    image, _ = render_road_scenes(torch.tensor([0]), height, 2 * width)
+    flow = lens_flow(RENDERED_LENS)[1]
+    starts = (width * (1 + np.sin(2 * np.pi * np.arange(num_frames) / num_frames)) / 2).round().astype(int)
+    views = (image[..., start : start + width] for start in starts)
+    pictures = (pixels_of(warp(view, flow, interpolation="bicubic")[0][0]) for view in views)
+    write_video(pictures, path, fps=10, size=(width, height))
+
+
+def jitter(flows: Sequence[Tensor]) -> float:
+    """Return the mean change of flows (1, 2, H, W) from each to the next, px of a frame 1920 px wide."""
+    changes = [(after - before).norm(dim=1).mean().item() for before, after in pairwise(flows)]
+    return _WIDTH / flows[0].shape[3] * sum(changes) / len(changes)
+
+
+def measure_clip(num_frames: int, restorer: Restorer, predict: Predictor) -> dict[str, dict[str, float]]:
+    """Restore a clip and estimate its lens; return frames per second of the processor, and jitter and error, px."""
+    with TemporaryDirectory() as folder:
+        clip, results = Path(folder, "clip.mp4"), dict[str, dict[str, float]]()
+        render_clip(num_frames, clip)
+
+        def frames() -> Iterator[Tensor]:
+            return (frame for _, frame in read_video(clip, range(num_frames)))
+
+        def convert(restore: Callable[[Sequence[Tensor]], list[Tensor]]) -> None:
+            out = Path(folder, "restored.mp4")
+            convert_video(clip, out, change=lambda views: (pixels_of(restore([view[0]])[0]) for view in views))
+
+        cameras: dict[str, Camera] = {}
+        for name, network in {"estimate_lens, lines": None, "estimate_lens, both": predict}.items():
+            start = time.process_time()
+            cameras[name] = estimate_lens(frames(), predict=network).camera
+            results[name] = {"frames_per_second": num_frames / (time.process_time() - start)}
+            results[name]["error_px"], results[name]["nothing_px"] = errors(cameras[name], lens_flow(RENDERED_LENS)[0])
+        pooled = LensRestorer(cameras["estimate_lens, both"])
+        for name, restore in {"restore, each frame": restorer, "restore, pool=lens": pooled}.items():
+            start = time.process_time()
+            convert(restore)
+            results[name] = {"frames_per_second": num_frames / (time.process_time() - start)}
+        results["restore, each frame"]["jitter_px"] = jitter([predict(frame) for frame in frames()])
+        still = [camera_flow(pooled.camera)[0]] * 2  # one flow for all frames
+        results["restore, pool=lens"]["jitter_px"] = jitter(still)
+    return results
 
 
 def to_gray(image: Tensor) -> np.ndarray:
@@ -216,6 +278,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder of real frames and chessboards")
     parser.add_argument("--checkpoint", help="of a training of the task undistort")
+    parser.add_argument("--clip", type=count(2), help="frames of a clip, whose restoration is measured instead")
     parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
     parser.add_argument("--out", type=Path, default=RESULTS / "lens_estimation.json")
     arguments = parser.parse_args()
@@ -225,6 +288,13 @@ def main() -> None:
         model: Any = loaded.model
         constant = model.constant_flow(torch.zeros(1, 2, *loaded.size))
         network = Network(flow_predictor(model, loaded.size, torch.device("cpu")), constant)
+        if arguments.clip:
+            results = measure_clip(arguments.clip, Restorer(model, size=loaded.size), network.predict)
+            for name, values in results.items():
+                print(f"{name:22}", *(f"{key} {value:.2f}" for key, value in values.items()), sep="  ")
+            return write_json(arguments.out.with_name("clip.json"), results)
+    elif arguments.clip:
+        parser.error("--clip needs --checkpoint, such as lens_small")
     if arguments.data:
         rows = real(arguments.data, arguments.sets, network)
     else:

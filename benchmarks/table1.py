@@ -2,12 +2,13 @@
 
 python benchmarks/table1.py --source FRAMES [--scale small|gpu|paper] [--rows resunet_undistort segformer_deweather ...]
     [--frames 0] [--groups br_] [--steps 10 50 250] [--sampled 8] [--device cpu] [--threads 2]
-    [--out benchmarks/results/table1_small]
+    [--out benchmarks/results/table1_small] [--options trainer.max_epochs=1 'data.size=[64,112]' --out FOLDER]
 
 Rows with a finished training in `--out` are loaded, stopped trainings are resumed, and the others are started.
 `--frames` frames of the held-out drives are scored; 0 scores all. A diffusion model restores only `--sampled` of them,
 once for each number of steps, and is compared with doing nothing on the same frames. The best constant flow is fitted
-to each effect separately. The score of the mix is the mean over its effects. It is repeated for the frames whose names
+to each effect separately. `--options` of `torchrefract.train` are for all trainings. A line under the tables names the
+commit of each training. The score of the mix is the mean over its effects. It is repeated for the frames whose names
 start with each prefix of `--groups`, and for the remaining frames.
 """
 
@@ -23,7 +24,7 @@ from statistics import median
 from typing import NamedTuple, cast
 
 import torch
-from timing import RESULTS, count, seconds, write_json
+from timing import RESULTS, commit, count, seconds, write_json
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
@@ -64,6 +65,7 @@ METRIC_SIZE = (1080, 1920)  # px, the frame of the paper's endpoint errors
 MIX = "all of the paper's"
 _BATCH = 8
 _ALL = "all"
+_COMMITS = "commits.txt"  # a line for each training that was started or resumed
 _NOTHING = "do nothing"
 _SEED = 1 << 40  # above the seeds of training and validation
 _CONSTANT_DRAWS = 256
@@ -109,14 +111,18 @@ class Line:
 
 def main() -> None:
     """Train or load the models, score them, print the tables and save them."""
-    args = _parser().parse_args()
+    parser = _parser()
+    args = parser.parse_args()
+    if args.options and args.out is None:
+        parser.error("--options needs --out, the folder of trainings with these options")
     args.out = args.out or RESULTS / f"table1_{args.scale}"
+    args.out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(args.threads)
     lines = list[Line]()
     for task in TASKS:
         rows = [row for row in args.rows if row.endswith(task)]
         lines += score_task(task, {row: load_model(train(row, args)) for row in rows}, args)
-    text = format_tables(lines)
+    text = format_tables(lines) + f"\n\n{describe_commits(args.rows, args.out)}"
     print(text)
     write_json(args.out / "table.json", [asdict(line) for line in lines])
     (args.out / "table.md").write_text(text + "\n", encoding="utf-8")
@@ -131,9 +137,18 @@ def train(row: str, args: argparse.Namespace) -> Path:
         finished = args.out / f"{row}_{len(runs)}"
         stopped = next((run / "last.ckpt" for run in reversed(runs) if (run / "last.ckpt").is_file()), None)
         words = [f"+experiment=table1_{row}", f"scale={args.scale}", f"data.root={args.source}"]
-        words += [] if stopped is None else [f"ckpt_path={stopped}"]
+        words += args.options if stopped is None else [*args.options, f"ckpt_path={stopped}"]
+        with (args.out / _COMMITS).open("a", encoding="utf-8") as file:
+            file.write(f"{row} {commit()}\n")
         subprocess.run([sys.executable, "-m", "torchrefract.train", *words, f"hydra.run.dir={finished}"], check=True)
     return finished / "best.ckpt"
+
+
+def describe_commits(rows: Sequence[str], out: Path) -> str:
+    """Name the commits of the trainings of rows in a folder, and that of this command."""
+    lines = (out / _COMMITS).read_text(encoding="utf-8").splitlines() if (out / _COMMITS).is_file() else []
+    commits = {of for row, _, of in (line.partition(" ") for line in lines) if row in rows}
+    return f"trained at commit {', '.join(sorted(commits)) or 'unknown'}, scored at {commit()}"
 
 
 def effects_of(task: str, width: int) -> dict[str, tuple[Effect, bool]]:
@@ -357,6 +372,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--frames", type=count(0), default=0, help="number of held-out frames to score, all")
     parser.add_argument("--steps", type=count(1), nargs="+", default=[10, 50, 250], help="steps of diffusion models")
     parser.add_argument("--sampled", type=count(1), default=8, help="frames that a diffusion model restores, 8")
+    parser.add_argument("--options", nargs="+", default=[], help="of torchrefract.train, for all trainings")
     parser.add_argument("--groups", nargs="+", default=[], help="prefixes of frame names, each scored as a group")
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"), help="device that scores, cpu")
     parser.add_argument("--threads", type=count(1), default=2, help="CPU threads, 2")

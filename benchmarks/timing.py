@@ -137,7 +137,7 @@ class Conditions:
         """Return the conditions of a run that starts now on this frame."""
         return Conditions(
             date=datetime.now(UTC).isoformat(timespec="seconds"),
-            commit=_commit(),
+            commit=commit(),
             device=torch.cuda.get_device_name(frame.device) if frame.device.type == "cuda" else frame.device.type,
             cpu=_cpu(),
             load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
@@ -403,7 +403,8 @@ def _describe(conditions: Conditions) -> str:
     )
 
 
-def _commit() -> str | None:
+def commit() -> str | None:
+    """Return the commit of the working tree, with `-dirty` if files differ from it; None without git."""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
         done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)

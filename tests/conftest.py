@@ -265,6 +265,23 @@ def shifted(known_model) -> Path:
 
 
 @pytest.fixture(scope="session")
+def undecided(tmp_path_factory) -> Path:
+    """Return a diffusion model whose flow points right by 0 widths with a standard deviation of 1/20."""
+    checkpoints = importlib.import_module("torchrefract.restoration.checkpoints")
+    restoration = "torchrefract.restoration"
+    network = {"_target_": f"{restoration}.models.denoiser.LensDenoiser", "_partial_": True, "lenses": 2}
+    model = {"_target_": f"{restoration}.flow_diffusion.FlowDiffusion", "network": network, "components": 1}
+    model["task"] = {"_target_": f"{restoration}.tasks.Undistort"}
+    weights = importlib.import_module("hydra.utils").instantiate(model).state_dict()
+    weights["components"][0, 0] = 1 / 20  # of the constant polynomial; an untrained network knows no more
+    content = {"state_dict": weights, "task": "undistort", "flows": (torch.zeros(0), torch.zeros(0))}
+    content |= {"config": {"model": model}, "data": {"size": [32, 64]}, "licenses": {}}
+    path = tmp_path_factory.mktemp("undecided") / "best.ckpt"
+    checkpoints.AtomicCheckpointIO().save_checkpoint(content, path)
+    return path
+
+
+@pytest.fixture(scope="session")
 def brighter(known_model) -> Path:
     """Return a model that adds 0.2 to red and subtracts 0.1 from blue."""
     return known_model("deweather", (0.2, 0.0, -0.1))

@@ -64,6 +64,13 @@ def test_pictures_keep_their_names_and_sizes_and_are_warped_along_the_flow(call,
         assert (read_image(folder / "out" / name) - expected).abs().max() < 0.51 / 255 + 1e-4
 
 
+def test_the_standard_deviation_of_a_flow_is_printed_in_px_of_the_frames(call, folder, undecided):
+    outcome = call("restore", f"ckpt_path={undecided}", "input=raw/a.png", "out=out")
+    deviation = re.search(r"^standard deviation of the flow: (\d+\.\d) px", outcome.out, re.MULTILINE)
+    assert deviation
+    assert float(deviation[1]) == pytest.approx(96 / 20, rel=0.2)  # of 64 samples
+
+
 def test_pooled_frames_of_a_camera_are_restored_along_one_flow(call, tmp_path, drive, shifted):
     for i, frame in enumerate(drive((-0.16, 0.06), 6)):
         write(tmp_path / "raw" / f"{i}.png", pixels_of(frame)[..., ::-1])

@@ -1,9 +1,11 @@
+import math
 from dataclasses import replace
 
 import lens_estimation
 import pytest
 import torch
 
+from torchrefract.data.video import read_video
 from torchrefract.fields.rectification import camera_flow
 
 
@@ -37,3 +39,14 @@ def test_a_network_that_sees_the_lens_has_rows_without_an_error():
     assert errors["both"] < 0.5 * rows[0].nothing
     assert errors["constant"] == pytest.approx(rows[0].nothing)
     assert errors["lines"] > 0.5 * rows[0].nothing
+
+
+def test_a_clip_pans_behind_a_lens_that_stays_and_jitter_is_in_px_of_1920(tmp_path, monkeypatch):
+    monkeypatch.setattr(lens_estimation, "_RENDERED_SIZE", (54, 96))
+    lens_estimation.render_clip(3, tmp_path / "clip.mp4")
+    first, second, third = (frame for _, frame in read_video(tmp_path / "clip.mp4", range(3)))
+    assert first.shape == (1, 3, 54, 96)
+    assert (first - second).abs().mean() > 0.02
+    assert (second - third).abs().mean() > 0.02
+    flows = [torch.zeros(1, 2, 54, 96), torch.full((1, 2, 54, 96), 3.0), torch.full((1, 2, 54, 96), 3.0)]
+    assert lens_estimation.jitter(flows) == pytest.approx((1920 / 96) * math.hypot(3, 3) / 2)

@@ -100,12 +100,15 @@ def test_a_finished_training_is_loaded_and_the_tables_hold_all_methods(tmp_path,
 def test_a_stopped_training_is_resumed_and_a_missing_one_is_started(tmp_path, monkeypatch):
     commands = []
     monkeypatch.setattr(table1.subprocess, "run", lambda words, check: commands.append(words))
-    args = argparse.Namespace(source=Path("frames"), out=tmp_path, scale="small")
+    args = argparse.Namespace(source=Path("frames"), out=tmp_path, scale="small", options=["trainer.max_epochs=1"])
+    monkeypatch.setattr(table1, "commit", lambda: "abc")
     assert table1.train("ddpm_deweather", args) == tmp_path / "ddpm_deweather_0" / "best.ckpt"
     (tmp_path / "ddpm_deweather_0").mkdir()
     (tmp_path / "ddpm_deweather_0" / "last.ckpt").touch()
     assert table1.train("ddpm_deweather", args) == tmp_path / "ddpm_deweather_1" / "best.ckpt"
     first, second = commands
-    assert {"+experiment=table1_ddpm_deweather", "scale=small"} < {*first}
+    assert {"+experiment=table1_ddpm_deweather", "scale=small", "trainer.max_epochs=1"} < {*first} & {*second}
     assert not any(word.startswith("ckpt_path=") for word in first)
     assert f"ckpt_path={tmp_path / 'ddpm_deweather_0' / 'last.ckpt'}" in second
+    assert table1.describe_commits(["ddpm_deweather"], tmp_path) == "trained at commit abc, scored at abc"
+    assert table1.describe_commits(["resunet_deweather"], tmp_path) == "trained at commit unknown, scored at abc"

@@ -1,4 +1,5 @@
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import pytest
 import torch
@@ -6,102 +7,104 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from torchrefract import LensDistortion
-from torchrefract.restoration.diffusion import NUM_LEVELS
-from torchrefract.restoration.flow_diffusion import FlowDiffusion
-from torchrefract.restoration.models.denoiser import LatticeDenoiser, lattice_size
+from torchrefract import LensDistortion, Pair
+from torchrefract.restoration.flow_diffusion import FlowDiffusion, fit_polynomial
+from torchrefract.restoration.models.coordconv import cell_axes, polynomial_basis
+from torchrefract.restoration.models.denoiser import LensDenoiser
+from torchrefract.restoration.models.lens_net import LENS_FEATURES
 from torchrefract.restoration.tasks import Deweather, Undistort
 
-SIZE = (48, 80)
+SIZE = (24, 40)
+DEVIATIONS = 0.3, 1.0  # of what the frames of the toy problem tell of the strength of their lens
+small = partial(LensDenoiser, weightings=2, lenses=3)
 
 
-class Condition(NamedTuple):
-    guess: Tensor
+class FirstPixel(nn.Module):
+    """Describe a frame by its first pixel."""
+
+    def forward(self, image: Tensor) -> tuple[Tensor, None]:
+        return F.pad(image[:, :, :1, :1], (0, 0, 0, 0, 0, LENS_FEATURES - 3)), None
 
 
-class Known(nn.Module):
-    """A denoiser that knows the target; with a spread, it adds a part of the noise that is left."""
+def toy(first: int, count: int) -> tuple[Pair, Tensor]:
+    """Return lenses of normal strength, which the first pixel tells with a deviation that it tells too.
 
-    def __init__(self, channels: int):
-        super().__init__()
-        self.target, self.spread = torch.zeros(1, channels, 1, 1), 0.0
-
-    def encode(self, image: Tensor) -> Condition:
-        return Condition(self.target.expand(len(image), -1, *lattice_size(image)))
-
-    def forward(self, noisy: Tensor, time: Tensor, condition: Condition) -> Tensor:
-        return condition.guess + self.spread * noisy
-
-
-@pytest.fixture
-def model() -> FlowDiffusion:
-    model = FlowDiffusion(Known, Undistort(0.1), seed=3)
-    model.deviation.fill_(0.05)
-    return model
+    The second value is the mean and the deviation of the flow in the corner given the pixel, by Bayes' rule, (B, 2).
+    """
+    strength, noise = torch.randn(2, count, generator=torch.Generator().manual_seed(first))
+    deviation = torch.tensor(DEVIATIONS)[torch.arange(count) % 2]
+    seen, variance = strength + deviation * noise, deviation.square()
+    image = torch.zeros(count, 3, *SIZE)
+    image[:, :2, 0, 0] = torch.stack([seen, deviation], dim=1)
+    x, y = cell_axes(image, 1)
+    radial = torch.stack([x.expand(SIZE), y[:, None].expand(SIZE)]) * (x.square() + y[:, None].square())
+    unit = radial * torch.tensor([SIZE[1], SIZE[0]]).view(2, 1, 1) / 20  # px
+    valid = torch.ones(count, 1, *SIZE, dtype=torch.bool)
+    posterior = torch.stack([-seen / (1 + variance), (variance / (1 + variance)).sqrt()], dim=1)
+    pair = Pair(image, image, strength.view(-1, 1, 1, 1) * unit, valid, torch.arange(first, first + count))
+    return pair, posterior * unit[0, 0, 0].abs()
 
 
-def test_nodes_hold_the_flow_of_a_lens_to_three_hundredths(model, make_batches):
-    size = (96, 160)
-    batch = make_batches(LensDistortion(), 2, size=size)[0]
-    target, valid = model._encode(batch)
-    assert target.shape[2:] == valid.shape[2:] == (7, 11)
-    assert 0.1 < target.abs().mean() < 10  # about unit deviation
-    decoded = model._decode(target, batch.degraded)
-    # A cubic through a node whose flow is unknown is wrong up to two nodes away.
-    inner = -F.max_pool2d(-valid.float(), 3, stride=1, padding=1)
-    known = F.interpolate(inner, size, mode="bilinear", align_corners=True) == 1
-    error = (decoded - batch.flow).norm(dim=1, keepdim=True)[batch.valid & known]
-    assert known.float().mean() > 0.1
-    assert error.mean() < 0.03 * batch.flow.norm(dim=1)[batch.valid[:, 0]].mean()
-
-
-def test_samples_of_a_known_flow_are_it_without_a_spread(model):
-    model.network.target = torch.tensor([0.7, -0.4]).view(1, 2, 1, 1)
-    image = torch.rand(2, 3, *SIZE)
-    flow, deviation = model.flow_and_deviation(image, torch.tensor([5, 6]))
-    assert_close(flow[:, 0], torch.full((2, *SIZE), 0.7 * 0.05 * 80), rtol=1e-3, atol=0)
-    assert_close(flow[:, 1], torch.full((2, *SIZE), -0.4 * 0.05 * 48), rtol=1e-3, atol=0)
-    assert deviation.max() < 1e-3
-    assert_close(model(image, torch.tensor([5, 6])).flow, flow)
-
-
-def test_a_sample_depends_on_its_key_alone_and_noise_shows_in_the_deviation(model):
-    model.network.spread = 0.5
-    image = torch.rand(3, 3, *SIZE)
-    flow, deviation = model.flow_and_deviation(image, torch.tensor([5, 6, 7]))
-    alone, _ = model.flow_and_deviation(image[2:], torch.tensor([7]))
-    assert_close(alone, flow[2:], rtol=1e-4, atol=1e-4)
-    assert deviation.mean() > 1e-3
-    model.samples = 1
-    assert not model.flow_and_deviation(image, torch.tensor([5, 6, 7]))[1].any()
-
-
-def test_the_noise_is_the_shift_times_that_of_the_cosine_schedule():
-    levels, plain = (FlowDiffusion(Known, Undistort(0.1), shift=s).levels.alphas_cumprod for s in (16.0, 1.0))
-    ratio = ((1 - levels) / levels / ((1 - plain) / plain)).sqrt()
-    assert len(levels) == NUM_LEVELS
-    assert_close(ratio[10:900], torch.full((890,), 16.0), rtol=1e-2, atol=0)
-
-
-def test_an_untrained_denoiser_predicts_no_flow_and_every_size_fits():
+@pytest.mark.filterwarnings("ignore:.*does not have many workers", "ignore:.*LeafSpec")
+def test_two_deviations_of_a_lens_of_known_posterior_cover_95_percent_in_4_steps(trainer, loader):
     torch.manual_seed(0)
-    network = LatticeDenoiser(2, widths=(32, 32), weightings=2, lenses=3).eval()
-    for size in (SIZE, (33, 97)):
-        image = torch.rand(2, 3, *size)
-        noisy = torch.randn(2, 2, *lattice_size(image))
-        predicted = network(noisy, torch.tensor([3, 900]), network.encode(image))
-        assert predicted.shape == noisy.shape
-        assert not predicted.any()
+    model = FlowDiffusion(small, Undistort(0.25), components=1, ema_decay=0.98, lr=1e-2)
+    model.network.encoder = FirstPixel()
+    run, (pair, posterior) = trainer(max_epochs=1), toy(10**6, 600)
+    run.fit(model, loader([toy(64 * i, 64)[0] for i in range(250)]), loader([pair]))
+    assert float(run.callback_metrics["val/coverage"]) == pytest.approx(0.95, abs=0.03)
+    restored = model.eval()(pair.degraded, pair.key)
+    assert restored.flow is not None
+    assert restored.deviation is not None
+    covered = (restored.flow - pair.flow).abs() <= 2 * restored.deviation
+    for rows in (slice(0, None, 2), slice(1, None, 2)):
+        assert float(covered[rows].float().mean()) == pytest.approx(0.95, abs=0.05)
+        mean, deviation = restored.flow[rows, 0, 0, 0], restored.deviation[rows, 0, 0, 0]
+        assert float(deviation.mean()) == pytest.approx(float(posterior[rows, 1].mean()), rel=0.2)
+        assert (mean - posterior[rows, 0]).square().mean().sqrt() < 0.7 * posterior[rows, 1].mean()
+
+
+def test_coefficients_hold_the_flow_of_a_lens_also_where_it_is_not_valid(make_batches):
+    batch = make_batches(LensDistortion(), 2, size=(96, 160))[0]
+    coefficients = fit_polynomial(batch).unflatten(1, (2, -1))
+    flow = torch.einsum("bct,thw->bchw", coefficients, polynomial_basis(*cell_axes(batch.flow, 1)))
+    error = (flow * torch.tensor([160.0, 96.0]).view(2, 1, 1) - batch.flow).norm(dim=1, keepdim=True)
+    assert batch.valid.float().mean() < 0.99
+    assert error[batch.valid].mean() < 0.03 * batch.flow.norm(dim=1)[batch.valid[:, 0]].mean()
+
+
+def test_a_sample_depends_on_its_key_alone_and_a_single_one_has_no_deviation():
+    torch.manual_seed(0)
+    model = FlowDiffusion(small, Undistort(0.1), components=3, samples=5, seed=3).eval()
+    nn.init.normal_(model.components, std=0.01)
+    image = torch.rand(3, 3, *SIZE)
+    restored, alone = model(image, torch.tensor([5, 6, 7])), model(image[2:], torch.tensor([7]))
+    for value, same in ((restored.flow, alone.flow), (restored.deviation, alone.deviation)):
+        assert_close(same, value[2:], rtol=1e-4, atol=1e-4)
+        assert value.abs().mean() > 1e-3
+    with torch.autocast("cpu", torch.bfloat16):
+        assert_close(model(image, torch.tensor([5, 6, 7])).flow, restored.flow, rtol=1e-3, atol=1e-4)
+    model.samples = 1
+    assert not model(image).deviation.any()
+
+
+def test_an_untrained_denoiser_knows_only_that_the_numbers_are_standard_normal():
+    torch.manual_seed(0)
+    network = small(4).eval()
+    noisy, share = torch.randn(2, 5, 4), torch.tensor([0.1, 0.3, 0.5, 0.7, 0.9]).view(1, 5, 1).expand(2, -1, -1)
+    mean, deviation = network(noisy, share, network.encode(torch.rand(2, 3, 33, 97)))
+    assert_close(mean, share.sqrt() * noisy)  # of z given sqrt(a) z + sqrt(1 - a) noise
+    assert_close(deviation, (1 - share).sqrt().expand_as(noisy))
 
 
 def test_another_task_and_invalid_numbers_raise():
     with pytest.raises(TypeError, match="task must be Undistort for FlowDiffusion: add model=ddpm_image"):
-        FlowDiffusion(Known, Deweather())
+        FlowDiffusion(small, Deweather())
     invalid: list[tuple[dict[str, Any], str]] = [
         ({"steps": 1001}, "steps must be at most"),
         ({"samples": 0}, "samples must"),
-        ({"shift": 0.0}, "shift must"),
+        ({"components": 43}, "components must be at most 42, got 43"),
     ]
     for options, rule in invalid:
         with pytest.raises(ValueError, match=rule):
-            FlowDiffusion(Known, Undistort(0.1), **options)
+            FlowDiffusion(small, Undistort(0.1), **options)

@@ -11,6 +11,7 @@ from torchrefract import LensFlare, UniformFog, remove_fog
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract.data.module import make_pair
 from torchrefract.restoration.metrics import (
+    coverage,
     endpoint_error,
     masked_mean,
     psnr,
@@ -124,3 +125,18 @@ def test_the_true_fog_restores_as_remove_fog_does_in_float64_and_leaves_a_flare(
     assert error[valid.expand_as(error)].max() <= 0.5 / 255 + 1e-7
     flare = make_pair(frame, LensFlare(), seed=1)._replace(transmission=torch.ones_like(frame.image[:, :1]))
     assert torch.equal(restore_by_transmission(flare), to_float(to_uint8(flare.degraded)).double())
+
+
+def test_two_standard_deviations_of_a_normal_flow_cover_95_percent_of_its_valid_values():
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(2, 2, 80, 90, generator=generator)
+    deviation = torch.rand(2, 2, 80, 90, generator=generator)
+    flow = torch.full_like(noise, 3.0)
+    valid = torch.ones(2, 1, 80, 90, dtype=torch.bool)
+    valid[:, :, :40] = False
+    noise[:, :, :40] = 9.0  # where it is not valid
+    expected = math.erf(2 / math.sqrt(2))
+    assert coverage(flow, deviation, flow + deviation * noise, valid).tolist() == pytest.approx(
+        [expected] * 2, abs=0.01
+    )
+    assert coverage(flow, 0 * deviation, flow + deviation * noise, valid).tolist() == [0, 0]

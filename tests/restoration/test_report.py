@@ -235,6 +235,10 @@ def test_the_table_compares_the_model_with_the_baselines():
     assert len(summary(scores(epe=0.0, epe_constant=0.0, epe_identity=0.0), (1080, 1920))) == 4
     stopped = {name: value for name, value in scores().items() if "ssim" not in name}
     assert [line.split()[-6] for line in words(summary(stopped, (1080, 1920))[1:])] == ["nan"] * 3
+    covered = words(summary(scores(coverage=0.934), (1080, 1920)))[-1]
+    assert (
+        covered == "model 93% of the values of the flow within two predicted standard deviations; 95% if they are right"
+    )
     head, *lines = summary(without_flow(), (1080, 1920))
     assert "endpoint" not in head
     assert "L_k" not in head

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext, suppress
 from itertools import islice
 from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -133,6 +134,8 @@ def _restore_missing(files: Sequence[Path], job: "_Job", out: Path) -> None:
     rate = num_frames / (time.perf_counter() - start)
     num_restored, num_existing = len(todo) - len(failed), len(files) - len(todo)
     print(f"{out}: {num_restored} restored, {num_existing} already existed, {len(failed)} skipped")
+    if deviations := job.restorer.deviations:
+        print(f"standard deviation of the flow: {median(deviations):.1f} px, root mean square, median of the frames")
     print(f"{num_frames} frames, {rate:.3g} frames a second on {job.device}")
     check_none_lost([str(error) for error in failed.values() if is_lost(error)])
 

@@ -291,7 +291,7 @@ def target_of(task: Task) -> Target:
 
 
 def normal(source: Stream, like: Tensor) -> Tensor:
-    """Draw standard normal noise in the shape (B, C, H, W) of `like`; each sample depends only on its own stream."""
+    """Draw standard normal noise in the shape (B, ...) of `like`; each sample depends only on its own stream."""
     count = like[0].numel()
     pairs = white_noise(noise_key(source).to(like.device), -(-count // 2))
     return pairs.flatten(1)[:, :count].view_as(like)
@@ -304,22 +304,21 @@ def sample(
     *,
     name: str,
     steps: int,
-    betas: Tensor | None = None,
+    schedule: str = "linear",
 ) -> Tensor:
     """Sample a target from noise. "ddpm" adds noise after each step, "dpm_solver" takes steps of second order.
 
     Args:
-        start: (B, C, H, W), standard normal; the target has the same shape.
+        start: (B, ...), standard normal; the target has the same shape.
         predict_target: predicts the target from a noisy one and its level (B,).
         source: stream of the noise of "ddpm".
         name, steps: as for `Diffusion`.
-        betas: variances of the levels, (1000,); None for those of `Diffusion`.
+        schedule: of the variances of the levels, a name of diffusers.
 
     Source: Ho et al. as for `Diffusion`; Song, Meng, Ermon, "Denoising diffusion implicit models", ICLR 2021; Lu et
     al., "DPM-Solver++", 2022.
     """
-    schedule = {"beta_schedule": "linear"} if betas is None else {"trained_betas": betas.cpu().numpy()}
-    options: dict[str, Any] = {"prediction_type": "sample", **schedule}
+    options: dict[str, Any] = {"prediction_type": "sample", "beta_schedule": schedule}
     if check_choice("sampler", name, SAMPLERS) == "ddpm":
         scheduler = DDPMScheduler(NUM_LEVELS, clip_sample=False, **options)
     else:

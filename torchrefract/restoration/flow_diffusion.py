@@ -1,47 +1,52 @@
-"""Diffusion of a smooth flow on a lattice, given the whole frame: `model=ddpm`."""
+"""Diffusion of the numbers of a lens, given the frame, which gives its flow and a deviation: `model=ddpm`."""
 
 from collections.abc import Callable, Sequence
+from itertools import count
 from typing import Any, cast
 
 import torch
-import torch.nn.functional as F
 from diffusers import DDPMScheduler
-from diffusers.schedulers.scheduling_ddpm import betas_for_alpha_bar
 from torch import Tensor, nn
 
 from torchrefract._tensor import as_device_tensor
-from torchrefract._validation import check_count, check_positive
-from torchrefract.random import uniform
+from torchrefract._validation import check_count
+from torchrefract.random import Stream, uniform
 from torchrefract.restoration.diffusion import NUM_LEVELS, AveragedRestoration, check_steps, normal, sample
-from torchrefract.restoration.metrics import masked_mean
-from torchrefract.restoration.models.denoiser import lattice_size
+from torchrefract.restoration.models.coordconv import NUM_TERMS, cell_axes, full_precision, polynomial_basis
 from torchrefract.restoration.tasks import Restored, Task, Undistort
 from torchrefract.types import Pair
 from torchrefract.warping.warp import warp
 
+_SCHEDULE = "squaredcos_cap_v2"  # the cosine of diffusers
+_STRIDE = 4  # px, between the pixels that tell the coefficients of a flow
+_NUM_NOISY = 8  # noisy versions of each sample in a step
+_RIDGE = 1e-6  # of the number of pixels: a frame with few valid pixels has small coefficients
+_WEAKEST = 1e-2  # of the strongest component, the least deviation that a component is divided by
+
 
 class FlowDiffusion(AveragedRestoration):
-    """Train a conditional diffusion model of the flow that undoes a warp.
+    """Train a conditional diffusion model of the flow that undoes a lens.
 
-        noisy = sqrt(a) target + sqrt(1 - a) noise
-        loss = mean |predicted target - target|, over valid nodes
-        a / (1 - a) = c / (1 - c) / shift^2,  c of the cosine schedule with 1000 levels
+        flow = (W, H) sum_t c_t basis_t,  c = mean + sum_i z_i component_i,  noisy = sqrt(a) z + sqrt(1 - a) noise
+        loss = mean ((z - predicted mean) / predicted deviation)^2 / 2 + log predicted deviation
 
-    The target is the flow at the nodes of a lattice, in shares of width and height, divided by its root mean square in
-    the first batch. The network predicts it from the whole frame, see `LatticeDenoiser`. DDIM samples it in few steps.
-    The mean of some samples is the restoration. Their spread is no measured uncertainty: after short trainings, all
-    samples of a frame are alike, and so is their error.
+    The coefficients c of the flow are those of `polynomial_basis`, over valid pixels. Their mean and principal
+    components in the first batch, scaled to unit deviation, turn them into a few numbers z. The network predicts the
+    mean and the deviation of z from noisy ones at a level of the cosine schedule and from the frame, see
+    `LensDenoiser`.
 
-    A lens is a few numbers, which every node shows. Therefore the noise of one number is smaller than that of a node by
-    about the square root of their count, and without `shift` a noisy target would tell the lens at nearly all levels.
+    A step of the sampler draws z from the predicted distribution, and then the noisy z of the next level given both.
+    Without the predicted deviation, few steps would draw samples that are too much alike. The mean of the samples of a
+    frame is the restoration, and their standard deviation its uncertainty. That is as good as the training:
+    `val/coverage` is the share of the flow within two deviations on the validation frames, 0.95 if they are right.
 
     Args:
-        network: builds the network from the number of channels of the target, see `LatticeDenoiser`.
+        network: builds the network from the number of components, see `LensDenoiser`.
         task: Undistort.
         lr, weight_decay, warmup_steps, schedule, metric_size: see `RestorationModule`.
-        steps: steps of DDIM, from 1 to 1000.
-        samples: number of samples that are averaged; the deviation needs at least 2.
-        shift: factor of the noise over that of the cosine schedule, about the square root of the number of nodes.
+        components: number of principal components, at most 42; an ordinary lens has fewer than 8.
+        steps: steps of the sampler, from 1 to 1000.
+        samples: number of samples of each frame; the deviation needs at least 2.
         ema_decay, seed: see `AveragedRestoration`.
 
     Raises:
@@ -49,26 +54,26 @@ class FlowDiffusion(AveragedRestoration):
         TypeError: the task is not Undistort.
 
     Source: Ho, Jain, Abbeel, "Denoising diffusion probabilistic models", NeurIPS 2020; Nichol, Dhariwal, "Improved
-    denoising diffusion probabilistic models", ICML 2021, for the cosine; Hoogeboom, Heek, Salimans, "simple diffusion",
-    ICML 2023, for the shift; Saxena et al., "The surprising effectiveness of diffusion models for optical flow and
-    monocular depth estimation", NeurIPS 2023, for a flow with an L1 loss.
+    denoising diffusion probabilistic models", ICML 2021, for the cosine; Bao, Li, Sun, Zhu, Zhang, "Estimating the
+    optimal covariance with imperfect mean in diffusion probabilistic models", ICML 2022, for the deviation.
     """
 
-    deviation: Tensor
+    center: Tensor
+    components: Tensor
 
     def __init__(
         self,
         network: Callable[[int], nn.Module],
         task: Task,
         *,
-        lr: float = 2e-3,
+        lr: float = 4e-3,
         weight_decay: float = 1e-2,
         warmup_steps: int = 50,
         schedule: str = "cosine",
         metric_size: Sequence[int] = (1080, 1920),
+        components: int = 8,
         steps: int = 4,
-        samples: int = 8,
-        shift: float = 16.0,
+        samples: int = 64,
         ema_decay: float = 0.999,
         seed: int = 0,
     ):
@@ -77,44 +82,43 @@ class FlowDiffusion(AveragedRestoration):
                 "task must be Undistort for FlowDiffusion: add model=ddpm_image for the diffusion of an image, got "
                 f"{type(task).__name__}"
             )
+        num_coefficients = task.channels * NUM_TERMS
+        if check_count("components", components) > num_coefficients:
+            raise ValueError(f"components must be at most {num_coefficients}, got {components}")
         options: dict[str, Any] = {"lr": lr, "weight_decay": weight_decay, "warmup_steps": warmup_steps}
         options |= {"schedule": schedule, "metric_size": metric_size, "ema_decay": ema_decay, "seed": seed}
-        super().__init__(network(task.channels), task, **options)
+        super().__init__(network(components), task, **options)
         self.steps, self.samples = check_steps("steps", steps), check_count("samples", samples)
-        self.betas = _shifted_cosine(check_positive("shift", shift))
-        self.levels = DDPMScheduler(NUM_LEVELS, trained_betas=self.betas.numpy())
-        self.register_buffer("deviation", torch.zeros(2))  # of the flow, in shares of width and height
-
-    def forward(self, degraded: Tensor, key: Tensor | None = None) -> Restored:
-        """Restore images (B, 3, H, W) in [0, 1] by the mean of the samples; see `RestorationModule.forward`."""
-        flow = self.flow_and_deviation(degraded, key)[0]
-        return Restored(warp(degraded, flow, padding="border")[0], flow)
+        self.levels = DDPMScheduler(NUM_LEVELS, beta_schedule=_SCHEDULE)
+        # Of the coefficients, in shares of width and height; components are scaled to the deviation along them.
+        self.register_buffer("center", torch.zeros(num_coefficients))
+        self.register_buffer("components", torch.zeros(components, num_coefficients))
 
     @torch.no_grad()
-    def flow_and_deviation(self, degraded: Tensor, key: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Sample flows, and return their mean (B, 2, H, W) and standard deviation per axis (B, 2, H, W), px.
+    def forward(self, degraded: Tensor, key: Tensor | None = None) -> Restored:
+        """Restore images (B, 3, H, W) in [0, 1] by the mean of the samples, with the deviation of the flow, px.
 
-        The deviation is 0 for one sample. The arguments are those of `forward`.
+        The deviation is 0 for one sample. The key is that of `RestorationModule.forward`.
         """
         key = torch.zeros(len(degraded), dtype=torch.int64) if key is None else key
-        source = self._stream(key, 0)
-        condition = cast(Any, self.network).encode(degraded)
-        like = condition.guess.repeat(1, self.samples, 1, 1)
-        # All samples of an image are in its noise, so that they depend on its key alone.
-        start = normal(source.at(3), like).unflatten(1, (self.samples, -1)).flatten(0, 1)
-        repeated = type(condition)(*(part.repeat_interleave(self.samples, dim=0) for part in condition))
-
-        def predict_target(noisy: Tensor, time: Tensor) -> Tensor:
-            return self.network(noisy, time, repeated)
-
-        target = sample(start, predict_target, source, name="ddim", steps=self.steps, betas=self.betas)
-        flows = self._decode(target, degraded).unflatten(0, (-1, self.samples))
-        return flows.mean(dim=1), flows.std(dim=1, correction=int(self.samples > 1))
+        numbers = self._sample(cast(Any, self.network).encode(degraded), self._stream(key, 0))
+        mean = numbers.mean(dim=1)
+        rest = numbers - mean[:, None]
+        with full_precision(degraded):
+            basis = polynomial_basis(*cell_axes(degraded, 1))
+            coefficients = torch.cat([self.center[None], self.components]).unflatten(1, (2, -1))
+            maps = _sides(degraded) * torch.einsum("kct,thw->kchw", coefficients, basis)  # px
+            center, maps = maps[0], maps[1:]
+            flow = center + torch.einsum("bk,kchw->bchw", mean, maps)
+            covariance = rest.mT @ rest / max(1, self.samples - 1)
+            variance = (torch.einsum("bkl,lchw->bkchw", covariance, maps) * maps).sum(dim=1)
+        deviation = variance.clamp(min=0).sqrt()
+        return Restored(warp(degraded, flow, padding="border")[0], flow, deviation=deviation)
 
     def training_loss(self, batch: Pair) -> tuple[Tensor, None]:
-        """Compute the loss at a random level for each sample; each step has its own draws."""
-        if not self.deviation.any():
-            self.deviation.copy_(self._root_mean_square(batch))
+        """Compute the loss at random levels for each sample; each step has its own draws."""
+        if not self.components.any():
+            self._find_components(batch)
         return self._loss(batch, 1 + self.global_step), None
 
     def validation_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
@@ -122,43 +126,63 @@ class FlowDiffusion(AveragedRestoration):
         return self._loss(batch, 0), self(batch.degraded, batch.key)
 
     def _loss(self, batch: Pair, step: int) -> Tensor:
-        source = self._stream(batch.key, step)
-        target, valid = self._encode(batch)
-        noise = normal(source.at(1), target)
-        time = (uniform(source.at(2), 1)[:, 0] * NUM_LEVELS).long()
-        noisy = self.levels.add_noise(target, noise, time)  # pyright: ignore[reportArgumentType]  # takes any int tensor
-        predicted = self.network(noisy, time, cast(Any, self.network).encode(batch.degraded))
-        return masked_mean((predicted - target).abs(), valid).mean()
+        source, features = self._stream(batch.key, step), cast(Any, self.network).encode(batch.degraded)
+        variance = self.components.square().sum(dim=1)
+        with full_precision(batch.flow):
+            numbers = (fit_polynomial(batch) - self.center) @ self.components.mT / variance
+        numbers = numbers[:, None].expand(-1, _NUM_NOISY, -1)
+        # One level in each of equal parts of the range, so that the loss varies less from step to step.
+        parts = torch.arange(_NUM_NOISY, device=numbers.device)
+        time = ((uniform(source.at(2), _NUM_NOISY) + parts) * (NUM_LEVELS / _NUM_NOISY)).long()
+        share = self._share(time)
+        noisy = share.sqrt() * numbers + (1 - share).sqrt() * normal(source.at(1), numbers)
+        mean, deviation = self.network(noisy, share, features)
+        loss = ((numbers - mean) / deviation).square() / 2 + deviation.log()
+        return (loss.mean(dim=(1, 2)) * batch.valid.flatten(1).any(dim=1)).mean()
 
-    def _root_mean_square(self, batch: Pair) -> Tensor:
-        """Return the root mean square of the valid flow in shares of width and height, (2,), over all ranks."""
-        share = torch.where(batch.valid, batch.flow, 0.0) / _sides(batch.flow)
-        mean = share.square().sum(dim=(0, 2, 3)) / batch.valid.sum().clamp(min=1)
-        return self.trainer.strategy.reduce(mean, reduce_op="mean").sqrt().clamp(min=1e-6)
+    def _sample(self, features: Tensor, source: Stream) -> Tensor:
+        """Draw the numbers of the lens, (B, samples, components)."""
+        # All samples of an image are in its noise, so that they depend on its key alone.
+        start = normal(source.at(3), self.components[:, :1].T.expand(len(features), self.samples, -1))
+        lanes = count(5)
 
-    def _encode(self, pair: Pair) -> tuple[Tensor, Tensor]:
-        """Return the target at the nodes, (B, 2, h, w), and its validity, (B, 1, h, w)."""
-        flow = torch.where(pair.valid, pair.flow, 0.0)
-        scaled = flow / (_sides(flow) * self.deviation.view(1, 2, 1, 1))
-        maps = torch.cat([scaled, pair.valid.to(flow)], dim=1)
-        maps = F.interpolate(maps, lattice_size(flow), mode="bilinear", align_corners=True)
-        return maps[:, :2], maps[:, 2:] > 1 - 1e-3
+        def draw(noisy: Tensor, time: Tensor) -> Tensor:
+            share = self._share(time[:, None].expand(-1, self.samples))
+            mean, deviation = self.network(noisy, share, features)
+            return mean + deviation * normal(source.at(next(lanes)), noisy)
 
-    def _decode(self, target: Tensor, degraded: Tensor) -> Tensor:
-        """Interpolate the target to a flow, px, of the size of the images."""
-        flow = F.interpolate(target, degraded.shape[2:], mode="bicubic", align_corners=True)
-        return flow * (_sides(flow) * self.deviation.view(1, 2, 1, 1))
+        return sample(start, draw, source.at(4), name="ddpm", steps=self.steps, schedule=_SCHEDULE)
+
+    def _share(self, time: Tensor) -> Tensor:
+        """Return a of the class docstring, (B, K, 1), at levels (B, K)."""
+        return self.levels.alphas_cumprod.to(time.device)[time][..., None]
+
+    def _find_components(self, batch: Pair) -> None:
+        """Find the mean and the principal components of the coefficients of a batch, over all ranks."""
+        coefficients = fit_polynomial(batch).double()  # autocast leaves doubles as they are
+        reduce = self.trainer.strategy.reduce
+        mean = reduce(coefficients.mean(dim=0), reduce_op="mean")
+        rest = coefficients - mean
+        values, vectors = torch.linalg.eigh(reduce(rest.mT @ rest / len(rest), reduce_op="mean"))
+        deviation = values.clamp(min=0).sqrt().flip(0)[: len(self.components)]
+        deviation = deviation.clamp(min=float((_WEAKEST * deviation[0]).clamp(min=1e-6)))
+        self.center.copy_(mean)
+        self.components.copy_(deviation[:, None] * vectors.T.flip(0)[: len(self.components)])
+
+
+def fit_polynomial(pair: Pair) -> Tensor:
+    """Fit polynomials to the valid flows of pairs, in shares of width and height; return coefficients (B, 2 * 21)."""
+    flow, valid = (
+        value[:, :, ::_STRIDE, ::_STRIDE].flatten(2) for value in (pair.flow / _sides(pair.flow), pair.valid)
+    )
+    basis = polynomial_basis(*cell_axes(pair.flow, 1))[:, ::_STRIDE, ::_STRIDE].flatten(1).double()
+    weighted = basis * valid  # (B, 21, n)
+    ridge = _RIDGE * basis.shape[1] * torch.eye(NUM_TERMS, dtype=basis.dtype, device=basis.device)
+    sums = weighted @ torch.where(valid, flow, 0.0).mT.double()
+    return torch.linalg.solve(weighted @ basis.T + ridge, sums).mT.flatten(1).to(pair.flow)
 
 
 def _sides(flow: Tensor) -> Tensor:
     """Return width and height, (1, 2, 1, 1)."""
     sides = [flow.shape[3], flow.shape[2]]
     return as_device_tensor(sides, dtype=flow.dtype, device=flow.device).view(1, 2, 1, 1)
-
-
-def _shifted_cosine(shift: float) -> Tensor:
-    """Return the betas of the cosine schedule with `shift` times the noise, (1000,)."""
-    share = torch.cumprod(1 - betas_for_alpha_bar(NUM_LEVELS).double(), dim=0)
-    share = share / (share + (1 - share) * shift**2)
-    before = torch.cat([torch.ones(1, dtype=torch.float64), share[:-1]])
-    return (1 - share / before).clamp(max=0.999).float()

@@ -25,7 +25,8 @@ class Restorer:
 
     The model sees each picture resized to `size`. If it predicts a flow, the flow is resized to the picture, which is
     warped once. Otherwise its change is brought to the picture by `transfer_change`. With `tile` the model sees tiles
-    of the picture at its own size instead, see `restore_tiles`.
+    of the picture at its own size instead, see `restore_tiles`. If the model predicts the standard deviation of the
+    flow, its root mean square over each picture, px, is added to the list `deviations`.
 
     Args:
         model: maps images (B, 3, H, W) in [0, 1] to `Restored`.
@@ -52,6 +53,7 @@ class Restorer:
         self.tile = None if tile is None else check_size("tile", tile)
         self.interpolation = check_choice("interpolation", interpolation, INTERPOLATIONS)
         self.batch = check_count("batch", batch)
+        self.deviations: list[float] = []  # px, of each picture
 
     @torch.inference_mode()
     def __call__(self, images: Sequence[Tensor]) -> list[Tensor]:
@@ -63,6 +65,10 @@ class Restorer:
         restored = self.model(small)
         flows = [None] * len(images) if restored.flow is None else restored.flow.split(1)
         parts = zip(images, small.split(1), map(Restored, restored.image.split(1), flows), strict=True)
+        if restored.deviation is not None:
+            for image, deviation in zip(images, restored.deviation, strict=True):
+                full = resize_flow(deviation[None], image.shape[1:])
+                self.deviations.append(full.square().sum(dim=1).mean().sqrt().item())
         return [
             at_full_size(one, image[None], small=before, interpolation=self.interpolation).image[0]
             for image, before, one in parts

@@ -74,3 +74,11 @@ def endpoint_error(flow: Tensor, target: Tensor, valid: Tensor, *, size: tuple[i
     scale = [size[1] / flow.shape[3], size[0] / flow.shape[2]]
     difference = (flow - target) * torch.tensor(scale, dtype=flow.dtype, device=flow.device).view(1, 2, 1, 1)
     return masked_mean(difference.square().sum(dim=1, keepdim=True).sqrt(), valid)
+
+
+def coverage(flow: Tensor, deviation: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+    """Compute the share (B,) of the values of `target` within two standard deviations of `flow`, each (B, 2, H, W).
+
+    It is 0.95 for a normal distribution with this deviation.
+    """
+    return masked_mean(((flow - target).abs() <= 2 * deviation).to(flow), valid)

@@ -13,7 +13,7 @@ from torch.optim.lr_scheduler import ReduceLROnPlateau
 
 from torchrefract._validation import UsageError, check_choice, check_count, check_number, check_size
 from torchrefract.restoration.checkpoints import rename_weights
-from torchrefract.restoration.metrics import endpoint_error, psnr, restore_by_transmission, ssim, through_fog
+from torchrefract.restoration.metrics import coverage, endpoint_error, psnr, restore_by_transmission, ssim, through_fog
 from torchrefract.restoration.tasks import Restored, Task
 from torchrefract.types import Pair
 from torchrefract.warping.warp import warp
@@ -237,6 +237,7 @@ def restoration_scores(
         psnr_seen: dB, over the pixels of `through_fog`, for a pair with a transmission.
         ssim: at most 1; missing unless `with_ssim`.
         epe: endpoint error, px of `metric_size` = (height, width).
+        coverage: share of the values of the flow within two standard deviations, for a restoration that has them.
     """
     reconstruction, of_map = task.loss_terms(restored, pair)
     losses = {"L": reconstruction, "L_rec": reconstruction}
@@ -250,6 +251,8 @@ def _main_scores(restored: Restored, pair: Pair, metric_size: tuple[int, int]) -
     scores = {"psnr": psnr(restored.image.detach(), pair.clean, pair.valid)}
     if restored.flow is not None:
         scores["epe"] = endpoint_error(restored.flow.detach(), pair.flow, pair.valid, size=metric_size)
+        if restored.deviation is not None:
+            scores["coverage"] = coverage(restored.flow, restored.deviation, pair.flow, pair.valid)
     elif pair.transmission.ndim == 4:
         scores["psnr_seen"] = psnr(restored.image.detach(), pair.clean, through_fog(pair))
     return scores

@@ -28,7 +28,7 @@ def pretrained(name: str) -> "Loaded":
     """Load a model that comes with torchrefract.
 
         loaded = torchrefract.pretrained("lens_small")
-        restored, flow, _ = loaded.model(resize(image, loaded.size))
+        restored = loaded.model(resize(image, loaded.size))  # restored.image, restored.flow
 
     The commands take the same name: `python -m torchrefract.restore ckpt_path=lens_small`. A card, in the folder
     `torchrefract/restoration/weights`, states the data, the license, the scores and the limits of each model.

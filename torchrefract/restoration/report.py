@@ -178,6 +178,9 @@ def summary(metrics: Mapping[str, Tensor], metric_size: tuple[int, int], *, bord
             epe = values[f"epe{suffix}"]
             line += f"{epe:.2f} ({epe / max(values['epe_identity'], 1e-9):.2f} x do nothing)".rjust(40)
         lines.append(line)
+    if "coverage" in values:
+        share = f"{values['coverage']:.0%} of the values of the flow within two predicted standard deviations"
+        lines.append(f"{'model':<{_NAME_WIDTH}}{share}; 95% if they are right")
     return lines
 
 

@@ -22,6 +22,7 @@ class Restored(NamedTuple):
     image: Tensor  # (B, 3, H, W)
     flow: Tensor | None = None  # (B, 2, H, W), px
     transmission: Tensor | None = None  # (B, 1, H, W), in (0, 1)
+    deviation: Tensor | None = None  # (B, 2, H, W), px, the standard deviation of the flow, of a model that samples
 
 
 class Task(ABC):

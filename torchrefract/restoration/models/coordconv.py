@@ -25,6 +25,8 @@ from torchrefract.warping.grid import pixel_axes
 _STRIDE = 32
 _MEAN, _STD = [0.5] * 3, [0.25] * 3  # of colors, for an encoder without pretrained weights
 _DEGREE = 5  # a lens with k1 and k2 has terms of degree 3 and 5
+_TERMS = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+NUM_TERMS = len(_TERMS)
 _HIDDEN = 256
 _HUB = "imagenet"
 _CONFIG, _TENSORS = "config.json", "model.safetensors"
@@ -152,11 +154,9 @@ class SegFormer(CoordConvSegmenter):
 class PolynomialFlowHead(nn.Module):
     """Predict smooth maps of the whole frame from its coarsest features.
 
-        map(x, y) = sum over i + j <= 5 of c_ij T_i(x) T_j(y),  T_n(x) = cos(n arccos(x))
-
-    with x and y as of `pixel_coordinates`. Two layers compute the 21 coefficients c_ij of each channel from the mean
-    and the maximum of each feature. The coefficients start at zero. The flow of a lens is such a map, and every pixel
-    carries a little evidence for it.
+    Two layers compute the coefficients of each map in the basis of `polynomial_basis` from the mean and the maximum of
+    each feature. The coefficients start at zero. The flow of a lens is such a map, and every pixel carries a little
+    evidence for it.
 
     Args:
         features: number of feature channels.
@@ -166,8 +166,7 @@ class PolynomialFlowHead(nn.Module):
     def __init__(self, features: int, channels: int):
         super().__init__()
         self.channels = channels
-        self.terms = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-        last = nn.Linear(_HIDDEN, channels * len(self.terms))
+        last = nn.Linear(_HIDDEN, channels * NUM_TERMS)
         for parameter in last.parameters():
             nn.init.zeros_(parameter)
         self.layers = nn.Sequential(nn.Linear(2 * features, _HIDDEN), nn.SiLU(), last)
@@ -176,10 +175,17 @@ class PolynomialFlowHead(nn.Module):
         """Evaluate the maps (B, channels, H, W), float32, from features (B, F, h, w) at x (W,) and y (H,)."""
         flat = features.float().flatten(2)
         pooled = torch.cat([flat.mean(dim=2), flat.amax(dim=2)], dim=1)
-        basis = torch.stack([_chebyshev(y, j)[:, None] * _chebyshev(x, i) for i, j in self.terms])
         with full_precision(features):
-            coefficients = self.layers(pooled).unflatten(1, (self.channels, len(self.terms)))
-            return torch.einsum("bct,thw->bchw", coefficients, basis)
+            coefficients = self.layers(pooled).unflatten(1, (self.channels, NUM_TERMS))
+            return torch.einsum("bct,thw->bchw", coefficients, polynomial_basis(x, y))
+
+
+def polynomial_basis(x: Tensor, y: Tensor) -> Tensor:
+    """Return the polynomials of degree 5 at x (W,) and y (H,), as of `pixel_coordinates`: (21, H, W), float32.
+
+    T_i(x) T_j(y) for i + j <= 5,  T_n(x) = cos(n arccos(x))
+    """
+    return torch.stack([_chebyshev(y, j)[:, None] * _chebyshev(x, i) for i, j in _TERMS])
 
 
 def full_precision(like: Tensor) -> AbstractContextManager[Any]:

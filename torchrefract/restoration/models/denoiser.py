@@ -1,8 +1,7 @@
-"""The U-Nets of the diffusion models: of images, and of flows on a lattice."""
+"""The networks of the diffusion models: of images, and of the numbers of a lens."""
 
 import json
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -10,11 +9,11 @@ from diffusers import UNet2DModel
 from torch import Tensor, nn
 
 from torchrefract._validation import check_count
-from torchrefract.restoration.models.coordconv import PolynomialFlowHead, pixel_coordinates
-from torchrefract.restoration.models.lens_net import EDGE_FEATURES, LENS_FEATURES, LensEncoder
+from torchrefract.restoration.models.coordconv import pixel_coordinates
+from torchrefract.restoration.models.lens_net import LENS_FEATURES, LensEncoder
 
-_LOCAL_CHANNELS = 64
-_NODE_DISTANCE = 16  # px
+_HIDDEN = 256
+_LOG_DEVIATION = (-5.0, 1.0)  # range of the logarithm of s
 _CONDITION_CHANNELS = 5  # the image and the coordinates of its pixels
 # These options follow from the task. A published network may differ in them.
 _FREE_OPTIONS = ("in_channels", "out_channels", "sample_size")
@@ -93,78 +92,47 @@ class Denoiser(nn.Module):
         return self.network(inputs, time).sample[:, :, :height, :width].float()
 
 
-class LatticeCondition(NamedTuple):
-    """The description of images for a `LatticeDenoiser`."""
+class LensDenoiser(nn.Module):
+    """Estimate a few numbers of a lens from noisy ones, given the frame, with the deviation of each.
 
-    guess: Tensor  # (B, channels, h, w): the target without a look at the noisy one
-    local: Tensor  # (B, 64, h, w)
-    token: Tensor  # (B, 4 widths[0]), of the whole frame
+        1 / deviation^2 = 1 / s^2 + a / (1 - a)
+        mean = deviation^2 (g / s^2 + sqrt(a) noisy / (1 - a)),  noisy = sqrt(a) numbers + sqrt(1 - a) noise
 
-
-class LatticeDenoiser(nn.Module):
-    """Predict a smooth target on a lattice of nodes about 16 px apart from a noisy one, given the whole frame.
-
-        predicted = guess(image) + unet(noisy, time, image)
-
-    A `LensEncoder` describes the frame: a `PolynomialFlowHead` on it is the guess, and the U-Net takes it in each of
-    its blocks, next to the edges of the frame by two strided convolutions. Both parts start at zero.
+    A `LensEncoder` describes the frame. Two layers compute from its features, the noisy numbers and their level the
+    evidence of the frame, numbers g with deviations s, which start at 0 and 1. The rest is Bayes' rule for normal
+    distributions: it holds exactly at any level if g and s do not depend on the noisy numbers.
 
     Args:
-        channels: number of channels of the target.
-        widths: channels of the two scales of the U-Net, multiples of 32.
+        count: number of the numbers, of about unit deviation.
         weightings, lenses, edges: see `LensEncoder`.
     """
 
-    def __init__(
-        self,
-        channels: int,
-        *,
-        widths: Sequence[int] = (64, 96),
-        weightings: int = 8,
-        lenses: int = 11,
-        edges: int = 1024,
-    ):
+    def __init__(self, count: int, *, weightings: int = 8, lenses: int = 11, edges: int = 1024):
         super().__init__()
         self.encoder = LensEncoder(weightings=weightings, lenses=lenses, edges=edges)
-        self.head = PolynomialFlowHead(LENS_FEATURES, channels)
-        self.token = nn.Linear(LENS_FEATURES, 4 * widths[0])
-        self.local = nn.Sequential(
-            nn.Conv2d(EDGE_FEATURES, 32, 3, stride=2, padding=1),
-            nn.SiLU(),
-            nn.Conv2d(32, _LOCAL_CHANNELS, 3, stride=2, padding=1),
-        )
-        self.network = UNet2DModel(
-            in_channels=channels + _LOCAL_CHANNELS,
-            out_channels=channels,
-            block_out_channels=tuple(widths),
-            down_block_types=("DownBlock2D", "AttnDownBlock2D"),
-            up_block_types=("AttnUpBlock2D", "UpBlock2D"),
-            layers_per_block=1,
-            class_embed_type="identity",
-        )
-        for parameter in self.network.conv_out.parameters():
+        last = nn.Linear(_HIDDEN, 2 * count)
+        for parameter in last.parameters():
             nn.init.zeros_(parameter)
+        self.layers = nn.Sequential(nn.Linear(LENS_FEATURES + count + 2, _HIDDEN), nn.SiLU(), last)
 
-    def encode(self, image: Tensor) -> LatticeCondition:
-        """Describe images (B, 3, H, W) in [0, 1]; the nodes are those of `lattice_size`."""
-        frame, cells = self.encoder(image)
-        size = lattice_size(image)
-        axes = (torch.linspace(-1, 1, count, device=image.device) for count in reversed(size))
-        local = F.interpolate(self.local(cells), size, mode="bilinear", align_corners=True)
-        return LatticeCondition(self.head(frame, *axes), local, self.token(frame.flatten(1)))
+    def encode(self, image: Tensor) -> Tensor:
+        """Describe images (B, 3, H, W) in [0, 1] by features (B, 128)."""
+        return self.encoder(image)[0].flatten(1)
 
-    def forward(self, noisy: Tensor, time: Tensor, condition: LatticeCondition) -> Tensor:
-        """Predict the target (B, channels, h, w), float32, from a noisy one at its noise level (B,), int64."""
-        height, width = noisy.shape[2:]
-        inputs = F.pad(torch.cat([noisy, condition.local], dim=1), (0, width % 2, 0, height % 2), mode="replicate")
-        change = self.network(inputs, time, class_labels=condition.token).sample[:, :, :height, :width]
-        return condition.guess + change.float()
+    def forward(self, noisy: Tensor, share: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the mean and the deviation of the numbers, each (B, K, count), float32.
 
-
-def lattice_size(image: Tensor) -> tuple[int, int]:
-    """Return the number of nodes down and across for images (B, C, H, W): the first and the last are at the border."""
-    height, width = image.shape[2:]
-    return 1 + -(-height // _NODE_DISTANCE), 1 + -(-width // _NODE_DISTANCE)
+        Args:
+            noisy: (B, K, count), K noisy versions of each sample.
+            share: (B, K, 1), a of the equations, in (0, 1).
+            features: (B, 128), as of `encode`.
+        """
+        repeated = features[:, None].expand(-1, noisy.shape[1], -1)
+        inputs = torch.cat([noisy, share.sqrt(), (1 - share).sqrt(), repeated], dim=2)
+        guess, log_deviation = self.layers(inputs).float().chunk(2, dim=2)
+        precision = torch.exp(-2 * log_deviation.clamp(*_LOG_DEVIATION))
+        total = precision + share / (1 - share)
+        return (precision * guess + share.sqrt() / (1 - share) * noisy) / total, total.rsqrt()
 
 
 def conditions(image: Tensor) -> Tensor:

@@ -44,14 +44,12 @@ class Compose(Effect):
     tolerance the composed flow is computed at the nodes of one lattice. Photometric effects between warps keep their
     place: the image is sampled before them, and their maps move with the warps after them. Effects that share a
     function from images to depth get the depth of the frame before fog and light, computed once. `restore_flow` is the
-    composition of the inverse flows; it is not valid where it misses by more than 0.5 px, as between the sheets of a
-    fold.
+    composition of the inverse flows, not valid where it misses by more than 0.5 px, as between the sheets of a fold.
 
     Args:
         effects: at least one; compositions may be nested.
         padding, interpolation, backend: of all samplings, in place of those of the effects and compositions inside;
-            None takes those of the last warp that moves the sample, or of the outermost composition inside that has
-            them.
+            None takes those of the last warp that moves the sample, or of the outermost composition inside with any.
         tolerance_px: largest error of the composed flow in px, see `plan`; None is exact. It replaces the tolerance of
             the effects and compositions inside, but an effect whose own tolerance is None stays exact. In frames too
             large for the default, the default is exact.

@@ -29,6 +29,7 @@ from torchrefract.restoration.report import save_figure
 CONF = Path(__file__).resolve().parents[1] / "conf"
 MODELS = ("ddpm", "resunet", "lens_net", "segformer")
 _TRIAL, _POINTS = 4, 6  # steps, validations
+_BATCH = 16  # frames
 Point = dict[str, float]  # the seconds and the scores of a validation, by name
 
 
@@ -101,7 +102,8 @@ def _fit(
 
 def _config(name: str, args: argparse.Namespace) -> Any:
     """Return the configuration of `torchrefract.train` for a model, with the frames of this process."""
-    words = ["+task=undistort", f"model={name}", f"frame_size=[{args.size[0]},{args.size[1]}]", "data.workers=0"]
+    words = ["+task=undistort", f"model={name}", f"frame_size=[{args.size[0]},{args.size[1]}]"]
+    words += ["data.workers=0", f"data.batch_size={_BATCH}"]
     words += [f"train_scenes={args.scenes}", f"data.val_count={args.val}"]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("train", words)

@@ -54,8 +54,8 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def bucket() -> Iterator[dict[str, str]]:
     """Start a server of the S3 protocol with the empty s3://bucket; return the environment that names it."""
-    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)
-    pytest.importorskip("s3fs")
+    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)  # in its own extra
+    pytest.importorskip("s3fs")  # in its own extra
     server.start()
     host, port = server.get_host_and_port()
     environment = {"AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b"}

@@ -3,7 +3,9 @@ import json
 import learning
 import pytest
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*does not have many workers", "ignore:.*LeafSpec", "ignore:.*logging")
+pytestmark = pytest.mark.filterwarnings(  # of Lightning: a training of seconds without workers, its own code
+    "ignore:.*does not have many workers", "ignore:.*LeafSpec", "ignore:.*logging"
+)
 
 
 def test_models_are_trained_for_the_same_seconds_and_only_once(tmp_path, monkeypatch, capsys):

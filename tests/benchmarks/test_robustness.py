@@ -9,7 +9,7 @@ import torch
 from torchrefract import presets
 
 
-@pytest.mark.filterwarnings("ignore:depth is that of a road")
+@pytest.mark.filterwarnings("ignore:depth is that of a road")  # scenes assume a depth; the test counts pictures
 def test_a_model_predicts_the_clean_picture_and_one_for_each_level_both_times(monkeypatch):
     monkeypatch.setattr(presets, "SEVERITIES", (1, 5))
     robustness.scenes.cache_clear()

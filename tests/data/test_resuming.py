@@ -16,6 +16,7 @@ from torchrefract.data.module import PairData, pairs
 from torchrefract.restoration.checkpoints import StopOnSigterm
 
 EPOCHS, BATCHES = 3, 3
+# Warnings of Lightning about its own code, small trainings and a folder that is continued, and of Python about fork.
 _IGNORED = ("LeafSpec", "does not have many workers", "multi-threaded", "exists and is not empty")
 pytestmark = [pytest.mark.filterwarnings(f"ignore:.*{text}") for text in _IGNORED]
 
@@ -105,7 +106,7 @@ def test_a_resumed_training_gets_the_batches_of_an_uninterrupted_one(tmp_path, e
 
 @pytest.mark.parametrize(("workers", "stop_at"), [(1, ("train", 1, 1)), (0, ("train", 0, 0)), (0, None)])
 def test_a_resumed_training_on_tars_gets_the_batches_of_an_uninterrupted_one(tmp_path, tars, workers, stop_at):
-    pytest.importorskip("webdataset")
+    pytest.importorskip("webdataset")  # in its own extra
     expected = fit(tmp_path / "whole", workers=0, tars=tars).batches
     assert len(expected) == EPOCHS * BATCHES
     first = fit(tmp_path, workers=workers, epochs=2 if stop_at is None else EPOCHS, stop_at=stop_at, tars=tars)

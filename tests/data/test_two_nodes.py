@@ -11,7 +11,7 @@ import pytest
 
 from torchrefract.data.pairs import PairedFolder
 
-pytest.importorskip("webdataset")
+pytest.importorskip("webdataset")  # in its own extra
 ROOT = Path(__file__).parents[2]
 # Runs the command, and writes the keys of each batch.
 SCRIPT = """

@@ -320,7 +320,7 @@ def _one_line_errors(name: str) -> Iterator[None]:
     """Print an error that the user can fix as one line and end the program; raise any other again."""
     try:
         yield
-    except Exception as error:
+    except Exception as error:  # all but the known ones are raised again
         is_missing = isinstance(error, ModuleNotFoundError)
         if (message := missing_library(error, name) if is_missing else _user_message(error, name)) is None:
             raise

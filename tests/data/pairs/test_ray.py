@@ -17,7 +17,7 @@ COUNT = 300
 @pytest.fixture(scope="module", params=["null", "25"], ids=["files", "tars"])
 def tar(request) -> str:
     """Return the option of the number of pairs in a tar."""
-    pytest.importorskip("ray")
+    pytest.importorskip("ray")  # in its own extra
     return request.param
 
 
@@ -80,6 +80,6 @@ def test_an_actor_that_is_killed_costs_no_pair(tmp_path, words, sums, complete, 
 
 
 def test_ray_without_actors_raises(call, words):
-    pytest.importorskip("ray")
+    pytest.importorskip("ray")  # in its own extra
     message = call("generate", *words("out"), "engine=ray").message
     assert message == "workers must be at least 1 for engine=ray, which counts its actors, got 0"

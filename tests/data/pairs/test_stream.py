@@ -15,7 +15,7 @@ from torchrefract.data.pairs import PairedFolder, PairStream
 from torchrefract.data.pairs.files import DamagedPairError
 from torchrefract.data.road_scenes import RoadScenes
 
-pytest.importorskip("webdataset")
+pytest.importorskip("webdataset")  # in its own extra
 COUNT = 23  # of the pairs in the tars
 Make = Callable[..., Path]
 

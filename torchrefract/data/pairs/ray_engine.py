@@ -81,5 +81,5 @@ class _Actor:
         """Return the result, or the error, which Ray would wrap and print."""
         try:
             return self.work(item), None
-        except Exception as error:
+        except Exception as error:  # whatever it is, the caller raises it
             return None, error

@@ -207,8 +207,8 @@ class Trained(NamedTuple):
 @pytest.fixture(scope="session")
 def small() -> tuple[str, ...]:
     """Return arguments of a training that takes seconds."""
-    data = ("data.train_count=32", "data.val_count=16", "data.batch_size=8", "data.size=[32,64]", "data.workers=0")
-    return (*data, "trainer.max_epochs=2", "model=resunet", "model.network.encoder=tu-mobilenetv3_small_050")
+    data = ("data.train_count=16", "data.val_count=8", "data.batch_size=4", "data.size=[32,64]", "data.workers=0")
+    return (*data, "trainer.max_epochs=2", "model=resunet", "model.network.encoder=tu-test_resnet")
 
 
 @pytest.fixture(scope="session")
@@ -243,7 +243,7 @@ def known_model(tmp_path_factory) -> Callable[..., Path]:
         model = {
             "_target_": "torchrefract.restoration.module.Restoration",
             "task": {"_target_": f"torchrefract.restoration.tasks.{task.capitalize()}"},
-            "network": network | {"encoder": "tu-mobilenetv3_small_050"},
+            "network": network | {"encoder": "tu-test_resnet"},
         }
         weights = importlib.import_module("hydra.utils").instantiate(model).state_dict()
         # The last layer is zero but for its bias.
@@ -296,6 +296,8 @@ def call(monkeypatch, tmp_path, capsys, on_threads) -> Iterator[Callable[..., Ou
     on_threads(1)
     # A slow machine would print lines of progress between the lines that tests compare.
     monkeypatch.setattr(importlib.import_module("torchrefract.cli.command"), "_MESSAGE_INTERVAL", 3600.0)
+    # Hydra composes the configuration once more to read hydra.mode, which no command sets; that takes 0.1 s.
+    monkeypatch.setattr("hydra._internal.hydra.Hydra.get_mode", lambda *_, **__: None)
     hydra = importlib.import_module("hydra.core.global_hydra").GlobalHydra.instance()
     handlers = list(logging.root.handlers)
 

@@ -40,7 +40,7 @@ def assert_agrees(oracle, path: Path, task: str, size: tuple[int, int]) -> None:
 def test_a_pt2_program_computes_the_model_for_any_batch_size(call, tmp_path, shifted, oracle):
     out, (height, width) = tmp_path / "out" / "model.pt2", SIZE
     (line,) = call("export", f"ckpt_path={shifted}", "out=out/model.pt2", f"size={height}x{width}").out.splitlines()
-    model = "ResUNet (tu-mobilenetv3_small_050) for undistort"
+    model = "ResUNet (tu-test_resnet) for undistort"
     assert line.startswith(f"out/model.pt2: {model}, frames of {height}x{width}, any batch size; largest difference ")
     assert [file.name for file in out.parent.iterdir()] == ["model.pt2"]
     assert_agrees(oracle, out, "undistort", SIZE)

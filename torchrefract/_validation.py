@@ -181,13 +181,11 @@ def requires_grad(values: Iterable[Any]) -> bool:
         if isinstance(value, tuple):
             if requires_grad(value):
                 return True
-        elif isinstance(value, Tensor) and ((is_enabled and value.requires_grad) or _has_tangent(value)):
+        elif isinstance(value, Tensor) and (
+            (is_enabled and value.requires_grad) or forward_ad.unpack_dual(value).tangent is not None
+        ):
             return True
     return False
-
-
-def _has_tangent(value: Tensor) -> bool:
-    return forward_ad.unpack_dual(value).tangent is not None
 
 
 def why_not_eager(value: Tensor) -> str | None:
@@ -197,7 +195,7 @@ def why_not_eager(value: Tensor) -> str | None:
     if value.device.type != "cpu":
         return f"on {value.device.type}"
     is_in_func = torch._C._are_functorch_transforms_active()
-    if not is_in_func and _has_tangent(value):
+    if not is_in_func and forward_ad.unpack_dual(value).tangent is not None:
         return "with forward-mode gradients"
     if not _has_memory(value):
         return "without memory of its own, as a FakeTensor"

@@ -6,7 +6,7 @@ import training
 
 from torchrefract import UniformFog
 
-SMALL = "tu-mobilenetv3_small_050"
+SMALL = "tu-test_resnet"
 
 
 def test_the_command_prints_and_saves_both_limits(monkeypatch, tmp_path, capsys, on_threads):

@@ -183,7 +183,7 @@ def test_weights_of_older_checkpoints_get_their_new_names():
 
 
 def test_networks_of_older_checkpoints_are_built_by_their_new_names(write):
-    for name, encoder in (("ResUNet", "tu-mobilenetv3_small_050"), ("SegFormer", "mit_b0")):
+    for name, encoder in (("ResUNet", "tu-test_resnet"), ("SegFormer", "mit_b0")):
         target = f"torchrefract.restoration.models.{name.lower()}.{name}"
         old = config(network=config()["network"] | {"_target_": target, "encoder": encoder})
         weights = instantiate(config(network=old["network"] | {"_target_": target.replace(name.lower(), "coordconv")}))
@@ -196,7 +196,7 @@ def config(**changes: Any) -> dict[str, Any]:
     network = {
         "_target_": "torchrefract.restoration.models.coordconv.ResUNet",
         "_partial_": True,
-        "encoder": "tu-mobilenetv3_small_050",
+        "encoder": "tu-test_resnet",
     }
     task = {"_target_": f"{TASKS}.Undistort", "limit": 0.5}
     return {"_target_": "torchrefract.restoration.module.Restoration", "task": task, "network": network, **changes}
@@ -236,7 +236,7 @@ def load_error(path: Path) -> str:
 @torch.no_grad()
 def test_a_checkpoint_alone_rebuilds_its_model(write, saved):
     loaded = load_model(write())
-    assert (loaded.name, loaded.task, loaded.size) == ("ResUNet (tu-mobilenetv3_small_050)", "undistort", (32, 64))
+    assert (loaded.name, loaded.task, loaded.size) == ("ResUNet (tu-test_resnet)", "undistort", (32, 64))
     assert loaded.licenses == {"data": None}
     assert not loaded.model.training
     model = instantiate(config())

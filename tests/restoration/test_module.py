@@ -20,7 +20,7 @@ from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
 
 SIZE = (32, 64)
 BATCH = 4
-small_unet = partial(ResUNet, encoder="tu-mobilenetv3_small_050")
+small_unet = partial(ResUNet, encoder="tu-test_resnet")
 
 # Lightning warns of small trainings, and of its own code (LeafSpec).
 pytestmark = pytest.mark.filterwarnings(

@@ -6,9 +6,8 @@ principal point. All functions take x and y as separate tensors of any shapes (B
 `radial.py`.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import islice
 from typing import NamedTuple
 
 import torch
@@ -153,7 +152,7 @@ def undistort_polynomial(
         scale = r / r_d.clamp(min=torch.finfo(r_d.dtype).tiny)
         x, y = scale * x_d, scale * y_d
         if terms.bent:
-            x, y = converge(newton((x, y), (x_d, y_d), distort))
+            x, y = converge((x, y), (x_d, y_d), distort)
         (back_x, back_y), jacobian = distort(x, y)
         residual = torch.maximum((back_x - x_d).abs(), (back_y - y_d).abs())
         exists = (residual <= MAX_RESIDUAL[r_d.dtype] * (1 + r_d)) & (x * x + y * y <= limit.radius.square())
@@ -164,42 +163,34 @@ def undistort_polynomial(
 def newton_undistort(x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, steps: int, terms: Terms = ALL_TERMS) -> Point:
     """Invert `distort_polynomial` by a fixed number of Newton steps in the plane, 0 or more, without gradient.
 
-    Converges for lenses that do not fold near the points; checks nothing.
+    The first guess divides the distorted point by the radial factor at that point. Converges for lenses that do not
+    fold near the points; checks nothing.
     """
     with torch.no_grad():
-        iterates = newton_iterates(x_d, y_d, coefficients, terms=terms)
-        return next(islice(iterates, steps, None))
+        k, p, s = _groups(coefficients, terms)
+        g = radial_factor(x_d * x_d + y_d * y_d, k).clamp(min=_MIN_RADIAL_FACTOR)
+        point = x_d / g, y_d / g
+        for _ in range(steps):
+            point = newton_step(point, (x_d, y_d), *distort_by_factor(*point, k=k, p=p, s=s))
+        return point
 
 
-def newton_iterates(x_d: Tensor, y_d: Tensor, coefficients: Tensor, *, terms: Terms = ALL_TERMS) -> Iterator[Point]:
-    """Yield the iterates of `newton_undistort` after 0, 1, 2 ... steps, without end.
+def newton_step(point: Point, target: Point, reached: Point, jacobian: Jacobian) -> Point:
+    """Return the next point of Newton's method in the plane, for a map that takes `point` to `reached`."""
+    step_x, step_y = jacobian.solve(reached[0] - target[0], reached[1] - target[1])
+    return point[0] - step_x, point[1] - step_y
 
-    The first guess divides the distorted point by the radial factor at that point.
+
+def converge(point: Point, target: Point, distort: Callable[[Tensor, Tensor], tuple[Point, Jacobian]]) -> Point:
+    """Solve distort(point) = target by Newton's method in the plane.
+
+    Each point stops after a small step, or after 12 steps, and does not depend on the others. If values cannot be
+    read, all points take 8 steps.
     """
-    k, p, s = _groups(coefficients, terms)
-    g = radial_factor(x_d * x_d + y_d * y_d, k).clamp(min=_MIN_RADIAL_FACTOR)
-    return newton((x_d / g, y_d / g), (x_d, y_d), partial(distort_by_factor, k=k, p=p, s=s))
-
-
-def newton(
-    point: Point, target: Point, function: Callable[[Tensor, Tensor], tuple[Point, Jacobian]]
-) -> Iterator[Point]:
-    """Yield the iterates of Newton's method for function(point) = target in the plane, without end."""
-    while True:
-        yield point
-        (x, y), jacobian = function(*point)
-        step_x, step_y = jacobian.solve(x - target[0], y - target[1])
-        point = point[0] - step_x, point[1] - step_y
-
-
-def converge(iterates: Iterator[Point]) -> Point:
-    """Return for each point the first iterate that a small step leads to, or the one after 12 steps.
-
-    A point does not depend on the others. If values cannot be read, all points take 8 steps.
-    """
-    x, y = next(iterates)
+    x, y = point
     is_done = torch.zeros_like(x, dtype=torch.bool)
-    for count, (new_x, new_y) in enumerate(islice(iterates, _MAX_NEWTON_STEPS), start=1):
+    for count in range(1, _MAX_NEWTON_STEPS + 1):
+        new_x, new_y = newton_step((x, y), target, *distort(x, y))
         step = torch.maximum((new_x - x).abs(), (new_y - y).abs())
         x, y = torch.where(is_done, x, new_x), torch.where(is_done, y, new_y)
         is_done = is_done | (step <= _SMALL_STEP[step.dtype])

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract.cameras.brown_conrady import MAX_RESIDUAL, Jacobian, Point, converge, distort_by_factor, newton
+from torchrefract.cameras.brown_conrady import MAX_RESIDUAL, Jacobian, Point, converge, distort_by_factor
 from torchrefract.cameras.radial import RADIAL, first_root, growth, invert_radius
 
 OPENCV14 = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
@@ -74,8 +74,8 @@ class RationalLens(NamedTuple):
             r_l = (x_l * x_l + y_l * y_l).sqrt()
             r = invert_radius(r_l, radius, self.numerator, self.denominator)
             scale = r / r_l.clamp(min=torch.finfo(r.dtype).tiny)
-            steps = newton((scale * x_l, scale * y_l), (x_l, y_l), self._distort_before_tilt)
-            x, y = (value.nan_to_num(0, 0, 0) for value in converge(steps))
+            solved = converge((scale * x_l, scale * y_l), (x_l, y_l), self._distort_before_tilt)
+            x, y = (value.nan_to_num(0, 0, 0) for value in solved)
             back_x, back_y = self.distort(x, y)[0]
             residual = torch.maximum((back_x - x_d).abs(), (back_y - y_d).abs())
             limit = MAX_RESIDUAL[x.dtype] * (1 + (x_d * x_d + y_d * y_d).sqrt())

@@ -17,7 +17,14 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor
-from torchrefract.cameras.brown_conrady import POLYNOMIAL12, Terms, newton_iterates, used_terms
+from torchrefract.cameras.brown_conrady import (
+    POLYNOMIAL12,
+    Terms,
+    distort_with_jacobian,
+    newton_step,
+    newton_undistort,
+    used_terms,
+)
 from torchrefract.fields.filled_frame import MARGIN_PX, STILL_PX
 from torchrefract.types import FlowBounds, Range, Simplification
 
@@ -320,18 +327,16 @@ def _corners_and_draws(ranges: LensRanges) -> np.ndarray:
 
 def _solve(x: Tensor, y: Tensor, c: Tensor) -> list[tuple[Tensor, Tensor]] | None:
     """Return the Newton iterates, of which the last has converged; None if none does."""
-    limit = _CONVERGED * (1 + torch.hypot(x, y).max())
-    iterates: list[tuple[Tensor, Tensor]] = []
-    for point in itertools.islice(newton_iterates(x, y, c, terms=used_terms(c[..., 0])), _MAX_STEPS):
+    limit, terms = _CONVERGED * (1 + torch.hypot(x, y).max()), used_terms(c[..., 0])
+    iterates = [newton_undistort(x, y, c, steps=0, terms=terms)]
+    while len(iterates) < _MAX_STEPS:
+        last = iterates[-1]
+        point = newton_step(last, (x, y), *distort_with_jacobian(*last, c, terms))
         iterates.append(point)
         # NaN never counts as converged.
-        if len(iterates) > 1 and _largest_step(*iterates[-2:]) <= limit:
+        if torch.stack([point[0] - last[0], point[1] - last[1]]).abs().max() <= limit:
             return iterates
     return None
-
-
-def _largest_step(last: tuple[Tensor, Tensor], point: tuple[Tensor, Tensor]) -> Tensor:
-    return torch.stack([point[0] - last[0], point[1] - last[1]]).abs().max()
 
 
 def _droppable(used: Sequence[bool], moved_px: Sequence[float], budget_px: float) -> list[int]:

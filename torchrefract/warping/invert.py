@@ -118,12 +118,13 @@ def _solve_band(
     inverse = _newton_step(torch.zeros_like(first_error), first_error, matrix)
     error = _sample_at(flow, x, y, inverse).add_(inverse)
     threshold = _solved_px(flow) ** 2
+    pixels = None if is_eager else _pixels(x, y, flow)
     for step in range(steps):
         squared_error = _squared_length(error)
         is_unsolved = squared_error > threshold
-        if not is_eager:
-            pixels, solution = _pixels(x, y, flow), inverse.flatten(2)
-            stepped, _ = _step_in_cells(flow, pixels, solution, _sample_clamped(flow, pixels + solution))
+        if pixels is not None:
+            solution = inverse.flatten(2)
+            stepped = _step_in_cells(solution, _sample_clamped(flow, pixels + solution))
             inverse = torch.where(is_unsolved, stepped.view_as(inverse), inverse)
             error = _sample_at(flow, x, y, inverse) + inverse
             continue
@@ -148,7 +149,8 @@ def _solve_pixels(
     pixels, solution = _pixels(x, y, flow).index_select(2, index), inverse.flatten(2).index_select(2, index)
     sample = _sample_clamped(flow, pixels + solution)
     for _ in range(steps):
-        solution, sample = _step_in_cells(flow, pixels, solution, sample)
+        solution = _step_in_cells(solution, sample)
+        sample = _sample_clamped(flow, pixels + solution)
         remainder = solution + sample.value
         for field, values in ((inverse, solution), (error, remainder)):
             field.view(1, 2, -1).index_copy_(2, index, values)
@@ -171,12 +173,11 @@ def _pixels(x: Tensor, y: Tensor, flow: Tensor) -> Tensor:
     return torch.cat(torch.broadcast_tensors(*axes), dim=1).round().flatten(2)
 
 
-def _step_in_cells(flow: Tensor, pixels: Tensor, solution: Tensor, sample: LinearSample) -> tuple[Tensor, LinearSample]:
-    """Take a Newton step of solutions (B, 2, N), at which the flow was sampled, and sample it at the new ones."""
+def _step_in_cells(solution: Tensor, sample: LinearSample) -> Tensor:
+    """Take a Newton step of solutions (B, 2, N), at which the flow was sampled."""
     gradient = torch.cat([sample.slope_x, sample.slope_y], dim=1).unsqueeze(2)
     matrix = _inverse_jacobian(gradient, _determinant(gradient))
-    solution = _newton_step(solution.unsqueeze(2), (solution + sample.value).unsqueeze(2), matrix).squeeze(2)
-    return solution, _sample_clamped(flow, pixels + solution)
+    return _newton_step(solution.unsqueeze(2), (solution + sample.value).unsqueeze(2), matrix).squeeze(2)
 
 
 def _newton_step(inverse: Tensor, error: Tensor, matrix: Tensor) -> Tensor:

@@ -136,11 +136,10 @@ def test_any_name_of_a_file_reaches_the_configuration_of_each_command(name, tmp_
         for file in ODD_NAMES:
             path = tmp_path / "x" / file
             path.mkdir(parents=True, exist_ok=True)
-            for option in options:
-                words = [word for word in required if not word.startswith(f"{option}=")]
-                words = prepare_arguments(name, [f"{option}={path}", *words])
-                cfg = compose(name, words, return_hydra_config=True)
-                assert OmegaConf.select(cfg, option) == str(path)
+            words = [word for word in required if word.partition("=")[0] not in options]
+            words = prepare_arguments(name, [*(f"{option}={path}" for option in options), *words])
+            cfg = compose(name, words, return_hydra_config=True)
+            assert [OmegaConf.select(cfg, option) for option in options] == [str(path)] * len(options)
 
 
 @pytest.mark.quick

@@ -5,8 +5,7 @@ import json
 
 import torch
 
-from torchrefract.ops.cubic import lagrange_weights
-from torchrefract.ops.sampling import sample_lattice
+from torchrefract.ops.sampling import lagrange_weights, sample_lattice
 
 # The interpreter runs Python, not a kernel that a compiler could see into.
 torch.library.wrap_triton = lambda kernel: kernel

@@ -36,7 +36,6 @@ from torchrefract.warping.lattice import pixel_lattice
 _LARGEST_COEFFICIENT = 100.0
 _FARTHEST = 1e10  # widths
 _SMALLEST_ZOOM = 1e-6
-_FIT_STEPS = 7  # of Newton's method, after which lenses that fold nowhere have converged in float64
 _SAME_VIEW = 1e-3  # difference of zooms and of shifts, in widths
 FRAMES = ("fill", "pad")
 _MODEL = "k1 ... k6, p1, p2, s1 ... s4 of the polynomial model (OpenCV's vectors are another model in another order)"
@@ -321,15 +320,17 @@ class LensDistortion(WarpEffect):
     def _fit(self, params: LensParams, height: int, width: int) -> tuple[Tensor, Tensor]:
         dtype = params.focal.dtype
         is_fixed = not (torch.is_grad_enabled() and requires_grad(params))
-        folds_nowhere = self._constant_plan(id(self), height, width, dtype).details is not None
+        details = self._constant_plan(id(self), height, width, dtype).details
         with torch.set_grad_enabled(not is_fixed):
             coefficients, focal, center = (value.double() for value in lens_in_px(params, height, width))
             lens = coefficients, focal, center
 
             def position(points: Points) -> Tensor:
                 pixels = torch.cat([points.x, points.y], dim=1)
-                if folds_nowhere and is_fixed:
-                    return pixels + newton_lens_flow(*lens, points, num_steps=_FIT_STEPS, terms=used_terms(lens[0]))
+                if details is not None and is_fixed:
+                    # One more step than for the flow squares the error of its Newton steps.
+                    steps = details.steps_for(1) + 1
+                    return pixels + newton_lens_flow(*lens, points, num_steps=steps, terms=used_terms(lens[0]))
                 flow, exists = lens_flow(*lens, points)
                 return torch.where(exists, pixels + flow, torch.nan)
 

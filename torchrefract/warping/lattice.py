@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._validation import eager_values
-from torchrefract.ops.cubic import interpolate_nodes, lagrange_basis
+from torchrefract.ops.sampling import interpolate_nodes, lagrange_basis
 from torchrefract.warping.grid import Points
 
 

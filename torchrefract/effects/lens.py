@@ -23,6 +23,7 @@ from torchrefract._validation import (
 from torchrefract.cameras.brown_conrady import ALL_TERMS, POLYNOMIAL12, used_terms
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import check_shapes, params_to
+from torchrefract.effects.batch_flow import everywhere
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.filled_frame import points_without_zoom, zoom_to_fill, zoomed_flow
 from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, newton_lens_flow
@@ -253,9 +254,14 @@ class LensDistortion(WarpEffect):
         """Undistort the points, and lead on to the clean view."""
         height, width = points.lattice.height, points.lattice.width
         lens = lens_in_px(params, height, width)
-        flow, exists = _flow(lens, points, plan)
-        if plan.details is None and points.lattice.stride == 1 and eager_bool(exists.all, of=exists) is False:
-            self._report_fold(params, height, width)
+        if plan.details is None:
+            flow, exists = lens_flow(*lens, points)
+            if points.lattice.stride == 1 and eager_bool(exists.all, of=exists) is False:
+                self._report_fold(params, height, width)
+        else:
+            steps = plan.details.steps_for(points.lattice.stride)
+            terms = ALL_TERMS if requires_grad(lens[:1]) else plan.details.terms
+            flow, exists = newton_lens_flow(*lens, points, num_steps=steps, terms=terms), everywhere(points.x.device)
         if params.zoom is not None and params.shift is not None:
             flow = zoomed_flow(flow, points, lens[2], params.zoom, params.shift * width)
         return flow, exists
@@ -354,15 +360,6 @@ class LensDistortion(WarpEffect):
             k1, k2 = params.coefficients[sample, :2].tolist()
             raise ValueError(f"coefficients: {rule}, got k1 = {k1:g} and k2 = {k2:g} in sample {sample}")
         warnings.warn(f"{rule}: pixels beyond have no preimage and are padded, not valid", stacklevel=2)
-
-
-def _flow(lens: tuple[Tensor, Tensor, Tensor], points: Points, plan: WarpPlan) -> tuple[Tensor, Tensor]:
-    """Undistort the points: `newton_lens_flow` under a tolerance, otherwise `lens_flow`."""
-    if plan.details is None:
-        return lens_flow(*lens, points)
-    terms = ALL_TERMS if requires_grad(lens[:1]) else plan.details.terms
-    flow = newton_lens_flow(*lens, points, num_steps=plan.details.steps_for(points.lattice.stride), terms=terms)
-    return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=flow.device)
 
 
 def check_lens(

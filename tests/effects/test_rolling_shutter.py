@@ -112,10 +112,23 @@ def test_the_flow_is_that_of_a_renderer_row_by_row(scene, readout, vibration):
     expected, depth = rendered_flow(params, SCENES[scene])
     image, depth = torch.zeros(1, 1, HEIGHT, WIDTH, dtype=torch.float64), torch.from_numpy(depth)[None, None]
     degraded = RollingShutter(camera=CAMERA).apply(image, params, depth=depth)
-    error = (degraded.flow[0] - torch.from_numpy(expected)).norm(dim=0)[degraded.valid[0, 0]]
+    error = (degraded.flow[0] - torch.from_numpy(expected)).norm(dim=0)
     assert np.linalg.norm(expected, axis=0).max() > 8
-    assert error.max() < 0.02 if scene != "corridor" else error.quantile(0.98) < 0.02  # but where its planes meet
-    assert error.max() < 0.2
+    # A map does not tell where within a pixel two planes meet.
+    meets = torch.from_numpy(sees_two_planes(1 / depth[0, 0].numpy(), expected))
+    assert error[degraded.valid[0, 0] & ~meets].max() < 0.02
+    assert error[degraded.valid[0, 0]].max() < 0.04
+    assert meets.double().mean() < 0.03
+
+
+def sees_two_planes(inverse_depth: np.ndarray, flow: np.ndarray) -> np.ndarray:
+    """Return (H, W), bool: the pixel shows a point between two planes; 1 / Z is linear on each of them."""
+    bends = np.zeros(inverse_depth.shape, bool)
+    for axis in (0, 1):
+        bend = np.abs(np.diff(inverse_depth, 2, axis=axis)) > 1e-9
+        bends |= np.pad(bend, [(1, 1) if axis == a else (0, 0) for a in (0, 1)], mode="edge")
+    row, column = (np.indices(bends.shape) + flow[::-1]).round().astype(int)
+    return bends[row.clip(0, HEIGHT - 1), column.clip(0, WIDTH - 1)]
 
 
 @pytest.mark.parametrize(("depth", "speed", "skew"), [(8.0, 40, 37), (8.0, 100, 91), (30.0, 40, 2.6), (30.0, 100, 6.5)])

@@ -57,6 +57,7 @@ _ROAD_WEIGHTS = (0.2, 0.3, 0.3, 0.2)
 _CONTRASTS = (0.0, 2.0)
 _SCALE_HEIGHTS = (0.05, 1e6)  # m
 _EVEN = 1e12  # m, a scale height at which the density is even
+_FARTHEST_PX = 1e5  # of a box
 
 
 class HeterogeneousFogParams(NamedTuple):
@@ -77,7 +78,7 @@ class HeterogeneousFogParams(NamedTuple):
     # used by an effect with `sunlight_range` only; None is no sunlight
     sun: Tensor | None = None
     # (B, V, 4) or, one for each frame of a clip, (B, T, V, 4): boxes x1, y1, x2, y2 of vehicles ahead, px from the
-    # center of the first pixel, as for `warp_boxes`; a box without an area is no vehicle. Set by the user, never drawn
+    # center of the first pixel, as for `warp_boxes`; a box without an area is no vehicle. Drawn params have no boxes
     vehicles: Tensor | None = None
 
     to = params_to
@@ -86,6 +87,11 @@ class HeterogeneousFogParams(NamedTuple):
     def is_identity(self) -> Tensor:
         """Return (B,), bool: the air is clear."""
         return self.visibility == torch.inf
+
+    @property
+    def has_vehicles(self) -> bool:
+        """Return True if there are boxes, also if none has an area."""
+        return self.vehicles is not None and self.vehicles.shape[-2] > 0
 
 
 class HeterogeneousFog(PhotometricEffect):
@@ -246,6 +252,7 @@ class HeterogeneousFog(PhotometricEffect):
             key=random.noise_key(stream),
             scale_height=scale_height,
             sun=sunlight,
+            vehicles=values.new_zeros(len(values), 0, 4),
         )
 
     def validate(self, params: HeterogeneousFogParams, image: Tensor) -> None:
@@ -296,7 +303,7 @@ class HeterogeneousFog(PhotometricEffect):
 
     def params_in_range(self, params: HeterogeneousFogParams) -> Tensor:
         """Return (), bool: fog and contrast lie in the ranges, the weights are the effect's, there are no vehicles."""
-        if params.vehicles is not None:
+        if params.has_vehicles:
             return torch.zeros((), dtype=torch.bool, device=params.applied.device)
         span = self.medium.extinction_range(self.visibility_range, self.deviation_range)
         weights = in_ranges(normalize_weights(params.weights), [(weight, weight) for weight in self._unit_weights()])
@@ -335,7 +342,7 @@ class HeterogeneousFog(PhotometricEffect):
         scale_height = params.scale_height if self.mode == "ray" else None
         if scale_height is not None and eager_bool(lambda: scale_height.isinf().all(), of=k) is not True:
             k = self._plume(scale_height, distance, image) * expand_batch(k, image.shape[0])
-        if params.vehicles is not None:
+        if params.vehicles is not None and params.has_vehicles:
             k, mean = (expand_batch(value, image.shape[0]) for value in (k, mean))
             k = k + self.wake_density * mean * self._wakes(params.vehicles, distance, image)
         airlight = None
@@ -379,7 +386,7 @@ class HeterogeneousFog(PhotometricEffect):
     def _wakes(self, vehicles: Tensor, distance: Tensor, image: Tensor) -> Tensor:
         """Compute (N, 1, H, W): the mean density of the dust behind vehicles along each ray."""
         (rows, _, height, width), dtype = image.shape, distance.dtype
-        boxes = finite_or(vehicles.to(dtype), 0.0)
+        boxes = finite_or(vehicles.to(dtype), 0.0).clamp(-_FARTHEST_PX, _FARTHEST_PX)
         boxes = boxes.flatten(0, 1) if boxes.ndim == 4 else expand_batch(boxes, rows)
         depth = expand_batch(distance / self._ray_length(distance, image), rows)
         (_, focal), (_, center) = pinhole_of(self.medium.camera, height=height, width=width)

@@ -21,9 +21,9 @@ class FogNet(nn.Module):
 
     Fog adds A (1 - t) and leaves t (J - A) of the scene J, so that log |I - A| falls with the distance as log t does.
     The inputs are I - A, A as of `airlight_in_fog`, the logarithm, and the coordinates of the pixels. The mean of the
-    coarsest features, which tells how dense the fog is, is added to all of them. The first three maps, the change of the
-    image, are (I - A) (exp(g) - 1) + r with g and r of the last layer: exp(g) takes the part of 1 / t, so that details
-    come from the image. The last layer starts at zero.
+    coarsest features, which tells how dense the fog is, is added to all of them. The first three maps, the change of
+    the image, are (I - A) (exp(g) - 1) + r with g and r of the last layer, which starts at zero: exp(g) takes the part
+    of 1 / t, so that details come from the image.
 
     Args:
         channels: number of maps to predict, at least the three of the change.

@@ -106,14 +106,12 @@ ODD_NAMES = (
     "epoch=1-step=20",
     "it#5%",
     "a@b, [c] {d}: e",
-    "'quoted'",
-    '"',
-    "back\\slash\\",
     "a${seed}b",
     "line\nbreak",
     "null",
     "霧~ $HOME `x` 1e3",
 )
+ODD_ENDS = ("'quoted'", '"', "back\\slash\\")  # which could end the quotes around a name, or escape them
 # The options of each command that take the name of a file, and the arguments that it needs.
 FILE_OPTIONS = {
     "preview": (("image", "depth"), ()),
@@ -133,9 +131,9 @@ def test_any_name_of_a_file_reaches_the_configuration_of_each_command(name, tmp_
     monkeypatch.chdir(tmp_path)
     options, required = FILE_OPTIONS[name]
     with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
-        for file in ODD_NAMES:
-            path = tmp_path / "x" / file
-            path.mkdir(parents=True, exist_ok=True)
+        for end in ODD_ENDS:
+            path = Path(tmp_path, *ODD_NAMES, end)
+            path.mkdir(parents=True)
             words = [word for word in required if word.partition("=")[0] not in options]
             words = prepare_arguments(name, [*(f"{option}={path}" for option in options), *words])
             cfg = compose(name, words, return_hydra_config=True)

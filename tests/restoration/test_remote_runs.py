@@ -41,7 +41,7 @@ def test_a_run_in_a_store_is_stopped_continued_scored_and_applied(call, small, s
     assert sorted(path.name for path in as_path(f"{store}/a").iterdir()) == files
     assert read_checkpoint(as_path(last), task="undistort")["global_step"] == 8
     outcome = call("eval", f"ckpt_path={store}/a/best.ckpt")
-    assert f"scoring {store}/a/best.ckpt on 16 validation frames of RoadScenes" in outcome.out
+    assert f"scoring {store}/a/best.ckpt on 8 validation frames of RoadScenes" in outcome.out
     pixels = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(tmp_path / "raw.png")
     assert call("restore", f"ckpt_path={store}/a/best.ckpt", "input=raw.png", "out=out").code == 0

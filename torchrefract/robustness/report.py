@@ -30,6 +30,7 @@ th { border-bottom: 1px solid #888; } td:first-child, th:first-child { text-alig
 figure { display: inline-block; margin: .5rem; vertical-align: top; } img { max-width: 100%; }
 figcaption { font-size: 13px; max-width: 29rem; }
 """
+_TOGETHER = "; mAP, mAP50 and mIoU are scores of all images together, as COCO and Cityscapes state them"
 _SPACING = 0.08  # of the curves, severities
 _COLORS = {"labels": (40, 160, 60), "predictions": (220, 40, 30)}
 
@@ -58,7 +59,7 @@ def write_tables(result: Robustness, out: Path, about: dict[str, Any], *, loss: 
     """
     rows = [_flat(row) for row in result.rows()]
     with replace_file(out / "results.csv") as path, path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0])
+        writer = csv.DictWriter(file, dict.fromkeys(name for row in rows for name in row))
         writer.writeheader()
         writer.writerows(rows)
     summary = {
@@ -66,6 +67,14 @@ def write_tables(result: Robustness, out: Path, about: dict[str, Any], *, loss: 
         "clean": result.clean_estimate()._asdict(),
         "mean_performance": result.mean_performance(),
         "relative_performance": result.relative_performance(),
+        "set_scores": {
+            name: {
+                "clean": value,
+                "mean_performance": result.mean_performance(of=name),
+                "relative_performance": result.relative_performance(of=name),
+            }
+            for name, value in result.set_scores[None].items()
+        },
         "tolerated": {scene: result.tolerated(scene, loss=loss)._asdict() for scene in result.quantities},
         "levels": rows,
         "failures": result.failures,
@@ -84,19 +93,21 @@ def write_report(result: Robustness, examples: Sequence[Example], out: Path, *, 
         title: one line.
         loss: as for `write_tables`.
     """
-    clean = result.clean_estimate()
     parts = [
         f"<h1>{html.escape(title)}</h1>",
-        f"<p>{len(result.names)} images; score of the clean images {clean.value:.3f} "
-        f"[{clean.low:.3f}, {clean.high:.3f}]. Mean over all scenes and severities (mPC) "
-        f"{result.mean_performance():.3f}, relative to the clean score (rPC) {result.relative_performance():.3f}. "
-        "Intervals hold 95 %.</p>",
+        f"<p>{len(result.names)} images. The score is the mean over images of the score of each, with an interval of "
+        f"95 %{_TOGETHER if result.set_scores[None] else ''}. mPC is the mean over all scenes and severities, rPC its "
+        "share of the clean score.</p>",
+        _table(["", "clean", "95 % interval", "mPC", "rPC"], _summary_cells(result)),
         f'<div class="wide"><img alt="scores by severity" src="data:image/svg+xml;base64,{_encoded(_curves(result))}">',
         "</div>",
         f"<h2>What the model tolerates</h2><p>Values up to which the mean score falls by at most {loss:.0%}.</p>",
         _table(["scene", "quantity", "tolerated", "95 % interval"], _tolerated_cells(result, loss)),
         "<h2>Scores</h2>",
-        _table(["scene", "severity", "quantity", "score", "95 % interval", "drop"], map(_score_cells, result.rows())),
+        _table(
+            ["scene", "severity", "quantity", "score", "95 % interval", "drop", *result.set_scores[None]],
+            map(_score_cells, result.rows()),
+        ),
     ]
     if result.failures:
         parts.append(f"<h2>Images left out</h2><p>The model failed for {len(result.failures)} images:</p>")
@@ -120,7 +131,9 @@ def format_tolerated(result: Robustness, scene: str, *, loss: float) -> str:
 
 def _flat(row: Row) -> dict[str, Any]:
     values = asdict(row) | {"score": row.score.value, "low": row.score.low, "high": row.score.high}
-    return values | {"drop": row.drop.value, "drop_low": row.drop.low, "drop_high": row.drop.high}
+    values |= {"drop": row.drop.value, "drop_low": row.drop.low, "drop_high": row.drop.high}
+    del values["set_scores"]
+    return values | row.set_scores
 
 
 def _without_nan(value: Any) -> Any:
@@ -162,10 +175,25 @@ def _tolerated_cells(result: Robustness, loss: float) -> list[tuple[str, ...]]:
     return cells
 
 
+def _summary_cells(result: Robustness) -> list[tuple[str, ...]]:
+    clean = result.clean_estimate()
+    cells = []
+    for name, value in ({"score": clean.value} | result.set_scores[None]).items():
+        means = result.mean_performance(of=name), result.relative_performance(of=name)
+        interval = f"{clean.low:.3f} to {clean.high:.3f}" if name == "score" else ""
+        cells.append((name, _number(value), interval, *map(_number, means)))
+    return cells
+
+
 def _score_cells(row: Row) -> tuple[str, ...]:
     value = f"{row.quantity} {row.value:.3g} {row.unit}" if row.quantity else ""
     interval = f"{row.score.low:.3f} to {row.score.high:.3f}"
-    return row.scene, str(row.severity), value, f"{row.score.value:.3f}", interval, f"{row.drop.value:.3f}"
+    numbers = (_number(value) for value in (row.drop.value, *row.set_scores.values()))
+    return row.scene, str(row.severity), value, _number(row.score.value), interval, *numbers
+
+
+def _number(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.3f}"
 
 
 def _table(head: Sequence[str], rows: Any) -> str:

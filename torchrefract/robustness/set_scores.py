@@ -91,10 +91,12 @@ def _mean_average_precision(contents: Sequence[Any]) -> dict[str, float]:
         warnings.warn(f"mAP is left out: {error}; pip install 'torchrefract[train]'", stacklevel=2)
         return {}
     metric.warn_on_many_detections = False
-    for detections, labels in contents:
-        predicted, expected = _decode(detections, 6), _decode(labels, 5)
+    pairs = [(_decode(detections, 6), _decode(labels, 5)) for detections, labels in contents]
+    classes = torch.cat([expected[:, 4] for _, expected in pairs]).unique()
+    for predicted, expected in pairs:
+        of_classes = predicted[torch.isin(predicted[:, 4], classes)]  # others do not count, but take time
         metric.update(
-            [{"boxes": predicted[:, :4], "labels": predicted[:, 4].long(), "scores": predicted[:, 5]}],
+            [{"boxes": of_classes[:, :4], "labels": of_classes[:, 4].long(), "scores": of_classes[:, 5]}],
             [{"boxes": expected[:, :4], "labels": expected[:, 4].long()}],
         )
     result = metric.compute()

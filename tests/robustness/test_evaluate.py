@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 from torchvision import tv_tensors
 
-from torchrefract import LensDistortion, UniformFog
+from torchrefract import LensDistortion, UniformFog, key_of, presets
 from torchrefract.effects.base import Effect
+from torchrefract.fields import fog_volume
 from torchrefract.robustness import Quantity, evaluate
 from torchrefract.robustness.scores import as_labels, classification_score, detection_score
 
@@ -90,6 +91,30 @@ def test_labels_and_clean_predictions_move_along_the_flow():
     for given in (target, None):
         result = evaluate(predict, [("a.png", image, given)], {"lens": {3: lens}}, detection_score, as_target=as_labels)
         assert [row.score.value for row in result.rows()] == [1]
+
+
+@pytest.mark.filterwarnings("ignore:depth is that of a road")
+def test_the_severities_of_a_scene_share_their_random_fields_which_changes_no_image(monkeypatch):
+    drawn, noise = [], fog_volume.noise_on_planes
+    monkeypatch.setattr(
+        fog_volume, "noise_on_planes", lambda *args, **kwargs: drawn.append(1) or noise(*args, **kwargs)
+    )
+    scenes = {
+        scene: {severity: getattr(presets, scene)(severity) for severity in (1, 4)}
+        for scene in ("cape_town_fog", "highveld_heat_haze", "highveld_telephoto")
+    }
+    image, images = torch.rand(3, 45, 80, generator=torch.Generator().manual_seed(0)), []
+
+    def predict(batch: Tensor) -> Tensor:
+        images.append(batch[0])
+        return torch.tensor([[0.0, 1.0]])
+
+    evaluate(predict, [("a.png", image, 1)], scenes, classification_score)
+    assert len(drawn) == 1
+    effects = [effect for by_severity in scenes.values() for effect in by_severity.values()]
+    for effect, degraded in zip(effects, images[1:], strict=True):
+        assert torch.equal(degraded, effect.degrade(image, seed=0, keys=[key_of("a.png")]).image)
+    assert len(drawn) == 3
 
 
 def test_a_prediction_that_raises_is_left_out_and_said_and_many_stop_the_run():

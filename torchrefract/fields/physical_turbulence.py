@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor, cached, exact_matmul
+from torchrefract._tensor import as_device_tensor, cached, exact_matmul, shareable
 from torchrefract._validation import why_not_eager
 from torchrefract.fields.random_field import fast_size
 from torchrefract.random import white_noise
@@ -162,19 +162,37 @@ def layer_gradients(
     Yields:
         For each layer two tensors (N, 1, n, m), along x and along y.
     """
+    places = {"focal": focal, "size": size, "rows": rows, "columns": columns}
+    for k in range(len(layers.distances)):
+        yield _layer_gradient(key, layers, k, shift=shift, dtype=dtype, **places)
+
+
+@shareable
+def _layer_gradient(
+    key: Tensor,
+    layers: Layers,
+    k: int,
+    *,
+    focal: tuple[float, float],
+    size: tuple[int, int],
+    rows: range,
+    columns: range,
+    shift: Tensor | None,
+    dtype: torch.dtype,
+) -> list[Tensor]:
+    """Compute one of `layer_gradients`."""
     height, half = size[0], size[1] // 2 + 1
     count = height * half
-    qy, qx = (q.to(dtype) for q in _frequencies(focal, size, key.device))
+    noise = white_noise(key, count, start=k * count).to(dtype).unflatten(2, (height, half))
     # A FakeTensor cannot be mixed with cached values.
     amplitudes = _cached_amplitudes if why_not_eager(key) is None else _amplitudes
-    for k, distance in enumerate(layers.distances):
-        noise = white_noise(key, count, start=k * count).to(dtype).unflatten(2, (height, half))
-        air = layers.air._replace(aperture=layers.apertures[k])
-        amplitude, uniform = amplitudes(distance, air, layers.strengths[k], focal, size, dtype, key.device)
-        values = noise * amplitude
-        if shift is not None:
-            values = _moved(values, shift / distance, focal, size)
-        yield _gradient(values, noise[:, :, :1, :1] * uniform, (qx, qy), size, rows, columns)
+    distance, air = layers.distances[k], layers.air._replace(aperture=layers.apertures[k])
+    amplitude, uniform = amplitudes(distance, air, layers.strengths[k], focal, size, dtype, key.device)
+    values = noise * amplitude
+    if shift is not None:
+        values = _moved(values, shift / distance, focal, size)
+    qy, qx = (q.to(dtype) for q in _frequencies(focal, size, key.device))
+    return _gradient(values, noise[:, :, :1, :1] * uniform, (qx, qy), size, rows, columns)
 
 
 def domain_size(height: int, width: int) -> tuple[int, int]:

@@ -9,6 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from torchrefract import random
+from torchrefract._tensor import sharing_results
 from torchrefract._validation import check_number
 from torchrefract.effects.base import Effect
 from torchrefract.labels.targets import warp_moved_labels
@@ -208,7 +209,6 @@ def evaluate(
         if given is None and as_target is None:
             raise ValueError(f"target must be labels, or as_target a function, got None for {name}")
         by_name = scenes(image.shape[-1]) if callable(scenes) else scenes
-        levels = {Level(scene, severity): effect for scene, by in by_name.items() for severity, effect in by.items()}
         try:
             prediction = _predict(predict, image)
             target = given
@@ -216,12 +216,15 @@ def evaluate(
                 target = as_target(prediction, (image.shape[-2], image.shape[-1]))
             clean, by_level = _score(score, prediction, target), {}
             options = {"seed": seed, "keys": [random.key_of(name)], "depth": depth and depth(name, image)}
-            for level, effect in levels.items():
-                degraded = effect.degrade(image, **options)
-                prediction = _predict(predict, degraded.image)
-                quantity = quantities.get(level.scene)
-                value = quantity.get(degraded.params).item() if quantity else 0.0
-                by_level[level] = _score(score, prediction, move_target(target, degraded, effect), value)
+            for scene, effects in by_name.items():
+                quantity = quantities.get(scene)
+                with sharing_results():  # the severities of a scene have the same random fields
+                    for severity, effect in effects.items():
+                        degraded = effect.degrade(image, **options)
+                        prediction = _predict(predict, degraded.image)
+                        value = quantity.get(degraded.params).item() if quantity else 0.0
+                        moved = move_target(target, degraded, effect)
+                        by_level[Level(scene, severity)] = _score(score, prediction, moved, value)
         except _PredictionError as error:
             failures[name] = str(error)
         else:

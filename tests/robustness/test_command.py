@@ -137,7 +137,7 @@ def test_other_settings_in_the_same_folder_are_refused(call, frames):
 def test_predictions_of_clean_pictures_stand_for_labels_and_a_function_for_the_score(call, tmp_path, frames):
     outcome = call(*COMMAND, "score=bright:count", "scene=cheap_dashcam", "severity=5", "limit=2")
     assert "2 pictures, clean score 1.000" in outcome.out
-    assert "cheap_dashcam: k1 at least" in outcome.out
+    assert "cheap_dashcam: k1 all tested, the strongest -0." in outcome.out
 
 
 def test_masks_and_modules_are_taken(call, tmp_path, frames):

@@ -9,7 +9,8 @@ from torchvision import tv_tensors
 from torchrefract import LensDistortion, UniformFog, key_of, presets
 from torchrefract.effects.base import Effect
 from torchrefract.fields import fog_volume
-from torchrefract.robustness import Quantity, evaluate
+from torchrefract.robustness import Level, Quantity, Robustness, evaluate
+from torchrefract.robustness.report import format_tolerated
 from torchrefract.robustness.scores import as_labels, classification_score, detection_score
 
 VISIBILITY = Quantity("visibility", "m", False, lambda params: params.visibility)
@@ -154,6 +155,25 @@ def test_a_model_without_a_score_on_clean_images_tolerates_nothing():
     result = evaluate(lambda x: x, black(3), {"fog": fogs()}, lambda *_: 0.0, quantities={"fog": VISIBILITY})
     with pytest.raises(ValueError, match="the mean score of the clean images must be above 0"):
         result.tolerated("fog")
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("values", [[300.0, 100.0], [200.0]])
+@pytest.mark.parametrize(
+    ("score", "expected"), [(0.5, "none tested, the mildest"), (0.95, "all tested, the strongest")]
+)
+def test_a_scene_of_which_nothing_or_everything_is_tolerated_is_described_so(values, score, expected):
+    levels = {Level("fog", severity): value for severity, value in enumerate(values, start=1)}
+    result = Robustness(
+        names=["a.png"],
+        clean=np.ones(1),
+        scores={level: np.array([score]) for level in levels},
+        values={level: np.array([value]) for level, value in levels.items()},
+        set_scores={},
+        quantities={"fog": VISIBILITY},
+    )
+    value = max(values) if score == 0.5 else min(values)
+    assert format_tolerated(result, "fog", loss=0.1).startswith(f"visibility {expected} {value:.0f} m [")
 
 
 def test_unknown_scenes_raise():

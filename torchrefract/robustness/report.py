@@ -117,9 +117,9 @@ def write_report(result: Robustness, examples: Sequence[Example], out: Path, *, 
         parts.append(f"<h2>Images left out</h2><p>The model failed for {len(result.failures)} images:</p>")
         parts.append(_table(["image", "reason"], result.failures.items()))
     if examples:
-        parts.append(
-            "<h2>The worst images</h2><p>Labels (or predictions for the clean image) are green, predictions red.</p>"
-        )
+        parts.append("<h2>The worst images</h2>")
+        if any(example.labels is not None for example in examples):
+            parts.append("<p>Labels (or predictions for the clean image) are green, predictions red.</p>")
         parts += map(_figure, examples)
     page = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
     page += '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -130,7 +130,13 @@ def write_report(result: Robustness, examples: Sequence[Example], out: Path, *, 
 def format_tolerated(result: Robustness, scene: str, *, loss: float) -> str:
     """Describe the tolerated value of a scene, as "visibility at least 142 m [131, 155]"."""
     estimate, quantity = result.tolerated(scene, loss=loss), result.quantities[scene]
+    values = np.concatenate([values for level, values in result.values.items() if level.scene == scene])
+    mildest, strongest = (values.min(), values.max()) if quantity.is_harm else (values.max(), values.min())
     side = "at most" if quantity.is_harm else "at least"
+    if estimate.value == strongest and result.relative_performance(scene) >= 1 - loss:
+        side = "all tested, the strongest"
+    elif estimate.value == mildest:
+        side = "none tested, the mildest"
     low, high = ("open" if math.isinf(end) else f"{end:.3g}" for end in estimate[1:])
     return f"{quantity.name} {side} {estimate.value:.3g} {quantity.unit}".rstrip() + f" [{low}, {high}]"
 

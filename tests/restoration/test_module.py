@@ -17,6 +17,7 @@ from torchrefract.restoration.metrics import endpoint_error, psnr, restore_by_tr
 from torchrefract.restoration.models.coordconv import ResUNet
 from torchrefract.restoration.module import NotFiniteError, Restoration
 from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
+from torchrefract.warping.flow import resize_flow
 
 SIZE = (32, 64)
 BATCH = 4
@@ -87,6 +88,8 @@ def test_the_baselines_are_the_degraded_image_and_the_mean_valid_flow_of_the_tra
     run.fit(model, loader(garbage), loader(validation))
     scores, expected = run.callback_metrics, mean_flow(training)
     assert_close(model.constant_flow(training[0].flow)[0], expected, rtol=0, atol=1e-5)
+    twice = torch.zeros(1, 2, *(2 * side for side in SIZE))
+    assert_close(model.constant_flow(twice), resize_flow(expected[None], twice.shape[2:]), rtol=0, atol=1e-5)
     assert scores["val/epe_identity"] == pytest.approx(mean_epe(validation, torch.zeros(2, 1, 1)), rel=1e-4)
     assert scores["val/epe_constant"] == pytest.approx(mean_epe(validation, expected), rel=1e-4)
     assert scores["val/psnr_identity"] == pytest.approx(mean_psnr(validation), abs=1e-3)

@@ -5,10 +5,12 @@ import pytest
 import torch
 from torch import Tensor
 from torch.testing import assert_close
+from torch.utils.data import DataLoader
 
 import torchrefract
 from torchrefract import presets
 from torchrefract.data.module import make_pair
+from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.restoration import pretrained
 from torchrefract.restoration.checkpoints import AtomicCheckpointIO, CheckpointError, load_model, read_checkpoint
 from torchrefract.restoration.metrics import endpoint_error
@@ -118,3 +120,16 @@ def test_the_shipped_model_reads_the_lens_and_not_a_border(lens_small, make_fram
     assert scores[None] < 0.75 * of_constant
     for border in ("black", "mirrored"):  # the same lenses and frames
         assert abs(scores[border] / scores[None] - 1) < 0.2, scores
+
+
+def test_the_shipped_model_is_scored_by_its_name(call, lens_small):
+    size = (96, 168)
+    outcome = call("eval", "ckpt_path=lens_small", f"data.size=[{size[0]},{size[1]}]", "data.val_count=4")
+    assert outcome.code == 0, outcome.err
+    frames = next(iter(DataLoader(RoadScenes(4, size=size, first=512), batch_size=4)))  # as of its training
+    pair = make_pair(frames, presets.cheap_dashcam(k1_range=(-0.33, 0.06), k2_range=(0.05, 0.16)), seed=0)
+    with torch.no_grad():
+        flow = lens_small.model(pair.degraded).flow
+    error = endpoint_error(flow, pair.flow, pair.valid, size=FULL_HD).mean().item()
+    (row,) = (line for line in outcome.out.splitlines() if line.startswith("model  "))
+    assert f"{error:.2f} (" in row

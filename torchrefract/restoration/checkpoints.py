@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pytorch_lightning
 import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
@@ -58,8 +59,9 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def load_checkpoint(self, path: str | Path, *args: Any, **options: Any) -> dict[str, Any]:
         """Read a checkpoint, or the weights of a model that comes with torchrefract."""
         with local_file(as_path(path)) as file:
-            is_small = file.suffix == WEIGHTS_SUFFIX
-            return read_weights(file) if is_small else super().load_checkpoint(file, *args, **options)
+            if file.suffix != WEIGHTS_SUFFIX:
+                return super().load_checkpoint(file, *args, **options)
+            return {"pytorch-lightning_version": pytorch_lightning.__version__} | read_weights(file)
 
 
 class StopOnSigterm(Callback):

@@ -16,6 +16,7 @@ from torchrefract.restoration.checkpoints import rename_weights
 from torchrefract.restoration.metrics import coverage, endpoint_error, psnr, restore_by_transmission, ssim, through_fog
 from torchrefract.restoration.tasks import Restored, Task
 from torchrefract.types import Pair
+from torchrefract.warping.flow import resize_flow
 from torchrefract.warping.warp import warp
 
 SCHEDULES = ("cosine", "plateau")
@@ -137,10 +138,11 @@ class RestorationModule(LightningModule, ABC):
         self.on_validation_start()
 
     def constant_flow(self, like: Tensor) -> Tensor:
-        """Return the mean valid flow of the training set in the shape of `like`; 0 without a valid flow."""
-        if self.flows.shape[1:] != like.shape[2:]:
+        """Return the mean valid flow of the training set at the size of `like`; 0 without a valid flow."""
+        if not len(self.flows):
             return torch.zeros_like(like)
-        return (self.flows[:2] / self.flows[2:].clamp(min=1)).to(like).expand_as(like)
+        mean = (self.flows[:2] / self.flows[2:].clamp(min=1))[None]
+        return resize_flow(mean, like.shape[2:]).to(like).expand_as(like)
 
     def num_warmup_steps(self, num_steps: int) -> int:
         """Return the steps of the warm-up in a training of `num_steps`: `warmup_steps`, but at most a tenth of all."""

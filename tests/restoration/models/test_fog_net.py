@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -49,6 +51,19 @@ def test_maps_have_the_size_of_the_image_and_start_at_zero(size):
     assert maps.isfinite().all()
 
 
+@pytest.mark.quick
+@pytest.mark.parametrize("t", [0.05, 0.4])
+def test_a_constant_gain_restores_what_fog_left(t):
+    model, image = build(), picture()
+    torch.nn.init.zeros_(model.head.weight)
+    with torch.no_grad():
+        model.head.bias[0] = -math.log(t)
+    airlight = airlight_in_fog(image)[:, :, None, None]
+    foggy = airlight + t * (image - airlight)
+    fog_of_all = airlight_in_fog(foggy)[:, :, None, None]
+    assert_close(foggy + model(foggy), fog_of_all + (foggy - fog_of_all) / t)
+
+
 def test_every_weight_and_the_image_have_a_gradient():
     model, image = build().train(), picture().requires_grad_()
     model(image).square().sum().backward()
@@ -61,6 +76,8 @@ def test_every_weight_and_the_image_have_a_gradient():
 def test_invalid_arguments_are_named():
     with pytest.raises(ValueError, match="width must be at least 1, got 0"):
         FogNet(3, width=0)
+    with pytest.raises(ValueError, match=r"channels must be .* got 2"):
+        FogNet(2)
     with pytest.raises(ValueError, match=r"smooth must be False for fog_net, .* got True: use model=lens_net"):
         FogNet(2, smooth=True)
     with pytest.raises(ValueError, match=r"image must have shape \(B, 3, H, W\), got \(1, 1, 8, 8\)"):

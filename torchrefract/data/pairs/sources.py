@@ -3,7 +3,7 @@
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -80,7 +80,9 @@ class Sources(NamedTuple):
         """Write the list and the options of its scan as a Parquet file."""
         about = {"options": json.dumps(options), "skipped": json.dumps(list(self.skipped))}
         with replace_file(path) as temporary:
-            pq.write_table(self.table.replace_schema_metadata(about), temporary)
+            # Small groups of rows, without a dictionary of names that differ, take little memory.
+            groups: dict[str, Any] = {"row_group_size": _BATCH, "use_dictionary": ["drive", "split"]}
+            pq.write_table(self.table.replace_schema_metadata(about), temporary, **groups)
 
 
 def read_sources(path: Path, root: Path, options: dict[str, Any]) -> Sources:
@@ -124,18 +126,22 @@ def find_sources(
         if source.suffix.lower() not in VIDEOS:
             raise UsageError(f"source must be a folder, or a video ({', '.join(VIDEOS)}), got the file {source}")
         return _find_video_frames(source.parent, {source.name: source.stat().st_size}, every, val_share, seed)
-    sizes = _sizes(source)
-    files = sorted(sizes)
+    sizes = _sizes_in_store(source) if is_remote(source) else None
+    files = sorted(list_names(source) if sizes is None else sizes)
+
+    def size_of(name: str) -> int | None:
+        return _size(f"{source}/{name}") if sizes is None else sizes[name]
+
     videos = [file for file in files if file.lower().endswith(VIDEOS)]
     if not videos:
         options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
         frames = split_frames(source, files, split=None, **options)
         _check_sample(source, [frame.path for frame in frames[:: len(frames) // _SAMPLES or 1]], size or (1, 1))
-        return Sources(source, table_of(frames, sizes))
+        return Sources(source, table_of(frames, size_of))
     if images := [file for file in files if file.lower().endswith(EXTENSIONS)]:
         both = f"{images[0]} and {videos[0]}"
         raise UsageError(f"source must hold images or videos, got both in {source}, such as {both}")
-    return _find_video_frames(source, {name: sizes[name] for name in videos}, every, val_share, seed)
+    return _find_video_frames(source, {name: size_of(name) for name in videos}, every, val_share, seed)
 
 
 def _find_video_frames(root: Path, sizes: Mapping[str, int | None], every: int, val_share: float, seed: int) -> Sources:
@@ -150,7 +156,7 @@ def _find_video_frames(root: Path, sizes: Mapping[str, int | None], every: int, 
     has_one_drive = len(set(drive_of.values())) < 2
     val = set() if has_one_drive else select_val_drives(root, drive_of, val_share=val_share, seed=seed)
     sources = [Source(path, drives[path] or ".", "val" if drives[path] in val else "train", i) for path, i in frames]
-    return Sources(root, table_of(sources, sizes), [path for path, count in counts.items() if count == 0])
+    return Sources(root, table_of(sources, sizes.__getitem__), [path for path, count in counts.items() if count == 0])
 
 
 def draw_of(source: Source, *, seed: int, repeat: int) -> tuple[int, int]:
@@ -180,24 +186,22 @@ def _check_sample(root: Path, paths: Sequence[str], size: tuple[int, int]) -> No
         raise ValueError(f"root must hold readable frames, got {first_names(reasons)} in {root}")
 
 
-def table_of(frames: Sequence[Source], sizes: Mapping[str, int | None]) -> pa.Table:
-    """Make the table of frames, with the sizes of their files, by path, and their keys."""
+def table_of(frames: Sequence[Source], size_of: Callable[[str], int | None]) -> pa.Table:
+    """Make the table of frames, with the size of the file of each path, and their keys."""
     columns = {
         "path": _texts([frame.path for frame in frames]),
         "drive": _texts([frame.drive for frame in frames]).dictionary_encode(),
         "split": pa.array([frame.split for frame in frames]).dictionary_encode(),
         "frame": pa.array([frame.frame for frame in frames], pa.int32()),
-        "bytes": pa.array([sizes[frame.path] for frame in frames], pa.int64()),
+        "bytes": pa.array([size_of(frame.path) for frame in frames], pa.int64()),
         "key": pa.array([key_of(frame.name) for frame in frames], pa.int64()),
     }
     return pa.table(columns)
 
 
-def _sizes(root: Path) -> dict[str, int | None]:
-    """Return the size of each file of a root by its name, without hidden ones."""
-    if not is_remote(root):
-        return {name: _size(f"{root}/{name}") for name in list_names(root)}
-    store, sizes = cast(Any, root), dict[str, int | None]()
+def _sizes_in_store(root: Path) -> dict[str, int]:
+    """Return the size of each file of a folder in a store by its name, without hidden ones."""
+    store, sizes = cast(Any, root), dict[str, int]()
 
     def scan() -> None:
         start = store.path.strip("/")

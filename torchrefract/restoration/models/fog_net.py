@@ -13,6 +13,7 @@ _INPUTS = 9
 _WIDTHS = (1, 2, 4, 6, 6)  # of the scales, in multiples of the width
 _SHARPNESS = 50.0  # of the weights of the airlight, per unit of the dark channel
 _LEVEL = 1 / 255
+_MAX_LOG_GAIN = 4.0  # beyond, 8 bits hold little of the scene
 
 
 class FogNet(nn.Module):
@@ -20,15 +21,17 @@ class FogNet(nn.Module):
 
     Fog adds A (1 - t) and leaves t (J - A) of the scene J, so that log |I - A| falls with the distance as log t does.
     The inputs are I - A, A as of `airlight_in_fog`, the logarithm, and the coordinates of the pixels. The mean of the
-    coarsest features, which tells how dense the fog is, is added to all of them. The last layer starts at zero.
+    coarsest features, which tells how dense the fog is, is added to all of them. The first three maps, the change of
+    the image, are (I - A) (exp(g) - 1) + r with g and r of the last layer, which starts at zero: exp(g) takes the part
+    of 1 / t, so that details come from the image.
 
     Args:
-        channels: number of maps to predict.
+        channels: number of maps to predict, at least the three of the change.
         width: number of features of the finest scale.
         smooth: must be False: the maps follow the edges of the image.
 
     Raises:
-        ValueError: the width is below 1, or `smooth` is True.
+        ValueError: `channels` is below 3, the width below 1, or `smooth` is True.
 
     Source: Ronneberger, Fischer, Brox, "U-Net", MICCAI 2015.
     """
@@ -46,7 +49,7 @@ class FogNet(nn.Module):
         self.of_frame = nn.Sequential(nn.Linear(widths[-1], widths[-1]), nn.SiLU(), nn.Linear(widths[-1], widths[-1]))
         self.up = nn.ModuleList(_convolution(after + before, before) for before, after in reversed(steps[1:]))
         self.finest = _convolution(widths[0] + _INPUTS, widths[0])
-        self.head = nn.Conv2d(widths[0], channels, 3, padding=1)
+        self.head = nn.Conv2d(widths[0], 1 + check_count("channels", channels, low=3), 3, padding=1)
         for parameter in self.head.parameters():
             nn.init.zeros_(parameter)
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # missing in torch's annotations
@@ -74,7 +77,9 @@ class FogNet(nn.Module):
         for layer in (*self.up, self.finest):
             features = F.interpolate(features, scale_factor=2, mode="bilinear")
             features = layer(torch.cat([features, scales.pop()], dim=1))
-        return self.head(features)[:, :, :height, :width]
+        log_gain, maps = self.head(features)[:, :, :height, :width].split([1, self.head.out_channels - 1], dim=1)
+        change = difference * torch.expm1(log_gain.clamp(max=_MAX_LOG_GAIN))
+        return torch.cat([maps[:, :3] + change, maps[:, 3:]], dim=1)
 
 
 def airlight_in_fog(image: Tensor) -> Tensor:

@@ -162,35 +162,37 @@ def layer_gradients(
     Yields:
         For each layer two tensors (N, 1, n, m), along x and along y.
     """
-    places = {"focal": focal, "size": size, "rows": rows, "columns": columns}
-    for k in range(len(layers.distances)):
-        yield _layer_gradient(key, layers, k, shift=shift, dtype=dtype, **places)
+    options = {"focal": focal, "size": size, "rows": rows, "columns": columns, "dtype": dtype}
+    for k, (distance, strength) in enumerate(zip(layers.distances, layers.strengths, strict=True)):
+        air, moved = layers.air._replace(aperture=layers.apertures[k]), shift if shift is None else shift / distance
+        yield _layer_gradient(key, k, distance, air, strength, moved=moved, **options)
 
 
 @shareable
 def _layer_gradient(
     key: Tensor,
-    layers: Layers,
     k: int,
+    distance: float,
+    air: Air,
+    strength: float,
     *,
+    moved: Tensor | None,
     focal: tuple[float, float],
     size: tuple[int, int],
     rows: range,
     columns: range,
-    shift: Tensor | None,
     dtype: torch.dtype,
 ) -> list[Tensor]:
-    """Compute one of `layer_gradients`."""
+    """Compute the gradient of layer k of `layer_gradients`, moved by angles (N, 2), rad."""
     height, half = size[0], size[1] // 2 + 1
     count = height * half
     noise = white_noise(key, count, start=k * count).to(dtype).unflatten(2, (height, half))
     # A FakeTensor cannot be mixed with cached values.
     amplitudes = _cached_amplitudes if why_not_eager(key) is None else _amplitudes
-    distance, air = layers.distances[k], layers.air._replace(aperture=layers.apertures[k])
-    amplitude, uniform = amplitudes(distance, air, layers.strengths[k], focal, size, dtype, key.device)
+    amplitude, uniform = amplitudes(distance, air, strength, focal, size, dtype, key.device)
     values = noise * amplitude
-    if shift is not None:
-        values = _moved(values, shift / distance, focal, size)
+    if moved is not None:
+        values = _moved(values, moved, focal, size)
     qy, qx = (q.to(dtype) for q in _frequencies(focal, size, key.device))
     return _gradient(values, noise[:, :, :1, :1] * uniform, (qx, qy), size, rows, columns)
 

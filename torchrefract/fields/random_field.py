@@ -262,6 +262,7 @@ def sum_of_waves(values: Tensor, frequencies: Frequencies, rows: range, columns:
     return values
 
 
+@shareable
 def sample_field(
     params: FieldParams,
     frequencies: Frequencies,

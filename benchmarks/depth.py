@@ -1,4 +1,7 @@
-"""Accuracy of the depth that effects assume: the mean error of log10(depth), up to 250 m.
+"""Accuracy of the depth that effects assume, and of fog with it.
+
+The first number is the mean error of log10(depth), up to 250 m, where the true depth is finite. The second is the rms
+error of the transmission of a fog of 100 m visibility over the whole frame, in which that of the sky is 0.
 
     python benchmarks/depth.py                          # rendered roads, whose depth is known
     python benchmarks/depth.py --references REFERENCES  # and real frames with lidar
@@ -23,6 +26,7 @@ from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.fields.depth import depth_of
 
 FARTHEST = 250.0  # m
+VISIBILITY = 100.0  # m
 
 
 def log_error(depth: Tensor, truth: Tensor) -> float:
@@ -30,6 +34,12 @@ def log_error(depth: Tensor, truth: Tensor) -> float:
     is_known = truth.isfinite()
     ratio = depth.expand_as(truth)[is_known].clamp(1, FARTHEST) / truth[is_known].clamp(1, FARTHEST)
     return ratio.log10().abs().mean().item()
+
+
+def transmission_error(depth: Tensor, truth: Tensor) -> float:
+    """Return the rms error of the transmission 0.05^(d / 100 m)."""
+    t, exact = (0.05 ** (value / VISIBILITY) for value in (depth.expand_as(truth), truth))
+    return (t - exact).square().mean().sqrt().item()
 
 
 def frames(references: Path | None) -> Iterator[tuple[str, Tensor, Tensor, float]]:
@@ -55,8 +65,9 @@ def main() -> None:
     print(f"{'':24}{'LinearDepth':>16}{'GroundPlaneDepth':>20}{'CorridorDepth':>16}")
     for name, image, truth, focal in frames(arguments.references):
         sources = (tr.LinearDepth(), tr.GroundPlaneDepth(focal=focal), tr.CorridorDepth(focal=focal))
-        errors = [log_error(depth_of(source, image, torch.float32), truth) for source in sources]
-        print(f"{name:24}{errors[0]:16.3f}{errors[1]:20.3f}{errors[2]:16.3f}")
+        depths = [depth_of(source, image, torch.float32) for source in sources]
+        texts = [f"{log_error(depth, truth):.3f}, {transmission_error(depth, truth):.3f}" for depth in depths]
+        print(f"{name:24}{texts[0]:>16}{texts[1]:>20}{texts[2]:>16}", flush=True)
 
 
 if __name__ == "__main__":

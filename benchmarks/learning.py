@@ -83,8 +83,8 @@ def main() -> None:
 def learn(name: str, data: PairData, args: argparse.Namespace) -> list[Point]:
     """Train a model for the seconds of the arguments; return its validations."""
     _fit(name, data, args, trial := Clock(name), steps=_TRIAL, interval=None)
-    steps = max(_POINTS, round(args.seconds / median(trial.steps)))
-    _fit(name, data, args, clock := Clock(name), steps=steps, interval=-(-steps // _POINTS))
+    interval = max(1, round(args.seconds / median(trial.steps) / _POINTS))
+    _fit(name, data, args, clock := Clock(name), steps=_POINTS * interval, interval=interval)
     return clock.points
 
 

@@ -10,12 +10,14 @@ from torch.testing import assert_close
 
 from torchrefract import Camera, GroundPlaneDepth, HeterogeneousFog, UniformFog, remove_fog
 from torchrefract.data.road_scenes import render_road_scenes
+from torchrefract.effects.batch import select_params
 from torchrefract.fields.airlight import forward_scattering
 from torchrefract.fields.perlin import draw_octave, perlin_noise
 from torchrefract.fields.random_field import Motion
 from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
 
 SIZE = (36, 64)
+NO_RANGE = (0.0, 0.0)
 PAPER = {"scales": (4, 8, 16, 32, 64, 128), "weights": (0.30, 0.22, 0.15, 0.11, 0.08, 0.07)}
 
 
@@ -264,6 +266,77 @@ def test_the_transmission_of_dust_is_that_of_its_optical_depth():
         height = 1.3 - 30 * ray[1] * share
         expected = torch.exp(math.log(0.05) / 50 * 30 * ray.norm() * torch.exp(-height / 1.5).mean())
         assert_close(t[row, column], expected, rtol=1e-6, atol=0)
+
+
+BOXES = torch.tensor([[[10.0, 16.0, 22.0, 26.0]], [[30.0, 17.0, 40.0, 23.0]]])
+
+
+@pytest.mark.parametrize("mode", ["image", "ray"])
+def test_dust_is_thicker_behind_the_vehicles_of_each_sample(mode):
+    image, depth = picture(2, 3, 40, 60), torch.full((2, 1, 40, 60), 80.0)
+    effect = HeterogeneousFog(mode=mode, tolerance=0.5)
+    params = effect.sample(image, seed=7)
+    plain, dusty = (effect.apply(image, params._replace(vehicles=v), depth=depth) for v in (None, BOXES))
+    thicker = dusty.extinction / plain.extinction
+    assert torch.equal(plain.image, effect.degrade(image, seed=7, depth=depth).image)
+    assert (thicker[[0, 1], 0, [24, 22], [16, 35]] > 1.15).all()
+    assert (thicker[[0, 1], 0, [24, 22], [45, 10]] < 1.01).all()
+    assert thicker[0, 0, 24, 16] > thicker[0, 0, 10, 16] >= 1  # dust stays near the road
+    alone = effect.apply(image[1:], select_params(params._replace(vehicles=BOXES), torch.tensor([1])), depth=depth[1:])
+    assert_close(alone.image, dusty.image[1:], rtol=0, atol=1e-5)
+    some = params._replace(vehicles=torch.cat([BOXES, torch.zeros(2, 2, 4)], dim=1))
+    assert_close(effect.apply(image, some, depth=depth).image, dusty.image, rtol=0, atol=1e-6)
+
+
+def test_the_dust_behind_vehicles_follows_their_boxes_over_a_clip():
+    clip, effect = picture(1, 3, 3, 40, 60), HeterogeneousFog(mode="ray", depth=GroundPlaneDepth())
+    params = effect.sample(clip, seed=7)
+    boxes = BOXES[:1, None] + torch.tensor([0.0, 5.0, 10.0]).view(1, 3, 1, 1)
+    moving = effect.apply(clip, params._replace(vehicles=boxes)).image
+    standing = effect.apply(clip, params._replace(vehicles=boxes[:, 2])).image
+    assert_close(moving[:, 2], standing[:, 2], rtol=0, atol=1e-5)
+    assert (moving[:, 0] - standing[:, 0]).abs().max() > 0.01
+    boxes.requires_grad_()
+    effect.apply(clip, params._replace(vehicles=boxes)).image.sum().backward()
+    assert boxes.grad is not None
+    assert boxes.grad.isfinite().all()
+    assert boxes.grad.abs().amin(dim=3).min() > 0
+
+
+def test_the_optical_depth_behind_a_vehicle_is_that_along_its_rays():
+    image, depth = torch.zeros(1, 3, 40, 60, dtype=torch.float64), torch.full((1, 1, 40, 60), 30.0, dtype=torch.float64)
+    camera = Camera(width=60, height=40, fx=50.0, fy=50.0, cx=29.5, cy=19.5, coefficients=(0.0,) * 4)
+    exact: dict[str, Any] = {"visibility_range": (50.0, 50.0), "deviation_range": NO_RANGE, "contrast_range": NO_RANGE}
+    effect = HeterogeneousFog(mode="ray", camera=camera, horizon=0.5, wake_density=6.0, wake_length=4.0, **exact)
+    params = effect.sample(image, seed=7)._replace(vehicles=torch.tensor([[[22.0, 14.0, 34.0, 22.0]]]))
+    t = effect.apply(image, params, depth=depth).transmission[0, 0]
+    place, high = 1.3 * 50 / 2.5, 1.3 * 8 / 2.5  # m: the lower edge lies 2.5 px below the horizon
+    for row, column in ((5, 28), (19, 20), (21, 30)):
+        ray = torch.tensor([(column - 29.5) / 50, (row - 19.5) / 50, 1.0], dtype=torch.float64)
+        z = 30 * (torch.arange(20000, dtype=torch.float64) + 0.5) / 20000
+        wake = torch.exp(-(1.3 - z * ray[1]) / high - (place - z) / 4) * (z <= place)
+        wake = 6 * math.exp(-2 * ((column - 28) / 12) ** 2) * wake
+        expected = torch.exp(math.log(0.05) / 50 * 30 * ray.norm() * (1 + wake).mean())
+        assert_close(t[row, column], expected, rtol=2e-4, atol=0)
+
+
+def test_invalid_vehicles_raise():
+    image = torch.zeros(2, 3, 8, 9)
+    params = HeterogeneousFog().sample(image, seed=7)
+    for boxes, problem in (
+        (torch.zeros(2, 4), r"params\.vehicles must have shape \(B, V, 4\)"),
+        (torch.zeros(2, 3, 5), r"params\.vehicles must have shape"),
+        (torch.zeros(2, 3, 1, 4), r"or \(B, 1, V, 4\)"),
+        (torch.zeros(1, 3, 4), r"params\.vehicles must have one row for each of the 2 images"),
+        (torch.full((2, 1, 4), math.inf), r"params\.vehicles must be finite"),
+        (torch.full((2, 1, 4), math.nan), r"params\.vehicles must not be NaN"),
+    ):
+        with pytest.raises(ValueError, match=problem):
+            HeterogeneousFog().apply(image, params._replace(vehicles=boxes))
+    for name in ("wake_density", "wake_length"):
+        options: dict[str, Any] = {name: -1.0}
+        with pytest.raises(ValueError, match=f"{name} must"):
+            HeterogeneousFog(**options)
 
 
 def test_fog_is_brighter_on_the_side_of_the_sun_by_henyey_and_greensteins_phase_function():

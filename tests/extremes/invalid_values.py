@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import islice, product
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -205,16 +206,23 @@ def params() -> Iterator[Case]:
     """Yield cases with a value in drawn parameters, checked in eager mode and unchecked inside vmap."""
     for name, make in {**WARPS, **LIGHTS}.items():
         effect = make()
-        drawn = effect.sample(random_image(), seed=7)
+        drawn = _drawn(effect, random_image())
         fields = [field for field, value in drawn._asdict().items() if value is not None and value.is_floating_point()]
         for field, value, is_mapped in product(fields, VALUES, (False, True)):
             mode = " inside vmap" if is_mapped else ""
             yield f"{name}, {value} in {field}{mode}", partial(_params, effect, field, value, is_mapped)
 
 
+def _drawn(effect: Effect, image: Tensor) -> Any:
+    """Return drawn parameters, with a vehicle where the effect takes some."""
+    drawn = effect.sample(image, seed=7)
+    has_vehicles = "vehicles" in drawn._fields
+    return drawn._replace(vehicles=torch.tensor([[[2.0, 3.0, 20.0, 17.0]]] * len(image))) if has_vehicles else drawn
+
+
 def _params(effect: Effect, field: str, value: float, is_mapped: bool) -> None:
     image = random_image().requires_grad_()
-    drawn = effect.sample(image, seed=7)
+    drawn = _drawn(effect, image)
     changed = getattr(drawn, field).clone()
     changed[0].view(-1)[-1] = value
     changed.requires_grad_()

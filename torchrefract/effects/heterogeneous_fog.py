@@ -34,7 +34,7 @@ from torchrefract.effects.random_field import (
 )
 from torchrefract.fields.airlight import sunlit_airlight
 from torchrefract.fields.depth import DepthSource
-from torchrefract.fields.dust import descent_of_rows, mean_density
+from torchrefract.fields.dust import descent_of_rows, mean_density, mean_wake_density
 from torchrefract.fields.fog_volume import ExtinctionField, mean_extinction_along_rays
 from torchrefract.fields.heterogeneous_fog import image_noise, normalize_weights, periods_in_frame
 from torchrefract.planning.photometric import (
@@ -57,6 +57,7 @@ _ROAD_WEIGHTS = (0.2, 0.3, 0.3, 0.2)
 _CONTRASTS = (0.0, 2.0)
 _SCALE_HEIGHTS = (0.05, 1e6)  # m
 _EVEN = 1e12  # m, a scale height at which the density is even
+_FARTHEST_PX = 1e5  # of a box
 
 
 class HeterogeneousFogParams(NamedTuple):
@@ -76,6 +77,9 @@ class HeterogeneousFogParams(NamedTuple):
     # (B, 3): degrees to the right of the camera, degrees above the horizon, share of direct sunlight in the airlight;
     # used by an effect with `sunlight_range` only; None is no sunlight
     sun: Tensor | None = None
+    # (B, V, 4) or, one for each frame of a clip, (B, T, V, 4): boxes x1, y1, x2, y2 of vehicles ahead, px from the
+    # center of the first pixel, as for `warp_boxes`; a box without an area is no vehicle. Drawn params have no boxes
+    vehicles: Tensor | None = None
 
     to = params_to
 
@@ -83,6 +87,11 @@ class HeterogeneousFogParams(NamedTuple):
     def is_identity(self) -> Tensor:
         """Return (B,), bool: the air is clear."""
         return self.visibility == torch.inf
+
+    @property
+    def has_vehicles(self) -> bool:
+        """Return True if there are boxes, also if none has an area."""
+        return self.vehicles is not None and self.vehicles.shape[-2] > 0
 
 
 class HeterogeneousFog(PhotometricEffect):
@@ -115,8 +124,12 @@ class HeterogeneousFog(PhotometricEffect):
         scale_height_range: m, in [0.05, 1e6], H of a plume of dust or of ground fog in the mode "ray", whose density
             falls with the height above the road as exp(-h / H). Its mean along each ray is exact, see `mean_density`,
             and multiplies that of the random field; V is the visibility on the road. None is an even density.
+        wake_density: of the dust on the road behind a vehicle ahead, relative to the mean extinction, at least 0.
+        wake_length: m, over which this dust falls to 1/e toward the camera. It is as wide and high as the vehicle, see
+            `mean_wake_density`, and is added to the fog where boxes are given:
+            `effect.apply(image, effect.sample(image)._replace(vehicles=boxes))`. Without boxes there is none.
         camera_height, horizon: m, of the camera above the road, and share of the height of the frame, from the top, at
-            which the road vanishes; for a plume, and the horizon for the sun.
+            which the road vanishes; for a plume and vehicles, and the horizon for the sun.
         sunlight_range: share of direct sunlight in the airlight, within [0, 1]: it makes the fog brighter on the side
             of the sun and darker on the other, see `sunlit_airlight`. About 0.1 for a sun that is hardly seen through
             fog and 0.5 for dust under a clear sky. None is the same airlight everywhere.
@@ -166,6 +179,8 @@ class HeterogeneousFog(PhotometricEffect):
         wind_z_range: Range = (0.0, 0.0),
         decorrelation_range: Range = (60.0, 150.0),
         scale_height_range: Range | None = None,
+        wake_density: float = 10.0,
+        wake_length: float = 15.0,
         camera_height: float = 1.3,
         horizon: float = 0.5,
         sunlight_range: Range | None = None,
@@ -203,6 +218,8 @@ class HeterogeneousFog(PhotometricEffect):
                 raise ValueError(f"scale_height_range must be None for mode='image', got {scale_height_range}")
             low, high = _SCALE_HEIGHTS
             self.scale_height_range = check_range("scale_height_range", scale_height_range, low=low, high=high)
+        self.wake_density = check_number("wake_density", wake_density, low=0.0, high=1e6)
+        self.wake_length = check_number("wake_length", wake_length, low=1e-3, high=1e6)
         self.camera_height = check_positive("camera_height", camera_height)
         self.horizon = check_number("horizon", horizon, low=-10.0, high=10.0)
         self.sunlight_range = (
@@ -235,6 +252,7 @@ class HeterogeneousFog(PhotometricEffect):
             key=random.noise_key(stream),
             scale_height=scale_height,
             sun=sunlight,
+            vehicles=values.new_zeros(len(values), 0, 4),
         )
 
     def validate(self, params: HeterogeneousFogParams, image: Tensor) -> None:
@@ -262,6 +280,14 @@ class HeterogeneousFog(PhotometricEffect):
             check_values("params.sun", "be finite", params.sun, torch.isfinite)
             if self.sunlight_range is not None:
                 check_within("params.sun[:, 2]", params.sun[:, 2], 0.0, 1.0)
+        if params.vehicles is not None:
+            shape, frames = tuple(params.vehicles.shape[1:]), params.frame.shape[1]
+            if len(shape) not in (2, 3) or shape[-1] != 4 or (len(shape) == 3 and shape[0] != frames):
+                raise ValueError(
+                    f"params.vehicles must have shape (B, V, 4) or (B, {frames}, V, 4), a box for each of V vehicles, "
+                    f"got {tuple(params.vehicles.shape)}"
+                )
+            check_values("params.vehicles", "be finite", params.vehicles, torch.isfinite)
 
     def airlight_map(self, params: HeterogeneousFogParams, height: int, width: int) -> Tensor:
         """Return the airlight at each pixel, with which `remove_fog` undoes fog lit by the sun.
@@ -276,7 +302,9 @@ class HeterogeneousFog(PhotometricEffect):
         return sunlit_airlight(airlight, params.sun.to(airlight.dtype), **view, asymmetry=self.asymmetry)
 
     def params_in_range(self, params: HeterogeneousFogParams) -> Tensor:
-        """Return (), bool: fog and contrast lie in the ranges, and the weights are those of the effect."""
+        """Return (), bool: fog and contrast lie in the ranges, the weights are the effect's, there are no vehicles."""
+        if params.has_vehicles:
+            return torch.zeros((), dtype=torch.bool, device=params.applied.device)
         span = self.medium.extinction_range(self.visibility_range, self.deviation_range)
         weights = in_ranges(normalize_weights(params.weights), [(weight, weight) for weight in self._unit_weights()])
         contrast = in_ranges(params.contrast[:, None], [self.contrast_range])
@@ -306,7 +334,7 @@ class HeterogeneousFog(PhotometricEffect):
         """Blend images with fog."""
         plan = self.plan_for(image, params, depth)
         distance = self.medium.distance(image, depth)
-        k = per_sample(self.medium.mean_extinction(params, field_dtype(image.dtype)))
+        k = mean = per_sample(self.medium.mean_extinction(params, field_dtype(image.dtype)))
         if plan.octaves != ():
             rows = image.shape[0]
             distance = expand_batch(distance, rows) if distance.shape[0] > 1 else distance
@@ -314,6 +342,9 @@ class HeterogeneousFog(PhotometricEffect):
         scale_height = params.scale_height if self.mode == "ray" else None
         if scale_height is not None and eager_bool(lambda: scale_height.isinf().all(), of=k) is not True:
             k = self._plume(scale_height, distance, image) * expand_batch(k, image.shape[0])
+        if params.vehicles is not None and params.has_vehicles:
+            k, mean = (expand_batch(value, image.shape[0]) for value in (k, mean))
+            k = k + self.wake_density * mean * self._wakes(params.vehicles, distance, image)
         airlight = None
         if params.sun is not None and self.sunlight_range is not None:
             lit = params._replace(airlight=finite_or(params.airlight.to(field_dtype(image.dtype)), 0.0))
@@ -347,10 +378,24 @@ class HeterogeneousFog(PhotometricEffect):
         (_, focal), (_, center) = pinhole_of(self.medium.camera, height=height, width=width)
         options = {"dtype": distance.dtype, "device": image.device}
         descent = descent_of_rows(self.horizon, height=height, focal=focal, center=center, **options)
-        length = self.medium.distance(image, torch.ones_like(descent))  # m along the ray per m of depth
+        length = self._ray_length(distance, image)
         scale = finite_or(scale_height.to(distance.dtype), _EVEN).clamp(min=_SCALE_HEIGHTS[0] / 2)
         scale = per_sample(expand_batch(scale, image.shape[0]))
         return mean_density(distance, descent / length, scale, camera_height=self.camera_height)
+
+    def _wakes(self, vehicles: Tensor, distance: Tensor, image: Tensor) -> Tensor:
+        """Compute (N, 1, H, W): the mean density of the dust behind vehicles along each ray."""
+        (rows, _, height, width), dtype = image.shape, distance.dtype
+        boxes = finite_or(vehicles.to(dtype), 0.0).clamp(-_FARTHEST_PX, _FARTHEST_PX)
+        boxes = boxes.flatten(0, 1) if boxes.ndim == 4 else expand_batch(boxes, rows)
+        depth = expand_batch(distance / self._ray_length(distance, image), rows)
+        (_, focal), (_, center) = pinhole_of(self.medium.camera, height=height, width=width)
+        view = {"width": width, "horizon": self.horizon, "focal": focal, "center": center}
+        return mean_wake_density(depth, boxes, **view, camera_height=self.camera_height, length=self.wake_length)
+
+    def _ray_length(self, distance: Tensor, image: Tensor) -> Tensor:
+        """Return m along the ray of each pixel per m of depth, (1, 1, H, 1 or W)."""
+        return self.medium.distance(image, distance.new_ones(1, 1, image.shape[2], 1))
 
     def _unit_weights(self) -> tuple[float, ...]:
         return tuple(weight / sum(self.weights) for weight in self.weights)

@@ -120,14 +120,14 @@ class NightGlow(PhotometricEffect):
         light = lamp_light(image, self.threshold)
         nodes = glow_at_nodes(light, thickness, asymmetry.clamp(0.05, 1.05), focal=focal, stride=stride)
         strength = -torch.expm1(-thickness) * luminance
-        glow = spread_glow(nodes, light, strength, height=height, width=width, stride=stride)
+        glow_at = spread_glow(nodes, light, strength, height=height, width=width, stride=stride)
 
         def of_rows(band: Tensor, rows: slice, out: Tensor | None) -> Tensor:
-            lit = srgb_to_linear(finite_image(band)).add_(glow[:, :, rows])
+            lit = srgb_to_linear(finite_image(band)).add_(glow_at(rows))
             return torch.clamp(linear_to_srgb(lit), 0, 1, out=out)
 
         return Rendered(
-            map_rows(of_rows, image, (glow,)),
-            lambda: is_unsaturated(image, srgb_to_linear(finite_image(image)) + glow),
-            intensity=lambda: glow.mean(dim=1, keepdim=True),
+            map_rows(of_rows, image, (nodes, strength)),
+            lambda: is_unsaturated(image, srgb_to_linear(finite_image(image)) + glow_at(slice(None))),
+            intensity=lambda: glow_at(slice(None)).mean(dim=1, keepdim=True),
         )

@@ -178,8 +178,8 @@ class RoadMirage(WarpEffect):
         lateral = (place - self.vanishing).abs() * plan.width / focal  # m, at a distance of 1 m
         is_road = (lateral <= self.half_width * ground) & (inverse_depth <= ground / _NEARER)
         v = road_mirage_flow(critical_angle(difference), below, is_road, focal=focal)
-        v = F.pad(v, (0, 0, rows.start or 0, height - v.shape[2] - (rows.start or 0)))
-        flow = torch.cat([torch.zeros_like(v), v], dim=1)
+        start = rows.start or 0
+        flow = F.pad(v, (0, 0, start, height - v.shape[2] - start, 1, 0))  # no flow along x, and none in other rows
         return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=v.device)
 
     def inverse_flow(self, params: ParamsAtDepth, flow: Tensor) -> tuple[Tensor, Tensor]:

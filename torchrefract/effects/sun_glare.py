@@ -242,17 +242,16 @@ class SunGlare(PhotometricEffect):
         sun = self._sun(params, image)
         x, y = (torch.arange(size, dtype=sun.center.dtype, device=image.device) for size in (width, height))
 
-        def light_of(x: Tensor, y: Tensor) -> Callable[[slice], Tensor]:
+        def light_of(sun: Sun, x: Tensor, y: Tensor) -> Callable[[slice], Tensor]:
             return sun_light(sun, x, y, principal_point=point, px_per_degree=math.radians(focal))
 
         clean, stride = metered_nodes(image)
-        with_sun = metered_mean(clean + light_of(x[::stride], y[::stride])(slice(None)))
+        with_sun = metered_mean(clean + light_of(sun, x[::stride], y[::stride])(slice(None)))
         gain = controlled_gain(with_sun, metered_mean(clean), params, low=self.min_gain, high=_HIGHEST_GAIN)
-        light_at, each_gain = light_of(x, y), gain.view(-1, 1, 1, 1)
+        each_gain, exposed_sun = gain.view(-1, 1, 1, 1), light_of(sun._replace(luminance=gain * sun.luminance), x, y)
 
         def exposed(band: Tensor, rows: slice) -> Tensor:
-            light = expose_clipped(srgb_to_linear(finite_image(band)), each_gain)
-            return torch.addcmul(light, each_gain, light_at(rows))
+            return expose_clipped(srgb_to_linear(finite_image(band)), each_gain).add_(exposed_sun(rows))
 
         def of_rows(band: Tensor, rows: slice, out: Tensor | None) -> Tensor:
             return torch.clamp(linear_to_srgb(exposed(band, rows)), 0, 1, out=out)
@@ -260,7 +259,7 @@ class SunGlare(PhotometricEffect):
         return Rendered(
             map_rows(of_rows, image, (gain, *sun)),
             lambda: is_unsaturated(image, exposed(image, slice(None))),
-            intensity=lambda: light_at(slice(None)).mean(dim=1, keepdim=True),
+            intensity=lambda: light_of(sun, x, y)(slice(None)).mean(dim=1, keepdim=True),
         )
 
     def _sun(self, params: SunGlareParams, image: Tensor) -> Sun:

@@ -113,8 +113,8 @@ def expose_clipped(light: Tensor, gain: Tensor) -> Tensor:
         light: (N, C, H, W), x, linear light in [0, 1].
         gain: (N, 1, 1, 1), G.
     """
-    clipped = ((light.amin(dim=1, keepdim=True) - _CLIPPED) / (1 - _CLIPPED)).clamp(0, 1).square()
-    return light * (gain + (1 - gain) * clipped)
+    clipped = (light.amin(dim=1, keepdim=True) - _CLIPPED).mul_(1 / (1 - _CLIPPED)).clamp(0, 1).square()
+    return light * torch.addcmul(gain, 1 - gain, clipped)
 
 
 def finite_image(image: Tensor) -> Tensor:

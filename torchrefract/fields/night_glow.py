@@ -1,6 +1,7 @@
 """Glow around lamps in fog: light that droplets scatter forward, so that it reaches the camera from beside the lamp."""
 
 import math
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
@@ -113,8 +114,12 @@ def glow_at_nodes(light: Tensor, optical_depth: Tensor, asymmetry: Tensor, *, fo
     return glow.clamp(min=0).contiguous()
 
 
-def spread_glow(glow: Tensor, light: Tensor, strength: Tensor, *, height: int, width: int, stride: int) -> Tensor:
-    """Interpolate glow from nodes to pixels; its sum becomes that of the light of the lamps times a strength.
+def spread_glow(
+    glow: Tensor, light: Tensor, strength: Tensor, *, height: int, width: int, stride: int
+) -> Callable[[slice], Tensor]:
+    """Return a function that interpolates glow from nodes to rows of pixels.
+
+    The sum over the frame becomes that of the light of the lamps times a strength.
 
     Args:
         glow, light: (N, C, h, w), see `glow_at_nodes`.
@@ -123,18 +128,25 @@ def spread_glow(glow: Tensor, light: Tensor, strength: Tensor, *, height: int, w
         stride: px, between nodes.
 
     Returns:
-        (N, C, H, W), linear light.
+        A function from a slice of rows to (N, C, n, W), linear light.
     """
     rows, columns = (_pixels_of_nodes(size, stride, light) for size in (height, width))
     scattered = strength[:, None] * (light * rows[:, None] * columns).sum(dim=(2, 3))
     rows, columns = (_weights_of_nodes(size, stride, light) for size in (height, width))
     total = (glow * rows[:, None] * columns).sum(dim=(2, 3)).clamp(min=_SMALLEST)
     glow = glow * (scattered / total)[:, :, None, None]
-    return _interpolate(glow, stride)[:, :, :height, :width]
+    # Along rows at once, and to the few nodes of a column that some rows need.
+    count = glow.shape[2]
+    lines = interpolate_channels(glow, (count, glow.shape[3] * stride))[..., :width]
+    place = ((torch.arange(height, dtype=glow.dtype, device=glow.device) + 0.5) / stride - 0.5).clamp(0, count - 1)
+    above = place.long().clamp(max=max(0, count - 2))
+    share = (place - above)[:, None]
 
+    def at_rows(rows: slice) -> Tensor:
+        below = (above[rows] + 1).clamp(max=count - 1)
+        return torch.lerp(lines.index_select(2, above[rows]), lines.index_select(2, below), share[rows])
 
-def _interpolate(nodes: Tensor, stride: int) -> Tensor:
-    return interpolate_channels(nodes, (nodes.shape[2] * stride, nodes.shape[3] * stride))
+    return at_rows
 
 
 def _pixels_of_nodes(size: int, stride: int, like: Tensor) -> Tensor:

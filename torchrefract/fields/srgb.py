@@ -12,13 +12,13 @@ _HIGHEST = 1e4  # stored value; higher ones, whose power would be infinite, coun
 def srgb_to_linear(value: Tensor) -> Tensor:
     """Convert stored values in [0, 1] to linear light, any shape. Source: IEC 61966-2-1."""
     # A sum of line and power, which meet: torch.where and pow take several times as long.
-    power = value.clamp(min=STORED_TOE, max=_HIGHEST).mul_(1 / 1.055).add_(0.055 / 1.055).log2().mul_(2.4).exp2_()
-    return (value.clamp(max=STORED_TOE) - STORED_TOE).mul_(1 / 12.92).add_(power)
+    power = value.clamp(min=STORED_TOE, max=_HIGHEST).add_(0.055).log2_().mul_(2.4).exp2_()
+    return value.clamp(max=STORED_TOE).sub_(STORED_TOE).mul_(1 / 12.92).add_(power, alpha=1.055**-2.4)
 
 
 def linear_to_srgb(value: Tensor) -> Tensor:
     """Convert linear light in [0, 1] to stored values, any shape. Source: IEC 61966-2-1."""
-    power = value.clamp(min=LINEAR_TOE).log2().mul_(1 / 2.4).exp2_()
+    power = value.clamp(min=LINEAR_TOE).log2_().mul_(1 / 2.4).exp2_()
     line = value.clamp(max=LINEAR_TOE).mul_(12.92).sub_(12.92 * LINEAR_TOE + 0.055)
     return line.add_(power, alpha=1.055)
 

@@ -47,7 +47,7 @@ def glare_tail(squared_distance: Tensor, scatter: Tensor, scale: Tensor, shape: 
     """
     peak = scatter * shape / (2 * math.pi * scale.square()) * (-torch.lgamma(2 / shape)).exp()
     # exp(-(r / scale)^shape); exp2 takes half the time of exp.
-    power = (squared_distance * scale**-2 + _SOFT_CORE).log2().mul(shape / 2).exp2_()
+    power = (squared_distance * scale**-2).add_(_SOFT_CORE).log2().mul(shape / 2).exp2_()
     return (power * -_LOG2_E).exp2_() * peak
 
 
@@ -76,27 +76,25 @@ def sun_light(
         value.view(-1, 1, 1, 1) for value in (sun.luminance, sun.scatter, sun.scale, sun.shape)
     )
     across, down = _squared_distances(sun.center, x, y, px_per_degree)
-    edge, color = px_per_degree / (2 * SUN_RADIUS), sun.color[:, :, None, None]
-    glare, disk = luminance * _SUN_AREA, luminance * (1 - scatter)
-    # Along the axes, 1 - (distance / radius)^2 in units of the edge of a ghost.
-    middle, ghosts = sun.center.new_tensor(principal_point), []
+    glare, color = luminance * _SUN_AREA, sun.color[:, :, None, None]
+    # Of each disk: along the axes, 1 - (distance / radius)^2 in units of its edge, and its light.
+    edge = px_per_degree / (2 * SUN_RADIUS)
+    disks = [((SUN_RADIUS**2 - across) * edge + 0.5, down * edge, luminance * (1 - scatter) * color)]
+    middle = sun.center.new_tensor(principal_point)
     for ghost, tint in zip(sun.ghosts.unbind(1), sun.tints.unbind(1), strict=True):
         radius, share = ghost[:, 1].view(-1, 1, 1, 1), ghost[:, 2].view(-1, 1, 1, 1)
         along_x, along_y = _squared_distances(torch.lerp(middle, sun.center, ghost[:, :1]), x, y, px_per_degree)
         fading, area = radius.square() * _GHOST_EDGE, math.pi * radius.square() * (1 - _GHOST_EDGE / 2)
         strength = glare * share / area * tint[:, :, None, None]
-        along_x, along_y = 1 / _GHOST_EDGE - along_x / fading, along_y / fading
-        # (H,), whether a row shows the ghost of any frame; None if all are computed.
-        shows = partial(_any_row, along_x.detach(), along_y.detach())
-        rows_seen = None if requires_grad(sun) else eager_values(shows, of=along_x)
-        ghosts.append((along_x, along_y, strength, rows_seen))
+        disks.append((1 / _GHOST_EDGE - along_x / fading, along_y / fading, strength))
+    # (H,) for each disk, whether a row shows it in any frame; None if all are computed.
+    shows = [partial(_any_row, along_x.detach(), along_y.detach()) for along_x, along_y, _ in disks]
+    rows_seen = [None if requires_grad(sun) else eager_values(of_rows, of=across) for of_rows in shows]
 
     def light_at(rows: slice) -> Tensor:
-        squared = across + down[:, :, rows]
-        light = glare * glare_tail(squared, scatter, scale, shape)
-        light = torch.addcmul(light, disk, ((SUN_RADIUS**2 - squared) * edge + 0.5).clamp(0, 1)) * color
-        for along_x, along_y, strength, rows_seen in ghosts:
-            if rows_seen is None or any(rows_seen[rows]):
+        light = glare_tail(across + down[:, :, rows], scatter, scale, shape) * (glare * color)
+        for (along_x, along_y, strength), seen in zip(disks, rows_seen, strict=True):
+            if seen is None or any(seen[rows]):
                 light = torch.addcmul(light, (along_x - along_y[:, :, rows]).clamp(0, 1), strength)
         return light
 

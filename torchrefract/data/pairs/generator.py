@@ -175,7 +175,7 @@ def _applied_effects(effect: Effect, params: Any) -> list[dict[str, Any]]:
         | {
             name: _plain(value[0].tolist())
             for name, value in values._asdict().items()
-            if name != "applied" and value is not None
+            if name != "applied" and value is not None and value.numel() > 0
         }
         for leaf, values in leaves
         if values.applied[0]

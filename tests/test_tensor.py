@@ -12,6 +12,8 @@ from torchrefract._tensor import (
     interpolate_channels,
     round_to_dtype,
     rows_at_once,
+    shareable,
+    sharing_results,
     to_float,
     to_uint8,
 )
@@ -124,3 +126,26 @@ def test_maxima_and_interpolation_are_those_of_pytorch():
     for reach in (1, 3):
         assert torch.equal(highest_nearby(value, reach), F.max_pool2d(value, 2 * reach + 1, 1, reach))
     assert_close(interpolate_channels(value, (15, 32)), F.interpolate(value, (15, 32), mode="bilinear"))
+
+
+@pytest.mark.quick
+def test_results_are_shared_within_a_block_for_equal_values_without_a_gradient():
+    calls = []
+
+    @shareable
+    def double(values, *, scale=2):
+        calls.append(scale)
+        return scale * values
+
+    x = torch.arange(3.0)
+    with sharing_results():
+        assert double(x) is double(x.clone())
+        assert double(x.double()).dtype is torch.float64
+        assert double(x + 1).tolist() == [2, 4, 6]
+        assert double(x, scale=3).tolist() == [0, 3, 6]
+        learned = x.clone().requires_grad_()
+        assert double(learned) is not double(learned)
+    assert calls == [2, 2, 2, 3, 2, 2]
+    double(x)
+    double(x)
+    assert len(calls) == 8

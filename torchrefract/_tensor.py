@@ -1,8 +1,9 @@
 """Small operations on tensors that several packages share."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextvars import ContextVar
 from functools import lru_cache, wraps
 from itertools import chain
 from typing import Any, TypeVar, cast
@@ -10,9 +11,11 @@ from typing import Any, TypeVar, cast
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _CACHED_VALUES = 1 << 17  # float32 values that fit into the cache of one core
+_results: ContextVar[dict[Any, list[Any]] | None] = ContextVar("_results", default=None)
 
 
 def as_device_tensor(values: Any, *, dtype: torch.dtype | None = None, device: torch.device) -> Tensor:
@@ -68,6 +71,46 @@ def cached(function: _F) -> _F:
         return (function if torch.compiler.is_compiling() or args[-1].type != "cpu" else once)(*args)
 
     return cast(_F, result)
+
+
+@contextmanager
+def sharing_results() -> Iterator[None]:
+    """Keep the results of `shareable` functions, in this thread, until the end of the block."""
+    token = _results.set({})
+    try:
+        yield
+    finally:
+        _results.reset(token)
+
+
+def shareable(function: _F) -> _F:
+    """Compute a function once for arguments of equal values within `sharing_results`.
+
+    The severities of a scene have the same random fields for a key. Results must not be written to, and have no
+    gradient.
+    """
+
+    @wraps(function)
+    def result(*args: Any, **kwargs: Any) -> Any:
+        results = None if torch.compiler.is_compiling() else _results.get()
+        if results is None:
+            return function(*args, **kwargs)
+        arguments, structure = pytree.tree_flatten((args, kwargs))
+        if any(isinstance(value, Tensor) and value.requires_grad for value in arguments):
+            return function(*args, **kwargs)
+        for others, other_structure, value in results.setdefault(function, []):
+            if structure == other_structure and all(map(_is_equal, arguments, others)):
+                return value
+        results[function].append((arguments, structure, function(*args, **kwargs)))
+        return results[function][-1][2]
+
+    return cast(_F, result)
+
+
+def _is_equal(value: Any, other: Any) -> bool:
+    if isinstance(value, Tensor) and isinstance(other, Tensor):
+        return value.dtype == other.dtype and value.device == other.device and torch.equal(value, other)
+    return type(value) is type(other) and value == other
 
 
 def expand_batch(value: Tensor, batch: int) -> Tensor:

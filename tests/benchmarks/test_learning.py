@@ -17,6 +17,7 @@ def test_models_are_trained_for_the_same_seconds_and_only_once(tmp_path, monkeyp
     curves = {name: json.loads((tmp_path / f"{name}_32x56_16_2_1s.json").read_text()) for name in names}
     for points in curves.values():
         assert [p["seconds"] for p in points] == sorted(p["seconds"] for p in points)
+        assert [p["steps"] for p in points] == [(i + 1) * points[0]["steps"] for i in range(6)]
         assert points[-1]["seconds"] == pytest.approx(1, rel=0.8)
         assert points[-1]["val/epe_identity"] == curves["ddpm"][0]["val/epe_identity"]
     assert 0 <= curves["ddpm"][-1]["val/coverage"] <= 1

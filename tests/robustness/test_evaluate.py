@@ -6,9 +6,11 @@ import torch
 from torch import Tensor
 from torchvision import tv_tensors
 
-from torchrefract import LensDistortion, UniformFog
+from torchrefract import LensDistortion, UniformFog, key_of, presets
 from torchrefract.effects.base import Effect
-from torchrefract.robustness import Quantity, evaluate
+from torchrefract.fields import fog_volume
+from torchrefract.robustness import Level, Quantity, Robustness, evaluate
+from torchrefract.robustness.report import format_tolerated
 from torchrefract.robustness.scores import as_labels, classification_score, detection_score
 
 VISIBILITY = Quantity("visibility", "m", False, lambda params: params.visibility)
@@ -92,6 +94,30 @@ def test_labels_and_clean_predictions_move_along_the_flow():
         assert [row.score.value for row in result.rows()] == [1]
 
 
+@pytest.mark.filterwarnings("ignore:depth is that of a road")
+def test_the_severities_of_a_scene_share_their_random_fields_which_changes_no_image(monkeypatch):
+    drawn, noise = [], fog_volume.noise_on_planes
+    monkeypatch.setattr(
+        fog_volume, "noise_on_planes", lambda *args, **kwargs: drawn.append(1) or noise(*args, **kwargs)
+    )
+    scenes = {
+        scene: {severity: getattr(presets, scene)(severity) for severity in (1, 4)}
+        for scene in ("cape_town_fog", "highveld_heat_haze", "highveld_telephoto")
+    }
+    image, images = torch.rand(3, 45, 80, generator=torch.Generator().manual_seed(0)), []
+
+    def predict(batch: Tensor) -> Tensor:
+        images.append(batch[0])
+        return torch.tensor([[0.0, 1.0]])
+
+    evaluate(predict, [("a.png", image, 1)], scenes, classification_score)
+    assert len(drawn) == 1
+    effects = [effect for by_severity in scenes.values() for effect in by_severity.values()]
+    for effect, degraded in zip(effects, images[1:], strict=True):
+        assert torch.equal(degraded, effect.degrade(image, seed=0, keys=[key_of("a.png")]).image)
+    assert len(drawn) == 3
+
+
 def test_a_prediction_that_raises_is_left_out_and_said_and_many_stop_the_run():
     def predict(images: Tensor) -> Tensor:
         if images.amax() > 0.9:
@@ -129,6 +155,25 @@ def test_a_model_without_a_score_on_clean_images_tolerates_nothing():
     result = evaluate(lambda x: x, black(3), {"fog": fogs()}, lambda *_: 0.0, quantities={"fog": VISIBILITY})
     with pytest.raises(ValueError, match="the mean score of the clean images must be above 0"):
         result.tolerated("fog")
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("values", [[300.0, 100.0], [200.0]])
+@pytest.mark.parametrize(
+    ("score", "expected"), [(0.5, "none tested, the mildest"), (0.95, "all tested, the strongest")]
+)
+def test_a_scene_of_which_nothing_or_everything_is_tolerated_is_described_so(values, score, expected):
+    levels = {Level("fog", severity): value for severity, value in enumerate(values, start=1)}
+    result = Robustness(
+        names=["a.png"],
+        clean=np.ones(1),
+        scores={level: np.array([score]) for level in levels},
+        values={level: np.array([value]) for level, value in levels.items()},
+        set_scores={},
+        quantities={"fog": VISIBILITY},
+    )
+    value = max(values) if score == 0.5 else min(values)
+    assert format_tolerated(result, "fog", loss=0.1).startswith(f"visibility {expected} {value:.0f} m [")
 
 
 def test_unknown_scenes_raise():

@@ -3,7 +3,13 @@ from typing import Any
 import pytest
 import torch
 
-from torchrefract.robustness.scores import as_labels, classification_score, detection_score, segmentation_score
+from torchrefract.robustness.scores import (
+    as_labels,
+    check_prediction,
+    classification_score,
+    detection_score,
+    segmentation_score,
+)
 
 pytestmark = pytest.mark.quick
 
@@ -60,5 +66,31 @@ def test_confident_detections_become_labels():
     assert detection_score(prediction, target) > 0
     assert as_labels(torch.tensor([0.1, 0.9]), (2, 2)) == 1
     assert as_labels(torch.tensor([[[0.0]], [[1.0]]]), (1, 1)).tolist() == [[1]]
-    with pytest.raises(TypeError, match="predictions must be dicts of boxes"):
+    with pytest.raises(ValueError, match="predictions must be dicts of boxes"):
         as_labels("a car", (2, 2))
+
+
+BOXES: dict[str, Any] = {"boxes": torch.zeros(2, 4), "labels": torch.zeros(2), "scores": torch.zeros(2)}
+
+
+@pytest.mark.parametrize("valid", [(BOXES, BOXES), (torch.zeros(3, 4, 5), torch.zeros(4, 5)), (torch.zeros(7), 3)])
+@pytest.mark.parametrize(
+    ("prediction", "message"),
+    [
+        (0.5, "predictions must be dicts .*, got float"),
+        (
+            BOXES | {"labels": torch.zeros(1)},
+            r"predictions must be dicts .*, got a dict of boxes \(2, 4\), labels \(1,\)",
+        ),
+        ({"labels": torch.zeros(1)}, r"predictions must be dicts .*, got a dict of labels \(1,\)"),
+        (
+            torch.zeros(3, 2, 5),
+            r"predictions must have the kind and the size of the labels: .*, got a tensor \(3, 2, 5\)",
+        ),
+        (torch.zeros(2, 5), "predictions must have the kind and the size of the labels"),
+    ],
+)
+def test_a_prediction_that_does_not_fit_its_labels_raises(valid, prediction, message):
+    check_prediction(*valid)
+    with pytest.raises(ValueError, match=message):
+        check_prediction(prediction, valid[1])

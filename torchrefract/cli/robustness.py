@@ -36,13 +36,20 @@ from torchrefract.data.label_files import (
 )
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.effects.base import Effect
-from torchrefract.robustness.evaluate import Level, Robustness, Scored, evaluate, move_target
+from torchrefract.robustness.evaluate import ImageScore, Level, Robustness, Scored, evaluate, move_target
 from torchrefract.robustness.predictors import Predict, import_function, load_predictor
 from torchrefract.robustness.quantities import QUANTITIES
 from torchrefract.robustness.report import Example, format_tolerated, write_report, write_tables
-from torchrefract.robustness.scores import as_labels, classification_score, detection_score, segmentation_score
+from torchrefract.robustness.scores import (
+    as_labels,
+    check_prediction,
+    classification_score,
+    detection_score,
+    segmentation_score,
+)
 
 _SCORES = "scores.jsonl"  # one line of settings, then one for each picture
+_FORMAT = 2  # of these lines; 1 had no summaries of predictions
 _SAID_ELSEWHERE = ("depth is that of a road", "predict failed for")  # by `warn_of_assumed_depth`, and at the end
 _WITH_WIDTH = ("highveld_heat_haze", "unpaved_road")  # scenes whose displacements are stated for a width
 _SETTINGS = ("model", "weights", "data", "labels", "score", "scene", "severity", "depth", "depth_scale", "seed")
@@ -78,6 +85,7 @@ def test_robustness(cfg: DictConfig) -> None:
         num_worst = check_count("worst", cfg.worst, low=0)
     folder, values = _folder(cfg), cast(dict[str, Any], OmegaConf.to_container(cfg))
     settings = {name: values[name] for name in _SETTINGS} | {"labels": folder.labels and folder.labels.digest()}
+    settings["format"] = _FORMAT
     levels = _levels(settings["scene"], settings["severity"])
     with naming("model"):
         predict = load_predictor(str(cfg.model), weights=cfg.weights, device=str(cfg.device))
@@ -107,7 +115,8 @@ def test_robustness(cfg: DictConfig) -> None:
             _example(name, level, result, folder, predict, scenes, seed) for name, level in _worst(result, num_worst)
         ]
         write_report(result, examples, out, title=f"{cfg.model} on {folder.path.name}", loss=loss)
-    print(f"{out / 'report.html'}: {len(result.names)} pictures, clean score {result.clean.mean():.3f}")
+    of_set = "".join(f", {name} {value:.3f}" for name, value in result.set_scores[None].items())
+    print(f"{out / 'report.html'}: {len(result.names)} pictures, clean score {result.clean.mean():.3f}{of_set}")
     for scene in result.quantities:
         print(f"{scene}: {format_tolerated(result, scene, loss=loss)} for a loss of at most {loss:.0%}")
     if result.failures:
@@ -118,6 +127,7 @@ def test_robustness(cfg: DictConfig) -> None:
 
 def choose_score(prediction: Any, target: Any) -> float:
     """Score a prediction by its kind: boxes, classes at each pixel, or the class of the image."""
+    check_prediction(prediction, target)
     if isinstance(prediction, dict):
         return detection_score(prediction, target)
     is_class = isinstance(prediction, Tensor) and prediction.ndim == 1
@@ -210,14 +220,14 @@ def _stored_scores(
             )
     for line in lines[1:]:
         row = json.loads(line)
-        of_levels = {Level(scene, severity): (score, value) for scene, severity, score, value in row["levels"]}
-        done[row["name"]] = Scored(row["clean"], of_levels)
+        of_levels = {Level(*level): ImageScore(*of) for *level, of in row["levels"]}
+        done[row["name"]] = Scored(ImageScore(*row["clean"]), of_levels)
     with replace_file(path, alone=True) as repaired:
         repaired.write_text("".join(lines) or json.dumps(settings) + "\n", encoding="utf-8")
     with path.open("a", encoding="utf-8") as stream:
 
         def store(name: str, scored: Scored) -> None:
-            levels = [[*level, *of] for level, of in scored.levels.items()]
+            levels = [[*level, of] for level, of in scored.levels.items()]
             stream.write(json.dumps({"name": name, "clean": scored.clean, "levels": levels}) + "\n")
             stream.flush()
 

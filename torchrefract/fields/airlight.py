@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor, highest_nearby
+from torchrefract._tensor import as_device_tensor, highest_nearby, shareable
 from torchrefract.fields.sky import find_sky
 from torchrefract.fields.srgb import linear_to_srgb, luma, srgb_to_linear
 
@@ -18,6 +18,7 @@ _KEPT_CHROMA = 0.25  # of blue light by day
 _STEPS = 2.0**16  # results are rounded to multiples of 1 / _STEPS, so that they have equal bits in every batch
 
 
+@shareable
 def airlight_of_frame(image: Tensor) -> Tensor:
     """Estimate the airlight of frames: the light that fog would scatter towards the camera.
 

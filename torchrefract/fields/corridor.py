@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchrefract._tensor import shareable
 from torchrefract._validation import check_number, check_positive
 from torchrefract.fields.depth import GroundPlaneDepth
 from torchrefract.fields.sky import find_sky, sky_mask
@@ -62,6 +63,7 @@ class CorridorDepth:
             far=math.inf,
         )
 
+    @shareable
     def __call__(self, image: Tensor) -> Tensor:
         """Return the depth of images (B, C, H, W) in [0, 1], (B, 1, H, W), m.
 

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor, exact_matmul, without_autocast
+from torchrefract._tensor import as_device_tensor, exact_matmul, shareable, without_autocast
 from torchrefract._validation import finite_or
 from torchrefract.fields.perlin import fade_out
 from torchrefract.fields.random_field import Motion
@@ -141,6 +141,7 @@ def make_view(height: int, width: int, focal: tuple[float, float], center: tuple
     return View(height, width, cell, down, across, rays)
 
 
+@shareable
 def extinction_on_planes(
     field: ExtinctionField, rays: Rays, *, scales: Sequence[float], reach: float, dtype: torch.dtype
 ) -> Tensor:

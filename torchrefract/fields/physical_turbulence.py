@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor, cached, exact_matmul
+from torchrefract._tensor import as_device_tensor, cached, exact_matmul, shareable
 from torchrefract._validation import why_not_eager
 from torchrefract.fields.random_field import fast_size
 from torchrefract.random import white_noise
@@ -162,19 +162,39 @@ def layer_gradients(
     Yields:
         For each layer two tensors (N, 1, n, m), along x and along y.
     """
+    options = {"focal": focal, "size": size, "rows": rows, "columns": columns, "dtype": dtype}
+    for k, (distance, strength) in enumerate(zip(layers.distances, layers.strengths, strict=True)):
+        air, moved = layers.air._replace(aperture=layers.apertures[k]), shift if shift is None else shift / distance
+        yield _layer_gradient(key, k, distance, air, strength, moved=moved, **options)
+
+
+@shareable
+def _layer_gradient(
+    key: Tensor,
+    k: int,
+    distance: float,
+    air: Air,
+    strength: float,
+    *,
+    moved: Tensor | None,
+    focal: tuple[float, float],
+    size: tuple[int, int],
+    rows: range,
+    columns: range,
+    dtype: torch.dtype,
+) -> list[Tensor]:
+    """Compute the gradient of layer k of `layer_gradients`, moved by angles (N, 2), rad."""
     height, half = size[0], size[1] // 2 + 1
     count = height * half
-    qy, qx = (q.to(dtype) for q in _frequencies(focal, size, key.device))
+    noise = white_noise(key, count, start=k * count).to(dtype).unflatten(2, (height, half))
     # A FakeTensor cannot be mixed with cached values.
     amplitudes = _cached_amplitudes if why_not_eager(key) is None else _amplitudes
-    for k, distance in enumerate(layers.distances):
-        noise = white_noise(key, count, start=k * count).to(dtype).unflatten(2, (height, half))
-        air = layers.air._replace(aperture=layers.apertures[k])
-        amplitude, uniform = amplitudes(distance, air, layers.strengths[k], focal, size, dtype, key.device)
-        values = noise * amplitude
-        if shift is not None:
-            values = _moved(values, shift / distance, focal, size)
-        yield _gradient(values, noise[:, :, :1, :1] * uniform, (qx, qy), size, rows, columns)
+    amplitude, uniform = amplitudes(distance, air, strength, focal, size, dtype, key.device)
+    values = noise * amplitude
+    if moved is not None:
+        values = _moved(values, moved, focal, size)
+    qy, qx = (q.to(dtype) for q in _frequencies(focal, size, key.device))
+    return _gradient(values, noise[:, :, :1, :1] * uniform, (qx, qy), size, rows, columns)
 
 
 def domain_size(height: int, width: int) -> tuple[int, int]:

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import exact_matmul
+from torchrefract._tensor import exact_matmul, shareable
 from torchrefract.random import white_noise, white_noise_at
 from torchrefract.warping.lattice import Lattice
 
@@ -222,6 +222,7 @@ def amplitudes(
     return amplitude, clipped[:, 0, 0].to(dtype)
 
 
+@shareable
 def coefficients(
     params: FieldParams, frequencies: Frequencies, *, kind: str, dtype: torch.dtype
 ) -> tuple[Tensor, Tensor]:
@@ -261,6 +262,7 @@ def sum_of_waves(values: Tensor, frequencies: Frequencies, rows: range, columns:
     return values
 
 
+@shareable
 def sample_field(
     params: FieldParams,
     frequencies: Frequencies,

@@ -279,6 +279,8 @@ def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped
     if flow.ndim == 4:
         raise ValueError(f"target must be a list of samples if it holds boxes and flow is a batch, got {type(boxes)}")
     plain = boxes.as_subclass(Tensor)
+    if len(plain) == 0:
+        return _Warped(boxes, torch.ones(0, dtype=torch.bool, device=plain.device))
     plain = plain if plain.is_floating_point() else plain.to(flow.dtype)
     if boxes.format.name in ("XYWHR", "CXCYWHR", "XYXYXYXY"):
         warped, keep = _warp_rotated_boxes(plain, boxes.format.name, flow, options)

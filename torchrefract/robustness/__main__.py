@@ -1,9 +1,9 @@
 """Score a model by scene and severity: `python -m torchrefract.robustness model=NAME data=DIR out=DIR`.
 
-Writes results.csv, results.json and report.html: scores with 95 % intervals, the value of a physical quantity that
-the model tolerates ("visibility at least 142 m"), and the worst pictures. A picture has the same fog, lens or haze at
-all severities but for its strength. Without labels, a prediction is scored by its agreement with that for the clean
-picture. A run that is stopped continues where it was.
+Writes results.csv, results.json and report.html: scores by image with 95 % intervals, COCO's mAP or the mean IoU of the
+set, the value of a physical quantity that the model tolerates ("visibility at least 142 m"), and the worst pictures. A
+picture has the same fog, lens or haze at all severities but for its strength. Without labels, a prediction is scored by
+its agreement with that for the clean picture. A run that is stopped continues where it was.
 
 Options:
     model=NAME              required: package.module:name of a function from images (1, 3, H, W) in [0, 1] to

@@ -9,9 +9,11 @@ import numpy as np
 from torch import Tensor
 
 from torchrefract import random
+from torchrefract._tensor import sharing_results
 from torchrefract._validation import check_number
 from torchrefract.effects.base import Effect
 from torchrefract.labels.targets import warp_moved_labels
+from torchrefract.robustness.set_scores import Summary, set_scores, summarize
 from torchrefract.robustness.statistics import Estimate, mean_estimate, tolerated_value
 from torchrefract.types import Degraded
 
@@ -39,11 +41,23 @@ class Level(NamedTuple):
     severity: int
 
 
-class Scored(NamedTuple):
-    """The scores of one image: clean, and at each level with the value of the quantity, 0 without one."""
+class ImageScore(NamedTuple):
+    """The score of one image at a level or clean.
 
-    clean: float
-    levels: dict[Level, tuple[float, float]]
+    value: of the quantity of the scene, 0 without one.
+    summary: of the prediction and its target, see `set_scores.summarize`.
+    """
+
+    score: float
+    value: float
+    summary: Summary | None
+
+
+class Scored(NamedTuple):
+    """The scores of one image."""
+
+    clean: ImageScore
+    levels: dict[Level, ImageScore]
 
 
 Scenes = Mapping[str, Mapping[int, Effect]]
@@ -56,6 +70,7 @@ class Row:
     quantity, value, unit: the physical quantity and its mean over the images; empty and NaN without one.
     score: mean over the images.
     drop: mean of the score of each clean image less that of the degraded one.
+    set_scores: by name, those of all images together, see `set_scores.set_scores`.
     """
 
     scene: str
@@ -66,6 +81,7 @@ class Row:
     num_images: int
     score: Estimate
     drop: Estimate
+    set_scores: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -76,6 +92,8 @@ class Robustness:
     clean: (n,), the scores of the clean images.
     scores: for each level, (n,), the scores of the degraded images.
     values: for each level of a scene with a quantity, (n,), its value for each image.
+    set_scores: for each level, and for the clean images by None, the scores of all images together by name: "mAP" and
+        "mAP50" of detections, "mIoU" of masks.
     quantities: by scene.
     failures: names of the images whose prediction raised, and why.
     """
@@ -84,6 +102,7 @@ class Robustness:
     clean: np.ndarray
     scores: dict[Level, np.ndarray]
     values: dict[Level, np.ndarray]
+    set_scores: dict[Level | None, dict[str, float]]
     quantities: Mapping[str, Quantity] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
 
@@ -95,7 +114,7 @@ class Robustness:
             name, unit = (quantity.name, quantity.unit) if quantity else ("", "")
             value = float(self.values[level].mean()) if quantity else float("nan")
             estimates = mean_estimate(scores), mean_estimate(self.clean - scores)
-            rows.append(Row(*level, name, value, unit, len(scores), *estimates))
+            rows.append(Row(*level, name, value, unit, len(scores), *estimates, self.set_scores[level]))
         return rows
 
     def clean_estimate(self) -> Estimate:
@@ -119,18 +138,27 @@ class Robustness:
         least, is_harm = (1 - loss) * float(self.clean.mean()), self.quantities[scene].is_harm
         return tolerated_value(values.ravel(), scores.ravel(), least=least, is_harm=is_harm)
 
-    def mean_performance(self, scene: str | None = None) -> float:
+    def mean_performance(self, scene: str | None = None, *, of: str = "score") -> float:
         """Return the mean score over the levels of a scene, or over those of all scenes with equal weights: mPC.
+
+        Args:
+            scene: its name, or None for all.
+            of: "score" for the mean over the images, or the name of a score of all images together, such as "mAP".
 
         Source: Michaelis et al., "Benchmarking robustness in object detection", 2019.
         """
         scenes = [scene] if scene else list(dict.fromkeys(level.scene for level in self.scores))
-        means = [np.mean([scores.mean() for level, scores in self.scores.items() if level.scene == s]) for s in scenes]
+        means = [np.mean([self._value(of, level) for level in self.scores if level.scene == s]) for s in scenes]
         return float(np.mean(means))
 
-    def relative_performance(self, scene: str | None = None) -> float:
-        """Return `mean_performance` divided by the mean score of the clean images: rPC."""
-        return self.mean_performance(scene) / float(self.clean.mean())
+    def relative_performance(self, scene: str | None = None, *, of: str = "score") -> float:
+        """Return `mean_performance` divided by the score of the clean images: rPC; NaN if that is 0."""
+        return self.mean_performance(scene, of=of) / (self._value(of, None) or float("nan"))
+
+    def _value(self, of: str, level: Level | None) -> float:
+        if of != "score":
+            return self.set_scores[level][of]
+        return float(self.clean.mean() if level is None else self.scores[level].mean())
 
 
 def evaluate(
@@ -181,7 +209,6 @@ def evaluate(
         if given is None and as_target is None:
             raise ValueError(f"target must be labels, or as_target a function, got None for {name}")
         by_name = scenes(image.shape[-1]) if callable(scenes) else scenes
-        levels = {Level(scene, severity): effect for scene, by in by_name.items() for severity, effect in by.items()}
         try:
             prediction = _predict(predict, image)
             target = given
@@ -189,12 +216,15 @@ def evaluate(
                 target = as_target(prediction, (image.shape[-2], image.shape[-1]))
             clean, by_level = _score(score, prediction, target), {}
             options = {"seed": seed, "keys": [random.key_of(name)], "depth": depth and depth(name, image)}
-            for level, effect in levels.items():
-                degraded = effect.degrade(image, **options)
-                prediction = _predict(predict, degraded.image)
-                quantity = quantities.get(level.scene)
-                value = quantity.get(degraded.params).item() if quantity else 0.0
-                by_level[level] = (_score(score, prediction, move_target(target, degraded, effect)), value)
+            for scene, effects in by_name.items():
+                quantity = quantities.get(scene)
+                with sharing_results():  # the severities of a scene have the same random fields
+                    for severity, effect in effects.items():
+                        degraded = effect.degrade(image, **options)
+                        prediction = _predict(predict, degraded.image)
+                        value = quantity.get(degraded.params).item() if quantity else 0.0
+                        moved = move_target(target, degraded, effect)
+                        by_level[Level(scene, severity)] = _score(score, prediction, moved, value)
         except _PredictionError as error:
             failures[name] = str(error)
         else:
@@ -236,24 +266,28 @@ def _predict(predict: Callable[[Tensor], Any], image: Tensor) -> Any:
     return prediction
 
 
-def _score(score: Callable[[Any, Any], float], prediction: Any, target: Any) -> float:
-    value = float(score(prediction, target))
-    if not 0 <= value <= 1:
-        raise ValueError(f"score must return a number in [0, 1], got {value}")
-    return value
+def _score(score: Callable[[Any, Any], float], prediction: Any, target: Any, value: float = 0.0) -> ImageScore:
+    number = float(score(prediction, target))
+    if not 0 <= number <= 1:
+        raise ValueError(f"score must return a number in [0, 1], got {number}")
+    return ImageScore(number, value, summarize(prediction, target))
 
 
 def _collect(
     scored: Mapping[str, Scored], quantities: Mapping[str, Quantity], failures: Mapping[str, str]
 ) -> Robustness:
     """Return the scores of images, by name and of the same levels, as arrays."""
-    levels = next(iter(scored.values())).levels
-    by_level = {level: np.array([of.levels[level] for of in scored.values()]) for level in levels}
+    levels = list(next(iter(scored.values())).levels)
+    of_level: dict[Level | None, list[ImageScore]] = {
+        level: [of.levels[level] for of in scored.values()] for level in levels
+    }
+    of_level[None] = [of.clean for of in scored.values()]
     return Robustness(
         names=list(scored),
-        clean=np.array([of.clean for of in scored.values()]),
-        scores={level: pairs[:, 0] for level, pairs in by_level.items()},
-        values={level: pairs[:, 1] for level, pairs in by_level.items() if level.scene in quantities},
+        clean=np.array([of.score for of in of_level[None]]),
+        scores={level: np.array([of.score for of in of_level[level]]) for level in levels},
+        values={level: np.array([of.value for of in of_level[level]]) for level in levels if level.scene in quantities},
+        set_scores={level: set_scores([of.summary for of in images]) for level, images in of_level.items()},
         quantities={
             scene: quantities[scene] for scene in {level.scene: None for level in levels} if scene in quantities
         },

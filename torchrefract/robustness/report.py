@@ -25,10 +25,11 @@ _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
 table { border-collapse: collapse; margin: 1rem 0; }
 td, th { padding: .25rem .8rem; text-align: right; white-space: nowrap; }
-.wide { overflow-x: auto; } .wide img { min-width: 40rem; }
+tr:nth-child(odd) td { background: #f3f3f3; } .wide { overflow-x: auto; }
 th { border-bottom: 1px solid #888; } td:first-child, th:first-child { text-align: left; }
 figure { display: inline-block; margin: .5rem; vertical-align: top; } img { max-width: 100%; }
 figcaption { font-size: 13px; max-width: 29rem; }
+@media (max-width: 40rem) { td, th { padding: .25rem .4rem; font-size: 13px; } figure { margin: .5rem 0; } }
 """
 _SPACING = 0.08  # of the curves, severities
 _COLORS = {"labels": (40, 160, 60), "predictions": (220, 40, 30)}
@@ -58,7 +59,7 @@ def write_tables(result: Robustness, out: Path, about: dict[str, Any], *, loss: 
     """
     rows = [_flat(row) for row in result.rows()]
     with replace_file(out / "results.csv") as path, path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0])
+        writer = csv.DictWriter(file, dict.fromkeys(name for row in rows for name in row))
         writer.writeheader()
         writer.writerows(rows)
     summary = {
@@ -66,6 +67,14 @@ def write_tables(result: Robustness, out: Path, about: dict[str, Any], *, loss: 
         "clean": result.clean_estimate()._asdict(),
         "mean_performance": result.mean_performance(),
         "relative_performance": result.relative_performance(),
+        "set_scores": {
+            name: {
+                "clean": value,
+                "mean_performance": result.mean_performance(of=name),
+                "relative_performance": result.relative_performance(of=name),
+            }
+            for name, value in result.set_scores[None].items()
+        },
         "tolerated": {scene: result.tolerated(scene, loss=loss)._asdict() for scene in result.quantities},
         "levels": rows,
         "failures": result.failures,
@@ -84,25 +93,33 @@ def write_report(result: Robustness, examples: Sequence[Example], out: Path, *, 
         title: one line.
         loss: as for `write_tables`.
     """
-    clean = result.clean_estimate()
+    names = list(result.set_scores[None])
+    together = f" For {' and '.join(names)}, all images count together." if names else ""
     parts = [
         f"<h1>{html.escape(title)}</h1>",
-        f"<p>{len(result.names)} images; score of the clean images {clean.value:.3f} "
-        f"[{clean.low:.3f}, {clean.high:.3f}]. Mean over all scenes and severities (mPC) "
-        f"{result.mean_performance():.3f}, relative to the clean score (rPC) {result.relative_performance():.3f}. "
-        "Intervals hold 95 %.</p>",
-        f'<div class="wide"><img alt="scores by severity" src="data:image/svg+xml;base64,{_encoded(_curves(result))}">',
-        "</div>",
-        f"<h2>What the model tolerates</h2><p>Values up to which the mean score falls by at most {loss:.0%}.</p>",
-        _table(["scene", "quantity", "tolerated", "95 % interval"], _tolerated_cells(result, loss)),
+        f"<p>{len(result.names)} images. The score is the mean over images, with its interval of 95 %.{together} mPC "
+        "is the mean over scenes and severities, rPC its share of the clean score.</p>",
+        _table(["", "clean", "95 % interval", "mPC", "rPC"], _summary_cells(result)),
+        *(
+            f'<img alt="{name} by severity" src="data:image/svg+xml;base64,{_encoded(_curves(result, name))}">'
+            for name in ["score", *names[:1]]
+        ),
+        f"<h2>What the model tolerates</h2><p>Values up to which the mean score falls by at most {loss:.0%}. An open "
+        "end of an interval lies beyond what was tested.</p>",
+        _table(["scene", "tolerated", "95 % interval", "quantity"], _tolerated_cells(result, loss)),
         "<h2>Scores</h2>",
-        _table(["scene", "severity", "quantity", "score", "95 % interval", "drop"], map(_score_cells, result.rows())),
+        _table(
+            ["scene", "severity", "score", "95 % interval", "drop", *names, "quantity"],
+            map(_score_cells, result.rows()),
+        ),
     ]
     if result.failures:
         parts.append(f"<h2>Images left out</h2><p>The model failed for {len(result.failures)} images:</p>")
         parts.append(_table(["image", "reason"], result.failures.items()))
     if examples:
-        parts.append("<h2>The worst images</h2><p>Labels are green, predictions red.</p>")
+        parts.append("<h2>The worst images</h2>")
+        if any(example.labels is not None for example in examples):
+            parts.append("<p>Labels (or predictions for the clean image) are green, predictions red.</p>")
         parts += map(_figure, examples)
     page = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
     page += '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -113,14 +130,22 @@ def write_report(result: Robustness, examples: Sequence[Example], out: Path, *, 
 def format_tolerated(result: Robustness, scene: str, *, loss: float) -> str:
     """Describe the tolerated value of a scene, as "visibility at least 142 m [131, 155]"."""
     estimate, quantity = result.tolerated(scene, loss=loss), result.quantities[scene]
+    values = np.concatenate([values for level, values in result.values.items() if level.scene == scene])
+    mildest, strongest = (values.min(), values.max()) if quantity.is_harm else (values.max(), values.min())
     side = "at most" if quantity.is_harm else "at least"
+    if estimate.value == strongest and result.relative_performance(scene) >= 1 - loss:
+        side = "all tested, the strongest"
+    elif estimate.value == mildest:
+        side = "none tested, the mildest"
     low, high = ("open" if math.isinf(end) else f"{end:.3g}" for end in estimate[1:])
     return f"{quantity.name} {side} {estimate.value:.3g} {quantity.unit}".rstrip() + f" [{low}, {high}]"
 
 
 def _flat(row: Row) -> dict[str, Any]:
     values = asdict(row) | {"score": row.score.value, "low": row.score.low, "high": row.score.high}
-    return values | {"drop": row.drop.value, "drop_low": row.drop.low, "drop_high": row.drop.high}
+    values |= {"drop": row.drop.value, "drop_low": row.drop.low, "drop_high": row.drop.high}
+    del values["set_scores"]
+    return values | row.set_scores
 
 
 def _without_nan(value: Any) -> Any:
@@ -132,20 +157,24 @@ def _without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _curves(result: Robustness) -> bytes:
-    figure = Figure(figsize=(9, 4), layout="constrained")
+def _curves(result: Robustness, of: str) -> bytes:
+    """Draw the score, with intervals, or one of all images together."""
+    figure = Figure(figsize=(5, 4.6), layout="constrained")
     axes = figure.subplots()
     scenes = list(dict.fromkeys(level.scene for level in result.scores))
     for i, scene in enumerate(scenes):
         rows = [row for row in result.rows() if row.scene == scene]
         shift = _SPACING * (i - (len(scenes) - 1) / 2)  # so that equal scores do not hide one another
-        x, y = [row.severity + shift for row in rows], np.array([row.score for row in rows])
-        axes.errorbar(x, y[:, 0], yerr=abs(y[:, 1:] - y[:, :1]).T, marker="o", capsize=3, label=scene)
-    axes.axhline(float(result.clean.mean()), color="gray", linestyle="--", label="clean")
-    axes.set(
-        xlabel="severity", ylabel="score", ylim=(0, 1.02), xticks=sorted({level.severity for level in result.scores})
-    )
-    axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+        x = [row.severity + shift for row in rows]
+        if of == "score":
+            y = np.array([row.score for row in rows])
+            axes.errorbar(x, y[:, 0], yerr=abs(y[:, 1:] - y[:, :1]).T, marker="o", capsize=3, label=scene)
+        else:
+            axes.plot(x, [row.set_scores[of] for row in rows], marker="o", label=scene)
+    clean = float(result.clean.mean()) if of == "score" else result.set_scores[None][of]
+    axes.axhline(clean, color="gray", linestyle="--", label="clean")
+    axes.set(xlabel="severity", ylabel=of, ylim=(0, 1.02), xticks=sorted({level.severity for level in result.scores}))
+    figure.legend(*axes.get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=2)
     buffer = io.BytesIO()
     # Without a date and with fixed names, equal scores give equal bytes.
     with rc_context({"svg.hashsalt": "torchrefract"}):
@@ -158,14 +187,29 @@ def _tolerated_cells(result: Robustness, loss: float) -> list[tuple[str, ...]]:
     for scene, quantity in result.quantities.items():
         text = format_tolerated(result, scene, loss=loss).removeprefix(quantity.name)
         value, _, interval = text.partition("[")
-        cells.append((scene, quantity.name, value.strip(), interval.rstrip("]")))
+        cells.append((scene, value.strip(), interval.rstrip("]").replace(",", " to"), quantity.name))
+    return cells
+
+
+def _summary_cells(result: Robustness) -> list[tuple[str, ...]]:
+    clean = result.clean_estimate()
+    cells = []
+    for name, value in ({"score": clean.value} | result.set_scores[None]).items():
+        means = result.mean_performance(of=name), result.relative_performance(of=name)
+        interval = f"{clean.low:.3f} to {clean.high:.3f}" if name == "score" else ""
+        cells.append((name, _number(value), interval, *map(_number, means)))
     return cells
 
 
 def _score_cells(row: Row) -> tuple[str, ...]:
     value = f"{row.quantity} {row.value:.3g} {row.unit}" if row.quantity else ""
     interval = f"{row.score.low:.3f} to {row.score.high:.3f}"
-    return row.scene, str(row.severity), value, f"{row.score.value:.3f}", interval, f"{row.drop.value:.3f}"
+    numbers = (_number(value) for value in (row.drop.value, *row.set_scores.values()))
+    return row.scene, str(row.severity), _number(row.score.value), interval, *numbers, value
+
+
+def _number(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.3f}"
 
 
 def _table(head: Sequence[str], rows: Any) -> str:

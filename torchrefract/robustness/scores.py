@@ -7,6 +7,8 @@ from torch import Tensor
 from torchvision import tv_tensors
 from torchvision.ops import box_iou
 
+from torchrefract.robustness.set_scores import class_areas
+
 _IOU = 0.5  # from which a box is found
 _CONFIDENT = 0.5  # score from which a detection counts as a label
 
@@ -38,16 +40,8 @@ def segmentation_score(prediction: Tensor, target: Tensor) -> float:
         prediction: (K, H, W), a score of each class at each pixel, or (H, W), integers.
         target: (H, W) or (1, H, W), integers.
     """
-    classes = prediction.detach().cpu()
-    classes = classes.argmax(dim=0) if classes.ndim == 3 else classes
-    expected = torch.as_tensor(target).cpu().as_subclass(Tensor).reshape(classes.shape)
-    counts = (expected >= 0) & (expected != 255)
-    classes, expected = classes[counts], expected[counts]
-    values = []
-    for name in torch.cat([classes, expected]).unique().tolist():
-        union = ((classes == name) | (expected == name)).sum().item()
-        values.append(((classes == name) & (expected == name)).sum().item() / union)
-    return sum(values) / len(values) if values else 1.0
+    areas = class_areas(prediction, target).values()
+    return sum(intersection / union for intersection, union in areas) / len(areas) if areas else 1.0
 
 
 def classification_score(prediction: Tensor, target: Tensor | int) -> float:
@@ -61,21 +55,43 @@ def as_labels(prediction: Any, size: tuple[int, int]) -> Any:
     Detections with a score of at least 0.5 become boxes, scores of classes at each pixel become a mask, and those of
     an image its class.
     """
+    check_prediction(prediction)
     if isinstance(prediction, dict):
         keep = prediction["scores"] >= _CONFIDENT
         boxes = prediction["boxes"][keep].detach()
         options: dict[str, Any] = {"format": "XYXY", "canvas_size": size}
         return {"boxes": tv_tensors.BoundingBoxes(boxes, **options), "labels": prediction["labels"][keep].detach()}
-    if isinstance(prediction, Tensor) and prediction.ndim == 3:
-        return tv_tensors.Mask(prediction.detach().argmax(dim=0))
-    if isinstance(prediction, Tensor) and prediction.ndim == 2:
-        return tv_tensors.Mask(prediction.detach())
-    if isinstance(prediction, Tensor) and prediction.ndim == 1:
+    if prediction.ndim == 1:
         return int(prediction.argmax())
-    kind = tuple(prediction.shape) if isinstance(prediction, Tensor) else type(prediction).__name__
-    raise TypeError(
-        f"predictions must be dicts of boxes, labels and scores, or tensors (K, H, W), (H, W) or (K,), got {kind}"
-    )
+    return tv_tensors.Mask((prediction.argmax(dim=0) if prediction.ndim == 3 else prediction).detach())
+
+
+def check_prediction(prediction: Any, target: Any = None) -> None:
+    """Raise ValueError if no score takes the prediction for an image, or none takes it with this target."""
+    if isinstance(prediction, dict):
+        shapes = [getattr(prediction.get(name), "shape", None) for name in ("boxes", "labels", "scores")]
+        is_valid = shapes[1] is not None and len(shapes[1]) == 1 and shapes == [(*shapes[1], 4), shapes[1], shapes[1]]
+        fits = isinstance(target, dict)
+    else:
+        is_valid = isinstance(prediction, Tensor) and prediction.ndim in (1, 2, 3)
+        size = prediction.shape[-2:] if is_valid and prediction.ndim > 1 else ()
+        fits = not isinstance(target, dict) and getattr(target, "shape", ())[-2:] == size
+    if not is_valid:
+        raise ValueError(
+            "predictions must be dicts of boxes (n, 4), labels (n,) and scores (n,), or tensors (K, H, W), (H, W) or "
+            f"(K,), got {_described(prediction)}"
+        )
+    if target is not None and not fits:
+        raise ValueError(
+            "predictions must have the kind and the size of the labels: boxes for boxes, a class of each pixel for a "
+            f"mask, got {_described(prediction)} for {_described(target)}"
+        )
+
+
+def _described(value: Any) -> str:
+    if isinstance(value, dict):
+        return "a dict of " + ", ".join(f"{name} {tuple(getattr(part, 'shape', ()))}" for name, part in value.items())
+    return f"a tensor {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
 
 
 def _average_precision(boxes: Tensor, expected: Tensor) -> float:

@@ -55,9 +55,9 @@ def test_maps_have_the_size_of_the_image_and_start_at_zero(size):
 @pytest.mark.parametrize("t", [0.05, 0.4])
 def test_a_constant_gain_restores_what_fog_left(t):
     model, image = build(), picture()
-    torch.nn.init.zeros_(model.head.weight)
-    with torch.no_grad():
-        model.head.bias[0] = -math.log(t)
+    bias = torch.zeros(1 + 3)
+    bias[0] = -math.log(t)
+    model.head.load_state_dict({"weight": torch.zeros_like(model.head.weight), "bias": bias})
     airlight = airlight_in_fog(image)[:, :, None, None]
     foggy = airlight + t * (image - airlight)
     fog_of_all = airlight_in_fog(foggy)[:, :, None, None]

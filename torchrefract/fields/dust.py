@@ -73,7 +73,7 @@ def mean_wake_density(
     options = {"dtype": depth.dtype, "device": depth.device}
     depth, x = depth.clamp(min=_NEAREST, max=_FARTHEST), torch.arange(width, **options)
     descent = descent_of_rows(**view, **options)
-    total = torch.zeros(len(boxes), 1, depth.shape[2], width, **options)
+    total = depth.new_zeros(len(boxes), 1, depth.shape[2], width)
     for box in boxes.unbind(1):
         x1, y1, x2, y2 = box.view(-1, 4, 1, 1, 1).unbind(1)
         is_vehicle = (x2 > x1) & (y2 > y1)

@@ -70,9 +70,9 @@ def mean_wake_density(
         (N, 1, H, W), relative to the density on the road at a vehicle.
     """
     view = {"horizon": horizon, "height": depth.shape[2], "focal": focal, "center": center}
-    options = {"dtype": depth.dtype, "device": depth.device}
-    depth, x = depth.clamp(min=_NEAREST, max=_FARTHEST), torch.arange(width, **options)
-    descent = descent_of_rows(**view, **options)
+    depth = depth.clamp(min=_NEAREST, max=_FARTHEST)
+    x = torch.arange(width, dtype=depth.dtype, device=depth.device)
+    descent = descent_of_rows(**view, dtype=depth.dtype, device=depth.device)
     total = depth.new_zeros(len(boxes), 1, depth.shape[2], width)
     for box in boxes.unbind(1):
         x1, y1, x2, y2 = box.view(-1, 4, 1, 1, 1).unbind(1)

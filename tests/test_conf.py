@@ -101,9 +101,9 @@ TINY = {
 DATA = ["data.size=[32,64]", "data.train_count=4", "data.val_count=2", "data.batch_size=2", "data.workers=0"]
 
 
-@pytest.mark.filterwarnings(
+@pytest.mark.filterwarnings(  # of Lightning: a small training, its own code
     "ignore:.*does not have many workers", "ignore:.*LeafSpec"
-)  # of Lightning: a small training, its own code
+)
 @pytest.mark.parametrize(("model", "task"), TINY)
 def test_every_model_trains_and_validates(tmp_path, model, task):
     words = (f"+task={task}", f"model={model}", *TINY[model, task], *DATA, "+trainer.fast_dev_run=2")

@@ -45,9 +45,9 @@ def toy(first: int, count: int) -> tuple[Pair, Tensor]:
     return pair, posterior * unit[0, 0, 0].abs()
 
 
-@pytest.mark.filterwarnings(
+@pytest.mark.filterwarnings(  # of Lightning: a small training, its own code
     "ignore:.*does not have many workers", "ignore:.*LeafSpec"
-)  # of Lightning: a small training, its own code
+)
 def test_two_deviations_of_a_lens_of_known_posterior_cover_95_percent_in_4_steps(trainer, loader):
     torch.manual_seed(0)
     model = FlowDiffusion(small, Undistort(0.25), components=1, ema_decay=0.98, lr=1e-2)

@@ -94,7 +94,7 @@ def test_labels_and_clean_predictions_move_along_the_flow():
         assert [row.score.value for row in result.rows()] == [1]
 
 
-@pytest.mark.filterwarnings("ignore:depth is that of a road")
+@pytest.mark.filterwarnings("ignore:depth is that of a road")  # scenes assume a depth; the test counts fields
 def test_the_severities_of_a_scene_share_their_random_fields_which_changes_no_image(monkeypatch):
     drawn, noise = [], fog_volume.noise_on_planes
     monkeypatch.setattr(

@@ -13,6 +13,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
+from torchrefract._validation import requires_grad
+
 _F = TypeVar("_F", bound=Callable[..., Any])
 _CACHED_VALUES = 1 << 17  # float32 values that fit into the cache of one core
 _results: ContextVar[dict[Any, list[Any]] | None] = ContextVar("_results", default=None)
@@ -96,7 +98,7 @@ def shareable(function: _F) -> _F:
         if results is None:
             return function(*args, **kwargs)
         arguments, structure = pytree.tree_flatten((args, kwargs))
-        if any(isinstance(value, Tensor) and value.requires_grad for value in arguments):
+        if requires_grad(arguments):
             return function(*args, **kwargs)
         for others, other_structure, value in results.setdefault(function, []):
             if structure == other_structure and all(map(_is_equal, arguments, others)):

@@ -1,4 +1,5 @@
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -52,6 +53,25 @@ def test_a_model_that_fails_below_a_visibility_has_it_as_its_tolerated_value():
     share = rows[2].score.value
     assert result.mean_performance("fog") == pytest.approx((2 + share) / 5)
     assert result.relative_performance() == pytest.approx((2 + share) / 5)
+
+
+def test_a_model_that_writes_to_its_images_is_scored_like_one_that_does_not():
+    def normalize(images: Tensor, *, in_place: bool) -> Tensor:
+        images = images.sub_(0.5) if in_place else images - 0.5
+        return torch.stack([images.mean(dim=(1, 2, 3)), 0.3 - images.mean(dim=(1, 2, 3))], dim=1)
+
+    def score(prediction: Tensor, _: int) -> float:
+        return prediction[0].clamp(0, 1).item()
+
+    samples = [("a.png", torch.full((3, 8, 12), 0.6), 1)]
+    levels: dict[int, Effect] = {1: UniformFog(p=0.0), 2: UniformFog(visibility_range=(50.0, 500.0))}
+    results = [
+        evaluate(partial(normalize, in_place=in_place), samples, {"fog": levels}, score, depth=flat_depth)
+        for in_place in (False, True)
+    ]
+    assert results[0].clean == results[1].clean == pytest.approx(0.1)
+    assert results[0].scores == results[1].scores
+    assert samples[0][1].eq(0.6).all()
 
 
 def test_differences_between_levels_are_less_than_half_as_uncertain_as_with_independent_draws():

@@ -259,9 +259,9 @@ def _example(
     _, image, target = next(folder.read([name]))
     effect = scenes(image.shape[2])[level.scene][level.severity]
     degraded = effect.degrade(image, seed=seed, keys=[random.key_of(name)], depth=folder.depth(name, image))
-    target = as_labels(predict(image[None])[0], (image.shape[1], image.shape[2])) if target is None else target
+    target = as_labels(predict(image[None].clone())[0], (image.shape[1], image.shape[2])) if target is None else target
     moved = move_target(target, degraded, effect)
-    prediction = predict(degraded.image[None])[0]
+    prediction = predict(degraded.image[None].clone())[0]
     i = result.names.index(name)
     caption = (
         f"{name}, {level.scene} {level.severity}: {result.clean[i]:.2f} clean, {result.scores[level][i]:.2f} degraded"

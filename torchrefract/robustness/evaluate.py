@@ -258,9 +258,9 @@ class _PredictionError(Exception):
 
 
 def _predict(predict: Callable[[Tensor], Any], image: Tensor) -> Any:
-    """Return the prediction for an image (3, H, W)."""
+    """Return the prediction for an image (3, H, W), which the model may write to."""
     try:
-        (prediction,) = predict(image[None])
+        (prediction,) = predict(image[None].clone())
     except Exception as error:  # a model may raise anything
         raise _PredictionError(f"{type(error).__name__}: {error}") from error
     return prediction

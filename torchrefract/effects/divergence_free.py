@@ -2,13 +2,13 @@
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import expand_batch
 from torchrefract._validation import check_choice, check_count
 from torchrefract.effects.batch import params_to
+from torchrefract.effects.batch_flow import everywhere
 from torchrefract.effects.random_field import (
     check_decorrelation,
     check_field_params,
@@ -142,7 +142,7 @@ class DivergenceFree(WarpEffect):
         )
         if frequencies.is_all:
             warn_if_clipped(clipped, params, frequencies.size)
-        return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=flow.device)
+        return flow, everywhere(flow.device)
 
     def error_model(self) -> RandomFieldErrorModel | None:
         """Return the error bounds of the ranges for Gaussian psi in one step, normalized by theory; otherwise None."""

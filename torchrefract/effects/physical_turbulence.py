@@ -22,6 +22,7 @@ from torchrefract._validation import (
 )
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import LATEST_FRAME, ParamsAtDepth, check_shapes, params_to
+from torchrefract.effects.batch_flow import everywhere
 from torchrefract.effects.random_field import check_frame
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.depth import DepthSource, GroundPlaneDepth, check_depth_provider
@@ -189,7 +190,7 @@ class PhysicalTurbulence(WarpEffect):
             below = (points.y - (self.horizon * height - 0.5)) / focal[1]
             scale = scale * height_gain(1 - depth * below / self.height, self._layers)
         flow = torch.cat([u * (scale * focal[0]), v * (scale * focal[1])], dim=1)
-        return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=flow.device)
+        return flow, everywhere(flow.device)
 
     def error_model(self) -> "_TurbulenceBounds":
         """Return the largest displacement of the ranges."""

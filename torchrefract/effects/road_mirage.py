@@ -21,6 +21,7 @@ from torchrefract._validation import (
     requires_grad,
 )
 from torchrefract.effects.batch import LATEST_FRAME, ParamsAtDepth, check_shapes, params_to
+from torchrefract.effects.batch_flow import everywhere
 from torchrefract.effects.random_field import check_frame
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.depth import DepthSource, GroundPlaneDepth, check_depth_provider
@@ -180,7 +181,7 @@ class RoadMirage(WarpEffect):
         v = road_mirage_flow(critical_angle(difference), below, is_road, focal=focal)
         start = rows.start or 0
         flow = F.pad(v, (0, 0, start, height - v.shape[2] - start, 1, 0))  # no flow along x, and none in other rows
-        return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=v.device)
+        return flow, everywhere(v.device)
 
     def inverse_flow(self, params: ParamsAtDepth, flow: Tensor) -> tuple[Tensor, Tensor]:
         """Return a flow of 0, which exists where the mirage hides nothing."""

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrefract import random
 from torchrefract._validation import check_count, check_range, check_values, eager_bool
 from torchrefract.effects.batch import params_to
+from torchrefract.effects.batch_flow import everywhere
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.thin_plate import check_points, fit_spline, spline_flow
 from torchrefract.fields.thin_plate_error import ThinPlateErrorModel
@@ -108,7 +109,7 @@ class ThinPlateSpline(WarpEffect):
         """Evaluate the splines at the points; the flow exists everywhere."""
         spline = fit_spline(params.points, params.displacement, params.smoothing)
         flow = spline_flow(spline, points.x, points.y, dtype=params.points.dtype)
-        return flow, torch.ones(1, 1, 1, 1, dtype=torch.bool, device=flow.device)
+        return flow, everywhere(flow.device)
 
     def error_model(self) -> ThinPlateErrorModel:
         """Return the error bounds of the ranges, for the control points of drawn splines."""

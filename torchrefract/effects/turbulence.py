@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from torchrefract import random
@@ -14,6 +13,7 @@ from torchrefract._tensor import expand_batch
 from torchrefract._validation import check_choice, check_positive, eager_bool
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import ParamsAtDepth, params_to
+from torchrefract.effects.batch_flow import everywhere
 from torchrefract.effects.physical_turbulence import PhysicalTurbulence, focal_px
 from torchrefract.effects.random_field import (
     check_decorrelation,
@@ -157,11 +157,11 @@ class Turbulence(WarpEffect):
 
     def flow(self, params: Any, points: Points, plan: WarpPlan) -> tuple[Tensor, Tensor]:
         """Compute the flow of each frame; it exists everywhere."""
-        everywhere = torch.ones(1, 1, 1, 1, dtype=torch.bool, device=params.applied.device)
+        exists = everywhere(params.applied.device)
         if not isinstance(params, ParamsAtDepth):
-            return self._field(params, points, plan, plan.details), everywhere
+            return self._field(params, points, plan, plan.details), exists
         share = share_at_depth(params.depth.to(params.params.amplitude.dtype), self.reference_distance)
-        return self._smooth_field(params.params, points, plan) * sample_at(share, points), everywhere
+        return self._smooth_field(params.params, points, plan) * sample_at(share, points), exists
 
     def error_model(self) -> ErrorModel | None:
         """Return the error bounds of the ranges; None if fields are normalized by the image."""

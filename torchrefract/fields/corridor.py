@@ -15,7 +15,7 @@ from torchrefract.fields.sky import find_sky, sky_mask
 from torchrefract.warping.grid import field_dtype
 
 _OPEN = 0.1  # share of sky from which a frame counts as open
-_POLE = 0.03  # widths: narrower things in front of the sky hide no skyline
+_POLE = 0.03  # widths: narrower things in front of the sky hide no skyline; it is smoothed alike
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +106,8 @@ class CorridorDepth:
         height, width = mask.shape[2:]
         lowest = torch.where(mask, y[:, None], -1.0).amax(dim=2, keepdim=True)
         side = int(_POLE * width / 2)
-        lowest = F.max_pool2d(lowest, (1, 2 * side + 1), stride=1, padding=(0, side))
+        around = {"kernel_size": (1, 2 * side + 1), "stride": 1, "padding": (0, side)}
+        lowest = F.avg_pool2d(F.max_pool2d(lowest, **around), **around, count_include_pad=False)
         rise = (self.horizon * height - 0.5 - lowest).clamp(min=1e-3)
         z = ((self.height - self.camera_height) * self.focal * width / rise).clamp(max=self.far)
         return torch.where(lowest < 0, 0.0, z)

@@ -226,7 +226,7 @@ def metrics_rows(run: Path) -> Iterator[dict[str, str]]:
 
 
 class MetricsLogger(CSVLogger):
-    """Write metrics.csv as Lightning's logger does; in a store, write all its rows each time, since some cannot append."""
+    """Write metrics.csv as Lightning's logger does; in a store, write all rows each time, as some cannot append."""
 
     @rank_zero_only
     def save(self) -> None:

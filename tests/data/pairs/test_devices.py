@@ -53,7 +53,9 @@ def test_a_device_that_actors_do_not_have_raises(name, num_gpus, message):
 def test_a_gpu_that_torch_does_not_see_is_one_line(call, words, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     message = call("generate", *words("out"), "device=cuda").message
-    assert message == "device must be cpu where PyTorch sees no GPU, got cuda; use a node with one and PyTorch with CUDA"
+    assert (
+        message == "device must be cpu where PyTorch sees no GPU, got cuda; use a node with one and PyTorch with CUDA"
+    )
     assert not (tmp_path / "out" / "config.json").exists()
 
 

@@ -83,7 +83,9 @@ def _check_gpus(available: float, workers: int, num_gpus: float, *, can_wait: bo
     if (fitting := int(available / num_gpus)) >= workers:
         return
     if can_wait:
-        print(f"the cluster has GPUs for {fitting} of {workers} workers; the others wait for nodes with GPUs", flush=True)
+        print(
+            f"the cluster has GPUs for {fitting} of {workers} workers; the others wait for nodes with GPUs", flush=True
+        )
         return
     raise UsageError(
         f"engine.num_gpus must be 0 or fit the GPUs of this machine, got {num_gpus} for each of {workers} workers and "

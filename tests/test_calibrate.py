@@ -1,3 +1,4 @@
+import errno
 import json
 import re
 from dataclasses import replace
@@ -44,6 +45,15 @@ def pictures(tmp_path, rendered_small) -> Path:
 
 def read_report(tmp_path: Path) -> str:
     return (tmp_path / "calibration" / "report.md").read_text()
+
+
+def test_rendered_pictures_on_a_full_disk_raise(tmp_path, monkeypatch):
+    def fail(path: Path, data: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", fail)
+    with pytest.raises(OSError, match="No space left on device"):
+        calibration._rendered(BOARD, tmp_path / "rendered")
 
 
 def test_the_camera_of_rendered_pictures_is_recovered(call, tmp_path, monkeypatch):

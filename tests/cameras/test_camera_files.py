@@ -281,7 +281,7 @@ REFUSED = {
     "shares of the frame": (
         storage(FIVE).replace("510.25, 0., 322.5, 0., 505.75, 237.125", "0.8, 0., 0.5, 0., 1.05, 0.5"),
         {},
-        "must hold fx, fy, cx, cy in px, got .* for frames of 640 x 480 px; multiply fx and cx by the width",
+        "must hold fx, fy, cx, cy in px, got .* for frames of 640 x 480 px; multiply shares by the width",
     ),
     "a model of others": (storage(FIVE), {"model": "omni"}, "model must be one of opencv, fisheye, got 'omni'"),
     "a fisheye without k": (message((), "equidistant"), {}, "must hold the four coefficients of a fisheye"),

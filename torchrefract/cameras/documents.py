@@ -119,7 +119,7 @@ class Document:
         if min(width, height) > _LARGEST_ICON and max(map(abs, pinhole)) <= _LARGEST_SHARE:
             raise ValueError(
                 f"path must hold fx, fy, cx, cy in px, got {self.path} with {fx:g}, {fy:g}, {cx:g}, {cy:g} for frames "
-                f"of {width} x {height} px; multiply fx and cx by the width and fy and cy by the height if they are shares"
+                f"of {width} x {height} px; multiply shares by the width and the height"
             )
         try:
             return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=lens, model=model)

@@ -43,7 +43,14 @@ from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera, read_covariance, read_opencv, write_opencv
 from torchrefract.cli.command import check_none_lost, make, naming, progress
 from torchrefract.data import media
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, is_lost, pixels_of, read_image
+from torchrefract.data.images import (
+    EXTENSIONS,
+    UnreadableImageError,
+    files_in,
+    is_lost,
+    pixels_of,
+    read_image,
+)
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.fields.rectification import camera_flow, zoom_to_crop
 from torchrefract.warping.warp import warp
@@ -221,8 +228,9 @@ def _rendered(board: Board, folder: Path) -> list[Path]:
     if not marker.is_file() or marker.read_text(encoding="utf-8") != content:
         folder.mkdir(exist_ok=True)
         for name, picture, _ in progress(render_views(board), "rendering", count=NUM_VIEWS):
+            _, encoded = cv2.imencode(".png", picture)
             with replace_file(folder / name) as path:
-                cv2.imwrite(str(path), picture)
+                path.write_bytes(encoded.tobytes())  # cv2.imwrite would not say that a disk is full
         with replace_file(marker) as path:
             path.write_text(content, encoding="utf-8")
     return find_pictures(folder)

@@ -4,6 +4,7 @@ import re
 import shlex
 import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,20 @@ def test_an_interrupt_while_a_command_loads_is_one_line(capsys, monkeypatch):
     with pytest.raises(SystemExit) as stop:
         command("degrade", "", "degradation:degrade")()
     assert (stop.value.code, capsys.readouterr().err) == (130, "stopped\n")
+
+
+@pytest.mark.quick
+def test_a_warning_to_the_user_is_one_line(run_main):
+    def warn() -> None:
+        with warnings.catch_warnings():  # pytest would keep them
+            warnings.simplefilter("always")
+            warnings.showwarning = lambda *given, **_: sys.stderr.write(warnings.formatwarning(*given[:4]))
+            warnings.warn("the lens is a guess", stacklevel=2)
+            warnings.warn("old", FutureWarning, stacklevel=2)
+
+    first, second = run_main(warn).splitlines()[:2]
+    assert first == "warning: the lens is a guess"
+    assert second.endswith("FutureWarning: old")
 
 
 @pytest.mark.quick

@@ -89,7 +89,7 @@ def run(name: str, function: Callable[[DictConfig], None]) -> None:
     values = (argument.partition("=")[2].strip("'\"") for argument in sys.argv[1:])
     # Hydra creates the folder of a run before it calls the job.
     existing = _existing_folders([*filter(None, values), *Path("runs").glob("*"), "runs"])
-    with _one_line_errors(name):
+    with _one_line_errors(name), _one_line_warnings():
         _check_outputs(name, sys.argv[1:])
         sys.argv[1:] = prepare_arguments(name, sys.argv[1:])
         hydra.main(config_path=str(_config_file(name).parent), config_name=name, version_base="1.3")(job)()
@@ -330,6 +330,21 @@ def _one_line_errors(name: str) -> Iterator[None]:
     except KeyboardInterrupt as error:
         print(f"stopped; {error if str(error) else 'the same command continues'}", file=sys.stderr)
         raise SystemExit(128 + signal.SIGINT) from None
+
+
+@contextmanager
+def _one_line_warnings() -> Iterator[None]:
+    """Print a warning to the user as one line, without the place in the code that gave it."""
+    form = warnings.formatwarning
+
+    def one_line(message: Warning | str, category: type[Warning], *place: Any, **text: Any) -> str:
+        return f"warning: {message}\n" if category is UserWarning else form(message, category, *place, **text)
+
+    warnings.formatwarning = one_line
+    try:
+        yield
+    finally:
+        warnings.formatwarning = form
 
 
 def _user_message(error: Exception, name: str) -> str | None:

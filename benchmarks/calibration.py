@@ -7,11 +7,12 @@
 The lens model is the one that `calibrate` chooses. "OpenCV" is cv2.calibrateCamera, with its five coefficients, of the
 corners of OpenCV's detectors in all pictures; "four" is the same without k3, of the corners of this library. Held-out
 errors are of five folds. All errors are in px rms over corners. "edge" is the largest distance over the frame, px,
-between where the camera and the published one show a ray; "folded" is the share of the frame without a ray. Bad views
-are planted in place of a good one, one at a time: a picture bent over the width of its board by up to a hundredth of
-the frame's width; corners of a picture enlarged by a tenth; one corner 5 px off; two neighboring corners swapped; the
-mirrored picture. They are searched as `calibrate` does before it chooses the lens model. "lines" is the distance of
-corners of one row or column from a straight line, in the pictures and after `rectify`.
+between where the camera and the published one show a ray, "nearest" the least that any model has from which `calibrate`
+chooses, as only the published camera can tell; "folded" is the share of the frame without a ray. Bad views are planted
+in place of a good one, one at a time: a picture bent over the width of its board by up to a hundredth of the frame's
+width; corners of a picture enlarged by a tenth; one corner 5 px off; two neighboring corners swapped; the mirrored
+picture. They are searched as `calibrate` does before it chooses the lens model. "lines" is the distance of corners of
+one row or column from a straight line, in the pictures and after `rectify`.
 
 `lenses` unprojects the pixels of each lens and puts the rays into OpenCV's forward formula. "wrong" is the share of
 pixels that are off by more than 1e-6 px and not marked: `valid` marks pixels of this library, -1e6 those of OpenCV's
@@ -22,8 +23,10 @@ CSV of `read_lenses`, without share-alike rows.
 """
 
 import argparse
+import contextlib
 import csv
 import importlib
+import itertools
 import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -40,9 +43,9 @@ from torch import Tensor
 from torchrefract._io import replace_file
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract.cameras.calibration.boards import Board, Charuco, Chessboard
-from torchrefract.cameras.calibration.choice import AUTO
+from torchrefract.cameras.calibration.choice import AUTO, CANDIDATES, is_one_to_one
 from torchrefract.cameras.calibration.detection import SEARCH_FLAGS, Detection, View, detect, has_enough_corners
-from torchrefract.cameras.calibration.fit import Fit, cross_validate, drop_outliers, fit_camera, rms
+from torchrefract.cameras.calibration.fit import PRIORS, Fit, cross_validate, drop_outliers, fit_camera, rms
 from torchrefract.cameras.calibration.report import FIRST_MODEL, FIRST_PRIOR, calibrate_camera, straightness
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.conversion import Conversion, convert
@@ -75,6 +78,7 @@ class BoardRow(NamedTuple):
     opencv_held_out: float
     four_held_out: float
     edge_px: float | None  # largest distance from the published camera
+    nearest_px: float | None  # the same, of the nested model that comes nearest to it
     folded: float  # share of the frame
     lines: float
     rectified_lines: float
@@ -131,6 +135,7 @@ def measure_board(name: str, entry: Mapping[str, Any], folder: Path) -> BoardRow
         name, f"{fit.model}, {fit.prior}", len(pictures), len(kept), sum(len(view.ids) for view in kept),
         fit.rms, calibration.held_out_rms, len(opencv_views), opencv_fit.rms, opencv_held_out,
         fit_and_validate(kept, "opencv4")[1], edge_distance(camera, published) if published else None,
+        nearest_edge(kept, board, size, published) if published else None,
         1 - camera.coverage(),
         *_line_errors(kept, pictures, board, camera),
         camera.fx, 100 * (camera.fx / published["fx"] - 1) if published else None,
@@ -147,6 +152,16 @@ def edge_distance(camera: Camera, published: Mapping[str, Any]) -> float:
     shown, valid, _ = camera.project(rays)
     distance = torch.where(valid, (shown - pixels).norm(dim=1), torch.inf)
     return distance[has_ray].max().item()
+
+
+def nearest_edge(views: Sequence[View], board: Board, size: tuple[int, int], published: Mapping[str, Any]) -> float:
+    """Return the least `edge_distance` of the models that `calibrate` chooses from."""
+    distances = []
+    for model, prior in itertools.product(CANDIDATES, PRIORS[1:]):
+        with contextlib.suppress(ValueError):  # views that do not fit the model
+            camera = fit_camera(views, board, model=model, size=size, prior=prior).camera
+            distances += [edge_distance(camera, published)] if is_one_to_one(camera) else []
+    return min(distances)
 
 
 def opencv_detect(gray: np.ndarray, board: Board, *, name: str) -> View:
@@ -307,8 +322,8 @@ def run_boards(args: argparse.Namespace) -> list[dict[str, Any]]:
     """Measure and print the sets of pictures."""
     print("px rms over corners; OpenCV: its detectors and all views; lines: in the pictures, and rectified")
     print(
-        f"{'set':16} {'model':20} views corners  error held-out | OpenCV held-out | four held-out   edge folded | "
-        " lines rectified       fx published planted"
+        f"{'set':16} {'model':20} views corners  error held-out | OpenCV held-out | four held-out   edge nearest "
+        "folded |  lines rectified       fx published planted"
     )
     rows = []
     for kind in ("charuco", "chessboard"):
@@ -319,11 +334,11 @@ def run_boards(args: argparse.Namespace) -> list[dict[str, Any]]:
             row = measure_board(name, entry, args.folder / kind / name)
             published = "" if row.published_fx_percent is None else f"{row.published_fx_percent:+.2f} %"
             planted = ", ".join(f"{kind}: {result}" for kind, result in row.planted.items())
-            edge = "" if row.edge_px is None else f"{row.edge_px:.1f}"
+            edge, nearest = ("" if px is None else f"{px:.1f}" for px in (row.edge_px, row.nearest_px))
             print(
                 f"{name:16} {row.model:20} {row.views:2}/{row.pictures:2} {row.corners:7} {row.error:6.3f} "
                 f"{row.held_out:8.3f} | {row.opencv_error:6.3f} {row.opencv_held_out:8.3f} | {row.four_held_out:13.3f} "
-                f"{edge:>6} {row.folded:6.1%} | {row.lines:6.3f} {row.rectified_lines:9.3f} "
+                f"{edge:>6} {nearest:>7} {row.folded:6.1%} | {row.lines:6.3f} {row.rectified_lines:9.3f} "
                 f"{row.fx:8.1f} {published:>9} {planted}",
                 flush=True,
             )

@@ -176,7 +176,7 @@ def draw(names: list[str], frame: Tensor, depth: Tensor | None) -> Figure:
 def main() -> None:
     """Print a table, or save a picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--root", type=Path, help="folder of frames; without it, rendered roads with their depth")
+    parser.add_argument("--root", type=Path, help="folder with pictures; without it, rendered roads with their depth")
     parser.add_argument("--without", nargs="*", default=[], help="beginnings of names of frames to leave out")
     parser.add_argument("--count", type=int, default=24, help="number of frames")
     parser.add_argument("--size", type=int, nargs=2, default=(360, 640), help="of rendered roads, px")
@@ -187,6 +187,8 @@ def main() -> None:
     depths: Sequence[Tensor | None]
     if arguments.root:
         frames = frames_in(arguments.root, arguments.count, arguments.without)
+        if not frames:
+            parser.error(f"--root must be a folder with pictures in it, got none in {arguments.root}")
         depths = [None] * len(frames)
     else:
         images, maps = render_road_scenes(torch.arange(arguments.count), *arguments.size)

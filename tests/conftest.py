@@ -2,9 +2,12 @@ import importlib
 import logging
 import math
 import os
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -52,21 +55,56 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def bucket() -> Iterator[dict[str, str]]:
+def s3() -> Iterator[dict[str, str]]:
     """Start a server of the S3 protocol with the empty s3://bucket; return the environment that names it."""
-    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)  # in its own extra
-    pytest.importorskip("s3fs")  # in its own extra
+    why = "moto and s3fs are in the extra test-stores"
+    pytest.importorskip("s3fs", reason=why)
+    server = pytest.importorskip("moto.server", reason=why).ThreadedMotoServer(port=0)
     server.start()
     host, port = server.get_host_and_port()
     environment = {"AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b"}
-    environment |= {"AWS_DEFAULT_REGION": "us-east-1"}
+    with empty_bucket("s3", environment | {"AWS_DEFAULT_REGION": "us-east-1"}) as environment:
+        yield environment
+    server.stop()
+
+
+@pytest.fixture(scope="session")
+def gs() -> Iterator[dict[str, str]]:
+    """Start a server of Google's protocol with the empty gs://bucket; return the environment that names it."""
+    why = "gcp-storage-emulator and gcsfs are in the extra test-stores"
+    pytest.importorskip("gcp_storage_emulator", reason=why)
+    with socket.create_server(("localhost", 0)) as free:
+        port = free.getsockname()[1]
+    # gcsfs asks Google for the kind of each bucket, whatever the server is, unless this is false when it is imported.
+    environment = {"STORAGE_EMULATOR_HOST": f"http://localhost:{port}", "GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT": "false"}
+    environment |= {"NO_GCE_CHECK": "true"}  # google.auth looks for a server of Google's machines otherwise
+    command = [sys.executable, "-m", "gcp_storage_emulator", "start", f"--port={port}", "--in-memory"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as server:
+        while server.poll() is None and not is_served(port):
+            time.sleep(0.05)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT", "false")
+            pytest.importorskip("gcsfs", reason=why)
+        with empty_bucket("gs", environment):
+            yield environment
+        server.terminate()
+
+
+def is_served(port: int) -> bool:
+    """Return True if a server of this machine accepts connections."""
+    with socket.socket() as client:
+        return client.connect_ex(("localhost", port)) == 0
+
+
+@contextmanager
+def empty_bucket(protocol: str, environment: dict[str, str]) -> Iterator[dict[str, str]]:
+    """Set an environment, and create the bucket of this name in the server that it names."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in environment.items():
             patch.setenv(name, value)
         fsspec: Any = importlib.import_module("fsspec")
-        fsspec.filesystem("s3", use_listings_cache=False).mkdir("bucket")
+        fsspec.filesystem(protocol, use_listings_cache=False).mkdir("bucket")
         yield environment
-    server.stop()
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,7 @@ from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning import Trainer
 from pytorch_lightning.callbacks import ModelCheckpoint
-from pytorch_lightning.loggers import CSVLogger, Logger
+from pytorch_lightning.loggers import Logger
 
 import torchrefract
 from torchrefract import presets
@@ -20,6 +20,7 @@ from torchrefract.effects.base import Effect
 from torchrefract.restoration.diffusion import Diffusion
 from torchrefract.restoration.models.denoiser import Denoiser
 from torchrefract.restoration.module import Restoration
+from torchrefract.restoration.report import MetricsLogger
 
 CONF = Path(CONFIG_DIR)
 
@@ -161,7 +162,7 @@ def test_every_logger_writes_into_the_run_folder_beside_the_metrics_that_reports
     assert options("logger") == ["csv", "tensorboard", "wandb"]
     for name in options("logger"):
         first, *others = compose_training(tmp_path, "+task=undistort", f"logger={name}").trainer.logger
-        assert get_class(first._target_) is CSVLogger
+        assert get_class(first._target_) is MetricsLogger
         assert [other._target_.rpartition(".")[2].lower() for other in others] == [f"{name}logger"] * (name != "csv")
         for logger in (first, *others):
             kind, arguments = get_class(logger._target_), {key: logger[key] for key in logger if key != "_target_"}

@@ -302,6 +302,23 @@ def test_the_corridor_is_nearer_to_lidar_than_a_flat_road_and_the_ramp(shared_da
             for d in (corridor, GroundPlaneDepth(**road)(360, 640, **size), LinearDepth()(360, 640, **size))
         ]
         assert errors[0] < 0.8 * errors[1] < 0.8 * errors[2]
+        t, flat, exact = (
+            torch.exp(-3 * d / 100) for d in (corridor, GroundPlaneDepth(**road)(360, 640, **size), truth)
+        )
+        assert (t - exact).square().mean() < 0.85 * (flat - exact).square().mean()
+
+
+@pytest.mark.filterwarnings("ignore:depth is that of a road")
+def test_walls_are_as_far_away_as_the_sky_above_them_is_low():
+    image = torch.full((2, 3, 120, 200), 0.2)
+    image[:, :, :31, :] = 0.9  # a skyline 29 rows above the horizon, whose row is 59.5
+    image[1, :, :40, 150:] = 0.9  # 20 rows above it on the right
+    depth = CorridorDepth(side=3.0, focal=1.0, spread=0.0, height=6.0)(image)
+    at_skyline = 200 * (6.0 - 1.3) / torch.tensor([59.5 - 30, 59.5 - 39])
+    assert_close(depth[:, 0, 50, 190], at_skyline)
+    assert_close(depth[1, 0, 50, 20], at_skyline[0])
+    assert depth[1, 0, 35, 20] < torch.inf == depth[1, 0, 35, 190]
+    assert_close(depth[0, 0, 110, 190], torch.tensor(1.3 * 200 / 51.0), rtol=0.02, atol=0)  # the road hides the wall
 
 
 def test_the_walls_stand_where_they_should_and_the_depth_is_announced_as_assumed():

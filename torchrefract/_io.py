@@ -1,6 +1,7 @@
 """Paths on this machine and in object stores, atomic file writes, and the folder of the configuration files."""
 
 import errno
+import logging
 import os
 import sys
 import tempfile
@@ -32,6 +33,7 @@ def as_path(text: str | Path) -> Path:
         return Path(text).expanduser() if isinstance(text, str) else text
     from upath import UPath  # noqa: PLC0415  # only the extra "train" has it
 
+    logging.getLogger("fsspec").setLevel(logging.WARNING)  # it notes each file that gcsfs opens
     try:
         # Other machines write to the same folder, so a listing must not be remembered.
         path = UPath(text, use_listings_cache=False)

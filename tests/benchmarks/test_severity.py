@@ -68,4 +68,4 @@ def test_the_command_prints_a_row_for_each_severity_and_saves_a_picture(monkeypa
 def test_level_3_takes_a_like_share_of_real_frames(shared_data, name):
     frames = severity.frames_in(shared_data / "frames" / "train", 4, ["br_", "us_atx"])
     kept, _ = severity.measure(severity.scene_for_width(name, 3, 640), frames, [None] * len(frames))
-    assert 0.35 < kept.taken < 0.65  # 0.45 to 0.55 over 24 frames
+    assert 0.35 < kept.taken < 0.65  # 0.49 to 0.58 over 24 frames

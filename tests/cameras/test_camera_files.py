@@ -247,8 +247,6 @@ TWO = message(FIVE, "plumb_bob") + message(EIGHT, "rational_polynomial")
 ZERO_K = message((), "plumb_bob").replace("510.25", "0.0")
 # Content, arguments, message.
 REFUSED = {
-    "four coefficients": (storage(FISHEYE), {}, 'the lens model of four .*; add fisheye_model: .*model="opencv" or'),
-    "four zeros": (storage((0.0,) * 4), {}, "must state the lens model of four coefficients"),
     "another model": (
         message(FISHEYE, "equidistant"),
         {"model": "opencv"},
@@ -309,12 +307,16 @@ def test_a_file_without_one_exact_camera_raises_with_the_way_out(case, tmp_path)
         read_camera(tmp_path / "file", **options)
 
 
-def test_read_opencv_does_not_guess_the_model_of_four_coefficients(tmp_path, make_camera):
-    (tmp_path / "a.yaml").write_text(storage(FISHEYE))
-    with pytest.raises(ValueError, match="path must state the lens model of four coefficients"):
-        read_opencv(tmp_path / "a.yaml")
-    write_opencv(tmp_path / "a.yaml", make_camera(RADIAL))
-    assert read_camera(tmp_path / "a.yaml") == make_camera(RADIAL)
+@pytest.mark.parametrize("coefficients", [FISHEYE, (0.0,) * 4])
+def test_four_coefficients_without_a_model_are_taken_as_k1_k2_p1_p2_with_a_warning(coefficients, tmp_path, make_camera):
+    path = tmp_path / "a.yaml"
+    path.write_text(storage(coefficients))
+    for read in (read_camera, read_opencv):
+        with pytest.warns(UserWarning, match="a.yaml are taken as k1, k2, p1, p2, .* add fisheye_model: 1 if"):
+            assert read(path) == make_camera(coefficients)
+    assert read_camera(path, model="fisheye") == make_camera(coefficients, "fisheye")
+    write_opencv(path, make_camera(RADIAL))  # which states the model
+    assert read_camera(path) == make_camera(RADIAL)
 
 
 @pytest.mark.parametrize("model", ["opencv", "fisheye"])

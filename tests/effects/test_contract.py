@@ -420,7 +420,8 @@ def test_channels_are_degraded_independently(case):
     result = effect.degrade(image, seed=7).image
     for channel in range(4):
         single = effect.degrade(image[:, [channel]], seed=7).image
-        assert torch.equal(single[:, 0], result[:, channel])
+        # Vector instructions round the last few pixels of a row otherwise, and which these are depends on the size.
+        assert_close(single[:, 0], result[:, channel], rtol=0, atol=1e-6)
 
 
 def channels_change_each_other_by_the_gain_alone(case: Case) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import Camera, NightGlow
-from torchrefract.fields.night_glow import glow_transfer
+from torchrefract.fields.night_glow import scattering_transfer
 from torchrefract.types import Degraded
 
 FOCAL = 90.0  # px
@@ -59,9 +59,8 @@ def test_the_transfer_of_single_scattering_is_the_mean_of_its_angles_along_the_w
     q, a = torch.tensor([0.0, 1e-5, 0.3, 5.0, 80.0], dtype=torch.float64), 0.1 / math.sqrt(0.9)
     share = (torch.arange(20000, dtype=torch.float64) + 0.5) / 20000
     single = torch.exp(-a * q[:, None] * share).mean(dim=1)
-    thickness = torch.tensor(2.0, dtype=torch.float64)
-    actual = glow_transfer(q, thickness, torch.tensor(0.9, dtype=torch.float64))
-    assert_close(actual, torch.exp(-2 * (1 - single)), rtol=1e-8, atol=0)
+    actual = scattering_transfer(q, torch.tensor(0.9, dtype=torch.float64))
+    assert_close(actual, single, rtol=1e-8, atol=0)
 
 
 @pytest.mark.parametrize("size", [(60, 90), (341, 643)])

@@ -12,14 +12,15 @@ from PIL import Image
 from torchrefract._io import as_path
 from torchrefract.restoration.checkpoints import read_checkpoint
 from torchrefract.restoration.module import Restoration
+from torchrefract.restoration.report import metrics_rows
 
 
-@pytest.fixture(params=["memory", "s3"])
+@pytest.fixture(params=["memory", "s3", "gs"])
 def store(request, monkeypatch) -> str:
     """Return the address of an empty folder in a store, without pauses before further tries."""
     monkeypatch.setattr("torchrefract._io._PAUSES", (0.0, 0.0, 0.0))
-    if request.param == "s3":
-        request.getfixturevalue("bucket")
+    if request.param != "memory":
+        request.getfixturevalue(request.param)
     return f"{request.param}://bucket/runs"
 
 
@@ -39,6 +40,8 @@ def test_a_run_in_a_store_is_stopped_continued_scored_and_applied(call, small, s
     assert call("train", "+task=undistort", *small, f"run_dir={store}/a", f"ckpt_path={last}").code == 0
     files = ["best.ckpt", "config.yaml", "curves.png", "last.ckpt", "metrics.csv", "metrics_before.csv", "panel.png"]
     assert sorted(path.name for path in as_path(f"{store}/a").iterdir()) == files
+    epochs = [row["epoch"] for row in metrics_rows(as_path(f"{store}/a")) if row.get("val/loss")]
+    assert epochs == ["0", "1"]  # Google's storage cannot append to a file
     assert read_checkpoint(as_path(last), task="undistort")["global_step"] == 8
     outcome = call("eval", f"ckpt_path={store}/a/best.ckpt")
     assert f"scoring {store}/a/best.ckpt on 8 validation frames of RoadScenes" in outcome.out
@@ -46,7 +49,7 @@ def test_a_run_in_a_store_is_stopped_continued_scored_and_applied(call, small, s
     Image.fromarray(pixels).save(tmp_path / "raw.png")
     assert call("restore", f"ckpt_path={store}/a/best.ckpt", "input=raw.png", "out=out").code == 0
     assert np.abs(np.asarray(Image.open(tmp_path / "out" / "raw.png")).astype(float) - pixels).mean() > 1
-    assert not [name for name in os.listdir(tmp_path) if name.startswith(("memory:", "s3:"))]
+    assert not [name for name in os.listdir(tmp_path) if name.startswith(("memory:", "s3:", "gs:"))]
 
 
 def test_a_checkpoint_that_is_missing_in_a_store_is_one_line_of_error(call, small, store):

@@ -5,6 +5,7 @@ ValueError with the name of the file if it does not hold what they describe. Wri
 cannot hold the camera; readers of the path find the old file or the complete new one.
 """
 
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -79,12 +80,16 @@ def read_camera(
         path: of the file, or of a folder of COLMAP.
         name: of the camera in a file of several: cam0 of Kalibr, the id of COLMAP, the lens of lensfun, Camera1.
         width, height: of the frames, px, for a file that does not state them.
-        model: "opencv" or "fisheye", for a file that does not state to which of them its four coefficients belong.
+        model: "opencv" or "fisheye", for a file that does not state to which of them its four coefficients belong; None
+            takes "opencv" there, and warns.
         focal_mm, crop_factor: of a lens of lensfun, see `lens_profiles.lensfun_rows`.
 
     Raises:
         ValueError: the file is of another form, has no exact counterpart here, leaves open what the arguments state,
             or contradicts them.
+
+    Warns:
+        UserWarning: four coefficients are taken as k1, k2, p1, p2 without a statement of the model.
     """
     if model is not None:
         check_choice("model", model, ("opencv", "fisheye"))
@@ -105,7 +110,7 @@ def read_opencv(path: str | Path) -> Camera:
     """Read image_width, image_height, camera_matrix, distortion_coefficients and fisheye_model of a camera.
 
     The model is "fisheye" if fisheye_model is present and not 0, "division" if division_model is, otherwise "opencv".
-    Four coefficients without fisheye_model may be of two models and raise ValueError; `read_camera` takes the model.
+    Four coefficients without fisheye_model may be of two models: they are taken as k1, k2, p1, p2, with a warning.
 
     Args:
         path: of YAML, JSON or XML.
@@ -323,10 +328,10 @@ def _document_camera(
     if not coefficients and model == "fisheye":
         raise ValueError(f"path must hold the four coefficients of a fisheye, got {path} without")
     if len(coefficients) == 4 and model is None:
-        raise ValueError(
-            f"path must state the lens model of four coefficients, got {path} without fisheye_model and "
-            "distortion_model; add fisheye_model: 0 if they are k1, k2, p1, p2, or 1 for those of cv2.fisheye; or "
-            'state model="opencv" or "fisheye" in read_camera'
+        warnings.warn(
+            f"the four coefficients of {path} are taken as k1, k2, p1, p2, since it states no lens model; add "
+            "fisheye_model: 1 if they are those of cv2.fisheye, or fisheye_model: 0; or state model= in read_camera",
+            stacklevel=2,
         )
     return document.camera(size, pinhole, coefficients or [0.0] * 4, model or "opencv")
 

@@ -5,7 +5,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
@@ -40,6 +40,7 @@ from torchrefract.data.pairs.generator import (
     PairStorage,
     PairTask,
     SourceReader,
+    device_of,
     generate_pairs,
 )
 from torchrefract.data.pairs.manifest import (
@@ -113,10 +114,10 @@ def generate(cfg: DictConfig) -> None:
         with locked("out", out, "sources", wait=True):  # other shards wait for the list instead of scanning again
             options = _parse(cfg, out)
             about = {"license": options.license, "made_with": _VERSIONS}
-            previous = claim(out, options.settings, count=options.num_pairs, about=about).get("made_with", _VERSIONS)
+            previous = claim(out, options.settings, count=options.num_pairs, about=about, earlier={"device": "cpu"})
             options.write_list()
-        if previous != _VERSIONS:
-            print(f"existing pairs were made with {previous}, new ones are made with {_VERSIONS}: bytes may differ")
+        if (versions := previous.get("made_with", _VERSIONS)) != _VERSIONS:
+            print(f"existing pairs were made with {versions}, new ones are made with {_VERSIONS}: bytes may differ")
         with locked_shard(out, *options.shard):
             num_made, lost = _make_missing(options, out)
         _finish(options, out, num_made=num_made)
@@ -177,10 +178,12 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
         "every": _checked(cfg, "every", check_count),
         "val_share": _checked(cfg, "val_share", check_number),
     }
+    engine = cast(dict[str, Any], OmegaConf.to_container(cfg.engine))
+    with naming("device"):
+        plain["device"] = choose_device(cfg.device, engine)
     if not 0 < plain["val_share"] < 1:
         raise UsageError(f"val_share must be between 0 and 1, got {plain['val_share']}")
     verify, shard, workers = _checked(cfg, "verify", check_flag), _shard(cfg), _workers(cfg)
-    engine = cast(dict[str, Any], OmegaConf.to_container(cfg.engine))
     if engine["name"] == "ray" and workers == 0:
         raise UsageError("workers must be at least 1 for engine=ray, which counts its actors, got 0")
     with naming("source"):
@@ -203,11 +206,30 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
     scene: dict[str, Any] = {"name": str(HydraConfig.get().runtime.choices["scene"])}
     scene |= cast(dict[str, Any], OmegaConf.to_container(cfg.scene, resolve=True))
     reader = SourceReader(sources.root, plain["size"], depth)
-    generator = PairGenerator(effect, scene["name"], reader, cfg.seed, plain["maps"])
+    generator = PairGenerator(effect, scene["name"], reader, cfg.seed, plain["maps"], plain["device"])
     settings = {"scene": scene, **plain, "frames": sources.num_frames, "sources": sources.digest()}
     return Options(
         generator, sources, write_list, settings, num_pairs, str(cfg.license), shard, workers, engine, verify, set()
     )
+
+
+def choose_device(name: str, engine: Mapping[str, Any]) -> str:
+    """Return the device that computes pairs, "cpu" or "cuda": `name`, or a GPU if actors of Ray get one.
+
+    Raises:
+        UsageError: PyTorch sees no GPU for engine=local.
+        ValueError, TypeError: the name or the number of GPUs is invalid, or the actors get no GPU for "cuda".
+    """
+    check_choice("device", name, ("cpu", "cuda"))
+    if engine["name"] != "ray":
+        device_of(name)  # Ray's actors run on other machines
+        return name
+    num_gpus = check_number("engine.num_gpus", engine["num_gpus"], low=0)
+    if name == "cuda" and num_gpus == 0:
+        raise ValueError(
+            "engine.num_gpus must be above 0 for device=cuda, because Ray hides GPUs from other actors, got 0"
+        )
+    return "cuda" if num_gpus else "cpu"
 
 
 def _list_frames(
@@ -273,7 +295,8 @@ def _check_disk(options: Options, missing: Sequence[int], storage: PairStorage) 
     """Print the estimated size of the missing pairs; raise UsageError if the disk has less space."""
     tasks = [options.task(number) for number in missing[:: max(1, len(missing) // _SAMPLES)][:_SAMPLES]]
     # A process takes the memory of the compiled effects with it when it ends.
-    work, workers = options.generator.generate, min(1, options.workers)
+    # Sizes on the CPU are those on a GPU, which the machine that starts Ray's actors may lack.
+    work, workers = options.generator._replace(device="cpu").generate, min(1, options.workers)
     samples = [*map_in_processes(work, tasks, workers=workers, preload="torchrefract.data.pairs.generator")]
     sizes = [storage.disk_bytes(pair) for pair in samples if pair.data]
     if lost := [pair.row.skipped.removeprefix(LOST) for pair in samples if pair.row.skipped.startswith(LOST)]:

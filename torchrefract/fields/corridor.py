@@ -5,6 +5,7 @@ import warnings
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._tensor import shareable
@@ -14,23 +15,28 @@ from torchrefract.fields.sky import find_sky, sky_mask
 from torchrefract.warping.grid import field_dtype
 
 _OPEN = 0.1  # share of sky from which a frame counts as open
+_POLE = 0.03  # widths: narrower things in front of the sky hide no skyline; it is smoothed alike
 
 
 @dataclass(frozen=True, kw_only=True)
 class CorridorDepth:
     """The depth of a flat road between two walls along it, and of the sky that is found in the image.
 
-        z = min(z_road(y), ((r / (f w))^2 + end^-2)^(-1/2)),  inf in the sky
-        r = hypot(x - x_v, max(y_h - y, 0)),  end = far, or min(far, closed) by day without sky
+        z = min(z_road(y), max(z_wall(x, y), z_skyline(x))),  inf in the sky
+        z_wall = ((r / (f w))^2 + end^-2)^(-1/2),  r = hypot(x - x_v, max(y_h - y, 0))
+        z_skyline = min(f (h - camera_height) / (y_h - y_s(x)), far)
 
     The walls stand for houses, trees and slopes beside the road, which a flat road alone puts at the horizon; above the
-    horizon they close in to a tunnel, since what stands far away is not seen high above it. By day a frame without sky
-    looks at something near, such as trees or the road itself. Pass it as `depth=` to a fog; a depth map, or a network
+    horizon they close in to a tunnel, since what stands far away is not seen high above it. Where the sky is seen down
+    to y_s(x), what stands below it ends there: if it is h high, it is z_skyline away. So open land has no walls.
+    A column without sky has no z_skyline, and by day a frame without sky looks at something near, such as trees or the
+    road itself: `end` is `far`, or min(`far`, `closed`) there. Pass it as `depth=` to a fog; a depth map, or a network
     (`torchrefract.depth.from_transformers`), is better.
 
     camera_height, focal, horizon, spread: of the road, as for `GroundPlaneDepth`.
     side: m, w, from the camera to each wall.
     vanishing: x_v, where the road vanishes, 0 at the left edge of the frame and 1 at its right edge.
+    height: m, h, of what stands beside the road, above `camera_height`.
     far: m, the largest depth outside of the sky.
     closed: m, the largest depth of a frame by day that shows no sky.
     """
@@ -41,6 +47,7 @@ class CorridorDepth:
     spread: float = 0.05
     side: float = 8.0
     vanishing: float = 0.5
+    height: float = 4.0
     far: float = 300.0
     closed: float = 30.0
 
@@ -50,6 +57,10 @@ class CorridorDepth:
             object.__setattr__(self, name, getattr(road, name))
         for name in ("side", "far", "closed"):
             object.__setattr__(self, name, check_positive(name, getattr(self, name)))
+        height = check_number("height", self.height)
+        if height <= self.camera_height:
+            raise ValueError(f"height must be above camera_height, {self.camera_height:g} m, got {height:g}")
+        object.__setattr__(self, "height", height)
         object.__setattr__(self, "vanishing", check_number("vanishing", self.vanishing, low=-10.0, high=10.0))
 
     @property
@@ -86,5 +97,17 @@ class CorridorDepth:
         seen = torch.where(find_sky(image).is_night, 1, seen).view(-1, 1, 1, 1)
         end = seen / self.far + (1 - seen) / min(self.far, self.closed)
         walls = (r2 / (self.side * self.focal * width) ** 2 + end.square()).rsqrt()
+        walls = torch.maximum(walls, self._skyline(mask, y))
         road = self.road(height, width, dtype=dtype, device=device)
         return torch.minimum(road, walls).masked_fill(mask, torch.inf)
+
+    def _skyline(self, mask: Tensor, y: Tensor) -> Tensor:
+        """Return (N, 1, 1, W), m, the depth of what ends at the lowest sky of its column; 0 in a column without sky."""
+        height, width = mask.shape[2:]
+        lowest = torch.where(mask, y[:, None], -1.0).amax(dim=2, keepdim=True)
+        side = int(_POLE * width / 2)
+        around = {"kernel_size": (1, 2 * side + 1), "stride": 1, "padding": (0, side)}
+        lowest = F.avg_pool2d(F.max_pool2d(lowest, **around), **around, count_include_pad=False)
+        rise = (self.horizon * height - 0.5 - lowest).clamp(min=1e-3)
+        z = ((self.height - self.camera_height) * self.focal * width / rise).clamp(max=self.far)
+        return torch.where(lowest < 0, 0.0, z)

@@ -58,27 +58,18 @@ def lattice_stride(image: Tensor) -> int:
     return -(-max(image.shape[2:]) // _NODES)
 
 
-def glow_transfer(frequency: Tensor, optical_depth: Tensor, asymmetry: Tensor) -> Tensor:
-    """Return the Fourier transform of the light that reaches the camera from a lamp of light 1, scattered or not.
+def scattering_transfer(frequency: Tensor, asymmetry: Tensor) -> Tensor:
+    """Return the Fourier transform of the angles by which one droplet turns the light that reaches the camera.
 
-        exp(-T (1 - (1 - exp(-a q)) / (a q))),  a = (1 - g) / sqrt(g)
+        (1 - exp(-a q)) / (a q),  a = (1 - g) / sqrt(g)
 
-    Each of a Poisson number of droplets, uniformly distributed over the way, turns the light by a small angle with the
-    Henyey-Greenstein phase function, whose transform is exp(-a q). An angle at the share u of the way from the lamp is
-    u times as large at the camera. exp(-T) arrives unscattered, and all light arrives: the transform is 1 at q = 0.
+    A droplet turns the light by a small angle with the Henyey-Greenstein phase function, whose transform is exp(-a q).
+    An angle at the share u of the way from the lamp is u times as large at the camera; this is the mean over the way.
 
     Args:
         frequency: q, radians per radian, at least 0.
-        optical_depth: T, extinction times distance of the lamp, broadcasts with q.
         asymmetry: g, mean cosine of the angle of scattering, in (0, 1].
-
-    Source: Wells, "Loss of resolution in water as a result of multiple small-angle scattering", Journal of the Optical
-    Society of America 59 (1969), for the form; Narasimhan and Nayar, "Shedding light on the weather", CVPR 2003.
     """
-    return torch.exp(-optical_depth * (1 - _single_transfer(frequency, asymmetry)))
-
-
-def _single_transfer(frequency: Tensor, asymmetry: Tensor) -> Tensor:
     x = frequency * (1 - asymmetry) / asymmetry.sqrt()
     is_small = x < 1e-3
     safe = torch.where(is_small, 1.0, x)
@@ -88,25 +79,31 @@ def _single_transfer(frequency: Tensor, asymmetry: Tensor) -> Tensor:
 def glow_at_nodes(light: Tensor, optical_depth: Tensor, asymmetry: Tensor, *, focal: float, stride: int) -> Tensor:
     """Return the scattered part of the light of lamps, relative to its sum: both have the same sum.
 
-    The transform is that of `glow_transfer` less exp(-T), over 1 - exp(-T); without fog, that of single scattering.
+        (exp(T s) - 1) / (exp(T) - 1),  s = scattering_transfer(q, g)
 
-    Light that would leave the frame is reflected at its border.
+    is its Fourier transform: a Poisson number of droplets, T in the mean, stands on the way. All light arrives, exp(-T)
+    of it unscattered, so that the whole has the transform exp(-T (1 - s)). Light that would leave the frame is
+    reflected at its border.
 
     Args:
         light: (N, C, h, w), at least 0.
-        optical_depth, asymmetry: (N,), T and g of `glow_transfer`.
+        optical_depth: (N,), T, extinction times distance of the lamps.
+        asymmetry: (N,), g of `scattering_transfer`.
         focal: px, of the frame.
         stride: px, between nodes.
 
     Returns:
         (N, C, h, w), at least 0.
+
+    Source: Wells, "Loss of resolution in water as a result of multiple small-angle scattering", Journal of the Optical
+    Society of America 59 (1969), for the form; Narasimhan and Nayar, "Shedding light on the weather", CVPR 2003.
     """
     optical_depth, asymmetry = (value.view(-1, 1, 1, 1) for value in (optical_depth, asymmetry))
     (down, fy), (across, fx) = (_cosines(size, light) for size in light.shape[2:])
     squared = fy.square()[:, None] + fx.square()
     frequency = (squared + _SMALLEST).sqrt() * (2 * math.pi * focal / stride)
     thickness = optical_depth.clamp(min=_THINNEST)
-    transfer = torch.expm1(thickness * _single_transfer(frequency, asymmetry)) / torch.expm1(thickness)
+    transfer = torch.expm1(thickness * scattering_transfer(frequency, asymmetry)) / torch.expm1(thickness)
     transfer = transfer * torch.exp(-2 * (math.pi * _SMOOTHING) ** 2 * squared)
     with without_autocast(light.device):
         spectrum = exact_matmul(exact_matmul(down, light), across.mT)

@@ -108,7 +108,6 @@ class WarpPlan:
     is_measured: True if each sample gets the coarsest lattice whose measured error fits, where values can be read.
     details: what the effect needs to compute the flow, from `Simplification.details`.
     bounds: of the flow; None if unknown.
-    node_error_px: part of the error that the flow has at the nodes already.
     num_samplings: how often the image is sampled.
     """
 
@@ -124,7 +123,6 @@ class WarpPlan:
     is_measured: bool = False
     details: Any = None
     bounds: FlowBounds | None = None
-    node_error_px: float = 0.0
     num_samplings: int = 1
 
     @property
@@ -200,7 +198,6 @@ def plan_warp(model: ErrorModel | None, request: PlanRequest) -> WarpPlan:
         dropped=simplified.dropped,
         is_random=model.is_random,
         details=simplified.details,
-        node_error_px=simplified.error_px + request.rounding_px,
     )
 
 

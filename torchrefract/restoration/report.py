@@ -2,7 +2,7 @@
 
 import csv
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
@@ -13,9 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 from pytorch_lightning import Callback, LightningModule, Trainer
+from pytorch_lightning.loggers import CSVLogger
+from pytorch_lightning.utilities import rank_zero_only
 from torch import Tensor
 
-from torchrefract._io import as_path, replace_file
+from torchrefract._io import as_path, is_remote, replace_file
 from torchrefract.data.module import PairData, fingerprint
 from torchrefract.effects.lens import LensDistortion
 from torchrefract.restoration.metrics import psnr
@@ -223,15 +225,30 @@ def metrics_rows(run: Path) -> Iterator[dict[str, str]]:
                 yield from csv.DictReader(file)
 
 
+class MetricsLogger(CSVLogger):
+    """Write metrics.csv as Lightning's logger does; in a store, write all rows each time, as some cannot append."""
+
+    @rank_zero_only
+    def save(self) -> None:
+        """Write the rows of this run, in a store with the further tries of `retried`."""
+        if not is_remote(run := as_path(self.log_dir)):
+            super().save()
+        elif rows := self.experiment.metrics:
+            _write_rows(run / METRICS, rows)
+
+
 def carry_over(resumed: Path, run: Path, *, before_epoch: float = math.inf) -> None:
     """Copy the metrics of the epochs below `before_epoch` from the folder `resumed` into the folder `run`."""
     complete = (row for row in metrics_rows(resumed) if _epoch_of(row) < before_epoch)
     # A row that is in both tables counts once.
     rows = [dict(row) for row in dict.fromkeys(tuple(pair for pair in row.items() if pair[1]) for row in complete)]
+    if rows:
+        _write_rows(run / METRICS_BEFORE, rows)
+
+
+def _write_rows(target: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     names = list(dict.fromkeys(name for row in rows for name in row))
-    if not rows:
-        return
-    with replace_file(run / METRICS_BEFORE) as path, path.open("w", newline="") as file:
+    with replace_file(target) as path, path.open("w", newline="") as file:
         writer = csv.DictWriter(file, names, restval="")
         writer.writeheader()
         writer.writerows(rows)

@@ -159,21 +159,27 @@ def test_videos_are_read_from_a_store(call, words, memory, tmp_path):
     assert len(PairedFolder("memory://out")) == 12
 
 
-def test_a_run_on_s3_that_is_killed_continues_to_the_bytes_on_disk(call, words, frames, bucket, sums, tmp_path):
-    store: Any = as_path("s3://bucket")
+@pytest.mark.parametrize(("protocol", "stop"), [("s3", signal.SIGKILL), ("gs", signal.SIGTERM)])
+def test_a_run_in_a_bucket_that_is_killed_continues_to_the_bytes_on_disk(
+    call, words, frames, sums, tmp_path, request, protocol, stop
+):
+    server, bucket = request.getfixturevalue(protocol), f"{protocol}://bucket"
+    store: Any = as_path(bucket)
     store.fs.put(str(frames), "bucket/frames", recursive=True)
-    options = words("s3://bucket/out", "tar=2", source="s3://bucket/frames")
+    options = words(f"{bucket}/out", "tar=2", source=f"{bucket}/frames")
     command = [sys.executable, "-m", "torchrefract.generate", *options, "workers=1"]
-    with subprocess.Popen(command, env=os.environ | bucket | {"PYTHONPATH": str(ROOT)}) as run:
+    with subprocess.Popen(command, env=os.environ | server | {"PYTHONPATH": str(ROOT)}) as run:
         end = time.monotonic() + 120
         while run.poll() is None and time.monotonic() < end and not store.fs.glob("bucket/out/tars/*"):
             time.sleep(0.02)
-        run.send_signal(signal.SIGKILL)
+        run.send_signal(stop)
+    assert run.returncode == -stop
     assert call("generate", *options).code == 0
     assert call("generate", *words("out", "tar=2")).code == 0
     assert sums_in(store.fs, "bucket/out") == sums_on_disk(sums, tmp_path / "out")
-    keys = [row.key for row in PairedFolder("s3://bucket/out").rows()]
-    assert [int(pair.key) for pair in PairStream("s3://bucket/out")] == keys
+    keys = [row.key for row in PairedFolder(f"{bucket}/out").rows()]
+    assert [int(pair.key) for pair in PairStream(f"{bucket}/out")] == keys
     assert len(keys) == 12
-    message = call("generate", *words("s3://missing/out", source="s3://bucket/frames")).message
-    assert message == "out must be a folder that can be written to, got s3://missing/out (No such file or directory)"
+    message = call("generate", *words(f"{protocol}://missing/out", source=f"{bucket}/frames")).message
+    reason = "No such file or directory"
+    assert message == f"out must be a folder that can be written to, got {protocol}://missing/out ({reason})"

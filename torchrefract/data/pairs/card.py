@@ -113,6 +113,8 @@ def format_card(summary: Summary, *, settings: Mapping[str, Any], license_text: 
         "",
         f"**License of the frames, as stated by the creator of this set:** {license_text}",
         "",
+        f"Pairs were computed on the device {settings.get('device', 'cpu')}.",
+        "",
         *("| split | pairs | drives |", "| --- | --- | --- |", *splits, ""),
         *("| effect | pairs |", "| --- | --- |", *effects, ""),
         *(line for remark in remarks for line in (remark, "")),

@@ -117,21 +117,22 @@ class GeneratedPair(NamedTuple):
 
 
 class PairGenerator(NamedTuple):
-    """Generates pairs on the CPU, one at a time, so that a pair has the same bytes in any order and process."""
+    """Generates pairs one at a time, so that a pair has the same bytes in any order and process of a device."""
 
     effect: Effect
     scene: str  # name of the effect
     reader: SourceReader
     seed: int
     maps: str  # format of the maps: png, npz or safetensors
+    device: str = "cpu"  # or "cuda", the first GPU that the process sees
 
     def generate(self, task: PairTask) -> GeneratedPair:
         """Generate a pair. A frame that is unreadable or lost gives a row with the reason and no files.
 
         Raises:
-            UsageError: the scene, the size or the format of the maps does not suit the frame.
+            UsageError: the scene, the size or the format of the maps does not suit the frame, or there is no GPU.
         """
-        source = task.source
+        source, device = task.source, device_of(self.device)
         seed, key = draw_of(source, seed=self.seed, repeat=task.repeat)
         origin = (source.path, source.frame, source.drive, source.split)
         row = PairRow(task.number, *origin, self.scene, seed, key, height=0, width=0, effects=[], beyond={}, files={})
@@ -148,7 +149,10 @@ class PairGenerator(NamedTuple):
             with warnings.catch_warnings(), torch.no_grad():
                 warnings.simplefilter("ignore", UserWarning)  # of folded pixels, which the masks exclude
                 degraded = self.effect.degrade(
-                    image[None], seed=seed, keys=[key], depth=None if depth is None else depth[None]
+                    image[None].to(device),
+                    seed=seed,
+                    keys=[key],
+                    depth=None if depth is None else depth[None].to(device),
                 )
         except (ValueError, TypeError, OSError) as error:
             raise UsageError(f"scene: {error}") from error
@@ -165,6 +169,19 @@ class PairGenerator(NamedTuple):
             files={name: StoredFile("", len(x), hashlib.sha256(x).hexdigest()) for name, x in data.items()},
         )
         return GeneratedPair(row, data)
+
+
+def device_of(name: str) -> torch.device:
+    """Return the device of the name "cpu" or "cuda", which is the first GPU that this process sees.
+
+    Raises:
+        UsageError: PyTorch sees no GPU.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UsageError(
+            f"device must be cpu where PyTorch sees no GPU, got {name}; use a node with one and PyTorch with CUDA"
+        )
+    return torch.device(name, 0) if name == "cuda" else torch.device(name)
 
 
 def _applied_effects(effect: Effect, params: Any) -> list[dict[str, Any]]:
@@ -191,13 +208,13 @@ def _plain(value: Any) -> Any:
 
 def maps_of(degraded: Degraded, depth: Tensor | None) -> dict[str, np.ndarray]:
     """Return the maps of the first sample, and the depth (1, H, W), m, as `PairArrays` holds them."""
-    maps = {"valid": degraded.valid[0, 0].numpy()}
+    maps = {"valid": degraded.valid[0, 0].cpu().numpy()}
     if depth is not None:
         maps[DEPTH] = depth[0].numpy()
     if degraded.has("flow"):
-        maps["restore_valid"] = degraded.restore_valid[0, 0].numpy()
-        maps |= {name: getattr(degraded, name)[0].float().numpy() for name in FLOWS}
-    return maps | {name: getattr(degraded, name)[0, 0].float().numpy() for name in LIGHTS if degraded.has(name)}
+        maps["restore_valid"] = degraded.restore_valid[0, 0].cpu().numpy()
+        maps |= {name: getattr(degraded, name)[0].float().cpu().numpy() for name in FLOWS}
+    return maps | {name: getattr(degraded, name)[0, 0].float().cpu().numpy() for name in LIGHTS if degraded.has(name)}
 
 
 class PairStorage(NamedTuple):
@@ -278,7 +295,8 @@ def generate_pairs(
         units: the pairs of each file that is written as a whole.
         generator, storage: make and write a pair.
         workers: number of processes, or of actors.
-        engine: name "ray" and address of a cluster, see `map_in_actors`; None takes processes of this machine.
+        engine: name "ray", address of a cluster and GPUs of an actor, see `map_in_actors`; None takes processes of
+            this machine.
 
     Yields:
         the rows of each unit when it is written, in any order.
@@ -290,5 +308,6 @@ def generate_pairs(
     work = partial(storage.write, generator=generator)
     if engine is not None and engine["name"] == "ray":
         block = 8 if storage.tar is None else 1  # a tar takes long enough by itself
-        return map_in_actors(work, units, workers=workers, address=engine["address"], block=block)
+        options: Any = {"address": engine["address"], "num_gpus": engine["num_gpus"], "block": block}
+        return map_in_actors(work, units, workers=workers, **options)
     return map_in_processes(work, units, workers=workers, preload=__name__)

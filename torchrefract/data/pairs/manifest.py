@@ -306,13 +306,21 @@ class Manifest:
         return (info.name, info.size) == (f"{name}.{suffix}", file.bytes)
 
 
-def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[str, Any]) -> dict[str, Any]:
+def claim(
+    out: Path,
+    settings: Mapping[str, Any],
+    *,
+    count: int,
+    about: Mapping[str, Any],
+    earlier: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
     """Create an output folder, or check that it has the same settings, and write its config.json.
 
     Args:
         settings: everything that determines the content, of types that JSON has.
         count: number of results; a later run may raise it.
         about: further entries of config.json that do not change the content.
+        earlier: values of settings that folders of earlier versions do not state.
 
     Returns:
         the previous content of config.json; empty for a new folder.
@@ -333,7 +341,7 @@ def claim(out: Path, settings: Mapping[str, Any], *, count: int, about: Mapping[
             previous = None
         if not isinstance(previous, dict):
             raise UsageError(f"out must be a folder with a valid {_CONFIG}, got {path}, which is damaged")
-        _check_same(previous.get("settings", {}), new, out)
+        _check_same({**(earlier or {}), **previous.get("settings", {})}, new, out)
         if count < previous.get("count", 0):
             raise UsageError(f"count must be at least that of the pairs in {out}, {previous['count']}, got {count}")
     elif others:

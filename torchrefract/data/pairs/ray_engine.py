@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import pyarrow as pa
 
+from torchrefract._validation import UsageError
 from torchrefract.data.workers import use_one_thread
 
 _Item = TypeVar("_Item")
@@ -17,7 +18,13 @@ _SILENT: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "
 
 
 def map_in_actors(
-    work: Callable[[_Item], _Result], items: Iterable[_Item], *, workers: int, address: str | None, block: int = 8
+    work: Callable[[_Item], _Result],
+    items: Iterable[_Item],
+    *,
+    workers: int,
+    address: str | None,
+    num_gpus: float = 0,
+    block: int = 8,
 ) -> Iterator[_Result]:
     """Apply a function to items in actors of Ray, each with a core and one thread.
 
@@ -27,11 +34,13 @@ def map_in_actors(
         workers: number of actors.
         block: number of items that are done again if their actor is lost.
         address: of a cluster, as Ray takes it; None starts Ray on this machine.
+        num_gpus: GPUs of an actor, which sees no others; below 1, actors share one.
 
     Yields:
         the results, in any order.
 
     Raises:
+        UsageError: this machine has fewer GPUs.
         Exception: any error of `work`.
     """
     import ray  # noqa: PLC0415  # pyright: ignore[reportMissingImports]  # in its own extra
@@ -43,6 +52,8 @@ def map_in_actors(
     if started:
         ray.init(address=address, **_SILENT, **({} if address else {"num_cpus": workers + 1}))
     try:
+        if num_gpus:
+            _check_gpus(ray.cluster_resources().get("GPU", 0), workers, num_gpus, can_wait=address is not None)
         ray.data.DataContext.get_current().enable_progress_bars = False
         rows = [{"item": pickle.dumps(item)} for item in items]
         blocks = max(workers, -(-len(rows) // block))
@@ -50,10 +61,11 @@ def map_in_actors(
         dataset = dataset.map_batches(
             _Actor,
             fn_constructor_args=(work,),
-            batch_size=None,
+            batch_size=1,  # Ray requires a number for GPUs, and joins blocks that are smaller
             batch_format="pyarrow",
             compute=ray.data.ActorPoolStrategy(size=workers),
             num_cpus=1,
+            num_gpus=num_gpus or None,
         )
         for batch in dataset.iter_batches(batch_size=None, batch_format="pyarrow", prefetch_batches=0):
             for data in batch["result"].to_pylist():
@@ -64,6 +76,21 @@ def map_in_actors(
     finally:
         if started:
             ray.shutdown()
+
+
+def _check_gpus(available: float, workers: int, num_gpus: float, *, can_wait: bool) -> None:
+    """Raise UsageError if there are too few GPUs; a cluster can grow, so print a line for one."""
+    if (fitting := int(available / num_gpus)) >= workers:
+        return
+    if can_wait:
+        print(
+            f"the cluster has GPUs for {fitting} of {workers} workers; the others wait for nodes with GPUs", flush=True
+        )
+        return
+    raise UsageError(
+        f"engine.num_gpus must be 0 or fit the GPUs of this machine, got {num_gpus} for each of {workers} workers and "
+        f"{available:g} GPUs; lower workers"
+    )
 
 
 class _Actor:

@@ -1,3 +1,4 @@
+import errno
 import json
 import re
 from dataclasses import replace
@@ -46,6 +47,15 @@ def read_report(tmp_path: Path) -> str:
     return (tmp_path / "calibration" / "report.md").read_text()
 
 
+def test_rendered_pictures_on_a_full_disk_raise(tmp_path, monkeypatch):
+    def fail(path: Path, data: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", fail)
+    with pytest.raises(OSError, match="No space left on device"):
+        calibration._rendered(BOARD, tmp_path / "rendered")
+
+
 def test_the_camera_of_rendered_pictures_is_recovered(call, tmp_path, monkeypatch):
     monkeypatch.setattr(calibration, "render_views", partial(render_views, count=8))
     outcome = call("calibrate")
@@ -85,6 +95,25 @@ def test_a_camera_of_the_division_model_is_recovered_written_and_rectifies(call,
     assert covariance.shape == (5, 5)
     assert call("rectify", "input=pictures", "camera=calibration/camera.yaml").code == 0
     assert (tmp_path / "rectified" / "view_00.png").is_file()
+
+
+def test_views_of_a_still_board_count_once(call, pictures, rendered_small):
+    noise = np.random.default_rng(0)
+    for k in range(4):
+        gray = rendered_small[0][1] + noise.normal(0, 2, rendered_small[0][1].shape)
+        cv2.imwrite(str(pictures / f"z{k}.png"), gray.clip(0, 255).astype(np.uint8))
+    outcome = call("calibrate", *OPTIONS)
+    assert "opencv4 from 6 views in 10 pictures" in outcome.out, outcome.message
+    assert "warning" not in outcome.err
+    assert f"shows the board where {rendered_small[0][0]} does" in read_report(pictures.parent)
+
+
+def test_pictures_that_were_turned_before_they_were_saved_are_warned_of(call, tmp_path):
+    (tmp_path / "pictures").mkdir()
+    for k, (name, gray, _) in enumerate(render_views(BOARD, replace(SMALL, cx=360.0, cy=165.0), count=8)):
+        cv2.imwrite(str(tmp_path / "pictures" / name), np.rot90(gray, 2 * (k % 2)))
+    outcome = call("calibrate", *OPTIONS, "drop_share=0")
+    assert re.search(r"warning: an error of \d\.\d+ px rms is high: .* turned before they were saved", outcome.err)
 
 
 def test_markers_of_another_size_than_stated_are_an_error(call, pictures):

@@ -80,6 +80,23 @@ def test_extra_args_of_the_container_interpolate_masks():
     assert_close(mask[inner], degraded[inner], rtol=0, atol=1e-4)
 
 
+def test_an_adapter_in_a_module_that_kornia_does_not_know_raises_beside_labels():
+    image = torch.rand(2, 3, *SIZE)
+    for effect in (LensDistortion(), UniformFog()):
+        module = nn.Sequential(adapter.KorniaEffect(effect))
+        container = K.AugmentationSequential(module, data_keys=["input", "mask"])
+        if isinstance(effect, UniformFog):
+            assert torch.equal(container(image, image)[1], image)
+        else:
+            with pytest.raises(TypeError, match=r"got .'mask'. too.* pass KorniaEffect to the container itself"):
+                container(image, image)
+        assert not torch.equal(module(image), image)
+    in_sequence = K.AugmentationSequential(
+        K.ImageSequential(adapter.KorniaEffect(LensDistortion())), data_keys=["input", "mask"]
+    )
+    assert not torch.equal(in_sequence(image, image)[1], image)
+
+
 def test_samples_of_a_batch_share_a_draw_on_request():
     image = torch.rand(1, 3, *SIZE).expand(2, -1, -1, -1).contiguous()
     shared, other = (

@@ -13,6 +13,19 @@ def test_a_seed_repeats_its_configuration():
     assert trial == attempt("LensDistortion", 1, (120, 160))
 
 
+def test_splines_in_small_frames_keep_the_tolerance_of_their_composition():
+    for seed in (91, 97):  # eight cells of a lattice along each axis tell its error, four do not
+        assert attempt("Compose", seed, (270, 480)).share < 0.5
+
+
+def test_the_rounding_of_deep_folds_counts_as_that_of_exact_flows():
+    trial = attempt("Compose", 288, (270, 480))  # stretches distances by 124
+    assert trial.tolerance < trial.error == pytest.approx(trial.rounding, rel=1e-3)
+    assert not trial.is_exceeded
+    assert Trial("lens", 64, 64, 0.1, error=0.11).is_exceeded
+    assert [Trial("lens", 64, 64, 0.1, 0.0, error).is_exceeded for error in (0.41, 0.43)] == [False, True]
+
+
 # A strong lens in a narrow frame; a lens at points far outside the frame; lattices whose corners have no ray.
 @pytest.mark.parametrize(("name", "seed"), [("LensDistortion", 9), ("Compose", 60), ("Rectification", 82)])
 def test_configurations_at_the_edge_of_their_error_bounds_keep_their_tolerance(name, seed):

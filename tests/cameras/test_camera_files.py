@@ -260,6 +260,27 @@ REFUSED = {
     "messages that differ": (TWO, {}, "must hold one camera, got .* of 2 different ones; keep those of one"),
     "a part of the frame": (ROI, {}, "whole frames, got .* the roi .*; remove roi, and use camera.cropped"),
     "the upper half": (HALF, {}, "must describe whole frames, got .* the roi .*; remove roi, and use camera.cropped"),
+    "binned frames": (
+        message(FIVE, "plumb_bob").replace("binning_x: 0", "binning_x: 2"),
+        {},
+        r"must describe whole frames, got .* with binning_x and binning_y of \[2, 0\]; remove them, and use camera.res",
+    ),
+    "a matrix twice": (storage(FIVE) + "camera_matrix: [1]\n", {}, "must hold camera_matrix once, got .* twice; keep"),
+    "a matrix twice, JSON": (
+        '{"image_width": 640, "K": [1], "K": [2]}',
+        {},
+        "must hold K once, got .* with it twice; keep one of them",
+    ),
+    "a matrix twice, XML": (
+        "<opencv_storage><K>1</K><K>2</K></opencv_storage>",
+        {},
+        "must hold K once, got .* with it twice; keep one of them",
+    ),
+    "shares of the frame": (
+        storage(FIVE).replace("510.25, 0., 322.5, 0., 505.75, 237.125", "0.8, 0., 0.5, 0., 1.05, 0.5"),
+        {},
+        "must hold fx, fy, cx, cy in px, got .* for frames of 640 x 480 px; multiply shares by the width",
+    ),
     "a model of others": (storage(FIVE), {"model": "omni"}, "model must be one of opencv, fisheye, got 'omni'"),
     "a fisheye without k": (message((), "equidistant"), {}, "must hold the four coefficients of a fisheye"),
     "a fisheye with five": (message(FIVE, "equidistant"), {}, "must be 4 numbers for the model fisheye, got 5"),

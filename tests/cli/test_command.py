@@ -16,6 +16,7 @@ from PIL import Image
 from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
 from torchrefract.cli.command import naming, prepare_arguments, progress, quote_text, run
+from torchrefract.cli.entry import command
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint
@@ -67,6 +68,7 @@ def test_an_error_of_the_user_is_one_line_and_another_keeps_its_traceback(run_ma
             OSError(errno.ENOSPC, "No space left on device", "run/a.csv"),
             "run/a.csv could not be written: No space left",
         ),
+        (PermissionError(errno.EACCES, "Permission denied", "frames"), "frames could not be opened: Permission denied"),
     ):
         with pytest.raises(SystemExit) as stop:
             run_main(lambda error=error: fail(error))
@@ -74,6 +76,18 @@ def test_an_error_of_the_user_is_one_line_and_another_keeps_its_traceback(run_ma
         assert capsys.readouterr().err.startswith(f"error: {message}")
     with pytest.raises(TypeError, match="not callable"):
         run_main(lambda: fail(TypeError("'int' object is not callable")))
+
+
+@pytest.mark.quick
+def test_an_interrupt_while_a_command_loads_is_one_line(capsys, monkeypatch):
+    def interrupt(name):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "argv", ["torchrefract.degrade"])
+    monkeypatch.setattr("importlib.import_module", interrupt)
+    with pytest.raises(SystemExit) as stop:
+        command("degrade", "", "degradation:degrade")()
+    assert (stop.value.code, capsys.readouterr().err) == (130, "stopped\n")
 
 
 @pytest.mark.quick
@@ -122,6 +136,7 @@ FILE_OPTIONS = {
     "restore": (("ckpt_path", "input", "out"), ("ckpt_path=a", "input=b")),
     "export": (("ckpt_path",), ()),
     "make_board": (("out",), ()),
+    "robustness": (("model", "weights", "data", "labels", "depth", "out"), ("model=a", "data=d", "out=o")),
     "train": (("data.root", "ckpt_path", "run_dir", "hydra.run.dir"), ("+task=undistort", "data=frames")),
 }
 
@@ -130,7 +145,8 @@ FILE_OPTIONS = {
 def test_any_name_of_a_file_reaches_the_configuration_of_each_command(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options, required = FILE_OPTIONS[name]
-    with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
+    folder = Path(CONFIG_DIR, name)
+    with initialize_config_dir(str(folder if folder.is_dir() else CONFIG_DIR), version_base="1.3"):
         for end in ODD_ENDS:
             path = Path(tmp_path, *ODD_NAMES, end)
             path.mkdir(parents=True)

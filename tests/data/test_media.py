@@ -1,8 +1,10 @@
 """Videos keep their times, sound and orientation; pictures their orientation, bits and color profile."""
 
+import errno
 import io
 import resource
 import warnings
+import zlib
 from collections.abc import Sequence
 from fractions import Fraction
 from itertools import count, product
@@ -17,11 +19,14 @@ import torch
 from av.codec.context import Flags
 from PIL import Image, ImageCms, ImageOps
 
-from torchrefract.data.images import UnreadableImageError, image_header, read_image
+from torchrefract._validation import UsageError
+from torchrefract.data.frames import FrameFolder
+from torchrefract.data.images import UnreadableImageError, image_header, image_size, read_image
 from torchrefract.data.media import (
     convert_video,
     describe_losses,
     describe_turned,
+    find_media,
     is_complete,
     read_video,
     video_info,
@@ -163,6 +168,7 @@ def test_opencv_shows_a_converted_video_as_the_original(tmp_path, quarter):
         (".mkv", "libx264", Fraction(1, 1000), TIMES_MS, "libopus"),
         (".mp4", "libx264", Fraction(1001, 30000), list(range(8)), "libmp3lame"),
         (".avi", "mjpeg", Fraction(1, 25), list(range(8)), "libmp3lame"),
+        (".ts", "libx264", Fraction(1, 90000), [3600 * t for t in range(8)], "aac"),  # of a dashcam
     ],
 )
 def test_a_converted_video_keeps_times_and_sound(tmp_path, suffix, codec, unit, times, sound):
@@ -179,7 +185,7 @@ def test_a_converted_video_keeps_times_and_sound(tmp_path, suffix, codec, unit, 
     )  # options in one place
     assert describe_losses([source], upright=True) == []
     assert convert_video(source, target, change=unchanged) == 8
-    if suffix != ".avi":  # which has one rate
+    if suffix not in (".avi", ".ts"):  # of one rate, and with a start above 0
         assert times_of(source) == pytest.approx([float(t * unit) for t in times], abs=1e-3)
     assert times_of(target) == pytest.approx(times_of(source), abs=1e-3)
     (start, samples), (new_start, new_samples) = samples_of(source), samples_of(target)
@@ -352,6 +358,50 @@ def test_a_picture_is_read_as_displayed_or_as_stored_and_stays_upright(tmp_path,
             assert np.abs(np.asarray(ImageOps.exif_transpose(written)).astype(float) - displayed).mean() < 4
         assert is_complete(source, target)
     assert bool(describe_turned([source])) == (orientation != 1)
+
+
+def test_exif_data_behind_the_pixels_of_a_png_turn_it(tmp_path):
+    source, target = tmp_path / "a.png", tmp_path / "b.png"
+    Image.fromarray(page()).save(source)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    chunk = b"eXIf" + exif.tobytes().removeprefix(b"Exif\0\0")
+    data = source.read_bytes()
+    late = (len(chunk) - 4).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big")
+    source.write_bytes(data[:-12] + late + data[-12:])  # before IEND
+    displayed = page().swapaxes(0, 1)[:, ::-1]
+    assert image_size(source) == displayed.shape[:2]
+    assert describe_turned([source])
+    for upright, pixels in ((True, displayed), (False, page())):
+        image = read_image(source, upright=upright)
+        assert np.array_equal(as_pixels(image[None]), pixels)
+        write_picture(image, target, source=source, upright=upright)
+        assert np.array_equal(np.asarray(ImageOps.exif_transpose(load(target))), displayed)
+    source.write_bytes(data[:-12] + late[:-1] + b"?" + data[-12:])
+    assert image_header(source).orientation == 1  # its checksum is wrong
+
+
+@pytest.mark.parametrize("deep", [True, False])
+def test_pictures_in_formats_that_are_not_read_are_warned_of(tmp_path, deep):
+    Image.fromarray(page()).save(tmp_path / "a.png")
+    for name in ("b.HEIC", "c.tif", "notes.txt"):
+        (tmp_path / name).touch()
+    with pytest.warns(
+        UserWarning, match=r"holds 2 pictures or videos in formats that are not read, such as .*\.(HEIC|tif)"
+    ):
+        assert find_media(tmp_path, deep=deep) == [tmp_path / "a.png"]
+    with pytest.warns(UserWarning, match="holds 2 pictures"):
+        assert len(FrameFolder(tmp_path, size=(8, 12))) == 1
+
+
+@pytest.mark.parametrize("deep", [True, False])
+def test_a_folder_that_cannot_be_read_is_one_line_of_error(tmp_path, monkeypatch, deep):
+    def refuse(path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr("os.scandir", refuse)
+    with pytest.raises(UsageError, match=f"source must be a folder that can be read, got .*{tmp_path.name}"):
+        find_media(tmp_path, deep=deep, name="source")
 
 
 def test_sixteen_bits_are_kept(tmp_path):

@@ -62,6 +62,15 @@ def test_values_are_read_once_for_each_effect_and_shape(monkeypatch):
     assert len(calls) == 3
 
 
+def test_a_clip_with_the_channels_before_the_frames_is_warned_of():
+    with pytest.warns(
+        UserWarning, match=r"taken for clips of 3 frames with 8 channels; use image\.movedim\(-4, -3\) if"
+    ):
+        LensFlare()(torch.rand(1, 3, 8, 24, 32))
+    LensFlare()(torch.rand(1, 8, 3, 24, 32))
+    LensFlare()(torch.rand(1, 3, 4, 24, 32))
+
+
 @pytest.mark.quick
 @pytest.mark.parametrize(
     ("image", "error", "message"),

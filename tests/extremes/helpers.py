@@ -31,6 +31,7 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "vignetting": tr.Vignetting,
     "chromatic aberration": partial(tr.ChromaticAberration, red_range=(0.02, 0.05)),
     "sun glare": tr.SunGlare,
+    "night glow": tr.NightGlow,
     "exposure": partial(tr.Exposure, shot_range=(1e-4, 1e-3)),
     "compose": lambda: tr.Compose([tr.Turbulence(), tr.LensDistortion(), tr.UniformFog()]),
     "one of": lambda: tr.OneOf([tr.DivergenceFree(), tr.ThinPlateSpline(), tr.LensFlare()]),

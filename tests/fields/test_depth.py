@@ -238,6 +238,24 @@ def test_check_depth_accepts_road_scenes_and_rejects_converted_ones(size):
         assert "not normalized" in error_of(sample / farthest)
 
 
+def test_check_depth_rejects_stored_integers_and_maps_with_holes():
+    _, depth = render_road_scenes(torch.arange(4), 64, 112)
+    generator = torch.Generator().manual_seed(0)
+    for sample in depth.clamp(max=200.0).split(1):
+        for factor in (1000, 256):
+            with pytest.raises(
+                ValueError, match=r"in m, got whole numbers from .* to .*; divide by 1000 if they are mill"
+            ):
+                check_depth((factor * sample).round())
+        lidar = torch.where(torch.rand(sample.shape, generator=generator) < 0.05, sample, 0)
+        with pytest.raises(
+            ValueError, match=r"depth must be known at each pixel, got 0 at 9[3-7] % of them; fill these"
+        ):
+            check_depth(lidar)
+        check_depth(sample.round())
+        check_depth(torch.zeros_like(sample))
+
+
 def test_check_depth_accepts_real_roads_and_rejects_converted_ones(shared_data):
     for depth in real_depths(shared_data):
         for kind in (torch.float64, torch.float32, torch.float16):

@@ -242,7 +242,7 @@ def test_all_rows_of_dropped_boxes_are_removed():
         "points": tv.KeyPoints(torch.rand(3, 17, 2, generator=generator()) * 20, canvas_size=SIZE),
         "scores": np.array([0.9, 0.8, 0.7]),
         "names": ["car", "dog", "sign"],
-        "polygons": [[1, 2], [3], [4, 5, 6]],
+        "tracks": [[1, 2], [3], [4, 5, 6]],
     }
     of_image = {"image_id": torch.tensor([7, 7, 7]), "orig_size": (3, 36, 64), "camera_matrix": torch.eye(3)}
     other = {"semantic": tv.Mask(torch.zeros(SIZE)), "image": tv.Image(torch.rand(3, *SIZE)), "ids": torch.arange(4)}
@@ -254,7 +254,7 @@ def test_all_rows_of_dropped_boxes_are_removed():
     assert warped["iscrowd"].tolist() == [[0], [0]]
     assert warped["scores"].tolist() == [0.9, 0.7]
     assert warped["names"] == ["car", "sign"]
-    assert warped["polygons"] == [[1, 2], [4, 5, 6]]
+    assert warped["tracks"] == [[1, 2], [4, 5, 6]]
     assert all(warped[key] is value for key, value in of_image.items())
     assert warped["image"].shape == (3, *SIZE)
     assert warped["ids"] is other["ids"]
@@ -304,6 +304,50 @@ def test_invisible_keypoints_lie_off_the_canvas_and_clear_their_visibility():
     assert warped.tolist() == [[[-1.0, -1.0], [5.0, 10.0]], [[50.0, 30.0], [0.0, 0.0]]]
     singles = tv.wrap(warped.as_subclass(Tensor).reshape(-1, 2), like=warped)
     assert v2.SanitizeKeyPoints()({"points": singles})["points"].tolist() == [[5.0, 10.0], [50.0, 30.0], [0.0, 0.0]]
+
+
+@pytest.mark.parametrize("key", ["visible", "keypoints_visible"])
+def test_the_visibility_of_keypoints_is_cleared_in_arrays_and_lists_too(key):
+    points = tv.KeyPoints(torch.tensor([[30.0, 10.0], [5.0, 10.0]]), canvas_size=SIZE)
+    for flags, expected in (([True, True], [True, False]), ((2, 1), (2, 0))):
+        moved = warp_labels({"points": points, key: flags}, SHIFT)[key]
+        assert (type(moved), moved) == (type(expected), expected)
+    array = warp_labels({"points": points, key: np.array([2, 2])}, SHIFT)[key]
+    assert type(array) is np.ndarray
+    assert array.tolist() == [2, 0]
+
+
+@pytest.mark.parametrize(
+    ("entry", "kind"),
+    [
+        ({"gt_bboxes": torch.zeros(2, 4)}, "BoundingBoxes"),
+        ({"boxes_xyxy": [[1.0, 2, 3, 4]]}, "BoundingBoxes"),
+        ({"box2d": {"x1": 1.0, "y1": 2.0, "x2": 3.0, "y2": 4.0}}, "BoundingBoxes"),
+        ({"object": [{"bndbox": {"xmin": "1", "ymin": "2", "xmax": "3", "ymax": "4"}}]}, "BoundingBoxes"),
+        ({"face_landmarks": np.zeros((5, 2))}, "KeyPoints"),
+        ({"lanes": [[[1, 2], [3, 4]]]}, "KeyPoints"),
+        ({"polygons": [[1.0, 2, 3, 4, 5, 6]]}, "Mask"),
+        ({"masks": [{"counts": b"1", "size": [36, 64]}]}, "Mask"),
+    ],
+)
+def test_plain_positions_under_names_of_other_data_sets_raise(entry, kind):
+    with pytest.raises(TypeError, match=f"target.* must be a {kind} of torchvision to move with the image, got"):
+        warp_labels(entry, SHIFT)
+
+
+def test_names_that_only_resemble_those_of_positions_pass():
+    target = {
+        "num_keypoints": torch.zeros(2, 1),
+        "boxes_3d": torch.zeros(2, 7),
+        "box_scores": torch.zeros(2, 3),
+        "keypoint_names": [["nose"], ["eye"]],
+        "lanes": torch.arange(3),
+        "size": {"width": "64", "height": "36"},
+        "counts": torch.arange(4),
+        "segmentation": {"name": "road"},
+        "x": 3.0,
+    }
+    assert warp_labels(target, SHIFT) == target
 
 
 def test_keypoints_on_the_outer_half_of_border_pixels_are_visible():

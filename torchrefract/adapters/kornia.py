@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract.effects.base import Effect
+from torchrefract.effects.base import Effect, check_kornia_keys
 from torchrefract.labels.boxes import warp_boxes
 from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.points import warp_points
@@ -57,6 +57,14 @@ class KorniaEffect(RigidAffineAugmentationBase2D):
         degraded = self.effect.degrade(input, seed=params["seed"], keys=params["keys"])
         self._drawn = params["seed"], degraded.flow
         return degraded.image
+
+    def forward(self, input: Tensor, params: dict[str, Tensor] | None = None, **kwargs: Any) -> Tensor:
+        """Degrade images; raise TypeError if the container would leave labels behind."""
+        result = super().forward(input, params=params, **kwargs)
+        # Containers give parameters to augmentations and to ImageSequential, but not to other modules.
+        if params is None and self._drawn[1] is not None:
+            check_kornia_keys("pass KorniaEffect to the container itself, or in kornia's ImageSequential")
+        return result
 
     def apply_transform_mask(
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None

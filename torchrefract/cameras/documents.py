@@ -4,6 +4,7 @@ import json
 import re
 import reprlib
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -13,6 +14,7 @@ from torchrefract.cameras.camera import Camera
 
 _MAX_MESSAGE = 400  # characters of a parser's error to repeat
 _MAX_NAMES = 20  # names of a file to list in an error
+_LARGEST_ICON, _LARGEST_SHARE = 64, 4.0  # px: no camera of larger frames has a smaller focal length and center
 # A list that refers to itself through YAML's aliases is small in memory but endless in print.
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxstring, _SHORT.maxother = 2, 14, 80, 80
@@ -114,6 +116,11 @@ class Document:
         self, size: Sequence[int], pinhole: Sequence[float], coefficients: Sequence[float], model: str
     ) -> Camera:
         (width, height), (fx, fy, cx, cy), lens = size, pinhole, tuple(coefficients)
+        if min(width, height) > _LARGEST_ICON and max(map(abs, pinhole)) <= _LARGEST_SHARE:
+            raise ValueError(
+                f"path must hold fx, fy, cx, cy in px, got {self.path} with {fx:g}, {fy:g}, {cx:g}, {cy:g} for frames "
+                f"of {width} x {height} px; multiply shares by the width and the height"
+            )
         try:
             return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=lens, model=model)
         except (ValueError, OverflowError) as error:
@@ -151,7 +158,7 @@ def parse_xml(path: Path, text: str) -> ElementTree.Element:
 
 def xml_document(path: Path | str, root: ElementTree.Element) -> Document:
     """Return the children of an element by their names: numbers, texts, and OpenCV's matrices as mappings."""
-    return Document(path, {node.tag: _xml_value(node) for node in root})
+    return Document(path, _once(path, ((node.tag, _xml_value(node)) for node in root)))
 
 
 def parse_documents(path: Path, text: str) -> list[Document]:
@@ -162,7 +169,7 @@ def parse_documents(path: Path, text: str) -> list[Document]:
     form = "JSON" if text.lstrip().startswith("{") else "YAML"
     if form == "JSON":
         try:
-            return [Document(path, json.loads(text))]
+            return [Document(path, json.loads(text, object_pairs_hook=partial(_once, path)))]
         except (ValueError, RecursionError):
             pass  # OpenCV writes .Nan and 1., which only YAML takes
     # OpenCV's first line, %YAML:1.0, is not a valid directive of YAML.
@@ -202,6 +209,16 @@ def _plain(name: Any) -> str:
     return name.replace("_", "").lower() if isinstance(name, str) else ""
 
 
+def _once(path: Path | str, pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Return pairs as a mapping; raise ValueError if a name comes twice, of which parsers take the last."""
+    values = dict[str, Any]()
+    for name, value in pairs:
+        if name in values:
+            raise ValueError(f"path must hold {name} once, got {path} with it twice; keep one of them")
+        values[name] = value
+    return values
+
+
 def _xml_value(node: ElementTree.Element) -> Any:
     values: dict[str, Any] = {child.tag: (child.text or "").strip() for child in node}
     if "data" in values:
@@ -214,6 +231,7 @@ def _load_yaml(path: Path, text: str, form: str) -> Any:
 
     class Loader(yaml.SafeLoader):
         def flatten_mapping(self, node: Any) -> None:
+            _once(path, ((key.value, None) for key, _ in node.value if isinstance(key.value, str)))
             # No camera file has merge keys, and a few lines of them can fill the memory.
             for key, _ in node.value:
                 if key.tag == "tag:yaml.org,2002:merge":
@@ -225,7 +243,9 @@ def _load_yaml(path: Path, text: str, form: str) -> Any:
     )
     try:
         return yaml.load(text, Loader=Loader)
-    except Exception as error:  # malformed scalars and keys raise many types besides YAMLError
+    except (
+        Exception
+    ) as error:  # a name that comes twice, and malformed scalars and keys of many types besides YAMLError
         message = " ".join(str(error).split())[:_MAX_MESSAGE]
         raise ValueError(f"path must hold {form}, got {path}: {message}") from error
 

@@ -320,6 +320,12 @@ def _document_camera(
             f"path must describe whole frames, got {path} with the roi {abbreviate(region)}; remove roi, and use "
             "camera.cropped"
         )
+    binning = [document.integers(key)[0] for key in ("binning_x", "binning_y") if values.get(key) is not None]
+    if any(number not in (0, 1) for number in binning):
+        raise ValueError(
+            f"path must describe whole frames, got {path} with binning_x and binning_y of {binning}; remove them, and "
+            "use camera.resized for frames of the reduced size"
+        )
     coefficients = document.numbers(document.find(*_COEFFICIENTS), is_matrix=True)
     stated = _stated_model(document)
     if model is not None and stated not in (None, model):

@@ -43,12 +43,21 @@ from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera, read_covariance, read_opencv, write_opencv
 from torchrefract.cli.command import check_none_lost, make, naming, progress
 from torchrefract.data import media
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, files_in, is_lost, pixels_of, read_image
+from torchrefract.data.images import (
+    EXTENSIONS,
+    UnreadableImageError,
+    files_in,
+    is_lost,
+    pixels_of,
+    read_image,
+)
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.fields.rectification import camera_flow, zoom_to_crop
 from torchrefract.warping.warp import warp
 
 _SYNTHETIC = "synthetic"
+_STILL_PX = 0.5  # between corners of two views of a still board
+_HIGH_RMS = 1e-3  # widths of the frame; the errors of fits to real boards are below
 _MIN_USABLE = MIN_VIEWS + 1  # views, so that each can be left out of the fit
 _MAX_REASONS = 300  # characters
 _CACHE_VERSION = 5  # of detections.jsonl; lines of other versions are ignored
@@ -97,7 +106,7 @@ def calibrate(cfg: DictConfig) -> None:
     paths = {file.name: file for file in files}
     try:
         size = _common_size(detections)
-        detections = [_reject_other_size(detection, size) for detection in detections]
+        detections = _reject_repeated([_reject_other_size(detection, size) for detection in detections])
         _check_count(detections, paths, board)
         _check_marker(detections, paths, board)
         calibration = calibrate_camera(detections, board, model=model, size=size, max_drop_share=max_drop_share)
@@ -185,6 +194,27 @@ def _reject_other_size(detection: Detection, size: tuple[int, int]) -> Detection
     return detection._replace(problem=f"{width} x {height} px, other pictures have {size[0]} x {size[1]} px")
 
 
+def _reject_repeated(detections: Sequence[Detection]) -> list[Detection]:
+    """Mark views that repeat an earlier one, as frames of a still board: they would count as independent evidence."""
+    views, result = list[View](), list[Detection]()
+    for detection in detections:
+        same = [] if detection.problem else [o.name for o in views if _motion_px(detection.view, o) < _STILL_PX]
+        if same:
+            detection = detection._replace(problem=f"shows the board where {same[0]} does")  # noqa: PLW2901 - a new value
+        elif not detection.problem:
+            views.append(detection.view)
+        result.append(detection)
+    return result
+
+
+def _motion_px(view: View, other: View) -> float:
+    """Return the largest distance between corners of two views; inf if they share less than half of them."""
+    _, i, j = np.intersect1d(view.ids, other.ids, return_indices=True)
+    if 2 * len(i) < max(len(view.ids), len(other.ids)):
+        return np.inf
+    return float(np.linalg.norm(view.corners[i] - other.corners[j], axis=1).max())
+
+
 def _check_count(detections: Sequence[Detection], paths: dict[str, Path], board: Board) -> None:
     """Raise UsageError if too few pictures show the board, with the likely cause."""
     failed = [detection for detection in detections if detection.problem]
@@ -221,8 +251,9 @@ def _rendered(board: Board, folder: Path) -> list[Path]:
     if not marker.is_file() or marker.read_text(encoding="utf-8") != content:
         folder.mkdir(exist_ok=True)
         for name, picture, _ in progress(render_views(board), "rendering", count=NUM_VIEWS):
+            _, encoded = cv2.imencode(".png", picture)
             with replace_file(folder / name) as path:
-                cv2.imwrite(str(path), picture)
+                path.write_bytes(encoded.tobytes())  # cv2.imwrite would not say that a disk is full
         with replace_file(marker) as path:
             path.write_text(content, encoding="utf-8")
     return find_pictures(folder)
@@ -231,6 +262,12 @@ def _rendered(board: Board, folder: Path) -> list[Path]:
 def _print_summary(calibration: Calibration, out: Path) -> None:
     for name, reason in calibration.dropped.items():
         print(f"{name} dropped: {reason}")
+    if calibration.fit.rms > _HIGH_RMS * calibration.fit.camera.width:
+        print(
+            f"warning: an error of {calibration.fit.rms:.2f} px rms is high: the board may be bent, or the pictures of "
+            "several cameras or zooms, cropped, or turned before they were saved; look at the views in the report",
+            file=sys.stderr,
+        )
     for message in camera_warnings(calibration.fit.camera):
         print(f"warning: {message}", file=sys.stderr)
     print(

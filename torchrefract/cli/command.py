@@ -41,10 +41,11 @@ _MESSAGE_INTERVAL = 10.0  # seconds between two lines of progress outside a term
 _FILE_ERRORS = (UnreadableImageError, DamagedPairError)  # their messages name the file
 _INFORMATION_OPTIONS = ("--hydra-help", "--info", "--shell-completion", "-sc")
 _MULTIRUN = ("-m", "--multirun")
-# Options whose value is text, mostly the path of a file: Hydra's syntax in it means nothing.
+# Options whose value is text, mostly the path of a file: Hydra's syntax in it means nothing. The model of robustness is
+# a file or a function, that of other commands the choice of a group, without a dot.
 _TEXT_OPTION = re.compile(
     r"(\+{0,2}(?:image|images|input|data|labels|weights|source|files|depth|network|checkpoint|camera|scene\.camera|out|ckpt_path|license|run_dir|data\.root|data\.depth|hydra\.run\.dir"
-    r"|hydra\.sweep\.dir|hydra\.sweep\.subdir|model\.network\.pretrained))=(.*)",
+    r"|model(?==.*[./])|hydra\.sweep\.dir|hydra\.sweep\.subdir|model\.network\.pretrained))=(.*)",
     re.DOTALL,
 )
 _SWEEP = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)")
@@ -343,7 +344,13 @@ def _user_message(error: Exception, name: str) -> str | None:
     if isinstance(error, UsageError | HydraException | OmegaConfBaseException | YAMLError):
         unknown = _UNKNOWN_OPTION.match(str(error))
         return _unknown_option(name, unknown[1]) if unknown else " ".join(str(error).split())
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
+    return _file_message(error) if isinstance(error, OSError) else None
+
+
+def _file_message(error: OSError) -> str | None:
+    if isinstance(error, PermissionError):
+        return f"{error.filename} could not be opened: {error.strerror}" if error.filename else str(error)
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG):
         return f"{error.filename or 'a file'} could not be written: {error.strerror}"
     return None
 

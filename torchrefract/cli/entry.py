@@ -1,6 +1,7 @@
 """Main functions of the commands. This module imports only the standard library: a bare wheel lacks all others."""
 
 import importlib
+import signal
 import sys
 from collections.abc import Callable
 
@@ -32,6 +33,9 @@ def command(name: str, page: str | None, function: str) -> Callable[[], None]:
                 raise
             print(f"error: {message}", file=sys.stderr)
             raise SystemExit(1) from error
+        except KeyboardInterrupt:
+            print("stopped", file=sys.stderr)
+            raise SystemExit(128 + signal.SIGINT) from None
         run(name, job)
 
     return main

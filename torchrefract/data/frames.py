@@ -20,7 +20,7 @@ from torch.utils.data import Dataset
 
 from torchrefract._validation import check_choice, check_number, check_size
 from torchrefract.data.depth_maps import DepthFolder
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, image_size, read_image
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, image_size, read_image, warn_of_unread
 from torchrefract.random import key_of
 from torchrefract.types import Frame
 
@@ -197,6 +197,7 @@ def _find_files(root: Path) -> list[str]:
 
 def _frames_of(root: Path, files: Sequence[str]) -> list[str]:
     """Return the files that are images; raise ValueError if there are none."""
+    warn_of_unread(root, files)
     frames = [file for file in files if file.lower().endswith(EXTENSIONS)]
     if not frames:
         raise ValueError(

@@ -7,7 +7,9 @@ if it is complete: if it has the end marker of JPEG and PNG, or the length that 
 import io
 import os
 import stat
-from collections.abc import Iterator, Sequence
+import warnings
+import zlib
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
@@ -26,6 +28,9 @@ from torchrefract.data.jpeg import lacks_pixel_data
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 
+# Pictures and videos that no reader here takes, in folders that hold others.
+_UNREAD = (".heic", ".heif", ".tif", ".tiff", ".avif", ".jxl", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw")
+_UNREAD += (".wmv", ".flv", ".vob", ".insv", ".360")
 _TAIL = 4096  # bytes at the end that are searched first for an end marker
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"
@@ -33,6 +38,7 @@ _JPEG = b"\xff\xd8\xff"
 _JPEG_END = b"\xff\xd9"
 _START_OF_SCAN = 0xDA
 _BARE_MARKERS = (0x01, *range(0xD0, 0xD8))  # TEM and RST0 to RST7 have no length
+_LATE_CHUNKS = 1 << 16  # bytes at the end of a PNG, in which EXIF data behind the pixels lies
 _PNG_DEPTH = 24  # position of the bits of a channel
 _ORIENTATION = 0x0112
 _EXIF_PREFIX = b"Exif\0\0"
@@ -186,9 +192,23 @@ def opened(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def files_in(folder: Path, suffixes: Sequence[str] = EXTENSIONS) -> list[Path]:
-    """List the files of a folder with some suffixes, in any case, sorted by name, without folders and hidden files."""
+    """List the files of a folder with some suffixes, in any case, sorted by name, without folders and hidden files.
+
+    Raises PermissionError if the folder cannot be read, and warns as `warn_of_unread` does.
+    """
+    warn_of_unread(folder, [entry.name for entry in os.scandir(folder)])
     files = (file for file in folder.glob("[!.]*") if file.suffix.lower() in suffixes)
     return sorted(file for file in files if not file.is_dir())
+
+
+def warn_of_unread(source: str | Path, names: Iterable[str]) -> None:
+    """Warn of pictures and videos among the files of a folder whose format is not read."""
+    if unread := [name for name in names if name.lower().endswith(_UNREAD)]:
+        warnings.warn(
+            f"{source} holds {len(unread)} pictures or videos in formats that are not read, such as {unread[0]}; they "
+            "are left out: convert them to PNG or MP4",
+            stacklevel=3,
+        )
 
 
 def has_complete_png_chunks(data: bytes) -> bool:
@@ -258,16 +278,33 @@ def _read_header(path: str | Path, stream: BinaryIO) -> ImageHeader:
             width, height = header.size
             info = header.info
             # Without the first test, Pillow decodes a whole PNG to search for EXIF data behind its pixels.
-            orientation = header.getexif().get(_ORIENTATION, 1) if "exif" in info else 1
+            tags = header.getexif() if "exif" in info else Image.Exif()
             num_frames, has_alpha = getattr(header, "n_frames", 1), header.has_transparency_data
         stream.seek(0)
         head = stream.read(_PNG_DEPTH + 1)
+        if not (exif := info.get("exif", b"")) and (exif := _late_exif(head, stream)):
+            tags.load(exif)
+        orientation = tags.get(_ORIENTATION, 1)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise UnreadableImageError(f"{path} has a damaged header ({error})") from error
     bits = max(8, head[_PNG_DEPTH]) if head.startswith(_PNG) else 8
     orientation = orientation if orientation in range(1, 9) else 1  # as viewers treat invalid values
-    exif = info.get("exif", b"").removeprefix(_EXIF_PREFIX)
+    exif = exif.removeprefix(_EXIF_PREFIX)
     return ImageHeader((height, width), orientation, bits, num_frames, has_alpha, exif, info.get("icc_profile") or b"")
+
+
+def _late_exif(head: bytes, stream: BinaryIO) -> bytes:
+    """Return the EXIF data of a PNG that stand behind its pixels, as ExifTool writes them; empty without."""
+    if not head.startswith(_PNG):
+        return b""
+    stream.seek(max(0, stream.seek(0, os.SEEK_END) - _LATE_CHUNKS))
+    tail = stream.read()
+    start = tail.rfind(b"eXIf")
+    if start < 4:
+        return b""
+    length = int.from_bytes(tail[start - 4 : start], "big")
+    chunk, checksum = tail[start : start + 4 + length], tail[start + 4 + length : start + 8 + length]
+    return chunk[4:] if zlib.crc32(chunk) == int.from_bytes(checksum, "big") else b""
 
 
 def _decode(path: str | Path, data: bytes, *, upright: bool) -> np.ndarray:

@@ -24,6 +24,7 @@ from torchrefract.data.images import (
     image_size,
     pixels_of,
     upright_exif,
+    warn_of_unread,
 )
 from torchrefract.data.video import (
     can_write_videos,
@@ -56,7 +57,7 @@ __all__ = [
 # OpenCV prints to the terminal; problems are raised as errors instead.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".gif")
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".gif", ".m4v", ".webm", ".ts", ".mts", ".m2ts", ".mpg", ".3gp")
 
 _ENCODING = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95], ".jpeg": [cv2.IMWRITE_JPEG_QUALITY, 95]}
 _TAGGED = (".jpg", ".jpeg", ".png", ".webp")  # formats that hold EXIF data and color profiles
@@ -75,7 +76,14 @@ def find_media(source: Path, *, deep: bool = False, name: str = "input") -> Sequ
     if not source.exists():
         raise UsageError(f"{name} must be a folder, a picture or a video, got {source}, which does not exist")
     suffixes = (*EXTENSIONS, *VIDEOS)
-    candidates = [source] if not source.is_dir() else sorted(list_files(source)) if deep else files_in(source, suffixes)
+    try:
+        candidates = (
+            [source] if not source.is_dir() else sorted(list_files(source)) if deep else files_in(source, suffixes)
+        )
+    except PermissionError as error:
+        raise UsageError(f"{name} must be a folder that can be read, got {error}") from error
+    if deep:
+        warn_of_unread(source, map(str, candidates))
     files = [file for file in candidates if file.suffix.lower() in suffixes]
     if not files:
         raise UsageError(f"{name} must be, or hold, {', '.join(suffixes)}, got {source}")

@@ -103,7 +103,7 @@ class Effect(nn.Module, ABC):
         if isinstance(image, Tensor):
             result, degraded = self._degrade_like(image)
             if degraded.has("flow"):
-                _check_kornia_keys()
+                check_kornia_keys()
             return result
         leaves, spec = pytree.tree_flatten(image)
         place = _find_image(leaves)
@@ -346,7 +346,7 @@ class Effect(nn.Module, ABC):
         return result if image.ndim == 4 and not shape.is_clip else result.map(shape.restore)
 
 
-def _check_kornia_keys() -> None:
+def check_kornia_keys(remedy: str = "pass torchrefract.adapters.kornia.KorniaEffect(effect) to the container") -> None:
     """Raise TypeError inside a container of kornia that passes labels, which it would not move."""
     operations = sys.modules.get("kornia.augmentation.container.ops")
     if operations is None or torch.compiler.is_compiling():
@@ -359,7 +359,7 @@ def _check_kornia_keys() -> None:
         if names:
             raise TypeError(
                 f"data_keys must be ['input'] for an effect as it is, got {names} too, which kornia would not move; "
-                "pass torchrefract.adapters.kornia.KorniaEffect(effect) to the container"
+                f"{remedy}"
             )
         frame = frame.f_back
 

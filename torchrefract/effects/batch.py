@@ -5,6 +5,7 @@ of a clip keeps B rows until it meets one that is not.
 """
 
 import sys
+import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
@@ -17,6 +18,7 @@ from torchrefract._validation import check_tensor, check_within, eager_bool, req
 from torchrefract.labels.targets import is_tv_tensor
 from torchrefract.warping.grid import field_dtype
 
+_MOST_CHANNELS = 4  # of usual images; a clip of 3 frames with more is likely (B, C, T, H, W)
 _MOST_CHANNELS_OF_NARROW_IMAGES = 16  # with a width of 1, 3 or 4; above it, the height of an image (H, W, C) is likely
 _CHECKED_PIXELS = 16  # a side, of the values of an image
 _LIMITS = ((1, 1.5, 0.25), (-1, 0.25, 0.05))  # sign, limit, and the largest share of pixels beyond it
@@ -76,6 +78,12 @@ def check_image(image: Tensor) -> BatchShape:
     batch, frames = (1, *leading)[-2:] if leading else (1, 1)
     if frames == 0:
         raise ValueError(f"image must have at least one frame in a clip, got {tuple(image.shape)}")
+    if frames == 3 and image.shape[-3] > _MOST_CHANNELS and not torch.compiler.is_compiling():
+        warnings.warn(
+            f"image of shape {tuple(image.shape)} is taken for clips of 3 frames with {image.shape[-3]} channels; use "
+            "image.movedim(-4, -3) if its channels are before its frames",
+            stacklevel=4,
+        )
     return BatchShape(batch, frames, leading)
 
 

@@ -27,6 +27,7 @@ from torchrefract.warping.lattice import Lattice, LatticeFlow, lattice_around, p
 from torchrefract.warping.warp import sample_image
 
 COARSEST = 64  # px, stride of the first lattice that is measured
+_FEWEST_CELLS = 8  # along each axis of the frame, so that the nodes show how fast the error falls
 _MARGIN = 2  # nodes beyond the frame that a measured lattice has
 _LEAST_FACTOR = 2.5  # by which the error falls if the stride is halved
 _BLOCK = 8  # nodes, along the sides of the parts in which that factor is measured
@@ -158,7 +159,7 @@ def flow_on_measured_lattice(
         tolerance_px: of the composed flow.
     """
     height, width = warps[0].plan.height, warps[0].plan.width
-    while stride > max(1, min(height, width) // 2):
+    while stride > max(1, min(height, width) // _FEWEST_CELLS):
         stride //= 2
     lattice = pixel_lattice(height, width) if stride == 1 else Lattice(height, width, stride, _MARGIN)
     composed = compose_at(warps, lattice.points(dtype=flow_dtype(warps[0].params), device=warps[0].active.device))
@@ -199,13 +200,10 @@ def flow_on_measured_lattice(
 
 
 def lattice_error(nodes: Tensor) -> Tensor:
-    """Estimate the error of the cubics between nodes (N, 2, h, w), at least 7 along each axis: (N,), px."""
-    error = errors_at_nodes(nodes)
-    fine = F.max_pool2d(error, _BLOCK, ceil_mode=True)
-    factor = torch.full_like(fine, _LEAST_FACTOR)
-    if min(nodes.shape[2:]) > 12:
-        coarse = F.max_pool2d(errors_at_nodes(nodes[..., ::2, ::2]), _BLOCK // 2, ceil_mode=True)
-        factor = (coarse / fine.clamp(min=1e-12) / 1.5).clamp(min=_LEAST_FACTOR)
+    """Estimate the error of the cubics between nodes (N, 2, h, w), at least 13 along each axis: (N,), px."""
+    fine = F.max_pool2d(errors_at_nodes(nodes), _BLOCK, ceil_mode=True)
+    coarse = F.max_pool2d(errors_at_nodes(nodes[..., ::2, ::2]), _BLOCK // 2, ceil_mode=True)
+    factor = (coarse / fine.clamp(min=1e-12) / 1.5).clamp(min=_LEAST_FACTOR)
     return (fine / factor).flatten(1).amax(dim=1)
 
 

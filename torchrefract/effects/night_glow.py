@@ -123,7 +123,8 @@ class NightGlow(PhotometricEffect):
         glow_at = spread_glow(nodes, light, strength, height=height, width=width, stride=stride)
 
         def of_rows(band: Tensor, rows: slice, out: Tensor | None) -> Tensor:
-            lit = srgb_to_linear(finite_image(band)).add_(glow_at(rows))
+            # Not in place: under vmap only the glow may have a batch.
+            lit = srgb_to_linear(finite_image(band)) + glow_at(rows)
             return torch.clamp(linear_to_srgb(lit), 0, 1, out=out)
 
         return Rendered(

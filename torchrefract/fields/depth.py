@@ -13,6 +13,9 @@ from torchrefract._validation import check_number, check_positive, check_tensor,
 from torchrefract.warping.grid import field_dtype, pixel_axes
 
 _FARTHEST = 1e12  # m; beyond it a depth is infinite and has no gradient
+_MAX_HOLES = 0.5  # share of values of 0
+_FARTHEST_MEDIAN = 1000.0  # m, of a map of whole numbers
+_FEWEST = 256  # values of a sample that tell stored integers and holes
 _NUM_CHECKED = 128 * 128  # values of a sample by which `check_depth` judges it
 _MIN_UPPER_HALF = 128  # values of its upper half; fewer are not judged
 
@@ -264,9 +267,10 @@ def check_depth(depth: Tensor, *, name: str = "depth") -> None:
     """Raise ValueError if a depth is not in meters, as far as reading it costs no wait for a device.
 
     Each sample or clip is judged alone. Invalid are negative values and NaN; maps that look normalized (all finite
-    values lie in [0, 1] and differ); and maps that look like disparity or inverse depth: no value is inf, a tenth of
-    the upper half is at most 2 % of the largest value, and the median of the lowest quarter is at least 20 % of it.
-    Frames of a few pixels are not tested for the latter.
+    values lie in [0, 1] and differ); whole numbers with a median above 1000, as of millimeters; maps of which more
+    than half is 0, as of lidar, whose zeros are holes; and maps that look like disparity or inverse depth: no value is
+    inf, a tenth of the upper half is at most 2 % of the largest value, and the median of the lowest quarter is at least
+    20 % of it. Frames of a few pixels are not tested for the last three.
 
     Args:
         depth: (B, 1, H, W) or (B, T, 1, H, W), m, inf for the sky.
@@ -284,7 +288,26 @@ def check_depth(depth: Tensor, *, name: str = "depth") -> None:
                 f"{name} must be in m, not normalized (see depth_from_normalized and depth_from_inverse), "
                 f"got values in [{ends[0]:g}, {ends[1]:g}]"
             )
+        _check_not_raw(name, values)
         _check_not_inverse(name, values.double())
+
+
+def _check_not_raw(name: str, values: Tensor) -> None:
+    """Raise ValueError for stored integers, as millimeters, and for maps with holes, as lidar and stereo give."""
+    share = (values == 0).float().mean().item()
+    measured = values[values.isfinite() & (values > 0)]
+    if values.numel() < _FEWEST or measured.numel() == 0 or measured.amin() == measured.amax():
+        return
+    if share > _MAX_HOLES:
+        raise ValueError(
+            f"{name} must be known at each pixel, got 0 at {100 * share:.0f} % of them; fill these holes, such as by a "
+            "depth network"
+        )
+    if measured.median() > _FARTHEST_MEDIAN and bool((measured == measured.round()).all()):
+        raise ValueError(
+            f"{name} must be in m, got whole numbers from {measured.amin():g} to {measured.amax():g}; divide by 1000 "
+            "if they are millimeters, by 256 if they are those of a PNG of KITTI"
+        )
 
 
 def check_floating(name: str, value: Tensor) -> Tensor:

@@ -155,7 +155,9 @@ def _pixels_of_nodes(size: int, stride: int, like: Tensor) -> Tensor:
 def _weights_of_nodes(size: int, stride: int, like: Tensor) -> Tensor:
     """Return the sum of the weights that each node has in pixels along a side: the stride, less what is cut."""
     count = -(-size // stride)
-    nodes, cut = (torch.arange(*ends, device=like.device) for ends in ((0, count), (size, count * stride)))
+    nodes, cut = (
+        torch.arange(*ends, dtype=torch.float64, device=like.device) for ends in ((0, count), (size, count * stride))
+    )
     place = ((cut + 0.5) / stride - 0.5).clamp(0, count - 1)
     return (stride - (1 - (place - nodes[:, None]).abs()).clamp(min=0).sum(dim=1)).to(like.dtype)
 
@@ -163,6 +165,6 @@ def _weights_of_nodes(size: int, stride: int, like: Tensor) -> Tensor:
 def _cosines(size: int, like: Tensor) -> tuple[Tensor, Tensor]:
     """Return the orthonormal matrix of the cosine transform, (size, size), and its frequencies, cycles per node."""
     node = torch.arange(size, dtype=torch.float64, device=like.device)
-    scale = torch.where(node == 0, 1.0, 2.0).div(size).sqrt()
+    scale = (2 - (node == 0).to(node.dtype)).div(size).sqrt()
     matrix = scale[:, None] * torch.cos(math.pi / size * node[:, None] * (node + 0.5))
     return matrix.to(like.dtype), (node / (2 * size)).to(like.dtype)

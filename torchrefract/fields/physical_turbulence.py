@@ -278,7 +278,7 @@ def _amplitudes(
     # The highest frequency of an even size has no derivative, and that of 0 is the uniform tilt.
     ky, kx = (torch.arange(n, device=device) for n in power.shape)
     is_used = (ky[:, None] != size[0] // 2) & (kx != size[1] // 2) & ((ky[:, None] != 0) | (kx != 0))
-    times = torch.where(kx == 0, 1.0, 2.0) * is_used  # how often a frequency of the half occurs among all
+    times = (2 - (kx == 0).to(power.dtype)) * is_used  # how often a frequency of the half occurs among all
     radius = torch.full((1,), math.sqrt(cell_x * cell_y / math.pi), dtype=torch.float64, device=device)
     uniform = (_integral(air, radius)[0] / strength).clamp(max=1)
     missing = (1 - uniform - (power * times).sum() / 2).clamp(min=0)
@@ -288,7 +288,7 @@ def _amplitudes(
     # A frame that is not square resolves more of the long waves along one axis than along the other.
     variances = [1 - (power * times * (along / q).square()).sum() for along in (qx, qy)]
     uniform = torch.stack(variances).clamp(min=0).sqrt().view(2, 1, 1)
-    amplitude = (power / torch.where(kx == 0, 1.0, 2.0)).sqrt() / q
+    amplitude = (power / (2 - (kx == 0).to(power.dtype))).sqrt() / q
     return amplitude.to(dtype), uniform.to(dtype)
 
 
@@ -364,7 +364,7 @@ def _sum(real: Tensor, imaginary: Tensor, size: tuple[int, int], rows: range, co
     cos, sin = turn_y.cos(), turn_y.sin()
     real_lines = exact_matmul(cos, real) - exact_matmul(sin, imaginary)
     imaginary_lines = exact_matmul(sin, real) + exact_matmul(cos, imaginary)
-    times = torch.where(kx == 0, 1.0, 2.0).to(real.dtype)
+    times = 2 - (kx == 0).to(real.dtype)
     cos, sin = turn_x.cos() * times, turn_x.sin() * times
     return exact_matmul(real_lines, cos.mT) - exact_matmul(imaginary_lines, sin.mT)
 

@@ -19,6 +19,7 @@ from torch.utils import _pytree as pytree
 from torchrefract._validation import check_choice, check_flag, check_tensor, eager_bool
 from torchrefract.labels.boxes import check_box_limits, warp_boxes, warp_outlines
 from torchrefract.labels.maps import warp_mask
+from torchrefract.labels.plain_values import check_moves, name_of
 from torchrefract.labels.points import STEPS, TOLERANCE_PX, check_coordinates, in_frame, solve_points
 from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS, warp
 
@@ -28,14 +29,7 @@ _PLAIN = (
     *(enum.Enum, os.PathLike, datetime.date, datetime.time, datetime.timedelta),
 )
 _SAMPLES_PER_EDGE = 64
-_LARGEST_MATRIX = 8  # rows; a tensor of the size of a smaller frame may be a matrix of a camera
-_VISIBILITY_KEYS = ("visible", "visibility")
-# Names of positions in the image, which would stay behind as plain values.
-_TYPES_BY_NAME = {
-    **dict.fromkeys(("box", "boxes", "bbox", "bboxes", "bounding_box", "bounding_boxes"), "BoundingBoxes"),
-    **dict.fromkeys(("mask", "masks", "segmentation", "segmentations"), "Mask"),
-    **dict.fromkeys(("keypoint", "keypoints"), "KeyPoints"),
-}
+_VISIBILITY_KEYS = ("visible", "visibility", "visibilities", "keypoints_visible", "keypoint_visibility")
 # Parts of names of values that describe the image or the camera, never one box.
 _OF_IMAGE = ("image", "img", "orig", "camera", "intrinsic", "extrinsic", "calib")
 
@@ -87,8 +81,9 @@ def warp_labels(
     accelerator. Without `drop`, these boxes stay and have zero area.
 
     A rotated box becomes the smallest box around its warped outline that has the direction of the warped top and bottom
-    edges. An invisible keypoint gets its position off the canvas, or (-1, -1) if it has none. A plain tensor "visible"
-    or "visibility" in the same dict, with one entry for each keypoint, is set to zero for invisible keypoints.
+    edges. An invisible keypoint gets its position off the canvas, or (-1, -1) if it has none. A plain tensor, array or
+    list "visible", "visibility" or "keypoints_visible" in the same dict, with one entry for each keypoint, is set to
+    zero for invisible keypoints.
 
     Args:
         target: nested dicts, lists, tuples and named tuples.
@@ -106,8 +101,8 @@ def warp_labels(
         The warped target, in the same nesting.
 
     Raises:
-        TypeError: if the target holds an unsupported type, or a plain value under a name such as boxes, bbox, masks or
-            keypoints, or of the size of the frame, which would not move.
+        TypeError: if the target holds an unsupported type, or a plain value under a name such as boxes, gt_bboxes,
+            masks, polygons, lanes or keypoints, or of the size of the frame, which would not move.
         ValueError: if shapes do not fit, an option is out of range, or it is not clear which rows belong to a box.
     """
     check_tensor("flow", flow)
@@ -157,8 +152,9 @@ def _warp_target(target: Any, flow: Tensor, options: _Options) -> Any:
 def _warp_sample(sample: Any, flow: Tensor, options: _Options) -> Any:
     pairs, spec = pytree.tree_flatten_with_path(sample, is_leaf=_is_plain_list)
     paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]
-    for path, leaf in pairs:
-        _check_moves(path, leaf, flow)
+    for i, (path, leaf) in enumerate(pairs):
+        siblings = {name: leaves[k] for name, k in _siblings(paths, i).items()}
+        check_moves(path, leaf, siblings, (flow.shape[-2], flow.shape[-1]))
     is_zero = (flow == 0).flatten(-3).all(dim=-1) if options.keep_unmoved else None
     if is_zero is not None and eager_bool(is_zero.all, of=is_zero):
         return sample
@@ -190,41 +186,6 @@ def _is_plain_list(node: Any) -> bool:
 
 def _is_plain_value(value: Any) -> bool:
     return isinstance(value, _PLAIN) and not isinstance(value, Tensor)
-
-
-def _names(path: Any) -> list[str]:
-    """Return the keys and field names of a path in lower case."""
-    names = [getattr(key, "key", getattr(key, "name", None)) for key in path]
-    return [str(name).lower() for name in names if name is not None]
-
-
-def _name(path: Any) -> str:
-    """Return the last key or field name of a path; "" if it has neither."""
-    return next(reversed(_names(path)), "")
-
-
-def _check_moves(path: Any, leaf: Any, flow: Tensor) -> None:
-    """Raise TypeError for a plain value that holds positions in the image, by its name or by its size."""
-    shape = None
-    if isinstance(leaf, Tensor | np.ndarray):
-        shape = tuple(leaf.shape)
-        if not shape or type(leaf) not in (Tensor, torch.nn.Parameter, np.ndarray):
-            return
-    elif not isinstance(leaf, list | tuple) or not leaf:
-        return
-    place, got = f"target{pytree.keystr(path)}", f"a plain {type(leaf).__name__}"
-    is_run_length = "segmentation" in _names(path)  # of COCO, a dict of counts and a size
-    kind = "Mask" if is_run_length else _TYPES_BY_NAME.get(_name(path))
-    size = tuple(flow.shape[-2:])
-    if kind is not None:
-        options = {"BoundingBoxes": f", format=..., canvas_size={size}", "KeyPoints": f", canvas_size={size}"}
-        remedy = f"tv_tensors.{kind}(...{options.get(kind, '')})"
-        raise TypeError(f"{place} must be a {kind} of torchvision to move with the image, got {got}; pass {remedy}")
-    if shape is not None and min(size) > _LARGEST_MATRIX and size in (shape[-2:], shape[:2]):
-        remedy = "tv_tensors.Mask(...), or Image(...) for values to interpolate"
-        raise TypeError(
-            f"{place} must be of a torchvision type to move with the image, got {got} {shape}; pass {remedy}"
-        )
 
 
 def _restore_unmoved(leaf: Any, warped: _Warped, is_zero: Tensor) -> _Warped:
@@ -352,7 +313,7 @@ def _rows_of_boxes(
         return sorted({i, *chosen, *(k for k in rows if is_tv_tensor(leaves[k], "Mask"))})
     if labels_getter is None:
         return [i, *(k for k in rows if is_tv_tensor(leaves[k], "Mask"))]
-    rows = [k for k in rows if not _is_of_image(leaves[k], _name(paths[k]))]
+    rows = [k for k in rows if not _is_of_image(leaves[k], name_of(paths[k]))]
     rivals = [k for k in boxes if k != i and leaves[k].shape[0] == count and paths[k][:-1] == parent]
     if rivals and rows:
         raise ValueError(
@@ -360,7 +321,8 @@ def _rows_of_boxes(
             f"{count} boxes in one; nest them, or pass labels_getter"
         )
     if len(boxes) == 1:
-        labels = [k for k in near if _name(paths[k]) == "labels"] or [k for k in near if "label" in _name(paths[k])][:1]
+        names = {k: name_of(paths[k]) for k in near}
+        labels = [k for k in near if names[k] == "labels"] or [k for k in near if "label" in names[k]][:1]
         for k in labels:
             _check_rows(leaves[k], count)
     return [i, *rows]
@@ -404,12 +366,15 @@ def _clear_visibility(values: list[Any], leaves: list[Any], siblings: dict[str, 
     """Set the visibility of invisible keypoints to zero, in place in the list of values."""
     for key in _VISIBILITY_KEYS:
         k = siblings.get(key)
-        if k is None or type(leaves[k]) is not Tensor:
+        kind = None if k is None else type(leaves[k])
+        if k is None or kind not in (Tensor, np.ndarray, list, tuple):
             continue
-        if leaves[k].shape not in (visible.shape, (*visible.shape, 1)):
-            shapes = f"{tuple(visible.shape)}, got {tuple(leaves[k].shape)}"
+        before = leaves[k] if kind is Tensor else torch.as_tensor(leaves[k], device="cpu")
+        if before.shape not in (visible.shape, (*visible.shape, 1)):
+            shapes = f"{tuple(visible.shape)}, got {tuple(before.shape)}"
             raise ValueError(f"{key} must have one entry for each keypoint, {shapes}")
-        values[k] = values[k] * visible.to(values[k].device).view(leaves[k].shape)
+        after = before * visible.to(before.device).view(before.shape)
+        values[k] = after if kind is Tensor else after.numpy() if kind is np.ndarray else kind(after.tolist())
 
 
 def _convert(boxes: Tensor, old: str, new: str) -> Tensor:

@@ -5,7 +5,7 @@ import re
 import runpy
 import tomllib
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -38,27 +38,10 @@ HEAVY = (
     "yaml",
 )
 LEARNING = ("diffusers", "pytorch_lightning", "segmentation_models_pytorch", "timm", "torch._dynamo", "torchvision")
-IMPORT = "import sys, {module}; print([name for name in {names} if name in sys.modules])"
-
-
-def test_the_package_imports_torch_and_numpy_only(spawn, tmp_path):
-    outcome = spawn("-W", "error", "-c", IMPORT.format(module="torchrefract", names=HEAVY), cwd=tmp_path)
-    assert (outcome.out.strip(), outcome.err) == ("[]", "")
-
-
-def test_commands_without_a_model_import_neither_the_training_stack_nor_workers_matplotlib(spawn, tmp_path):
-    # Workers that generate pairs import the module of their command.
-    workers = IMPORT.format(
-        module="torchrefract.generate, torchrefract.cli.generation", names=(*LEARNING, "matplotlib")
-    )
-    modules = ", ".join(f"torchrefract.cli.{name}" for name in ("calibration", "degradation", "generation", "preview"))
-    outcome = spawn("-c", f"{workers}; {IMPORT.format(module=modules, names=LEARNING)}", cwd=tmp_path)
-    assert (outcome.code, outcome.out.split()) == (0, ["[]", "[]"]), outcome.err
-
-
+LISTED = "import {modules}; print([name for name in {names} if name in sys.modules])"
 # Run commands with a finder that misses the libraries of a list, and print the exit code of each.
 WITHOUT = """
-import importlib, sys
+import importlib
 class Missing:
     def find_spec(self, name, path=None, target=None):
         if name.partition(".")[0] in {missing}:
@@ -71,6 +54,18 @@ for command, *words in {calls}:
     except SystemExit as stop:
         print("exit", stop.code)
 """
+# Import the package once, which takes seconds, and run each script in a process of its own that is forked from there.
+FORKED = """
+import os, sys, torchrefract
+for name, script in {scripts}.items():
+    child = os.fork()
+    if child == 0:
+        for stream, kind in ((1, "out"), (2, "err")):
+            os.dup2(os.open(f"{{name}}.{{kind}}", os.O_WRONLY | os.O_CREAT), stream)
+        exec(script)
+        sys.exit(0)
+    os.waitpid(child, 0)
+"""
 MODULES = {  # by distribution, if the name differs
     "hydra-core": "hydra",
     "opencv-contrib-python-headless": "cv2",
@@ -79,6 +74,7 @@ MODULES = {  # by distribution, if the name differs
     "pyyaml": "yaml",
     "segmentation-models-pytorch": "segmentation_models_pytorch",
 }
+COMMANDS = {"train": "train", "calibrate": "calibration"}  # and their extras
 
 
 def extra_modules(extra: str) -> set[str]:
@@ -88,33 +84,62 @@ def extra_modules(extra: str) -> set[str]:
     return {MODULES.get(name, name) for name in names}
 
 
-def test_a_command_without_its_libraries_names_the_extra_to_install_and_shows_its_help(spawn, tmp_path):
-    missing = sorted(extra_modules("train") | extra_modules("calibration"))
-    extras = {"train": "train", "calibrate": "calibration"}
-    calls = [(command, *words) for command in extras for words in ([], ["--help"])]
-    outcome = spawn("-c", WITHOUT.format(missing=missing, calls=calls), cwd=tmp_path)
-    assert outcome.code == 0, outcome.err
-    assert outcome.err.splitlines() == [
+@pytest.fixture(scope="module")
+def printed(tmp_path_factory, spawn) -> Callable[[str], tuple[str, str]]:
+    """Return a function that gives what a script has printed and its errors, in a process that had only the package."""
+    train, calibration = extra_modules("train"), extra_modules("calibration")
+    folder, parts = tmp_path_factory.mktemp("forked"), ("calibration", "degradation", "generation", "preview")
+    scripts = {
+        "package": LISTED.format(modules="torchrefract", names=HEAVY),
+        "workers": LISTED.format(
+            modules="torchrefract.generate, torchrefract.cli.generation", names=(*LEARNING, "matplotlib")
+        ),
+        "commands": LISTED.format(modules=", ".join(f"torchrefract.cli.{name}" for name in parts), names=LEARNING),
+        "train": WITHOUT.format(
+            missing=sorted(train | calibration),
+            calls=[(name, *words) for name in COMMANDS for words in ([], ["--help"])],
+        ),
+        "calibration": WITHOUT.format(
+            missing=sorted(train - calibration),
+            calls=[("make_board", "out=board.pdf"), ("calibrate", "images=none", "out=a")],
+        ),
+        "restore": WITHOUT.format(
+            missing=["diffusers"], calls=[("restore", "ckpt_path=best.ckpt", "input=.", "out=out")]
+        ),
+    }
+    outcome = spawn("-W", "error", "-c", FORKED.format(scripts=scripts), cwd=folder)
+    assert (outcome.code, outcome.err) == (0, "")
+    return lambda name: ((folder / f"{name}.out").read_text(), (folder / f"{name}.err").read_text())
+
+
+def test_the_package_imports_torch_and_numpy_only(printed):
+    assert printed("package") == ("[]\n", "")
+
+
+def test_commands_without_a_model_import_neither_the_training_stack_nor_workers_matplotlib(printed):
+    # Workers that generate pairs import the module of their command.
+    assert (printed("workers")[0], printed("commands")[0]) == ("[]\n", "[]\n")
+
+
+def test_a_command_without_its_libraries_names_the_extra_to_install_and_shows_its_help(printed):
+    out, err = printed("train")
+    assert err.splitlines() == [
         f"error: {command} needs hydra, which is not installed: pip install 'torchrefract[{extra}]'"
-        for command, extra in extras.items()
+        for command, extra in COMMANDS.items()
     ]
-    pages = outcome.out.split("exit 1\n")[1:]
-    assert len(pages) == len(extras)
-    assert all(f"python -m torchrefract.{name} " in page for name, page in zip(extras, pages, strict=True))
+    pages = out.split("exit 1\n")[1:]
+    assert all(f"python -m torchrefract.{name} " in page for name, page in zip(COMMANDS, pages, strict=True))
 
 
-def test_the_calibration_extra_suffices_for_calibration(spawn, tmp_path):
-    missing = sorted(extra_modules("train") - extra_modules("calibration"))
-    calls = [("make_board", "out=board.pdf"), ("calibrate", "images=none", "out=a")]
-    outcome = spawn("-c", WITHOUT.format(missing=missing, calls=calls), cwd=tmp_path)
-    assert (tmp_path / "board.pdf").is_file(), outcome.err
-    assert outcome.err.startswith("error: images must be an existing folder of pictures, got none")
+def test_the_calibration_extra_suffices_for_calibration(printed):
+    out, err = printed("calibration")
+    assert "board.pdf" in out
+    assert err.startswith("error: images must be an existing folder of pictures, got none")
 
 
-def test_restoring_without_diffusers_names_the_extra(spawn, tmp_path):
-    calls = [("restore", "ckpt_path=best.ckpt", "input=.", "out=out")]
-    outcome = spawn("-c", WITHOUT.format(missing=["diffusers"], calls=calls), cwd=tmp_path)
-    assert outcome.err == "error: restore needs diffusers, which is not installed: pip install 'torchrefract[train]'\n"
+def test_restoring_without_diffusers_names_the_extra(printed):
+    message = "error: restore needs diffusers, which is not installed: pip install 'torchrefract[train]'\n"
+    assert printed("restore")[1] == message
 
 
 def test_a_command_speaks_before_it_imports_torch(spawn, tmp_path):

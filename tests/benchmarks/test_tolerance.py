@@ -4,16 +4,13 @@ import sys
 import pytest
 import tolerance
 import torch
-from tolerance import CONFIGURATIONS, Trial, attempt, summary
+from tolerance import Trial, attempt, summary
 
 
-@pytest.mark.parametrize("name", list(CONFIGURATIONS))
-def test_a_random_configuration_keeps_its_tolerance(name):
-    trial = attempt(name, 1, (120, 160))
+def test_a_seed_repeats_its_configuration():
+    trial = attempt("LensDistortion", 1, (120, 160))  # tests of plans try all kinds
     assert 64 <= trial.height <= 120
-    assert 0 <= trial.share <= 1
-    assert 0 <= trial.restore_share <= 1
-    assert trial == attempt(name, 1, (120, 160))
+    assert trial == attempt("LensDistortion", 1, (120, 160))
 
 
 def test_splines_in_small_frames_keep_the_tolerance_of_their_composition():

@@ -75,8 +75,8 @@ def test_the_flow_is_the_composition_of_the_pure_flows_at_displaced_points():
 
 def undistort(x: Tensor, y: Tensor, params: Any) -> tuple[Tensor, Tensor]:
     """Return the point that a radial lens shows at a pixel, by bisection of the radius."""
-    fx, fy = (params.focal[0] * 960).tolist()
-    cx, cy = (479.5 + params.center[0, 0].item() * 960, 269.5 + params.center[0, 1].item() * 960)
+    fx, fy = (params.focal[0] * 480).tolist()
+    cx, cy = (239.5 + params.center[0, 0].item() * 480, 134.5 + params.center[0, 1].item() * 480)
     k1, k2 = params.coefficients[0, :2].tolist()
     u, v = (x - cx) / fx, (y - cy) / fy
     distorted = (u * u + v * v).sqrt()
@@ -92,11 +92,11 @@ def undistort(x: Tensor, y: Tensor, params: Any) -> tuple[Tensor, Tensor]:
 def test_the_composed_flow_of_two_radial_lenses_is_the_one_found_by_bisection():
     options = {"k2_range": (0.1, 0.1), "p1_range": NONE, "p2_range": NONE, "frame": "pad"}
     lenses = [LensDistortion(k1_range=(k, k), **options) for k in (-0.2, -0.1)]
-    degraded = Compose(lenses, tolerance_px=None).degrade(torch.zeros(1, 1, 540, 960, dtype=torch.float64), seed=0)
+    degraded = Compose(lenses, tolerance_px=None).degrade(torch.zeros(1, 1, 270, 480, dtype=torch.float64), seed=0)
     first, second = degraded.params.children
-    y, x = torch.meshgrid(torch.arange(540.0).double(), torch.arange(960.0).double(), indexing="ij")
+    y, x = torch.meshgrid(torch.arange(270.0).double(), torch.arange(480.0).double(), indexing="ij")
     expected = torch.stack(undistort(*undistort(x, y, second), first)) - torch.stack([x, y])
-    assert degraded.flow.abs().max() > 20
+    assert degraded.flow.abs().max() > 10
     assert_close(degraded.flow[0], expected, rtol=0, atol=1e-6)
 
 
@@ -307,9 +307,9 @@ def test_gradients_reach_every_effect_and_the_image():
 
 
 def test_one_graph_draws_and_degrades_as_eager_mode():
-    choice = OneOf([Turbulence(), ThinPlateSpline()])
     lens = LensDistortion(frame="pad", p=0.7)  # with less to compile than a view that fills the frame
-    effect = Compose([ThinPlateSpline(padding="border", p=0.7), UniformFog(p=0.7), lens, choice])
+    choice = OneOf([lens, ThinPlateSpline()])
+    effect = Compose([ThinPlateSpline(padding="border", p=0.7), UniformFog(p=0.7), choice])
     image = picture(4, 3, 24, 32)
     torch.manual_seed(3)
     expected = [effect(image) for _ in range(2)]

@@ -1,6 +1,7 @@
 """Promises of every effect; a new effect is one more entry of EFFECTS."""
 
 import copy
+import itertools
 import math
 import random
 from collections.abc import Callable
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from domain import IGNORE_STRENGTH
-from helpers import DTYPES, assert_close_maps, assert_equal_maps, maps_of, random_image
+from helpers import assert_close_maps, assert_equal_maps, maps_of, random_image
 from torch import Tensor, nn
 from torch.testing import assert_close
 from torch.utils.data import DataLoader, Dataset
@@ -240,16 +241,17 @@ def case(request) -> Case:
 
 
 class DegradedFrames(Dataset):
-    """Frames that each worker degrades."""
+    """Frames that each worker degrades by all effects, one after the other."""
 
-    def __init__(self, effect: Effect, images: Tensor, keys: Tensor):
-        self.effect, self.images, self.keys = effect, images, keys
+    def __init__(self, effects: list[Effect], images: Tensor, keys: Tensor):
+        self.effects, self.images, self.keys = effects, images, keys
 
     def __len__(self) -> int:
-        return len(self.images)
+        return len(self.effects) * len(self.images)
 
     def __getitem__(self, i: int) -> dict[str, Tensor]:
-        return maps_of(self.effect.degrade(self.images[i], seed=7, keys=self.keys[i : i + 1]))
+        effect, i = self.effects[i // len(self.images)], i % len(self.images)
+        return maps_of(effect.degrade(self.images[i], seed=7, keys=self.keys[i : i + 1]))
 
 
 def tensors_in(params: Any) -> dict[str, Tensor]:
@@ -267,10 +269,9 @@ def test_every_public_effect_is_tested():
 
 @pytest.mark.quick
 def test_a_sample_does_not_depend_on_its_batch(case):
-    effect, images, keys = case.strong(p=0.8), random_image(16, 3, 33, 47), torch.arange(100, 116) * 2**33
+    effect, images, keys = case.strong(p=0.8), random_image(8, 3, 33, 47), torch.arange(100, 108) * 2**33
     batch = effect.degrade(images, seed=7, keys=keys)
-    shuffled = torch.randperm(16, generator=torch.Generator().manual_seed(1))
-    for rows in ([0], [11], [5, 0, 9], shuffled.tolist()):
+    for rows in ([0], [7], [5, 0, 3, 6, 2]):
         part = effect.degrade(images[rows], seed=7, keys=keys[rows])
         assert_equal_maps(tensors_in(part.params), {name: v[rows] for name, v in tensors_in(batch.params).items()})
         assert_close_maps(maps_of(part), {name: value[rows] for name, value in maps_of(batch).items()})
@@ -287,14 +288,16 @@ def test_a_sample_does_not_depend_on_the_number_of_threads(case, batch, on_threa
 
 
 @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
-def test_a_sample_does_not_depend_on_the_worker(case):
-    effect, images, keys = case.strong(p=0.8), random_image(6, 3, 20, 30), torch.tensor([4, -1, 7, 2**40, 0, 3])
-    expected = maps_of(effect.degrade(images, seed=7, keys=keys))
-    frames = DegradedFrames(effect, images, keys)
-    for workers in (0, 2):
-        context = "fork" if workers else None
-        batches = list(DataLoader(frames, batch_size=4, num_workers=workers, multiprocessing_context=context))
-        assert_close_maps({name: torch.cat([batch[name] for batch in batches]) for name in expected}, expected)
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_sample_does_not_depend_on_the_worker(workers):
+    images, keys = random_image(6, 3, 20, 30), torch.tensor([4, -1, 7, 2**40, 0, 3])
+    effects = [case.strong(p=0.8) for case in EFFECTS.values()]
+    frames, context = DegradedFrames(effects, images, keys), "fork" if workers else None
+    # Batches of 3, so that each holds maps of one effect.
+    batches = list(DataLoader(frames, batch_size=3, num_workers=workers, multiprocessing_context=context))
+    for effect, first, second in zip(effects, batches[::2], batches[1::2], strict=True):
+        expected = maps_of(effect.degrade(images, seed=7, keys=keys))
+        assert_close_maps({name: torch.cat([first[name], second[name]]) for name in expected}, expected)
 
 
 @pytest.mark.quick
@@ -329,8 +332,8 @@ def test_forward_stores_nothing_on_the_module(case):
     assert not list(effect.parameters())
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("reason", ["p = 0", "strength zero", "not applied"])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.bfloat16, torch.float32])
 def test_an_effect_that_is_off_returns_the_image_bit_for_bit(case, dtype, reason):
     image = random_image(3, 3, 21, 17, dtype=dtype)
     if reason == "not applied":
@@ -349,7 +352,7 @@ def test_an_effect_that_is_off_returns_the_image_bit_for_bit(case, dtype, reason
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float16, torch.float32])
 def test_only_the_applied_samples_of_a_batch_change(case, dtype):
     image = random_image(16, 3, 21, 17, dtype=dtype)
     degraded = case.strong(p=0.5).degrade(image, seed=7)
@@ -386,8 +389,13 @@ def test_the_gradient_at_strength_zero_is_the_limit_of_small_strengths(case, pix
     assert_close(gradients[0], gradients[1], rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
+@pytest.mark.parametrize(
+    ("dtype", "layout"),
+    [
+        *((dtype, torch.contiguous_format) for dtype in (torch.uint8, torch.bfloat16, torch.float32)),
+        *((dtype, torch.channels_last) for dtype in (torch.uint8, torch.float16, torch.float32, torch.float64)),
+    ],
+)
 def test_shape_type_and_layout_stay_and_the_result_is_that_of_float32(case, dtype, layout):
     effect, scale = case.strong(), 255 if dtype is torch.uint8 else 1
     image = random_image(2, 3, 20, 30, dtype=dtype).contiguous(memory_format=layout)
@@ -460,8 +468,9 @@ def test_an_empty_batch_stays_empty(case):
         assert (value.shape[0], *value.shape[2:]) == (0, 8, 9), name
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
+@pytest.mark.parametrize(
+    ("value", "interpolation"), [(math.nan, "bilinear"), (math.inf, "bicubic"), (-math.inf, "bilinear")]
+)
 def test_an_invalid_pixel_does_not_change_the_gradients_of_others(case, value, interpolation):
     effect = case.strong(**{"gamma_range": NO_RANGE} if case.meters else {})  # a gain has another test
     if isinstance(effect, WarpEffect):
@@ -515,19 +524,18 @@ def test_params_of_a_smaller_type_than_the_flow_are_converted(case, dtype):
     assert {value.dtype for value in maps_of(result).values() if value.is_floating_point()} == {image.dtype}
 
 
-@pytest.mark.parametrize("value", [1e5, -1e5, 1e10, -1e10, 1e20, 3e38, -3e38, 1e-10, 1e-38])
 @IGNORE_STRENGTH
-def test_extreme_params_raise_or_give_finite_maps(case, value):
+def test_extreme_params_raise_or_give_finite_maps(case):
     effect, image = case.strong(), random_image(2, 3, 24, 32)
     params = effect.sample(image, seed=1)
-    for name in case.fields:
+    for name, value in [(name, x) for name in case.fields for x in (1e5, -1e5, 1e20, 3e38, -3e38, 1e-38)]:
         try:
             result = effect.apply(image, params._replace(**{name: torch.full_like(getattr(params, name), value)}))
         except ValueError as error:
             if name not in str(error):
                 raise
         else:
-            assert all(shown.isfinite().all() for shown in maps_of(result).values()), name
+            assert all(shown.isfinite().all() for shown in maps_of(result).values()), (name, value)
 
 
 def test_gradients_of_params_and_image_match_finite_differences(case):
@@ -542,9 +550,8 @@ def test_gradients_of_params_and_image_match_finite_differences(case):
         return effect.apply(image, params._replace(**dict(zip(case.fields, values, strict=True)))).image
 
     inputs = [image, *(getattr(params, name).clone().requires_grad_() for name in case.fields)]
-    # Volumetric fog takes 100 ms a call, and gradcheck without the fast mode calls it for each of a hundred numbers.
-    is_slow = getattr(effect, "mode", "") == "ray"
-    assert torch.autograd.gradcheck(degrade, [image.requires_grad_(), *inputs[1:]], fast_mode=is_slow)
+    # The fast mode compares the Jacobian along random directions instead of a hundred entries one by one.
+    assert torch.autograd.gradcheck(degrade, [image.requires_grad_(), *inputs[1:]], fast_mode=True)
 
 
 def test_a_sample_that_is_not_applied_has_a_gradient_of_the_image_only(case):
@@ -559,45 +566,35 @@ def test_a_sample_that_is_not_applied_has_a_gradient_of_the_image_only(case):
 
 
 def test_one_graph_gives_the_same_as_eager_mode(request, case):
-    effect, image = case.strong(p=0.8), random_image(3, 3, 24, 32)
-    # Compiling a graph to machine code takes long and tests PyTorch; one warp and one photometric effect suffice.
-    is_compiled = request.node.callspec.params["case"] in ("thin-plate spline", "uniform fog")
+    effect, image, name = case.strong(p=0.8), random_image(3, 3, 24, 32), request.node.callspec.params["case"]
+    # Each graph is traced whole. Lowering it takes as long again and tests PyTorch: one warp and one photometric effect
+    # become machine code, and of effects with the same code one is lowered; a lens is in the graph of a composition.
+    backend = "inductor" if name in ("road mirage", "uniform fog") else "aot_eager"
+    if name in ("lens", "turbulence", "physical turbulence", "heterogeneous fog", "volumetric fog"):
+        backend = "eager"
     torch.manual_seed(3)
     expected = [effect(image) for _ in range(2)]
-    compiled = torch.compile(effect, fullgraph=True, backend="inductor" if is_compiled else "aot_eager")
+    compiled = torch.compile(effect, fullgraph=True, backend=backend)
     torch.manual_seed(3)
     assert_close([compiled(image) for _ in range(2)], expected, rtol=0, atol=2e-4)
 
 
-def test_nan_in_a_field_of_the_params_raises(case):
+def test_nan_or_infinity_in_a_field_of_the_params_raises(case):
     effect, image = case.strong(), random_image(2, 3, 8, 9)
     params = effect.sample(image, seed=7)
-    for name in case.fields:
-        wrong = getattr(params, name).clone()
-        wrong.view(-1)[-1] = math.nan
-        with pytest.raises(ValueError, match=rf"params\.{name} must"):
-            effect.apply(image, params._replace(**{name: wrong}))
-
-
-@pytest.mark.parametrize("value", [math.inf, -math.inf])
-def test_an_infinite_field_of_the_params_raises(case, value):
-    effect, image = case.strong(), random_image(2, 3, 8, 9)
-    params = effect.sample(image, seed=7)
-    for name in case.fields:
+    for name, value in [(name, x) for name in case.fields for x in (math.nan, math.inf, -math.inf)]:
         if name in MAY_BE_INFINITE and value == math.inf:
             continue
         wrong = getattr(params, name).clone()
         wrong.view(-1)[-1] = value
-        with pytest.raises(ValueError, match=rf"params\.{name} must|points must"):
+        with pytest.raises(ValueError, match=rf"params\.{name} must{'' if math.isnan(value) else '|points must'}"):
             effect.apply(image, params._replace(**{name: wrong}))
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_range_with_nan_or_infinity_raises(case, value):
-    names = [name for name, ends in vars(case.strong()).items() if name.endswith("_range") and isinstance(ends, tuple)]
-    assert names
-    for name in names:
-        low, high = getattr(case.strong(), name)
+def test_a_range_with_nan_or_infinity_raises(case):
+    ranges = {k: v for k, v in vars(case.strong()).items() if k.endswith("_range") and isinstance(v, tuple)}
+    assert ranges
+    for (name, (low, high)), value in itertools.product(ranges.items(), (math.nan, math.inf, -math.inf)):
         for wrong in ((value, high), (low, value)):
             if wrong == (low, math.inf) and name.removesuffix("_range") in MAY_BE_INFINITE:
                 continue
@@ -634,23 +631,21 @@ def test_unknown_arguments_raise(case):
         case.make((0.0, 1.0))
 
 
-@pytest.mark.parametrize("shape", [(8, 9), (1, 1, 2, 3, 8, 9), (3, 0, 9), (2, 0, 8, 9)])
-def test_an_image_of_another_shape_raises(case, shape):
-    with pytest.raises(
-        ValueError, match=r"image must have shape \(B, C, H, W\), \(C, H, W\) or, for clips, \(B, T, C, H, W\)"
-    ):
-        case.strong()(torch.zeros(shape))
+def test_an_image_of_another_shape_raises(case):
+    rule = r"image must have shape \(B, C, H, W\), \(C, H, W\) or, for clips, \(B, T, C, H, W\)"
+    for shape in ((8, 9), (1, 1, 2, 3, 8, 9), (3, 0, 9), (2, 0, 8, 9)):
+        with pytest.raises(ValueError, match=rule):
+            case.strong()(torch.zeros(shape))
 
 
-@pytest.mark.parametrize("image", [torch.zeros(3, 8, 9, dtype=torch.int32), np.zeros((3, 8, 9)), None])
-def test_an_image_of_another_type_raises(case, image):
-    with pytest.raises(TypeError, match="image must be"):
-        case.strong()(image)
+def test_an_image_of_another_type_raises(case):
+    for image in (torch.zeros(3, 8, 9, dtype=torch.int32), np.zeros((3, 8, 9)), None):
+        with pytest.raises(TypeError, match="image must be"):
+            case.strong()(image)
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "rule"),
-    [
+def test_wrong_seeds_keys_and_depths_raise(case):
+    wrong: list[tuple[dict[str, Any], type[Exception], str]] = [
         ({"keys": [1, 2, 3]}, ValueError, "keys must have one key for each of the 2 images"),
         ({"keys": torch.zeros(2)}, TypeError, "keys must be whole numbers"),
         ({"keys": torch.zeros(2, 1, dtype=torch.int64)}, ValueError, "keys must have one key for each"),
@@ -661,11 +656,10 @@ def test_an_image_of_another_type_raises(case, image):
         ({"seed": torch.tensor([1, 2])}, ValueError, r"seed must be one number, got shape \(2,\)"),
         ({"depth": torch.zeros(2, 1, 9, 8)}, ValueError, "depth must have one channel and the size of the image"),
         ({"depth": [1.0]}, TypeError, "depth must be a floating tensor"),
-    ],
-)
-def test_wrong_seeds_keys_and_depths_raise(case, options, error, rule):
-    with pytest.raises(error, match=rule):
-        case.strong().degrade(random_image(2, 3, 8, 9), **options)
+    ]
+    for options, error, rule in wrong:
+        with pytest.raises(error, match=rule):
+            case.strong().degrade(random_image(2, 3, 8, 9), **options)
 
 
 def test_an_effect_is_a_module_among_modules(case):

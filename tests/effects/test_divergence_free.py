@@ -91,17 +91,3 @@ def test_an_amplitude_that_folds_is_measured_and_folded_pixels_are_not_valid():
     degraded, _ = warp(ramp, wild.flow)
     restored, _ = warp(degraded, wild.restore_flow)
     assert (restored - ramp)[wild.restore_valid].abs().max() < 0.05
-
-
-@pytest.mark.parametrize(
-    ("options", "rule"),
-    [
-        ({"length_range": (0.0, 1.0)}, "length_range must be"),
-        ({"covariance": "spherical"}, "covariance must be one of"),
-        ({"normalize": "image"}, "normalize must be one of theory, max, none"),
-        ({"steps": 0}, "steps must be at least 1, got 0"),
-    ],
-)
-def test_wrong_arguments_raise(options, rule):
-    with pytest.raises(ValueError, match=rule):
-        DivergenceFree(**options)

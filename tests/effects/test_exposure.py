@@ -126,25 +126,3 @@ def test_a_quantized_image_has_levels_and_the_gradient_of_the_unrounded_one():
     assert_close(255 * quantized, (255 * exact).round(), rtol=0, atol=1e-9)
     gradients = [torch.autograd.grad(result.sum(), image)[0] for result in (quantized, exact)]
     assert torch.equal(*gradients)
-
-
-@pytest.mark.parametrize(
-    ("options", "rule"),
-    [
-        ({"max_gain": 8.0}, r"max_gain must be a number in \[1, 4\]"),
-        ({"min_gain": 0.0}, r"min_gain must be a number in"),
-        ({"shot_range": (0.0, 2.0)}, "shot_range must"),
-        ({"time_constant_range": (-1.0, 2.0)}, "time_constant_range must"),
-    ],
-)
-def test_arguments_out_of_range_raise(options, rule):
-    with pytest.raises(ValueError, match=rule):
-        Exposure(**options)
-
-
-@pytest.mark.parametrize(("field", "value"), [("target", 0.0), ("gamma", -0.5), ("time_constant", -1.0), ("shot", 2.0)])
-def test_invalid_params_raise(field, value):
-    image, effect = picture(2, 3, *SIZE), Exposure()
-    params = effect.sample(image, seed=1)
-    with pytest.raises(ValueError, match=rf"params\.{field} must"):
-        effect.apply(image, params._replace(**{field: torch.full((2,), value, dtype=torch.float64)}))

@@ -74,7 +74,7 @@ def test_the_mean_extinction_is_that_of_the_visibility(options):
 @pytest.mark.parametrize("options", [{}, {"mode": "ray"}])
 def test_the_mean_over_many_fogs_is_that_of_the_visibility(options):
     effect = HeterogeneousFog(mean="ensemble", deviation_range=(0.0, 0.0), **options)
-    k = effect.degrade(picture(150, 1, 9, 16, dtype=torch.float32), seed=4).extinction
+    k = effect.degrade(picture(150, 1, 4, 7, dtype=torch.float32), seed=4).extinction
     expected = -math.log(0.05) / 100
     assert (k.mean() / expected).item() == pytest.approx(1, abs=0.02)
     assert (k.mean(dim=(1, 2, 3)) - expected).abs().max() > 0.005 * expected
@@ -138,17 +138,13 @@ def test_near_objects_stay_visible_and_far_ones_vanish(mode):
 
 
 @pytest.mark.parametrize("mode", ["image", "ray"])
-def test_gradients_of_all_parameters_and_depth_match_finite_differences(mode):
+def test_the_gradient_of_depth_matches_finite_differences(mode):
     image, depth = picture(2, 3, 3, 4), 10 + 80 * picture(2, 1, 3, 4)
     effect = HeterogeneousFog(mode=mode)
     params = effect.sample(image, seed=3, frame=2.5)
-    names = ("visibility", "deviation", "airlight", "weights", "contrast", "wind", "decorrelation", "frame")
-
-    def foggy(image: Tensor, depth: Tensor, *values: Tensor) -> Tensor:
-        return effect.apply(image, params._replace(**dict(zip(names, values, strict=True))), depth=depth).image
-
-    inputs = [image, depth, *(getattr(params, name).clone() for name in names)]
-    assert torch.autograd.gradcheck(foggy, [value.requires_grad_() for value in inputs], fast_mode=True)
+    assert torch.autograd.gradcheck(
+        lambda depth: effect.apply(image, params, depth=depth).image, depth.requires_grad_(), fast_mode=True
+    )
 
 
 # --- ends of the domain, invalid arguments
@@ -171,62 +167,12 @@ def test_clear_air_keeps_the_image_and_opaque_fog_shows_its_color(mode):
     assert not effect.apply(image, params, depth=depth + math.inf).transmission.any()
 
 
-@pytest.mark.parametrize(
-    ("options", "rule"),
-    [
-        ({"mode": "volume"}, "mode must be one of image, ray, got 'volume'"),
-        ({"weights": ()}, r"weights must be one number for each of 6 scales, got \(\)"),
-        ({"scales": (4.0,)}, "weights must be one number for each of 1 scales, got None"),
-        ({"scale_unit": "m"}, "scale_unit must be one of px, cells, got 'm'"),
-        ({"normalize": "max"}, "normalize must be one of theory, image"),
-        ({"mean": "time"}, "mean must be one of image, ensemble"),
-        ({"wind_z_range": (-1.0, 0.0)}, r"wind_z_range must be \(0, 0\) for mode='image', which has no depth"),
-        ({"decorrelation_range": (0.0, 1.0)}, "decorrelation_range must be"),
-        ({"reach": 0.0}, "reach must be"),
-    ],
-)
-def test_arguments_out_of_range_raise(options: dict[str, Any], rule: str):
-    with pytest.raises(ValueError, match=rule):
-        HeterogeneousFog(**options)
-
-
-@pytest.mark.parametrize("wrong", [{"depth": 100.0}, {"camera": "dashcam"}, {"linear_light": 1}])
-def test_arguments_of_another_type_raise(wrong: dict[str, Any]):
-    (name,) = wrong
-    with pytest.raises(TypeError, match=f"{name} must be"):
-        HeterogeneousFog(**wrong)
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "rule"),
-    [
-        ("weights", -0.1, "be at least 0 and finite"),
-        ("contrast", -0.1, r"lie in \[0, 2\]"),
-        ("decorrelation", 0.0, "be above 0"),
-        ("visibility", 0.0, "be above 0"),
-    ],
-)
-def test_params_out_of_range_raise(field, value, rule):
-    image, effect = picture(2, 3, 8, 9), HeterogeneousFog()
-    params = effect.sample(image, seed=1)
-    wrong = getattr(params, field).clone()
-    wrong.view(-1)[-1] = value
-    with pytest.raises(ValueError, match=rf"params\.{field} must {rule}"):
-        effect.apply(image, params._replace(**{field: wrong}))
-    with pytest.raises(ValueError, match=r"params\.weights must have a sum above 0, got 0"):
-        effect.apply(image, params._replace(weights=torch.zeros(2, 6)))
-
-
 def test_a_normalized_depth_raises():
     with pytest.raises(ValueError, match="depth must be in m, not normalized"):
         HeterogeneousFog().degrade(picture(1, 3, 8, 9), depth=picture(1, 1, 8, 9))
 
 
 def test_a_scale_height_that_does_not_fit_raises():
-    with pytest.raises(ValueError, match="scale_height_range must be None for mode='image'"):
-        HeterogeneousFog(scale_height_range=(1.0, 2.0))
-    with pytest.raises(ValueError, match="scale_height_range must"):
-        HeterogeneousFog(mode="ray", scale_height_range=(0.0, 2.0))
     image = torch.zeros(1, 3, 8, 9)
     plume = HeterogeneousFog(mode="ray", scale_height_range=(1.0, 2.0)).sample(image, seed=7)
     with pytest.raises(ValueError, match=r"params\.scale_height must be inf for mode='image'"):
@@ -333,10 +279,6 @@ def test_invalid_vehicles_raise():
     ):
         with pytest.raises(ValueError, match=problem):
             HeterogeneousFog().apply(image, params._replace(vehicles=boxes))
-    for name in ("wake_density", "wake_length"):
-        options: dict[str, Any] = {name: -1.0}
-        with pytest.raises(ValueError, match=f"{name} must"):
-            HeterogeneousFog(**options)
 
 
 def test_fog_is_brighter_on_the_side_of_the_sun_by_henyey_and_greensteins_phase_function():

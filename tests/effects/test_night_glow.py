@@ -109,18 +109,3 @@ def test_a_frame_with_a_sky_of_the_day_has_no_glow():
     assert (degraded.params.luminance == torch.tensor([0.0, 10.0])).all()
     assert torch.equal(degraded.image[0], image[0])
     assert (degraded.image[1] > image[1]).any()
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "rule"),
-    [
-        ({"optical_depth_range": (-1.0, 0.0)}, ValueError, "optical_depth_range must"),
-        ({"asymmetry_range": (0.0, 0.5)}, ValueError, "asymmetry_range must"),
-        ({"luminance_range": (2.0, 1.0)}, ValueError, "luminance_range must"),
-        ({"threshold": 1.0}, ValueError, "threshold must"),
-        ({"camera": 3}, TypeError, "camera must be a Camera"),
-    ],
-)
-def test_invalid_arguments_raise(options: dict[str, Any], error: type[Exception], rule: str):
-    with pytest.raises(error, match=rule):
-        NightGlow(**options)

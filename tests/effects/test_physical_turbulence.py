@@ -171,10 +171,10 @@ def test_air_that_thins_with_height_gives_rays_to_the_road_twice_the_variance():
 
 def test_the_bonnet_is_still_and_the_horizon_shimmers():
     effect = PhysicalTurbulence(cn2_range=(1e-10, 1e-10), tolerance_px=None)
-    flow = effect.degrade(torch.zeros(40, 1, 270, 480), seed=1).flow
+    flow = effect.degrade(torch.zeros(40, 1, 90, 160), seed=1).flow
     rows = flow.square().mean(dim=(0, 1, 3)).sqrt()
-    assert rows[136] > 5 * rows[-1]
-    assert rows[136] > 3 * rows[0]
+    assert rows[45] > 5 * rows[-1]
+    assert rows[45] > 3 * rows[0]
 
 
 def test_the_wind_carries_each_layer():
@@ -263,30 +263,7 @@ def test_a_displacement_below_the_tolerance_is_not_computed():
     assert "each pixel has a ray of its own" in str(PhysicalTurbulence().plan(1080, 1920))
 
 
-@pytest.mark.parametrize(
-    ("options", "rule"),
-    [
-        ({"num_layers": 2}, "num_layers must be at least 3"),
-        ({"num_layers": 9}, "num_layers must be at most 8"),
-        ({"cn2_range": (-1e-12, 0.0)}, "cn2_range must be"),
-        ({"aperture": 0.0}, "aperture must be"),
-        ({"outer_scale": 0.001}, "outer_scale must be a number"),
-        ({"height": 0.0}, "height must be"),
-        ({"reach": 0.0}, "reach must be"),
-    ],
-)
-def test_wrong_arguments_raise(options, rule):
-    with pytest.raises(ValueError, match=rule):
-        PhysicalTurbulence(**options)
-
-
-def test_invalid_parameters_and_a_missing_width_raise():
-    effect, image = PhysicalTurbulence(), torch.rand(2, 3, 8, 9)
-    params = effect.sample(image, seed=1)
-    with pytest.raises(ValueError, match=r"params.tilt must lie in \[0, 1e\+06\]"):
-        effect.apply(image, params._replace(tilt=torch.tensor([1.0, -1.0])))
-    with pytest.raises(ValueError, match=r"params.wind must have shape \(B, 2\)"):
-        effect.apply(image, params._replace(wind=torch.zeros(2, 3)))
+def test_a_missing_width_raises():
     with pytest.raises(ValueError, match="width must be that of the frames"):
         Turbulence().equivalent_cn2()
-    assert isinstance(effect.depth, GroundPlaneDepth)
+    assert isinstance(PhysicalTurbulence().depth, GroundPlaneDepth)

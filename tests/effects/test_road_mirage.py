@@ -124,30 +124,6 @@ def test_a_mirage_below_the_tolerance_is_not_computed():
     assert "the edge of the mirage is sharp" in str(RoadMirage().plan(1080, 1920))
 
 
-@pytest.mark.parametrize(
-    ("options", "rule"),
-    [
-        ({"difference_range": (-1.0, 5.0)}, "difference_range must be"),
-        ({"shimmer_range": (0.0, 1.5)}, "shimmer_range must be"),
-        ({"half_width": 0.0}, "half_width must be above 0"),
-        ({"num_waves": 0}, "num_waves must be at least 1"),
-        ({"focal": 0.0}, "focal must be"),
-    ],
-)
-def test_wrong_arguments_raise(options, rule):
-    with pytest.raises(ValueError, match=rule):
-        RoadMirage(**options)
-
-
-def test_invalid_parameters_raise():
-    effect, image = RoadMirage(), torch.rand(2, 3, 8, 9)
-    params = effect.sample(image, seed=1)
-    with pytest.raises(ValueError, match=r"params.difference must lie in \[0, 300\]"):
-        effect.apply(image, params._replace(difference=torch.tensor([1.0, -1.0])))
-    with pytest.raises(ValueError, match=r"params.rate must have shape \(B, 6\)"):
-        effect.apply(image, params._replace(rate=torch.zeros(2, 3)))
-
-
 def test_the_rows_that_are_computed_hold_all_of_the_mirage():
     image, effect = torch.rand(2, 3, 60, 200), RoadMirage(difference_range=(20.0, 30.0), focal=8.0, half_width=math.inf)
     params = effect.sample(image, seed=2)

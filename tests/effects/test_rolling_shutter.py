@@ -152,22 +152,22 @@ def sees_two_planes(inverse_depth: np.ndarray, flow: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("depth", "speed", "skew"), [(8.0, 40, 37), (8.0, 100, 91), (30.0, 40, 2.6), (30.0, 100, 6.5)])
 def test_a_pole_beside_the_road_is_skewed_as_computed_by_hand(depth, speed, skew):
     effect = RollingShutter(
-        camera=Camera(width=1920, height=1080, fx=1400, fy=1400, cx=959.5, cy=539.5, coefficients=(0,) * 4)
+        camera=Camera(width=480, height=270, fx=350, fy=350, cx=239.5, cy=134.5, coefficients=(0,) * 4)
     )
-    flow = effect.apply(
-        torch.zeros(1, 1, 1080, 1920), driving(speed, 30.0), depth=torch.full((1, 1, 1080, 1920), depth)
-    ).flow
-    column = round(959.5 + 1400 * 5 / depth)  # 5 m beside the camera
-    assert (flow[0, 0, 0, column] - flow[0, 0, -1, column]).item() == pytest.approx(skew, rel=0.02)
+    wall = torch.full((1, 1, 270, 480), depth)
+    flow = effect.apply(torch.zeros_like(wall), driving(speed, 30.0), depth=wall).flow
+    column = round(239.5 + 350 * 5 / depth)  # 5 m beside the camera
+    # The skew is that of a frame of 1920 x 1080 px.
+    assert 4 * (flow[0, 0, 0, column] - flow[0, 0, -1, column]).item() == pytest.approx(skew, rel=0.02)
 
 
 def test_a_pitch_of_a_fifth_of_a_degree_at_15_hz_moves_rows_by_five_pixels():
     effect = RollingShutter(
-        camera=Camera(width=1920, height=1080, fx=1400, fy=1400, cx=959.5, cy=539.5, coefficients=(0,) * 4)
+        camera=Camera(width=481, height=1080, fx=1400, fy=1400, cx=240, cy=539.5, coefficients=(0,) * 4)
     )
-    flow = effect.apply(torch.zeros(1, 1, 1080, 1920), driving(0.0, 30.0, pitch=0.2)).flow
+    flow = effect.apply(torch.zeros(1, 1, 1080, 481), driving(0.0, 30.0, pitch=0.2)).flow
     stretch = 1 + (539.5 / 1400) ** 2  # of small angles, at the last row
-    assert flow[0, 1, -1, 960].abs().item() / stretch == pytest.approx(4.9, rel=0.02)
+    assert flow[0, 1, -1, 240].abs().item() / stretch == pytest.approx(4.9, rel=0.02)
     assert flow[0, 1, 540].abs().max() < 0.01  # the middle row stays
 
 
@@ -194,8 +194,7 @@ def test_the_restore_flow_leads_to_where_each_point_is_exposed_and_leaves_out_wh
     assert smooth.restore_valid.float().mean() > 0.85
 
 
-@pytest.mark.parametrize("horizon", [0.4, 0.5])
-@pytest.mark.parametrize("exposure_range", [NONE, (5.0, 10.0)])
+@pytest.mark.parametrize(("horizon", "exposure_range"), [(0.4, NONE), (0.5, (5.0, 10.0))])
 def test_planned_flows_of_a_road_are_within_the_tolerance(horizon, exposure_range):
     depth, size = GroundPlaneDepth(horizon=horizon), (270, 480)
     for tolerance_px in (0.02, 0.2):
@@ -294,23 +293,6 @@ def test_a_network_gives_the_depth_of_each_image():
     assert not list(effect.parameters())
     flow = effect.degrade(image, seed=1).flow
     assert_close(flow, RollingShutter().degrade(image, seed=1, depth=network(image)).flow)
-
-
-def test_invalid_arguments_raise():
-    invalid: list[tuple[dict[str, Any], str]] = [
-        ({"speed_range": (0.0, 2000.0)}, "speed_range must"),
-        ({"exposure_range": (-1.0, 0.0)}, "exposure_range must"),
-        ({"pitch_range": (0.0, 6.0)}, "pitch_range must"),
-        ({"num_frequencies": 0}, "num_frequencies must be at least 1"),
-        ({"fps": 0.0}, "fps must"),
-    ]
-    for given, rule in invalid:
-        with pytest.raises(ValueError, match=rule):
-            RollingShutter(**given)
-    unfit: dict[str, Any] = {"depth": 8.0, "camera": (1400, 1400)}
-    for name, rule in (("depth", "depth must be a provider"), ("camera", "camera must be a Camera")):
-        with pytest.raises(TypeError, match=rule):
-            RollingShutter(**{name: unfit[name]})
 
 
 @dataclass(frozen=True)

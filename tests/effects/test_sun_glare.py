@@ -158,23 +158,6 @@ def test_the_sun_drifts_over_a_clip():
     assert_close(intensity[2, 1:, 2:], intensity[1, :-1, :-2], rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "rule"),
-    [
-        ({"center_x_range": (0.1, 0.2)}, ValueError, "center_x_range and center_y_range must both be given"),
-        ({"outside": 1.5}, ValueError, "outside must be a number in"),
-        ({"scatter_range": (0.0, 1.5)}, ValueError, "scatter_range must"),
-        ({"scale_range": (0.0, 1.0)}, ValueError, "scale_range must"),
-        ({"num_ghosts": -1}, ValueError, "num_ghosts must be at least 0"),
-        ({"color": (1.0, 2000.0, 1.0)}, ValueError, "color must be a number in"),
-        ({"camera": 3}, TypeError, "camera must be a Camera, got int"),
-    ],
-)
-def test_invalid_arguments_raise(options, error, rule):
-    with pytest.raises(error, match=rule):
-        SunGlare(**options)
-
-
 @pytest.mark.parametrize(("index", "name", "value"), [(1, "radius", -1.0), (2, "share", 2.0), (0, "place", 1e6)])
 def test_invalid_ghosts_raise(index, name, value):
     image, effect = picture(2, 3, *SIZE), SunGlare()

@@ -59,30 +59,6 @@ def test_splines_that_cannot_be_drawn_for_a_frame_are_exact(points):
     assert torch.equal(effect.apply(image, params).flow, effect.exact().apply(image, params).flow)
 
 
-def test_parameters_of_a_wrong_shape_raise():
-    effect, image = ThinPlateSpline(), torch.zeros(2, 1, 8, 9)
-    params = effect.sample(image, seed=1)
-    with pytest.raises(ValueError, match=r"params\.displacement must have the shape of points"):
-        effect.apply(image, params._replace(displacement=params.displacement[:, :3]))
-    with pytest.raises(ValueError, match=r"params\.points must have shape \(B, N, 2\)"):
-        effect.apply(image, params._replace(points=params.points[..., 0]))
-    with pytest.raises(ValueError, match=r"params\.smoothing must be at least 0"):
-        effect.apply(image, params._replace(smoothing=-torch.ones(2)))
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "rule"),
-    [
-        ({"smoothing_range": (-1.0, 1.0)}, ValueError, "smoothing_range must be"),
-        ({"lattice": (1, 4)}, ValueError, "lattice must be at least 2, got 1"),
-        ({"lattice": (2.5, 4)}, TypeError, "lattice must be a whole number"),
-    ],
-)
-def test_wrong_arguments_raise(options, error, rule):
-    with pytest.raises(error, match=rule):
-        ThinPlateSpline(**options)
-
-
 def test_parameters_with_gradients_work_without_grad_mode():
     effect, image = ThinPlateSpline(), torch.rand(2, 3, 120, 200, dtype=torch.float64)
     params = effect.sample(image, seed=1)

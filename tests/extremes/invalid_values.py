@@ -1,6 +1,6 @@
-"""Pass NaN, infinite and huge values to effects and functions: `python tests/extremes/invalid_values.py GROUP EVERY`.
+"""Pass NaN, infinite and huge values to effects and functions: `python invalid_values.py GROUP=EVERY ...`.
 
-`test_invalid_values.py` runs it in a process of its own, which may crash. It runs every EVERY-th case of a group, and
+`test_invalid_values.py` runs it in a process of its own, which may crash. It runs every EVERY-th case of a GROUP, and
 prints each case first, so that the last line names the one that crashed. A failed case prints WRONG and makes the exit
 status 1.
 """
@@ -304,22 +304,24 @@ def _converters(value: float) -> None:
 GROUPS: dict[str, Callable[[], Iterator[Case]]] = {cases.__name__: cases for cases in (images, flows, params, depths)}
 
 
-def main(group: str, every: int) -> int:
-    """Run every `every`-th case of a group, and return 1 if one fails."""
+def main(*words: str) -> int:
+    """Run every EVERY-th case of each GROUP=EVERY, and return 1 if one fails."""
     # Strong flows warn that they fold.
     warnings.simplefilter("ignore")
-    wrong = count = 0
-    for name, case in islice(GROUPS[group](), 0, None, every):
-        print(f"case: {name}", flush=True)
-        count += 1
-        try:
-            case()
-        except Exception as error:  # the next case still has to run
-            wrong += 1
-            print(f"WRONG: {name}: {error!r}", flush=True)
-    print(f"cases: {count}", flush=True)
+    wrong = 0
+    for group, every in (word.split("=") for word in words):
+        count = 0
+        for name, case in islice(GROUPS[group](), 0, None, int(every)):
+            print(f"case: {name}", flush=True)
+            count += 1
+            try:
+                case()
+            except Exception as error:  # the next case still has to run
+                wrong += 1
+                print(f"WRONG: {name}: {error!r}", flush=True)
+        print(f"cases of {group}: {count}", flush=True)
     return min(wrong, 1)
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1], int(sys.argv[2])))
+    sys.exit(main(*sys.argv[1:]))

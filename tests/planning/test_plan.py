@@ -55,9 +55,10 @@ def picture(batch: int = 2) -> torch.Tensor:
 
 @pytest.mark.parametrize("name", tolerance.CONFIGURATIONS)
 def test_random_configurations_stay_within_their_tolerance(name):
-    for seed in range(1000, 1008):
+    for seed in range(1000, 1006):
         trial = tolerance.attempt(name, seed, (160, 240))
-        assert trial.share <= 1, trial
+        assert 0 <= trial.share <= 1, trial
+        assert 0 <= trial.restore_share <= 1, trial
 
 
 @pytest.mark.quick
@@ -117,7 +118,7 @@ def test_clips_stay_within_the_tolerance(name):
 
 def test_graphs_of_one_kind_of_effect_have_plans_of_their_own():
     image, flows = picture().double(), []
-    for effect in (effect_with("divergence-free", 1.0), effect_with("divergence-free", None)):
+    for effect in (effect_with("thin plate", 1.0), effect_with("thin plate", None)):
         compiled = torch.compile(effect.degrade, fullgraph=True, backend="eager")
         flows.append(compiled(image, seed=torch.tensor(3)).image)
         assert_close(flows[-1], effect.degrade(image, seed=3).image, rtol=0, atol=1e-5)

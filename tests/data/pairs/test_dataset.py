@@ -15,13 +15,20 @@ from torchrefract.restoration.tasks import Undistort
 SIZE = (32, 48)
 
 
-@pytest.fixture
-def made(call, words, tmp_path):
-    """Return a function that writes pairs of the frames."""
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory):
+    return tmp_path_factory.mktemp("sets")
 
-    def make(*more: str, out: str = "out", scene: str = "paper_refractive"):
-        assert call("generate", *words(out, *more, scene=scene)).code == 0
-        return tmp_path / out
+
+@pytest.fixture
+def made(call, words, sets):
+    """Return a function that gives pairs of the frames, which its first call for a scene and options writes."""
+
+    def make(*more: str, scene: str = "paper_refractive"):
+        out = sets / "_".join((scene, *more)).replace("=", "_")
+        if not out.exists():
+            assert call("generate", *words(out, *more, scene=scene)).code == 0
+        return out
 
     return make
 
@@ -90,7 +97,7 @@ def test_a_reduced_pair_is_the_pair_of_the_reduced_frame(made):
 
 
 def test_pairs_without_a_required_map_raise(made):
-    weather, moved = made(scene="paper_weather"), made(out="moved")
+    weather, moved = made(scene="paper_weather"), made()
     with pytest.raises(ValueError, match="root must hold pairs with a transmission, as of fog, got 0 in "):
         PairedFolder(moved, transmission=True)[0]
     with pytest.raises(ValueError, match="root must hold pairs with a flow, as of a lens, got "):
@@ -120,21 +127,22 @@ def test_training_from_disk_has_the_losses_of_training_on_the_fly(made, frames, 
 
 
 def test_files_and_tars_hold_the_same_pairs(made):
-    folder, tars = PairedFolder(made()), PairedFolder(made("tar=5", out="tars"))
+    folder, tars = PairedFolder(made()), PairedFolder(made("tar=5"))
     assert len(folder) == len(tars) == 12
     for i in range(12):
         for name, a, b in zip(Pair._fields, folder[i], tars[i], strict=True):
             assert torch.equal(a, b), name
 
 
-def test_concatenated_manifests_of_shards_are_one_set(made):
-    single = made()
-    out, *_ = [made("shards=3", f"shard={shard}", out="shards") for shard in range(3)]
+def test_concatenated_manifests_of_shards_are_one_set(made, call, words, tmp_path):
+    for shard in range(3):
+        assert call("generate", *words("shards", "shards=3", f"shard={shard}")).code == 0
+    out = tmp_path / "shards"
     texts = [path.read_text() for path in sorted(out.glob("manifest-*"), reverse=True)]
     for path in out.glob("manifest-*"):
         path.unlink()
     (out / "manifest.jsonl").write_text("".join(texts))
-    one, several = PairedFolder(single, split="val"), PairedFolder(out, split="val")
+    one, several = PairedFolder(made(), split="val"), PairedFolder(out, split="val")
     assert [one.row(i) for i in range(len(one))] == [several.row(i) for i in range(len(several))]
 
 

@@ -20,11 +20,17 @@ from torchrefract.data.images import read_image
 COUNT = 10
 
 
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("refractive") / "out"
+
+
 @pytest.fixture
-def refractive(call, words, tmp_path) -> Path:
-    """Write ten pairs of warps as files."""
-    assert call("generate", *words("out", f"count={COUNT}")).code == 0
-    return tmp_path / "out"
+def refractive(call, words, shared) -> Path:
+    """Return ten pairs of warps as files, which the first test writes and all tests read."""
+    if not shared.exists():
+        assert call("generate", *words(shared, f"count={COUNT}")).code == 0
+    return shared
 
 
 def made_again(row, frames, effect):

@@ -46,8 +46,9 @@ def divergence_free_flow(
     dtype = amplitude.dtype
     if lattice.stride == 1:
         rows, columns = (range(span.start, span.stop + 2) for span in (rows, columns))
-        psi, clipped = sample_field(params, frequencies, rows, columns, kind=covariance, dtype=dtype)
-        flow = curl(psi[:, :1])
+        # Neighbors differ by about 1 / length of psi, whose rounding would count as often.
+        psi, clipped = sample_field(params, frequencies, rows, columns, kind=covariance, dtype=torch.float64)
+        flow, clipped = curl(psi[:, :1]).to(dtype), clipped.to(dtype)
     else:
         flow, clipped = sample_field(
             params, frequencies, rows, columns, kind=covariance, dtype=dtype, transform=_curl_of_waves

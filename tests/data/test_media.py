@@ -81,7 +81,7 @@ def write(
             track = container.add_stream(sound, rate=48000, layout="mono")
         for pixels, t in zip(pages, times or range(len(pages)), strict=True):
             frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
-            frame = frame.reformat(format=pix_fmt, dst_colorspace=space if space != 2 else 5)
+            frame = frame.reformat(format=pix_fmt, dst_colorspace=space if space != 2 else 5, threads=1)
             frame.pts, frame.time_base = t, unit
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
@@ -249,6 +249,31 @@ def test_an_interlaced_video_is_warned_of_once(tmp_path):
     with pytest.warns(UserWarning, match=r"a\.mp4 is interlaced: .* Deinterlace it first: ffmpeg .*bwdif") as caught:
         assert convert_video(tmp_path / "a.mp4", tmp_path / "b.mp4", change=unchanged) == 3
     assert len(caught) == 1
+
+
+# A thread of the parent that the child waits for does not exist in it.
+FORKED = """
+import gc, os, signal, sys
+from pathlib import Path
+import numpy as np
+from torchrefract.data.video import read_video, write_video
+
+gc.disable()  # so that the child frees what the parent has left, as a worker of a DataLoader may
+path = Path("a.mp4")
+write_video([np.full((64, 96, 3), 9, np.uint8)] * 3, path, fps=25, size=(64, 96))
+frames = list(read_video(path, range(3)))
+if child := os.fork():
+    signal.signal(signal.SIGALRM, lambda *_: os.kill(child, signal.SIGKILL))
+    signal.alarm(20)
+    sys.exit(os.waitpid(child, 0)[1])
+gc.collect()
+os._exit(0)
+"""
+
+
+def test_a_forked_process_frees_what_was_read_and_written(tmp_path, spawn):
+    (tmp_path / "fork.py").write_text(FORKED)
+    assert spawn("fork.py", cwd=tmp_path).code == 0
 
 
 def test_what_a_video_loses_is_described(tmp_path):

@@ -30,6 +30,8 @@ from torchrefract.data.images import UnreadableImageError, opened
 _DEFAULT_RATE = Fraction(25)  # of a video whose header has no rate
 # Without frames that refer to later ones, the packets of a video are in the order of their times.
 _VIDEO_OPTIONS = {"crf": "17", "preset": "veryfast", "bf": "0"}
+# A process that is forked later, as a worker of a DataLoader, would wait forever for threads that it does not have.
+_THREADS = 1  # of a conversion
 # Without these options swscale darkens colors by more than one level.
 _CONVERSION = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 _COLOR_MATRICES = {int(space) for space in Colorspace}  # those that can be converted
@@ -278,7 +280,7 @@ def _encode(
     options = {"dst_colorspace": _matrix_of(stream.colorspace), "dst_color_range": ColorRange.MPEG}
     for picture, (pts, duration) in zip(pictures, times, strict=False):
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-        frame = frame.reformat(format=stream.pix_fmt, interpolation=_CONVERSION, **options)
+        frame = frame.reformat(format=stream.pix_fmt, interpolation=_CONVERSION, threads=_THREADS, **options)
         frame.pts, frame.duration, frame.time_base = pts, duration, stream.codec_context.time_base
         yield from stream.encode(frame)
     yield from stream.encode(None)
@@ -296,7 +298,7 @@ def _mux(container: OutputContainer, stream: av.VideoStream, packets: Iterable[P
 def _tensor_of(frame: av.VideoFrame, *, upright: bool) -> Tensor:
     """Convert a frame into (1, 3, H, W), float32 in [0, 1], RGB."""
     options: Any = {"src_colorspace": _matrix_of(frame.colorspace), "src_color_range": frame.color_range}
-    pixels = frame.to_ndarray(format="rgb24", interpolation=_CONVERSION, **options)
+    pixels = frame.to_ndarray(format="rgb24", interpolation=_CONVERSION, threads=_THREADS, **options)
     if upright:
         pixels = _turn(pixels, _display_matrix(frame))
     return to_float(torch.from_numpy(pixels.copy()).permute(2, 0, 1)[None].contiguous())

@@ -18,10 +18,11 @@ def test_splines_in_small_frames_keep_the_tolerance_of_their_composition():
         assert attempt("Compose", seed, (270, 480)).share < 0.5
 
 
-def test_the_rounding_of_deep_folds_counts_as_that_of_exact_flows():
-    trial = attempt("Compose", 288, (270, 480))  # stretches distances by 124
-    assert trial.tolerance < trial.error == pytest.approx(trial.rounding, rel=1e-3)
-    assert not trial.is_exceeded
+def test_deep_folds_keep_a_small_tolerance():
+    assert attempt("Compose", 288, (270, 480)).share < 0.1  # which stretches errors of single flows by 124
+
+
+def test_a_restore_flow_may_have_four_tolerances_and_a_little():
     assert Trial("lens", 64, 64, 0.1, error=0.11).is_exceeded
     assert [Trial("lens", 64, 64, 0.1, 0.0, error).is_exceeded for error in (0.41, 0.43)] == [False, True]
 

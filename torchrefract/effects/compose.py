@@ -52,7 +52,7 @@ class Compose(Effect):
             None takes those of the last warp that moves the sample, or of the outermost composition inside with any.
         tolerance_px: largest error of the composed flow in px, see `plan`; None is exact. It replaces the tolerance of
             the effects and compositions inside, but an effect whose own tolerance is None stays exact. In frames too
-            large for the default, the default is exact. Deep folds stretch the rounding of float32 too, even above it.
+            large for the default, the default is exact.
         p: probability that a sample is degraded.
 
     Raises:

@@ -308,7 +308,7 @@ def test_the_corridor_is_nearer_to_lidar_than_a_flat_road_and_the_ramp(shared_da
         assert (t - exact).square().mean() < 0.85 * (flat - exact).square().mean()
 
 
-@pytest.mark.filterwarnings("ignore:depth is that of a road")
+@pytest.mark.filterwarnings("ignore:depth is that of a road")  # the warning has a test of its own, the next one
 def test_walls_are_as_far_away_as_the_sky_above_them_is_low():
     image = torch.full((2, 3, 120, 200), 0.2)
     image[:, :, :31, :] = 0.9  # a skyline 29 rows above the horizon, whose row is 59.5

@@ -22,11 +22,6 @@ def test_deep_folds_keep_a_small_tolerance():
     assert attempt("Compose", 288, (270, 480)).share < 0.1  # which stretches errors of single flows by 124
 
 
-def test_a_restore_flow_may_have_four_tolerances_and_a_little():
-    assert Trial("lens", 64, 64, 0.1, error=0.11).is_exceeded
-    assert [Trial("lens", 64, 64, 0.1, 0.0, error).is_exceeded for error in (0.41, 0.43)] == [False, True]
-
-
 # A strong lens in a narrow frame; a lens at points far outside the frame; lattices whose corners have no ray.
 @pytest.mark.parametrize(("name", "seed"), [("LensDistortion", 9), ("Compose", 60), ("Rectification", 82)])
 def test_configurations_at_the_edge_of_their_error_bounds_keep_their_tolerance(name, seed):

@@ -421,7 +421,7 @@ def test_channels_are_degraded_independently(case):
     for channel in range(4):
         single = effect.degrade(image[:, [channel]], seed=7).image
         # Vector instructions round the last few pixels of a row otherwise, and which these are depends on the size.
-        assert_close(single[:, 0], result[:, channel], rtol=0, atol=1e-6)
+        assert_close(single[:, 0], result[:, channel], rtol=0, atol=torch.finfo(torch.float32).eps)
 
 
 def channels_change_each_other_by_the_gain_alone(case: Case) -> None:
@@ -528,7 +528,9 @@ def test_params_of_a_smaller_type_than_the_flow_are_converted(case, dtype):
 def test_extreme_params_raise_or_give_finite_maps(case):
     effect, image = case.strong(), random_image(2, 3, 24, 32)
     params = effect.sample(image, seed=1)
-    for name, value in [(name, x) for name in case.fields for x in (1e5, -1e5, 1e20, 3e38, -3e38, 1e-38)]:
+    for name, value in [
+        (name, x) for name in case.fields for x in (1e5, -1e5, 1e10, -1e10, 1e20, 3e38, -3e38, 1e-10, 1e-38)
+    ]:
         try:
             result = effect.apply(image, params._replace(**{name: torch.full_like(getattr(params, name), value)}))
         except ValueError as error:
@@ -550,8 +552,9 @@ def test_gradients_of_params_and_image_match_finite_differences(case):
         return effect.apply(image, params._replace(**dict(zip(case.fields, values, strict=True)))).image
 
     inputs = [image, *(getattr(params, name).clone().requires_grad_() for name in case.fields)]
-    # The fast mode compares the Jacobian along random directions instead of a hundred entries one by one.
-    assert torch.autograd.gradcheck(degrade, [image.requires_grad_(), *inputs[1:]], fast_mode=True)
+    # Volumetric fog takes 100 ms a call, and gradcheck without the fast mode calls it for each of a hundred numbers.
+    is_slow = getattr(effect, "mode", "") == "ray"
+    assert torch.autograd.gradcheck(degrade, [image.requires_grad_(), *inputs[1:]], fast_mode=is_slow)
 
 
 def test_a_sample_that_is_not_applied_has_a_gradient_of_the_image_only(case):

@@ -196,9 +196,10 @@ def files_in(folder: Path, suffixes: Sequence[str] = EXTENSIONS) -> list[Path]:
 
     Raises PermissionError if the folder cannot be read, and warns as `warn_of_unread` does.
     """
-    warn_of_unread(folder, [entry.name for entry in os.scandir(folder)])
-    files = (file for file in folder.glob("[!.]*") if file.suffix.lower() in suffixes)
-    return sorted(file for file in files if not file.is_dir())
+    with os.scandir(folder) as entries:
+        names = [entry.name for entry in entries if not entry.name.startswith(".") and not entry.is_dir()]
+    warn_of_unread(folder, names)
+    return sorted(folder / name for name in names if Path(name).suffix.lower() in suffixes)
 
 
 def warn_of_unread(source: str | Path, names: Iterable[str]) -> None:

@@ -359,7 +359,7 @@ def check_kornia_keys(remedy: str = "pass torchrefract.adapters.kornia.KorniaEff
         if names:
             raise TypeError(
                 f"data_keys must be ['input'] for an effect as it is, got {names} too, which kornia would not move; "
-                f"{remedy}"
+                + remedy
             )
         frame = frame.f_back
 

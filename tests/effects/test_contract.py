@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from domain import IGNORE_STRENGTH
-from helpers import assert_close_maps, assert_equal_maps, maps_of, random_image
+from helpers import DTYPES, assert_close_maps, assert_equal_maps, maps_of, random_image
 from torch import Tensor, nn
 from torch.testing import assert_close
 from torch.utils.data import DataLoader, Dataset
@@ -333,7 +333,7 @@ def test_forward_stores_nothing_on_the_module(case):
 
 
 @pytest.mark.parametrize("reason", ["p = 0", "strength zero", "not applied"])
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.bfloat16, torch.float32])
+@pytest.mark.parametrize("dtype", DTYPES)
 def test_an_effect_that_is_off_returns_the_image_bit_for_bit(case, dtype, reason):
     image = random_image(3, 3, 21, 17, dtype=dtype)
     if reason == "not applied":
@@ -352,7 +352,7 @@ def test_an_effect_that_is_off_returns_the_image_bit_for_bit(case, dtype, reason
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.float16, torch.float32])
+@pytest.mark.parametrize("dtype", DTYPES)
 def test_only_the_applied_samples_of_a_batch_change(case, dtype):
     image = random_image(16, 3, 21, 17, dtype=dtype)
     degraded = case.strong(p=0.5).degrade(image, seed=7)

@@ -85,9 +85,10 @@ def estimate_lens(
 def radial_lens_of_flow(flow: Tensor, *, aspect: float | None = None) -> Tensor:
     """Fit k1 and k2 to the flow that undistorts frames, by linear least squares.
 
-        p + flow(p) = c + s (p - c) (1 + k1 r^2 + k2 r^4),  r = |p - c| in half diagonals
+        p + flow(p) = c + s (p - c) (1 + k1 r^2 + k2 r^4),  r = s |p - c| in half diagonals
 
-    for s, s k1 and s k2, at 33 x 33 points; c is the middle of the frame and s an unknown zoom.
+    for s, s^3 k1 and s^5 k2, at 33 x 33 points; c is the middle of the frame and s an unknown zoom, by which the flow of
+    a filled frame magnifies the rectified frame.
 
     Args:
         flow: (1, 2, h, w), px.
@@ -108,8 +109,8 @@ def radial_lens_of_flow(flow: Tensor, *, aspect: float | None = None) -> Tensor:
     target = torch.stack([x + u * stretch / half_diagonal, y + v / half_diagonal])
     base = torch.stack(torch.broadcast_tensors(x, y))
     columns = torch.stack([base, base * r2, base * r2 * r2], dim=-1).reshape(-1, 3)
-    zoom, *scaled = torch.linalg.lstsq(columns, target.reshape(-1, 1)).solution[:, 0]
-    return torch.stack(scaled) / zoom
+    zoom, cubic, quintic = torch.linalg.lstsq(columns, target.reshape(-1, 1)).solution[:, 0]
+    return torch.stack([cubic / zoom**3, quintic / zoom**5])
 
 
 def _check_frame(frame: Tensor, index: int, size: tuple[int, int] | None) -> Tensor:

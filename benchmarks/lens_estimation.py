@@ -3,6 +3,7 @@
     python benchmarks/lens_estimation.py  # rendered roads through a known lens, and without a lens
     python benchmarks/lens_estimation.py --data DATA [--sets ca280_1280 ...]  # real cameras with a calibration
     python benchmarks/lens_estimation.py --checkpoint lens_small  # also by a network, and by both together
+    python benchmarks/lens_estimation.py --drives FRAMES --without us_  # single frames of held-out drives
     python benchmarks/lens_estimation.py --checkpoint lens_small --clip 100  # speed, and how still the lens is
 
 DATA holds frames/train/ca280_*.jpg and fullres/ca280_*.jpg, of the camera of chessboard/udacity_p4, and folders of
@@ -15,6 +16,11 @@ the pixels of the rectified frame. Both rectified frames have their principal po
 1 there, as the flow of `rectify`. "nothing" is the same for the frames as they are. Pools are drawn at random; medians
 over the draws. "rectified" rows are the same frames after `rectify` by the calibrated camera: their lens is none.
 "lines" is the distance of corners of one row or column from a straight line, px rms, before and after.
+
+--drives degrades the frames of FRAMES/val by `cheap_dashcam`, as a validation of the task undistort does, and estimates
+the flow of each frame alone, by straight edges: the mean of the flows of 256 lenses that the effect draws, weighted by
+their likelihood. "constant" is their mean without weights. --without leaves out frames whose own lens shows, by the
+beginnings of their names.
 
 --clip writes a video of that many frames, which pan over a rendered road behind a lens that stays, and restores it
 frame by frame and with `pool=lens`. "jitter" is the mean change of the flow from a frame to the next, px of a frame
@@ -47,6 +53,7 @@ from torchrefract.cameras.calibration.plumb_line import (
     find_chains,
     fit_lens,
     is_distinct,
+    line_costs,
     pool_chains,
     published_prior,
 )
@@ -54,10 +61,13 @@ from torchrefract.cameras.calibration.report import straightness, undistort_view
 from torchrefract.cameras.camera import Camera
 from torchrefract.cli.calibration import find_pictures, read_gray
 from torchrefract.cli.lens import Predictor, flow_predictor
+from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import pixels_of, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.data.video import convert_video, read_video, write_video
+from torchrefract.effects.base import Effect
 from torchrefract.fields.rectification import camera_flow
+from torchrefract.presets import cheap_dashcam
 from torchrefract.restoration.checkpoints import load_model
 from torchrefract.restoration.inference import LensRestorer, Restorer
 from torchrefract.warping.warp import warp
@@ -75,6 +85,8 @@ _NUM_RENDERED, _RENDERED_SIZE, _SHRINK = 30, (720, 1280), 0.7
 _POOLS = {1: 7, 5: 5, 20: 3}  # number of draws by the number of frames
 _WIDTH = 1920  # px, of errors
 _GRID = 41
+_NUM_LENSES, _FLOW_STRIDE = 256, 8  # of the prior of single frames; px
+_PRIOR_SEED = 123  # another one than that of the frames
 
 
 class Network(NamedTuple):
@@ -82,6 +94,13 @@ class Network(NamedTuple):
 
     predict: Predictor
     constant: Tensor  # (1, 2, h, w)
+
+
+class EffectPrior(NamedTuple):
+    """Lenses that an effect draws, and the flows that undo them."""
+
+    lenses: Tensor  # (L, 2), relative to the half diagonal
+    flows: Tensor  # (L, 2, h, w), px of the frames, at every eighth pixel
 
 
 class Row(NamedTuple):
@@ -235,6 +254,43 @@ def measure_clip(num_frames: int, restorer: Restorer, predict: Predictor) -> dic
     return results
 
 
+def sparse(flow: Tensor) -> Tensor:
+    """Return every eighth pixel of flows (B, 2, H, W)."""
+    return flow[..., _FLOW_STRIDE // 2 :: _FLOW_STRIDE, _FLOW_STRIDE // 2 :: _FLOW_STRIDE].double()
+
+
+def draw_prior(effect: Effect, size: tuple[int, int], *, count: int) -> EffectPrior:
+    """Draw lenses of an effect for frames of a size."""
+    blank = torch.zeros(1, 3, *size)
+    flows = [effect.degrade(blank, seed=_PRIOR_SEED, keys=[key]).restore_flow for key in range(count)]
+    return EffectPrior(
+        torch.stack([radial_lens_of_flow(flow) for flow in flows]), torch.cat([sparse(f) for f in flows])
+    )
+
+
+def posterior_flow(gray: np.ndarray, prior: EffectPrior) -> Tensor:
+    """Return the mean flow (2, h, w) of the lenses of a prior, weighted by their likelihood in a picture (H, W)."""
+    chains = pool_chains([find_chains(gray)], (gray.shape[0], gray.shape[1]))
+    costs = torch.cat([line_costs(chains, lenses) for lenses in prior.lenses.split(16)]).sum(dim=1)
+    return torch.einsum("l,lchw->chw", torch.softmax(-costs, dim=0), prior.flows)
+
+
+def held_out(root: Path, size: tuple[int, int], without: Sequence[str]) -> list[dict[str, Any]]:
+    """Estimate the flow of each frame of held-out drives alone; return and print errors, px of a frame 1920 px wide."""
+    frames, effect, rows = FrameFolder(root, size=size, split="val"), cheap_dashcam(), list[dict[str, Any]]()
+    prior = draw_prior(effect, size, count=_NUM_LENSES)
+    for i, path in enumerate(frames.paths):
+        if not path.name.startswith(tuple(without)):
+            pair = effect.degrade(frames[i].image[None], seed=0, keys=[frames.keys[i]])  # the draws of a validation
+            true, mean = sparse(pair.restore_flow)[0], prior.flows.mean(dim=0)
+            flows = {"nothing": 0 * true, "constant": mean, "lines": posterior_flow(to_gray(pair.image[0]), prior)}
+            error = {name: _WIDTH / size[1] * (flow - true).norm(dim=0).mean().item() for name, flow in flows.items()}
+            rows.append({"frame": path.relative_to(root).as_posix(), **error})
+    means = {name: sum(row[name] for row in rows) / len(rows) for name in ("nothing", "constant", "lines")}
+    print(f"{len(rows)} frames", *(f"{name} {value:.2f}" for name, value in means.items()), sep="  ")
+    return rows
+
+
 def to_gray(image: Tensor) -> np.ndarray:
     """Convert a frame (3, H, W) in [0, 1] to gray bytes."""
     return cv2.cvtColor(pixels_of(image), cv2.COLOR_RGB2GRAY)
@@ -280,9 +336,19 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="folder of real frames and chessboards")
     parser.add_argument("--checkpoint", help="of a training of the task undistort")
     parser.add_argument("--clip", type=count(2), help="frames of a clip, whose restoration is measured instead")
+    parser.add_argument(
+        "--drives", type=Path, help="folder with sub-folders train and val, whose frames are scored alone"
+    )
+    parser.add_argument(
+        "--size", nargs=2, type=count(1), default=[352, 616], help="height and width of those frames, px"
+    )
+    parser.add_argument("--without", nargs="+", default=[], help="beginnings of the names of frames to leave out")
     parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
     parser.add_argument("--out", type=Path, default=RESULTS / "lens_estimation.json")
     arguments = parser.parse_args()
+    if arguments.drives:
+        rows = held_out(arguments.drives, tuple(arguments.size), arguments.without)
+        return write_json(arguments.out.with_name("held_out.json"), rows)
     network = None
     if arguments.checkpoint:
         loaded = load_model(arguments.checkpoint)

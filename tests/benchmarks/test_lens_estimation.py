@@ -1,12 +1,15 @@
 import math
 from dataclasses import replace
 
+import cv2
 import lens_estimation
+import numpy as np
 import pytest
 import torch
 
 from torchrefract.data.video import read_video
 from torchrefract.fields.rectification import camera_flow
+from torchrefract.presets import cheap_dashcam
 
 
 def test_errors_are_in_px_of_a_frame_1920_px_wide_and_grow_with_the_lens():
@@ -50,3 +53,37 @@ def test_a_clip_pans_behind_a_lens_that_stays_and_jitter_is_in_px_of_1920(tmp_pa
     assert (second - third).abs().mean() > 0.02
     flows = [torch.zeros(1, 2, 54, 96), torch.full((1, 2, 54, 96), 3.0), torch.full((1, 2, 54, 96), 3.0)]
     assert lens_estimation.jitter(flows) == pytest.approx((1920 / 96) * math.hypot(3, 3) / 2)
+
+
+def poles(height: int, width: int) -> np.ndarray:
+    """Return a picture (H, W, 3) of vertical and horizontal straight edges all over it."""
+    picture = np.full((height, width, 3), 60, np.uint8)
+    for x in range(20, width, 60):
+        picture[:, x : x + 25] = 200
+    picture[height - 40 : height - 20] = 120
+    picture[20:40] = 120
+    return picture
+
+
+def test_lines_of_one_frame_choose_among_the_lenses_of_an_effect():
+    effect, size = cheap_dashcam(), (216, 384)
+    prior = lens_estimation.draw_prior(effect, size, count=64)
+    assert prior.lenses.shape == (64, 2)
+    flow = lens_estimation.posterior_flow(np.zeros(size, np.uint8), prior)
+    torch.testing.assert_close(flow, prior.flows.mean(dim=0))  # a frame without edges tells nothing
+    clean = torch.from_numpy(poles(*size)).permute(2, 0, 1)[None] / 255
+    degraded = effect.degrade(clean, seed=1, keys=[5])
+    flow = lens_estimation.posterior_flow(lens_estimation.to_gray(degraded.image[0]), prior)
+    true = lens_estimation.sparse(degraded.restore_flow)[0]
+    assert (flow - true).norm(dim=0).mean() < 0.25 * (prior.flows.mean(dim=0) - true).norm(dim=0).mean()
+
+
+def test_held_out_frames_leave_out_drives_whose_lens_shows(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(lens_estimation, "_NUM_LENSES", 8)
+    for name in ("train/a_1.png", "val/b_1.png", "val/bent_1.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / name), poles(144, 256))
+    rows = lens_estimation.held_out(tmp_path, (144, 256), without=("bent_",))
+    assert [row["frame"] for row in rows] == ["val/b_1.png"]
+    assert rows[0]["lines"] < 0.5 * min(rows[0]["constant"], rows[0]["nothing"])
+    assert "1 frames" in capsys.readouterr().out

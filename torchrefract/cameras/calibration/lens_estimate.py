@@ -87,8 +87,8 @@ def radial_lens_of_flow(flow: Tensor, *, aspect: float | None = None) -> Tensor:
 
         p + flow(p) = c + s (p - c) (1 + k1 r^2 + k2 r^4),  r = s |p - c| in half diagonals
 
-    for s, s^3 k1 and s^5 k2, at 33 x 33 points; c is the middle of the frame and s an unknown zoom, by which the flow of
-    a filled frame magnifies the rectified frame.
+    for s, s^3 k1 and s^5 k2, at 33 x 33 points; c is the middle of the frame and s an unknown zoom, by which
+    the flow of a filled frame magnifies the rectified frame.
 
     Args:
         flow: (1, 2, h, w), px.

@@ -83,7 +83,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--pictures", type=Path, help="folder for a picture of each reference beside its scene")
-    parser.add_argument("--clear", help="clear frames of all references without a measured depth, a pattern in the data")
+    parser.add_argument(
+        "--clear", help="clear frames of all references without a measured depth, a pattern in the data"
+    )
     arguments = parser.parse_args()
     if not arguments.data.is_dir():
         print(f"skipped: needs real pictures, and {arguments.data} does not exist")

@@ -250,7 +250,9 @@ def _params(effect: Effect, field: str, value: float, is_mapped: bool) -> None:
         assert field in message, f"the error does not name the field: {message}"
         assert " must " in message, f"the error has no rule: {message}"
         return
-    assert is_mapped or math.isfinite(value) or (field in ("visibility", "decorrelation", "scale_height") and value > 0), "no error"
+    assert (
+        is_mapped or math.isfinite(value) or (field in ("visibility", "decorrelation", "scale_height") and value > 0)
+    ), "no error"
     assert result.isfinite().all(), "the image is not finite"
     gradients = torch.autograd.grad(result.sum(), [image, changed], allow_unused=True)
     for gradient in gradients:

@@ -34,6 +34,7 @@ _SUFFIXES = (".txt", ".png")  # of YOLO and masks
 _SIMPLIFICATION_PX = 0.02  # largest distance between a warped outline and the polygon that is written
 _DIGITS = 3  # of coordinates in a COCO JSON, px
 _UNIT_BOX = (0.0, 0.0, 1.0, 1.0)
+_FARTHEST_SHARE = 1.0  # of the frame, outside of which numbers of a YOLO file are those of another format
 _GEOMETRY = ("bbox", "segmentation", "keypoints")  # entries of an annotation that move
 
 
@@ -261,24 +262,33 @@ def _check_named(others: Collection[str], path: Path) -> None:
 
 def _problem(annotation: Annotation) -> str:
     """Return what is wrong with an annotation; empty if it can be moved."""
-    box, parts, keypoints = (annotation.get(key) for key in ("bbox", "segmentation", "keypoints"))
+    box, keypoints = annotation.get("bbox"), annotation.get("keypoints")
     if box and not (_are_numbers(box) and len(box) == 4 and min(box[2:]) >= 0):
         return "has a bbox that is not x, y, width, height"
-    if isinstance(parts, dict):
-        if not parts.keys() >= {"counts", "size"}:
-            return "has a run-length code without counts and size"
-        if isinstance(parts["counts"], list) and not _covers(parts["counts"], parts["size"]):
-            return "has a run-length code whose counts do not add up to the pixels of its size"
-        if not isinstance(parts["counts"], list) and _decompressed(parts) is None:
-            return "has a run-length code with counts that cannot be decoded"
-    elif parts and not (
-        isinstance(parts, list) and all(_are_numbers(part) and len(part) > 5 and len(part) % 2 == 0 for part in parts)
-    ):
-        return "has a segmentation that is not lists of x, y of three or more corners"
     if keypoints and not (_are_numbers(keypoints) and len(keypoints) % 3 == 0):
         return "has keypoints that are not x, y, visibility of each"
     if keypoints and not {*keypoints[2::3]} <= {0, 1, 2}:
         return "has keypoints whose visibility is not 0, 1 or 2"
+    return _problem_of_segmentation(annotation.get("segmentation")) or _problem_of_others(annotation)
+
+
+def _problem_of_segmentation(parts: Any) -> str:
+    if not isinstance(parts, dict):
+        are_polygons = isinstance(parts, list) and all(
+            _are_numbers(part) and len(part) > 5 and len(part) % 2 == 0 for part in parts
+        )
+        return (
+            "" if not parts or are_polygons else "has a segmentation that is not lists of x, y of three or more corners"
+        )
+    if not parts.keys() >= {"counts", "size"}:
+        return "has a run-length code without counts and size"
+    if isinstance(parts["counts"], list):
+        is_mask = _covers(parts["counts"], parts["size"])
+        return "" if is_mask else "has a run-length code whose counts do not add up to the pixels of its size"
+    return "" if _decompressed(parts) is not None else "has a run-length code with counts that cannot be decoded"
+
+
+def _problem_of_others(annotation: Annotation) -> str:
     for name, value in annotation.items():
         if name not in _GEOMETRY and isinstance(value, list | dict) and value and names_positions(name):
             return f"has {name}, positions that would stay where they are; remove them, or state them as {_GEOMETRY[0]}"
@@ -414,7 +424,11 @@ def _yolo_row(line: bytes, place: str) -> tuple[str, list[float]]:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = []
-    if len(numbers) not in (4, *range(6, len(numbers) + 1, 2)) or not all(map(math.isfinite, numbers)):
+    is_form = label.isdecimal() and len(numbers) in (4, *range(6, len(numbers) + 1, 2))
+    if not is_form or not all(-_FARTHEST_SHARE <= number <= 1 + _FARTHEST_SHARE for number in numbers):
         got = " ".join([label, *words])[:80]
-        raise ValueError(f"{place}, must be a class with x y w h, or with x y of three or more corners, got {got}")
+        raise ValueError(
+            f"{place}, must be a class with x y w h, or with x y of three or more corners, as shares of the frame, "
+            f"got {got}"
+        )
     return label, numbers

@@ -283,7 +283,7 @@ def _problem_of_segmentation(parts: Any) -> str:
     if not parts.keys() >= {"counts", "size"}:
         return "has a run-length code without counts and size"
     if isinstance(parts["counts"], list):
-        is_mask = _covers(parts["counts"], parts["size"])
+        is_mask = _is_mask_code(parts["counts"], parts["size"])
         return "" if is_mask else "has a run-length code whose counts do not add up to the pixels of its size"
     return "" if _decompressed(parts) is not None else "has a run-length code with counts that cannot be decoded"
 
@@ -382,7 +382,7 @@ def _moved_run_lengths(code: Mapping[str, Any], flow: Tensor) -> tuple[dict[str,
     return {"size": [height, width], "counts": counts}, int(moved.sum())
 
 
-def _covers(counts: Sequence[Any], size: Any) -> bool:
+def _is_mask_code(counts: Sequence[Any], size: Any) -> bool:
     """Return True if the runs of a code are those of a mask of its size."""
     are_counts = all(isinstance(count, int) and count >= 0 for count in counts)
     return are_counts and _are_numbers(size) and len(size) == 2 and sum(counts) == math.prod(size)

@@ -170,7 +170,9 @@ def test_a_json_of_coco_may_have_sizes_as_text_and_other_entries(tmp_path):
     others = {"attributes": {"rotation": 0.0, "occluded": True}, "bbox_3d": [1, 2, 3, 4, 5, 6, 7], "num_lanes": 2}
     images = [{"id": 0, "file_name": "0.png", "height": str(HEIGHT), "width": str(WIDTH)}]
     path = write_coco(tmp_path / "a.json", images=images, annotations=[BOX | others | {"image_id": 0}])
-    (annotation,) = read_labels(path, fill=0).of("0.png").move(shift(2.0, 0.0), SIZE).content
+    labels = read_labels(path, fill=0).of("0.png")
+    assert isinstance(labels, CocoAnnotations)
+    (annotation,) = labels.move(shift(2.0, 0.0), SIZE).content
     assert others.items() <= annotation.items()
 
 

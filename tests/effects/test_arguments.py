@@ -27,7 +27,7 @@ from torchrefract import (
     Vignetting,
 )
 
-KINDS = (
+KINDS: tuple[type, ...] = (
     *(ChromaticAberration, DivergenceFree, Exposure, HeterogeneousFog, LensDistortion, LensFlare, NightGlow),
     *(PhysicalTurbulence, RoadMirage, RollingShutter, SunGlare, ThinPlateSpline, Turbulence, UniformFog, Vignetting),
 )

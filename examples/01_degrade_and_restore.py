@@ -1,6 +1,6 @@
 """Degrade a frame by a lens and by fog, and restore it with the maps of the effects.
 
-python examples/01_degrade_and_restore.py [PICTURE.png]
+python examples/01_degrade_and_restore.py [PICTURE]
 """
 
 import sys
@@ -12,7 +12,7 @@ import torchrefract as tr
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.visualization import flow_to_rgb, hatch_invalid, transmission_to_rgb
 
-out = sys.argv[1] if len(sys.argv) > 1 else "degrade_and_restore.png"
+out = sys.argv[1] if len(sys.argv) > 1 else "degrade_and_restore.webp"
 clean, depth = render_road_scenes(torch.tensor([29]), 270, 480)
 
 lens = tr.LensDistortion(k1_range=(-0.3, -0.3), focal_range=(0.75, 0.75)).degrade(clean, seed=7)

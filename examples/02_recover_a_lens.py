@@ -2,7 +2,7 @@
 
 A point at distance rho from the center moves by rho (k1 (rho / f)^2 + k2 (rho / f)^4): an image determines k1 / f^2
 and k2 / f^4, but not f. So f is set to one width of the frame, and two numbers are fitted.
-python examples/02_recover_a_lens.py [PICTURE.png] [FRAME]
+python examples/02_recover_a_lens.py [PICTURE] [FRAME]
 """
 
 import sys

@@ -1,6 +1,6 @@
 """Use effects in the torchvision transforms of a training script: DataLoader workers degrade frames and move boxes.
 
-python examples/03_train_with_transforms.py [PICTURE.png]
+python examples/03_train_with_transforms.py [PICTURE]
 """
 
 import sys
@@ -35,7 +35,7 @@ class Scenes(Dataset):
 
 def main() -> None:
     """Draw one batch."""
-    out = sys.argv[1] if len(sys.argv) > 1 else "train_with_transforms.png"
+    out = sys.argv[1] if len(sys.argv) > 1 else "train_with_transforms.webp"
     weather = tr.OneOf([tr.UniformFog(visibility_range=(60, 200)), tr.Turbulence(amplitude_range=(0.5, 1.0))], p=0.8)
     transform = v2.Compose([v2.RandomHorizontalFlip(), weather, tr.LensDistortion(padding="border", p=0.8)])
     torch.manual_seed(0)  # seeds the workers, which seed the effects

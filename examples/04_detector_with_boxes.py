@@ -1,7 +1,7 @@
 """Use effects inside a detector: in training it degrades the batch on its device, and the boxes move along.
 
 Each frame has a magenta sign, so that the moved boxes can be compared with the degraded image.
-python examples/04_detector_with_boxes.py [PICTURE.png]
+python examples/04_detector_with_boxes.py [PICTURE]
 """
 
 import sys
@@ -57,4 +57,4 @@ for name, boxes in (("moved", moved), ("original", targets)):
     iou = [box_iou(target["boxes"], sign[None]).item() for target, sign in zip(boxes, signs, strict=True)]
     print(f"IoU of the {name} boxes with the degraded signs:", *(f"{value:.3f}" for value in iou))
 drawn = [draw_bounding_boxes(image, t["boxes"], colors="yellow") for image, t in zip(images, moved, strict=True)]
-save_image(make_grid(torch.stack(drawn), nrow=2), sys.argv[1] if len(sys.argv) > 1 else "detector_with_boxes.png")
+save_image(make_grid(torch.stack(drawn), nrow=2), sys.argv[1] if len(sys.argv) > 1 else "detector_with_boxes.webp")

@@ -2,7 +2,7 @@
 
 The model detects edges; replace it by yours. A match may be 3 px away, and pixels outside the lens are ignored.
 
-python examples/05_robustness_curve.py [PICTURE.png]
+python examples/05_robustness_curve.py [PICTURE]
 """
 
 import sys

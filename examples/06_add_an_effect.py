@@ -1,4 +1,4 @@
-"""Add an effect, the bands of flickering lamps: python examples/06_add_an_effect.py [PICTURE.png]."""
+"""Add an effect, the bands of flickering lamps: python examples/06_add_an_effect.py [PICTURE]."""
 
 import math
 import sys
@@ -51,4 +51,4 @@ clean, _ = render_road_scenes(torch.tensor([29]), 216, 384)
 image = Flicker(strength_range=(0.5, 0.5)).degrade(clean, seed=0).image
 expected = 1 - 0.5 * math.sin(math.pi * 3 * 36.5 / 216) ** 2
 print(f"row 36: {(image / clean)[0, :, 36].mean():.4f}, by the formula {expected:.4f}")
-imsave([*sys.argv, "add_an_effect.png"][1], torch.cat([clean, image], dim=3)[0].movedim(0, -1).numpy())
+imsave([*sys.argv, "add_an_effect.webp"][1], torch.cat([clean, image], dim=3)[0].movedim(0, -1).numpy())

@@ -1,7 +1,7 @@
 """Train a detector of Ultralytics, from its architecture, on frames that a transform of Albumentations degrades.
 
 Ultralytics moves the boxes of its YOLO labels by the same transform and draws them, which makes the picture.
-python examples/07_train_yolo.py [PICTURE.png]
+python examples/07_train_yolo.py [PICTURE]
 """
 
 import sys

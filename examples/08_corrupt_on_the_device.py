@@ -1,6 +1,6 @@
 """Degrade the batch where the model is, once it is there: in a hook of Lightning, and in a plain loop; boxes follow.
 
-python examples/08_corrupt_on_the_device.py [PICTURE.png]
+python examples/08_corrupt_on_the_device.py [PICTURE]
 """
 
 import sys
@@ -57,4 +57,4 @@ pl.Trainer(max_epochs=1, accelerator="auto", devices=1, logger=False, enable_che
 for clean, labels in loader:  # the same in a plain loop
     images, boxes = SCENE(clean.to(DEVICE), [box.to(DEVICE) for box in labels])
     drawn = [draw_bounding_boxes(image, box, colors="yellow") for image, box in zip(images, boxes, strict=True)]
-save_image(make_grid(torch.stack(drawn), nrow=4), sys.argv[1] if len(sys.argv) > 1 else "corrupt_on_the_device.png")
+save_image(make_grid(torch.stack(drawn), nrow=4), sys.argv[1] if len(sys.argv) > 1 else "corrupt_on_the_device.webp")

@@ -27,7 +27,7 @@ from torchrefract import (
     Vignetting,
 )
 
-KINDS: tuple[type, ...] = (
+KINDS = (
     *(ChromaticAberration, DivergenceFree, Exposure, HeterogeneousFog, LensDistortion, LensFlare, NightGlow),
     *(PhysicalTurbulence, RoadMirage, RollingShutter, SunGlare, ThinPlateSpline, Turbulence, UniformFog, Vignetting),
 )
@@ -163,7 +163,7 @@ def test_every_range_out_of_bounds_raises(kind):
     assert names
     for name, value in product(names, ((-1e300, 0.0), (0.0, 1e300), (2.0, 1.0), (1.0,), "ab", 5.0)):
         others = {other: (0.0, 1.0) for other in names if other.startswith("center")}  # a sun has none or both
-        options = others | ({"mode": "ray"} if kind is HeterogeneousFog else {}) | {name: value}
+        options: dict[str, Any] = others | ({"mode": "ray"} if kind is HeterogeneousFog else {}) | {name: value}
         with pytest.raises(ValueError, match=f"^{name} must"):
             kind(**options)
 

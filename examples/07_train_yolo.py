@@ -45,7 +45,7 @@ def main() -> None:
         model = YOLO("yolo11n.yaml")
         model.train(data=write_data(root), augmentations=[transform], project=root, name="run", **options)
         picture = Image.open(root / "run/train_batch0.jpg").resize((768, 768))
-        picture.save(sys.argv[1] if len(sys.argv) > 1 else "train_yolo.png")
+        picture.save(sys.argv[1] if len(sys.argv) > 1 else "train_yolo.webp")
 
 
 if __name__ == "__main__":

@@ -1,3 +1,4 @@
+import gc
 import importlib
 import logging
 import math
@@ -18,8 +19,12 @@ from torch import Tensor
 
 from torchrefract.cameras.projection import undistort
 
-# Files of few and slow tests, which would leave one process of pytest-xdist alone if they ran last.
-SLOW_FILES = ("test_train.py", "test_examples.py", "test_export.py", "test_calibrate.py", "test_table1.py")
+# Files of slow tests, the slowest first, which would leave one process of pytest-xdist alone if they ran last.
+SLOW_FILES = (
+    *("effects/test_contract.py", "test_train.py", "data/test_two_nodes.py", "data/pairs/test_runs.py"),
+    *("cli/test_preview.py", "effects/test_compose.py", "test_calibrate.py", "test_examples.py", "test_export.py"),
+    "benchmarks/test_table1.py",
+)
 
 
 def pytest_addoption(parser) -> None:
@@ -36,7 +41,26 @@ def pytest_configure() -> None:
 
 def pytest_collection_modifyitems(items) -> None:
     """Put slow files first: pytest-xdist gives files to its processes in this order."""
-    items.sort(key=lambda item: item.path.name not in SLOW_FILES)
+    tests = Path(__file__).parent
+    order = {tests / name: number for number, name in enumerate(SLOW_FILES)}
+    items.sort(key=lambda item: order.get(item.path, len(order)))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Hide the million objects of libraries and tests from the garbage collector, which would find none to free."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.collect()
+        gc.freeze()
+        gc.enable()
+
+
+def pytest_unconfigure() -> None:
+    """Show all objects to the garbage collector again, since libraries in C++ report what it leaves at the end."""
+    gc.unfreeze()
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,6 @@
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,11 +11,28 @@ from PIL import Image
 
 from torchrefract import Pair, presets
 from torchrefract.data.module import PairData
+from torchrefract.data.pairs import card
 from torchrefract.data.pairs.generator import PairGenerator, PairStorage, PairTask, SourceReader
 from torchrefract.data.pairs.manifest import Manifest
 from torchrefract.data.pairs.sources import find_sources
 
 SIZE = (32, 48)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _equal_figures_are_drawn_once() -> Iterator[None]:
+    """Keep the histograms of a set, which take longer than its pairs, for other sets of the same parameters."""
+    draw, figures = card.draw_histograms, dict[Any, bytes | None]()
+
+    def draw_once(summary: card.Summary) -> bytes | None:
+        columns = ((key, *map(bytes, columns)) for key, columns in sorted(summary.parameters.items()))
+        if (key := tuple(columns)) not in figures:
+            figures[key] = draw(summary)
+        return figures[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(card, "draw_histograms", draw_once)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,7 @@ import ctypes
 import gc
 import pickle
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import _lru_cache_wrapper, partial
 from pathlib import Path
@@ -60,13 +60,14 @@ def allocated_mb() -> float:
 @pytest.fixture(scope="module")
 def bounded_caches() -> list[Any]:
     """Return all caches of the package that keep a limited number of results."""
+    gc.unfreeze()  # the list of objects leaves out frozen ones
     caches: list[Any] = [value for value in gc.get_objects() if type(value) is _lru_cache_wrapper]
     ours = [cache for cache in caches if str(cache.__module__).startswith("torchrefract.")]
     return [cache for cache in ours if cache.cache_parameters()["maxsize"] is not None]
 
 
 @pytest.fixture
-def num_tensors(bounded_caches) -> Iterator[Callable[[], int]]:
+def num_tensors(bounded_caches) -> Callable[[], int]:
     """Return a function that counts the tensors that are new since the start of the test and in no bounded cache."""
 
     def count() -> int:
@@ -78,8 +79,7 @@ def num_tensors(bounded_caches) -> Iterator[Callable[[], int]]:
 
     gc.collect()
     gc.freeze()  # so that a count looks at new objects alone, not at a million of those of all libraries
-    yield count
-    gc.unfreeze()
+    return count
 
 
 @needs_proc
@@ -125,7 +125,6 @@ def test_results_and_effects_are_freed_without_the_garbage_collector(make):
     finally:
         gc.set_debug(0)
         gc.garbage.clear()
-        gc.unfreeze()
         gc.enable()
     assert not cycles
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
+from matplotlib.image import BboxImage
 from torch import Tensor, nn
 
 from torchrefract import Pair, presets
@@ -119,7 +120,8 @@ def examples(*, has_flow: bool = False, size: tuple[int, int] = (8, 10), count: 
 
 def cells(figure: Figure, columns: int) -> list[list[Tensor]]:
     """Return the drawn images by column and row, each (3, height, width) in [0, 1]."""
-    drawn = [torch.from_numpy(np.asarray(axes.images[0].get_array())).movedim(-1, 0) / 255 for axes in figure.axes]
+    shown = (artist for artist in figure.artists if isinstance(artist, BboxImage))
+    drawn = [torch.from_numpy(np.asarray(image.get_array())).movedim(-1, 0) / 255 for image in shown]
     return [drawn[2 * j : 2 * j + 2] for j in range(columns)]
 
 
@@ -179,7 +181,8 @@ def test_invalid_pixels_are_hatched_from_the_third_column_on():
 def test_nothing_on_a_panel_overlaps_or_leaves_the_page(size):
     figure = draw_panel(*examples(has_flow=True, size=size))
     figure.canvas.draw()
-    boxes = [axes.get_window_extent() for axes in figure.axes] + [text.get_window_extent() for text in figure.texts]
+    assert figure.artists
+    boxes = [artist.get_window_extent() for artist in (*figure.artists, *figure.texts)]
     for i, box in enumerate(boxes):
         assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
         assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple, cast
 
 import torch
 import torch.nn.functional as F
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import BboxImage
+from matplotlib.transforms import Bbox, TransformedBbox
 from torch import Tensor
 
 from torchrefract._tensor import to_float, to_uint8
@@ -160,14 +161,19 @@ class FigureLayout:
         position, points = (x / self.size[0], 1 - y / self.size[1]), 0.8 * self.text * 72 / _DPI
         self.figure.text(*position, text, ha=ha, va="bottom", weight=weight, fontsize=points, parse_math=False)
 
-    def show(self, image: Tensor, x: int, y: int) -> Axes:
+    def box(self, height: int, width: int, x: int, y: int) -> tuple[float, float, float, float]:
+        """Return left, bottom, width and height of an image with its upper left corner at (x, y), as shares."""
+        total_width, total_height = self.size
+        return x / total_width, 1 - (y + height) / total_height, width / total_width, height / total_height
+
+    def show(self, image: Tensor, x: int, y: int) -> None:
         """Place an image (3, h, w) in [0, 1] with its upper left corner at (x, y), pixel by pixel."""
-        (height, width), (total_width, total_height) = image.shape[1:], self.size
-        box = (x / total_width, 1 - (y + height) / total_height, width / total_width, height / total_height)
-        axes = self.figure.add_axes(box)
-        axes.set_axis_off()
-        axes.imshow(to_uint8(image[None])[0].movedim(0, -1).numpy(), interpolation="nearest", aspect="auto")
-        return axes
+        # Without axes, whose unseen ticks took a third of the time of a contact sheet.
+        _, height, width = image.shape
+        box = TransformedBbox(Bbox.from_bounds(*self.box(height, width, x, y)), self.figure.transFigure)
+        shown = BboxImage(box, interpolation="nearest", origin="upper")
+        shown.set_data(to_uint8(image[None])[0].movedim(0, -1).numpy())
+        self.figure.add_artist(shown)
 
     def explain(self, image: Tensor, text: str, *, x: int, y: int) -> None:
         """Write a legend: a patch of an image (3, h, w), three lines wide and two high, and a text to its right."""
@@ -436,5 +442,9 @@ def _draw_row(layout: FigureLayout, row: ContactSheetRow, i: int) -> None:
         return
     text = f"motion x {row.arrows.enlargement:g}, up to {row.arrows.longest:.2g} px"
     layout.write(text, x + layout.width / 2, y - 0.4 * layout.text, ha="center")
-    axes = layout.show(0.3 * row.corrupted + 0.7, x, y)
+    layout.show(0.3 * row.corrupted + 0.7, x, y)
+    height, width = row.corrupted.shape[1:]
+    axes = layout.figure.add_axes(layout.box(height, width, x, y))
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    axes.set_axis_off()
     draw_arrows(axes, row.arrows)

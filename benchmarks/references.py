@@ -2,6 +2,7 @@
 
     python benchmarks/references.py                   # DATA is ../shared/data beside the checkout
     python benchmarks/references.py --pictures FOLDER # and saves them side by side
+    python benchmarks/references.py --clear PATTERN   # from other clear frames, where the depth is not measured
 
 Real and clear frames show different roads and exposures, so that only statistics are compared: the mean distance, over
 twelve bands of rows, of the histograms of luma, and of those of local contrast, the standard deviation of luma in a
@@ -82,6 +83,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--pictures", type=Path, help="folder for a picture of each reference beside its scene")
+    parser.add_argument(
+        "--clear", help="clear frames of all references without a measured depth, a pattern in the data"
+    )
     arguments = parser.parse_args()
     if not arguments.data.is_dir():
         print(f"skipped: needs real pictures, and {arguments.data} does not exist")
@@ -90,8 +94,12 @@ def main() -> None:
     print("| reference | scene | clear | " + " | ".join(map(str, presets.SEVERITIES)) + " |")
     print("| --- | --- | --- |" + " --- |" * len(presets.SEVERITIES))
     for name, reference in REFERENCES.items():
+        if arguments.clear and reference.depth is not None:
+            continue
         real = fit(read_image(arguments.data / reference.real), SIZE)
-        paths = sorted(arguments.data.glob(reference.clear))[:FRAMES]
+        paths = sorted(arguments.data.glob(arguments.clear or reference.clear))[:FRAMES]
+        if not paths:
+            parser.error(f"--clear must name pictures in {arguments.data}, got none for {arguments.clear}")
         clear = torch.stack([fit(read_image(path), SIZE) for path in paths])
         depth = None if reference.depth is None else read_depth(arguments.data / reference.depth)[0][None, None]
         versions = [clear]

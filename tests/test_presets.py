@@ -186,7 +186,7 @@ def test_camera_horizon_depth_width_and_other_arguments_reach_each_effect(name):
         assert leaf.p == 0.25
         view = getattr(leaf, "medium", leaf)
         assert getattr(view, "camera", camera) == camera
-        assert getattr(view, "depth", None) in (None, depth)  # None of turbulence and lenses is no depth
+        assert view.depth is (None if isinstance(leaf, LensDistortion | SunGlare) else depth)
         assert getattr(leaf, "horizon", 0.4) == 0.4
         assert getattr(leaf, "focal", 500 / 640) == 500 / 640
     with pytest.raises(TypeError, match="mistyped"):

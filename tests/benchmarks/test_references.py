@@ -24,6 +24,13 @@ def test_without_the_pictures_the_command_says_why_it_skips(monkeypatch, tmp_pat
     assert capsys.readouterr().out == f"skipped: needs real pictures, and {tmp_path / 'none'} does not exist\n"
 
 
+def test_a_pattern_that_names_no_clear_frames_is_an_error(monkeypatch, shared_data, capsys):
+    monkeypatch.setattr(sys, "argv", ["references.py", "--data", str(shared_data), "--clear", "frames/none*"])
+    with pytest.raises(SystemExit):
+        references.main()
+    assert f"--clear must name pictures in {shared_data}, got none for frames/none*" in capsys.readouterr().err
+
+
 def test_every_reference_has_its_pictures(shared_data: Path):
     for reference in REFERENCES.values():
         for pattern in filter(None, (reference.real, reference.clear, reference.depth)):

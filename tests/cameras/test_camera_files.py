@@ -340,6 +340,20 @@ def test_four_coefficients_without_a_model_are_taken_as_k1_k2_p1_p2_with_a_warni
     assert read_camera(path) == make_camera(RADIAL)
 
 
+@pytest.mark.quick
+def test_a_principal_point_far_from_the_middle_is_warned_of_and_a_transposed_matrix_is_named(tmp_path):
+    rows, path = [[510.0, 0.0, 322.0], [0.0, 505.0, 237.0], [0.0, 0.0, 1.0]], tmp_path / "a.json"
+    values = {"image_width": 960, "image_height": 720, "camera_matrix": rows, "D": [-0.3, 0.1, 0.0, 0.0, 0.0]}
+    path.write_text(json.dumps(values))
+    with pytest.warns(UserWarning, match=r"principal point at \(322, 237\), far from the middle of 960 x 720 px; if"):
+        assert read_camera(path).cx == 322.0
+    path.write_text(json.dumps(values | {"image_width": 720, "image_height": 540}))
+    assert read_camera(path).width == 720
+    path.write_text(json.dumps(values | {"camera_matrix": [list(column) for column in zip(*rows, strict=True)]}))
+    with pytest.raises(ValueError, match=r"without skew, got .* last row \[322\.0, 237\.0, 1\.0\]; transpose it, as"):
+        read_camera(path)
+
+
 @pytest.mark.parametrize("model", ["opencv", "fisheye"])
 def test_read_cameras_project_as_opencv(model, rays, tmp_path, oracle):
     coefficients = EIGHT if model == "opencv" else FISHEYE

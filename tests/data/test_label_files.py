@@ -103,7 +103,13 @@ def test_yolo_files_keep_their_order_and_drop_what_leaves_the_frame(tmp_path):
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("line", ["0 0.5 0.5 0.1", "0 0.5 0.5 0.1 nan", "0 0.5 0.5 0.1 0.1 0.9", "0 a b c d", "0"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("0 0.5 0.5 0.1", "0 0.5 0.5 0.1 nan", "0 0.5 0.5 0.1 0.1 0.9", "0 a b c d", "0", "car 0.5 0.5 0.1 0.1"),
+        *("0 40 30 8 6", "Car 0.0 0 -1.6 587.0 173.3 614.1 200.1 1.65 1.67 3.64 -0.65 1.71 46.7 -1.59"),  # px; KITTI
+    ],
+)
 def test_an_invalid_line_of_a_yolo_file_is_named(tmp_path, line):
     (tmp_path / "a.txt").write_text(f"0 0.5 0.5 0.1 0.1\n{line}\n")
     with pytest.raises(ValueError, match=r"a\.txt, line 2, must be a class with x y w h, or with x y of three or more"):
@@ -155,6 +161,21 @@ def write_coco(path: Path, **changes: Any) -> Path:
     return path
 
 
+def run_lengths(*counts: Any) -> dict[str, Any]:
+    return {"size": [*SIZE], "counts": counts[0] if isinstance(counts[0], str) else [*counts]}
+
+
+@pytest.mark.quick
+def test_a_json_of_coco_may_have_sizes_as_text_and_other_entries(tmp_path):
+    others = {"attributes": {"rotation": 0.0, "occluded": True}, "bbox_3d": [1, 2, 3, 4, 5, 6, 7], "num_lanes": 2}
+    images = [{"id": 0, "file_name": "0.png", "height": str(HEIGHT), "width": str(WIDTH)}]
+    path = write_coco(tmp_path / "a.json", images=images, annotations=[BOX | others | {"image_id": 0}])
+    labels = read_labels(path, fill=0).of("0.png")
+    assert isinstance(labels, CocoAnnotations)
+    (annotation,) = labels.move(shift(2.0, 0.0), SIZE).content
+    assert others.items() <= annotation.items()
+
+
 @pytest.mark.quick
 @pytest.mark.parametrize(
     ("changes", "message"),
@@ -166,6 +187,17 @@ def write_coco(path: Path, **changes: Any) -> Path:
         ({"annotations": [BOX | {"image_id": 0, "segmentation": [[1, 2, 3, 4]]}]}, "has a segmentation that is not"),
         ({"annotations": [BOX | {"image_id": 0, "segmentation": {"size": 3}}]}, "a run-length code without counts"),
         ({"annotations": [BOX | {"image_id": 0, "keypoints": [1, 2]}]}, "has keypoints that are not x, y, visibility"),
+        ({"annotations": [BOX | {"image_id": 0, "keypoints": [20, 15, 0.9]}]}, "whose visibility is not 0, 1 or 2"),
+        ({"annotations": [BOX | {"image_id": 0, "keypoints": [20, 15, 30, 20, 25, 16]}]}, "visibility is not 0, 1 or"),
+        ({"annotations": [BOX | {"image_id": 0, "segmentation": run_lengths(100, 50)}]}, "whose counts do not add up"),
+        ({"annotations": [BOX | {"image_id": 0, "segmentation": run_lengths(-1, 4801)}]}, "whose counts do not add up"),
+        (
+            {"annotations": [BOX | {"image_id": 0, "segmentation": run_lengths("not run lengths")}]},
+            "counts that cannot be decoded",
+        ),
+        ({"annotations": [BOX | {"image_id": 0, "polygon": [1, 2, 3, 4, 5, 6]}]}, "has polygon, positions that would"),
+        ({"annotations": [BOX | {"image_id": 0, "vbox": [1, 2, 3, 4]}]}, "has vbox, positions that would stay"),
+        ({"annotations": [BOX | {"image_id": 0, "attributes": {"rotation": 30.0}}]}, "a box that is turned by 30"),
         ({"annotations": [{"image_id": 0, "segments_info": []}]}, "panoptic labels, which cannot be moved"),
         ({"images": 2 * [{"id": 0, "file_name": "0.png", "height": 1, "width": 1}]}, "must list each image once"),
     ],

@@ -1,6 +1,8 @@
 """Arguments and parameters of single effects that are out of range or of another type."""
 
 import math
+from inspect import signature
+from itertools import product
 from typing import Any
 
 import pytest
@@ -25,6 +27,10 @@ from torchrefract import (
     Vignetting,
 )
 
+KINDS = (
+    *(ChromaticAberration, DivergenceFree, Exposure, HeterogeneousFog, LensDistortion, LensFlare, NightGlow),
+    *(PhysicalTurbulence, RoadMirage, RollingShutter, SunGlare, ThinPlateSpline, Turbulence, UniformFog, Vignetting),
+)
 ARGUMENTS: list[tuple[type, dict[str, Any], str]] = [
     (ChromaticAberration, {"red_range": (0.0, 0.2)}, "red_range must"),
     (ChromaticAberration, {"interpolation": "linear"}, "interpolation must be one of"),
@@ -151,6 +157,17 @@ def test_an_argument_out_of_range_raises(kind, options, rule):
         kind(**options)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_range_out_of_bounds_raises(kind):
+    names = [name for name in signature(kind).parameters if name.endswith("_range")]
+    assert names
+    for name, value in product(names, ((-1e300, 0.0), (0.0, 1e300), (2.0, 1.0), (1.0,), "ab", 5.0)):
+        others = {other: (0.0, 1.0) for other in names if other.startswith("center")}  # a sun has none or both
+        options: dict[str, Any] = others | ({"mode": "ray"} if kind is HeterogeneousFog else {}) | {name: value}
+        with pytest.raises(ValueError, match=f"^{name} must"):
+            kind(**options)
+
+
 @pytest.mark.parametrize(("kind", "options", "rule"), TYPES)
 def test_an_argument_of_another_type_raises(kind, options, rule):
     with pytest.raises(TypeError, match=rule):
@@ -172,3 +189,17 @@ def test_parameters_that_do_not_fit_raise(kind, values, rule):
     image, effect = random_image(2, 3, 8, 9), kind()
     with pytest.raises(ValueError, match=rule):
         effect.apply(image, effect.sample(image, seed=1)._replace(**values))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_parameter_of_another_shape_or_kind_raises(kind):
+    image, effect = random_image(2, 3, 8, 9), kind()
+    params = effect.sample(image, seed=1)
+    fields = {field: value for field, value in params._asdict().items() if value is not None}
+    for field, value in fields.items():
+        wider = value[:, None] if value.ndim == 1 else torch.cat([value, value[..., -1:]], dim=-1)
+        # Several fields of one count may be blamed for it.
+        with pytest.raises(ValueError, match=r"^params\.\w+ must"):
+            effect.apply(image, params._replace(**{field: wider}))
+    with pytest.raises(ValueError, match=r"params\.applied must be bool"):
+        effect.apply(image, params._replace(applied=torch.ones(2)))

@@ -19,6 +19,7 @@ from torchrefract.fields.physical_turbulence import (
     layers_of,
     tilt_variance,
 )
+from torchrefract.planning.plan import TOLERANCE_PX
 
 DASHCAM = Air(0.002, 0.005, 10.0)
 # Along and across the separation of two rays, in apertures at the object; Kolmogorov's spectrum, by quadrature.
@@ -261,6 +262,12 @@ def test_a_displacement_below_the_tolerance_is_not_computed():
     for depth in (None, 300 * torch.rand(1, 1, 36, 64)):
         assert torch.equal(weak.degrade(image, seed=1, depth=depth).image, image)
     assert "each pixel has a ray of its own" in str(PhysicalTurbulence().plan(1080, 1920))
+    # Some pixel of a frame moves by up to seven deviations, and towards the road air moves pixels farther.
+    deviation = PhysicalTurbulence(cn2_range=(1e-15, 1e-15)).equivalent_amplitude(1920)[1]
+    for share, height, is_identity in ((0.15, None, False), (0.12, None, True), (0.12, 1.3, False)):
+        cn2 = 1e-15 * (share * TOLERANCE_PX / deviation) ** 2
+        effect = PhysicalTurbulence(cn2_range=(cn2, cn2), height=height)
+        assert effect.plan(1080, 1920).is_identity == is_identity
 
 
 def test_a_missing_width_raises():

@@ -42,9 +42,11 @@ def test_each_color_has_its_scale_about_the_principal_point_and_green_stays(pixe
     assert_close(degraded.image[0, 0][valid], ((30 + (x - 30) / 1.02) / 100).expand_as(valid)[valid])
     assert torch.equal(degraded.image[:, 1], image[:, 1])
     assert_close(degraded.image[0, 2][valid], ((25 + (y - 25) / 0.99) / 100).expand_as(valid)[valid])
-    # Blue is smaller, so it lacks the pixels beyond 1 / 0.99 of the frame.
+    # Blue is smaller, so it lacks the pixels beyond 1 / 0.99 of the frame; so does a smaller red.
     outside = ((25 + (y - 25) / 0.99 - 30).abs() > 30) | ((30 + (x - 30) / 0.99 - 40).abs() > 40)
     assert torch.equal(valid, ~outside.expand_as(valid))
+    swapped = ChromaticAberration(red_range=(-0.01, -0.01), blue_range=(0.02, 0.02), camera=CAMERA)
+    assert torch.equal(swapped.degrade(image).valid, degraded.valid)
 
 
 def test_labels_are_those_of_green_and_a_gray_image_stays():

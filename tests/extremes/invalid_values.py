@@ -36,6 +36,9 @@ WARPS: dict[str, Callable[..., WarpEffect]] = {
     "thin-plate spline": partial(tr.ThinPlateSpline, amplitude_range=(0.5, 1.0)),
     "divergence-free": partial(tr.DivergenceFree, amplitude_range=(0.5, 1.0), length_range=(9.0, 12.0)),
     "rectification": partial(tr.Rectification, _CAMERA),
+    "physical turbulence": partial(tr.PhysicalTurbulence, cn2_range=(1e-11, 1e-10)),
+    "rolling shutter": tr.RollingShutter,
+    "road mirage": partial(tr.RoadMirage, horizon=0.45, focal=40.0),
 }
 LIGHTS: dict[str, Callable[..., Effect]] = {
     "uniform fog": partial(tr.UniformFog, visibility_range=(20.0, 60.0)),
@@ -46,6 +49,10 @@ LIGHTS: dict[str, Callable[..., Effect]] = {
     # Without a gain, since every pixel counts for it; in tests of exposure an invalid one counts as black.
     "sun glare": partial(tr.SunGlare, center_x_range=(0.2, 0.8), center_y_range=(0.1, 0.6), gamma_range=(0.0, 0.0)),
     "exposure": partial(tr.Exposure, gamma_range=(0.0, 0.0), shot_range=(1e-4, 1e-3)),
+    "plume": partial(tr.HeterogeneousFog, mode="ray", visibility_range=(20.0, 60.0), scale_height_range=(1.0, 3.0)),
+    "night glow": tr.NightGlow,  # no pixel is a lamp, whose light spreads
+    "vignetting": tr.Vignetting,
+    "chromatic aberration": partial(tr.ChromaticAberration, red_range=(0.02, 0.02), blue_range=(-0.02, -0.02)),
 }
 
 
@@ -243,7 +250,9 @@ def _params(effect: Effect, field: str, value: float, is_mapped: bool) -> None:
         assert field in message, f"the error does not name the field: {message}"
         assert " must " in message, f"the error has no rule: {message}"
         return
-    assert is_mapped or math.isfinite(value) or (field in ("visibility", "decorrelation") and value > 0), "no error"
+    assert (
+        is_mapped or math.isfinite(value) or (field in ("visibility", "decorrelation", "scale_height") and value > 0)
+    ), "no error"
     assert result.isfinite().all(), "the image is not finite"
     gradients = torch.autograd.grad(result.sum(), [image, changed], allow_unused=True)
     for gradient in gradients:

@@ -185,7 +185,7 @@ def camera_files(folder: Path) -> Iterator[Reader]:
     files |= {name: (partial(Path.write_text, data=text), camera_io.read_camera) for name, text in PROFILES.items()}
     for name, (write, read) in files.items():
         write(folder / name)
-        yield Reader(folder / name, (folder / name).read_bytes(), read)
+        yield Reader(folder / name, (folder / name).read_bytes(), read, (ValueError, UserWarning))
 
 
 TABLE = ",".join(COLUMNS) + '\na,b,c,opencv,640,480,500,500,320,240,"[-0.3, 0.1, 0, 0]",,0.1,1,s,l\n'

@@ -5,7 +5,7 @@ from pathlib import Path
 
 # The number of cases, and the step between those that run without --extremes=full: coprime to the numbers of paddings,
 # interpolations, types and values, so that all of these run.
-GROUPS = {"images": (693, 31), "flows": (264, 5), "params": (624, 11), "depths": (29, 1)}
+GROUPS = {"images": (1099, 47), "flows": (264, 5), "params": (880, 13), "depths": (29, 1)}
 
 
 def test_invalid_values_neither_crash_nor_spread(full_extremes):

@@ -142,11 +142,21 @@ def test_a_flare_has_a_map_of_its_intensity_and_nothing_to_undo(frame):
     row, d = contact_sheet_row("flare", FLARE, frame=frame, seed=1), FLARE.degrade(frame, seed=1)
     (scale,) = row.scales
     assert (scale.name, row.restored) == ("intensity", None)
-    assert d.intensity.max() <= scale.top <= 1.1 * d.intensity.max()
+    assert d.intensity.max() <= scale.top <= min(1, 1.1 * d.intensity.max())
     assert row.map is not None
     assert_close(row.map, enlarged(transmission_to_rgb(d.intensity / scale.top)[0]))
     assert row.scores == f"{d.valid.float().mean():.1%} valid; {psnr(d.image, frame, d.valid):.1f} dB corrupted"
     assert {"no flow or fog to undo", f"{scale.top:g} intensity"} < set(texts(contact_sheet([row], title="flare")))
+
+
+def test_the_map_of_the_sun_ends_at_white_so_that_its_glare_shows(frame):
+    sun = tr.SunGlare(center_x_range=(0.5, 0.5), center_y_range=(0.3, 0.3), scatter_range=(0.06, 0.06))
+    row, d = contact_sheet_row("sun", sun, frame=frame, seed=1), sun.degrade(frame, seed=1)
+    assert d.intensity.max() > 2
+    assert row.scales == (MapScale("intensity", 1.0),)
+    assert row.map is not None
+    assert_close(row.map, enlarged(transmission_to_rgb(d.intensity)[0]))
+    assert "1 or more, intensity" in texts(contact_sheet([row], title="sun"))
 
 
 def test_the_map_of_one_of_several_effects_is_that_of_the_one_drawn(frame):

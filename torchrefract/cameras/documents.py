@@ -3,6 +3,7 @@
 import json
 import re
 import reprlib
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,6 +14,7 @@ from torchrefract._io import replace_file
 from torchrefract.cameras.camera import Camera
 
 _MAX_MESSAGE = 400  # characters of a parser's error to repeat
+_FARTHEST_CENTER = 0.15  # widths or heights, of a principal point from the middle; of published lenses at most 0.13
 _MAX_NAMES = 20  # names of a file to list in an error
 _LARGEST_ICON, _LARGEST_SHARE = 64, 4.0  # px: no camera of larger frames has a smaller focal length and center
 # A list that refers to itself through YAML's aliases is small in memory but endless in print.
@@ -107,8 +109,9 @@ class Document:
         """Return fx, fy, cx, cy of a matrix without skew."""
         fx, skew, cx, zero, fy, cy, *last = self.numbers(name, count=9, is_matrix=True)
         if (skew, zero) != (0, 0) or last != [0.0, 0.0, 1.0]:
+            remedy = "; transpose it, as programs store columns first" if (cx, cy, zero) == (0, 0, 0) else ""
             raise ValueError(
-                f"path must hold a {name} without skew, got {self.path} with skew {skew:g}, last row {last}"
+                f"path must hold a {name} without skew, got {self.path} with skew {skew:g}, last row {last}{remedy}"
             )
         return fx, fy, cx, cy
 
@@ -122,9 +125,16 @@ class Document:
                 f"of {width} x {height} px; multiply shares by the width and the height"
             )
         try:
-            return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=lens, model=model)
+            camera = Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=lens, model=model)
         except (ValueError, OverflowError) as error:
             raise ValueError(f"path must hold a camera, got {self.path}: {error}") from error
+        if max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > _FARTHEST_CENTER and min(width, height) > _LARGEST_ICON:
+            warnings.warn(
+                f"{self.path} has its principal point at ({cx:g}, {cy:g}), far from the middle of {width} x {height} "
+                "px; if the frames were calibrated at another size, state that size and use camera.resized",
+                stacklevel=2,
+            )
+        return camera
 
 
 def read_text(path: Path) -> str:

@@ -89,7 +89,8 @@ def read_camera(
             or contradicts them.
 
     Warns:
-        UserWarning: four coefficients are taken as k1, k2, p1, p2 without a statement of the model.
+        UserWarning: four coefficients are taken as k1, k2, p1, p2 without a statement of the model; the principal point
+            is more than 0.15 widths or heights off the middle, as for frames of another size.
     """
     if model is not None:
         check_choice("model", model, ("opencv", "fisheye"))

@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ from torchrefract.data.frames import first_names, list_files
 from torchrefract.data.images import image_header, opened
 from torchrefract.labels.boxes import warp_boxes
 from torchrefract.labels.maps import warp_mask
+from torchrefract.labels.plain_values import names_positions
 from torchrefract.labels.points import STEPS, TOLERANCE_PX, in_frame, solve_points
 from torchrefract.labels.polygons import polygon_area, warp_polygons
 
@@ -33,6 +34,8 @@ _SUFFIXES = (".txt", ".png")  # of YOLO and masks
 _SIMPLIFICATION_PX = 0.02  # largest distance between a warped outline and the polygon that is written
 _DIGITS = 3  # of coordinates in a COCO JSON, px
 _UNIT_BOX = (0.0, 0.0, 1.0, 1.0)
+_FARTHEST_SHARE = 1.0  # of the frame, outside of which numbers of a YOLO file are those of another format
+_GEOMETRY = ("bbox", "segmentation", "keypoints")  # entries of an annotation that move
 
 
 class MovedLabels(NamedTuple):
@@ -183,7 +186,7 @@ class CocoLabels(NamedTuple):
         """Return the annotations of a picture; None if the JSON does not list it."""
         if (image := self.images.get(name)) is None:
             return None
-        return CocoAnnotations(self.annotations.get(image["id"], []), (image["height"], image["width"]))
+        return CocoAnnotations(self.annotations.get(image["id"], []), (int(image["height"]), int(image["width"])))
 
     def digest(self) -> str:
         """Return the SHA-256 digest of the file."""
@@ -225,7 +228,7 @@ def _read_coco(path: Path) -> CocoLabels:
     try:
         document = json.loads(path.read_bytes())
         images = {image["file_name"]: image for image in document["images"]}
-        ids = {image["id"]: (image["height"], image["width"]) for image in document["images"]}
+        ids = {image["id"]: (int(image["height"]), int(image["width"])) for image in document["images"]}
         annotations = defaultdict[Any, list[Annotation]](list)
         for annotation in document["annotations"]:
             annotations[annotation["image_id"]].append(annotation)
@@ -259,18 +262,39 @@ def _check_named(others: Collection[str], path: Path) -> None:
 
 def _problem(annotation: Annotation) -> str:
     """Return what is wrong with an annotation; empty if it can be moved."""
-    box, parts, keypoints = (annotation.get(key) for key in ("bbox", "segmentation", "keypoints"))
+    box, keypoints = annotation.get("bbox"), annotation.get("keypoints")
     if box and not (_are_numbers(box) and len(box) == 4 and min(box[2:]) >= 0):
         return "has a bbox that is not x, y, width, height"
-    if isinstance(parts, dict):
-        if not parts.keys() >= {"counts", "size"}:
-            return "has a run-length code without counts and size"
-    elif parts and not (
-        isinstance(parts, list) and all(_are_numbers(part) and len(part) > 5 and len(part) % 2 == 0 for part in parts)
-    ):
-        return "has a segmentation that is not lists of x, y of three or more corners"
     if keypoints and not (_are_numbers(keypoints) and len(keypoints) % 3 == 0):
         return "has keypoints that are not x, y, visibility of each"
+    if keypoints and not {*keypoints[2::3]} <= {0, 1, 2}:
+        return "has keypoints whose visibility is not 0, 1 or 2"
+    return _problem_of_segmentation(annotation.get("segmentation")) or _problem_of_others(annotation)
+
+
+def _problem_of_segmentation(parts: Any) -> str:
+    if not isinstance(parts, dict):
+        are_polygons = isinstance(parts, list) and all(
+            _are_numbers(part) and len(part) > 5 and len(part) % 2 == 0 for part in parts
+        )
+        return (
+            "" if not parts or are_polygons else "has a segmentation that is not lists of x, y of three or more corners"
+        )
+    if not parts.keys() >= {"counts", "size"}:
+        return "has a run-length code without counts and size"
+    if isinstance(parts["counts"], list):
+        is_mask = _is_mask_code(parts["counts"], parts["size"])
+        return "" if is_mask else "has a run-length code whose counts do not add up to the pixels of its size"
+    return "" if _decompressed(parts) is not None else "has a run-length code with counts that cannot be decoded"
+
+
+def _problem_of_others(annotation: Annotation) -> str:
+    for name, value in annotation.items():
+        if name not in _GEOMETRY and isinstance(value, list | dict) and value and names_positions(name):
+            return f"has {name}, positions that would stay where they are; remove them, or state them as {_GEOMETRY[0]}"
+    attributes = annotation.get("attributes")
+    if isinstance(attributes, dict) and (angle := attributes.get("rotation")):
+        return f"has a box that is turned by {angle} degrees; state its corners as segmentation"
     return "has segments_info of panoptic labels, which cannot be moved" if "segments_info" in annotation else ""
 
 
@@ -350,7 +374,7 @@ def _moved_run_lengths(code: Mapping[str, Any], flow: Tensor) -> tuple[dict[str,
         flat = np.repeat(np.arange(len(code["counts"])) % 2, code["counts"]).astype(np.uint8)
         mask = flat.reshape(width, height).T
     else:
-        mask = _decompressed(code)
+        mask = cast(np.ndarray, _decompressed(code))  # checked when the JSON was read
     moved = warp_mask(torch.from_numpy(np.ascontiguousarray(mask))[None], flow)[0].numpy()
     columns = np.concatenate([[0], moved.T.ravel()])  # codes begin with a run of zeros, which may be empty
     ends = np.flatnonzero(np.diff(columns)).tolist()
@@ -358,8 +382,14 @@ def _moved_run_lengths(code: Mapping[str, Any], flow: Tensor) -> tuple[dict[str,
     return {"size": [height, width], "counts": counts}, int(moved.sum())
 
 
-def _decompressed(code: Mapping[str, Any]) -> np.ndarray:
-    """Decode a compressed run-length code into a mask (H, W), uint8."""
+def _is_mask_code(counts: Sequence[Any], size: Any) -> bool:
+    """Return True if the runs of a code are those of a mask of its size."""
+    are_counts = all(isinstance(count, int) and count >= 0 for count in counts)
+    return are_counts and _are_numbers(size) and len(size) == 2 and sum(counts) == math.prod(size)
+
+
+def _decompressed(code: Mapping[str, Any]) -> np.ndarray | None:
+    """Decode a compressed run-length code into a mask (H, W), uint8; return None for an invalid one."""
     try:
         from pycocotools import mask  # noqa: PLC0415 - only these codes need it
     except ImportError as error:
@@ -368,7 +398,10 @@ def _decompressed(code: Mapping[str, Any]) -> np.ndarray:
             "install pycocotools"
         ) from error
     decode: Any = mask.decode  # its types know compressed codes as bytes only
-    return decode(code)
+    try:
+        return decode(code)
+    except (ValueError, TypeError, LookupError):
+        return None
 
 
 def _rounded(values: Iterable[float]) -> list[float]:
@@ -391,7 +424,11 @@ def _yolo_row(line: bytes, place: str) -> tuple[str, list[float]]:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = []
-    if len(numbers) not in (4, *range(6, len(numbers) + 1, 2)) or not all(map(math.isfinite, numbers)):
+    is_form = label.isdecimal() and len(numbers) in (4, *range(6, len(numbers) + 1, 2))
+    if not is_form or not all(-_FARTHEST_SHARE <= number <= 1 + _FARTHEST_SHARE for number in numbers):
         got = " ".join([label, *words])[:80]
-        raise ValueError(f"{place}, must be a class with x y w h, or with x y of three or more corners, got {got}")
+        raise ValueError(
+            f"{place}, must be a class with x y w h, or with x y of three or more corners, as shares of the frame, "
+            f"got {got}"
+        )
     return label, numbers

@@ -284,6 +284,9 @@ class Effect(nn.Module, ABC):
             if value.is_floating_point():
                 # Some parameters, as a visibility, may be infinite; `validate` decides.
                 check_values(f"params.{name}", "not be NaN", value, lambda v: ~v.isnan())
+        if params.applied.ndim != 1 or params.applied.dtype is not torch.bool:
+            got = f"{params.applied.dtype} of shape {tuple(params.applied.shape)}"
+            raise ValueError(f"params.applied must be bool of shape (B,), got {got}")
         self.validate(params, image)
 
     def draw_in_ranges(self, stream: random.Stream, ranges: Sequence[Range], image: Tensor) -> tuple[Tensor, Tensor]:

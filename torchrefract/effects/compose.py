@@ -121,6 +121,8 @@ class Compose(Effect):
                 f"params.applied must have one row for each of the {image.shape[0]} images, "
                 f"got {tuple(params.applied.shape)}"
             )
+        if params.applied.dtype is not torch.bool:
+            raise ValueError(f"params.applied must be bool, got {params.applied.dtype}")
         self.validate(params, image)
 
     def for_params(self, params: ComposeParams, height: int, width: int) -> "Compose":

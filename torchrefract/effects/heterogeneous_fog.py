@@ -223,7 +223,7 @@ class HeterogeneousFog(PhotometricEffect):
         self.camera_height = check_positive("camera_height", camera_height)
         self.horizon = check_number("horizon", horizon, low=-10.0, high=10.0)
         self.sunlight_range = (
-            None if sunlight_range is None else check_range("sunlight_range", sunlight_range, high=1.0)
+            None if sunlight_range is None else check_range("sunlight_range", sunlight_range, low=0.0, high=1.0)
         )
         self.sun_azimuth_range = check_range("sun_azimuth_range", sun_azimuth_range, low=-360.0, high=360.0)
         self.sun_elevation_range = check_range("sun_elevation_range", sun_elevation_range, low=-10.0, high=90.0)

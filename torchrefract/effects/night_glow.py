@@ -112,13 +112,15 @@ class NightGlow(PhotometricEffect):
         height, width = image.shape[2:]
         focal = pinhole_of(self.camera, height=height, width=width).focal[0]
         stride = lattice_stride(image)
-        # Invalid values, which cannot be read on an accelerator, scatter nothing.
-        thickness, asymmetry, luminance = (
-            expand_batch(finite_or(getattr(params, name).to(field_dtype(image.dtype)), low), len(image))
-            for name, (low, _) in _LIMITS.items()
-        )
+
+        def parameter(name: str) -> Tensor:
+            # Invalid values cannot be read on an accelerator; a clamp would have no gradient at the ends of the range.
+            value, (low, high) = getattr(params, name).to(field_dtype(image.dtype)), _LIMITS[name]
+            return expand_batch(finite_or(value, low).clamp(low - 0.05 * high, 1.05 * high), len(image))
+
+        thickness, asymmetry, luminance = map(parameter, _LIMITS)
         light = lamp_light(image, self.threshold)
-        nodes = glow_at_nodes(light, thickness, asymmetry.clamp(0.05, 1.05), focal=focal, stride=stride)
+        nodes = glow_at_nodes(light, thickness, asymmetry, focal=focal, stride=stride)
         strength = -torch.expm1(-thickness) * luminance
         glow_at = spread_glow(nodes, light, strength, height=height, width=width, stride=stride)
 

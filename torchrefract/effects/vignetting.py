@@ -82,7 +82,8 @@ class Vignetting(PhotometricEffect):
     def render(self, image: Tensor, params: VignettingParams, depth: Tensor | None) -> Rendered:
         """Darken images."""
         height, width = image.shape[2:]
-        strength = finite_or(params.strength.to(field_dtype(image.dtype)), 0.0)
+        # Invalid values cannot be read on an accelerator; a clamp would have no gradient at the ends of the range.
+        strength = finite_or(params.strength.to(field_dtype(image.dtype)), 0.0).clamp(-1, 2)
         view = pinhole_of(self.camera, height=height, width=width)
         t = vignetting(expand_batch(strength, len(image)), view, height=height, width=width)
         # Powers are rounded by the place of a value in memory, so that all layouts are computed in one.

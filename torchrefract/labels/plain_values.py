@@ -18,7 +18,7 @@ _TYPES = {
 # Last words of longer names, as in "gt_bboxes"; their values have at least two dimensions.
 _TYPES_BY_WORD = {
     **_TYPES,
-    **dict.fromkeys(("bndbox", "obb"), "BoundingBoxes"),
+    **dict.fromkeys(("bndbox", "obb", "fbox", "hbox", "vbox"), "BoundingBoxes"),
     **dict.fromkeys(("poly", "polygon", "polygons", "contour", "contours"), "Mask"),
     **dict.fromkeys(("kpt", "kpts", "landmark", "landmarks", "lane", "lanes", "polyline", "polylines"), "KeyPoints"),
 }
@@ -65,6 +65,11 @@ def check_moves(path: Any, leaf: Any, siblings: Mapping[str, Any], size: tuple[i
         raise TypeError(
             f"{place} must be of a torchvision type to move with the image, got {got} {shape}; pass {remedy}"
         )
+
+
+def names_positions(name: str) -> bool:
+    """Return True if data sets store positions in the image under a name, as "lanes" or "gt_bboxes"."""
+    return _kind_by_word(name.lower()) is not None
 
 
 def _may_hold_positions(leaf: Any) -> bool:

@@ -313,7 +313,7 @@ def _rows_of_boxes(
         return sorted({i, *chosen, *(k for k in rows if is_tv_tensor(leaves[k], "Mask"))})
     if labels_getter is None:
         return [i, *(k for k in rows if is_tv_tensor(leaves[k], "Mask"))]
-    rows = [k for k in rows if not _is_of_image(leaves[k], name_of(paths[k]))]
+    rows = [k for k in rows if not _is_of_image(name_of(paths[k]))]
     rivals = [k for k in boxes if k != i and leaves[k].shape[0] == count and paths[k][:-1] == parent]
     if rivals and rows:
         raise ValueError(
@@ -342,7 +342,7 @@ def _looks_like_camera_matrix(leaf: Any) -> bool:
     return is_plain and "float" in str(leaf.dtype)
 
 
-def _is_of_image(leaf: Any, name: str) -> bool:
+def _is_of_image(name: str) -> bool:
     return name in ("size", "shape") or any(part in name for part in _OF_IMAGE)
 
 

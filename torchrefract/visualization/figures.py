@@ -81,6 +81,7 @@ _PARAMETER_TEXTS: dict[str, Callable[[Tensor], str]] = {
     "wind_m": lambda value: f"wind ({', '.join(f'{v:.2g}' for v in value.tolist())}) m/frame",
 }
 _MAP_UNITS = {"extinction": "/m"}
+_WHITE = 1.0  # the largest light of an intensity that is shown
 _NEUTRAL = {"transmission": 1.0, "intensity": 0.0}  # value of a map that changes nothing
 
 
@@ -324,7 +325,8 @@ def describe_params(effect: Effect, params: Any) -> str:
 def map_scales(degraded: Degraded) -> tuple[MapScale, ...]:
     """Choose the maps to show: the flow; else transmission or intensity, and an extinction that varies.
 
-    The scale of a flow is that of its valid pixels, the scale of an intensity or extinction its largest value.
+    The scale of a flow is that of its valid pixels, the scale of an extinction its largest value. That of an intensity
+    ends at 1, the light of white: the disc of the sun has tens of thousands, and would leave the rest of the map dark.
     """
     if degraded.has("flow"):
         return (MapScale("flow", full_color_px(degraded.flow, degraded.valid)),)
@@ -333,7 +335,7 @@ def map_scales(degraded: Degraded) -> tuple[MapScale, ...]:
         return ()
     name = next((name for name in names if (getattr(degraded, name) != _NEUTRAL[name]).any()), names[0])
     if name == "intensity":
-        return (MapScale(name, round_up(degraded.intensity.amax().item())),)
+        return (MapScale(name, min(_WHITE, round_up(degraded.intensity.amax().item()))),)
     k = degraded.extinction if degraded.has("extinction") else torch.zeros(1)
     varies = k.amax() > 1.001 * k.amin()
     return (MapScale(name, 1.0), *([MapScale("extinction", round_up(k.amax().item()))] if varies else []))
@@ -374,7 +376,8 @@ def draw_legend(layout: FigureLayout, scales: Sequence[MapScale], *, x: int, y: 
         layout.write("0", x, line)
         layout.show(bar, x + text, round(line - 1.1 * text))
         side = "" if len(scales) == 1 else " (right)" if i == 0 else " (left)"
-        layout.write(f"{scale.top:g}{_MAP_UNITS.get(scale.name, '')} {scale.name}{side}", x + 4.4 * text, line)
+        rest = " or more," if scale == MapScale("intensity", _WHITE) else _MAP_UNITS.get(scale.name, "")
+        layout.write(f"{scale.top:g}{rest} {scale.name}{side}", x + 4.4 * text, line)
 
 
 def draw_invalid_key(layout: FigureLayout, *, x: int, y: int) -> None:

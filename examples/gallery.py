@@ -74,7 +74,7 @@ def draw(choice: str) -> tuple[Image.Image, str]:
         scales = map_scales(degraded)
         panels = [image, degraded.image, *([map_image(degraded, scales, largest=SIZE[1])[None]] if scales else [])]
     row = torch.cat([_panel(panel, setting) for panel in panels], dim=3)
-    maps = " and ".join(f"{scale.name} up to {scale.top:g}" for scale in scales)
+    maps = " and ".join(f"{scale.name} shown up to {scale.top:g}" for scale in scales)
     return Image.fromarray(pixels_of(row[0])), maps
 
 

@@ -1,4 +1,5 @@
 import math
+import pickle
 from typing import NamedTuple
 
 import numpy as np
@@ -188,6 +189,27 @@ def test_the_data_set_renders_its_keys():
     for index in (5, -6):
         with pytest.raises(IndexError, match=r"index must lie in \[-5, 4\]"):
             scenes[index]
+
+
+def test_frames_that_several_processes_render_are_kept_and_leave_the_random_numbers_of_a_training(monkeypatch):
+    expected, scenes = RoadScenes(5, size=(16, 24), first=7), RoadScenes(5, size=(16, 24), first=7)
+    state = torch.get_rng_state()
+    assert list(scenes.render(processes=2)) == list(range(5))
+    assert torch.equal(torch.get_rng_state(), state)
+    assert not pickle.loads(pickle.dumps(scenes))._frames
+    frames = [expected[i] for i in range(5)]
+    monkeypatch.setattr("torchrefract.data.road_scenes.render.render_road_scenes", None)  # no frame is rendered again
+    for index, frame in enumerate(frames):
+        assert_close(tuple(scenes[index]), tuple(frame), rtol=0, atol=0)
+
+
+def test_only_frames_that_fit_the_memory_are_rendered_in_advance(monkeypatch):
+    monkeypatch.setattr("torchrefract.data.road_scenes.render._KEPT_BYTES", 3 * 7 * 16 * 24 - 1)
+    scenes = RoadScenes(5, size=(16, 24))
+    assert scenes.num_kept == 3
+    assert list(scenes.render(processes=0)) == [0, 1, 2]
+    assert scenes[4].key == 4
+    assert len(scenes._frames) == 3
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The commands `train` and `eval`, and those that apply a model: `restore` writes pictures, `export` a program."""
 
 import hashlib
+import math
 import os
 import signal
 import sys
@@ -39,6 +40,8 @@ from torchrefract.data.media import (
 )
 from torchrefract.data.module import PairData, fingerprint
 from torchrefract.data.pairs.manifest import claim, locked
+from torchrefract.data.road_scenes import RoadScenes
+from torchrefract.data.workers import num_cores
 from torchrefract.restoration.checkpoints import (
     check_fits,
     how_to_continue,
@@ -54,6 +57,7 @@ from torchrefract.restoration.pretrained import WEIGHTS_SUFFIX, find_checkpoint,
 from torchrefract.restoration.tasks import Undistort
 
 _T = TypeVar("_T")
+_MANY_PIXELS = 1 << 22  # of road scenes, whose rendering takes longer than the start of processes
 
 
 def train(cfg: DictConfig) -> None:
@@ -69,7 +73,16 @@ def train(cfg: DictConfig) -> None:
     with locked("run_dir", run) if trainer.is_global_zero else nullcontext():
         if trainer.is_global_zero:
             _remove_incomplete({run} if cfg.ckpt_path is None else {run, as_path(cfg.ckpt_path).parent}, run)
+        _render_scenes(data)
         _fit(cfg, data, model, trainer)
+
+
+def _render_scenes(data: PairData) -> None:
+    """Render road scenes on all cores before the training, whose single worker would take longer."""
+    for scenes in (data.train, data.val):
+        if isinstance(scenes, RoadScenes) and data.workers and scenes.num_kept * math.prod(scenes.size) > _MANY_PIXELS:
+            for _ in progress(scenes.render(processes=num_cores()), "road scenes", count=scenes.num_kept):
+                pass
 
 
 def _remove_incomplete(folders: Iterable[Path], locked_folder: Path) -> None:

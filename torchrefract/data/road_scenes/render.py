@@ -6,12 +6,13 @@ the direction is linear in the pixel's column and row.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
+from torch.utils.data import DataLoader, Dataset
 
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract._validation import check_count, check_size, check_tensor
@@ -32,7 +33,7 @@ from torchrefract.types import Frame
 Window = tuple[slice, slice, slice]  # rays, rows, columns
 
 _SMALLEST = 8  # px a side
-_KEPT_BYTES = 2 << 30
+_KEPT_BYTES, _PIXEL_BYTES = 2 << 30, 7  # of all frames, and of a pixel with its depth
 _BITS = (1 << 64) - 1  # negative seeds and keys count modulo 2^64
 # Position of each ray in its pixel, (right, down), px from the center, on distinct rows and columns.
 _OFFSETS = np.array([(0.0, 0.0), (-0.15, -0.4), (0.4, -0.15), (0.15, 0.4), (-0.4, 0.15)])
@@ -74,9 +75,31 @@ class RoadScenes(Dataset[Frame]):
         if frame is None:
             image, depth = render_road_scenes(key[None], *self.size, seed=self.seed)
             frame = Frame(to_uint8(image)[0], key, depth[0])
-            if len(self._frames) * (frame.image.nbytes + frame.depth.nbytes) < _KEPT_BYTES:
+            if len(self._frames) < self.num_kept:
                 self._frames[int(key)] = frame
         return Frame(to_float(frame.image), frame.key.clone(), frame.depth.clone())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the rendered frames: a process that starts without them renders what it needs."""
+        return vars(self) | {"_frames": {}}
+
+    @property
+    def num_kept(self) -> int:
+        """The number of frames that a process keeps."""
+        return min(self.count, -(-_KEPT_BYTES // (_PIXEL_BYTES * self.size[0] * self.size[1])))
+
+    def render(self, *, processes: int) -> Iterator[int]:
+        """Render the frames that this process keeps, in several processes; yield the number of each when it is done.
+
+        Loaders whose workers are forked afterwards have the frames too.
+        """
+        # A generator of its own leaves that of PyTorch, and so a training, as it is.
+        options: dict[str, Any] = {"batch_size": None, "generator": torch.Generator()}
+        loader = DataLoader(self, sampler=range(self.num_kept), num_workers=processes, **options)
+        for number, frame in enumerate(loader):
+            # Copies, since memory that processes share is scarce.
+            self._frames[int(frame.key)] = Frame(to_uint8(frame.image[None])[0], frame.key.clone(), frame.depth.clone())
+            yield number
 
 
 def render_road_scenes(keys: Tensor, height: int, width: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:

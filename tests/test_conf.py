@@ -152,7 +152,7 @@ def test_every_trainer_writes_into_the_run_folder(tmp_path, trainer):
     assert built.checkpoint_callback.dirpath == str(tmp_path)  # pyright: ignore[reportAttributeAccessIssue]  # a ModelCheckpoint
     assert built.logger is not None
     assert Path(built.logger.log_dir or "") == tmp_path
-    assert built.max_epochs == 16
+    assert built.max_epochs == 12
     assert compose_training(tmp_path, "+task=deweather", f"trainer={trainer}").trainer.max_epochs == 8
     assert type(built.strategy).__name__ == {"cpu": "SingleDeviceStrategy", "ddp": "DDPStrategy"}[trainer]
 

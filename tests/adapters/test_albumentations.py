@@ -112,12 +112,11 @@ def test_a_picture_without_labels_or_with_none_left_keeps_empty_lists():
     assert [len(out[key]) for key in corner] == [0, 0, 0, 0]
 
 
-@pytest.mark.filterwarnings("ignore:the lens must not fold", "ignore:Turbulence this strong folds")  # to hide points
+@pytest.mark.filterwarnings("ignore:the lens must not fold", "ignore:Turbulence this strong folds")  # both on purpose
 def test_keypoints_that_a_fold_hides_go_with_their_labels_and_others_stay_outside():
     folds = tr.LensDistortion(k1_range=(-1.5, -1.5), focal_range=(0.6, 0.6), frame="pad")
-    waves = tr.Turbulence(
-        amplitude_range=(12, 12), length_range=(12, 12), covariance="gaussian"
-    )  # shows points mirrored
+    # It shows some points mirrored.
+    waves = tr.Turbulence(amplitude_range=(12, 12), length_range=(12, 12), covariance="gaussian")
     grid = np.stack(np.meshgrid(np.arange(4, W, 8), np.arange(4, H, 8)), axis=-1).reshape(-1, 2).astype(np.float32)
     for effect, names in ((folds, ["ids"]), (folds, None), (waves, ["ids"]), (BULGE, ["ids"])):
         points = A.KeypointParams("xy", label_fields=names, remove_invisible=False)

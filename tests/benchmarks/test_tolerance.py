@@ -44,13 +44,6 @@ def test_exceeded_tolerances_are_counted_and_end_the_command(monkeypatch, tmp_pa
     assert [trial["error"] for trial in json.loads(out.read_text())] == [0.02, 0.05, 0.3]
 
 
-@pytest.mark.quick
-def test_a_restore_flow_may_have_four_tolerances_and_a_fiftieth_of_a_pixel():
-    assert not Trial("lens", 64, 64, 0.1, 0.05, 0.419).exceeds
-    assert Trial("lens", 64, 64, 0.1, 0.05, 0.421).exceeds
-    assert Trial("lens", 64, 64, 0.1, 0.101, 0.05).exceeds
-
-
 # Flows that fold: pixels are shown several times, or next to a fold. The last one folds outside of the frame.
 @pytest.mark.parametrize(
     ("name", "seed"),

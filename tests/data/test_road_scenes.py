@@ -9,6 +9,9 @@ import torch.nn.functional as F
 from torch.testing import assert_close
 from torch.utils.data import DataLoader
 
+from torchrefract import LensDistortion
+from torchrefract.cli import restoration
+from torchrefract.data.module import road_scenes
 from torchrefract.data.road_scenes import RoadScenes, render_road_scenes
 from torchrefract.data.road_scenes.render import Camera, render
 from torchrefract.data.road_scenes.scene import Body, Panel, Scene, View, draw_scene, noise, textured
@@ -201,6 +204,16 @@ def test_frames_that_several_processes_render_are_kept_and_leave_the_random_numb
     monkeypatch.setattr("torchrefract.data.road_scenes.render.render_road_scenes", None)  # no frame is rendered again
     for index, frame in enumerate(frames):
         assert_close(tuple(scenes[index]), tuple(frame), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_a_training_renders_many_scenes_in_advance_where_its_workers_are_forked(monkeypatch, method):
+    monkeypatch.setattr(restoration, "_MANY_PIXELS", 4 * 16 * 24)
+    monkeypatch.setattr(restoration, "start_method", lambda: method)
+    data = road_scenes(effect=LensDistortion(), size=(16, 24), train_count=5, val_count=4, batch_size=2)
+    restoration._render_scenes(data)
+    counts = [len(scenes._frames) for scenes in (data.train, data.val) if isinstance(scenes, RoadScenes)]
+    assert counts == ([5, 0] if method == "fork" else [0, 0])  # few scenes are left to the loader
 
 
 def test_only_frames_that_fit_the_memory_are_rendered_in_advance(monkeypatch):

@@ -201,5 +201,7 @@ def test_a_parameter_of_another_shape_or_kind_raises(kind):
         # Several fields of one count may be blamed for it.
         with pytest.raises(ValueError, match=r"^params\.\w+ must"):
             effect.apply(image, params._replace(**{field: wider}))
-    with pytest.raises(ValueError, match=r"params\.applied must be bool"):
+    with pytest.raises(
+        ValueError, match=r"params\.applied must have .* and be bool of shape \(B,\), got torch\.float32"
+    ):
         effect.apply(image, params._replace(applied=torch.ones(2)))

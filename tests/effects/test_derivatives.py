@@ -28,11 +28,10 @@ from torchrefract.fields.lens import lens_flow
 from torchrefract.warping.lattice import pixel_lattice
 
 pytestmark = [
-    # PyTorch's forward mode compiles scripts when it is first used.
-    pytest.mark.filterwarnings("ignore:`torch.jit.script:FutureWarning"),
-    pytest.mark.filterwarnings("ignore:`torch.jit.script:DeprecationWarning"),
-    pytest.mark.filterwarnings("ignore:.*must fit into a periodic domain:UserWarning"),
-    pytest.mark.filterwarnings("ignore:.*folds:UserWarning"),
+    pytest.mark.filterwarnings("ignore:`torch.jit.script:FutureWarning"),  # PyTorch's forward mode compiles scripts
+    pytest.mark.filterwarnings("ignore:`torch.jit.script:DeprecationWarning"),  # in other versions of PyTorch
+    pytest.mark.filterwarnings("ignore:.*must fit into a periodic domain:UserWarning"),  # frames of 7 x 8 px are small
+    pytest.mark.filterwarnings("ignore:.*folds:UserWarning"),  # a fold changes no derivative
 ]
 
 # Images are sampled by PyTorch's grid_sample, and the color of light by the same, which have no forward over reverse.

@@ -13,13 +13,8 @@ from torch.testing import assert_close
 
 import torchrefract as tr
 from torchrefract.visualization.color import checkerboard, flow_to_rgb, flow_wheel, transmission_to_rgb
-from torchrefract.visualization.figures import (
-    MapScale,
-    contact_sheet,
-    contact_sheet_row,
-    describe_params,
-    resize_for_display,
-)
+from torchrefract.visualization.figures import MapScale, contact_sheet, contact_sheet_row, describe_params
+from torchrefract.visualization.layout import resize_for_display
 
 SIZE = (32, 40)  # displayed with 8 x 8 px for each pixel
 WARP = tr.DivergenceFree(amplitude_range=(1.0, 1.0), length_range=(12.0, 12.0))

@@ -21,7 +21,6 @@ from torchrefract.data.images import UnreadableImageError, fit, pixels_of, read_
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.types import Degraded
 from torchrefract.visualization.figures import (
-    FigureLayout,
     MapScale,
     describe_params,
     draw_invalid_key,
@@ -29,6 +28,7 @@ from torchrefract.visualization.figures import (
     map_image,
     map_scales,
 )
+from torchrefract.visualization.layout import FigureLayout
 
 RENDERED_SIZE = (540, 960)  # height and width
 _MAP_SIDE = 640  # px

@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext, suppress
 from itertools import islice
@@ -38,7 +39,7 @@ from torchrefract.data.media import (
     video_info,
     write_picture,
 )
-from torchrefract.data.module import PairData, fingerprint
+from torchrefract.data.module import PairData, fingerprint, start_method
 from torchrefract.data.pairs.manifest import claim, locked
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.data.workers import num_cores
@@ -79,10 +80,12 @@ def train(cfg: DictConfig) -> None:
 
 def _render_scenes(data: PairData) -> None:
     """Render road scenes on all cores before the training, whose single worker would take longer."""
+    if not data.workers or start_method() != "fork":  # other workers would not have them
+        return
     for scenes in (data.train, data.val):
-        if isinstance(scenes, RoadScenes) and data.workers and scenes.num_kept * math.prod(scenes.size) > _MANY_PIXELS:
-            for _ in progress(scenes.render(processes=num_cores()), "road scenes", count=scenes.num_kept):
-                pass
+        if isinstance(scenes, RoadScenes) and scenes.num_kept * math.prod(scenes.size) > _MANY_PIXELS:
+            numbers = scenes.render(processes=num_cores())
+            deque(progress(numbers, "road scenes", count=scenes.num_kept), maxlen=0)  # renders them all
 
 
 def _remove_incomplete(folders: Iterable[Path], locked_folder: Path) -> None:

@@ -273,13 +273,13 @@ def _problem(annotation: Annotation) -> str:
 
 
 def _problem_of_segmentation(parts: Any) -> str:
+    if not parts:
+        return ""
     if not isinstance(parts, dict):
         are_polygons = isinstance(parts, list) and all(
             _are_numbers(part) and len(part) > 5 and len(part) % 2 == 0 for part in parts
         )
-        return (
-            "" if not parts or are_polygons else "has a segmentation that is not lists of x, y of three or more corners"
-        )
+        return "" if are_polygons else "has a segmentation that is not lists of x, y of three or more corners"
     if not parts.keys() >= {"counts", "size"}:
         return "has a run-length code without counts and size"
     if isinstance(parts["counts"], list):
@@ -291,7 +291,7 @@ def _problem_of_segmentation(parts: Any) -> str:
 def _problem_of_others(annotation: Annotation) -> str:
     for name, value in annotation.items():
         if name not in _GEOMETRY and isinstance(value, list | dict) and value and names_positions(name):
-            return f"has {name}, positions that would stay where they are; remove them, or state them as {_GEOMETRY[0]}"
+            return f"has {name}, positions that would stay where they are; remove them, or state them as bbox"
     attributes = annotation.get("attributes")
     if isinstance(attributes, dict) and (angle := attributes.get("rotation")):
         return f"has a box that is turned by {angle} degrees; state its corners as segmentation"

@@ -205,13 +205,13 @@ class PairData(LightningDataModule):
             sampler=sampler,
             drop_last=training and batch_size is not None,
             num_workers=workers,
-            multiprocessing_context=_start_method() if workers else None,
+            multiprocessing_context=start_method() if workers else None,
             persistent_workers=workers > 0,
             pin_memory=torch.cuda.is_available(),
         )
 
 
-def _start_method() -> str:
+def start_method() -> str:
     """Return how workers start: as the program chose, or as Python does by default."""
     chosen, methods = multiprocessing.get_start_method(), multiprocessing.get_all_start_methods()
     # Launchers of jobs, as joblib, choose a method of their own, with which no DataLoader starts workers.

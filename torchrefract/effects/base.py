@@ -22,6 +22,7 @@ from torchrefract._validation import (
 )
 from torchrefract.effects.batch import (
     BatchShape,
+    check_applied,
     check_depth_fits,
     check_frames,
     check_image,
@@ -284,9 +285,7 @@ class Effect(nn.Module, ABC):
             if value.is_floating_point():
                 # Some parameters, as a visibility, may be infinite; `validate` decides.
                 check_values(f"params.{name}", "not be NaN", value, lambda v: ~v.isnan())
-        if params.applied.ndim != 1 or params.applied.dtype is not torch.bool:
-            got = f"{params.applied.dtype} of shape {tuple(params.applied.shape)}"
-            raise ValueError(f"params.applied must be bool of shape (B,), got {got}")
+        check_applied(params.applied, len(image))
         self.validate(params, image)
 
     def draw_in_ranges(self, stream: random.Stream, ranges: Sequence[Range], image: Tensor) -> tuple[Tensor, Tensor]:

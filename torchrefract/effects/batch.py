@@ -267,6 +267,15 @@ class ParamsAtDepth(NamedTuple):
         return self._replace(moment=torch.full(depth.shape[:1], moment, dtype=depth.dtype, device=depth.device))
 
 
+def check_applied(applied: Tensor, count: int) -> None:
+    """Raise ValueError unless there is a flag for each of `count` samples."""
+    if applied.shape != (count,) or applied.dtype is not torch.bool:
+        raise ValueError(
+            f"params.applied must have one row for each of the {count} images, and be bool of shape (B,), got "
+            f"{applied.dtype} of shape {tuple(applied.shape)}"
+        )
+
+
 def check_shapes(params: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Raise ValueError unless these fields of the parameters have rows of the given shapes."""
     for name, row in shapes.items():

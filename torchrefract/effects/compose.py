@@ -12,7 +12,7 @@ from torchrefract import random
 from torchrefract._tensor import as_device_tensor, assume_constant_result
 from torchrefract._validation import check_choice, check_number, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.batch import params_per_frame, params_to, select_params
+from torchrefract.effects.batch import check_applied, params_per_frame, params_to, select_params
 from torchrefract.effects.batch_flow import FlowPart, SamplingOptions, can_read, flow_on_measured_lattice, zero_flow
 from torchrefract.effects.photometric_effect import PhotometricEffect
 from torchrefract.effects.progress import Leaf, Progress
@@ -116,13 +116,7 @@ class Compose(Effect):
         """Raise for parameters that do not belong to these effects and this batch."""
         if not isinstance(params, ComposeParams):
             raise TypeError(f"params must be ComposeParams, got {type(params).__name__}")
-        if params.applied.shape != image.shape[:1]:
-            raise ValueError(
-                f"params.applied must have one row for each of the {image.shape[0]} images, "
-                f"got {tuple(params.applied.shape)}"
-            )
-        if params.applied.dtype is not torch.bool:
-            raise ValueError(f"params.applied must be bool, got {params.applied.dtype}")
+        check_applied(params.applied, len(image))
         self.validate(params, image)
 
     def for_params(self, params: ComposeParams, height: int, width: int) -> "Compose":

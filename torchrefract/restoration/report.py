@@ -26,13 +26,8 @@ from torchrefract.restoration.module import RestorationModule
 from torchrefract.restoration.tasks import Restored
 from torchrefract.types import Pair
 from torchrefract.visualization.color import flow_to_rgb, full_color_px, hatch_invalid
-from torchrefract.visualization.figures import (
-    FigureLayout,
-    MapScale,
-    draw_invalid_key,
-    draw_legend,
-    resize_for_display,
-)
+from torchrefract.visualization.figures import MapScale, draw_invalid_key, draw_legend
+from torchrefract.visualization.layout import FigureLayout, resize_for_display
 
 METRICS, METRICS_BEFORE = "metrics.csv", "metrics_before.csv"
 _PANEL_ROWS = 4

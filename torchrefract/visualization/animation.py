@@ -18,15 +18,14 @@ from torchrefract.data.media import can_write_videos, write_video
 from torchrefract.effects.base import Effect
 from torchrefract.types import Degraded
 from torchrefract.visualization.figures import (
-    FigureLayout,
     MapScale,
     describe_params,
     draw_invalid_key,
     draw_legend,
     map_image,
     map_scales,
-    resize_for_display,
 )
+from torchrefract.visualization.layout import FigureLayout, resize_for_display
 
 _MAX_STACKED = 3  # effects below one another; more stand in two columns, and are drawn smaller
 _LARGEST_SIDE = (480, 320)  # px, largest longer side of an image, of few effects and of many

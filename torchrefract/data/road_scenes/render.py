@@ -89,13 +89,14 @@ class RoadScenes(Dataset[Frame]):
         return min(self.count, -(-_KEPT_BYTES // (_PIXEL_BYTES * self.size[0] * self.size[1])))
 
     def render(self, *, processes: int) -> Iterator[int]:
-        """Render the frames that this process keeps, in several processes; yield the number of each when it is done.
+        """Render the frames that this process keeps, in forked processes; yield the number of each when it is done.
 
-        Loaders whose workers are forked afterwards have the frames too.
+        Workers of a loader that are forked afterwards have the frames too; others render what they need.
         """
         # A generator of its own leaves that of PyTorch, and so a training, as it is.
         options: dict[str, Any] = {"batch_size": None, "generator": torch.Generator()}
-        loader = DataLoader(self, sampler=range(self.num_kept), num_workers=processes, **options)
+        options |= {"num_workers": processes, "multiprocessing_context": "fork" if processes else None}
+        loader = DataLoader(self, sampler=range(self.num_kept), **options)
         for number, frame in enumerate(loader):
             # Copies, since memory that processes share is scarce.
             self._frames[int(frame.key)] = Frame(to_uint8(frame.image[None])[0], frame.key.clone(), frame.depth.clone())

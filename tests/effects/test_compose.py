@@ -351,7 +351,7 @@ def test_params_of_other_effects_or_batches_raise():
         effect.apply(image, params.children[0])
     with pytest.raises(ValueError, match=r"params\.children must be those of 2 effects, got 1"):
         effect.apply(image, params._replace(children=params.children[:1]))
-    with pytest.raises(ValueError, match=r"params\.applied must be bool, got torch\.float32"):
+    with pytest.raises(ValueError, match=r"params\.applied must have .* be bool of shape \(B,\), got torch\.float32"):
         effect.apply(image, params._replace(applied=torch.ones(2)))
     with pytest.raises(ValueError, match=r"params\.applied must have one row for each of the 3 images"):
         effect.apply(picture(3, 3, 8, 9), params)

@@ -268,9 +268,10 @@ def check_depth(depth: Tensor, *, name: str = "depth") -> None:
 
     Each sample or clip is judged alone. Invalid are negative values and NaN; maps that look normalized (all finite
     values lie in [0, 1] and differ); whole numbers with a median above 1000, as of millimeters, and any numbers with
-    such a median in the lower half; maps of which more than half is 0, as of lidar, whose zeros are holes; and maps that look like disparity or inverse depth: no value is
-    inf, a tenth of the upper half is at most 2 % of the largest value, and the median of the lowest quarter is at least
-    20 % of it. Frames of a few pixels are not tested for the last three.
+    such a median in the lower half; maps of which more than half is 0, as of lidar, whose zeros are holes; and maps
+    that look like disparity or inverse depth: no value is inf, a tenth of the upper half is at most 2 % of the largest
+    value, and the median of the lowest quarter is at least 20 % of it. Frames of a few pixels are tested for the first
+    two alone.
 
     Args:
         depth: (B, 1, H, W) or (B, T, 1, H, W), m, inf for the sky.

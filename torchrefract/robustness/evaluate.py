@@ -260,16 +260,26 @@ class _PredictionError(Exception):
 def _predict(predict: Callable[[Tensor], Any], image: Tensor) -> Any:
     """Return the prediction for an image (3, H, W), which the model may write to."""
     try:
-        (prediction,) = predict(image[None].clone())
+        predictions = predict(image[None].clone())
     except Exception as error:  # a model may raise anything
         raise _PredictionError(f"{type(error).__name__}: {error}") from error
-    return prediction
+    if isinstance(predictions, dict) or not hasattr(predictions, "__len__") or len(predictions) != 1:
+        count = f" of {len(predictions)}" if isinstance(predictions, Tensor | list | tuple) else ""
+        raise ValueError(
+            "predict must return a sequence of one prediction for one image, got "
+            f"{type(predictions).__name__}{count}; return a list, or a tensor (1, ...)"
+        )
+    return predictions[0]
 
 
 def _score(score: Callable[[Any, Any], float], prediction: Any, target: Any, value: float = 0.0) -> ImageScore:
-    number = float(score(prediction, target))
+    value_of_score = score(prediction, target)
+    try:
+        number = float(value_of_score)
+    except (TypeError, ValueError, RuntimeError):  # of a tensor with several values
+        number = float("nan")
     if not 0 <= number <= 1:
-        raise ValueError(f"score must return a number in [0, 1], got {number}")
+        raise ValueError(f"score must return a number in [0, 1], got {value_of_score}")
     return ImageScore(number, value, summarize(prediction, target))
 
 

@@ -369,6 +369,9 @@ def test_the_command_writes_maps_that_fog_and_pairs_use_and_continues(call, netw
     maps[1].unlink()
     assert "1 depth maps written" in call("estimate_depth", *words).out
     assert [path.stat().st_mtime_ns for path in maps][::2] == times[::2]
+    for word in ("scale_by=road", "source=frames/b"):
+        *_, message = call("estimate_depth", *words, word).err.splitlines()  # transformers prints its progress
+        assert message.startswith("error: out must be a folder of the same configuration, got depth, where")
     folder = DepthFolder(tmp_path / "depth")
     depth = folder.read("b/c.jpg", frame_size=(56, 84), size=None)
     picture = cv2.imread(str(tmp_path / "frames" / "b" / "c.jpg"))

@@ -5,10 +5,10 @@ import sys
 from collections.abc import Iterable, Iterator
 from itertools import count
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchrefract._validation import UsageError, check_count
@@ -16,7 +16,7 @@ from torchrefract.cli.command import make, naming, progress
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder, write_depth
 from torchrefract.data.images import UnreadableImageError, read_image
-from torchrefract.data.pairs.manifest import locked
+from torchrefract.data.pairs.manifest import claim, locked
 from torchrefract.depth import RoadSpreadError, TransformersDepth
 
 
@@ -43,7 +43,7 @@ def estimate_depth(cfg: DictConfig) -> None:
     if not isinstance(network, TransformersDepth):
         raise UsageError(f"model must be torchrefract.depth.from_transformers, got {type(network).__name__}")
     with naming("out"):
-        out.mkdir(parents=True, exist_ok=True)
+        _claim(cfg, out, root)
     skipped, spreads = dict[str, str](), list[float]()
     num_written = 0
     with locked("out", out):
@@ -63,6 +63,17 @@ def estimate_depth(cfg: DictConfig) -> None:
     print(f"{out}: {num_written} depth maps written, {len(skipped)} frames skipped{spread}")
     if skipped:
         raise SystemExit(1)
+
+
+def _claim(cfg: DictConfig, out: Path, root: Path) -> None:
+    """Create the output folder; raise UsageError if maps in it are of another network, road or source."""
+    out.mkdir(parents=True, exist_ok=True)
+    names = [path.name for path in out.iterdir() if not path.name.startswith(".")]
+    if names and "config.json" not in names:
+        return  # a folder of maps of another program, of which the frames without one are estimated
+    model = cast(dict[str, Any], OmegaConf.to_container(cfg.model, resolve=True))
+    content = {name: value for name, value in model.items() if name not in ("device", "max_spread")}
+    claim(out, {"source": str(root.resolve()), "model": content}, count=0, about={})
 
 
 def _missing_frames(

@@ -189,7 +189,7 @@ def test_masks_and_modules_are_taken(call, tmp_path, frames):
         ("severity=true", "severity must be some of (1, 2, 3, 4, 5), got [True]"),
         ("severity=[2.5]", "severity must be some of (1, 2, 3, 4, 5), got [2.5]"),
         ("scene=null", "scene must be some of cheap_dashcam, cape_town_fog"),
-        ("device=tpu", "device must be one of PyTorch, such as cpu or cuda, got tpu"),
+        ("device=tpu", "device must be auto, cpu or another device of this machine, got tpu"),
         ("out=coco.json", "out: "),
         ("model=damaged.pt", "model: model must be a TorchScript file of torch.jit.save, got damaged.pt (it is no ZIP"),
         ("model=damaged.pt2", "model: model must be a program of torch.export or ONNX, got damaged.pt2 (it is no ZIP"),

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import hydra
+import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, InstantiationException, MissingConfigException
@@ -194,6 +195,16 @@ def check_seed(seed: Any) -> int:
     if not isinstance(seed, int) or not 0 <= seed < _NUM_SEEDS:
         raise UsageError(f"seed must be a whole number from 0 to {_NUM_SEEDS - 1}, got {seed}")
     return seed
+
+
+def find_device(name: str) -> torch.device:
+    """Return a device by its name; "auto" is a GPU if there is one."""
+    try:
+        device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # torch asserts in builds without CUDA
+        raise UsageError(f"device must be auto, cpu or another device of this machine, got {name}") from error
+    return device
 
 
 def make(cfg: DictConfig, part: str) -> Any:

@@ -21,7 +21,7 @@ import torchrefract
 from torchrefract import presets, random
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_count, check_number, check_positive
-from torchrefract.cli.command import check_seed, naming, progress, warn_of_assumed_depth
+from torchrefract.cli.command import check_seed, find_device, naming, progress, warn_of_assumed_depth
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import first_names, list_files
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, read_image
@@ -93,12 +93,9 @@ def test_robustness(cfg: DictConfig) -> None:
     settings = {name: values[name] for name in _SETTINGS} | {"labels": folder.labels and folder.labels.digest()}
     settings["format"] = _FORMAT
     levels = _levels(settings["scene"], settings["severity"])
-    try:
-        torch.device(str(cfg.device))
-    except RuntimeError as error:
-        raise UsageError(f"device must be one of PyTorch, such as cpu or cuda, got {cfg.device}") from error
+    device = str(find_device(str(cfg.device)))
     with naming("model"):
-        predict = load_predictor(str(cfg.model), weights=cfg.weights, device=str(cfg.device))
+        predict = load_predictor(str(cfg.model), weights=cfg.weights, device=device)
     with naming("score"):
         score = choose_score if cfg.score is None else import_function(*str(cfg.score).partition(":")[::2])
     scenes = lru_cache(lambda width: _scenes(levels, width))

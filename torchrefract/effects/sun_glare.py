@@ -151,8 +151,10 @@ class SunGlare(PhotometricEffect):
         p: float = 1.0,
     ):
         super().__init__(tolerance=tolerance, p=p)
-        self.center_x_range = center_x_range and _check_place("center_x_range", center_x_range)
-        self.center_y_range = center_y_range and _check_place("center_y_range", center_y_range)
+        places = {"center_x_range": center_x_range, "center_y_range": center_y_range}
+        self.center_x_range, self.center_y_range = (
+            None if place is None else _check_place(name, place) for name, place in places.items()
+        )
         if (center_x_range is None) != (center_y_range is None):
             raise ValueError("center_x_range and center_y_range must both be given, or neither, got one of them")
         self.outside = check_number("outside", outside, low=0.0, high=1.0)

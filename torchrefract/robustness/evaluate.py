@@ -197,18 +197,23 @@ def evaluate(
 
     Raises:
         RuntimeError: the prediction raised for more than a tenth of the images, from ten on, or for all of them.
-        ValueError: a target of None without `as_target`; a score outside [0, 1].
+        TypeError: a name that is no text; scenes that are not effects by scene and severity.
+        ValueError: an image of another form; a name twice; a target of None without `as_target`; predictions that are
+            not a sequence of one; a score outside [0, 1].
     """
     quantities, done = dict(quantities or {}), done or {}
     scored: dict[str, Scored] = {}
     failures: dict[str, str] = {}
     for name, image, given in samples:
+        _check_sample(name, image, scored, failures)
         if name in done:
             scored[name] = done[name]
             continue
         if given is None and as_target is None:
             raise ValueError(f"target must be labels, or as_target a function, got None for {name}")
-        by_name = scenes(image.shape[-1]) if callable(scenes) else scenes
+        by_name = _checked_scenes(
+            scenes(image.shape[-1]) if callable(scenes) and not isinstance(scenes, Effect) else scenes
+        )
         try:
             prediction = _predict(predict, image)
             target = given
@@ -251,6 +256,27 @@ def move_target(target: Any, degraded: Degraded, effect: Effect) -> Any:
     if target is None or not degraded.has("flow"):
         return target
     return warp_moved_labels(target, degraded.flow.detach(), effect.labels_getter)
+
+
+def _check_sample(name: Any, image: Any, *earlier: Mapping[str, Any]) -> None:
+    """Raise TypeError for a name that is no text, and ValueError for an earlier name or an image of another form."""
+    if not isinstance(name, str):
+        raise TypeError(f"samples must have names that are texts, got {name!r}")
+    if any(name in names for names in earlier):
+        raise ValueError(f"samples must have names of their own, got {name} twice")
+    if not isinstance(image, Tensor) or image.ndim != 3:
+        got = tuple(image.shape) if isinstance(image, Tensor) else type(image).__name__
+        raise ValueError(f"samples must have images (3, H, W), tensors, got {got} for {name}")
+
+
+def _checked_scenes(scenes: Any) -> Scenes:
+    """Return the scenes; raise TypeError if they are not effects by scene and severity."""
+    is_valid = isinstance(scenes, Mapping) and all(
+        isinstance(of, Mapping) and all(isinstance(effect, Effect) for effect in of.values()) for of in scenes.values()
+    )
+    if not is_valid:
+        raise TypeError(f"scenes must be {{scene: {{severity: effect}}}}, got {type(scenes).__name__}")
+    return scenes
 
 
 class _PredictionError(Exception):

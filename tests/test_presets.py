@@ -210,3 +210,13 @@ def test_the_telephoto_haze_takes_frames_of_any_shape_and_has_a_focal_length_of_
     )
     assert torch.equal(unknown.flow, known.flow)
     assert unknown.flow.any() or size == (1, 1)
+
+
+@pytest.mark.quick
+def test_a_gray_frame_is_degraded_by_each_scene_with_the_luminance_of_its_colors(scene):
+    effect = scene_for_size(scene)
+    gray = effect.degrade(torch.rand(2, 1, *SIZE), seed=1)
+    assert gray.image.shape == (2, 1, *SIZE)
+    if scene == "limpopo_sun_glare":
+        luminance = 0.2126 + 0.7152 * 0.94 + 0.0722 * 0.82
+        assert gray.params.color.flatten().tolist() == pytest.approx([luminance] * 2)

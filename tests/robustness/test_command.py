@@ -232,6 +232,19 @@ def test_a_model_that_fails_for_one_picture_is_said_and_for_all_stops(call, tmp_
     assert message.endswith("the last was white.png: RuntimeError: a white picture")
 
 
+@pytest.mark.filterwarnings("ignore:.*deprecated:FutureWarning")  # of TorchScript, which people still have
+def test_another_model_under_the_name_of_the_first_is_not_mixed_with_its_scores(call, tmp_path, frames):
+    words = ("robustness.__main__", "model=net.pt", "data=frames", "out=out", "scene=cheap_dashcam", "severity=1")
+    for shift, code in ((0.0, 0), (0.0, 0), (1.0, 1)):
+        network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten(), torch.nn.Linear(3, 2))
+        torch.nn.init.constant_(network[2].weight, shift)
+        torch.nn.init.constant_(network[2].bias, shift)
+        torch.jit.save(torch.jit.script(network), tmp_path / "net.pt")
+        outcome = call(*words)
+        assert outcome.code == code, outcome.err
+    assert "error: out must be a folder of the same settings, got one with files={'net.pt': " in outcome.err
+
+
 def test_a_file_that_is_no_picture_is_named_and_skipped(call, tmp_path, frames):
     words = ("scene=cheap_dashcam", "severity=1")
     expected = call(*COMMAND, *words).out

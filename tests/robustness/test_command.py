@@ -237,8 +237,8 @@ def test_another_model_under_the_name_of_the_first_is_not_mixed_with_its_scores(
     words = ("robustness.__main__", "model=net.pt", "data=frames", "out=out", "scene=cheap_dashcam", "severity=1")
     for shift, code in ((0.0, 0), (0.0, 0), (1.0, 1)):
         network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten(), torch.nn.Linear(3, 2))
-        torch.nn.init.constant_(network[2].weight, shift)
-        torch.nn.init.constant_(network[2].bias, shift)
+        for parameter in network.parameters():
+            torch.nn.init.constant_(parameter, shift)
         torch.jit.save(torch.jit.script(network), tmp_path / "net.pt")
         outcome = call(*words)
         assert outcome.code == code, outcome.err

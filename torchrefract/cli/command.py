@@ -2,6 +2,7 @@
 
 import difflib
 import errno
+import hashlib
 import logging
 import os
 import re
@@ -195,6 +196,16 @@ def check_seed(seed: Any) -> int:
     if not isinstance(seed, int) or not 0 <= seed < _NUM_SEEDS:
         raise UsageError(f"seed must be a whole number from 0 to {_NUM_SEEDS - 1}, got {seed}")
     return seed
+
+
+def file_digests(values: Iterable[Any]) -> dict[str, str] | None:
+    """Return the SHA-256 digests of the files that are among the values of options, by path; None without any."""
+    paths = [value for value in values if isinstance(value, str) and os.path.isfile(value)]
+    digests = dict[str, str]()
+    for path in paths:
+        with open(path, "rb") as stream:
+            digests[path] = hashlib.file_digest(stream, "sha256").hexdigest()
+    return digests or None
 
 
 def find_device(name: str) -> torch.device:

@@ -1,6 +1,5 @@
 """The command that scores a model on degraded pictures by scene and severity."""
 
-import hashlib
 import io
 import json
 import sys
@@ -22,7 +21,7 @@ import torchrefract
 from torchrefract import presets, random
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_count, check_number, check_positive
-from torchrefract.cli.command import check_seed, find_device, naming, progress, warn_of_assumed_depth
+from torchrefract.cli.command import check_seed, file_digests, find_device, naming, progress, warn_of_assumed_depth
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import first_names, list_files
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, read_image
@@ -92,7 +91,7 @@ def test_robustness(cfg: DictConfig) -> None:
         num_worst = check_count("worst", cfg.worst, low=0)
     folder, values = _folder(cfg), cast(dict[str, Any], OmegaConf.to_container(cfg))
     settings = {name: values[name] for name in _SETTINGS} | {"labels": folder.labels and folder.labels.digest()}
-    settings["format"], settings["files"] = _FORMAT, _digests(cfg)
+    settings["format"], settings["files"] = _FORMAT, file_digests([cfg.model, cfg.weights])
     levels = _levels(settings["scene"], settings["severity"])
     device = str(find_device(str(cfg.device)))
     with naming("model"):
@@ -143,16 +142,6 @@ def choose_score(prediction: Any, target: Any) -> float:
         return detection_score(prediction, target)
     is_class = isinstance(prediction, Tensor) and prediction.ndim == 1
     return classification_score(prediction, target) if is_class else segmentation_score(prediction, target)
-
-
-def _digests(cfg: DictConfig) -> dict[str, str] | None:
-    """Return the SHA-256 digests of the files of a model, by path; None for a model of a module."""
-    paths = [path for path in (cfg.model, cfg.weights) if path is not None and Path(str(path)).is_file()]
-    digests = dict[str, str]()
-    for path in map(str, paths):
-        with Path(path).open("rb") as stream:
-            digests[path] = hashlib.file_digest(stream, "sha256").hexdigest()
-    return digests or None
 
 
 def _levels(scenes: Any, severities: Any) -> list[Level]:

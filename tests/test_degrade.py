@@ -14,6 +14,8 @@ from PIL import Image
 from pycocotools.coco import COCO
 
 from torchrefract import key_of, presets, warp_boxes, warp_mask
+from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.io import write_opencv
 from torchrefract.data.images import read_image
 from torchrefract.data.media import read_video
 from torchrefract.data.pairs.files import decode_flow
@@ -346,3 +348,14 @@ def test_the_settings_are_kept_beside_the_pictures(call, folder):
     settings = json.loads((folder / "out" / "config.json").read_text())["settings"]
     assert settings["scene"] == {"_target_": "torchrefract.presets.cheap_dashcam", "severity": 4}
     assert (settings["source"], settings["seed"]) == (str(folder / "raw"), 0)
+
+
+def test_another_camera_under_the_name_of_the_first_is_not_mixed_with_its_pictures(call, folder):
+    write(folder / "square" / "a.png", picture(64, 64))
+    words = ("source=square", "out=out", "scene=cape_town_fog", "scene.camera=camera.yaml", "workers=0")
+    for focal, code in ((50.0, 0), (50.0, 0), (60.0, 1)):
+        camera = Camera(width=64, height=64, fx=focal, fy=focal, cx=31.5, cy=31.5, coefficients=(0.0,) * 4)
+        write_opencv(folder / "camera.yaml", camera)
+        outcome = call("degrade", *words)
+        assert outcome.code == code, outcome.err
+    assert "error: out must be a folder of the same configuration, got out, where files.camera.yaml is" in outcome.err

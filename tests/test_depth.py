@@ -369,6 +369,9 @@ def test_the_command_writes_maps_that_fog_and_pairs_use_and_continues(call, netw
     maps[1].unlink()
     assert "1 depth maps written" in call("estimate_depth", *words).out
     assert [path.stat().st_mtime_ns for path in maps][::2] == times[::2]
+    for word in ("scale_by=road", "source=frames/b"):
+        *_, message = call("estimate_depth", *words, word).err.splitlines()  # transformers prints its progress
+        assert message.startswith("error: out must be a folder of the same configuration, got depth, where")
     folder = DepthFolder(tmp_path / "depth")
     depth = folder.read("b/c.jpg", frame_size=(56, 84), size=None)
     picture = cv2.imread(str(tmp_path / "frames" / "b" / "c.jpg"))
@@ -387,6 +390,17 @@ def test_the_command_writes_maps_that_fog_and_pairs_use_and_continues(call, netw
     maps[0].unlink()
     message = call("generate", *options, "out=other").message
     assert re.fullmatch(r"depth must be a folder with a map for each frame, got none for a\.png in depth .*", message)
+
+
+def test_a_run_without_a_map_leaves_no_folder_and_a_wrong_device_is_named(call, network, tmp_path):
+    write_frames(tmp_path)
+    words = ("source=frames", "out=depth", f"network={network('metric')}")
+    *_, message = call("estimate_depth", *words, "max_spread=1e-9").err.splitlines()
+    assert message.startswith("error: source must hold a frame whose depth can be estimated")
+    assert not (tmp_path / "depth").exists()
+    assert call("estimate_depth", *words, "scale_by=model").code == 0
+    message = call("estimate_depth", *words, "device=tpu").message
+    assert message == "device must be auto, cpu or another device of this machine, got tpu"
 
 
 def test_two_pictures_that_would_share_a_map_raise(call, tmp_path):

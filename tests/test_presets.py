@@ -99,8 +99,9 @@ def test_each_severity_is_stronger_than_the_one_before(scene):
 @pytest.mark.quick
 def test_the_default_severity_is_3_and_others_are_1_to_5(scene):
     assert repr(SCENES[scene]()) == repr(SCENES[scene](3)) != repr(SCENES[scene](4))
+    assert repr(SCENES[scene](4.0)) == repr(SCENES[scene](4))
     for severity in (0, 6, 2.5, True, "3"):
-        with pytest.raises(ValueError, match=f"severity must be one of 1, 2, 3, 4, 5, got {severity}"):
+        with pytest.raises(ValueError, match=f"severity must be one of 1, 2, 3, 4, 5, got {severity!r}"):
             SCENES[scene](severity)
 
 
@@ -191,3 +192,31 @@ def test_camera_horizon_depth_width_and_other_arguments_reach_each_effect(name):
         assert getattr(leaf, "focal", 500 / 640) == 500 / 640
     with pytest.raises(TypeError, match="mistyped"):
         SCENES[name](mistyped=1)
+    if name != "cheap_dashcam":
+        with pytest.raises(TypeError, match="camera must be a Camera, got int"):
+            SCENES[name](camera=1)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("size", [(54, 96), (72, 96), (96, 54), (1, 1)])
+def test_the_telephoto_haze_takes_frames_of_any_shape_and_has_a_focal_length_of_four_widths(size):
+    height, width = size
+    options = {"width": width, "height": height, "cx": (width - 1) / 2, "cy": (height - 1) / 2}
+    camera = Camera(**options, fx=4.0 * width, fy=4.0 * width, coefficients=(0.0,) * 4, model="opencv")
+    image, depth = torch.rand(1, 3, height, width), torch.full((1, 1, height, width), 800.0)
+    unknown, known = (
+        SCENES["highveld_telephoto"](5, tolerance_px=None, **given).degrade(image, seed=3, depth=depth)
+        for given in ({}, {"camera": camera})
+    )
+    assert torch.equal(unknown.flow, known.flow)
+    assert unknown.flow.any() or size == (1, 1)
+
+
+@pytest.mark.quick
+def test_a_gray_frame_is_degraded_by_each_scene_with_the_luminance_of_its_colors(scene):
+    effect = scene_for_size(scene)
+    gray = effect.degrade(torch.rand(2, 1, *SIZE), seed=1)
+    assert gray.image.shape == (2, 1, *SIZE)
+    if scene == "limpopo_sun_glare":
+        luminance = 0.2126 + 0.7152 * 0.94 + 0.0722 * 0.82
+        assert gray.params.color.flatten().tolist() == pytest.approx([luminance] * 2)

@@ -89,13 +89,6 @@ def check_color(name: str, color: float | Sequence[float], *, high: float) -> tu
     return tuple(check_number(name, value, low=0.0, high=high) for value in values)
 
 
-def color_per_channel(name: str, color: Sequence[float], channels: int) -> Sequence[float]:
-    """Return the color with one number for each channel."""
-    if len(color) not in (1, channels):
-        raise ValueError(f"{name} must have 1 number or {channels}, one for each channel, got {tuple(color)}")
-    return color if len(color) == channels else [color[0]] * channels
-
-
 def check_tensor(name: str, value: Tensor) -> Tensor:
     """Return `value` if it is a tensor."""
     if not isinstance(value, Tensor):

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from torchrefract._validation import check_positive
-from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera
 from torchrefract.cameras.io import read_camera
 from torchrefract.effects.compose import Compose, OneOf
 from torchrefract.effects.divergence_free import DivergenceFree
@@ -43,9 +43,7 @@ SEVERITIES = (1, 2, 3, 4, 5)
 _REFERENCE_WIDTH = 1920.0
 _HORIZON, _SPREAD = 0.55, 0.1  # an angle that varies from car to car
 _LOW_SUN = (1.0, 0.94, 0.82)
-_TELEPHOTO = Camera(
-    width=1920, height=1080, fx=7680.0, fy=7680.0, cx=959.5, cy=539.5, coefficients=(0.0,) * 4, model="opencv"
-)
+_TELEPHOTO_FOCAL = 4.0  # widths
 _T = TypeVar("_T")
 _CameraSource = Camera | str | Path | None
 _DepthSource = DepthProvider | Callable[[Tensor], Tensor] | None
@@ -149,12 +147,13 @@ def highveld_telephoto(
 
     Args:
         severity: 1 to 5, Cn2 of 1e-13, 3e-13, 1e-12, 3e-12, 1e-11 m^(-2/3), each +-50 %. 1e-12 is a hot day.
-        camera, horizon, depth: as for all scenes; without a camera, frames are 16:9, with a focal length of 4 widths.
+        camera, horizon, depth: as for all scenes; without a camera, frames have a focal length of 4 widths.
         arguments: of `PhysicalTurbulence`, and those of all scenes.
     """
     cn2 = _at_severity(severity, [1e-13, 3e-13, 1e-12, 3e-12, 1e-11])
-    options: dict[str, Any] = {"cn2_range": (0.5 * cn2, 1.5 * cn2), "horizon": horizon}
-    options |= _place(camera or _TELEPHOTO, horizon, depth)
+    place = _place(camera, horizon, depth, focal=_TELEPHOTO_FOCAL)
+    options: dict[str, Any] = {"cn2_range": (0.5 * cn2, 1.5 * cn2), "horizon": horizon, "focal": _TELEPHOTO_FOCAL}
+    options |= _focal(place["camera"]) | place
     return PhysicalTurbulence(**options | _without_place(arguments))
 
 
@@ -262,14 +261,16 @@ def paper_weather(severity: int = 3) -> OneOf:
 
 
 def _camera(source: _CameraSource) -> Camera | None:
-    return read_camera(source) if isinstance(source, str | Path) else source
+    return read_camera(source) if isinstance(source, str | Path) else check_camera(source)
 
 
-def _place(source: _CameraSource, horizon: float, depth: _DepthSource) -> dict[str, Any]:
-    """Return the arguments of an effect that tell the camera and the depth."""
+def _place(
+    source: _CameraSource, horizon: float, depth: _DepthSource, *, focal: float = UNKNOWN_FOCAL
+) -> dict[str, Any]:
+    """Return the arguments of an effect that tell the camera and the depth; `focal` is that of no camera, widths."""
     camera = _camera(source)
     if depth is None:
-        depth = CorridorDepth(horizon=horizon, spread=_SPREAD, **_focal(camera))
+        depth = CorridorDepth(horizon=horizon, spread=_SPREAD, **{"focal": focal} | _focal(camera))
     return {"camera": camera, "depth": depth}
 
 
@@ -318,5 +319,5 @@ def _around(value: float, spread: float) -> Range:
 
 def _at_severity(severity: int, values: Sequence[_T]) -> _T:
     if isinstance(severity, bool) or severity not in SEVERITIES:
-        raise ValueError(f"severity must be one of 1, 2, 3, 4, 5, got {severity}")
-    return values[severity - 1]
+        raise ValueError(f"severity must be one of 1, 2, 3, 4, 5, got {severity!r}")
+    return values[SEVERITIES.index(severity)]

@@ -300,12 +300,14 @@ def test_depth_that_was_not_measured_counts_as_infinite_and_is_reported(call, pi
     steps = np.full((24, 32), 256 * 40, np.uint16)
     steps[:6] = 0
     Image.fromarray(steps).save(tmp_path / "depth.png")
-    outcome = call("preview", "frame.png", *FOG, "depth=depth.png")
-    assert outcome.out == "preview.png: cape_town_fog on frame.png; 25.0% of its depth is 0, taken as infinite\n"
+    np.save(tmp_path / "depth.npy", steps / 256)
     depth = np.where(steps == 0, np.inf, 40.0)
-    assert sheet_shows(
-        tmp_path / "preview.png", row_of(cape_town_fog(), read_image(picture)[None], depth=depth).corrupted
-    )
+    for name in ("depth.png", "depth.npy"):
+        outcome = call("preview", "frame.png", *FOG, f"depth={name}")
+        assert outcome.out == "preview.png: cape_town_fog on frame.png; 25.0% of its depth is 0, taken as infinite\n"
+        assert sheet_shows(
+            tmp_path / "preview.png", row_of(cape_town_fog(), read_image(picture)[None], depth=depth).corrupted
+        )
 
 
 def test_depth_is_cropped_with_its_picture(call, picture, tmp_path):
@@ -322,6 +324,7 @@ def test_depth_is_cropped_with_its_picture(call, picture, tmp_path):
         ("d.npy", meters() - 50, "depth must be at least 0, in m, got -"),
         ("d.npy", np.where(meters() > 100, np.nan, meters()), "depth must be at least 0, in m, got nan"),
         ("d.npy", meters() / 1000, "depth must be in m, not normalized"),
+        ("d.npy", np.zeros((12, 16)), "depth must be known in half of the pixels .* d.npy with 100.0% at 0"),
         ("d.npy", np.ones((12, 16), np.uint16), r"depth must be \(height, width\) of floating numbers, in m, got d"),
         ("d.npy", np.ones((2, 12, 16)), r"depth must be \(height, width\) of floating numbers, in m, got d.npy"),
         ("d.npy", np.array([{}], dtype=object), "depth must be an array of numbers, got d.npy, which is damaged"),

@@ -226,3 +226,13 @@ def test_folders_and_json_are_told_apart_and_compared_with_the_pictures(tmp_path
     (tmp_path / "txt" / "0.txt").unlink()
     with pytest.raises(UsageError, match=r"labels must hold a mask for each picture, got none for 1\.png"):
         read_labels(tmp_path / "txt", fill=0).check(["0.jpg", "1.jpg"])
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("suffix", [".txt", ".png"])
+def test_the_digest_of_a_folder_changes_with_the_content_of_a_file_of_the_same_size(tmp_path, suffix):
+    digests = []
+    for content in (b"0 .5 .5 .2 .2", b"1 .5 .5 .2 .2"):
+        (tmp_path / f"a{suffix}").write_bytes(content)
+        digests += [read_labels(tmp_path, fill=0).digest() for _ in range(2)]
+    assert digests[0] == digests[1] != digests[2] == digests[3]

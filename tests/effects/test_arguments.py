@@ -82,6 +82,7 @@ ARGUMENTS: list[tuple[type, dict[str, Any], str]] = [
     (RollingShutter, {"num_frequencies": 0}, "num_frequencies must be at least 1"),
     (RollingShutter, {"fps": 0.0}, "fps must"),
     (SunGlare, {"center_x_range": (0.1, 0.2)}, "center_x_range and center_y_range must both be given"),
+    (SunGlare, {"center_x_range": (), "center_y_range": ()}, r"center_x_range must be \(low, high\), got \(\)"),
     (SunGlare, {"outside": 1.5}, "outside must be a number in"),
     (SunGlare, {"scatter_range": (0.0, 1.5)}, "scatter_range must"),
     (SunGlare, {"scale_range": (0.0, 1.0)}, "scale_range must"),

@@ -659,6 +659,7 @@ def test_wrong_seeds_keys_and_depths_raise(case):
         ({"seed": torch.tensor([1, 2])}, ValueError, r"seed must be one number, got shape \(2,\)"),
         ({"depth": torch.zeros(2, 1, 9, 8)}, ValueError, "depth must have one channel and the size of the image"),
         ({"depth": [1.0]}, TypeError, "depth must be a floating tensor"),
+        ({"depth": np.ones((2, 1, 8, 9), np.float32)}, TypeError, "depth must be a floating tensor, got ndarray"),
     ]
     for options, error, rule in wrong:
         with pytest.raises(error, match=rule):

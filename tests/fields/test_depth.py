@@ -247,6 +247,11 @@ def test_check_depth_rejects_stored_integers_and_maps_with_holes():
                 ValueError, match=r"in m, got whole numbers from .* to .*; divide by 1000 if they are mill"
             ):
                 check_depth((factor * sample).round())
+        resized = torch.nn.functional.interpolate((1000 * sample).round(), (90, 160), mode="bilinear")
+        with pytest.raises(
+            ValueError, match=r"in m, got a median of .* in the lower half; divide by 1000 if it is in mi"
+        ):
+            check_depth(resized)
         lidar = torch.where(torch.rand(sample.shape, generator=generator) < 0.05, sample, 0)
         with pytest.raises(
             ValueError, match=r"depth must be known at each pixel, got 0 at 9[3-7] % of them; fill these"

@@ -30,6 +30,15 @@ def detect(images):
 def count(prediction, target):
     return float(len(prediction["boxes"]) == len(target["boxes"]))
 
+def nobody(prediction, target):
+    return None
+
+def one(images):
+    return detect(images)[0]
+
+def none(images):
+    return None
+
 network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten(), torch.nn.Linear(3, 2))
 """
 
@@ -148,9 +157,13 @@ def test_masks_and_modules_are_taken(call, tmp_path, frames):
     (tmp_path / "classes.py").write_text(
         "import torch\n\ndef segment(images):\n    return torch.stack([1 - images[:, 0], images[:, 0] - 0.9], dim=1)\n"
     )
-    words = ("robustness.__main__", "model=classes:segment", "data=frames", "out=out", "labels=masks")
-    outcome = call(*words, "scene=cheap_dashcam", "severity=1")
-    assert re.search(r"4 pictures, clean score (0\.\d+), mIoU \1", outcome.out)  # all pictures have the same pixels
+    words = ("robustness.__main__", "model=classes:segment", "data=frames", "scene=cheap_dashcam", "severity=1")
+    first = call(*words, "labels=masks", "out=out").out
+    assert re.search(r"4 pictures, clean score (0\.\d+), mIoU \1", first)  # all pictures have the same pixels
+    (tmp_path / "deep").mkdir()
+    for path in frames.iterdir():
+        cv2.imwrite(str(tmp_path / "deep" / path.name), np.zeros((72, 128), np.uint16))
+    assert call(*words, "labels=deep", "out=o3").out == first.replace("out/", "o3/")
     outcome = call("robustness.__main__", "model=bright:network", "data=frames", "out=o2", "scene=cheap_dashcam")
     assert "clean score 1.000" in outcome.out
 
@@ -169,9 +182,24 @@ def test_masks_and_modules_are_taken(call, tmp_path, frames):
             "labels=small.json",
             "labels: labels must be of pictures as they are displayed, 72x128 (height x width), got 36x64",
         ),
+        ("labels=outline.json", "labels: labels must have a bbox and a category_id that is a whole number in each"),
+        ("labels=names.json", "labels: labels must have a bbox and a category_id that is a whole number in each"),
         ("scene=[cape_town_frog]", "scene must be some of cheap_dashcam, cape_town_fog"),
         ("severity=[6]", "severity must be some of (1, 2, 3, 4, 5), got [6]"),
+        ("severity=true", "severity must be some of (1, 2, 3, 4, 5), got [True]"),
+        ("severity=[2.5]", "severity must be some of (1, 2, 3, 4, 5), got [2.5]"),
+        ("scene=null", "scene must be some of cheap_dashcam, cape_town_fog"),
+        ("device=tpu", "device must be auto, cpu or another device of this machine, got tpu"),
+        ("out=coco.json", "out: "),
+        ("model=damaged.pt", "model: model must be a TorchScript file of torch.jit.save, got damaged.pt (it is no ZIP"),
+        ("model=damaged.pt2", "model: model must be a program of torch.export or ONNX, got damaged.pt2 (it is no ZIP"),
+        ("model=damaged.onnx", "model: model must be a program of torch.export or ONNX, got damaged.onnx ("),
+        ("score=bright:nobody", "score must return a number in [0, 1], got None"),
+        ("model=bright:one", "predict must return a sequence of one prediction for one image, got dict"),
+        ("model=bright:none", "predict must return a sequence of one prediction for one image, got NoneType"),
         ("loss=2", "loss: loss must"),
+        ("weights=damaged.pt", "model: weights must be a state_dict of resnet18, got damaged.pt ("),
+        ("weights=other.pt", "model: weights must be a state_dict of resnet18, got other.pt (Error(s) in loading"),
         ("score=bright:nothing", "score: a function must be package.module:name"),
     ],
 )
@@ -180,7 +208,14 @@ def test_an_invalid_option_is_one_line_of_error(call, tmp_path, frames, word, me
     document = json.loads((tmp_path / "coco.json").read_text())
     images = [image | {"height": 36, "width": 64} for image in document["images"]]
     (tmp_path / "small.json").write_text(json.dumps(document | {"images": images}))
+    for name, change in (("outline", {"bbox": []}), ("names", {"category_id": "car"})):
+        annotations = [annotation | change for annotation in document["annotations"]]
+        (tmp_path / f"{name}.json").write_text(json.dumps(document | {"annotations": annotations}))
+    torch.save({}, tmp_path / "other.pt")
+    for suffix in (".pt", ".pt2", ".onnx"):
+        (tmp_path / f"damaged{suffix}").write_text("nothing")
     words = (word,) if word.startswith("scene") else (word, "scene=cheap_dashcam")
+    words += ("model=torchvision:resnet18",) if word.startswith("weights") else ()
     assert call(*COMMAND, *words).message.startswith(message)
     assert not list(tmp_path.glob("out/results*"))
 
@@ -195,6 +230,32 @@ def test_a_model_that_fails_for_one_picture_is_said_and_for_all_stops(call, tmp_
         path.unlink()
     message = call(*COMMAND[:-1], "out=o2", "scene=cheap_dashcam").message
     assert message.endswith("the last was white.png: RuntimeError: a white picture")
+
+
+@pytest.mark.filterwarnings("ignore:.*deprecated:FutureWarning")  # of TorchScript, which people still have
+def test_another_model_under_the_name_of_the_first_is_not_mixed_with_its_scores(call, tmp_path, frames):
+    words = ("robustness.__main__", "model=net.pt", "data=frames", "out=out", "scene=cheap_dashcam", "severity=1")
+    for shift, code in ((0.0, 0), (0.0, 0), (1.0, 1)):
+        network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten(), torch.nn.Linear(3, 2))
+        for parameter in network.parameters():
+            torch.nn.init.constant_(parameter, shift)
+        torch.jit.save(torch.jit.script(network), tmp_path / "net.pt")
+        outcome = call(*words)
+        assert outcome.code == code, outcome.err
+    assert "error: out must be a folder of the same settings, got one with files={'net.pt': " in outcome.err
+
+
+def test_a_file_that_is_no_picture_is_named_and_skipped(call, tmp_path, frames):
+    words = ("scene=cheap_dashcam", "severity=1")
+    expected = call(*COMMAND, *words).out
+    (frames / "empty.png").touch()
+    outcome = call(*COMMAND[:-1], "out=o2", *words)
+    assert outcome.out == expected.replace("out/", "o2/")
+    assert outcome.err.count("skipped: frames/empty.png is empty (0 bytes)\n") == 1
+    for path in frames.glob("* a=b.png"):
+        path.unlink()
+    *_, message = call(*COMMAND[:-1], "out=o3", *words).err.splitlines()
+    assert message == "error: data must hold a picture that can be read, got frames/empty.png is empty (0 bytes)"
 
 
 @pytest.mark.filterwarnings("ignore:.*deprecated:FutureWarning")  # of TorchScript, which people still have

@@ -1,10 +1,11 @@
 import math
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torchvision import tv_tensors
 
 from torchrefract import LensDistortion, UniformFog, key_of, presets
@@ -169,6 +170,27 @@ def test_an_error_of_the_effect_or_the_score_is_not_taken_for_one_of_the_model()
         evaluate(lambda x: x, black(2), {"fog": fogs()}, lambda *_: 1.0, depth=no_depth)
     with pytest.raises(ValueError, match=r"score must return a number in \[0, 1\], got 7\.0"):
         evaluate(lambda x: x, black(2), {"fog": fogs()}, lambda *_: 7.0)
+
+
+@pytest.mark.quick
+def test_samples_and_scenes_of_another_form_raise():
+    scenes: Any = {"fog": fogs()}
+    calls = []
+
+    def run(samples: Any, scenes: Any = scenes) -> Robustness:
+        return evaluate(lambda image: calls.append(1) or image.mean(dim=(2, 3)), samples, scenes, lambda *_: 1.0)
+
+    for image in (torch.zeros(1, 3, 8, 12), torch.zeros(8, 12), np.zeros((3, 8, 12))):
+        with pytest.raises(ValueError, match=r"samples must have images \(3, H, W\), tensors, got .* for a"):
+            run([("a", image, 1)])
+    with pytest.raises(TypeError, match="samples must have names that are texts, got 7"):
+        run([(7, torch.zeros(3, 8, 12), 1)])
+    for wrong in ({"fog": UniformFog()}, [UniformFog()], UniformFog(), {"fog": {1: nn.Identity()}}):
+        with pytest.raises(TypeError, match=r"scenes must be \{scene: \{severity: effect\}\}, got"):
+            run(black(1), wrong)
+    assert not calls
+    with pytest.raises(ValueError, match=r"samples must have names of their own, got drive/000\.png twice"):
+        run(black(2) + black(1))
 
 
 def test_a_model_without_a_score_on_clean_images_tolerates_nothing():

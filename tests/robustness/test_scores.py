@@ -66,7 +66,7 @@ def test_confident_detections_become_labels():
     assert detection_score(prediction, target) > 0
     assert as_labels(torch.tensor([0.1, 0.9]), (2, 2)) == 1
     assert as_labels(torch.tensor([[[0.0]], [[1.0]]]), (1, 1)).tolist() == [[1]]
-    with pytest.raises(ValueError, match="predictions must be dicts of boxes"):
+    with pytest.raises(ValueError, match="predictions must be dicts of tensors: boxes"):
         as_labels("a car", (2, 2))
 
 
@@ -83,6 +83,10 @@ BOXES: dict[str, Any] = {"boxes": torch.zeros(2, 4), "labels": torch.zeros(2), "
             r"predictions must be dicts .*, got a dict of boxes \(2, 4\), labels \(1,\)",
         ),
         ({"labels": torch.zeros(1)}, r"predictions must be dicts .*, got a dict of labels \(1,\)"),
+        (
+            {name: value.numpy() for name, value in BOXES.items()},
+            r"predictions must be dicts of tensors: .*, got a dict of boxes ndarray, labels ndarray, scores ndarray",
+        ),
         (
             torch.zeros(3, 2, 5),
             r"predictions must have the kind and the size of the labels: .*, got a tensor \(3, 2, 5\)",

@@ -121,3 +121,31 @@ def test_invalid_arguments_raise(frames):
         worst_case(lambda image, _: image.mean(), UniformFog(), frames, steps=0)
     with pytest.raises(ValueError, match="lr must"):
         worst_case(lambda image, _: image.mean(), UniformFog(), frames, lr=math.nan)
+    model = nn.Conv2d(3, 1, 3)
+    with pytest.raises(ValueError, match="loss must be differentiable with respect to the degraded image"):
+        worst_case(lambda image, _: model(image.detach()).mean(), UniformFog(), frames)
+    for image in (255 * frames, 4 * frames - 2):
+        with pytest.raises(ValueError, match=r"image must lie in \[0, 1\] if it is floating"):
+            worst_case(lambda image, _: image.mean(), UniformFog(), image)
+    with pytest.raises(TypeError, match=r"image must be floating in \[0, 1\], got torch.uint8; use image.float"):
+        worst_case(lambda image, _: image.float().mean(), UniformFog(), (255 * frames).byte())
+    with pytest.raises(TypeError, match="effect must be an effect of torchrefract, got Identity"):
+        worst_case(lambda image, _: image.mean(), nn.Identity(), frames)  # pyright: ignore[reportArgumentType]  # wrong
+    with pytest.raises(TypeError, match="seed must be a whole number, got None"):
+        worst_case(lambda image, _: image.mean(), UniformFog(), frames, seed=None)  # pyright: ignore[reportArgumentType]  # wrong
+
+
+@pytest.mark.quick
+def test_a_search_leaves_the_gradients_of_the_model_and_needs_none_around_it(frames):
+    torch.manual_seed(0)
+    model = nn.Conv2d(3, 1, 3)
+    effect = UniformFog(visibility_range=(40.0, 400.0))
+
+    def loss(image: Tensor, _: None) -> Tensor:
+        return model(image).mean(dim=(1, 2, 3))
+
+    worst = worst_case(loss, effect, frames, steps=3, restarts=1)
+    assert all(parameter.grad is None for parameter in model.parameters())
+    with torch.no_grad():
+        again = worst_case(loss, effect, frames, steps=3, restarts=1)
+    assert torch.equal(again.image, worst.image)

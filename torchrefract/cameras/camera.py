@@ -276,10 +276,10 @@ class Pinhole(NamedTuple):
     center: tuple[float, float]  # px, principal point
 
 
-def pinhole_of(camera: Camera | None, *, height: int, width: int) -> Pinhole:
-    """Return the pinhole of a camera for frames of a size; None is a centered one with a focal length of 0.9 widths."""
+def pinhole_of(camera: Camera | None, *, height: int, width: int, focal: float = UNKNOWN_FOCAL) -> Pinhole:
+    """Return the pinhole of a camera for frames of a size; None is a centered one with a focal length in widths."""
     if camera is None:
-        return Pinhole((UNKNOWN_FOCAL * width, UNKNOWN_FOCAL * width), ((width - 1) / 2, (height - 1) / 2))
+        return Pinhole((focal * width, focal * width), ((width - 1) / 2, (height - 1) / 2))
     camera = camera.resized(width=width, height=height)
     return Pinhole((camera.fx, camera.fy), (camera.cx, camera.cy))
 

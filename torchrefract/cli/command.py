@@ -2,6 +2,7 @@
 
 import difflib
 import errno
+import hashlib
 import logging
 import os
 import re
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import hydra
+import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, InstantiationException, MissingConfigException
@@ -194,6 +196,26 @@ def check_seed(seed: Any) -> int:
     if not isinstance(seed, int) or not 0 <= seed < _NUM_SEEDS:
         raise UsageError(f"seed must be a whole number from 0 to {_NUM_SEEDS - 1}, got {seed}")
     return seed
+
+
+def file_digests(values: Iterable[Any]) -> dict[str, str] | None:
+    """Return the SHA-256 digests of the files that are among the values of options, by path; None without any."""
+    paths = [value for value in values if isinstance(value, str) and os.path.isfile(value)]
+    digests = dict[str, str]()
+    for path in paths:
+        with open(path, "rb") as stream:
+            digests[path] = hashlib.file_digest(stream, "sha256").hexdigest()
+    return digests or None
+
+
+def find_device(name: str) -> torch.device:
+    """Return a device by its name; "auto" is a GPU if there is one."""
+    try:
+        device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # torch asserts in builds without CUDA
+        raise UsageError(f"device must be auto, cpu or another device of this machine, got {name}") from error
+    return device
 
 
 def make(cfg: DictConfig, part: str) -> Any:

@@ -20,7 +20,15 @@ from torch import Tensor
 
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_positive
-from torchrefract.cli.command import check_none_lost, check_seed, make, naming, progress, warn_of_assumed_depth
+from torchrefract.cli.command import (
+    check_none_lost,
+    check_seed,
+    file_digests,
+    make,
+    naming,
+    progress,
+    warn_of_assumed_depth,
+)
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import first_names
@@ -164,7 +172,7 @@ def degrade(cfg: DictConfig) -> None:
     with naming("workers"):
         workers = num_cores() if cfg.workers is None else check_count("workers", cfg.workers, low=0)
     with naming("out"):
-        claim(out, _settings(cfg, root, job, labels), count=0, about={})
+        claim(out, _settings(cfg, root, job, labels), count=0, about={}, earlier={"files": None})
     with locked("out", out):
         finished = {name for name, _ in _read_journal(out)}
         tasks = [
@@ -251,9 +259,11 @@ def _job(cfg: DictConfig, out: Path, pictures: Sequence[str], labels: CocoLabels
 
 def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: CocoLabels | LabelFolder | None) -> dict[str, Any]:
     """Return everything that decides the output, so that a folder is only continued with the same settings."""
+    scene = json.loads(job.scene)
     return {
         "source": str(root.resolve()),
-        "scene": json.loads(job.scene),
+        "scene": scene,
+        "files": file_digests(scene.values()),  # as that of a camera
         "width": "of each file" if job.has_width else None,
         "seed": job.seed,
         "maps": job.maps,

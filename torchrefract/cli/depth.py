@@ -5,18 +5,18 @@ import sys
 from collections.abc import Iterable, Iterator
 from itertools import count
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchrefract._validation import UsageError, check_count
-from torchrefract.cli.command import make, naming, progress
+from torchrefract.cli.command import find_device, make, naming, progress
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder, write_depth
 from torchrefract.data.images import UnreadableImageError, read_image
-from torchrefract.data.pairs.manifest import locked
+from torchrefract.data.pairs.manifest import claim, locked
 from torchrefract.depth import RoadSpreadError, TransformersDepth
 
 
@@ -36,6 +36,7 @@ def estimate_depth(cfg: DictConfig) -> None:
     folder, root = DepthFolder(out), source if source.is_dir() else source.parent
     pictures = [file.relative_to(root).as_posix() for file in files if not media.is_video(file)]
     folder.check([(name, None) for name in pictures], exist=False)
+    cfg.device = str(find_device(str(cfg.device)))
     try:
         network = make(cfg, "model")
     except ImportError as error:
@@ -43,6 +44,8 @@ def estimate_depth(cfg: DictConfig) -> None:
     if not isinstance(network, TransformersDepth):
         raise UsageError(f"model must be torchrefract.depth.from_transformers, got {type(network).__name__}")
     with naming("out"):
+        if (out / "config.json").is_file():
+            _claim(cfg, out, root)
         out.mkdir(parents=True, exist_ok=True)
     skipped, spreads = dict[str, str](), list[float]()
     num_written = 0
@@ -53,6 +56,8 @@ def estimate_depth(cfg: DictConfig) -> None:
                 if isinstance(result, RoadSpreadError):
                     _skip(skipped, frame.name, f"{frame.name}: {result}")
                     continue
+                if num_written == 0:
+                    _claim(cfg, out, root)
                 frame.target.parent.mkdir(parents=True, exist_ok=True)
                 write_depth(frame.target, result.depth[0].cpu())
                 num_written += 1
@@ -63,6 +68,16 @@ def estimate_depth(cfg: DictConfig) -> None:
     print(f"{out}: {num_written} depth maps written, {len(skipped)} frames skipped{spread}")
     if skipped:
         raise SystemExit(1)
+
+
+def _claim(cfg: DictConfig, out: Path, root: Path) -> None:
+    """Note the settings in the output folder; raise UsageError if its maps are of another network, road or source."""
+    names = [path.name for path in out.iterdir() if not path.name.startswith(".")]
+    if names and "config.json" not in names:
+        return  # a folder of maps of another program, of which the frames without one are estimated
+    model = cast(dict[str, Any], OmegaConf.to_container(cfg.model, resolve=True))
+    content = {name: value for name, value in model.items() if name not in ("device", "max_spread")}
+    claim(out, {"source": str(root.resolve()), "model": content}, count=0, about={})
 
 
 def _missing_frames(

@@ -14,7 +14,7 @@ from torchrefract._validation import UsageError, check_count
 from torchrefract.cameras.calibration import estimate_lens as estimate
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import write_opencv
-from torchrefract.cli.command import naming, progress
+from torchrefract.cli.command import find_device, naming, progress
 from torchrefract.data import media
 from torchrefract.data.images import UnreadableImageError, read_image
 from torchrefract.warping.flow import resize_image
@@ -107,8 +107,7 @@ def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> 
 
 def _load_network(cfg: DictConfig) -> Predictor:
     """Return a function that predicts the flow of a frame by the model of a checkpoint, at the size of its training."""
-    from torchrefract.cli.restoration import find_device  # noqa: PLC0415 - lines alone need no training stack
-    from torchrefract.restoration.checkpoints import load_model  # noqa: PLC0415 - as above
+    from torchrefract.restoration.checkpoints import load_model  # noqa: PLC0415 - lines alone need no training stack
     from torchrefract.restoration.tasks import Undistort  # noqa: PLC0415 - as above
 
     loaded, device = load_model(str(cfg.checkpoint)), find_device(str(cfg.device))

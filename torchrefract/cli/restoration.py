@@ -24,7 +24,7 @@ from torch import Tensor
 
 from torchrefract._io import as_path, make_folder, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
-from torchrefract.cli.command import check_none_lost, check_seed, make, naming, progress
+from torchrefract.cli.command import check_none_lost, check_seed, find_device, make, naming, progress
 from torchrefract.cli.evaluation import describe_validation, use_validation_config
 from torchrefract.cli.lens import estimate_camera, flow_predictor
 from torchrefract.data.images import UnreadableImageError, is_lost, pixels_of, read_image
@@ -272,15 +272,6 @@ def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
         options = {"tile": tile, "interpolation": cfg.interpolation, "batch": batch}
         restorer = Restorer(loaded.model.to(device), size=size, **options)
     return _Job(restorer, restorer, source, out, batch, side_by_side, device)
-
-
-def find_device(name: str) -> torch.device:
-    try:
-        device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:  # torch asserts in builds without CUDA
-        raise UsageError(f"device must be auto, cpu or another device of this machine, got {name}") from error
-    return device
 
 
 def _settings(cfg: DictConfig, job: _Job) -> dict[str, Any]:

@@ -21,10 +21,10 @@ import torchrefract
 from torchrefract import presets, random
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_count, check_number, check_positive
-from torchrefract.cli.command import check_seed, naming, progress, warn_of_assumed_depth
+from torchrefract.cli.command import check_seed, file_digests, find_device, naming, progress, warn_of_assumed_depth
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import first_names, list_files
-from torchrefract.data.images import EXTENSIONS, read_image
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, read_image
 from torchrefract.data.label_files import (
     CocoLabels,
     LabelFolder,
@@ -62,6 +62,7 @@ class _Folder(NamedTuple):
     names: list[str]
     labels: CocoLabels | LabelFolder | None
     depths: DepthFolder | None
+    skipped: list[str]  # why pictures cannot be read
 
     def depth(self, name: str, image: Tensor) -> Tensor | None:
         """Return the depth map (1, H, W), m, of a picture; None without maps."""
@@ -70,7 +71,12 @@ class _Folder(NamedTuple):
     def read(self, names: Iterable[str]) -> Iterator[tuple[str, Tensor, Any]]:
         """Yield name, image and target; a target of None stands for the prediction for the clean picture."""
         for name in names:
-            image = read_image(self.path / name)
+            try:
+                image = read_image(self.path / name)
+            except UnreadableImageError as error:
+                self.skipped.append(str(error))
+                print(f"skipped: {error}", file=sys.stderr)
+                continue
             with naming("labels"):
                 target = None if self.labels is None else _target(self.labels.of(name), image)
             yield name, image, target
@@ -85,16 +91,18 @@ def test_robustness(cfg: DictConfig) -> None:
         num_worst = check_count("worst", cfg.worst, low=0)
     folder, values = _folder(cfg), cast(dict[str, Any], OmegaConf.to_container(cfg))
     settings = {name: values[name] for name in _SETTINGS} | {"labels": folder.labels and folder.labels.digest()}
-    settings["format"] = _FORMAT
+    settings["format"], settings["files"] = _FORMAT, file_digests([cfg.model, cfg.weights])
     levels = _levels(settings["scene"], settings["severity"])
+    device = str(find_device(str(cfg.device)))
     with naming("model"):
-        predict = load_predictor(str(cfg.model), weights=cfg.weights, device=str(cfg.device))
+        predict = load_predictor(str(cfg.model), weights=cfg.weights, device=device)
     with naming("score"):
         score = choose_score if cfg.score is None else import_function(*str(cfg.score).partition(":")[::2])
     scenes = lru_cache(lambda width: _scenes(levels, width))
     if folder.depths is None:
         warn_of_assumed_depth(nn.ModuleList(effect for by in scenes(1920).values() for effect in by.values()))
-    out.mkdir(parents=True, exist_ok=True)
+    with naming("out"):
+        out.mkdir(parents=True, exist_ok=True)
     with locked("out", out), _stored_scores(out / _SCORES, settings) as (done, store), warnings.catch_warnings():
         for message in _SAID_ELSEWHERE:
             warnings.filterwarnings("ignore", message)  # the command prints it once
@@ -104,6 +112,8 @@ def test_robustness(cfg: DictConfig) -> None:
         try:
             result = evaluate(predict, folder.read(names), scenes, score, **options)
         except RuntimeError as error:
+            if len(folder.skipped) == len(folder.names):
+                raise UsageError(f"data must hold a picture that can be read, got {folder.skipped[0]}") from error
             raise UsageError(f"model: {error}") from error
         except ValueError as error:
             raise UsageError(str(error)) from error
@@ -135,14 +145,14 @@ def choose_score(prediction: Any, target: Any) -> float:
 
 
 def _levels(scenes: Any, severities: Any) -> list[Level]:
-    names = [scenes] if isinstance(scenes, str) else scenes
+    names = [scenes] if isinstance(scenes, str) else scenes or []
     unknown = [name for name in names if name not in QUANTITIES]
     if unknown or not names:
         raise UsageError(f"scene must be some of {', '.join(QUANTITIES)}, got {', '.join(unknown) or 'none'}")
-    severities = [severities] if isinstance(severities, int) else severities
-    if not severities or any(severity not in presets.SEVERITIES for severity in severities):
+    severities = [severities] if isinstance(severities, int | float) else severities
+    if not severities or any(isinstance(s, bool) or s not in presets.SEVERITIES for s in severities):
         raise UsageError(f"severity must be some of {presets.SEVERITIES}, got {severities}")
-    return [Level(name, severity) for name in names for severity in severities]
+    return [Level(name, int(severity)) for name in names for severity in severities]
 
 
 def _scenes(levels: Iterable[Level], width: int) -> dict[str, dict[int, Effect]]:
@@ -174,7 +184,7 @@ def _folder(cfg: DictConfig) -> _Folder:
         with naming("depth_scale"):
             depths = DepthFolder(Path(str(cfg.depth)).expanduser(), check_positive("depth_scale", cfg.depth_scale))
         depths.check((name, None) for name in names)
-    return _Folder(path, names, labels, depths)
+    return _Folder(path, names, labels, depths, [])
 
 
 def _target(labels: PictureLabels | None, image: Tensor) -> Any:
@@ -183,7 +193,8 @@ def _target(labels: PictureLabels | None, image: Tensor) -> Any:
     content: Any = [] if labels is None else labels.move(None, size).content  # raises for labels of another size
     if isinstance(labels, MaskFile):
         with Image.open(io.BytesIO(content)) as picture:
-            return tv_tensors.Mask(np.array(picture))
+            pixels = np.array(picture)
+            return tv_tensors.Mask(pixels.astype(np.int32) if pixels.dtype == np.uint16 else pixels)
     if isinstance(labels, YoloFile):
         scale = np.array([size[1], size[0]])
         rows = [(int(name), np.reshape(numbers, (-1, 2)) * scale) for name, numbers in yolo_rows(content, labels.path)]
@@ -195,6 +206,12 @@ def _target(labels: PictureLabels | None, image: Tensor) -> Any:
         classes = [name for name, _ in rows]
     else:
         annotations = [annotation for annotation in content if not annotation.get("iscrowd")]
+        for annotation in annotations:
+            if not annotation.get("bbox") or not isinstance(annotation.get("category_id"), int):
+                raise ValueError(
+                    "labels must have a bbox and a category_id that is a whole number in each annotation, got "
+                    f"{first_names([str(name) for name in annotation])} in annotation {annotation.get('id')}"
+                )
         corners = np.reshape([annotation["bbox"] for annotation in annotations], (-1, 4))
         boxes = np.concatenate([corners[:, :2], corners[:, :2] + corners[:, 2:]], axis=1).tolist()
         classes = [annotation["category_id"] for annotation in annotations]

@@ -96,15 +96,15 @@ def read_depth(path: Path, *, scale: float = STEP) -> tuple[Tensor, float]:
         UsageError, UnreadableImageError: the file is not such a map.
     """
     if path.suffix.lower() == ".npy":
-        return _read_npy(path), 0.0
-    image_size(path)  # raises UnreadableImageError
-    steps = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    if steps is None or steps.dtype != np.uint16 or steps.ndim != 2:
-        raise UsageError(f"depth must be a gray PNG of 16 bits, or a .npy in m, got {path}")
-    missing = float((steps == 0).mean())
+        stored = _read_npy(path)
+        depth = np.where(stored == 0, np.inf, stored).astype(np.float32)
+    else:
+        stored = _read_png(path)
+        depth = depth_of_levels(stored, scale)
+    missing = float((stored == 0).mean())
     if missing > 0.5:
         raise UsageError(f"depth must be known in half of the pixels at least, got {path} with {missing:.1%} at 0")
-    return torch.from_numpy(depth_of_levels(steps, scale)), missing
+    return torch.from_numpy(depth), missing
 
 
 def crop_depth(
@@ -133,7 +133,15 @@ def crop_depth(
     return depth[y, x][None]
 
 
-def _read_npy(path: Path) -> Tensor:
+def _read_png(path: Path) -> np.ndarray:
+    image_size(path)  # raises UnreadableImageError
+    steps = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    if steps is None or steps.dtype != np.uint16 or steps.ndim != 2:
+        raise UsageError(f"depth must be a gray PNG of 16 bits, or a .npy in m, got {path}")
+    return steps
+
+
+def _read_npy(path: Path) -> np.ndarray:
     try:
         value = np.load(path, allow_pickle=False)
     except OSError as error:
@@ -144,4 +152,4 @@ def _read_npy(path: Path) -> Tensor:
         raise UsageError(f"depth must be an array of numbers, got {path}, which is damaged or not an array") from error
     if not isinstance(value, np.ndarray) or value.dtype.kind != "f" or value.size == 0 or value.squeeze().ndim != 2:
         raise UsageError(f"depth must be (height, width) of floating numbers, in m, got {path}")
-    return torch.from_numpy(value.squeeze().astype(np.float32))
+    return value.squeeze()

@@ -155,9 +155,13 @@ class LabelFolder(NamedTuple):
         return YoloFile(path) if path.is_file() else None
 
     def digest(self) -> str:
-        """Return a SHA-256 digest of the names and sizes of the files."""
-        files = sorted((path.relative_to(self.root).as_posix(), path.stat().st_size) for path in self._files())
-        return hashlib.sha256(ascii(files).encode()).hexdigest()
+        """Return a SHA-256 digest of the names and contents of the files."""
+        digest = hashlib.sha256()
+        for path in sorted(self._files()):
+            with path.open("rb") as stream:
+                content = hashlib.file_digest(stream, "sha256").hexdigest()
+            digest.update(ascii((path.relative_to(self.root).as_posix(), content)).encode())
+        return digest.hexdigest()
 
     def check(self, names: Sequence[str]) -> None:
         """Raise UsageError if a file is of none of the pictures, or if a picture has no mask."""

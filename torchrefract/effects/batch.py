@@ -134,7 +134,8 @@ def check_depth_fits(depth: Any, image: Tensor, shape: BatchShape) -> Tensor:
         ValueError: not (..., 1, H, W) for an image (..., C, H, W).
     """
     if not isinstance(depth, Tensor) or not depth.is_floating_point():
-        raise TypeError(f"depth must be a floating tensor, got {getattr(depth, 'dtype', type(depth).__name__)}")
+        got = depth.dtype if isinstance(depth, Tensor) else type(depth).__name__
+        raise TypeError(f"depth must be a floating tensor, got {got}")
     size = (1, *image.shape[-2:])
     static = (*shape.leading[:-1], 1)
     if depth.shape != (*shape.leading, *size) and not (shape.is_clip and depth.shape == (*static, *size)):

@@ -15,7 +15,6 @@ from torchrefract._validation import (
     check_flag,
     check_range,
     check_values,
-    color_per_channel,
     eager_values,
     finite_or,
     requires_grad,
@@ -24,6 +23,7 @@ from torchrefract.effects.batch import check_shapes, params_to, per_sample
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.effects.random_field import check_frame
 from torchrefract.fields.flare import add_light, flare_axes, screen_light
+from torchrefract.fields.srgb import color_per_channel
 from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, in_ranges, plan_flare
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
@@ -65,7 +65,8 @@ class LensFlare(PhotometricEffect):
             may lie outside.
         radius_range: rho, in diagonals of the frame; 0 is no flare.
         strength_range: beta; 0 is no flare.
-        color: of the sun, relative to `strength`, one number for each channel or one for all.
+        color: of the sun, relative to `strength`, one number for each channel or one for all;
+            gray images take the luma of three.
         blend: "add" or "screen".
         clip: clip the result of "add" to [0, 1]; without, it is linear in everything.
         drift_x_range, drift_y_range: widths and heights per frame of a clip.

@@ -17,7 +17,6 @@ from torchrefract._validation import (
     check_range,
     check_values,
     check_within,
-    color_per_channel,
     finite_or,
 )
 from torchrefract.cameras.camera import Camera, check_camera
@@ -42,7 +41,7 @@ from torchrefract.fields.depth import (
     ray_distance,
 )
 from torchrefract.fields.fog import blend_fog, extinction, transmission, unblend_fog
-from torchrefract.fields.srgb import REC_709
+from torchrefract.fields.srgb import REC_709, color_per_channel
 from torchrefract.planning.photometric import (
     FogErrorModel,
     PhotometricPlan,
@@ -222,7 +221,8 @@ class UniformFog(PhotometricEffect):
     Args:
         visibility_range: V in m, above 0, inf for clear air.
         deviation_range: relative deviation of the extinction, within (-1, 1).
-        airlight: color of the fog in [0, 1], one number for each channel or one for all; None is that of the paper,
+        airlight: color of the fog in [0, 1], one number for each channel or one for all, of three the luma for gray
+            images; None is that of the paper,
             (220, 220, 235) / 255 for three channels and its luminance for any other number; "frame" estimates it from
             each image, see `airlight_of_frame`: gray under clouds, dark at night; "dust" is laterite in that light,
             see `dust_airlight`. A clip has the color of its first frame, and frame t alone its own, so pass the params

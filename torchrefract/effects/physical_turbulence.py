@@ -83,7 +83,8 @@ class PhysicalTurbulence(WarpEffect):
 
     Args:
         cn2_range: m^(-2/3), at the height of the camera; its root is drawn uniformly. 1e-14 is weak, 1e-12 a hot day.
-        camera: of the frames, whose pinhole counts; None is a centered one with a focal length of 0.9 widths.
+        camera: of the frames, whose pinhole counts; None is a centered one with the focal length `focal`.
+        focal: widths of the frame, of a camera that is None, in [1e-3, 1e4].
         aperture: m, diameter of the entrance pupil.
         inner_scale, outer_scale: m, of the turbulence.
         height: m, of the camera above the ground; None for Cn2 that is the same everywhere.
@@ -111,6 +112,7 @@ class PhysicalTurbulence(WarpEffect):
         *,
         cn2_range: Range = (1e-13, 1e-12),
         camera: Camera | None = None,
+        focal: float = UNKNOWN_FOCAL,
         aperture: float = 0.002,
         inner_scale: float = 0.005,
         outer_scale: float = 10.0,
@@ -131,6 +133,7 @@ class PhysicalTurbulence(WarpEffect):
         super().__init__(padding=padding, interpolation=interpolation, backend=backend, tolerance_px=tolerance_px, p=p)
         self.cn2_range = check_range("cn2_range", cn2_range, low=0.0, high=_STRONGEST)
         self.camera = check_camera(camera)
+        self.focal = check_number("focal", focal, low=1e-3, high=1e4)
         self.aperture = check_number("aperture", aperture, low=1e-6, high=100.0)
         self.inner_scale = check_number("inner_scale", inner_scale, low=1e-5, high=1.0)
         self.outer_scale = check_number("outer_scale", outer_scale, low=self.inner_scale, high=1e6)
@@ -166,7 +169,7 @@ class PhysicalTurbulence(WarpEffect):
         """Compute the flow at the depth of each point; it exists everywhere."""
         air: PhysicalTurbulenceParams = params.params
         dtype, (height, width) = air.tilt.dtype, (plan.height, plan.width)
-        focal, _ = pinhole_of(self.camera, height=height, width=width)
+        focal, _ = pinhole_of(self.camera, height=height, width=width, focal=self.focal)
         rows, columns = node_positions(points.lattice)
         gradients = layer_gradients(
             air.key,
@@ -195,7 +198,7 @@ class PhysicalTurbulence(WarpEffect):
     def error_model(self) -> "_TurbulenceBounds":
         """Return the largest displacement of the ranges."""
         gain = 1.0 if self.height is None else max(self._layers.gains)
-        return _TurbulenceBounds(self._tilts, gain, self.camera)
+        return _TurbulenceBounds(self._tilts, gain, self.camera, self.focal)
 
     def equivalent_amplitude(self, width: int, *, distance: float | None = None) -> Range:
         """Return the displacement, px, of what is a distance away in frames of a width, for the ends of `cn2_range`.
@@ -205,7 +208,7 @@ class PhysicalTurbulence(WarpEffect):
             distance: m, of a level path; None is the reach.
         """
         distance = self.reach if distance is None else check_positive("distance", distance)
-        focal = focal_px(self.camera, width)
+        focal = focal_px(self.camera, width, focal=self.focal)
         sigma = focal * math.sqrt(tilt_variance(min(distance, self.reach), self._air))
         low, high = self.cn2_range
         return sigma * math.sqrt(low), sigma * math.sqrt(high)
@@ -215,7 +218,7 @@ class PhysicalTurbulence(WarpEffect):
         return Air(self.aperture, self.inner_scale, self.outer_scale)
 
     def _road(self) -> GroundPlaneDepth:
-        focal = focal_px(self.camera, 1)
+        focal = focal_px(self.camera, 1, focal=self.focal)
         height = 1.3 if self.height is None else self.height
         return GroundPlaneDepth(camera_height=height, focal=focal, horizon=self.horizon, far=math.inf)
 
@@ -235,18 +238,19 @@ class _TurbulenceBounds:
 
     tilt: microradians, from the reach on a level path.
     gain: the largest gain by height.
-    camera: as for `PhysicalTurbulence`.
+    camera, focal: as for `PhysicalTurbulence`.
     """
 
     tilt: Range
     gain: float
     camera: Camera | None
+    focal: float
 
     is_random = True
 
     def bounds(self, height: int, width: int) -> FlowBounds:
         """Return the largest displacement; each pixel has a ray of its own, so the flow is not smooth."""
-        focal, _ = pinhole_of(self.camera, height=height, width=width)
+        focal, _ = pinhole_of(self.camera, height=height, width=width, focal=self.focal)
         largest = _SIGMAS * self.gain * self.tilt[1] * 1e-6 * max(focal)
         return FlowBounds(largest, math.inf, lambda strides: np.full(np.shape(strides), np.inf))
 
@@ -260,7 +264,7 @@ class _TurbulenceBounds:
         return ((params.tilt >= low * (1 - 1e-5)) & (params.tilt <= high * (1 + 1e-5))).all()
 
 
-def focal_px(camera: Camera | None, width: int) -> float:
-    """Return the focal length in frames of a width, px."""
+def focal_px(camera: Camera | None, width: int, *, focal: float = UNKNOWN_FOCAL) -> float:
+    """Return the focal length in frames of a width, px; that of a camera that is None is `focal`, in widths."""
     check_count("width", width)
-    return UNKNOWN_FOCAL * width if camera is None else camera.fx * width / camera.width
+    return focal * width if camera is None else camera.fx * width / camera.width

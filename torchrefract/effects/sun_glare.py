@@ -16,7 +16,6 @@ from torchrefract._validation import (
     check_range,
     check_values,
     check_within,
-    color_per_channel,
     finite_or,
 )
 from torchrefract.cameras.camera import Camera, check_camera, pinhole_of
@@ -38,7 +37,7 @@ from torchrefract.fields.exposure import (
     metered_nodes,
 )
 from torchrefract.fields.sky import find_sky, sky_point
-from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
+from torchrefract.fields.srgb import color_per_channel, linear_to_srgb, srgb_to_linear
 from torchrefract.fields.sun import Sun, sun_light
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
@@ -106,7 +105,7 @@ class SunGlare(PhotometricEffect):
         num_ghosts: K.
         ghost_radius_range: degrees.
         ghost_share_range: of the light of the sun; two reflections of 0.5 % give 2.5e-5.
-        color: of the sun, one number for each channel or one for all.
+        color: of the sun, one number for each channel or one for all; gray images take the luma of three.
         gamma_range: strength of the exposure; 0 keeps the gain of the clean frame, and above 1 the camera darkens more
             than the mean asks for, as real ones do to keep highlights.
         min_gain: lowest G, in [1/32, 1].
@@ -151,8 +150,10 @@ class SunGlare(PhotometricEffect):
         p: float = 1.0,
     ):
         super().__init__(tolerance=tolerance, p=p)
-        self.center_x_range = center_x_range and _check_place("center_x_range", center_x_range)
-        self.center_y_range = center_y_range and _check_place("center_y_range", center_y_range)
+        places = {"center_x_range": center_x_range, "center_y_range": center_y_range}
+        self.center_x_range, self.center_y_range = (
+            None if place is None else _check_place(name, place) for name, place in places.items()
+        )
         if (center_x_range is None) != (center_y_range is None):
             raise ValueError("center_x_range and center_y_range must both be given, or neither, got one of them")
         self.outside = check_number("outside", outside, low=0.0, high=1.0)

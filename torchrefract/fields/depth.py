@@ -14,7 +14,7 @@ from torchrefract.warping.grid import field_dtype, pixel_axes
 
 _FARTHEST = 1e12  # m; beyond it a depth is infinite and has no gradient
 _MAX_HOLES = 0.5  # share of values of 0
-_FARTHEST_MEDIAN = 1000.0  # m, of a map of whole numbers
+_FARTHEST_MEDIAN = 1000.0  # m, of a map of whole numbers, or of the lower half of any map
 _FEWEST = 256  # values of a sample that tell stored integers and holes
 _NUM_CHECKED = 128 * 128  # values of a sample by which `check_depth` judges it
 _MIN_UPPER_HALF = 128  # values of its upper half; fewer are not judged
@@ -267,10 +267,11 @@ def check_depth(depth: Tensor, *, name: str = "depth") -> None:
     """Raise ValueError if a depth is not in meters, as far as reading it costs no wait for a device.
 
     Each sample or clip is judged alone. Invalid are negative values and NaN; maps that look normalized (all finite
-    values lie in [0, 1] and differ); whole numbers with a median above 1000, as of millimeters; maps of which more
-    than half is 0, as of lidar, whose zeros are holes; and maps that look like disparity or inverse depth: no value is
-    inf, a tenth of the upper half is at most 2 % of the largest value, and the median of the lowest quarter is at least
-    20 % of it. Frames of a few pixels are not tested for the last three.
+    values lie in [0, 1] and differ); whole numbers with a median above 1000, as of millimeters, and any numbers with
+    such a median in the lower half; maps of which more than half is 0, as of lidar, whose zeros are holes; and maps
+    that look like disparity or inverse depth: no value is inf, a tenth of the upper half is at most 2 % of the largest
+    value, and the median of the lowest quarter is at least 20 % of it. Frames of a few pixels are tested for the first
+    two alone.
 
     Args:
         depth: (B, 1, H, W) or (B, T, 1, H, W), m, inf for the sky.
@@ -307,6 +308,14 @@ def _check_not_raw(name: str, values: Tensor) -> None:
         raise ValueError(
             f"{name} must be in m, got whole numbers from {measured.amin():g} to {measured.amax():g}; divide by 1000 "
             "if they are millimeters, by 256 if they are those of a PNG of KITTI"
+        )
+    # A sky may be finite and far, the lower half of a road is neither.
+    lower = values[:, values.shape[1] // 2 :]
+    lower = lower[lower.isfinite()]
+    if lower.numel() and (median := lower.median().item()) > _FARTHEST_MEDIAN:
+        raise ValueError(
+            f"{name} must be in m, got a median of {median:.4g} in the lower half; divide by 1000 if it is in "
+            "millimeters, by 256 if it holds the steps of a PNG of KITTI"
         )
 
 

@@ -1,5 +1,7 @@
 """Stored values (sRGB), linear light, and luma."""
 
+from collections.abc import Sequence
+
 from torch import Tensor
 
 REC_709 = (0.2126, 0.7152, 0.0722)  # shares of red, green and blue in the luma
@@ -7,6 +9,19 @@ REC_709 = (0.2126, 0.7152, 0.0722)  # shares of red, green and blue in the luma
 LINEAR_TOE = 0.003130668442500535
 STORED_TOE = 12.92 * LINEAR_TOE
 _HIGHEST = 1e4  # stored value; higher ones, whose power would be infinite, count as this
+
+
+def color_per_channel(name: str, color: Sequence[float], channels: int) -> Sequence[float]:
+    """Return a color with one number for each channel; images of one channel take the luma of red, green and blue.
+
+    Raises:
+        ValueError: the numbers do not fit the channels.
+    """
+    if channels == 1 and len(color) == len(REC_709):
+        return [sum(share * value for share, value in zip(REC_709, color, strict=True))]
+    if len(color) not in (1, channels):
+        raise ValueError(f"{name} must have 1 number or {channels}, one for each channel, got {tuple(color)}")
+    return color if len(color) == channels else [color[0]] * channels
 
 
 def srgb_to_linear(value: Tensor) -> Tensor:

@@ -197,18 +197,23 @@ def evaluate(
 
     Raises:
         RuntimeError: the prediction raised for more than a tenth of the images, from ten on, or for all of them.
-        ValueError: a target of None without `as_target`; a score outside [0, 1].
+        TypeError: a name that is no text; scenes that are not effects by scene and severity.
+        ValueError: an image of another form; a name twice; a target of None without `as_target`; predictions that are
+            not a sequence of one; a score outside [0, 1].
     """
     quantities, done = dict(quantities or {}), done or {}
     scored: dict[str, Scored] = {}
     failures: dict[str, str] = {}
     for name, image, given in samples:
+        _check_sample(name, image, scored, failures)
         if name in done:
             scored[name] = done[name]
             continue
         if given is None and as_target is None:
             raise ValueError(f"target must be labels, or as_target a function, got None for {name}")
-        by_name = scenes(image.shape[-1]) if callable(scenes) else scenes
+        by_name = _checked_scenes(
+            scenes(image.shape[-1]) if callable(scenes) and not isinstance(scenes, Effect) else scenes
+        )
         try:
             prediction = _predict(predict, image)
             target = given
@@ -253,6 +258,27 @@ def move_target(target: Any, degraded: Degraded, effect: Effect) -> Any:
     return warp_moved_labels(target, degraded.flow.detach(), effect.labels_getter)
 
 
+def _check_sample(name: Any, image: Any, *earlier: Mapping[str, Any]) -> None:
+    """Raise TypeError for a name that is no text, and ValueError for an earlier name or an image of another form."""
+    if not isinstance(name, str):
+        raise TypeError(f"samples must have names that are texts, got {name!r}")
+    if any(name in names for names in earlier):
+        raise ValueError(f"samples must have names of their own, got {name} twice")
+    if not isinstance(image, Tensor) or image.ndim != 3:
+        got = tuple(image.shape) if isinstance(image, Tensor) else type(image).__name__
+        raise ValueError(f"samples must have images (3, H, W), tensors, got {got} for {name}")
+
+
+def _checked_scenes(scenes: Any) -> Scenes:
+    """Return the scenes; raise TypeError if they are not effects by scene and severity."""
+    is_valid = isinstance(scenes, Mapping) and all(
+        isinstance(of, Mapping) and all(isinstance(effect, Effect) for effect in of.values()) for of in scenes.values()
+    )
+    if not is_valid:
+        raise TypeError(f"scenes must be {{scene: {{severity: effect}}}}, got {type(scenes).__name__}")
+    return scenes
+
+
 class _PredictionError(Exception):
     """A model that raised, with its reason."""
 
@@ -260,16 +286,26 @@ class _PredictionError(Exception):
 def _predict(predict: Callable[[Tensor], Any], image: Tensor) -> Any:
     """Return the prediction for an image (3, H, W), which the model may write to."""
     try:
-        (prediction,) = predict(image[None].clone())
+        predictions = predict(image[None].clone())
     except Exception as error:  # a model may raise anything
         raise _PredictionError(f"{type(error).__name__}: {error}") from error
-    return prediction
+    if isinstance(predictions, dict) or not hasattr(predictions, "__len__") or len(predictions) != 1:
+        count = f" of {len(predictions)}" if isinstance(predictions, Tensor | list | tuple) else ""
+        raise ValueError(
+            "predict must return a sequence of one prediction for one image, got "
+            f"{type(predictions).__name__}{count}; return a list, or a tensor (1, ...)"
+        )
+    return predictions[0]
 
 
 def _score(score: Callable[[Any, Any], float], prediction: Any, target: Any, value: float = 0.0) -> ImageScore:
-    number = float(score(prediction, target))
+    value_of_score = score(prediction, target)
+    try:
+        number = float(value_of_score)
+    except (TypeError, ValueError, RuntimeError):  # of a tensor with several values
+        number = float("nan")
     if not 0 <= number <= 1:
-        raise ValueError(f"score must return a number in [0, 1], got {number}")
+        raise ValueError(f"score must return a number in [0, 1], got {value_of_score}")
     return ImageScore(number, value, summarize(prediction, target))
 
 

@@ -3,7 +3,9 @@
 import importlib
 import os
 import sys
-from collections.abc import Callable
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -89,11 +91,33 @@ def _load_program(path: Path, device: str) -> Predict:
     if not path.is_file():
         raise ValueError(f"model must be a file that exists, got {path}")
     if path.suffix == ".pt":
-        return torch.jit.load(path, map_location=device)
+        with _naming(f"model must be a TorchScript file of torch.jit.save, got {path}"):
+            _check_zip(path)
+            return torch.jit.load(path, map_location=device)
     from torchrefract.restoration.export import load_program  # noqa: PLC0415 - imports the training stack
 
-    program = load_program(path)
+    with _naming(f"model must be a program of torch.export or ONNX, got {path}"):
+        if path.suffix == ".pt2":
+            _check_zip(path)
+        program = load_program(path)
     return lambda images: program(images)[0]
+
+
+def _check_zip(path: Path) -> None:
+    # PyTorch prints pages before it raises for other files.
+    if not zipfile.is_zipfile(path):
+        raise ValueError("it is no ZIP archive")
+
+
+@contextmanager
+def _naming(rule: str) -> Iterator[None]:
+    """Turn any error of a file that a library cannot load into ValueError."""
+    try:
+        yield
+    except ImportError:
+        raise
+    except Exception as error:  # PyTorch and ONNX Runtime raise errors of many types
+        raise ValueError(f"{rule} ({str(error).splitlines()[0]})") from error
 
 
 def _load_torchvision(name: str, weights: str | None, device: str) -> Predict:
@@ -108,7 +132,10 @@ def _load_torchvision(name: str, weights: str | None, device: str) -> Predict:
     else:
         parts = {"weights_backbone": None} if kind in ("detection", "segmentation") else {}
         network = models.get_model(name, weights=None, **parts)
-        network.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
+        if not Path(weights).is_file():
+            raise ValueError(f"weights must be a file that exists, got {weights}")
+        with _naming(f"weights must be a state_dict of {name}, got {weights}"):
+            network.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
     # A segmenter must keep the size of the images, in which the labels are.
     prepare = stored.transforms(resize_size=None) if kind == "segmentation" else stored.transforms()
     network = network.eval().to(device)

@@ -69,7 +69,8 @@ def as_labels(prediction: Any, size: tuple[int, int]) -> Any:
 def check_prediction(prediction: Any, target: Any = None) -> None:
     """Raise ValueError if no score takes the prediction for an image, or none takes it with this target."""
     if isinstance(prediction, dict):
-        shapes = [getattr(prediction.get(name), "shape", None) for name in ("boxes", "labels", "scores")]
+        parts = [prediction.get(name) for name in ("boxes", "labels", "scores")]
+        shapes = [part.shape if isinstance(part, Tensor) else None for part in parts]
         is_valid = shapes[1] is not None and len(shapes[1]) == 1 and shapes == [(*shapes[1], 4), shapes[1], shapes[1]]
         fits = isinstance(target, dict)
     else:
@@ -78,8 +79,8 @@ def check_prediction(prediction: Any, target: Any = None) -> None:
         fits = not isinstance(target, dict) and getattr(target, "shape", ())[-2:] == size
     if not is_valid:
         raise ValueError(
-            "predictions must be dicts of boxes (n, 4), labels (n,) and scores (n,), or tensors (K, H, W), (H, W) or "
-            f"(K,), got {_described(prediction)}"
+            "predictions must be dicts of tensors: boxes (n, 4), labels (n,) and scores (n,), or tensors (K, H, W), "
+            f"(H, W) or (K,), got {_described(prediction)}"
         )
     if target is not None and not fits:
         raise ValueError(
@@ -90,7 +91,10 @@ def check_prediction(prediction: Any, target: Any = None) -> None:
 
 def _described(value: Any) -> str:
     if isinstance(value, dict):
-        return "a dict of " + ", ".join(f"{name} {tuple(getattr(part, 'shape', ()))}" for name, part in value.items())
+        kinds = {
+            name: tuple(part.shape) if isinstance(part, Tensor) else type(part).__name__ for name, part in value.items()
+        }
+        return "a dict of " + ", ".join(f"{name} {kind}" for name, kind in kinds.items())
     return f"a tensor {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
 
 

@@ -9,8 +9,9 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from torchrefract import random
-from torchrefract._validation import check_count, check_number
+from torchrefract._validation import check_count, check_number, check_tensor, check_whole
 from torchrefract.effects.base import Effect
+from torchrefract.effects.batch import check_image, check_image_values
 from torchrefract.robustness.evaluate import move_target
 from torchrefract.types import Degraded
 
@@ -68,12 +69,22 @@ def worst_case(
         seed, keys: of the draws, as for `effect.degrade`; restart i takes the seed `seed + i`.
         depth: as for `effect.degrade`.
 
+    The gradients of a model in the loss stay as they are.
+
     Raises:
-        ValueError: an argument out of range; an effect without random parameters, or a loss without a gradient.
+        TypeError: an image that is not floating; an effect or a seed of another type.
+        ValueError: an argument out of range; an image that clearly is not in [0, 1]; an effect without random
+            parameters, or a loss without a gradient.
     """
     steps, restarts = check_count("steps", steps), check_count("restarts", restarts)
-    lr = check_number("lr", lr, low=1e-6, high=1.0)
+    lr, seed = check_number("lr", lr, low=1e-6, high=1.0), check_whole("seed", seed)
+    if not isinstance(effect, Effect):
+        raise TypeError(f"effect must be an effect of torchrefract, got {type(effect).__name__}")
+    if not check_tensor("image", image).is_floating_point():
+        raise TypeError(f"image must be floating in [0, 1], got {image.dtype}; use image.float() / 255 for uint8")
     image = image.detach()
+    check_image(image)
+    check_image_values(image)
     steps_taken: list[tuple[Any, Tensor]] = []  # parameters and loss at each step
     for restart in range(restarts):
         draw = _Draw(effect, image, seed + restart, keys)
@@ -84,13 +95,11 @@ def worst_case(
                 value = _evaluate(loss, effect, effect.apply(image, params, depth=depth), target)
             steps_taken.append((pytree.tree_map_only(Tensor, torch.Tensor.detach, params), value.detach()))
             if step < steps - 1:
-                if not value.requires_grad:
+                if not draw.differentiate(value):
                     raise ValueError(
                         "loss must be differentiable with respect to the degraded image, and effect must draw "
                         f"parameters, got a loss without a gradient for {type(effect).__name__}"
                     )
-                optimizer.zero_grad()
-                value.sum().backward()
                 for group in optimizer.param_groups:
                     group["lr"] = lr * (1 - (1 - _LAST_RATE) * step / (steps - 1))
                 draw.step(optimizer)
@@ -119,11 +128,19 @@ class _Draw:
         """Return the parameters of the numbers."""
         return self._effect.sample(self._image, seed=self._seed, keys=self._keys, substitute=self._substitute)
 
+    def differentiate(self, value: Tensor) -> bool:
+        """Set the gradients of the numbers to those of a loss (B,); return False if it depends on no number."""
+        numbers = self.numbers()
+        if not value.requires_grad:
+            return False
+        with torch.enable_grad():
+            gradients = torch.autograd.grad(value.sum(), numbers, allow_unused=True)
+        for number, gradient in zip(numbers, gradients, strict=True):
+            number.grad = None if gradient is None else gradient.nan_to_num(0, 0, 0)
+        return any(gradient is not None for gradient in gradients)
+
     def step(self, optimizer: torch.optim.Optimizer) -> None:
         """Take a step, and clamp the numbers to (0, 1)."""
-        for number in self._numbers.values():
-            if number.grad is not None:
-                number.grad.nan_to_num_(0, 0, 0)
         optimizer.step()
         with torch.no_grad():
             for number in self._numbers.values():

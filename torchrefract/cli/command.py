@@ -39,6 +39,12 @@ _T = TypeVar("_T")
 _NUM_SEEDS = 2**32  # NumPy's limit
 _MESSAGE_INTERVAL = 10.0  # seconds between two lines of progress outside a terminal
 _FILE_ERRORS = (UnreadableImageError, DamagedPairError)  # their messages name the file
+_WRITING_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
+_WRITING_ERRORS += (
+    errno.EEXIST,
+    errno.ENOTDIR,
+    errno.ENAMETOOLONG,
+)  # of a folder with the name of a file, and the like
 _INFORMATION_OPTIONS = ("--hydra-help", "--info", "--shell-completion", "-sc")
 _MULTIRUN = ("-m", "--multirun")
 # Options whose value is text, mostly the path of a file: Hydra's syntax in it means nothing. The model of robustness is
@@ -66,6 +72,7 @@ _IGNORED_WARNINGS = (
     "Glyph .* missing from font.*",
     ".*local_dir_use_symlinks.*",
     ".*callbacks used to create the checkpoint.*",
+    ".*could not find the monitored key.*",  # before the first validation; afterwards it is an error
 )
 
 
@@ -365,7 +372,7 @@ def _user_message(error: Exception, name: str) -> str | None:
 def _file_message(error: OSError) -> str | None:
     if isinstance(error, PermissionError):
         return f"{error.filename} could not be opened: {error.strerror}" if error.filename else str(error)
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG):
+    if error.errno in _WRITING_ERRORS:
         return f"{error.filename or 'a file'} could not be written: {error.strerror}"
     return None
 

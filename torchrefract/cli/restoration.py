@@ -65,7 +65,8 @@ def train(cfg: DictConfig) -> None:
     """Train the model of a configuration on its data; with `ckpt_path`, resume a stopped run."""
     data, model, trainer, checkpoint = _make_parts(cfg)
     num_epochs = num_epochs_done(checkpoint) if checkpoint else 0
-    limit = trainer.max_epochs
+    with naming("trainer"):
+        limit = None if trainer.max_epochs is None else check_count("max_epochs", trainer.max_epochs, low=-1)
     if num_epochs and limit is not None and -1 < limit <= num_epochs:
         raise UsageError(f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}")
     model.origin = _origin(cfg, data)
@@ -101,10 +102,14 @@ def _fit(cfg: DictConfig, data: PairData, model: RestorationModule, trainer: Tra
         trainer.fit(model, data, ckpt_path=cfg.ckpt_path, weights_only=True)
     except SIGTERMException:
         raise SystemExit(128 + signal.SIGTERM) from None
+    except MisconfigurationException as error:
+        raise UsageError(f"trainer: {error}") from error
     except SystemExit as error:  # Lightning turns Ctrl-C into the status 1
         if isinstance(error.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt(how_to_continue(as_path(cfg.run_dir) / "last.ckpt")) from None
         raise
+    if trainer.global_step == 0:
+        raise UsageError("trainer must make a step, got none; raise its max_epochs, max_steps or limit_train_batches")
 
 
 def evaluate(cfg: DictConfig) -> None:
@@ -193,6 +198,8 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
         raise UsageError(f"trainer: {error}") from error
     except ModuleNotFoundError as error:
         name = HydraConfig.get().runtime.choices["logger"]
+        if name == "csv":
+            raise UsageError(f"trainer: {error}") from error
         raise UsageError(f"logger={name} needs its package: pip install 'torchrefract[loggers]'") from error
     # Lightning starts the processes of other runs itself.
     processes = int(os.environ.get("WORLD_SIZE") or trainer.world_size)

@@ -347,7 +347,7 @@ def _restore_video(file: Path, job: _Job, failed: dict[Path, UnreadableImageErro
 
 
 def _skip(file: Path, error: UnreadableImageError, failed: dict[Path, UnreadableImageError]) -> None:
-    failed[file] = error
+    failed[file] = error.with_traceback(None)  # which would keep frames and open files until the end
     print(f"skipped: {error}", file=sys.stderr)
 
 

@@ -339,7 +339,8 @@ def claim(
             previous = json.loads(read_bytes(path))
         except ValueError:
             previous = None
-        if not isinstance(previous, dict):
+        is_valid = isinstance(previous, dict) and isinstance(previous.get("settings", {}), dict)
+        if not is_valid or not isinstance(previous.get("count", 0), int):
             raise UsageError(f"out must be a folder with a valid {_CONFIG}, got {path}, which is damaged")
         _check_same({**(earlier or {}), **previous.get("settings", {})}, new, out)
         if count < previous.get("count", 0):

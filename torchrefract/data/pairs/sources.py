@@ -215,10 +215,10 @@ def _sizes_in_store(root: Path) -> dict[str, int]:
 
 
 def _size(path: str) -> int | None:
-    """Return the size of a file in bytes; None if it has vanished, which is an error when the frame is read."""
+    """Return the size of a file in bytes; None if it cannot be opened, which is an error when the frame is read."""
     try:
         return os.stat(path).st_size
-    except FileNotFoundError:
+    except OSError:
         return None
 
 

@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 
 from torchrefract import warp
-from torchrefract.cli import restoration
 from torchrefract.cameras.io import read_camera
+from torchrefract.cli import restoration
 from torchrefract.data.images import pixels_of, read_image
 from torchrefract.data.media import video_info
 from torchrefract.fields.rectification import camera_flow

@@ -268,7 +268,7 @@ def test_a_metric_that_no_validation_has_is_one_line_of_error(call, small):
     assert "val/nothing" in outcome.err.splitlines()[-1]
 
 
-@pytest.mark.parametrize("words", [("trainer.max_epochs=0",), ("trainer.limit_train_batches=0",)])
+@pytest.mark.parametrize("words", [("trainer.limit_train_batches=0",), ("+trainer.max_steps=0",)])
 def test_a_training_without_a_step_is_an_error(call, small, words):
     message = call("train", "+task=undistort", *small, *words).message
     assert message.startswith("trainer must make a step, got none; ")

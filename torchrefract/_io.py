@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, TypeVar, cast
 from uuid import uuid4
@@ -77,6 +78,20 @@ def read_bytes(path: Path) -> bytes:
     """Read a file on this machine or in a store; errors are those of `retried`."""
     store = cast(Any, path)
     return retried(lambda: store.fs.cat_file(store.path), path) if is_remote(path) else path.read_bytes()
+
+
+def matching_files(folder: Path, pattern: str) -> list[Path]:
+    """Return the files of a folder whose names match a pattern, sorted; stores would take the folder's for one, too."""
+    try:
+        return sorted(path for path in folder.iterdir() if fnmatchcase(path.name, pattern))
+    except (FileNotFoundError, NotADirectoryError):  # a store has no empty folders
+        return []
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file; in a store, `unlink` would take brackets in its name for a pattern."""
+    store = cast(Any, path)
+    retried(lambda: store.fs.rm_file(store.path), path) if is_remote(path) else path.unlink()
 
 
 @contextmanager

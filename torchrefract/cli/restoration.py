@@ -22,7 +22,7 @@ from pytorch_lightning import Trainer, seed_everything
 from pytorch_lightning.utilities.exceptions import MisconfigurationException, SIGTERMException
 from torch import Tensor
 
-from torchrefract._io import as_path, make_folder, replace_file
+from torchrefract._io import as_path, make_folder, matching_files, remove_file, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cli.command import check_none_lost, check_seed, make, naming, progress
 from torchrefract.cli.evaluation import describe_validation, use_validation_config
@@ -93,8 +93,8 @@ def _remove_incomplete(folders: Iterable[Path], locked_folder: Path) -> None:
     """Remove the checkpoints that killed runs left incomplete in folders, unless another run uses the folder."""
     for folder in folders:
         with suppress(UsageError, OSError), nullcontext() if folder == locked_folder else locked("ckpt_path", folder):
-            for path in folder.glob(".*.ckpt"):
-                path.unlink()
+            for path in matching_files(folder, ".*.ckpt"):
+                remove_file(path)
 
 
 def _fit(cfg: DictConfig, data: PairData, model: RestorationModule, trainer: Trainer) -> None:
@@ -108,8 +108,8 @@ def _fit(cfg: DictConfig, data: PairData, model: RestorationModule, trainer: Tra
         if isinstance(error.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt(how_to_continue(as_path(cfg.run_dir) / "last.ckpt")) from None
         raise
-    if trainer.global_step == 0:
-        raise UsageError("trainer must make a step, got none; raise its max_epochs, max_steps or limit_train_batches")
+    if trainer.global_step == 0 and trainer.max_epochs != 0:  # 0 writes the configuration alone
+        raise UsageError("trainer must make a step, got none; raise its max_steps, max_time or limit_train_batches")
 
 
 def evaluate(cfg: DictConfig) -> None:

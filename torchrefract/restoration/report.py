@@ -17,7 +17,7 @@ from pytorch_lightning.loggers import CSVLogger
 from pytorch_lightning.utilities import rank_zero_only
 from torch import Tensor
 
-from torchrefract._io import as_path, is_remote, replace_file
+from torchrefract._io import as_path, is_remote, matching_files, replace_file
 from torchrefract.data.module import PairData, fingerprint
 from torchrefract.effects.lens import LensDistortion
 from torchrefract.restoration.metrics import psnr
@@ -96,7 +96,7 @@ class RunSummary(Callback):
         print(verdict(trainer.callback_metrics, best=getattr(best, "best_model_score", None)))
 
     def _files(self) -> str:
-        names = sorted(path.name for path in self.run_dir.glob("[!.]*") if path.is_file())
+        names = sorted(path.name for path in matching_files(self.run_dir, "[!.]*") if path.is_file())
         return f"{self.run_dir}: {', '.join(names)}"
 
 

@@ -98,6 +98,11 @@ def test_a_configuration_of_other_types_is_one_line(call, words, tmp_path, chang
     assert call("generate", *words("out", "count=2")).message.startswith("out must be a folder ")
 
 
+def test_a_relative_folder_with_a_colon_is_no_address(call, words, tmp_path):
+    assert call("generate", *words("cam:07-30", "count=2")).code == 0
+    assert len(PairedFolder(tmp_path / "cam:07-30")) == 2
+
+
 def test_changed_sources_that_are_listed_again_raise(call, words, frames, tmp_path):
     shutil.copytree(frames, tmp_path / "frames")
     assert call("generate", *words("out", source="frames")).code == 0

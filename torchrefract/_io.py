@@ -3,6 +3,7 @@
 import errno
 import logging
 import os
+import re
 import sys
 import tempfile
 import time
@@ -17,6 +18,8 @@ _T = TypeVar("_T")
 
 _PAUSES = (1.0, 4.0, 16.0)  # seconds, before each further try of a store
 
+_ONE_SLASH = re.compile(r"((?:s3a?|gs|gcs|az|abfss?|hf|https?|memory|file):)/(?!/)", re.IGNORECASE)
+
 _PACKAGE = Path(__file__).parent
 # A wheel carries conf/ inside the package; a checkout and an editable install have it beside the package.
 CONFIG_DIR = str(next((d for d in (_PACKAGE / "conf", _PACKAGE.parent / "conf") if d.is_dir()), _PACKAGE / "conf"))
@@ -28,8 +31,12 @@ def as_path(text: str | Path) -> Path:
     Addresses are those of fsspec; its package for the kind of store must be installed, as s3fs for s3://.
 
     Raises:
-        ValueError: fsspec has no such kind of address, or lacks its package.
+        ValueError: fsspec has no such kind of address, or lacks its package, or the address has one slash alone.
     """
+    if isinstance(text, str) and (match := _ONE_SLASH.match(text)):
+        raise ValueError(
+            f"an address must have two slashes behind its scheme, got {text}; write {match[1]}//{text[match.end() :]}"
+        )
     if isinstance(text, Path) or is_remote(text) or "://" not in text:
         return Path(text).expanduser() if isinstance(text, str) else text
     from upath import UPath  # noqa: PLC0415  # only the extra "train" has it

@@ -339,8 +339,7 @@ def claim(
             previous = json.loads(read_bytes(path))
         except ValueError:
             previous = None
-        is_valid = isinstance(previous, dict) and isinstance(previous.get("settings", {}), dict)
-        if not is_valid or not isinstance(previous.get("count", 0), int):
+        if not isinstance(previous, dict) or not _has_valid_values(previous):
             raise UsageError(f"out must be a folder with a valid {_CONFIG}, got {path}, which is damaged")
         _check_same({**(earlier or {}), **previous.get("settings", {})}, new, out)
         if count < previous.get("count", 0):
@@ -352,6 +351,10 @@ def claim(
         with replace_file(path) as temporary:
             temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     return previous
+
+
+def _has_valid_values(config: Mapping[str, Any]) -> bool:
+    return isinstance(config.get("settings", {}), dict) and isinstance(config.get("count", 0), int)
 
 
 @contextmanager

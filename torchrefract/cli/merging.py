@@ -51,7 +51,7 @@ def _configuration(out: Path) -> tuple[dict[str, Any], int, str]:
     try:
         document = json.loads(read_bytes(out / "config.json"))
         settings = document["settings"]
-        settings["scene"]["name"], settings["seed"]  # an error if there is none
+        _ = settings["scene"]["name"], settings["seed"]  # an error if there is none
         return settings, int(document["count"]), str(document["license"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"out must be a folder of generate with a valid config.json, got {out}") from error

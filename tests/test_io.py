@@ -1,6 +1,8 @@
+from pathlib import Path
+
 import pytest
 
-from torchrefract._io import replace_file
+from torchrefract._io import as_path, replace_file
 
 
 def test_the_old_file_stays_until_the_new_one_is_complete(tmp_path):
@@ -36,3 +38,10 @@ def test_a_failure_keeps_the_old_file_and_deletes_the_temporary_one(tmp_path, er
 def test_a_block_that_writes_nothing_raises(tmp_path):
     with pytest.raises(FileNotFoundError), replace_file(tmp_path / "panel.png"):
         pass
+
+
+@pytest.mark.parametrize("text", ["s3:/bucket/pairs", "gs:/a", "memory:/x", "file:/tmp/x", "S3:/a"])
+def test_an_address_with_one_slash_raises_instead_of_naming_a_folder(text):
+    with pytest.raises(ValueError, match=f"an address must have two slashes behind its scheme, got {text}; write "):
+        as_path(text)
+    assert as_path("cam:/x") == Path("cam:/x")

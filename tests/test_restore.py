@@ -10,6 +10,7 @@ from PIL import Image
 
 from torchrefract import warp
 from torchrefract.cameras.io import read_camera
+from torchrefract.cli import restoration
 from torchrefract.data.images import pixels_of, read_image
 from torchrefract.data.media import video_info
 from torchrefract.fields.rectification import camera_flow
@@ -190,6 +191,21 @@ def test_a_video_keeps_its_number_and_rate_of_frames(call, folder, brighter):
         expected = np.concatenate([raw, (raw + np.array([51, 0, -25.5])).clip(0, 255)], axis=1)
         assert np.abs(frame - expected).mean() < 8  # two lossy codecs
     assert "0 restored, 5 already existed" in call("restore", *words).out
+
+
+def test_a_video_that_is_skipped_is_closed_at_once(call, tmp_path, brighter, monkeypatch):
+    """An error that is kept with its traceback keeps frames, open files and the thread that prints the progress."""
+    (tmp_path / "raw").mkdir()
+    Image.fromarray(picture(33, 65)).save(tmp_path / "raw" / "a.gif")
+    skip, tracebacks = restoration._skip, list[object]()
+
+    def noted(file, error, failed):
+        skip(file, error, failed)
+        tracebacks.append(failed[file].__traceback__)
+
+    monkeypatch.setattr(restoration, "_skip", noted)
+    assert call("restore", f"ckpt_path={brighter}", "input=raw", "out=out").code == 1
+    assert tracebacks == [None]
 
 
 def test_a_video_with_an_odd_side_is_rejected(call, tmp_path, brighter):

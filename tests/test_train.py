@@ -248,6 +248,10 @@ def test_a_finished_run_cannot_be_resumed(call, trained):
         (("+task=undistort", "model.weight_decay=-1"), "model: weight_decay must be a number of at least 0, got -1"),
         (("+task=undistort", "model.warmup_steps=-1"), "model: warmup_steps must be at least 0, got -1"),
         (("+task=undistort", "model.metric_size=[1080]"), "model: metric_size must be (height, width), got [1080]"),
+        (("+task=undistort", "trainer.max_epochs=2.5"), "trainer: max_epochs must be a whole number, got 2.5"),
+        (("+task=undistort", "trainer.accelerator=tpu"), "trainer: "),
+        (("+task=undistort", "trainer.max_epochs=-1", "+trainer.max_time=00:00:00:05"), "schedule must be plateau "),
+        (("+task=undistort", "hydra.run.dir=/dev/null/run"), "/dev/null/run could not be written: "),
         (("+task=undistort", *DDPM, "model.steps=0"), "model: steps must be at least 1, got 0"),
         (("+task=undistort", *DDPM, "model.network.pretrained=./none"), "model: pretrained must be null, a folder "),
     ],
@@ -255,6 +259,28 @@ def test_a_finished_run_cannot_be_resumed(call, trained):
 def test_an_invalid_option_is_one_line_of_error(call, small, words, message):
     options = [word for word in small if not word.startswith("model.")] if "model=ddpm_image" in words else small
     assert call("train", *options, *words).message.startswith(message)
+
+
+def test_a_metric_that_no_validation_has_is_one_line_of_error(call, small):
+    outcome = call("train", "+task=undistort", *small, "best.monitor=val/nothing")
+    assert outcome.code == 1
+    assert "error: trainer: " in outcome.err.splitlines()[-1]
+    assert "val/nothing" in outcome.err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("words", [("trainer.limit_train_batches=0",), ("+trainer.max_steps=0",)])
+def test_a_training_without_a_step_is_an_error(call, small, words):
+    message = call("train", "+task=undistort", *small, *words).message
+    assert message.startswith("trainer must make a step, got none; ")
+
+
+def test_a_training_that_ends_before_its_first_validation_says_what_it_saved(call, small):
+    outcome = call("train", "+task=undistort", *small, "+trainer.max_steps=3", "run_dir=run")
+    assert outcome.code == 0, outcome.err
+    assert outcome.out.splitlines()[-2:] == [
+        "run: config.yaml, last.ckpt, metrics.csv",
+        "no best.ckpt and no scores: the training ended before its first validation",
+    ]
 
 
 def test_a_logger_without_its_package_names_the_extra(call, small, monkeypatch):

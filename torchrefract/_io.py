@@ -3,11 +3,13 @@
 import errno
 import logging
 import os
+import re
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, TypeVar, cast
 from uuid import uuid4
@@ -15,6 +17,8 @@ from uuid import uuid4
 _T = TypeVar("_T")
 
 _PAUSES = (1.0, 4.0, 16.0)  # seconds, before each further try of a store
+
+_ONE_SLASH = re.compile(r"((?:s3a?|gs|gcs|az|abfss?|hf|https?|memory|file):)/(?!/)", re.IGNORECASE)
 
 _PACKAGE = Path(__file__).parent
 # A wheel carries conf/ inside the package; a checkout and an editable install have it beside the package.
@@ -27,8 +31,12 @@ def as_path(text: str | Path) -> Path:
     Addresses are those of fsspec; its package for the kind of store must be installed, as s3fs for s3://.
 
     Raises:
-        ValueError: fsspec has no such kind of address, or lacks its package.
+        ValueError: fsspec has no such kind of address, or lacks its package, or the address has one slash alone.
     """
+    if isinstance(text, str) and (match := _ONE_SLASH.match(text)):
+        raise ValueError(
+            f"an address must have two slashes behind its scheme, got {text}; write {match[1]}//{text[match.end() :]}"
+        )
     if isinstance(text, Path) or is_remote(text) or "://" not in text:
         return Path(text).expanduser() if isinstance(text, str) else text
     from upath import UPath  # noqa: PLC0415  # only the extra "train" has it
@@ -77,6 +85,20 @@ def read_bytes(path: Path) -> bytes:
     """Read a file on this machine or in a store; errors are those of `retried`."""
     store = cast(Any, path)
     return retried(lambda: store.fs.cat_file(store.path), path) if is_remote(path) else path.read_bytes()
+
+
+def matching_files(folder: Path, pattern: str) -> list[Path]:
+    """Return the files of a folder whose names match a pattern, sorted; stores would take the folder's for one, too."""
+    try:
+        return sorted(path for path in folder.iterdir() if fnmatchcase(path.name, pattern))
+    except (FileNotFoundError, NotADirectoryError):  # a store has no empty folders
+        return []
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file; in a store, `unlink` would take brackets in its name for a pattern."""
+    store = cast(Any, path)
+    retried(lambda: store.fs.rm_file(store.path), path) if is_remote(path) else path.unlink()
 
 
 @contextmanager

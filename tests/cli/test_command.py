@@ -69,6 +69,8 @@ def test_an_error_of_the_user_is_one_line_and_another_keeps_its_traceback(run_ma
             OSError(errno.ENOSPC, "No space left on device", "run/a.csv"),
             "run/a.csv could not be written: No space left",
         ),
+        (FileExistsError(errno.EEXIST, "File exists", "a.yaml"), "a.yaml could not be written: File exists"),
+        (NotADirectoryError(errno.ENOTDIR, "Not a directory", "a/b"), "a/b could not be written: Not a directory"),
         (PermissionError(errno.EACCES, "Permission denied", "frames"), "frames could not be opened: Permission denied"),
     ):
         with pytest.raises(SystemExit) as stop:

@@ -2,6 +2,7 @@
 
 import errno
 import io
+import re
 import resource
 import warnings
 import zlib
@@ -249,6 +250,23 @@ def test_an_interlaced_video_is_warned_of_once(tmp_path):
     with pytest.warns(UserWarning, match=r"a\.mp4 is interlaced: .* Deinterlace it first: ffmpeg .*bwdif") as caught:
         assert convert_video(tmp_path / "a.mp4", tmp_path / "b.mp4", change=unchanged) == 3
     assert len(caught) == 1
+
+
+@pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG"), (1, None), (13, None)])
+def test_a_video_of_high_dynamic_range_is_warned_of_once(tmp_path, transfer, name):
+    with media_file(tmp_path / "a.mp4", "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt, stream.color_trc = 48, 32, "yuv420p", transfer
+        for k in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(page(k), format="rgb24")))
+        container.mux(stream.encode(None))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert len([*read_video(tmp_path / "a.mp4", count())]) == 3
+    messages = [str(warning.message) for warning in caught]
+    assert len(messages) == (name is not None)
+    for message in messages:
+        assert re.search(rf"a\.mp4 has a high dynamic range \({name}\), .* Convert it first: ffmpeg .*tonemap", message)
 
 
 # A thread of the parent that the child waits for does not exist in it.

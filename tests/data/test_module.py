@@ -1,16 +1,22 @@
 import multiprocessing
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from PIL import Image
-from pytorch_lightning import Trainer
+from pytorch_lightning import LightningModule, Trainer
 from torch.testing import assert_close
 
 from torchrefract import Frame, LensDistortion, Pair, UniformFog, presets
-from torchrefract.data.module import PairData, frames, make_pair, road_scenes
+from torchrefract.data.module import PairData, frames, make_pair, pairs, road_scenes
 from torchrefract.data.road_scenes import RoadScenes
 
+ROOT = Path(__file__).parents[2]
 SIZE = (12, 20)
 COUNT = 10
 
@@ -206,6 +212,60 @@ def test_two_ranks_share_the_training_frames_and_validate_each_once(first_epoch,
     assert sorted(keys) == list(range(COUNT, COUNT + 5))
     with pytest.raises(ValueError, match="the validation must have a frame for each of 6 processes, got 5 frames"):
         scenes(batch_size=1).check_ranks(6)
+
+
+def test_a_trainer_with_its_default_sampler_for_two_processes_validates_each_frame_once(tmp_path):
+    """Lightning replaces a sampler of another type by one that takes a share of the share of a process."""
+    script = """
+        import sys
+        from pytorch_lightning import LightningModule, Trainer
+        from torchrefract import LensDistortion
+        from torchrefract.data.module import road_scenes
+
+        class Module(LightningModule):
+            def validation_step(self, batch, _):
+                with open(f"{self.global_rank}.txt", "a") as file:
+                    file.writelines(f"{key}\\n" for key in batch.key.tolist())
+
+        data = road_scenes(
+            effect=LensDistortion(), size=(8, 14), train_count=4, val_count=7, batch_size=2, workers=0
+        )
+        quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+        trainer = Trainer(accelerator="cpu", devices=2, strategy="ddp", **quiet)
+        trainer.validate(Module(), datamodule=data, verbose=False)
+    """
+    path = tmp_path / "validate.py"
+    path.write_text(textwrap.dedent(script))
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": "lo"}
+    run = subprocess.run(
+        [sys.executable, str(path)], cwd=tmp_path, env=environment, capture_output=True, timeout=200, check=False
+    )
+    assert run.returncode == 0, run.stderr.decode()
+    parts = [(tmp_path / f"{rank}.txt").read_text().split() for rank in range(2)]
+    assert sorted(int(key) for part in parts for key in part) == list(range(4, 11))
+
+
+@pytest.mark.filterwarnings("ignore:.*no `validation_step`", "ignore:.*returned `None`", "ignore:.*overfit")
+@pytest.mark.filterwarnings("ignore:.*does not have many workers", "ignore:.*LeafSpec")
+def test_a_trainer_that_overfits_batches_gets_the_first_ones_in_each_epoch(tars):
+    class Module(LightningModule):
+        def __init__(self) -> None:
+            super().__init__()
+            self.keys = list[int]()
+
+        def training_step(self, batch: Pair, _: int) -> None:
+            self.keys += batch.key.tolist()
+
+        def configure_optimizers(self) -> None: ...
+
+    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False, "accelerator": "cpu"}
+    from_tars = pairs(root=tars, batch_size=4, workers=0, buffer=5)
+    for data, expected in ((scenes(), list(range(8))), (from_tars, None)):
+        module, trainer = Module(), Trainer(max_epochs=2, overfit_batches=2, enable_model_summary=False, **quiet)
+        trainer.fit(module, datamodule=data)
+        assert len(module.keys) == 16
+        assert module.keys[:8] == (expected or module.keys[8:])
+        assert module.keys[:8] == module.keys[8:]
 
 
 def test_keys_stay_on_the_cpu(during):

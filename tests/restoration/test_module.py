@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 from torchrefract import Frame, LensDistortion, Pair, UniformFog, presets
+from torchrefract._validation import UsageError
 from torchrefract.data.module import make_pair
 from torchrefract.restoration.checkpoints import read_checkpoint
 from torchrefract.restoration.metrics import endpoint_error, psnr, restore_by_transmission
@@ -207,6 +208,37 @@ def test_a_plateau_halves_the_rate_after_more_than_five_epochs_without_a_lower_l
         scheduler.step(loss)
     # The first 1.0 is the lowest until the eighth epoch, so the seventh is the sixth without a lower loss.
     assert rates == [1.0] * 7 + [0.5] * 7 + [0.25]
+
+
+@pytest.mark.filterwarnings("ignore:.*not available but strict is set to `False`")
+def test_a_plateau_takes_a_validation_every_second_epoch(trainer, training, validation, loader):
+    model, run = (
+        Restoration(Constant, Undistort(), schedule="plateau"),
+        trainer(max_epochs=3, check_val_every_n_epoch=2),
+    )
+    run.fit(model, loader(training), loader(validation))
+    assert run.lr_scheduler_configs[0].scheduler.last_epoch == 1
+
+
+def test_a_cosine_without_a_last_step_raises(trainer, training, loader):
+    with pytest.raises(UsageError, match="schedule must be plateau for a training without a last step, got cosine"):
+        trainer(max_epochs=-1, max_time={"seconds": 60}).fit(Restoration(Constant, Undistort()), loader(training))
+
+
+@pytest.mark.parametrize("kind", [Frame, list, dict])
+def test_batches_that_are_no_pairs_raise_with_the_remedy(trainer, training, loader, kind):
+    pair = training[0]
+    batch = {Frame: Frame(pair.clean, pair.key, pair.transmission), list: list(pair), dict: pair._asdict()}[kind]
+    for start in ("fit", "validate", "predict"):
+        with pytest.raises(TypeError, match=f"batch must be a Pair.*, got {kind.__name__}; .*datamodule=PairData"):
+            getattr(trainer(max_epochs=1), start)(Restoration(Constant, Undistort()), loader([batch]))
+
+
+def test_a_trainer_predicts_for_images_and_for_pairs(trainer, training, loader):
+    model = Restoration(Constant, Undistort())
+    for batch in (training[0], training[0].degraded):
+        (restored,) = trainer().predict(model, loader([batch]))
+        assert_close(restored.image, training[0].degraded)
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])

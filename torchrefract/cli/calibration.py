@@ -333,7 +333,8 @@ def rectify(cfg: DictConfig) -> None:
                         media.write_picture(rectify_frame(frame), path, source=file, upright=False)
                 num_written += 1
             except ValueError as error:
-                failed[file] = error if isinstance(error, UnreadableImageError) else ValueError(f"{file}: {error}")
+                named = error if isinstance(error, UnreadableImageError) else ValueError(f"{file}: {error}")
+                failed[file] = named.with_traceback(None)  # which would keep frames and open files until the end
                 print(f"skipped: {failed[file]}", file=sys.stderr)
     if len(failed) == len(files):
         raise UsageError(f"input must hold a file that can be rectified, got {next(iter(failed.values()))}")

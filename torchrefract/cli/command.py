@@ -41,6 +41,12 @@ _T = TypeVar("_T")
 _NUM_SEEDS = 2**32  # NumPy's limit
 _MESSAGE_INTERVAL = 10.0  # seconds between two lines of progress outside a terminal
 _FILE_ERRORS = (UnreadableImageError, DamagedPairError)  # their messages name the file
+_WRITING_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
+_WRITING_ERRORS += (
+    errno.EEXIST,
+    errno.ENOTDIR,
+    errno.ENAMETOOLONG,
+)  # of a folder with the name of a file, and the like
 _INFORMATION_OPTIONS = ("--hydra-help", "--info", "--shell-completion", "-sc")
 _MULTIRUN = ("-m", "--multirun")
 # Options whose value is text, mostly the path of a file: Hydra's syntax in it means nothing. The model of robustness is
@@ -57,6 +63,7 @@ _OPTIONS_WITH_VALUE = ("--config-dir", "-cd", "--config-name", "-cn", "--config-
 _OPTIONS_WITH_VALUE += ("--package", "-p", "--info", "-i", "--experimental-rerun")
 _UNKNOWN_OPTION = re.compile(r"Could not override '(\w+)'")
 _REMOTE_OUTPUT = re.compile(r"\+*(out|run_dir|hydra\.(?:run|sweep)\.dir)=['\"]?([A-Za-z][\w+.-]*://.*?)['\"]?$")
+_REMOTE_INPUT = re.compile(r"(input|source|images?|labels|depth|camera)=['\"]?([A-Za-z][\w+.-]*://.*?)['\"]?$")
 _REMOTE_OPTIONS = (("generate", "out"), ("merge", "out"), ("train", "run_dir"), ("eval", "run_dir"))
 # Warnings of libraries about settings that are intended.
 _IGNORED_WARNINGS = (
@@ -68,6 +75,7 @@ _IGNORED_WARNINGS = (
     "Glyph .* missing from font.*",
     ".*local_dir_use_symlinks.*",
     ".*callbacks used to create the checkpoint.*",
+    ".*could not find the monitored key.*",  # before the first validation; afterwards it is an error
 )
 
 
@@ -92,7 +100,7 @@ def run(name: str, function: Callable[[DictConfig], None]) -> None:
     # Hydra creates the folder of a run before it calls the job.
     existing = _existing_folders([*filter(None, values), *Path("runs").glob("*"), "runs"])
     with _one_line_errors(name), _one_line_warnings():
-        _check_outputs(name, sys.argv[1:])
+        _check_addresses(name, sys.argv[1:])
         sys.argv[1:] = prepare_arguments(name, sys.argv[1:])
         hydra.main(config_path=str(_config_file(name).parent), config_name=name, version_base="1.3")(job)()
 
@@ -141,16 +149,20 @@ def quote_text(override: str, *, is_multirun: bool = False) -> str:
     return f"{option}={_quote(text, is_literal=exists or not is_path)}"
 
 
-def _check_outputs(name: str, arguments: list[str]) -> None:
-    """Raise UsageError if an output option is an address, of which pathlib would make a folder such as "s3:".
+def _check_addresses(name: str, arguments: list[str]) -> None:
+    """Raise UsageError if an option is an address, of which pathlib would make a path in a folder such as "s3:".
 
-    Those of `_REMOTE_OPTIONS` may be addresses.
+    Outputs of `_REMOTE_OPTIONS` and the source of `generate` may be addresses.
     """
     for argument in arguments:
         if (match := _REMOTE_OUTPUT.match(argument)) and (name, match[1]) not in _REMOTE_OPTIONS:
             raise UsageError(
                 f"{match[1]} must be a path on this machine, got {match[2]}; write to a folder and copy it, or mount "
                 "the storage"
+            )
+        if (match := _REMOTE_INPUT.match(argument)) and (name, match[1]) != ("generate", "source"):
+            raise UsageError(
+                f"{match[1]} must be a path on this machine, got {match[2]}; copy it to a folder, or mount the storage"
             )
 
 
@@ -387,7 +399,7 @@ def _user_message(error: Exception, name: str) -> str | None:
 def _file_message(error: OSError) -> str | None:
     if isinstance(error, PermissionError):
         return f"{error.filename} could not be opened: {error.strerror}" if error.filename else str(error)
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG):
+    if error.errno in _WRITING_ERRORS:
         return f"{error.filename or 'a file'} could not be written: {error.strerror}"
     return None
 

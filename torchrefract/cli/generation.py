@@ -146,7 +146,7 @@ def _make_missing(options: Options, out: Path) -> tuple[int, list[str]]:
                 lost += [row.skipped.removeprefix(LOST) for row in unit if row.skipped.startswith(LOST)]
                 readable = [row for row in unit if not row.skipped.startswith(LOST)]
                 manifest.add(readable)
-                num_made += len(readable)
+                num_made += sum(not row.skipped for row in readable)
         finally:
             manifest.flush()
     manifest.close()

@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +19,14 @@ from torchrefract.data.pairs.manifest import Manifest, find_manifests, locked_sh
 
 
 def merge(cfg: DictConfig) -> None:
-    """Join the manifests of a set; raise UsageError if a pair is missing or two pairs have the same draw."""
+    """Join the manifests of a set; raise UsageError if it lacks a pair, or has one twice or of other options."""
     with naming("out"):
         out = as_path(str(cfg.out))
     verify = check_flag("verify", cfg.verify)
     settings, count, license_text = _configuration(out)
     with disk_errors(out), locked_shard(out, 0, 1):
         num_rows = _count_lines(out)
+        _check_configuration(out, settings, count)
         manifest = Manifest(out, 0, 1)
         complete, _ = manifest.open(lambda number: number < count, verify=verify, is_repaired=lambda _: False)
         draws = Counter((row.seed, row.key) for row, _ in scan_rows([manifest.path], lambda row: not row.skipped))
@@ -48,9 +50,23 @@ def _configuration(out: Path) -> tuple[dict[str, Any], int, str]:
     """Return the settings, the number of pairs and the license in config.json."""
     try:
         document = json.loads(read_bytes(out / "config.json"))
-        return document["settings"], int(document["count"]), str(document["license"])
+        settings = document["settings"]
+        _ = settings["scene"]["name"], settings["seed"]  # an error if there is none
+        return settings, int(document["count"]), str(document["license"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"out must be a folder of generate with a valid config.json, got {out}") from error
+
+
+def _check_configuration(out: Path, settings: Mapping[str, Any], count: int) -> None:
+    """Raise UsageError if rows are of another seed or scene, as of shards that were copied into one folder."""
+    rows = (row for row, _ in scan_rows(find_manifests(out), lambda row: row.number < count, skip_invalid=True))
+    expected = settings["scene"]["name"], settings["seed"]
+    # The seed of a draw holds that of the set in its upper bits, see `draw_of`.
+    if other := [str(row.number) for row in rows if (row.scene, row.seed >> 32) != expected]:
+        raise UsageError(
+            f"out must hold pairs of one configuration, got {len(other)} of another seed or scene: "
+            f"{first_names(sorted(other, key=int))}; make each set in a folder of its own"
+        )
 
 
 def _count_lines(out: Path) -> int:

@@ -22,7 +22,7 @@ from pytorch_lightning import Trainer, seed_everything
 from pytorch_lightning.utilities.exceptions import MisconfigurationException, SIGTERMException
 from torch import Tensor
 
-from torchrefract._io import as_path, make_folder, replace_file
+from torchrefract._io import as_path, make_folder, matching_files, remove_file, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cli.command import check_none_lost, check_seed, find_device, make, naming, progress
 from torchrefract.cli.evaluation import describe_validation, use_validation_config
@@ -65,7 +65,8 @@ def train(cfg: DictConfig) -> None:
     """Train the model of a configuration on its data; with `ckpt_path`, resume a stopped run."""
     data, model, trainer, checkpoint = _make_parts(cfg)
     num_epochs = num_epochs_done(checkpoint) if checkpoint else 0
-    limit = trainer.max_epochs
+    with naming("trainer"):
+        limit = None if trainer.max_epochs is None else check_count("max_epochs", trainer.max_epochs, low=-1)
     if num_epochs and limit is not None and -1 < limit <= num_epochs:
         raise UsageError(f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}")
     model.origin = _origin(cfg, data)
@@ -92,8 +93,8 @@ def _remove_incomplete(folders: Iterable[Path], locked_folder: Path) -> None:
     """Remove the checkpoints that killed runs left incomplete in folders, unless another run uses the folder."""
     for folder in folders:
         with suppress(UsageError, OSError), nullcontext() if folder == locked_folder else locked("ckpt_path", folder):
-            for path in folder.glob(".*.ckpt"):
-                path.unlink()
+            for path in matching_files(folder, ".*.ckpt"):
+                remove_file(path)
 
 
 def _fit(cfg: DictConfig, data: PairData, model: RestorationModule, trainer: Trainer) -> None:
@@ -101,10 +102,14 @@ def _fit(cfg: DictConfig, data: PairData, model: RestorationModule, trainer: Tra
         trainer.fit(model, data, ckpt_path=cfg.ckpt_path, weights_only=True)
     except SIGTERMException:
         raise SystemExit(128 + signal.SIGTERM) from None
+    except MisconfigurationException as error:
+        raise UsageError(f"trainer: {error}") from error
     except SystemExit as error:  # Lightning turns Ctrl-C into the status 1
         if isinstance(error.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt(how_to_continue(as_path(cfg.run_dir) / "last.ckpt")) from None
         raise
+    if trainer.global_step == 0 and trainer.max_epochs != 0:  # 0 writes the configuration alone
+        raise UsageError("trainer must make a step, got none; raise its max_steps, max_time or limit_train_batches")
 
 
 def evaluate(cfg: DictConfig) -> None:
@@ -193,6 +198,8 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
         raise UsageError(f"trainer: {error}") from error
     except ModuleNotFoundError as error:
         name = HydraConfig.get().runtime.choices["logger"]
+        if name == "csv":
+            raise UsageError(f"trainer: {error}") from error
         raise UsageError(f"logger={name} needs its package: pip install 'torchrefract[loggers]'") from error
     # Lightning starts the processes of other runs itself.
     processes = int(os.environ.get("WORLD_SIZE") or trainer.world_size)
@@ -331,7 +338,7 @@ def _restore_video(file: Path, job: _Job, failed: dict[Path, UnreadableImageErro
 
 
 def _skip(file: Path, error: UnreadableImageError, failed: dict[Path, UnreadableImageError]) -> None:
-    failed[file] = error
+    failed[file] = error.with_traceback(None)  # which would keep frames and open files until the end
     print(f"skipped: {error}", file=sys.stderr)
 
 

@@ -42,6 +42,16 @@ class _BatchSampler(_Sampler):
         return ((self.epoch, number) for number in super().__iter__())
 
 
+class _ValidationSampler(DistributedSampler[Any]):
+    """Give each frame to one process, in order; Lightning keeps a sampler of this type, and shares out any other's."""
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(range(self.rank, len(self.dataset), self.num_replicas))  # pyright: ignore[reportArgumentType]  # a map-style dataset has a length
+
+    def __len__(self) -> int:
+        return len(range(self.rank, len(self.dataset), self.num_replicas))  # pyright: ignore[reportArgumentType]  # as above
+
+
 class _Position:
     """A point in a training: an epoch, the number of its batches that were handed out, and that of all of them."""
 
@@ -63,7 +73,10 @@ class _TrainingLoader(DataLoader[Any]):
     def __iter__(self) -> Iterator[Any]:  # pyright: ignore[reportIncompatibleMethodOverride]  # an iterator is enough
         # A generator starts at its first batch, when Lightning has set the epoch. Workers would take the order of the
         # sampler at once, which is still that of epoch 0 in a resumed run.
-        sampler, position = cast(_Sampler, self.sampler), self.position
+        sampler, position = self.sampler, self.position
+        if not isinstance(sampler, _Sampler):  # Lightning gives one of its own to overfit the first batches
+            yield from super().__iter__()
+            return
         epoch, total = sampler.epoch, len(self)
         start, expected = position.resumed[1:] if position.resumed[0] == epoch else (0, 0)
         if start and expected not in (0, total):
@@ -198,7 +211,7 @@ class PairData(LightningDataModule):
         elif training:
             sampler = _Sampler(frames, ranks, rank, seed=self.seed, drop_last=True)
         else:
-            sampler = range(rank, len(frames), ranks)
+            sampler = _ValidationSampler(frames, ranks, rank)
         return (_TrainingLoader if training else DataLoader)(
             frames,
             batch_size=batch_size,

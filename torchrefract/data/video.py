@@ -35,6 +35,7 @@ _THREADS = 1  # of a conversion
 # Without these options swscale darkens colors by more than one level.
 _CONVERSION = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 _COLOR_MATRICES = {int(space) for space in Colorspace}  # those that can be converted
+_HDR = {16: "PQ", 18: "HLG"}  # transfer characteristics of ITU-T H.273
 _UPRIGHT = np.eye(3, dtype=np.int32)
 _MAX_SKEW = 0.01  # of a display matrix, which is rounded
 
@@ -196,12 +197,12 @@ def _open(path: Path) -> av.VideoStream | None:
 def _decode(path: Path) -> Iterator[av.VideoFrame]:
     """Decode the frames of a video, in the order of their times.
 
-    Warns of damaged packets, which it leaves out, and of interlaced frames. Raises UnreadableImageError for frames that
-    are turned by another angle than a multiple of 90 degrees.
+    Warns of damaged packets, which it leaves out, of interlaced frames and of a high dynamic range. Raises
+    UnreadableImageError for frames that are turned by another angle than a multiple of 90 degrees.
     """
     if (video := _open(path)) is None:
         return
-    num_damaged, is_interlaced = 0, False
+    num_damaged, is_interlaced, is_hdr = 0, False, False
     with video.container:
         # With threads that decode several frames at once, damage would also lose the frame before.
         video.thread_type = "SLICE"
@@ -209,6 +210,14 @@ def _decode(path: Path) -> Iterator[av.VideoFrame]:
             try:
                 for frame in packet.decode():
                     _check_turn(frame, path)
+                    if not is_hdr and (is_hdr := frame.color_trc in _HDR):
+                        warnings.warn(
+                            f"{path} has a high dynamic range ({_HDR[frame.color_trc]}), whose values are used like "
+                            "those of an ordinary video: colors are pale, and light in fog and glare does not add up. "
+                            "Convert it first: ffmpeg -i INPUT -vf zscale=t=linear:npl=100,tonemap=hable,"
+                            "zscale=p=bt709:t=bt709:m=bt709,format=yuv420p OUTPUT",
+                            stacklevel=2,
+                        )
                     if not is_interlaced and (is_interlaced := frame.interlaced_frame):
                         warnings.warn(
                             f"{path} is interlaced: the rows of a frame are of two times. Deinterlace it first: "

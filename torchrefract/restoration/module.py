@@ -1,5 +1,6 @@
 """The training loop that all networks share, and the module of networks that restore in a single pass."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -91,7 +92,9 @@ class RestorationModule(LightningModule, ABC):
 
         Raises:
             NotFiniteError: the loss is NaN or infinite.
+            TypeError: the batch is no Pair.
         """
+        _check_pair(batch)
         loss, restored = self.training_loss(batch)
         if not loss.isfinite():
             # The corruption of a frame is drawn from (seed, epoch, key), so the message is enough to repeat the batch.
@@ -108,6 +111,7 @@ class RestorationModule(LightningModule, ABC):
 
     def validation_step(self, batch: Pair, _: int) -> dict[str, Any]:
         """Log the scores of the model and of the baselines; return the restoration as a dict."""
+        _check_pair(batch)
         loss, restored = self.validation_loss(batch)
         self._log("val", {"loss": loss}, batch)
         clear = None if restored.transmission is None else torch.ones_like(restored.transmission)
@@ -126,6 +130,13 @@ class RestorationModule(LightningModule, ABC):
             scores = restoration_scores(self.task, result, batch, metric_size=self.metric_size, with_ssim=with_ssim)
             self._log("val", scores, batch, suffix=suffix)
         return restored._asdict()
+
+    def predict_step(self, batch: Tensor | Pair, _: int) -> Restored:
+        """Restore a batch of images (B, 3, H, W), or the degraded images of pairs."""
+        if isinstance(batch, Tensor):
+            return self(batch)
+        _check_pair(batch)
+        return self(batch.degraded, batch.key)
 
     def on_validation_start(self) -> None:
         """Add up the flows of all ranks for the constant baseline."""
@@ -149,13 +160,23 @@ class RestorationModule(LightningModule, ABC):
         return min(self.warmup_steps, num_steps // 10)
 
     def configure_optimizers(self) -> Any:
-        """Create AdamW and its learning rate schedule."""
+        """Create AdamW and its learning rate schedule; raise UsageError if a cosine has no last step."""
         optimizer = torch.optim.AdamW(self.parameters(), lr=self.lr, weight_decay=self.weight_decay)
         if self.schedule == "plateau":
-            scheduler = {"scheduler": ReduceLROnPlateau(optimizer, factor=0.5, patience=5), "monitor": "val/loss"}
+            plateau = ReduceLROnPlateau(optimizer, factor=0.5, patience=5)
+            scheduler = {
+                "scheduler": plateau,
+                "monitor": "val/loss",
+                "strict": False,
+            }  # an epoch may have no validation
         else:
-            steps = int(self.trainer.estimated_stepping_batches)
-            cosine = get_cosine_schedule_with_warmup(optimizer, self.num_warmup_steps(steps), steps)
+            steps = self.trainer.estimated_stepping_batches
+            if math.isinf(steps):
+                raise UsageError(
+                    f"schedule must be plateau for a training without a last step, got {self.schedule}; or give the "
+                    "trainer max_epochs or max_steps"
+                )
+            cosine = get_cosine_schedule_with_warmup(optimizer, self.num_warmup_steps(int(steps)), int(steps))
             scheduler = {"scheduler": cosine, "interval": "step"}
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
 
@@ -258,6 +279,14 @@ def _main_scores(restored: Restored, pair: Pair, metric_size: tuple[int, int]) -
     elif pair.transmission.ndim == 4:
         scores["psnr_seen"] = psnr(restored.image.detach(), pair.clean, through_fog(pair))
     return scores
+
+
+def _check_pair(batch: object) -> None:
+    if not isinstance(batch, Pair):
+        raise TypeError(
+            f"batch must be a Pair of torchrefract, got {type(batch).__name__}; give the trainer "
+            "datamodule=PairData(...), which degrades frames on the device, or a loader of pairs"
+        )
 
 
 def _add(old: Tensor, new: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from pytorch_lightning.loggers import CSVLogger
 from pytorch_lightning.utilities import rank_zero_only
 from torch import Tensor
 
-from torchrefract._io import as_path, is_remote, replace_file
+from torchrefract._io import as_path, is_remote, matching_files, replace_file
 from torchrefract.data.drive_lenses import bent_drives
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.module import PairData, fingerprint
@@ -82,7 +82,12 @@ class RunSummary(Callback):
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Save the pictures; print the table and the files of the run."""
-        if self._examples is None or not trainer.is_global_zero or not isinstance(pl_module, RestorationModule):
+        if not trainer.is_global_zero or not isinstance(pl_module, RestorationModule):
+            return
+        if self._examples is None:
+            if stage == "fit" and trainer.global_step:
+                print(self._files())
+                print("no best.ckpt and no scores: the training ended before its first validation")
             return
         height, width = pl_module.metric_size
         # With fast_dev_run, the logger writes no metrics.
@@ -92,10 +97,13 @@ class RunSummary(Callback):
         data = getattr(trainer, "datamodule", None)
         border = border_name(data) if isinstance(data, PairData) else ""
         print("\n".join(summary(trainer.callback_metrics, pl_module.metric_size, border=border)))
-        names = sorted(path.name for path in self.run_dir.glob("[!.]*") if path.is_file())
-        print(f"{self.run_dir}: {', '.join(names)}")
+        print(self._files())
         best = getattr(trainer, "checkpoint_callback", None) if stage == "fit" else None
         print(verdict(trainer.callback_metrics, best=getattr(best, "best_model_score", None)))
+
+    def _files(self) -> str:
+        names = sorted(path.name for path in matching_files(self.run_dir, "[!.]*") if path.is_file())
+        return f"{self.run_dir}: {', '.join(names)}"
 
 
 def save_figure(figure: Figure, out: Path) -> None:

@@ -1,5 +1,6 @@
 """Errors that a user can fix are one line, and existing files stay."""
 
+import json
 import os
 import re
 import shutil
@@ -86,6 +87,20 @@ def test_an_output_folder_must_be_new_and_lie_outside_of_the_source(call, words,
     assert not (frames / "pairs").exists()
     with pytest.raises(ValueError, match=r"root must be a folder with manifest\.jsonl, got"):
         PairedFolder(tmp_path / "out")
+
+
+@pytest.mark.parametrize("change", [{"count": "x"}, {"settings": []}, {"settings": {}}])
+def test_a_configuration_of_other_types_is_one_line(call, words, tmp_path, change):
+    assert call("generate", *words("out", "count=2")).code == 0
+    path = tmp_path / "out" / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    assert call("merge", "out=out").message.startswith("out must be a folder of generate with a valid config.json, got")
+    assert call("generate", *words("out", "count=2")).message.startswith("out must be a folder ")
+
+
+def test_a_relative_folder_with_a_colon_is_no_address(call, words, tmp_path):
+    assert call("generate", *words("cam:07-30", "count=2")).code == 0
+    assert len(PairedFolder(tmp_path / "cam:07-30")) == 2
 
 
 def test_changed_sources_that_are_listed_again_raise(call, words, frames, tmp_path):

@@ -76,10 +76,19 @@ def test_an_unreadable_frame_is_tried_again_by_the_same_command(call, words, fra
     arguments = words("out", source="frames")
     outcome = call("generate", *arguments)
     assert "unreadable, tried again by the same command: drive1/005.png is truncated (300 bytes" in outcome.out
+    assert ": 11 pairs made, 11 in total, 1 frames are unreadable" in outcome.out
     assert ": 0 pairs made, 11 in total, 1 frames are unreadable" in call("generate", *arguments).out
     path.write_bytes(data)
     assert ": 1 pairs made, 12 in total; see" in call("generate", *arguments).out
     assert not any(row["skipped"] for row in rows(tmp_path / "out"))
+
+
+def test_a_link_that_leads_to_itself_is_named_after_the_other_frames(call, words, frames, tmp_path, rows):
+    shutil.copytree(frames, tmp_path / "frames")
+    (tmp_path / "frames" / "drive1" / "ring.png").symlink_to("ring.png")
+    message = call("generate", *words("out", source="frames")).message
+    assert message.startswith("source must stay unchanged during a run, got frames/drive1/ring.png cannot be opened (")
+    assert len(rows(tmp_path / "out")) == 12
 
 
 def test_a_list_of_many_frames_takes_little_memory_and_keeps_any_name(tmp_path):

@@ -3,6 +3,8 @@
 import json
 import shutil
 
+import pytest
+
 from torchrefract.data.pairs.manifest import locked_shard
 
 
@@ -30,6 +32,19 @@ def test_shards_are_joined_and_repeats_dropped(call, words, tmp_path):
     assert [path.name for path in (tmp_path / "out").glob("manifest*")] == ["manifest.jsonl"]
     assert sorted((tmp_path / "out" / "manifest.jsonl").read_text().splitlines()) == lines
     assert (tmp_path / "out" / "README.md").is_file()
+
+
+@pytest.mark.parametrize("name", ["seed", "scene"])
+def test_shards_of_another_seed_or_scene_in_one_folder_are_an_error(call, words, tmp_path, name):
+    """Machines without a common disk may write shards with other options, which are copied together afterwards."""
+    for shard in (0, 1):
+        options = words(f"out{shard}", "shards=2", f"shard={shard}")
+        if shard and name == "scene":
+            options = words(f"out{shard}", "shards=2", f"shard={shard}", scene="paper_weather")
+        assert call("generate", *options, *(["seed=7"] if shard and name == "seed" else [])).code == 0
+    shutil.copytree(tmp_path / "out1", tmp_path / "out0", dirs_exist_ok=True)
+    message = call("merge", "out=out0").message
+    assert message.startswith("out must hold pairs of one configuration, got 6 of another seed or scene: 0, 2, 4 ")
 
 
 def test_pairs_of_one_draw_are_an_error(call, words, tmp_path, rows):

@@ -150,6 +150,21 @@ def test_an_invalid_address_raises(call, words, memory, option, message):
     assert call("generate", *options, option).message.startswith(message)
 
 
+@pytest.mark.parametrize("name", ["run [1]", "a?b", "*", "ü #1 = {x}"])
+def test_the_name_of_a_folder_in_a_store_is_no_pattern(call, words, memory, name):
+    """Other sets match such a pattern: their manifests must neither be read nor removed."""
+    assert call("generate", *words("memory://sets/1", "count=3", source="memory://frames")).code == 0
+    memory.copy("/sets/1", "/sets/a-b", recursive=True)
+    memory.copy("/sets/1", "/sets/run 1", recursive=True)
+    before = sums_in(memory, "/sets")
+    options = words(f"memory://sets/{name}", "count=4", source="memory://frames")
+    assert ": 4 pairs made, 4 in total; see" in call("generate", *options).out
+    assert ": 0 pairs made, 4 in total; see" in call("generate", *options).out
+    assert ": 4 of 4 pairs" in call("merge", f"out=memory://sets/{name}").out
+    assert len(PairedFolder(f"memory://sets/{name}")) == 4
+    assert {path: value for path, value in sums_in(memory, "/sets").items() if f"/{name}/" not in path} == before
+
+
 def test_videos_are_read_from_a_store(call, words, memory, tmp_path):
     pages = [np.full((32, 48, 3), 20 * i, np.uint8) for i in range(6)]
     for name in ("a.mp4", "b.mp4"):

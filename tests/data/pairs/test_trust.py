@@ -82,6 +82,14 @@ def test_an_address_as_output_raises(call, words, tmp_path, out):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("command", "option"), [("degrade", "source"), ("restore", "input"), ("rectify", "input"), ("preview", "image")]
+)
+def test_an_address_as_input_of_a_command_that_takes_none_raises(call, command, option):
+    message = call(command, f"{option}=s3://bucket/frames").message
+    assert message.startswith(f"{option} must be a path on this machine, got s3://bucket/frames; copy it ")
+
+
 @pytest.fixture
 def pair(call, words, tmp_path) -> Path:
     assert call("generate", *words("out", "count=1", "maps=npz")).code == 0

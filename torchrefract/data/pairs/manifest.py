@@ -15,7 +15,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, cast
 
-from torchrefract._io import is_remote, make_folder, read_bytes, replace_file
+from torchrefract._io import is_remote, make_folder, matching_files, read_bytes, remove_file, replace_file
 from torchrefract._validation import UsageError
 from torchrefract.data.images import UnreadableImageError, opened
 from torchrefract.data.pairs.files import DamagedPairError
@@ -129,7 +129,7 @@ def _has_valid_types(row: PairRow) -> bool:
 
 def find_manifests(root: Path) -> list[Path]:
     """Return the manifest files in a folder, sorted."""
-    return sorted(root.glob(_MANIFESTS))
+    return matching_files(root, _MANIFESTS)
 
 
 def scan_rows(
@@ -226,7 +226,7 @@ class Manifest:
         """Remove the rows of this shard from the manifests of another number of shards."""
         stem = self.path.stem
         others = f"manifest-[0-9]*{stem[14:]}.*jsonl" if "-of-" in stem else f"{stem}.*jsonl"  # with their parts
-        current = set(self.out.glob(others))
+        current = set(matching_files(self.out, others))
         with locked("out", self.out, "manifests", wait=True):
             for path in set(find_manifests(self.out)) - current:
                 rows = scan_rows([path], lambda row: not is_in_shard(row.number), skip_invalid=True)
@@ -234,7 +234,7 @@ class Manifest:
                 if kept:
                     self._write(kept, path)
                 else:
-                    path.unlink()
+                    remove_file(path)
 
     def add(self, rows: Iterable[PairRow]) -> None:
         """Append the rows of pairs whose files are written."""
@@ -262,11 +262,11 @@ class Manifest:
         self._remove_parts()
 
     def _part_paths(self) -> list[Path]:
-        return sorted(self.out.glob(f"{self.path.stem}.[0-9]*.jsonl"))
+        return matching_files(self.out, f"{self.path.stem}.[0-9]*.jsonl")
 
     def _remove_parts(self) -> None:
         for path in self._part_paths():
-            path.unlink()
+            remove_file(path)
 
     def _write(self, rows: Sequence[tuple[int, RowLocation]], path: Path | None = None) -> None:
         with replace_file(path or self.path, alone=True) as temporary, temporary.open("wb") as stream:
@@ -339,7 +339,7 @@ def claim(
             previous = json.loads(read_bytes(path))
         except ValueError:
             previous = None
-        if not isinstance(previous, dict):
+        if not isinstance(previous, dict) or not _has_valid_values(previous):
             raise UsageError(f"out must be a folder with a valid {_CONFIG}, got {path}, which is damaged")
         _check_same({**(earlier or {}), **previous.get("settings", {})}, new, out)
         if count < previous.get("count", 0):
@@ -351,6 +351,10 @@ def claim(
         with replace_file(path) as temporary:
             temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     return previous
+
+
+def _has_valid_values(config: Mapping[str, Any]) -> bool:
+    return isinstance(config.get("settings", {}), dict) and isinstance(config.get("count", 0), int)
 
 
 @contextmanager

@@ -79,10 +79,11 @@ class Sources(NamedTuple):
     def write(self, path: Path, options: dict[str, Any]) -> None:
         """Write the list and the options of its scan as a Parquet file."""
         about = {"options": json.dumps(options), "skipped": json.dumps(list(self.skipped))}
-        with replace_file(path) as temporary:
+        # PyArrow would take a relative path with a colon for an address.
+        with replace_file(path) as temporary, temporary.open("wb") as stream:
             # Small groups of rows, without a dictionary of names that differ, take little memory.
             groups: dict[str, Any] = {"row_group_size": _BATCH, "use_dictionary": ["drive", "split"]}
-            pq.write_table(self.table.replace_schema_metadata(about), temporary, **groups)
+            pq.write_table(self.table.replace_schema_metadata(about), stream, **groups)
 
 
 def read_sources(path: Path, root: Path, options: dict[str, Any]) -> Sources:
@@ -215,10 +216,10 @@ def _sizes_in_store(root: Path) -> dict[str, int]:
 
 
 def _size(path: str) -> int | None:
-    """Return the size of a file in bytes; None if it has vanished, which is an error when the frame is read."""
+    """Return the size of a file in bytes; None if it cannot be opened, which is an error when the frame is read."""
     try:
         return os.stat(path).st_size
-    except FileNotFoundError:
+    except OSError:
         return None
 
 

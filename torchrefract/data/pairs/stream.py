@@ -92,9 +92,12 @@ class PairBatches(Dataset[Pair]):
     def __len__(self) -> int:
         return self.readers * self.num_batches
 
-    def __getitem__(self, index: tuple[int, int]) -> Pair:
-        """Read the batch (epoch, number). In a worker that has not just read the one before, read over the earlier."""
-        epoch, number = index
+    def __getitem__(self, index: tuple[int, int] | int) -> Pair:
+        """Read the batch (epoch, number), or a number of epoch 0.
+
+        In a worker that has not just read the one before, read over the earlier.
+        """
+        epoch, number = index = (0, index) if isinstance(index, int) else index
         turn, reader = divmod(number, self.readers)
         part = _part(len(self.pairs), self.first + reader, self.all_readers)
         batch = _part(len(part), turn, self.num_batches)

@@ -52,7 +52,7 @@ _MULTIRUN = ("-m", "--multirun")
 # Options whose value is text, mostly the path of a file: Hydra's syntax in it means nothing. The model of robustness is
 # a file or a function, that of other commands the choice of a group, without a dot.
 _TEXT_OPTION = re.compile(
-    r"(\+{0,2}(?:image|images|input|data|labels|weights|source|files|depth|network|checkpoint|camera|scene\.camera|out|ckpt_path|license|run_dir|data\.root|data\.depth|hydra\.run\.dir"
+    r"(\+{0,2}(?:image|images|input|data|labels|weights|source|files|depth|network|checkpoint|camera|scene\.camera|base|out|ckpt_path|license|run_dir|data\.root|data\.depth|hydra\.run\.dir"
     r"|model(?==.*[./])|hydra\.sweep\.dir|hydra\.sweep\.subdir|model\.network\.pretrained))=(.*)",
     re.DOTALL,
 )
@@ -63,7 +63,7 @@ _OPTIONS_WITH_VALUE = ("--config-dir", "-cd", "--config-name", "-cn", "--config-
 _OPTIONS_WITH_VALUE += ("--package", "-p", "--info", "-i", "--experimental-rerun")
 _UNKNOWN_OPTION = re.compile(r"Could not override '(\w+)'")
 _REMOTE_OUTPUT = re.compile(r"\+*(out|run_dir|hydra\.(?:run|sweep)\.dir)=['\"]?([A-Za-z][\w+.-]*://.*?)['\"]?$")
-_REMOTE_INPUT = re.compile(r"(input|source|images?|labels|depth|camera)=['\"]?([A-Za-z][\w+.-]*://.*?)['\"]?$")
+_REMOTE_INPUT = re.compile(r"(input|source|images?|labels|depth|camera|base)=['\"]?([A-Za-z][\w+.-]*://.*?)['\"]?$")
 _REMOTE_OPTIONS = (("generate", "out"), ("merge", "out"), ("train", "run_dir"), ("eval", "run_dir"))
 # Warnings of libraries about settings that are intended.
 _IGNORED_WARNINGS = (

@@ -36,6 +36,7 @@ from torchrefract.data.label_files import (
 )
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.effects.base import Effect
+from torchrefract.robustness.corruption_error import BaseComparison, compare_with_base
 from torchrefract.robustness.evaluate import ImageScore, Level, Robustness, Scored, evaluate, move_target
 from torchrefract.robustness.predictors import Predict, import_function, load_predictor
 from torchrefract.robustness.quantities import QUANTITIES
@@ -52,6 +53,13 @@ _SCORES = "scores.jsonl"  # one line of settings, then one for each picture
 _FORMAT = 2  # of these lines; 1 had no summaries of predictions
 _SAID_ELSEWHERE = ("depth is that of a road", "predict failed for")  # by `warn_of_assumed_depth`, and at the end
 _WITH_WIDTH = ("highveld_heat_haze", "unpaved_road")  # scenes whose displacements are stated for a width
+_SHARED = (
+    "labels",
+    "score",
+    "depth_scale",
+    "seed",
+    "format",
+)  # settings which a base has, and data, scenes, severities
 _SETTINGS = ("model", "weights", "data", "labels", "score", "scene", "severity", "depth", "depth_scale", "seed")
 
 
@@ -93,9 +101,9 @@ def test_robustness(cfg: DictConfig) -> None:
     settings = {name: values[name] for name in _SETTINGS} | {"labels": folder.labels and folder.labels.digest()}
     settings["format"], settings["files"] = _FORMAT, file_digests([cfg.model, cfg.weights])
     levels = _levels(settings["scene"], settings["severity"])
-    device = str(find_device(str(cfg.device)))
+    base = None if cfg.base is None else _read_base(Path(str(cfg.base)).expanduser(), settings, folder.names)
     with naming("model"):
-        predict = load_predictor(str(cfg.model), weights=cfg.weights, device=device)
+        predict = load_predictor(str(cfg.model), weights=cfg.weights, device=str(find_device(str(cfg.device))))
     with naming("score"):
         score = choose_score if cfg.score is None else import_function(*str(cfg.score).partition(":")[::2])
     scenes = lru_cache(lambda width: _scenes(levels, width))
@@ -120,19 +128,44 @@ def test_robustness(cfg: DictConfig) -> None:
         if not result.clean.any():
             raise UsageError("model must score above 0 on a clean picture, got 0 on all: check labels and classes")
         about = settings | {"torchrefract": torchrefract.__version__, "torch": torch.__version__}
-        write_tables(result, out, about, loss=loss)
+        beside = base and _compare(result, base, str(cfg.base))
+        write_tables(result, out, about, loss=loss, beside=beside)
         examples = [
             _example(name, level, result, folder, predict, scenes, seed) for name, level in _worst(result, num_worst)
         ]
-        write_report(result, examples, out, title=f"{cfg.model} on {folder.path.name}", loss=loss)
+        write_report(result, examples, out, title=f"{cfg.model} on {folder.path.name}", loss=loss, beside=beside)
     of_set = "".join(f", {name} {value:.3f}" for name, value in result.set_scores[None].items())
     print(f"{out / 'report.html'}: {len(result.names)} pictures, clean score {result.clean.mean():.3f}{of_set}")
     for scene in result.quantities:
         print(f"{scene}: {format_tolerated(result, scene, loss=loss)} for a loss of at most {loss:.0%}")
+    _print_comparison(beside, has_labels=folder.labels is not None)
     if result.failures:
         name, reason = next(iter(result.failures.items()))
         names = first_names(list(result.failures))
         print(f"warning: the model failed for {names}, which are left out; for {name}: {reason}", file=sys.stderr)
+
+
+def _compare(result: Robustness, base: tuple[str, Robustness], folder: str) -> BaseComparison:
+    with naming("base"):
+        return compare_with_base(result, base[1], folder=folder, model=base[0])
+
+
+def _print_comparison(beside: BaseComparison | None, *, has_labels: bool) -> None:
+    if beside is None:
+        return
+    without = [scene for scene, error in beside.scenes.items() if np.isnan(error)]
+    number = f"no mCE beside {beside.model}" if without else f"mCE {beside.mean:.3f} beside {beside.model}"
+    print(
+        f"{number}, on the {beside.num_images} pictures of both runs; left out: {beside.left_out} of this one and "
+        f"{beside.left_out_of_base} of {beside.base}"
+    )
+    if without:
+        print(f"warning: there is no mCE, as the base makes no error in {', '.join(without)}", file=sys.stderr)
+    if not has_labels:
+        print(
+            "warning: without labels, each error is the disagreement of a model with its own clean predictions",
+            file=sys.stderr,
+        )
 
 
 def choose_score(prediction: Any, target: Any) -> float:
@@ -220,14 +253,62 @@ def _target(labels: PictureLabels | None, image: Tensor) -> Any:
     return {"boxes": boxes, "labels": torch.tensor(classes, dtype=torch.int64)}
 
 
+def _read_base(path: Path, settings: Mapping[str, Any], names: Iterable[str]) -> tuple[str, Robustness]:
+    """Return the model and the scores of an earlier run.
+
+    Raises:
+        UsageError: the folder has no run; its settings are others; it has none of the pictures.
+    """
+    lines = _complete_lines(path / _SCORES)
+    if not lines:
+        raise UsageError(f"base must be a folder of an earlier run, got {path}, which has no {_SCORES}")
+    before, scored = json.loads(lines[0]), dict(map(_parse_scores, lines[1:]))
+    expected, of_base = _comparable(settings), _comparable(before)
+    changed = [f"{name}={of_base[name]}" for name in expected if of_base[name] != expected[name]]
+    if changed:
+        raise UsageError(
+            f"base must be a run on the same data with the same settings, got one with {', '.join(changed)}; score "
+            "that model again with the options of this run"
+        )
+    if scored.keys().isdisjoint(names):
+        raise UsageError(f"base must have scores of the same images, got none of {first_names(list(names))}")
+    levels, of_images = next(iter(scored.values())).levels, scored.values()
+    result = Robustness(
+        names=list(scored),
+        clean=np.array([of.clean.score for of in of_images]),
+        scores={level: np.array([of.levels[level].score for of in of_images]) for level in levels},
+        values={level: np.array([of.levels[level].value for of in of_images]) for level in levels},
+        set_scores={},
+    )
+    return str(before["model"]), result
+
+
+def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings that a run and its base share, in one form."""
+    levels = _levels(settings["scene"], settings["severity"])
+    scenes, severities = (sorted({level[i] for level in levels}) for i in range(2))
+    paths = {name: settings[name] and str(Path(settings[name]).expanduser().resolve()) for name in ("data", "depth")}
+    return paths | {"scene": scenes, "severity": severities} | {name: settings.get(name) for name in _SHARED}
+
+
+def _complete_lines(path: Path) -> list[str]:
+    """Return the lines of a file, without a part of one that a killed run left; none without a file."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
+    return [line for line in lines if line.endswith("\n")]
+
+
+def _parse_scores(line: str) -> tuple[str, Scored]:
+    row = json.loads(line)
+    of_levels = {Level(*level): ImageScore(*of) for *level, of in row["levels"]}
+    return row["name"], Scored(ImageScore(*row["clean"]), of_levels)
+
+
 @contextmanager
 def _stored_scores(
     path: Path, settings: Mapping[str, Any]
 ) -> Iterator[tuple[dict[str, Scored], Callable[[str, Scored], None]]]:
     """Yield the scores of an earlier run, and a function that stores those of a picture."""
-    done: dict[str, Scored] = {}
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
-    lines = [line for line in lines if line.endswith("\n")]  # a killed run may leave a part of a line
+    lines = _complete_lines(path)
     if lines:
         before = json.loads(lines[0])
         changed = [f"{name}={before.get(name)}" for name in settings if before.get(name) != settings[name]]
@@ -235,10 +316,7 @@ def _stored_scores(
             raise UsageError(
                 f"out must be a folder of the same settings, got one with {', '.join(changed)}; choose another"
             )
-    for line in lines[1:]:
-        row = json.loads(line)
-        of_levels = {Level(*level): ImageScore(*of) for *level, of in row["levels"]}
-        done[row["name"]] = Scored(ImageScore(*row["clean"]), of_levels)
+    done = dict(map(_parse_scores, lines[1:]))
     with replace_file(path, alone=True) as repaired:
         repaired.write_text("".join(lines) or json.dumps(settings) + "\n", encoding="utf-8")
     with path.open("a", encoding="utf-8") as stream:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchrefract._io import replace_file
 from torchrefract._tensor import to_uint8
+from torchrefract.robustness.corruption_error import BaseComparison
 from torchrefract.robustness.evaluate import Robustness, Row
 
 _STYLE = """
@@ -48,7 +49,9 @@ class Example:
     predictions: Tensor | None
 
 
-def write_tables(result: Robustness, out: Path, about: dict[str, Any], *, loss: float) -> None:
+def write_tables(
+    result: Robustness, out: Path, about: dict[str, Any], *, loss: float, beside: BaseComparison | None = None
+) -> None:
     """Write results.csv and results.json into a folder.
 
     Args:
@@ -56,6 +59,7 @@ def write_tables(result: Robustness, out: Path, about: dict[str, Any], *, loss: 
         out: an existing folder.
         about: settings and versions, for results.json.
         loss: share of the clean score that is tolerated, in (0, 1).
+        beside: the errors relative to those of a base, or None.
     """
     rows = [_flat(row) for row in result.rows()]
     with replace_file(out / "results.csv") as path, path.open("w", newline="", encoding="utf-8") as file:
@@ -76,6 +80,7 @@ def write_tables(result: Robustness, out: Path, about: dict[str, Any], *, loss: 
             for name, value in result.set_scores[None].items()
         },
         "tolerated": {scene: result.tolerated(scene, loss=loss)._asdict() for scene in result.quantities},
+        **({"corruption_error": beside._asdict()} if beside else {}),
         "levels": rows,
         "failures": result.failures,
     }
@@ -83,7 +88,15 @@ def write_tables(result: Robustness, out: Path, about: dict[str, Any], *, loss: 
         path.write_text(json.dumps(_without_nan(summary), indent=1) + "\n", encoding="utf-8")
 
 
-def write_report(result: Robustness, examples: Sequence[Example], out: Path, *, title: str, loss: float) -> None:
+def write_report(
+    result: Robustness,
+    examples: Sequence[Example],
+    out: Path,
+    *,
+    title: str,
+    loss: float,
+    beside: BaseComparison | None = None,
+) -> None:
     """Write report.html into a folder: curves, tables, the tolerated values, and examples as pictures.
 
     Args:
@@ -91,7 +104,7 @@ def write_report(result: Robustness, examples: Sequence[Example], out: Path, *, 
         examples: such as the worst images.
         out: an existing folder.
         title: one line.
-        loss: as for `write_tables`.
+        loss, beside: as for `write_tables`.
     """
     names = list(result.set_scores[None])
     together = f" For {' and '.join(names)}, all images count together." if names else ""
@@ -113,6 +126,8 @@ def write_report(result: Robustness, examples: Sequence[Example], out: Path, *, 
             map(_score_cells, result.rows()),
         ),
     ]
+    if beside:
+        parts += _comparison(beside)
     if result.failures:
         parts.append(f"<h2>Images left out</h2><p>The model failed for {len(result.failures)} images:</p>")
         parts.append(_table(["image", "reason"], result.failures.items()))
@@ -189,6 +204,18 @@ def _tolerated_cells(result: Robustness, loss: float) -> list[tuple[str, ...]]:
         value, _, interval = text.partition("[")
         cells.append((scene, value.strip(), interval.rstrip("]").replace(",", " to"), quantity.name))
     return cells
+
+
+def _comparison(beside: BaseComparison) -> list[str]:
+    text = (
+        f"The error is 1 less the score. The corruption error of a scene is the sum of the errors over its severities, "
+        f"divided by that of {beside.model} (run {beside.base}), on the {beside.num_images} images of both runs; "
+        f"{beside.left_out} of this one and {beside.left_out_of_base} of the base are left out. mCE is its mean over "
+        "scenes. Without labels, each error is the disagreement of a model with its own clean predictions. A number is "
+        "missing where the base makes no error."
+    )
+    cells = [(name, _number(error)) for name, error in (beside.scenes | {"mCE": beside.mean}).items()]
+    return [f"<h2>Beside the base</h2><p>{html.escape(text)}</p>", _table(["scene", "corruption error"], cells)]
 
 
 def _summary_cells(result: Robustness) -> list[tuple[str, ...]]:

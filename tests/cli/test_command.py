@@ -153,7 +153,10 @@ FILE_OPTIONS = {
     "restore": (("ckpt_path", "input", "out"), ("ckpt_path=a", "input=b")),
     "export": (("ckpt_path",), ()),
     "make_board": (("out",), ()),
-    "robustness": (("model", "weights", "data", "labels", "depth", "base", "out"), ("model=a", "data=d", "out=o")),
+    "robustness": (
+        ("model", "weights", "data", "labels", "depth", "camera", "base", "out"),
+        ("model=a", "data=d", "out=o"),
+    ),
     "train": (("data.root", "ckpt_path", "run_dir", "hydra.run.dir"), ("+task=undistort", "data=frames")),
 }
 

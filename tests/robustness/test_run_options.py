@@ -1,11 +1,14 @@
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
+import torchrefract
 from torchrefract import Camera, key_of, presets
 from torchrefract.cameras.io import write_opencv
 from torchrefract.data.images import read_image
@@ -28,6 +31,12 @@ def blind(images):
 def darkness(prediction, target):
     return 1 - prediction.item()
 
+def lightness(prediction, target):
+    raise AssertionError
+
+def half(prediction, target):
+    return 0.5
+
 def classes(images):
     return torch.tensor([[0.0, 1.0]])
 
@@ -37,7 +46,7 @@ def pixels(images):
 def boxes(images):
     return [{"boxes": torch.tensor([[8.0, 8, 30, 30]]), "labels": torch.ones(1).long(), "scores": torch.ones(1)}]
 """
-RUN = ("robustness.__main__", "data=frames", "score=bright:darkness", "severity=[1,5]")
+RUN = ("robustness.__main__", "data=frames", "score=gray:darkness", "severity=[1,5]")
 FOG = "scene=[cape_town_fog,cheap_dashcam]"
 CAMERA = Camera(width=64, height=36, fx=80.0, fy=80.0, cx=31.5, cy=17.5, coefficients=(0.0,) * 5)
 
@@ -49,7 +58,7 @@ def frames(tmp_path, monkeypatch) -> Path:
     folder.mkdir()
     for i, level in enumerate((0, 40, 80, 120, 255)):
         cv2.imwrite(str(folder / f"{i}.png"), np.full((36, 64, 3), level, np.uint8))
-    (tmp_path / "bright.py").write_text(MODEL)
+    (tmp_path / "gray.py").write_text(MODEL)
     monkeypatch.syspath_prepend(tmp_path)
     return folder
 
@@ -67,9 +76,9 @@ def scores(out: Path) -> dict[str, list]:
 
 
 def test_a_run_beside_a_base_states_its_corruption_errors_and_the_pictures_left_out(call, tmp_path, frames):
-    assert call(*RUN, FOG, "model=bright:shaken", "out=base").code == 0
+    assert call(*RUN, FOG, "model=gray:shaken", "out=base").code == 0
     (frames / "0.png").unlink()
-    outcome = call(*RUN, FOG, "model=bright:brightness", "out=out", "base=base")
+    outcome = call(*RUN, FOG, "model=gray:brightness", "out=out", "base=base")
     assert outcome.code == 0, outcome.err
     errors = {
         (out, scene): np.mean(
@@ -86,25 +95,24 @@ def test_a_run_beside_a_base_states_its_corruption_errors_and_the_pictures_left_
     assert of_both["scenes"] == pytest.approx({scene: 2.0 for scene in expected}, rel=1e-4)  # half of the error
     assert of_both["mean"] == pytest.approx(np.mean(list(expected.values())))
     assert (of_both["num_images"], of_both["left_out"], of_both["left_out_of_base"]) == (3, 1, 1)
-    assert (of_both["base"], of_both["model"]) == ("base", "bright:shaken")
-    assert (
-        "mCE 2.000 beside bright:shaken, on the 3 pictures of both runs; left out: 1 of this one and 1 of base\n"
-        in (outcome.out)
+    assert (of_both["base"], of_both["model"]) == ("base", "gray:shaken")
+    assert "mCE 2.000 beside gray:shaken, on the 3 pictures of both runs; left out: 1 of this one and 1 of base\n" in (
+        outcome.out
     )
     page = (tmp_path / "out" / "report.html").read_text()
     assert "<td>cape_town_fog</td><td>2.000</td>" in page
     assert "<td>mCE</td><td>2.000</td>" in page
     assert "on the 3 images of both runs; 1 of this one and 1 of the base are left out" in page
     without = (tmp_path / "out" / "scores.jsonl").read_bytes()
-    assert call(*RUN, FOG, "model=bright:brightness", "out=out").code == 0  # continues
+    assert call(*RUN, FOG, "model=gray:brightness", "out=out").code == 0  # continues
     assert (tmp_path / "out" / "scores.jsonl").read_bytes() == without
     assert "corruption_error" not in results(tmp_path / "out")
     assert "mCE" not in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_a_base_without_an_error_gives_no_number_and_says_so(call, tmp_path, frames):
-    assert call(*RUN, "scene=cape_town_fog", "model=bright:blind", "out=base").code == 0
-    outcome = call(*RUN, "scene=cape_town_fog", "model=bright:brightness", "out=out", "base=base")
+    assert call(*RUN, "scene=cape_town_fog", "model=gray:blind", "out=base").code == 0
+    outcome = call(*RUN, "scene=cape_town_fog", "model=gray:brightness", "out=out", "base=base")
     of_both = results(tmp_path / "out")["corruption_error"]
     assert of_both["scenes"] == {"cape_town_fog": None}
     assert of_both["mean"] is None
@@ -113,7 +121,7 @@ def test_a_base_without_an_error_gives_no_number_and_says_so(call, tmp_path, fra
 
 
 def test_a_base_without_labels_is_said_to_state_another_number(call, frames):
-    words = ("scene=cheap_dashcam", "model=bright:brightness", "base=base")
+    words = ("scene=cheap_dashcam", "model=gray:brightness", "base=base")
     assert call(*RUN, *words[:2], "out=base").code == 0
     warning = "warning: without labels, each error is the disagreement of a model with its own clean predictions"
     assert warning in call(*RUN, *words, "out=out").err
@@ -126,7 +134,7 @@ def test_a_base_without_labels_is_said_to_state_another_number(call, frames):
         (("severity=[1,4]",), "got one with severity=[1, 5]; "),
         (("scene=cheap_dashcam",), "got one with scene=['cape_town_fog', 'cheap_dashcam']; "),
         (("data=others",), "/frames; "),
-        (("score=bright:lightness",), "got one with score=bright:darkness; "),
+        (("score=gray:lightness",), "got one with score=gray:darkness; "),
         (("horizon=0.4",), "got one with horizon=None; "),
         (("base=nowhere",), "base must be a folder of an earlier run, got nowhere, which has no scores.jsonl"),
         (("limit=1",), "base must have scores of the same images, got none of 0.png"),
@@ -136,13 +144,11 @@ def test_a_base_of_other_settings_is_one_line_before_the_first_prediction(call, 
     (tmp_path / "others").mkdir()
     for path in frames.iterdir():
         (tmp_path / "others" / path.name).write_bytes(path.read_bytes())
-    with (tmp_path / "bright.py").open("a") as file:
-        file.write("\n\ndef lightness(prediction, target):\n    raise AssertionError\n")
-    assert call(*RUN, FOG, "model=bright:shaken", "out=base").code == 0
+    assert call(*RUN, FOG, "model=gray:shaken", "out=base").code == 0
     lines = (tmp_path / "base" / "scores.jsonl").read_text().splitlines(keepends=True)
     if "limit=1" in words:
         (tmp_path / "base" / "scores.jsonl").write_text("".join(line for line in lines if '"0.png"' not in line))
-    error = call(*RUN, FOG, "model=bright:brightness", "out=out", "base=base", *words).message
+    error = call(*RUN, FOG, "model=gray:brightness", "out=out", "base=base", *words).message
     assert message in error
     assert not (tmp_path / "out").exists()
     if "got one with" in message:
@@ -151,13 +157,117 @@ def test_a_base_of_other_settings_is_one_line_before_the_first_prediction(call, 
 
 
 def test_a_base_whose_pictures_had_other_draws_is_one_line_and_no_table(call, tmp_path, frames):
-    assert call(*RUN, "scene=cape_town_fog", "model=bright:shaken", "out=base").code == 0
+    assert call(*RUN, "scene=cape_town_fog", "model=gray:shaken", "out=base").code == 0
     path = tmp_path / "base" / "scores.jsonl"
     settings, *rows = map(json.loads, path.read_text().splitlines())
     for row in rows:  # as of a version that draws other fogs
         row["levels"] = [[*level, [score, 7000.0, *rest]] for *level, (score, _, *rest) in row["levels"]]
     path.write_text("".join(json.dumps(row) + "\n" for row in [settings, *rows]))
-    outcome = call(*RUN, "scene=cape_town_fog", "model=bright:brightness", "out=out", "base=base")
+    outcome = call(*RUN, "scene=cape_town_fog", "model=gray:brightness", "out=out", "base=base")
     *_, error = outcome.err.splitlines()
     assert error.startswith("error: base: base must be of the same draws, by the same seed and version, got a visib")
     assert [path.name for path in (tmp_path / "out").iterdir() if path.name[0] != "."] == ["scores.jsonl"]
+
+
+# --- columns of the table
+
+
+@pytest.mark.parametrize(
+    ("model", "words", "metric"),
+    [
+        ("brightness", ("score=gray:darkness",), "agreement (gray:darkness)"),
+        ("classes", (), "agreement (accuracy)"),
+        ("pixels", (), "agreement (IoU by image)"),
+        ("boxes", (), "agreement (AP50 by image)"),
+        ("boxes", ("labels=labels",), "AP50 by image"),
+        ("boxes", ("labels=labels", "score=gray:half"), "gray:half"),
+    ],
+)
+def test_each_line_of_the_table_names_its_metric_seed_and_versions(call, tmp_path, frames, model, words, metric):
+    (tmp_path / "labels").mkdir()
+    for path in frames.iterdir():
+        (tmp_path / "labels" / f"{path.stem}.txt").write_text(f"1 {19 / 64} {19 / 36} {22 / 64} {22 / 36}\n")
+    run = ("robustness.__main__", f"model=gray:{model}", "data=frames", "out=out", "seed=3", "limit=2", *words)
+    run += ("scene=[cape_town_fog,cheap_dashcam]", "severity=[1,3]")
+    for _ in range(2):  # the second run takes all scores of the first
+        assert call(*run).code == 0
+        with (tmp_path / "out" / "results.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        earlier = ["scene", "severity", "quantity", "value", "unit", "num_images", "score", "drop", "low", "high"]
+        assert list(rows[0])[: len(earlier)] == earlier
+        assert len(rows) == 4
+        for row in rows:
+            assert (row["metric"], row["seed"]) == (metric, "3")
+            assert (row["torchrefract"], row["torch"]) == (torchrefract.__version__, torch.__version__)
+        assert results(tmp_path / "out")["about"]["metric"] == metric
+
+
+# --- the camera and the horizon of the frames
+
+
+def test_the_camera_and_the_horizon_are_those_of_each_scene(call, tmp_path, frames):
+    picture = np.random.default_rng(0).integers(0, 255, (36, 64, 3), np.uint8)
+    cv2.imwrite(str(frames / "0.png"), np.linspace(0.2, 1, 36)[:, None, None] * picture)
+    write_opencv(tmp_path / "my camera=1.yaml", CAMERA)
+    words = ("robustness.__main__", "data=frames", "score=gray:darkness", "severity=4", "limit=1")
+    words += ("model=gray:brightness",)
+    assert call(*words, "out=out", "camera=my camera=1.yaml", "horizon=0.4").code == 0
+    assert call(*words, "out=without").code == 0
+    given, without = ({s: of[0] for s, _, of in scores(tmp_path / out)["0.png"]} for out in ("out", "without"))
+    assert list(given) == list(QUANTITIES)
+    image = read_image(frames / "0.png")
+    for scene, score in given.items():
+        options = {"width": 64} if scene in ("highveld_heat_haze", "unpaved_road") else {}
+        effect = getattr(presets, scene)(4, camera=CAMERA, horizon=0.4, **options)
+        degraded = effect.degrade(image, seed=0, keys=[key_of("0.png")])
+        assert score == pytest.approx(1 - degraded.image.mean().item(), abs=1e-6), scene
+    same = {scene for scene in given if given[scene] == without[scene]}
+    assert same == {"cheap_dashcam"}  # a lens of its own, and no horizon
+    about = results(tmp_path / "out")["about"]
+    assert (about["camera"]["fx"], about["camera"]["width"], about["horizon"]) == (80.0, 64, 0.4)
+
+
+def test_a_run_is_not_continued_with_another_camera_or_horizon(call, tmp_path, frames):
+    words = (*RUN, "scene=cheap_dashcam", "model=gray:brightness", "camera=camera.yaml", "horizon=0.5")
+    write_opencv(tmp_path / "camera.yaml", CAMERA)
+    assert call(*words, "out=out").code == 0
+    assert call(*words, "out=out").code == 0
+    assert call(*words, "out=out", "horizon=0.4").message.endswith("got one with horizon=0.5; choose another")
+    write_opencv(tmp_path / "camera.yaml", replace(CAMERA, fx=90.0))
+    message = call(*words, "out=out").message
+    assert message.startswith("out must be a folder of the same settings, got one with camera={'width': 64, ")
+    assert "'fx': 80.0" in message
+    assert (
+        "base must be a run on the same data with the same settings, got one with camera={"
+        in call(*words, "out=o2", "base=out").message
+    )
+
+
+def test_a_run_of_an_earlier_version_without_a_camera_continues(call, tmp_path, frames):
+    words = (*RUN, "scene=cheap_dashcam", "model=gray:brightness", "out=out")
+    assert call(*words).code == 0
+    path = tmp_path / "out" / "scores.jsonl"
+    settings, *rows = path.read_text().splitlines(keepends=True)
+    settings = {name: value for name, value in json.loads(settings).items() if name not in ("camera", "horizon")}
+    path.write_text(json.dumps(settings) + "\n" + "".join(rows))
+    assert call(*words).code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("camera=lost.yaml",), "camera: "),
+        (("camera=gray.py",), "camera: "),
+        (("horizon=up",), "horizon: horizon must be a real number, got 'up'"),
+        (("horizon=540",), "horizon: horizon must be a number in [-10, 10], got 540"),
+        (
+            ("camera=large.yaml",),
+            "camera must be that of all pictures, got 0.png: image must have the shape of the camera's frames, "
+            "100 x 30 px, got 64 x 36",
+        ),
+    ],
+)
+def test_an_invalid_camera_or_horizon_is_one_line(call, tmp_path, frames, words, message):
+    write_opencv(tmp_path / "large.yaml", replace(CAMERA, width=100, height=30, cx=49.5, cy=14.5))
+    error = call(*RUN, "scene=cheap_dashcam", "model=gray:brightness", "out=out", *words).message
+    assert error.startswith(message)

@@ -6,7 +6,9 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -21,6 +23,8 @@ import torchrefract
 from torchrefract import presets, random
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_count, check_number, check_positive
+from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.io import read_camera
 from torchrefract.cli.command import check_seed, file_digests, find_device, naming, progress, warn_of_assumed_depth
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import first_names, list_files
@@ -53,14 +57,11 @@ _SCORES = "scores.jsonl"  # one line of settings, then one for each picture
 _FORMAT = 2  # of these lines; 1 had no summaries of predictions
 _SAID_ELSEWHERE = ("depth is that of a road", "predict failed for")  # by `warn_of_assumed_depth`, and at the end
 _WITH_WIDTH = ("highveld_heat_haze", "unpaved_road")  # scenes whose displacements are stated for a width
-_SHARED = (
-    "labels",
-    "score",
-    "depth_scale",
-    "seed",
-    "format",
-)  # settings which a base has, and data, scenes, severities
+# Settings that a base shares, beside its data, scenes and severities.
+_SHARED = ("labels", "score", "depth_scale", "seed", "camera", "horizon", "format")
+_METRICS = {"boxes": "AP50 by image", "pixels": "IoU by image", None: "accuracy"}  # of `choose_score`, by summary
 _SETTINGS = ("model", "weights", "data", "labels", "score", "scene", "severity", "depth", "depth_scale", "seed")
+_SETTINGS += ("camera", "horizon")
 
 
 class _Folder(NamedTuple):
@@ -71,6 +72,12 @@ class _Folder(NamedTuple):
     labels: CocoLabels | LabelFolder | None
     depths: DepthFolder | None
     skipped: list[str]  # why pictures cannot be read
+    place: dict[str, Any]  # arguments of the scenes
+
+    @property
+    def camera(self) -> Camera | None:
+        """Return the camera of all pictures, if it is given."""
+        return self.place.get("camera")
 
     def depth(self, name: str, image: Tensor) -> Tensor | None:
         """Return the depth map (1, H, W), m, of a picture; None without maps."""
@@ -85,6 +92,8 @@ class _Folder(NamedTuple):
                 self.skipped.append(str(error))
                 print(f"skipped: {error}", file=sys.stderr)
                 continue
+            if self.camera:
+                _check_shape(self.camera, name, image)
             with naming("labels"):
                 target = None if self.labels is None else _target(self.labels.of(name), image)
             yield name, image, target
@@ -98,6 +107,7 @@ def test_robustness(cfg: DictConfig) -> None:
     with naming("worst"):
         num_worst = check_count("worst", cfg.worst, low=0)
     folder, values = _folder(cfg), cast(dict[str, Any], OmegaConf.to_container(cfg))
+    values["camera"] = folder.camera and json.loads(json.dumps(asdict(folder.camera)))  # as it is stored
     settings = {name: values[name] for name in _SETTINGS} | {"labels": folder.labels and folder.labels.digest()}
     settings["format"], settings["files"] = _FORMAT, file_digests([cfg.model, cfg.weights])
     levels = _levels(settings["scene"], settings["severity"])
@@ -106,7 +116,7 @@ def test_robustness(cfg: DictConfig) -> None:
         predict = load_predictor(str(cfg.model), weights=cfg.weights, device=str(find_device(str(cfg.device))))
     with naming("score"):
         score = choose_score if cfg.score is None else import_function(*str(cfg.score).partition(":")[::2])
-    scenes = lru_cache(lambda width: _scenes(levels, width))
+    scenes = lru_cache(lambda width: _scenes(levels, width, folder.place))
     if folder.depths is None:
         warn_of_assumed_depth(nn.ModuleList(effect for by in scenes(1920).values() for effect in by.values()))
     with naming("out"):
@@ -127,7 +137,11 @@ def test_robustness(cfg: DictConfig) -> None:
             raise UsageError(str(error)) from error
         if not result.clean.any():
             raise UsageError("model must score above 0 on a clean picture, got 0 on all: check labels and classes")
-        about = settings | {"torchrefract": torchrefract.__version__, "torch": torch.__version__}
+        about = settings | {
+            "metric": _metric(cfg, out / _SCORES),
+            "torchrefract": torchrefract.__version__,
+            "torch": torch.__version__,
+        }
         beside = base and _compare(result, base, str(cfg.base))
         write_tables(result, out, about, loss=loss, beside=beside)
         examples = [
@@ -188,10 +202,40 @@ def _levels(scenes: Any, severities: Any) -> list[Level]:
     return [Level(name, int(severity)) for name in names for severity in severities]
 
 
-def _scenes(levels: Iterable[Level], width: int) -> dict[str, dict[int, Effect]]:
+def _metric(cfg: DictConfig, path: Path) -> str:
+    """Return the name of the score of a picture, by the first of the stored ones."""
+    if cfg.score is None:
+        with path.open(encoding="utf-8") as lines:
+            _, scored = _parse_scores(list(islice(lines, 2))[1])
+        name = _METRICS[scored.clean.summary[0] if scored.clean.summary else None]
+    else:
+        name = str(cfg.score)
+    return f"agreement ({name})" if cfg.labels is None else name
+
+
+def _place(cfg: DictConfig) -> dict[str, Any]:
+    """Return the arguments of all scenes that tell of the camera and the horizon, if they are given."""
+    place = {}
+    if cfg.camera is not None:
+        with naming("camera"):
+            place["camera"] = read_camera(Path(str(cfg.camera)).expanduser())
+    if cfg.horizon is not None:
+        with naming("horizon"):
+            place["horizon"] = check_number("horizon", cfg.horizon, low=-10, high=10)  # as the effects
+    return place
+
+
+def _check_shape(camera: Camera, name: str, image: Tensor) -> None:
+    try:
+        camera.resized(width=image.shape[2], height=image.shape[1])
+    except ValueError as error:
+        raise UsageError(f"camera must be that of all pictures, got {name}: {error}") from error
+
+
+def _scenes(levels: Iterable[Level], width: int, place: Mapping[str, Any]) -> dict[str, dict[int, Effect]]:
     scenes: dict[str, dict[int, Effect]] = {}
     for name, severity in levels:
-        options = {"width": width} if name in _WITH_WIDTH else {}
+        options = {**place, "width": width} if name in _WITH_WIDTH else place
         scenes.setdefault(name, {})[severity] = getattr(presets, name)(severity, **options)
     return scenes
 
@@ -217,7 +261,7 @@ def _folder(cfg: DictConfig) -> _Folder:
         with naming("depth_scale"):
             depths = DepthFolder(Path(str(cfg.depth)).expanduser(), check_positive("depth_scale", cfg.depth_scale))
         depths.check((name, None) for name in names)
-    return _Folder(path, names, labels, depths, [])
+    return _Folder(path, names, labels, depths, [], _place(cfg))
 
 
 def _target(labels: PictureLabels | None, image: Tensor) -> Any:

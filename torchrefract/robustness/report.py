@@ -32,6 +32,7 @@ figure { display: inline-block; margin: .5rem; vertical-align: top; } img { max-
 figcaption { font-size: 13px; max-width: 29rem; }
 @media (max-width: 40rem) { td, th { padding: .25rem .4rem; font-size: 13px; } figure { margin: .5rem 0; } }
 """
+_OF_RUN = ("metric", "seed", "torchrefract", "torch")  # columns that are the same in all lines
 _SPACING = 0.08  # of the curves, severities
 _COLORS = {"labels": (40, 160, 60), "predictions": (220, 40, 30)}
 
@@ -57,15 +58,15 @@ def write_tables(
     Args:
         result: the scores.
         out: an existing folder.
-        about: settings and versions, for results.json.
+        about: settings and versions, for results.json; its metric, seed and versions are columns of results.csv too.
         loss: share of the clean score that is tolerated, in (0, 1).
         beside: the errors relative to those of a base, or None.
     """
     rows = [_flat(row) for row in result.rows()]
     with replace_file(out / "results.csv") as path, path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, dict.fromkeys(name for row in rows for name in row))
+        writer = csv.DictWriter(file, [*dict.fromkeys(name for row in rows for name in row), *_OF_RUN])
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(row | {name: about[name] for name in _OF_RUN} for row in rows)
     summary = {
         "about": about,
         "clean": result.clean_estimate()._asdict(),

@@ -57,7 +57,7 @@ _SCORES = "scores.jsonl"  # one line of settings, then one for each picture
 _FORMAT = 2  # of these lines; 1 had no summaries of predictions
 _SAID_ELSEWHERE = ("depth is that of a road", "predict failed for")  # by `warn_of_assumed_depth`, and at the end
 _WITH_WIDTH = ("highveld_heat_haze", "unpaved_road")  # scenes whose displacements are stated for a width
-# Settings that a base shares, beside its data, scenes and severities.
+# Settings that a base shares, besides its data, scenes and severities.
 _SHARED = ("labels", "score", "depth_scale", "seed", "camera", "horizon", "format")
 _METRICS = {"boxes": "AP50 by image", "pixels": "IoU by image", None: "accuracy"}  # of `choose_score`, by summary
 _SETTINGS = ("model", "weights", "data", "labels", "score", "scene", "severity", "depth", "depth_scale", "seed")
@@ -142,17 +142,19 @@ def test_robustness(cfg: DictConfig) -> None:
             "torchrefract": torchrefract.__version__,
             "torch": torch.__version__,
         }
-        beside = base and _compare(result, base, str(cfg.base))
-        write_tables(result, out, about, loss=loss, beside=beside)
+        comparison = base and _compare(result, base, str(cfg.base))
+        write_tables(result, out, about, loss=loss, comparison=comparison)
         examples = [
             _example(name, level, result, folder, predict, scenes, seed) for name, level in _worst(result, num_worst)
         ]
-        write_report(result, examples, out, title=f"{cfg.model} on {folder.path.name}", loss=loss, beside=beside)
+        write_report(
+            result, examples, out, title=f"{cfg.model} on {folder.path.name}", loss=loss, comparison=comparison
+        )
     of_set = "".join(f", {name} {value:.3f}" for name, value in result.set_scores[None].items())
     print(f"{out / 'report.html'}: {len(result.names)} pictures, clean score {result.clean.mean():.3f}{of_set}")
     for scene in result.quantities:
         print(f"{scene}: {format_tolerated(result, scene, loss=loss)} for a loss of at most {loss:.0%}")
-    _print_comparison(beside, has_labels=folder.labels is not None)
+    _print_comparison(comparison, has_labels=folder.labels is not None)
     if result.failures:
         name, reason = next(iter(result.failures.items()))
         names = first_names(list(result.failures))
@@ -164,14 +166,14 @@ def _compare(result: Robustness, base: tuple[str, Robustness], folder: str) -> B
         return compare_with_base(result, base[1], folder=folder, model=base[0])
 
 
-def _print_comparison(beside: BaseComparison | None, *, has_labels: bool) -> None:
-    if beside is None:
+def _print_comparison(comparison: BaseComparison | None, *, has_labels: bool) -> None:
+    if comparison is None:
         return
-    without = [scene for scene, error in beside.scenes.items() if np.isnan(error)]
-    number = f"no mCE beside {beside.model}" if without else f"mCE {beside.mean:.3f} beside {beside.model}"
+    without = [scene for scene, error in comparison.scenes.items() if np.isnan(error)]
+    number = f"no mCE beside {comparison.model}" if without else f"mCE {comparison.mean:.3f} beside {comparison.model}"
     print(
-        f"{number}, on the {beside.num_images} pictures of both runs; left out: {beside.left_out} of this one and "
-        f"{beside.left_out_of_base} of {beside.base}"
+        f"{number}, on the {comparison.num_images} pictures of both runs; left out: {comparison.left_out} of this one "
+        f"and {comparison.left_out_of_base} of {comparison.base}"
     )
     if without:
         print(f"warning: there is no mCE, as the base makes no error in {', '.join(without)}", file=sys.stderr)

@@ -15,6 +15,8 @@ Options:
     severity=[1,3,5]        1 to 5
     score=NAME              package.module:name of a function from a prediction and a target to a number in [0, 1]
     depth=DIR               depth maps of the pictures, as estimate_depth writes
+    camera=FILE             of the pictures, for all scenes; horizon=0.5 of their height, 0 at the top
+    base=DIR                output folder of an earlier run of another model, for the errors relative to it (mCE)
     loss=0.1                share of the clean score that is tolerated; weights=FILE for a model of torchvision
     limit=N                 number of pictures; device=cuda, seed=0 of the draws
 

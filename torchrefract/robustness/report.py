@@ -51,7 +51,7 @@ class Example:
 
 
 def write_tables(
-    result: Robustness, out: Path, about: dict[str, Any], *, loss: float, beside: BaseComparison | None = None
+    result: Robustness, out: Path, about: dict[str, Any], *, loss: float, comparison: BaseComparison | None = None
 ) -> None:
     """Write results.csv and results.json into a folder.
 
@@ -60,7 +60,7 @@ def write_tables(
         out: an existing folder.
         about: settings and versions, for results.json; its metric, seed and versions are columns of results.csv too.
         loss: share of the clean score that is tolerated, in (0, 1).
-        beside: the errors relative to those of a base, or None.
+        comparison: the errors relative to those of a base, or None.
     """
     rows = [_flat(row) for row in result.rows()]
     with replace_file(out / "results.csv") as path, path.open("w", newline="", encoding="utf-8") as file:
@@ -81,7 +81,7 @@ def write_tables(
             for name, value in result.set_scores[None].items()
         },
         "tolerated": {scene: result.tolerated(scene, loss=loss)._asdict() for scene in result.quantities},
-        **({"corruption_error": beside._asdict()} if beside else {}),
+        **({"corruption_error": comparison._asdict()} if comparison else {}),
         "levels": rows,
         "failures": result.failures,
     }
@@ -96,7 +96,7 @@ def write_report(
     *,
     title: str,
     loss: float,
-    beside: BaseComparison | None = None,
+    comparison: BaseComparison | None = None,
 ) -> None:
     """Write report.html into a folder: curves, tables, the tolerated values, and examples as pictures.
 
@@ -105,7 +105,7 @@ def write_report(
         examples: such as the worst images.
         out: an existing folder.
         title: one line.
-        loss, beside: as for `write_tables`.
+        loss, comparison: as for `write_tables`.
     """
     names = list(result.set_scores[None])
     together = f" For {' and '.join(names)}, all images count together." if names else ""
@@ -127,8 +127,8 @@ def write_report(
             map(_score_cells, result.rows()),
         ),
     ]
-    if beside:
-        parts += _comparison(beside)
+    if comparison:
+        parts += _comparison(comparison)
     if result.failures:
         parts.append(f"<h2>Images left out</h2><p>The model failed for {len(result.failures)} images:</p>")
         parts.append(_table(["image", "reason"], result.failures.items()))
@@ -207,15 +207,15 @@ def _tolerated_cells(result: Robustness, loss: float) -> list[tuple[str, ...]]:
     return cells
 
 
-def _comparison(beside: BaseComparison) -> list[str]:
+def _comparison(comparison: BaseComparison) -> list[str]:
     text = (
-        f"The error is 1 less the score. The corruption error of a scene is the sum of the errors over its severities, "
-        f"divided by that of {beside.model} (run {beside.base}), on the {beside.num_images} images of both runs; "
-        f"{beside.left_out} of this one and {beside.left_out_of_base} of the base are left out. mCE is its mean over "
-        "scenes. Without labels, each error is the disagreement of a model with its own clean predictions. A number is "
-        "missing where the base makes no error."
+        "The error is 1 less the score. The corruption error of a scene is the sum of the errors over its severities, "
+        f"divided by that of {comparison.model} (run {comparison.base}), on the {comparison.num_images} images of both "
+        f"runs; {comparison.left_out} of this one and {comparison.left_out_of_base} of the base are left out. mCE is "
+        "its mean over scenes. Without labels, each error is the disagreement of a model with its own clean "
+        "predictions. A number is missing where the base makes no error."
     )
-    cells = [(name, _number(error)) for name, error in (beside.scenes | {"mCE": beside.mean}).items()]
+    cells = [(name, _number(error)) for name, error in (comparison.scenes | {"mCE": comparison.mean}).items()]
     return [f"<h2>Beside the base</h2><p>{html.escape(text)}</p>", _table(["scene", "corruption error"], cells)]
 
 

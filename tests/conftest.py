@@ -2,12 +2,13 @@ import gc
 import importlib
 import logging
 import math
+import multiprocessing
 import os
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -285,6 +286,27 @@ def spawn() -> Callable[..., Outcome]:
         return Outcome(done.returncode, done.stdout, done.stderr)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def fork() -> Callable[..., Any]:
+    """Return a function that starts a function in a forked process, which has imported what this one has."""
+
+    def start(function: Callable[..., Any], *arguments: Any, argv: Sequence[str], cwd: Path) -> Any:
+        def run() -> None:
+            os.chdir(cwd)
+            sys.argv = ["torchrefract.train", *argv]
+            with open("output.txt", "a", buffering=1) as sys.stderr:
+                sys.stdout = sys.stderr
+                for descriptor in (1, 2):
+                    os.dup2(sys.stderr.fileno(), descriptor)
+                function(*arguments)
+
+        process = multiprocessing.get_context("fork").Process(target=run)
+        process.start()
+        return process
+
+    return start
 
 
 @pytest.fixture(scope="session")

@@ -14,17 +14,22 @@ from torchrefract.data.pairs import PairedFolder
 pytest.importorskip("webdataset")  # in its own extra
 
 
+def noting(name: str, step: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a step of Lightning's that writes the keys of its batch first."""
+
+    def noted(self, batch: Any, index: int) -> Any:
+        with open(f"{name}-{os.environ['RANK']}.txt", "a") as file:
+            file.writelines(f"{key}\n" for key in batch.key.tolist())
+        return step(self, batch, index)
+
+    return noted
+
+
 def train_and_note_keys() -> None:
     """Run the command, and write the keys of each batch."""
     restoration = importlib.import_module("torchrefract.restoration.module").Restoration
     for name in ("training_step", "validation_step"):
-
-        def noted(self, batch: Any, index: int, *, name: str = name, step: Callable = getattr(restoration, name)) -> Any:
-            with open(f"{name}-{os.environ['RANK']}.txt", "a") as file:
-                file.writelines(f"{key}\n" for key in batch.key.tolist())
-            return step(self, batch, index)
-
-        setattr(restoration, name, noted)
+        setattr(restoration, name, noting(name, getattr(restoration, name)))
     importlib.import_module("torchrefract.train").main()
 
 

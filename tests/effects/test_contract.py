@@ -47,8 +47,8 @@ from torchrefract.effects.warp_effect import WarpEffect
 NO_RANGE = (0.0, 0.0)
 MOTION = ("wind", "decorrelation", "frame")
 HETEROGENEOUS_FOG = ("visibility", "deviation", "airlight", "weights", "contrast", *MOTION, "scale_height")
-# Clear air, a field that only moves with the wind, and an even density.
 TWO_OCTAVES = {"scales": (12.0, 48.0), "weights": (0.4, 0.6)}  # each more takes a graph a second, by the same code
+# Clear air, a field that only moves with the wind, and an even density.
 MAY_BE_INFINITE = {"visibility", "decorrelation", "scale_height"}
 
 

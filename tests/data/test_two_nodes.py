@@ -58,7 +58,7 @@ def test_two_nodes_train_on_each_pair_once_and_validate_each_once(tars, small, t
     finally:
         for node in nodes:
             node.kill()
-    assert [node.exitcode for node in nodes] == [0, 0], (tmp_path / "output.txt").read_text()
+    assert [node.exitcode for node in nodes] == [0, 0], (tmp_path / "err.txt").read_text()
     for name, split in (("training_step", "train"), ("validation_step", "val")):
         expected = Counter(row.key for row in PairedFolder(tars, split=split).rows())
         parts = [(tmp_path / f"{name}-{rank}.txt").read_text().splitlines() for rank in range(2)]

@@ -195,8 +195,8 @@ def test_threads_that_share_an_effect_get_the_results_and_gradients_of_one_threa
 
     def call(effect: Effect, number: int) -> tuple[dict[str, Tensor], Tensor]:
         scale = step * (number // THREADS % 7)
-        image = frame(number, size=(HEIGHT + 4 * scale, WIDTH + 6 * scale), batch=2).requires_grad_()
-        degraded = effect.degrade(image, seed=7, keys=[number, -number])
+        image = frame(number, size=(HEIGHT + 4 * scale, WIDTH + 6 * scale)).requires_grad_()
+        degraded = effect.degrade(image, seed=7, keys=[number])
         (gradient,) = torch.autograd.grad(degraded.image.square().sum(), image)
         return maps_of(degraded), gradient
 
